@@ -142,6 +142,7 @@ impl Server {
         let archive = Archive::new(&config, pool.settings().budget.clone());
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
+        let readers = Arc::new(Semaphore::new(config.jobs.workers));
         let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
         let (stop, stopping) = watch::channel(Stop::Serve);
         let app = Arc::new(App {
@@ -152,6 +153,7 @@ impl Server {
             store,
             job_store,
             result_headers: Cache::new(CACHED_HEADERS),
+            readers,
             save_permits,
             save_start: Mutex::new(()),
             saves: SingleFlight::default(),

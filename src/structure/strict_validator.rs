@@ -17,12 +17,16 @@ use pdbtbx::{Context, ErrorLevel, Format, PDBError, ReadOptions, StrictnessLevel
 
 use super::atoms::SourceFormat;
 use super::error::StructureError;
-use super::read::{ReadLimits, without_mark};
+use super::read::{ReadLimits, Reading, without_mark};
 use super::text::decode;
 use super::{inflate, sniff};
+use crate::surface::Control;
 
 /// Largest text that is checked. Takes a few seconds in the worst case.
 pub const MAX_BYTES: u64 = 8 << 20;
+
+/// Memory of pdbtbx, bytes per byte of text.
+const MEMORY_PER_BYTE: u64 = 32;
 
 /// Largest number of returned diagnostics. A damaged file has one per line.
 pub const MAX_DIAGNOSTICS: usize = 100;
@@ -88,11 +92,12 @@ pub fn quiet_panics() {
 /// Checks a file, compressed or not. Blocks for up to several seconds. Never panics.
 ///
 /// # Errors
-/// Returns errors of decompression and format detection.
-pub fn check(bytes: &[u8], limits: &ReadLimits) -> Result<Vec<Diagnostic>, StructureError> {
+/// Returns errors of decompression and format detection, of memory and of cancellation.
+pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result<Vec<Diagnostic>, StructureError> {
     let limit = limits.max_inflated_bytes.min(MAX_BYTES);
+    let reading = Reading::new(limits, control);
     let too_large = || vec![Diagnostic::note(format!("not checked: the text is larger than {limit} bytes"))];
-    let plain = match inflate::inflate(bytes, limit) {
+    let plain = match inflate::inflate(bytes, limit, &reading) {
         Err(StructureError::InflatedTooLarge { .. }) if limit < limits.max_inflated_bytes => return Ok(too_large()),
         plain => plain?,
     };
@@ -105,6 +110,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits) -> Result<Vec<Diagnostic>, Struc
             return Ok(vec![Diagnostic::note("not checked: the strict validator does not read BinaryCIF".to_owned())]);
         }
     };
+    let _memory = reading.reserve(MEMORY_PER_BYTE * text.len() as u64)?;
     INSIDE.set(true);
     let outcome = catch_unwind(AssertUnwindSafe(|| findings(text, format)));
     INSIDE.set(false);

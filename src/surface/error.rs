@@ -2,6 +2,8 @@
 
 use thiserror::Error;
 
+use super::memory::OutOfMemory;
+
 /// Errors of the meshing core.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum SurfaceError {
@@ -108,6 +110,9 @@ pub enum SurfaceError {
     /// The deadline passed.
     #[error("the deadline passed")]
     Deadline,
+    /// Memory is not available now.
+    #[error(transparent)]
+    Memory(#[from] OutOfMemory),
     /// The run was cancelled by its caller.
     #[error("cancelled")]
     Cancelled,

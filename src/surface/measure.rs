@@ -82,9 +82,13 @@ impl Measures {
     /// [`SurfaceError::Cancelled`].
     pub fn of(mesh: &Mesh, validation: Validation, control: &Control<'_>) -> Result<Self, SurfaceError> {
         control.check()?;
+        let labels = control.reserve(size_of::<u32>() as u64 * mesh.n_vertices() as u64)?;
         let Totals { components, used, checksum, degenerate } = Totals::of(mesh);
+        drop(labels);
         control.check()?;
         let (faces, balanced) = (mesh.n_triangles() as u64, checksum == 0 && !degenerate);
+        let exact = validation == Validation::Exact || !balanced;
+        let _edges = control.reserve(if exact { topology::BYTES_PER_TRIANGLE * faces } else { 0 })?;
         let topology = match validation {
             Validation::Checksum if balanced => Topology::of_closed(faces),
             Validation::Exact => topology::check(&mesh.triangles),

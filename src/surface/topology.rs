@@ -35,7 +35,10 @@ fn ends(key: u64) -> [u32; 2] {
     [half(key >> 32), half(key)]
 }
 
-/// Checks `triangles`. Takes memory of 32 bytes for each of their edges.
+/// Memory of [`check`], bytes per triangle: 32 for each of its edges.
+pub(super) const BYTES_PER_TRIANGLE: u64 = 3 * 32;
+
+/// Checks `triangles`.
 #[must_use]
 pub fn check(triangles: &[[u32; 3]]) -> Topology {
     let corners = |&[a, b, c]: &[u32; 3]| [(key(a, b), c), (key(b, c), a), (key(c, a), b)];

@@ -149,7 +149,7 @@ fn curl(args: &[&str]) -> serde_json::Value {
 #[test]
 fn identical_atoms_are_rejected_before_allocation() {
     let folder = Folder::new();
-    let service = Service::start(&folder, &["--devices", "cpu"]);
+    let service = Service::start(&folder, &["--devices", "cpu", "--set", "limits.duplicate_atoms=300000"]);
     let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 300_000]));
     let body = format!("@{}", input.display());
     let url = format!("http://{}/v1/meshes?radius_scale=10", service.addr);
@@ -163,7 +163,7 @@ fn identical_atoms_are_rejected_before_allocation() {
 #[test]
 fn cancelled_job_returns_its_memory() {
     let folder = Folder::new();
-    let service = Service::start(&folder, &["--devices", "cpu"]);
+    let service = Service::start(&folder, &["--devices", "cpu", "--set", "limits.duplicate_atoms=80000"]);
     let before = service.memory("VmRSS");
     // Most candidate lists are long enough to be freed when their tile is finished.
     let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 80_000]));

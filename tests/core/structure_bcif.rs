@@ -7,6 +7,7 @@ use crate::bcif_support;
 use bcif_support::Pack::{Array, Bytes, Int, Map, Nil, Real};
 use bcif_support::*;
 use molmesh::structure::{Kind, ReadLimits, SourceFormat, Structure, StructureError, read, strict_validator};
+use molmesh::surface::Control;
 
 fn bcif(bytes: &[u8]) -> Structure {
     read(bytes, &ReadLimits::default()).unwrap_or_else(|e| panic!("{e}"))
@@ -672,7 +673,7 @@ fn never_panics_on_truncated_or_changed_files() {
 
 #[test]
 fn strict_validator_reports_that_it_does_not_read_binary_cif() {
-    let findings = strict_validator::check(CRAMBIN, &ReadLimits::default()).unwrap();
+    let findings = strict_validator::check(CRAMBIN, &ReadLimits::default(), &Control::default()).unwrap();
     assert_eq!(findings.len(), 1);
     assert_eq!((findings[0].level, findings[0].line), (strict_validator::Level::Note, None));
     assert!(findings[0].message.contains("BinaryCIF"), "{}", findings[0].message);

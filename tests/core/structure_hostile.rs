@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use molmesh::structure::strict_validator::{self, Level};
 use molmesh::structure::{Contents, ReadLimits, Selection, StructureError, read, select};
+use molmesh::surface::Control;
 
 const ATOM: &str = "ATOM      2  CA  ALA A  12      11.104  -6.134   0.500  1.00 20.25           C  \n";
 
@@ -25,7 +26,7 @@ fn gzip(data: &[u8]) -> Vec<u8> {
 }
 
 fn limits() -> ReadLimits {
-    ReadLimits { max_inflated_bytes: 64 << 20, max_atoms: 2_000_000 }
+    ReadLimits { max_inflated_bytes: 64 << 20, max_atoms: 2_000_000, ..ReadLimits::default() }
 }
 
 /// Serializes the tests that measure time.
@@ -275,15 +276,15 @@ fn counts_ambiguous_atoms_before_allocation() {
 fn strict_validator_reports_and_never_panics() {
     strict_validator::quiet_panics();
     let sound = std::fs::read("samples/4pti.pdb").unwrap();
-    let findings = strict_validator::check(&sound, &limits()).unwrap();
+    let findings = strict_validator::check(&sound, &limits(), &Control::default()).unwrap();
     assert!(findings.iter().all(|d| d.level < Level::Error), "{findings:?}");
 
-    let short = strict_validator::check(&ATOM.as_bytes()[..60], &limits()).unwrap();
+    let short = strict_validator::check(&ATOM.as_bytes()[..60], &limits(), &Control::default()).unwrap();
     assert!(short.iter().any(|d| d.level == Level::Error && d.line == Some(1)), "{short:?}");
 
     // pdbtbx panics on this space group.
     let panics = format!("CRYST1   28.070   28.070   53.350  90.00  90.00  90.00 Q 99 99 9   8\n{ATOM}");
-    let findings = strict_validator::check(panics.as_bytes(), &limits()).unwrap();
+    let findings = strict_validator::check(panics.as_bytes(), &limits(), &Control::default()).unwrap();
     assert_eq!(findings.len(), 1);
     assert!(
         findings[0].message.contains("failed on this file") && findings[0].message.contains("space group"),
@@ -291,12 +292,18 @@ fn strict_validator_reports_and_never_panics() {
     );
 
     let packed = gzip(&sound);
-    assert_eq!(strict_validator::check(&packed, &limits()), strict_validator::check(&sound, &limits()));
+    assert_eq!(
+        strict_validator::check(&packed, &limits(), &Control::default()),
+        strict_validator::check(&sound, &limits(), &Control::default())
+    );
     let large = ATOM.repeat(1 + (strict_validator::MAX_BYTES as usize) / ATOM.len());
-    let findings = strict_validator::check(large.as_bytes(), &limits()).unwrap();
+    let findings = strict_validator::check(large.as_bytes(), &limits(), &Control::default()).unwrap();
     assert!(findings[0].message.starts_with("not checked: the text is larger than"), "{findings:?}");
-    assert!(matches!(strict_validator::check(b"hello", &limits()), Err(StructureError::UnknownFormat { .. })));
-    let many = strict_validator::check("ATOM\n".repeat(5000).as_bytes(), &limits()).unwrap();
+    assert!(matches!(
+        strict_validator::check(b"hello", &limits(), &Control::default()),
+        Err(StructureError::UnknownFormat { .. })
+    ));
+    let many = strict_validator::check("ATOM\n".repeat(5000).as_bytes(), &limits(), &Control::default()).unwrap();
     assert!(many.len() <= strict_validator::MAX_DIAGNOSTICS + 1);
 }
 

@@ -209,6 +209,18 @@ fn atoms_are_limited() {
 }
 
 #[test]
+fn atoms_at_one_position_are_limited() {
+    let server = fake(|c| c.limits.duplicate_atoms = 10);
+    let line = carbons(1);
+    for path in ["/v1/meshes", "/v1/structures", "/v1/estimate"] {
+        let problem = server.post(path, &[], &line.repeat(11)).problem(422, "too-many-duplicates");
+        assert_eq!((&problem["limit"], &problem["position"]), (&10.into(), &serde_json::json!([0.0, 0.0, 0.0])));
+        assert!([200, 201].contains(&server.post(path, &[], &line.repeat(10)).status), "{path}");
+    }
+    assert!(rejected(&server, "too-many-duplicates") >= 3.0);
+}
+
+#[test]
 fn listed_atoms_are_limited() {
     let server = fake(|c| c.limits.labels = 100);
     let listed = |atoms| {
@@ -380,6 +392,52 @@ fn memory_is_shared_and_limited() {
     assert_eq!(problem["limit"], 200_000);
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
     assert!(rejected(&server, "memory-full") >= 1.0);
+}
+
+/// Returns 100,000 atoms (8 MB) in a small file.
+fn compressed_atoms() -> Vec<u8> {
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(&carbons(100_000)).unwrap();
+    encoder.finish().unwrap()
+}
+
+#[test]
+fn reading_counts_against_the_memory_limit() {
+    let server = fake(|c| c.limits.memory_bytes = 8_000_000);
+    let body = compressed_atoms();
+    assert!(body.len() < 2_000_000, "{}", body.len());
+    for path in ["/v1/meshes", "/v1/structures", "/v1/estimate", "/v1/meshes?check=strict"] {
+        let refused = server.post(path, &[], &body);
+        let problem = refused.problem(503, "memory-full");
+        assert_eq!(problem["limit"], 8_000_000, "{path}");
+        assert!(problem["actual"].as_u64() <= problem["limit"].as_u64(), "{problem}");
+        assert!(refused.header("retry-after").is_some(), "{path}");
+    }
+    wait_for("the memory to be returned", || server.metric("molmesh_memory_held_bytes", &[]) == 0.0);
+    assert_eq!(server.post("/v1/structures", &[], &carbons(1000)).status, 201);
+}
+
+#[test]
+fn abandoned_uploads_are_read_one_at_a_time_and_cancelled() {
+    let server = fake(|c| c.jobs.workers = 1);
+    let body = compressed_atoms();
+    let head = format!("POST /v1/structures HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    let mut most: f64 = 0.0;
+    let mut measure = || most = most.max(server.metric("molmesh_memory_held_bytes", &[]));
+    for _ in 0..12 {
+        let mut stream = connect(server.addr);
+        stream.write_all(&[head.as_bytes(), &body].concat()).unwrap();
+        measure();
+        std::thread::sleep(Duration::from_millis(50));
+        measure();
+    }
+    wait_for("the readings to stop", || {
+        measure();
+        server.metric("molmesh_memory_held_bytes", &[]) == 0.0
+    });
+    // A reading holds 24 MB while its text grows from 8 to 16 MB, or 16 MB and 6 MB of atoms.
+    assert!(most > 1e6 && most < 30e6 + 12.0 * body.len() as f64, "{most}");
+    assert_eq!(server.post("/v1/structures", &[], &carbons(1000)).status, 201);
 }
 
 #[test]
