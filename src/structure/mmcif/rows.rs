@@ -343,7 +343,9 @@ mod tests {
     /// Returns the number of rows that several threads read of a text with this ending, and where they stop.
     fn parallel(rows: &str, end: &str) -> Option<(usize, usize)> {
         let text = format!("{TAGS}{rows}{end}");
-        let (limits, control) = (ReadLimits::default(), Control::default());
+        // All rows are equal.
+        let limits = ReadLimits { max_duplicates: u64::MAX, ..ReadLimits::default() };
+        let control = Control::default();
         let reading = Reading::new(&limits, &control);
         let mut table = Rows::new(text.as_bytes(), layout(&text), &reading);
         let stop = table.read_parallel(TAGS.len()).unwrap()?;
