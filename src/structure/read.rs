@@ -7,6 +7,7 @@ use crate::surface::{Control, Reservation};
 
 /// Limits of reading, checked before memory is allocated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(clippy::struct_field_names, reason = "every field is a maximum")]
 pub struct ReadLimits {
     /// Bytes after decompression.
     pub max_inflated_bytes: u64,
