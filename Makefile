@@ -1,6 +1,6 @@
 # Main targets: `make run` and `make test`. `make help` lists all targets.
 #
-# Optional variables: PROFILE=release runs optimised tests; ARGS passes flags to `make run`.
+# Optional variables: PROFILE=release runs optimized tests; ARGS passes flags to `make run`.
 
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
@@ -85,7 +85,7 @@ gallery: release ## Draw docs/gallery; DATA=FOLDER holds the structures, named b
 figures: ## Update the tables of docs/research/paper.md and its figures from docs/results/paper
 	$(CARGO) run --package molmesh-bench -- figures docs/results/paper --out docs/figures --page docs/research/paper.md
 
-release: web-if-possible ## Build the optimised binary, target/release/molmesh
+release: web-if-possible ## Build the optimized binary, target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh
 
 static: ## Build the command line as a static file for any Linux, CPU only: dist/molmesh; installs what it needs

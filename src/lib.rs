@@ -13,7 +13,7 @@
 //! [`Options`] selects atoms and the surface; [`formats::Encoder`] writes the mesh as GLB, glTF, PLY, STL or OBJ, and
 //! [`pipeline::run`] also returns a report with area, volume and components.
 //!
-//! [`surface`] is the meshing core: spheres in, mesh out. [`structure`] reads files into spheres, [`formats`] encodes
+//! [`surface`] is the meshing core, which converts spheres to a mesh. [`structure`] reads files, [`formats`] encodes
 //! meshes, [`picture`] renders them, and [`pipeline`] runs one job from bytes to report. The `gpu` feature adds the GPU
 //! backend and the `server` feature the HTTP service. All lengths are ångström. `ARCHITECTURE.md` describes the
 //! folders.

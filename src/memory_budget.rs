@@ -1,4 +1,5 @@
-//! Memory budget of all requests, in bytes: uploads, jobs from reading to the mesh, and meshes that are not yet sent.
+//! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, and meshes that are
+//! not yet sent.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -29,7 +30,7 @@ impl Budget {
         Self::new(u64::MAX)
     }
 
-    /// Fails while more than the limit is in use.
+    /// Checks that at most the limit is in use.
     ///
     /// # Errors
     /// [`OutOfMemory::Budget`].
@@ -45,7 +46,7 @@ impl Budget {
     }
 }
 
-/// Bytes taken from a budget, until this is dropped.
+/// Bytes taken from a budget. Dropping the lease returns them.
 #[derive(Debug)]
 pub struct Lease {
     budget: Budget,
@@ -53,7 +54,7 @@ pub struct Lease {
 }
 
 impl Lease {
-    /// Adds `bytes` to the lease; changes nothing on failure.
+    /// Adds `bytes` to the lease. A failure changes nothing.
     ///
     /// # Errors
     /// [`OutOfMemory::Budget`].

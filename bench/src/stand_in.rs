@@ -2,7 +2,7 @@
 //!
 //! The grid of the paper consists of whole cubes of 0.4 Å over the bounding box of the atom centres plus a margin of 5
 //! Å. This gives the exact number of cubes for the four structures with known coordinates. A number of cubes is
-//! therefore a product of three integers. The most even factorisation determines the box of the centres.
+//! therefore a product of three integers. The most even factorization determines the box of the centres.
 //!
 //! The atoms are on a perturbed cubic lattice as dense as the heavy atoms of proteins, those nearest to the diagonal
 //! first. Few atoms in a large box form a rod, like the filaments and chains among the paper's structures.

@@ -11,6 +11,7 @@ use super::error::AccessError;
 use super::keys::{Denied, Key, KeyRing};
 use super::meter::Meter;
 use super::sign::{SignatureCheck, SigningKeys};
+use super::sites::Sites;
 use super::{file, forwarded};
 use crate::config::{AccessConfig, Config, Origins, ServerConfig};
 
@@ -22,6 +23,7 @@ pub(crate) struct Access {
     /// Quota per address of clients without a key; `None` means unlimited.
     address_quota: Option<Arc<Quota>>,
     meter: Arc<Meter>,
+    sites: Sites,
     config: AccessConfig,
     server: ServerConfig,
 }
@@ -46,6 +48,7 @@ fn stamp(path: &Path) -> Option<Stamp> {
 impl Access {
     /// Creates the access control and reads the key file, if one is configured.
     pub(crate) fn open(config: &Config) -> Result<Self, AccessError> {
+        let sites = Sites::new(config);
         let (config, server) = (config.access.clone(), config.server.clone());
         if config.cors_credentials && config.cors_origins == Some(Origins::Any) {
             return Err(AccessError::CredentialsForAll);
@@ -67,6 +70,7 @@ impl Access {
             signing: signing.transpose().map_err(AccessError::Signing)?,
             address_quota: (!quota.is_unlimited()).then(|| Arc::new(quota)),
             meter: Arc::new(Meter::new(config.max_addresses)),
+            sites,
             config,
             server,
         })
@@ -88,9 +92,14 @@ impl Access {
         ring.map_or(Err(Denied::Unknown), |ring| ring.verify(text, now))
     }
 
-    /// Checks the signature of a path and query. No signature is found if signatures are off.
+    /// Checks the signature of a path and query. Returns [`SignatureCheck::Absent`] if no signing key is configured.
     pub(crate) fn check_signature(&self, path: &str, query: Option<&str>, now: SystemTime) -> SignatureCheck {
         self.signing.as_ref().map_or(SignatureCheck::Absent, |keys| keys.check(path, query, now))
+    }
+
+    /// Signs a target of this service until `end`, s of Unix time. Returns `None` if signatures are off.
+    pub(crate) fn sign(&self, target: &str, end: u64) -> Option<String> {
+        self.signing.as_ref()?.sign(None, target, end).ok()
     }
 
     /// Returns the quota of clients without a key.
@@ -101,6 +110,11 @@ impl Access {
     /// Returns the usage meter.
     pub(crate) fn meter(&self) -> &Arc<Meter> {
         &self.meter
+    }
+
+    /// Returns the origins and host names of the service.
+    pub(crate) fn sites(&self) -> &Sites {
+        &self.sites
     }
 
     /// Returns the configuration.

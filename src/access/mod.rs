@@ -12,6 +12,7 @@ mod forwarded;
 mod keys;
 mod meter;
 mod sign;
+mod sites;
 mod token;
 
 pub(crate) use account::{Account, Exceeded};
@@ -19,6 +20,7 @@ pub(crate) use authorizer::Access;
 pub(crate) use fields::{rate_limit, rate_limit_policy};
 pub(crate) use keys::Denied;
 pub(crate) use sign::{SIGNATURE, SignatureCheck, remove_signature};
+pub(crate) use sites::authority;
 
 pub use account::Quota;
 pub use error::{AccessError, KeyFileError};

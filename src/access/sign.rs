@@ -1,8 +1,9 @@
 //! Signed URLs, which allow GET without a key until they expire.
 //!
 //! The signature covers the path and all query parameters as sent, sorted by their bytes: no parameter can be added,
-//! removed or rewritten. Three parameters carry it: [`EXPIRES`] in seconds of Unix time, [`KEY_ID`], and [`SIGNATURE`],
-//! an HMAC-SHA-256 in base64url. The host is not signed, because a service behind proxies does not know its own.
+//! removed or rewritten. The signature of a job covers its events and its result as well. Three parameters carry it:
+//! [`EXPIRES`] in seconds of Unix time, [`KEY_ID`], and [`SIGNATURE`], an HMAC-SHA-256 in base64url. The host is not
+//! signed, because a service behind proxies does not know its own.
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -21,6 +22,8 @@ pub(crate) const KEY_ID: &str = "key_id";
 /// Query parameter of the signature.
 pub(crate) const SIGNATURE: &str = "signature";
 
+/// Path of all jobs.
+const JOBS: &str = "/v1/jobs/";
 /// Prefix of the signed message, which separates it from messages of other kinds.
 const DOMAIN: &str = "molmesh-address-1\n";
 /// Minimum length of a secret, characters: 128 bits in hexadecimal. [`token::new_secret`] returns twice as many.
@@ -53,8 +56,8 @@ pub enum SignError {
 pub(crate) enum SignatureCheck {
     /// The query has no signature.
     Absent,
-    /// The signature is valid.
-    Valid,
+    /// The signature is valid until this time, s of Unix time.
+    Valid(u64),
     /// The signature is invalid. The wrong part is not revealed.
     Invalid,
     /// The signature is correct but expired at this time, s of Unix time.
@@ -156,7 +159,7 @@ impl SigningKeys {
         if UNIX_EPOCH.checked_add(Duration::from_secs(end)).is_some_and(|end| end <= now) {
             return SignatureCheck::Expired(end);
         }
-        SignatureCheck::Valid
+        SignatureCheck::Valid(end)
     }
 }
 
@@ -178,11 +181,20 @@ fn only<'a>(parameters: &[&'a str], name: &str) -> Option<&'a str> {
     first.split_once('=').map(|(_, value)| value).filter(|_| more.is_none())
 }
 
+/// Returns the path that a signature of `path` covers: for the events and the result of a job, that of the job.
+fn covered(path: &str) -> &str {
+    let of_job = path.strip_prefix(JOBS).and_then(|rest| rest.split_once('/'));
+    match of_job {
+        Some((id, "events" | "result")) => &path[..JOBS.len() + id.len()],
+        _ => path,
+    }
+}
+
 /// Returns the MAC of a path and its parameters. Neither can contain a line break, so the message is unambiguous.
 fn message(mac: &Hmac<Sha256>, path: &str, mut parameters: Vec<&str>) -> Hmac<Sha256> {
     parameters.sort_unstable();
     let mut mac = mac.clone();
-    for part in [DOMAIN, path, "\n", &parameters.join("&")] {
+    for part in [DOMAIN, covered(path), "\n", &parameters.join("&")] {
         mac.update(part.as_bytes());
     }
     mac
@@ -224,7 +236,7 @@ mod tests {
         ] {
             let signed = keys.sign(None, target, 100).unwrap();
             assert!(signed.starts_with(target) && signed.contains("expires=100&key_id=new&signature="), "{signed}");
-            assert_eq!(check(&keys, &signed, 99), SignatureCheck::Valid, "{signed}");
+            assert_eq!(check(&keys, &signed, 99), SignatureCheck::Valid(100), "{signed}");
             assert_eq!(remove_signature(signed.split_once('?').unwrap().1).as_deref(), rest);
             assert_eq!(check(&keys, &signed, 100), SignatureCheck::Expired(100));
             assert_eq!(check(&keys, target, 99), SignatureCheck::Absent);
@@ -233,17 +245,32 @@ mod tests {
         let signed = keys.sign(None, "/x?b=1&a=2", 100).unwrap();
         let (_, query) = signed.split_once('?').unwrap();
         let reversed: Vec<&str> = query.split('&').rev().collect();
-        assert_eq!(check(&keys, &format!("/x?{}", reversed.join("&")), 0), SignatureCheck::Valid);
+        assert_eq!(check(&keys, &format!("/x?{}", reversed.join("&")), 0), SignatureCheck::Valid(100));
+    }
+
+    #[test]
+    fn the_signature_of_a_job_covers_its_events_and_result() {
+        let keys = keys();
+        let signed = keys.sign(None, "/v1/jobs/7", 100).unwrap();
+        let at = |path: &str| check(&keys, &signed.replace("/v1/jobs/7", path), 0);
+        for path in ["/v1/jobs/7", "/v1/jobs/7/events", "/v1/jobs/7/result"] {
+            assert_eq!(at(path), SignatureCheck::Valid(100), "{path}");
+        }
+        for path in
+            ["/v1/jobs/8", "/v1/jobs/8/result", "/v1/jobs/7/x", "/v1/jobs/7/events/result", "/v1/jobs", "/v1/jobs/"]
+        {
+            assert_eq!(at(path), SignatureCheck::Invalid, "{path}");
+        }
     }
 
     #[test]
     fn signing_keys_can_be_rotated() {
         let both = keys();
         let signed = both.sign(Some("old"), "/x", 100).unwrap();
-        assert_eq!(check(&both, &signed, 0), SignatureCheck::Valid);
+        assert_eq!(check(&both, &signed, 0), SignatureCheck::Valid(100));
         let only_new = SigningKeys::parse(&format!("new:{}", "new".repeat(11))).unwrap();
         assert_eq!(check(&only_new, &signed, 0), SignatureCheck::Invalid);
-        assert_eq!(check(&only_new, &both.sign(None, "/x", 100).unwrap(), 0), SignatureCheck::Valid);
+        assert_eq!(check(&only_new, &both.sign(None, "/x", 100).unwrap(), 0), SignatureCheck::Valid(100));
         let renamed = signed.replace("key_id=old", "key_id=new");
         assert_eq!(check(&both, &renamed, 0), SignatureCheck::Invalid);
         assert!(

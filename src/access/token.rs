@@ -9,7 +9,7 @@ use std::str::FromStr;
 use sha2::{Digest as _, Sha256};
 use subtle::ConstantTimeEq as _;
 
-/// Prefix of every key, by which secret scanners recognise keys.
+/// Prefix of every key, by which secret scanners recognize keys.
 const PREFIX: &str = "mm_";
 /// Length of a secret: 256 bits in lower-case hexadecimal digits.
 const SECRET_CHARS: usize = 64;

@@ -17,7 +17,7 @@ use crate::config::{ArchiveConfig, Templates};
 use crate::memory_budget::Lease;
 use crate::store::Digest;
 use crate::surface::OutOfMemory;
-use crate::telemetry::{SpanContext, traceparent, tracestate};
+use crate::telemetry::{SpanContext, traceparent};
 
 /// Maximum number of redirects.
 const MAX_REDIRECTS: usize = 3;
@@ -28,7 +28,6 @@ const MAX_RETRY_AFTER: Duration = Duration::from_hours(24);
 const USER_AGENT: &str = concat!("molmesh/", env!("CARGO_PKG_VERSION"), " (molecular surface service)");
 
 const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
-const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
 /// URL of a response and its validators, for a later conditional request.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -113,7 +112,8 @@ pub(super) async fn head(client: &Client, url: Url) -> Result<u16, Failed> {
 }
 
 /// Sends one GET request, a conditional one if a copy is `known`. `lease` is charged with the body while it arrives and
-/// until the answer is dropped. The check of a gzip file stops after `inflated_bytes`.
+/// until the answer is dropped. Nothing of the client's request is passed on except the id of a `trace` that is
+/// exported. The check of a gzip file stops after `inflated_bytes`.
 pub(super) async fn get(
     client: &Client,
     url: Url,
@@ -121,12 +121,14 @@ pub(super) async fn get(
     config: &ArchiveConfig,
     inflated_bytes: u64,
     lease: Lease,
-    trace: &SpanContext,
+    trace: Option<&SpanContext>,
 ) -> Result<Answer, Failed> {
     let compressed = Path::new(url.path()).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gz"));
     let name = url.to_string();
-    let mut request = client.get(url).header(TRACEPARENT, traceparent(trace));
-    request = tracestate(trace).into_iter().fold(request, |request, state| request.header(TRACESTATE, state));
+    let mut request = client.get(url);
+    if let Some(trace) = trace {
+        request = request.header(TRACEPARENT, traceparent(trace));
+    }
     if let Some(Origin { etag, last_modified, .. }) = known {
         for (header, value) in [(IF_NONE_MATCH, etag), (IF_MODIFIED_SINCE, last_modified)] {
             request = value.iter().fold(request, |request, value| request.header(header.clone(), value));
@@ -135,7 +137,7 @@ pub(super) async fn get(
     let head_timeout = Duration::from_millis(config.connect_timeout_ms.saturating_add(config.first_byte_timeout_ms));
     let response = tokio::time::timeout(head_timeout, request.send())
         .await
-        .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "no head in time"))?
+        .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the response did not begin in time"))?
         .map_err(|error| of_client(&error))?;
     match response.status() {
         StatusCode::OK => {}
@@ -180,7 +182,7 @@ async fn body(mut response: Response, config: &ArchiveConfig, lease: &Lease) -> 
     loop {
         let chunk = tokio::time::timeout(Duration::from_millis(config.first_byte_timeout_ms), response.chunk())
             .await
-            .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the body stalls"))?;
+            .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the body stalled"))?;
         let Some(chunk) = chunk.map_err(|error| of_client(&error))? else { break };
         if body.len() as u64 + chunk.len() as u64 > config.max_bytes {
             return Err(Failed::TooLarge(None));

@@ -85,7 +85,7 @@ impl Archive {
         let shared = Shared {
             folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
             disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
-            remote: Remote::new(archive, inflated, memory),
+            remote: Remote::new(config, memory),
             fetches: SingleFlight::default(),
             known: Cache::new(CACHED_DIGESTS),
             absent: Cache::new(CACHED_DIGESTS),
@@ -194,7 +194,8 @@ impl Shared {
         histogram!(ARCHIVE_FETCH, "result" => result).record(checked.elapsed().as_secs_f64());
         match (answer, stored) {
             (Ok(Answer::Body { bytes, digest, origin, lease }), _) => {
-                tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms = checked.elapsed().as_millis(), "fetched an entry");
+                let ms = checked.elapsed().as_millis();
+                tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms, "fetched an entry");
                 let kept = bytes.clone();
                 self.on_disk(id, "stored", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
                 self.remember(

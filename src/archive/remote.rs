@@ -11,7 +11,7 @@ use tokio::time::Instant;
 use super::breaker::Breaker;
 use super::client::{self, Answer, Failed, Origin};
 use super::error::{FetchError, UnavailableReason};
-use crate::config::{ArchiveConfig, Template};
+use crate::config::{ArchiveConfig, Config, Template};
 use crate::memory_budget::Budget;
 use crate::structure::EntryId;
 use crate::telemetry::{SpanKind, SpanParent, TraceSpan};
@@ -29,6 +29,8 @@ pub(super) struct Remote {
     config: ArchiveConfig,
     /// Inflated bytes after which the check of a gzip file stops.
     inflated_bytes: u64,
+    /// Pass on the trace context, since its spans are exported.
+    sends_trace: bool,
     permits: Semaphore,
     memory: Budget,
     /// Created on first use, because it reads the system's certificates.
@@ -37,7 +39,9 @@ pub(super) struct Remote {
 
 impl Remote {
     /// Creates the remote archive of a configuration, if it names one. Bodies that arrive are charged to `memory`.
-    pub(super) fn new(config: &ArchiveConfig, inflated_bytes: u64, memory: Budget) -> Option<Self> {
+    pub(super) fn new(config: &Config, memory: Budget) -> Option<Self> {
+        let (inflated_bytes, sends_trace) = (config.limits.inflated_bytes, config.telemetry.endpoint.is_some());
+        let config = &config.archive;
         let mut sources: Vec<(Template, Arc<Breaker>)> = Vec::new();
         for template in config.url.as_ref()?.as_slice() {
             let known = sources.iter().find(|(_, breaker)| breaker.host() == template.host());
@@ -52,7 +56,8 @@ impl Remote {
             sources.push((template.clone(), breaker));
         }
         let permits = Semaphore::new(config.concurrent);
-        Some(Self { sources, config: config.clone(), inflated_bytes, permits, memory, client: OnceCell::new() })
+        let client = OnceCell::new();
+        Some(Self { sources, config: config.clone(), inflated_bytes, sends_trace, permits, memory, client })
     }
 
     /// Sends a HEAD request for `id` to every URL. Returns the hosts with the status or the error.
@@ -66,7 +71,7 @@ impl Remote {
                     Failed::Other { detail, .. } => detail,
                 };
                 let client = self.client().await.map_err(failed)?;
-                let url = template.url(id).ok_or("the address is no URL")?;
+                let url = template.url(id).ok_or("the URL is invalid")?;
                 client::head(client, url).await.map_err(failed)
             };
             let answer = tokio::time::timeout(limit, request).await;
@@ -161,12 +166,13 @@ impl Remote {
             .map_err(|_elapsed| Failed::other(UnavailableReason::Busy, "no permit in time"))?
             .map_err(|closed| Failed::other(UnavailableReason::Busy, &closed))?;
         let client = self.client().await?;
-        let url = template.url(id).ok_or_else(|| Failed::other(UnavailableReason::Client, "the address is no URL"))?;
+        let url = template.url(id).ok_or_else(|| Failed::other(UnavailableReason::Client, "the URL is invalid"))?;
         let known = copy.filter(|copy| copy.url == url.as_str());
         let permit = breaker.acquire().map_err(paused)?;
         let span = TraceSpan::start(&SpanParent::current(), "GET", SpanKind::Client, std::time::Instant::now());
-        let trace = span.context();
-        let get = client::get(client, url, known, &self.config, self.inflated_bytes, self.memory.lease(), &trace);
+        let trace = self.sends_trace.then(|| span.context());
+        let lease = self.memory.lease();
+        let get = client::get(client, url, known, &self.config, self.inflated_bytes, lease, trace.as_ref());
         let answer = tokio::time::timeout_at(deadline, get)
             .await
             .unwrap_or_else(|_elapsed| Err(Failed::other(UnavailableReason::Timeout, "incomplete at the deadline")));
@@ -232,8 +238,9 @@ mod tests {
 
     #[test]
     fn pauses_double_and_are_random() {
-        let config = ArchiveConfig { backoff_ms: 1000, ..ArchiveConfig::default() };
-        let remote = Remote::new(&config, 1, Budget::unlimited()).unwrap();
+        let mut config = Config::default();
+        config.archive.backoff_ms = 1000;
+        let remote = Remote::new(&config, Budget::unlimited()).unwrap();
         let longest = |attempt| (0..200).map(|_| remote.pause(attempt, None)).max().unwrap_or_default().as_millis();
         for (attempt, span) in [(1, 1000), (2, 2000), (3, 4000)] {
             let longest = longest(attempt);

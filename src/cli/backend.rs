@@ -60,7 +60,7 @@ impl<'a> BackendRequest<'a> {
         matches!(self.purpose, Purpose::Mesh | Purpose::Picture)
     }
 
-    /// Returns the threads that the CPU backend of a command gets.
+    /// Returns the number of threads of a command's CPU backend.
     fn n_threads(&self) -> usize {
         self.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, NonZero::get))
     }
@@ -130,19 +130,21 @@ fn gpu_or_cpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliErro
         return instead_of_gpu(requested, format!("auto: {why}"), NoGpu { why, devices: Vec::new() });
     }
     let auto = requested.backend == BackendName::Auto;
-    let these = matches!(requested.devices, DeviceChoice::Listed(_));
+    let listed = matches!(requested.devices, DeviceChoice::Listed(_));
     match gpu(requested) {
         Ok(mut selected) => {
             let estimate = estimate.map(|estimate| format!(", {estimate}")).unwrap_or_default();
-            selected.reason = match auto {
-                _ if these => format!("--devices {}", requested.devices),
-                true => format!("auto: {}{estimate}", selected.reason),
-                false => "requested".to_owned(),
+            selected.reason = if listed {
+                format!("--devices {}", requested.devices)
+            } else if auto {
+                format!("auto: {}{estimate}", selected.reason)
+            } else {
+                "requested".to_owned()
             };
             Ok(selected)
         }
         // A request for a specific device fails instead of falling back to the CPU.
-        Err(NoGpu { why, .. }) if !auto || these => {
+        Err(NoGpu { why, .. }) if !auto || listed => {
             Err(CliError::NoBackend { requested: "gpu", why: format!("no GPU can be used: {why}") })
         }
         Err(none) => {
@@ -166,7 +168,7 @@ fn cpu(requested: &BackendRequest<'_>) -> Result<Box<dyn Backend>, CliError> {
     Ok(Box::new(backend))
 }
 
-/// Reason for not using a GPU, with the discovered devices.
+/// Reason why no GPU is used, with the discovered devices.
 struct NoGpu {
     why: String,
     devices: Vec<FoundDevice>,
@@ -188,8 +190,8 @@ fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
     let discovery = discover(requested.devices, mode);
     let missing = discovery.missing(requested.devices);
     if !missing.is_empty() {
-        let there = discovery.no_device_reason().map(|why| format!(" ({why})")).unwrap_or_default();
-        return Err(NoGpu { why: format!("{}{there}", missing.join(", ")), devices: discovery.devices });
+        let detail = discovery.no_device_reason().map(|why| format!(" ({why})")).unwrap_or_default();
+        return Err(NoGpu { why: format!("{}{detail}", missing.join(", ")), devices: discovery.devices });
     }
     if let Some(why) = discovery.no_device_reason() {
         return Err(NoGpu { why, devices: discovery.devices });

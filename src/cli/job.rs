@@ -1,4 +1,4 @@
-//! The job of a command: one structure in, one file and one report out.
+//! Job of the commands `mesh` and `render`: reads one structure, and writes one file and one report.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -21,7 +21,7 @@ use super::style::Style;
 use super::summary::{self, Written};
 use super::{interrupt, request};
 
-/// A command's only job with its input and backend.
+/// Job of a command, with its input and backend.
 pub(super) struct CommandJob<'a> {
     path: &'a Path,
     args: &'a JobArgs,
@@ -58,11 +58,12 @@ impl<'a> CommandJob<'a> {
         Ok((Self { path, args, job, limits, cancel, input, selected, progress, findings }, output))
     }
 
+    /// Returns the control of a run: cancellation, no deadline and no memory limit.
     fn control(&self) -> Control<'static> {
         Control { cancel: self.cancel.clone(), ..Control::default() }
     }
 
-    /// Makes the mesh. With a `sink`, writes it there as GLB while it is meshed, if the job allows that.
+    /// Computes the mesh. If the job allows it, the mesh is written to `sink` as GLB at the same time.
     pub(super) fn run(&self, sink: Option<&GlbSink<'_>>) -> Result<Product, JobError> {
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
         pipeline::run(&self.input, &self.job, &self.limits, &choice, &self.control(), &self.progress, sink)
@@ -106,7 +107,7 @@ impl<'a> CommandJob<'a> {
     }
 }
 
-/// Reads the input. `limit` is that of the decompressed bytes, which are not fewer.
+/// Reads the input, of at most `limit` bytes. The limit of decompressed bytes also suits a compressed input.
 fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
     let stdin = is_stdio(path);
     let name = || name_of(path);
@@ -116,7 +117,7 @@ fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
         }
         let file = File::open(path)?;
         let size = file.metadata()?.len();
-        // The spare byte lets the reader detect the end of the file without growing the buffer.
+        // One spare byte lets the reader detect the end of the file without growing the buffer.
         take(file, if size > limit { 0 } else { size + 1 }, limit)
     };
     let bytes = read().map_err(|source| CliError::Input { name: name(), source })?;
@@ -149,7 +150,7 @@ fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic
     }
 }
 
-/// Returns the worst finding of the strict validator in a file with a syntax error.
+/// Returns the worst finding of the strict validator if the file has a syntax error.
 fn worst_finding(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
     let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
     let findings = strict_validator::check(input, &limits.read, &Control::default()).ok()?;
@@ -177,7 +178,7 @@ fn write_report(
             let lines: Option<Vec<String>> =
                 findings.map(|all| all.iter().map(|f| format!("{}: {}", f.level.name(), finding(f))).collect());
             let text = summary::text(report, written, lines.as_deref(), Style::stderr());
-            // A closed stderr does not make a finished mesh a failure.
+            // The mesh is finished, so a closed stderr is not an error.
             drop(io::stderr().write_all(text.as_bytes()));
             Ok(())
         }
@@ -191,7 +192,7 @@ fn write_report(
 }
 
 fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Written<'_>) -> Result<String, CliError> {
-    let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialised: {e}"));
+    let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialized: {e}"));
     let mut value = serde_json::to_value(report).map_err(failed)?;
     if let Value::Object(map) = &mut value {
         let output = json!({ "file": written.name, "format": written.format, "bytes": written.bytes });

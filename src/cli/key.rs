@@ -76,7 +76,8 @@ pub(super) fn end(text: &str) -> Result<SystemTime, CliError> {
         CliError::usage(format!("parameter `expires`: `{text}` is not allowed; {expected}"))
     };
     if let Ok(date) = humantime::parse_rfc3339(text) {
-        return Ok(date);
+        let past = || CliError::usage(format!("parameter `expires`: `{text}` is in the past"));
+        return Some(date).filter(|date| *date > SystemTime::now()).ok_or_else(past);
     }
     let from_now = seconds("expires", text).map_err(|_other| message())?;
     SystemTime::now().checked_add(Duration::from_secs(from_now)).filter(is_a_date).ok_or_else(message)

@@ -26,7 +26,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
             hint: Some("molmesh render writes pictures".to_owned()),
         });
     }
-    request::settle(&mut job, format)?;
+    request::set_format(&mut job, format)?;
     let paths = (args.input.as_path(), args.output.as_path());
     let (job, mut output) = CommandJob::prepare(job, strict, paths, &args.job, Purpose::Mesh)?;
     let product = if format == Format::Glb && output.has_random_access() {
@@ -62,7 +62,7 @@ fn format(output: &Path) -> Result<Format, CliError> {
     }
 }
 
-/// Runs the job and writes a GLB while it is meshed, if the job allows that.
+/// Runs the job. If the job allows it, the GLB is written while the mesh is computed.
 fn run_to_file(job: &CommandJob<'_>, output: &Output) -> Result<Product, CliError> {
     let sink = GlbSink::new(output);
     job.run(Some(&sink)).map_err(|error| match error {

@@ -27,7 +27,7 @@ pub(super) fn of_render(args: &RenderArgs) -> Result<Request, CliError> {
         ("style", style),
     ];
     let mut request = parse(&own, &args.job)?;
-    settle(&mut request.job, Format::Png)?;
+    set_format(&mut request.job, Format::Png)?;
     Ok(request)
 }
 
@@ -35,8 +35,8 @@ fn parse(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Result<Requ
     params::parse(pairs(own, args)).map_err(|error| refusal(&error))
 }
 
-/// Adapts the job to the output format.
-pub(super) fn settle(job: &mut Job, format: Format) -> Result<(), CliError> {
+/// Sets the format of a job. Fails if the format cannot hold what the flags request.
+pub(super) fn set_format(job: &mut Job, format: Format) -> Result<(), CliError> {
     params::set_format(job, format).map_err(|error| refusal(&error))
 }
 

@@ -26,6 +26,7 @@ const RUNTIME_THREADS: usize = 2;
 
 /// Runs the service until it has been stopped and drained.
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
+    hide_new_files();
     let Loaded { config, warnings, .. } = super::config::load(args)?;
     telemetry::init_logs(&config.log).map_err(|e| CliError::usage(e.to_string()))?;
     for warning in warnings {
@@ -71,6 +72,12 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     // Do not wait for file reads and jobs that outlast the drain timeout.
     runtime.shutdown_timeout(Duration::from_millis(100));
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
+}
+
+/// Makes new files and folders accessible to the user of the service only.
+fn hide_new_files() {
+    #[cfg(target_os = "linux")]
+    rustix::process::umask(rustix::fs::Mode::RWXG | rustix::fs::Mode::RWXO);
 }
 
 /// Raises the limit of open files to the hard limit.

@@ -4,6 +4,7 @@ use std::time::SystemTime;
 
 use molmesh::access::SigningKeys;
 use molmesh::config::Config;
+use molmesh::http::check_signable;
 
 use super::args::SignArgs;
 use super::error::CliError;
@@ -16,7 +17,9 @@ pub(super) fn run(args: &SignArgs) -> Result<(), CliError> {
     let end = key::end(&args.expires)?;
     let expires = end.duration_since(SystemTime::UNIX_EPOCH).map(|since| since.as_secs()).unwrap_or_default();
     let signed = keys.sign(args.key_id.as_deref(), target, expires);
-    let signed = signed.map_err(|why| CliError::usage(format!("cannot sign `{}`: {why}", args.url)))?;
+    let refused = |why: String| CliError::usage(format!("cannot sign `{}`: {why}", args.url));
+    let signed = signed.map_err(|why| refused(why.to_string()))?;
+    check_signable(target).map_err(refused)?;
     super::print(&format!("{origin}{signed}\n"))
 }
 

@@ -267,7 +267,7 @@ mod tests {
                 pixel: 0.12345,
                 renderer: "cpu",
                 arithmetic: String::new(),
-                device: "CPU rasteriser, 2 threads".into(),
+                device: "CPU rasterizer, 2 threads".into(),
                 reason: "auto: no GPU".into(),
                 fallback: None,
             }),
@@ -297,7 +297,7 @@ mod tests {
             "cpu: 2 threads (requested)",
             "a.glb (glb, 720,000 bytes)",
             "640 × 480, principal view, azimuth 30°, elevation 0°, surface, transparent background, 0.1235 Å per pixel",
-            "cpu: CPU rasteriser, 2 threads (auto: no GPU)",
+            "cpu: CPU rasterizer, 2 threads (auto: no GPU)",
             "2.75 ms",
             "field",
         ] {

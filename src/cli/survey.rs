@@ -24,7 +24,7 @@ pub(crate) fn backends(selected: &SelectedBackend) -> Vec<Availability> {
     let gpu = match &selected.no_gpu {
         None => Ok(selected.backend.describe()),
         Some(why) if selected.devices.is_empty() => Err(why.clone()),
-        // The devices have their own reasons.
+        // Each device is listed with its own reason.
         Some(_) => Err("no device is used".to_owned()),
     };
     let cpu = CpuBackend::new(None).map(|cpu| cpu.describe());
@@ -33,7 +33,7 @@ pub(crate) fn backends(selected: &SelectedBackend) -> Vec<Availability> {
         .into()
 }
 
-/// Returns the unused devices with the reasons.
+/// Returns the unused devices with their reasons.
 pub(crate) fn unused_devices(selected: &SelectedBackend) -> impl Iterator<Item = Availability> {
     selected.devices.iter().filter(|device| !device.selected).map(|device| Availability {
         name: format!("gpu {}", device.number),

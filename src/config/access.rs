@@ -39,8 +39,9 @@ pub struct AccessConfig {
     /// Number of addresses with a separate quota. Default 10,000, about 2 MB. Further addresses share one quota,
     /// because forgetting an address would give it a new one.
     pub max_addresses: usize,
-    /// Origins whose pages may read responses: `*`, or a list such as `https://viewer.example`. Default `*`: the
-    /// service uses no cookies, and only a page that has a key can send it. `none`: only pages of this server.
+    /// Origins whose pages may read responses and send requests without a key: `auto`, `*`, or a list such as
+    /// `https://viewer.example`. Default `auto`: loopback origins if the service listens on a loopback address, no
+    /// others. `none`: only pages of this server.
     #[serde(with = "list")]
     #[schemars(schema_with = "Origins::schema")]
     pub cors_origins: Option<Origins>,
@@ -63,14 +64,14 @@ impl Default for AccessConfig {
             address_concurrent: None,
             window_s: 60,
             max_addresses: 10_000,
-            cors_origins: Some(Origins::Any),
+            cors_origins: Some(Origins::Auto),
             cors_credentials: false,
             hsts_s: None,
         }
     }
 }
 
-/// Deserialises an optional count from a number or text; its default `none` does not tell the loader the type.
+/// Deserializes an optional count from a number or text; its default `none` does not tell the loader the type.
 fn count<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<u64>, D::Error> {
     let number = match Value::deserialize(deserializer)? {
         Value::Null => return Ok(None),
@@ -85,6 +86,8 @@ fn count<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<u64>, D::E
 /// Origins whose pages may read responses.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Origins {
+    /// Loopback origins if the service listens on a loopback address; otherwise none.
+    Auto,
     /// All origins.
     Any,
     /// These origins, at least one, each in the form of the `Origin` header.
@@ -93,18 +96,20 @@ pub enum Origins {
 
 impl Origins {
     fn schema(_: &mut SchemaGenerator) -> Schema {
-        list::schema(r"(\*|https?://\S+)")
+        list::schema(r"(auto|\*|https?://\S+)")
     }
 }
 
 impl FromStr for Origins {
     type Err = String;
 
-    /// Parses `*` or origins separated by white space. The error states the expected form.
+    /// Parses `auto`, `*`, or origins separated by white space. The error states the expected form.
     fn from_str(text: &str) -> Result<Self, String> {
         let all: Vec<&str> = text.split_whitespace().collect();
-        if all == ["*"] {
-            return Ok(Self::Any);
+        match all.as_slice() {
+            ["auto"] => return Ok(Self::Auto),
+            ["*"] => return Ok(Self::Any),
+            _ => {}
         }
         let is_origin = |origin: &&str| {
             let url = origin.parse::<Url>().ok().filter(|url| ["http", "https"].contains(&url.scheme()));
@@ -112,11 +117,11 @@ impl FromStr for Origins {
         };
         if let Some(bad) = all.iter().find(|origin| !is_origin(origin)) {
             return Err(format!(
-                "*, none, or origins such as https://viewer.example without a path; `{bad}` is not one"
+                "auto, *, none, or origins such as https://viewer.example without a path; `{bad}` is not one"
             ));
         }
         if all.is_empty() {
-            return Err("*, none, or origins such as https://viewer.example".to_owned());
+            return Err("auto, *, none, or origins such as https://viewer.example".to_owned());
         }
         Ok(Self::These(all.into_iter().map(str::to_owned).collect()))
     }
@@ -125,6 +130,7 @@ impl FromStr for Origins {
 impl fmt::Display for Origins {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
+            Self::Auto => f.write_str("auto"),
             Self::Any => f.write_str("*"),
             Self::These(origins) => f.write_str(&origins.join(" ")),
         }
@@ -138,10 +144,19 @@ mod tests {
     #[test]
     fn parses_origins_in_the_form_of_the_header() {
         assert_eq!("*".parse(), Ok(Origins::Any));
+        assert_eq!("auto".parse(), Ok(Origins::Auto));
         let two = "https://a.example http://localhost:3000";
         assert_eq!(two.parse::<Origins>().unwrap().to_string(), two);
-        for bad in ["", "https://a.example/", "https://a.example:443", "a.example", "null", "ftp://a", "* https://a.b"]
-        {
+        for bad in [
+            "",
+            "https://a.example/",
+            "https://a.example:443",
+            "a.example",
+            "null",
+            "ftp://a",
+            "* https://a.b",
+            "auto *",
+        ] {
             assert!(bad.parse::<Origins>().is_err(), "{bad}");
         }
     }

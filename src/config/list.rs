@@ -1,4 +1,4 @@
-//! Serde and schema of lists, such as of origins: a string of items separated by white space, or an array of strings.
+//! Serialization and schema of lists, such as origins: a string with white space between the items, or an array.
 
 use std::fmt::Display;
 use std::str::FromStr;

@@ -8,11 +8,11 @@ use super::secrets::{SECRETS, file_key, is_hidden};
 /// Printed key.
 struct Row {
     key: String,
-    /// `None` for a secret.
+    /// Value; `None` for a secret.
     value: Option<Value>,
     /// Source of the value. For a secret from a file, source of the key that names the file.
     source: Source,
-    /// The value is a secret from the file that the `_file` key names.
+    /// True if the value is a secret from the file that the `_file` key names.
     is_from_file: bool,
 }
 

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{ForwardedHeader, Proxies, list};
+use super::{ForwardedHeader, Hosts, Proxies, list};
 
 /// Listeners and limits of connections.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -15,6 +15,12 @@ pub struct ServerConfig {
     /// Address of the service. Default 127.0.0.1:8080: the service is not exposed unless configured. Port 0 selects a
     /// free port.
     pub listen: SocketAddr,
+    /// Host names by which clients reach the service, without ports, besides the names of the loopback addresses.
+    /// Default `none`: a service that listens on a loopback address answers no other name with anything but a 421, so
+    /// that a web page cannot reach it through a name of its own. With a list, this applies to every address.
+    #[serde(with = "list")]
+    #[schemars(schema_with = "Hosts::schema")]
+    pub hosts: Option<Hosts>,
     /// Address of `/metrics`. Default `none`: no port is free on every machine. A separate address, so that a proxy
     /// cannot expose the metrics by accident.
     pub metrics_listen: Option<SocketAddr>,
@@ -67,6 +73,7 @@ impl Default for ServerConfig {
     fn default() -> Self {
         Self {
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8080)),
+            hosts: None,
             metrics_listen: None,
             data_dir: PathBuf::from("molmesh-data"),
             connections: 1024,

@@ -85,7 +85,7 @@ impl Default for StoreConfig {
     }
 }
 
-/// Text that `Debug`, serialisation and error messages never show.
+/// Text that `Debug`, serialization and error messages never show.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
 

@@ -1,5 +1,5 @@
-//! Writers of columns: copied from memory if the layouts agree, otherwise converted through one reused block of
-//! fixed-size records.
+//! Writers of columns. They copy a column from memory if the layouts agree, and otherwise convert it through one reused
+//! block of fixed-size records.
 
 use std::io::{self, Write};
 use std::ops::Range;

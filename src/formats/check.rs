@@ -15,7 +15,7 @@ const CHUNK_ROWS: usize = 1 << 16;
 /// Maximum component of a unit vector, with tolerance for rounding.
 const MAX_NORMAL: f32 = 1.001;
 
-/// Returns true if the writer relies on indices: STL looks vertices up, and glTF narrows indices that fit into 16 bits.
+/// Returns true if the writer requires valid indices: STL looks up vertices, and glTF narrows indices to 16 bits.
 fn needs_indices(format: Format, n_vertices: usize) -> bool {
     match format {
         Format::Stl => true,
@@ -59,7 +59,7 @@ pub(super) fn check(mesh: &Mesh, format: Format) -> Result<Summary, FormatError>
         None => extent("position", &mesh.positions[..])?.unwrap_or_default(),
     };
     if format == Format::Obj {
-        // The length of a line is bounded.
+        // The writer relies on a bounded length of lines.
         check_normals(&mesh.normals[..])?;
     }
     if needs_indices(format, n) {
@@ -229,7 +229,10 @@ mod tests {
         ];
         for (name, mesh) in broken {
             assert!(
-                matches!(check(&mesh, Format::Glb), Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name),
+                matches!(
+                    check(&mesh, Format::Glb),
+                    Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name
+                ),
                 "{name}"
             );
         }

@@ -62,6 +62,7 @@ pub(super) struct ObjPlan {
 }
 
 impl ObjPlan {
+    /// Checks the coordinates and computes the header and the length bound.
     pub(super) fn new(mesh: &Mesh, storage: Storage, summary: &Summary, meta: &Meta) -> Result<Self, FormatError> {
         let (smooth, decimals) = (storage.normals == Normals::Smooth, Decimals::of(storage.units));
         let mut extreme = 0.0_f64;
@@ -76,7 +77,7 @@ impl ObjPlan {
         }
         let header = header(mesh, storage.units, meta);
         let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
-        // Rounding up can add a digit, hence the one.
+        // Adds 1 because rounding up can add a digit.
         let number = |largest: f64, decimals: Decimals| format!("-{:.*}", decimals.count(), largest + 1.0).len() as u64;
         let vertex = "v   \n".len() as u64 + 3 * number(extreme, decimals);
         let normal = if smooth { "vn   \n".len() as u64 + 3 * number(1.0, NORMAL_DECIMALS) } else { 0 };
@@ -86,10 +87,12 @@ impl ObjPlan {
         Ok(Self { header, len_bound, storage })
     }
 
+    /// Returns an upper bound of the file's length, bytes.
     pub(super) fn len_bound(&self) -> u64 {
         self.len_bound
     }
 
+    /// Writes the file.
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(self.header.as_bytes())?;
         let mut lines = Lines::new(out, self.len_bound);

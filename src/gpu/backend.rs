@@ -18,7 +18,7 @@ use crate::surface::{
 /// Backend that meshes on devices.
 pub struct GpuBackend {
     pool: DevicePool,
-    /// Backend for jobs that no device could run; reported in [`MeshOutput::made_by`].
+    /// Backend for jobs that no device could run. [`MeshOutput::made_by`] reports it.
     fallback: Option<Box<dyn Backend>>,
 }
 

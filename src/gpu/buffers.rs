@@ -8,7 +8,7 @@ pub enum BufferId {
     Params,
     /// Atoms on the lattice.
     Atoms,
-    /// Reach of each atom.
+    /// Reach of each atom, in spacings.
     Reaches,
     /// Tile table.
     Tiles,
@@ -26,13 +26,13 @@ pub enum BufferId {
     Field,
     /// Bits of the samples inside the surface.
     Inside,
-    /// Records of bricks.
+    /// Result of `classify` for each brick: crossing edges, vertices per layer, neighbours.
     Records,
     /// Vertex and triangle counts of bricks.
     Counts,
     /// First vertex and first triangle of bricks.
     Offsets,
-    /// Counts of groups of bricks.
+    /// Sums of the counts over groups of 1024 bricks.
     Groups,
     /// Counters that the host reads back.
     Counters,
@@ -73,7 +73,7 @@ impl BufferId {
         Self::Triangles,
     ];
 
-    /// Index of the buffer among those of a job; [`Self::Cases`] comes last.
+    /// Returns the index of the buffer in [`Self::OF_JOB`]; [`Self::Cases`] comes after them.
     pub(super) const fn index(self) -> usize {
         self as usize
     }

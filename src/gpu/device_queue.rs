@@ -83,7 +83,7 @@ pub(super) struct DeviceQueue {
     pub(super) state: DeviceState,
     /// Number of rebuilds since the last finished job.
     pub(super) consecutive_rebuilds: usize,
-    /// Name and counters; [`Self::status`] fills in the rest.
+    /// Name and counters. [`Self::status`] adds the other fields.
     pub(super) counters: DeviceStatus,
 }
 

@@ -12,7 +12,7 @@ use super::error::GpuError;
 use super::{choose, hardware};
 use crate::surface::{DeviceChoice, DeviceFacts, DeviceKind, FoundDevice};
 
-/// Features that are used if the device has them.
+/// Features that are requested if the device has them.
 const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 
 /// Effort of a discovery.
@@ -165,7 +165,7 @@ pub(super) fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
         .map_err(|error| GpuError::Failed(format!("the device cannot be opened: {error}")))
 }
 
-/// Name of the arithmetic of a device: model and driver, and the processor, which prepares jobs and measures meshes.
+/// Returns the arithmetic of a device: model, driver, and the processor, which prepares jobs and measures meshes.
 pub(super) fn arithmetic(name: &str, device: &str) -> String {
     format!("{name} {device} {}", crate::surface::arithmetic())
 }

@@ -153,7 +153,7 @@ impl Engine {
         self.errors.check(|| GpuError::Failed("out of memory".to_owned()))
     }
 
-    /// Fails likewise after an allocation of `needed` bytes for `job`.
+    /// Fails like [`Self::check_errors`], after an allocation of `needed` bytes for `job`.
     fn check_allocation(&self, job: &GpuJob, needed: u64) -> Result<(), GpuError> {
         self.errors.check(|| out_of_memory(job, needed, self.budget.memory.min(needed)))
     }

@@ -59,7 +59,8 @@ impl Prepared {
         scan::check_size(&self.params, &self.limits, n_vertices, n_triangles)
     }
 
-    /// Checks the size of a complete mesh likewise, rejects an empty one, and adds its memory to the meter.
+    /// Checks the size of a complete mesh like [`Self::check_size`], rejects an empty mesh, and adds the memory of the
+    /// mesh to the meter.
     pub(super) fn check_mesh(&self, size: [u64; 2]) -> Result<(), SurfaceError> {
         if size[1] == 0 {
             Err(SurfaceError::NoSurface { isovalue: self.params.isovalue })

@@ -122,7 +122,7 @@ pub(super) fn values<T: Pod>(bytes: &[u8], offset: u64, n: u64) -> Result<&[T], 
     values.ok_or_else(|| GpuError::Failed(format!("no values in bytes {range:?} of {}", bytes.len())))
 }
 
-/// Byte range of `n` values at byte `offset`.
+/// Returns the byte range of `n` values at byte `offset`.
 pub(super) fn byte_range<T>(offset: u64, n: u64) -> Result<Range<usize>, GpuError> {
     let number = |n: u64| usize::try_from(n).map_err(|e| GpuError::Failed(e.to_string()));
     let from = number(offset)?;

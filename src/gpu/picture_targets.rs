@@ -91,8 +91,8 @@ impl FinishParams {
             n_taps: u32::try_from(finish.taps.len()).unwrap_or(0),
             line_width: finish.line_width,
             falloff: finish.falloff,
-            bias: finish::BIAS,
-            strength: finish::STRENGTH,
+            bias: finish::OCCLUSION_BIAS,
+            strength: finish::OCCLUSION_STRENGTH,
             min_light: finish::MIN_LIGHT,
             step_min,
             step_max,
@@ -160,7 +160,7 @@ pub(super) fn layered(device: &Device, label: &str, format: TextureFormat, param
     texture(device, label, format, params, PATTERN.len(), usage)
 }
 
-/// View of the layer of one sample, as a render target.
+/// Creates a view of the layer of one sample, as a render target.
 pub(super) fn layer(texture: &Texture, sample: u32) -> TextureView {
     texture.create_view(&TextureViewDescriptor {
         dimension: Some(TextureViewDimension::D2),

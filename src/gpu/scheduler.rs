@@ -29,9 +29,9 @@ pub struct PoolSettings {
 }
 
 impl Default for PoolSettings {
-    /// 64 waiting jobs, so that memory runs out before callers block. 16 jobs per submission: the fixed cost is
-    /// negligible beyond. 200 ms between rebuilds: a driver restarts in about half a second. 5 s of idle time: longer
-    /// than the gaps between consecutive large jobs of one caller.
+    /// Returns the defaults. With 64 waiting jobs, memory runs out before callers block. With 16 jobs per submission,
+    /// the fixed cost is negligible. A driver restarts in about half a second: it is retried after 200 ms. The gaps
+    /// between consecutive large jobs of one caller are shorter than 5 s.
     fn default() -> Self {
         let (rebuild_pause, idle) = (Duration::from_millis(200), Duration::from_secs(5));
         Self { queue: 64, batch: 16, rebuild_pause, idle, min_partition_bricks: Some(MIN_PARTITION_BRICKS) }
@@ -171,7 +171,7 @@ impl Scheduler {
     }
 
     /// Waits for the next batch of device `n`: one job, or several small ones. The batch is empty if none came for
-    /// [`PoolSettings::idle`]. `None` once the device is down or the scheduler is closed.
+    /// [`PoolSettings::idle`]. Returns `None` once the device is down or the scheduler is closed.
     pub(super) fn next_batch(&self, n: usize) -> Option<Vec<QueuedJob>> {
         let mut state = self.lock();
         let mut timed_out = false;

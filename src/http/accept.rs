@@ -132,7 +132,7 @@ fn set_up(stream: &TcpStream) -> io::Result<()> {
 }
 
 /// Permit of `server.connections`, counted in the metrics.
-type Place = (OwnedSemaphorePermit, GaugeGuard);
+type ConnectionPermit = (OwnedSemaphorePermit, GaugeGuard);
 
 /// Answers a connection beyond the limit with 503, without reading its request.
 fn refuse(stream: TcpStream, hold: OwnedSemaphorePermit) {
@@ -181,7 +181,7 @@ impl Drop for Working {
 
 /// Serves one connection.
 async fn connection(
-    stream: Guarded<Place>,
+    stream: Guarded<ConnectionPermit>,
     peer: Peer,
     router: Router,
     config: Arc<ServerConfig>,
@@ -210,8 +210,8 @@ async fn connection(
     let builder = builder(&config, Streams::new(rate, &broken));
     let connection = builder.serve_connection(TokioIo::new(stream), service);
     tokio::pin!(connection);
-    let (mut stopping, mut patient) = (false, false);
-    let mut look = Instant::now() + Duration::from_millis(config.header_timeout_ms);
+    let (mut stopping, mut in_grace) = (false, false);
+    let mut next_check = Instant::now() + Duration::from_millis(config.header_timeout_ms);
     loop {
         tokio::select! {
             ended = connection.as_mut() => {
@@ -230,15 +230,15 @@ async fn connection(
                 if activity.begun.load(Ordering::Relaxed) {
                     connection.as_mut().graceful_shutdown();
                 } else {
-                    (look, patient) = (Instant::now() + UNDER_WAY, true);
+                    (next_check, in_grace) = (Instant::now() + UNDER_WAY, true);
                 }
             }
-            () = tokio::time::sleep_until(look), if patient => {
-                patient = false;
+            () = tokio::time::sleep_until(next_check), if in_grace => {
+                in_grace = false;
                 connection.as_mut().graceful_shutdown();
-                look = Instant::now() + Duration::from_millis(config.header_timeout_ms);
+                next_check = Instant::now() + Duration::from_millis(config.header_timeout_ms);
             }
-            () = tokio::time::sleep_until(look), if !patient => {
+            () = tokio::time::sleep_until(next_check), if !in_grace => {
                 // hyper starts its own timer only when the protocol version is known.
                 if !activity.begun.load(Ordering::Relaxed) {
                     late();
@@ -248,7 +248,7 @@ async fn connection(
                 if !busy {
                     connection.as_mut().graceful_shutdown();
                 }
-                look = Instant::now() + Duration::from_millis(config.idle_timeout_ms);
+                next_check = Instant::now() + Duration::from_millis(config.idle_timeout_ms);
             }
         }
     }

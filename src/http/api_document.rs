@@ -20,12 +20,12 @@ Send a structure file to `POST /v1/meshes`; the response is a mesh (GLB by defau
 `GET /v1/results/{file}` returns the mesh. Lengths are in ångström (Å).
 
 Every error is a problem document (RFC 9457). Its `type` is the path of an explanation, and `GET /problems` lists all \
-types. Any operation may also return 405 (`method-not-allowed`), 500 (`internal`), 503 (`too-many-connections`) and \
-504 (`deadline`).
+types. Any operation may also return 403 (`cross-site`), 405 (`method-not-allowed`), 421 (`wrong-host`), 500 \
+(`internal`), 503 (`too-many-connections`) and 504 (`deadline`).
 
 `HEAD` is available wherever `GET` is. If the server has quotas, responses carry `RateLimit-Policy` and `RateLimit` \
 (draft-ietf-httpapi-ratelimit-headers-11). API keys are optional: a server without keys ignores them and never returns \
-401 or 403. Every response has an `X-Request-Id`: that of the request, if it has at most 64 letters, digits, `-`, `_` \
+401. Every response has an `X-Request-Id`: that of the request, if it has at most 64 letters, digits, `-`, `_` \
 and `.`, or a new one.";
 
 /// OpenAPI document.

@@ -10,7 +10,7 @@ use utoipa::ToSchema;
 
 use super::kinds::Kind;
 use super::openapi::meshes::NotModified;
-use super::openapi::parameters::{EntryPath, IfNoneMatchHeader, StructurePath};
+use super::openapi::parameters::{ConditionHeaders, EntryPath, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
 use super::problem::Problem;
@@ -66,11 +66,14 @@ struct ResidueColumns {
 
 problem_responses!(StructureProblems: [
     READING,
-    [Kind::BadRequest, Kind::NoSuchStructure, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::StoreFailed],
+    [
+        Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
+        Kind::StoreFailed,
+    ],
 ]);
 problem_responses!(EntryProblems: [READING, [
     Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
-    Kind::MemoryFull, Kind::TooManyDeliveries,
+    Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
 ]]);
 
 /// List the atoms of a structure
@@ -78,7 +81,7 @@ problem_responses!(EntryProblems: [READING, [
 /// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
 /// list.
 #[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
-    params(StructurePath, IfNoneMatchHeader),
+    params(StructurePath, ConditionHeaders),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),
@@ -99,7 +102,7 @@ pub(super) async fn of_structure(
 /// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
 /// list.
 #[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
-    params(EntryPath, IfNoneMatchHeader),
+    params(EntryPath, ConditionHeaders),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),

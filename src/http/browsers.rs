@@ -1,7 +1,10 @@
 //! Headers for browsers: CORS, and restrictions on the use of responses.
 
+use std::sync::Arc;
+
 use axum::extract::{Request, State};
 use axum::http::header::{self, HeaderName};
+use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::Response;
@@ -14,17 +17,17 @@ use super::state::Shared;
 use super::timing::SERVER_TIMING;
 use super::{delivery, request_id};
 use crate::access::Access;
-use crate::config::Origins;
 
 /// Content security policy of responses that are not pages: no scripts, no frames.
 const POLICY: HeaderValue = HeaderValue::from_static("default-src 'none'; frame-ancestors 'none'");
 
 /// Request headers that listed origins may send.
-const ALLOWED: [HeaderName; 14] = [
+const ALLOWED: [HeaderName; 15] = [
     header::ACCEPT,
     header::AUTHORIZATION,
     header::CONTENT_ENCODING,
     header::CONTENT_TYPE,
+    header::IF_MATCH,
     header::IF_NONE_MATCH,
     header::IF_RANGE,
     header::RANGE,
@@ -39,7 +42,7 @@ const ALLOWED: [HeaderName; 14] = [
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 
 /// Builds the CORS layer.
-pub(super) fn cors(access: &Access) -> CorsLayer {
+pub(super) fn cors(access: &Arc<Access>) -> CorsLayer {
     let exposed = [
         header::ETAG,
         header::LOCATION,
@@ -62,35 +65,36 @@ pub(super) fn cors(access: &Access) -> CorsLayer {
         .allow_methods([Method::GET, Method::HEAD, Method::POST, Method::DELETE])
         .expose_headers(exposed.collect::<Vec<_>>())
         .max_age(std::time::Duration::from_hours(24));
-    match &access.config().cors_origins {
-        Some(Origins::Any) if access.is_closed() => {
-            // `*` does not include `Authorization`.
-            let all = [HeaderName::from_static("*"), header::AUTHORIZATION];
-            layer.allow_origin(Any).allow_headers(AllowHeaders::list(all))
+    if access.sites().allows_any_origin() {
+        if !access.is_closed() {
+            return layer.allow_origin(Any).allow_headers(Any);
         }
-        Some(Origins::Any) => layer.allow_origin(Any).allow_headers(Any),
-        Some(Origins::These(origins)) => {
-            let origins = origins.iter().filter_map(|origin| HeaderValue::from_str(origin).ok());
-            layer
-                .allow_origin(AllowOrigin::list(origins))
-                .allow_headers(AllowHeaders::list(ALLOWED))
-                .allow_credentials(access.config().cors_credentials)
-        }
-        // Without CORS headers browsers reject cross-origin requests.
-        None => layer,
+        // `*` does not include `Authorization`.
+        let all = [HeaderName::from_static("*"), header::AUTHORIZATION];
+        return layer.allow_origin(Any).allow_headers(AllowHeaders::list(all));
     }
+    let (shared, credentials) = (Arc::clone(access), access.config().cors_credentials);
+    let allows = move |origin: &HeaderValue, _: &Parts| origin.to_str().is_ok_and(|o| shared.sites().allows_origin(o));
+    layer
+        .allow_origin(AllowOrigin::predicate(allows))
+        .allow_headers(AllowHeaders::list(ALLOWED))
+        .allow_credentials(credentials)
 }
 
 /// Adds security headers that the handler has not set.
 pub(super) async fn restrain(State(app): State<Shared>, request: Request, next: Next) -> Response {
     let mut response = next.run(request).await;
     let config = app.access.config();
-    let any_origin = config.cors_origins == Some(Origins::Any);
+    let sites = app.access.sites();
     let headers = response.headers_mut();
     // Browsers must not interpret a mesh as a script or a page.
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     // Only origins that may read responses may embed them.
-    let embedders = if any_origin { "cross-origin" } else { "same-origin" };
+    let embedders = match (sites.allows_any_origin(), sites.allows_loopback_origins()) {
+        (true, _) => "cross-origin",
+        (_, true) => "same-site",
+        _ => "same-origin",
+    };
     headers.insert(CROSS_ORIGIN_RESOURCE_POLICY, HeaderValue::from_static(embedders));
     or(headers, header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
     or(headers, header::CONTENT_SECURITY_POLICY, POLICY);

@@ -20,7 +20,7 @@ use crate::formats::Format;
 use crate::jobs::{ContentKey, Finished};
 use crate::pipeline::Report;
 
-/// Header that summarises a member of the report.
+/// Header that summarizes a member of the report.
 pub(super) struct SummaryHeader {
     pub(super) name: &'static str,
     /// Name of the member.
@@ -49,17 +49,19 @@ pub(super) static SUMMARY: [SummaryHeader; 17] = [
     summary("molmesh-kernel", "kernel", Type::String, "Density kernel."),
     summary("molmesh-preset", "preset", Type::String, "Preset."),
     summary("molmesh-resolution", "resolution", Type::Number, "Grid spacing in Å."),
-    summary("molmesh-resolution-from", "resolution_from", Type::String, "Parameter that set the spacing: `resolution`, `detail` or `max_triangles`."),
+    summary("molmesh-resolution-from", "resolution_from", Type::String,
+        "Parameter that set the spacing: `resolution`, `detail` or `max_triangles`."),
     summary("molmesh-isovalue", "isovalue", Type::Number, "Isovalue of the density."),
     summary("molmesh-radii", "radii", Type::String, "Table of van der Waals radii."),
-    summary("molmesh-backend", "backend", Type::String, "Backend that computed the mesh: `cpu` or `gpu`."),
+    summary("molmesh-backend", "backend", Type::String, "Backend that computed the mesh: `cpu`, `gpu` or `reference`."),
     summary("molmesh-backend-reason", "backend_reason", Type::String, "Reason for the choice of the backend."),
 ];
 
 /// Headers of a picture, with members of the report's `picture`.
 #[rustfmt::skip]
 pub(super) static PICTURE: [SummaryHeader; 4] = [
-    summary("molmesh-renderer", "renderer", Type::String, "Backend that rendered the picture: `cpu` or `gpu`. Pictures only."),
+    summary("molmesh-renderer", "renderer", Type::String,
+        "Backend that rendered the picture: `cpu` or `gpu`. Pictures only."),
     summary("molmesh-renderer-device", "device", Type::String, "Device that rendered the picture. Pictures only."),
     summary("molmesh-renderer-reason", "reason", Type::String, "Reason for the choice of the renderer. Pictures only."),
     summary("molmesh-pixel", "pixel", Type::Number, "Width and height of a pixel in Å. Pictures only."),

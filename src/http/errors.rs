@@ -17,7 +17,7 @@ use crate::structure::StructureError;
 use crate::structure::strict_validator::Diagnostic;
 use crate::surface::{OutOfMemory, SurfaceError};
 
-/// Finding of the strict parser.
+/// Finding of the strict validator.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Finding {
     /// Severity: `note`, `warning` or `error`.
@@ -29,13 +29,13 @@ pub(super) struct Finding {
     message: String,
 }
 
-/// Converts the findings of the strict parser.
+/// Converts the findings of the strict validator.
 pub(super) fn findings(diagnostics: &[Diagnostic]) -> Vec<Finding> {
     let finding = |d: &Diagnostic| Finding { level: d.level.name(), line: d.line, message: d.message.clone() };
     diagnostics.iter().map(finding).collect()
 }
 
-/// Adds the findings of the strict parser, if there are any.
+/// Adds the findings of the strict validator, if there are any.
 fn diagnosed(problem: Problem, diagnostics: &[Diagnostic]) -> Problem {
     if diagnostics.is_empty() {
         return problem;
@@ -174,6 +174,13 @@ impl From<StoreError> for Problem {
                 .with("actual", held)
                 .with("limit", max_bytes)
                 .retry_after(wait),
+            StoreError::NoSpace { .. } => {
+                tracing::error!(%error, "the disk of the store is full");
+                Self::new(Kind::StoreFull, "the disk of the store is full").retry_after(wait)
+            }
+            StoreError::Quarantined { .. } => {
+                Self::new(Kind::RecordUnreadable, "the record of the job cannot be read and is in quarantine")
+            }
             other => {
                 tracing::error!(error = %other, "the store failed");
                 Self::new(Kind::StoreFailed, "the store cannot be reached").retry_after(wait)

@@ -32,7 +32,7 @@ struct Listener {
     over: bool,
 }
 
-problem_responses!(EventsProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::StoreFailed]]);
+problem_responses!(EventsProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed]]);
 
 /// Follow a job as server-sent events
 ///
@@ -49,7 +49,7 @@ problem_responses!(EventsProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::St
 pub(super) async fn show(State(app): State<Shared>, id: JobId, headers: HeaderMap) -> Result<Response, Problem> {
     let watched = app.job_store.watch(&id).await?.ok_or_else(|| jobs::no_such_job(id.as_str()))?;
     let last = headers.get(LAST_EVENT_ID).and_then(|id| id.to_str().ok()?.trim().parse::<u64>().ok());
-    // Versions start again with the service, so a larger id is from an earlier process.
+    // An id from the future is unknown: the clock was set back.
     let seen = last.filter(|last| *last <= watched.borrow().version).unwrap_or(0);
     if last == Some(watched.borrow().version) && watched.borrow().record.status.is_final() {
         // A 204 stops browsers from reconnecting.

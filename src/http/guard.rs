@@ -5,7 +5,7 @@
 
 use std::net::IpAddr;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use axum::extract::{Request, State};
 use axum::http::header::{self, AUTHORIZATION, HeaderMap, HeaderName, WWW_AUTHENTICATE};
@@ -88,8 +88,8 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     request.headers_mut().remove(AUTHORIZATION);
     request.headers_mut().remove(API_KEY);
     let Some(scope) = scopes::needed(&request) else { return next.run(request).await };
-    let caller = match authorize(&app.access, scope, key, &mut request) {
-        Ok(caller) => caller,
+    let (caller, signed_until) = match authorize(&app.access, scope, key, &mut request) {
+        Ok(authorized) => authorized,
         Err(problem) => {
             swallow(request).await;
             return problem.into_response();
@@ -115,12 +115,15 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     if app.access.is_closed() {
         keep_private(response.headers_mut());
     }
+    if let Some(end) = signed_until {
+        end_with_signature(&app.access, end, response.headers_mut());
+    }
     response
 }
 
 /// Reads the body of a refused request if it is small and arrives at once: some HTTP/2 clients report a broken stream
 /// if the response arrives before they have sent their body.
-async fn swallow(request: Request) {
+pub(super) async fn swallow(request: Request) {
     const MOST: u64 = 64 << 10;
     const PATIENCE: Duration = Duration::from_millis(500);
     let asks_first = request.headers().contains_key(header::EXPECT);
@@ -148,6 +151,11 @@ enum Presented {
     Nonsense,
 }
 
+/// Returns true if a request has a key, known or not.
+pub(super) fn has_key(headers: &HeaderMap) -> bool {
+    !matches!(presented(headers), Presented::Nothing)
+}
+
 fn presented(headers: &HeaderMap) -> Presented {
     const SCHEME: &str = "bearer ";
     let bearer = headers.get_all(AUTHORIZATION).iter().filter_map(|value| {
@@ -165,10 +173,16 @@ fn presented(headers: &HeaderMap) -> Presented {
     }
 }
 
-/// Identifies and authorizes the client. Removes a signature from the address.
-fn authorize(access: &Access, scope: Scope, key: Presented, request: &mut Request) -> Result<Caller, Problem> {
+/// Identifies and authorizes the client. Removes a signature from the address. Returns its expiry as well, s of Unix
+/// time.
+fn authorize(
+    access: &Access,
+    scope: Scope,
+    key: Presented,
+    request: &mut Request,
+) -> Result<(Caller, Option<u64>), Problem> {
     if !access.is_closed() {
-        return Ok(Caller::address(access, request));
+        return Ok((Caller::address(access, request), None));
     }
     let now = SystemTime::now();
     let may_be_signed = [Method::GET, Method::HEAD].contains(request.method());
@@ -181,7 +195,9 @@ fn authorize(access: &Access, scope: Scope, key: Presented, request: &mut Reques
     let found = match key {
         Presented::Text(text) => access.verify(&text, now),
         Presented::Nonsense => Err(Denied::Unknown),
-        Presented::Nothing => return by_signature(&signature).map(|()| Caller::address(access, request)),
+        Presented::Nothing => {
+            return by_signature(&signature).map(|end| (Caller::address(access, request), Some(end)));
+        }
     };
     let key = found.map_err(no_key)?;
     Span::current().record("key", key.id.as_str());
@@ -192,7 +208,8 @@ fn authorize(access: &Access, scope: Scope, key: Presented, request: &mut Reques
             .with("scope", scope.name())
             .header(WWW_AUTHENTICATE, &challenge));
     }
-    Ok(Caller::key(&key))
+    let end = if let SignatureCheck::Valid(end) = signature { Some(end) } else { None };
+    Ok((Caller::key(&key), end))
 }
 
 /// Returns the address without its signature.
@@ -204,9 +221,10 @@ fn unsigned(uri: &Uri) -> Result<Uri, Problem> {
     Uri::from_parts(parts).map_err(Problem::internal)
 }
 
-fn by_signature(signature: &SignatureCheck) -> Result<(), Problem> {
+/// Returns the expiry of a valid signature.
+fn by_signature(signature: &SignatureCheck) -> Result<u64, Problem> {
     match signature {
-        SignatureCheck::Valid => Ok(()),
+        SignatureCheck::Valid(end) => Ok(*end),
         SignatureCheck::Absent => Err(Problem::new(
             Kind::KeyRequired,
             "a key is required, in `Authorization: Bearer …` or `X-Api-Key`; a GET may use a signed address instead",
@@ -287,6 +305,31 @@ fn keep_private(headers: &mut HeaderMap) {
     }
 }
 
+/// Limits the caching of a response to the time for which its signed address is valid, and signs the address that it
+/// redirects to until then.
+fn end_with_signature(access: &Access, end: u64, headers: &mut HeaderMap) {
+    let end_time = UNIX_EPOCH.checked_add(Duration::from_secs(end)).unwrap_or_else(SystemTime::now);
+    let left = end_time.duration_since(SystemTime::now()).unwrap_or_default().as_secs();
+    let text = |name| headers.get(name).and_then(|value: &HeaderValue| value.to_str().ok());
+    let cached = text(header::CACHE_CONTROL).map(|value| cached_for(value, left));
+    let location = text(header::LOCATION).and_then(|target| access.sign(target, end));
+    for (name, value) in [(header::CACHE_CONTROL, cached), (header::LOCATION, location)] {
+        if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
+            headers.insert(name, value);
+        }
+    }
+}
+
+/// Returns a `Cache-Control` for `left` seconds at most: without permission to use a response that is older.
+fn cached_for(value: &str, left: u64) -> String {
+    let directives = value.split(',').map(str::trim).filter_map(|directive| match directive.split_once('=') {
+        Some(("max-age", age)) => Some(format!("max-age={}", age.parse().map_or(left, |age: u64| age.min(left)))),
+        Some(("stale-while-revalidate" | "stale-if-error", _)) => None,
+        _ => Some(directive.to_owned()).filter(|directive| directive != "immutable"),
+    });
+    directives.collect::<Vec<_>>().join(", ")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -329,6 +372,19 @@ mod tests {
             [("192.0.2.1", "192.0.2.1"), ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"), ("::1", "0:0:0:0::/64")]
         {
             assert_eq!(client_name(address.parse().unwrap()), name);
+        }
+    }
+
+    #[test]
+    fn caching_ends_with_the_signature() {
+        for (value, limited) in [
+            ("private, max-age=31536000, immutable", "private, max-age=60"),
+            ("private, max-age=5", "private, max-age=5"),
+            ("private, max-age=86400, stale-while-revalidate=604800", "private, max-age=60"),
+            ("private, no-cache", "private, no-cache"),
+            ("no-store", "no-store"),
+        ] {
+            assert_eq!(cached_for(value, 60), limited);
         }
     }
 

@@ -53,7 +53,7 @@ pub(super) struct ReadyDocument {
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = ReadinessCheck)]
 pub(super) struct Check {
-    /// Name of the check: `accepting`, `devices` or `store`.
+    /// Name of the check: `accepting`, `devices`, `store` or `records`.
     name: &'static str,
     /// True if the check passed.
     ok: bool,
@@ -76,11 +76,11 @@ problem_responses!(ReadyProblems: [[Kind::NotReady]]);
 /// Check that the service is ready for requests
 ///
 /// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts
-/// jobs, and can write and read the store. The answer does not depend on the load.
+/// jobs, can write and read the store, and has no unreadable job record in quarantine. The answer does not depend on the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
     responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyProblems))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {
-    let checks = [accepting(&app), devices(&app), store(&app).await];
+    let checks = [accepting(&app), devices(&app), store(&app).await, records(&app).await];
     let failing = checks.iter().find(|check| !check.ok).map(|check| check.detail.clone());
     match failing {
         None => {
@@ -124,6 +124,15 @@ async fn store(app: &Shared) -> Check {
         Some(why) => Err(format!("the store does not work: {why}")),
     };
     Check::new("store", found)
+}
+
+async fn records(app: &Shared) -> Check {
+    let found = match app.store.quarantined().await {
+        Ok(0) => Ok("no job record is in quarantine".to_owned()),
+        Ok(count) => Err(format!("{count} job records cannot be read and are in quarantine; see the log")),
+        Err(_logged) => Err("the quarantine of job records cannot be read".to_owned()),
+    };
+    Check::new("records", found)
 }
 
 /// Get the version of the program

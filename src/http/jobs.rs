@@ -22,7 +22,7 @@ use super::openapi::problems::{MESHING, ProblemDocument, READING};
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::{ContentKey, JobId, JobView, Status, rfc3339};
+use crate::jobs::{ContentKey, JobId, JobView, Status, is_stored, rfc3339};
 
 /// Longest poll, s. Proxies commonly cut an exchange after a minute.
 pub(super) const MAX_WAIT_S: u64 = 55;
@@ -120,10 +120,18 @@ enum StatusSchema {
     Dismissed,
 }
 
-problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::StoreFailed]]);
-problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::StoreFailed]]);
+impl Poll {
+    /// Returns the seconds to wait.
+    pub(super) fn wait(&self) -> u64 {
+        self.wait.unwrap_or(0)
+    }
+}
+
+problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed]]);
+problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::RecordUnreadable, Kind::StoreFull, Kind::StoreFailed]]);
 problem_responses!(ResultProblems: [READING, MESHING, [
     Kind::BadRequest, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed, Kind::ResultGone, Kind::JobAbandoned,
+    Kind::RecordUnreadable,
     Kind::StoreFull, Kind::StoreFailed,
 ]]);
 
@@ -159,7 +167,7 @@ pub(super) async fn show(
     query: Result<Query<Poll>, QueryRejection>,
 ) -> Result<Response, Problem> {
     let Query(poll) = query.map_err(|e| Problem::new(Kind::BadParameter, e.body_text()).with("parameter", "wait"))?;
-    let wait = poll.wait.unwrap_or(0);
+    let wait = poll.wait();
     if wait > MAX_WAIT_S {
         return Err(Problem::new(Kind::BadParameter, format!("parameter `wait`: {wait} is more than {MAX_WAIT_S} s"))
             .with("parameter", "wait")
@@ -195,8 +203,8 @@ pub(super) async fn dismiss(State(app): State<Shared>, id: JobId) -> Result<Resp
 
 /// Get the result of a job
 ///
-/// Redirects to the mesh of a successful job. For a failed job the response is the error that the synchronous request
-/// would have returned.
+/// Redirects to the mesh of a successful job. The target of a signed request is signed until the same time. For a
+/// failed job the response is the error that the synchronous request would have returned.
 #[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
     responses(
         (status = 303, description = "The job has succeeded.",
@@ -211,7 +219,8 @@ pub(super) async fn result(State(app): State<Shared>, id: JobId) -> Result<Respo
             let gone =
                 || Problem::new(Kind::ResultGone, "the result was removed after some time; request the mesh again");
             let key: ContentKey = key.parse().map_err(|_bad| gone())?;
-            if app.store.head(&key.name(&record.format)?).await?.is_none() {
+            let format = record.format.parse().map_err(|_bad| gone())?;
+            if !is_stored(&app.store, format, &key).await? {
                 return Err(gone());
             }
             let location = delivery::text(&format!("/v1/results/{key}.{}", record.format));
@@ -234,7 +243,7 @@ fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Respons
     let headers = response.headers_mut();
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
     if status == StatusCode::ACCEPTED {
-        headers.insert(header::LOCATION, delivery::text(&format!("/v1/jobs/{}", view.record.id)));
+        headers.insert(header::LOCATION, delivery::text(&format!("/v1/jobs/{}", view.record.id.as_str())));
     }
     if !view.record.status.is_final() {
         let seconds = wait.map_or(1, |wait| (wait + Duration::from_millis(999)).as_secs().clamp(1, 600));
@@ -246,7 +255,7 @@ fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Respons
 /// Returns the document of a job.
 pub(super) fn document(view: &JobView) -> JobDocument {
     let record = &view.record;
-    let own = format!("/v1/jobs/{}", record.id);
+    let own = format!("/v1/jobs/{}", record.id.as_str());
     let link = |rel, href: String, kind| Link { rel, href, r#type: kind };
     let mut links = vec![link("self", own.clone(), "application/json")];
     if !record.status.is_final() {
@@ -261,7 +270,7 @@ pub(super) fn document(view: &JobView) -> JobDocument {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction")]
     let progress = (view.fraction * 100.0) as u64;
     JobDocument {
-        job_id: record.id.to_string(),
+        job_id: record.id.as_str().to_owned(),
         process_id: "surface",
         r#type: "process",
         status: record.status,

@@ -87,6 +87,10 @@ impl MeshRequest {
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
         let key = ContentKey::new(digest, &request.job, *format, &app.pool.maker(&request.job));
         let etag = delivery::etag(&key);
+        // A report has no validator.
+        if !report {
+            conditional::check_match(headers, &etag)?;
+        }
         if is_reusable {
             if let Some(cache) = &self.cache
                 && conditional::is_unchanged(headers, &etag)
@@ -172,7 +176,7 @@ impl MeshRequest {
         let is_stored = results::save_later(&app, &finished, format, &key);
         let mut response = delivery::mesh(&app, Arc::clone(&finished), format, &key, timing, permit).await?;
         let headers = response.headers_mut();
-        if is_stored {
+        if is_stored && results::will_be_stored(&app, &key, format, headers).await? {
             headers.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, format.extension())));
         }
         if let Some(cache) = cache {

@@ -4,7 +4,6 @@
 //! threads. A file uses only files of earlier groups in the list below; `tests/core/architecture.rs` checks this order.
 
 // Protocol rules that use no other file.
-mod conditional;
 mod kinds;
 mod observed_body;
 mod pace;
@@ -21,6 +20,7 @@ mod stop;
 // Problems, and what can be checked without the state of the service.
 mod problem;
 
+mod conditional;
 mod content_type;
 mod errors;
 mod json_body;
@@ -53,6 +53,7 @@ mod jobs;
 mod results;
 
 mod mesh_request;
+mod signing;
 
 mod atoms;
 mod estimate;
@@ -75,6 +76,7 @@ mod key_reload;
 mod observe;
 
 mod browsers;
+mod origin;
 
 mod middleware;
 
@@ -84,4 +86,5 @@ mod server;
 
 pub use page::has_viewer;
 pub use server::{Chosen, ServeError, Server};
+pub use signing::check_signable;
 pub use stop::{Stop, shutdown_signals};

@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 use axum::extract::{MatchedPath, Request, State};
+use axum::http::header::CONTENT_LENGTH;
 use axum::http::{HeaderName, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::Response;
@@ -17,12 +18,12 @@ use super::request_id::RequestId;
 use super::timing;
 use crate::telemetry::{
     HTTP_ACTIVE, HTTP_DURATION, HTTP_REQUEST_SIZE, HTTP_RESPONSE_SIZE, SpanKind, SpanParent, TraceSpan, Tracer,
-    read_trace_context, traceparent,
+    read_trace_context, shorten, traceparent,
 };
 
 /// `traceparent` (W3C Trace Context), of requests and responses.
 pub(super) const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
-/// `tracestate` (W3C Trace Context), of requests; passed on to the archive.
+/// `tracestate` (W3C Trace Context), of requests; exported with the spans.
 const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
 /// Middleware: observes one request.
@@ -44,18 +45,18 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
         TraceSpan::start(&parent, name, SpanKind::Server, start)
     };
     // Without the query, which may hold a signature. The guard adds the id of the key.
-    let path = request.uri().path();
+    let path = shorten(request.uri().path());
     let span = tracing::info_span!(
         "request",
         request_id = id.as_str(),
         trace_id = %trace.trace_id(),
         %method,
-        path,
+        path = path.as_str(),
         key = tracing::field::Empty
     );
     let received = Arc::new(AtomicU64::new(0));
     gauge!(HTTP_ACTIVE, "method" => known(&method)).increment(1.0);
-    let path = if trace.is_recording() { path.to_owned() } else { String::new() };
+    let path = if trace.is_recording() { path } else { String::new() };
     let mut log = Log {
         start,
         method,
@@ -66,6 +67,7 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
         trace: trace.clone(),
         received: Arc::clone(&received),
         bytes: 0,
+        length: None,
         complete: false,
     };
     let request = request
@@ -77,9 +79,11 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
         response.headers_mut().insert(TRACEPARENT, place);
     }
     log.status = Some(response.status().as_u16());
+    let length = response.headers().get(CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
     response.map(|body| {
         // An empty body and the answer to HEAD are not polled.
         log.complete = body.is_end_stream() || log.method == Method::HEAD;
+        log.length = length.or_else(|| body.size_hint().exact());
         observed(body, move |bytes, is_end| log.count(bytes, is_end))
     })
 }
@@ -97,8 +101,10 @@ struct Log {
     trace: TraceSpan,
     /// Size of the request body, bytes.
     received: Arc<AtomicU64>,
-    /// Size of the response body, bytes.
+    /// Bytes of the response body that were sent.
     bytes: usize,
+    /// Announced size of the response body, bytes. A body of known size is not polled after its last byte.
+    length: Option<u64>,
     complete: bool,
 }
 
@@ -136,7 +142,7 @@ impl Drop for Log {
 impl Log {
     fn count(&mut self, bytes: usize, is_end: bool) {
         self.bytes += bytes;
-        self.complete |= is_end;
+        self.complete |= is_end || self.length == Some(self.bytes as u64);
     }
 
     /// Sets the attributes of the span, named by OpenTelemetry's conventions, and its status.

@@ -1,4 +1,4 @@
-//! Body that reports each frame that is read from it.
+//! HTTP body with a callback for each frame that is read.
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
@@ -7,8 +7,8 @@ use axum::body::Body;
 use bytes::Bytes;
 use hyper::body::{Body as HttpBody, Frame, SizeHint};
 
-/// Wraps a body. `observe` gets the size of each frame in bytes, and true at the end of the body. It is dropped with
-/// the body.
+/// Wraps a body. `observe` receives the size of each frame in bytes, and true at the end of the body. It is dropped
+/// with the body.
 pub(super) fn observed(body: Body, observe: impl FnMut(usize, bool) + Send + Unpin + 'static) -> Body {
     Body::new(Observed { body, observe })
 }

@@ -197,7 +197,7 @@ impl Drop for Slice {
     }
 }
 
-/// Adds 1 to a gauge until it is dropped.
+/// Guard that adds 1 to a gauge until it is dropped.
 pub(super) struct GaugeGuard(Gauge);
 
 impl GaugeGuard {

@@ -15,13 +15,13 @@ use bytes::Bytes;
 use super::kinds::Kind;
 use super::problem::Problem;
 
-/// Content security policy of the viewer: scripts and requests of this server only. WebAssembly is allowed for the
-/// meshopt decoder, `eval` is not. Images may be blobs, since the address of an image cannot carry a key.
+/// Content security policy of the viewer. It allows scripts and requests of this server only. It allows WebAssembly,
+/// for the meshopt decoder, but not `eval`. Images may be blobs, since the address of an image cannot carry a key.
 const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; \
                       img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
                       frame-ancestors 'none'";
 
-/// Content security policy of Swagger UI: data URIs for its icons. Its inline styles are set by scripts, which a policy
+/// Content security policy of Swagger UI. It allows data URIs, for icons. Scripts set the inline styles, which a policy
 /// does not restrict.
 const DOCS_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \
                            connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
@@ -72,19 +72,19 @@ fn is_named_by_contents(path: &str) -> bool {
 /// Answers with a file of the page, or with `instead`.
 fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Response, Problem> {
     match found(path) {
-        Some(bytes) => Ok((headers(path, POLICY), packed(request, bytes)?).into_response()),
+        Some(bytes) => Ok((headers(path, POLICY), gzip_file(request, bytes)?).into_response()),
         None => Ok((headers(path, POLICY), instead).into_response()),
     }
 }
 
 /// Answers with a file that is compressed with gzip. Inflates it for clients that do not accept gzip.
-fn packed(request: &HeaderMap, bytes: &'static [u8]) -> Result<Response, Problem> {
-    let takes = |coding: &str| {
+fn gzip_file(request: &HeaderMap, bytes: &'static [u8]) -> Result<Response, Problem> {
+    let accepts_gzip = |coding: &str| {
         let (name, weight) = coding.split_once(';').unwrap_or((coding, "q=1"));
         matches!(name.trim(), "gzip" | "*") && weight.trim().strip_prefix("q=").is_none_or(|q| q.parse() != Ok(0.0))
     };
     let accepted = request.get_all(ACCEPT_ENCODING).iter().filter_map(|value| value.to_str().ok());
-    if accepted.flat_map(|value| value.split(',')).any(takes) {
+    if accepted.flat_map(|value| value.split(',')).any(accepts_gzip) {
         let coding = [(CONTENT_ENCODING, "gzip"), (VARY, "accept-encoding")];
         return Ok((coding, Bytes::from_static(bytes)).into_response());
     }
@@ -136,13 +136,13 @@ pub(super) async fn docs_script() -> Response {
 /// Serves the style of Swagger UI, a file of the package `swagger-ui-dist`.
 pub(super) async fn swagger_style(request: HeaderMap) -> Result<Response, Problem> {
     let style = include_bytes!("../../web/swagger/swagger-ui.css.gz");
-    Ok((headers("swagger-ui.css", DOCS_POLICY), packed(&request, style)?).into_response())
+    Ok((headers("swagger-ui.css", DOCS_POLICY), gzip_file(&request, style)?).into_response())
 }
 
 /// Serves the script of Swagger UI, a file of the package `swagger-ui-dist`.
 pub(super) async fn swagger_script(request: HeaderMap) -> Result<Response, Problem> {
     let script = include_bytes!("../../web/swagger/swagger-ui-bundle.js.gz");
-    Ok((headers("swagger-ui-bundle.js", DOCS_POLICY), packed(&request, script)?).into_response())
+    Ok((headers("swagger-ui-bundle.js", DOCS_POLICY), gzip_file(&request, script)?).into_response())
 }
 
 #[cfg(test)]

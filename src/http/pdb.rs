@@ -7,14 +7,15 @@ use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::meshes::{CacheableMeshOrJob, ReportResponse};
 use super::openapi::parameters::{
-    EntryPath, IfNoneMatchHeader, MeshParameters, PreferenceHeaders, RangeHeaders, SurfaceParameters,
+    ConditionHeaders, EntryPath, MeshParameters, PreferenceHeaders, RangeHeaders, SurfaceParameters,
 };
 use super::openapi::problem_responses;
 use super::openapi::problems::{MESHING, PARAMETERS, READING, SUBMITTING};
 use super::problem::Problem;
 
 problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
-    Kind::NotFound, Kind::NotInArchive, Kind::EntryTooLarge, Kind::RangeNotSatisfiable, Kind::ArchiveUnavailable,
+    Kind::NotFound, Kind::NotInArchive, Kind::EntryTooLarge, Kind::PreconditionFailed, Kind::RangeNotSatisfiable,
+    Kind::ArchiveUnavailable,
 ]]);
 
 /// Mesh an archive entry
@@ -25,7 +26,7 @@ problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
     path = "/v1/pdb/{id}/{file}",
     tag = "meshes",
     operation_id = "meshEntry",
-    params(EntryPath, SurfaceParameters, PreferenceHeaders, IfNoneMatchHeader, RangeHeaders),
+    params(EntryPath, SurfaceParameters, PreferenceHeaders, ConditionHeaders, RangeHeaders),
     responses(CacheableMeshOrJob, SurfaceProblems)
 )]
 pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {

@@ -17,7 +17,7 @@ use tracing::Instrument as _;
 
 use super::kinds::Kind;
 use super::openapi::meshes::{NotModified, StoredMesh};
-use super::openapi::parameters::{IfNoneMatchHeader, RangeHeaders, ResultFile, ResultPath};
+use super::openapi::parameters::{ConditionHeaders, RangeHeaders, ResultFile, ResultPath};
 use super::openapi::problem_responses;
 use super::problem::Problem;
 use super::range::{self, Wanted};
@@ -40,9 +40,10 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
 }
 
 problem_responses!(ShowProblems: [[
-    Kind::BadRequest, Kind::NotFound, Kind::RangeNotSatisfiable, Kind::MemoryFull, Kind::StoreFailed,
+    Kind::BadRequest, Kind::NotFound, Kind::PreconditionFailed, Kind::RangeNotSatisfiable, Kind::MemoryFull,
+    Kind::StoreFailed,
 ]]);
-problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
+problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::PreconditionFailed, Kind::StoreFailed]]);
 
 /// Get a stored mesh
 ///
@@ -52,7 +53,7 @@ problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::Sto
     path = "/v1/results/{file}",
     tag = "results",
     operation_id = "showResult",
-    params(ResultFile, IfNoneMatchHeader, RangeHeaders),
+    params(ResultFile, ConditionHeaders, RangeHeaders),
     responses(StoredMesh, ShowProblems)
 )]
 pub(super) async fn show(
@@ -64,18 +65,20 @@ pub(super) async fn show(
     let Path(file) = path?;
     let (key, format) = parse(&file).ok_or_else(|| no_such_result(&file))?;
     let etag = delivery::etag(&key);
-    if conditional::is_unchanged(&headers, &etag) {
+    let expected = conditional::check_match(&headers, &etag);
+    if expected.is_ok() && conditional::is_unchanged(&headers, &etag) {
         return Ok(
             (StatusCode::NOT_MODIFIED, [(header::ETAG, etag), (header::CACHE_CONTROL, IMMUTABLE)]).into_response()
         );
     }
     wait_for_save(&app, &key).await;
-    stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))
+    let found = stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))?;
+    expected.map(|()| found)
 }
 
 /// Get the report of a stored mesh
 #[utoipa::path(get, path = "/v1/results/{key}/report.json", tag = "results", operation_id = "showReport",
-    params(ResultPath, IfNoneMatchHeader),
+    params(ResultPath, ConditionHeaders),
     responses(
         (status = 200, description = "The report of the run that computed the mesh.", body = Report,
             headers(("ETag" = String, description = "Strong validator of the document."))),
@@ -94,6 +97,7 @@ pub(super) async fn report(
     let etag =
         HeaderValue::from_str(&format!("\"{}\"", crate::store::Digest::of(&bytes))).map_err(Problem::internal)?;
     let caching = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, HeaderValue::from_static("public, no-cache"))];
+    conditional::check_match(&headers, &etag)?;
     if conditional::is_unchanged(&headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
     }
@@ -214,6 +218,24 @@ async fn wait_for_save(app: &App, key: &ContentKey) {
     if let Some(mut saved) = app.saves.running(key) {
         drop(tokio::time::timeout(MAX_SAVE_WAIT, saved.recv()).await);
     }
+}
+
+/// Returns true if a result that is being stored will be found at its address. `headers` are those of its answer. Waits
+/// for the end only if the space may not suffice.
+pub(super) async fn will_be_stored(
+    app: &App,
+    key: &ContentKey,
+    format: Format,
+    headers: &HeaderMap,
+) -> Result<bool, Problem> {
+    let bytes = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+    if let Some(bytes) = bytes
+        && app.store.has_room(bytes).await
+    {
+        return Ok(true);
+    }
+    wait_for_save(app, key).await;
+    Ok(jobs::is_stored(&app.store, format, key).await?)
 }
 
 /// Waits until no result is being stored. No new results may be computed by then.

@@ -30,8 +30,6 @@ use crate::telemetry::{self, Recorder, TelemetryError, Traces};
 /// Interval of metrics upkeep.
 const UPKEEP: Duration = Duration::from_secs(5);
 
-/// Pause between two attempts to list the jobs of earlier processes.
-const RECOVER_PAUSE: Duration = Duration::from_secs(5);
 /// Number of results whose headers are cached, about 1 KB each.
 const CACHED_HEADERS: usize = 4096;
 
@@ -109,6 +107,9 @@ impl Server {
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
         let Chosen { backend, reason, renderer, devices: found } = chosen;
         let access = Arc::new(Access::open(&config)?);
+        if access.sites().lacks_origins() {
+            tracing::warn!("pages of other origins are rejected: set access.cors_origins to their origins, or to none");
+        }
         let (listener, addr) = listen("server.listen", config.server.listen).await?;
         let metrics_listener = match config.server.metrics_listen {
             Some(addr) => Some(listen("server.metrics_listen", addr).await?),
@@ -139,6 +140,11 @@ impl Server {
         let describe = |error: &EndError| Problem::from(error.clone()).record();
         let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
         let job_store = JobStore::new(store.clone(), Arc::clone(&pool), jobs, output_bytes, secret, describe);
+        // The inputs of open jobs are pinned before a request can evict them.
+        let recovered = job_store.recover().await?;
+        if recovered > 0 {
+            tracing::info!(jobs = recovered, "resumed jobs of an earlier process");
+        }
         let archive = Archive::new(&config, pool.settings().budget.clone());
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
@@ -195,7 +201,6 @@ impl Server {
         background.spawn(key_reload::run(Arc::clone(&self.app.access)));
         let app = Arc::clone(&self.app);
         background.spawn_blocking(move || warm_up(&app));
-        background.spawn(recover(self.app.job_store.clone()));
         background.spawn(sweep(self.app.store.clone(), Duration::from_millis(self.app.config.store.sweep_ms)));
         let serving = accept::serve(self.listener, router::router(&self.app), Arc::clone(&config), stopped.clone());
         let serving = tokio::spawn(serving);
@@ -274,21 +279,6 @@ async fn sweep(store: Store, interval: Duration) {
     loop {
         tokio::time::sleep(interval).await;
         store.sweep(SystemTime::now()).await;
-    }
-}
-
-/// Resumes unfinished jobs of earlier processes; retries while the store fails.
-async fn recover(jobs: JobStore) {
-    loop {
-        match jobs.recover().await {
-            Ok(0) => return,
-            Ok(jobs) => {
-                tracing::info!(jobs, "resumed jobs of an earlier process");
-                return;
-            }
-            Err(error) => tracing::error!(%error, "cannot list the jobs of earlier processes"),
-        }
-        tokio::time::sleep(RECOVER_PAUSE).await;
     }
 }
 

@@ -3,8 +3,8 @@
 #[cfg(unix)]
 use tokio::signal::unix::{Signal as UnixSignal, SignalKind, signal};
 
-/// Listener for one signal, from its creation on. Requires a tokio runtime. A signal that the system does not have
-/// never arrives.
+/// Listener for one signal. It receives the signals that arrive after its creation, and requires a tokio runtime. A
+/// signal that the system does not have never arrives.
 pub(super) struct Signal {
     #[cfg(unix)]
     inner: Option<UnixSignal>,

@@ -120,6 +120,7 @@ impl StructureSource {
         F: Future<Output = Result<Response, Problem>>,
     {
         let validators = validators(&self.digest(app).await?)?;
+        conditional::check_match(headers, &validators[0].1)?;
         if conditional::is_unchanged(headers, &validators[0].1) {
             return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
         }

@@ -54,7 +54,7 @@ pub(super) struct App {
     pub(super) stopping: watch::Receiver<Stop>,
     /// Permits of `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
-    /// Set after the first mesh: true if it was computed, false if it failed.
+    /// True if the first mesh was computed, false if it failed; unset before.
     pub(super) first_mesh: OnceLock<bool>,
     /// Health check of the store.
     pub(super) probe: Probe,

@@ -16,7 +16,7 @@ use super::mesh_request::MeshRequest;
 use super::openapi::bodies::StructureFile;
 use super::openapi::meshes::{CacheableMeshOrJob, NotModified, ReportResponse};
 use super::openapi::parameters::{
-    ContentEncodingHeader, IfNoneMatchHeader, MeshParameters, PreferenceHeaders, RangeHeaders, StructurePath,
+    ConditionHeaders, ContentEncodingHeader, MeshParameters, PreferenceHeaders, RangeHeaders, StructurePath,
     SurfaceParameters,
 };
 use super::openapi::problem_responses;
@@ -98,11 +98,14 @@ problem_responses!(CreateProblems: [
 ]);
 problem_responses!(ShowProblems: [
     READING,
-    [Kind::BadRequest, Kind::NoSuchStructure, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::StoreFailed],
+    [
+        Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
+        Kind::StoreFailed,
+    ],
 ]);
-problem_responses!(SurfaceProblems: [
-    PARAMETERS, READING, MESHING, SUBMITTING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
-]);
+problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
+    Kind::NotFound, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::RangeNotSatisfiable,
+]]);
 
 /// Upload a structure
 ///
@@ -141,7 +144,7 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     let input = Input::uploaded(bytes, lease).await?;
     let digest = input.digest;
     // Parse before storing, so that only readable structures are stored.
-    let summary = summarise(&app, input.clone()).await.map_err(|failure| declared.explain(failure))?;
+    let summary = summarize(&app, input.clone()).await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(summary.format)?;
     let created = app.store.put_new(&Name::input(&digest), input.bytes).await?;
     let status = if created { StatusCode::CREATED } else { StatusCode::OK };
@@ -151,7 +154,7 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
 
 /// Get the contents of a structure
 #[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
-    params(StructurePath, IfNoneMatchHeader),
+    params(StructurePath, ConditionHeaders),
     responses(
         (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),
@@ -164,7 +167,7 @@ pub(super) async fn show(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let write = async |input| Ok(Json(summarise(&app, input).await?).into_response());
+    let write = async |input| Ok(Json(summarize(&app, input).await?).into_response());
     source.document(&app, &headers, write).await
 }
 
@@ -176,7 +179,7 @@ pub(super) async fn show(
     path = "/v1/structures/{digest}/{file}",
     tag = "meshes",
     operation_id = "meshStructure",
-    params(StructurePath, SurfaceParameters, PreferenceHeaders, IfNoneMatchHeader, RangeHeaders),
+    params(StructurePath, SurfaceParameters, PreferenceHeaders, ConditionHeaders, RangeHeaders),
     responses(CacheableMeshOrJob, SurfaceProblems)
 )]
 pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
@@ -202,7 +205,7 @@ pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
 }
 
 /// Parses a structure and describes its contents, on a blocking thread.
-async fn summarise(app: &Shared, input: Input) -> Result<StructureDocument, Failure> {
+async fn summarize(app: &Shared, input: Input) -> Result<StructureDocument, Failure> {
     let limits = app.config.limits.job().read;
     let parsing = app.read(move |control| {
         let structure = structure::read_with(&input.bytes, &limits, control)?;

@@ -49,7 +49,7 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
         Upload { bytes, lease, fields: Vec::new(), declared }
     };
     if let Some((name, _)) = coding.filter(|(_, magic)| !upload.bytes.starts_with(magic)) {
-        return Err(bad_encoding(&format!("the body is declared as {name} but is not")));
+        return Err(bad_encoding(&format!("the body is declared as {name}, but is not {name} data")));
     }
     upload.declared.check_bytes(&upload.bytes)?;
     Ok(upload)

@@ -34,7 +34,9 @@ pub(super) struct DurableJob {
 impl DurableJob {
     pub(super) fn new(record: Record) -> Self {
         let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
-        let (state, _) = watch::channel(JobView { record, stage: None, fraction, version: 1 });
+        // Later than every version of an earlier process, unless the job has ended.
+        let version = record.finished_ms.unwrap_or_else(now_ms);
+        let (state, _) = watch::channel(JobView { record, stage: None, fraction, version });
         Self { state, dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
     }
 
@@ -56,12 +58,14 @@ impl DurableJob {
         view.record.finished_ms.map(|ms| (ms, view.record.id.clone()))
     }
 
-    /// Changes the state unless the job has ended. Returns true if `change` did.
-    fn update(&self, change: impl FnOnce(&mut JobView) -> bool) -> bool {
+    /// Changes the state unless the job has ended. Returns true if `change` did. `change` gets the present time, which
+    /// becomes the version of the state.
+    fn update(&self, change: impl FnOnce(&mut JobView, u64) -> bool) -> bool {
         self.state.send_if_modified(|view| {
-            let changed = !view.record.status.is_final() && change(view);
+            let now = now_ms().max(view.version + 1);
+            let changed = !view.record.status.is_final() && change(view, now);
             if changed {
-                view.version += 1;
+                view.version = now;
             }
             changed
         })
@@ -69,10 +73,10 @@ impl DurableJob {
 
     /// Marks the job as running and counts an attempt. Returns false if the job has ended, for example by a dismissal.
     pub(super) fn begin(&self) -> bool {
-        self.update(|view| {
+        self.update(|view, now| {
             view.record.attempts += 1;
             view.record.status = Status::Running;
-            view.record.started_ms = Some(now_ms());
+            view.record.started_ms = Some(now);
             true
         })
     }
@@ -80,7 +84,7 @@ impl DurableJob {
     /// Marks the job as accepted again, with `attempts` attempts, for the next process. Returns true if that changed
     /// the record.
     fn leave(&self, attempts: u32) -> bool {
-        self.update(|view| {
+        self.update(|view, _| {
             if view.record.attempts == attempts && view.record.started_ms.is_none() {
                 return false;
             }
@@ -94,9 +98,9 @@ impl DurableJob {
 
     /// Ends the job with `status` and changes its record with `and`. Returns false if it had already ended.
     pub(super) fn end(&self, status: Status, and: impl FnOnce(&mut Record)) -> bool {
-        self.update(|view| {
+        self.update(|view, now| {
             view.record.status = status;
-            view.record.finished_ms = Some(now_ms());
+            view.record.finished_ms = Some(now);
             and(&mut view.record);
             view.stage = None;
             if status == Status::Successful {
@@ -106,16 +110,16 @@ impl DurableJob {
         })
     }
 
-    /// Publishes stage and fraction of the running work if they have advanced.
+    /// Publishes the stage and the finished fraction of the running work if they have advanced.
     fn publish_stage(&self, stage: &'static str, fraction: f64) {
-        self.update(|view| {
+        self.update(|view, now| {
             let waits = view.record.status == Status::Accepted;
             if !waits && view.stage == Some(stage) && fraction <= view.fraction + 0.004 {
                 return false;
             }
             if waits {
                 view.record.status = Status::Running;
-                view.record.started_ms = Some(now_ms());
+                view.record.started_ms = Some(now);
             }
             view.stage = Some(stage);
             view.fraction = view.fraction.max(fraction);

@@ -41,10 +41,10 @@ pub(crate) enum Failure {
     #[error("{error}")]
     Job {
         error: JobError,
-        /// Findings of the strict parser if the file cannot be read; empty otherwise.
+        /// Findings of the strict validator if the file cannot be read; empty otherwise.
         diagnostics: Vec<Diagnostic>,
     },
-    /// The strict parser found errors.
+    /// The strict validator found errors.
     #[error("the strict check found {} errors", errors(diagnostics))]
     Check { diagnostics: Vec<Diagnostic> },
     /// The deadline passed.

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
 
-use bytes::Bytes;
+use futures_util::{StreamExt as _, stream};
 use metrics::counter;
 use serde_json::Value;
 use tokio::sync::watch;
@@ -17,7 +17,7 @@ use super::durable_job::{DurableJob, Runner};
 use super::rank::{Client, Rank};
 use super::record::{JobId, Record, Requester, Status, now_ms};
 use super::retry::retry;
-use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket};
+use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Secret, Store, StoreError};
@@ -25,6 +25,8 @@ use crate::telemetry::JOBS_RECOVERED;
 
 /// Number of ended jobs that are held in memory; older ones are read from the store.
 const MAX_ENDED: usize = 10_000;
+/// Concurrent reads of records at startup.
+const RECOVERY_READS: usize = 64;
 
 /// Request for a durable job.
 #[derive(Debug)]
@@ -48,7 +50,7 @@ pub(crate) struct JobView {
     pub(crate) stage: Option<&'static str>,
     /// Finished fraction, from 0 to 1.
     pub(crate) fraction: f64,
-    /// Number of this state; grows with every change.
+    /// Number of this state: the time of the change, ms since 1970. Grows with every change, also after a restart.
     pub(crate) version: u64,
 }
 
@@ -74,12 +76,12 @@ pub(super) struct Inner {
 }
 
 impl Inner {
-    /// Returns the time from the acceptance of a job to its result.
+    /// Returns the maximum time from the acceptance of a job to its result.
     pub(super) fn allowed(&self) -> Duration {
         Duration::from_millis(self.config.batch_deadline_ms)
     }
 
-    /// Returns the time for which a write is retried that the store rejects.
+    /// Returns the time for which a rejected write is retried.
     pub(super) fn retry_time(&self) -> Duration {
         Duration::from_millis(self.config.save_retry_ms)
     }
@@ -95,8 +97,21 @@ impl Inner {
 
     /// Writes a record to the store.
     pub(super) async fn write(&self, record: &Record) -> Result<(), StoreError> {
-        let bytes = serde_json::to_vec(record).unwrap_or_default();
-        self.store.put(&Name::job(record.id.as_str())?, Bytes::from(bytes)).await
+        self.store.put(&Name::job(record.id.as_str())?, record.to_bytes()).await
+    }
+
+    /// Reads a record. One that cannot be parsed goes into quarantine.
+    async fn read(&self, name: &Name) -> Result<Option<Record>, StoreError> {
+        match self.store.get(name).await?.map(|stored| Record::from_bytes(&stored.bytes)) {
+            Some(Ok(record)) => return Ok(Some(record)),
+            Some(Err(error)) => {
+                tracing::error!(%name, %error, "the record of a job cannot be read; moving it into quarantine");
+                self.store.quarantine(name).await?;
+            }
+            None if self.store.is_quarantined(name).await? => {}
+            None => return Ok(None),
+        }
+        Err(StoreError::Quarantined { name: name.to_string() })
     }
 
     /// Writes the present record of a job. Writers of one job take turns, so the last write has the latest state, and a
@@ -198,9 +213,9 @@ impl JobStore {
             ticket
         };
         inner.store.put_new(&Name::input(&digest), input).await?;
-        let record = serde_json::to_vec(&job.record()).unwrap_or_default();
+        let record = job.record().to_bytes();
         let name = Name::job(id.as_str()).map_err(StoreError::from)?;
-        if !inner.store.put_new(&name, Bytes::from(record)).await?
+        if !inner.store.put_new(&name, record).await?
             && let Some(view) = self.view(&id).await?
         {
             // A concurrent request with the same key stored its record first.
@@ -220,7 +235,7 @@ impl JobStore {
     /// Returns the key of a task's result if it is stored. Strict tasks always run.
     pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<String>, StoreError> {
         let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job));
-        let found = !task.strict && self.0.store.head(&key.name(format.extension())?).await?.is_some();
+        let found = !task.strict && results::is_stored(&self.0.store, format, &key).await?;
         Ok(found.then(|| key.to_string()))
     }
 
@@ -229,9 +244,7 @@ impl JobStore {
         if let Some(job) = self.0.lock().get(id) {
             return Ok(Some(job.state.subscribe()));
         }
-        let Some(stored) = self.0.store.get(&Name::job(id.as_str())?).await? else { return Ok(None) };
-        // Only a foreign program writes records that cannot be parsed.
-        let Ok(record) = serde_json::from_slice::<Record>(&stored.bytes) else { return Ok(None) };
+        let Some(record) = self.0.read(&Name::job(id.as_str())?).await? else { return Ok(None) };
         if record.status.is_final() {
             return Ok(Some(DurableJob::new(record).state.subscribe()));
         }
@@ -257,15 +270,17 @@ impl JobStore {
 
     /// Resumes the unfinished jobs of earlier processes and returns their number.
     pub(crate) async fn recover(&self) -> Result<usize, StoreError> {
+        let names = self.0.store.list(Folder::Jobs).await?;
+        let mut reads = stream::iter(&names).map(|(name, _)| self.0.read(name)).buffer_unordered(RECOVERY_READS);
         let mut open = Vec::new();
-        for (name, _) in self.0.store.list(Folder::Jobs).await? {
-            let Some(stored) = self.0.store.get(&name).await? else { continue };
-            match serde_json::from_slice::<Record>(&stored.bytes) {
-                Ok(record) if !record.status.is_final() => open.push(record),
-                Ok(_) => {}
-                Err(error) => tracing::warn!(name = %name, %error, "cannot parse the record of a job"),
+        while let Some(read) = reads.next().await {
+            match read {
+                Ok(record) => open.extend(record.filter(|record| !record.status.is_final())),
+                Err(StoreError::Quarantined { .. }) => {}
+                Err(error) => return Err(error),
             }
         }
+        drop(reads);
         // In the order of their acceptance.
         open.sort_by_key(|record| (record.created_ms, record.id.clone()));
         let before = self.0.lock().len();

@@ -1,6 +1,6 @@
 //! The worker pool: a bounded queue in front of one backend, with worker threads of its own, and durable jobs on top.
 //!
-//! A [`Task`] (structure bytes and a [`crate::pipeline::Job`]) goes in, a mesh with its report comes out. Deadlines,
+//! The result of a [`Task`] (structure bytes and a [`crate::pipeline::Job`]) is a mesh with its report. Deadlines,
 //! cancellation and panics are handled here, so callers only wait for a [`Ticket`]. This module knows no HTTP and no
 //! graphics API.
 //!
@@ -33,7 +33,7 @@ pub(crate) use key::ContentKey;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
 pub(crate) use record::{JobId, Status, rfc3339};
-pub(crate) use results::{REPORT, SaveError, save};
+pub(crate) use results::{REPORT, SaveError, is_stored, save};
 pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;
@@ -52,14 +52,14 @@ pub(crate) struct Task {
     pub(crate) input: Bytes,
     /// SHA-256 of `input`.
     pub(crate) digest: Digest,
-    /// Run the strict parser as well, and reject a file in which it finds errors.
+    /// Run the strict validator as well, and reject a file in which it finds errors.
     pub(crate) strict: bool,
     /// Parameters of the mesh.
     pub(crate) job: Job,
     /// Client and priority.
     pub(crate) rank: Rank,
     /// Memory budget that `input` is charged to.
-    #[expect(dead_code, reason = "held until this is dropped")]
+    #[expect(dead_code, reason = "holds the memory until it is dropped")]
     pub(crate) lease: Option<Arc<Lease>>,
     /// Parent of the spans of the task.
     pub(crate) parent: SpanParent,
@@ -72,12 +72,12 @@ pub(crate) struct Task {
 pub(crate) struct Finished {
     /// Mesh and report.
     pub(crate) product: Product,
-    /// Findings of the strict parser if the task was strict.
+    /// Findings of the strict validator if the task was strict.
     pub(crate) diagnostics: Option<Vec<Diagnostic>>,
     /// SHA-256 of the input.
     pub(crate) digest: Digest,
     /// Memory budget that the mesh is charged to, until this is dropped.
-    #[expect(dead_code, reason = "held until this is dropped")]
+    #[expect(dead_code, reason = "holds the memory until it is dropped")]
     pub(crate) lease: Arc<Lease>,
 }
 

@@ -35,8 +35,8 @@ pub(crate) struct Settings {
     pub(crate) tracer: Tracer,
 }
 
-/// Receives the time that a worker spent on a job of a client, successful or not. A shared job is charged to its first
-/// client. Called before the outcome is sent.
+/// Callback with the time that a worker spent on a job of a client, successful or not. A shared job is charged to its
+/// first client. The callback precedes the outcome.
 pub(crate) type Meter = Arc<dyn Fn(Client, Duration) + Send + Sync>;
 
 /// State that workers share.

@@ -4,16 +4,17 @@ use std::fmt;
 use std::str::FromStr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use bytes::Bytes;
 use hmac::{Hmac, KeyInit as _, Mac as _};
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Map, Value};
 use sha2::Sha256;
 use thiserror::Error;
 
 use crate::formats::Format;
 use crate::pipeline::params;
 use crate::store::Secret;
-use crate::telemetry::{SpanParent, Tracer, read_trace_context, traceparent, tracestate};
+use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, traceparent, tracestate};
 
 /// Error of a text that is not a job id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
@@ -34,7 +35,7 @@ impl JobId {
     }
 
     /// Returns the id for an idempotency key: the same for the same key of the same client, also after a restart.
-    /// HMAC-SHA-256 under `secret`, so that client and key alone do not reveal it.
+    /// The id is a truncated HMAC-SHA-256 under `secret`: client and key alone do not reveal it.
     pub(super) fn of_key(secret: &Secret, client: u64, key: &str) -> Self {
         // HMAC pads a key to the block length with zeros.
         let mut block = [0; 64];
@@ -46,15 +47,16 @@ impl JobId {
         Self(format!("{id:032x}"))
     }
 
-    /// Returns the id as text.
+    /// Returns the whole id.
     pub(crate) fn as_str(&self) -> &str {
         &self.0
     }
 }
 
 impl fmt::Display for JobId {
+    /// Writes the first digits, for logs and traces: the whole id gives access to the job.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
+        f.write_str(&shorten(&self.0))
     }
 }
 
@@ -126,7 +128,7 @@ pub(crate) struct Record {
     pub(crate) urgency: u8,
     /// Status at the last write.
     pub(crate) status: Status,
-    /// Number of attempts to run it.
+    /// Number of attempts to run the job.
     pub(crate) attempts: u32,
     /// Time of acceptance, ms since 1970.
     pub(crate) created_ms: u64,
@@ -138,12 +140,12 @@ pub(crate) struct Record {
     pub(crate) result: Option<String>,
     /// Problem document of a failed job.
     pub(crate) problem: Option<Value>,
-    /// Request that created it.
+    /// Request that created the job.
     #[serde(default)]
     pub(crate) requester: Requester,
 }
 
-/// Request that created a job, with its W3C trace context.
+/// Id and W3C trace context of the request that created a job.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub(crate) struct Requester {
@@ -156,7 +158,7 @@ pub(crate) struct Requester {
 }
 
 impl Requester {
-    /// Returns the part of a span's parent that is stored.
+    /// Converts the parent of a span to its stored form.
     pub(crate) fn of(parent: &SpanParent) -> Self {
         Self {
             request: parent.request.as_deref().map(str::to_owned),
@@ -165,7 +167,7 @@ impl Requester {
         }
     }
 
-    /// Returns the stored parent, for spans of `tracer`.
+    /// Returns the stored parent for spans that `tracer` records.
     pub(crate) fn parent(&self, tracer: &Tracer) -> SpanParent {
         let text = |text: &'_ Option<String>| text.clone().unwrap_or_default();
         SpanParent {
@@ -176,7 +178,48 @@ impl Requester {
     }
 }
 
+/// Version of the record format.
+const VERSION: u64 = 1;
+
+/// Version of a stored record; the first records have none.
+#[derive(Debug, Serialize, Deserialize)]
+struct Versioned<T> {
+    #[serde(default = "first_version")]
+    version: u64,
+    #[serde(flatten)]
+    content: T,
+}
+
+fn first_version() -> u64 {
+    VERSION
+}
+
+/// Error of a stored record.
+#[derive(Debug, Error)]
+pub(super) enum BadRecord {
+    /// The document is damaged.
+    #[error("{0}")]
+    Damaged(#[from] serde_json::Error),
+    /// A later release wrote the record.
+    #[error("the record has version {0}, expected {VERSION}")]
+    Version(u64),
+}
+
 impl Record {
+    /// Returns the document to store.
+    pub(super) fn to_bytes(&self) -> Bytes {
+        Bytes::from(serde_json::to_vec(&Versioned { version: VERSION, content: self }).unwrap_or_default())
+    }
+
+    /// Parses a stored document.
+    pub(super) fn from_bytes(bytes: &[u8]) -> Result<Self, BadRecord> {
+        // The version first: other fields of another version may have other types.
+        match serde_json::from_slice::<Versioned<Map<String, Value>>>(bytes)?.version {
+            VERSION => Ok(serde_json::from_slice(bytes)?),
+            other => Err(BadRecord::Version(other)),
+        }
+    }
+
     /// Parses the stored parameters and the format.
     pub(super) fn request(&self) -> Result<(params::Request, Format), String> {
         let mut request = params::parse(self.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
@@ -185,7 +228,7 @@ impl Record {
         Ok((request, format))
     }
 
-    /// Returns true if both records are of the same request: equal input, format and parsed parameters.
+    /// Returns true if both records describe the same request: equal input, format and parsed parameters.
     pub(super) fn is_same_request(&self, other: &Self) -> bool {
         let parsed = |record: &Self| {
             let (request, _) = record.request().ok()?;
@@ -203,7 +246,7 @@ pub(crate) fn now_ms() -> u64 {
     u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }
 
-/// Formats a time as RFC 3339.
+/// Formats a time, ms since 1970, as RFC 3339.
 pub(crate) fn rfc3339(ms: u64) -> String {
     humantime::format_rfc3339_millis(UNIX_EPOCH + Duration::from_millis(ms.min(MAX_MS))).to_string()
 }
@@ -271,12 +314,19 @@ mod tests {
     #[test]
     fn records_survive_a_round_trip() {
         let record = record(&[("resolution", "0.5")]);
-        let text = serde_json::to_vec(&record).unwrap();
-        assert_eq!(serde_json::from_slice::<Record>(&text).unwrap(), record);
+        let text = record.to_bytes().to_vec();
+        assert_eq!(Record::from_bytes(&text).unwrap(), record);
         // Records of earlier versions have no requester.
         let mut old = serde_json::to_value(&record).unwrap();
         old.as_object_mut().unwrap().remove("requester").unwrap();
         assert_eq!(serde_json::from_value::<Record>(old).unwrap().requester, Requester::default());
+        let old = serde_json::to_vec(&record).unwrap();
+        assert_eq!(Record::from_bytes(&old).unwrap(), record, "the first records have no version");
+        let later = br#"{"version":2,"id":7}"#;
+        assert!(matches!(Record::from_bytes(later), Err(BadRecord::Version(2))));
+        for damaged in [b"".as_slice(), &text[..text.len() / 2], b"[]", br#"{"version":1}"#] {
+            assert!(matches!(Record::from_bytes(damaged), Err(BadRecord::Damaged(_))), "{damaged:?}");
+        }
         let hostile = String::from_utf8(text).unwrap().replace(record.id.as_str(), "../../x");
         assert!(serde_json::from_str::<Record>(&hostile).is_err());
     }

@@ -42,7 +42,13 @@ impl SaveError {
     }
 }
 
-/// Stores the report and the mesh as `format`, unless the mesh is stored already. The report comes first, so that every
+/// Returns true if a mesh and its report are stored. A mesh without its report counts as absent.
+pub(crate) async fn is_stored(store: &Store, format: Format, key: &ContentKey) -> Result<bool, StoreError> {
+    let (mesh, report) = (key.name(format.extension())?, key.name(REPORT)?);
+    Ok(store.head(&mesh).await?.is_some() && store.head(&report).await?.is_some())
+}
+
+/// Stores the report and the mesh as `format`, unless both are stored already. The report comes first, so that every
 /// stored mesh has one.
 pub(crate) async fn save(
     store: &Store,
@@ -52,20 +58,29 @@ pub(crate) async fn save(
     limit: u64,
 ) -> Result<(), SaveError> {
     let (mesh, report) = (key.name(format.extension())?, key.name(REPORT)?);
-    if store.head(&mesh).await?.is_some() {
+    // Writing the mesh must not evict its report.
+    let _pin = store.pin(&mesh);
+    if is_stored(store, format, key).await? {
         return Ok(());
     }
     let document = serde_json::to_vec(&finished.product.report).map_err(|e| SaveError::Other(e.to_string()))?;
     store.put(&report, Bytes::from(document)).await?;
-    let mut writer = store.writer(&mesh);
+    let (store, runtime) = (store.clone(), tokio::runtime::Handle::current());
     let encode = move || {
         let file = finished.product.file(format)?;
         let bytes = file.bytes_bound();
         if bytes > limit {
             return Err(SaveError::TooLarge { bytes, limit });
         }
-        file.write(&mut writer).and_then(|()| writer.flush()).map_err(of_io)?;
-        Ok(writer.finish()?)
+        let write = || {
+            let mut writer = store.writer(&mesh);
+            file.write(&mut writer).and_then(|()| writer.flush()).map_err(of_io)?;
+            Ok(writer.finish()?)
+        };
+        match write() {
+            Err(SaveError::Store(StoreError::NoSpace { .. })) if runtime.block_on(store.make_room(bytes)) => write(),
+            done => done,
+        }
     };
     tokio::task::spawn_blocking(encode).await.map_err(|e| SaveError::Other(e.to_string()))?
 }

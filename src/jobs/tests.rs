@@ -32,7 +32,7 @@ struct Fixture {
     faults: Arc<Faults>,
     store: Store,
     jobs: JobStore,
-    _dir: TempDir,
+    dir: TempDir,
 }
 
 impl Fixture {
@@ -52,7 +52,7 @@ impl Fixture {
         let save_retry_ms = u64::try_from(retry_for.as_millis()).unwrap();
         let config = JobsConfig { attempts, save_retry_ms, ..JobsConfig::default() };
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
-        Self { faults, jobs: JobStore::new(store.clone(), pool, config, 1 << 30, [0; 32], describe), store, _dir: dir }
+        Self { faults, jobs: JobStore::new(store.clone(), pool, config, 1 << 30, [0; 32], describe), store, dir }
     }
 
     async fn accept(&self) -> Result<JobView, AcceptError> {
@@ -100,7 +100,7 @@ impl Fixture {
     /// Returns the stored record of a job.
     async fn on_record(&self, id: &JobId) -> Record {
         let stored = self.store.get(&Name::job(id.as_str()).unwrap()).await.unwrap().unwrap();
-        serde_json::from_slice(&stored.bytes).unwrap()
+        Record::from_bytes(&stored.bytes).unwrap()
     }
 
     async fn watch(&self, id: &JobId) -> watch::Receiver<JobView> {
@@ -258,4 +258,67 @@ async fn the_last_record_has_the_latest_state() {
     drop(turn);
     writes.await.unwrap();
     assert_eq!(fixture.on_record(&id).await.status, Status::Dismissed);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn records_that_cannot_be_read_go_into_quarantine() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let good = fixture.inherit().await;
+    let whole = fixture.on_record(&good).await.to_bytes();
+    let bad = [Bytes::new(), whole.slice(..whole.len() / 2), Bytes::from_static(br#"{"version":2,"id":[]}"#)];
+    let names: Vec<_> = bad.iter().map(|_| Name::job(JobId::random().unwrap().as_str()).unwrap()).collect();
+    for (name, bytes) in names.iter().zip(&bad) {
+        fixture.store.put(name, bytes.clone()).await.unwrap();
+    }
+    // One is read by a request, the others by the recovery.
+    let id = |name: &Name| name.to_string()[5..37].parse::<JobId>().unwrap();
+    let refused = fixture.jobs.view(&id(&names[0])).await;
+    assert!(matches!(refused, Err(StoreError::Quarantined { .. })), "{refused:?}");
+    assert_eq!(fixture.store.quarantined().await.unwrap(), 1);
+    assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
+    ended(&mut fixture.watch(&good).await).await;
+    assert_eq!(fixture.store.quarantined().await.unwrap(), 3);
+    let folder = fixture.dir.path().join("store/quarantine");
+    for (name, bytes) in names.iter().zip(&bad) {
+        let refused = fixture.jobs.dismiss(&id(name)).await;
+        assert!(matches!(refused, Err(StoreError::Quarantined { .. })), "{refused:?}");
+        let file = folder.join(format!("{}.json", id(name)));
+        assert_eq!(&std::fs::read(&file).unwrap(), bytes, "kept as it was");
+        std::fs::remove_file(file).unwrap();
+    }
+    assert_eq!(fixture.store.quarantined().await.unwrap(), 0);
+    assert_eq!(fixture.jobs.view(&id(&names[0])).await.unwrap(), None);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn recovered_inputs_are_pinned() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    // The job cannot start, so only the recovery protects its input.
+    fixture.faults.silence(Some(Folder::Inputs));
+    assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
+    fixture.store.sweep(std::time::SystemTime::now() + Duration::from_hours(10_000)).await;
+    fixture.faults.silence(None);
+    let mut seen = fixture.watch(&id).await;
+    ended(&mut seen).await;
+    is(&seen, |record| record.status, &Status::Successful);
+}
+
+#[tokio::test]
+async fn versions_of_states_continue_after_a_restart() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    let job = DurableJob::new(fixture.on_record(&id).await);
+    let mut versions = vec![job.view().version];
+    for _ in 0..5 {
+        assert!(job.begin());
+        versions.push(job.view().version);
+    }
+    tokio::time::sleep(Duration::from_millis(50)).await;
+    let next = DurableJob::new(job.record());
+    versions.push(next.view().version);
+    assert!(next.end(Status::Failed, |_| {}));
+    versions.push(next.view().version);
+    assert!(versions.is_sorted_by(|a, b| a < b), "{versions:?}");
+    assert_eq!(DurableJob::new(next.record()).view().version, *versions.last().unwrap(), "no event follows the last");
 }

@@ -22,9 +22,9 @@ pub(crate) struct Ticket {
     pub(super) progress: Arc<Progress>,
     /// Span of the job.
     pub(crate) span: TraceSpan,
-    /// The task joined a job that was queued or running.
+    /// True if the task joined a queued or running job.
     pub(crate) is_shared: bool,
-    /// The joined job was already running; its `on_start` callback is not called then.
+    /// True if the task joined a running job. The `on_start` callback of the task is not called then.
     pub(super) joined_running: bool,
 }
 

@@ -16,7 +16,7 @@ use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, Control, SurfaceError};
 use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan};
 
-/// Size limit of files that the strict parser examines after a failure, bytes: it takes 10 to 40 ms for this size.
+/// Size limit of files that the strict validator examines after a failure, bytes: it takes 10 to 40 ms for this size.
 const MAX_EXPLAINED: u64 = 512 << 10;
 
 /// Runs jobs until the queue is closed and empty.
@@ -135,7 +135,7 @@ fn end_span(span: &TraceSpan, id: Option<JobId>, label: &'static str, outcome: O
     span.end();
 }
 
-/// Runs the strict parser. Fails if it finds errors.
+/// Runs the strict validator. Fails if it finds errors.
 fn check(shared: &Shared, input: &[u8], control: &Control<'_>) -> Result<Vec<Diagnostic>, Failure> {
     let diagnostics = strict_validator::check(input, &shared.settings.limits.read, control).map_err(JobError::from)?;
     if diagnostics.iter().any(|d| d.level == Level::Error) {
@@ -144,12 +144,12 @@ fn check(shared: &Shared, input: &[u8], control: &Control<'_>) -> Result<Vec<Dia
     Ok(diagnostics)
 }
 
-/// Adds the findings of the strict parser to the failure of a small file that cannot be read.
+/// Adds the findings of the strict validator to the failure of a small file that cannot be read.
 fn explained(shared: &Shared, input: &[u8], error: JobError, control: &Control<'_>) -> Failure {
     let unreadable =
         matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
     let limits = ReadLimits { max_inflated_bytes: MAX_EXPLAINED, ..shared.settings.limits.read };
-    // If the strict parser fails as well, there are no findings.
+    // If the strict validator fails as well, there are no findings.
     if !unreadable {
         return error.into();
     }

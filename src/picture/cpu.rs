@@ -24,7 +24,7 @@ impl Renderer for CpuRenderer {
 
     fn describe(&self) -> String {
         let threads = rayon::current_num_threads();
-        format!("CPU rasteriser, {threads} thread{}", if threads == 1 { "" } else { "s" })
+        format!("CPU rasterizer, {threads} thread{}", if threads == 1 { "" } else { "s" })
     }
 
     fn render(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Rendered, PictureError> {

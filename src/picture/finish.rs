@@ -8,7 +8,7 @@ use super::layers::{Layers, NOTHING};
 use super::light::{self, Levels};
 use super::{Background, Image, PictureParams, Style};
 
-/// Directions around a pixel in a quarter of the circle, at equal angles.
+/// Directions from a pixel in a quarter of the circle, at equal angles.
 const QUARTER: [[f64; 2]; 4] = {
     const C: f64 = 0.923_879_532_511_286_7;
     const S: f64 = 0.382_683_432_365_089_8;
@@ -22,9 +22,9 @@ const RINGS: [f64; 6] = [0.06, 0.13, 0.24, 0.4, 0.65, 1.0];
 const RADIUS: f64 = 6.0;
 const RADIUS_SHARE: f64 = 0.07;
 /// Sine above the tangent plane below which a neighbour does not occlude, so that convex surfaces are not darkened.
-pub const BIAS: f32 = 0.12;
+pub const OCCLUSION_BIAS: f32 = 0.12;
 /// Factor of the mean occlusion.
-pub const STRENGTH: f32 = 2.8;
+pub const OCCLUSION_STRENGTH: f32 = 2.8;
 /// Minimum light after occlusion.
 pub const MIN_LIGHT: f32 = 0.25;
 /// Step in depth at which an outline begins, in Å plus pixels, and the factor at which it has full strength.
@@ -191,7 +191,7 @@ impl Row {
             let normal = self.normal.each_ref().map(|column| &column[from..to]);
             add_occlusion(&mut self.open[from..to], &depth[from..to], other, normal, *tap, shading.falloff);
         }
-        let scale = STRENGTH / shading.taps.len() as f32;
+        let scale = OCCLUSION_STRENGTH / shading.taps.len() as f32;
         self.open.iter_mut().for_each(|shade| *shade = (1.0 - *shade * scale).max(MIN_LIGHT));
     }
 }
@@ -211,7 +211,7 @@ fn add_occlusion(
     for i in 0..n {
         let rise = depth[i] - other[i];
         let square = flat + rise * rise;
-        let sine = (right[i] * tap.right + up[i] * tap.up + toward[i] * rise) / square.sqrt() - BIAS;
+        let sine = (right[i] * tap.right + up[i] * tap.up + toward[i] * rise) / square.sqrt() - OCCLUSION_BIAS;
         // Without a surface at either pixel the sine is NaN and nothing is added.
         shade[i] += if sine > 0.0 { sine / (1.0 + square * falloff) } else { 0.0 };
     }

@@ -114,7 +114,7 @@ pub trait Renderer: Send + Sync {
     /// Description of the hardware, for display.
     fn describe(&self) -> String;
 
-    /// Identity of this renderer, as the maker of a picture.
+    /// Returns the identity of this renderer for the report of a picture.
     fn identity(&self) -> BackendIdentity {
         BackendIdentity {
             backend: self.name(),

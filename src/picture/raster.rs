@@ -1,4 +1,4 @@
-//! Rasteriser of one tile: the nearest triangle at four samples of every pixel.
+//! Rasterizer of one tile: the nearest triangle at four samples of every pixel.
 
 use super::bins::{Bins, PARTS, TILE_HEIGHT, TILE_WIDTH, Tiles, corner, twice_area};
 use super::camera::{Camera, dot};

@@ -4,7 +4,7 @@
 //! |nx| + |ny| + |nz| over all normals is 1.5. Each crossing is a vertex, and a closed mesh has about two triangles per
 //! vertex. A coarser mesh gives the area.
 
-use super::fit::{self, COARSE, COARSER};
+use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
 use crate::surface::cpu::scan;
 use crate::surface::lattice::Lattice;
@@ -102,7 +102,7 @@ fn of_mesh(
     let bricks = Occupancy::new(lattice, limits, control)?.n_reached();
     let h = params.resolution;
     let single = SurfaceParams { atom_ids: false, quantize: None, ..params.clone() };
-    let coarse = SurfaceParams { resolution: (COARSER * h).max(COARSE).max(h), ..single.clone() };
+    let coarse = SurfaceParams { resolution: (COARSE_FACTOR * h).max(MIN_COARSE_SPACING).max(h), ..single.clone() };
     let mesh = match choice.backend.run(spheres, &coarse, limits, control) {
         // A coarse grid can miss single small spheres: use the job's grid then.
         Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, &single, limits, control)?.mesh,

@@ -21,10 +21,10 @@ const TRIES_BEFORE_COARSEST: u32 = 4;
 const FULL: f64 = 0.95;
 /// Fraction of the limit that the search aims at. It is below 1, as the power law is not exact.
 const AIM: f64 = 0.98;
-/// Spacing of a first, coarse mesh as a multiple of the expected one.
-pub(super) const COARSER: f64 = 2.0;
-/// Minimum spacing of that mesh, Å.
-pub(super) const COARSE: f64 = 1.0;
+/// Spacing of a first, coarse mesh as a multiple of the expected spacing.
+pub(super) const COARSE_FACTOR: f64 = 2.0;
+/// Minimum spacing of a first, coarse mesh, Å.
+pub(super) const MIN_COARSE_SPACING: f64 = 1.0;
 
 /// Next step of the search.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -55,7 +55,7 @@ impl Search {
     /// Creates a search for at most `limit` triangles.
     pub(super) fn new(limit: u64, params: &SurfaceParams, atoms: usize) -> Self {
         let expected = Spacing::MaxTriangles(limit).expected(params, atoms as f64);
-        let first = rounded((COARSER * expected).clamp(COARSE, COARSEST));
+        let first = rounded((COARSE_FACTOR * expected).clamp(MIN_COARSE_SPACING, COARSEST));
         Self { limit, first, tried: Vec::new() }
     }
 

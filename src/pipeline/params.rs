@@ -168,7 +168,7 @@ impl From<SurfaceError> for ParamError {
     }
 }
 
-/// Values of the parameters so far.
+/// Values of the parameters that are parsed so far.
 #[derive(Default)]
 struct Values {
     options: SurfaceOptions,
@@ -177,7 +177,7 @@ struct Values {
 }
 
 impl Values {
-    /// Parameters of the picture, which exists from the first of them on.
+    /// Returns the picture parameters of the job. The first call creates them.
     fn picture(&mut self) -> &mut PictureParams {
         self.request.job.picture.get_or_insert_default()
     }
@@ -284,7 +284,7 @@ pub fn canonical(job: &Job) -> String {
         // Follows from `compress` and the spheres.
         quantize: _,
     } = params;
-    // Only the parameter that sets the spacing; the other two have their defaults.
+    // Contains only the parameter that sets the spacing: the other two have their defaults.
     let spacing = match spacing {
         Spacing::Given => format!("resolution={resolution}"),
         Spacing::Detail(level) => format!("detail={level}"),

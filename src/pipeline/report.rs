@@ -229,7 +229,7 @@ pub struct Report {
     /// Quantization of the vertices in the mesh file; absent if they are not quantized.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub quantization: Option<Quantization>,
-    /// Backend that computed the mesh: `cpu` or `gpu`.
+    /// Backend that computed the mesh: `cpu`, `gpu` or `reference`.
     pub backend: &'static str,
     /// Arithmetic of the backend, part of the key of the file.
     #[serde(skip)]

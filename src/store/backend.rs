@@ -14,8 +14,10 @@ use object_store::{GetOptions, GetRange, GetResult, ObjectMeta, ObjectStore, Obj
 use tokio::task::spawn_blocking;
 
 use super::error::StoreError;
+use super::lock::{create_folder, sync_folder};
 use super::name::{Folder, Name};
 use super::object::{Meta, Stored};
+use super::quarantine::QUARANTINE;
 use super::s3::{self, Bucket};
 use super::secret::{self, Secret};
 use super::stale;
@@ -54,8 +56,12 @@ impl Backend {
         let place = root.display().to_string();
         let folder = root.clone();
         let opened = spawn_blocking(move || {
-            for name in Folder::ALL.map(Folder::as_str).into_iter().chain([PROBE]) {
-                std::fs::create_dir_all(folder.join(name)).map_err(|e| e.to_string())?;
+            for name in Folder::ALL.map(Folder::as_str).into_iter().chain([PROBE, QUARANTINE]) {
+                create_folder(&folder.join(name)).map_err(|e| e.to_string())?;
+            }
+            // An earlier process may have died between creating a folder and making it durable.
+            for above in [Some(folder.as_path()), folder.parent()].into_iter().flatten() {
+                sync_folder(above).map_err(|e| e.to_string())?;
             }
             LocalFileSystem::new_with_prefix(&folder).map(|files| files.with_fsync(true)).map_err(|e| e.to_string())
         });
@@ -201,6 +207,30 @@ impl Backend {
         outcome.map_err(|error| self.open_error(&error))
     }
 
+    /// Returns the free bytes of the disk, 0 if unknown; `None` on S3.
+    pub(super) async fn free_bytes(&self) -> Option<u64> {
+        let Kind::Local(root) = &self.kind else { return None };
+        let root = root.clone();
+        Some(spawn_blocking(move || free_bytes(&root)).await.unwrap_or(0))
+    }
+
+    /// Sets the modification times of objects to their last uses, which the next process reads. S3 has no such operation.
+    pub(super) async fn save_uses(&self, uses: Vec<(Name, SystemTime)>) -> Result<(), StoreError> {
+        let Kind::Local(root) = &self.kind else { return Ok(()) };
+        let root = root.clone();
+        let save = move || {
+            for (name, used) in uses {
+                match std::fs::File::open(root.join(name.to_string())).and_then(|file| file.set_modified(used)) {
+                    Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error),
+                    _ => {}
+                }
+            }
+            Ok(())
+        };
+        let saved = spawn_blocking(save).await.unwrap_or_else(|e| Err(e.into()));
+        saved.map_err(|error| self.fail("use", "", &error))
+    }
+
     /// Removes leftovers of crashed processes: staged files, unfinished uploads, probes. Returns their number.
     pub(super) async fn clear_stale(&self, now: SystemTime) -> Result<u64, StoreError> {
         let fail = |e: object_store::Error| self.fail("clear", PROBE, &e);
@@ -221,6 +251,16 @@ impl Backend {
         };
         unfinished.map(|unfinished| removed + unfinished)
     }
+}
+
+#[cfg(target_os = "linux")]
+fn free_bytes(folder: &FilePath) -> u64 {
+    rustix::fs::statvfs(folder).map_or(0, |disk| disk.f_bavail.saturating_mul(disk.f_frsize))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn free_bytes(_: &FilePath) -> u64 {
+    0
 }
 
 /// Converts a "not found" error to `None`.

@@ -71,6 +71,12 @@ pub enum StoreError {
     /// A writer is used after one of its writes failed. Nothing is stored.
     #[error("an earlier write of the object failed")]
     WriterFailed,
+    /// A job document could not be read and is in quarantine.
+    #[error("{name} cannot be read and is in the folder `quarantine` of the store")]
+    Quarantined {
+        /// Name of the document.
+        name: String,
+    },
     /// The name is invalid.
     #[error(transparent)]
     Name(#[from] BadName),

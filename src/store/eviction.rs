@@ -2,6 +2,7 @@
 
 use std::time::{Duration, SystemTime};
 
+use futures_util::future::join_all;
 use metrics::counter;
 
 use super::error::StoreError;
@@ -13,6 +14,9 @@ use crate::telemetry::STORE_REMOVED;
 
 /// Attempts to free space. Other requests may use the candidates or take the freed space in between.
 const ATTEMPTS: usize = 16;
+
+/// Shortest time between two saved uses of an object.
+const SAVE_USE: Duration = Duration::from_hours(1);
 
 /// Result of a sweep.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -56,7 +60,7 @@ impl Drop for Reservation {
 
 impl Store {
     /// Removes expired objects, then the least recently used ones until the store is within its capacity, and about
-    /// once an hour leftovers of crashed processes. The service calls it regularly.
+    /// once an hour leftovers of crashed processes. Saves times of last use, at most once an hour for an object. The service calls it regularly.
     pub async fn sweep(&self, now: SystemTime) -> Swept {
         let mut swept = Swept::default();
         let mut cleared = self.0.last_cleanup.lock().await;
@@ -66,6 +70,10 @@ impl Store {
         let (excess, _) = self.index().excess(0, self.0.config.max_bytes);
         let (evicted, bytes) = self.remove_all(&excess, "cap", &mut swept.failed).await;
         (swept.evicted, swept.bytes) = (evicted, swept.bytes + bytes);
+        let uses = self.index().unsaved_uses(SAVE_USE);
+        if let Err(error) = self.0.backend.save_uses(uses).await {
+            tracing::warn!(%error, "times of last use were not saved");
+        }
         if now.duration_since(*cleared).is_ok_and(|age| age >= STALE) {
             match self.0.backend.clear_stale(now).await {
                 Ok(stale) => (swept.stale, *cleared) = (stale, now),
@@ -124,17 +132,33 @@ impl Store {
         Err(StoreError::Full { bytes, held, max_bytes })
     }
 
+    /// Evicts the least recently used objects after the disk had no space for `bytes`: twice as many bytes, since other
+    /// writers need space too. Returns true if that freed any.
+    pub(crate) async fn make_room(&self, bytes: u64) -> bool {
+        let _one_at_a_time = self.0.last_cleanup.lock().await;
+        let candidates = self.index().oldest(bytes.saturating_mul(2));
+        let (objects, freed) = self.remove_all(&candidates, "cap", &mut 0).await;
+        tracing::warn!(objects, bytes = freed, "the disk is full; evicted objects");
+        freed > 0
+    }
+
+    /// Returns true if an object of `bytes` surely fits: into the capacity, and twice into the free space of the disk.
+    pub(crate) async fn has_room(&self, bytes: u64) -> bool {
+        let (_, missing) = self.index().excess(bytes, self.0.config.max_bytes);
+        missing == 0 && self.0.backend.free_bytes().await.is_none_or(|free| free / 2 >= bytes)
+    }
+
     /// Removes the candidates that are still unused. Returns the numbers of removed objects and bytes; adds failures to
     /// `failed`.
     async fn remove_all(&self, candidates: &[EvictionCandidate], reason: &'static str, failed: &mut u64) -> (u64, u64) {
         let (mut objects, mut bytes) = (0, 0);
         for candidate in candidates {
             match self.remove_candidate(candidate.clone()).await {
-                Ok(true) => (objects, bytes) = (objects + 1, bytes + candidate.bytes),
+                Ok(true) => (objects, bytes) = (objects + candidate.names.len() as u64, bytes + candidate.bytes),
                 Ok(false) => {}
                 Err(error) => {
                     *failed += 1;
-                    tracing::warn!(%error, name = %candidate.name, "an object could not be removed");
+                    tracing::warn!(%error, "an object could not be removed");
                 }
             }
         }
@@ -145,10 +169,12 @@ impl Store {
     async fn remove_candidate(&self, candidate: EvictionCandidate) -> Result<bool, StoreError> {
         let store = self.clone();
         self.run_to_completion(async move {
-            let _lock = store.write_lock(&candidate.name).lock().await;
+            let Some(first) = candidate.names.first() else { return Ok(false) };
+            let _lock = store.write_lock(first).lock().await;
             let begun = store.index().begin_removal(&candidate);
             if begun {
-                store.remove(&candidate.name).await?;
+                let removed = join_all(candidate.names.iter().map(|name| store.remove(name))).await;
+                removed.into_iter().collect::<Result<(), _>>()?;
             }
             Ok(begun)
         })

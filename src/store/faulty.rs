@@ -25,6 +25,8 @@ use crate::config::StoreConfig;
 pub(crate) struct Faults {
     /// Writes fail.
     pub(crate) full: AtomicBool,
+    /// A removal ends `full`.
+    pub(crate) frees: AtomicBool,
     /// Removals fail.
     pub(crate) stuck: AtomicBool,
     /// Folder whose operations hang; true if reads hang too.
@@ -125,6 +127,9 @@ impl ObjectStore for Faulty {
     fn delete_stream(&self, at: BoxStream<'static, Result<Path>>) -> BoxStream<'static, Result<Path>> {
         if self.faults.stuck.load(Ordering::Relaxed) {
             return at.map(|_| Err(error(io::ErrorKind::PermissionDenied))).boxed();
+        }
+        if self.faults.frees.load(Ordering::Relaxed) {
+            self.faults.full.store(false, Ordering::Relaxed);
         }
         self.files.delete_stream(at)
     }

@@ -6,6 +6,7 @@ use std::future::Future;
 use std::hash::{Hash as _, Hasher as _};
 use std::ops::Range;
 use std::path::Path;
+use std::sync::atomic::AtomicUsize;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::SystemTime;
 
@@ -21,7 +22,7 @@ use super::memory::Memory;
 use super::name::{Folder, Name};
 use super::object::{ByteStream, Meta, Pin, Stored, Usage};
 use super::secret::Secret;
-use super::{stream, upload};
+use super::stream;
 use crate::config::StoreConfig;
 use crate::telemetry::CACHE_REQUESTS;
 
@@ -43,6 +44,8 @@ pub(super) struct Inner {
     /// Serializes evictions, so that two do not remove twice as much. The value is the time of the last search for
     /// staged files.
     pub(super) last_cleanup: AsyncMutex<SystemTime>,
+    /// Number of job documents in quarantine at the last count.
+    pub(super) quarantined: AtomicUsize,
     pub(super) runtime: Handle,
 }
 
@@ -84,15 +87,18 @@ impl Store {
         }
         let [inputs, jobs, results] = Folder::ALL.map(|folder| index.usage(folder).objects);
         tracing::info!(place = backend.place(), inputs, jobs, results, cleared, "store opened");
-        Ok(Self(Arc::new(Inner {
+        let store = Self(Arc::new(Inner {
             backend,
             index: Mutex::new(index),
             memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
             write_locks: [const { AsyncMutex::const_new(()) }; WRITE_LOCKS],
             last_cleanup: AsyncMutex::new(now),
+            quarantined: AtomicUsize::new(0),
             runtime: Handle::current(),
             config: config.clone(),
-        })))
+        }));
+        store.count_quarantined().await.map_err(|e| store.0.backend.open_error(&e))?;
+        Ok(store)
     }
 
     /// Stores `bytes` under `name`, replacing any existing object. The object is durable on return.
@@ -114,31 +120,6 @@ impl Store {
             return Ok(false);
         }
         self.write(name, bytes, true).await
-    }
-
-    async fn write(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
-        let (store, name) = (self.clone(), name.clone());
-        self.run_to_completion(async move {
-            let mut reservation = store.empty_reservation(&name);
-            reservation.grow(bytes.len() as u64).await?;
-            let _lock = store.write_lock(&name).lock().await;
-            let backend = &store.0.backend;
-            // Content-addressed objects are equal anyway; only job documents need an atomic check.
-            let create = new && name.folder() == Folder::Jobs;
-            if new && !create && backend.head(&name).await?.is_some() {
-                return Ok(false);
-            }
-            if create || backend.is_local() || bytes.len() <= backend.part_size() {
-                if !backend.put(&name, bytes.clone(), create).await? {
-                    return Ok(false);
-                }
-            } else {
-                upload::put_in_parts(&store, &name, bytes.clone()).await?;
-            }
-            store.commit(&name, bytes.len() as u64, Some(&bytes));
-            Ok(true)
-        })
-        .await
     }
 
     /// Reads all bytes of an object. Results in memory need no disk access and no other thread. For large objects, use
@@ -252,13 +233,13 @@ impl Store {
         self.0.backend.list(folder).await
     }
 
-    /// Records a use of an object at time `at`, which restarts its time to live.
+    /// Records a use of an object at time `at`, which restarts its time to live. A mesh and its report are used together.
     pub fn touch(&self, name: &Name, at: SystemTime) {
         self.index().touch(name, at);
     }
 
-    /// Protects a name from eviction and expiry until the pin is dropped. The object need not exist yet.
-    /// [`delete`](Self::delete) ignores pins.
+    /// Protects an object from eviction and expiry until the pin is dropped, a mesh together with its report. The object
+    /// need not exist yet. [`delete`](Self::delete) ignores pins.
     pub fn pin(&self, name: &Name) -> Pin {
         self.index().pin(name);
         Pin { store: self.clone(), name: name.clone() }
@@ -302,10 +283,10 @@ impl Store {
         self.0.index.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns the lock for writing and removing an object.
+    /// Returns the lock for writing and removing an object, which its group shares.
     pub(super) fn write_lock(&self, name: &Name) -> &AsyncMutex<()> {
         let mut hasher = DefaultHasher::new();
-        name.hash(&mut hasher);
+        name.group().hash(&mut hasher);
         let ix = usize::try_from(hasher.finish() % WRITE_LOCKS as u64).unwrap_or_default();
         &self.0.write_locks[ix]
     }

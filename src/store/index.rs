@@ -16,6 +16,8 @@ type Use = (SystemTime, u64);
 struct Entry {
     bytes: u64,
     used: Use,
+    /// Time of last use that the disk has.
+    saved: SystemTime,
     /// Number of writes to the name.
     version: u64,
 }
@@ -27,12 +29,12 @@ pub(super) struct Seen {
     removals: u64,
 }
 
-/// Object that may be evicted, and its state when it was chosen.
+/// Group of objects that may be evicted together, and their state when they were chosen.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct EvictionCandidate {
-    pub(super) name: Name,
+    pub(super) names: Vec<Name>,
     pub(super) bytes: u64,
-    used: Use,
+    used: Vec<Use>,
 }
 
 /// Reason for a failed reservation.
@@ -49,10 +51,11 @@ pub(super) enum ReserveError {
 pub(super) struct Index {
     entries: BTreeMap<Name, Entry>,
     by_use: BTreeMap<Use, Name>,
+    /// Number of pins by group.
     pins: BTreeMap<Name, usize>,
     /// Objects being removed: no longer readable, but still on disk.
     removing: BTreeSet<Name>,
-    /// Usage by folder, including objects being removed.
+    /// Usage by folder, including objects that are being removed.
     totals: [Usage; Folder::ALL.len()],
     /// Bytes reserved by writers, in folders that count against the capacity.
     reserved: u64,
@@ -66,12 +69,16 @@ impl Index {
         self.count
     }
 
-    /// Adds an object that was written, or found at startup.
+    /// Adds an object that was written, or found at startup. Its group counts as used.
     pub(super) fn commit(&mut self, name: &Name, bytes: u64, used: SystemTime) {
         self.forget(name);
-        let (version, used) = (self.next(), (used, self.next()));
+        let members = self.members(&name.group());
+        let last = members.iter().filter_map(|name| Some(self.entries.get(name)?.used.0)).max();
+        let (saved, at) = (used, last.map_or(used, |last| last.max(used)));
+        let (version, used) = (self.next(), (at, self.next()));
         self.by_use.insert(used, name.clone());
-        self.entries.insert(name.clone(), Entry { bytes, used, version });
+        self.entries.insert(name.clone(), Entry { bytes, used, saved, version });
+        self.touch(name, at);
         let total = &mut self.totals[name.folder() as usize];
         *total = Usage { bytes: total.bytes + bytes, objects: total.objects + 1 };
         self.update_metrics(name.folder());
@@ -88,13 +95,21 @@ impl Index {
         true
     }
 
-    /// Records a use at time `at`, unless a later one is known.
+    /// Records a use of the group of an object at time `at`, unless a later one is known.
     pub(super) fn touch(&mut self, name: &Name, at: SystemTime) {
-        let count = self.next();
-        let Some(entry) = self.entries.get_mut(name) else { return };
-        self.by_use.remove(&entry.used);
-        entry.used = (entry.used.0.max(at), count);
-        self.by_use.insert(entry.used, name.clone());
+        for name in self.members(&name.group()) {
+            let count = self.next();
+            let Some(entry) = self.entries.get_mut(&name) else { continue };
+            self.by_use.remove(&entry.used);
+            entry.used = (entry.used.0.max(at), count);
+            self.by_use.insert(entry.used, name);
+        }
+    }
+
+    /// Returns the objects of a group, whose names are adjacent.
+    fn members(&self, group: &Name) -> Vec<Name> {
+        let from_group = self.entries.range(group..).map(|(name, _)| name);
+        from_group.take_while(|name| name.group() == *group).cloned().collect()
     }
 
     /// Starts a read. Returns `None` if the object is being removed.
@@ -118,30 +133,54 @@ impl Index {
     }
 
     pub(super) fn pin(&mut self, name: &Name) {
-        *self.pins.entry(name.clone()).or_default() += 1;
+        *self.pins.entry(name.group()).or_default() += 1;
     }
 
     pub(super) fn unpin(&mut self, name: &Name) {
-        if let Some(count) = self.pins.get_mut(name) {
+        let group = name.group();
+        if let Some(count) = self.pins.get_mut(&group) {
             *count -= 1;
             if *count == 0 {
-                self.pins.remove(name);
+                self.pins.remove(&group);
             }
         }
     }
 
-    fn is_removable(&self, name: &Name) -> bool {
-        !self.pins.contains_key(name) && !self.removing.contains(name)
+    /// Returns the objects whose last use is `interval` later than the disk says, and marks them as saved.
+    pub(super) fn unsaved_uses(&mut self, interval: Duration) -> Vec<(Name, SystemTime)> {
+        let late = |entry: &Entry| entry.used.0.duration_since(entry.saved).is_ok_and(|since| since >= interval);
+        let late = self.entries.iter_mut().filter(|(_, entry)| late(entry));
+        late.map(|(name, entry)| {
+            entry.saved = entry.used.0;
+            (name.clone(), entry.saved)
+        })
+        .collect()
     }
 
-    /// Returns the objects whose time to live has expired, oldest first.
+    /// Returns the groups whose time to live has expired, oldest first.
     pub(super) fn expired(&self, now: SystemTime, ttl: impl Fn(Folder) -> Duration) -> Vec<EvictionCandidate> {
-        self.by_use
+        let expired = self
+            .by_use
             .iter()
-            .filter(|((used, _), name)| now.duration_since(*used).is_ok_and(|age| age >= ttl(name.folder())))
-            .filter(|(_, name)| self.is_removable(name))
-            .filter_map(|(used, name)| self.candidate(name, *used))
-            .collect()
+            .filter(|((used, _), name)| now.duration_since(*used).is_ok_and(|age| age >= ttl(name.folder())));
+        self.candidates(expired.map(|(_, name)| name)).collect()
+    }
+
+    /// Returns the removable groups of `names`, each once, in their order.
+    fn candidates<'a>(&self, names: impl Iterator<Item = &'a Name>) -> impl Iterator<Item = EvictionCandidate> {
+        let mut seen = BTreeSet::new();
+        let groups = names.map(Name::group).filter(move |group| seen.insert(group.clone()));
+        groups.filter_map(|group| self.candidate(&group))
+    }
+
+    /// Returns a group as a candidate, unless it is pinned or being removed.
+    fn candidate(&self, group: &Name) -> Option<EvictionCandidate> {
+        let names = self.members(group);
+        let entries: Vec<_> = names.iter().filter_map(|name| self.entries.get(name)).collect();
+        let is_removable = !self.pins.contains_key(group) && names.iter().all(|name| !self.removing.contains(name));
+        let bytes = entries.iter().map(|entry| entry.bytes).sum();
+        let used = entries.iter().map(|entry| entry.used).collect();
+        (is_removable && !names.is_empty()).then_some(EvictionCandidate { names, bytes, used })
     }
 
     /// Reserves `bytes` within the capacity `cap`, or returns the objects to evict.
@@ -161,19 +200,23 @@ impl Index {
     /// Returns the least recently used objects to evict so that `bytes` more fit into `cap`, and the bytes that are
     /// missing even then.
     pub(super) fn excess(&self, bytes: u64, cap: u64) -> (Vec<EvictionCandidate>, u64) {
-        let mut missing = self.used_bytes().saturating_add(bytes).saturating_sub(cap);
-        let mut candidates = Vec::new();
-        for (used, name) in &self.by_use {
-            if missing == 0 {
-                break;
-            }
-            if name.folder().is_capped() && self.is_removable(name) {
-                let Some(candidate) = self.candidate(name, *used) else { continue };
-                missing = missing.saturating_sub(candidate.bytes);
-                candidates.push(candidate);
-            }
+        let missing = self.used_bytes().saturating_add(bytes).saturating_sub(cap);
+        let chosen = self.oldest(missing);
+        let found = chosen.iter().map(|candidate| candidate.bytes).sum();
+        (chosen, missing.saturating_sub(found))
+    }
+
+    /// Returns the least recently used objects, of at least `missing` bytes if there are so many.
+    pub(super) fn oldest(&self, mut missing: u64) -> Vec<EvictionCandidate> {
+        let mut chosen = Vec::new();
+        let mut candidates = self.candidates(self.by_use.values().filter(|name| name.folder().is_capped()));
+        while missing > 0 {
+            let Some(candidate) = candidates.next() else { break };
+            missing = missing.saturating_sub(candidate.bytes);
+            chosen.push(candidate);
         }
-        (candidates, missing)
+        drop(candidates);
+        chosen
     }
 
     /// Returns the bytes that count against the capacity: on disk and reserved.
@@ -187,19 +230,20 @@ impl Index {
         self.reserved -= bytes;
     }
 
-    fn candidate(&self, name: &Name, used: Use) -> Option<EvictionCandidate> {
-        self.entries.get(name).map(|entry| EvictionCandidate { name: name.clone(), bytes: entry.bytes, used })
-    }
-
     /// Marks an object as being removed, unconditionally.
     pub(super) fn mark_removed(&mut self, name: &Name) {
         self.removing.insert(name.clone());
     }
 
-    /// Marks a candidate as being removed, unless it was used, written or pinned since it was chosen.
+    /// Marks a candidate as being removed, unless an object of its group was used, written or pinned since it was
+    /// chosen.
     pub(super) fn begin_removal(&mut self, candidate: &EvictionCandidate) -> bool {
-        let unchanged = self.entries.get(&candidate.name).is_some_and(|entry| entry.used == candidate.used);
-        unchanged && self.is_removable(&candidate.name) && self.removing.insert(candidate.name.clone())
+        let unchanged =
+            candidate.names.first().and_then(|name| self.candidate(&name.group())).as_ref() == Some(candidate);
+        if unchanged {
+            self.removing.extend(candidate.names.iter().cloned());
+        }
+        unchanged
     }
 
     /// Ends a removal. If it failed, the object becomes readable again.
@@ -272,7 +316,7 @@ mod tests {
         let Err(ReserveError::Remove(candidates)) = index.reserve(20, 30) else {
             panic!("reserved more than the capacity")
         };
-        assert_eq!(candidates.iter().map(|v| v.name.clone()).collect::<Vec<_>>(), [name("a"), name("b")]);
+        assert_eq!(candidates.iter().map(|v| v.names.clone()).collect::<Vec<_>>(), [[name("a")], [name("b")]]);
         index.touch(&name("a"), at(1));
         index.pin(&name("b"));
         assert!(!index.begin_removal(&candidates[0]) && !index.begin_removal(&candidates[1]));
@@ -285,5 +329,30 @@ mod tests {
         assert_eq!(index.reserve(1, 30), Err(ReserveError::Held(30)));
         index.release(10);
         assert_eq!(index.reserve(10, 30), Ok(()));
+    }
+
+    #[test]
+    fn a_mesh_and_its_report_are_used_pinned_and_removed_together() {
+        let result = |key: &str, extension| Name::result(&key.repeat(64), extension).unwrap();
+        let mut index = Index::default();
+        for (key, used) in [("a", 1), ("b", 3)] {
+            index.commit(&result(key, "json"), 10, at(used));
+            index.commit(&result(key, "glb"), 90, at(used + 1));
+        }
+        let ttl = |_: Folder| Duration::from_secs(8);
+        let chosen = |found: &[EvictionCandidate]| found.iter().flat_map(|v| v.names.clone()).collect::<Vec<_>>();
+        // The later use of either counts for both.
+        assert_eq!(index.expired(at(9), ttl), []);
+        let oldest = [result("a", "glb"), result("a", "json")];
+        assert_eq!(chosen(&index.expired(at(10), ttl)), oldest);
+        assert_eq!(chosen(&index.excess(1, 200).0), oldest, "a part of the group would suffice");
+        let chosen_before = index.excess(1, 200).0;
+        index.touch(&result("a", "glb"), at(20));
+        assert!(!index.begin_removal(&chosen_before[0]), "the group was used");
+        assert_eq!(chosen(&index.excess(1, 200).0), [result("b", "glb"), result("b", "json")]);
+        index.pin(&result("b", "glb"));
+        assert_eq!(chosen(&index.excess(1, 200).0), oldest, "the report is pinned with its mesh");
+        let candidates = index.excess(1, 200).0;
+        assert!(index.begin_removal(&candidates[0]) && oldest.iter().all(|name| index.begin_read(name).is_none()));
     }
 }

@@ -13,6 +13,26 @@ use std::time::SystemTime;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+/// Creates a folder and those above it, so that they survive a power failure.
+pub(super) fn create_folder(folder: &Path) -> io::Result<()> {
+    let Some(parent) = folder.parent().filter(|_| !folder.is_dir()) else { return Ok(()) };
+    create_folder(parent)?;
+    match std::fs::create_dir(folder) {
+        // Another process may have created it.
+        Err(error) if !folder.is_dir() => Err(error),
+        _ => sync_folder(parent),
+    }
+}
+
+/// Makes the entries of a folder durable.
+pub(super) fn sync_folder(folder: &Path) -> io::Result<()> {
+    // The parent of a relative path with one component is empty.
+    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    #[cfg(unix)]
+    File::open(folder)?.sync_all()?;
+    Ok(())
+}
+
 /// Name of the lock file in a data folder.
 const FILE: &str = "lock";
 /// Largest description of a holder that is read, bytes.
@@ -74,7 +94,7 @@ impl FolderLock {
     /// Returns [`LockError::Held`] if another service uses the folder.
     pub fn acquire(folder: &Path, address: SocketAddr) -> Result<Self, LockError> {
         let failed = |error| LockError::Io { folder: folder.to_owned(), error };
-        std::fs::create_dir_all(folder).map_err(failed)?;
+        create_folder(folder).map_err(failed)?;
         let open = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(folder.join(FILE));
         let mut file = open.map_err(failed)?;
         lock(&mut file, folder)?;

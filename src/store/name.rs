@@ -90,6 +90,13 @@ impl Name {
         self.folder
     }
 
+    /// Returns the name of the group of objects that are used, pinned and removed together: a mesh and its report.
+    /// Other objects are groups of their own.
+    pub(super) fn group(&self) -> Self {
+        let stem = if self.folder == Folder::Results { self.file.split('.').next() } else { None };
+        Self { folder: self.folder, file: stem.unwrap_or(&self.file).into() }
+    }
+
     /// Returns the path relative to the root of the store.
     pub(super) fn path(&self) -> Path {
         Path::from_iter([self.folder.as_str(), &self.file])

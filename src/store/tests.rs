@@ -9,7 +9,8 @@ use bytes::Bytes;
 use tempfile::TempDir;
 
 use super::faulty::{error, faulty};
-use super::{Folder, Name, StoreError};
+use super::{Folder, Name, Store, StoreError};
+use crate::config::StoreConfig;
 
 fn name(number: u8) -> Name {
     Name::result(&format!("{number:064x}"), "glb").unwrap()
@@ -28,6 +29,7 @@ fn files(dir: &TempDir) -> Vec<PathBuf> {
 async fn a_full_disk_is_reported_and_stored_objects_remain() {
     let (dir, faults, store) = faulty(8 << 20).await;
     store.put(&name(1), body(1000)).await.unwrap();
+    let pin = store.pin(&name(1));
     faults.full.store(true, Ordering::Relaxed);
     for refused in [store.put(&name(2), body(1000)).await, store.put_new(&name(2), body(9)).await.map(|_| ())] {
         let Err(StoreError::NoSpace { op: "put", place, .. }) = refused else { panic!("{refused:?}") };
@@ -45,10 +47,63 @@ async fn a_full_disk_is_reported_and_stored_objects_remain() {
     tokio::task::spawn_blocking(write).await.unwrap();
     assert_eq!(store.get(&name(1)).await.unwrap().unwrap().bytes, body(1000));
     assert_eq!((store.usage(Folder::Results).bytes, files(&dir).len()), (1000, 1));
+    drop(pin);
     // All reservations were released: the full capacity is available again.
     faults.full.store(false, Ordering::Relaxed);
     store.put(&name(4), body(8 << 20)).await.unwrap();
     assert_eq!((store.usage(Folder::Results).bytes, files(&dir).len()), (8 << 20, 1));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_full_disk_evicts_twice_the_size_and_tries_once_more() {
+    let (_dir, faults, store) = faulty(8 << 20).await;
+    for number in 1..=5 {
+        store.put(&name(number), body(1000)).await.unwrap();
+    }
+    faults.frees.store(true, Ordering::Relaxed);
+    faults.full.store(true, Ordering::Relaxed);
+    store.put(&name(6), body(800)).await.unwrap();
+    let mut left = Vec::new();
+    for number in 1..=6 {
+        left.push(store.head(&name(number)).await.unwrap().is_some());
+    }
+    assert_eq!(left, [false, false, true, true, true, true]);
+    // A second failure is reported.
+    faults.frees.store(false, Ordering::Relaxed);
+    faults.full.store(true, Ordering::Relaxed);
+    let refused = store.put(&name(7), body(800)).await;
+    assert!(matches!(refused, Err(StoreError::NoSpace { .. })), "{refused:?}");
+    assert_eq!(store.usage(Folder::Results).objects, 2);
+}
+
+#[tokio::test]
+async fn the_last_use_survives_a_restart() {
+    let dir = tempfile::tempdir().unwrap();
+    let open = async || Store::open(&StoreConfig::default(), dir.path()).await.unwrap();
+    let file = |number| dir.path().join("store").join(name(number).to_string());
+    let set = |number, at| std::fs::File::open(file(number)).unwrap().set_modified(at).unwrap();
+    let of = |number| std::fs::metadata(file(number)).unwrap().modified().unwrap();
+    let now = SystemTime::now();
+    let hours = |n| now - Duration::from_hours(n);
+    let store = open().await;
+    for number in 1..=3 {
+        store.put(&name(number), body(10)).await.unwrap();
+    }
+    set(1, hours(20));
+    set(2, hours(20));
+    set(3, now - Duration::from_mins(30));
+    let store = open().await;
+    for number in [1, 3] {
+        assert!(store.get(&name(number)).await.unwrap().is_some());
+    }
+    store.sweep(now).await;
+    assert!(of(1) >= now - Duration::from_secs(1), "the use is saved");
+    assert!(of(2) < hours(19), "an object that is not used keeps its time");
+    assert!(of(3) < now - Duration::from_mins(29), "at most one save an hour");
+    // The day since the write of the first object has passed, not the day since its use.
+    let store = open().await;
+    assert_eq!(store.sweep(now + Duration::from_hours(5)).await.expired, 1);
+    assert!(store.head(&name(1)).await.unwrap().is_some() && store.head(&name(2)).await.unwrap().is_none());
 }
 
 #[tokio::test]

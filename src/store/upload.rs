@@ -1,11 +1,11 @@
-//! Multipart upload of large objects. An object becomes visible with its last part, or not at all.
+//! Writing of objects, large ones in parts. An object becomes visible with its last part, or not at all.
 
 use bytes::Bytes;
 use object_store::{ObjectStoreExt as _, WriteMultipart};
 
 use super::error::StoreError;
 use super::handle::Store;
-use super::name::Name;
+use super::name::{Folder, Name};
 
 /// Concurrent parts. Hides the latency of a connection and bounds the memory.
 const PARTS: usize = 3;
@@ -50,8 +50,47 @@ impl Upload {
     }
 }
 
-/// Uploads an object in parts, which S3 requires from 5 GiB on and which is faster for much smaller ones.
-pub(super) async fn put_in_parts(store: &Store, name: &Name, mut bytes: Bytes) -> Result<(), StoreError> {
+impl Store {
+    /// Writes an object; with `new`, only if none exists. Returns true if it was written. If the disk is full, evicts
+    /// objects and tries once more.
+    pub(super) async fn write(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
+        let (store, name) = (self.clone(), name.clone());
+        self.run_to_completion(async move {
+            let size = bytes.len() as u64;
+            let mut reservation = store.empty_reservation(&name);
+            reservation.grow(size).await?;
+            match store.write_reserved(&name, &bytes, new).await {
+                Err(StoreError::NoSpace { .. }) if store.make_room(size).await => {
+                    store.write_reserved(&name, &bytes, new).await
+                }
+                done => done,
+            }
+        })
+        .await
+    }
+
+    async fn write_reserved(&self, name: &Name, bytes: &Bytes, new: bool) -> Result<bool, StoreError> {
+        let _lock = self.write_lock(name).lock().await;
+        let backend = &self.0.backend;
+        // Content-addressed objects are equal anyway; only job documents need an atomic check.
+        let create = new && name.folder() == Folder::Jobs;
+        if new && !create && backend.head(name).await?.is_some() {
+            return Ok(false);
+        }
+        if create || backend.is_local() || bytes.len() <= backend.part_size() {
+            if !backend.put(name, bytes.clone(), create).await? {
+                return Ok(false);
+            }
+        } else {
+            put_in_parts(self, name, bytes.clone()).await?;
+        }
+        self.commit(name, bytes.len() as u64, Some(bytes));
+        Ok(true)
+    }
+}
+
+/// Uploads an object in parts. S3 requires parts from 5 GiB on; they are also faster for much smaller objects.
+async fn put_in_parts(store: &Store, name: &Name, mut bytes: Bytes) -> Result<(), StoreError> {
     let mut upload = Upload::begin(store, name).await?;
     while !bytes.is_empty() {
         let next = bytes.split_to(store.0.backend.part_size().min(bytes.len()));

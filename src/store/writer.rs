@@ -1,4 +1,4 @@
-//! Writers for blocking threads.
+//! Writer of objects for blocking threads.
 
 use std::io;
 
@@ -20,9 +20,9 @@ pub struct Writer {
     name: Name,
     reservation: Reservation,
     filling: BytesMut,
-    /// Begins when the first part is full.
+    /// Upload in parts, from the first full part on.
     upload: Option<Upload>,
-    /// Size of the uploaded parts, bytes.
+    /// Total size of the uploaded parts, bytes.
     uploaded: u64,
     failed: bool,
 }

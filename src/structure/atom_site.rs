@@ -184,7 +184,7 @@ impl<F> AtomSite<F> {
         Self { layout, tables: Tables::default(), warnings: Warnings::default(), guesses: HashMap::new() }
     }
 
-    /// Appends the string tables and warnings of the site that read `rows`, which come next.
+    /// Appends the string tables and warnings of `later`, which read the following rows, `rows`.
     pub(super) fn append(&mut self, later: Self, rows: &mut Slices<'_>) {
         rows.adopt(&later.tables, &mut self.tables);
         self.warnings.append(later.warnings);

@@ -37,7 +37,7 @@ pub(super) struct Token {
 impl Token {
     /// Returns the fault of a token other than the `expected` one.
     #[cold]
-    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
+    #[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
     pub(super) fn fault(&self, text: &[u8], expected: impl Into<String>) -> Box<Fault> {
         match self.kind {
             Kind::End => Fault::words(self.start, "the end of the file", expected),

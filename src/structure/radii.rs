@@ -15,7 +15,7 @@ pub const TABLE: &str = "Bondi 1964, completed by Mantina et al. 2009; 2.0 Å el
 /// Radius of elements without a value in either source, and of unknown elements, Å.
 pub const FALLBACK: f32 = 2.0;
 
-/// [`FALLBACK`] in the table.
+/// Short name of [`FALLBACK`] for the table.
 const FB: f32 = FALLBACK;
 
 /// Radii by atomic number, 0 for unknown elements. The main groups are those of Mantina et al. 2009, table 12, and the

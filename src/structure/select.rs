@@ -38,7 +38,7 @@ impl Default for Selection {
     }
 }
 
-/// Names of kinds in the list form, in documentation order.
+/// Names that [`Selection::set_kinds`] accepts, in documentation order: four kinds, and `all` for all of them.
 pub const KIND_NAMES: [&str; 5] = ["polymer", "ligand", "water", "hydrogens", "all"];
 
 /// Error for an invalid list of kinds.
@@ -55,7 +55,7 @@ impl Selection {
     /// Selects exactly the kinds in a list such as `polymer,ligand,hydrogens`.
     ///
     /// # Errors
-    /// [`BadKinds`] for a name that is not in [`KIND_NAMES`], an empty list, and `hydrogens` alone.
+    /// Returns [`BadKinds`] for a name that is not in [`KIND_NAMES`], an empty list, and `hydrogens` alone.
     pub fn set_kinds(&mut self, names: &str) -> Result<(), BadKinds> {
         let mut taken = [false; 4];
         for name in names.split(',').map(str::trim) {

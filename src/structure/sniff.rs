@@ -79,7 +79,7 @@ fn is_binary_cif(bytes: &[u8]) -> bool {
     is_map(bytes) && !is_mmtf(bytes) && has_key(bytes, [b"dataBlocks", b"encoder"])
 }
 
-/// Names unsupported binary formats, recognised by their first bytes.
+/// Names unsupported binary formats, recognized by their first bytes.
 fn binary(bytes: &[u8]) -> Option<String> {
     let head = &bytes[..bytes.len().min(4096)];
     if is_mmtf(bytes) {
@@ -111,7 +111,7 @@ fn binary(bytes: &[u8]) -> Option<String> {
     (odd * 10 > head.len()).then(|| format!("binary data beginning with {}", hex(head)))
 }
 
-/// Names unsupported text formats, recognised by typical words.
+/// Names unsupported text formats, recognized by typical words.
 fn words(head: &[u8]) -> String {
     let trimmed = head.trim_ascii_start();
     let has = |word: &[u8]| memchr::memmem::find(&head[..head.len().min(4096)], word).is_some();

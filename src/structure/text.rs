@@ -18,14 +18,14 @@ pub(super) struct Fault {
 impl Fault {
     /// Creates a fault whose `found` is an excerpt of `text[start..end]`.
     #[cold]
-    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
+    #[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
     pub(super) fn token(text: &[u8], start: usize, end: usize, expected: impl Into<String>) -> Box<Self> {
         Box::new(Self { at: start, found: quote(&text[start..end]), expected: expected.into() })
     }
 
     /// Creates a fault with a description of what was found.
     #[cold]
-    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
+    #[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
     pub(super) fn words(at: usize, found: impl Into<String>, expected: impl Into<String>) -> Box<Self> {
         Box::new(Self { at, found: found.into(), expected: expected.into() })
     }

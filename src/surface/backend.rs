@@ -134,7 +134,7 @@ pub trait Backend: Send + Sync {
     /// Description of the hardware for display: threads and vector extension, or the adapter's name.
     fn describe(&self) -> String;
 
-    /// Identity of this backend, as the maker of a mesh.
+    /// Returns the identity of this backend for the report of a mesh.
     fn identity(&self) -> BackendIdentity {
         BackendIdentity {
             backend: self.name(),

@@ -7,8 +7,10 @@
 //! On each face the surface's outline is traced with the inside on its right (seen from outside the cell). If diagonal
 //! corners of a face are inside, each is cut off by itself. This rule depends only on the face's four signs, so two
 //! cells that share a face always agree. The outlines close into loops. Each loop is triangulated without a diagonal
-//! within a face, so no edge of the mesh gets a third triangle. The tests verify both for every case and for every pair
-//! of cases that can share a face, and that the table below follows from the rule.
+//! within a face, so no edge of the mesh gets a third triangle.
+//!
+//! The tests verify these properties for every case and for every pair of cases that can share a face. They also verify
+//! that the table below follows from the rule.
 
 /// Maximum number of triangles of a case.
 pub const MAX_TRIANGLES: usize = 5;
@@ -56,18 +58,18 @@ pub struct CellEdge {
     pub axis: u8,
 }
 
-/// All cases: number of triangles, and their corners as cell edges.
+/// Table of all cases: the triangles and loops of each.
 #[derive(Debug, Clone)]
 pub struct Cases {
-    /// Triangles per case.
+    /// Number of triangles per case.
     pub count: [u8; 256],
-    /// Closed loops in the outline of each case. Each bounds a separate disc.
+    /// Number of closed loops in the outline of each case. Each loop bounds a separate disc.
     pub loops: [u8; 256],
     /// Triangles per case as cell edges, counter-clockwise seen from outside the surface.
     pub triangles: [[[u8; 3]; MAX_TRIANGLES]; 256],
 }
 
-/// The cell edge with index `e`.
+/// Returns the cell edge with index `e`.
 #[must_use]
 pub const fn cell_edge(e: u8) -> CellEdge {
     let (axis, k) = (e / 4, e % 4);
@@ -100,8 +102,7 @@ impl Cases {
                 corner += 1;
                 if corner % 3 == 0 {
                     table.count[case] += 1;
-                    // A loop's triangles follow each other, and each but the first has a corner with an earlier one in
-                    // common.
+                    // The triangles of a loop are consecutive. Each but the first shares a corner with an earlier one.
                     if seen & own == 0 {
                         table.loops[case] += 1;
                     }
@@ -118,7 +119,7 @@ impl Cases {
         table
     }
 
-    /// The triangles of a case as cell edges.
+    /// Returns the triangles of a case as cell edges.
     #[must_use]
     pub fn of(&self, case: u8) -> &[[u8; 3]] {
         &self.triangles[usize::from(case)][..usize::from(self.count[usize::from(case)])]

@@ -64,7 +64,7 @@ impl Quantized {
     }
 }
 
-/// Lowest and highest of the first three numbers of the rows; `None` without rows.
+/// Returns the minimum and maximum of the first three columns; `None` without rows.
 pub(super) fn bounds_of<T: Copy + PartialOrd + Send + Sync, const N: usize>(rows: &[[T; N]]) -> Option<[[T; 3]; 2]> {
     let of = |rows: &[[T; N]]| rows.iter().map(|row| [[row[0], row[1], row[2]]; 2]).reduce(joined_bounds);
     if rows.len() <= ROWS { of(rows) } else { rows.par_chunks(ROWS).filter_map(of).reduce_with(joined_bounds) }
@@ -182,8 +182,8 @@ impl Mesh {
         }
     }
 
-    /// Adds the rows of `next` without a copy. Its triangles already refer to the joint vertices. An empty mesh takes
-    /// the centre and the representation of `next`.
+    /// Adds the rows of `next` without a copy. Its triangles already refer to the joined vertices. The mesh takes the
+    /// centre of `next` and, if it is empty, its representation.
     pub(crate) fn append(&mut self, next: Self) {
         let before = (self.n_vertices(), self.n_triangles());
         self.parts.extend(next.parts.iter().map(|(v, t)| (before.0 + v, before.1 + t)));

@@ -1,6 +1,6 @@
 //! The meshing core: spheres and parameters in, a closed triangle mesh out.
 //!
-//! The core does not depend on files, clocks, async, serialisation, GPUs or molecules. Lengths are ångström (Å), areas
+//! The core does not depend on files, clocks, async, serialization, GPUs or molecules. Lengths are ångström (Å), areas
 //! Å², volumes Å³. Density grows inwards; a sample is inside if its density is at least the isovalue; triangles wind
 //! counter-clockwise seen from outside and normals point outwards.
 

@@ -54,7 +54,7 @@ macro_rules! named {
         impl $type {
             /// Every value, in documentation order.
             pub const ALL: &'static [Self] = &[$(Self::$variant),+];
-            /// Their names.
+            /// Names of all values.
             pub const NAMES: &'static [&'static str] = &[$($name),+];
 
             /// The value's name in query, JSON and on the command line.

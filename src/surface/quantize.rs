@@ -17,7 +17,7 @@ const NORMAL_MAX_SQUARE: i32 = 16_347;
 /// Exponent of the smallest step, 1.5e-5 Å: 32,767 of them are half an ångström, less than any atom's radius.
 const MIN_EXPONENT: i32 = -16;
 
-/// The distance between two neighbouring values of a quantized coordinate: a power of two, Å.
+/// Distance between two neighbouring values of a quantized coordinate: a power of two, Å.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Step {
     exponent: i32,

@@ -34,7 +34,7 @@ impl Vertices<'_> {
         }
     }
 
-    /// Lowest and highest position per axis, Å; `None` without rows.
+    /// Returns the minimum and maximum of the positions, Å; `None` without rows.
     pub(super) fn bounds(&self) -> Option<[[f32; 3]; 2]> {
         match self {
             Self::Single { positions, .. } => bounds_of(positions),

@@ -1,6 +1,6 @@
 //! Sums over triangles: area, volume, and the checksum of directed edges.
 //!
-//! Work is vectorised over batches of triangles.
+//! Work is vectorized over batches of triangles.
 
 use super::measure::Component;
 use super::mesh::Mesh;

@@ -16,7 +16,7 @@ pub struct Topology {
 }
 
 impl Topology {
-    /// Topology of a closed manifold with this many triangles: every edge has two of them.
+    /// Returns the topology of a closed manifold, in which every edge has two triangles.
     pub(super) const fn of_closed(n_triangles: u64) -> Self {
         Self { edges: n_triangles * 3 / 2, closed: true, oriented: true, manifold: true }
     }

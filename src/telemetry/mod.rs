@@ -7,6 +7,7 @@ mod metrics;
 mod names;
 mod process;
 mod recorder;
+mod shorten;
 mod span;
 mod traces;
 
@@ -16,5 +17,6 @@ pub use metrics::{Kind, Label, Metric};
 pub use names::*;
 pub(crate) use opentelemetry::trace::{SpanContext, SpanKind};
 pub use recorder::{Recorder, recorder};
+pub(crate) use shorten::shorten;
 pub(crate) use span::{SpanParent, TraceSpan, read_trace_context, traceparent, tracestate};
 pub(crate) use traces::{Tracer, Traces};

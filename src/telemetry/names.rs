@@ -97,6 +97,8 @@ metrics! {
     STORE_BYTES = "molmesh_store_bytes", Gauge, folder: "folders of the store";
     /// Objects in the store.
     STORE_OBJECTS = "molmesh_store_objects", Gauge, folder: "folders of the store";
+    /// Job documents in quarantine because they cannot be read.
+    RECORDS_QUARANTINED = "molmesh_records_quarantined", Gauge;
     /// Objects that the store evicted or that expired.
     STORE_REMOVED = "molmesh_store_removed_total", Counter, reason: "ttl|cap";
     /// Failed operations of the store.
@@ -105,7 +107,8 @@ metrics! {
     ARCHIVE_REQUESTS = "molmesh_archive_requests_total", Counter, source: "local|cache|remote",
         result: "known|found|absent|unchanged|stale|corrupt|failed|too-large|no-memory|unavailable";
     /// Time to fetch an entry from the remote archive, including all attempts and pauses.
-    ARCHIVE_FETCH = "molmesh_archive_fetch_seconds", Histogram, result: "found|unchanged|absent|too-large|no-memory|unavailable";
+    ARCHIVE_FETCH = "molmesh_archive_fetch_seconds", Histogram,
+        result: "found|unchanged|absent|too-large|no-memory|unavailable";
     /// 1 while the circuit breaker of a host of the remote archive is open, else 0.
     ARCHIVE_BREAKER = "molmesh_archive_breaker_open", Gauge, host: "hosts of `archive.url`";
     /// Bytes of cached archive entries on disk.

@@ -14,7 +14,7 @@ use opentelemetry::{Context, KeyValue, Value};
 use opentelemetry_sdk::propagation::TraceContextPropagator;
 use opentelemetry_sdk::trace::Span;
 
-use super::Tracer;
+use super::{Tracer, shorten};
 
 /// Request and parent span of some work. Outlives the span.
 #[derive(Debug, Clone, Default)]
@@ -33,11 +33,11 @@ impl SpanParent {
         TraceSpan::current().map(|span| span.as_parent()).unwrap_or_default()
     }
 
-    /// Returns the log span of a job: its lines name the request, the trace and the job.
+    /// Returns the log span of a job: its lines name the request, the trace and the job (shortened).
     pub(crate) fn log_span(&self, job: Option<&str>) -> tracing::Span {
         use tracing::field::{Empty, display};
         let span = tracing::info_span!("job", request_id = Empty, trace_id = Empty, job_id = Empty);
-        for (field, id) in [("request_id", self.request.as_deref()), ("job_id", job)] {
+        for (field, id) in [("request_id", self.request.as_deref()), ("job_id", job.map(shorten).as_deref())] {
             if let Some(id) = id {
                 span.record(field, display(id));
             }
@@ -122,7 +122,7 @@ impl TraceSpan {
         self.0.request.as_deref().unwrap_or_default()
     }
 
-    /// Returns whether attributes of this span are recorded.
+    /// Returns true if attributes of this span are recorded.
     pub(crate) fn is_recording(&self) -> bool {
         self.span().is_recording()
     }

@@ -109,6 +109,7 @@ fn invalid_keys_and_urls_are_rejected_with_a_reason() {
         (&["--id", "a", "--work", "long"], "parameter `work`"),
         (&["--id", "a", "--window", "1ms"], "parameter `window`"),
         (&["--id", "a", "--expires", "soon"], "parameter `expires`"),
+        (&["--id", "a", "--expires", "2001-01-01T00:00:00Z"], "is in the past"),
         (&["--id", "a", "--requests", "0"], "--requests"),
     ] {
         let refused = run(["key", "new"].iter().chain(args));
@@ -124,6 +125,10 @@ fn invalid_keys_and_urls_are_rejected_with_a_reason() {
         (&["/x?signature=1", "--set", secret], "already"),
         (&["/x", "--set", secret, "--key-id", "b"], "expected one of a"),
         (&["/x", "--set", secret, "--expires", "0s"], "parameter `expires`"),
+        (&["/v1/capabilities", "--set", secret, "--expires", "2001-01-01T00:00:00Z"], "is in the past"),
+        (&["/nonexistent", "--set", secret], "no such path"),
+        (&["http://host/v1/meshes", "--set", secret], "GET only"),
+        (&["/v1/pdb/4pti/surface.glb?sginature=1", "--set", secret], "unknown parameter `sginature`"),
     ] {
         let refused = run(["sign"].iter().chain(args));
         assert_code(&refused, 2);

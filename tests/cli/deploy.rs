@@ -182,8 +182,10 @@ fn compose_matches_the_image() {
         let inside: Vec<u16> =
             strings(&service["ports"]).iter().map(|p| p.rsplit_once(':').unwrap().1.parse().unwrap()).collect();
         assert_eq!(inside, ports(&config));
-        // The metrics are published on the loopback address only.
-        assert!(strings(&service["ports"])[1].starts_with("127.0.0.1:"));
+        // Both are published on the loopback address unless configured.
+        let published = strings(&service["ports"]);
+        assert!(published[0].starts_with("${MOLMESH_ADDRESS:-127.0.0.1}:") && published[1].starts_with("127.0.0.1:"));
+        assert_eq!(service["environment"]["MOLMESH__SERVER__HOSTS"], json!("${MOLMESH_HOSTS:-localhost}"));
         assert_eq!(service["secrets"][0]["target"], json!("/etc/molmesh/molmesh.toml"));
         let grace = service["stop_grace_period"].as_str().unwrap().strip_suffix('s').unwrap().parse::<u64>().unwrap();
         assert!(grace >= config.server.drain_timeout_ms / 1000 + MARGIN, "{grace} s to stop");
@@ -301,6 +303,10 @@ fn pod_matches_the_image_and_its_configuration() {
     let open: Vec<_> =
         network["spec"]["ingress"].as_array().unwrap().iter().map(|rule| &rule["ports"][0]["port"]).collect();
     assert_eq!(open, [&json!(service_port), &json!(metrics_port)]);
+    // Only labelled pods reach the service.
+    let from = &network["spec"]["ingress"][0]["from"];
+    assert_eq!(from[0]["podSelector"], json!({ "matchLabels": { "molmesh-client": "true" } }));
+    assert_eq!(from.as_array().unwrap().len(), 1);
     // Time to stop: the pause, the drain, a margin.
     let grace = pod["terminationGracePeriodSeconds"].as_u64().unwrap();
     let pause = container["lifecycle"]["preStop"]["sleep"]["seconds"].as_u64().unwrap();
@@ -320,7 +326,13 @@ fn pod_matches_the_image_and_its_configuration() {
     // Mounts of the configuration and the data.
     let mounts: Vec<_> =
         container["volumeMounts"].as_array().unwrap().iter().map(|m| m["mountPath"].as_str().unwrap()).collect();
-    assert_eq!(mounts, [config.server.data_dir.to_str().unwrap(), "/etc/molmesh", "/tmp"]);
+    let keys = config.access.keys_file.as_ref().unwrap().parent().unwrap().to_str().unwrap();
+    assert_eq!(mounts, [config.server.data_dir.to_str().unwrap(), "/etc/molmesh", "/tmp", keys]);
+    let secret = pod["volumes"].as_array().unwrap().iter().find(|volume| volume["name"] == "keys").unwrap();
+    assert_eq!(
+        (&secret["secret"]["secretName"], &secret["secret"]["optional"]),
+        (&json!("molmesh-keys"), &json!(null))
+    );
 }
 
 #[test]

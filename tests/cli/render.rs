@@ -30,7 +30,7 @@ fn writes_a_file_and_a_summary() {
     assert_eq!(size(&fs::read(&output).unwrap()), (80, 60));
     let summary = stderr(&done);
     for part in
-        ["80 × 60, top view, azimuth -30°", "Å per pixel", "cpu: CPU rasteriser", "a backend other than the GPU", "png"]
+        ["80 × 60, top view, azimuth -30°", "Å per pixel", "cpu: CPU rasterizer", "a backend other than the GPU", "png"]
     {
         assert!(summary.contains(part), "no `{part}` in\n{summary}");
     }

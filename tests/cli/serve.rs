@@ -65,23 +65,88 @@ fn log_lines_name_their_request_and_job() {
     let job = job["jobID"].as_str().unwrap().to_owned();
     let done = ask("polls", &[&format!("http://{}/v1/jobs/{job}?wait=30", service.addr)]);
     assert_eq!(done["status"], "successful", "{done}");
+    let result = done["result"].as_str().unwrap().to_owned();
+    let url = format!("http://{}/v1/results/{result}", service.addr);
+    for (id, more) in [("whole", &[][..]), ("part", &["-r", "0-9"]), ("head", &["-I"]), ("again", &[])] {
+        let header = format!("X-Request-Id: {id}");
+        let curl = Command::new("curl").args(["-sSf", "-o", "/dev/null", "-H", &header, &url]).args(more).status();
+        assert!(curl.unwrap().success(), "{id}");
+    }
     let (code, log) = service.stop("TERM");
     assert_eq!(code, Some(0), "{log}");
+    for secret in [&job, &result[..64], done["structure"].as_str().unwrap()] {
+        let leak = log.lines().find(|line| line.contains(&secret[..9]));
+        assert_eq!(leak, None, "the log contains {secret}");
+    }
 
     let lines: Vec<serde_json::Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let of = |key: &str, value: &str| -> Vec<_> { lines.iter().filter(|l| l["span"][key] == value).collect() };
-    for id in ["submits", "polls"] {
+    for id in ["submits", "polls", "whole", "part", "head", "again"] {
         let answered: Vec<_> = of("request_id", id).into_iter().filter(|l| l["message"] == "answered").collect();
         assert_eq!(answered.len(), 1, "one line per request\n{log}");
-        assert_eq!(answered[0]["span"]["trace_id"], trace, "{log}");
+        assert_eq!(answered[0]["complete"], true, "{log}");
         assert!(answered[0]["ms"].is_number() && answered[0]["status"].is_u64(), "{}", answered[0]);
     }
     // The lines of the job name the request that submitted it, not the one that polled it.
-    let of_job = of("job_id", &job);
+    let of_job = of("job_id", &format!("{}…", &job[..8]));
     assert!(!of_job.is_empty(), "no line of the job\n{log}");
     for line in of_job {
         assert_eq!((&line["span"]["request_id"], &line["span"]["trace_id"]), (&"submits".into(), &trace.into()));
     }
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn stored_data_is_readable_by_its_user_only() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--archive", "samples"]);
+    let pdb = folder.file("rod.pdb", cli_support::rod());
+    let upload = format!("@{}", pdb.display());
+    for prefer in ["Prefer: respond-async", "Prefer: handling=lenient"] {
+        let url = format!("http://{}/v1/meshes", service.addr);
+        let args = ["-sSf", "-o", "/dev/null", "-H", prefer, "--data-binary", &upload, &url];
+        assert!(Command::new("curl").args(args).status().unwrap().success());
+    }
+    assert_eq!(service.stop("TERM").0, Some(0));
+    let (mut left, mut n) = (vec![folder.path("data")], 0);
+    while let Some(path) = left.pop() {
+        let meta = std::fs::metadata(&path).unwrap();
+        assert_eq!(meta.permissions().mode() & 0o077, 0, "{}", path.display());
+        if meta.is_dir() {
+            left.extend(std::fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));
+        }
+        n += 1;
+    }
+    assert!(n >= 8, "{n} files and folders");
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn the_limit_of_open_files_is_raised() {
+    use std::io::{BufRead as _, BufReader};
+    let folder = Folder::new();
+    let binary = cli_support::molmesh();
+    let mut child = Command::new("sh")
+        .args(["-c", "ulimit -Sn 256 && exec \"$@\"", "sh"])
+        .arg(binary.get_program())
+        .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
+        .arg(folder.path("data"))
+        .envs(binary.get_envs().filter_map(|(name, value)| Some((name, value?))))
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    // The service raises its limit before it prints its banner.
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    let started = lines.any(|line| line.unwrap().trim_start().starts_with("try "));
+    let limits = std::fs::read_to_string(format!("/proc/{}/limits", child.id()));
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(started);
+    let limits = limits.unwrap();
+    let line = limits.lines().find_map(|line| line.strip_prefix("Max open files")).unwrap();
+    let [soft, hard] = [0, 1].map(|n| line.split_whitespace().nth(n).unwrap());
+    assert!(soft == hard && soft != "256", "{line}");
 }
 
 #[test]

@@ -29,7 +29,8 @@ fn addr(service: &Service) -> SocketAddr {
 
 /// Sends one request on a persistent connection. Returns the status and whether the server keeps the connection.
 fn ask(stream: &mut TcpStream, body: &[u8]) -> (u16, bool) {
-    let head = format!("POST /v1/meshes?resolution=1.5 HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    let head =
+        format!("POST /v1/meshes?resolution=1.5 HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", body.len());
     stream.write_all(&[head.as_bytes(), body].concat()).unwrap();
     let (mut head, mut byte) = (Vec::new(), [0]);
     while !head.ends_with(b"\r\n\r\n") {
@@ -86,7 +87,8 @@ fn no_request_fails_under_load() {
         let mut slow = [0, 1].map(|n| {
             let mut stream = connect(addr);
             let body = sample(77_000_000 + n);
-            write!(stream, "POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len()).unwrap();
+            write!(stream, "POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", body.len())
+                .unwrap();
             stream.write_all(&body[..1000]).unwrap();
             (stream, body)
         });
@@ -126,7 +128,7 @@ fn second_signal_ends_the_drain() {
             ],
         );
         let mut stream = connect(addr(&service));
-        stream.write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: 5000\r\n\r\n").unwrap();
+        stream.write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\ncontent-length: 5000\r\n\r\n").unwrap();
         stream.write_all(&SAMPLE[..1000]).unwrap();
         // A response to a later connection shows that this one was accepted.
         eventually("the service responds", || send(addr(&service), "GET", "/livez", &[], b"").status == 200);

@@ -32,7 +32,7 @@ use Items::{Any, Only};
 /// Crates that no layer below the service may reference.
 const SERVICE: &[&str] =
     &["tokio", "axum", "tower", "tower_http", "hyper", "hyper_util", "tracing", "metrics", "toml", "clap", "indicatif"];
-/// Crates that the core may not reference: those of the service, serialisation, file formats and graphics APIs.
+/// Crates that the core may not reference: those of the service, serialization, file formats and graphics APIs.
 const NOT_CORE: &[&str] = &[
     "tokio",
     "axum",

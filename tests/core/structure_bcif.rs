@@ -416,10 +416,13 @@ fn rejects_inconsistent_encodings() {
     let nest = string_array("AB", &[0, 1, 2], vec![string_array("AB", &[0, 1, 2], vec![byte_array(3)])]);
     let cases: Vec<(Pack, &str)> = vec![
         (number(&two, vec![]), "auth_seq_id: found no encoding, expected at least ByteArray"),
-        (number(&two, vec![delta(0)]), "auth_seq_id, Delta (encoding 1 of 1): found it at the end of its chain"),
+        (
+            number(&two, vec![delta(0)]),
+            "auth_seq_id, Delta (encoding 1 of 1): found this encoding at the end of its chain",
+        ),
         (
             number(&two, vec![byte_array(3), byte_array(3)]),
-            "auth_seq_id, ByteArray (encoding 1 of 2): found it in the middle",
+            "auth_seq_id, ByteArray (encoding 1 of 2): found this encoding in the middle",
         ),
         (number(&two, vec![byte_array(7)]), "auth_seq_id, encoding 1, ByteArray: found type 7"),
         (number(&two, vec![byte_array(-1)]), "auth_seq_id, encoding 1, `type`: found -1"),
@@ -523,11 +526,11 @@ fn rejects_inconsistent_encodings() {
         (strings(&[0, 0, 0], &[0, 1]), "auth_asym_id, StringArray: found 3 values, expected 2"),
         (
             column("auth_asym_id", i32s(&[0, 0]), vec![nest]),
-            "auth_asym_id, StringArray, data, StringArray (encoding 1 of 1): found it at the end",
+            "auth_asym_id, StringArray, data, StringArray (encoding 1 of 1): found this encoding at the end",
         ),
         (
             column("auth_asym_id", i32s(&[0, 0]), vec![string_array("A", &[0, 1], vec![]), byte_array(3)]),
-            "auth_asym_id, StringArray (encoding 1 of 2): found it among others",
+            "auth_asym_id, StringArray (encoding 1 of 2): found this encoding among others",
         ),
         (reals("auth_asym_id", &[1.0, 2.0]), "auth_asym_id: found real numbers, expected texts"),
         (

@@ -16,7 +16,7 @@ use molmesh::surface::Control;
 
 const ATOM: &str = "ATOM      2  CA  ALA A  12      11.104  -6.134   0.500  1.00 20.25           C  \n";
 
-/// Time limit for a release build. An unoptimised build on a busy machine has a larger one.
+/// Time limit for a release build. An unoptimized build on a busy machine has a larger one.
 const IN_TIME: Duration = Duration::from_millis(if cfg!(debug_assertions) { 2000 } else { 100 });
 
 fn gzip(data: &[u8]) -> Vec<u8> {

@@ -301,5 +301,5 @@ fn an_empty_mesh_stays_empty_when_quantized() {
     let mut mesh = Mesh::default();
     assert!(mesh.quantize(Step::covering(1.0)));
     assert_eq!((mesh.n_vertices(), mesh.bounds()), (0, [[0.0; 3]; 2]));
-    assert!(Encoder::new(Format::Glb, Packing::Full, &mesh, &molmesh::formats::Meta::default()).is_ok());
+    assert!(Encoder::new(Format::Glb, Packing::of(&mesh), &mesh, &molmesh::formats::Meta::default()).is_ok());
 }

@@ -253,7 +253,7 @@ fn concurrent_requests_are_counted_to_the_last_byte() {
     assert_eq!(accepted.header("ratelimit"), Some("\"concurrency\";r=0"));
     let job = accepted.header("location").unwrap();
     let mut listening = connect(server.addr);
-    let head = format!("GET {job}/events HTTP/1.1\r\nhost: t\r\nx-api-key: {}\r\n\r\n", keys.text("a"));
+    let head = format!("GET {job}/events HTTP/1.1\r\nhost: localhost\r\nx-api-key: {}\r\n\r\n", keys.text("a"));
     let mut begun = [0; 12];
     eventually("the POST request has ended", || {
         listening = connect(server.addr);
@@ -323,7 +323,9 @@ fn addresses_have_quotas_of_time_and_concurrency() {
     // A request with an incomplete body is running.
     let upload = || {
         let mut stream = connect(server.addr);
-        stream.write_all(b"POST /v1/structures HTTP/1.1\r\nhost: t\r\ncontent-length: 1000\r\n\r\nATOM").unwrap();
+        stream
+            .write_all(b"POST /v1/structures HTTP/1.1\r\nhost: localhost\r\ncontent-length: 1000\r\n\r\nATOM")
+            .unwrap();
         stream.set_nonblocking(true).unwrap();
         stream
     };
@@ -388,7 +390,7 @@ fn a_signed_url_replaces_a_key_and_changes_nothing_else() {
         let (signed, keyed) = (get(&server, &sign(&target, None), &[]), with(&server, keys.text("a"), &target));
         assert_eq!((signed.status, keyed.status), (200, 200), "{}", signed.text());
         assert!(signed.body == keyed.body);
-        for name in ["etag", "content-type", "cache-control"] {
+        for name in ["etag", "content-type"] {
             assert_eq!(signed.header(name), keyed.header(name), "{name}");
         }
         assert!(!signed.headers.iter().any(|(_, value)| value.contains("signature")), "{:?}", signed.headers);
@@ -413,6 +415,54 @@ fn a_signed_url_replaces_a_key_and_changes_nothing_else() {
     send(server.addr, "POST", &sign("/v1/meshes", None), &key, SAMPLE).problem(400, "bad-parameter");
     get(&server, &format!("{ENTRY}?expires=1"), &key).problem(400, "bad-parameter");
     get(&server, &sign(&format!("{ENTRY}?sginature=1"), None), &[]).problem(400, "bad-parameter");
+}
+
+#[test]
+fn a_signature_opens_a_job_with_its_events_and_bytes() {
+    let keys = Keys::new(&[("a", "mesh,read", "")]);
+    let server = signing(&keys, SECRETS);
+    let key = ("x-api-key", keys.text("a"));
+    let accepted = server.post("/v1/meshes", &[key, ("prefer", "respond-async")], SAMPLE);
+    let job = accepted.header("location").unwrap();
+    eventually("the job ends", || with(&server, keys.text("a"), job).json()["status"] == "successful");
+    let signed = sign(job, None);
+    let query = signed.split_once('?').unwrap().1;
+    assert_eq!(get(&server, &signed, &[]).json()["status"], "successful");
+    let events = get(&server, &format!("{job}/events?{query}"), &[]);
+    assert!(events.status == 200 && events.text().contains("successful"), "{}", events.text());
+    let result = get(&server, &format!("{job}/result?{query}"), &[]);
+    let target = result.header("location").unwrap();
+    assert!(result.status == 303 && target.contains("signature="), "{result:?}");
+    let mesh = get(&server, target, &[]);
+    assert!(mesh.status == 200 && mesh.body.starts_with(b"glTF"), "{}", mesh.status);
+    // The target expires with the job's address.
+    let expires = |target: &str| target.split("expires=").nth(1).unwrap()[..10].to_owned();
+    assert_eq!(expires(target), expires(&signed));
+    get(&server, &format!("{job}x/result?{query}"), &[]).problem(403, "signature-invalid");
+    let keyed = with(&server, keys.text("a"), &format!("{job}/result"));
+    assert!(!keyed.header("location").unwrap().contains('?'));
+}
+
+#[test]
+fn signed_responses_are_not_cached_longer_than_their_signature() {
+    let keys = Keys::new(&[("a", "mesh,read", "")]);
+    let server = signing(&keys, SECRETS);
+    let end = now() + 100;
+    let until = |target: &str| SigningKeys::parse(SECRETS).unwrap().sign(None, target, end).unwrap();
+    let fresh = get(&server, &until(ENTRY), &[]);
+    let stored = fresh.header("content-location").unwrap();
+    eventually("the result is stored", || get(&server, &until(stored), &[]).status == 200);
+    for target in [ENTRY, stored] {
+        let etag = fresh.header("etag").unwrap();
+        for headers in [&[][..], &[("if-none-match", etag)]] {
+            let reply = get(&server, &until(target), headers);
+            let caching = reply.header("cache-control").unwrap();
+            let age: u64 = caching.strip_prefix("private, max-age=").unwrap().parse().unwrap();
+            assert!(age <= 100 && now() + age <= end + 1, "{target}: {caching}");
+        }
+        let keyed = with(&server, keys.text("a"), target);
+        assert!(keyed.header("cache-control").unwrap().len() > "private, max-age=100".len(), "{keyed:?}");
+    }
 }
 
 #[test]
@@ -517,7 +567,10 @@ fn pages_of_listed_origins_may_read_responses() {
     assert!(exposed.contains("ratelimit") && exposed.contains("retry-after") && !exposed.contains('*'), "{exposed}");
 
     let keys = Keys::new(&[]);
-    let any_origin = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let any_origin = server(Mode::Octahedra, |c| {
+        c.access.keys_file = Some(keys.path());
+        c.access.cors_origins = "*".parse().ok();
+    });
     let reply = preflight(&any_origin, other);
     assert_eq!(reply.header("access-control-allow-origin"), Some("*"));
     assert_eq!(reply.header("access-control-allow-credentials"), None);
@@ -541,7 +594,7 @@ fn security_headers_are_sent() {
         let reply = get(&plain, path, &[]);
         assert_eq!(reply.header("x-content-type-options"), Some("nosniff"), "{path}");
         assert_eq!(reply.header("referrer-policy"), Some("no-referrer"), "{path}");
-        assert_eq!(reply.header("cross-origin-resource-policy"), Some("cross-origin"), "{path}");
+        assert_eq!(reply.header("cross-origin-resource-policy"), Some("same-site"), "{path}");
         let policy = reply.header("content-security-policy").unwrap();
         assert!(
             policy.starts_with("default-src 'none'") && policy.contains("frame-ancestors 'none'"),

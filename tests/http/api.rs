@@ -625,18 +625,21 @@ fn request_ids_are_kept_or_generated() {
 }
 
 #[test]
-fn other_origins_may_read_all_responses() {
+fn allowed_origins_may_read_all_responses() {
     let preflight = send(
         SERVER.addr,
         "OPTIONS",
         "/v1/meshes",
-        &[("origin", "http://else.where"), ("access-control-request-method", "POST")],
+        &[("origin", "http://localhost:5173"), ("access-control-request-method", "POST")],
         b"",
     );
-    assert_eq!((preflight.status, preflight.header("access-control-allow-origin")), (200, Some("*")));
-    let error = SERVER.post("/v1/meshes?x=1", &[("origin", "http://else.where")], b"");
+    assert_eq!(
+        (preflight.status, preflight.header("access-control-allow-origin")),
+        (200, Some("http://localhost:5173"))
+    );
+    let error = SERVER.post("/v1/meshes?x=1", &[("origin", "http://localhost:5173")], b"");
     error.problem(400, "bad-parameter");
-    assert_eq!(error.header("access-control-allow-origin"), Some("*"));
+    assert_eq!(error.header("access-control-allow-origin"), Some("http://localhost:5173"));
     assert!(error.header("access-control-expose-headers").unwrap().contains("molmesh-triangles"));
     assert_eq!(error.header("x-content-type-options"), Some("nosniff"));
 }

@@ -16,7 +16,7 @@ use molmesh::surface::cpu::CpuBackend;
 use rows::{ATOMS, BODY_BYTES, INFLATED_BYTES, Is, Row, rows};
 use serde_json::Value;
 
-/// Time limit of an answer. Unoptimised builds are slower.
+/// Time limit of an answer. Unoptimized builds are slower.
 const IN_TIME: Duration = Duration::from_millis(if cfg!(debug_assertions) { 3000 } else { 100 });
 /// Number of slowest rows to print.
 const SHOWN: usize = 8;

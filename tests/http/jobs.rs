@@ -204,7 +204,7 @@ fn a_coalesced_job_survives_a_client_that_disconnects() {
     let backend = slow(500);
     let server = start(Arc::clone(&backend) as _, |_| {});
     let mut first_client = connect(server.addr);
-    let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
+    let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
     first_client.write_all(head.as_bytes()).unwrap();
     first_client.write_all(SAMPLE).unwrap();
     wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
@@ -248,8 +248,11 @@ fn an_idempotency_key_maps_many_requests_to_one_job() {
 fn events(server: &Running, path: &str, last: Option<&str>) -> Vec<(u64, String, Value)> {
     let mut stream = connect(server.addr);
     let last = last.map_or(String::new(), |id| format!("last-event-id: {id}\r\n"));
-    write!(stream, "GET {path} HTTP/1.1\r\nhost: t\r\nconnection: close\r\naccept: text/event-stream\r\n{last}\r\n")
-        .unwrap();
+    write!(
+        stream,
+        "GET {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\naccept: text/event-stream\r\n{last}\r\n"
+    )
+    .unwrap();
     let (mut found, mut id, mut name) = (Vec::new(), 0, String::new());
     for line in BufReader::new(stream).lines() {
         let line = line.unwrap();

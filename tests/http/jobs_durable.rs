@@ -23,7 +23,11 @@ struct Process {
 impl Process {
     /// Starts a process and waits until it prints its address.
     fn start(folder: &Path) -> Self {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_molmesh"))
+        Self::spawn(Command::new(env!("CARGO_BIN_EXE_molmesh")), folder)
+    }
+
+    fn spawn(mut program: Command, folder: &Path) -> Self {
+        let mut child = program
             .args(["serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--data-dir"])
             .arg(folder)
             .args(["--set", "jobs.attempts=1000", "--set", "archive.url=none", "--set", "jobs.queue=500"])
@@ -65,7 +69,7 @@ fn ask(
     stream.set_read_timeout(Some(Duration::from_secs(30))).ok()?;
     let length = body.len();
     let head = format!(
-        "{method} {path} HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: {length}\r\n{headers}\r\n"
+        "{method} {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-length: {length}\r\n{headers}\r\n"
     );
     stream.write_all(head.as_bytes()).ok()?;
     stream.write_all(body).ok()?;
@@ -259,4 +263,72 @@ fn a_restart_resumes_open_jobs_only() {
     assert_eq!(server.get(&dismissed).json()["status"], "dismissed");
     assert_eq!(backend.started.load(Ordering::SeqCst), 5, "exactly three jobs were resumed");
     assert!(server.metric("molmesh_jobs_recovered_total", &[]) >= 3.0);
+}
+
+/// Starts a process whose data folder is a disk of 16 MB of its own. Returns `None` if no disk can be mounted.
+fn start_on_small_disk(folder: &Path) -> Option<Process> {
+    let mount = r#"mount -t tmpfs -o size=16m tmpfs "$0""#;
+    let isolated = |script: &str| {
+        let mut command = Command::new("unshare");
+        command.args(["-m", "sh", "-c", script]).arg(folder);
+        command
+    };
+    if !isolated(mount).output().is_ok_and(|output| output.status.success()) {
+        assert!(std::env::var_os("CI").is_none(), "a disk can be mounted only by root");
+        println!("SKIPPED: a full disk: mounting needs root and unshare");
+        return None;
+    }
+    let mut program = isolated(&format!("{mount} && exec \"$@\""));
+    program.arg(env!("CARGO_BIN_EXE_molmesh"));
+    Some(Process::spawn(program, folder))
+}
+
+#[test]
+fn a_full_disk_evicts_objects_and_is_reported_as_a_full_store() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(server) = start_on_small_disk(folder.path()) else { return };
+    let filled = |n: usize, bytes: usize| {
+        let mut text = sample(n);
+        while text.len() < bytes {
+            text.extend_from_slice(b"REMARK 999 FILLS THE DISK\n");
+        }
+        text
+    };
+    // Seven uploads of 4 MB each: the oldest ones are evicted.
+    for n in 0..7 {
+        let (status, ..) = ask(server.addr, "POST", "/v1/structures", "", &filled(n, 4 << 20)).unwrap();
+        assert_eq!(status, 201, "upload {n}");
+    }
+    // An upload that never fits is no failure of the store.
+    let (status, _, body) = ask(server.addr, "POST", "/v1/structures", "", &filled(7, 17 << 20)).unwrap();
+    let problem: serde_json::Value = serde_json::from_slice(&body).unwrap();
+    assert_eq!((status, problem["type"].as_str()), (503, Some("/problems/store-full")), "{problem}");
+    // Every announced result is kept.
+    for n in 20..26 {
+        let mut stream = TcpStream::connect(server.addr).unwrap();
+        let body = sample(n);
+        let head = "POST /v1/meshes?format=stl&resolution=0.5 HTTP/1.1\r\nhost: t\r\nconnection: close";
+        write!(stream, "{head}\r\ncontent-length: {}\r\n\r\n", body.len()).unwrap();
+        stream.write_all(&body).unwrap();
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).unwrap();
+        let end = answer.windows(4).position(|w| w == b"\r\n\r\n").unwrap();
+        let head = String::from_utf8_lossy(&answer[..end]).to_ascii_lowercase();
+        assert!(head.starts_with("http/1.1 200"), "{head}");
+        if let Some(place) = head.lines().find_map(|line| line.strip_prefix("content-location: ")) {
+            assert_eq!(ask(server.addr, "GET", place, "", b"").unwrap().0, 200, "{place}");
+        }
+    }
+    // Jobs are accepted, and their results stored.
+    for n in 10..14 {
+        let (path, _) = job_request(n);
+        let answer = ask(server.addr, "POST", &path, "prefer: respond-async\r\n", &filled(n, 2 << 20)).unwrap();
+        let (202, Some(job), _) = answer else { panic!("job {n}: {answer:?}") };
+        let (_, _, body) = ask(server.addr, "GET", &format!("{job}?wait=50"), "", b"").unwrap();
+        let state: serde_json::Value = serde_json::from_slice(&body).unwrap();
+        assert_eq!(state["status"], "successful", "{state}");
+        let (code, location, _) = ask(server.addr, "GET", &format!("{job}/result"), "", b"").unwrap();
+        assert_eq!((code, ask(server.addr, "GET", &location.unwrap(), "", b"").unwrap().0), (303, 200));
+    }
+    server.kill();
 }

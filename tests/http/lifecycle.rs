@@ -17,7 +17,7 @@ fn running(backend: &Arc<Fake>) -> Running {
 /// Sends an upload without waiting for the answer.
 fn begin(server: &Running, body: &[u8]) -> TcpStream {
     let mut stream = connect(server.addr);
-    let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", body.len());
     stream.write_all(head.as_bytes()).unwrap();
     stream.write_all(body).unwrap();
     stream
@@ -144,7 +144,7 @@ fn a_drain_finishes_running_and_queued_jobs() {
         let idle = connect(server.addr);
         // A request that has started is finished, even if its body is incomplete.
         let mut slow = connect(server.addr);
-        let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
+        let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
         slow.write_all(head.as_bytes()).unwrap();
         slow.write_all(&SAMPLE[..1000]).unwrap();
         std::thread::sleep(Duration::from_millis(50));
@@ -190,7 +190,7 @@ fn keep_alive_serves_many_requests_on_one_connection() {
     let server = running(&backend);
     let mut stream = connect(server.addr);
     for _ in 0..50 {
-        stream.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+        stream.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n").unwrap();
         let mut bytes = Vec::new();
         let mut byte = [0];
         while !bytes.ends_with(b"\"live\"}") {

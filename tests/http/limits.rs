@@ -23,7 +23,9 @@ fn rejected(server: &Running, reason: &str) -> f64 {
 fn post_chunked(server: &Running, body: &[u8]) -> Reply {
     let mut stream = connect(server.addr);
     stream
-        .write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\r\n")
+        .write_all(
+            b"POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\r\n",
+        )
         .unwrap();
     for chunk in body.chunks(16 << 10) {
         let framed = [format!("{:x}\r\n", chunk.len()).as_bytes(), chunk, b"\r\n"].concat();
@@ -49,7 +51,7 @@ fn bodies_are_limited_with_and_without_a_declared_length() {
     let kind = ("content-type", "multipart/form-data; boundary=XX");
     assert_eq!(server.post("/v1/meshes", &[kind], &form).problem(413, "body-too-large")["limit"], 100_000);
     let mut stream = connect(server.addr);
-    let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-type: multipart/form-data; \
+    let head = "POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-type: multipart/form-data; \
                 boundary=XX\r\ntransfer-encoding: chunked\r\n\r\n";
     stream.write_all(head.as_bytes()).unwrap();
     stream.write_all(format!("{:x}\r\n", form.len()).as_bytes()).unwrap();
@@ -60,7 +62,9 @@ fn bodies_are_limited_with_and_without_a_declared_length() {
     let start = Instant::now();
     let mut stream = connect(server.addr);
     stream
-        .write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: 99999999999\r\n\r\n")
+        .write_all(
+            b"POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-length: 99999999999\r\n\r\n",
+        )
         .unwrap();
     assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["actual"], 99_999_999_999u64);
     assert!(start.elapsed() < Duration::from_secs(20));
@@ -80,7 +84,7 @@ fn json_bodies_are_limited_before_parsing() {
     }
     // Without a declared length, the body is rejected during the transfer.
     let mut stream = connect(server.addr);
-    let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-type: application/json\r\n\
+    let head = "POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-type: application/json\r\n\
                 transfer-encoding: chunked\r\n\r\n10001\r\n";
     stream.write_all(&[head.as_bytes(), &vec![b' '; 0x10001]].concat()).unwrap();
     assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 65_536);
@@ -92,7 +96,7 @@ fn json_bodies_are_limited_before_parsing() {
 /// Starts a form in a chunked body.
 fn begin_form(server: &Running) -> std::net::TcpStream {
     let mut stream = connect(server.addr);
-    let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\
+    let head = "POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\
                 content-type: multipart/form-data; boundary=XX\r\n\r\n";
     stream.write_all(head.as_bytes()).unwrap();
     stream
@@ -314,7 +318,9 @@ fn slow_bodies_time_out() {
     let mut stream = connect(server.addr);
     let start = Instant::now();
     stream
-        .write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: 1000\r\n\r\nATOM")
+        .write_all(
+            b"POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-length: 1000\r\n\r\nATOM",
+        )
         .unwrap();
     assert_eq!(read_reply(&mut stream, false).problem(408, "body-timeout")["limit"], 300);
     assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
@@ -325,7 +331,7 @@ fn slow_bodies_time_out() {
 fn slow_heads_and_idle_connections_are_closed() {
     let server = fake(|c| c.server.header_timeout_ms = 300);
     let before = rejected(&server, "header-timeout");
-    for sent in [&b""[..], b"P", b"PRI * HTTP/2.0\r\n", b"GET /livez HTTP/1.1\r\nhost: t\r\nx-slow: "] {
+    for sent in [&b""[..], b"P", b"PRI * HTTP/2.0\r\n", b"GET /livez HTTP/1.1\r\nhost: localhost\r\nx-slow: "] {
         let mut stream = connect(server.addr);
         stream.write_all(sent).unwrap();
         let start = Instant::now();
@@ -336,7 +342,7 @@ fn slow_heads_and_idle_connections_are_closed() {
     }
     // A connection that becomes idle after a request is closed too.
     let mut stream = connect(server.addr);
-    stream.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+    stream.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n").unwrap();
     let start = Instant::now();
     let reply = read_reply(&mut stream, false);
     assert!(reply.status == 200 && start.elapsed() < Duration::from_secs(8), "{:?}", start.elapsed());
@@ -351,7 +357,7 @@ fn excess_connections_are_rejected_with_503() {
     let mut held = Vec::new();
     let refused = loop {
         let mut stream = connect(server.addr);
-        stream.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+        stream.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n").unwrap();
         let mut start = [0; 12];
         stream.read_exact(&mut start).unwrap();
         if &start[9..] == b"503" {
@@ -375,7 +381,8 @@ fn a_client_that_does_not_read_is_disconnected_and_its_mesh_freed() {
     let body = carbons(60_000);
     let before = rejected(&server, "write-timeout");
     let mut stream = connect(server.addr);
-    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    let head =
+        format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", body.len());
     stream.write_all(head.as_bytes()).unwrap();
     stream.write_all(&body).unwrap();
     wait_for("the client is given up", || rejected(&server, "write-timeout") > before);
@@ -467,7 +474,8 @@ fn slow_readers_cannot_occupy_all_threads() {
     let server = fake(|c| c.jobs.deliveries = 1);
     let body = carbons(60_000);
     let mut stream = connect(server.addr);
-    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    let head =
+        format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", body.len());
     stream.write_all(head.as_bytes()).unwrap();
     stream.write_all(&body).unwrap();
     let mut some = [0; 1000];
@@ -538,7 +546,7 @@ fn idle_event_streams_send_heartbeats() {
     let accepted = server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE);
     assert_eq!(accepted.status, 202);
     let mut stream = connect(server.addr);
-    write!(stream, "GET {}/events HTTP/1.1\r\nhost: t\r\n\r\n", accepted.header("location").unwrap()).unwrap();
+    write!(stream, "GET {}/events HTTP/1.1\r\nhost: localhost\r\n\r\n", accepted.header("location").unwrap()).unwrap();
     let mut text = String::new();
     let mut some = [0; 1024];
     // Comments are lines that begin with a colon.

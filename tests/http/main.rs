@@ -35,6 +35,7 @@ mod limits;
 mod openapi;
 mod openapi_clients;
 mod openapi_statuses;
+mod origins;
 mod pictures;
 mod ready;
 mod results;

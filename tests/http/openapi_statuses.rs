@@ -107,10 +107,11 @@ fn surfaces(seen: &Seen, server: &Running) {
         };
         get(&path, &[LATER], 202);
         let whole = get(&path, &[], 200);
-        assert_eq!((whole.header("content-type"), whole.header("vary")), (Some("model/gltf-binary"), None));
+        assert_eq!((whole.header("content-type"), whole.header("vary")), (Some("model/gltf-binary"), Some("origin")));
         let octets = get(&path, &[("accept", "application/octet-stream")], 200);
-        let found = (octets.header("content-type"), octets.header("vary"), octets.body == whole.body);
-        assert_eq!(found, (Some("application/octet-stream"), Some("accept"), true));
+        let varies = octets.headers.iter().any(|(name, value)| name == "vary" && value.contains("accept"));
+        let found = (octets.header("content-type"), varies, octets.body == whole.body);
+        assert_eq!(found, (Some("application/octet-stream"), true, true));
         get(&path, &[("if-none-match", whole.header("etag").unwrap())], 304);
         let kept = whole.header("content-location").unwrap();
         get(kept, &[], 200);
@@ -127,6 +128,16 @@ fn surfaces(seen: &Seen, server: &Running) {
         get(kept, &[("range", "bytes=0-9")], 206);
         get(kept, &[("range", "bytes=99999999-")], 416);
         get(kept, &[("if-none-match", "*")], 304);
+        // An expected file is sent, another one is not.
+        let other = [("if-match", "\"other\""), ("if-none-match", "*")];
+        for path in [&path, kept, &format!("{base}/atoms"), &kept.replace(".glb", "/report.json")] {
+            get(path, &other, 412).problem(412, "precondition-failed");
+            let etag = get(path, &[("if-match", "*")], 200).header("etag").unwrap().to_owned();
+            get(path, &[("if-match", &etag)], 200);
+            get(path, &[("if-match", &format!("W/{etag}"))], 412);
+        }
+        get(&format!("{base}/surface.ply"), &other[..1], 412);
+        get(&format!("{base}/report.json"), &[("if-match", "\"other\"")], 200);
         let atoms = format!("{base}/atoms");
         let tag = get(&atoms, &[], 200).header("etag").unwrap().to_owned();
         get(&atoms, &[("if-none-match", &tag)], 304);
@@ -138,6 +149,7 @@ fn surfaces(seen: &Seen, server: &Running) {
         |path: &str, headers: &[(&str, &str)], status| seen.expect(status, server.addr, ("GET", path), headers, b"");
     let etag = get(&structure, &[], 200).header("etag").unwrap().to_owned();
     get(&structure, &[("if-none-match", &etag)], 304);
+    get(&structure, &[("if-match", "\"other\"")], 412);
     get(&format!("/v1/structures/{ZERO}"), &[], 404);
     get(&format!("/v1/structures/{ZERO}/atoms"), &[], 404);
     get("/v1/pdb/9xyz/atoms", &[], 404);
@@ -164,6 +176,13 @@ fn jobs(seen: &Seen) {
         get(path, 404);
     }
     seen.expect(404, server.addr, ("DELETE", NO_JOB), &[], b"");
+    // A damaged record.
+    let torn = "1".repeat(32);
+    std::fs::write(server.dir.path().join(format!("store/jobs/{torn}.json")), "{").unwrap();
+    for path in ["", "/events", "/result"] {
+        get(&format!("/v1/jobs/{torn}{path}"), 500);
+    }
+    seen.expect(500, server.addr, ("DELETE", &format!("/v1/jobs/{torn}")), &[], b"");
     get(&format!("{NO_JOB}?wait=1000"), 400);
     // Ends without a result are told as a synchronous request would be.
     result(&ended(seen, &server, &vec![b' '; 100_001]), 413);
@@ -190,7 +209,8 @@ fn sizes(seen: &Seen) {
     for path in UPLOADS {
         seen.expect(413, small.addr, ("POST", path), &[], SAMPLE);
         let mut stream = connect(small.addr);
-        let head = format!("POST {path} HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: 10\r\n\r\nATOM");
+        let head =
+            format!("POST {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-length: 10\r\n\r\nATOM");
         stream.write_all(head.as_bytes()).unwrap();
         let late = read_reply(&mut stream, false);
         assert_eq!(late.status, 408);

@@ -52,7 +52,7 @@ fn every_route_of_a_mesh_also_returns_a_picture() {
         assert_eq!(reply.header("etag"), replies[0].header("etag"));
         assert_eq!(reply.header("content-disposition"), Some("inline; filename=\"4PTI.png\""));
         assert_eq!(reply.header("molmesh-renderer"), Some("cpu"));
-        assert!(reply.header("molmesh-renderer-device").unwrap().contains("rasteriser"));
+        assert!(reply.header("molmesh-renderer-device").unwrap().contains("rasterizer"));
         assert_eq!(reply.header("molmesh-renderer-reason"), Some("set by a test"));
         assert!(reply.header("molmesh-pixel").unwrap().parse::<f64>().unwrap() > 0.1);
         assert_eq!(reply.header("molmesh-atoms"), Some("454"));

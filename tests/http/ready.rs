@@ -6,19 +6,19 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use http_support::{Fake, Mode, Running, SAMPLE, log_lines, sample, start, wait_for};
+use http_support::{Fake, Mode, Running, SAMPLE, log_lines, sample, start, start_cold, wait_for};
 use molmesh::http::Stop;
 use molmesh::surface::{
     Backend, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 use serde_json::Value;
 
-/// Returns the names of failed checks. Asserts that all three checks are present.
+/// Returns the names of failed checks. Asserts that all four checks are present.
 #[track_caller]
 fn failing(document: &Value) -> Vec<String> {
     let checks = document["checks"].as_array().unwrap_or_else(|| panic!("{document}"));
     let names: Vec<_> = checks.iter().map(|check| check["name"].as_str().unwrap()).collect();
-    assert_eq!(names, ["accepting", "devices", "store"]);
+    assert_eq!(names, ["accepting", "devices", "store", "records"]);
     assert!(checks.iter().all(|check| !check["detail"].as_str().unwrap().is_empty()), "{document}");
     checks.iter().filter(|check| check["ok"] == false).map(|check| check["name"].as_str().unwrap().to_owned()).collect()
 }
@@ -59,6 +59,29 @@ fn failure_and_recovery_of_the_store_are_detected() {
     set_unavailable(&server, false);
     wait_for("the store is back", || server.get("/readyz").status == 200);
     assert_eq!((logged(), log_lines("the store works again").len()), (1, 1));
+}
+
+#[test]
+fn unreadable_job_records_make_the_service_unready_until_they_are_deleted() {
+    let folder = tempfile::tempdir().unwrap();
+    let jobs = folder.path().join("store/jobs");
+    std::fs::create_dir_all(&jobs).unwrap();
+    let ids = ["0", "1"].map(|digit| digit.repeat(32));
+    for id in &ids {
+        std::fs::write(jobs.join(format!("{id}.json")), "{").unwrap();
+    }
+    let server = start_cold(Fake::new(Mode::Octahedra), |c| folder.path().clone_into(&mut c.server.data_dir));
+    wait_for("the first mesh", || failing(&server.get("/readyz").json()) == ["records"]);
+    let problem = server.get("/readyz").problem(503, "not-ready");
+    assert!(problem["detail"].as_str().unwrap().starts_with("2 job records"), "{problem}");
+    for path in ["", "/events", "/result"] {
+        server.get(&format!("/v1/jobs/{}{path}", ids[0])).problem(500, "record-unreadable");
+    }
+    for id in &ids {
+        std::fs::remove_file(folder.path().join(format!("store/quarantine/{id}.json"))).unwrap();
+    }
+    assert_eq!(server.get("/readyz").status, 200);
+    server.get(&format!("/v1/jobs/{}", ids[0])).problem(404, "no-such-job");
 }
 
 #[test]

@@ -4,6 +4,7 @@ use crate::http_support;
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
 
 use http_support::{Fake, Mode, Reply, Running, SAMPLE, carbons, sample, send, start, wait_for};
 use molmesh::surface::CpuBackend;
@@ -98,13 +99,77 @@ fn ranges_of_a_result_add_up_to_the_whole() {
 }
 
 #[test]
+fn a_mesh_and_its_report_live_and_die_together() {
+    let folder = tempfile::tempdir().unwrap();
+    let backend = Fake::new(Mode::Octahedra);
+    let open = |ttl_ms| {
+        start(Arc::clone(&backend) as _, |c| {
+            folder.path().clone_into(&mut c.server.data_dir);
+            (c.store.result_ttl_ms, c.store.sweep_ms) = (ttl_ms, 50);
+        })
+    };
+    let server = open(1000);
+    let made = server.post("/v1/meshes?format=stl", &[], SAMPLE);
+    let mesh = made.header("content-location").unwrap().to_owned();
+    let report = mesh.replace(".stl", "/report.json");
+    // Only the mesh is read, for three times its time to live.
+    let end = Instant::now() + Duration::from_secs(3);
+    while Instant::now() < end {
+        assert_eq!(server.get(&mesh).status, 200);
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    assert_eq!(server.get(&report).status, 200);
+    server.join();
+    let server = open(3_600_000);
+    assert_eq!([&mesh, &report].map(|path| server.get(path).status), [200, 200]);
+    server.join();
+    // A mesh without its report counts as absent, and both are stored again.
+    let key = mesh.rsplit('/').next().unwrap().strip_suffix(".stl").unwrap();
+    let remove_report = || std::fs::remove_file(folder.path().join(format!("store/results/{key}.json"))).unwrap();
+    remove_report();
+    let server = open(3_600_000);
+    server.get(&mesh).problem(404, "not-found");
+    assert_eq!(server.post("/v1/meshes?format=stl", &[], SAMPLE).header("content-location"), Some(mesh.as_str()));
+    assert_eq!([&mesh, &report].map(|path| server.get(path).status), [200, 200]);
+    server.join();
+    remove_report();
+    let server = open(3_600_000);
+    let job = server.post("/v1/meshes?format=stl", &[("prefer", "respond-async")], SAMPLE);
+    let job = job.header("location").unwrap();
+    assert_eq!(server.get(&format!("{job}?wait=20")).json()["status"], "successful");
+    assert_eq!(server.get(&format!("{job}/result")).header("location"), Some(mesh.as_str()));
+    assert_eq!([&mesh, &report].map(|path| server.get(path).status), [200, 200]);
+    assert_eq!(backend.started.load(Ordering::SeqCst), 3);
+}
+
+#[test]
+fn eviction_removes_a_mesh_with_its_report() {
+    let server = start(Fake::new(Mode::Octahedra), |c| c.store.max_bytes = 400_000);
+    let made: Vec<String> = (0..8)
+        .map(|n| {
+            let made = server.post("/v1/meshes?format=stl", &[], &carbons(200 + n));
+            let mesh = made.header("content-location").unwrap().to_owned();
+            // The answer arrives when the mesh is stored.
+            assert_eq!(server.get(&mesh).status, 200);
+            mesh
+        })
+        .collect();
+    let statuses = made
+        .iter()
+        .map(|mesh| [mesh.clone(), mesh.replace(".stl", "/report.json")].map(|path| server.get(&path).status));
+    let statuses: Vec<_> = statuses.collect();
+    assert!(statuses.iter().all(|[mesh, report]| mesh == report), "{statuses:?}");
+    assert!(statuses.contains(&[200; 2]) && statuses.contains(&[404; 2]), "{statuses:?}");
+}
+
+#[test]
 fn a_result_that_exceeds_the_store_is_not_found_later() {
     let server = start(Fake::new(Mode::Octahedra), |c| c.store.max_bytes = 3_000);
     let before = server.metric("molmesh_results_not_stored_total", &["failed"]);
     let made = server.post("/v1/meshes", &[], SAMPLE);
     assert_eq!((made.status, made.complete), (200, true), "the answer does not depend on the store");
     wait_for("the metric", || server.metric("molmesh_results_not_stored_total", &["failed"]) > before);
-    server.get(made.header("content-location").unwrap()).problem(404, "not-found");
+    assert_eq!(made.header("content-location"), None, "a result that is not kept has no address");
     // Work that requires the store is rejected.
     let refused = server.post("/v1/meshes", &[("prefer", "respond-async")], &sample(1));
     assert_eq!(refused.problem(503, "store-full")["limit"], 3_000);

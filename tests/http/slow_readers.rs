@@ -23,7 +23,7 @@ const END_STREAM: u8 = 1;
 /// Streams on one connection: `server.streams`.
 const STREAMS: u32 = 64;
 
-/// Serialises the tests, because metrics and file descriptors belong to the process.
+/// Serializes the tests, because metrics and file descriptors belong to the process.
 fn serialize() -> MutexGuard<'static, ()> {
     static SERIAL: Mutex<()> = Mutex::new(());
     SERIAL.lock().unwrap_or_else(PoisonError::into_inner)
@@ -84,7 +84,7 @@ impl H2 {
         for (n, path) in (0..).zip(paths) {
             // HPACK (RFC 7541): GET, http, and two literals, `:path` and `:authority`.
             let path = [&[0x04, u8::try_from(path.len()).unwrap()], path.as_bytes()].concat();
-            let head = [&[0x82, 0x86][..], &path, b"\x01\x01t"].concat();
+            let head = [&[0x82, 0x86][..], &path, b"\x01\x09localhost"].concat();
             socket.write_all(&frame(HEADERS, 0x4 | END_STREAM, 2 * n + 1, &head)).unwrap();
             seen.insert(2 * n + 1, Seen::default());
         }
@@ -216,7 +216,7 @@ fn readers_above_the_minimum_rate_get_the_whole_body() {
         // Over HTTP/1.1 the kernel hides progress from the server until its buffer has space.
         scope.spawn(|| {
             let mut reader = connect_with_small_buffers(server.addr);
-            write!(reader, "GET {path} HTTP/1.1\r\nhost: t\r\nconnection: close\r\n\r\n").unwrap();
+            write!(reader, "GET {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n").unwrap();
             let (mut some, mut bytes) = (vec![0; 32 << 10], 0);
             loop {
                 match reader.read(&mut some).unwrap() {
@@ -238,7 +238,7 @@ fn http1_readers_below_the_minimum_rate_are_disconnected() {
     let path = result(&server, 20_000);
     let before = cut_off(&server);
     let mut reader = connect_with_small_buffers(server.addr);
-    write!(reader, "GET {path} HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+    write!(reader, "GET {path} HTTP/1.1\r\nhost: localhost\r\n\r\n").unwrap();
     let start = Instant::now();
     let mut byte = [0; 1];
     while cut_off(&server) < before + 1.0 {

@@ -24,7 +24,7 @@ fn with_long_timeouts(config: &mut Config) {
 /// Sends the head of an upload and part of its body.
 fn begin(server: &Running) -> TcpStream {
     let mut stream = connect(server.addr);
-    let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
+    let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
     stream.write_all(head.as_bytes()).unwrap();
     stream.write_all(&SAMPLE[..1000]).unwrap();
     stream
@@ -48,7 +48,7 @@ fn all_requests_are_served_during_the_notice() {
     let server = start(Fake::new(Mode::Octahedra), with_long_timeouts);
     // Opened before the notice, used during it.
     let mut old = connect(server.addr);
-    old.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+    old.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n").unwrap();
     let mut some = [0; 12];
     old.read_exact(&mut some).unwrap();
     server.request_stop(Stop::Notice);
@@ -65,7 +65,7 @@ fn all_requests_are_served_during_the_notice() {
         server.get(&format!("/v1/jobs/{job}?wait=20")).json()["status"] == "successful"
     });
     // Each response closes its connection, so that the client reconnects elsewhere.
-    old.write_all(b"GET /version HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+    old.write_all(b"GET /version HTTP/1.1\r\nhost: localhost\r\n\r\n").unwrap();
     let mut rest = String::new();
     old.read_to_string(&mut rest).unwrap();
     assert!(rest.contains("\"name\":\"molmesh\"") && rest.contains("connection: close\r\n"), "{rest}");
@@ -146,7 +146,7 @@ fn asynchronous_jobs_are_accepted_during_the_drain() {
     let mut server = start(Fake::new(Mode::Octahedra), with_long_timeouts);
     let mut upload = connect(server.addr);
     let head = format!(
-        "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nprefer: respond-async\r\ncontent-length: {}\r\n\r\n",
+        "POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\nprefer: respond-async\r\ncontent-length: {}\r\n\r\n",
         SAMPLE.len()
     );
     upload.write_all(head.as_bytes()).unwrap();

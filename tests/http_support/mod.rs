@@ -340,7 +340,7 @@ impl Reply {
 /// Sends one request on a new connection and reads the response.
 pub(crate) fn send(addr: SocketAddr, method: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Reply {
     let mut stream = connect(addr);
-    let mut head = format!("{method} {path} HTTP/1.1\r\nhost: test\r\nconnection: close\r\n");
+    let mut head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n");
     if !body.is_empty() || method == "POST" {
         head += &format!("content-length: {}\r\n", body.len());
     }

@@ -109,7 +109,8 @@ fn held(look: &dyn Fn()) {
 fn unread(look: &dyn Fn()) {
     let server = start(Fake::new(Mode::Octahedra), |_| {});
     let (mut client, body) = (connect(server.addr), carbons(60_000));
-    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    let head =
+        format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", body.len());
     client.write_all(&[head.as_bytes(), &body].concat()).unwrap();
     look();
 }
@@ -219,7 +220,7 @@ fn nothing(look: &dyn Fn()) {
     look();
 }
 
-/// Serialises the tests that count, because the recorder belongs to the process.
+/// Serializes the tests that count, because the recorder belongs to the process.
 static SERIAL: Mutex<()> = Mutex::new(());
 
 fn scrape() -> Scrape {

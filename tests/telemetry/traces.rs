@@ -196,12 +196,12 @@ fn an_asynchronous_job_stays_in_the_trace_of_its_request() {
     let spans = collector.trace(TRACE);
     let (request, job) = (named(&spans, "POST /v1/meshes"), named(&spans, "job"));
     assert_eq!((&job.parent_span_id, kind(job)), (&request.span_id, SpanKind::Consumer));
-    assert_eq!(attribute(job, "molmesh.job.id"), Some(id));
+    assert_eq!(attribute(job, "molmesh.job.id"), Some(format!("{}…", &id[..8])));
     assert_eq!(named(&spans, "save").parent_span_id, request.span_id);
     // Log lines of a job name request, trace and job.
     let lines = log_lines("a job failed");
     let (trace, _) = place(&failed);
-    let job = failed.json()["jobID"].as_str().unwrap().to_owned();
+    let job = format!("{}…", &failed.json()["jobID"].as_str().unwrap()[..8]);
     let named = |line: &&String| ["later-2", &trace, &job].iter().all(|id| line.contains(*id));
     assert_eq!(lines.iter().filter(named).count(), 1, "{lines:?}");
 }
@@ -262,14 +262,20 @@ fn requests_are_linked_to_a_coalesced_job() {
 }
 
 #[test]
-fn archives_receive_the_trace_context() {
+fn archives_receive_the_trace_but_nothing_else_of_the_client() {
     let collector = Collector::start(CollectorMode::Accept);
     let archive = archive_support::Remote::saying(archive_support::ok(SAMPLE));
     let url = archive.url("/d/{id}.pdb");
     let server = traced(Fake::new(Mode::Octahedra), &collector, |config| {
         config.archive.url = Some(url.parse().unwrap());
     });
-    let headers = [("traceparent", PARENT), ("tracestate", "rojo=1,congo=2")];
+    let headers = [
+        ("traceparent", PARENT),
+        ("tracestate", "rojo=1,congo=2"),
+        ("x-request-id", "private-id"),
+        ("user-agent", "private-agent"),
+        ("cookie", "private-cookie"),
+    ];
     let reply = send(server.addr, "GET", "/v1/pdb/4pti/surface.glb", &headers, b"");
     assert_eq!(reply.status, 200);
     assert!(server.join());
@@ -281,7 +287,13 @@ fn archives_receive_the_trace_context() {
     let asked = archive.requests();
     let told = asked.iter().map(|a| (a.header("traceparent"), a.header("tracestate"))).collect::<Vec<_>>();
     let expected = format!("00-{TRACE}-{}-01", hex(&fetch.span_id));
-    assert_eq!(told, [(Some(expected.as_str()), Some("rojo=1,congo=2"))]);
+    assert_eq!(told, [(Some(expected.as_str()), None)]);
+    assert!(!format!("{asked:?}").contains("private-"), "{asked:?}");
+    // Without export, not even the trace.
+    let silent = start(Fake::new(Mode::Octahedra), |config| config.archive.url = Some(url.parse().unwrap()));
+    assert_eq!(send(silent.addr, "GET", "/v1/pdb/4pti/surface.glb", &headers, b"").status, 200);
+    assert_eq!(archive.requests().last().unwrap().header("traceparent"), None);
+    assert_eq!(archive.requests().len(), 2);
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //
 // Reads file names from the arguments, or one per line from standard input, and answers each with one line of
 // JSON: how many errors, warnings, infos and hints, their codes with a count each, and the first messages.
-// For a file that the validator does not recognise as glTF, the line contains `error`.
+// For a file that the validator does not recognize as glTF, the line contains `error`.
 import { readFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
 import { createInterface } from 'node:readline';

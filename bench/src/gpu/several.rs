@@ -109,7 +109,7 @@ fn measure(backend: &GpuBackend, spheres: &Spheres, params: &SurfaceParams, runs
     Ok((row, digest.finalize().to_vec()))
 }
 
-/// Summarises each part over all runs. The parts are the same in all runs, but idle devices take them in any order.
+/// Summarizes each part over all runs. The parts are the same in all runs, but idle devices take them in any order.
 fn parts(all: &[CompletedJob]) -> Vec<Part> {
     let n = all.iter().map(|ran| ran.devices.len()).min().unwrap_or_default();
     let part = |k: usize| {

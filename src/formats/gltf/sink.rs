@@ -1,7 +1,7 @@
 //! GLB sink: writes the rows of a mesh to their final offset as they arrive, and the header last.
 //!
-//! The bytes are those of [`GlbPlan::write`]. A large buffer begins at a fixed place, so its rows can be written before
-//! the header is known. A small one is collected in memory.
+//! The bytes are those of [`GlbPlan::write`]. A large buffer begins at a fixed offset, so its rows can be written
+//! before the header is known. A small one is collected in memory.
 
 use std::io::{self, Cursor, Write};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
@@ -16,7 +16,7 @@ use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::{MeshPart, MeshSink, SinkFailed, Vertices};
 
-/// Output with random access, such as a file. Several threads write to it at once.
+/// Output with random access, such as a file. Several threads write to it concurrently.
 pub trait RandomAccess: Sync {
     /// Writes all `bytes` from byte `offset` on.
     ///
@@ -47,13 +47,13 @@ pub struct GlbSink<'a> {
     out: &'a dyn RandomAccess,
     storage: OnceLock<Storage>,
     layout: OnceLock<Option<Layout>>,
-    /// The buffer, if it is small.
+    /// Contents of a small buffer.
     small: Mutex<Vec<u8>>,
     failure: Mutex<Option<GlbSinkError>>,
 }
 
 impl<'a> GlbSink<'a> {
-    /// Creates a sink that writes to `out`, which is empty.
+    /// Creates a sink that writes to `out`, which must be empty.
     #[must_use]
     pub fn new(out: &'a dyn RandomAccess) -> Self {
         let (storage, layout) = (OnceLock::new(), OnceLock::new());
@@ -126,15 +126,15 @@ impl<'a> GlbSink<'a> {
         let normals = layout.normals.map(|normals| normals.offset + packing.normal_bytes() * row);
         match part.vertices {
             Vertices::Single { positions: rows, normals: units } => {
-                self.place(&layout, positions, |out| write_positions(out, packing, rows))?;
+                self.write_at(&layout, positions, |out| write_positions(out, packing, rows))?;
                 if let Some(normals) = normals {
-                    self.place(&layout, normals, |out| write_normals(out, packing, units))?;
+                    self.write_at(&layout, normals, |out| write_normals(out, packing, units))?;
                 }
             }
             Vertices::Quantized { step, positions: rows, normals: units } if packing.step() == Some(step) => {
-                self.place(&layout, positions, |out| write_rows(out, rows))?;
+                self.write_at(&layout, positions, |out| write_rows(out, rows))?;
                 if let Some(normals) = normals {
-                    self.place(&layout, normals, |out| write_rows(out, units))?;
+                    self.write_at(&layout, normals, |out| write_rows(out, units))?;
                 }
             }
             Vertices::Quantized { step, .. } => {
@@ -143,11 +143,11 @@ impl<'a> GlbSink<'a> {
         }
         let (index_type, indices) = layout.indices;
         let indices = indices.offset + 3 * index_type.bytes() * part.first_triangle as u64;
-        Ok(self.place(&layout, indices, |out| write_indices(out, index_type, part.triangles.as_flattened()))?)
+        Ok(self.write_at(&layout, indices, |out| write_indices(out, index_type, part.triangles.as_flattened()))?)
     }
 
     /// Writes rows from byte `offset` of the buffer on.
-    fn place(
+    fn write_at(
         &self,
         layout: &Layout,
         offset: u64,

@@ -36,7 +36,7 @@ impl Chunk {
         u64::from(self.n_own) + self.halo.len() as u64
     }
 
-    /// Number of groups of own bricks, whose counts take 16 bytes each.
+    /// Returns the number of groups of own bricks. The counts of a group take 16 bytes.
     #[must_use]
     pub fn n_groups(&self) -> u64 {
         u64::from(self.n_own.div_ceil(GROUP))

@@ -234,9 +234,10 @@ parameters!(
 );
 parameters!(
     /// Conditional request.
-    IfNoneMatchHeader: headers(&[(
-        "If-None-Match", None, "\"ba7816bf\"", "`ETag`s that the client has. If one matches, the response is 304.",
-    )])
+    ConditionHeaders: headers(&[
+        ("If-None-Match", None, "\"ba7816bf\"", "`ETag`s that the client has. If one matches, the response is 304."),
+        ("If-Match", None, "\"ba7816bf\"", "`ETag`s that the client expects. If none matches, the response is 412."),
+    ])
 );
 parameters!(
     /// Range request.

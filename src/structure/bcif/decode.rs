@@ -34,7 +34,7 @@ impl Chain<'_> {
 /// Returns the type of the numbers in `data`. The last encoding of a chain must be `ByteArray`.
 fn byte_array(last: &Encoding<'_>, data: &[u8]) -> Result<Number, Box<Fault>> {
     let &Encoding::ByteArray(number) = last else {
-        return Err(Fault::new("it at the end of its chain", "ByteArray at the end"));
+        return Err(Fault::new("this encoding at the end of its chain", "ByteArray at the end"));
     };
     let size = number.size();
     if !data.len().is_multiple_of(size) {
@@ -86,7 +86,7 @@ fn numbers(data: &[u8], number: Number, most: usize) -> Result<Values, Box<Fault
         Number::Uint16 => Values::Int(converted(data, |b| u16::from_le_bytes(b).into())),
         Number::Uint32 => {
             let values: Option<Vec<i32>> = converted(data, |b| i32::try_from(u32::from_le_bytes(b)).ok());
-            Values::Int(values.ok_or_else(|| Fault::new("a number of 2³¹ or more", "one below"))?)
+            Values::Int(values.ok_or_else(|| Fault::new("a number of 2³¹ or more", "a smaller number"))?)
         }
         Number::Float32 => Values::Real(converted(data, |b| f32::from_le_bytes(b).into())),
         Number::Float64 => Values::Real(converted(data, f64::from_le_bytes)),
@@ -167,11 +167,13 @@ impl Encoding<'_> {
                 let width = (max - min) / f64::from(steps - 1);
                 Values::Real(ints.iter().map(|&v| min + width * f64::from(v)).collect())
             }
-            Self::ByteArray(_) => return Err(Fault::new("it in the middle of its chain", "it at the end")),
+            Self::ByteArray(_) => {
+                return Err(Fault::new("this encoding in the middle of its chain", "ByteArray at the end"));
+            }
             Self::IntegerPacking { .. } => {
                 return Err(Fault::new("another encoding after it", "ByteArray after it"));
             }
-            Self::StringArray(_) => return Err(Fault::new("it among others", "it alone")),
+            Self::StringArray(_) => return Err(Fault::new("this encoding among others", "StringArray alone")),
         })
     }
 }

@@ -99,7 +99,7 @@ impl<'a> Encoding<'a> {
                 Self::ByteArray(number)
             }
             b"FixedPoint" => match at.required("factor", Cursor::number)? {
-                0.0 => return Err(Fault::new("a factor of 0", "another one").within("FixedPoint")),
+                0.0 => return Err(Fault::new("a factor of 0", "another factor").within("FixedPoint")),
                 factor => Self::FixedPoint { factor },
             },
             b"IntervalQuantization" => {

@@ -14,14 +14,14 @@ pub(super) struct Fault {
 
 impl Fault {
     #[cold]
-    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
+    #[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
     pub(super) fn new(found: impl Into<String>, expected: impl Into<String>) -> Box<Self> {
         Box::new(Self { place: String::new(), found: found.into(), expected: expected.into() })
     }
 
     /// Prepends an enclosing location.
     #[cold]
-    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
+    #[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
     pub(super) fn within(mut self: Box<Self>, outer: impl Display) -> Box<Self> {
         self.place = if self.place.is_empty() { outer.to_string() } else { format!("{outer}, {}", self.place) };
         self

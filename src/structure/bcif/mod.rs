@@ -31,6 +31,7 @@ const MAX_COLUMNS: usize = 1000;
 /// Largest number of texts of a column in a category with fewer rows. Programs that select atoms keep all texts.
 const MAX_UNUSED_TEXTS: usize = 1 << 20;
 
+/// Reads the first data block that has atoms with coordinates.
 pub(super) fn read(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     let mut passed = Passed::default();
     let (mut found, mut last, mut any) = (None, None, false);
@@ -105,7 +106,7 @@ impl<'a> Category<'a> {
         Ok(columns)
     }
 
-    /// Decodes the texts of an item; `None` without the item.
+    /// Decodes the texts of an item. Returns `None` if the category does not have it.
     fn column(&self, item: &str, max_rows: usize) -> Result<Option<Column<'a>>, Box<Fault>> {
         let columns = self.columns()?;
         let named = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item.as_bytes()));
@@ -122,7 +123,7 @@ impl<'a> Category<'a> {
         Ok(column.as_ref().and_then(|column| column.text(0)).and_then(|text| normalize(text, max)))
     }
 
-    /// Returns the values of an item, with empty texts for missing values. Returns no values without the item.
+    /// Returns the values of an item, with empty texts for missing values; none if the category lacks the item.
     fn values(&self, item: &str, max_rows: usize) -> Result<Vec<String>, Box<Fault>> {
         let Some(column) = self.column(item, max_rows)? else { return Ok(Vec::new()) };
         let rows = 0..usize::try_from(self.rows).unwrap_or(0);

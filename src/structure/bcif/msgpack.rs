@@ -267,7 +267,7 @@ impl<'a> Cursor<'a> {
     }
 
     #[cold]
-    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
+    #[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
     fn end(&self, wanted: usize) -> Box<Fault> {
         let left = self.bytes.len() - self.at.min(self.bytes.len());
         Fault::new(format!("the end of the file after {left} bytes"), format!("{wanted} bytes or more"))

@@ -50,7 +50,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
     }
 }
 
-/// Data block with what has been read of it.
+/// Values of a data block that have been read so far.
 #[derive(Debug, Default)]
 struct Block {
     name: Option<String>,

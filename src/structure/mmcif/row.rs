@@ -19,7 +19,7 @@ pub(super) fn layout(text: &[u8], tags: &[(usize, usize)]) -> Result<Layout, Box
     })
 }
 
-/// Returns true for a tag of the category.
+/// Returns true if the tag belongs to the category.
 pub(super) fn has_prefix(tag: &[u8]) -> bool {
     tag.get(..PREFIX.len()).is_some_and(|prefix| prefix.eq_ignore_ascii_case(PREFIX))
 }

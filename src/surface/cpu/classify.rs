@@ -114,7 +114,7 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
 }
 
 impl ClassifiedBricks {
-    /// Returns an empty value with capacity for `bricks` bricks, usually more than needed: growing would copy, and
+    /// Returns an empty value with capacity for `bricks` bricks, usually more than required: growing would copy, and
     /// untouched memory costs nothing.
     pub(super) fn with_capacity(bricks: usize) -> Self {
         Self {

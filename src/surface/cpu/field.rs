@@ -2,7 +2,7 @@
 //!
 //! Each sample's density is a sum over the brick's candidates in ascending order, and each term is a function of the
 //! atom and the sample alone. An atom out of reach adds an exact zero. A sample therefore has the same bits in every
-//! tile and for every candidate list that is long enough: neighbours never disagree on a sign.
+//! tile, and for every candidate list that contains all atoms in reach. Neighbouring bricks thus agree on every sign.
 
 use super::bin::NORMAL_ONLY;
 use crate::surface::kernel::{MIN_DISTANCE2, Profile};
@@ -17,7 +17,7 @@ pub(super) type Samples = [f32; BRICK_SAMPLES];
 /// small lie beyond the cut-off for every valid smoothness.
 const MIN_EXPONENT: f32 = -62.0;
 
-/// Constants of a kernel in the form that the inner loops use.
+/// Constants of a kernel in the form that the inner loops use. u is d²/ρ², as in [`crate::surface::kernel`].
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Constants {
     pub(crate) kernel: Kernel,
@@ -33,7 +33,7 @@ pub(crate) struct Constants {
     pub(crate) tail_end: f32,
     /// Soft object, inverse square: factor of the density.
     pub(crate) amplitude: f32,
-    /// Inverse square: least u, per 1/ρ².
+    /// Inverse square: lower bound of u, as a factor of 1/ρ².
     pub(crate) u_min: f32,
     /// Gaussian: the slope −dF/du is `2^(slope_offset − rate·u) − slope_tail` up to a factor. The amplitude is omitted,
     /// as it does not affect a direction, so numbers stay near 1.
@@ -42,7 +42,7 @@ pub(crate) struct Constants {
 }
 
 impl Constants {
-    /// Constants of `profile` on a lattice of `spacing` Å.
+    /// Returns the constants of `profile` on a lattice of `spacing` Å.
     pub(crate) fn new(profile: &Profile, spacing: f64) -> Self {
         let gaussian = profile.kernel == Kernel::Gaussian;
         let support = profile.support();
@@ -66,12 +66,12 @@ impl Constants {
     }
 }
 
-/// Range of samples of a brick that are needed: all, or only the first layer along some axes.
+/// Range of the required samples of a brick: all, or only the first layer along y, z or both.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SampleRange {
-    /// Row pairs along y: 4, or 1 for the first layer.
+    /// Number of row pairs along y: 4, or 1 for the first layer.
     pub(super) y_pairs: usize,
-    /// Layers along z: 8, or 1.
+    /// Number of layers along z: 8, or 1.
     pub(super) z_layers: usize,
 }
 
@@ -95,13 +95,13 @@ impl Axes {
         Self { x, yz }
     }
 
-    /// Of layer z.
+    /// Returns the number of layer `z`.
     #[inline(always)]
     fn z(&self, z: usize) -> f32 {
         self.yz[8 + (z & 7)]
     }
 
-    /// Combined along x and y into the brick's 8 × 8 plane, as 4 pairs of rows.
+    /// Combines the numbers along x and y into the brick's 8 × 8 plane, as 4 pairs of rows.
     #[inline(always)]
     fn plane(&self, combine: impl Fn(f32, f32) -> f32) -> [[f32; 16]; 4] {
         let mut xy = [[0.0; 16]; 4];
@@ -114,7 +114,7 @@ impl Axes {
     }
 }
 
-/// One atom as a brick sees it: the range of rows in reach, and u along each axis.
+/// One atom relative to a brick: the range of rows in reach, and u along each axis.
 struct AtomInBrick {
     z: [usize; 2],
     /// Pairs of rows.
@@ -142,14 +142,14 @@ fn place_atom(atom: &LatticeAtom, origin: [i32; 3], support: f32, range: SampleR
     AtomInBrick { z: rows(2, range.z_layers), y, u }
 }
 
-/// A row number within 0 to `n`.
+/// Converts `v` to a row number from 0 to `n`.
 #[inline(always)]
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the range before")]
 fn to_row(v: f32, n: usize) -> usize {
     v.clamp(0.0, n as f32) as usize
 }
 
-/// `FULL`: all pairs of rows are needed, not only the first.
+/// Adds densities of the Gaussian kernel. `FULL` means that all pairs of rows are required, not only the first.
 #[inline(always)]
 fn gaussian<const FMA: bool, const FULL: bool>(
     c: &Constants,
@@ -167,7 +167,7 @@ fn gaussian<const FMA: bool, const FULL: bool>(
         let placed = place_atom(atom, origin, c.support, range);
         let e = placed.u.map(|u| {
             let exponent = fma::<FMA>(-c.rate, u, c.share);
-            // A plain comparison: `f32::max` handles NaN and prevents vectorisation.
+            // A plain comparison: `f32::max` handles NaN and prevents vectorization.
             exp2::<FMA>(if exponent > MIN_EXPONENT { exponent } else { MIN_EXPONENT })
         });
         let w = placed.u.map(|u| fma::<FMA>(c.tail_rate, u, c.tail_share));
@@ -189,6 +189,7 @@ fn gaussian<const FMA: bool, const FULL: bool>(
     }
 }
 
+/// Adds densities of the soft-object or, if `INVERSE`, of the inverse-square kernel.
 #[inline(always)]
 fn compact<const FMA: bool, const INVERSE: bool>(
     c: &Constants,
@@ -228,7 +229,8 @@ fn compact<const FMA: bool, const INVERSE: bool>(
 }
 
 dispatched! {
-/// Adds the densities of `candidates` to `out`, for the brick whose first sample is `origin`.
+/// Adds the densities of `candidates` to `out`, for the brick whose first sample is `origin`. Skips candidates that
+/// have the flag [`NORMAL_ONLY`].
 pub(super) fn evaluate(
     c: &Constants,
     atoms: &[LatticeAtom],

@@ -190,7 +190,13 @@ fn write<P, N>(
 
 dispatched! {
 /// Positions in Å and normals of length 1, row by row.
-fn finish(spacing: f64, offset: [f64; 3], batch: &VertexBatch, positions: &mut [[f32; 3]], normals: &mut [[f32; 3]]) -> usize {
+fn finish(
+    spacing: f64,
+    offset: [f64; 3],
+    batch: &VertexBatch,
+    positions: &mut [[f32; 3]],
+    normals: &mut [[f32; 3]],
+) -> usize {
     write(spacing, offset, batch, (positions, |p| p), (normals, |n| n))
 }
 }

@@ -110,7 +110,7 @@ impl Sheet {
 }
 
 impl PieceSums {
-    /// An empty tally with memory for a typical piece of this many bricks.
+    /// Returns empty sums with capacity for a typical piece of `bricks` bricks.
     pub(super) fn with_capacity(bricks: usize) -> Self {
         Self {
             bricks: Vec::with_capacity(bricks),
@@ -162,7 +162,7 @@ impl PieceSums {
     }
 
     /// Calls `pair` for the pairs of sheets that neighbouring bricks share, beyond those of `lone`. `near(brick,
-    /// neighbour)` returns a brick's neighbour, the tally of its piece, its piece, and its index in that piece; `pair`
+    /// neighbour)` returns a brick's neighbour, the sums of its piece, its piece, and its index in that piece; `pair`
     /// receives the sheet of this piece, and the other piece and sheet.
     #[inline(always)]
     pub(super) fn pairs<'a>(
@@ -172,27 +172,27 @@ impl PieceSums {
     ) {
         let mut far = self.far.iter().peekable();
         for (ix, brick) in self.bricks.iter().enumerate() {
-            // Nothing but those of the brick, where it has several sheets; neighbour by neighbour.
+            // Only vertices of this brick, if it has several sheets, ordered by neighbour.
             while let Some(FarVertex { neighbour, .. }) = far.peek().filter(|f| f.brick as usize == ix) {
                 let met = near(ix, usize::from(*neighbour));
                 let mut last = None;
                 while let Some(at) = far.next_if(|f| f.brick as usize == ix && f.neighbour == *neighbour) {
-                    let Some((_, tally, (piece, other))) = met else { continue };
-                    let sheets = (at.sheet, tally.sheet_of(other, at.rank));
+                    let Some((_, sums, (piece, other))) = met else { continue };
+                    let sheets = (at.sheet, sums.sheet_of(other, at.rank));
                     if last.replace(sheets) != Some(sheets) {
                         pair(at.sheet, (piece, sheets.1));
                     }
                 }
             }
             for neighbour in (1..8).filter(|n| brick.unsettled >> n & 1 == 1) {
-                let Some((of, tally, (piece, other))) = near(ix, neighbour) else { continue };
-                if tally.bricks[other].n == 1 {
-                    pair(brick.first, (piece, tally.bricks[other].first));
+                let Some((of, sums, (piece, other))) = near(ix, neighbour) else { continue };
+                if sums.bricks[other].n == 1 {
+                    pair(brick.first, (piece, sums.bricks[other].first));
                     continue;
                 }
                 let mut last = None;
                 shared_vertices(&of, neighbour, |Shared { rank, .. }| {
-                    let sheet = tally.sheet_of(other, rank);
+                    let sheet = sums.sheet_of(other, rank);
                     if last.replace(sheet) != Some(sheet) {
                         pair(brick.first, (piece, sheet));
                     }
@@ -223,13 +223,13 @@ dispatched! {
 /// Records the sheet, numbered from `first`, of every vertex of a brick with several sheets: its own by rank, and those
 /// of its neighbours for the later join of bricks.
 fn note_vertices(
-    tally: &mut PieceSums,
+    piece: &mut PieceSums,
     table: &BrickTable,
     sheets: &Sheets,
     around: &[Option<NumberedBrick<'_>>; 8],
     first: u32,
 ) {
-    let PieceSums { sheets: sums, bricks, of_vertices, far, lone, .. } = tally;
+    let PieceSums { sheets: sums, bricks, of_vertices, far, lone, .. } = piece;
     let brick = to_u32(bricks.len() - 1);
     let on = |edge: usize| sheets.of(table.sheet(u16::try_from(edge).unwrap_or_default()));
     for (neighbour, near) in (0_u8..).zip(around) {

@@ -76,7 +76,7 @@ pub(super) struct PieceSummary {
     flat: usize,
     /// Sums over its triangles.
     pub(super) sums: PieceSums,
-    /// Bounds of its positions, Å; for a sink only.
+    /// Bounds of its positions, Å; computed for a sink only.
     bounds: Option<[[f32; 3]; 2]>,
 }
 

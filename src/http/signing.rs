@@ -1,0 +1,118 @@
+//! Check of addresses before they are signed.
+
+use axum::extract::Query;
+use axum::http::{Method, Uri};
+
+use super::jobs::{MAX_WAIT_S, Poll};
+use super::scopes::{Row, TABLE};
+use crate::formats::Format;
+use crate::pipeline::params;
+
+/// Checks that a signature can open `target`, a path with or without a query.
+///
+/// # Errors
+/// Returns the reason for which it cannot.
+pub fn check_signable(target: &str) -> Result<(), String> {
+    let uri: Uri = target.parse().map_err(|error| format!("it is not a path with a query: {error}"))?;
+    let rows = || TABLE.iter().filter(|row| matches(row.path, uri.path()));
+    // A literal segment precedes a placeholder, as in the router.
+    let row = rows().filter(|row| row.method == Method::GET).min_by_key(|row| row.path.matches('{').count());
+    let Some(row) = row else {
+        return Err(if rows().next().is_some() {
+            "a signature allows GET only, which this path does not have".to_owned()
+        } else {
+            "the service has no such path".to_owned()
+        });
+    };
+    if row.scope.is_none() {
+        return Err("this path needs no signature".to_owned());
+    }
+    check_file(row, uri.path())?;
+    check_parameters(row, &uri)
+}
+
+/// Returns true if a route matches a path.
+fn matches(route: &str, path: &str) -> bool {
+    let mut segments = path.split('/');
+    let fits = |expected: &str| {
+        segments.next().is_some_and(|found| expected == found || expected.starts_with('{') && !found.is_empty())
+    };
+    route.split('/').all(fits) && segments.next().is_none()
+}
+
+/// Checks the name of a mesh file.
+fn check_file(row: &Row, path: &str) -> Result<(), String> {
+    if !row.path.ends_with("/{file}") {
+        return Ok(());
+    }
+    let (stem, extension) = path.rsplit('/').next().and_then(|file| file.split_once('.')).unwrap_or_default();
+    let is_mesh = Format::ALL.into_iter().any(|format| format.extension() == extension);
+    let is_named = if is_result(row) { stem.len() == 64 } else { stem == "surface" };
+    let expected = if is_result(row) { "a result has a name of 64 digits" } else { "a structure has `surface`" };
+    let of = || format!("{expected} and one of the extensions {}", Format::ALL.map(Format::extension).join(", "));
+    if is_mesh && is_named { Ok(()) } else { Err(of()) }
+}
+
+fn is_result(row: &Row) -> bool {
+    row.path.starts_with("/v1/results/")
+}
+
+fn check_parameters(row: &Row, uri: &Uri) -> Result<(), String> {
+    let Query(pairs) = Query::<Vec<(String, String)>>::try_from_uri(uri).map_err(|error| error.body_text())?;
+    if row.path == "/v1/jobs/{id}" {
+        let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;
+        return if poll.wait() <= MAX_WAIT_S { Ok(()) } else { Err(format!("`wait` is more than {MAX_WAIT_S} s")) };
+    }
+    let is_mesh = !is_result(row) && (row.path.ends_with("/{file}") || row.path.ends_with("/report.json"));
+    if is_mesh {
+        return params::parse(pairs).map(drop).map_err(|error| error.to_string());
+    }
+    match pairs.first() {
+        Some((name, _)) => Err(format!("unknown parameter `{name}`; this path has none")),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::check_signable;
+
+    #[test]
+    fn only_what_a_signature_opens_is_signable() {
+        let digest = "0123456789abcdef".repeat(4);
+        for good in [
+            "/v1/pdb/4pti/surface.glb?resolution=1&chains=A,B",
+            "/v1/pdb/4pti/report.json?preset=ses-like",
+            "/v1/pdb/4pti/atoms",
+            "/v1/capabilities",
+            "/v1/jobs/7?wait=20",
+            "/v1/jobs/7/events",
+            "/v1/jobs/7/result",
+            &format!("/v1/structures/{digest}/surface.stl"),
+            &format!("/v1/structures/{digest}/atoms"),
+            &format!("/v1/results/{digest}.glb"),
+            &format!("/v1/results/{digest}/report.json"),
+        ] {
+            assert_eq!(check_signable(good), Ok(()), "{good}");
+        }
+        for (bad, why) in [
+            ("/nonexistent", "no such path"),
+            ("/v1/pdb//surface.glb", "no such path"),
+            ("/v1/capabilities/", "no such path"),
+            ("/v1/meshes", "GET only"),
+            ("/v1/estimate?resolution=1", "GET only"),
+            ("/docs", "needs no signature"),
+            ("/v1/pdb/4pti/surface.txt", "one of the extensions glb"),
+            ("/v1/pdb/4pti/mesh.glb", "`surface`"),
+            ("/v1/results/7.glb", "64 digits"),
+            ("/v1/pdb/4pti/surface.glb?resolutoin=1", "did you mean `resolution`"),
+            ("/v1/pdb/4pti/surface.glb?resolution=fine", "parameter `resolution`"),
+            ("/v1/jobs/7?wait=99", "more than 55"),
+            ("/v1/jobs/7?wiat=9", "unknown field `wiat`"),
+            ("/v1/jobs/7/result?wait=9", "`wait`; this path has none"),
+        ] {
+            let error = check_signable(bad).unwrap_err();
+            assert!(error.contains(why), "{bad}: {error}");
+        }
+    }
+}

@@ -1,0 +1,63 @@
+//! Quarantine of job documents that cannot be read. Only an operator removes them.
+
+use std::sync::atomic::Ordering;
+
+use futures_util::TryStreamExt as _;
+use metrics::gauge;
+use object_store::path::Path;
+use object_store::{Error, ObjectStoreExt as _};
+
+use super::error::StoreError;
+use super::handle::Store;
+use super::name::Name;
+use crate::telemetry::RECORDS_QUARANTINED;
+
+/// Folder of the documents, beside those of the objects.
+pub(super) const QUARANTINE: &str = "quarantine";
+
+fn place(name: &Name) -> Path {
+    Path::from_iter([QUARANTINE, name.path().filename().unwrap_or_default()])
+}
+
+impl Store {
+    /// Moves a job document into quarantine. Succeeds if it does not exist any more.
+    pub(crate) async fn quarantine(&self, name: &Name) -> Result<(), StoreError> {
+        let (store, name) = (self.clone(), name.clone());
+        let moved = async move {
+            let _lock = store.write_lock(&name).lock().await;
+            match store.0.backend.objects().rename(&name.path(), &place(&name)).await {
+                Ok(()) | Err(Error::NotFound { .. }) => {}
+                Err(error) => return Err(store.0.backend.fail_at("quarantine", &name)(error)),
+            }
+            store.index().forget(&name);
+            store.count_quarantined().await
+        };
+        self.run_to_completion(moved).await.map(drop)
+    }
+
+    /// Returns true if the document of this name is in quarantine.
+    pub(crate) async fn is_quarantined(&self, name: &Name) -> Result<bool, StoreError> {
+        match self.0.backend.objects().head(&place(name)).await {
+            Ok(_) => Ok(true),
+            Err(Error::NotFound { .. }) => Ok(false),
+            Err(error) => Err(self.0.backend.fail_at("quarantine", name)(error)),
+        }
+    }
+
+    /// Returns the number of documents in quarantine.
+    pub(crate) async fn quarantined(&self) -> Result<usize, StoreError> {
+        // Without documents, no request to the disk or the service is needed.
+        if self.0.quarantined.load(Ordering::Relaxed) == 0 { Ok(0) } else { self.count_quarantined().await }
+    }
+
+    /// Counts the documents in quarantine, which an operator may have removed.
+    pub(super) async fn count_quarantined(&self) -> Result<usize, StoreError> {
+        let backend = &self.0.backend;
+        let listed = backend.objects().list(Some(&Path::from(QUARANTINE)));
+        let count = listed.try_fold(0, |n, _| std::future::ready(Ok(n + 1))).await;
+        let count = count.map_err(|error| backend.fail("quarantine", QUARANTINE, &error))?;
+        self.0.quarantined.store(count, Ordering::Relaxed);
+        gauge!(RECORDS_QUARANTINED).set(count as f64);
+        Ok(count)
+    }
+}
