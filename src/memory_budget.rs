@@ -1,5 +1,5 @@
-//! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, and meshes that are
-//! not yet sent.
+//! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, and meshes that
+//! are not yet sent.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

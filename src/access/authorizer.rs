@@ -211,7 +211,8 @@ mod tests {
 
     #[test]
     fn invalid_configurations_are_rejected() {
-        assert!(matches!(open(|c| c.cors_credentials = true), Err(AccessError::CredentialsForAll)));
+        let any = open(|c| (c.cors_credentials, c.cors_origins) = (true, "*".parse().ok()));
+        assert!(matches!(any, Err(AccessError::CredentialsForAll)));
         assert!(open(|c| c.keys_file = Some("/no/such".into())).is_err());
         let message = open(|c| c.signing_secret = Some(Secret::new("a:hush"))).unwrap_err().to_string();
         assert!(message.contains("access.signing_secret") && !message.contains("hush"), "{message}");

@@ -25,7 +25,7 @@ pub fn is_id(id: &str) -> bool {
     (1..=MAX_ID).contains(&id.len()) && id.bytes().all(allowed)
 }
 
-/// Creates the text of a key, of which only the [`Hash`] is stored. `id` must have passed [`is_id`].
+/// Creates the text of a key, of which only the [`struct@Hash`] is stored. `id` must have passed [`is_id`].
 ///
 /// # Errors
 /// Returns the error of the system's random number generator.

@@ -39,6 +39,7 @@ pub(crate) enum Purpose {
     Picture,
     /// A service.
     #[cfg(feature = "server")]
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only GPUs have settings"))]
     Service(DevicesConfig),
 }
 

@@ -124,12 +124,7 @@ impl Backend for GpuBackend {
                 // Only identical devices share a job.
                 let device = completed.devices.first().map_or("", |work| work.device.as_str());
                 let arithmetic = arithmetic(self.name(), device);
-                let made_by = BackendIdentity {
-                    backend: self.name(),
-                    arithmetic,
-                    device: completed.device(),
-                    fallback_reason: None,
-                };
+                let made_by = BackendIdentity::new(self.name(), arithmetic, completed.device());
                 let output = MeshOutput { made_by: Some(made_by), ..completed.finished.meshed };
                 return output.deliver(params, control, sink);
             }

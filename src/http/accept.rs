@@ -27,7 +27,7 @@ use tower::ServiceExt as _;
 
 use super::guard::Peer;
 use super::kinds::Kind;
-use super::pace::{self, GaugeGuard, MAX_PATIENCE, Pace, Rate, Streams};
+use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, Pace, Rate, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::socket::Guarded;
 use super::stop::{self, Stop};
@@ -107,7 +107,7 @@ pub(super) async fn serve(
         let stream = Guarded::new(
             stream,
             (place, GaugeGuard::new(gauge!(CONNECTIONS))),
-            MAX_PATIENCE * Duration::from_millis(config.write_timeout_ms),
+            MAX_TIME_FACTOR * Duration::from_millis(config.write_timeout_ms),
         );
         connections.spawn(connection(stream, Peer(peer.ip()), router.clone(), Arc::clone(&config), stop.clone()));
     }
@@ -266,7 +266,7 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
         .timer(TokioTimer::new())
         .keep_alive_interval(PING)
         // A slow client answers a ping after it has read all data before it.
-        .keep_alive_timeout(MAX_PATIENCE * Duration::from_millis(config.write_timeout_ms))
+        .keep_alive_timeout(MAX_TIME_FACTOR * Duration::from_millis(config.write_timeout_ms))
         .initial_stream_window_size(WINDOWS[0])
         .initial_connection_window_size(WINDOWS[1])
         .max_concurrent_streams(config.streams)

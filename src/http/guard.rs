@@ -91,7 +91,7 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     let (caller, signed_until) = match authorize(&app.access, scope, key, &mut request) {
         Ok(authorized) => authorized,
         Err(problem) => {
-            swallow(request).await;
+            discard_body(request).await;
             return problem.into_response();
         }
     };
@@ -105,7 +105,7 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
             observed(body, move |_bytes, _is_end| _ = &running)
         }),
         Err(exceeded) => {
-            swallow(request).await;
+            discard_body(request).await;
             refusal(&exceeded).into_response()
         }
     };
@@ -123,24 +123,24 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
 
 /// Reads the body of a refused request if it is small and arrives at once: some HTTP/2 clients report a broken stream
 /// if the response arrives before they have sent their body.
-pub(super) async fn swallow(request: Request) {
-    const MOST: u64 = 64 << 10;
-    const PATIENCE: Duration = Duration::from_millis(500);
+pub(super) async fn discard_body(request: Request) {
+    const MAX_BYTES: u64 = 64 << 10;
+    const MAX_TIME: Duration = Duration::from_millis(500);
     let asks_first = request.headers().contains_key(header::EXPECT);
     let mut body = request.into_body();
-    if asks_first || body.size_hint().lower() > MOST {
+    if asks_first || body.size_hint().lower() > MAX_BYTES {
         return;
     }
     let read = async {
         let mut seen = 0;
         while let Some(Ok(frame)) = body.frame().await {
             seen += frame.data_ref().map_or(0, |data| data.len() as u64);
-            if seen > MOST {
+            if seen > MAX_BYTES {
                 break;
             }
         }
     };
-    drop(tokio::time::timeout(PATIENCE, read).await);
+    drop(tokio::time::timeout(MAX_TIME, read).await);
 }
 
 /// Key of a request as the client sent it.

@@ -76,7 +76,8 @@ problem_responses!(ReadyProblems: [[Kind::NotReady]]);
 /// Check that the service is ready for requests
 ///
 /// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts
-/// jobs, can write and read the store, and has no unreadable job record in quarantine. The answer does not depend on the load.
+/// jobs, can write and read the store, and has no unreadable job record in quarantine. The answer does not depend on
+/// the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
     responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyProblems))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {

@@ -1,6 +1,6 @@
 //! The HTTP service. axum, hyper and tower are used here and nowhere else.
 //!
-//! Nothing here computes a mesh or blocks the runtime: work goes to [`crate::jobs`], files are parsed on blocking
+//! Nothing here computes a mesh or blocks the runtime: work goes to `jobs`, files are parsed on blocking
 //! threads. A file uses only files of earlier groups in the list below; `tests/core/architecture.rs` checks this order.
 
 // Protocol rules that use no other file.

@@ -26,7 +26,7 @@ pub(super) async fn check(State(app): State<Shared>, request: Request, next: Nex
     match admit(&app.access, &request) {
         Ok(()) => next.run(request).await,
         Err(problem) => {
-            guard::swallow(request).await;
+            guard::discard_body(request).await;
             problem.into_response()
         }
     }

@@ -46,14 +46,14 @@ pub(super) struct Rate {
 /// Number of bytes for which a client may pause one second longer.
 const BYTES_PER_SECOND: u64 = 16 << 10;
 /// Maximum time without progress, as a multiple of the rate's time.
-pub(super) const MAX_PATIENCE: u32 = 4;
+pub(super) const MAX_TIME_FACTOR: u32 = 4;
 
 impl Rate {
     /// Returns the time for the next bytes of a client that has read `total` bytes. A slow client on a fast line fills
     /// the buffers of its system first, then pauses until it has read a part of these megabytes.
-    fn patience(&self, total: u64) -> Duration {
+    fn allowed_time(&self, total: u64) -> Duration {
         let more = Duration::from_secs(total / BYTES_PER_SECOND);
-        self.within.saturating_add(more).min(MAX_PATIENCE * self.within)
+        self.within.saturating_add(more).min(MAX_TIME_FACTOR * self.within)
     }
 
     pub(super) fn new(config: &ServerConfig) -> Self {
@@ -139,7 +139,7 @@ impl Pace {
                 let state = self.state();
                 // Without outstanding bytes the time starts now.
                 let since = if state.offered == 0 { now } else { state.since };
-                since + self.rate.patience(state.total)
+                since + self.rate.allowed_time(state.total)
             };
             if due <= now {
                 return;

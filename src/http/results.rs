@@ -230,7 +230,7 @@ pub(super) async fn will_be_stored(
 ) -> Result<bool, Problem> {
     let bytes = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
     if let Some(bytes) = bytes
-        && app.store.has_room(bytes).await
+        && app.store.has_space(bytes).await
     {
         return Ok(true);
     }

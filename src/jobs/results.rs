@@ -78,7 +78,7 @@ pub(crate) async fn save(
             Ok(writer.finish()?)
         };
         match write() {
-            Err(SaveError::Store(StoreError::NoSpace { .. })) if runtime.block_on(store.make_room(bytes)) => write(),
+            Err(SaveError::Store(StoreError::NoSpace { .. })) if runtime.block_on(store.evict_for(bytes)) => write(),
             done => done,
         }
     };

@@ -282,7 +282,7 @@ async fn records_that_cannot_be_read_go_into_quarantine() {
     for (name, bytes) in names.iter().zip(&bad) {
         let refused = fixture.jobs.dismiss(&id(name)).await;
         assert!(matches!(refused, Err(StoreError::Quarantined { .. })), "{refused:?}");
-        let file = folder.join(format!("{}.json", id(name)));
+        let file = folder.join(format!("{}.json", id(name).as_str()));
         assert_eq!(&std::fs::read(&file).unwrap(), bytes, "kept as it was");
         std::fs::remove_file(file).unwrap();
     }

@@ -116,12 +116,7 @@ pub trait Renderer: Send + Sync {
 
     /// Returns the identity of this renderer for the report of a picture.
     fn identity(&self) -> BackendIdentity {
-        BackendIdentity {
-            backend: self.name(),
-            arithmetic: self.arithmetic(),
-            device: self.describe(),
-            fallback_reason: None,
-        }
+        BackendIdentity::new(self.name(), self.arithmetic(), self.describe())
     }
 
     /// Draws `mesh`, whose vertices must not be quantized.

@@ -214,7 +214,8 @@ impl Backend {
         Some(spawn_blocking(move || free_bytes(&root)).await.unwrap_or(0))
     }
 
-    /// Sets the modification times of objects to their last uses, which the next process reads. S3 has no such operation.
+    /// Sets the modification times of objects to their last uses, which the next process reads. S3 has no such
+    /// operation.
     pub(super) async fn save_uses(&self, uses: Vec<(Name, SystemTime)>) -> Result<(), StoreError> {
         let Kind::Local(root) = &self.kind else { return Ok(()) };
         let root = root.clone();

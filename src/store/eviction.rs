@@ -60,7 +60,8 @@ impl Drop for Reservation {
 
 impl Store {
     /// Removes expired objects, then the least recently used ones until the store is within its capacity, and about
-    /// once an hour leftovers of crashed processes. Saves times of last use, at most once an hour for an object. The service calls it regularly.
+    /// once an hour leftovers of crashed processes. Saves times of last use, at most once an hour for an object. The
+    /// service calls it regularly.
     pub async fn sweep(&self, now: SystemTime) -> Swept {
         let mut swept = Swept::default();
         let mut cleared = self.0.last_cleanup.lock().await;
@@ -134,7 +135,7 @@ impl Store {
 
     /// Evicts the least recently used objects after the disk had no space for `bytes`: twice as many bytes, since other
     /// writers need space too. Returns true if that freed any.
-    pub(crate) async fn make_room(&self, bytes: u64) -> bool {
+    pub(crate) async fn evict_for(&self, bytes: u64) -> bool {
         let _one_at_a_time = self.0.last_cleanup.lock().await;
         let candidates = self.index().oldest(bytes.saturating_mul(2));
         let (objects, freed) = self.remove_all(&candidates, "cap", &mut 0).await;
@@ -142,8 +143,8 @@ impl Store {
         freed > 0
     }
 
-    /// Returns true if an object of `bytes` surely fits: into the capacity, and twice into the free space of the disk.
-    pub(crate) async fn has_room(&self, bytes: u64) -> bool {
+    /// Returns true if an object of `bytes` fits into the capacity, and twice into the free space of the disk.
+    pub(crate) async fn has_space(&self, bytes: u64) -> bool {
         let (_, missing) = self.index().excess(bytes, self.0.config.max_bytes);
         missing == 0 && self.0.backend.free_bytes().await.is_none_or(|free| free / 2 >= bytes)
     }

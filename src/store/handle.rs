@@ -233,13 +233,14 @@ impl Store {
         self.0.backend.list(folder).await
     }
 
-    /// Records a use of an object at time `at`, which restarts its time to live. A mesh and its report are used together.
+    /// Records a use of an object at time `at`, which restarts its time to live. A mesh and its report are used
+    /// together.
     pub fn touch(&self, name: &Name, at: SystemTime) {
         self.index().touch(name, at);
     }
 
-    /// Protects an object from eviction and expiry until the pin is dropped, a mesh together with its report. The object
-    /// need not exist yet. [`delete`](Self::delete) ignores pins.
+    /// Protects an object from eviction and expiry until the pin is dropped, a mesh together with its report. The
+    /// object need not exist yet. [`delete`](Self::delete) ignores pins.
     pub fn pin(&self, name: &Name) -> Pin {
         self.index().pin(name);
         Pin { store: self.clone(), name: name.clone() }

@@ -2,7 +2,8 @@
 //!
 //! [`Store`] is the whole interface. `backend.rs` accesses folder or bucket, `index.rs` tracks objects and their use,
 //! `memory.rs` caches small results, `eviction.rs` frees space, `upload.rs` writes objects, large ones in parts, and
-//! `writer.rs` accepts data from blocking threads. `quarantine.rs` keeps unreadable job documents, and `lock.rs` protects the data folder against a second service.
+//! `writer.rs` accepts data from blocking threads. `quarantine.rs` keeps unreadable job documents, and `lock.rs`
+//! protects the data folder against a second service.
 //!
 //! A write or removal reserves space first and then holds the lock of the name (`Store::write_lock`), so it never waits
 //! for space under a lock. Reads take no lock. Their results enter index and cache only if the name has not changed.

@@ -15,7 +15,7 @@ use crate::telemetry::RECORDS_QUARANTINED;
 /// Folder of the documents, beside those of the objects.
 pub(super) const QUARANTINE: &str = "quarantine";
 
-fn place(name: &Name) -> Path {
+fn quarantine_path(name: &Name) -> Path {
     Path::from_iter([QUARANTINE, name.path().filename().unwrap_or_default()])
 }
 
@@ -25,7 +25,7 @@ impl Store {
         let (store, name) = (self.clone(), name.clone());
         let moved = async move {
             let _lock = store.write_lock(&name).lock().await;
-            match store.0.backend.objects().rename(&name.path(), &place(&name)).await {
+            match store.0.backend.objects().rename(&name.path(), &quarantine_path(&name)).await {
                 Ok(()) | Err(Error::NotFound { .. }) => {}
                 Err(error) => return Err(store.0.backend.fail_at("quarantine", &name)(error)),
             }
@@ -37,7 +37,7 @@ impl Store {
 
     /// Returns true if the document of this name is in quarantine.
     pub(crate) async fn is_quarantined(&self, name: &Name) -> Result<bool, StoreError> {
-        match self.0.backend.objects().head(&place(name)).await {
+        match self.0.backend.objects().head(&quarantine_path(name)).await {
             Ok(_) => Ok(true),
             Err(Error::NotFound { .. }) => Ok(false),
             Err(error) => Err(self.0.backend.fail_at("quarantine", name)(error)),

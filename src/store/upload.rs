@@ -60,7 +60,7 @@ impl Store {
             let mut reservation = store.empty_reservation(&name);
             reservation.grow(size).await?;
             match store.write_reserved(&name, &bytes, new).await {
-                Err(StoreError::NoSpace { .. }) if store.make_room(size).await => {
+                Err(StoreError::NoSpace { .. }) if store.evict_for(size).await => {
                     store.write_reserved(&name, &bytes, new).await
                 }
                 done => done,

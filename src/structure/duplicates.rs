@@ -14,6 +14,8 @@ type Place = (i32, [u64; 3]);
 const ROWS_PER_BUCKET: usize = 64;
 /// Bytes of an entry of the exact count.
 const BYTES_PER_PLACE: u64 = 64;
+/// Rows between two checks of the cancellation flag: about a millisecond.
+const ROWS_PER_CHECK: usize = 1 << 17;
 
 /// Rejects rows of which more than the limit have the same model and position. `row` returns both for a row below `n`.
 ///
@@ -37,7 +39,7 @@ pub(super) fn check(
         (model, position.map(|c| (c + 0.0).to_bits()))
     };
     let n_buckets = (n / ROWS_PER_BUCKET).next_power_of_two();
-    let memory = reading.reserve(4 * n_buckets as u64)?;
+    let _of_counts = reading.reserve(4 * n_buckets as u64)?;
     let mut counts = vec![0_u32; n_buckets];
     // The high bits of the hash depend on all bits of the input.
     let bucket = |i| (FxBuildHasher.hash_one(place(i)) >> 32) as usize & (n_buckets - 1);
@@ -52,9 +54,15 @@ pub(super) fn check(
     if crowded == 0 {
         return Ok(());
     }
-    let memory = (memory, reading.reserve(BYTES_PER_PLACE * crowded)?);
+    let _of_places = reading.reserve(BYTES_PER_PLACE * crowded)?;
     let mut places: FxHashMap<Place, u64> = FxHashMap::default();
-    for i in (0..n).filter(|&i| is_crowded(counts[bucket(i)])) {
+    for i in 0..n {
+        if i % ROWS_PER_CHECK == 0 {
+            reading.check()?;
+        }
+        if !is_crowded(counts[bucket(i)]) {
+            continue;
+        }
         let count = places.entry(place(i)).or_default();
         *count += 1;
         if *count > limit {
@@ -62,12 +70,8 @@ pub(super) fn check(
             return Err(StructureError::TooManyDuplicates { limit, x, y, z });
         }
     }
-    drop(memory);
     Ok(())
 }
-
-/// Rows between two checks of the cancellation flag: about a millisecond.
-const ROWS_PER_CHECK: usize = 1 << 17;
 
 #[cfg(test)]
 mod tests {

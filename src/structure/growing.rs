@@ -8,12 +8,12 @@ use super::read::Reading;
 /// Rows between two checks: a few milliseconds.
 const CHUNK: usize = 1 << 16;
 
-/// Columns with room for some more rows.
+/// Columns with reserved memory for some more rows.
 #[derive(Debug, Default)]
 pub(super) struct GrowingColumns {
     columns: Columns,
     /// Number of rows at which the next check is due.
-    room: usize,
+    next_check: usize,
     /// Number of texts whose memory is reserved.
     n_texts: usize,
 }
@@ -21,7 +21,7 @@ pub(super) struct GrowingColumns {
 impl GrowingColumns {
     /// Returns columns that hold rows already, whose memory is reserved.
     pub(super) fn filled(columns: Columns, tables: &Tables) -> Self {
-        Self { room: columns.len(), columns, n_texts: tables.n_texts() }
+        Self { next_check: columns.len(), columns, n_texts: tables.n_texts() }
     }
 
     pub(super) fn columns(&self) -> &Columns {
@@ -34,18 +34,18 @@ impl GrowingColumns {
 
     /// Returns true if [`Self::push`] would succeed.
     #[inline]
-    pub(super) fn has_room(&self) -> bool {
-        self.columns.len() < self.room
+    pub(super) fn has_space(&self) -> bool {
+        self.columns.len() < self.next_check
     }
 
-    /// Adds an atom. Returns false if [`Self::make_room`] must be called first.
+    /// Adds an atom. Returns false if [`Self::reserve_chunk`] must be called first.
     #[inline]
     pub(super) fn push(&mut self, atom: &Atom) -> bool {
-        let room = self.has_room();
-        if room {
+        let fits = self.has_space();
+        if fits {
             self.columns.push(atom);
         }
-        room
+        fits
     }
 
     /// Checks the rows added last and reserves memory for more, for `expected` rows in an empty column.
@@ -53,14 +53,14 @@ impl GrowingColumns {
     /// # Errors
     /// Returns [`StructureError::TooManyAtoms`] at the limit, [`StructureError::TooManyDuplicates`],
     /// [`StructureError::Memory`] and [`StructureError::Cancelled`].
-    pub(super) fn make_room(
+    pub(super) fn reserve_chunk(
         &mut self,
         tables: &Tables,
         reading: &Reading<'_>,
         expected: usize,
     ) -> Result<(), StructureError> {
         let (n, limit) = (self.columns.len(), reading.limits.max_rows());
-        if n < self.room {
+        if n < self.next_check {
             return Ok(());
         }
         reading.check()?;
@@ -75,7 +75,7 @@ impl GrowingColumns {
             let more = if n == 0 { expected } else { (n / 2).max(CHUNK) };
             self.columns.reserve(more.clamp(1, limit - n), reading)?;
         }
-        self.room = self.columns.capacity().min(n + CHUNK).min(limit);
+        self.next_check = self.columns.capacity().min(n + CHUNK).min(limit);
         Ok(())
     }
 }

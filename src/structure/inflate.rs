@@ -95,8 +95,8 @@ fn append(
 ) -> Result<(), StructureError> {
     let limit_len = usize::try_from(limit).unwrap_or(usize::MAX - 1);
     loop {
-        let room = limit_len.saturating_sub(out.len()).saturating_add(1);
-        let step = out.len().max(1 << 20).min(room);
+        let remaining = limit_len.saturating_sub(out.len()).saturating_add(1);
+        let step = out.len().max(1 << 20).min(remaining);
         let start = out.len();
         if out.capacity() - start < step {
             let (old, new) = (out.capacity() as u64, (start + step) as u64);

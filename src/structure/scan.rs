@@ -19,9 +19,9 @@ impl Edges {
     /// Scans `window`, which must begin outside a token and be smaller than 4 GiB. Leaves out a token that the end of
     /// the window may have cut, unless `last` is true (the text ends with the window).
     pub(super) fn scan(&mut self, window: &[u8], last: bool) {
-        let room = window.len() + 2 * BLOCK;
-        if self.offsets.len() < room {
-            self.offsets.resize(room, 0);
+        let needed = window.len() + 2 * BLOCK;
+        if self.offsets.len() < needed {
+            self.offsets.resize(needed, 0);
         }
         self.len = edges(window, &mut self.offsets);
         let cut = self.len > 0 && self.offsets[self.len - 1] as usize == window.len();

@@ -113,6 +113,12 @@ pub struct BackendIdentity {
 }
 
 impl BackendIdentity {
+    /// Creates the identity of a backend or renderer that did not replace another one.
+    #[must_use]
+    pub fn new(backend: &'static str, arithmetic: String, device: String) -> Self {
+        Self { backend, arithmetic, device, fallback_reason: None }
+    }
+
     /// Adds the reason for a fallback, if there was one, to the reason for the choice of a backend.
     #[must_use]
     pub fn reason(&self, choice: &str) -> String {
@@ -136,12 +142,7 @@ pub trait Backend: Send + Sync {
 
     /// Returns the identity of this backend for the report of a mesh.
     fn identity(&self) -> BackendIdentity {
-        BackendIdentity {
-            backend: self.name(),
-            arithmetic: self.arithmetic(),
-            device: self.describe(),
-            fallback_reason: None,
-        }
+        BackendIdentity::new(self.name(), self.arithmetic(), self.describe())
     }
 
     /// Meshes `spheres`, in memory or, if there is a `sink`, into that. Both get the same rows.

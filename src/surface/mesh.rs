@@ -184,6 +184,7 @@ impl Mesh {
 
     /// Adds the rows of `next` without a copy. Its triangles already refer to the joined vertices. The mesh takes the
     /// centre of `next` and, if it is empty, its representation.
+    #[cfg(feature = "gpu")]
     pub(crate) fn append(&mut self, next: Self) {
         let before = (self.n_vertices(), self.n_triangles());
         self.parts.extend(next.parts.iter().map(|(v, t)| (before.0 + v, before.1 + t)));

@@ -63,7 +63,16 @@ const LAYERS: &[Layer] = &[
         name: "structure",
         layers: &[(
             "surface",
-            Only(&["Control", "MemoryMeter", "OutOfMemory", "Reservation", "Spheres", "SurfaceError", "spheres"]),
+            Only(&[
+                "CancelToken",
+                "Control",
+                "MemoryMeter",
+                "OutOfMemory",
+                "Reservation",
+                "Spheres",
+                "SurfaceError",
+                "spheres",
+            ]),
         )],
         crates: &["tokio", "axum", "tower", "hyper", "tracing", "wgpu", "gltf_json", "clap"],
     },

@@ -604,7 +604,7 @@ fn checks_limits_before_allocation() {
         let all = ["Cartn_x", "Cartn_y", "Cartn_z", "auth_seq_id"].map(runs).to_vec();
         file(vec![block("x", vec![category("_atom_site", rows, all)])])
     };
-    let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 10_000 };
+    let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 10_000, max_duplicates: 10_000 };
     assert!(bomb(n).len() < 1500);
     assert_eq!(read(&bomb(n), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
     assert_eq!(read(&bomb(i64::MAX), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
@@ -648,7 +648,7 @@ fn checks_limits_before_allocation() {
 
 #[test]
 fn never_panics_on_truncated_or_changed_files() {
-    let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 1_000 };
+    let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 1_000, ..ReadLimits::default() };
     let whole = CRAMBIN;
     assert_eq!(read(whole, &limits).unwrap().len(), 327);
     for cut in 0..whole.len() {

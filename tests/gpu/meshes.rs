@@ -35,8 +35,7 @@ fn difference(mesh: &Mesh, expected: &Mesh) -> Option<String> {
     };
     let (n, apart) = (mesh.n_vertices(), furthest(&mesh.positions, &expected.positions));
     let turned = furthest(&mesh.normals, &expected.normals);
-    // Vertices of an H100 and of the CPU are up to 1.2e-4 Å apart, those of software Vulkan up to 1e-4 Å.
-    (n != expected.n_vertices() || mesh.normals.len() != n || apart > 2e-4 || turned > 2e-2)
+    (n != expected.n_vertices() || mesh.normals.len() != n || apart > 1e-4 || turned > 2e-2)
         .then(|| format!("{n} vertices of {}, {apart} Å apart, normals {turned}", expected.n_vertices()))
 }
 

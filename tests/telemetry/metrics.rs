@@ -14,7 +14,7 @@ use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, sample, start};
+use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, sample, start, start_cold};
 use metrics_support::{Devices, Held, Scrape, check, queries, until};
 use molmesh::surface::CpuBackend;
 use molmesh::telemetry::{self as t, Kind, METRICS, Metric, recorder};
@@ -38,6 +38,7 @@ const ROWS: &[Row] = &[
     (t::JOBS_FINISHED, &["outcome=\"successful\""], meshes),
     (t::JOBS_OPEN, &[], held),
     (t::JOBS_RECOVERED, &[], restart),
+    (t::RECORDS_QUARANTINED, &[], damaged_record),
     (t::JOBS_FALLBACK, &[], devices),
     (t::STAGE_DURATION, &["stage=\"field\""], meshes),
     (t::RESULTS_NOT_STORED, &["reason=\"failed\""], tiny_store),
@@ -141,6 +142,17 @@ fn restart(look: &dyn Fn()) {
     let _drained = server.join();
     let _server = start(Fake::new(Mode::Octahedra), keep);
     look();
+}
+
+/// Start with a truncated job record in the store.
+fn damaged_record(look: &dyn Fn()) {
+    let folder = tempfile::tempdir().unwrap();
+    let jobs = folder.path().join("store/jobs");
+    std::fs::create_dir_all(&jobs).unwrap();
+    std::fs::write(jobs.join(format!("{}.json", "0".repeat(32))), "{").unwrap();
+    let server = start_cold(Fake::new(Mode::Octahedra), |config| folder.path().clone_into(&mut config.server.data_dir));
+    look();
+    drop(server);
 }
 
 /// Devices with nonzero metrics and a fallback.

@@ -109,7 +109,7 @@ impl<'a> Raw<'a> {
             let cells = Cells::Text(strings.read(data, bounds).map_err(|f| f.within("StringArray"))?);
             return Ok(Column { cells, mask });
         }
-        let values = chain.decode(data, room(bounds.rows))?;
+        let values = chain.decode(data, max_values(bounds.rows))?;
         whole_column(values.len(), bounds.rows)?;
         let cells = match values {
             Values::Int(values) if texts => Cells::Text(written_out(&values)),
@@ -122,7 +122,7 @@ impl<'a> Raw<'a> {
 }
 
 /// Returns the largest number of values in an intermediate step of decoding `n` values. Run-length pairs take two.
-const fn room(n: usize) -> usize {
+const fn max_values(n: usize) -> usize {
     n.saturating_add(1).saturating_mul(2)
 }
 
@@ -140,7 +140,7 @@ fn encoded(at: Cursor<'_>) -> Result<(&[u8], Chain<'_>), Box<Fault>> {
 /// Decodes a mask of rows without a value: 1 is `.`, 2 is `?`. Returns `None` if all rows have a value.
 fn nulls(mask: Cursor<'_>, rows: usize) -> Result<Option<Vec<bool>>, Box<Fault>> {
     let (data, chain) = encoded(mask)?;
-    let values = chain.decode(data, room(rows))?.ints()?;
+    let values = chain.decode(data, max_values(rows))?.ints()?;
     whole_column(values.len(), rows)?;
     if let Some(odd) = values.iter().find(|value| !(0..=2).contains(*value)) {
         return Err(Fault::new(odd.to_string(), "0 (a value), 1 (.) or 2 (?)"));
@@ -153,9 +153,9 @@ impl<'a> Strings<'a> {
     fn read(&self, data: &'a [u8], bounds: Bounds) -> Result<Texts<'a>, Box<Fault>> {
         let chain = |at, what| Chain::read(at).map_err(|f: Box<Fault>| f.within(what));
         let offset_chain = chain(self.offset_chain, "offsetEncoding")?;
-        let offsets = offset_chain.decode(self.offsets, room(bounds.texts)).and_then(Values::ints);
+        let offsets = offset_chain.decode(self.offsets, max_values(bounds.texts)).and_then(Values::ints);
         let offsets = offsets.and_then(|o| self.byte_offsets(o)).map_err(|f| f.within("offsets"))?;
-        let ids = chain(self.data_chain, "dataEncoding")?.decode(data, room(bounds.rows)).and_then(Values::ints);
+        let ids = chain(self.data_chain, "dataEncoding")?.decode(data, max_values(bounds.rows)).and_then(Values::ints);
         let ids = ids.map_err(|f| f.within("data"))?;
         whole_column(ids.len(), bounds.rows)?;
         let n = offsets.len().saturating_sub(1);

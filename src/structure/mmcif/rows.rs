@@ -105,7 +105,7 @@ impl<'a> Rows<'a> {
             offsets.extend([from, to]);
         }
         let atom = self.site.atom(&Row::<true> { text: self.text, base, offsets: &offsets })?;
-        self.columns.make_room(&self.site.tables, self.reading, self.expected)?;
+        self.columns.reserve_chunk(&self.site.tables, self.reading, self.expected)?;
         self.columns.push(&atom);
         Ok(())
     }
@@ -251,8 +251,8 @@ impl<'a> Scanner<'a> {
         Self { text, edges: Edges::default(), window: MAX_WINDOW }
     }
 
-    /// Reads rows from `at` to `end` and calls `put`, which returns false if there is no room. Stops before the first
-    /// row that is incomplete, not plain or without room, and returns the end of the row before it.
+    /// Reads rows from `at` to `end` and calls `put`, which returns false if the memory for rows is full. Stops before
+    /// the first row that is incomplete, not plain or not added, and returns the end of the row before it.
     fn rows(
         &mut self,
         site: &mut AtomSite<Box<Fault>>,

@@ -43,7 +43,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         if std::mem::take(&mut reader.full) {
             // Number of atoms if all lines were as long as this one.
             let expected = text.len() / (line.1 - line.0 + 1) + 1;
-            reader.columns.make_room(&reader.tables, reading, expected)?;
+            reader.columns.reserve_chunk(&reader.tables, reading, expected)?;
             reader.line(line).map_err(|fault| fault.locate(text))?;
         }
     }
@@ -82,7 +82,7 @@ impl Models {
 #[derive(Default)]
 struct Reader<'a> {
     text: &'a [u8],
-    /// Set instead of reading an atom for which there is no room.
+    /// Set instead of reading an atom for which no memory is reserved.
     full: bool,
     tabs: bool,
     columns: GrowingColumns,
@@ -192,7 +192,7 @@ impl<'a> Reader<'a> {
             padded = card(line);
             &padded
         });
-        if !self.columns.has_room() {
+        if !self.columns.has_space() {
             self.full = true;
             return Ok(());
         }
