@@ -401,17 +401,17 @@ fn memory_is_shared_and_limited() {
     assert!(rejected(&server, "memory-full") >= 1.0);
 }
 
-/// Returns 100,000 atoms (8 MB) in a small file.
-fn compressed_atoms() -> Vec<u8> {
+/// Returns atoms, 81 bytes each, in a small file.
+fn compressed_atoms(n: usize) -> Vec<u8> {
     let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
-    encoder.write_all(&carbons(100_000)).unwrap();
+    encoder.write_all(&carbons(n)).unwrap();
     encoder.finish().unwrap()
 }
 
 #[test]
 fn reading_counts_against_the_memory_limit() {
     let server = fake(|c| c.limits.memory_bytes = 8_000_000);
-    let body = compressed_atoms();
+    let body = compressed_atoms(100_000);
     assert!(body.len() < 2_000_000, "{}", body.len());
     for path in ["/v1/meshes", "/v1/structures", "/v1/estimate", "/v1/meshes?check=strict"] {
         let refused = server.post(path, &[], &body);
@@ -427,23 +427,24 @@ fn reading_counts_against_the_memory_limit() {
 #[test]
 fn abandoned_uploads_are_read_one_at_a_time_and_cancelled() {
     let server = fake(|c| c.jobs.workers = 1);
-    let body = compressed_atoms();
-    let head = format!("POST /v1/structures HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    let body = compressed_atoms(300_000);
+    let head = format!("POST /v1/structures HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", body.len());
     let mut most: f64 = 0.0;
     let mut measure = || most = most.max(server.metric("molmesh_memory_held_bytes", &[]));
-    for _ in 0..12 {
+    for _ in 0..4 {
         let mut stream = connect(server.addr);
         stream.write_all(&[head.as_bytes(), &body].concat()).unwrap();
-        measure();
-        std::thread::sleep(Duration::from_millis(50));
-        measure();
+        for _ in 0..5 {
+            std::thread::sleep(Duration::from_millis(10));
+            measure();
+        }
     }
     wait_for("the readings to stop", || {
         measure();
         server.metric("molmesh_memory_held_bytes", &[]) == 0.0
     });
-    // A reading holds 24 MB while its text grows from 8 to 16 MB, or 16 MB and 6 MB of atoms.
-    assert!(most > 1e6 && most < 30e6 + 12.0 * body.len() as f64, "{most}");
+    // A reading holds 50 MB while its text grows from 17 to 34 MB, or 34 MB and 18 MB of atoms.
+    assert!(most > 10e6 && most < 60e6 + 4.0 * body.len() as f64 && body.len() < 8_000_000, "{most}");
     assert_eq!(server.post("/v1/structures", &[], &carbons(1000)).status, 201);
 }
 

@@ -301,7 +301,7 @@ fn mmcif() -> Vec<Row> {
             body: chains().into_bytes(),
             ..empty_selection("none of 100,000 chains", "chains=Z", "chains", "Z", "c0")
         },
-        beyond("100,001 atoms", many(ATOMS + 1, |_| "A . 1 1 2 3\n".to_owned()), 422, "too-many-atoms", ATOMS),
+        beyond("100,001 atoms", many(ATOMS + 1, |i| format!("A . 1 {i} 2 3\n")), 422, "too-many-atoms", ATOMS),
         beyond("blanks beyond every limit", vec![b' '; 9 << 20], 413, "body-too-large", BODY_BYTES),
     ]
 }
