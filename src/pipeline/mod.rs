@@ -254,7 +254,7 @@ fn read(
     // Selecting holds an index for each atom, and a sphere for each selected one.
     control.memory.grow(INDEX_BYTES * structure.len() as u64).map_err(SurfaceError::from)?;
     let (selected, spheres) = clock.time("select", || -> Result<_, JobError> {
-        let selected = structure::select(&structure, &job.selection)?;
+        let selected = structure::select_with(&structure, &job.selection, control)?;
         control.check()?;
         control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
         let spheres = selected.spheres(&structure)?;

@@ -284,7 +284,7 @@ impl Columns {
         reading: &Reading<'_>,
     ) -> Result<Structure, StructureError> {
         duplicates::check(self.len(), |row| self.place(row), reading)?;
-        kinds::assign(&mut self, &tables, &source.sequence);
+        kinds::assign(&mut self, &tables, &source.sequence, reading)?;
         if tables.label_chain.is_empty() {
             self.label_chain = Vec::new();
         }

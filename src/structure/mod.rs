@@ -42,6 +42,6 @@ pub use atoms::{SourceFormat, Structure};
 pub use contents::{Contents, Kind};
 pub use error::StructureError;
 pub use read::{ReadLimits, read, read_with};
-pub use select::{BadKinds, LeftOut, Selected, Selection, select};
+pub use select::{BadKinds, LeftOut, Selected, Selection, select, select_with};
 pub use survey::{Survey, survey};
 pub use texts::TextColumn;

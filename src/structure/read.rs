@@ -48,7 +48,7 @@ impl<'a> Reading<'a> {
 
     /// Fails if the caller cancelled.
     pub(super) fn check(&self) -> Result<(), StructureError> {
-        if self.control.cancel.is_cancelled() { Err(StructureError::Cancelled) } else { Ok(()) }
+        check(self.control)
     }
 
     /// Reserves memory until the reservation is dropped.
@@ -60,6 +60,11 @@ impl<'a> Reading<'a> {
     pub(super) fn keep_texts(&self, n: usize) -> Result<(), StructureError> {
         Ok(self.control.memory.grow(BYTES_PER_TEXT * n as u64)?)
     }
+}
+
+/// Fails if the caller cancelled.
+pub(super) fn check(control: &Control<'_>) -> Result<(), StructureError> {
+    if control.cancel.is_cancelled() { Err(StructureError::Cancelled) } else { Ok(()) }
 }
 
 /// Largest accepted coordinate (Å, absolute value per axis). No structure file format has columns for larger values.
