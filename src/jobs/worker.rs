@@ -11,13 +11,10 @@ use super::coalesced_job::Entry;
 use super::pool::Shared;
 use super::{Failure, Finished, JobId, Lease, Outcome};
 use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report};
-use crate::structure::strict_validator::{self, Diagnostic, Level};
+use crate::structure::strict_validator::{self, Diagnostic, Level, MAX_UNREAD_BYTES};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, Control, SurfaceError};
 use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan};
-
-/// Size limit of files that the strict validator examines after a failure, bytes: it takes 10 to 40 ms for this size.
-const MAX_EXPLAINED: u64 = 512 << 10;
 
 /// Runs jobs until the queue is closed and empty.
 pub(super) fn work(shared: &Shared) {
@@ -148,7 +145,7 @@ fn check(shared: &Shared, input: &[u8], control: &Control<'_>) -> Result<Vec<Dia
 fn explained(shared: &Shared, input: &[u8], error: JobError, control: &Control<'_>) -> Failure {
     let unreadable =
         matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
-    let limits = ReadLimits { max_inflated_bytes: MAX_EXPLAINED, ..shared.settings.limits.read };
+    let limits = ReadLimits { max_inflated_bytes: MAX_UNREAD_BYTES, ..shared.settings.limits.read };
     // If the strict validator fails as well, there are no findings.
     if !unreadable {
         return error.into();

@@ -31,6 +31,8 @@ pub mod select;
 mod sites;
 mod sniff;
 #[cfg(feature = "strict")]
+mod strict_cost;
+#[cfg(feature = "strict")]
 pub mod strict_validator;
 mod survey;
 mod text;
