@@ -389,6 +389,19 @@ fn parameters() -> Vec<Row> {
         parameter("an unknown kernel", "kernel=sphere", "kernel", "sphere"),
         parameter("half of the paper's parameters", "paper_a=1", "paper_a", "1"),
         parameter("a chain without a name", "chains=,", "chains", ","),
+        Row {
+            named: vec![
+                ("parameter", Is::Equal("chains".into())),
+                ("expected", Is::Equal("at most 4096 bytes".into())),
+            ],
+            ..parameter("chains of 4 KB", &format!("chains=A{}", ",A".repeat(2048)), "", "")
+        },
+        parameter(
+            "chains of almost 4 KB",
+            &format!("chains=A{},", ",A".repeat(2047)),
+            "chains",
+            format!("A{}", ",A".repeat(31)) + ",",
+        ),
         parameter("a model beyond 32 bits", "model=99999999999", "model", "99999999999"),
         parameter("an altloc of two letters", "altloc=AB", "altloc", "AB"),
         parameter("an unknown kind of atoms", "select=everything", "select", "everything"),
