@@ -3,6 +3,8 @@
 
 use crate::cli_support;
 
+#[cfg(target_os = "linux")]
+use std::io::Write as _;
 use std::process::Command;
 #[cfg(target_os = "linux")]
 use std::time::{Duration, Instant};
@@ -222,6 +224,28 @@ fn identical_atoms_are_rejected_before_allocation() {
     assert_eq!(problem["type"], "/problems/too-many-candidates", "{problem}");
     assert!(problem["actual"].as_u64() > problem["limit"].as_u64(), "{problem}");
     assert!(service.memory("VmHWM") < 300, "{} MiB", service.memory("VmHWM"));
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn memory_of_a_structure_is_returned() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--devices", "cpu"]);
+    let before = service.memory("VmRSS");
+    let atoms: Vec<[f64; 3]> =
+        (0..1_000_000_u32).map(|i| [i % 100, i / 100 % 100, i / 10_000].map(f64::from)).collect();
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(cli_support::pdb(&atoms).as_bytes()).unwrap();
+    let input = folder.file("large.pdb.gz", encoder.finish().unwrap());
+    let url = format!("http://{}/v1/structures", service.addr);
+    let structure = curl(&["--data-binary", &format!("@{}", input.display()), &url]);
+    assert_eq!(structure["atoms"], 1_000_000, "{structure}");
+    assert!(service.memory("VmHWM") > before + 100, "{} MiB", service.memory("VmHWM"));
+    let end = Instant::now() + Duration::from_secs(9);
+    while service.memory("VmRSS") > before + 60 {
+        assert!(Instant::now() < end, "{} MiB, {before} before", service.memory("VmRSS"));
+        std::thread::sleep(Duration::from_millis(50));
+    }
 }
 
 #[cfg(target_os = "linux")]
