@@ -1,6 +1,7 @@
 # Main targets: `make run` and `make test`. `make help` lists all targets.
 #
-# Optional variables: PROFILE=release runs optimized tests; ARGS passes flags to `make run`.
+# Optional variables: PROFILE=release runs optimized tests; ARGS passes flags to `make run`; SECONDS=180 fuzzes each
+# target for longer.
 
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
@@ -8,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
+.PHONY: help run test interleavings fuzz chaos soak nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -18,7 +19,7 @@ run: web-if-possible ## Build (the first time takes minutes) and serve on http:/
 
 # The steps add a line to this file for each check that they skip; the last step prints it.
 test: export SKIPPED := $(CURDIR)/target/skipped
-test: nothing-skipped tools web fmt-check lint deny-if-installed matrix static-if-possible tests ## All checks and tests; installs what they need
+test: nothing-skipped tools web fmt-check lint deny-if-installed matrix static-if-possible interleavings tests ## All checks and tests; installs what they need
 
 nothing-skipped:
 	@mkdir -p target && : >"$$SKIPPED"
@@ -51,6 +52,9 @@ matrix: ## Clippy on the other supported combinations of features
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
 
+interleavings: ## Explore interleavings of threads and tasks in the queue, the device pool and the store (Shuttle)
+	$(CARGO) test --quiet --locked --lib --features shuttle interleavings
+
 deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (three minutes) when absent
 	@command -v cargo-deny >/dev/null || $(CARGO) install cargo-deny --locked
 	$(CARGO) deny --workspace check licenses bans sources
@@ -75,6 +79,22 @@ container: $(if $(BINARY),,release) ## Build and test the images (two to four mi
 tests: ## Run only the tests
 	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)
 
+# The wrapper compiles the library with counters that guide the fuzzer. Dependencies are those of the tests.
+fuzz: override SECONDS := $(or $(SECONDS),30)
+fuzz: ## Fuzz readers, configuration, keys, records and requests, 30 s per target
+	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/fuzz/rustc.sh $(CARGO) build --locked --package molmesh-fuzz --target-dir target
+	target/debug/molmesh-fuzz --seconds $(SECONDS)
+
+# BINARY=target/debug/molmesh uses the binary of the tests.
+chaos: override KILLS := $(or $(KILLS),200)
+chaos: $(if $(BINARY),,release) ## Kill the service at random points, KILLS=200 times, and check that no job is lost
+	python3 benches/load/chaos.py $(or $(BINARY),target/release/molmesh) samples/4pti.pdb --kills $(KILLS)
+
+soak: override HOURS := $(or $(HOURS),1)
+soak: $(if $(BINARY),,release) ## Mixed load for HOURS=1, and check that nothing grows
+	python3 benches/load/soak.py $(or $(BINARY),target/release/molmesh) samples/4pti.pdb samples/1crn.cif \
+		--minutes $$(python3 -c 'print(60 * $(HOURS))')
+
 bench: ## Run the benchmarks
 	$(CARGO) bench
 
@@ -91,7 +111,8 @@ release: web-if-possible ## Build the optimized binary, target/release/molmesh
 static: ## Build the command line as a static file for any Linux, CPU only: dist/molmesh; installs what it needs
 	deploy/static.sh
 
-# Without Linux or network access, the tests of the static executable are skipped. A failed build is an error.
+# Without Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A failed build
+# is an error.
 static-if-possible:
 	@deploy/static.sh || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
 

@@ -30,6 +30,9 @@ pub mod access;
 pub mod archive;
 #[cfg(feature = "server")]
 pub mod config;
+#[cfg(feature = "server")]
+#[doc(hidden)]
+pub mod fuzzing;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 #[cfg(feature = "server")]
@@ -42,6 +45,8 @@ pub mod memory_budget;
 mod single_flight;
 #[cfg(feature = "server")]
 pub mod store;
+#[cfg(any(feature = "server", feature = "gpu"))]
+mod sync;
 #[cfg(feature = "server")]
 pub mod telemetry;
 #[cfg(feature = "server")]

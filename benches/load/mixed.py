@@ -31,8 +31,7 @@ class Server:
     def start(self):
         """Starts the service. Returns the time until it is ready, s."""
         begin = time.perf_counter()
-        with open(self.log, "ab") as log:
-            self.process = subprocess.Popen(self.command, stdout=log, stderr=log)
+        self.launch()
         while True:
             try:
                 if fetch(self.port, "GET", "/readyz")[0] == 200:
@@ -42,6 +41,11 @@ class Server:
             if self.process.poll() is not None:
                 raise SystemExit(f"the server ended with {self.process.returncode}: see {self.log}")
             time.sleep(0.01)
+
+    def launch(self):
+        """Starts the process."""
+        with open(self.log, "ab") as log:
+            self.process = subprocess.Popen(self.command, stdout=log, stderr=log)
 
     def stop(self):
         """Stops the service with SIGTERM. Returns its exit code and the time until it has ended, s."""

@@ -20,7 +20,7 @@ const NAMES: [&str; 9] = ["id", "hash", "scopes", "requests", "work_s", "concurr
 type Field<'a> = (Range<usize>, &'a DeValue<'a>);
 
 /// Parses a key file. `window_s` is the quota window of keys without their own, s.
-pub(super) fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> {
+pub(crate) fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> {
     let wrong = |span: Range<usize>, reason: String| KeyFileError { line: line_of(text, span.start), reason };
     let table = DeTable::parse(text).map_err(|e| wrong(e.span().unwrap_or_default(), e.message().to_owned()))?;
     let mut keys = BTreeMap::new();

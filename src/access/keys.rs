@@ -71,7 +71,7 @@ pub(crate) enum Denied {
 
 /// All keys, by id.
 #[derive(Debug, Clone, Default)]
-pub(super) struct KeyRing(pub(super) BTreeMap<String, Arc<Key>>);
+pub(crate) struct KeyRing(pub(super) BTreeMap<String, Arc<Key>>);
 
 impl KeyRing {
     /// Returns the key with this text. Reports expiry only for the correct secret.

@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 use super::args::{JobArgs, ReportStyle};
 use super::backend::{self, BackendRequest, Purpose, SelectedBackend};
 use super::error::CliError;
-use super::output::{Output, is_stdio};
+use super::output::{self, Output, is_stdio};
 use super::progress::Progress;
 use super::style::Style;
 use super::summary::{self, Written};
@@ -41,15 +41,18 @@ impl<'a> CommandJob<'a> {
         job: Job,
         strict: bool,
         (path, output): (&'a Path, &Path),
+        format: Format,
         args: &'a JobArgs,
-        purpose: Purpose,
     ) -> Result<(Self, Output), CliError> {
         let limits = request::limits(&args.limits);
+        let purpose = if format.is_picture() { Purpose::Picture } else { Purpose::Mesh };
         let mut requested = BackendRequest::of_command(args, purpose);
         backend::check(&requested)?;
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
+        output::refuse_input(path, output)?;
         let output = Output::open(output, &cancel)?;
+        output.refuse_terminal(format)?;
         let input = read(path, limits.read.max_inflated_bytes)?;
         requested.work = Some(pipeline::estimate_work(&input, &job));
         let selected = backend::select(&requested)?;

@@ -10,7 +10,6 @@ use molmesh::pipeline::{JobError, Product, ProgressSink};
 use molmesh::surface::SurfaceError;
 
 use super::args::MeshArgs;
-use super::backend::Purpose;
 use super::error::CliError;
 use super::job::CommandJob;
 use super::output::{Output, is_stdio};
@@ -28,7 +27,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     }
     request::set_format(&mut job, format)?;
     let paths = (args.input.as_path(), args.output.as_path());
-    let (job, mut output) = CommandJob::prepare(job, strict, paths, &args.job, Purpose::Mesh)?;
+    let (job, mut output) = CommandJob::prepare(job, strict, paths, format, &args.job)?;
     let product = if format == Format::Glb && output.has_random_access() {
         run_to_file(&job, &output)?
     } else {

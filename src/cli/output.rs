@@ -1,11 +1,11 @@
 //! Output of a command: stdout, or a file that gets its name only when it is complete.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
+use std::io::{self, IsTerminal as _, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use molmesh::formats::RandomAccess;
+use molmesh::formats::{Format, RandomAccess};
 use molmesh::surface::CancelToken;
 
 use super::error::CliError;
@@ -56,6 +56,20 @@ impl Output {
     /// Returns true if the mesh goes to stdout.
     pub(crate) fn is_stdout(&self) -> bool {
         matches!(self.to, To::Stdout(_))
+    }
+
+    /// Rejects a binary format on a terminal, which would interpret the bytes as commands.
+    pub(crate) fn refuse_terminal(&self, format: Format) -> Result<(), CliError> {
+        let terminal = match &self.to {
+            To::Stdout(out) => out.is_terminal(),
+            To::Device(file) => file.is_terminal(),
+            To::Staged { .. } => false,
+        };
+        if !terminal || format.is_text() {
+            return Ok(());
+        }
+        let message = format!("{} is a terminal, and {format} is a binary format", self.name);
+        Err(CliError::Usage { message, hint: Some("name a file with -o, or redirect the output".to_owned()) })
     }
 
     /// Renames the file to its final name.
@@ -125,6 +139,36 @@ impl Write for Output {
 /// Returns true if `path` denotes stdin or stdout.
 pub(crate) fn is_stdio(path: &Path) -> bool {
     path.as_os_str() == "-"
+}
+
+/// Rejects an output that would replace the input.
+pub(crate) fn refuse_input(input: &Path, output: &Path) -> Result<(), CliError> {
+    let is_input = !is_stdio(output) && same_file(input, output).unwrap_or(false);
+    if !is_input {
+        return Ok(());
+    }
+    let message = format!("the output `{}` is the input", output.display());
+    Err(CliError::Usage { message, hint: Some("name another file with -o".to_owned()) })
+}
+
+/// Returns true if both are the same regular file, also through links or a redirected stdin.
+#[cfg(unix)]
+fn same_file(input: &Path, output: &Path) -> io::Result<bool> {
+    use std::os::fd::AsFd as _;
+    use std::os::unix::fs::MetadataExt as _;
+
+    let input = if is_stdio(input) {
+        File::from(io::stdin().as_fd().try_clone_to_owned()?).metadata()?
+    } else {
+        fs::metadata(input)?
+    };
+    let output = fs::metadata(output)?;
+    Ok(output.is_file() && (input.dev(), input.ino()) == (output.dev(), output.ino()))
+}
+
+#[cfg(not(unix))]
+fn same_file(input: &Path, output: &Path) -> io::Result<bool> {
+    Ok(input.canonicalize()? == output.canonicalize()?)
 }
 
 fn open_file(path: &Path) -> io::Result<To> {

@@ -7,7 +7,6 @@ use molmesh::formats::Format;
 use molmesh::pipeline::params::Request;
 
 use super::args::RenderArgs;
-use super::backend::Purpose;
 use super::error::CliError;
 use super::job::CommandJob;
 use super::output::is_stdio;
@@ -18,7 +17,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     let Request { job, strict, .. } = request::of_render(args)?;
     require_png(&args.output)?;
     let paths = (args.input.as_path(), args.output.as_path());
-    let (job, mut output) = CommandJob::prepare(job, strict, paths, &args.job, Purpose::Picture)?;
+    let (job, mut output) = CommandJob::prepare(job, strict, paths, Format::Png, &args.job)?;
     let mut product = job.run(None).map_err(|source| job.failure(source))?;
     job.draw(&mut product).map_err(|source| job.failure(source))?;
     let start = Instant::now();

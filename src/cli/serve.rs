@@ -4,7 +4,7 @@ use std::io::{self, Write};
 use std::sync::Arc;
 use std::time::Duration;
 
-use molmesh::config::Loaded;
+use molmesh::config::{Loaded, LogFormat};
 use molmesh::http::{Chosen, ServeError, Server, has_viewer, shutdown_signals};
 use molmesh::store::LockError;
 use molmesh::structure::strict_validator;
@@ -34,6 +34,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     for warning in warnings {
         tracing::warn!("{warning}");
     }
+    let json = config.log.format == LogFormat::Json;
     strict_validator::quiet_panics();
     let selected = backend::select(&BackendRequest::of_service(args.backend, &config.devices))?;
     let others = survey::backends(&selected).into_iter().chain(survey::unused_devices(&selected)).collect();
@@ -66,9 +67,14 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
                 error => CliError::Service(error.to_string()),
             }
         })?;
-    let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
-    // A closed stderr does not stop the service.
-    drop(io::stderr().write_all(text.as_bytes()));
+    if json {
+        let metrics = server.metrics_addr().map(|addr| addr.to_string());
+        tracing::info!(address = %server.addr(), metrics, device = facts.device, reason = facts.reason, "listening");
+    } else {
+        let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
+        // A closed stderr does not stop the service.
+        drop(io::stderr().write_all(text.as_bytes()));
+    }
 
     let drained =
         runtime.block_on(async { server.run(shutdown_signals()).await }).map_err(|e| CliError::Service(e.to_string()));

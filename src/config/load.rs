@@ -107,7 +107,7 @@ pub fn load(
             }
         }
     }
-    let mut env: Vec<_> = env.into_iter().filter(|(name, _)| name.starts_with(PREFIX)).collect();
+    let (mut env, others): (Vec<_>, Vec<_>) = env.into_iter().partition(|(name, _)| name.starts_with(PREFIX));
     env.sort();
     for (name, value) in env {
         let key = name[PREFIX.len()..].to_ascii_lowercase().replace("__", ".");
@@ -116,7 +116,8 @@ pub fn load(
     for (key, value) in flags {
         tree.set(key, &Value::String(value.clone()), &Source::Flag)?;
     }
-    let warnings = tree.read_secrets()?;
+    let mut warnings = tree.read_secrets()?;
+    warnings.extend(others.iter().filter_map(|(name, _)| tree.misspelt(name)));
     Ok(Loaded { config: tree.config, warnings, sources: tree.sources })
 }
 
@@ -135,11 +136,26 @@ impl Tree {
         Self { values: defaults.clone(), defaults, config, sources: BTreeMap::new() }
     }
 
-    fn unknown(&self, key: &str, source_layer: Source) -> ConfigError {
-        let mut known = Vec::new();
-        for (section, keys) in self.defaults.as_object().into_iter().flatten() {
-            known.extend(keys.as_object().into_iter().flatten().map(|(key, _)| format!("{section}.{key}")));
+    /// Returns a warning for a variable such as `MOLMESH_LIMITS_ATOMS`, which lacks an underscore and is ignored.
+    fn misspelt(&self, variable: &str) -> Option<String> {
+        let plain = |text: &str| text.to_ascii_lowercase().replace("__", "_");
+        let name = plain(variable.strip_prefix("MOLMESH_")?);
+        let key = self.keys().into_iter().find(|key| key.replace('.', "_") == name)?;
+        let meant = format!("{PREFIX}{}", key.replace('.', "__").to_ascii_uppercase());
+        Some(format!("the variable {variable} is ignored: {key} is set by {meant}, with two underscores"))
+    }
+
+    /// Returns the paths of all keys.
+    fn keys(&self) -> Vec<String> {
+        let mut keys = Vec::new();
+        for (section, entries) in self.defaults.as_object().into_iter().flatten() {
+            keys.extend(entries.as_object().into_iter().flatten().map(|(key, _)| format!("{section}.{key}")));
         }
+        keys
+    }
+
+    fn unknown(&self, key: &str, source_layer: Source) -> ConfigError {
+        let known = self.keys();
         // A key in the wrong section or in none: suggest the key of the same name.
         let last = key.rsplit('.').next().unwrap_or(key);
         let namesake = known.iter().find(|k| k.rsplit('.').next() == Some(last)).cloned();

@@ -54,6 +54,12 @@ impl Format {
         matches!(self, Self::Png)
     }
 
+    /// Returns true if files of the format are text.
+    #[must_use]
+    pub const fn is_text(self) -> bool {
+        matches!(self, Self::Gltf | Self::Obj)
+    }
+
     /// Returns true if the format can hold quantized vertices.
     #[must_use]
     pub const fn holds_quantized(self) -> bool {

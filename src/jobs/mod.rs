@@ -12,6 +12,9 @@ mod cost;
 mod devices;
 mod durable_job;
 mod error;
+#[cfg(test)]
+#[cfg(feature = "shuttle")]
+mod interleavings;
 mod job_store;
 mod key;
 mod pool;
@@ -32,7 +35,7 @@ pub(crate) use job_store::{JobSpec, JobStore, JobView};
 pub(crate) use key::ContentKey;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
-pub(crate) use record::{JobId, Status, rfc3339};
+pub(crate) use record::{JobId, Record, Status, rfc3339};
 pub(crate) use results::{REPORT, SaveError, is_stored, save};
 pub(crate) use ticket::Ticket;
 

@@ -221,7 +221,7 @@ impl Record {
     }
 
     /// Parses the stored parameters and the format.
-    pub(super) fn request(&self) -> Result<(params::Request, Format), String> {
+    pub(crate) fn request(&self) -> Result<(params::Request, Format), String> {
         let mut request = params::parse(self.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
         let format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
         params::set_format(&mut request.job, format).map_err(|e| e.to_string())?;

@@ -219,6 +219,17 @@ await run({
     assert.equal((await described(page)).name, "1CRN");
   },
 
+  "a hostile title or file name is shown as text": async () => {
+    const attack = '<img src=x onerror="window.hit=1">';
+    const atoms = readFileSync(sample("4pti.pdb"), "latin1").replace(/^TITLE.*\n/gm, "");
+    await remeshed(page, () => drop(page, `${attack}.pdb`, Buffer.from(`TITLE     ${attack} \u001b[31m\n${atoms}`, "latin1")));
+    const now = await described(page);
+    assert.ok(now.words.includes(attack) && !now.words.includes("\u001b"), now.words);
+    assert.equal(await page.locator("img[src=x]").count(), 0);
+    assert.equal(await page.evaluate(() => window.hit), undefined);
+    assert.ok(now.title.endsWith("molmesh"), now.title);
+  },
+
   "a structure that the service forgets is sent again, once": async () => {
     const forgotten = { status: 404, contentType: "application/problem+json", body: JSON.stringify({ type: "/problems/no-such-structure", title: "There is no such structure", status: 404 }) };
     await remeshed(page, () => drop(page, "1crn.cif", readFileSync(sample("1crn.cif"))));

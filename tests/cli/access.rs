@@ -39,7 +39,6 @@ fn keys_and_signed_urls_work_and_are_not_logged() {
     let (config, file) = (config.to_str().unwrap(), format!("access.keys_file={}", file.display()));
     let service =
         Service::start(&folder, &["--config", config, "--set", &file, "--set", "log.filter=trace", "--log", "json"]);
-    assert!(service.banner.contains("$MOLMESH_KEY"), "{}", service.banner);
     let base = format!("http://{}", service.addr);
     let address = format!("{base}/v1/capabilities");
     let signed = stdout(&run(["sign", &address, "--expires", "1h", "--config", config]));

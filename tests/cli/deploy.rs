@@ -117,6 +117,8 @@ fn all_files_of_the_build_are_sent_to_the_builder() {
         "web/build.sh",
         "bench/Cargo.toml",
         "bench/src/main.rs",
+        "fuzz/Cargo.toml",
+        "fuzz/src/main.rs",
     ];
     files.extend(more.into_iter().chain([CONFIGURATIONS[0], "deploy/notices.py"]).map(PathBuf::from));
     let left_out: Vec<_> = files.iter().filter(|path| !deploy_support::sent(&ignore, path)).collect();

@@ -65,9 +65,12 @@ fn all_checks_pass() {
     let folder = Folder::new();
     let done = doctor(&folder, &["--set", "jobs.queue=7"]);
     assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
-    for name in ["config", "log", "memory", "devices", "listen", "store", "archive"] {
+    for name in ["config", "log", "memory", "volume", "devices", "listen", "store", "archive"] {
         let (state, detail) = check(&done, name);
-        assert!(state == "ok" || name == "memory" && state == "warning", "{name} {state}: {detail}");
+        assert!(
+            state == "ok" || ["memory", "volume"].contains(&name) && state == "warning",
+            "{name} {state}: {detail}"
+        );
     }
     let document: Value = serde_json::from_slice(&done.stdout).unwrap();
     assert_eq!(document["molmesh"]["version"], env!("CARGO_PKG_VERSION"));
@@ -81,6 +84,16 @@ fn all_checks_pass() {
     std::fs::create_dir_all(folder.path("data/store/results")).unwrap();
     assert_eq!(doctor(&folder, &[]).status.code(), Some(0));
     assert!(folder.path("data/store/results").is_dir());
+}
+
+#[test]
+fn stores_larger_than_the_volume_are_a_warning() {
+    let folder = Folder::new();
+    let done = doctor(&folder, &["--set", "store.max_bytes=8000000GiB"]);
+    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    let (state, detail) = check(&done, "volume");
+    assert_eq!(state, "warning", "{detail}");
+    assert!(detail.contains("8000000GiB store.max_bytes") && detail.contains("exceed the volume of"), "{detail}");
 }
 
 #[test]
@@ -208,7 +221,7 @@ fn readable_secrets_are_a_warning() {
     let secret = folder.file("secret", "hush");
     std::fs::set_permissions(&secret, std::fs::Permissions::from_mode(0o644)).unwrap();
     let done = doctor(&folder, &["--set", &format!("store.secret_access_key_file={}", secret.display())]);
-    warns(&done, "secrets", "mode 644");
+    warns(&done, "warnings", "mode 644");
     assert!(!stdout(&done).contains("hush"));
 }
 

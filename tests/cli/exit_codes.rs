@@ -194,3 +194,69 @@ fn unreachable_service_exits_with_1() {
     assert_code(&run(["healthcheck", "--url", "ftp://x"]), 2);
     assert_code(&run(["healthcheck", "--timeout=-1"]), 2);
 }
+
+#[cfg(unix)]
+#[test]
+fn the_output_never_replaces_the_input() {
+    let folder = Folder::new();
+    let input = folder.file("a.ply", rod());
+    let (link, hard, picture) = (folder.path("link.ply"), folder.path("hard.ply"), folder.path("a.png"));
+    std::os::unix::fs::symlink(&input, &link).unwrap();
+    fs::hard_link(&input, &hard).unwrap();
+    fs::hard_link(&input, &picture).unwrap();
+    let render = |output: &Path| molmesh().arg("render").arg(&input).arg("-o").arg(output).output().unwrap();
+    let redirected = |output: &Path| {
+        let stdin = fs::File::open(&input).unwrap();
+        molmesh().args(["mesh", "-", "-o"]).arg(output).stdin(stdin).output().unwrap()
+    };
+    for done in [
+        mesh(&input, &input, &[]),
+        mesh(&input, &link, &[]),
+        mesh(&link, &input, &[]),
+        mesh(&input, &hard, &[]),
+        redirected(&input),
+        redirected(&link),
+        render(&picture),
+    ] {
+        assert_code(&done, 2);
+        assert!(stderr(&done).contains("is the input"), "{}", stderr(&done));
+        assert_eq!(fs::read_to_string(&input).unwrap(), rod());
+    }
+    // A copy is another file.
+    let copy = folder.file("copy.ply", rod());
+    assert_code(&mesh(&input, &copy, &[]), 0);
+    assert!(fs::read(&copy).unwrap().starts_with(b"ply"));
+    assert_eq!(folder.entries(), ["a.ply", "a.png", "copy.ply", "hard.ply", "link.ply"]);
+}
+
+/// Runs the binary with a terminal as stdout and stderr. Returns the exit code and what the terminal received.
+#[cfg(target_os = "linux")]
+fn on_a_terminal(args: &str) -> (Option<i32>, Vec<u8>) {
+    let line = format!("{} {args}", env!("CARGO_BIN_EXE_molmesh"));
+    let command = ["-q", "-e", "-c", &line, "/dev/null"];
+    let done = std::process::Command::new("script").args(command).stdin(std::process::Stdio::null()).output();
+    let done = done.expect("`script` of util-linux");
+    (done.status.code(), done.stdout)
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn binary_files_are_not_written_to_a_terminal() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let input = input.display();
+    for args in [
+        format!("mesh {input} -o -"),
+        format!("mesh {input} -o - --format stl"),
+        format!("mesh {input} -o /dev/tty --format ply"),
+        format!("render {input} -o -"),
+    ] {
+        let (code, shown) = on_a_terminal(&args);
+        let shown = String::from_utf8(shown).unwrap();
+        assert_eq!(code, Some(2), "{args}: {shown}");
+        assert!(shown.contains("is a terminal, and") && shown.contains("hint:"), "{args}: {shown}");
+    }
+    let (code, shown) = on_a_terminal(&format!("mesh {input} -o - --format obj --quiet"));
+    assert_eq!(code, Some(0));
+    assert!(String::from_utf8_lossy(&shown).contains("\r\nv "), "text formats may be shown");
+}

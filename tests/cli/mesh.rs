@@ -375,3 +375,22 @@ fn report_lists_at_most_100_voids() {
         assert!(center.iter().all(|c| (0.0..20.0).contains(&c.as_f64().unwrap())), "{void}");
     }
 }
+
+#[test]
+fn hostile_titles_do_not_reach_the_terminal() {
+    let folder = Folder::new();
+    let title = "<img src=x onerror=alert(1)> \u{1b}[2J\u{1b}]0;owned\u{7}\u{9b}31m red";
+    let row = "_atom_site.Cartn_x 1\n_atom_site.Cartn_y 2\n_atom_site.Cartn_z 3\n_atom_site.type_symbol C\n";
+    let cif = folder.file("in.cif", format!("data_x\n_entry.id 1ABC\n_struct.title\n;{title}\n;\n{row}"));
+    let old = folder.file("in.pdb", format!("TITLE     {title}\n{}", rod()));
+    for input in [cif, old] {
+        let text = mesh(&input, &folder.path("out.glb"), &[]);
+        assert_code(&text, 0);
+        let report = mesh(&input, &folder.path("out.glb"), &["--report", "json"]);
+        assert_code(&report, 0);
+        for shown in [stderr(&text), stdout(&report)] {
+            assert!(shown.contains("<img src=x onerror=alert(1)>"), "the title is shown as it is: {shown}");
+            assert!(!shown.chars().any(|c| c.is_control() && c != '\n'), "{shown:?}");
+        }
+    }
+}

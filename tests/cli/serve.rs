@@ -31,12 +31,23 @@ fn example_command_of_the_banner_works() {
 fn stops_on_signals_without_warnings() {
     for signal in ["TERM", "INT"] {
         let folder = Folder::new();
-        let (code, log) = Service::start(&folder, &["--log", "json"]).stop(signal);
+        let service = Service::start(&folder, &["--log", "json", "--devices", "cpu"]);
+        let (mut lines, addr) = (service.banner.clone(), service.addr.clone());
+        let (code, log) = service.stop(signal);
         assert_eq!(code, Some(0), "{log}");
-        for line in log.lines() {
+        lines.push_str(&log);
+        let mut listening = 0;
+        for line in lines.lines() {
             let value: serde_json::Value = serde_json::from_str(line).unwrap_or_else(|e| panic!("{e}: {line}"));
             assert!(!["WARN", "ERROR"].contains(&value["level"].as_str().unwrap()), "{line}");
+            if value["message"] == "listening" {
+                listening += 1;
+                assert_eq!(value["address"], addr, "{line}");
+                assert!(value["metrics"].as_str().is_some_and(|metrics| metrics.starts_with("127.0.0.1:")), "{line}");
+                assert!(value["device"].as_str().is_some_and(|device| device.starts_with("cpu")), "{line}");
+            }
         }
+        assert_eq!(listening, 1, "{lines}");
     }
 }
 

@@ -1,8 +1,9 @@
 //! The static executable of `make static`, without the service.
 #![cfg(target_os = "linux")]
-#![expect(clippy::unwrap_used, clippy::print_stdout, reason = "tests fail by panicking and print what they skip")]
+#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
 use crate::cli_support;
+use crate::tools;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -32,8 +33,7 @@ fn tool() -> Option<PathBuf> {
         return Some(tool);
     }
     let why = if built.is_some() { "is older than the sources" } else { "does not exist" };
-    println!("SKIPPED: dist/molmesh {why}; make static builds it");
-    None
+    tools::skip(&format!("dist/molmesh {why}; make static builds it"))
 }
 
 fn run(tool: &Path, args: &[&str]) -> Output {

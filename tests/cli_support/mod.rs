@@ -126,7 +126,7 @@ pub struct Service {
     child: std::process::Child,
     /// Address, such as `127.0.0.1:41234`.
     pub addr: String,
-    /// Banner.
+    /// Banner, or the first lines of a JSON log.
     pub banner: String,
     log: Option<std::thread::JoinHandle<String>>,
 }
@@ -148,14 +148,20 @@ impl Service {
             let line = lines.next().unwrap_or_else(|| panic!("the service ended after\n{banner}")).unwrap();
             banner.push_str(&line);
             banner.push('\n');
-            if line.trim_start().starts_with("try ") {
+            // The last line of the banner, or the event that replaces it in a JSON log.
+            if line.trim_start().starts_with("try ") || line.contains("\"listening\"") {
                 break;
             }
         }
         // Read the rest of the log, as a full pipe would block the service.
         let log = std::thread::spawn(move || lines.map_while(Result::ok).collect::<Vec<_>>().join("\n"));
-        let viewer = banner.lines().find(|l| l.contains("viewer")).unwrap();
-        let addr = viewer.split("http://").nth(1).unwrap().trim_end_matches('/').to_owned();
+        let json = banner.lines().last().and_then(|line| serde_json::from_str::<serde_json::Value>(line).ok());
+        let addr = if let Some(event) = json {
+            event["address"].as_str().unwrap().to_owned()
+        } else {
+            let viewer = banner.lines().find(|l| l.contains("viewer")).unwrap();
+            viewer.split("http://").nth(1).unwrap().trim_end_matches('/').to_owned()
+        };
         let service = Self { child, addr, banner, log: Some(log) };
         let start = std::time::Instant::now();
         while !service.ready() {

@@ -6,7 +6,6 @@
     clippy::pedantic,
     clippy::unwrap_used,
     clippy::panic,
-    clippy::print_stderr,
     reason = "tests fail by panicking and print what they skip"
 )]
 
@@ -23,7 +22,6 @@ use molmesh::surface::{Backend, Control, CpuBackend, SurfaceLimits, SurfaceOptio
 use serde::Deserialize;
 use tools::files::encoded;
 
-const FOLDER: &str = "../shared/data/structures";
 const VARIANTS: [&str; 7] = ["plain", "packed", "bytes", "texts", "compressed", "single", "quantized"];
 
 fn structure(path: &Path) -> Structure {
@@ -38,12 +36,7 @@ fn anonymous(structure: &Structure) -> Structure {
 
 /// Returns a file of the folder beside the repository.
 fn beside(name: &str) -> Option<PathBuf> {
-    let path = Path::new(FOLDER).join(name);
-    let there = path.is_file();
-    if !there {
-        eprintln!("SKIPPED: {} is missing", path.display());
-    }
-    there.then_some(path)
+    tools::structures().map(|folder| folder.join(name))
 }
 
 /// mmCIF files: crambin; four more with alternative locations, several models, ligands, insertion codes.

@@ -4,7 +4,7 @@
 //! The samples always run. Structures in a folder beside the repository run too: those of up to [`EVERYDAY`] atoms on
 //! every run, all of them with `MOLMESH_ALL_STRUCTURES=1`.
 
-#![expect(clippy::unwrap_used, clippy::panic, clippy::print_stderr, reason = "tests fail by panicking")]
+#![expect(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 use crate::tools;
 
@@ -32,15 +32,7 @@ struct Case {
 }
 
 fn folders() -> Vec<PathBuf> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut folders = vec![root.join("samples")];
-    let beside = root.join("../shared/data/structures");
-    if beside.is_dir() {
-        folders.push(beside);
-    } else {
-        eprintln!("SKIPPED: no folder of structures beside the repository; the samples run alone");
-    }
-    folders
+    [Path::new(env!("CARGO_MANIFEST_DIR")).join("samples")].into_iter().chain(tools::structures()).collect()
 }
 
 /// Returns all available structures with atoms, smallest first. Asserts that the others are rejected as expected.

@@ -22,10 +22,8 @@ const FOLDER: &str = "../shared/data/structures";
 
 /// Rows of SOURCES.tsv: file, atoms, models.
 fn sources() -> Vec<(String, Option<usize>, Option<usize>)> {
-    let Ok(list) = std::fs::read_to_string(Path::new(FOLDER).join("SOURCES.tsv")) else {
-        eprintln!("SKIPPED: {FOLDER}/SOURCES.tsv is not there");
-        return Vec::new();
-    };
+    let Some(folder) = tools::structures() else { return Vec::new() };
+    let list = std::fs::read_to_string(folder.join("SOURCES.tsv")).expect("the folder has a list");
     let rows = list.lines().skip(1).map(|line| line.split('\t').collect::<Vec<_>>());
     rows.map(|row| (row[0].to_owned(), row[3].parse().ok(), row[4].parse().ok())).collect()
 }

@@ -253,3 +253,18 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         seen.push(text);
     }
 }
+
+#[test]
+fn variables_without_two_underscores_are_reported() {
+    let warnings = |name: &str| load(None, pairs(&[(name, "7")]), &[]).unwrap().warnings;
+    for name in ["MOLMESH_LIMITS_ATOMS", "MOLMESH_LIMITS__ATOMS", "MOLMESH_limits_atoms"] {
+        let [warning] = &warnings(name)[..] else { panic!("{name}: {:?}", warnings(name)) };
+        assert!(warning.contains(name) && warning.contains(" MOLMESH__LIMITS__ATOMS,"), "{warning}");
+    }
+    let [of_many] = &warnings("MOLMESH_SERVER_HEADER_TIMEOUT_MS")[..] else { panic!("one warning") };
+    assert!(of_many.contains(" MOLMESH__SERVER__HEADER_TIMEOUT_MS,"), "{of_many}");
+    for name in ["MOLMESH_CONFIG", "MOLMESH_KEY", "LIMITS_ATOMS", "OTHER_LIMITS_ATOMS"] {
+        assert_eq!(warnings(name), [""; 0], "{name}");
+    }
+    assert_eq!(load(None, pairs(&[("MOLMESH_LIMITS_ATOMS", "7")]), &[]).unwrap().config, Config::default());
+}

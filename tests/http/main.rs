@@ -37,6 +37,7 @@ mod openapi_clients;
 mod openapi_statuses;
 mod origins;
 mod pictures;
+mod raw_sockets;
 mod ready;
 mod results;
 mod schemathesis;

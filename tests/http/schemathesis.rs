@@ -1,5 +1,5 @@
 //! Schemathesis generates valid and invalid requests from the OpenAPI document and checks the responses against it. The
-//! requests are the same in every run; the settings are in `tests/tools/schemathesis.toml`.
+//! seed is random and printed; `MOLMESH_SEED` repeats a run. The settings are in `tests/tools/schemathesis.toml`.
 
 use crate::http_support;
 use crate::tools;
@@ -7,6 +7,7 @@ use crate::tools;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use http_support::{Running, SAMPLE, start};
 use molmesh::surface::CpuBackend;
@@ -32,8 +33,11 @@ fn server() -> Running {
 fn schemathesis(server: &Running, description: &Path, more: &[&str]) -> Option<(bool, String)> {
     let Some(python) = tools::python_interpreter() else { return tools::missing("Schemathesis") };
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
-    let output = Command::new(python.with_file_name("st"))
-        .args(["--config-file", "schemathesis.toml", "--no-color", "run"])
+    let seed = std::env::var("MOLMESH_SEED")
+        .unwrap_or_else(|_unset| SystemTime::now().duration_since(UNIX_EPOCH).unwrap().subsec_nanos().to_string());
+    let output = Command::new(&python)
+        .arg(python.with_file_name("st"))
+        .args(["--config-file", "schemathesis.toml", "--no-color", "run", "--seed", &seed])
         .arg(description)
         .args(["--url", &format!("http://{}", server.addr)])
         .args(more)
@@ -42,7 +46,7 @@ fn schemathesis(server: &Running, description: &Path, more: &[&str]) -> Option<(
         .output()
         .unwrap();
     let printed = [output.stdout, output.stderr].concat();
-    Some((output.status.success(), String::from_utf8_lossy(&printed).into_owned()))
+    Some((output.status.success(), format!("MOLMESH_SEED={seed}\n{}", String::from_utf8_lossy(&printed))))
 }
 
 #[test]

@@ -199,18 +199,44 @@ pub fn python_interpreter() -> Option<PathBuf> {
     python.filter(|_| venv.join(".stamp").is_file())
 }
 
-/// Reports a missing tool: panics if tools are required, otherwise prints a skip message.
+/// Reports a missing tool, as [`skip`] does.
 pub fn missing<T>(tool: &str) -> Option<T> {
-    let required =
-        ["CI", "MOLMESH_REQUIRE_TOOLS"].into_iter().find(|v| std::env::var_os(v).is_some_and(|v| !v.is_empty()));
+    skip(&format!("{tool} is not installed; run tests/tools/setup.sh"))
+}
+
+/// Reports why a test cannot run: panics if `CI` or `MOLMESH_REQUIRE_TOOLS` is set, otherwise prints a skip message.
+pub fn skip<T>(why: &str) -> Option<T> {
+    let required = ["CI", "MOLMESH_REQUIRE_TOOLS"].into_iter().find(|variable| is_set(variable));
     if let Some(variable) = required {
-        panic!("{tool} is not installed and {variable} is set: run tests/tools/setup.sh");
+        panic!("{why} ({variable} is set, so no test may be skipped)");
     }
+    print_skipped(why);
+    None
+}
+
+/// Returns the folder of real structures beside the repository. Where it does not exist, `MOLMESH_NO_STRUCTURES` says
+/// that this is intended, and the tests that need it are skipped even if `CI` is set.
+pub fn structures() -> Option<PathBuf> {
+    let folder = root().join("../shared/data/structures");
+    if folder.is_dir() {
+        return Some(folder);
+    }
+    let why = "no folder ../shared/data/structures; the samples run alone";
+    if is_set("MOLMESH_NO_STRUCTURES") {
+        print_skipped(why);
+        return None;
+    }
+    skip(why)
+}
+
+fn is_set(variable: &str) -> bool {
+    std::env::var_os(variable).is_some_and(|value| !value.is_empty())
+}
+
+fn print_skipped(why: &str) {
     let test = std::thread::current().name().unwrap_or("a test").to_owned();
     // The harness hides the output of `eprintln!` if the test passes.
-    let line = format!("SKIPPED: {test}: {tool} is not installed; run tests/tools/setup.sh\n");
-    std::io::stderr().write_all(line.as_bytes()).unwrap();
-    None
+    std::io::stderr().write_all(format!("SKIPPED: {test}: {why}\n").as_bytes()).unwrap();
 }
 
 fn root() -> &'static Path {

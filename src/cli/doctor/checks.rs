@@ -69,9 +69,9 @@ pub(super) fn sources(file: Option<&Path>, loaded: &Loaded) -> Check {
     Check::new("config", State::Ok, format!("{file}; {variables}; {flags} from the command line"))
 }
 
-/// Warns about secret files that other users can read.
-pub(super) fn secrets(loaded: &Loaded) -> impl Iterator<Item = Check> {
-    loaded.warnings.iter().map(|warning| Check::new("secrets", State::Warning, warning.clone()))
+/// Reports the warnings of the configuration: readable secret files, misspelt variables.
+pub(super) fn warnings(loaded: &Loaded) -> impl Iterator<Item = Check> {
+    loaded.warnings.iter().map(|warning| Check::new("warnings", State::Warning, warning.clone()))
 }
 
 /// Checks the log filter.
@@ -134,9 +134,37 @@ pub(super) fn files(machine: &Machine, config: &Config) -> Option<Check> {
     })
 }
 
+/// Checks that the volume of the data folder, of `volume` bytes, can hold what is stored there.
+pub(super) fn volume(volume: Option<u64>, config: &Config) -> Option<Check> {
+    let volume = volume?;
+    let results = if config.store.url.is_none() { config.store.max_bytes } else { 0 };
+    let copies = if config.archive.url.is_some() { config.archive.cache_bytes } else { 0 };
+    let most = results.saturating_add(copies);
+    let sum = format!("{} store.max_bytes, {} archive.cache_bytes", size(results), size(copies));
+    Some(if most > volume {
+        let detail = format!("{} at most ({sum}) exceed the volume of {}: it will be full", size(most), size(volume));
+        Check::new("volume", State::Warning, detail)
+    } else {
+        Check::new("volume", State::Ok, format!("{} at most ({sum}), of {}", size(most), size(volume)))
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn stored_data_must_fit_the_volume() {
+        let mut config = Config::default();
+        (config.store.max_bytes, config.archive.cache_bytes) = (1000, 100);
+        let state = |bytes, config: &Config| volume(Some(bytes), config).unwrap().state;
+        assert_eq!((state(1100, &config), state(1099, &config)), (State::Ok, State::Warning));
+        config.archive.url = None;
+        assert_eq!((state(1000, &config), state(999, &config)), (State::Ok, State::Warning));
+        config.store.url = Some("s3://bucket".to_owned());
+        assert_eq!(state(0, &config), State::Ok, "the store is elsewhere");
+        assert_eq!(volume(None, &config), None);
+    }
 
     #[test]
     fn connections_need_open_files() {

@@ -40,6 +40,19 @@ pub(super) fn data_dir(config: &Config) -> Option<Check> {
     Some(Check::new("data_dir", State::Failed, error.to_string()))
 }
 
+/// Returns the size of the volume of the data folder, or of the folder that it will be created in, bytes.
+#[cfg(target_os = "linux")]
+pub(super) fn volume(config: &Config) -> Option<u64> {
+    let folder = std::path::absolute(&config.server.data_dir).ok()?;
+    let volume = folder.ancestors().find_map(|folder| rustix::fs::statvfs(folder).ok())?;
+    volume.f_blocks.checked_mul(volume.f_frsize)
+}
+
+#[cfg(not(target_os = "linux"))]
+pub(super) fn volume(_config: &Config) -> Option<u64> {
+    None
+}
+
 /// Checks that the store can be opened, written, read and listed, and reports its content.
 pub(super) async fn store(config: &Config, limit: Duration) -> Check {
     let created = CreatedFolders::before(config.store.url.is_none().then_some(config.server.data_dir.as_path()));

@@ -51,7 +51,7 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     let machine = Machine::detect();
     let config: Config = loaded.config.clone();
     let mut checks = vec![checks::sources(args.serve.config.as_deref(), &loaded), checks::log(&config)];
-    checks.extend(checks::secrets(&loaded));
+    checks.extend(checks::warnings(&loaded));
     // The same steps as in a service: query all drivers, build the pipelines of the selected devices, make a mesh.
     let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);
     match backend::select(&BackendRequest::of_service(args.serve.backend, &config.devices)) {
@@ -72,6 +72,7 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     checks.extend(checks::files(&machine, &config));
     checks.extend(external::listeners(&config));
     checks.extend(external::data_dir(&config));
+    checks.extend(checks::volume(external::volume(&config), &config));
     let failed = |e: std::io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().map_err(failed)?;
     checks.push(runtime.block_on(external::store(&config, limit)));
