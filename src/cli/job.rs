@@ -157,7 +157,7 @@ fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic
 fn worst_finding(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
     let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
     let findings = strict_validator::check(input, &limits.read, &Control::default()).ok()?;
-    let worst = findings.iter().max_by_key(|f| f.level)?;
+    let worst = findings.iter().filter(|f| f.level > Level::Note).max_by_key(|f| f.level)?;
     Some(format!("the strict validator reports: {}", finding(worst)))
 }
 

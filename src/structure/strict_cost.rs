@@ -5,21 +5,23 @@ use rustc_hash::FxHashMap;
 
 use super::atoms::{SourceFormat, Structure};
 
-/// Largest number of search steps: about half a second.
-const MAX_STEPS: u64 = 500_000_000;
-/// Largest number of copied atoms: about half a second.
-const MAX_COPIES: u64 = 2_000_000;
+/// Largest number of search steps: about a second.
+const MAX_STEPS: u64 = 1_000_000_000;
+/// Steps that take as long as copying an atom.
+const STEPS_PER_COPY: u64 = 700;
 /// Memory of a copied atom, bytes.
 const BYTES_PER_COPY: u64 = 320;
 /// Residue names of a SEQRES record.
 const NAMES_PER_SEQRES: u64 = 13;
+/// Steps that take as long as comparing a record with an atom.
+const STEPS_PER_RECORD: u64 = 8;
 /// Steps per residue of a chain when a missing one is inserted.
 const STEPS_PER_INSERTION: u64 = 4;
 
 /// Upper bound of the work on a file.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Cost {
-    /// Steps of searches.
+    /// Steps of searches, and of copies as steps.
     steps: u64,
     /// Atoms copied to the alternatives of their residue.
     copies: u64,
@@ -80,19 +82,20 @@ impl Cost {
             SourceFormat::Pdb => {
                 let records = Records::of(text);
                 let names = NAMES_PER_SEQRES * records.seqres;
-                records.others * (n_atoms + records.others) / 2 + STEPS_PER_INSERTION * names * (n_residues + names)
+                let others = STEPS_PER_RECORD * records.others * n_atoms.max(records.others);
+                others + STEPS_PER_INSERTION * names * (n_residues + names)
             }
             SourceFormat::Mmcif => hierarchy + count(text, b"_struct_ncs_oper.").pow(2),
             SourceFormat::BinaryCif => 0,
         };
         // A residue of n atoms has at most n / 2 alternatives of n / 2 atoms.
-        let copies = residues.values().map(|r| r.n_atoms * r.n_atoms / 4).sum();
-        Self { steps: compared + searched, copies }
+        let copies: u64 = residues.values().map(|r| r.n_atoms * r.n_atoms / 4).sum();
+        Self { steps: compared + searched + STEPS_PER_COPY * copies, copies }
     }
 
     /// Returns true if checking the file takes at most about a second.
     pub(super) fn is_low(&self) -> bool {
-        self.steps <= MAX_STEPS && self.copies <= MAX_COPIES
+        self.steps <= MAX_STEPS
     }
 
     /// Returns the memory of copied atoms, bytes.
