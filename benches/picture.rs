@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use molmesh::picture::{CpuRenderer, Image, PictureParams, Renderer, Style, png};
 use molmesh::pipeline::{self, Choice, JobLimits, params};
-use molmesh::surface::{CancelToken, Control, CpuBackend, Mesh};
+use molmesh::surface::{Control, CpuBackend, Mesh};
 use rayon::prelude::*;
 
 /// Returns the available structures: the bundled one, and 2HHB.
@@ -29,7 +29,7 @@ fn mesh(path: &PathBuf) -> Mesh {
     let choice = Choice { backend: &backend, reason: "measured" };
     let job = params::parse::<&str, &str>([]).unwrap().job;
     let bytes = std::fs::read(path).unwrap();
-    let product = pipeline::run(&bytes, &job, &JobLimits::default(), &choice, &CancelToken::default(), &(), None);
+    let product = pipeline::run(&bytes, &job, &JobLimits::default(), &choice, &Control::default(), &(), None);
     let mut mesh = product.unwrap().mesh;
     mesh.make_contiguous();
     mesh

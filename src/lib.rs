@@ -65,8 +65,8 @@ pub use surface::Mesh;
 /// reaches the isovalue.
 pub fn mesh(bytes: &[u8], options: &Options) -> Result<Mesh, Error> {
     let choice = pipeline::Choice { backend: &surface::CpuBackend::default(), reason: "library" };
-    let (limits, cancel) = (pipeline::JobLimits::default(), surface::CancelToken::default());
-    let mut product = pipeline::run(bytes, options, &limits, &choice, &cancel, &(), None)?;
+    let (limits, control) = (pipeline::JobLimits::default(), surface::Control::default());
+    let mut product = pipeline::run(bytes, options, &limits, &choice, &control, &(), None)?;
     product.mesh.make_contiguous();
     Ok(product.mesh)
 }

@@ -1,23 +1,14 @@
-//! Memory budget of all requests, in bytes: uploads, archive entries, and meshes that are not yet sent.
+//! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, and meshes that
+//! are not yet sent.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 use metrics::gauge;
-use thiserror::Error;
 
+use crate::surface::{MemoryMeter, OutOfMemory};
 use crate::telemetry::MEMORY_HELD;
-
-/// Error of an exhausted budget.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
-#[error("{held} of {limit} bytes of memory for uploads and meshes are in use")]
-pub struct Exhausted {
-    /// Size of the budget, bytes.
-    pub limit: u64,
-    /// Used part of the budget, bytes.
-    pub held: u64,
-}
 
 /// Memory budget in bytes. Clones share one budget.
 #[derive(Debug, Clone)]
@@ -42,16 +33,16 @@ impl Budget {
     /// Checks that at most the limit is in use.
     ///
     /// # Errors
-    /// [`Exhausted`].
-    pub fn check(&self) -> Result<(), Exhausted> {
+    /// [`OutOfMemory::Budget`].
+    pub fn check(&self) -> Result<(), OutOfMemory> {
         let held = self.held.load(Ordering::Relaxed);
-        if held > self.limit { Err(Exhausted { limit: self.limit, held }) } else { Ok(()) }
+        if held > self.limit { Err(OutOfMemory::Budget { needed: 0, held, limit: self.limit }) } else { Ok(()) }
     }
 
     /// Creates a lease of 0 bytes.
     #[must_use]
     pub fn lease(&self) -> Lease {
-        Lease { budget: self.clone(), bytes: 0 }
+        Lease { budget: self.clone(), bytes: AtomicU64::new(0) }
     }
 }
 
@@ -59,28 +50,42 @@ impl Budget {
 #[derive(Debug)]
 pub struct Lease {
     budget: Budget,
-    bytes: u64,
+    bytes: AtomicU64,
 }
 
 impl Lease {
     /// Adds `bytes` to the lease. A failure changes nothing.
     ///
     /// # Errors
-    /// [`Exhausted`].
-    pub fn grow(&mut self, bytes: u64) -> Result<(), Exhausted> {
+    /// [`OutOfMemory::Budget`].
+    pub fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
         let Budget { limit, held } = &self.budget;
         held.try_update(Ordering::Relaxed, Ordering::Relaxed, |now| now.checked_add(bytes).filter(|sum| sum <= limit))
-            .map_err(|held| Exhausted { limit: *limit, held })?;
-        self.bytes += bytes;
+            .map_err(|held| OutOfMemory::Budget { needed: bytes, held, limit: *limit })?;
+        self.bytes.fetch_add(bytes, Ordering::Relaxed);
         publish(bytes, 1.0);
         Ok(())
     }
 
     /// Adds `bytes` regardless of the limit, for memory that is allocated already.
-    pub fn force(&mut self, bytes: u64) {
+    pub fn force(&self, bytes: u64) {
         self.budget.held.fetch_add(bytes, Ordering::Relaxed);
-        self.bytes += bytes;
+        self.bytes.fetch_add(bytes, Ordering::Relaxed);
         publish(bytes, 1.0);
+    }
+
+    /// Subtracts `bytes` of freed memory.
+    pub fn shrink(&self, bytes: u64) {
+        self.budget.held.fetch_sub(bytes, Ordering::Relaxed);
+        self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        publish(bytes, -1.0);
+    }
+
+    /// Sets the lease to `bytes` regardless of the limit, for memory that remains of a finished job.
+    pub fn set(&self, bytes: u64) {
+        let before = self.bytes.load(Ordering::Relaxed);
+        self.force(bytes.saturating_sub(before));
+        self.shrink(before.saturating_sub(bytes));
     }
 
     /// Returns `memory` as bytes that hold this lease until the last reference to them is dropped.
@@ -101,10 +106,19 @@ impl<T: AsRef<[u8]>> AsRef<[u8]> for Leased<T> {
     }
 }
 
+impl MemoryMeter for Lease {
+    fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
+        self.grow(bytes)
+    }
+
+    fn shrink(&self, bytes: u64) {
+        self.shrink(bytes);
+    }
+}
+
 impl Drop for Lease {
     fn drop(&mut self) {
-        self.budget.held.fetch_sub(self.bytes, Ordering::Relaxed);
-        publish(self.bytes, -1.0);
+        self.shrink(self.bytes.load(Ordering::Relaxed));
     }
 }
 
@@ -116,17 +130,25 @@ fn publish(bytes: u64, sign: f64) {
 
 #[cfg(test)]
 mod tests {
-    use super::Budget;
+    use super::{Budget, OutOfMemory};
+
+    fn held(error: OutOfMemory) -> u64 {
+        let OutOfMemory::Budget { held, .. } = error else { return 0 };
+        held
+    }
 
     #[test]
     fn leases_add_up_and_come_back() {
         let budget = Budget::new(100);
-        let (mut a, mut b) = (budget.lease(), budget.lease());
+        let (a, b) = (budget.lease(), budget.lease());
         a.grow(60).unwrap();
-        assert_eq!(b.grow(41).unwrap_err().held, 60);
+        assert_eq!(held(b.grow(41).unwrap_err()), 60);
         b.grow(40).unwrap();
         b.force(10);
-        assert_eq!(budget.check().unwrap_err().held, 110);
+        assert_eq!(held(budget.check().unwrap_err()), 110);
+        b.set(45);
+        assert_eq!(held(budget.check().unwrap_err()), 105);
+        b.set(50);
         drop(b);
         budget.check().unwrap();
         drop(a);
@@ -136,12 +158,12 @@ mod tests {
     #[test]
     fn attached_bytes_hold_their_lease_to_the_last_reference() {
         let budget = Budget::new(10);
-        let mut lease = budget.lease();
+        let lease = budget.lease();
         lease.force(11);
         let mut bytes = lease.attach(vec![7; 11]);
         let tail = bytes.split_off(10);
         drop(bytes);
-        assert_eq!((&tail[..], budget.check().unwrap_err().held), (&[7][..], 11));
+        assert_eq!((&tail[..], held(budget.check().unwrap_err())), (&[7][..], 11));
         drop(tail);
         budget.check().unwrap();
     }

@@ -14,8 +14,9 @@ use super::address::{PublicResolver, Refused};
 use super::error::UnavailableReason;
 use super::gzip;
 use crate::config::{ArchiveConfig, Templates};
-use crate::memory_budget::{Exhausted, Lease};
+use crate::memory_budget::Lease;
 use crate::store::Digest;
+use crate::surface::OutOfMemory;
 use crate::telemetry::{SpanContext, traceparent};
 
 /// Maximum number of redirects.
@@ -53,7 +54,7 @@ pub(super) enum Failed {
     /// The body is too large. Contains the announced size, bytes, if any.
     TooLarge(Option<u64>),
     /// The memory limit is reached.
-    Memory(Exhausted),
+    Memory(OutOfMemory),
     /// Any other failure: cause, `Retry-After` of the host, details for the log.
     Other { reason: UnavailableReason, retry_after: Option<Duration>, detail: String },
 }
@@ -119,7 +120,7 @@ pub(super) async fn get(
     known: Option<&Origin>,
     config: &ArchiveConfig,
     inflated_bytes: u64,
-    mut lease: Lease,
+    lease: Lease,
     trace: Option<&SpanContext>,
 ) -> Result<Answer, Failed> {
     let compressed = Path::new(url.path()).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gz"));
@@ -157,7 +158,7 @@ pub(super) async fn get(
     }
     let text = |name: HeaderName| Some(response.headers().get(name)?.to_str().ok()?.to_owned());
     let origin = Origin { url: name, etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
-    let bytes = body(response, config, &mut lease).await?;
+    let bytes = body(response, config, &lease).await?;
     let (bytes, digest) = tokio::task::spawn_blocking(move || {
         if compressed && !gzip::is_complete_gzip(&bytes, inflated_bytes) {
             return Err(Failed::other(UnavailableReason::Damaged, "the file is incomplete"));
@@ -171,7 +172,7 @@ pub(super) async fn get(
 }
 
 /// Receives the body up to the limit.
-async fn body(mut response: Response, config: &ArchiveConfig, lease: &mut Lease) -> Result<Bytes, Failed> {
+async fn body(mut response: Response, config: &ArchiveConfig, lease: &Lease) -> Result<Bytes, Failed> {
     let announced = response.content_length();
     if announced.is_some_and(|bytes| bytes > config.max_bytes) {
         return Err(Failed::TooLarge(announced));

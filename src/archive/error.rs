@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use thiserror::Error;
 
-use crate::memory_budget::Exhausted;
 use crate::structure::{ArchiveError, EntryId};
+use crate::surface::OutOfMemory;
 
 /// Errors of fetching an entry.
 #[derive(Debug, Clone, Error)]
@@ -47,7 +47,7 @@ pub enum FetchError {
         /// Requested entry.
         id: EntryId,
         /// Limit and use of the memory.
-        error: Exhausted,
+        error: OutOfMemory,
     },
     /// Internal error, or the service is stopping.
     #[error("the entry could not be fetched: {0}")]

@@ -250,6 +250,9 @@ pub(crate) struct LimitArgs {
     /// Atoms in the file, all models [default: 20000000]
     #[arg(long, value_name = "N")]
     pub(crate) max_atoms: Option<u64>,
+    /// Atoms of one model at exactly the same position [default: 1000]
+    #[arg(long, value_name = "N")]
+    pub(crate) max_duplicates: Option<u64>,
     /// Bytes of the input after decompression [default: 4 GiB]
     #[arg(long, value_name = "BYTES")]
     pub(crate) max_input_bytes: Option<u64>,

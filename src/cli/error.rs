@@ -174,6 +174,7 @@ impl CliError {
             Self::Job { source: JobError::Surface(error), .. } => surface_hint(error),
             Self::Job { source: JobError::Structure(error), strict_finding, .. } => match error {
                 StructureError::TooManyAtoms { .. } => Some("raise it with --max-atoms".to_owned()),
+                StructureError::TooManyDuplicates { .. } => Some("raise it with --max-duplicates".to_owned()),
                 StructureError::InflatedTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
                 _ => strict_finding.clone(),
             },
@@ -198,7 +199,10 @@ impl CliError {
 
 fn structure_code(error: &StructureError) -> i32 {
     match error {
-        StructureError::InflatedTooLarge { .. } | StructureError::TooManyAtoms { .. } => code::LIMIT,
+        StructureError::InflatedTooLarge { .. }
+        | StructureError::TooManyAtoms { .. }
+        | StructureError::TooManyDuplicates { .. }
+        | StructureError::Memory(_) => code::LIMIT,
         _ => code::STRUCTURE,
     }
 }
@@ -213,6 +217,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         | SurfaceError::MeshTooLarge { .. }
         | SurfaceError::TooManyTriangles { .. }
         | SurfaceError::DeviceMemory { .. }
+        | SurfaceError::Memory(_)
         | SurfaceError::Deadline => code::LIMIT,
         SurfaceError::Device { .. } => code::BACKEND,
         SurfaceError::Cancelled => code::INTERRUPTED,
@@ -222,7 +227,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
 
 fn picture_code(error: &PictureError) -> i32 {
     match error {
-        PictureError::TooLarge { .. } => code::LIMIT,
+        PictureError::TooLarge { .. } | PictureError::Memory(_) => code::LIMIT,
         PictureError::Device { .. } => code::BACKEND,
         PictureError::Cancelled => code::INTERRUPTED,
         PictureError::Quantized | PictureError::Png(_) => code::INTERNAL,

@@ -9,7 +9,7 @@ use molmesh::formats::{Format, GlbSink};
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, Report};
 use molmesh::structure::StructureError;
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
-use molmesh::surface::{CancelToken, SurfaceError};
+use molmesh::surface::{CancelToken, Control, SurfaceError};
 use serde_json::{Value, json};
 
 use super::args::{JobArgs, ReportStyle};
@@ -61,16 +61,21 @@ impl<'a> CommandJob<'a> {
         Ok((Self { path, args, job, limits, cancel, input, selected, progress, findings }, output))
     }
 
+    /// Returns the control of a run: cancellation, no deadline and no memory limit.
+    fn control(&self) -> Control<'static> {
+        Control { cancel: self.cancel.clone(), ..Control::default() }
+    }
+
     /// Computes the mesh. If the job allows it, the mesh is written to `sink` as GLB at the same time.
     pub(super) fn run(&self, sink: Option<&GlbSink<'_>>) -> Result<Product, JobError> {
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
-        pipeline::run(&self.input, &self.job, &self.limits, &choice, &self.cancel, &self.progress, sink)
+        pipeline::run(&self.input, &self.job, &self.limits, &choice, &self.control(), &self.progress, sink)
     }
 
     /// Draws the picture of a product.
     pub(super) fn draw(&self, product: &mut Product) -> Result<(), JobError> {
         let params = self.job.picture.unwrap_or_default();
-        pipeline::draw(product, &params, &self.selected.renderer, &self.cancel, &self.progress)
+        pipeline::draw(product, &params, &self.selected.renderer, &self.control(), &self.progress)
     }
 
     /// Converts the error of the job.
@@ -139,11 +144,8 @@ fn name_of(input: &Path) -> String {
 /// Returns the findings of the strict validator, or an error if there are errors among them.
 fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
     let name = || name_of(path);
-    let findings = strict_validator::check(input, &limits.read).map_err(|source| CliError::Job {
-        name: name(),
-        source: source.into(),
-        strict_finding: None,
-    })?;
+    let findings = strict_validator::check(input, &limits.read, &Control::default())
+        .map_err(|source| CliError::Job { name: name(), source: source.into(), strict_finding: None })?;
     let errors = findings.iter().filter(|f| f.level == Level::Error);
     match errors.clone().next() {
         Some(first) => Err(CliError::Strict { name: name(), errors: errors.count(), first: finding(first) }),
@@ -154,8 +156,8 @@ fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic
 /// Returns the worst finding of the strict validator if the file has a syntax error.
 fn worst_finding(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
     let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
-    let findings = strict_validator::check(input, &limits.read).ok()?;
-    let worst = findings.iter().max_by_key(|f| f.level)?;
+    let findings = strict_validator::check(input, &limits.read, &Control::default()).ok()?;
+    let worst = findings.iter().filter(|f| f.level > Level::Note).max_by_key(|f| f.level)?;
     Some(format!("the strict validator reports: {}", finding(worst)))
 }
 

@@ -11,6 +11,9 @@ use molmesh::surface::CancelToken;
 use super::error::CliError;
 use super::interrupt;
 
+/// Maximum size of one write, bytes. Cancellation is checked between writes.
+const MAX_WRITE: usize = 1 << 20;
+
 /// Open output. Dropping it without [`Output::finish`] removes the file.
 pub(crate) struct Output {
     to: To,
@@ -115,6 +118,7 @@ impl RandomAccess for Output {
 impl Write for Output {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.check_cancelled()?;
+        let bytes = &bytes[..bytes.len().min(MAX_WRITE)];
         let start = Instant::now();
         let written = match &mut self.to {
             To::Stdout(out) => out.write(bytes),

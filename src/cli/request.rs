@@ -52,6 +52,7 @@ pub(super) fn limits(args: &LimitArgs) -> JobLimits {
     let mut limits = JobLimits::default();
     let set = |limit: &mut u64, flag: Option<u64>| *limit = flag.unwrap_or(*limit);
     set(&mut limits.read.max_atoms, args.max_atoms);
+    set(&mut limits.read.max_duplicates, args.max_duplicates);
     set(&mut limits.read.max_inflated_bytes, args.max_input_bytes);
     set(&mut limits.surface.max_samples, args.max_grid_points);
     set(&mut limits.surface.max_candidates, args.max_candidates);

@@ -23,6 +23,8 @@ use super::survey;
 const COMPUTE_NICE: i32 = 5;
 /// Threads of the async runtime, which serve sockets. Meshing has other threads.
 const RUNTIME_THREADS: usize = 2;
+/// Time after which an idle thread that read a structure ends. The allocator returns its memory then.
+const IDLE_THREAD: Duration = Duration::from_secs(1);
 
 /// Runs the service until it has been stopped and drained.
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
@@ -51,6 +53,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(RUNTIME_THREADS)
         .thread_name("http")
+        .thread_keep_alive(IDLE_THREAD)
         .enable_all()
         .build()
         .map_err(failed)?;

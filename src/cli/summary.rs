@@ -113,11 +113,12 @@ fn drawn(picture: &PictureReport) -> String {
 fn validation(report: &Report, style: Style) -> String {
     let status = |holds: bool, yes: &str, no: &str| if holds { style.green(yes) } else { style.red(no) };
     let method = if report.validation == Validation::Exact.name() { "exact edge matching" } else { "edge checksum" };
+    let manifold = if report.manifold_from == "check" { "manifold" } else { "manifold by construction" };
     format!(
         "{} (by {method}), {}, {}, Euler number {}",
         status(report.closed, "watertight", "NOT watertight"),
         status(report.oriented, "oriented", "NOT oriented"),
-        status(report.manifold, "manifold", "NOT manifold"),
+        status(report.manifold, manifold, "NOT manifold"),
         report.euler
     )
 }
@@ -239,6 +240,7 @@ mod tests {
             closed: true,
             oriented: true,
             manifold: false,
+            manifold_from: "check",
             validation: "checksum",
             euler: 2,
             components: 2,

@@ -27,6 +27,9 @@ pub struct LimitsConfig {
     /// Number of atoms in all models of a structure. Default 10,000,000: four times the largest PDB entry; at 80 bytes
     /// each 800 MB.
     pub atoms: u64,
+    /// Number of atoms of one model at exactly the same position. Default 1,000: structures have at most a few, and the
+    /// work of a mesh grows with the square of their number.
+    pub duplicate_atoms: u64,
     /// Number of atoms whose names are listed, for web pages that show them. Default 1,000,000: about 10 MB of JSON,
     /// the most that is useful in a browser.
     pub labels: u64,
@@ -42,9 +45,9 @@ pub struct LimitsConfig {
     /// Size of a mesh file, bytes. Default 3 GiB: below the 4 GiB limit of GLB, and above the mesh in memory because
     /// text formats are larger.
     pub output_bytes: u64,
-    /// Memory of uploads, finished meshes and responses of all requests together, bytes. Default 8 GiB. While it is
-    /// used up, new uploads, jobs and stored results are rejected. Running jobs may exceed it by `mesh_bytes` and the
-    /// candidate lists of `candidate_pairs` each, responses by their next chunk.
+    /// Memory of all requests together, bytes: uploads, jobs from decompression to the finished mesh, and responses.
+    /// Default 8 GiB. Memory is counted before it is allocated. A request or job that would exceed the limit is
+    /// rejected and may be repeated later. Responses may exceed it by their next chunk.
     pub memory_bytes: u64,
     /// Width and height of a picture, pixels. Default 4,096: at 40 bytes a pixel the largest picture needs 640 MiB, and
     /// rendering takes seconds.
@@ -60,6 +63,7 @@ impl Default for LimitsConfig {
             parts: 128,
             inflated_bytes: 2 << 30,
             atoms: 10_000_000,
+            duplicate_atoms: 1000,
             labels: 1_000_000,
             grid_points: 1 << 30,
             candidate_pairs: 1 << 28,
@@ -76,14 +80,17 @@ impl LimitsConfig {
     #[must_use]
     pub fn job(&self) -> JobLimits {
         JobLimits {
-            read: ReadLimits { max_inflated_bytes: self.inflated_bytes, max_atoms: self.atoms },
+            read: ReadLimits {
+                max_inflated_bytes: self.inflated_bytes,
+                max_atoms: self.atoms,
+                max_duplicates: self.duplicate_atoms,
+            },
             surface: SurfaceLimits {
                 max_samples: self.grid_points,
                 max_mesh_bytes: self.mesh_bytes,
                 max_candidates: self.candidate_pairs,
             },
             picture: PictureLimits { max_side: self.picture_side },
-            deadline: None,
         }
     }
 }

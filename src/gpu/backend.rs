@@ -11,8 +11,8 @@ use super::job::{GpuJob, Prepared};
 use super::pool::{self, DevicePool, PoolDevice};
 use super::scheduler::PoolSettings;
 use crate::surface::{
-    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, Stage, SurfaceError, SurfaceLimits,
-    SurfaceParams, backend::one_atom,
+    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Reservation, Spheres, Stage, SurfaceError,
+    SurfaceLimits, SurfaceParams, backend::one_atom,
 };
 
 /// Backend that meshes on devices.
@@ -114,9 +114,12 @@ impl Backend for GpuBackend {
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
         control.check()?;
-        let job = Self::job(spheres, params, limits, control)?;
+        let memory = Arc::new(Reservation::new(&control.memory));
+        let of_job = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
+        let job = Self::job(spheres, params, limits, &of_job)?;
         let error = match self.pool.run(&job) {
             Ok(completed) => {
+                memory.keep();
                 completed.finished.stages.iter().for_each(|(stage, ns)| control.observer.elapsed(*stage, *ns));
                 // Only identical devices share a job.
                 let device = completed.devices.first().map_or("", |work| work.device.as_str());
@@ -128,7 +131,7 @@ impl Backend for GpuBackend {
             Err(error) => error,
         };
         // Frees the input before the fallback runs.
-        drop(job);
+        drop((job, of_job, memory));
         match (error, &self.fallback) {
             (GpuError::Surface(error), _) => Err(error),
             (GpuError::OutOfMemory { needed, available, suggested_resolution }, _) => {

@@ -1,14 +1,16 @@
 //! Jobs for devices: prepared on the caller's thread, independent of the device that runs them.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use super::error::GpuError;
 use super::plan::Plan;
-use crate::surface::cpu::scan;
+use crate::surface::cpu::{LATTICE_BYTES, scan};
 use crate::surface::lattice::Lattice;
 use crate::surface::{
-    CancelToken, Control, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
+    CancelToken, Control, MemoryMeter, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
+    candidates,
 };
 
 /// Maximum number of atoms of a small job. Latency dominates its cost, so several small jobs share a submission.
@@ -25,6 +27,10 @@ pub struct Prepared {
     pub params: SurfaceParams,
     /// Limits.
     pub limits: SurfaceLimits,
+    /// Meter of the mesh's memory.
+    memory: Arc<dyn MemoryMeter>,
+    /// True once the mesh is added to the meter: another device may repeat a job.
+    is_counted: AtomicBool,
 }
 
 impl Prepared {
@@ -40,10 +46,12 @@ impl Prepared {
     ) -> Result<Self, SurfaceError> {
         control.check()?;
         candidates::check(spheres, params, limits)?;
+        control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
         let lattice = Lattice::new(spheres, params)?;
         control.check()?;
         let plan = Plan::new(&lattice, limits, control)?;
-        Ok(Self { lattice, plan, params: params.clone(), limits: *limits })
+        let memory = Arc::clone(&control.memory);
+        Ok(Self { lattice, plan, params: params.clone(), limits: *limits, memory, is_counted: AtomicBool::new(false) })
     }
 
     /// Checks the size of a mesh, given as numbers of vertices and triangles, against the limits.
@@ -51,12 +59,17 @@ impl Prepared {
         scan::check_size(&self.params, &self.limits, n_vertices, n_triangles)
     }
 
-    /// Checks the size of a complete mesh like [`Self::check_size`], and rejects an empty mesh.
+    /// Checks the size of a complete mesh like [`Self::check_size`], rejects an empty mesh, and adds the memory of the
+    /// mesh to the meter.
     pub(super) fn check_mesh(&self, size: [u64; 2]) -> Result<(), SurfaceError> {
         if size[1] == 0 {
             Err(SurfaceError::NoSurface { isovalue: self.params.isovalue })
         } else {
-            self.check_size(size)
+            self.check_size(size)?;
+            if !self.is_counted.swap(true, Ordering::Relaxed) {
+                self.memory.grow(self.params.mesh_bytes(size[0], size[1]))?;
+            }
+            Ok(())
         }
     }
 

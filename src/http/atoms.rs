@@ -123,14 +123,14 @@ pub(super) async fn of_entry(
 async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
     let mut limits = app.config.limits.job().read;
     limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
-    let mut lease = app.pool.settings().budget.lease();
-    let listing = tokio::task::spawn_blocking(move || {
-        let structure = structure::read(&input.bytes, &limits)?;
+    let lease = app.pool.settings().budget.lease();
+    let listing = app.read(move |control| {
+        let structure = structure::read_with(&input.bytes, &limits, control)?;
         lease.grow(BYTES_PER_ATOM * structure.len() as u64)?;
         let text = serde_json::to_vec(&document(&structure)).map_err(Problem::internal)?;
         Ok::<Bytes, Problem>(lease.attach(text))
     });
-    let text = listing.await.map_err(Problem::internal)??;
+    let text = listing.await??;
     Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response())
 }
 

@@ -43,7 +43,7 @@ pub(super) static SUMMARY: [SummaryHeader; 17] = [
     summary("molmesh-area", "area", Type::Number, "Surface area in Å², including the walls of voids."),
     summary("molmesh-volume", "volume", Type::Number, "Enclosed volume in Å³, voids subtracted."),
     summary("molmesh-closed", "closed", Type::Boolean, "`true` if the mesh has no boundary."),
-    summary("molmesh-manifold", "manifold", Type::Boolean, "`true` if all edges and vertices are manifold."),
+    summary("molmesh-manifold", "manifold", Type::Boolean, "`true` if all edges and vertices are manifold, by a check or by construction: `manifold_from` in the report."),
     summary("molmesh-euler", "euler", Type::Integer, "Euler characteristic: vertices − edges + triangles."),
     summary("molmesh-components", "components", Type::Integer, "Connected components of the mesh."),
     summary("molmesh-kernel", "kernel", Type::String, "Density kernel."),

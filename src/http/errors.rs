@@ -8,14 +8,14 @@ use utoipa::ToSchema;
 use super::kinds::Kind;
 use super::problem::Problem;
 use crate::formats::FormatError;
-use crate::jobs::{AcceptError, EndError, Exhausted, Failure, Refusal, SaveError};
+use crate::jobs::{AcceptError, EndError, Failure, Refusal, SaveError};
 use crate::picture::PictureError;
 use crate::pipeline::JobError;
 use crate::pipeline::params::ParamError;
 use crate::store::StoreError;
 use crate::structure::StructureError;
 use crate::structure::strict_validator::Diagnostic;
-use crate::surface::SurfaceError;
+use crate::surface::{OutOfMemory, SurfaceError};
 
 /// Finding of the strict validator.
 #[derive(Debug, Serialize, ToSchema)]
@@ -86,12 +86,13 @@ impl From<ParamError> for Problem {
     }
 }
 
-impl From<Exhausted> for Problem {
-    fn from(error: Exhausted) -> Self {
-        Self::new(Kind::MemoryFull, error.to_string())
-            .with("limit", error.limit)
-            .with("actual", error.held)
-            .retry_after(Duration::from_secs(1))
+impl From<OutOfMemory> for Problem {
+    fn from(error: OutOfMemory) -> Self {
+        let problem = Self::new(Kind::MemoryFull, error.to_string()).retry_after(Duration::from_secs(1));
+        match error {
+            OutOfMemory::Budget { held, limit, .. } => problem.with("limit", limit).with("actual", held),
+            OutOfMemory::System { .. } => problem,
+        }
     }
 }
 
@@ -206,6 +207,11 @@ impl From<StructureError> for Problem {
             E::Decompress { encoding, .. } => Self::new(Kind::UnreadableStructure, detail).with("encoding", encoding),
             E::InflatedTooLarge { limit } => Self::new(Kind::InflatedTooLarge, detail).with("limit", limit),
             E::TooManyAtoms { limit } => Self::new(Kind::TooManyAtoms, detail).with("limit", limit),
+            E::TooManyDuplicates { limit, x, y, z } => {
+                Self::new(Kind::TooManyDuplicates, detail).with("limit", limit).with("position", vec![x, y, z])
+            }
+            E::Memory(error) => error.into(),
+            E::Cancelled => Self::from(Failure::Stopped),
             E::NoAtoms { found } => Self::new(Kind::NoAtoms, detail).with("found", found),
             E::EmptySelection { holds } => Self::new(Kind::EmptySelection, detail).with("found", holds),
             E::NotFound { what, asked, available } => Self::new(Kind::EmptySelection, detail)
@@ -274,6 +280,7 @@ impl From<SurfaceError> for Problem {
                 Self::new(Kind::DeviceFailed, "no device could run the job").retry_after(Duration::from_secs(1))
             }
             E::Deadline => Self::new(Kind::Deadline, detail),
+            E::Memory(error) => error.into(),
             E::Cancelled => Self::from(Failure::Stopped),
             // Responses are not written to a sink.
             E::Sink => Self::internal(detail),

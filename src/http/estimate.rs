@@ -2,7 +2,7 @@
 //! of `POST /v1/meshes`.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use axum::Json;
 use axum::body::Body;
@@ -25,18 +25,7 @@ use super::parsed_request::{Pairs, ParsedRequest};
 use super::problem::Problem;
 use super::source::Input;
 use super::state::Shared;
-use crate::jobs::Failure;
 use crate::pipeline::{self, Choice, Estimate};
-use crate::surface::CancelToken;
-
-/// Cancels the work when its request ends.
-struct CancelOnDrop(CancelToken);
-
-impl Drop for CancelOnDrop {
-    fn drop(&mut self) {
-        self.0.cancel();
-    }
-}
 
 /// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and samples are exact; the size of the mesh and
 /// the times are estimates.
@@ -127,27 +116,18 @@ pub(super) async fn create(
     let Input { bytes, digest, lease } = source.load(&app).await?;
     drop(source);
     let seconds = app.pool.expected(&bytes, &job);
-    let stop = CancelOnDrop(CancelToken::default());
-    let limit = Duration::from_millis(app.config.jobs.deadline_ms);
-    let limits = pipeline::JobLimits { deadline: Some(Instant::now() + limit), ..app.config.limits.job() };
-    let estimating = tokio::task::spawn_blocking({
-        let (app, cancel, job) = (Arc::clone(&app), stop.0.clone(), job.clone());
-        move || {
+    let reading = app.read({
+        let (app, job) = (Arc::clone(&app), job.clone());
+        move |control| {
             let start = Instant::now();
             let choice = Choice { backend: app.pool.backend().as_ref(), reason: app.pool.reason() };
-            let estimate = pipeline::estimate(&bytes, &job, &limits, &choice, &cancel);
+            let estimate = pipeline::estimate(&bytes, &job, &app.config.limits.job(), &choice, control);
             app.charge(&caller, start.elapsed());
             drop((lease, permit));
             estimate
         }
     });
-    // A backend may ignore the deadline. Then the end of this request cancels it.
-    let estimate = tokio::time::timeout(limit, estimating)
-        .await
-        .map_err(|_elapsed| Problem::from(Failure::Deadline { limit }))?
-        .map_err(Problem::internal)?
-        .map_err(|error| declared.explain(Failure::Job { error, diagnostics: Vec::new() }))?;
-    drop(stop);
+    let estimate = reading.await?.map_err(|error| declared.explain(error.into()))?;
     let wait = app.pool.estimated_wait().as_secs_f64();
     // The size of a picture does not depend on the mesh.
     let limit = if format.is_picture() { u64::MAX } else { app.config.limits.output_bytes };

@@ -120,7 +120,7 @@ pub(super) async fn read(
     within: Limit,
     content_type: &str,
     body: Body,
-    mut lease: Lease,
+    lease: Lease,
 ) -> Result<Upload, Problem> {
     let bounds = Bounds::new(limits, within);
     let boundary = multer::parse_boundary(content_type).map_err(|e| bounds.problem(&e))?;

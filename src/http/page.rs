@@ -1,7 +1,9 @@
 //! Embedded pages: the viewer at `/`, if the program was built with it, `<molmesh-viewer>` for other pages, and Swagger
 //! UI for the OpenAPI document at `/docs`. Nothing is loaded from other servers.
 
-use std::io::Read as _;
+use std::collections::BTreeMap;
+use std::io::{self, Read as _};
+use std::sync::{Mutex, PoisonError};
 
 use axum::extract::Path;
 use axum::extract::rejection::PathRejection;
@@ -88,9 +90,22 @@ fn gzip_file(request: &HeaderMap, bytes: &'static [u8]) -> Result<Response, Prob
         let coding = [(CONTENT_ENCODING, "gzip"), (VARY, "accept-encoding")];
         return Ok((coding, Bytes::from_static(bytes)).into_response());
     }
+    Ok(([(VARY, "accept-encoding")], inflated(bytes).map_err(Problem::internal)?).into_response())
+}
+
+/// Returns the contents of a file that is compressed with gzip. Each file is inflated once.
+fn inflated(bytes: &'static [u8]) -> io::Result<Bytes> {
+    /// Contents by the address of the compressed file.
+    static INFLATED: Mutex<BTreeMap<usize, Bytes>> = Mutex::new(BTreeMap::new());
+    let mut files = INFLATED.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(plain) = files.get(&bytes.as_ptr().addr()) {
+        return Ok(plain.clone());
+    }
     let mut plain = Vec::new();
-    flate2::read::GzDecoder::new(bytes).read_to_end(&mut plain).map_err(Problem::internal)?;
-    Ok(([(VARY, "accept-encoding")], plain).into_response())
+    flate2::read::GzDecoder::new(bytes).read_to_end(&mut plain)?;
+    let plain = Bytes::from(plain);
+    files.insert(bytes.as_ptr().addr(), plain.clone());
+    Ok(plain)
 }
 
 /// Serves the viewer.
@@ -148,6 +163,14 @@ pub(super) async fn swagger_script(request: HeaderMap) -> Result<Response, Probl
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn files_are_inflated_once() {
+        let file: &[u8] = include_bytes!("../../web/swagger/swagger-ui.css.gz");
+        let [first, second] = [(); 2].map(|()| inflated(file).unwrap());
+        assert!(first.len() > file.len());
+        assert_eq!(first.as_ptr(), second.as_ptr());
+    }
 
     #[test]
     fn only_names_that_say_the_contents_are_kept_for_ever() {

@@ -160,7 +160,7 @@ pub(super) async fn stored(
     // Pieces of running answers are charged regardless of the limit; new answers are refused while it is exceeded.
     let budget = app.pool.settings().budget.clone();
     let charged = body.map_ok(move |piece| {
-        let mut lease = budget.lease();
+        let lease = budget.lease();
         lease.force(piece.len() as u64);
         lease.attach(piece)
     });

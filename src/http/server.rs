@@ -148,6 +148,7 @@ impl Server {
         let archive = Archive::new(&config, pool.settings().budget.clone());
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
+        let readers = Arc::new(Semaphore::new(config.jobs.workers));
         let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
         let (stop, stopping) = watch::channel(Stop::Serve);
         let app = Arc::new(App {
@@ -158,6 +159,7 @@ impl Server {
             store,
             job_store,
             result_headers: Cache::new(CACHED_HEADERS),
+            readers,
             save_permits,
             save_start: Mutex::new(()),
             saves: SingleFlight::default(),
@@ -251,14 +253,13 @@ async fn wind_down(
         served = &mut serving => Some(served),
         () = cut.as_mut() => None,
     };
-    let (requests, jobs) = match served {
-        Some(served) => (served.unwrap_or(false), app.pool.drain(cut).await),
+    let (requests, jobs) = if let Some(served) = served {
+        (served, app.pool.drain(cut).await)
+    } else {
         // Cancelled jobs end their requests, which respond before their connections are closed.
-        None => {
-            let (served, jobs) = tokio::join!(serving, app.pool.drain(std::future::ready(())));
-            (served.unwrap_or(false), jobs)
-        }
+        tokio::join!(serving, app.pool.drain(std::future::ready(())))
     };
+    let requests = requests.unwrap_or(false);
     // Records of ended jobs and results that are being stored.
     let ends = async { tokio::join!(app.job_store.settled(), results::all_saved(app)) };
     let settled = tokio::time::timeout(CANCELLING, ends).await.is_ok();

@@ -49,7 +49,7 @@ pub(super) struct Input {
 impl Input {
     /// Charges bytes to the service's memory budget.
     fn new(app: &Shared, bytes: Bytes, digest: Digest) -> Result<Self, Problem> {
-        let mut lease = app.pool.settings().budget.lease();
+        let lease = app.pool.settings().budget.lease();
         lease.grow(bytes.len() as u64)?;
         Ok(Self { bytes, digest, lease: Arc::new(lease) })
     }
@@ -94,9 +94,12 @@ impl StructureSource {
         match self {
             Self::Uploaded(input) => Ok(input.clone()),
             Self::Stored(digest) => {
-                let stored = app.store.get(&Name::input(digest)).await?;
-                let bytes = stored.ok_or_else(|| no_such_structure(&digest.to_string()))?.bytes;
-                Input::new(app, bytes, *digest)
+                let (name, absent) = (Name::input(digest), || no_such_structure(&digest.to_string()));
+                let size = app.store.head(&name).await?.ok_or_else(absent)?.size;
+                let lease = app.pool.settings().budget.lease();
+                lease.grow(size)?;
+                let bytes = app.store.get(&name).await?.ok_or_else(absent)?.bytes;
+                Ok(Input { bytes, digest: *digest, lease: Arc::new(lease) })
             }
             Self::Entry(id) => {
                 let entry = app.archive.fetch(id).await.map_err(|error| archive_problem(&error))?;

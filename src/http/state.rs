@@ -1,11 +1,13 @@
 //! State of the service that the handlers share.
 
 use std::sync::{Arc, Mutex, OnceLock};
+use std::time::Duration;
 
 use axum::http::HeaderMap;
 use bytes::Bytes;
 use quick_cache::sync::Cache;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::time::{Instant, timeout_at};
 
 use super::kinds::Kind;
 use super::probe::Probe;
@@ -18,8 +20,17 @@ use crate::jobs::{ContentKey, Failure, JobStore, Pool};
 use crate::pipeline::Job;
 use crate::single_flight::SingleFlight;
 use crate::store::Store;
-use crate::surface::FoundDevice;
+use crate::surface::{CancelToken, Control, FoundDevice};
 use crate::telemetry::Tracer;
+
+/// Cancels the work when its request ends.
+struct CancelOnDrop(CancelToken);
+
+impl Drop for CancelOnDrop {
+    fn drop(&mut self) {
+        self.0.cancel();
+    }
+}
 
 /// State of the service.
 pub(super) struct App {
@@ -31,6 +42,8 @@ pub(super) struct App {
     pub(super) job_store: JobStore,
     /// Headers of recently requested results.
     pub(super) result_headers: Cache<ContentKey, Arc<HeaderMap>>,
+    /// Permits to read structures outside of jobs: one per worker.
+    pub(super) readers: Arc<Semaphore>,
     /// Permits of `jobs.concurrent_saves`.
     pub(super) save_permits: Arc<Semaphore>,
     /// Held while a save starts, so that its permit and its entry in `saves` appear together.
@@ -58,6 +71,33 @@ impl App {
     pub(super) fn accepts(&self, job: &Job) -> Result<(), Problem> {
         let refused = |error| Failure::Job { error, diagnostics: Vec::new() };
         job.check(&self.config.limits.job()).map_err(|error| refused(error).into())
+    }
+
+    /// Runs `work`, which reads a structure, on a blocking thread. Waits for a permit first; `jobs.deadline_ms` limits
+    /// both together. If the request ends earlier, the work is cancelled; permit and memory are released when it has
+    /// stopped.
+    pub(super) async fn read<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Control<'_>) -> T + Send + 'static,
+    ) -> Result<T, Failure> {
+        let limit = Duration::from_millis(self.config.jobs.deadline_ms);
+        let end = Instant::now() + limit;
+        let late = |_elapsed| Failure::Deadline { limit };
+        let panicked = |message: String| Failure::Panicked { message };
+        let permit = timeout_at(end, Arc::clone(&self.readers).acquire_owned()).await.map_err(late)?;
+        let permit = permit.map_err(|closed| panicked(closed.to_string()))?;
+        let stop = CancelOnDrop(CancelToken::default());
+        let reading = tokio::task::spawn_blocking({
+            let (cancel, lease) = (stop.0.clone(), self.pool.settings().budget.lease());
+            move || {
+                let control =
+                    Control { cancel, deadline: Some(end.into_std()), memory: Arc::new(lease), ..Control::default() };
+                let value = work(&control);
+                drop((control, permit));
+                value
+            }
+        });
+        timeout_at(end, reading).await.map_err(late)?.map_err(|error| panicked(error.to_string()))
     }
 
     /// Takes a permit for one request for a mesh.

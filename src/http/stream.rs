@@ -108,7 +108,7 @@ impl Pieces {
 
     fn send_buffer(&mut self) -> io::Result<()> {
         let data = std::mem::take(&mut self.buffer).freeze();
-        let mut lease = self.budget.lease();
+        let lease = self.budget.lease();
         lease.force(data.len() as u64);
         self.send(Piece::Data(lease.attach(data)))
     }

@@ -26,6 +26,7 @@ use super::source::{Input, StructureSource};
 use super::state::Shared;
 use super::{delivery, upload};
 use crate::jobs::Failure;
+use crate::pipeline::JobError;
 use crate::store::{Digest, Name};
 use crate::structure::contents::Counts;
 use crate::structure::{self, Contents, Structure};
@@ -206,12 +207,11 @@ pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
 /// Parses a structure and describes its contents, on a blocking thread.
 async fn summarize(app: &Shared, input: Input) -> Result<StructureDocument, Failure> {
     let limits = app.config.limits.job().read;
-    let parsing = tokio::task::spawn_blocking(move || {
-        let structure = structure::read(&input.bytes, &limits)?;
+    let parsing = app.read(move |control| {
+        let structure = structure::read_with(&input.bytes, &limits, control)?;
         Ok(summary(&input.digest, input.bytes.len(), &structure))
     });
-    let parsed = parsing.await.map_err(|error| Failure::Panicked { message: error.to_string() })?;
-    parsed.map_err(|error: structure::StructureError| Failure::Job { error: error.into(), diagnostics: Vec::new() })
+    parsing.await?.map_err(|error: structure::StructureError| JobError::from(error).into())
 }
 
 fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDocument {

@@ -43,8 +43,8 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
         let form = form::read(&app.config.limits, limit, content_type, body, app.pool.settings().budget.lease());
         in_time(app, form).await?
     } else {
-        let mut lease = app.pool.settings().budget.lease();
-        let bytes = in_time(app, collect(body, announced, limit, &mut lease)).await?;
+        let lease = app.pool.settings().budget.lease();
+        let bytes = in_time(app, collect(body, announced, limit, &lease)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
         Upload { bytes, lease, fields: Vec::new(), declared }
     };
@@ -62,8 +62,8 @@ pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> 
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
-    let mut lease = app.pool.settings().budget.lease();
-    in_time(app, collect(body, announced, limit, &mut lease)).await
+    let lease = app.pool.settings().budget.lease();
+    in_time(app, collect(body, announced, limit, &lease)).await
 }
 
 /// Returns the length that the headers announce, 0 if they do not.
@@ -92,7 +92,7 @@ fn broken(error: &dyn std::fmt::Display) -> Problem {
 }
 
 /// Reads a body into one buffer; a body of one frame is not copied.
-async fn collect(body: Body, announced: u64, limit: Limit, lease: &mut Lease) -> Result<Bytes, Problem> {
+async fn collect(body: Body, announced: u64, limit: Limit, lease: &Lease) -> Result<Bytes, Problem> {
     let mut stream = body.into_data_stream();
     let (mut first, mut all, mut length) = (Bytes::new(), BytesMut::new(), 0u64);
     while let Some(data) = stream.next().await {

@@ -4,10 +4,11 @@ use std::time::Duration;
 
 use thiserror::Error;
 
-use super::{Exhausted, SaveError};
+use super::SaveError;
 use crate::pipeline::JobError;
 use crate::store::StoreError;
 use crate::structure::strict_validator::{Diagnostic, Level};
+use crate::surface::{OutOfMemory, SurfaceError};
 
 /// Error of a task that the queue does not accept.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -49,15 +50,24 @@ pub(crate) enum Failure {
     /// The deadline passed.
     #[error("the deadline of {} s passed", limit.as_secs_f64())]
     Deadline { limit: Duration },
-    /// The memory budget is exhausted.
+    /// Memory is not available now.
     #[error(transparent)]
-    Memory(#[from] Exhausted),
+    Memory(#[from] OutOfMemory),
     /// The pool stopped before the job was finished.
     #[error("the service shut down before the job was finished")]
     Stopped,
     /// The job panicked; the message belongs in the log.
     #[error("the job panicked: {message}")]
     Panicked { message: String },
+}
+
+impl From<JobError> for Failure {
+    fn from(error: JobError) -> Self {
+        match error {
+            JobError::Surface(SurfaceError::Memory(error)) => Self::Memory(error),
+            error => Self::Job { error, diagnostics: Vec::new() },
+        }
+    }
 }
 
 fn errors(diagnostics: &[Diagnostic]) -> usize {

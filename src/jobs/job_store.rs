@@ -365,7 +365,7 @@ impl JobStore {
         let stored = self.0.store.get(&Name::input(&digest)).await?;
         let Some(input) = stored.map(|stored| stored.bytes) else { return Ok(Err("its input was removed".to_owned())) };
         let settings = self.0.pool.settings();
-        let mut lease = settings.budget.lease();
+        let lease = settings.budget.lease();
         lease.force(input.len() as u64);
         Ok(record.request().map(|(request, format)| {
             let rank = Rank { client: Client(record.client), batch: true, urgency: record.urgency };

@@ -28,7 +28,7 @@ mod tests;
 mod ticket;
 mod worker;
 
-pub(crate) use crate::memory_budget::{Budget, Exhausted, Lease};
+pub(crate) use crate::memory_budget::{Budget, Lease};
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};
@@ -81,7 +81,7 @@ pub(crate) struct Finished {
     pub(crate) digest: Digest,
     /// Memory budget that the mesh is charged to, until this is dropped.
     #[expect(dead_code, reason = "holds the memory until it is dropped")]
-    pub(crate) lease: Lease,
+    pub(crate) lease: Arc<Lease>,
 }
 
 /// Outcome of a job.

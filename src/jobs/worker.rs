@@ -9,15 +9,12 @@ use metrics::{counter, histogram};
 
 use super::coalesced_job::Entry;
 use super::pool::Shared;
-use super::{Failure, Finished, JobId, Outcome};
+use super::{Failure, Finished, JobId, Lease, Outcome};
 use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report};
-use crate::structure::strict_validator::{self, Diagnostic, Level};
+use crate::structure::strict_validator::{self, Diagnostic, Level, MAX_UNREAD_BYTES};
 use crate::structure::{ReadLimits, StructureError};
-use crate::surface::{Column, SurfaceError};
+use crate::surface::{Column, Control, SurfaceError};
 use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan};
-
-/// Size limit of files that the strict validator examines after a failure, bytes: it takes 10 to 40 ms for this size.
-const MAX_EXPLAINED: u64 = 512 << 10;
 
 /// Runs jobs until the queue is closed and empty.
 pub(super) fn work(shared: &Shared) {
@@ -49,9 +46,10 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
     let waited = accepted.elapsed();
     span.part("queue", accepted, waited);
     let outcome = shared.settings.budget.check().map_err(Failure::from).and_then(|()| {
-        // The memory for drawing is known in advance.
-        let mut drawing = shared.settings.budget.lease();
-        drawing.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
+        let lease = Arc::new(shared.settings.budget.lease());
+        // The memory for drawing is known in advance: reserved now, jobs do not fail at their end for lack of it.
+        lease.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
+        let control = Control { cancel: cancel.clone(), memory: Arc::<Lease>::clone(&lease), ..Control::default() };
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
         let work = || {
             for callback in on_start {
@@ -59,7 +57,7 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
             }
             let (diagnostics, checked) = if task.strict {
                 let begun = Instant::now();
-                let found = check(shared, &task.input);
+                let found = check(shared, &task.input, &control);
                 progress.ended("check", begun, begun.elapsed());
                 (Some(found?), Some(begun.elapsed()))
             } else {
@@ -70,14 +68,13 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
                 &task.job,
                 &shared.settings.limits,
                 &choice,
-                &cancel,
+                &control,
                 progress.as_ref(),
                 None,
             )
-            .map_err(|error| explained(shared, &task.input, error))?;
+            .map_err(|error| explained(shared, &task.input, error, &control))?;
             if let Some(picture) = &task.job.picture {
-                pipeline::draw(&mut product, picture, &shared.settings.renderer, &cancel, progress.as_ref())
-                    .map_err(|error| Failure::Job { error, diagnostics: Vec::new() })?;
+                pipeline::draw(&mut product, picture, &shared.settings.renderer, &control, progress.as_ref())?;
             }
             if let Some(time) = checked {
                 product.report.add_timing("check", ms(time));
@@ -98,8 +95,7 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
             counter!(JOBS_FALLBACK).increment(1);
             tracing::warn!(renderer, why, "a picture fell back to another renderer");
         }
-        let mut lease = shared.settings.budget.lease();
-        lease.force(bytes_of(&product));
+        lease.set(bytes_of(&product));
         Ok(Finished { product, diagnostics, digest: task.digest, lease })
     });
     // Frees the input before the outcome is sent, so that the receiver sees the true memory use.
@@ -137,9 +133,8 @@ fn end_span(span: &TraceSpan, id: Option<JobId>, label: &'static str, outcome: O
 }
 
 /// Runs the strict validator. Fails if it finds errors.
-fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
-    let diagnostics = strict_validator::check(input, &shared.settings.limits.read)
-        .map_err(|error| Failure::Job { error: error.into(), diagnostics: Vec::new() })?;
+fn check(shared: &Shared, input: &[u8], control: &Control<'_>) -> Result<Vec<Diagnostic>, Failure> {
+    let diagnostics = strict_validator::check(input, &shared.settings.limits.read, control).map_err(JobError::from)?;
     if diagnostics.iter().any(|d| d.level == Level::Error) {
         return Err(Failure::Check { diagnostics });
     }
@@ -147,13 +142,15 @@ fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
 }
 
 /// Adds the findings of the strict validator to the failure of a small file that cannot be read.
-fn explained(shared: &Shared, input: &[u8], error: JobError) -> Failure {
+fn explained(shared: &Shared, input: &[u8], error: JobError, control: &Control<'_>) -> Failure {
     let unreadable =
         matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
-    let limits = ReadLimits { max_inflated_bytes: MAX_EXPLAINED, ..shared.settings.limits.read };
+    let limits = ReadLimits { max_inflated_bytes: MAX_UNREAD_BYTES, ..shared.settings.limits.read };
     // If the strict validator fails as well, there are no findings.
-    let diagnostics = if unreadable { strict_validator::check(input, &limits).unwrap_or_default() } else { Vec::new() };
-    Failure::Job { error, diagnostics }
+    if !unreadable {
+        return error.into();
+    }
+    Failure::Job { error, diagnostics: strict_validator::check(input, &limits, control).unwrap_or_default() }
 }
 
 /// Counts and logs an outcome. Returns its label.

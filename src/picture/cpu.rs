@@ -10,6 +10,9 @@ use super::raster::{Band, Samples, Shape, fill};
 use super::{PictureError, PictureParams, Rendered, Renderer};
 use crate::surface::{Control, Mesh, Vertices};
 
+/// Memory of the bins, bytes per triangle.
+const BIN_BYTES: u64 = 16;
+
 /// Renderer on the threads of the current pool.
 #[derive(Debug, Clone, Copy)]
 pub struct CpuRenderer;
@@ -31,6 +34,8 @@ impl Renderer for CpuRenderer {
         control.check()?;
         let (width, height) = (params.width as usize, params.height as usize);
         let tiles = Tiles::of(width, height);
+        // A pair of tile and triangle, before and after sorting; few triangles lie in several tiles.
+        let memory = control.reserve(BIN_BYTES * shape.triangles.len() as u64)?;
         let bins = Bins::new(positions, shape.triangles, &camera, tiles);
         control.check()?;
         let mut layers = Layers::empty(width, height);
@@ -43,7 +48,7 @@ impl Renderer for CpuRenderer {
             fill(shape, &camera, &bins, tiles, &mut band, samples);
             Ok::<_, PictureError>(())
         })?;
-        drop(bins);
+        drop((bins, memory));
         control.check()?;
         let image = finish(&layers, &Finish::new(params, &camera), params);
         control.check()?;

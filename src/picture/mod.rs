@@ -23,7 +23,7 @@ use std::sync::Arc;
 
 use thiserror::Error;
 
-use crate::surface::{BackendIdentity, Control, Mesh, SurfaceError, arithmetic};
+use crate::surface::{BackendIdentity, Control, Mesh, OutOfMemory, SurfaceError, arithmetic};
 pub use cpu::CpuRenderer;
 pub use params::{Background, DEFAULT_SIDE, MAX_SIDE, PictureLimits, PictureParams, Style, View};
 
@@ -43,6 +43,9 @@ pub enum PictureError {
     /// The run was cancelled.
     #[error("cancelled")]
     Cancelled,
+    /// Memory is not available now.
+    #[error(transparent)]
+    Memory(#[from] OutOfMemory),
     /// The vertices are quantized.
     #[error("quantized vertices cannot be drawn")]
     Quantized,
@@ -61,6 +64,7 @@ impl From<SurfaceError> for PictureError {
     fn from(error: SurfaceError) -> Self {
         match error {
             SurfaceError::Cancelled => Self::Cancelled,
+            SurfaceError::Memory(error) => Self::Memory(error),
             other => Self::Device { why: other.to_string() },
         }
     }

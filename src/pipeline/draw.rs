@@ -3,7 +3,7 @@
 use super::report::{PictureReport, Report};
 use super::{JobError, Product, ProgressSink, StageClock};
 use crate::picture::{PictureParams, Rendered, SelectedRenderer, png};
-use crate::surface::{CancelToken, Control, Mesh};
+use crate::surface::{Control, Mesh};
 
 /// Draws the mesh of `product` and replaces it with the PNG.
 ///
@@ -14,7 +14,7 @@ pub fn draw(
     product: &mut Product,
     params: &PictureParams,
     renderer: &SelectedRenderer,
-    cancel: &CancelToken,
+    control: &Control<'_>,
     progress: &dyn ProgressSink,
 ) -> Result<(), JobError> {
     let clock = StageClock::new(progress);
@@ -22,7 +22,7 @@ pub fn draw(
     let drawn = clock.time("draw", || {
         // The renderer needs random access to vertices.
         mesh.make_contiguous();
-        let control = Control { cancel: cancel.clone(), deadline: None, observer: &clock };
+        let control = Control { observer: &clock, ..control.clone() };
         renderer.renderer.render(&mesh, params, &control)
     })?;
     // Free the mesh before the PNG is allocated.

@@ -9,7 +9,7 @@ use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
 use crate::surface::cpu::scan;
 use crate::surface::lattice::Lattice;
 use crate::surface::occupancy::Occupancy;
-use crate::surface::{CancelToken, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+use crate::surface::{Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// Estimated size of a job.
 #[derive(Debug, Clone, PartialEq)]
@@ -52,15 +52,14 @@ pub fn estimate(
     job: &Job,
     limits: &JobLimits,
     choice: &Choice<'_>,
-    cancel: &CancelToken,
+    control: &Control<'_>,
 ) -> Result<Estimate, JobError> {
     let clock = StageClock::new(&());
-    let (structure, selected, spheres) = super::read(bytes, job, limits, &clock)?;
-    let control = Control { cancel: cancel.clone(), deadline: limits.deadline, ..Control::default() };
+    let (structure, selected, spheres) = super::read(bytes, job, limits, &clock, control)?;
     let mut params = job.params_for(spheres.len());
     let mut refused = None;
     if let Spacing::MaxTriangles(limit) = job.spacing {
-        match fit::expected(&spheres, job, limit, &limits.surface, choice, &control) {
+        match fit::expected(&spheres, job, limit, &limits.surface, choice, control) {
             Ok(resolution) => params.resolution = resolution,
             Err(error) => {
                 if let SurfaceError::TooManyTriangles { resolution, .. } = error {
@@ -73,7 +72,7 @@ pub fn estimate(
     let _storage = super::storage(job, &mut params, &spheres);
     let lattice = Lattice::new(&spheres, &params)?;
     let (resolution, box_cells) = (params.resolution, lattice.box_cells);
-    let mesh = refused.map_or_else(|| of_mesh(&lattice, &spheres, &params, &limits.surface, choice, &control), Err);
+    let mesh = refused.map_or_else(|| of_mesh(&lattice, &spheres, &params, &limits.surface, choice, control), Err);
     let mesh = match (mesh, job.spacing) {
         (Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)), _) => return Err(error.into()),
         (Ok(mesh), Spacing::MaxTriangles(limit)) => Ok(mesh.at_most(limit, &params)),
@@ -145,9 +144,9 @@ mod tests {
         let choice = Choice { backend: &backend, reason: "" };
         for resolution in ["0.3", "0.5", "1", "2"] {
             let job = params::parse([("resolution", resolution)]).unwrap().job;
-            let (limits, cancel) = (JobLimits::default(), CancelToken::default());
-            let estimate = estimate(SAMPLE, &job, &limits, &choice, &cancel).unwrap();
-            let report = run(SAMPLE, &job, &limits, &choice, &cancel, &(), None).unwrap().report;
+            let (limits, control) = (JobLimits::default(), Control::default());
+            let estimate = estimate(SAMPLE, &job, &limits, &choice, &control).unwrap();
+            let report = run(SAMPLE, &job, &limits, &choice, &control, &(), None).unwrap().report;
             let mesh = estimate.mesh.unwrap();
             assert_eq!((mesh.samples, estimate.atoms), (report.samples, report.atoms));
             let ratio = mesh.triangles as f64 / report.triangles as f64;
@@ -161,7 +160,7 @@ mod tests {
         let choice = Choice { backend: &backend, reason: "" };
         let of = |compress: &str| {
             let job = params::parse([("compress", compress)]).unwrap().job;
-            estimate(SAMPLE, &job, &JobLimits::default(), &choice, &CancelToken::default()).unwrap().mesh.unwrap()
+            estimate(SAMPLE, &job, &JobLimits::default(), &choice, &Control::default()).unwrap().mesh.unwrap()
         };
         let (single, rounded) = (of("none"), of("quantize"));
         assert_eq!((single.vertices, single.triangles), (rounded.vertices, rounded.triangles));
@@ -174,10 +173,10 @@ mod tests {
         let choice = Choice { backend: &backend, reason: "" };
         let small = SurfaceLimits { max_mesh_bytes: 100_000, ..SurfaceLimits::default() };
         let limits = JobLimits { surface: small, ..JobLimits::default() };
-        let refused = estimate(SAMPLE, &Job::default(), &limits, &choice, &CancelToken::default()).unwrap();
+        let refused = estimate(SAMPLE, &Job::default(), &limits, &choice, &Control::default()).unwrap();
         let Err(SurfaceError::MeshTooLarge { suggested_resolution, .. }) = refused.mesh else { panic!("{refused:?}") };
         let text = suggested_resolution.to_string();
         let job = params::parse([("resolution", text.as_str())]).unwrap().job;
-        assert!(estimate(SAMPLE, &job, &limits, &choice, &CancelToken::default()).unwrap().mesh.is_ok());
+        assert!(estimate(SAMPLE, &job, &limits, &choice, &Control::default()).unwrap().mesh.is_ok());
     }
 }

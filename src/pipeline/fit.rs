@@ -4,10 +4,14 @@
 //! surface, and narrow necks close or open. The search therefore computes meshes and counts their triangles. The number
 //! of meshes is bounded, and the first one is coarse, so it is cheap.
 
+use std::sync::Arc;
+
 use super::clock::StageClock;
 use super::spacing::{COARSEST, FINEST, Spacing};
 use super::{Choice, Job};
-use crate::surface::{Control, MeshOutput, Observer, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams};
+use crate::surface::{
+    Control, MeshOutput, Observer, Reservation, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
+};
 
 /// Maximum number of meshes, including the first coarse one and a repetition of the best one.
 const MAX_TRIES: u32 = 8;
@@ -171,15 +175,19 @@ pub(super) fn mesh(
     control: &Control<'_>,
 ) -> Result<Fitted, SurfaceError> {
     let mut search = Search::new(limit, &job.params, spheres.len());
-    let mut last: Option<(f64, MeshOutput)> = None;
+    // The last mesh with its memory.
+    let mut last: Option<(f64, MeshOutput, Arc<Reservation>)> = None;
     // Name of the backend that computed the meshes.
     let mut made_by = None;
     let mut restarted = false;
     loop {
         let (spacing, again) = match search.next() {
             Next::Try(spacing) => (spacing, false),
-            Next::Use(spacing) => match last.take().filter(|(made, _)| made.total_cmp(&spacing).is_eq()) {
-                Some((resolution, output)) => return Ok(Fitted { output, resolution, tries: search.tries() }),
+            Next::Use(spacing) => match last.take().filter(|(made, ..)| made.total_cmp(&spacing).is_eq()) {
+                Some((resolution, output, memory)) => {
+                    memory.keep();
+                    return Ok(Fitted { output, resolution, tries: search.tries() });
+                }
                 None => (spacing, true),
             },
             Next::Fail { resolution, triangles } => return Err(no_fit(&job.params, limit, resolution, triangles)),
@@ -190,7 +198,8 @@ pub(super) fn mesh(
         let _storage = super::storage(job, &mut params, spheres);
         let without_progress = WithoutProgress(clock);
         let observer: &dyn Observer = if search.tries() == 0 { &without_progress } else { clock };
-        let control = Control { observer, ..control.clone() };
+        let memory = Arc::new(Reservation::new(&control.memory));
+        let control = Control { observer, memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
         let made = unless_empty(clock.pass(|| choice.backend.run(spheres, &params, limits, &control)))?;
         let by = made.as_ref().map(|m| m.made_by.as_ref().map_or(choice.backend.name(), |s| s.backend));
         if by.is_some() && made_by.is_some() && by != made_by {
@@ -213,9 +222,10 @@ pub(super) fn mesh(
             let meshed = meshed.ok_or_else(|| SurfaceError::Device {
                 why: "two runs on the same input returned different meshes".into(),
             })?;
+            memory.keep();
             return Ok(Fitted { output: meshed, resolution: spacing, tries: search.tries() });
         }
-        last = made.map(|meshed| (spacing, meshed));
+        last = made.map(|meshed| (spacing, meshed, memory));
     }
 }
 

@@ -13,8 +13,6 @@ mod report;
 pub mod spacing;
 mod work;
 
-use std::time::Instant;
-
 use thiserror::Error;
 
 pub use clock::{ProgressSink, StageClock};
@@ -33,8 +31,8 @@ use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, U
 use crate::picture::{PictureError, PictureLimits, PictureParams};
 use crate::structure::{self, ReadLimits, Selected, Selection, Structure, StructureError};
 use crate::surface::{
-    Backend, CancelToken, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError,
-    SurfaceLimits, SurfaceParams, Validation, lattice,
+    Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits,
+    SurfaceParams, Validation, lattice,
 };
 use report::Counts;
 
@@ -96,8 +94,6 @@ pub struct JobLimits {
     pub surface: SurfaceLimits,
     /// Limits of drawing.
     pub picture: PictureLimits,
-    /// Time by which the mesh must be finished.
-    pub deadline: Option<Instant>,
 }
 
 /// Chosen backend and the reason for the choice, for reports and logs.
@@ -136,7 +132,7 @@ impl Product {
 pub enum JobError {
     /// Reading or selecting failed.
     #[error(transparent)]
-    Structure(#[from] StructureError),
+    Structure(StructureError),
     /// Meshing failed.
     #[error(transparent)]
     Surface(#[from] SurfaceError),
@@ -145,18 +141,30 @@ pub enum JobError {
     Picture(PictureError),
 }
 
+impl From<StructureError> for JobError {
+    fn from(error: StructureError) -> Self {
+        match error {
+            // Cancellation and lack of memory are the same errors in all stages.
+            StructureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
+            StructureError::Memory(error) => Self::Surface(error.into()),
+            error => Self::Structure(error),
+        }
+    }
+}
+
 impl From<PictureError> for JobError {
     fn from(error: PictureError) -> Self {
         match error {
-            // Cancellation is the same error in all stages.
             PictureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
+            PictureError::Memory(error) => Self::Surface(error.into()),
             PictureError::Device { why } => Self::Surface(SurfaceError::Device { why }),
             error => Self::Picture(error),
         }
     }
 }
 
-/// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh.
+/// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh. The observer of
+/// `control` is not used; `progress` is. Memory of the product stays added to the meter of `control`.
 ///
 /// With a `sink`, the mesh is streamed into it as GLB unless the job needs the whole mesh in memory.
 /// [`Product::streamed_bytes`] is set then.
@@ -168,14 +176,14 @@ pub fn run(
     job: &Job,
     limits: &JobLimits,
     choice: &Choice<'_>,
-    cancel: &CancelToken,
+    control: &Control<'_>,
     progress: &dyn ProgressSink,
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
     job.check(limits)?;
     let clock = StageClock::new(progress);
-    let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
-    let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
+    let control = Control { observer: &clock, ..control.clone() };
+    let (structure, selected, spheres) = read(bytes, job, limits, &clock, &control)?;
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -228,16 +236,27 @@ fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage 
     Storage { packing, normals: job.normals, units: job.units }
 }
 
+/// Memory of selecting, bytes per atom of the structure.
+const INDEX_BYTES: u64 = 8;
+/// Memory of a sphere, bytes.
+const SPHERE_BYTES: u64 = 28;
+
 /// Reads a structure and selects its spheres.
 fn read(
     bytes: &[u8],
     job: &Job,
     limits: &JobLimits,
     clock: &StageClock<'_>,
+    control: &Control<'_>,
 ) -> Result<(Structure, Selected, Spheres), JobError> {
-    let structure = clock.time("read", || structure::read(bytes, &limits.read))?;
+    let structure = clock.time("read", || structure::read_with(bytes, &limits.read, control))?;
+    control.check()?;
+    // Selecting holds an index for each atom, and a sphere for each selected one.
+    control.memory.grow(INDEX_BYTES * structure.len() as u64).map_err(SurfaceError::from)?;
     let (selected, spheres) = clock.time("select", || -> Result<_, JobError> {
-        let selected = structure::select(&structure, &job.selection)?;
+        let selected = structure::select_with(&structure, &job.selection, control)?;
+        control.check()?;
+        control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
         let spheres = selected.spheres(&structure)?;
         Ok((selected, spheres))
     })?;

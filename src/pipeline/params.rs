@@ -79,6 +79,9 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         if std::mem::replace(&mut seen[index], true) {
             return Err(ParamError::Repeated { name: parameter.name });
         }
+        if value.len() > MAX_VALUE_BYTES {
+            return Err(parameter.bad_value(value, format!("at most {MAX_VALUE_BYTES} bytes")));
+        }
         // A default conflicts with nothing, since clients may send every default. An explicit format still overrides
         // `Accept`.
         if parameter.name != "format" && parameter.is_default(value) {
@@ -98,6 +101,9 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     }
     Ok(request)
 }
+
+/// Maximum length of the value of a parameter, bytes: enough for the names of 1,000 chains. Job records contain values.
+pub const MAX_VALUE_BYTES: usize = 4096;
 
 /// Parameters of a picture.
 pub(crate) const PICTURES: [&str; 7] = ["width", "height", "view", "azimuth", "elevation", "background", "style"];

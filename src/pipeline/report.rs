@@ -6,7 +6,7 @@ use serde_json::{Map, Value};
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
 use crate::structure::{LeftOut, Selected, Structure, radii};
-use crate::surface::{BackendIdentity, Component, GridStats, Measures};
+use crate::surface::{BackendIdentity, Component, GridStats, Measures, Validation};
 
 /// Connected component of the mesh.
 #[derive(Debug, Clone, Serialize)]
@@ -203,7 +203,10 @@ pub struct Report {
     pub oriented: bool,
     /// True if all edges and vertices are manifold.
     pub manifold: bool,
-    /// Method that checked `closed`, `oriented` and `manifold`: `checksum` or `exact`.
+    /// `check` if a check of the mesh found `manifold`; `construction` if it follows from the case table, because the
+    /// checksum does not see vertices.
+    pub manifold_from: &'static str,
+    /// Method that checked `closed`, `oriented` and, unless it is by construction, `manifold`: `checksum` or `exact`.
     pub validation: &'static str,
     /// Euler characteristic: vertices − edges + triangles.
     pub euler: i64,
@@ -305,6 +308,11 @@ impl Report {
             closed: measures.closed,
             oriented: measures.oriented,
             manifold: measures.manifold,
+            // A mesh that fails the checksum is not manifold, whatever its vertices.
+            manifold_from: match measures.validation {
+                Validation::Checksum if measures.manifold => "construction",
+                _ => "check",
+            },
             validation: measures.validation.name(),
             euler: measures.euler,
             components: measures.components.len() as u64,

@@ -7,6 +7,12 @@
 use std::collections::HashMap;
 
 use super::atoms::Structure;
+use super::error::StructureError;
+use super::read;
+use crate::surface::Control;
+
+/// Atoms between two checks of the cancellation flag: about a millisecond.
+pub(super) const ATOMS_PER_CHECK: usize = 1 << 16;
 
 type Residue = (u32, i32, u8);
 
@@ -38,9 +44,20 @@ fn residue(structure: &Structure, i: usize) -> Residue {
 impl Alternatives {
     /// Chooses an alternative for each residue of `model`: `wanted` if the residue has it, otherwise the one with the
     /// highest mean occupancy. The lowest letter wins a tie.
-    pub(super) fn choose(structure: &Structure, model: i32, wanted: Option<u8>) -> Self {
+    pub(super) fn choose(
+        structure: &Structure,
+        model: i32,
+        wanted: Option<u8>,
+        control: &Control<'_>,
+    ) -> Result<Self, StructureError> {
         let mut letters: HashMap<Residue, Vec<Letter>> = HashMap::new();
-        for i in (0..structure.len()).filter(|&i| structure.altloc[i] != 0 && structure.model[i] == model) {
+        for i in 0..structure.len() {
+            if i % ATOMS_PER_CHECK == 0 {
+                read::check(control)?;
+            }
+            if structure.altloc[i] == 0 || structure.model[i] != model {
+                continue;
+            }
             let of_residue = letters.entry(residue(structure, i)).or_default();
             let (letter, occupancy) = (structure.altloc[i], f64::from(structure.occupancy[i]));
             match of_residue.iter_mut().find(|l| l.code == letter) {
@@ -56,7 +73,7 @@ impl Alternatives {
             let best = letters.iter().max_by_key(|l| (l.rank(), std::cmp::Reverse(l.code)));
             has.or(best).map_or(0, |l| l.code)
         };
-        Self { chosen: letters.into_iter().map(|(residue, letters)| (residue, best(letters))).collect() }
+        Ok(Self { chosen: letters.into_iter().map(|(residue, letters)| (residue, best(letters))).collect() })
     }
 
     /// Returns true if atom `i` is common to all alternatives or belongs to the chosen one.

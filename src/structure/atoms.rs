@@ -1,8 +1,12 @@
 //! Atoms of a structure file, stored as a structure of arrays.
 
 use super::contents::Kind;
+use super::duplicates;
+use super::error::StructureError;
 use super::kinds::{self, Sequence};
+use super::read::Reading;
 use super::texts::{Interner, TextColumn};
+use crate::surface::OutOfMemory;
 
 /// The file format that a structure was read from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -132,6 +136,13 @@ pub(super) struct Tables {
     pub(super) label_chain: Interner,
 }
 
+impl Tables {
+    /// Returns the number of distinct texts in all tables.
+    pub(super) fn n_texts(&self) -> usize {
+        [&self.name, &self.residue, &self.chain, &self.label_chain].map(|table| table.texts().len()).iter().sum()
+    }
+}
+
 macro_rules! columns {
     ($($field:ident: $type:ty = $from:expr),+ $(,)?) => {
         /// Columns that are being filled.
@@ -139,9 +150,17 @@ macro_rules! columns {
         pub(super) struct Columns { $(pub(super) $field: Vec<$type>),+ }
 
         impl Columns {
-            /// Reserves memory for exactly `n` more atoms.
-            pub(super) fn reserve(&mut self, n: usize) {
-                $(self.$field.reserve_exact(n);)+
+            /// Bytes of an atom.
+            const BYTES_PER_ROW: usize = 0 $(+ size_of::<$type>())+;
+
+            /// Allocates memory for exactly `n` more atoms, which belongs to the structure.
+            pub(super) fn reserve(&mut self, n: usize, reading: &Reading<'_>) -> Result<(), StructureError> {
+                let needed = Self::bytes(n);
+                let memory = reading.reserve(needed)?;
+                let refused = |_refused| OutOfMemory::System { needed };
+                $(self.$field.try_reserve_exact(n).map_err(refused)?;)+
+                memory.keep();
+                Ok(())
             }
 
             #[inline]
@@ -149,7 +168,7 @@ macro_rules! columns {
                 $(self.$field.push($from(atom));)+
             }
 
-            /// Returns `n` zeroed atoms, to be filled through [`Self::slices`].
+            /// Returns `n` zeroed atoms, to be filled through [`Self::slices`]. The caller reserves their memory.
             pub(super) fn zeroed(n: usize) -> Self {
                 Self { $($field: vec![<$type>::default(); n]),+ }
             }
@@ -213,6 +232,16 @@ columns! {
 }
 
 impl Slices<'_> {
+    /// Returns the number of rows that have been filled.
+    pub(super) fn n_filled(&self) -> usize {
+        self.next
+    }
+
+    /// Returns model and position of a row.
+    pub(super) fn place(&self, row: usize) -> (i32, [f64; 3]) {
+        (self.model[row], [self.x[row], self.y[row], self.z[row]])
+    }
+
     /// Returns true if every row has been filled.
     pub(super) fn is_full(&self) -> bool {
         self.next == self.element.len()
@@ -232,24 +261,36 @@ impl Columns {
         self.element.len()
     }
 
-    /// Adds an atom. Returns false if there are `max_rows` already.
-    #[inline]
-    pub(super) fn push_within(&mut self, max_rows: usize, atom: &Atom) -> bool {
-        let fits = self.len() < max_rows;
-        if fits {
-            self.push(atom);
-        }
-        fits
+    /// Returns the number of rows that fit without allocating.
+    pub(super) fn capacity(&self) -> usize {
+        self.element.capacity()
     }
 
-    /// Returns the finished structure.
-    pub(super) fn finish(mut self, tables: Tables, source: Source) -> Structure {
-        kinds::assign(&mut self, &tables, &source.sequence);
+    /// Returns the memory of `n` atoms, bytes.
+    pub(super) const fn bytes(n: usize) -> u64 {
+        (Self::BYTES_PER_ROW * n) as u64
+    }
+
+    /// Returns model and position of a row.
+    pub(super) fn place(&self, row: usize) -> (i32, [f64; 3]) {
+        (self.model[row], [self.x[row], self.y[row], self.z[row]])
+    }
+
+    /// Returns the finished structure, if not too many atoms have the same position.
+    pub(super) fn finish(
+        mut self,
+        tables: Tables,
+        source: Source,
+        reading: &Reading<'_>,
+    ) -> Result<Structure, StructureError> {
+        duplicates::check(self.len(), |row| self.place(row), reading)?;
+        kinds::assign(&mut self, &tables, &source.sequence, reading)?;
         if tables.label_chain.is_empty() {
             self.label_chain = Vec::new();
         }
         self.shrink();
-        Structure {
+        reading.check()?;
+        Ok(Structure {
             format: source.format,
             id: source.id,
             title: source.title,
@@ -270,6 +311,6 @@ impl Columns {
             hetero: self.hetero,
             kind: self.kind,
             warnings: source.warnings,
-        }
+        })
     }
 }

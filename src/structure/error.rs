@@ -2,6 +2,8 @@
 
 use thiserror::Error;
 
+use crate::surface::OutOfMemory;
+
 /// Errors of reading and selecting.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum StructureError {
@@ -55,6 +57,24 @@ pub enum StructureError {
         /// Limit, number of atoms.
         limit: u64,
     },
+    /// More atoms of one model at the same position than allowed.
+    #[error("more than {limit} atoms have the position {x}, {y}, {z}")]
+    TooManyDuplicates {
+        /// Limit, number of atoms.
+        limit: u64,
+        /// Coordinates, Å.
+        x: f64,
+        /// Coordinates, Å.
+        y: f64,
+        /// Coordinates, Å.
+        z: f64,
+    },
+    /// Memory is not available now.
+    #[error(transparent)]
+    Memory(#[from] OutOfMemory),
+    /// The caller cancelled.
+    #[error("cancelled")]
+    Cancelled,
     /// The file holds no atoms.
     #[error("no atoms: {found}")]
     NoAtoms {

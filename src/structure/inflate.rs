@@ -7,6 +7,8 @@ use std::borrow::Cow;
 use std::io::{self, Read};
 
 use super::error::StructureError;
+use super::read::Reading;
+use crate::surface::{MemoryMeter as _, OutOfMemory};
 
 const GZIP: &[u8] = b"\x1f\x8b";
 const ZSTD: &[u8] = b"\x28\xb5\x2f\xfd";
@@ -26,17 +28,17 @@ pub(super) fn encoding(bytes: &[u8]) -> Option<&'static str> {
 }
 
 /// Returns the decompressed bytes, or the input itself if it is not compressed.
-pub(super) fn inflate(bytes: &[u8], limit: u64) -> Result<Cow<'_, [u8]>, StructureError> {
+pub(super) fn inflate<'a>(bytes: &'a [u8], limit: u64, reading: &Reading<'_>) -> Result<Cow<'a, [u8]>, StructureError> {
     let plain = match encoding(bytes) {
         None if bytes.len() as u64 > limit => return Err(StructureError::InflatedTooLarge { limit }),
         None => return Ok(Cow::Borrowed(bytes)),
-        Some("gzip") => gzip(bytes, limit)?,
-        Some(_) => zstd(bytes, limit)?,
+        Some("gzip") => gzip(bytes, limit, reading)?,
+        Some(_) => zstd(bytes, limit, reading)?,
     };
     Ok(Cow::Owned(plain))
 }
 
-fn gzip(mut rest: &[u8], limit: u64) -> Result<Vec<u8>, StructureError> {
+fn gzip(mut rest: &[u8], limit: u64, reading: &Reading<'_>) -> Result<Vec<u8>, StructureError> {
     let broken = |e: io::Error| StructureError::Decompress { encoding: "gzip", reason: e.to_string() };
     let mut out = Vec::new();
     while !rest.is_empty() {
@@ -49,13 +51,13 @@ fn gzip(mut rest: &[u8], limit: u64) -> Result<Vec<u8>, StructureError> {
             return Err(StructureError::Decompress { encoding: "gzip", reason });
         }
         let mut decoder = flate2::bufread::GzDecoder::new(rest);
-        append(&mut decoder, &mut out, limit, broken)?;
+        append(&mut decoder, &mut out, limit, reading, broken)?;
         rest = decoder.into_inner();
     }
     Ok(out)
 }
 
-fn zstd(mut rest: &[u8], limit: u64) -> Result<Vec<u8>, StructureError> {
+fn zstd(mut rest: &[u8], limit: u64, reading: &Reading<'_>) -> Result<Vec<u8>, StructureError> {
     let broken = |reason: String| StructureError::Decompress { encoding: "zstd", reason };
     let mut out = Vec::new();
     while !rest.is_empty() {
@@ -66,7 +68,7 @@ fn zstd(mut rest: &[u8], limit: u64) -> Result<Vec<u8>, StructureError> {
         }
         let mut decoder = ruzstd::decoding::StreamingDecoder::new_with_max_window_size(rest, MAX_ZSTD_WINDOW)
             .map_err(|e| broken(e.to_string()))?;
-        append(&mut decoder, &mut out, limit, |e| broken(e.to_string()))?;
+        append(&mut decoder, &mut out, limit, reading, |e| broken(e.to_string()))?;
         // The frame may end with a checksum of the decompressed data.
         let frame = &decoder.decoder;
         if let (Some(said), Some(computed)) = (frame.get_checksum_from_data(), frame.get_calculated_checksum())
@@ -79,11 +81,16 @@ fn zstd(mut rest: &[u8], limit: u64) -> Result<Vec<u8>, StructureError> {
     Ok(out)
 }
 
-/// Reads `decoder` to its end into a buffer that doubles.
+/// Bytes decompressed between two checks of the cancellation flag: a few milliseconds.
+const BYTES_PER_CHECK: u64 = 1 << 20;
+
+/// Reads `decoder` to its end into a buffer that doubles. Memory is reserved before the buffer grows; the old buffer
+/// counts until it has been copied.
 fn append(
     decoder: &mut dyn Read,
     out: &mut Vec<u8>,
     limit: u64,
+    reading: &Reading<'_>,
     broken: impl Fn(io::Error) -> StructureError,
 ) -> Result<(), StructureError> {
     let limit_len = usize::try_from(limit).unwrap_or(usize::MAX - 1);
@@ -91,10 +98,19 @@ fn append(
         let remaining = limit_len.saturating_sub(out.len()).saturating_add(1);
         let step = out.len().max(1 << 20).min(remaining);
         let start = out.len();
-        if out.try_reserve_exact(step).is_err() {
-            return Err(StructureError::InflatedTooLarge { limit });
+        if out.capacity() - start < step {
+            let (old, new) = (out.capacity() as u64, (start + step) as u64);
+            reading.text.grow(new)?;
+            out.try_reserve_exact(step).map_err(|_refused| OutOfMemory::System { needed: new })?;
+            reading.text.shrink(old);
         }
-        decoder.take(step as u64).read_to_end(out).map_err(&broken)?;
+        let mut left = step as u64;
+        while left > 0 {
+            reading.check()?;
+            let part = left.min(BYTES_PER_CHECK);
+            let n = decoder.take(part).read_to_end(out).map_err(&broken)? as u64;
+            left = if n < part { 0 } else { left - n };
+        }
         if out.len() > limit_len {
             return Err(StructureError::InflatedTooLarge { limit });
         }
@@ -116,6 +132,11 @@ mod tests {
 
     use super::*;
 
+    fn inflated(bytes: &[u8], limit: u64) -> Result<Cow<'_, [u8]>, StructureError> {
+        let control = crate::surface::Control::default();
+        inflate(bytes, limit, &Reading::new(&super::super::ReadLimits::default(), &control))
+    }
+
     fn gz(data: &[u8]) -> Vec<u8> {
         let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
         encoder.write_all(data).unwrap();
@@ -133,18 +154,18 @@ mod tests {
             ([zst(b"ab"), b"\x53\x2a\x4d\x18\x03\0\0\0xyz".to_vec(), zst(b"cd")].concat(), "zstd"),
         ] {
             assert_eq!(super::encoding(&packed), Some(encoding));
-            assert_eq!(inflate(&packed, 4).unwrap(), &b"abcd"[..]);
-            assert_eq!(inflate(&packed, 3), Err(StructureError::InflatedTooLarge { limit: 3 }));
+            assert_eq!(inflated(&packed, 4).unwrap(), &b"abcd"[..]);
+            assert_eq!(inflated(&packed, 3), Err(StructureError::InflatedTooLarge { limit: 3 }));
         }
-        assert_eq!(inflate(&[gz(b"ab"), vec![0; 512]].concat(), 9).unwrap(), &b"ab"[..]);
+        assert_eq!(inflated(&[gz(b"ab"), vec![0; 512]].concat(), 9).unwrap(), &b"ab"[..]);
     }
 
     #[test]
     fn a_bomb_stops_at_the_limit() {
         let zeros = vec![b' '; 64 << 20];
         for bomb in [gz(&zeros), zst(&zeros)] {
-            assert_eq!(inflate(&bomb, 1 << 20), Err(StructureError::InflatedTooLarge { limit: 1 << 20 }));
-            assert_eq!(inflate(&bomb, 64 << 20).unwrap().len(), 64 << 20);
+            assert_eq!(inflated(&bomb, 1 << 20), Err(StructureError::InflatedTooLarge { limit: 1 << 20 }));
+            assert_eq!(inflated(&bomb, 64 << 20).unwrap().len(), 64 << 20);
         }
     }
 
@@ -152,16 +173,16 @@ mod tests {
     fn broken_data_is_an_error() {
         for (packed, encoding) in [(gz(&[7; 5000]), "gzip"), (zst(&[7; 5000]), "zstd")] {
             for cut in 4..packed.len() {
-                let error = inflate(&packed[..cut], 1 << 20).unwrap_err();
+                let error = inflated(&packed[..cut], 1 << 20).unwrap_err();
                 assert!(
                     matches!(error, StructureError::Decompress { encoding: e, .. } if e == encoding),
                     "{cut}: {error}"
                 );
             }
         }
-        assert!(inflate(&[gz(b"ab"), b"junk".to_vec()].concat(), 100).is_err());
+        assert!(inflated(&[gz(b"ab"), b"junk".to_vec()].concat(), 100).is_err());
         // A zstd frame header that asks for a window of 2 GiB.
         let huge = [ZSTD, &[0x00, 0xA8, 0, 0, 0][..]].concat();
-        assert!(matches!(inflate(&huge, u64::MAX), Err(StructureError::Decompress { .. })));
+        assert!(matches!(inflated(&huge, u64::MAX), Err(StructureError::Decompress { .. })));
     }
 }

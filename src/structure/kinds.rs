@@ -9,6 +9,8 @@ use std::collections::{HashMap, HashSet};
 
 use super::atoms::{Columns, Tables};
 use super::contents::Kind;
+use super::error::StructureError;
+use super::read::Reading;
 use super::{residue, sites};
 
 /// Sequence information of a file, by chain.
@@ -38,17 +40,26 @@ const PEPTIDE_BOND: f64 = 2.0;
 const PHOSPHATE_BOND: f64 = 2.2;
 
 /// Sets the kinds of all atoms. The reader has made ATOM records and rows with a `label_seq_id` polymer, and other
-/// HETATM records ligands.
-pub(super) fn assign(columns: &mut Columns, tables: &Tables, sequence: &Sequence) {
+/// HETATM records ligands. Checks for cancellation between passes.
+pub(super) fn assign(
+    columns: &mut Columns,
+    tables: &Tables,
+    sequence: &Sequence,
+    reading: &Reading<'_>,
+) -> Result<(), StructureError> {
     let solvent = Solvent::new(tables);
     if columns.hetero.contains(&true) {
         let decided = sequenced(columns, tables, sequence, &solvent);
+        reading.check()?;
         solvent.mark(columns);
+        reading.check()?;
         bonded(columns, tables, &decided);
     } else {
         solvent.mark(columns);
     }
+    reading.check()?;
     sites::mark(columns, tables);
+    reading.check()
 }
 
 /// Residue names of water and single ions.

@@ -4,13 +4,14 @@ use std::collections::HashSet;
 
 use thiserror::Error;
 
-use super::altloc::Alternatives;
+use super::altloc::{ATOMS_PER_CHECK, Alternatives};
 use super::atoms::Structure;
 use super::contents::{Contents, Kind};
 use super::error::StructureError;
 use super::radii;
+use super::read::check;
 use super::text::list;
-use crate::surface::{Spheres, SurfaceError};
+use crate::surface::{Control, Spheres, SurfaceError};
 
 /// Selection of atoms. Default: first model, polymer, no hydrogens, alternative locations with the highest occupancy.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -153,15 +154,33 @@ impl LeftOut {
 /// Returns [`StructureError::EmptySelection`] if no atom is selected, and [`StructureError::NotFound`] for a model,
 /// chain or alternative location that does not exist.
 pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, StructureError> {
+    select_with(structure, selection, &Control::default())
+}
+
+/// Selects atoms as [`select`] does, and checks for cancellation every few milliseconds.
+///
+/// # Errors
+/// Returns the errors of [`select`], and [`StructureError::Cancelled`].
+pub fn select_with(
+    structure: &Structure,
+    selection: &Selection,
+    control: &Control<'_>,
+) -> Result<Selected, StructureError> {
     let model = model(structure, selection)?;
     let chains = chains(structure, selection)?;
     let wanted = alternative(structure, selection, model)?;
-    let alternatives = Alternatives::choose(structure, model, wanted);
+    let alternatives = Alternatives::choose(structure, model, wanted, control)?;
     let mut left_out = LeftOut::default();
     let mut by_residue = vec![0; structure.residue.texts().len()];
     let mut atoms: Vec<u32> = Vec::new();
     // The reader limits the number of atoms to 32 bits.
-    for (i, index) in (0..structure.len()).zip(0_u32..).filter(|&(i, _)| structure.model[i] == model) {
+    for (i, index) in (0..structure.len()).zip(0_u32..) {
+        if i % ATOMS_PER_CHECK == 0 {
+            check(control)?;
+        }
+        if structure.model[i] != model {
+            continue;
+        }
         let kind = structure.kind[i];
         if chains.as_ref().is_some_and(|chains| !chains[structure.chain.id(i) as usize]) {
             left_out.other_chains += 1;

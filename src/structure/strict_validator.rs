@@ -1,10 +1,11 @@
 //! Strict validation of a structure file by pdbtbx.
 //!
 //! The reader of this crate parses only what it needs and stops at the first error. This module checks the whole file
-//! against the format and lists all findings. They accompany a read error, or answer a strict check. pdbtbx is slow
-//! (quadratic in the residues of a chain) and panics on hostile input. Therefore:
+//! against the format and lists all findings. They accompany a read error, or answer a strict check. pdbtbx cannot be
+//! stopped, is slow (quadratic in the residues of a chain) and panics on hostile input. Therefore:
 //!
-//! * Call it on a thread that may block, with at most [`MAX_BYTES`] of text.
+//! * It checks at most [`MAX_BYTES`] of text whose [`Cost`] is low, or [`MAX_UNREAD_BYTES`] of text that this crate
+//!   cannot read. Call it on a thread that may block for about a second.
 //! * Panics are caught and become a diagnostic. The panic hook is shared by the whole process, so a library cannot
 //!   replace it without races. Call [`quiet_panics`] from `main` before starting threads: it wraps the hook once and
 //!   silences panics of threads inside [`check`]. Without that call, a caught panic also prints to standard error.
@@ -12,17 +13,27 @@
 use std::cell::Cell;
 use std::io::BufReader;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 
 use pdbtbx::{Context, ErrorLevel, Format, PDBError, ReadOptions, StrictnessLevel};
 
 use super::atoms::SourceFormat;
 use super::error::StructureError;
-use super::read::{ReadLimits, without_mark};
+use super::read::{self, ReadLimits, Reading, without_mark};
+use super::strict_cost::{Cost, count};
 use super::text::decode;
 use super::{inflate, sniff};
+use crate::surface::{Control, Reservation};
 
-/// Largest text that is checked. Takes a few seconds in the worst case.
+/// Largest text that is checked.
 pub const MAX_BYTES: u64 = 8 << 20;
+
+/// Largest text that is checked if this crate cannot read it, so that the cost of checking is unknown. Takes about a
+/// second in the worst case.
+pub const MAX_UNREAD_BYTES: u64 = 32 << 10;
+
+/// Memory of pdbtbx, bytes per byte of text.
+const MEMORY_PER_BYTE: u64 = 32;
 
 /// Largest number of returned diagnostics. A damaged file has one per line.
 pub const MAX_DIAGNOSTICS: usize = 100;
@@ -85,14 +96,16 @@ pub fn quiet_panics() {
     }));
 }
 
-/// Checks a file, compressed or not. Blocks for up to several seconds. Never panics.
+/// Checks a file, compressed or not. Blocks for about a second at most. Never panics. The only finding about a file
+/// that would take longer is a note that says so.
 ///
 /// # Errors
-/// Returns errors of decompression and format detection.
-pub fn check(bytes: &[u8], limits: &ReadLimits) -> Result<Vec<Diagnostic>, StructureError> {
+/// Returns errors of decompression and format detection, of limits, of memory and of cancellation.
+pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result<Vec<Diagnostic>, StructureError> {
     let limit = limits.max_inflated_bytes.min(MAX_BYTES);
+    let reading = Reading::new(limits, control);
     let too_large = || vec![Diagnostic::note(format!("not checked: the text is larger than {limit} bytes"))];
-    let plain = match inflate::inflate(bytes, limit) {
+    let plain = match inflate::inflate(bytes, limit, &reading) {
         Err(StructureError::InflatedTooLarge { .. }) if limit < limits.max_inflated_bytes => return Ok(too_large()),
         plain => plain?,
     };
@@ -105,6 +118,28 @@ pub fn check(bytes: &[u8], limits: &ReadLimits) -> Result<Vec<Diagnostic>, Struc
             return Ok(vec![Diagnostic::note("not checked: the strict validator does not read BinaryCIF".to_owned())]);
         }
     };
+    let _memory = reading.reserve(MEMORY_PER_BYTE * text.len() as u64)?;
+    let of_structure = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+    let cost = match read::read_with(text, limits, &of_structure) {
+        Ok(structure) => Cost::of(&structure, text),
+        Err(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }) => {
+            if text.len() as u64 > MAX_UNREAD_BYTES {
+                let message =
+                    format!("not checked: the file cannot be read and has more than {MAX_UNREAD_BYTES} bytes");
+                return Ok(vec![Diagnostic::note(message)]);
+            }
+            Cost::default()
+        }
+        Err(error) => return Err(error),
+    };
+    drop(of_structure);
+    // The cost is that of one category.
+    if !cost.is_low() || count(text, b"_atom_site.label_asym_id") > 1 {
+        let message = "not checked: the strict validator would take too long, because its time grows with the square \
+                       of the residues of a chain, the atoms of a residue and the records that refer to atoms";
+        return Ok(vec![Diagnostic::note(message.to_owned())]);
+    }
+    let _copies = reading.reserve(cost.bytes())?;
     INSIDE.set(true);
     let outcome = catch_unwind(AssertUnwindSafe(|| findings(text, format)));
     INSIDE.set(false);

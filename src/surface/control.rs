@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use super::error::SurfaceError;
+use super::memory::{MemoryMeter, OutOfMemory, Reservation};
 
 /// Stages of a meshing run, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -86,7 +87,7 @@ impl CancelToken {
     }
 }
 
-/// Cancellation, deadline and observer of a run.
+/// Cancellation, deadline, observer and memory of a run.
 #[derive(Clone)]
 pub struct Control<'a> {
     /// Checked between stages and every few bricks.
@@ -96,11 +97,13 @@ pub struct Control<'a> {
     pub deadline: Option<Instant>,
     /// Receives stages and progress.
     pub observer: &'a dyn Observer,
+    /// Receives memory before it is allocated. The result of a run stays added; the owner of the meter subtracts it.
+    pub memory: Arc<dyn MemoryMeter>,
 }
 
 impl Default for Control<'_> {
     fn default() -> Self {
-        Self { cancel: CancelToken::default(), deadline: None, observer: &() }
+        Self { cancel: CancelToken::default(), deadline: None, observer: &(), memory: Arc::new(()) }
     }
 }
 
@@ -111,6 +114,16 @@ impl Control<'_> {
     /// Returns [`SurfaceError::Cancelled`] if the token is cancelled.
     pub fn check(&self) -> Result<(), SurfaceError> {
         if self.cancel.is_cancelled() { Err(SurfaceError::Cancelled) } else { Ok(()) }
+    }
+
+    /// Reserves `bytes` of memory until the reservation is dropped.
+    ///
+    /// # Errors
+    /// [`OutOfMemory`].
+    pub fn reserve(&self, bytes: u64) -> Result<Reservation, OutOfMemory> {
+        let reservation = Reservation::new(&self.memory);
+        reservation.grow(bytes)?;
+        Ok(reservation)
     }
 
     /// Times `work` as a part of `stage` and returns its value.

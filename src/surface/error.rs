@@ -2,6 +2,7 @@
 
 use thiserror::Error;
 
+use super::memory::OutOfMemory;
 use super::params::MAX_RESOLUTION;
 
 /// Errors of the meshing core.
@@ -111,6 +112,9 @@ pub enum SurfaceError {
     /// The deadline passed.
     #[error("the deadline passed")]
     Deadline,
+    /// Memory is not available now.
+    #[error(transparent)]
+    Memory(#[from] OutOfMemory),
     /// The run was cancelled by its caller.
     #[error("cancelled")]
     Cancelled,

@@ -7,10 +7,15 @@
 use rayon::prelude::*;
 
 use super::column::Column;
+use super::control::Control;
+use super::error::SurfaceError;
 use super::measure::Component;
 use super::mesh::Mesh;
 use super::sums::NONE;
 use super::union_find::UnionFind;
+
+/// Triangles between two checks of the cancellation flag: a fraction of a millisecond.
+pub(super) const TRIANGLES_PER_CHECK: usize = 1 << 16;
 
 /// Component of every vertex.
 pub(super) struct Labels {
@@ -99,12 +104,15 @@ pub(super) fn split<'a>(mesh: &'a Mesh, labels: &'a mut [u32]) -> Vec<Part<'a>> 
 }
 
 impl Part<'_> {
-    /// Labels the part's own vertices, with labels from 0.
-    pub(super) fn label(&mut self) -> PartLabels {
+    /// Labels the part's own vertices, with labels from 0. Fails if the run is cancelled.
+    pub(super) fn label(&mut self, control: &Control<'_>) -> Result<PartLabels, SurfaceError> {
         let mut joined = PartLabels::default();
         let (first, labels) = (self.first, &mut *self.labels);
         labels.fill(NONE);
-        for &[a, b, c] in self.triangles {
+        for (n, &[a, b, c]) in self.triangles.iter().enumerate() {
+            if n % TRIANGLES_PER_CHECK == 0 {
+                control.check()?;
+            }
             let own = |v: u32| labels.get(v.wrapping_sub(first) as usize).copied();
             let (i, j, k) = (own(a), own(b), own(c));
             if [i, j, k].contains(&None) {
@@ -129,6 +137,6 @@ impl Part<'_> {
                 }
             }
         }
-        joined
+        Ok(joined)
     }
 }

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::column::Column;
 use super::control::Control;
 use super::error::SurfaceError;
-use super::labels::{self, Labels, PartLabels};
+use super::labels::{self, Labels, PartLabels, TRIANGLES_PER_CHECK};
 use super::mesh::Mesh;
 use super::params::named;
 use super::sums::{self, Positions, Sums};
@@ -82,14 +82,18 @@ impl Measures {
     /// [`SurfaceError::Cancelled`].
     pub fn of(mesh: &Mesh, validation: Validation, control: &Control<'_>) -> Result<Self, SurfaceError> {
         control.check()?;
-        let Totals { components, used, checksum, degenerate } = Totals::of(mesh);
+        let labels = control.reserve(size_of::<u32>() as u64 * mesh.n_vertices() as u64)?;
+        let Totals { components, used, checksum, degenerate } = Totals::of(mesh, control)?;
+        drop(labels);
         control.check()?;
         let (faces, balanced) = (mesh.n_triangles() as u64, checksum == 0 && !degenerate);
+        let exact = validation == Validation::Exact || !balanced;
+        let _edges = control.reserve(if exact { topology::BYTES_PER_TRIANGLE * faces } else { 0 })?;
         let topology = match validation {
             Validation::Checksum if balanced => Topology::of_closed(faces),
-            Validation::Exact => topology::check(&mesh.triangles),
+            Validation::Exact => topology::check(&mesh.triangles, control)?,
             Validation::Checksum => {
-                let Topology { edges, .. } = topology::check(&mesh.triangles);
+                let Topology { edges, .. } = topology::check(&mesh.triangles, control)?;
                 Topology { edges, closed: false, oriented: false, manifold: false }
             }
         };
@@ -130,19 +134,23 @@ struct Totals {
 
 impl Totals {
     /// Labels and sums each part while it is in cache, then joins the parts.
-    fn of(mesh: &Mesh) -> Self {
+    fn of(mesh: &Mesh, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let mut of_vertex = Column::zeroed(mesh.n_vertices());
         let positions = Positions::from(mesh);
-        let (joined, sums): (Vec<PartLabels>, Vec<Sums>) = labels::split(mesh, &mut of_vertex)
+        let parts: Vec<(PartLabels, Sums)> = labels::split(mesh, &mut of_vertex)
             .into_par_iter()
             .with_max_len(1)
             .map(|mut part| {
-                let joined = part.label();
-                let n = joined.equal.len();
-                let sums = sums::sum(positions, part.triangles, part.first, part.labels, n);
-                (joined, sums)
+                let joined = part.label(control)?;
+                let mut sums = Sums::new(joined.equal.len());
+                for chunk in part.triangles.chunks(TRIANGLES_PER_CHECK) {
+                    control.check()?;
+                    sums::add(&mut sums, positions, chunk, part.first, part.labels);
+                }
+                Ok((joined, sums))
             })
-            .unzip();
+            .collect::<Result<_, SurfaceError>>()?;
+        let (joined, sums): (Vec<_>, Vec<_>) = parts.into_iter().unzip();
         let labels = Labels::join(mesh, of_vertex, &joined);
         let mut components = labels.count_vertices();
         let used = components.iter().map(|c| c.vertices).sum();
@@ -164,7 +172,7 @@ impl Totals {
         }
         components.retain(|c| c.triangles > 0);
         components.sort_by(|a, b| b.area.total_cmp(&a.area));
-        Self { components, used, checksum, degenerate }
+        Ok(Self { components, used, checksum, degenerate })
     }
 }
 

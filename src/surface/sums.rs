@@ -6,7 +6,7 @@ use super::measure::Component;
 use super::mesh::Mesh;
 use super::simd::dispatched;
 
-/// No label: see [`sum`].
+/// No label: see [`add`].
 pub(super) const NONE: u32 = u32::MAX;
 
 /// Sums over the triangles of one part of a mesh.
@@ -20,6 +20,13 @@ pub(super) struct Sums {
     pub(super) checksum: u64,
     /// True if a triangle has a corner twice.
     pub(super) degenerate: bool,
+}
+
+impl Sums {
+    /// Returns empty sums of `n_labels` labels.
+    pub(super) fn new(n_labels: usize) -> Self {
+        Self { by_label: vec![Component::default(); n_labels], ..Self::default() }
+    }
 }
 
 impl Component {
@@ -69,10 +76,10 @@ const LANES: usize = 128;
 type Lanes = [[f32; LANES]; 5];
 
 dispatched! {
-/// Sums `triangles` by the label of their vertices. `labels` are those of the vertices from `first` on; the label of a
-/// triangle is that of its first corner among them, if any is.
-pub(super) fn sum(positions: Positions<'_>, triangles: &[[u32; 3]], first: u32, labels: &[u32], n_labels: usize) -> Sums {
-    let mut sums = Sums { by_label: vec![Component::default(); n_labels], ..Sums::default() };
+/// Adds `triangles` to `sums` by the label of their vertices. `labels` are those of the vertices from `first` on; the
+/// label of a triangle is that of its first corner among them, if any is. The sums do not depend on how the triangles
+/// are divided among calls, if all slices but the last have a multiple of [`LANES`] triangles.
+pub(super) fn add(sums: &mut Sums, positions: Positions<'_>, triangles: &[[u32; 3]], first: u32, labels: &[u32]) {
     for batch in triangles.chunks(LANES) {
         let (shares, degenerate) = edge_shares(batch);
         sums.checksum = sums.checksum.wrapping_add(shares);
@@ -97,7 +104,6 @@ pub(super) fn sum(positions: Positions<'_>, triangles: &[[u32; 3]], first: u32, 
             }
         }
     }
-    sums
 }
 }
 

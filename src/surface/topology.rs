@@ -1,6 +1,11 @@
 //! The exact check of a triangle mesh's topology: every edge, and the fan of triangles around every vertex.
 
+use std::cmp::Ordering;
+
 use rayon::prelude::*;
+
+use super::control::Control;
+use super::error::SurfaceError;
 
 /// Result of [`check`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,31 +40,45 @@ fn ends(key: u64) -> [u32; 2] {
     [half(key >> 32), half(key)]
 }
 
-/// Checks `triangles`. Takes memory of 32 bytes for each of their edges.
-#[must_use]
-pub fn check(triangles: &[[u32; 3]]) -> Topology {
+/// Memory of [`check`], bytes per triangle: 32 for each of its edges.
+pub(super) const BYTES_PER_TRIANGLE: u64 = 3 * 32;
+
+/// Checks `triangles`.
+///
+/// # Errors
+/// [`SurfaceError::Cancelled`].
+pub fn check(triangles: &[[u32; 3]], control: &Control<'_>) -> Result<Topology, SurfaceError> {
     let corners = |&[a, b, c]: &[u32; 3]| [(key(a, b), c), (key(b, c), a), (key(c, a), b)];
-    let mut forward: Vec<Corner> = triangles.par_iter().flat_map_iter(corners).collect();
-    forward.par_sort_unstable();
+    let proceeds = |_: &_| !control.cancel.is_cancelled();
+    let mut forward: Vec<Corner> = triangles.par_iter().take_any_while(proceeds).flat_map_iter(corners).collect();
+    sort(&mut forward, control)?;
     let mut backward: Vec<u64> = forward.par_iter().map(|(edge, _)| edge.rotate_left(32)).collect();
-    backward.par_sort_unstable();
+    sort(&mut backward, control)?;
     let degenerate = triangles.par_iter().any(|[a, b, c]| a == b || b == c || c == a);
     let closed = !degenerate && forward.par_iter().map(|(edge, _)| edge).eq(backward.par_iter());
     let oriented = forward.par_windows(2).all(|pair| pair[0].0 != pair[1].0);
     let fans = || forward.par_chunk_by(|a, b| a.0 >> 32 == b.0 >> 32).all(one_fan);
-    Topology { edges: count_edges(&forward), closed, oriented, manifold: closed && oriented && fans() }
+    let edges = count_edges(&forward, control)?;
+    control.check()?;
+    Ok(Topology { edges, closed, oriented, manifold: closed && oriented && fans() })
 }
 
 /// Distinct undirected edges.
-fn count_edges(forward: &[Corner]) -> u64 {
+fn count_edges(forward: &[Corner], control: &Control<'_>) -> Result<u64, SurfaceError> {
     let undirected = |edge: u64| {
         let [from, to] = ends(edge);
         key(from.min(to), from.max(to))
     };
     let mut edges: Vec<u64> = forward.par_iter().map(|(edge, _)| undirected(*edge)).collect();
-    edges.par_sort_unstable();
+    sort(&mut edges, control)?;
     edges.dedup();
-    edges.len() as u64
+    Ok(edges.len() as u64)
+}
+
+/// Sorts `items`. Once the run is cancelled, all items compare as equal, so that the sort ends soon.
+fn sort<T: Ord + Send>(items: &mut [T], control: &Control<'_>) -> Result<(), SurfaceError> {
+    items.par_sort_unstable_by(|a, b| if control.cancel.is_cancelled() { Ordering::Equal } else { a.cmp(b) });
+    control.check()
 }
 
 /// Returns true if the triangles around one vertex form one cycle. `fan`: its outgoing edges, each with the third

@@ -242,7 +242,7 @@ fn summary_fits_a_screen_and_has_no_colour_without_a_terminal() {
         "10 of 10",
         "bricks",
         "vertices",
-        "watertight (by edge checksum), oriented, manifold, Euler number 2",
+        "watertight (by edge checksum), oriented, manifold by construction, Euler number 2",
         "1 component",
         "Å²",
         "Å³",

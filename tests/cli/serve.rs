@@ -3,6 +3,8 @@
 
 use crate::cli_support;
 
+#[cfg(target_os = "linux")]
+use std::io::Write as _;
 use std::process::Command;
 #[cfg(target_os = "linux")]
 use std::time::{Duration, Instant};
@@ -225,7 +227,7 @@ fn curl(args: &[&str]) -> serde_json::Value {
 #[test]
 fn identical_atoms_are_rejected_before_allocation() {
     let folder = Folder::new();
-    let service = Service::start(&folder, &["--devices", "cpu"]);
+    let service = Service::start(&folder, &["--devices", "cpu", "--set", "limits.duplicate_atoms=300000"]);
     let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 300_000]));
     let body = format!("@{}", input.display());
     let url = format!("http://{}/v1/meshes?radius_scale=10", service.addr);
@@ -237,9 +239,31 @@ fn identical_atoms_are_rejected_before_allocation() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn cancelled_job_returns_its_memory() {
+fn memory_of_a_structure_is_returned() {
     let folder = Folder::new();
     let service = Service::start(&folder, &["--devices", "cpu"]);
+    let before = service.memory("VmRSS");
+    let atoms: Vec<[f64; 3]> =
+        (0..1_000_000_u32).map(|i| [i % 100, i / 100 % 100, i / 10_000].map(f64::from)).collect();
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(cli_support::pdb(&atoms).as_bytes()).unwrap();
+    let input = folder.file("large.pdb.gz", encoder.finish().unwrap());
+    let url = format!("http://{}/v1/structures", service.addr);
+    let structure = curl(&["--data-binary", &format!("@{}", input.display()), &url]);
+    assert_eq!(structure["atoms"], 1_000_000, "{structure}");
+    assert!(service.memory("VmHWM") > before + 100, "{} MiB", service.memory("VmHWM"));
+    let end = Instant::now() + Duration::from_secs(9);
+    while service.memory("VmRSS") > before + 60 {
+        assert!(Instant::now() < end, "{} MiB, {before} before", service.memory("VmRSS"));
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn cancelled_job_returns_its_memory() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--devices", "cpu", "--set", "limits.duplicate_atoms=80000"]);
     let before = service.memory("VmRSS");
     // Most candidate lists are long enough to be freed when their tile is finished.
     let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 80_000]));

@@ -66,7 +66,19 @@ const LAYERS: &[Layer] = &[
     Layer { name: "gpu", layers: &[("surface", Any), ("picture", Any), ("sync", Any)], crates: SERVICE },
     Layer {
         name: "structure",
-        layers: &[("surface", Only(&["Spheres", "SurfaceError", "spheres"]))],
+        layers: &[(
+            "surface",
+            Only(&[
+                "CancelToken",
+                "Control",
+                "MemoryMeter",
+                "OutOfMemory",
+                "Reservation",
+                "Spheres",
+                "SurfaceError",
+                "spheres",
+            ]),
+        )],
         crates: &["tokio", "axum", "tower", "hyper", "tracing", "wgpu", "gltf_json", "clap"],
     },
     Layer {
@@ -114,7 +126,7 @@ const LAYERS: &[Layer] = &[
     },
     Layer {
         name: "memory_budget",
-        layers: &[("telemetry", Any)],
+        layers: &[("surface", Only(&["MemoryMeter", "OutOfMemory"])), ("telemetry", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
     Layer {
@@ -125,6 +137,7 @@ const LAYERS: &[Layer] = &[
     Layer {
         name: "archive",
         layers: &[
+            ("surface", Only(&["OutOfMemory"])),
             ("structure", Any),
             ("config", Any),
             ("telemetry", Any),

@@ -9,6 +9,7 @@ mod tools;
 
 mod architecture;
 mod bcif_oracles;
+mod cancellation;
 mod formats_oracles;
 mod formats_quantized;
 mod formats_roundtrip;

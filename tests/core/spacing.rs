@@ -2,7 +2,7 @@
 
 use molmesh::pipeline::spacing::{COARSEST, FINEST};
 use molmesh::pipeline::{Choice, Estimate, JobError, JobLimits, Product, Report, estimate, params, run};
-use molmesh::surface::{CancelToken, CpuBackend, SurfaceError, SurfaceLimits};
+use molmesh::surface::{Control, CpuBackend, SurfaceError, SurfaceLimits};
 
 const PTI: &[u8] = include_bytes!("../../samples/4pti.pdb");
 const CRAMBIN: &[u8] = include_bytes!("../../samples/1crn.cif");
@@ -38,7 +38,7 @@ fn with(input: &[u8], pairs: &[(&str, &str)], surface: SurfaceLimits) -> Result<
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     let backend = CpuBackend::new(None).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
-    run(input, &job, &JobLimits { surface, ..JobLimits::default() }, &choice, &CancelToken::default(), &(), None)
+    run(input, &job, &JobLimits { surface, ..JobLimits::default() }, &choice, &Control::default(), &(), None)
 }
 
 fn product(input: &[u8], pairs: &[(&str, &str)]) -> Result<Product, JobError> {
@@ -53,7 +53,7 @@ fn expected(input: &[u8], pairs: &[(&str, &str)]) -> Estimate {
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     let backend = CpuBackend::new(None).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
-    estimate(input, &job, &JobLimits::default(), &choice, &CancelToken::default()).unwrap()
+    estimate(input, &job, &JobLimits::default(), &choice, &Control::default()).unwrap()
 }
 
 #[test]

@@ -7,6 +7,7 @@ use crate::bcif_support;
 use bcif_support::Pack::{Array, Bytes, Int, Map, Nil, Real};
 use bcif_support::*;
 use molmesh::structure::{Kind, ReadLimits, SourceFormat, Structure, StructureError, read, strict_validator};
+use molmesh::surface::Control;
 
 fn bcif(bytes: &[u8]) -> Structure {
     read(bytes, &ReadLimits::default()).unwrap_or_else(|e| panic!("{e}"))
@@ -603,7 +604,7 @@ fn checks_limits_before_allocation() {
         let all = ["Cartn_x", "Cartn_y", "Cartn_z", "auth_seq_id"].map(runs).to_vec();
         file(vec![block("x", vec![category("_atom_site", rows, all)])])
     };
-    let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 10_000 };
+    let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 10_000, max_duplicates: 10_000 };
     assert!(bomb(n).len() < 1500);
     assert_eq!(read(&bomb(n), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
     assert_eq!(read(&bomb(i64::MAX), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
@@ -647,7 +648,7 @@ fn checks_limits_before_allocation() {
 
 #[test]
 fn never_panics_on_truncated_or_changed_files() {
-    let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 1_000 };
+    let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 1_000, ..ReadLimits::default() };
     let whole = CRAMBIN;
     assert_eq!(read(whole, &limits).unwrap().len(), 327);
     for cut in 0..whole.len() {
@@ -675,7 +676,7 @@ fn never_panics_on_truncated_or_changed_files() {
 
 #[test]
 fn strict_validator_reports_that_it_does_not_read_binary_cif() {
-    let findings = strict_validator::check(CRAMBIN, &ReadLimits::default()).unwrap();
+    let findings = strict_validator::check(CRAMBIN, &ReadLimits::default(), &Control::default()).unwrap();
     assert_eq!(findings.len(), 1);
     assert_eq!((findings[0].level, findings[0].line), (strict_validator::Level::Note, None));
     assert!(findings[0].message.contains("BinaryCIF"), "{}", findings[0].message);

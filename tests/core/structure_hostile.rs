@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use molmesh::structure::strict_validator::{self, Level};
 use molmesh::structure::{Contents, ReadLimits, Selection, StructureError, read, select};
+use molmesh::surface::Control;
 
 const ATOM: &str = "ATOM      2  CA  ALA A  12      11.104  -6.134   0.500  1.00 20.25           C  \n";
 
@@ -25,7 +26,7 @@ fn gzip(data: &[u8]) -> Vec<u8> {
 }
 
 fn limits() -> ReadLimits {
-    ReadLimits { max_inflated_bytes: 64 << 20, max_atoms: 2_000_000 }
+    ReadLimits { max_inflated_bytes: 64 << 20, max_atoms: 2_000_000, max_duplicates: u64::MAX }
 }
 
 /// Serializes the tests that measure time.
@@ -275,15 +276,15 @@ fn counts_ambiguous_atoms_before_allocation() {
 fn strict_validator_reports_and_never_panics() {
     strict_validator::quiet_panics();
     let sound = std::fs::read("samples/4pti.pdb").unwrap();
-    let findings = strict_validator::check(&sound, &limits()).unwrap();
+    let findings = strict_validator::check(&sound, &limits(), &Control::default()).unwrap();
     assert!(findings.iter().all(|d| d.level < Level::Error), "{findings:?}");
 
-    let short = strict_validator::check(&ATOM.as_bytes()[..60], &limits()).unwrap();
+    let short = strict_validator::check(&ATOM.as_bytes()[..60], &limits(), &Control::default()).unwrap();
     assert!(short.iter().any(|d| d.level == Level::Error && d.line == Some(1)), "{short:?}");
 
     // pdbtbx panics on this space group.
     let panics = format!("CRYST1   28.070   28.070   53.350  90.00  90.00  90.00 Q 99 99 9   8\n{ATOM}");
-    let findings = strict_validator::check(panics.as_bytes(), &limits()).unwrap();
+    let findings = strict_validator::check(panics.as_bytes(), &limits(), &Control::default()).unwrap();
     assert_eq!(findings.len(), 1);
     assert!(
         findings[0].message.contains("failed on this file") && findings[0].message.contains("space group"),
@@ -291,13 +292,66 @@ fn strict_validator_reports_and_never_panics() {
     );
 
     let packed = gzip(&sound);
-    assert_eq!(strict_validator::check(&packed, &limits()), strict_validator::check(&sound, &limits()));
+    assert_eq!(
+        strict_validator::check(&packed, &limits(), &Control::default()),
+        strict_validator::check(&sound, &limits(), &Control::default())
+    );
     let large = ATOM.repeat(1 + (strict_validator::MAX_BYTES as usize) / ATOM.len());
-    let findings = strict_validator::check(large.as_bytes(), &limits()).unwrap();
+    let findings = strict_validator::check(large.as_bytes(), &limits(), &Control::default()).unwrap();
     assert!(findings[0].message.starts_with("not checked: the text is larger than"), "{findings:?}");
-    assert!(matches!(strict_validator::check(b"hello", &limits()), Err(StructureError::UnknownFormat { .. })));
-    let many = strict_validator::check("ATOM\n".repeat(5000).as_bytes(), &limits()).unwrap();
+    assert!(matches!(
+        strict_validator::check(b"hello", &limits(), &Control::default()),
+        Err(StructureError::UnknownFormat { .. })
+    ));
+    let many = strict_validator::check("ATOM\n".repeat(5000).as_bytes(), &limits(), &Control::default()).unwrap();
     assert!(many.len() <= strict_validator::MAX_DIAGNOSTICS + 1);
+}
+
+/// Returns an mmCIF with the columns that the strict validator requires.
+fn strict_cif(rows: impl Iterator<Item = String>) -> String {
+    let items =
+        "group_PDB id type_symbol label_atom_id label_comp_id label_asym_id label_seq_id Cartn_x Cartn_y Cartn_z";
+    let tags: String = items.split(' ').map(|item| format!("_atom_site.{item}\n")).collect();
+    format!("data_x\nloop_\n{tags}{}", rows.collect::<String>())
+}
+
+#[test]
+fn strict_validator_does_not_check_files_that_would_take_long() {
+    strict_validator::quiet_panics();
+    let residues =
+        |n: usize| strict_cif((1..=n).map(|i| format!("ATOM {i} C CA GLY A {i} {}.25 2 3.12345678901234\n", i % 9000)));
+    // Half of the atoms are copied to each of the other half.
+    let named = |n: usize| strict_cif((1..n).map(|i| format!("ATOM {i} C CA R{} A 1 {i} 2 3\n", i.min(n / 2))));
+    let atom = |i: usize| {
+        let (chain, number) = (char::from(b'A' + (i / 3000) as u8), i / 3 % 1000);
+        let line = format!("ATOM  {:>5}  CA  ALA {chain}{number:>4}    {:>8.3}", i % 100_000, (i % 9000) as f64);
+        format!("{line}   1.000   1.000  1.00  0.00           C  \n")
+    };
+    let atoms = |n| (0..n).map(atom).collect::<String>();
+    let sequence = "SEQRES   1 A 9999  ALA ALA ALA ALA ALA ALA ALA ALA ALA ALA ALA ALA ALA\n";
+    let displacement = "ANISOU    1  CA  ALA A   1     1000   1000   1000      0      0      0       C  \n";
+    let found = |text: String| {
+        assert!(text.len() < 8 << 20, "{}", text.len());
+        let start = Instant::now();
+        let findings = strict_validator::check(text.as_bytes(), &limits(), &Control::default()).unwrap();
+        assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
+        findings.first().map_or_else(String::new, |finding| finding.message.clone())
+    };
+    for (what, text) in [
+        ("residues of a chain", residues(130_000)),
+        ("alternatives of a residue", named(4000)),
+        ("sequences", atoms(3000) + &sequence.repeat(2000)),
+        ("displacements", atoms(30_000) + &displacement.repeat(30_000)),
+        ("two loops", residues(10).replacen("data_x", &residues(10), 1)),
+    ] {
+        assert!(found(text).starts_with("not checked: the strict validator would take too long"), "{what}");
+    }
+    assert!(found("ATOM\n".repeat(20_000)).starts_with("not checked: the file cannot be read and has more than"));
+    // Just below the limits.
+    for text in [residues(20_000), named(2000), atoms(75_000)] {
+        let message = found(text);
+        assert!(!message.starts_with("not checked"), "{message}");
+    }
 }
 
 // ---- any bytes ----

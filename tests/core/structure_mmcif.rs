@@ -9,8 +9,11 @@
 
 use molmesh::structure::{ReadLimits, Structure, StructureError, read};
 
+/// Limits of files that repeat one row.
+const REPEATED: ReadLimits = ReadLimits { max_inflated_bytes: 1 << 30, max_atoms: 1_000_000, max_duplicates: u64::MAX };
+
 fn cif(text: impl AsRef<[u8]>) -> Structure {
-    read(text.as_ref(), &ReadLimits::default()).unwrap_or_else(|e| panic!("{e}"))
+    read(text.as_ref(), &REPEATED).unwrap_or_else(|e| panic!("{e}"))
 }
 
 fn refusal(text: impl AsRef<[u8]>) -> String {
@@ -263,7 +266,7 @@ fn limits_atoms() {
     // Large enough for several threads.
     for n in [10, 60_000] {
         let text = file(&ROW.repeat(n));
-        let with = |max_atoms| read(text.as_bytes(), &ReadLimits { max_atoms, ..ReadLimits::default() });
+        let with = |max_atoms| read(text.as_bytes(), &ReadLimits { max_atoms, ..REPEATED });
         assert_eq!(with(n as u64 - 1), Err(StructureError::TooManyAtoms { limit: n as u64 - 1 }));
         assert_eq!(with(n as u64).unwrap().len(), n);
     }
@@ -288,7 +291,7 @@ fn large_files_have_the_same_result_on_every_path() {
         "data_y\n".to_owned(),
     ] {
         let text = file(&rows(&special));
-        let reads = [1, 3].map(|n| pool(n).install(|| read(text.as_bytes(), &ReadLimits::default())));
+        let reads = [1, 3].map(|n| pool(n).install(|| read(text.as_bytes(), &REPEATED)));
         assert_eq!(reads[0], reads[1], "{special}");
         match &reads[0] {
             Ok(s) => assert!(s.len() >= 50_000, "{special}"),

@@ -12,6 +12,7 @@ mod gpu_support;
 mod tools;
 
 mod backend;
+mod cancellation;
 mod meshes;
 mod multi_device;
 mod picture;

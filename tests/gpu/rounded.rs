@@ -14,7 +14,7 @@ use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Packing, Step};
 use molmesh::gpu::{DevicePool, Executor, GpuBackend, PoolDevice, PoolSettings};
 use molmesh::pipeline::{self, Choice, Job, JobLimits, Product, params};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Mesh, ReferenceBackend, SurfaceLimits, SurfaceParams, Validation,
+    Backend, Control, CpuBackend, Mesh, ReferenceBackend, SurfaceLimits, SurfaceParams, Validation,
 };
 use serde_json::Value;
 use tools::files::{Files, MemoryFile};
@@ -43,7 +43,7 @@ fn devices(n: usize) -> GpuBackend {
 
 fn made(backend: &dyn Backend, job: &Job) -> Product {
     let choice = Choice { backend, reason: "set by a test" };
-    pipeline::run(&sample(), job, &JobLimits::default(), &choice, &CancelToken::default(), &(), None).unwrap()
+    pipeline::run(&sample(), job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap()
 }
 
 fn glb(product: &Product) -> Vec<u8> {
@@ -152,8 +152,8 @@ fn one_and_two_devices_make_the_same_file_in_any_write_order() {
         let file = MemoryFile::default();
         let sink = GlbSink::new(&file);
         let (choice, limits) = (Choice { backend, reason: "set by a test" }, JobLimits::default());
-        let cancel = CancelToken::default();
-        let product = pipeline::run(&sample(), &job, &limits, &choice, &cancel, &(), Some(&sink)).unwrap();
+        let control = Control::default();
+        let product = pipeline::run(&sample(), &job, &limits, &choice, &control, &(), Some(&sink)).unwrap();
         drop(sink);
         assert!(product.mesh.positions.is_empty() && product.streamed_bytes == Some(expected.len() as u64));
         assert!(file.into_bytes() == *expected);

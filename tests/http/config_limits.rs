@@ -31,6 +31,7 @@ const ROWS: &[Row] = &[
     ("limits.parts", "body-too-large", "http/limits::parts_of_forms_are_limited"),
     ("limits.inflated_bytes", "inflated-too-large", "http/limits::compression_bombs_stop_at_the_inflated_limit"),
     ("limits.atoms", "too-many-atoms", "http/limits::atoms_are_limited"),
+    ("limits.duplicate_atoms", "too-many-duplicates", "http/limits::atoms_at_one_position_are_limited"),
     ("limits.labels", "too-many-atoms", "http/limits::listed_atoms_are_limited"),
     ("limits.grid_points", "grid-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
     (

@@ -90,7 +90,8 @@ fn json_bodies_are_limited_before_parsing() {
     assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 65_536);
     assert!(rejected(&server, "body-too-large") >= before + 3.0);
     // A document within the limit is read: only the entry is missing.
-    server.post("/v1/meshes", &[json], &list(30_000)).problem(404, "not-in-archive");
+    let document = [list(2000), vec![b' '; 60_000]].concat();
+    server.post("/v1/meshes", &[json], &document).problem(404, "not-in-archive");
 }
 
 /// Starts a form in a chunked body.
@@ -210,6 +211,18 @@ fn atoms_are_limited() {
     assert_eq!(server.post("/v1/meshes", &[], &carbons(101)).problem(422, "too-many-atoms")["limit"], 100);
     assert_eq!(server.post("/v1/meshes", &[], &carbons(100)).status, 200);
     assert!(rejected(&server, "too-many-atoms") >= 1.0);
+}
+
+#[test]
+fn atoms_at_one_position_are_limited() {
+    let server = fake(|c| c.limits.duplicate_atoms = 10);
+    let line = carbons(1);
+    for path in ["/v1/meshes", "/v1/structures", "/v1/estimate"] {
+        let problem = server.post(path, &[], &line.repeat(11)).problem(422, "too-many-duplicates");
+        assert_eq!((&problem["limit"], &problem["position"]), (&10.into(), &serde_json::json!([0.0, 0.0, 0.0])));
+        assert!([200, 201].contains(&server.post(path, &[], &line.repeat(10)).status), "{path}");
+    }
+    assert!(rejected(&server, "too-many-duplicates") >= 3.0);
 }
 
 #[test]
@@ -387,6 +400,53 @@ fn memory_is_shared_and_limited() {
     assert_eq!(problem["limit"], 200_000);
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
     assert!(rejected(&server, "memory-full") >= 1.0);
+}
+
+/// Returns atoms, 81 bytes each, in a small file.
+fn compressed_atoms(n: usize) -> Vec<u8> {
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(&carbons(n)).unwrap();
+    encoder.finish().unwrap()
+}
+
+#[test]
+fn reading_counts_against_the_memory_limit() {
+    let server = fake(|c| c.limits.memory_bytes = 8_000_000);
+    let body = compressed_atoms(100_000);
+    assert!(body.len() < 2_000_000, "{}", body.len());
+    for path in ["/v1/meshes", "/v1/structures", "/v1/estimate", "/v1/meshes?check=strict"] {
+        let refused = server.post(path, &[], &body);
+        let problem = refused.problem(503, "memory-full");
+        assert_eq!(problem["limit"], 8_000_000, "{path}");
+        assert!(problem["actual"].as_u64() <= problem["limit"].as_u64(), "{problem}");
+        assert!(refused.header("retry-after").is_some(), "{path}");
+    }
+    wait_for("the memory to be returned", || server.metric("molmesh_memory_held_bytes", &[]) == 0.0);
+    assert_eq!(server.post("/v1/structures", &[], &carbons(1000)).status, 201);
+}
+
+#[test]
+fn abandoned_uploads_are_read_one_at_a_time_and_cancelled() {
+    let server = fake(|c| c.jobs.workers = 1);
+    let body = compressed_atoms(300_000);
+    let head = format!("POST /v1/structures HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", body.len());
+    let mut most: f64 = 0.0;
+    let mut measure = || most = most.max(server.metric("molmesh_memory_held_bytes", &[]));
+    for _ in 0..4 {
+        let mut stream = connect(server.addr);
+        stream.write_all(&[head.as_bytes(), &body].concat()).unwrap();
+        for _ in 0..5 {
+            std::thread::sleep(Duration::from_millis(10));
+            measure();
+        }
+    }
+    wait_for("the readings to stop", || {
+        measure();
+        server.metric("molmesh_memory_held_bytes", &[]) == 0.0
+    });
+    // A reading holds 50 MB while its text grows from 17 to 34 MB, or 34 MB and 18 MB of atoms.
+    assert!(most > 10e6 && most < 60e6 + 4.0 * body.len() as f64 && body.len() < 8_000_000, "{most}");
+    assert_eq!(server.post("/v1/structures", &[], &carbons(1000)).status, 201);
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use molmesh::formats::{Compress, Format};
 use molmesh::pipeline::{self, Choice, Job, JobLimits, Spacing};
 use molmesh::structure::{ReadLimits, Selection};
-use molmesh::surface::{CancelToken, CpuBackend, SurfaceLimits, SurfaceOptions, SurfaceParams, Validation};
+use molmesh::surface::{Control, CpuBackend, SurfaceLimits, SurfaceOptions, SurfaceParams, Validation};
 
 /// Words of PDB files.
 pub(super) const PDB: &[&str] = &[
@@ -83,10 +83,9 @@ pub(super) const BINARYCIF: &[&str] = &[
 ];
 
 const LIMITS: JobLimits = JobLimits {
-    read: ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 5_000 },
+    read: ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 5_000, max_duplicates: 1_000 },
     surface: SurfaceLimits { max_samples: 1 << 19, max_mesh_bytes: 8 << 20, max_candidates: 1 << 18 },
     picture: molmesh::picture::PictureLimits { max_side: 64 },
-    deadline: None,
 };
 
 /// Reads a structure, meshes it on a coarse grid, checks the mesh exactly and writes it in every format.
@@ -105,7 +104,7 @@ pub(super) fn mesh(bytes: &[u8]) {
         ..Job::default()
     };
     let choice = Choice { backend: &CpuBackend::default(), reason: "fuzzing" };
-    let product = match pipeline::run(bytes, &job, &LIMITS, &choice, &CancelToken::default(), &(), None) {
+    let product = match pipeline::run(bytes, &job, &LIMITS, &choice, &Control::default(), &(), None) {
         Ok(product) => product,
         Err(error) => return assert_readable(&error.to_string()),
     };

@@ -64,7 +64,11 @@ fn schema(parameter: &params::Parameter) -> RefOr<Schema> {
         Domain::Flag => object(Type::Boolean).default(parameter.default.parse::<bool>().ok().map(Value::from)).into(),
         Domain::Choice(_) => RefOr::Ref(choice()),
         Domain::Set(_) => ArrayBuilder::new().items(choice()).min_items(Some(1)).into(),
-        Domain::Text { expected } => object(Type::String).min_length(Some(1)).title(Some(expected)).into(),
+        Domain::Text { expected } => object(Type::String)
+            .min_length(Some(1))
+            .max_length(Some(params::MAX_VALUE_BYTES))
+            .title(Some(expected))
+            .into(),
     }
 }
 

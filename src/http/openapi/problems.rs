@@ -30,7 +30,7 @@ pub(in crate::http) const NAMED_STRUCTURE: &[Kind] =
 pub(in crate::http) const PARAMETERS: &[Kind] = &[Kind::BadRequest, Kind::BadParameter];
 /// Problems of reading a structure.
 pub(in crate::http) const READING: &[Kind] =
-    &[Kind::InflatedTooLarge, Kind::UnreadableStructure, Kind::NoAtoms, Kind::TooManyAtoms];
+    &[Kind::InflatedTooLarge, Kind::UnreadableStructure, Kind::NoAtoms, Kind::TooManyAtoms, Kind::TooManyDuplicates];
 /// Problems of a job after the structure was read.
 pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::EmptySelection,

@@ -74,8 +74,13 @@ pub struct Parameter {
 impl Parameter {
     /// Returns the error for a value that is not valid.
     pub(super) fn invalid(&self, value: &str) -> ParamError {
+        self.bad_value(value, self.domain.expected())
+    }
+
+    /// Returns the error for a value that is not the `expected` one.
+    pub(super) fn bad_value(&self, value: &str, expected: String) -> ParamError {
         let value = format!("`{}`", value.chars().take(64).collect::<String>());
-        ParamError::BadValue { name: self.name, value, expected: self.domain.expected() }
+        ParamError::BadValue { name: self.name, value, expected }
     }
 
     /// Returns true if `text` equals the declared default. Defaults in words, such as `the first model of the file`,

@@ -17,19 +17,22 @@ use self::column::{Bounds, Column, Raw};
 use self::fault::Fault;
 use self::msgpack::Cursor;
 use super::atom_site::{Layout, Passed};
-use super::atoms::{Source, SourceFormat, Structure};
+use super::atoms::{Columns, Source, SourceFormat, Structure};
 use super::entities::{self, Entities};
 use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
-use super::read::ReadLimits;
+use super::read::{ReadLimits, Reading};
 use super::text::{decode, normalize};
+use crate::surface::MemoryMeter as _;
 
 /// Largest number of columns in a category. The dictionary has about a hundred for `atom_site`.
 const MAX_COLUMNS: usize = 1000;
+/// Largest number of texts of a column in a category with fewer rows. Programs that select atoms keep all texts.
+const MAX_UNUSED_TEXTS: usize = 1 << 20;
 
 /// Reads the first data block that has atoms with coordinates.
-pub(super) fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
+pub(super) fn read(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     let mut passed = Passed::default();
     let (mut found, mut last, mut any) = (None, None, false);
     let mut file = Cursor::new(bytes);
@@ -43,7 +46,7 @@ pub(super) fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, Struc
             if found.is_none() {
                 passed.block();
                 let block = Block::read(at, &mut passed)?;
-                found = block.structure(limits, &mut passed).transpose();
+                found = block.structure(reading, &mut passed).transpose();
                 last = block.name;
             }
             Ok(())
@@ -130,8 +133,8 @@ impl<'a> Category<'a> {
     /// Returns the limits of decoding, or `None` if there are more rows than allowed atoms.
     fn bounds(&self, limits: &ReadLimits) -> Option<Bounds> {
         let rows = usize::try_from(self.rows).ok().filter(|&n| n <= limits.max_rows())?;
-        // Unused texts are allowed, within the limit of rows.
-        Some(Bounds { rows, texts: limits.max_rows() })
+        // Unused texts are allowed, within a limit.
+        Some(Bounds { rows, texts: rows.max(MAX_UNUSED_TEXTS).min(limits.max_rows()) })
     }
 }
 
@@ -184,14 +187,14 @@ impl<'a> Block<'a> {
     }
 
     /// Returns the structure, if the block has atoms with coordinates.
-    fn structure(&self, limits: &ReadLimits, passed: &mut Passed) -> Result<Option<Structure>, StructureError> {
+    fn structure(&self, reading: &Reading<'_>, passed: &mut Passed) -> Result<Option<Structure>, StructureError> {
         let (entities, unread) = self.entities();
-        let Some((columns, tables, warnings)) = self.atoms(entities.are_known(), limits, passed)? else {
+        let Some((columns, tables, warnings)) = self.atoms(entities.are_known(), reading, passed)? else {
             return Ok(None);
         };
         let value = |category, item, max| -> Result<Option<String>, StructureError> {
             let Some(category) = self.category(category) else { return Ok(None) };
-            Ok(category.value(item, max, limits).map_err(|f| f.within(category.place()))?)
+            Ok(category.value(item, max, reading.limits).map_err(|f| f.within(category.place()))?)
         };
         let entry = value("entry", "id", 80)?;
         let title = value("struct", "title", MAX_TITLE)?;
@@ -203,7 +206,7 @@ impl<'a> Block<'a> {
             sequence: Sequence { polymer_chains: entities.polymer_chains(), ..Sequence::default() },
             warnings: warnings.messages(|fault| fault.within(&place).into()).into_iter().chain(unread).collect(),
         };
-        Ok(Some(columns.finish(tables, source)))
+        columns.finish(tables, source, reading).map(Some)
     }
 
     /// Returns the entities of the block, and a warning if they cannot be read.
@@ -226,9 +229,10 @@ impl<'a> Block<'a> {
     fn atoms(
         &self,
         entities: bool,
-        limits: &ReadLimits,
+        reading: &Reading<'_>,
         passed: &mut Passed,
     ) -> Result<Option<rows::Atoms>, StructureError> {
+        let limits = reading.limits;
         let Some(category) = self.category("atom_site").filter(|category| category.rows > 0) else { return Ok(None) };
         let bounds = category.bounds(limits).ok_or(StructureError::TooManyAtoms { limit: limits.max_atoms })?;
         let within = |fault: Box<Fault>| fault.within(category.place());
@@ -241,10 +245,20 @@ impl<'a> Block<'a> {
         // The column is not needed if entities are known.
         let layout = if entities { layout.without_sequence_numbers() } else { layout };
         // Decoded data counts as decompressed data, because a few bytes of run-length encoding may expand to many.
-        if rows::decoded_bytes(&layout, bounds.rows) > limits.max_inflated_bytes {
+        let decoded = rows::decoded_bytes(&layout, bounds.rows);
+        if decoded > limits.max_inflated_bytes {
             return Err(StructureError::InflatedTooLarge { limit: limits.max_inflated_bytes });
         }
-        Ok(Some(rows::read(&raw, layout, bounds).map_err(within)?))
+        // A step of decoding holds its input and its output.
+        reading.text.grow(2 * decoded)?;
+        let memory = reading.reserve(Columns::bytes(bounds.rows))?;
+        let stop = || reading.check().is_err();
+        let atoms = rows::read(&raw, layout, bounds, &stop).map_err(within);
+        reading.check()?;
+        let atoms = atoms?;
+        memory.keep();
+        reading.keep_texts(atoms.1.n_texts())?;
+        Ok(Some(atoms))
     }
 }
 

@@ -96,8 +96,14 @@ pub(super) fn decoded_bytes(layout: &Layout, rows: usize) -> u64 {
 /// Atoms, their string tables, and warnings about replaced values.
 pub(super) type Atoms = (Columns, Tables, Warnings<Box<Fault>>);
 
-/// Decodes the columns of the layout and converts their rows to atoms.
-pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<Atoms, Box<Fault>> {
+/// Decodes the columns of the layout and converts their rows to atoms. Ends early, with any result, once `stop` returns
+/// true.
+pub(super) fn read(
+    raw: &[Raw<'_>],
+    layout: Layout,
+    bounds: Bounds,
+    stop: &(dyn Fn() -> bool + Sync),
+) -> Result<Atoms, Box<Fault>> {
     let table = Table { raw, columns: load(raw, &layout, bounds)? };
     let mut columns = Columns::zeroed(bounds.rows);
     let mut rest = columns.slices();
@@ -111,6 +117,9 @@ pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<At
     let done: Vec<Result<(), Box<Fault>>> = parts
         .par_iter_mut()
         .map(|(rows, slices, site)| {
+            if stop() {
+                return Ok(());
+            }
             for index in rows.clone() {
                 slices.put(&site.atom(&Row { table: &table, index })?);
             }

@@ -14,16 +14,25 @@ use super::entities::Entities;
 use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
-use super::read::ReadLimits;
+use super::read::Reading;
 use super::text::{Fault, decode, normalize};
+
+/// Values between two checks of the cancellation flag: a few milliseconds.
+const VALUES_PER_CHECK: usize = 1 << 16;
 
 /// Reason to stop reading rows.
 #[derive(Debug)]
 enum Stop {
     /// Syntax error.
     Fault(Box<Fault>),
-    /// The atom limit was reached.
-    TooMany,
+    /// Error that has no place in the text.
+    Error(Box<StructureError>),
+}
+
+impl From<StructureError> for Stop {
+    fn from(error: StructureError) -> Self {
+        Self::Error(Box::new(error))
+    }
 }
 
 impl From<Box<Fault>> for Stop {
@@ -32,12 +41,12 @@ impl From<Box<Fault>> for Stop {
     }
 }
 
-pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
-    let mut reader = Reader::new(text, limits);
+pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
+    let mut reader = Reader::new(text, reading);
     match reader.run() {
         Ok(()) => reader.finish(),
         Err(Stop::Fault(fault)) => Err(fault.locate(text)),
-        Err(Stop::TooMany) => Err(StructureError::TooManyAtoms { limit: limits.max_atoms }),
+        Err(Stop::Error(error)) => Err(*error),
     }
 }
 
@@ -57,21 +66,22 @@ struct Block {
 struct Reader<'a> {
     text: &'a [u8],
     tokens: Tokenizer<'a>,
-    limits: &'a ReadLimits,
+    reading: &'a Reading<'a>,
     block: Block,
     rows: Option<Rows<'a>>,
     passed: Passed,
 }
 
 impl<'a> Reader<'a> {
-    fn new(text: &'a [u8], limits: &'a ReadLimits) -> Self {
+    fn new(text: &'a [u8], reading: &'a Reading<'a>) -> Self {
         let (tokens, block, passed) = (Tokenizer::new(text), Block::default(), Passed::default());
-        Self { text, tokens, limits, block, rows: None, passed }
+        Self { text, tokens, reading, block, rows: None, passed }
     }
 
     fn run(&mut self) -> Result<(), Stop> {
         let mut token = self.tokens.next()?;
         loop {
+            self.reading.check()?;
             match token.kind {
                 Kind::End | Kind::Data => {
                     self.end_block()?;
@@ -174,7 +184,7 @@ impl<'a> Reader<'a> {
         if is_atom_site && self.rows.is_none() && token.kind == Kind::Value {
             let ranges: Vec<_> = tags.iter().map(|t| (t.start, t.end)).collect();
             if let Some(layout) = self.layout(&ranges)? {
-                let mut rows = Rows::new(self.text, layout, self.limits.max_rows());
+                let mut rows = Rows::new(self.text, layout, self.reading);
                 self.tokens.at = rows.read(token.start)?;
                 self.rows = Some(rows);
                 return Ok(self.tokens.next()?);
@@ -192,6 +202,9 @@ impl<'a> Reader<'a> {
                 self.note_entity(place, &token);
             }
             i += 1;
+            if i % VALUES_PER_CHECK == 0 {
+                self.reading.check()?;
+            }
             token = self.tokens.next()?;
         }
         Ok(token)
@@ -214,7 +227,7 @@ impl<'a> Reader<'a> {
             return Ok(());
         }
         if let Some(layout) = self.layout(&tags)? {
-            let mut rows = Rows::new(self.text, layout, self.limits.max_rows());
+            let mut rows = Rows::new(self.text, layout, self.reading);
             rows.single(&values)?;
             self.rows = Some(rows);
         }
@@ -238,6 +251,7 @@ impl<'a> Reader<'a> {
             };
             match next {
                 Ok(next) => token = next,
+                // Cancelled runs end in `finish`.
                 Err(_) => return,
             }
         }
@@ -265,6 +279,6 @@ impl<'a> Reader<'a> {
             sequence: Sequence { polymer_chains: self.block.entities.polymer_chains(), ..Sequence::default() },
             warnings: warnings.into_iter().chain(too_many).collect(),
         };
-        Ok(columns.finish(tables, source))
+        columns.finish(tables, source, self.reading)
     }
 }

@@ -12,6 +12,10 @@ use rayon::prelude::*;
 use super::super::atom_site::{AtomSite, Layout};
 use super::super::atoms::{Atom, Columns, Tables};
 use super::super::cif::{Kind, Tokenizer, bare_kind};
+use super::super::duplicates;
+use super::super::error::StructureError;
+use super::super::growing::GrowingColumns;
+use super::super::read::Reading;
 use super::super::scan::Edges;
 use super::super::text::Fault;
 use super::super::warnings::Warnings;
@@ -29,37 +33,40 @@ const CHUNK_BYTES: usize = 512 << 10;
 pub(super) struct Rows<'a> {
     text: &'a [u8],
     site: AtomSite<Box<Fault>>,
-    columns: Columns,
-    limit: usize,
+    columns: GrowingColumns,
+    reading: &'a Reading<'a>,
+    /// Number of rows that the text holds, estimated.
+    expected: usize,
 }
 
 impl<'a> Rows<'a> {
-    pub(super) fn new(text: &'a [u8], layout: Layout, max_rows: usize) -> Self {
-        Self { text, site: AtomSite::new(layout), columns: Columns::default(), limit: max_rows }
+    pub(super) fn new(text: &'a [u8], layout: Layout, reading: &'a Reading<'a>) -> Self {
+        Self { text, site: AtomSite::new(layout), columns: GrowingColumns::default(), reading, expected: 1 }
     }
 
     pub(super) fn into_parts(self) -> (Columns, Tables, Warnings<Box<Fault>>) {
-        (self.columns, self.site.tables, self.site.warnings)
+        (self.columns.into_columns(), self.site.tables, self.site.warnings)
     }
 
     /// Returns true if some row is a HETATM record.
     pub(super) fn has_hetero(&self) -> bool {
-        self.columns.hetero.contains(&true)
+        self.columns.columns().hetero.contains(&true)
     }
 
     /// Reads rows from the first value on. Returns the end of the loop.
     pub(super) fn read(&mut self, first: usize) -> Result<usize, Stop> {
         let large = self.text.len() - first >= PARALLEL_BYTES && rayon::current_num_threads() > 1;
-        let parallel = if large { self.read_parallel(first) } else { None };
+        let parallel = if large { self.read_parallel(first)? } else { None };
         let mut at = parallel.unwrap_or_else(|| {
-            self.columns.reserve(estimate(&self.text[first..]).min(self.limit));
+            self.expected = estimate(&self.text[first..]);
             first
         });
         let mut scanner = Scanner::new(self.text);
         loop {
-            let (columns, limit) = (&mut self.columns, self.limit);
-            let put = |atom: &Atom| columns.push_within(limit, atom);
-            at = scanner.rows(&mut self.site, put, at, self.text.len(), &AtomicBool::new(false))?;
+            self.reading.check()?;
+            let (columns, reading) = (&mut self.columns, self.reading);
+            let put = |atom: &Atom| columns.push(atom);
+            at = scanner.rows(&mut self.site, put, at, self.text.len(), &|| reading.check().is_err())?;
             match self.special_row(at)? {
                 Some(next) => at = next,
                 None => return Ok(at),
@@ -98,19 +105,26 @@ impl<'a> Rows<'a> {
             offsets.extend([from, to]);
         }
         let atom = self.site.atom(&Row::<true> { text: self.text, base, offsets: &offsets })?;
-        if self.columns.push_within(self.limit, &atom) { Ok(()) } else { Err(Stop::TooMany) }
+        self.columns.reserve_chunk(&self.site.tables, self.reading, self.expected)?;
+        self.columns.push(&atom);
+        Ok(())
     }
 
     /// Reads rows from `first` on by several threads, and returns the end of what they read. Returns `None`, and
     /// changes nothing, if the text does not have one plain row per line.
-    fn read_parallel(&mut self, first: usize) -> Option<usize> {
+    ///
+    /// # Errors
+    /// Returns the errors of cancellation and memory.
+    fn read_parallel(&mut self, first: usize) -> Result<Option<usize>, StructureError> {
         let text = self.text;
-        let stretches = stretches(text, first)?;
+        let reading = self.reading;
+        let Some(stretches) = stretches(text, first) else { return Ok(None) };
         let n_rows: usize = stretches.iter().map(|s| s.lines).sum();
-        let end = stretches.last()?.to;
-        if n_rows > self.limit {
-            return None;
+        let Some(end) = stretches.last().map(|last| last.to) else { return Ok(None) };
+        if n_rows > reading.limits.max_rows() {
+            return Ok(None);
         }
+        let memory = reading.reserve(Columns::bytes(n_rows))?;
         let mut columns = Columns::zeroed(n_rows);
         let mut rest = columns.slices();
         let mut parts = Vec::with_capacity(stretches.len());
@@ -123,22 +137,28 @@ impl<'a> Rows<'a> {
         parts.par_iter_mut().for_each_init(
             || Scanner::new(text),
             |scanner, (stretch, slices, site)| {
-                let done = scanner.rows(site, |atom| slices.put(atom), stretch.from, stretch.to, &failed);
+                let stop = || failed.load(Ordering::Relaxed) || reading.check().is_err();
+                let done = scanner.rows(site, |atom| slices.put(atom), stretch.from, stretch.to, &stop);
                 let whole =
                     done.is_ok_and(|done| text[done..stretch.to].iter().all(|&b| b <= b' ')) && slices.is_full();
-                if !whole {
+                // The sequential path reports the error.
+                let duplicates = duplicates::check(slices.n_filled(), |row| slices.place(row), reading);
+                if !whole || duplicates.is_err() {
                     failed.store(true, Ordering::Relaxed);
                 }
             },
         );
+        reading.check()?;
         if failed.into_inner() {
-            return None;
+            return Ok(None);
         }
         for (_, mut slices, site) in parts {
+            reading.keep_texts(site.tables.n_texts())?;
             self.site.append(site, &mut slices);
         }
-        self.columns = columns;
-        Some(end)
+        memory.keep();
+        self.columns = GrowingColumns::filled(columns, &self.site.tables);
+        Ok(Some(end))
     }
 }
 
@@ -231,15 +251,15 @@ impl<'a> Scanner<'a> {
         Self { text, edges: Edges::default(), window: MAX_WINDOW }
     }
 
-    /// Reads rows from `at` to `end` and calls `put`, which returns false if the limit is reached. Stops before the
-    /// first row that is incomplete or not plain, and returns the end of the row before it.
+    /// Reads rows from `at` to `end` and calls `put`, which returns false if the memory for rows is full. Stops before
+    /// the first row that is incomplete, not plain or not added, and returns the end of the row before it.
     fn rows(
         &mut self,
         site: &mut AtomSite<Box<Fault>>,
         mut put: impl FnMut(&Atom) -> bool,
         mut at: usize,
         end: usize,
-        stop: &AtomicBool,
+        stop: &dyn Fn() -> bool,
     ) -> Result<usize, Stop> {
         let per_row = 2 * site.layout.width;
         let mut edges = std::mem::take(&mut self.edges);
@@ -263,7 +283,8 @@ impl<'a> Scanner<'a> {
                     }
                 };
                 if !put(&atom) {
-                    return Err(Stop::TooMany);
+                    plain = false;
+                    break;
                 }
                 done = at + offsets[per_row - 1] as usize;
             }
@@ -271,7 +292,7 @@ impl<'a> Scanner<'a> {
                 self.window = MIN_WINDOW;
                 break done;
             }
-            if to == end || (done == at && self.window == MAX_WINDOW) || stop.load(Ordering::Relaxed) {
+            if to == end || (done == at && self.window == MAX_WINDOW) || stop() {
                 break done;
             }
             self.window = (2 * self.window).min(MAX_WINDOW);
@@ -305,6 +326,8 @@ fn values_only(window: &[u8], offsets: &[u32], words: bool) -> bool {
 #[allow(clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
+    use crate::structure::ReadLimits;
+    use crate::surface::Control;
 
     const TAGS: &str = "_atom_site.Cartn_x _atom_site.Cartn_y _atom_site.Cartn_z _atom_site.auth_asym_id\n";
 
@@ -320,9 +343,13 @@ mod tests {
     /// Returns the number of rows that several threads read of a text with this ending, and where they stop.
     fn parallel(rows: &str, end: &str) -> Option<(usize, usize)> {
         let text = format!("{TAGS}{rows}{end}");
-        let mut table = Rows::new(text.as_bytes(), layout(&text), usize::MAX);
-        let stop = table.read_parallel(TAGS.len())?;
-        Some((table.columns.len(), stop - TAGS.len()))
+        // All rows are equal.
+        let limits = ReadLimits { max_duplicates: u64::MAX, ..ReadLimits::default() };
+        let control = Control::default();
+        let reading = Reading::new(&limits, &control);
+        let mut table = Rows::new(text.as_bytes(), layout(&text), &reading);
+        let stop = table.read_parallel(TAGS.len()).unwrap()?;
+        Some((table.columns.columns().len(), stop - TAGS.len()))
     }
 
     #[test]

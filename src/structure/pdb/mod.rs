@@ -16,30 +16,38 @@ use std::collections::{HashMap, HashSet};
 use self::card::{Card, card, coordinate, expand_tabs, number, numbered_line, residue_number};
 use self::chains::TwoLetterChains;
 use self::lines::Lines;
-use super::atoms::{Atom, Columns, Source, SourceFormat, Structure, Tables};
+use super::atoms::{Atom, Source, SourceFormat, Structure, Tables};
 use super::contents::Kind;
 use super::element::{self, Name, atomic_number};
 use super::error::StructureError;
+use super::growing::GrowingColumns;
 use super::kinds::{Listed, Sequence};
 use super::number::single;
-use super::read::ReadLimits;
+use super::read::Reading;
 use super::text::{self, Fault, normalize, trimmed};
 use super::warnings::Warnings;
 
 /// Longest title, characters.
 pub(super) const MAX_TITLE: usize = 1000;
 
-pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
-    let mut reader = Reader::new(text, limits);
-    for line in Lines::new(text) {
-        if let Err(fault) = reader.line(line) {
-            return Err(fault.locate(text));
+/// Lines between two checks of the cancellation flag: a few milliseconds.
+const LINES_PER_CHECK: usize = 1 << 14;
+
+pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
+    let mut reader = Reader::new(text);
+    for (n, line) in Lines::new(text).enumerate() {
+        if n % LINES_PER_CHECK == 0 {
+            reading.check()?;
         }
-        if reader.full {
-            return Err(StructureError::TooManyAtoms { limit: limits.max_atoms });
+        reader.line(line).map_err(|fault| fault.locate(text))?;
+        if std::mem::take(&mut reader.full) {
+            // Number of atoms if all lines were as long as this one.
+            let expected = text.len() / (line.1 - line.0 + 1) + 1;
+            reader.columns.reserve_chunk(&reader.tables, reading, expected)?;
+            reader.line(line).map_err(|fault| fault.locate(text))?;
         }
     }
-    if reader.columns.len() == 0 {
+    if reader.columns.columns().len() == 0 {
         return Err(StructureError::NoAtoms { found: describe(text) });
     }
     let source = Source {
@@ -49,7 +57,7 @@ pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, Struct
         sequence: Sequence { listed: reader.listed, ..Sequence::default() },
         warnings: reader.warnings.messages(|fault| fault.locate(text)),
     };
-    Ok(reader.columns.finish(reader.tables, source))
+    reader.columns.into_columns().finish(reader.tables, source, reading)
 }
 
 /// Assigns atoms to models. A repeated model number, or atoms after the end of a model, begin a new model.
@@ -74,10 +82,10 @@ impl Models {
 #[derive(Default)]
 struct Reader<'a> {
     text: &'a [u8],
-    max_rows: usize,
+    /// Set instead of reading an atom for which no memory is reserved.
     full: bool,
     tabs: bool,
-    columns: Columns,
+    columns: GrowingColumns,
     tables: Tables,
     models: Models,
     id: Option<String>,
@@ -94,9 +102,9 @@ struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    fn new(text: &'a [u8], limits: &ReadLimits) -> Self {
+    fn new(text: &'a [u8]) -> Self {
         let tabs = memchr::memchr(b'\t', text).is_some();
-        Self { text, max_rows: limits.max_rows(), tabs, ..Self::default() }
+        Self { text, tabs, ..Self::default() }
     }
 
     #[inline]
@@ -184,7 +192,7 @@ impl<'a> Reader<'a> {
             padded = card(line);
             &padded
         });
-        if self.columns.len() >= self.max_rows {
+        if !self.columns.has_space() {
             self.full = true;
             return Ok(());
         }
@@ -213,11 +221,6 @@ impl<'a> Reader<'a> {
             hetero,
             kind: if hetero { Kind::Ligand } else { Kind::Polymer },
         };
-        if self.columns.len() == 0 {
-            // Number of atoms if all lines were as long as this one.
-            let rows = self.text.len() / (line.len() + 1) + 1;
-            self.columns.reserve(rows.min(self.max_rows));
-        }
         self.columns.push(&atom);
         Ok(())
     }

@@ -23,6 +23,8 @@ pub(super) const SLOTS: usize = SIDE * SIDE * SIDE;
 pub(super) const NORMAL_ONLY: u32 = 1 << 31;
 /// Pairs of an atom and a tile between two checks of the cancellation flag.
 const PAIRS_PER_CHECK: u64 = 1 << 16;
+/// Memory of a pair of an atom and a tile, bytes: in a list that doubles, and sorted.
+const PAIR_BYTES: u64 = 20;
 /// Atoms whose candidate pairs are counted and checked against the limit together: 190,000 pairs at most.
 const ATOMS_PER_CHECK: usize = 256;
 /// Maximum capacity of a list that is kept between tiles; longer lists are freed.
@@ -79,6 +81,7 @@ impl Tiles {
             unchecked += n;
             if unchecked > PAIRS_PER_CHECK {
                 control.check()?;
+                control.memory.grow(PAIR_BYTES * unchecked)?;
                 unchecked = 0;
             }
             if n > max_tiles || index.len() as u64 > max_tiles {

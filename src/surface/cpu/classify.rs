@@ -127,6 +127,21 @@ impl ClassifiedBricks {
         }
     }
 
+    /// Returns the memory of the records, bytes.
+    pub(super) fn bytes(&self) -> u64 {
+        let of_vertex = size_of::<f32>() + size_of::<Edge>();
+        let of_bricks = size_of::<SurfaceBrick>() * self.bricks.len() + size_of::<u32>() * self.candidates.len();
+        let of_cells = self.cases.len() + size_of::<[u64; 8]>() * self.sheets.len();
+        (of_bricks + of_vertex * self.t.len() + of_cells) as u64
+    }
+
+    /// Returns the memory that is set aside for the records of `bricks` bricks in reach of an atom, bytes, without
+    /// candidates.
+    pub(super) const fn max_bytes(bricks: usize) -> u64 {
+        let of_vertex = size_of::<f32>() + size_of::<Edge>() + size_of::<u8>();
+        (bricks * (size_of::<SurfaceBrick>() + USUAL * of_vertex)) as u64
+    }
+
     /// Returns unused memory to the allocator, for the next tile.
     pub(super) fn shrink_to_fit(&mut self) {
         self.bricks.shrink_to_fit();

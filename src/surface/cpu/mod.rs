@@ -28,6 +28,7 @@ mod threads;
 mod write;
 
 use std::ops::Range;
+use std::sync::Arc;
 
 // Limits that the occupancy count shares with this backend.
 pub(crate) use self::bin::{check_lower_bound, too_large as grid_too_large};
@@ -43,6 +44,7 @@ use super::candidates;
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::lattice::{Lattice, TILE, to_f32, to_u32};
+use super::memory::Reservation;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
 use super::simd;
@@ -111,7 +113,10 @@ impl Backend for CpuBackend {
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
         self.install(|free_threads| {
-            let scanned = scan(spheres, RunContext { params, limits, control, free_threads })?;
+            // Only the mesh outlives the run.
+            let memory = Arc::new(Reservation::new(&control.memory));
+            let of_scan = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
+            let scanned = scan(spheres, RunContext { params, limits, control: &of_scan, free_threads })?;
             write::write(&scanned, params.atom_ids, control, sink)
         })
     }
@@ -167,9 +172,13 @@ fn pieces(done: &mut [Tile]) -> Vec<Piece> {
     pieces
 }
 
+/// Memory of placing an atom on the lattice, bytes: the atom, and its key before and after sorting.
+pub(crate) const LATTICE_BYTES: u64 = 64;
+
 fn scan(spheres: &Spheres, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
     let lattice = context.control.span(Stage::Bin, || {
         candidates::check(spheres, context.params, context.limits)?;
+        context.control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
         Lattice::new(spheres, context.params)
     });
     scan_lattice(lattice?, context)
@@ -177,7 +186,7 @@ fn scan(spheres: &Spheres, context: RunContext<'_>) -> Result<Scanned, SurfaceEr
 
 fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
     let RunContext { params, limits, control, free_threads } = context;
-    let tiles = control.span(Stage::Bin, || {
+    let tiles = control.span(Stage::Bin, || -> Result<_, SurfaceError> {
         let tiles = Tiles::new(&lattice, limits, control)?;
         if tiles.len() as f64 * f64::from(TILE).powi(3) > limits.max_samples as f64 {
             bin::check_lower_bound(&lattice, limits)?;

@@ -14,6 +14,7 @@ use crate::surface::candidates;
 use crate::surface::control::Stage;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK_SAMPLES, Lattice};
+use crate::surface::memory::{MemoryMeter as _, Reservation};
 
 /// Buffers that a thread reuses from tile to tile.
 struct Scratch {
@@ -46,6 +47,9 @@ impl Default for Scratch {
 
 /// Candidates of a brick between two checks of the cancellation flag: a fraction of a millisecond.
 const CANDIDATES_PER_CHECK: usize = 4096;
+
+/// Memory of a tile's table of bricks, bytes.
+const TILE_BYTES: u64 = (size_of::<u16>() * BRICK_SAMPLES) as u64;
 
 thread_local! {
     // Thread-local: rayon splits work and would create a scratch for each part, and fresh memory costs more than
@@ -115,9 +119,10 @@ impl Pass<'_> {
         Ok(tile)
     }
 
-    /// Counts `n` more candidate pairs.
-    fn count(&self, n: u64) -> Result<(), SurfaceError> {
+    /// Counts `n` more candidate pairs, and their memory in the tile's lists.
+    fn count(&self, n: u64, memory: &Reservation) -> Result<(), SurfaceError> {
         self.context.control.check()?;
+        memory.grow(size_of::<u32>() as u64 * n)?;
         let all = self.counters.candidate_pairs.fetch_add(n, Ordering::Relaxed) + n;
         if all > candidates::limit(self.context.limits) {
             return Err(candidates::exceeded(self.lattice, all, self.context.limits));
@@ -126,11 +131,12 @@ impl Pass<'_> {
     }
 
     fn sample_into(&self, slab: &Slab, scratch: &mut Scratch) -> Result<Tile, SurfaceError> {
+        let memory = Reservation::new(&self.context.control.memory);
         let (coord, counters, layers) = (self.tiles.coords[slab.tile], &self.counters, &slab.layers);
         let atoms = self.tiles.atoms(slab.tile);
         self.context
             .control
-            .span(Stage::Bin, || scratch.bricks.fill(self.lattice, coord, layers, atoms, |n| self.count(n)))?;
+            .span(Stage::Bin, || scratch.bricks.fill(self.lattice, coord, layers, atoms, |n| self.count(n, &memory)))?;
         let reached = count_occupied(&scratch.bricks, layers, counters);
         let occupied = reached as u64 * BRICK_SAMPLES as u64;
         let samples = counters.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
@@ -141,6 +147,7 @@ impl Pass<'_> {
                 self.context.limits,
             ));
         }
+        memory.grow(TILE_BYTES + ClassifiedBricks::max_bytes(reached))?;
         let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
         let mut found = ClassifiedBricks::with_capacity(reached);
         for z in layers.start..=layers.end {
@@ -152,6 +159,8 @@ impl Pass<'_> {
             }
         }
         self.context.control.span(Stage::Classify, || found.shrink_to_fit());
+        self.context.control.memory.grow(TILE_BYTES + found.bytes())?;
+        drop(memory);
         let bytes = self.context.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
         let so_far = counters.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
         if so_far > self.context.limits.max_mesh_bytes {

@@ -112,8 +112,16 @@ pub(super) fn write(
     Ok(MeshOutput { streamed, measures: Some(measures), ..MeshOutput::new(mesh, scanned.grid) })
 }
 
+/// Bytes of a vertex with 32-bit floating-point numbers, and of a quantized one.
+const SINGLE_BYTES: usize = 24;
+const QUANTIZED_BYTES: usize = 12;
+
 fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
     let Scanned { lattice, done, totals, pieces, .. } = scanned;
+    let of_ids = if atom_ids { size_of::<u32>() * totals.vertices } else { 0 };
+    let of_vertex = if scanned.quantize.is_some() { QUANTIZED_BYTES } else { SINGLE_BYTES };
+    let bytes = of_vertex * totals.vertices + size_of::<[u32; 3]>() * totals.triangles + of_ids;
+    control.memory.grow(bytes as u64)?;
     let n_single = if scanned.quantize.is_some() { 0 } else { totals.vertices };
     let mut mesh = Mesh {
         centre: lattice.centre(),

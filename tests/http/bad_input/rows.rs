@@ -301,7 +301,7 @@ fn mmcif() -> Vec<Row> {
             body: chains().into_bytes(),
             ..empty_selection("none of 100,000 chains", "chains=Z", "chains", "Z", "c0")
         },
-        beyond("100,001 atoms", many(ATOMS + 1, |_| "A . 1 1 2 3\n".to_owned()), 422, "too-many-atoms", ATOMS),
+        beyond("100,001 atoms", many(ATOMS + 1, |i| format!("A . 1 {i} 2 3\n")), 422, "too-many-atoms", ATOMS),
         beyond("blanks beyond every limit", vec![b' '; 9 << 20], 413, "body-too-large", BODY_BYTES),
     ]
 }
@@ -389,6 +389,19 @@ fn parameters() -> Vec<Row> {
         parameter("an unknown kernel", "kernel=sphere", "kernel", "sphere"),
         parameter("half of the paper's parameters", "paper_a=1", "paper_a", "1"),
         parameter("a chain without a name", "chains=,", "chains", ","),
+        Row {
+            named: vec![
+                ("parameter", Is::Equal("chains".into())),
+                ("expected", Is::Equal("at most 4096 bytes".into())),
+            ],
+            ..parameter("chains of 4 KB", &format!("chains=A{}", ",A".repeat(2048)), "", "")
+        },
+        parameter(
+            "chains of almost 4 KB",
+            &format!("chains=A{},", ",A".repeat(2047)),
+            "chains",
+            format!("A{}", ",A".repeat(31)) + ",",
+        ),
         parameter("a model beyond 32 bits", "model=99999999999", "model", "99999999999"),
         parameter("an altloc of two letters", "altloc=AB", "altloc", "AB"),
         parameter("an unknown kind of atoms", "select=everything", "select", "everything"),

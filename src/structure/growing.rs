@@ -1,0 +1,81 @@
+//! Columns that grow while a file is read: limits, memory and cancellation are checked once per chunk of rows.
+
+use super::atoms::{Atom, Columns, Tables};
+use super::duplicates;
+use super::error::StructureError;
+use super::read::Reading;
+
+/// Rows between two checks: a few milliseconds.
+const CHUNK: usize = 1 << 16;
+
+/// Columns with reserved memory for some more rows.
+#[derive(Debug, Default)]
+pub(super) struct GrowingColumns {
+    columns: Columns,
+    /// Number of rows at which the next check is due.
+    next_check: usize,
+    /// Number of texts whose memory is reserved.
+    n_texts: usize,
+}
+
+impl GrowingColumns {
+    /// Returns columns that hold rows already, whose memory is reserved.
+    pub(super) fn filled(columns: Columns, tables: &Tables) -> Self {
+        Self { next_check: columns.len(), columns, n_texts: tables.n_texts() }
+    }
+
+    pub(super) fn columns(&self) -> &Columns {
+        &self.columns
+    }
+
+    pub(super) fn into_columns(self) -> Columns {
+        self.columns
+    }
+
+    /// Returns true if [`Self::push`] would succeed.
+    #[inline]
+    pub(super) fn has_space(&self) -> bool {
+        self.columns.len() < self.next_check
+    }
+
+    /// Adds an atom. Returns false if [`Self::reserve_chunk`] must be called first.
+    #[inline]
+    pub(super) fn push(&mut self, atom: &Atom) -> bool {
+        let fits = self.has_space();
+        if fits {
+            self.columns.push(atom);
+        }
+        fits
+    }
+
+    /// Checks the rows added last and reserves memory for more, for `expected` rows in an empty column.
+    ///
+    /// # Errors
+    /// Returns [`StructureError::TooManyAtoms`] at the limit, [`StructureError::TooManyDuplicates`],
+    /// [`StructureError::Memory`] and [`StructureError::Cancelled`].
+    pub(super) fn reserve_chunk(
+        &mut self,
+        tables: &Tables,
+        reading: &Reading<'_>,
+        expected: usize,
+    ) -> Result<(), StructureError> {
+        let (n, limit) = (self.columns.len(), reading.limits.max_rows());
+        if n < self.next_check {
+            return Ok(());
+        }
+        reading.check()?;
+        if n >= limit {
+            return Err(StructureError::TooManyAtoms { limit: reading.limits.max_atoms });
+        }
+        let first = n.saturating_sub(CHUNK);
+        duplicates::check(n - first, |i| self.columns.place(first + i), reading)?;
+        reading.keep_texts(tables.n_texts() - self.n_texts)?;
+        self.n_texts = tables.n_texts();
+        if n == self.columns.capacity() {
+            let more = if n == 0 { expected } else { (n / 2).max(CHUNK) };
+            self.columns.reserve(more.clamp(1, limit - n), reading)?;
+        }
+        self.next_check = self.columns.capacity().min(n + CHUNK).min(limit);
+        Ok(())
+    }
+}

@@ -1,0 +1,145 @@
+//! Every stage of a job ends soon after its cancellation.
+
+use std::fmt::Write as _;
+use std::io::{self, Write};
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+use molmesh::formats::{Format, GlbSink};
+use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, ProgressSink, params};
+use molmesh::structure::{self, ReadLimits, Selection};
+use molmesh::surface::{
+    Backend as _, CancelToken, Control, CpuBackend, Measures, MeshSink, Observer, Spheres, Stage, SurfaceError,
+    SurfaceLimits, SurfaceParams, Validation,
+};
+
+use crate::tools::files::MemoryFile;
+
+/// Maximum time from the cancellation to the end of a job.
+const LIMIT: Duration = Duration::from_millis(500);
+/// Time from the begin of the stage to the cancellation.
+const DELAY: Duration = Duration::from_millis(5);
+
+/// Cancels a job soon after one of its stages has begun.
+struct CancelIn {
+    stage: &'static str,
+    cancel: CancelToken,
+    begun: Mutex<Option<Instant>>,
+}
+
+impl CancelIn {
+    fn new(stage: &'static str) -> Self {
+        Self { stage, cancel: CancelToken::default(), begun: Mutex::default() }
+    }
+
+    fn begin(&self, stage: &'static str) {
+        let mut begun = self.begun.lock().unwrap();
+        if stage == self.stage && begun.is_none() {
+            *begun = Some(Instant::now());
+            let cancel = self.cancel.clone();
+            std::thread::spawn(move || {
+                std::thread::sleep(DELAY);
+                cancel.cancel();
+            });
+        }
+    }
+
+    fn control(&self) -> Control<'_> {
+        Control { cancel: self.cancel.clone(), observer: self, ..Control::default() }
+    }
+
+    /// Checks that the job has just ended in time.
+    fn assert_in_time(&self) {
+        let begun = self.begun.lock().unwrap().expect("the stage has begun");
+        assert!(begun.elapsed() < DELAY + LIMIT, "{}: {:?}", self.stage, begun.elapsed());
+    }
+}
+
+impl ProgressSink for CancelIn {
+    fn progress(&self, stage: &'static str, _fraction: f64) {
+        self.begin(stage);
+    }
+}
+
+impl Observer for CancelIn {
+    fn span(&self, stage: Stage, work: &mut dyn FnMut()) {
+        self.begin(stage.name());
+        work();
+    }
+}
+
+/// Fails once the job is cancelled, as the outputs of the service and the command line do.
+struct Output(CancelToken);
+
+impl Write for Output {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.0.is_cancelled() { Err(io::ErrorKind::BrokenPipe.into()) } else { Ok(bytes.len().min(1 << 20)) }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Returns a PDB file of `n`³ separate atoms, whose surface is large.
+fn lattice(n: usize) -> Vec<u8> {
+    let mut text = String::new();
+    for i in 0..n * n * n {
+        let [x, y, z] = [i % n, i / n % n, i / (n * n)].map(|k| 4.0 * k as f64);
+        writeln!(text, "ATOM  {:>5}  CA  ALA A{:>4}    {x:>8.3}{y:>8.3}{z:>8.3}  1.00  0.00           C", 1, i % 9999)
+            .unwrap();
+    }
+    text.into_bytes()
+}
+
+fn job(pairs: &[(&str, &str)]) -> Job {
+    params::parse(pairs.iter().copied()).unwrap().job
+}
+
+#[test]
+fn jobs_end_soon_after_cancellation_in_any_stage() {
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "set by a test" };
+    let many = lattice(100);
+    let few = lattice(20);
+    let exact = job(&[("resolution", "0.4"), ("validation", "exact")]);
+    for (stage, input, job) in [("read", &many, &exact), ("select", &many, &exact), ("measure", &few, &exact)] {
+        let at = CancelIn::new(stage);
+        let stopped = pipeline::run(input, job, &JobLimits::default(), &choice, &at.control(), &at, None);
+        at.assert_in_time();
+        assert!(matches!(stopped, Err(JobError::Surface(SurfaceError::Cancelled))), "{stage}");
+    }
+
+    let quick = job(&[("resolution", "0.4")]);
+    let mut product =
+        pipeline::run(&few, &quick, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
+    let at = CancelIn::new("encode");
+    at.begin("encode");
+    let written = product.file(Format::Obj).unwrap().write(&mut Output(at.cancel.clone()));
+    at.assert_in_time();
+    assert_eq!(written.unwrap_err().kind(), io::ErrorKind::BrokenPipe);
+
+    // Meshes of devices have one part.
+    product.mesh.parts.clear();
+    let at = CancelIn::new("measure");
+    at.begin("measure");
+    let stopped = Measures::of(&product.mesh, Validation::Exact, &at.control());
+    at.assert_in_time();
+    assert_eq!(stopped.unwrap_err(), SurfaceError::Cancelled);
+}
+
+#[test]
+fn backends_end_soon_after_cancellation_in_any_stage() {
+    let structure = structure::read(&lattice(24), &ReadLimits::default()).unwrap();
+    let spheres: Spheres = structure::select(&structure, &Selection::default()).unwrap().spheres(&structure).unwrap();
+    let params = SurfaceParams { resolution: 0.4, ..SurfaceParams::default() };
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    for stage in Stage::ALL.into_iter().filter(|stage| *stage != Stage::Measure) {
+        let (at, file) = (CancelIn::new(stage.name()), MemoryFile::default());
+        let sink = GlbSink::new(&file);
+        let sink = (stage == Stage::Write).then_some(&sink as &dyn MeshSink);
+        let stopped = backend.write(&spheres, &params, &SurfaceLimits::default(), &at.control(), sink);
+        at.assert_in_time();
+        assert_eq!(stopped.map(|_| ()).unwrap_err(), SurfaceError::Cancelled, "{}", stage.name());
+    }
+}

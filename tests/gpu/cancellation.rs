@@ -1,0 +1,47 @@
+//! Jobs on a device end soon after their cancellation.
+
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use molmesh::gpu::{DevicePool, Executor, GpuBackend, PoolDevice, PoolSettings};
+use molmesh::surface::{Backend as _, CancelToken, Control, Kernel, Observer, Stage, SurfaceError, SurfaceLimits};
+
+use crate::gpu_support::{engine_with, params, spheres};
+
+/// Notes the begin of the first stage.
+#[derive(Default)]
+struct Begin(OnceLock<Instant>);
+
+impl Observer for Begin {
+    fn span(&self, _stage: Stage, work: &mut dyn FnMut()) {
+        self.0.get_or_init(Instant::now);
+        work();
+    }
+}
+
+#[test]
+fn jobs_end_soon_after_cancellation_at_any_time() {
+    let build = || Ok(Box::new(engine_with(|_| ())) as Box<dyn Executor>);
+    let device = PoolDevice { number: 0, name: "device".to_owned(), build: Box::new(build) };
+    let backend = GpuBackend::with_pool(DevicePool::start(vec![device], &PoolSettings::default()).unwrap(), None);
+    // 27,000 separate atoms have about 14 million triangles.
+    let at = |i: usize| [i % 30, i / 30 % 30, i / 900].map(|k| 4.0 * k as f64);
+    let rows: Vec<[f64; 4]> = (0..27_000).map(at).map(|[x, y, z]| [x, y, z, 1.7]).collect();
+    let (spheres, params) = (spheres(&rows), params(Kernel::Gaussian, 0.4));
+    // In stage bin, and while the device works.
+    for delay in [0, 5, 100, 400].map(Duration::from_millis) {
+        let (begin, cancel) = (Begin::default(), CancelToken::default());
+        let control = Control { cancel: cancel.clone(), observer: &begin, ..Control::default() };
+        let stopped = std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let begun = *begin.0.wait();
+                std::thread::sleep(delay.saturating_sub(begun.elapsed()));
+                cancel.cancel();
+            });
+            backend.run(&spheres, &params, &SurfaceLimits::default(), &control)
+        });
+        let time = begin.0.get().unwrap().elapsed();
+        assert_eq!(stopped.map(|_| ()).unwrap_err(), SurfaceError::Cancelled, "{delay:?}");
+        assert!(time < delay + Duration::from_millis(500), "{delay:?}: {time:?}");
+    }
+}
