@@ -31,6 +31,8 @@ pub(crate) struct Faults {
     pub(crate) stuck: AtomicBool,
     /// Folder whose operations hang; true if reads hang too.
     silent: Mutex<Option<(Folder, bool)>>,
+    /// Number of reads of job documents.
+    pub(crate) job_reads: AtomicUsize,
     /// Number of operations that hang.
     pub(crate) unanswered: AtomicUsize,
 }
@@ -117,6 +119,9 @@ impl ObjectStore for Faulty {
 
     async fn get_opts(&self, at: &Path, options: GetOptions) -> Result<GetResult> {
         self.faults.check_silence(at, true)?;
+        if !options.head && at.as_ref().starts_with(Folder::Jobs.as_str()) {
+            self.faults.job_reads.fetch_add(1, Ordering::SeqCst);
+        }
         self.files.get_opts(at, options).await
     }
 
@@ -150,12 +155,18 @@ impl ObjectStore for Faulty {
 /// Opens a store with injected faults in a temporary folder. `max_bytes` is its capacity.
 pub(crate) async fn faulty(max_bytes: u64) -> (TempDir, Arc<Faults>, Store) {
     let dir = tempfile::tempdir().unwrap();
+    let (faults, store) = faulty_in(dir.path(), max_bytes).await;
+    (dir, faults, store)
+}
+
+/// Opens a store with injected faults in the data folder `dir`.
+pub(crate) async fn faulty_in(dir: &std::path::Path, max_bytes: u64) -> (Arc<Faults>, Store) {
     let config = StoreConfig { max_bytes, memory_object_bytes: 1, ..StoreConfig::default() };
     // Creates the folders.
-    drop(Store::open(&config, dir.path()).await.unwrap());
-    let (root, faults) = (dir.path().join("store"), Arc::new(Faults::default()));
+    drop(Store::open(&config, dir).await.unwrap());
+    let (root, faults) = (dir.join("store"), Arc::new(Faults::default()));
     let files = LocalFileSystem::new_with_prefix(&root).unwrap();
     let objects = Arc::new(Faulty { files, faults: Arc::clone(&faults) });
     let store = Store::open_backend(Backend::over(objects, root), &config).await.unwrap();
-    (dir, faults, store)
+    (faults, store)
 }

@@ -233,6 +233,11 @@ impl Store {
         self.0.backend.list(folder).await
     }
 
+    /// Returns the names of the objects of a folder in the index, in name order.
+    pub(crate) fn names(&self, folder: Folder) -> Vec<Name> {
+        self.index().names(folder)
+    }
+
     /// Records a use of an object at time `at`, which restarts its time to live. A mesh and its report are used
     /// together.
     pub fn touch(&self, name: &Name, at: SystemTime) {

@@ -265,6 +265,29 @@ fn a_restart_resumes_open_jobs_only() {
     assert!(server.metric("molmesh_jobs_recovered_total", &[]) >= 3.0);
 }
 
+#[test]
+fn open_jobs_are_limited() {
+    let backend = Fake::new(Mode::Held);
+    let server = start(Arc::clone(&backend) as _, |c| c.jobs.records = 2);
+    let later = [("prefer", "respond-async")];
+    let submit = |n: usize| server.post("/v1/meshes?format=stl", &later, &sample(n));
+    let jobs: Vec<String> = (0..2).map(|n| submit(n).header("location").unwrap().to_owned()).collect();
+    for n in [0, 2] {
+        let problem = submit(n).problem(503, "too-many-jobs");
+        assert_eq!(problem["limit"], 2, "{problem}");
+    }
+    assert!(server.metric("molmesh_requests_rejected_total", &["reason=\"too-many-jobs\""]) >= 2.0);
+    backend.set(Mode::Octahedra);
+    for job in &jobs {
+        assert_eq!(server.get(&format!("{job}?wait=20")).json()["status"], "successful");
+    }
+    // An ended job makes room for the next one.
+    wait_for("a record to end", || submit(2).status == 202);
+    let mut left: Vec<u16> = jobs.iter().map(|job| server.get(job).status).collect();
+    left.sort_unstable();
+    assert_eq!(left, [200, 404]);
+}
+
 /// Starts a process whose data folder is a disk of 16 MB of its own. Returns `None` if no disk can be mounted.
 #[expect(clippy::print_stdout, reason = "the list of skipped tests contains this line")]
 fn start_on_small_disk(folder: &Path) -> Option<Process> {
