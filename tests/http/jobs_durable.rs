@@ -15,9 +15,9 @@ use http_support::{Fake, Mode, SAMPLE, sample, start, wait_for};
 use molmesh::surface::CpuBackend;
 
 /// Server process on a data folder.
-struct Process {
+pub(crate) struct Process {
     child: Child,
-    addr: SocketAddr,
+    pub(crate) addr: SocketAddr,
 }
 
 impl Process {
@@ -26,7 +26,8 @@ impl Process {
         Self::spawn(Command::new(env!("CARGO_BIN_EXE_molmesh")), folder)
     }
 
-    fn spawn(mut program: Command, folder: &Path) -> Self {
+    /// Starts `program` with the arguments of a service.
+    pub(crate) fn spawn(mut program: Command, folder: &Path) -> Self {
         let mut child = program
             .args(["serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--data-dir"])
             .arg(folder)
@@ -55,10 +56,15 @@ impl Process {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }
+
+    /// Waits for the end of the process.
+    pub(crate) fn wait(mut self) {
+        self.child.wait().unwrap();
+    }
 }
 
 /// Sends a request to a server that may be killed. Returns status, `Location` and the body if it is complete.
-fn ask(
+pub(crate) fn ask(
     addr: SocketAddr,
     method: &str,
     path: &str,
