@@ -19,7 +19,7 @@ use super::retry::retry;
 use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
-use crate::store::{Digest, Name, Secret, Store, StoreError};
+use crate::store::{Digest, Name, Pin, Secret, Store, StoreError};
 use crate::telemetry::JOBS_RECOVERED;
 
 /// Number of ended jobs that are held in memory; older ones are read from the store.
@@ -155,7 +155,7 @@ impl JobStore {
             return existing(&record, view);
         }
         if ticket.is_none()
-            && let Some(key) = self.stored_result(&spec.task, spec.format).await?
+            && let Some((key, _pin)) = self.stored_result(&spec.task, spec.format).await?
         {
             let ended = Some(now_ms());
             let record = Record { status: Status::Successful, result: Some(key), finished_ms: ended, ..record };
@@ -199,11 +199,12 @@ impl JobStore {
         Ok(view)
     }
 
-    /// Returns the key of a task's result if it is stored. Strict tasks always run.
-    pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<String>, StoreError> {
+    /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
+    pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<(String, Pin)>, StoreError> {
         let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job));
+        let pin = self.0.store.pin(&key.name(format.extension())?);
         let found = !task.strict && results::is_stored(&self.0.store, format, &key).await?;
-        Ok(found.then(|| key.to_string()))
+        Ok(found.then(|| (key.to_string(), pin)))
     }
 
     /// Watches the state of a job; `None` if there is no such job.
@@ -274,12 +275,12 @@ impl JobStore {
         })
     }
 
-    /// Records the end of a job, unless it was dismissed meanwhile.
-    pub(super) async fn finish(&self, job: &DurableJob, ending: Result<String, EndError>) {
+    /// Records the end of a job, unless it was dismissed meanwhile. Its result is pinned until then.
+    pub(super) async fn finish(&self, job: &DurableJob, ending: Result<(String, Pin), EndError>) {
         let id = job.id();
-        let changed = match ending {
-            Ok(key) => {
-                let changed = job.end(Status::Successful, |record| record.result = Some(key));
+        let changed = match &ending {
+            Ok((key, _pin)) => {
+                let changed = job.end(Status::Successful, |record| record.result = Some(key.clone()));
                 if changed {
                     tracing::info!(job_id = %id, "a job finished");
                 }
@@ -287,7 +288,7 @@ impl JobStore {
             }
             Err(error) => {
                 tracing::info!(job_id = %id, %error, "a job failed");
-                let problem = (self.0.describe)(&error);
+                let problem = (self.0.describe)(error);
                 job.end(Status::Failed, |record| record.problem = Some(problem))
             }
         };

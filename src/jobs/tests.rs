@@ -4,7 +4,7 @@ use std::fmt::Debug;
 use std::future::Future;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use serde_json::Value;
@@ -221,8 +221,15 @@ async fn the_end_of_a_job_is_recorded_once_the_store_works_again() {
     ended(&mut seen).await;
     is(&seen, |record| record.status, &Status::Successful);
     fixture.unanswered(2).await;
+    // Until then nothing removes the result.
+    let expire = async || fixture.store.sweep(SystemTime::now() + Duration::from_hours(10_000)).await;
+    expire().await;
+    assert_eq!(fixture.store.usage(Folder::Results).objects, 2);
     fixture.faults.silence(None);
     until("the record", || async { fixture.on_record(&id).await.status == Status::Successful }).await;
+    fixture.jobs.settled().await;
+    expire().await;
+    assert_eq!(fixture.store.usage(Folder::Results).objects, 0, "control: an unused result expires");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -308,7 +315,7 @@ async fn recovered_inputs_are_pinned() {
     // The job cannot start, so only the recovery protects its input.
     fixture.faults.silence(Some(Folder::Inputs));
     assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
-    fixture.store.sweep(std::time::SystemTime::now() + Duration::from_hours(10_000)).await;
+    fixture.store.sweep(SystemTime::now() + Duration::from_hours(10_000)).await;
     fixture.faults.silence(None);
     let mut seen = fixture.watch(&id).await;
     ended(&mut seen).await;

@@ -134,10 +134,15 @@ impl Store {
     }
 
     /// Evicts the least recently used objects after the disk had no space for `bytes`: twice as many bytes, since other
-    /// writers need space too. Returns true if that freed any.
+    /// writers need space too. Evicts nothing if `bytes` would not fit even then. Returns true if that freed any.
     pub(crate) async fn evict_for(&self, bytes: u64) -> bool {
         let _one_at_a_time = self.0.last_cleanup.lock().await;
+        let free = self.0.backend.free_bytes().await;
         let candidates = self.index().oldest(bytes.saturating_mul(2));
+        let evictable: u64 = candidates.iter().map(|candidate| candidate.bytes).sum();
+        if free.is_some_and(|free| free.saturating_add(evictable) < bytes) {
+            return false;
+        }
         let (objects, freed) = self.remove_all(&candidates, "cap", &mut 0).await;
         tracing::warn!(objects, bytes = freed, "the disk is full; evicted objects");
         freed > 0

@@ -325,14 +325,17 @@ fn a_full_disk_evicts_objects_and_is_reported_as_a_full_store() {
         text
     };
     // Seven uploads of 4 MB each: the oldest ones are evicted.
+    let mut last = None;
     for n in 0..7 {
-        let (status, ..) = ask(server.addr, "POST", "/v1/structures", "", &filled(n, 4 << 20)).unwrap();
+        let (status, location, _) = ask(server.addr, "POST", "/v1/structures", "", &filled(n, 4 << 20)).unwrap();
         assert_eq!(status, 201, "upload {n}");
+        last = location;
     }
-    // An upload that never fits is no failure of the store.
+    // An upload that never fits is no failure of the store, and evicts nothing.
     let (status, _, body) = ask(server.addr, "POST", "/v1/structures", "", &filled(7, 17 << 20)).unwrap();
     let problem: serde_json::Value = serde_json::from_slice(&body).unwrap();
     assert_eq!((status, problem["type"].as_str()), (503, Some("/problems/store-full")), "{problem}");
+    assert_eq!(ask(server.addr, "GET", &last.unwrap(), "", b"").unwrap().0, 200);
     // Every announced result is kept.
     for n in 20..26 {
         let mut stream = TcpStream::connect(server.addr).unwrap();
