@@ -351,7 +351,9 @@ async fn records_are_limited_in_total_and_for_each_client() {
     for client in ["a", "a", "b"] {
         open.push(fixture.accept_from(client).await.unwrap().record.id);
     }
-    for (client, limit, key) in [("a", 2, "jobs.records_per_client"), ("b", 3, "jobs.records"), ("c", 3, "jobs.records")] {
+    for (client, limit, key) in
+        [("a", 2, "jobs.records_per_client"), ("b", 3, "jobs.records"), ("c", 3, "jobs.records")]
+    {
         let refused = fixture.accept_from(client).await;
         let Err(AcceptError::Store(StoreError::TooManyRecords { limit: l, key: k })) = refused else {
             panic!("{refused:?}")
@@ -412,4 +414,35 @@ async fn a_record_of_an_ended_job_prevents_another_one() {
     fixture.jobs.0.write(&ended).await.unwrap();
     assert!(!fixture.jobs.0.write_new(&open).await.unwrap(), "the job has ended");
     assert_eq!((fixture.on_record(&id).await, fixture.jobs.recover().await.unwrap()), (ended, 0));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn occasional_errors_of_the_store_end_no_job() {
+    let fixture = Fixture::new(3, PATIENT).await;
+    fixture.faults.error_every.store(10, Ordering::SeqCst);
+    let mut accepted = Vec::new();
+    for client in 0..30 {
+        match fixture.accept_from(&client.to_string()).await {
+            Ok(view) => accepted.push(view.record.id),
+            Err(AcceptError::Store(StoreError::Failed { .. })) => {}
+            Err(error) => panic!("{error:?}"),
+        }
+    }
+    fixture.jobs.settled().await;
+    assert!(accepted.len() < 30 && accepted.len() >= 5, "{} jobs are accepted", accepted.len());
+    fixture.faults.error_every.store(0, Ordering::SeqCst);
+    for id in &accepted {
+        assert_eq!(fixture.on_record(id).await.status, Status::Successful);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_truncated_read_of_a_record_is_no_damage() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    fixture.faults.truncate.store(true, Ordering::SeqCst);
+    let refused = fixture.jobs.0.read(&id).await;
+    assert!(matches!(refused, Err(StoreError::Failed { .. })), "{refused:?}");
+    fixture.faults.truncate.store(false, Ordering::SeqCst);
+    assert_eq!((fixture.on_record(&id).await.id, fixture.store.quarantined().await.unwrap()), (id, 0));
 }

@@ -71,12 +71,15 @@ impl Store {
         let (excess, _) = self.index().excess(0, self.0.config.max_bytes);
         let (evicted, bytes) = self.remove_all(&excess, "cap", &mut swept.failed).await;
         (swept.evicted, swept.bytes) = (evicted, swept.bytes + bytes);
-        let uses = self.index().unsaved_uses(SAVE_USE);
+        let mut uses = self.index().unsaved_uses(SAVE_USE);
+        for (_, used) in &mut uses {
+            *used = self.0.clock.to_system(*used);
+        }
         if let Err(error) = self.0.backend.save_uses(uses).await {
             tracing::warn!(%error, "times of last use were not saved");
         }
         if now.duration_since(*cleared).is_ok_and(|age| age >= STALE) {
-            match self.0.backend.clear_stale(now).await {
+            match self.0.backend.clear_stale(self.0.clock.to_system(now)).await {
                 Ok(stale) => (swept.stale, *cleared) = (stale, now),
                 Err(error) => tracing::warn!(%error, "leftovers of crashed processes were not removed from the store"),
             }
