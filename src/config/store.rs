@@ -32,8 +32,8 @@ pub struct StoreConfig {
     /// File that contains the value of `secret_access_key`, such as a mounted container secret; one line break at its
     /// end is ignored. Default `none`. Excludes `secret_access_key`.
     pub secret_access_key_file: Option<PathBuf>,
-    /// Time without a response after which a request to S3 fails or is retried, ms. Default 30,000: a part of 8 MiB at
-    /// 2 Mbit/s.
+    /// Time without a response after which a request to S3 fails or is retried, and time limit of an operation of a
+    /// folder, ms. Default 30,000: a part of 8 MiB at 2 Mbit/s, or an upload of 256 MiB on a slow disk.
     pub timeout_ms: u64,
     /// Minimum time between health checks of the store, ms; `/readyz` writes, reads and removes a small object. Default
     /// 5,000: orchestrators send a request every few seconds.

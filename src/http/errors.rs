@@ -178,6 +178,9 @@ impl From<StoreError> for Problem {
                 tracing::error!(%error, "the disk of the store is full");
                 Self::new(Kind::StoreFull, "the disk of the store is full").retry_after(wait)
             }
+            StoreError::TooManyRecords { limit, .. } => {
+                Self::new(Kind::TooManyJobs, error.to_string()).with("limit", limit).retry_after(wait)
+            }
             StoreError::Quarantined { .. } => {
                 Self::new(Kind::RecordUnreadable, "the record of the job cannot be read and is in quarantine")
             }

@@ -3,7 +3,7 @@
 use std::io;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, OnceLock};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use futures_util::FutureExt as _;
 use quick_cache::sync::Cache;
@@ -281,7 +281,7 @@ async fn publish(app: Shared, recorder: Option<Recorder>) {
 async fn sweep(store: Store, interval: Duration) {
     loop {
         tokio::time::sleep(interval).await;
-        store.sweep(SystemTime::now()).await;
+        store.sweep(store.now()).await;
     }
 }
 

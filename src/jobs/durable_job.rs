@@ -164,7 +164,8 @@ impl JobStore {
 
 /// Result of one attempt to run a job.
 enum Attempt {
-    Ended(Result<String, EndError>),
+    /// With the key of the result and its pin.
+    Ended(Result<(String, Pin), EndError>),
     /// A temporary shortage of places or memory.
     Retry,
     /// The store fails; it is retried with growing pauses.
@@ -264,8 +265,8 @@ async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &Record, digest:
     };
     let (task, format) = jobs.load_task(record, digest).await.map_err(failed)?.map_err(lost)?;
     // An earlier process may have ended between storing the result and updating the record.
-    if let Some(key) = jobs.stored_result(&task, format).await.map_err(failed)? {
-        return Err(Attempt::Ended(Ok(key)));
+    if let Some(stored) = jobs.stored_result(&task, format).await.map_err(failed)? {
+        return Err(Attempt::Ended(Ok(stored)));
     }
     let on_start = jobs.on_start(job, None);
     let ticket = jobs.0.pool.submit(task, jobs.0.allowed(), Some(on_start)).map_err(|refusal| match refusal {
@@ -279,8 +280,8 @@ async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &Record, digest:
     Ok(ticket)
 }
 
-/// Stores the result and returns its key.
-async fn save(jobs: &JobStore, record: &Record, finished: Arc<Finished>) -> Result<String, EndError> {
+/// Stores the result and returns its key, with its pin.
+async fn save(jobs: &JobStore, record: &Record, finished: Arc<Finished>) -> Result<(String, Pin), EndError> {
     let lost = |why| EndError::Lost { why };
     let (request, format) = record.request().map_err(lost)?;
     let report = &finished.product.report;
@@ -289,9 +290,9 @@ async fn save(jobs: &JobStore, record: &Record, finished: Arc<Finished>) -> Resu
     let parent = record.requester.parent(&jobs.0.pool.settings().tracer);
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
     let save = || results::save(&jobs.0.store, Arc::clone(&finished), format, &key, jobs.0.output_bytes);
-    retry(&record.id, jobs.0.retry_time(), SaveError::is_temporary, save)
+    let pin = retry(&record.id, jobs.0.retry_time(), SaveError::is_temporary, save)
         .await
         .map_err(|error| EndError::Save { error, resolution })?;
     span.end();
-    Ok(key.to_string())
+    Ok((key.to_string(), pin))
 }

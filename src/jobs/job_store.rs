@@ -8,7 +8,6 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
 
-use futures_util::{StreamExt as _, stream};
 use metrics::counter;
 use serde_json::Value;
 use tokio::sync::watch;
@@ -20,13 +19,11 @@ use super::retry::retry;
 use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
-use crate::store::{Digest, Folder, Name, Pin, Secret, Store, StoreError};
+use crate::store::{Digest, Name, Pin, Secret, Store, StoreError};
 use crate::telemetry::JOBS_RECOVERED;
 
 /// Number of ended jobs that are held in memory; older ones are read from the store.
 const MAX_ENDED: usize = 10_000;
-/// Concurrent reads of records at startup.
-const RECOVERY_READS: usize = 64;
 
 /// Request for a durable job.
 #[derive(Debug)]
@@ -86,39 +83,8 @@ impl Inner {
         Duration::from_millis(self.config.save_retry_ms)
     }
 
-    fn lock(&self) -> MutexGuard<'_, HashMap<JobId, Arc<DurableJob>>> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, HashMap<JobId, Arc<DurableJob>>> {
         self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Protects input and record of an unfinished job from eviction.
-    fn pin(&self, id: &JobId, input: &Digest) -> Result<[Pin; 2], StoreError> {
-        Ok([self.store.pin(&Name::input(input)), self.store.pin(&Name::job(id.as_str())?)])
-    }
-
-    /// Writes a record to the store.
-    pub(super) async fn write(&self, record: &Record) -> Result<(), StoreError> {
-        self.store.put(&Name::job(record.id.as_str())?, record.to_bytes()).await
-    }
-
-    /// Reads a record. One that cannot be parsed goes into quarantine.
-    async fn read(&self, name: &Name) -> Result<Option<Record>, StoreError> {
-        match self.store.get(name).await?.map(|stored| Record::from_bytes(&stored.bytes)) {
-            Some(Ok(record)) => return Ok(Some(record)),
-            Some(Err(error)) => {
-                tracing::error!(%name, %error, "the record of a job cannot be read; moving it into quarantine");
-                self.store.quarantine(name).await?;
-            }
-            None if self.store.is_quarantined(name).await? => {}
-            None => return Ok(None),
-        }
-        Err(StoreError::Quarantined { name: name.to_string() })
-    }
-
-    /// Writes the present record of a job. Writers of one job take turns, so the last write has the latest state, and a
-    /// job that was dismissed while it started stays dismissed after a restart.
-    pub(super) async fn write_job(&self, job: &DurableJob) -> Result<(), StoreError> {
-        let _turn = job.writing.lock().await;
-        self.write(&job.record()).await
     }
 
     /// Adds a job to the map, unless there is one with this id, and returns the job in the map.
@@ -165,7 +131,7 @@ impl JobStore {
         let client = spec.task.rank.client.0;
         let id = match &spec.idempotency_key {
             Some(key) => JobId::of_key(&inner.secret, client, key),
-            None => JobId::random().map_err(AcceptError::Random)?,
+            None => JobId::random(&inner.secret, client).map_err(AcceptError::Random)?,
         };
         let record = Record {
             id: id.clone(),
@@ -189,10 +155,11 @@ impl JobStore {
             return existing(&record, view);
         }
         if ticket.is_none()
-            && let Some(key) = self.stored_result(&spec.task, spec.format).await?
+            && let Some((key, _pin)) = self.stored_result(&spec.task, spec.format).await?
         {
             let ended = Some(now_ms());
             let record = Record { status: Status::Successful, result: Some(key), finished_ms: ended, ..record };
+            let _place = inner.admit(&id).await?;
             inner.write(&record).await?;
             return Ok(inner.insert(&id, &Arc::new(DurableJob::new(record))).view());
         }
@@ -212,15 +179,15 @@ impl JobStore {
             }
             ticket
         };
+        let place = inner.admit(&id).await?;
         inner.store.put_new(&Name::input(&digest), input).await?;
-        let record = job.record().to_bytes();
-        let name = Name::job(id.as_str()).map_err(StoreError::from)?;
-        if !inner.store.put_new(&name, record).await?
+        if !inner.write_new(&job.record()).await?
             && let Some(view) = self.view(&id).await?
         {
             // A concurrent request with the same key stored its record first.
             return existing(&job.record(), view);
         }
+        drop(place);
         // Releases the worker that waits in `on_start`; no worker does if the job was joined while it ran.
         _ = recorded.send(());
         let inserted = inner.insert(&id, &job);
@@ -232,11 +199,12 @@ impl JobStore {
         Ok(view)
     }
 
-    /// Returns the key of a task's result if it is stored. Strict tasks always run.
-    pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<String>, StoreError> {
+    /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
+    pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<(String, Pin)>, StoreError> {
         let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job));
+        let pin = self.0.store.pin(&key.name(format.extension())?);
         let found = !task.strict && results::is_stored(&self.0.store, format, &key).await?;
-        Ok(found.then(|| key.to_string()))
+        Ok(found.then(|| (key.to_string(), pin)))
     }
 
     /// Watches the state of a job; `None` if there is no such job.
@@ -244,7 +212,7 @@ impl JobStore {
         if let Some(job) = self.0.lock().get(id) {
             return Ok(Some(job.state.subscribe()));
         }
-        let Some(record) = self.0.read(&Name::job(id.as_str())?).await? else { return Ok(None) };
+        let Some(record) = self.0.read(id).await? else { return Ok(None) };
         if record.status.is_final() {
             return Ok(Some(DurableJob::new(record).state.subscribe()));
         }
@@ -268,30 +236,8 @@ impl JobStore {
         Ok(Some(job.view()))
     }
 
-    /// Resumes the unfinished jobs of earlier processes and returns their number.
-    pub(crate) async fn recover(&self) -> Result<usize, StoreError> {
-        let names = self.0.store.list(Folder::Jobs).await?;
-        let mut reads = stream::iter(&names).map(|(name, _)| self.0.read(name)).buffer_unordered(RECOVERY_READS);
-        let mut open = Vec::new();
-        while let Some(read) = reads.next().await {
-            match read {
-                Ok(record) => open.extend(record.filter(|record| !record.status.is_final())),
-                Err(StoreError::Quarantined { .. }) => {}
-                Err(error) => return Err(error),
-            }
-        }
-        drop(reads);
-        // In the order of their acceptance.
-        open.sort_by_key(|record| (record.created_ms, record.id.clone()));
-        let before = self.0.lock().len();
-        for record in open {
-            self.resume(record).await?;
-        }
-        Ok(self.0.lock().len() - before)
-    }
-
     /// Resumes a job from its record, unless it runs already.
-    async fn resume(&self, record: Record) -> Result<Arc<DurableJob>, StoreError> {
+    pub(super) async fn resume(&self, record: Record) -> Result<Arc<DurableJob>, StoreError> {
         let (id, input, earlier_attempts) = (record.id.clone(), record.input.parse::<Digest>(), record.attempts);
         let fresh = Arc::new(DurableJob::new(record));
         let known = self.0.lock().get(&id).cloned();
@@ -329,12 +275,12 @@ impl JobStore {
         })
     }
 
-    /// Records the end of a job, unless it was dismissed meanwhile.
-    pub(super) async fn finish(&self, job: &DurableJob, ending: Result<String, EndError>) {
+    /// Records the end of a job, unless it was dismissed meanwhile. Its result is pinned until then.
+    pub(super) async fn finish(&self, job: &DurableJob, ending: Result<(String, Pin), EndError>) {
         let id = job.id();
-        let changed = match ending {
-            Ok(key) => {
-                let changed = job.end(Status::Successful, |record| record.result = Some(key));
+        let changed = match &ending {
+            Ok((key, _pin)) => {
+                let changed = job.end(Status::Successful, |record| record.result = Some(key.clone()));
                 if changed {
                     tracing::info!(job_id = %id, "a job finished");
                 }
@@ -342,7 +288,7 @@ impl JobStore {
             }
             Err(error) => {
                 tracing::info!(job_id = %id, %error, "a job failed");
-                let problem = (self.0.describe)(&error);
+                let problem = (self.0.describe)(error);
                 job.end(Status::Failed, |record| record.problem = Some(problem))
             }
         };

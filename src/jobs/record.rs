@@ -13,7 +13,7 @@ use thiserror::Error;
 
 use crate::formats::Format;
 use crate::pipeline::params;
-use crate::store::Secret;
+use crate::store::{OWNER_DIGITS, Secret};
 use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, traceparent, tracestate};
 
 /// Error of a text that is not a job id.
@@ -21,36 +21,52 @@ use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, tracepar
 #[error("a job id has 32 lower-case hexadecimal digits")]
 pub(crate) struct BadJobId;
 
+/// Digits of a job id.
+const DIGITS: usize = 32;
+
 /// Id of a job. It is a secret: every client that knows it can see and cancel the job.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String")]
 pub(crate) struct JobId(String);
 
 impl JobId {
-    /// Creates an id of 128 random bits.
-    pub(crate) fn random() -> std::io::Result<Self> {
-        let mut bytes = [0; 16];
+    /// Creates an id of 96 random bits and the number of `client`.
+    pub(super) fn random(secret: &Secret, client: u64) -> std::io::Result<Self> {
+        let mut bytes = [0; 32];
         getrandom::fill(&mut bytes).map_err(std::io::Error::from)?;
-        Ok(Self(format!("{:032x}", u128::from_be_bytes(bytes))))
+        Ok(Self::new(&bytes, secret, client))
+    }
+
+    /// Returns the first digits of `unique` and the number of `client`, so that the store counts the jobs of each
+    /// client without reading their records. The number is an HMAC: it does not reveal the client.
+    fn new(unique: &[u8; 32], secret: &Secret, client: u64) -> Self {
+        let hex = |bytes: &[u8; 32], digits: usize| -> String {
+            bytes.iter().map(|byte| format!("{byte:02x}")).take(digits / 2).collect()
+        };
+        let owner = hex(&hmac(secret, &format!("client\n{client:x}")), OWNER_DIGITS);
+        Self(hex(unique, DIGITS - OWNER_DIGITS) + &owner)
     }
 
     /// Returns the id for an idempotency key: the same for the same key of the same client, also after a restart.
     /// The id is a truncated HMAC-SHA-256 under `secret`: client and key alone do not reveal it.
     pub(super) fn of_key(secret: &Secret, client: u64, key: &str) -> Self {
-        // HMAC pads a key to the block length with zeros.
-        let mut block = [0; 64];
-        block[..secret.len()].copy_from_slice(secret);
-        let mut mac = Hmac::<Sha256>::new(&block.into());
-        mac.update(format!("idempotency\n{client:x}\n{key}").as_bytes());
-        let bytes = mac.finalize().into_bytes();
-        let id = bytes.iter().take(16).fold(0_u128, |id, byte| id << 8 | u128::from(*byte));
-        Self(format!("{id:032x}"))
+        Self::new(&hmac(secret, &format!("idempotency\n{client:x}\n{key}")), secret, client)
     }
 
     /// Returns the whole id.
     pub(crate) fn as_str(&self) -> &str {
         &self.0
     }
+}
+
+/// Returns the HMAC-SHA-256 of `text`.
+fn hmac(secret: &Secret, text: &str) -> [u8; 32] {
+    // HMAC pads a key to the block length with zeros.
+    let mut block = [0; 64];
+    block[..secret.len()].copy_from_slice(secret);
+    let mut mac = Hmac::<Sha256>::new(&block.into());
+    mac.update(text.as_bytes());
+    mac.finalize().into_bytes().into()
 }
 
 impl fmt::Display for JobId {
@@ -65,7 +81,7 @@ impl FromStr for JobId {
 
     fn from_str(text: &str) -> Result<Self, BadJobId> {
         let hex = |c: u8| c.is_ascii_digit() || (b'a'..=b'f').contains(&c);
-        if text.len() == 32 && text.bytes().all(hex) { Ok(Self(text.to_owned())) } else { Err(BadJobId) }
+        if text.len() == DIGITS && text.bytes().all(hex) { Ok(Self(text.to_owned())) } else { Err(BadJobId) }
     }
 }
 
@@ -261,9 +277,12 @@ mod tests {
 
     #[test]
     fn ids_are_random_or_follow_their_key() {
-        let (a, b) = (JobId::random().unwrap(), JobId::random().unwrap());
+        let random = |client| JobId::random(&[0; 32], client).unwrap();
+        let (a, b) = (random(1), random(1));
         assert_ne!(a, b);
         assert_eq!(a.as_str().parse(), Ok(a.clone()));
+        let owner = |id: &JobId| id.as_str()[DIGITS - OWNER_DIGITS..].to_owned();
+        assert!(owner(&a) == owner(&b) && owner(&a) != owner(&random(2)));
         let of = |secret: u8, client, key| JobId::of_key(&[secret; 32], client, key);
         assert_eq!(of(0, 1, "x"), of(0, 1, "x"));
         assert_eq!(of(0, 1, "x").as_str().parse(), Ok(of(0, 1, "x")));
@@ -271,7 +290,7 @@ mod tests {
             assert_ne!(of(0, 1, "x"), other);
         }
         // Computed with another implementation of HMAC-SHA-256.
-        assert_eq!(of(7, 255, "upload-1").as_str(), "0a0f88f773ba0077f73431b46274a47a");
+        assert_eq!(of(7, 255, "upload-1").as_str(), "0a0f88f773ba0077f73431b4ed19acb5");
         for bad in ["", "..", &"A".repeat(32), &"a".repeat(31), &"a".repeat(33), "../../../../etc/passwd0123456789"] {
             assert_eq!(bad.parse::<JobId>(), Err(BadJobId), "{bad}");
         }
@@ -279,7 +298,7 @@ mod tests {
 
     fn record(parameters: &[(&str, &str)]) -> Record {
         Record {
-            id: JobId::random().unwrap(),
+            id: JobId::random(&[0; 32], 1).unwrap(),
             input: Digest::of(b"x").to_string(),
             parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect(),
             format: "glb".to_owned(),

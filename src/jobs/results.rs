@@ -8,7 +8,7 @@ use thiserror::Error;
 
 use super::{ContentKey, Finished};
 use crate::formats::{Format, FormatError};
-use crate::store::{Store, StoreError};
+use crate::store::{Pin, Store, StoreError};
 
 /// File name extension of a report.
 pub(crate) const REPORT: &str = "json";
@@ -49,19 +49,19 @@ pub(crate) async fn is_stored(store: &Store, format: Format, key: &ContentKey) -
 }
 
 /// Stores the report and the mesh as `format`, unless both are stored already. The report comes first, so that every
-/// stored mesh has one.
+/// stored mesh has one. They are not removed before the returned pin is dropped.
 pub(crate) async fn save(
     store: &Store,
     finished: Arc<Finished>,
     format: Format,
     key: &ContentKey,
     limit: u64,
-) -> Result<(), SaveError> {
+) -> Result<Pin, SaveError> {
     let (mesh, report) = (key.name(format.extension())?, key.name(REPORT)?);
     // Writing the mesh must not evict its report.
-    let _pin = store.pin(&mesh);
+    let pin = store.pin(&mesh);
     if is_stored(store, format, key).await? {
-        return Ok(());
+        return Ok(pin);
     }
     let document = serde_json::to_vec(&finished.product.report).map_err(|e| SaveError::Other(e.to_string()))?;
     store.put(&report, Bytes::from(document)).await?;
@@ -82,7 +82,8 @@ pub(crate) async fn save(
             done => done,
         }
     };
-    tokio::task::spawn_blocking(encode).await.map_err(|e| SaveError::Other(e.to_string()))?
+    tokio::task::spawn_blocking(encode).await.map_err(|e| SaveError::Other(e.to_string()))??;
+    Ok(pin)
 }
 
 /// Converts an I/O error of a store writer back into the store's error.

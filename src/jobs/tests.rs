@@ -4,7 +4,7 @@ use std::fmt::Debug;
 use std::future::Future;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use serde_json::Value;
@@ -19,7 +19,7 @@ use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::picture::SelectedRenderer;
 use crate::pipeline::{JobLimits, params};
-use crate::store::faulty::{Faults, faulty};
+use crate::store::faulty::{Faults, faulty_in};
 use crate::store::{Digest, Folder, Name, Store, StoreError};
 use crate::surface::ReferenceBackend;
 use crate::telemetry::{SpanParent, Tracer};
@@ -37,7 +37,13 @@ struct Fixture {
 
 impl Fixture {
     async fn new(attempts: u32, retry_for: Duration) -> Self {
-        let (dir, faults, store) = faulty(1 << 30).await;
+        let save_retry_ms = u64::try_from(retry_for.as_millis()).unwrap();
+        let config = JobsConfig { attempts, save_retry_ms, ..JobsConfig::default() };
+        Self::open(tempfile::tempdir().unwrap(), config).await
+    }
+
+    async fn open(dir: TempDir, config: JobsConfig) -> Self {
+        let (faults, store) = faulty_in(dir.path(), 1 << 30).await;
         let settings = Settings {
             workers: 1,
             queue: 8,
@@ -49,16 +55,18 @@ impl Fixture {
             tracer: Tracer::default(),
         };
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
-        let save_retry_ms = u64::try_from(retry_for.as_millis()).unwrap();
-        let config = JobsConfig { attempts, save_retry_ms, ..JobsConfig::default() };
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
         Self { faults, jobs: JobStore::new(store.clone(), pool, config, 1 << 30, [0; 32], describe), store, dir }
     }
 
     async fn accept(&self) -> Result<JobView, AcceptError> {
+        self.accept_from("a").await
+    }
+
+    async fn accept_from(&self, client: &str) -> Result<JobView, AcceptError> {
         let pairs = [("resolution", "2")].map(|(name, value)| (name.to_owned(), value.to_owned()));
         let request = params::parse(pairs.iter().map(|(name, value)| (name, value))).unwrap();
-        let rank = Rank { client: Client::named("a"), batch: true, urgency: DEFAULT_URGENCY };
+        let rank = Rank { client: Client::named(client), batch: true, urgency: DEFAULT_URGENCY };
         let (input, digest) = (Bytes::from_static(SAMPLE), Digest::of(SAMPLE));
         let task = Task {
             input,
@@ -77,7 +85,7 @@ impl Fixture {
     /// Stores the record of a job that an earlier process accepted.
     async fn inherit(&self) -> JobId {
         let record = Record {
-            id: JobId::random().unwrap(),
+            id: new_id(),
             input: Digest::of(SAMPLE).to_string(),
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),
@@ -99,8 +107,7 @@ impl Fixture {
 
     /// Returns the stored record of a job.
     async fn on_record(&self, id: &JobId) -> Record {
-        let stored = self.store.get(&Name::job(id.as_str()).unwrap()).await.unwrap().unwrap();
-        Record::from_bytes(&stored.bytes).unwrap()
+        self.jobs.0.read(id).await.unwrap().unwrap()
     }
 
     async fn watch(&self, id: &JobId) -> watch::Receiver<JobView> {
@@ -111,6 +118,10 @@ impl Fixture {
     async fn unanswered(&self, times: usize) {
         until("questions", || async { self.faults.unanswered.load(Ordering::SeqCst) >= times }).await;
     }
+}
+
+fn new_id() -> JobId {
+    JobId::random(&[0; 32], Client::named("a").0).unwrap()
 }
 
 async fn until<F: Future<Output = bool>>(what: &str, mut holds: impl FnMut() -> F) {
@@ -210,8 +221,15 @@ async fn the_end_of_a_job_is_recorded_once_the_store_works_again() {
     ended(&mut seen).await;
     is(&seen, |record| record.status, &Status::Successful);
     fixture.unanswered(2).await;
+    // Until then nothing removes the result.
+    let expire = async || fixture.store.sweep(SystemTime::now() + Duration::from_hours(10_000)).await;
+    expire().await;
+    assert_eq!(fixture.store.usage(Folder::Results).objects, 2);
     fixture.faults.silence(None);
     until("the record", || async { fixture.on_record(&id).await.status == Status::Successful }).await;
+    fixture.jobs.settled().await;
+    expire().await;
+    assert_eq!(fixture.store.usage(Folder::Results).objects, 0, "control: an unused result expires");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -266,7 +284,7 @@ async fn records_that_cannot_be_read_go_into_quarantine() {
     let good = fixture.inherit().await;
     let whole = fixture.on_record(&good).await.to_bytes();
     let bad = [Bytes::new(), whole.slice(..whole.len() / 2), Bytes::from_static(br#"{"version":2,"id":[]}"#)];
-    let names: Vec<_> = bad.iter().map(|_| Name::job(JobId::random().unwrap().as_str()).unwrap()).collect();
+    let names: Vec<_> = bad.iter().map(|_| Name::job(new_id().as_str()).unwrap()).collect();
     for (name, bytes) in names.iter().zip(&bad) {
         fixture.store.put(name, bytes.clone()).await.unwrap();
     }
@@ -297,7 +315,7 @@ async fn recovered_inputs_are_pinned() {
     // The job cannot start, so only the recovery protects its input.
     fixture.faults.silence(Some(Folder::Inputs));
     assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
-    fixture.store.sweep(std::time::SystemTime::now() + Duration::from_hours(10_000)).await;
+    fixture.store.sweep(SystemTime::now() + Duration::from_hours(10_000)).await;
     fixture.faults.silence(None);
     let mut seen = fixture.watch(&id).await;
     ended(&mut seen).await;
@@ -321,4 +339,110 @@ async fn versions_of_states_continue_after_a_restart() {
     versions.push(next.view().version);
     assert!(versions.is_sorted_by(|a, b| a < b), "{versions:?}");
     assert_eq!(DurableJob::new(next.record()).view().version, *versions.last().unwrap(), "no event follows the last");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn records_are_limited_in_total_and_for_each_client() {
+    let config = JobsConfig { records: 3, records_per_client: 2, ..JobsConfig::default() };
+    let fixture = Fixture::open(tempfile::tempdir().unwrap(), config).await;
+    // Results cannot be stored, so the jobs stay open.
+    fixture.faults.seal(Folder::Results);
+    let mut open = Vec::new();
+    for client in ["a", "a", "b"] {
+        open.push(fixture.accept_from(client).await.unwrap().record.id);
+    }
+    for (client, limit, key) in
+        [("a", 2, "jobs.records_per_client"), ("b", 3, "jobs.records"), ("c", 3, "jobs.records")]
+    {
+        let refused = fixture.accept_from(client).await;
+        let Err(AcceptError::Store(StoreError::TooManyRecords { limit: l, key: k })) = refused else {
+            panic!("{refused:?}")
+        };
+        assert_eq!((l, k), (limit, key), "the request would join the work of the others");
+    }
+    fixture.faults.silence(None);
+    fixture.jobs.settled().await;
+    // In the order of their use.
+    for id in &open {
+        assert_eq!(fixture.on_record(id).await.status, Status::Successful);
+    }
+    // The result exists. The oldest ended job of the client makes room, then the oldest of all.
+    for (client, oldest) in [("a", &open[0]), ("c", &open[1])] {
+        let new = fixture.accept_from(client).await.unwrap().record;
+        assert_eq!(new.status, Status::Successful);
+        assert_eq!(fixture.jobs.view(oldest).await.unwrap(), None, "{client}");
+        assert!(fixture.jobs.view(&new.id).await.unwrap().is_some());
+        assert_eq!(fixture.store.usage(Folder::Jobs).objects, 3);
+    }
+    assert!(fixture.jobs.view(&open[2]).await.unwrap().is_some());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_start_reads_the_records_of_open_jobs_only() {
+    const ENDED: usize = 20_000;
+    let config = JobsConfig { records_per_client: ENDED, ..JobsConfig::default() };
+    let fixture = Fixture::open(tempfile::tempdir().unwrap(), config.clone()).await;
+    let open = [fixture.inherit().await, fixture.inherit().await];
+    // A process that dies between the two steps of ending a job leaves both documents.
+    let half_ended = fixture.inherit().await;
+    let folder = fixture.dir.path().join("store/jobs");
+    let write = |id: &JobId| std::fs::write(folder.join(format!("{}.ended.json", id.as_str())), b"{}").unwrap();
+    write(&half_ended);
+    (1..ENDED).for_each(|_| write(&new_id()));
+    let fixture = Fixture::open(fixture.dir, config).await;
+    assert_eq!(fixture.jobs.recover().await.unwrap(), open.len());
+    assert_eq!(fixture.faults.job_reads.load(Ordering::SeqCst), open.len());
+    assert!(!folder.join(format!("{}.json", half_ended.as_str())).exists());
+    for id in &open {
+        ended(&mut fixture.watch(id).await).await;
+    }
+    fixture.jobs.settled().await;
+    let count = || fixture.store.usage(Folder::Jobs).objects;
+    assert_eq!(count(), ENDED as u64 + 2);
+    // The names alone tell the client: its ended records make room down to the cap.
+    fixture.accept().await.unwrap();
+    assert_eq!(count(), ENDED as u64);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_record_of_an_ended_job_prevents_another_one() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    let open = fixture.on_record(&id).await;
+    let ended = Record { status: Status::Dismissed, finished_ms: Some(now_ms()), ..open.clone() };
+    assert!(!fixture.jobs.0.write_new(&open).await.unwrap(), "the job is open");
+    fixture.jobs.0.write(&ended).await.unwrap();
+    assert!(!fixture.jobs.0.write_new(&open).await.unwrap(), "the job has ended");
+    assert_eq!((fixture.on_record(&id).await, fixture.jobs.recover().await.unwrap()), (ended, 0));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn occasional_errors_of_the_store_end_no_job() {
+    let fixture = Fixture::new(3, PATIENT).await;
+    fixture.faults.error_every.store(10, Ordering::SeqCst);
+    let mut accepted = Vec::new();
+    for client in 0..30 {
+        match fixture.accept_from(&client.to_string()).await {
+            Ok(view) => accepted.push(view.record.id),
+            Err(AcceptError::Store(StoreError::Failed { .. })) => {}
+            Err(error) => panic!("{error:?}"),
+        }
+    }
+    fixture.jobs.settled().await;
+    assert!(accepted.len() < 30 && accepted.len() >= 5, "{} jobs are accepted", accepted.len());
+    fixture.faults.error_every.store(0, Ordering::SeqCst);
+    for id in &accepted {
+        assert_eq!(fixture.on_record(id).await.status, Status::Successful);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_truncated_read_of_a_record_is_no_damage() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    fixture.faults.truncate.store(true, Ordering::SeqCst);
+    let refused = fixture.jobs.0.read(&id).await;
+    assert!(matches!(refused, Err(StoreError::Failed { .. })), "{refused:?}");
+    fixture.faults.truncate.store(false, Ordering::SeqCst);
+    assert_eq!((fixture.on_record(&id).await.id, fixture.store.quarantined().await.unwrap()), (id, 0));
 }

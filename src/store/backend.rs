@@ -1,16 +1,18 @@
 //! Storage backend: a folder or S3. Classifies and counts errors.
 
+use std::future::Future;
+use std::io;
 use std::path::{Path as FilePath, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use futures_util::TryStreamExt as _;
 use metrics::counter;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
-use object_store::{GetOptions, GetRange, GetResult, ObjectMeta, ObjectStore, ObjectStoreExt as _, PutMode};
+use object_store::{GetOptions, GetRange, GetResult, ObjectMeta, ObjectStore, ObjectStoreExt as _, PutMode, Result};
 
 use super::error::StoreError;
 use super::lock::{create_folder, sync_folder};
@@ -21,7 +23,7 @@ use super::s3::{self, Bucket};
 use super::secret::{self, Secret};
 use super::stale;
 use crate::config::StoreConfig;
-use crate::sync::spawn_blocking;
+use crate::sync::{spawn_blocking, timeout};
 use crate::telemetry::STORE_ERRORS;
 
 /// Size of a part of a large object on S3, bytes. S3 requires at least 5 MiB and accepts 10,000 parts: 80 GB.
@@ -42,15 +44,19 @@ pub(super) struct Backend {
     kind: Kind,
     /// Folder, or URL without credentials, for messages.
     place: String,
+    /// Time limit of an operation of a folder. The client of S3 has time limits of its own.
+    limit: Duration,
 }
 
 impl Backend {
     /// Opens the configured store. The default is a folder in `data_dir`.
     pub(super) async fn open(config: &StoreConfig, data_dir: &FilePath) -> Result<Self, StoreError> {
+        let limit = Duration::from_millis(config.timeout_ms);
         if let Some(url) = &config.url {
             let failed = |reason| StoreError::Open { key: "store.url", place: url.clone(), reason };
             let (objects, bucket) = s3::connect(config, url).map_err(failed)?;
-            return Ok(Self { objects, kind: Kind::S3(bucket), place: url.trim_end_matches('/').to_owned() });
+            let place = url.trim_end_matches('/').to_owned();
+            return Ok(Self { objects, kind: Kind::S3(bucket), place, limit });
         }
         let root = data_dir.join("store");
         let place = root.display().to_string();
@@ -67,14 +73,14 @@ impl Backend {
         });
         let opened = opened.await.unwrap_or_else(|e| Err(e.to_string()));
         let failed = |reason| StoreError::Open { key: "server.data_dir", place: place.clone(), reason };
-        Ok(Self { objects: Arc::new(opened.map_err(failed)?), kind: Kind::Local(root), place })
+        Ok(Self { objects: Arc::new(opened.map_err(failed)?), kind: Kind::Local(root), place, limit })
     }
 
     /// Creates a backend over a folder with injected behaviour, for tests.
     #[cfg(test)]
-    pub(super) fn over(objects: Arc<dyn ObjectStore>, root: PathBuf) -> Self {
-        let place = root.display().to_string();
-        Self { objects, kind: Kind::Local(root), place }
+    pub(super) fn over(objects: Arc<dyn ObjectStore>, root: PathBuf, config: &StoreConfig) -> Self {
+        let (place, limit) = (root.display().to_string(), Duration::from_millis(config.timeout_ms));
+        Self { objects, kind: Kind::Local(root), place, limit }
     }
 
     /// Returns the location, for messages.
@@ -101,6 +107,28 @@ impl Backend {
         &self.objects
     }
 
+    /// Runs an operation, in a folder for at most `store.timeout_ms`. A hanging one keeps its thread until the system
+    /// answers.
+    pub(super) async fn timed<T>(&self, work: impl Future<Output = Result<T>>) -> Result<T> {
+        if !self.is_local() {
+            return work.await;
+        }
+        let late = || format!("no answer within {} ms (store.timeout_ms)", self.limit.as_millis());
+        let late = |_elapsed| Err(of_io(io::Error::new(io::ErrorKind::TimedOut, late())));
+        timeout(self.limit, work).await.unwrap_or_else(late)
+    }
+
+    /// Runs a blocking operation in a folder, for at most `store.timeout_ms`.
+    async fn blocking<T: Send + 'static>(
+        &self,
+        op: &'static str,
+        at: &str,
+        work: impl FnOnce() -> io::Result<T> + Send + 'static,
+    ) -> Result<T, StoreError> {
+        let done = async { spawn_blocking(work).await.unwrap_or_else(|e| Err(e.into())).map_err(of_io) };
+        self.timed(done).await.map_err(|error| self.fail(op, at, &error))
+    }
+
     /// Classifies and counts an error. `at` is a path relative to the root of the store.
     pub(super) fn fail(&self, op: &'static str, at: &str, error: &(dyn std::error::Error + 'static)) -> StoreError {
         counter!(STORE_ERRORS, "op" => op).increment(1);
@@ -119,7 +147,7 @@ impl Backend {
     /// Writes an object. With `new`, returns false and changes nothing if the object exists.
     pub(super) async fn put(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
         let mode = if new { PutMode::Create } else { PutMode::Overwrite };
-        match self.objects.put_opts(&name.path(), bytes.into(), mode.into()).await {
+        match self.timed(self.objects.put_opts(&name.path(), bytes.into(), mode.into())).await {
             Ok(_) => Ok(true),
             Err(object_store::Error::AlreadyExists { .. }) if new => Ok(false),
             Err(e) => Err(self.fail_at("put", name)(e)),
@@ -133,35 +161,45 @@ impl Backend {
         range: Option<std::ops::Range<u64>>,
     ) -> Result<Option<GetResult>, StoreError> {
         let options = GetOptions { range: range.map(GetRange::Bounded), ..GetOptions::default() };
-        found(self.objects.get_opts(&name.path(), options).await).map_err(self.fail_at("get", name))
+        found(self.timed(self.objects.get_opts(&name.path(), options)).await).map_err(self.fail_at("get", name))
     }
 
     /// Reads all bytes of an object.
     pub(super) async fn get_whole(&self, name: &Name) -> Result<Option<Stored>, StoreError> {
         let Some(read) = self.get(name, None).await? else { return Ok(None) };
         let meta = Meta::from(&read.meta);
-        let bytes = read.bytes().await.map_err(self.fail_at("get", name))?;
+        let bytes = self.timed(read.bytes()).await.map_err(self.fail_at("get", name))?;
+        self.check_length(name, &bytes, meta.size)?;
         Ok(Some(Stored { bytes, meta }))
     }
 
     /// Reads a range of an object. Keeps no file open.
     pub(super) async fn piece(&self, name: &Name, range: std::ops::Range<u64>) -> Result<Bytes, StoreError> {
         let length = range.end - range.start;
-        let parts = self.objects.get_ranges(&name.path(), &[range]).await.map_err(self.fail_at("read", name))?;
-        match parts.into_iter().next() {
-            Some(bytes) if bytes.len() as u64 == length => Ok(bytes),
-            _ => Err(self.fail("read", &name.to_string(), &std::io::Error::other("the object has become shorter"))),
+        let (path, ranges) = (name.path(), [range]);
+        let read = self.timed(self.objects.get_ranges(&path, &ranges)).await;
+        let bytes = read.map_err(self.fail_at("read", name))?.into_iter().next().unwrap_or_default();
+        self.check_length(name, &bytes, length)?;
+        Ok(bytes)
+    }
+
+    /// Rejects a read that returned fewer bytes than expected.
+    fn check_length(&self, name: &Name, bytes: &Bytes, expected: u64) -> Result<(), StoreError> {
+        if bytes.len() as u64 == expected {
+            return Ok(());
         }
+        let short = format!("read {} of {expected} bytes", bytes.len());
+        Err(self.fail("read", &name.to_string(), &io::Error::other(short)))
     }
 
     pub(super) async fn head(&self, name: &Name) -> Result<Option<Meta>, StoreError> {
-        let found = found(self.objects.head(&name.path()).await).map_err(self.fail_at("head", name))?;
+        let found = found(self.timed(self.objects.head(&name.path())).await).map_err(self.fail_at("head", name))?;
         Ok(found.as_ref().map(Meta::from))
     }
 
     /// Removes an object. Succeeds if it does not exist.
     pub(super) async fn delete(&self, name: &Name) -> Result<(), StoreError> {
-        found(self.objects.delete(&name.path()).await).map_err(self.fail_at("delete", name)).map(|_| ())
+        found(self.timed(self.objects.delete(&name.path())).await).map_err(self.fail_at("delete", name)).map(|_| ())
     }
 
     /// Lists the objects of a folder in name order. Ignores files with other names.
@@ -183,13 +221,16 @@ impl Backend {
         let path = Path::from_iter([PROBE, &file]);
         let fail = |e: object_store::Error| self.fail("probe", path.as_ref(), &e);
         let written = Bytes::from(file.into_bytes());
-        self.objects.put(&path, written.clone().into()).await.map_err(fail)?;
-        let read = self.objects.get(&path).await.map_err(fail)?.bytes().await.map_err(fail)?;
-        self.objects.delete(&path).await.map_err(fail)?;
+        let answered = async {
+            self.objects.put(&path, written.clone().into()).await?;
+            let read = self.objects.get(&path).await?.bytes().await?;
+            self.objects.delete(&path).await.map(|()| read)
+        };
+        let read = self.timed(answered).await.map_err(fail)?;
         if read == written {
             return Ok(());
         }
-        Err(self.fail("probe", path.as_ref(), &std::io::Error::other("the bytes read differ from the bytes written")))
+        Err(self.fail("probe", path.as_ref(), &io::Error::other("the bytes read differ from the bytes written")))
     }
 
     /// Reads the secret of the store, or creates it.
@@ -197,8 +238,7 @@ impl Backend {
         let outcome = match &self.kind {
             Kind::Local(root) => {
                 let root = root.clone();
-                let read = spawn_blocking(move || secret::in_folder(&root)).await;
-                read.unwrap_or_else(|e| Err(e.into())).map_err(|e| self.fail("secret", "secret", &e))
+                self.blocking("secret", "secret", move || secret::in_folder(&root)).await
             }
             Kind::S3(_) => {
                 secret::in_bucket(self.objects.as_ref()).await.map_err(|e| self.fail("secret", "secret", &e))
@@ -211,7 +251,7 @@ impl Backend {
     pub(super) async fn free_bytes(&self) -> Option<u64> {
         let Kind::Local(root) = &self.kind else { return None };
         let root = root.clone();
-        Some(spawn_blocking(move || free_bytes(&root)).await.unwrap_or(0))
+        Some(self.blocking("free", "", move || Ok(free_bytes(&root))).await.unwrap_or(0))
     }
 
     /// Sets the modification times of objects to their last uses, which the next process reads. S3 has no such
@@ -222,31 +262,30 @@ impl Backend {
         let save = move || {
             for (name, used) in uses {
                 match std::fs::File::open(root.join(name.to_string())).and_then(|file| file.set_modified(used)) {
-                    Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error),
+                    Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
                     _ => {}
                 }
             }
             Ok(())
         };
-        let saved = spawn_blocking(save).await.unwrap_or_else(|e| Err(e.into()));
-        saved.map_err(|error| self.fail("use", "", &error))
+        self.blocking("use", "", save).await
     }
 
     /// Removes leftovers of crashed processes: staged files, unfinished uploads, probes. Returns their number.
     pub(super) async fn clear_stale(&self, now: SystemTime) -> Result<u64, StoreError> {
         let fail = |e: object_store::Error| self.fail("clear", PROBE, &e);
-        let probes: Vec<_> = self.objects.list(Some(&Path::from(PROBE))).try_collect().await.map_err(fail)?;
+        let listed = self.timed(self.objects.list(Some(&Path::from(PROBE))).try_collect());
+        let probes: Vec<_> = listed.await.map_err(fail)?;
         let mut removed = 0;
         for probe in probes.into_iter().filter(|probe| stale::is_stale(probe.last_modified.into(), now)) {
-            found(self.objects.delete(&probe.location).await).map_err(fail)?;
+            found(self.timed(self.objects.delete(&probe.location)).await).map_err(fail)?;
             removed += 1;
         }
         let unfinished = match &self.kind {
             Kind::Local(root) => {
                 let folders: Vec<_> =
                     Folder::ALL.map(Folder::as_str).into_iter().chain([PROBE]).map(|name| root.join(name)).collect();
-                let cleared = spawn_blocking(move || stale::clear_files(&folders, now)).await;
-                cleared.unwrap_or_else(|e| Err(e.into())).map_err(|e| self.fail("clear", "", &e))
+                self.blocking("clear", "", move || stale::clear_files(&folders, now)).await
             }
             Kind::S3(bucket) => bucket.clear_uploads(now).await.map_err(|e| self.fail("clear", "", e.as_ref())),
         };
@@ -264,8 +303,12 @@ fn free_bytes(_: &FilePath) -> u64 {
     0
 }
 
+fn of_io(error: io::Error) -> object_store::Error {
+    object_store::Error::Generic { store: "folder", source: Box::new(error) }
+}
+
 /// Converts a "not found" error to `None`.
-fn found<T>(answer: object_store::Result<T>) -> object_store::Result<Option<T>> {
+fn found<T>(answer: Result<T>) -> Result<Option<T>> {
     match answer {
         Ok(found) => Ok(Some(found)),
         Err(object_store::Error::NotFound { .. }) => Ok(None),

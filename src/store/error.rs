@@ -77,6 +77,14 @@ pub enum StoreError {
         /// Name of the document.
         name: String,
     },
+    /// The limit of jobs on record is reached, and all of them are open.
+    #[error("{limit} jobs are on record ({key}), and none of them has ended")]
+    TooManyRecords {
+        /// Largest number of jobs on record.
+        limit: usize,
+        /// Configuration key of the limit.
+        key: &'static str,
+    },
     /// The name is invalid.
     #[error(transparent)]
     Name(#[from] BadName),

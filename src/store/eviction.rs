@@ -76,12 +76,15 @@ impl Store {
         let (excess, _) = self.index().excess(0, self.0.config.max_bytes);
         let (evicted, bytes) = self.remove_all(&excess, "cap", &mut swept.failed).await;
         (swept.evicted, swept.bytes) = (evicted, swept.bytes + bytes);
-        let uses = self.index().unsaved_uses(SAVE_USE);
+        let mut uses = self.index().unsaved_uses(SAVE_USE);
+        for (_, used) in &mut uses {
+            *used = self.0.clock.to_system(*used);
+        }
         if let Err(error) = self.0.backend.save_uses(uses).await {
             tracing::warn!(%error, "times of last use were not saved");
         }
         if now.duration_since(*cleared).is_ok_and(|age| age >= STALE) {
-            match self.0.backend.clear_stale(now).await {
+            match self.0.backend.clear_stale(self.0.clock.to_system(now)).await {
                 Ok(stale) => (swept.stale, *cleared) = (stale, now),
                 Err(error) => tracing::warn!(%error, "leftovers of crashed processes were not removed from the store"),
             }
@@ -139,10 +142,15 @@ impl Store {
     }
 
     /// Evicts the least recently used objects after the disk had no space for `bytes`: twice as many bytes, since other
-    /// writers need space too. Returns true if that freed any.
+    /// writers need space too. Evicts nothing if `bytes` would not fit even then. Returns true if that freed any.
     pub(crate) async fn evict_for(&self, bytes: u64) -> bool {
         let _one_at_a_time = self.0.last_cleanup.lock().await;
+        let free = self.0.backend.free_bytes().await;
         let candidates = self.index().oldest(bytes.saturating_mul(2));
+        let evictable: u64 = candidates.iter().map(|candidate| candidate.bytes).sum();
+        if free.is_some_and(|free| free.saturating_add(evictable) < bytes) {
+            return false;
+        }
         let (objects, freed) = self.remove_all(&candidates, "cap", &mut 0).await;
         tracing::warn!(objects, bytes = freed, "the disk is full; evicted objects");
         freed > 0
@@ -152,6 +160,13 @@ impl Store {
     pub(crate) async fn has_space(&self, bytes: u64) -> bool {
         let (_, missing) = self.index().excess(bytes, self.0.config.max_bytes);
         missing == 0 && self.0.backend.free_bytes().await.is_none_or(|free| free / 2 >= bytes)
+    }
+
+    /// Removes the documents of an ended job, unless they were used meanwhile. Returns true if they were removed.
+    pub(super) async fn evict_record(&self, candidate: &EvictionCandidate) -> Result<bool, StoreError> {
+        let removed = self.remove_candidate(candidate.clone()).await?;
+        counter!(STORE_REMOVED, "reason" => "records").increment(u64::from(removed));
+        Ok(removed)
     }
 
     /// Removes the candidates that are still unused. Returns the numbers of removed objects and bytes; adds failures to

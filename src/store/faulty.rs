@@ -2,8 +2,9 @@
 
 use std::io;
 use std::ops::Range;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::StreamExt as _;
@@ -11,8 +12,8 @@ use futures_util::stream::BoxStream;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 use object_store::{
-    CopyOptions, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore, PutMultipartOptions,
-    PutOptions, PutPayload, PutResult, Result, UploadPart,
+    CopyOptions, GetOptions, GetResult, GetResultPayload, ListResult, MultipartUpload, ObjectMeta, ObjectStore,
+    PutMultipartOptions, PutOptions, PutPayload, PutResult, Result, UploadPart,
 };
 use tempfile::TempDir;
 
@@ -29,9 +30,22 @@ pub(crate) struct Faults {
     pub(crate) frees: AtomicBool,
     /// Removals fail.
     pub(crate) stuck: AtomicBool,
-    /// Folder whose operations hang; true if reads hang too.
+    /// Folder whose operations time out; true if reads do too.
     silent: Mutex<Option<(Folder, bool)>>,
-    /// Number of operations that hang.
+    /// Time that each operation takes, ms.
+    pub(crate) slow_ms: AtomicU64,
+    /// Operations never end.
+    pub(crate) hang: AtomicBool,
+    /// Every operation with a multiple of this number fails; none if 0.
+    pub(crate) error_every: AtomicUsize,
+    operations: AtomicUsize,
+    /// Number of operations that failed because of `error_every`.
+    pub(crate) errors: AtomicUsize,
+    /// Reads return half of the bytes.
+    pub(crate) truncate: AtomicBool,
+    /// Number of reads of job documents.
+    pub(crate) job_reads: AtomicUsize,
+    /// Number of operations that timed out.
     pub(crate) unanswered: AtomicUsize,
 }
 
@@ -40,13 +54,13 @@ pub(crate) fn error(kind: io::ErrorKind) -> object_store::Error {
 }
 
 impl Faults {
-    /// Makes all operations on this folder hang, and no others.
+    /// Makes all operations on this folder time out, and no others.
     pub(crate) fn silence(&self, folder: Option<Folder>) {
         self.unanswered.store(0, Ordering::SeqCst);
         *self.silent.lock().unwrap() = folder.map(|folder| (folder, true));
     }
 
-    /// Makes only writes to this folder hang.
+    /// Makes only writes to this folder time out.
     pub(crate) fn seal(&self, folder: Folder) {
         self.unanswered.store(0, Ordering::SeqCst);
         *self.silent.lock().unwrap() = Some((folder, false));
@@ -59,6 +73,24 @@ impl Faults {
             return Err(error(io::ErrorKind::TimedOut));
         }
         Ok(())
+    }
+
+    /// Delays an operation, or makes it hang or fail.
+    async fn delay(&self) -> Result<()> {
+        let period = self.error_every.load(Ordering::SeqCst);
+        if period > 0 && (self.operations.fetch_add(1, Ordering::SeqCst) + 1).is_multiple_of(period) {
+            self.errors.fetch_add(1, Ordering::SeqCst);
+            return Err(error(io::ErrorKind::ConnectionReset));
+        }
+        if self.hang.load(Ordering::SeqCst) {
+            std::future::pending::<()>().await;
+        }
+        tokio::time::sleep(Duration::from_millis(self.slow_ms.load(Ordering::SeqCst))).await;
+        Ok(())
+    }
+
+    fn shorten(&self, bytes: Bytes) -> Bytes {
+        if self.truncate.load(Ordering::SeqCst) { bytes.slice(..bytes.len() / 2) } else { bytes }
     }
 
     fn check_space(&self) -> Result<()> {
@@ -86,14 +118,16 @@ struct FaultyUpload(Box<dyn MultipartUpload>, Arc<Faults>);
 impl MultipartUpload for FaultyUpload {
     fn put_part(&mut self, data: PutPayload) -> UploadPart {
         let part = self.0.put_part(data);
-        let space = self.1.check_space();
+        let faults = Arc::clone(&self.1);
         Box::pin(async move {
+            faults.delay().await?;
             part.await?;
-            space
+            faults.check_space()
         })
     }
 
     async fn complete(&mut self) -> Result<PutResult> {
+        self.1.delay().await?;
         self.0.complete().await
     }
 
@@ -107,6 +141,7 @@ impl ObjectStore for Faulty {
     async fn put_opts(&self, at: &Path, payload: PutPayload, options: PutOptions) -> Result<PutResult> {
         self.faults.check_silence(at, false)?;
         self.faults.check_space()?;
+        self.faults.delay().await?;
         self.files.put_opts(at, payload, options).await
     }
 
@@ -117,11 +152,25 @@ impl ObjectStore for Faulty {
 
     async fn get_opts(&self, at: &Path, options: GetOptions) -> Result<GetResult> {
         self.faults.check_silence(at, true)?;
-        self.files.get_opts(at, options).await
+        if !options.head && at.as_ref().starts_with(Folder::Jobs.as_str()) {
+            self.faults.job_reads.fetch_add(1, Ordering::SeqCst);
+        }
+        self.faults.delay().await?;
+        let read = self.files.get_opts(at, options).await?;
+        if !self.faults.truncate.load(Ordering::SeqCst) || read.range.is_empty() {
+            return Ok(read);
+        }
+        let (meta, range, attributes, extensions) =
+            (read.meta.clone(), read.range.clone(), read.attributes.clone(), read.extensions.clone());
+        let bytes = self.faults.shorten(read.bytes().await?);
+        let payload = GetResultPayload::Stream(futures_util::stream::iter([Ok(bytes)]).boxed());
+        Ok(GetResult { payload, meta, range, attributes, extensions })
     }
 
     async fn get_ranges(&self, at: &Path, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
-        self.files.get_ranges(at, ranges).await
+        self.faults.delay().await?;
+        let parts = self.files.get_ranges(at, ranges).await?;
+        Ok(parts.into_iter().map(|bytes| self.faults.shorten(bytes)).collect())
     }
 
     fn delete_stream(&self, at: BoxStream<'static, Result<Path>>) -> BoxStream<'static, Result<Path>> {
@@ -131,7 +180,15 @@ impl ObjectStore for Faulty {
         if self.faults.frees.load(Ordering::Relaxed) {
             self.faults.full.store(false, Ordering::Relaxed);
         }
-        self.files.delete_stream(at)
+        let faults = Arc::clone(&self.faults);
+        let delayed = at.then(move |at| {
+            let faults = Arc::clone(&faults);
+            async move {
+                faults.delay().await?;
+                at
+            }
+        });
+        self.files.delete_stream(delayed.boxed())
     }
 
     fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, Result<ObjectMeta>> {
@@ -150,12 +207,22 @@ impl ObjectStore for Faulty {
 /// Opens a store with injected faults in a temporary folder. `max_bytes` is its capacity.
 pub(crate) async fn faulty(max_bytes: u64) -> (TempDir, Arc<Faults>, Store) {
     let dir = tempfile::tempdir().unwrap();
-    let config = StoreConfig { max_bytes, memory_object_bytes: 1, ..StoreConfig::default() };
+    let (faults, store) = faulty_in(dir.path(), max_bytes).await;
+    (dir, faults, store)
+}
+
+/// Opens a store with injected faults in the data folder `dir`.
+pub(crate) async fn faulty_in(dir: &std::path::Path, max_bytes: u64) -> (Arc<Faults>, Store) {
+    open_faulty(dir, StoreConfig { max_bytes, memory_object_bytes: 1, ..StoreConfig::default() }).await
+}
+
+/// Opens a store with injected faults and its own configuration in the data folder `dir`.
+pub(crate) async fn open_faulty(dir: &std::path::Path, config: StoreConfig) -> (Arc<Faults>, Store) {
     // Creates the folders.
-    drop(Store::open(&config, dir.path()).await.unwrap());
-    let (root, faults) = (dir.path().join("store"), Arc::new(Faults::default()));
+    drop(Store::open(&config, dir).await.unwrap());
+    let (root, faults) = (dir.join("store"), Arc::new(Faults::default()));
     let files = LocalFileSystem::new_with_prefix(&root).unwrap();
     let objects = Arc::new(Faulty { files, faults: Arc::clone(&faults) });
-    let store = Store::open_backend(Backend::over(objects, root), &config).await.unwrap();
-    (dir, faults, store)
+    let store = Store::open_backend(Backend::over(objects, root, &config), &config).await.unwrap();
+    (faults, store)
 }

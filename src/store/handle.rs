@@ -15,6 +15,7 @@ use metrics::counter;
 use tokio::sync::Mutex as AsyncMutex;
 
 use super::backend::Backend;
+use super::clock::Clock;
 use super::error::StoreError;
 use super::eviction::Reservation;
 use super::index::{Index, Seen};
@@ -45,6 +46,7 @@ pub(super) struct Inner {
     /// Serializes evictions, so that two do not remove twice as much. The value is the time of the last search for
     /// staged files.
     pub(super) last_cleanup: AsyncMutex<SystemTime>,
+    pub(super) clock: Clock,
     /// Number of job documents in quarantine at the last count.
     pub(super) quarantined: AtomicUsize,
     pub(super) runtime: Handle,
@@ -70,7 +72,8 @@ impl Store {
     /// Opens a store over `backend`; see [`open`](Self::open).
     pub(super) async fn open_backend(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
         backend.probe().await.map_err(|e| backend.open_error(&e))?;
-        let now = SystemTime::now();
+        let clock = Clock::start();
+        let now = clock.now();
         // Not fatal: credentials may permit uploads without permitting their listing.
         let cleared = match backend.clear_stale(now).await {
             Ok(cleared) => cleared,
@@ -94,6 +97,7 @@ impl Store {
             memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
             write_locks: [const { AsyncMutex::const_new(()) }; WRITE_LOCKS],
             last_cleanup: AsyncMutex::new(now),
+            clock,
             quarantined: AtomicUsize::new(0),
             runtime: Handle::current(),
             config: config.clone(),
@@ -117,7 +121,7 @@ impl Store {
     /// Returns a [`StoreError`]. Nothing has changed then.
     pub async fn put_new(&self, name: &Name, bytes: Bytes) -> Result<bool, StoreError> {
         if self.head(name).await?.is_some() {
-            self.touch(name, SystemTime::now());
+            self.touch(name, self.now());
             return Ok(false);
         }
         self.write(name, bytes, true).await
@@ -234,6 +238,18 @@ impl Store {
         self.0.backend.list(folder).await
     }
 
+    /// Returns the names of the objects of a folder in the index, in name order.
+    pub(crate) fn names(&self, folder: Folder) -> Vec<Name> {
+        self.index().names(folder)
+    }
+
+    /// Returns the time for [`touch`](Self::touch) and [`sweep`](Self::sweep). It does not follow jumps of the system
+    /// clock.
+    #[must_use]
+    pub fn now(&self) -> SystemTime {
+        self.0.clock.now()
+    }
+
     /// Records a use of an object at time `at`, which restarts its time to live. A mesh and its report are used
     /// together.
     pub fn touch(&self, name: &Name, at: SystemTime) {
@@ -296,12 +312,12 @@ impl Store {
     /// Indexes an object that was just written under the lock of its name, and ends its reservation in the same step,
     /// so that it never counts twice. Caches small results in memory.
     pub(super) fn commit(&self, name: &Name, size: u64, bytes: Option<&Bytes>, reservation: &mut Reservation) {
-        let now = SystemTime::now();
+        let (used, modified) = (self.now(), SystemTime::now());
         let mut index = self.index();
-        index.commit(name, size, now);
+        index.commit(name, size, used);
         index.release(reservation.take());
         match bytes {
-            Some(bytes) => self.0.memory.put(name, Stored { bytes: bytes.clone(), meta: Meta { size, modified: now } }),
+            Some(bytes) => self.0.memory.put(name, Stored { bytes: bytes.clone(), meta: Meta { size, modified } }),
             None => self.0.memory.remove(name),
         }
     }
@@ -331,7 +347,7 @@ impl Store {
         let found = self.0.memory.get(name);
         count("memory", found.is_some());
         if found.is_some() {
-            self.touch(name, SystemTime::now());
+            self.touch(name, self.now());
         }
         found
     }
@@ -352,7 +368,7 @@ impl Store {
         }
         self.reconcile(name, seen, meta);
         if meta.is_some() {
-            self.touch(name, SystemTime::now());
+            self.touch(name, self.now());
         }
     }
 
@@ -360,7 +376,7 @@ impl Store {
     fn reconcile(&self, name: &Name, seen: Seen, meta: Option<Meta>) {
         let mut index = self.index();
         match meta {
-            Some(meta) => index.adopt(name, seen, meta.size, meta.modified),
+            Some(meta) => index.adopt(name, seen, meta.size, self.0.clock.of_system(meta.modified)),
             None if index.is_current(name, seen) => {
                 index.forget(name);
                 self.0.memory.remove(name);

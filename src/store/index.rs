@@ -7,10 +7,11 @@ use metrics::gauge;
 
 use super::name::{Folder, Name};
 use super::object::Usage;
+use super::records::{Admission, RecordCaps, Records};
 use crate::telemetry::{STORE_BYTES, STORE_OBJECTS};
 
 /// Order of last use. The counter orders uses within one clock tick.
-type Use = (SystemTime, u64);
+pub(super) type Use = (SystemTime, u64);
 
 #[derive(Debug, Clone, Copy)]
 struct Entry {
@@ -51,6 +52,7 @@ pub(super) enum ReserveError {
 pub(super) struct Index {
     entries: BTreeMap<Name, Entry>,
     by_use: BTreeMap<Use, Name>,
+    pub(super) records: Records,
     /// Number of pins by group.
     pins: BTreeMap<Name, usize>,
     /// Objects being removed: no longer readable, but still on disk.
@@ -76,7 +78,10 @@ impl Index {
         let last = members.iter().filter_map(|name| Some(self.entries.get(name)?.used.0)).max();
         let (saved, at) = (used, last.map_or(used, |last| last.max(used)));
         let (version, used) = (self.next(), (at, self.next()));
-        self.by_use.insert(used, name.clone());
+        if name.folder() == Folder::Jobs && members.is_empty() {
+            self.records.add(name);
+        }
+        self.reorder(name, None, Some(used));
         self.entries.insert(name.clone(), Entry { bytes, used, saved, version });
         self.touch(name, at);
         let total = &mut self.totals[name.folder() as usize];
@@ -87,7 +92,10 @@ impl Index {
     /// Removes an object that no longer exists. Returns true if it was in the index.
     pub(super) fn forget(&mut self, name: &Name) -> bool {
         let Some(entry) = self.entries.remove(name) else { return false };
-        self.by_use.remove(&entry.used);
+        self.reorder(name, Some(entry.used), None);
+        if name.folder() == Folder::Jobs && self.members(&name.group()).is_empty() {
+            self.records.remove(name);
+        }
         self.removals += 1;
         let total = &mut self.totals[name.folder() as usize];
         *total = Usage { bytes: total.bytes - entry.bytes, objects: total.objects - 1 };
@@ -100,10 +108,34 @@ impl Index {
         for name in self.members(&name.group()) {
             let count = self.next();
             let Some(entry) = self.entries.get_mut(&name) else { continue };
-            self.by_use.remove(&entry.used);
-            entry.used = (entry.used.0.max(at), count);
-            self.by_use.insert(entry.used, name);
+            let (old, new) = (entry.used, (entry.used.0.max(at), count));
+            entry.used = new;
+            self.reorder(&name, Some(old), Some(new));
         }
+    }
+
+    /// Changes the place of an object in the orders of use.
+    fn reorder(&mut self, name: &Name, old: Option<Use>, new: Option<Use>) {
+        old.and_then(|old| self.by_use.remove(&old));
+        new.and_then(|new| self.by_use.insert(new, name.clone()));
+        if name.is_ended_job() {
+            self.records.reorder(name, old, new);
+        }
+    }
+
+    /// Returns the names of the objects of a folder.
+    pub(super) fn names(&self, folder: Folder) -> Vec<Name> {
+        self.entries.keys().filter(|name| name.folder() == folder).cloned().collect()
+    }
+
+    /// Counts the record of a new job, unless a cap is reached.
+    pub(super) fn admit_record(&mut self, name: &Name, caps: RecordCaps) -> Admission {
+        if let Some((scope, cap, mut ended)) = self.records.at_cap(name, caps) {
+            let oldest = ended.find_map(|name| self.candidate(&name.group()));
+            return oldest.map_or(Admission::Full(scope, cap), Admission::Remove);
+        }
+        self.records.add(name);
+        Admission::Admitted
     }
 
     /// Returns the objects of a group, whose names are adjacent.

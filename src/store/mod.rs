@@ -1,14 +1,15 @@
 //! Bounded object store for inputs, jobs and results, in a folder or on S3.
 //!
-//! [`Store`] is the whole interface. `backend.rs` accesses folder or bucket, `index.rs` tracks objects and their use,
+//! [`Store`] is the whole interface. `backend.rs` accesses folder or bucket, `index.rs` tracks objects and their use by `clock.rs`,
 //! `memory.rs` caches small results, `eviction.rs` frees space, `upload.rs` writes objects, large ones in parts, and
-//! `writer.rs` accepts data from blocking threads. `quarantine.rs` keeps unreadable job documents, and `lock.rs`
-//! protects the data folder against a second service.
+//! `writer.rs` accepts data from blocking threads. `records.rs` limits the number of job documents,
+//! `quarantine.rs` keeps unreadable ones, and `lock.rs` protects the data folder against a second service.
 //!
 //! A write or removal reserves space first and then holds the lock of the name (`Store::write_lock`), so it never waits
 //! for space under a lock. Reads take no lock. Their results enter index and cache only if the name has not changed.
 
 mod backend;
+mod clock;
 mod digest;
 mod error;
 mod eviction;
@@ -24,6 +25,7 @@ mod memory;
 mod name;
 mod object;
 mod quarantine;
+mod records;
 mod s3;
 mod secret;
 mod stale;
@@ -38,7 +40,9 @@ pub use error::StoreError;
 pub use eviction::Swept;
 pub use handle::Store;
 pub use lock::{FolderLock, LockError};
+pub(crate) use name::OWNER_DIGITS;
 pub use name::{BadName, Folder, Name};
 pub use object::{ByteStream, Meta, Pin, Stored, Usage};
+pub(crate) use records::{RecordCaps, RecordPlace};
 pub(crate) use secret::Secret;
 pub use writer::Writer;

@@ -17,7 +17,7 @@ pub struct BadName(&'static str);
 pub enum Folder {
     /// Uploaded structure files, by digest.
     Inputs,
-    /// Job documents, by job id.
+    /// Job documents, by job id. The documents of ended jobs have names of their own.
     Jobs,
     /// Mesh files and reports, by content key.
     Results,
@@ -43,6 +43,13 @@ impl Folder {
     }
 }
 
+/// End of the file name of an open job's document.
+const OPEN: &str = ".json";
+/// End of the file name of an ended job's document.
+const ENDED: &str = ".ended.json";
+/// Digits of a job id that name its client.
+pub(crate) const OWNER_DIGITS: usize = 8;
+
 /// Name of an object: a folder, and a file name of lower-case letters, digits, `-` and `.`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Name {
@@ -60,13 +67,41 @@ impl Name {
     /// Returns the name of a job document.
     ///
     /// # Errors
-    /// Returns [`BadName`] unless the id has 1 to 64 lower-case hexadecimal digits and dashes.
+    /// Returns [`BadName`] unless the id has 1 to 64 lower-case hexadecimal digits.
     pub fn job(id: &str) -> Result<Self, BadName> {
-        let good = |c: u8| matches!(c, b'0'..=b'9' | b'a'..=b'f' | b'-');
+        Self::job_document(id, OPEN)
+    }
+
+    /// Returns the name of the document of an ended job, which replaces the other one.
+    ///
+    /// # Errors
+    /// As for [`job`](Self::job).
+    pub fn ended_job(id: &str) -> Result<Self, BadName> {
+        Self::job_document(id, ENDED)
+    }
+
+    fn job_document(id: &str, extension: &str) -> Result<Self, BadName> {
+        let good = |c: u8| matches!(c, b'0'..=b'9' | b'a'..=b'f');
         if id.is_empty() || id.len() > 64 || !id.bytes().all(good) {
-            return Err(BadName("a job's id has 1 to 64 hexadecimal digits in lower case, or dashes"));
+            return Err(BadName("a job's id has 1 to 64 hexadecimal digits in lower case"));
         }
-        Ok(Self { folder: Folder::Jobs, file: format!("{id}.json").into() })
+        Ok(Self { folder: Folder::Jobs, file: format!("{id}{extension}").into() })
+    }
+
+    /// Returns true for the document of an ended job.
+    pub(crate) fn is_ended_job(&self) -> bool {
+        self.folder == Folder::Jobs && self.file.ends_with(ENDED)
+    }
+
+    /// Returns the file name up to its first dot: the id of a job, or the key of a result.
+    pub(crate) fn stem(&self) -> &str {
+        self.file.split('.').next().unwrap_or_default()
+    }
+
+    /// Returns the number of the client of a job: the last eight digits of its id.
+    pub(super) fn owner(&self) -> u32 {
+        let id = self.stem();
+        u32::from_str_radix(&id[id.len().saturating_sub(OWNER_DIGITS)..], 16).unwrap_or_default()
     }
 
     /// Returns the name of a result, by content key (64 lower-case hexadecimal digits) and extension.
@@ -90,11 +125,10 @@ impl Name {
         self.folder
     }
 
-    /// Returns the name of the group of objects that are used, pinned and removed together: a mesh and its report.
-    /// Other objects are groups of their own.
+    /// Returns the name of the group of objects that are used, pinned and removed together: a mesh and its report, or
+    /// the documents of a job. An input is a group of its own.
     pub(super) fn group(&self) -> Self {
-        let stem = if self.folder == Folder::Results { self.file.split('.').next() } else { None };
-        Self { folder: self.folder, file: stem.unwrap_or(&self.file).into() }
+        Self { folder: self.folder, file: self.stem().into() }
     }
 
     /// Returns the path relative to the root of the store.
@@ -106,7 +140,10 @@ impl Name {
     pub(super) fn from_file_name(folder: Folder, file: &str) -> Option<Self> {
         match folder {
             Folder::Inputs => file.parse().ok().map(|digest| Self::input(&digest)),
-            Folder::Jobs => Self::job(file.strip_suffix(".json")?).ok(),
+            Folder::Jobs => match file.strip_suffix(ENDED) {
+                Some(id) => Self::ended_job(id).ok(),
+                None => Self::job(file.strip_suffix(OPEN)?).ok(),
+            },
             Folder::Results => file.split_once('.').and_then(|(key, extension)| Self::result(key, extension).ok()),
         }
     }

@@ -25,9 +25,10 @@ impl Store {
         let (store, name) = (self.clone(), name.clone());
         let moved = async move {
             let _lock = store.write_lock(&name).lock().await;
-            match store.0.backend.objects().rename(&name.path(), &quarantine_path(&name)).await {
+            let backend = &store.0.backend;
+            match backend.timed(backend.objects().rename(&name.path(), &quarantine_path(&name))).await {
                 Ok(()) | Err(Error::NotFound { .. }) => {}
-                Err(error) => return Err(store.0.backend.fail_at("quarantine", &name)(error)),
+                Err(error) => return Err(backend.fail_at("quarantine", &name)(error)),
             }
             store.index().forget(&name);
             store.count_quarantined().await
@@ -37,10 +38,11 @@ impl Store {
 
     /// Returns true if the document of this name is in quarantine.
     pub(crate) async fn is_quarantined(&self, name: &Name) -> Result<bool, StoreError> {
-        match self.0.backend.objects().head(&quarantine_path(name)).await {
+        let backend = &self.0.backend;
+        match backend.timed(backend.objects().head(&quarantine_path(name))).await {
             Ok(_) => Ok(true),
             Err(Error::NotFound { .. }) => Ok(false),
-            Err(error) => Err(self.0.backend.fail_at("quarantine", name)(error)),
+            Err(error) => Err(backend.fail_at("quarantine", name)(error)),
         }
     }
 
@@ -54,8 +56,8 @@ impl Store {
     pub(super) async fn count_quarantined(&self) -> Result<usize, StoreError> {
         let backend = &self.0.backend;
         let listed = backend.objects().list(Some(&Path::from(QUARANTINE)));
-        let count = listed.try_fold(0, |n, _| std::future::ready(Ok(n + 1))).await;
-        let count = count.map_err(|error| backend.fail("quarantine", QUARANTINE, &error))?;
+        let count = backend.timed(listed.try_fold(0, |n, _| std::future::ready(Ok(n + 1))));
+        let count = count.await.map_err(|error| backend.fail("quarantine", QUARANTINE, &error))?;
         self.0.quarantined.store(count, Ordering::Relaxed);
         gauge!(RECORDS_QUARANTINED).set(count as f64);
         Ok(count)

@@ -3,12 +3,13 @@
 use std::io;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
+use futures_util::TryStreamExt as _;
 use tempfile::TempDir;
 
-use super::faulty::{error, faulty};
+use super::faulty::{error, faulty, open_faulty};
 use super::{Folder, Name, Store, StoreError};
 use crate::config::StoreConfig;
 
@@ -123,6 +124,107 @@ async fn objects_that_cannot_be_removed_still_count() {
     store.put(&name(2), body(600)).await.unwrap();
     assert_eq!((store.get(&name(1)).await.unwrap(), store.usage(Folder::Results).bytes), (None, 600));
     assert_eq!(store.sweep(far).await.expired, 1);
+}
+
+/// Applies every operation to the object 1, which exists, and returns their errors. Writes the objects 2 to 4.
+async fn operate(store: &Store) -> Vec<StoreError> {
+    let mut errors = Vec::new();
+    let read = async || store.read(&name(1), None).await?.unwrap().1.try_collect::<Vec<_>>().await;
+    errors.extend(read().await.err());
+    errors.extend(store.get(&name(1)).await.err());
+    errors.extend(store.head(&name(1)).await.err());
+    errors.extend(store.put(&name(2), body(1000)).await.err());
+    errors.extend(store.put_new(&name(3), body(1000)).await.err());
+    errors.extend(store.probe().await.err());
+    let mut writer = store.writer(&name(4));
+    let write = move || match io::Write::write_all(&mut writer, &body(3 << 20)) {
+        Ok(()) => writer.finish().err(),
+        Err(error) => Some(error.downcast::<StoreError>().unwrap()),
+    };
+    errors.extend(tokio::task::spawn_blocking(write).await.unwrap());
+    errors.extend(store.delete(&name(1)).await.err());
+    errors
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn slow_operations_succeed_and_hanging_ones_fail_in_time() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = StoreConfig { timeout_ms: 500, memory_object_bytes: 1, ..StoreConfig::default() };
+    let (faults, store) = open_faulty(dir.path(), config).await;
+    store.put(&name(1), body(1000)).await.unwrap();
+    faults.hang.store(true, Ordering::SeqCst);
+    let begun = Instant::now();
+    let errors = operate(&store).await;
+    assert_eq!(errors.len(), 8, "every operation fails: {errors:?}");
+    for error in errors {
+        assert!(error.is_temporary() && error.to_string().contains("store.timeout_ms"), "{error}");
+    }
+    assert!(begun.elapsed() < Duration::from_secs(40), "{:?}", begun.elapsed());
+    let whole = [dir.path().join("store").join(name(1).to_string())];
+    while files(&dir) != whole {
+        assert!(begun.elapsed() < Duration::from_secs(40), "half-written: {:?}", files(&dir));
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    // Nothing stays locked or reserved.
+    faults.hang.store(false, Ordering::SeqCst);
+    faults.slow_ms.store(20, Ordering::SeqCst);
+    assert!(operate(&store).await.is_empty());
+    assert_eq!((store.usage(Folder::Results).objects, files(&dir).len()), (3, 3));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn truncated_reads_are_errors_and_not_cached() {
+    let dir = tempfile::tempdir().unwrap();
+    let (faults, store) = open_faulty(dir.path(), StoreConfig::default()).await;
+    std::fs::write(dir.path().join("store").join(name(1).to_string()), body(1000)).unwrap();
+    faults.truncate.store(true, Ordering::SeqCst);
+    let refused = store.get(&name(1)).await;
+    assert!(matches!(refused, Err(StoreError::Failed { op: "read", .. })), "{refused:?}");
+    let refused = store.read(&name(1), None).await.unwrap().unwrap().1.try_collect::<Vec<_>>().await;
+    assert!(matches!(refused, Err(StoreError::Failed { op: "read", .. })), "{refused:?}");
+    faults.truncate.store(false, Ordering::SeqCst);
+    assert_eq!(store.get(&name(1)).await.unwrap().unwrap().bytes, body(1000));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn occasional_errors_lose_and_damage_nothing() {
+    let (dir, faults, store) = faulty(1 << 30).await;
+    faults.error_every.store(100, Ordering::SeqCst);
+    let mut kept = 0;
+    for number in 0..400_u64 {
+        let name = Name::result(&format!("{number:064x}"), "glb").unwrap();
+        kept += u64::from(store.put(&name, body(100)).await.is_ok());
+        // One of two attempts succeeds.
+        let first = store.get(&name).await;
+        let read = if first.is_err() { store.get(&name).await } else { first };
+        assert!(read.unwrap().is_none_or(|stored| stored.bytes == body(100)), "{number}");
+    }
+    let errors = faults.errors.load(Ordering::SeqCst);
+    assert!(errors >= 8 && (390..400).contains(&kept), "{errors} errors, {kept} objects");
+    assert_eq!((store.usage(Folder::Results).objects, files(&dir).len() as u64), (kept, kept));
+}
+
+#[tokio::test]
+async fn a_jump_of_the_clock_neither_expires_nor_prolongs_objects() {
+    for days in [1, -1] {
+        let dir = tempfile::tempdir().unwrap();
+        let config = StoreConfig { result_ttl_ms: 4 * 3_600_000, ..StoreConfig::default() };
+        let (_faults, store) = open_faulty(dir.path(), config).await;
+        store.put(&name(1), body(10)).await.unwrap();
+        store.0.clock.jump.store(days, Ordering::Relaxed);
+        store.put(&name(2), body(10)).await.unwrap();
+        assert_eq!(store.sweep(store.now()).await.expired, 0);
+        // Files have the time of the system, which the next process compares with.
+        let hour = Duration::from_hours(1);
+        store.touch(&name(2), store.now() + 2 * hour);
+        assert_eq!(store.sweep(store.now() + 2 * hour).await.expired, 0);
+        let file = std::fs::metadata(dir.path().join("store").join(name(2).to_string())).unwrap();
+        let ahead = store.0.clock.system() + 2 * hour;
+        let error = file.modified().unwrap().duration_since(ahead).unwrap_or_else(|e| e.duration());
+        assert!(error < Duration::from_mins(10), "{error:?}");
+        assert_eq!(store.sweep(store.now() + 5 * hour).await.expired, 1);
+        assert!(store.head(&name(1)).await.unwrap().is_none() && store.head(&name(2)).await.unwrap().is_some());
+    }
 }
 
 #[test]

@@ -23,29 +23,33 @@ impl Upload {
     /// Starts an upload. The backend of a folder creates the staged file on the calling thread.
     pub(super) async fn begin(store: &Store, name: &Name) -> Result<Self, StoreError> {
         let backend = &store.0.backend;
-        let begun = backend.objects().put_multipart(&name.path()).await.map_err(backend.fail_at("put", name))?;
+        let begun = backend.timed(backend.objects().put_multipart(&name.path())).await;
+        let begun = begun.map_err(backend.fail_at("put", name))?;
         let parts = WriteMultipart::new_with_chunk_size(begun, backend.part_size());
         Ok(Self { store: store.clone(), name: name.clone(), parts })
     }
 
     /// Uploads the next bytes. Waits while [`PARTS`] parts are in progress.
     pub(super) async fn push(&mut self, bytes: Bytes) -> Result<(), StoreError> {
-        let sent = self.parts.wait_for_capacity(PARTS).await;
-        sent.map_err(self.store.0.backend.fail_at("put", &self.name))?;
+        let backend = &self.store.0.backend;
+        let sent = backend.timed(self.parts.wait_for_capacity(PARTS)).await;
+        sent.map_err(backend.fail_at("put", &self.name))?;
         self.parts.put(bytes);
         Ok(())
     }
 
     /// Makes the object visible and durable.
     pub(super) async fn finish(self) -> Result<(), StoreError> {
-        let finished = self.parts.finish().await;
-        finished.map(|_| ()).map_err(self.store.0.backend.fail_at("put", &self.name))
+        let backend = &self.store.0.backend;
+        let finished = backend.timed(self.parts.finish()).await;
+        finished.map(|_| ()).map_err(backend.fail_at("put", &self.name))
     }
 
     /// Aborts the upload and removes its parts, as far as possible.
     pub(super) async fn abort(self) {
-        if let Err(error) = self.parts.abort().await {
-            let error = self.store.0.backend.fail_at("abort", &self.name)(error);
+        let backend = &self.store.0.backend;
+        if let Err(error) = backend.timed(self.parts.abort()).await {
+            let error = backend.fail_at("abort", &self.name)(error);
             tracing::warn!(%error, "an unfinished object was not removed; it will be removed when it is one hour old");
         }
     }

@@ -100,7 +100,7 @@ metrics! {
     /// Job documents in quarantine because they cannot be read.
     RECORDS_QUARANTINED = "molmesh_records_quarantined", Gauge;
     /// Objects that the store evicted or that expired.
-    STORE_REMOVED = "molmesh_store_removed_total", Counter, reason: "ttl|cap";
+    STORE_REMOVED = "molmesh_store_removed_total", Counter, reason: "ttl|cap|records";
     /// Failed operations of the store.
     STORE_ERRORS = "molmesh_store_errors_total", Counter, op: "operations of a store";
     /// Lookups of archive entries.

@@ -15,9 +15,9 @@ use http_support::{Fake, Mode, SAMPLE, sample, start, wait_for};
 use molmesh::surface::CpuBackend;
 
 /// Server process on a data folder.
-struct Process {
+pub(crate) struct Process {
     child: Child,
-    addr: SocketAddr,
+    pub(crate) addr: SocketAddr,
 }
 
 impl Process {
@@ -26,7 +26,8 @@ impl Process {
         Self::spawn(Command::new(env!("CARGO_BIN_EXE_molmesh")), folder)
     }
 
-    fn spawn(mut program: Command, folder: &Path) -> Self {
+    /// Starts `program` with the arguments of a service.
+    pub(crate) fn spawn(mut program: Command, folder: &Path) -> Self {
         let mut child = program
             .args(["serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--data-dir"])
             .arg(folder)
@@ -55,10 +56,15 @@ impl Process {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }
+
+    /// Waits for the end of the process.
+    pub(crate) fn wait(mut self) {
+        self.child.wait().unwrap();
+    }
 }
 
 /// Sends a request to a server that may be killed. Returns status, `Location` and the body if it is complete.
-fn ask(
+pub(crate) fn ask(
     addr: SocketAddr,
     method: &str,
     path: &str,
@@ -265,6 +271,29 @@ fn a_restart_resumes_open_jobs_only() {
     assert!(server.metric("molmesh_jobs_recovered_total", &[]) >= 3.0);
 }
 
+#[test]
+fn open_jobs_are_limited() {
+    let backend = Fake::new(Mode::Held);
+    let server = start(Arc::clone(&backend) as _, |c| c.jobs.records = 2);
+    let later = [("prefer", "respond-async")];
+    let submit = |n: usize| server.post("/v1/meshes?format=stl", &later, &sample(n));
+    let jobs: Vec<String> = (0..2).map(|n| submit(n).header("location").unwrap().to_owned()).collect();
+    for n in [0, 2] {
+        let problem = submit(n).problem(503, "too-many-jobs");
+        assert_eq!(problem["limit"], 2, "{problem}");
+    }
+    assert!(server.metric("molmesh_requests_rejected_total", &["reason=\"too-many-jobs\""]) >= 2.0);
+    backend.set(Mode::Octahedra);
+    for job in &jobs {
+        assert_eq!(server.get(&format!("{job}?wait=20")).json()["status"], "successful");
+    }
+    // An ended job makes room for the next one.
+    wait_for("a record to end", || submit(2).status == 202);
+    let mut left: Vec<u16> = jobs.iter().map(|job| server.get(job).status).collect();
+    left.sort_unstable();
+    assert_eq!(left, [200, 404]);
+}
+
 /// Starts a process whose data folder is a disk of 16 MB of its own. Returns `None` if no disk can be mounted.
 #[expect(clippy::print_stdout, reason = "the list of skipped tests contains this line")]
 fn start_on_small_disk(folder: &Path) -> Option<Process> {
@@ -296,14 +325,17 @@ fn a_full_disk_evicts_objects_and_is_reported_as_a_full_store() {
         text
     };
     // Seven uploads of 4 MB each: the oldest ones are evicted.
+    let mut last = None;
     for n in 0..7 {
-        let (status, ..) = ask(server.addr, "POST", "/v1/structures", "", &filled(n, 4 << 20)).unwrap();
+        let (status, location, _) = ask(server.addr, "POST", "/v1/structures", "", &filled(n, 4 << 20)).unwrap();
         assert_eq!(status, 201, "upload {n}");
+        last = location;
     }
-    // An upload that never fits is no failure of the store.
+    // An upload that never fits is no failure of the store, and evicts nothing.
     let (status, _, body) = ask(server.addr, "POST", "/v1/structures", "", &filled(7, 17 << 20)).unwrap();
     let problem: serde_json::Value = serde_json::from_slice(&body).unwrap();
     assert_eq!((status, problem["type"].as_str()), (503, Some("/problems/store-full")), "{problem}");
+    assert_eq!(ask(server.addr, "GET", &last.unwrap(), "", b"").unwrap().0, 200);
     // Every announced result is kept.
     for n in 20..26 {
         let mut stream = TcpStream::connect(server.addr).unwrap();

@@ -26,6 +26,8 @@ mod bad_input;
 mod config;
 mod config_limits;
 mod config_schema;
+#[cfg(target_os = "linux")]
+mod crash;
 mod defaults;
 mod devices;
 mod jobs;

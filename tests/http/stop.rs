@@ -39,7 +39,8 @@ fn submit(server: &Running, n: usize) -> String {
 
 /// Reads the record of a job.
 fn record(server: &Running, id: &str) -> Value {
-    let bytes = std::fs::read(server.dir.path().join(format!("store/jobs/{id}.json"))).unwrap();
+    let read = |end: &str| std::fs::read(server.dir.path().join(format!("store/jobs/{id}{end}")));
+    let bytes = read(".ended.json").or_else(|_| read(".json")).unwrap();
     serde_json::from_slice(&bytes).unwrap()
 }
 

@@ -95,11 +95,12 @@ async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) 
 #[test]
 fn names_cannot_leave_their_folder() {
     let key = "0123456789abcdef".repeat(4);
-    assert_eq!(Name::job("0a-1f").unwrap().to_string(), "jobs/0a-1f.json");
+    assert_eq!(Name::job("0a1f").unwrap().to_string(), "jobs/0a1f.json");
     assert_eq!(Name::result(&key, "report.json").unwrap().to_string(), format!("results/{key}.report.json"));
     assert_eq!(Name::input(&Digest::of(b"abc")).to_string(), format!("inputs/{}", Digest::of(b"abc")));
     assert_eq!(Name::result(&key, "glb").unwrap().folder(), Folder::Results);
-    for bad in ["", "..", "../a", "a/b", "a\\b", "a.b", "A", "g", "a\0", "a%2f", "é", "a#1", &"a".repeat(65)] {
+    assert_eq!(Name::ended_job("0a1f").unwrap().to_string(), "jobs/0a1f.ended.json");
+    for bad in ["", "..", "../a", "a/b", "a-b", "a\\b", "a.b", "A", "g", "a\0", "a%2f", "é", "a#1", &"a".repeat(65)] {
         assert!(Name::job(bad).is_err(), "{bad:?}");
     }
     for bad in ["", ".", "..", "glb.", ".glb", "a..b", "../x", "g/b", "GLB", "glb#1", "a b", "é", &"a".repeat(17)] {

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs what the tests need: Mesa's software Vulkan and Chromium into the system, if they are missing, and promtool,
+# Installs what the tests need: Mesa's software Vulkan, Chromium and strace into the system, if they are missing, and promtool,
 # Python and Node packages into target/test-tools. Prints one line per step. Without root, skips what needs it and names
 # it at the end; the tests that need it are then skipped too. SKIPPED=FILE collects these names.
 set -eu
@@ -8,7 +8,7 @@ here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
 root=$(CDPATH='' cd -- "$here/../.." && pwd)
 tools=$root/target/test-tools
 python=${PYTHON:-python3}
-steps=5
+steps=6
 step=0
 skipped=
 
@@ -110,6 +110,10 @@ step=2
 if browser; then say "a browser is installed"; else install chromium; fi
 
 step=3
+# Only Linux has it.
+if [ "$(uname -s)" != Linux ] || command -v strace >/dev/null 2>&1; then say "strace is installed"; else install strace; fi
+
+step=4
 if [ -x "$tools/promtool" ]; then
     say "promtool is installed"
 else
@@ -117,7 +121,7 @@ else
     promtool || skip "promtool cannot be had from apt-get; put it into target/test-tools by hand"
 fi
 
-step=4
+step=5
 stamp=$(digest "$("$python" -VV) $root" "$here/requirements.txt")
 if [ "$(cat "$tools/venv/.stamp" 2>/dev/null)" = "$stamp" ]; then
     say "the Python packages are installed"
@@ -130,7 +134,7 @@ else
     echo "$stamp" >"$tools/venv/.stamp"
 fi
 
-step=5
+step=6
 stamp=$(digest "$(node --version)" "$here/package.json" "$here/package-lock.json")
 if [ "$(cat "$tools/node/.stamp" 2>/dev/null)" = "$stamp" ]; then
     say "the Node packages are installed"

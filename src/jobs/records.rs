@@ -1,0 +1,125 @@
+//! Records of durable jobs in the store.
+//!
+//! The record of an open job is `ID.json`. At its end, the record `ID.ended.json` is written, then the other one is
+//! removed, so that one of them exists at any time. If both exist, the job has ended. The end of a job is thus known
+//! from the name, and a start reads the records of open jobs only.
+
+use futures_util::{StreamExt as _, stream};
+
+use super::durable_job::DurableJob;
+use super::job_store::{Inner, JobStore};
+use super::record::{JobId, Record};
+use crate::store::{Digest, Folder, Name, Pin, RecordCaps, RecordPlace, StoreError};
+
+/// Concurrent reads of records at startup.
+const RECOVERY_READS: usize = 64;
+
+impl Inner {
+    /// Protects input and record of an unfinished job from eviction.
+    pub(super) fn pin(&self, id: &JobId, input: &Digest) -> Result<[Pin; 2], StoreError> {
+        Ok([self.store.pin(&Name::input(input)), self.store.pin(&Name::job(id.as_str())?)])
+    }
+
+    /// Makes room for the record of a new job. At a cap, forgets ended jobs.
+    pub(super) async fn admit(&self, id: &JobId) -> Result<RecordPlace, StoreError> {
+        let caps = RecordCaps { total: self.config.records, per_client: self.config.records_per_client };
+        let (place, removed) = self.store.admit_record(&Name::job(id.as_str())?, caps).await?;
+        for id in removed.iter().filter_map(|name| name.stem().parse().ok()) {
+            self.lock().remove(&id);
+        }
+        Ok(place)
+    }
+
+    /// Writes a record to the store.
+    pub(super) async fn write(&self, record: &Record) -> Result<(), StoreError> {
+        let (id, bytes) = (record.id.as_str(), record.to_bytes());
+        if !record.status.is_final() {
+            return self.store.put(&Name::job(id)?, bytes).await;
+        }
+        self.store.put(&Name::ended_job(id)?, bytes).await?;
+        self.store.delete(&Name::job(id)?).await
+    }
+
+    /// Writes the present record of a job. Writers of one job take turns, so the last write has the latest state, and a
+    /// job that was dismissed while it started stays dismissed after a restart.
+    pub(super) async fn write_job(&self, job: &DurableJob) -> Result<(), StoreError> {
+        let _turn = job.writing.lock().await;
+        self.write(&job.record()).await
+    }
+
+    /// Writes the record of a new, open job. Returns false if there is a job with its id, open or ended.
+    pub(super) async fn write_new(&self, record: &Record) -> Result<bool, StoreError> {
+        let (open, ended) = (Name::job(record.id.as_str())?, Name::ended_job(record.id.as_str())?);
+        if !self.store.put_new(&open, record.to_bytes()).await? {
+            return Ok(false);
+        }
+        // A job with the same idempotency key may have been accepted and ended meanwhile.
+        let is_new = self.store.head(&ended).await?.is_none();
+        if !is_new {
+            self.store.delete(&open).await?;
+        }
+        Ok(is_new)
+    }
+
+    /// Reads the record of a job.
+    pub(super) async fn read(&self, id: &JobId) -> Result<Option<Record>, StoreError> {
+        // In this order, a job that ends meanwhile is not missed.
+        let open = self.read_document(&Name::job(id.as_str())?).await?;
+        let ended = self.read_document(&Name::ended_job(id.as_str())?).await?;
+        Ok(ended.or(open))
+    }
+
+    /// Reads a document. One that cannot be parsed goes into quarantine.
+    async fn read_document(&self, name: &Name) -> Result<Option<Record>, StoreError> {
+        match self.store.get(name).await?.map(|stored| Record::from_bytes(&stored.bytes)) {
+            Some(Ok(record)) => return Ok(Some(record)),
+            Some(Err(error)) => {
+                tracing::error!(%name, %error, "the record of a job cannot be read; moving it into quarantine");
+                self.store.quarantine(name).await?;
+            }
+            None if self.store.is_quarantined(name).await? => {}
+            None => return Ok(None),
+        }
+        Err(StoreError::Quarantined { name: name.to_string() })
+    }
+
+    /// Reads the records of open jobs, in the order of their acceptance. Removes those of jobs that have ended.
+    async fn read_open(&self) -> Result<Vec<Record>, StoreError> {
+        let (ended, open): (Vec<_>, Vec<_>) = self.store.names(Folder::Jobs).into_iter().partition(Name::is_ended_job);
+        let read = |name: Name| {
+            let ended = &ended;
+            async move {
+                if ended.binary_search(&Name::ended_job(name.stem())?).is_ok() {
+                    return self.store.delete(&name).await.map(|()| None);
+                }
+                self.read_document(&name).await
+            }
+        };
+        let mut reads = stream::iter(open).map(read).buffer_unordered(RECOVERY_READS);
+        let mut records = Vec::new();
+        while let Some(read) = reads.next().await {
+            match read {
+                Ok(record) => records.extend(record),
+                Err(StoreError::Quarantined { .. }) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        records.sort_by_key(|record| (record.created_ms, record.id.clone()));
+        Ok(records)
+    }
+}
+
+impl JobStore {
+    /// Resumes the unfinished jobs of earlier processes and returns their number.
+    pub(crate) async fn recover(&self) -> Result<usize, StoreError> {
+        let before = self.0.lock().len();
+        for record in self.0.read_open().await? {
+            if record.status.is_final() {
+                self.0.write(&record).await?;
+            } else {
+                self.resume(record).await?;
+            }
+        }
+        Ok(self.0.lock().len() - before)
+    }
+}
