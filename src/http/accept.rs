@@ -31,6 +31,7 @@ use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, Pace, Rate, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::socket::Guarded;
 use super::stop::{self, Stop};
+use crate::client_shares::{ClientShares, Place};
 use crate::config::ServerConfig;
 use crate::telemetry::{CONNECTIONS, REJECTED};
 
@@ -64,6 +65,7 @@ pub(super) async fn serve(
     mut stop: watch::Receiver<Stop>,
 ) -> bool {
     let places = Arc::new(Semaphore::new(config.connections));
+    let shares = ClientShares::new(config.connections, config.client_share);
     let refusals = Arc::new(Semaphore::new(MAX_REFUSALS));
     let mut connections = JoinSet::new();
     let mut stopping = false;
@@ -93,12 +95,16 @@ pub(super) async fn serve(
                 continue;
             }
         };
-        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
-            counter!(REJECTED, "reason" => Kind::TooManyConnections.row().slug).increment(1);
-            if let Ok(hold) = Arc::clone(&refusals).try_acquire_owned() {
-                refuse(stream, hold);
+        let peer = Peer(peer.ip());
+        let place = match place(&places, &shares, &config, peer) {
+            Ok(place) => place,
+            Err(problem) => {
+                counter!(REJECTED, "reason" => problem.slug()).increment(1);
+                if let Ok(hold) = Arc::clone(&refusals).try_acquire_owned() {
+                    refuse(stream, &problem, hold);
+                }
+                continue;
             }
-            continue;
         };
         if let Err(error) = set_up(&stream) {
             tracing::debug!(%error, "the client disconnected at once");
@@ -109,7 +115,7 @@ pub(super) async fn serve(
             (place, GaugeGuard::new(gauge!(CONNECTIONS))),
             MAX_TIME_FACTOR * Duration::from_millis(config.write_timeout_ms),
         );
-        connections.spawn(connection(stream, Peer(peer.ip()), router.clone(), Arc::clone(&config), stop.clone()));
+        connections.spawn(connection(stream, peer, router.clone(), Arc::clone(&config), stop.clone()));
     }
     drop(listener);
     let all = async { while connections.join_next().await.is_some() {} };
@@ -131,13 +137,28 @@ fn set_up(stream: &TcpStream) -> io::Result<()> {
     stream.set_nodelay(true)
 }
 
-/// Permit of `server.connections`, counted in the metrics.
-type ConnectionPermit = (OwnedSemaphorePermit, GaugeGuard);
+/// Place of a connection in the limits of all clients and of its client. A trusted proxy has many clients, so it has no
+/// share.
+type ConnectionPlace = (OwnedSemaphorePermit, Option<Place>);
 
-/// Answers a connection beyond the limit with 503, without reading its request.
-fn refuse(stream: TcpStream, hold: OwnedSemaphorePermit) {
-    let body =
-        Problem::new(Kind::TooManyConnections, "the server has reached its limit of connections").document("unknown");
+/// Takes the place of a connection.
+fn place(
+    places: &Arc<Semaphore>,
+    shares: &Arc<ClientShares>,
+    config: &ServerConfig,
+    peer: Peer,
+) -> Result<ConnectionPlace, Problem> {
+    let permit = Arc::clone(places)
+        .try_acquire_owned()
+        .map_err(|_full| Problem::new(Kind::TooManyConnections, "the server has reached its limit of connections"))?;
+    let is_proxy = config.trusted_proxies.as_ref().is_some_and(|proxies| proxies.contains(peer.0));
+    let share = if is_proxy { None } else { Some(shares.take(peer.client().0)?) };
+    Ok((permit, share))
+}
+
+/// Answers a connection beyond a limit with 503, without reading its request.
+fn refuse(stream: TcpStream, problem: &Problem, hold: OwnedSemaphorePermit) {
+    let body = problem.document("unknown");
     let head = format!(
         "HTTP/1.1 503 Service Unavailable\r\ncontent-type: {MEDIA_TYPE}\r\ncontent-length: {}\r\n\
          retry-after: 1\r\nconnection: close\r\n\r\n",
@@ -181,7 +202,7 @@ impl Drop for Working {
 
 /// Serves one connection.
 async fn connection(
-    stream: Guarded<ConnectionPermit>,
+    stream: Guarded<(ConnectionPlace, GaugeGuard)>,
     peer: Peer,
     router: Router,
     config: Arc<ServerConfig>,

@@ -7,6 +7,7 @@ use utoipa::ToSchema;
 
 use super::kinds::Kind;
 use super::problem::Problem;
+use crate::client_shares::ShareExceeded;
 use crate::formats::FormatError;
 use crate::jobs::{AcceptError, EndError, Exhausted, Failure, Refusal, SaveError};
 use crate::picture::PictureError;
@@ -92,6 +93,13 @@ impl From<Exhausted> for Problem {
             .with("limit", error.limit)
             .with("actual", error.held)
             .retry_after(Duration::from_secs(1))
+    }
+}
+
+impl From<ShareExceeded> for Problem {
+    fn from(ShareExceeded { limit }: ShareExceeded) -> Self {
+        let detail = format!("this client holds {limit} places, which is its share; the others are for other clients");
+        Self::new(Kind::ShareExceeded, detail).with("limit", limit).retry_after(Duration::from_secs(1))
     }
 }
 

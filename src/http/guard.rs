@@ -3,12 +3,14 @@
 //! Only permitted requests for operations that need a scope count towards a quota. Work is charged when it is done, to
 //! the client that requested it first.
 
+use std::convert::Infallible;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use axum::extract::{Request, State};
+use axum::extract::{FromRequestParts, Request, State};
 use axum::http::header::{self, AUTHORIZATION, HeaderMap, HeaderName, WWW_AUTHENTICATE};
+use axum::http::request::Parts;
 use axum::http::uri::{PathAndQuery, Uri};
 use axum::http::{Extensions, HeaderValue, Method};
 use axum::middleware::Next;
@@ -37,6 +39,13 @@ pub(super) const RATE_LIMIT: HeaderName = HeaderName::from_static("ratelimit");
 /// Remote address of a connection.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Peer(pub(super) IpAddr);
+
+impl Peer {
+    /// Returns the identity of the peer, which is that of its requests if it is no proxy and they have no key.
+    pub(super) fn client(self) -> Client {
+        Client::named(&client_name(self.0.to_canonical()))
+    }
+}
 
 /// Client of a request.
 #[derive(Debug, Clone, Default)]
@@ -67,6 +76,15 @@ impl Caller {
         let Some(Peer(peer)) = request.extensions().get::<Peer>() else { return Self::default() };
         let values = request.headers().get_all(access.forwarded_header()).iter().filter_map(|v| v.to_str().ok());
         Self::new(&client_name(access.client(*peer, values)), false, access.address_quota())
+    }
+}
+
+/// Reads the caller that [`check`] has found.
+impl<S: Sync> FromRequestParts<S> for Caller {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
+        Ok(Self::of(&parts.extensions))
     }
 }
 

@@ -68,13 +68,13 @@ impl MeshRequest {
 
     /// Answers the request.
     pub(super) async fn answer(mut self) -> Result<Response, Problem> {
-        let digest = self.parsed.source.digest(&self.app).await?;
+        let digest = self.parsed.source.digest(&self.app, &self.preferences.caller).await?;
         self.timing.lap("receive");
         if let Some(response) = self.without_work(&digest).await? {
             return Ok(response);
         }
         self.timing.lap("lookup");
-        let input = self.parsed.source.load(&self.app).await?;
+        let input = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
         self.timing.lap("load");
         self.compute(input).await
     }
@@ -98,7 +98,7 @@ impl MeshRequest {
                 let caching = [(header::ETAG, etag), (header::CACHE_CONTROL, cache.clone())];
                 return Ok(Some((StatusCode::NOT_MODIFIED, caching).into_response()));
             }
-            let stored = match results::stored(app, &key, *format, method, headers).await {
+            let stored = match results::stored(app, &self.preferences.caller, &key, *format, method, headers).await {
                 // The store has logged its error. The mesh is computed again.
                 Err(problem) if problem.is(Kind::StoreFailed) => None,
                 stored => stored?,
@@ -133,7 +133,7 @@ impl MeshRequest {
         if self.preferences.respond_async && !report {
             return self.accept(input, None).await;
         }
-        let permit = app.delivery()?;
+        let permit = app.delivery(self.preferences.caller.client)?;
         let wait = self.preferences.wait.filter(|_| !report);
         let jobs = &app.config.jobs;
         let deadline = Duration::from_millis(jobs.deadline_ms);

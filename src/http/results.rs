@@ -15,6 +15,7 @@ use metrics::counter;
 use serde_json::Value;
 use tracing::Instrument as _;
 
+use super::guard::Caller;
 use super::kinds::Kind;
 use super::openapi::meshes::{NotModified, StoredMesh};
 use super::openapi::parameters::{ConditionHeaders, RangeHeaders, ResultFile, ResultPath};
@@ -41,7 +42,7 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
 
 problem_responses!(ShowProblems: [[
     Kind::BadRequest, Kind::NotFound, Kind::PreconditionFailed, Kind::RangeNotSatisfiable, Kind::MemoryFull,
-    Kind::StoreFailed,
+    Kind::ShareExceeded, Kind::StoreFailed,
 ]]);
 problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::PreconditionFailed, Kind::StoreFailed]]);
 
@@ -58,6 +59,7 @@ problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::Pre
 )]
 pub(super) async fn show(
     State(app): State<Shared>,
+    caller: Caller,
     method: Method,
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
@@ -72,7 +74,7 @@ pub(super) async fn show(
         );
     }
     wait_for_save(&app, &key).await;
-    let found = stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))?;
+    let found = stored(&app, &caller, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))?;
     expected.map(|()| found)
 }
 
@@ -121,6 +123,7 @@ fn parse(file: &str) -> Option<(ContentKey, Format)> {
 /// Returns a stored result, or the requested range of it; `None` if it is not stored.
 pub(super) async fn stored(
     app: &App,
+    caller: &Caller,
     key: &ContentKey,
     format: Format,
     method: &Method,
@@ -157,9 +160,12 @@ pub(super) async fn stored(
         let Some((_, part)) = app.store.read(&name, Some(part)).await? else { return Ok(None) };
         body = part;
     }
+    let share = app.delivery_shares.take(caller.client.0)?;
     // Pieces of running answers are charged regardless of the limit; new answers are refused while it is exceeded.
     let budget = app.pool.settings().budget.clone();
     let charged = body.map_ok(move |piece| {
+        // The share is held until the body is dropped.
+        _ = &share;
         let mut lease = budget.lease();
         lease.force(piece.len() as u64);
         lease.attach(piece)

@@ -19,6 +19,7 @@ use super::stop::{self, Stop};
 use super::{accept, capabilities, key_reload, metrics, results, router};
 use crate::access::{Access, AccessError};
 use crate::archive::Archive;
+use crate::client_shares::ClientShares;
 use crate::config::Config;
 use crate::jobs::{Budget, Client, EndError, JobStore, Pool, Settings};
 use crate::picture::SelectedRenderer;
@@ -148,6 +149,7 @@ impl Server {
         let archive = Archive::new(&config, pool.settings().budget.clone());
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
+        let delivery_shares = ClientShares::new(config.jobs.deliveries, config.server.client_share);
         let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
         let (stop, stopping) = watch::channel(Stop::Serve);
         let app = Arc::new(App {
@@ -163,6 +165,7 @@ impl Server {
             saves: SingleFlight::default(),
             stopping,
             deliveries,
+            delivery_shares,
             first_mesh: OnceLock::new(),
             probe: Probe::new(),
             tracer: traces.tracer(),

@@ -13,8 +13,9 @@ use super::problem::Problem;
 use super::stop::Stop;
 use crate::access::Access;
 use crate::archive::Archive;
+use crate::client_shares::{ClientShares, Place};
 use crate::config::Config;
-use crate::jobs::{ContentKey, Failure, JobStore, Pool};
+use crate::jobs::{Client, ContentKey, Failure, JobStore, Pool};
 use crate::pipeline::Job;
 use crate::single_flight::SingleFlight;
 use crate::store::Store;
@@ -41,6 +42,8 @@ pub(super) struct App {
     pub(super) stopping: watch::Receiver<Stop>,
     /// Permits of `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
+    /// Shares of the clients in `jobs.deliveries`. Stored results that are being sent count as well.
+    pub(super) delivery_shares: Arc<ClientShares>,
     /// True if the first mesh was computed, false if it failed; unset before.
     pub(super) first_mesh: OnceLock<bool>,
     /// Health check of the store.
@@ -60,9 +63,9 @@ impl App {
         job.check(&self.config.limits.job()).map_err(|error| refused(error).into())
     }
 
-    /// Takes a permit for one request for a mesh.
-    pub(super) fn delivery(&self) -> Result<OwnedSemaphorePermit, Problem> {
-        Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {
+    /// Takes a place for one request for a mesh.
+    pub(super) fn delivery(&self, client: Client) -> Result<Delivery, Problem> {
+        let permit = Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {
             let limit = self.config.jobs.deliveries;
             Problem::new(
                 Kind::TooManyDeliveries,
@@ -70,8 +73,15 @@ impl App {
             )
             .with("limit", limit)
             .retry_after(self.pool.estimated_wait())
-        })
+        })?;
+        Ok(Delivery { _permit: permit, _share: self.delivery_shares.take(client.0)? })
     }
+}
+
+/// Place of a request in `jobs.deliveries`, and in the share of its client.
+pub(super) struct Delivery {
+    _permit: OwnedSemaphorePermit,
+    _share: Place,
 }
 
 /// State as handlers extract it.

@@ -11,6 +11,7 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::form::Upload;
+use super::guard::Caller;
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::bodies::StructureFile;
@@ -93,12 +94,12 @@ struct ChainDocument {
 }
 
 problem_responses!(CreateProblems: [
-    BODY, READING, [Kind::BadParameter, Kind::TooManyDeliveries, Kind::StoreFull, Kind::StoreFailed],
+    BODY, READING, [Kind::BadParameter, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFull, Kind::StoreFailed],
 ]);
 problem_responses!(ShowProblems: [
     READING,
     [
-        Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
+        Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::ShareExceeded,
         Kind::StoreFailed,
     ],
 ]);
@@ -125,7 +126,12 @@ problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
             headers(("Location" = String, description = "Path of the structure."))),
         CreateProblems,
     ))]
-pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
+pub(super) async fn create(
+    State(app): State<Shared>,
+    caller: Caller,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, Problem> {
     if upload::is_json(&headers) {
         let detail =
             "a structure is uploaded as a file, not as JSON; `POST /v1/meshes` takes JSON that names a structure";
@@ -139,7 +145,7 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
         )
         .with("parameter", name.as_str()));
     }
-    let _permit = app.delivery()?;
+    let _permit = app.delivery(caller.client)?;
     let input = Input::uploaded(bytes, lease).await?;
     let digest = input.digest;
     // Parse before storing, so that only readable structures are stored.
@@ -163,11 +169,12 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     ))]
 pub(super) async fn show(
     State(app): State<Shared>,
+    caller: Caller,
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let write = async |input| Ok(Json(summarize(&app, input).await?).into_response());
-    source.document(&app, &headers, write).await
+    source.document(&app, &caller, &headers, write).await
 }
 
 /// Mesh an uploaded structure
@@ -187,7 +194,7 @@ pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
 
 problem_responses!(ReportProblems: [
     PARAMETERS, READING, MESHING,
-    [Kind::NoSuchStructure, Kind::QueueFull, Kind::TooManyDeliveries, Kind::StoreFailed],
+    [Kind::NoSuchStructure, Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed],
 ]);
 
 /// Mesh an uploaded structure and return the report

@@ -107,6 +107,7 @@ const LAYERS: &[Layer] = &[
         layers: &[],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
+    Layer { name: "client_shares", layers: &[], crates: SERVICE },
     Layer {
         name: "memory_budget",
         layers: &[("telemetry", Any)],
@@ -125,6 +126,7 @@ const LAYERS: &[Layer] = &[
             ("telemetry", Any),
             ("single_flight", Any),
             ("memory_budget", Any),
+            ("client_shares", Any),
             ("tls", Any),
             ("store", Any),
         ],
@@ -158,6 +160,7 @@ const LAYERS: &[Layer] = &[
             ("telemetry", Any),
             ("single_flight", Any),
             ("memory_budget", Any),
+            ("client_shares", Any),
             ("store", Any),
             ("archive", Any),
             ("jobs", Any),

@@ -340,7 +340,7 @@ fn slow_heads_and_idle_connections_are_closed() {
 
 #[test]
 fn excess_connections_are_rejected_with_503() {
-    let server = fake(|c| c.server.connections = 4);
+    let server = fake(|c| (c.server.connections, c.server.client_share) = (4, 1.0));
     wait_for("earlier connections to be gone", || server.metric("molmesh_connections", &[]) >= 0.0);
     let mut held = Vec::new();
     let refused = loop {

@@ -41,6 +41,7 @@ mod ready;
 mod results;
 mod schemathesis;
 mod service_s3;
+mod shares;
 mod slow_readers;
 mod spacing;
 mod stop;

@@ -47,8 +47,14 @@ pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::Deadline,
 ];
 /// Problems of submitting a job.
-pub(in crate::http) const SUBMITTING: &[Kind] =
-    &[Kind::OtherRequest, Kind::QueueFull, Kind::TooManyDeliveries, Kind::StoreFull, Kind::StoreFailed];
+pub(in crate::http) const SUBMITTING: &[Kind] = &[
+    Kind::OtherRequest,
+    Kind::QueueFull,
+    Kind::TooManyDeliveries,
+    Kind::ShareExceeded,
+    Kind::StoreFull,
+    Kind::StoreFailed,
+];
 
 /// Declares a type for `responses(…)` with the problems of one operation:
 /// `problem_responses!(Name: [GROUP, …, [Kind::…, …]])`.
