@@ -42,7 +42,7 @@ pub struct LimitsConfig {
     /// Size of a mesh file, bytes. Default 3 GiB: below the 4 GiB limit of GLB, and above the mesh in memory because
     /// text formats are larger.
     pub output_bytes: u64,
-    /// Memory of uploads, finished meshes and responses of all requests together, bytes. Default 8 GiB. While it is
+    /// Memory of uploads, finished meshes, responses and buffers of connections together, bytes. Default 8 GiB. While it is
     /// used up, new uploads, jobs and stored results are rejected. Running jobs may exceed it by `mesh_bytes` and the
     /// candidate lists of `candidate_pairs` each, responses by their next chunk.
     pub memory_bytes: u64,

@@ -27,12 +27,13 @@ use tower::ServiceExt as _;
 
 use super::guard::Peer;
 use super::kinds::Kind;
-use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, Pace, Rate, Streams};
+use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, Pace, Rate, STREAM_BUFFER, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::socket::Guarded;
 use super::stop::{self, Stop};
 use crate::client_shares::{ClientShares, Place};
 use crate::config::ServerConfig;
+use crate::memory_budget::{Budget, Buffers};
 use crate::telemetry::{CONNECTIONS, REJECTED};
 
 /// Time for the first request of a connection after the service begins to stop.
@@ -44,11 +45,11 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 const MAX_REFUSALS: usize = 64;
 /// HTTP/2 flow control windows per request and per connection, bytes: large enough for long distances.
 const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
-/// Send buffer of an HTTP/2 stream, bytes.
-const SEND_BUFFER: usize = 64 << 10;
 /// Send buffer of a socket, bytes. The system accepts more data only when a third of it is free, so with the default of
 /// megabytes a slow client seems to stall for a minute.
 const SOCKET_BUFFER: usize = 256 << 10;
+/// Receive buffer of a connection, bytes, as charged to the memory budget.
+const RECEIVE_BUFFER: usize = 64 << 10;
 /// Unsent bytes that the system buffers per connection: few enough to see the progress of a slow client every few
 /// seconds.
 #[cfg(target_os = "linux")]
@@ -57,11 +58,12 @@ const UNSENT: u32 = 256 << 10;
 const PING: Duration = Duration::from_secs(20);
 
 /// Serves `router` on `listener` until the drain; then lets requests finish until the drain timeout or [`Stop::Now`].
-/// Returns true if all of them finished.
+/// Returns true if all of them finished. The buffers of connections are charged to `budget`.
 pub(super) async fn serve(
     listener: TcpListener,
     router: Router,
     config: Arc<ServerConfig>,
+    budget: Budget,
     mut stop: watch::Receiver<Stop>,
 ) -> bool {
     let places = Arc::new(Semaphore::new(config.connections));
@@ -112,10 +114,10 @@ pub(super) async fn serve(
         }
         let stream = Guarded::new(
             stream,
-            (place, GaugeGuard::new(gauge!(CONNECTIONS))),
+            (place, GaugeGuard::new(gauge!(CONNECTIONS)), budget.buffers((SOCKET_BUFFER + RECEIVE_BUFFER) as u64)),
             MAX_TIME_FACTOR * Duration::from_millis(config.write_timeout_ms),
         );
-        connections.spawn(connection(stream, peer, router.clone(), Arc::clone(&config), stop.clone()));
+        connections.spawn(connection(stream, peer, router.clone(), Arc::clone(&config), budget.clone(), stop.clone()));
     }
     drop(listener);
     let all = async { while connections.join_next().await.is_some() {} };
@@ -202,10 +204,11 @@ impl Drop for Working {
 
 /// Serves one connection.
 async fn connection(
-    stream: Guarded<(ConnectionPlace, GaugeGuard)>,
+    stream: Guarded<(ConnectionPlace, GaugeGuard, Buffers)>,
     peer: Peer,
     router: Router,
     config: Arc<ServerConfig>,
+    budget: Budget,
     mut stop: watch::Receiver<Stop>,
 ) {
     let activity = Arc::new(Activity::default());
@@ -228,7 +231,7 @@ async fn connection(
             Ok::<_, Infallible>(Pace::watch(answer, &pace, version))
         }
     });
-    let builder = builder(&config, Streams::new(rate, &broken));
+    let builder = builder(&config, Streams::new(rate, &broken, budget));
     let connection = builder.serve_connection(TokioIo::new(stream), service);
     tokio::pin!(connection);
     let (mut stopping, mut in_grace) = (false, false);
@@ -291,7 +294,7 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
         .initial_stream_window_size(WINDOWS[0])
         .initial_connection_window_size(WINDOWS[1])
         .max_concurrent_streams(config.streams)
-        .max_send_buf_size(SEND_BUFFER)
+        .max_send_buf_size(STREAM_BUFFER)
         .max_header_list_size(config.head_bytes);
     builder
 }

@@ -203,13 +203,14 @@ impl Server {
         let app = Arc::clone(&self.app);
         background.spawn_blocking(move || warm_up(&app));
         background.spawn(sweep(self.app.store.clone(), Duration::from_millis(self.app.config.store.sweep_ms)));
-        let serving = accept::serve(self.listener, router::router(&self.app), Arc::clone(&config), stopped.clone());
+        let (router, budget) = (router::router(&self.app), self.app.pool.settings().budget.clone());
+        let serving = accept::serve(self.listener, router, Arc::clone(&config), budget, stopped.clone());
         let serving = tokio::spawn(serving);
         let mut recorder = None;
         if let Some((listener, _)) = self.metrics_listener {
             let of_process = telemetry::recorder()?;
             let router = metrics::router(of_process.clone());
-            background.spawn(accept::serve(listener, router, config, stopped).map(drop));
+            background.spawn(accept::serve(listener, router, config, Budget::unlimited(), stopped).map(drop));
             recorder = Some(of_process);
         }
         background.spawn(publish(Arc::clone(&self.app), recorder));

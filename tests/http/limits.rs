@@ -15,6 +15,9 @@ fn fake(change: impl FnOnce(&mut Config)) -> Running {
     start(Fake::new(Mode::Octahedra), change)
 }
 
+/// Bytes of the memory budget that a connection takes.
+const CONNECTION_BYTES: u64 = 320 << 10;
+
 fn rejected(server: &Running, reason: &str) -> f64 {
     server.metric("molmesh_requests_rejected_total", &[&format!("reason=\"{reason}\"")])
 }
@@ -163,10 +166,10 @@ fn an_endless_head_of_a_part_uses_little_memory_and_time() {
     assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 16_384);
     assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
     // The parser's buffer counts as memory: if it does not fit, a form is rejected and a plain file is not.
-    let server = fake(|c| c.limits.memory_bytes = 60_000);
+    let server = fake(|c| c.limits.memory_bytes = CONNECTION_BYTES + 60_000);
     let kind = ("content-type", "multipart/form-data; boundary=XX");
     server.post("/v1/meshes", &[kind], b"--XX\r\n").problem(503, "memory-full");
-    assert_eq!(server.post("/v1/meshes", &[], &carbons(10)).status, 200);
+    wait_for("a plain file is accepted", || server.post("/v1/meshes", &[], &carbons(10)).status == 200);
 }
 
 #[test]
@@ -382,11 +385,25 @@ fn a_client_that_does_not_read_is_disconnected_and_its_mesh_freed() {
 
 #[test]
 fn memory_is_shared_and_limited() {
-    let server = fake(|c| c.limits.memory_bytes = 200_000);
+    let limit = CONNECTION_BYTES + 200_000;
+    let server = fake(|c| c.limits.memory_bytes = limit);
     let problem = server.post("/v1/meshes", &[], &carbons(3_000)).problem(503, "memory-full");
-    assert_eq!(problem["limit"], 200_000);
-    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    assert_eq!(problem["limit"], limit);
+    wait_for("a small structure is accepted", || server.post("/v1/meshes", &[], SAMPLE).status == 200);
     assert!(rejected(&server, "memory-full") >= 1.0);
+}
+
+#[test]
+fn buffers_of_connections_count_as_memory() {
+    let server = fake(|c| c.limits.memory_bytes = 10 * CONNECTION_BYTES);
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    let idle: Vec<_> = (0..10).map(|_| connect(server.addr)).collect();
+    wait_for("the budget is used up", || server.post("/v1/meshes", &[], SAMPLE).status == 503);
+    let problem = server.post("/v1/meshes", &[], SAMPLE).problem(503, "memory-full");
+    assert!(problem["actual"].as_u64().unwrap() >= 10 * CONNECTION_BYTES, "{problem}");
+    assert_eq!(server.get("/livez").status, 200);
+    drop(idle);
+    wait_for("the buffers are freed", || server.post("/v1/meshes", &[], SAMPLE).status == 200);
 }
 
 #[test]
