@@ -98,7 +98,8 @@ pub(super) struct EstimateDocument {
 }
 
 problem_responses!(EstimateProblems: [BODY, NAMED_STRUCTURE, PARAMETERS, READING, [
-    Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::Deadline,
+    Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::ShareExceeded,
+    Kind::Deadline,
 ]]);
 
 /// Estimate a mesh

@@ -85,7 +85,8 @@ impl MeshRequest {
         let ParsedRequest { request, format, report, declared, .. } = &self.parsed;
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
-        let key = ContentKey::new(digest, &request.job, *format, &app.pool.maker(&request.job));
+        let namespace = self.preferences.caller.namespace;
+        let key = ContentKey::new(digest, &request.job, *format, &app.pool.maker(&request.job), namespace);
         let etag = delivery::etag(&key);
         // A report has no validator.
         if !report {
@@ -155,7 +156,7 @@ impl MeshRequest {
                 }
             },
         };
-        let (digest, joined) = (input.digest, ticket.is_shared);
+        let (digest, joined, namespace) = (input.digest, ticket.is_shared, self.preferences.caller.namespace);
         // Dropping the last ticket of unfinished work cancels it.
         drop((ticket, input));
         let finished = outcome.map_err(|failure| self.failed(failure))?;
@@ -172,7 +173,7 @@ impl MeshRequest {
             return delivery::report(&finished, timing);
         }
         // Another backend may have computed the mesh, with other bytes.
-        let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.maker());
+        let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.maker(), namespace);
         let is_stored = results::save_later(&app, &finished, format, &key);
         let mut response = delivery::mesh(&app, Arc::clone(&finished), format, &key, timing, permit).await?;
         let headers = response.headers_mut();
@@ -189,6 +190,7 @@ impl MeshRequest {
         Task {
             input: input.bytes.clone(),
             digest: input.digest,
+            namespace: self.preferences.caller.namespace,
             strict: self.parsed.request.strict,
             job: self.parsed.request.job.clone(),
             rank: self.preferences.rank,

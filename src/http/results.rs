@@ -28,6 +28,7 @@ use super::{conditional, delivery};
 use crate::formats::Format;
 use crate::jobs::{self, ContentKey, Finished, REPORT};
 use crate::pipeline::Report;
+use crate::store::Namespace;
 use crate::telemetry::{RESULTS_NOT_STORED, SpanKind, SpanParent, TraceSpan};
 
 /// Caching of results, whose bytes follow from their key.
@@ -65,7 +66,7 @@ pub(super) async fn show(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let Path(file) = path?;
-    let (key, format) = parse(&file).ok_or_else(|| no_such_result(&file))?;
+    let (key, format) = parse(&file, caller.namespace).ok_or_else(|| no_such_result(&file))?;
     let etag = delivery::etag(&key);
     let expected = conditional::check_match(&headers, &etag);
     if expected.is_ok() && conditional::is_unchanged(&headers, &etag) {
@@ -88,11 +89,12 @@ pub(super) async fn show(
     ))]
 pub(super) async fn report(
     State(app): State<Shared>,
+    caller: Caller,
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let Path(text) = path?;
-    let key: ContentKey = text.parse().map_err(|_bad| no_such_result(&text))?;
+    let key = ContentKey::parse(&text, caller.namespace).map_err(|_bad| no_such_result(&text))?;
     wait_for_save(&app, &key).await;
     let bytes = app.store.get(&key.name(REPORT)?).await?.ok_or_else(|| no_such_result(&text))?.bytes;
     // A report holds the times of one run, so its validator is its own digest.
@@ -114,10 +116,10 @@ fn no_such_result(what: &str) -> Problem {
     )
 }
 
-fn parse(file: &str) -> Option<(ContentKey, Format)> {
+fn parse(file: &str, namespace: Namespace) -> Option<(ContentKey, Format)> {
     let (key, extension) = file.split_once('.')?;
     let format = Format::ALL.into_iter().find(|format| format.extension() == extension)?;
-    Some((key.parse().ok()?, format))
+    Some((ContentKey::parse(key, namespace).ok()?, format))
 }
 
 /// Returns a stored result, or the requested range of it; `None` if it is not stored.

@@ -159,6 +159,7 @@ impl Server {
             archive,
             store,
             job_store,
+            secret,
             result_headers: Cache::new(CACHED_HEADERS),
             save_permits,
             save_start: Mutex::new(()),

@@ -83,7 +83,7 @@ impl StructureSource {
     pub(super) async fn digest(&self, app: &Shared, caller: &Caller) -> Result<Digest, Problem> {
         match self {
             Self::Uploaded(input) => Ok(input.digest),
-            Self::Stored(digest) => match app.store.head(&Name::input(digest)).await? {
+            Self::Stored(digest) => match app.store.head(&Name::input(digest).within(caller.namespace)).await? {
                 Some(_) => Ok(*digest),
                 None => Err(no_such_structure(&digest.to_string())),
             },
@@ -98,7 +98,7 @@ impl StructureSource {
         match self {
             Self::Uploaded(input) => Ok(input.clone()),
             Self::Stored(digest) => {
-                let stored = app.store.get(&Name::input(digest)).await?;
+                let stored = app.store.get(&Name::input(digest).within(caller.namespace)).await?;
                 let bytes = stored.ok_or_else(|| no_such_structure(&digest.to_string()))?.bytes;
                 Input::new(app, bytes, *digest)
             }

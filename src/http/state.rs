@@ -18,7 +18,7 @@ use crate::config::Config;
 use crate::jobs::{Client, ContentKey, Failure, JobStore, Pool};
 use crate::pipeline::Job;
 use crate::single_flight::SingleFlight;
-use crate::store::Store;
+use crate::store::{Namespace, Secret, Store};
 use crate::surface::FoundDevice;
 use crate::telemetry::Tracer;
 
@@ -30,6 +30,8 @@ pub(super) struct App {
     pub(super) archive: Archive,
     pub(super) store: Store,
     pub(super) job_store: JobStore,
+    /// Secret of the store.
+    pub(super) secret: Secret,
     /// Headers of recently requested results.
     pub(super) result_headers: Cache<ContentKey, Arc<HeaderMap>>,
     /// Permits of `jobs.concurrent_saves`.
@@ -61,6 +63,11 @@ impl App {
     pub(super) fn accepts(&self, job: &Job) -> Result<(), Problem> {
         let refused = |error| Failure::Job { error, diagnostics: Vec::new() };
         job.check(&self.config.limits.job()).map_err(|error| refused(error).into())
+    }
+
+    /// Returns the namespace of a group of keys. Without keys all clients share the common one.
+    pub(super) fn namespace(&self, group: &str) -> Namespace {
+        if self.access.has_keys() { Namespace::of_group(&self.secret, group) } else { Namespace::default() }
     }
 
     /// Takes a place for one request for a mesh.

@@ -94,13 +94,14 @@ struct ChainDocument {
 }
 
 problem_responses!(CreateProblems: [
-    BODY, READING, [Kind::BadParameter, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFull, Kind::StoreFailed],
+    BODY, READING,
+    [Kind::BadParameter, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFull, Kind::StoreFailed],
 ]);
 problem_responses!(ShowProblems: [
     READING,
     [
-        Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::ShareExceeded,
-        Kind::StoreFailed,
+        Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
+        Kind::ShareExceeded, Kind::StoreFailed,
     ],
 ]);
 problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
@@ -151,7 +152,8 @@ pub(super) async fn create(
     // Parse before storing, so that only readable structures are stored.
     let summary = summarize(&app, input.clone()).await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(summary.format)?;
-    let created = app.store.put_new(&Name::input(&digest), input.bytes).await?;
+    let name = Name::input(&digest).within(caller.namespace);
+    let created = app.store.put_new(&name, input.bytes).await?;
     let status = if created { StatusCode::CREATED } else { StatusCode::OK };
     let location = delivery::text(&format!("/v1/structures/{digest}"));
     Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())

@@ -5,15 +5,13 @@ use std::str::FromStr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
-use hmac::{Hmac, KeyInit as _, Mac as _};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
-use sha2::Sha256;
 use thiserror::Error;
 
 use crate::formats::Format;
 use crate::pipeline::params;
-use crate::store::Secret;
+use crate::store::{Name, Namespace, Secret, StoreError, derive};
 use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, traceparent, tracestate};
 
 /// Error of a text that is not a job id.
@@ -21,7 +19,7 @@ use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, tracepar
 #[error("a job id has 32 lower-case hexadecimal digits")]
 pub(crate) struct BadJobId;
 
-/// Id of a job. It is a secret: every client that knows it can see and cancel the job.
+/// Id of a job. It is a secret: every client of its namespace that knows it can see and cancel the job.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String")]
 pub(crate) struct JobId(String);
@@ -34,17 +32,17 @@ impl JobId {
         Ok(Self(format!("{:032x}", u128::from_be_bytes(bytes))))
     }
 
-    /// Returns the id for an idempotency key: the same for the same key of the same client, also after a restart.
-    /// The id is a truncated HMAC-SHA-256 under `secret`: client and key alone do not reveal it.
-    pub(super) fn of_key(secret: &Secret, client: u64, key: &str) -> Self {
-        // HMAC pads a key to the block length with zeros.
-        let mut block = [0; 64];
-        block[..secret.len()].copy_from_slice(secret);
-        let mut mac = Hmac::<Sha256>::new(&block.into());
-        mac.update(format!("idempotency\n{client:x}\n{key}").as_bytes());
-        let bytes = mac.finalize().into_bytes();
-        let id = bytes.iter().take(16).fold(0_u128, |id, byte| id << 8 | u128::from(*byte));
-        Self(format!("{id:032x}"))
+    /// Returns the id for an idempotency key: the same for the same key of the same client in a namespace, also after a
+    /// restart. Client and key alone do not reveal it.
+    pub(super) fn of_key(secret: &Secret, namespace: Namespace, client: u64, key: &str) -> Self {
+        // A key has no line break, so the text is unambiguous.
+        let space = if namespace.is_common() { String::new() } else { format!("{namespace}\n") };
+        Self(format!("{:032x}", derive(secret, &format!("idempotency\n{client:x}\n{space}{key}"))))
+    }
+
+    /// Returns the name of the record in the store.
+    pub(super) fn record_name(&self, namespace: Namespace) -> Result<Name, StoreError> {
+        Ok(Name::job(&self.0)?.within(namespace))
     }
 
     /// Returns the whole id.
@@ -116,6 +114,9 @@ impl Status {
 pub(crate) struct Record {
     /// Id of the job.
     pub(crate) id: JobId,
+    /// Namespace of the job, its input and its result.
+    #[serde(default, skip_serializing_if = "Namespace::is_common")]
+    pub(crate) namespace: Namespace,
     /// SHA-256 of the input.
     pub(crate) input: String,
     /// Names and values of the parameters, as the client wrote them.
@@ -264,7 +265,7 @@ mod tests {
         let (a, b) = (JobId::random().unwrap(), JobId::random().unwrap());
         assert_ne!(a, b);
         assert_eq!(a.as_str().parse(), Ok(a.clone()));
-        let of = |secret: u8, client, key| JobId::of_key(&[secret; 32], client, key);
+        let of = |secret: u8, client, key| JobId::of_key(&[secret; 32], Namespace::default(), client, key);
         assert_eq!(of(0, 1, "x"), of(0, 1, "x"));
         assert_eq!(of(0, 1, "x").as_str().parse(), Ok(of(0, 1, "x")));
         for other in [of(1, 1, "x"), of(0, 2, "x"), of(0, 1, "y")] {
@@ -280,6 +281,7 @@ mod tests {
     fn record(parameters: &[(&str, &str)]) -> Record {
         Record {
             id: JobId::random().unwrap(),
+            namespace: Namespace::default(),
             input: Digest::of(b"x").to_string(),
             parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect(),
             format: "glb".to_owned(),

@@ -32,6 +32,7 @@ mod jobs;
 mod jobs_durable;
 mod lifecycle;
 mod limits;
+mod namespaces;
 mod openapi;
 mod openapi_clients;
 mod openapi_statuses;
