@@ -29,6 +29,8 @@ pub mod access;
 #[cfg(feature = "server")]
 pub mod archive;
 #[cfg(feature = "server")]
+mod client_shares;
+#[cfg(feature = "server")]
 pub mod config;
 #[cfg(feature = "server")]
 #[doc(hidden)]

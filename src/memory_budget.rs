@@ -1,5 +1,5 @@
-//! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, and meshes that
-//! are not yet sent.
+//! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, meshes that are not
+//! yet sent, and the buffers of connections.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -39,10 +39,31 @@ impl Budget {
         if held > self.limit { Err(OutOfMemory::Budget { needed: 0, held, limit: self.limit }) } else { Ok(()) }
     }
 
+    /// Takes `bytes` regardless of the limit until the result is dropped, for buffers that are bounded elsewhere. The
+    /// metric of the budget does not count them.
+    #[must_use]
+    pub fn buffers(&self, bytes: u64) -> Buffers {
+        self.held.fetch_add(bytes, Ordering::Relaxed);
+        Buffers { budget: self.clone(), bytes }
+    }
+
     /// Creates a lease of 0 bytes.
     #[must_use]
     pub fn lease(&self) -> Lease {
         Lease { budget: self.clone(), bytes: AtomicU64::new(0) }
+    }
+}
+
+/// Buffers that are charged to a budget.
+#[derive(Debug)]
+pub struct Buffers {
+    budget: Budget,
+    bytes: u64,
+}
+
+impl Drop for Buffers {
+    fn drop(&mut self) {
+        self.budget.held.fetch_sub(self.bytes, Ordering::Relaxed);
     }
 }
 

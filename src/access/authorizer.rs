@@ -10,7 +10,7 @@ use super::account::Quota;
 use super::error::AccessError;
 use super::keys::{Denied, Key, KeyRing};
 use super::meter::Meter;
-use super::sign::{SignatureCheck, SigningKeys};
+use super::sign::{Signature, SignatureCheck, SigningKeys};
 use super::sites::Sites;
 use super::{file, forwarded};
 use crate::config::{AccessConfig, Config, Origins, ServerConfig};
@@ -97,9 +97,9 @@ impl Access {
         self.signing.as_ref().map_or(SignatureCheck::Absent, |keys| keys.check(path, query, now))
     }
 
-    /// Signs a target of this service until `end`, s of Unix time. Returns `None` if signatures are off.
-    pub(crate) fn sign(&self, target: &str, end: u64) -> Option<String> {
-        self.signing.as_ref()?.sign(None, target, end).ok()
+    /// Signs a target of this service like `signature`. Returns `None` if signatures are off.
+    pub(crate) fn sign(&self, target: &str, signature: &Signature) -> Option<String> {
+        self.signing.as_ref()?.sign(Some(&signature.key_id), target, signature.until).ok()
     }
 
     /// Returns the quota of clients without a key.
@@ -171,8 +171,15 @@ mod tests {
     fn new_key(id: &str) -> (String, String) {
         let text = token::new_key(id).unwrap();
         let hash = token::Hash::of(&text);
-        let key =
-            Key { id: id.into(), hash, scopes: vec![Scope::Read], quota: Arc::default(), expires: None, note: None };
+        let key = Key {
+            id: id.into(),
+            group: id.into(),
+            hash,
+            scopes: vec![Scope::Read],
+            quota: Arc::default(),
+            expires: None,
+            note: None,
+        };
         (text, file::format_key(&key))
     }
 

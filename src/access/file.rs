@@ -15,7 +15,8 @@ use super::token;
 use crate::pipeline::nearest::nearest;
 
 /// Fields of a key.
-const NAMES: [&str; 9] = ["id", "hash", "scopes", "requests", "work_s", "concurrent", "window_s", "expires", "note"];
+const NAMES: [&str; 10] =
+    ["id", "group", "hash", "scopes", "requests", "work_s", "concurrent", "window_s", "expires", "note"];
 
 type Field<'a> = (Range<usize>, &'a DeValue<'a>);
 
@@ -63,6 +64,13 @@ fn key(fields: &DeTable<'_>, span_of_key: Range<usize>, window_s: u64) -> Result
     if !token::is_id(id) {
         return Err((span, "`id`: expected 1 to 32 lower-case letters, digits and hyphens".to_owned()));
     }
+    let group = match text("group")? {
+        Some((span, group)) if !token::is_id(group) => {
+            return Err((span, "`group`: expected 1 to 32 lower-case letters, digits and hyphens".to_owned()));
+        }
+        Some((_, group)) => group,
+        None => id,
+    };
     let (span, hash) = required("hash")?;
     let hash = hash.parse().map_err(|expected| (span, format!("`hash`: expected {expected}")))?;
     let scopes = get("scopes").ok_or_else(|| (span_of_key.clone(), "the key has no `scopes`".to_owned()))?;
@@ -78,6 +86,7 @@ fn key(fields: &DeTable<'_>, span_of_key: Range<usize>, window_s: u64) -> Result
     };
     Ok(Key {
         id: id.to_owned(),
+        group: group.to_owned(),
         hash,
         scopes: self::scopes(scopes)?,
         quota: Arc::new(quota),
@@ -139,8 +148,9 @@ pub fn format_key(key: &Key) -> String {
     // TOML accepts all escapes of JSON. DEL, which only JSON allows unescaped, is removed.
     let quote = |text: &str| serde_json::Value::from(text.replace('\u{7f}', "")).to_string();
     let scopes: Vec<String> = key.scopes.iter().map(|scope| quote(scope.name())).collect();
-    let mut lines =
-        format!("[[key]]\nid = {}\nhash = \"{}\"\nscopes = [{}]\n", quote(&key.id), key.hash, scopes.join(", "));
+    let group = if key.group == key.id { String::new() } else { format!("group = {}\n", quote(&key.group)) };
+    let (id, hash, scopes) = (quote(&key.id), &key.hash, scopes.join(", "));
+    let mut lines = format!("[[key]]\nid = {id}\n{group}hash = \"{hash}\"\nscopes = [{scopes}]\n");
     let counts = [
         ("requests", key.quota.requests),
         ("work_s", key.quota.work_s),
@@ -168,9 +178,18 @@ mod tests {
         let quota = Quota { requests: Some(1000), work_s: Some(60), concurrent: Some(4), window_s: 3600 };
         let expires = Some(SystemTime::UNIX_EPOCH + Duration::from_secs(1_900_000_000));
         let note = Some("the \"viewer\" of\nlab 3".to_owned());
-        let full = Key { id: "a-1".into(), hash, scopes: Scope::ALL.into(), quota: Arc::new(quota), expires, note };
+        let full = Key {
+            id: "a-1".into(),
+            group: "lab".into(),
+            hash,
+            scopes: Scope::ALL.into(),
+            quota: Arc::new(quota),
+            expires,
+            note,
+        };
         let plain = Key {
             id: "b".into(),
+            group: "b".into(),
             scopes: vec![Scope::Read],
             quota: Arc::new(Quota { window_s: 60, ..Quota::default() }),
             expires: None,
@@ -182,13 +201,17 @@ mod tests {
         assert_eq!(ring.0.len(), 2);
         for key in [&full, &plain] {
             let read = &ring.0[&key.id];
-            assert!(read.hash.same(&key.hash));
+            assert!(read.hash.same(&key.hash) && read.group == key.group);
             assert_eq!(
                 (&read.scopes, &read.quota, &read.expires, &read.note),
                 (&key.scopes, &key.quota, &key.expires, &key.note)
             );
         }
-        assert!(!format_key(&plain).contains("window_s") && parse("", 60).unwrap().0.is_empty());
+        assert!(
+            !format_key(&plain).contains("group")
+                && !format_key(&plain).contains("window_s")
+                && parse("", 60).unwrap().0.is_empty()
+        );
     }
 
     #[test]
@@ -206,6 +229,7 @@ mod tests {
             (("[\"read\"]", "[1]"), 4, "expected a list of"),
             (("scopes = [\"read\"]", ""), 1, "has no `scopes`"),
             (("id = \"a\"", "id = \"A B\""), 2, "`id`: expected"),
+            (("id = \"a\"", "id = \"a\"\ngroup = \"A B\""), 3, "`group`: expected"),
             (("id = \"a\"", "id = 3"), 2, "`id`: expected a string"),
             (("sha256:", "mm_a_"), 3, "`hash`: expected"),
             (("id = \"a\"", "id = \"a\"\nrequests = 0"), 3, "`requests`: expected a positive integer"),

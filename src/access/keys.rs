@@ -41,6 +41,8 @@ impl Scope {
 pub struct Key {
     /// Public name, which also appears in logs.
     pub id: String,
+    /// Group whose keys share structures, results and jobs. Default: the id.
+    pub group: String,
     /// Hash of the text.
     pub hash: Hash,
     /// Permissions.
@@ -100,6 +102,7 @@ mod tests {
         let end = SystemTime::UNIX_EPOCH + Duration::from_secs(100);
         let key = Key {
             id: "a".into(),
+            group: "a".into(),
             hash: Hash::of(&minted),
             scopes: vec![Scope::Read],
             quota: Arc::default(),

@@ -51,13 +51,24 @@ pub enum SignError {
     },
 }
 
+/// Valid signature.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Signature {
+    /// Expiry, s of Unix time.
+    pub(crate) until: u64,
+    /// Key that signed.
+    pub(crate) key_id: String,
+    /// Group of the key.
+    pub(crate) group: String,
+}
+
 /// Result of checking a signature.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum SignatureCheck {
     /// The query has no signature.
     Absent,
-    /// The signature is valid until this time, s of Unix time.
-    Valid(u64),
+    /// The signature is valid.
+    Valid(Signature),
     /// The signature is invalid. The wrong part is not revealed.
     Invalid,
     /// The signature is correct but expired at this time, s of Unix time.
@@ -66,36 +77,52 @@ pub(crate) enum SignatureCheck {
 
 /// Signing keys. The first one signs, all are accepted.
 #[derive(Clone)]
-pub struct SigningKeys(Vec<(String, Hmac<Sha256>)>);
+pub struct SigningKeys(Vec<SigningKey>);
+
+#[derive(Clone)]
+struct SigningKey {
+    id: String,
+    /// Group of API keys whose structures, results and jobs its signatures open.
+    group: String,
+    mac: Hmac<Sha256>,
+}
 
 impl std::fmt::Debug for SigningKeys {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_list().entries(self.0.iter().map(|(id, _)| id)).finish()
+        f.debug_list().entries(self.0.iter().map(|key| &key.id)).finish()
     }
 }
 
 impl SigningKeys {
-    /// Parses one or more `ID:SECRET`, separated by white space.
+    /// Parses one or more `ID:SECRET` or `ID@GROUP:SECRET`, separated by white space. The default group is the id.
     ///
     /// # Errors
     /// Returns the expected form, without the text.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let mut keys: Vec<(String, Hmac<Sha256>)> = Vec::new();
+        let mut keys: Vec<SigningKey> = Vec::new();
         for (n, word) in text.split_whitespace().enumerate() {
             let nth = n + 1;
-            let expected = || format!("key {nth} is not ID:SECRET with an id of lower-case letters, digits and `-`");
-            let (id, secret) = word.split_once(':').filter(|(id, _)| token::is_id(id)).ok_or_else(expected)?;
+            let expected = || {
+                format!(
+                    "key {nth} is not ID:SECRET or ID@GROUP:SECRET with names of lower-case letters, digits and `-`"
+                )
+            };
+            let (name, secret) = word.split_once(':').ok_or_else(expected)?;
+            let (id, group) = name.split_once('@').unwrap_or((name, name));
+            if !token::is_id(id) || !token::is_id(group) {
+                return Err(expected());
+            }
             if secret.len() < MIN_SECRET {
                 return Err(format!(
                     "the secret of `{id}` has less than {MIN_SECRET} characters; `molmesh key signing` prints a new one"
                 ));
             }
-            if keys.iter().any(|(other, _)| other == id) {
+            if keys.iter().any(|other| other.id == id) {
                 return Err(format!("duplicate key `{id}`"));
             }
             // HMAC takes keys of any length.
             let mac = Hmac::new_from_slice(secret.as_bytes()).map_err(|error| error.to_string())?;
-            keys.push((id.to_owned(), mac));
+            keys.push(SigningKey { id: id.to_owned(), group: group.to_owned(), mac });
         }
         if keys.is_empty() { Err("there is no key; expected ID:SECRET".to_owned()) } else { Ok(Self(keys)) }
     }
@@ -119,13 +146,13 @@ impl SigningKeys {
         if let Some(name) = own.into_iter().find(|own| parameters.iter().any(|p| name_of(p) == *own)) {
             return Err(SignError::Signed(name));
         }
-        let (id, mac) = match key_id {
+        let SigningKey { id, mac, .. } = match key_id {
             None => self.0.first(),
-            Some(requested) => self.0.iter().find(|(id, _)| id == requested),
+            Some(requested) => self.0.iter().find(|key| key.id == requested),
         }
         .ok_or_else(|| SignError::UnknownKey {
             requested: key_id.unwrap_or_default().to_owned(),
-            available: self.0.iter().map(|(id, _)| id.as_str()).collect::<Vec<_>>().join(", "),
+            available: self.0.iter().map(|key| key.id.as_str()).collect::<Vec<_>>().join(", "),
         })?;
         let own = format!("{EXPIRES}={expires}&{KEY_ID}={id}");
         let separator = if query.is_none() { '?' } else { '&' };
@@ -148,9 +175,9 @@ impl SigningKeys {
         let Ok(tag) = URL_SAFE_NO_PAD.decode(signature) else { return SignatureCheck::Invalid };
         let signed = parameters.iter().copied().filter(|parameter| name_of(parameter) != SIGNATURE).collect();
         // Unknown ids take as long as known ones.
-        let found = self.0.iter().find(|(id, _)| id == key_id);
-        let Some((_, mac)) = found.or(self.0.first()) else { return SignatureCheck::Invalid };
-        let matches = message(mac, path, signed).verify_slice(&tag).is_ok();
+        let found = self.0.iter().find(|key| key.id == key_id);
+        let Some(key) = found.or(self.0.first()) else { return SignatureCheck::Invalid };
+        let matches = message(&key.mac, path, signed).verify_slice(&tag).is_ok();
         if !matches || found.is_none() {
             return SignatureCheck::Invalid;
         }
@@ -159,7 +186,7 @@ impl SigningKeys {
         if UNIX_EPOCH.checked_add(Duration::from_secs(end)).is_some_and(|end| end <= now) {
             return SignatureCheck::Expired(end);
         }
-        SignatureCheck::Valid(end)
+        SignatureCheck::Valid(Signature { until: end, key_id: key.id.clone(), group: key.group.clone() })
     }
 }
 
@@ -206,13 +233,19 @@ mod tests {
     use proptest::prelude::*;
 
     fn keys() -> SigningKeys {
-        let secrets = ["new", "old"].map(|id| format!("{id}:{}", id.repeat(11)));
+        let secrets = [("new", "new"), ("old@lab", "old")].map(|(name, word)| format!("{name}:{}", word.repeat(11)));
         SigningKeys::parse(&secrets.join("\n ")).unwrap()
     }
 
     fn check(keys: &SigningKeys, target: &str, now: u64) -> SignatureCheck {
         let (path, query) = target.split_once('?').map_or((target, None), |(path, query)| (path, Some(query)));
         keys.check(path, query, UNIX_EPOCH + Duration::from_secs(now))
+    }
+
+    /// Returns the result for a signature of a key until 100 s.
+    fn valid(key_id: &str) -> SignatureCheck {
+        let group = if key_id == "old" { "lab" } else { key_id };
+        SignatureCheck::Valid(Signature { until: 100, key_id: key_id.to_owned(), group: group.to_owned() })
     }
 
     #[test]
@@ -236,7 +269,7 @@ mod tests {
         ] {
             let signed = keys.sign(None, target, 100).unwrap();
             assert!(signed.starts_with(target) && signed.contains("expires=100&key_id=new&signature="), "{signed}");
-            assert_eq!(check(&keys, &signed, 99), SignatureCheck::Valid(100), "{signed}");
+            assert_eq!(check(&keys, &signed, 99), valid("new"), "{signed}");
             assert_eq!(remove_signature(signed.split_once('?').unwrap().1).as_deref(), rest);
             assert_eq!(check(&keys, &signed, 100), SignatureCheck::Expired(100));
             assert_eq!(check(&keys, target, 99), SignatureCheck::Absent);
@@ -245,7 +278,7 @@ mod tests {
         let signed = keys.sign(None, "/x?b=1&a=2", 100).unwrap();
         let (_, query) = signed.split_once('?').unwrap();
         let reversed: Vec<&str> = query.split('&').rev().collect();
-        assert_eq!(check(&keys, &format!("/x?{}", reversed.join("&")), 0), SignatureCheck::Valid(100));
+        assert_eq!(check(&keys, &format!("/x?{}", reversed.join("&")), 0), valid("new"));
     }
 
     #[test]
@@ -254,7 +287,7 @@ mod tests {
         let signed = keys.sign(None, "/v1/jobs/7", 100).unwrap();
         let at = |path: &str| check(&keys, &signed.replace("/v1/jobs/7", path), 0);
         for path in ["/v1/jobs/7", "/v1/jobs/7/events", "/v1/jobs/7/result"] {
-            assert_eq!(at(path), SignatureCheck::Valid(100), "{path}");
+            assert_eq!(at(path), valid("new"), "{path}");
         }
         for path in
             ["/v1/jobs/8", "/v1/jobs/8/result", "/v1/jobs/7/x", "/v1/jobs/7/events/result", "/v1/jobs", "/v1/jobs/"]
@@ -267,10 +300,10 @@ mod tests {
     fn signing_keys_can_be_rotated() {
         let both = keys();
         let signed = both.sign(Some("old"), "/x", 100).unwrap();
-        assert_eq!(check(&both, &signed, 0), SignatureCheck::Valid(100));
+        assert_eq!(check(&both, &signed, 0), valid("old"));
         let only_new = SigningKeys::parse(&format!("new:{}", "new".repeat(11))).unwrap();
         assert_eq!(check(&only_new, &signed, 0), SignatureCheck::Invalid);
-        assert_eq!(check(&only_new, &both.sign(None, "/x", 100).unwrap(), 0), SignatureCheck::Valid(100));
+        assert_eq!(check(&only_new, &both.sign(None, "/x", 100).unwrap(), 0), valid("new"));
         let renamed = signed.replace("key_id=old", "key_id=new");
         assert_eq!(check(&both, &renamed, 0), SignatureCheck::Invalid);
         assert!(
@@ -322,6 +355,7 @@ mod tests {
             ("", "no key"),
             ("justasecretjustasecretjustasecret", "key 1"),
             ("A:justasecretjustasecretjustasecret", "key 1"),
+            ("a@:justasecretjustasecretjustasecret", "key 1"),
             ("a:short", "less than 32"),
             ("a:justasecretjustasecretjustasecret a:justasecretjustasecretjustasecret", "duplicate key `a`"),
         ] {

@@ -12,6 +12,7 @@ use super::client::Answer;
 use super::disk::{Disk, Found, Stored};
 use super::error::FetchError;
 use super::remote::Remote;
+use crate::client_shares::{ClientShares, ShareExceeded};
 use crate::config::Config;
 use crate::memory_budget::Budget;
 use crate::single_flight::SingleFlight;
@@ -60,6 +61,8 @@ struct Known {
 #[derive(Debug, Clone)]
 pub struct Archive {
     shared: Arc<Shared>,
+    /// Client whose share of `archive.concurrent` its fetches take; `None`: no share.
+    client: Option<u64>,
 }
 
 #[derive(Debug)]
@@ -67,6 +70,7 @@ struct Shared {
     folder: Folder,
     disk: Disk,
     remote: Option<Remote>,
+    shares: Arc<ClientShares>,
     fetches: SingleFlight<EntryId, Result<Entry, FetchError>>,
     known: Cache<EntryId, Known>,
     /// Entries that no remote archive has, each with the time until which it is not requested again.
@@ -86,6 +90,7 @@ impl Archive {
             folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
             disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
             remote: Remote::new(config, memory),
+            shares: ClientShares::new(archive.concurrent, config.server.client_share),
             fetches: SingleFlight::default(),
             known: Cache::new(CACHED_DIGESTS),
             absent: Cache::new(CACHED_DIGESTS),
@@ -93,7 +98,13 @@ impl Archive {
             revalidate_after: Duration::from_millis(archive.revalidate_after_ms),
             retry_missing_after: Duration::from_millis(archive.retry_missing_after_ms),
         };
-        Self { shared: Arc::new(shared) }
+        Self { shared: Arc::new(shared), client: None }
+    }
+
+    /// Returns the archive for a client, which may fetch its share of `archive.concurrent` entries at once.
+    #[must_use]
+    pub fn for_client(&self, client: u64) -> Self {
+        Self { shared: Arc::clone(&self.shared), client: Some(client) }
     }
 
     /// Returns the bytes of an entry from the first source that has it. Waits at most `archive.timeout_ms` for the
@@ -102,11 +113,11 @@ impl Archive {
     /// # Errors
     /// Returns any [`FetchError`].
     pub async fn fetch(&self, id: &EntryId) -> Result<Entry, FetchError> {
-        let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
+        let (shared, wanted, client) = (Arc::clone(&self.shared), id.clone(), self.client);
         // The fetch outlives its first caller, but is traced under that caller's request.
         let mut fetch = self.shared.fetches.run(id, move || {
             let span = TraceSpan::current();
-            let find = async move { shared.find(&wanted).await };
+            let find = async move { shared.find(&wanted, client).await };
             let find = async move {
                 match span {
                     Some(span) => span.run(find).await,
@@ -159,7 +170,7 @@ impl Archive {
 }
 
 impl Shared {
-    async fn find(self: &Arc<Self>, id: &EntryId) -> Result<Entry, FetchError> {
+    async fn find(self: &Arc<Self>, id: &EntryId, client: Option<u64>) -> Result<Entry, FetchError> {
         let checked = Instant::now();
         if let Some((bytes, digest, stamp)) = self.local(id).await? {
             self.remember(id, Known { digest, stamp: Some(stamp), checked, fresh_until: None });
@@ -181,6 +192,8 @@ impl Shared {
             count("cache", "absent");
             return Err(FetchError::NotFound { id: id.clone() });
         }
+        let place = client.map(|client| self.shares.take(client)).transpose();
+        let _place = place.map_err(|ShareExceeded { limit }| FetchError::Share { id: id.clone(), limit })?;
         let answer = remote.fetch(id, stored.as_ref().map(|stored| &stored.origin)).await;
         let result = match &answer {
             Ok(Answer::Unchanged) => "unchanged",

@@ -49,6 +49,14 @@ pub enum FetchError {
         /// Limit and use of the memory.
         error: OutOfMemory,
     },
+    /// The client is fetching its share of entries.
+    #[error("entry {id} cannot be fetched now: this client is fetching {limit} entries, which is its share")]
+    Share {
+        /// Requested entry.
+        id: EntryId,
+        /// Number of entries.
+        limit: usize,
+    },
     /// Internal error, or the service is stopping.
     #[error("the entry could not be fetched: {0}")]
     Internal(&'static str),

@@ -19,7 +19,8 @@ pub(super) fn run(command: &KeyCommand) -> Result<(), CliError> {
 
 /// Prints the key to stderr and its entry to stdout, so that `>> keys.toml` stores the entry only.
 fn new(args: &NewKeyArgs) -> Result<(), CliError> {
-    let id = id(&args.id)?;
+    let id = name("id", &args.id)?;
+    let group = args.group.as_deref().map(|group| name("group", group)).transpose()?;
     let scope = |name: &str| {
         let known = Scope::ALL.map(Scope::name).join(", ");
         let message = format!("parameter `scopes`: `{name}` is not allowed; expected {known}");
@@ -38,6 +39,7 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
     let expires = args.expires.as_deref().map(end).transpose()?;
     let key = Key {
         id: id.to_owned(),
+        group: group.unwrap_or(id).to_owned(),
         hash: Hash::of(&key_text),
         scopes,
         quota: Arc::new(quota),
@@ -50,15 +52,19 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
 }
 
 fn signing(args: &SigningKeyArgs) -> Result<(), CliError> {
-    let id = id(&args.id)?;
+    let mut id = name("id", &args.id)?.to_owned();
+    if let Some(group) = &args.group {
+        id = format!("{id}@{}", name("group", group)?);
+    }
     let secret = access::new_secret().map_err(|error| CliError::Internal(error.to_string()))?;
     super::print(&format!("{id}:{secret}\n"))
 }
 
-fn id(id: &str) -> Result<&str, CliError> {
-    let message =
-        || format!("parameter `id`: `{id}` is not allowed; expected 1 to 32 lower-case letters, digits and hyphens");
-    Some(id).filter(|id| access::is_id(id)).ok_or_else(|| CliError::usage(message()))
+/// Checks the name of a key or group.
+fn name<'a>(parameter: &str, text: &'a str) -> Result<&'a str, CliError> {
+    let expected = "expected 1 to 32 lower-case letters, digits and hyphens";
+    let message = || format!("parameter `{parameter}`: `{text}` is not allowed; {expected}");
+    Some(text).filter(|text| access::is_id(text)).ok_or_else(|| CliError::usage(message()))
 }
 
 /// Parses a time such as `1h` into whole seconds, at least one.

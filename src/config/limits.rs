@@ -45,9 +45,9 @@ pub struct LimitsConfig {
     /// Size of a mesh file, bytes. Default 3 GiB: below the 4 GiB limit of GLB, and above the mesh in memory because
     /// text formats are larger.
     pub output_bytes: u64,
-    /// Memory of all requests together, bytes: uploads, jobs from decompression to the finished mesh, and responses.
-    /// Default 8 GiB. Memory is counted before it is allocated. A request or job that would exceed the limit is
-    /// rejected and may be repeated later. Responses may exceed it by their next chunk.
+    /// Memory of all requests together, bytes: uploads, jobs from decompression to the finished mesh, responses, and
+    /// buffers of connections. Default 8 GiB. Memory is counted before it is allocated. A request or job that would
+    /// exceed the limit is rejected and may be repeated later. Responses may exceed it by their next chunk.
     pub memory_bytes: u64,
     /// Width and height of a picture, pixels. Default 4,096: at 40 bytes a pixel the largest picture needs 640 MiB, and
     /// rendering takes seconds.

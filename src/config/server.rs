@@ -6,10 +6,10 @@ use std::path::PathBuf;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{ForwardedHeader, Hosts, Proxies, list};
+use super::{ForwardedHeader, Hosts, Proxies, list, telemetry};
 
 /// Listeners and limits of connections.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServerConfig {
     /// Address of the service. Default 127.0.0.1:8080: the service is not exposed unless configured. Port 0 selects a
@@ -30,6 +30,13 @@ pub struct ServerConfig {
     /// Number of open connections. Default 1,024. Further ones get a 503 and are closed. The hard limit of open files
     /// should be a few hundred higher; `molmesh doctor` compares them.
     pub connections: usize,
+    /// Fraction of a pool that one client may hold, from 0 to 1, at least one place: of `server.connections` by the
+    /// address of the peer, except for `trusted_proxies`; of `jobs.deliveries` and `archive.concurrent` by key, or by
+    /// address without a key. Default 0.25: one client cannot occupy the service, and three others find places. With 1
+    /// a client may hold all places. Requests and connections beyond the share get a 503.
+    #[serde(deserialize_with = "telemetry::ratio")]
+    #[schemars(range(min = 0, max = 1))]
+    pub client_share: f64,
     /// Time for the head of a request, ms, counted from the connection or the previous response; also the time that an
     /// idle HTTP/1.1 connection is kept. Default 15,000: slow clients need seconds, only attackers need a minute.
     pub header_timeout_ms: u64,
@@ -77,6 +84,7 @@ impl Default for ServerConfig {
             metrics_listen: None,
             data_dir: PathBuf::from("molmesh-data"),
             connections: 1024,
+            client_share: 0.25,
             header_timeout_ms: 15_000,
             body_timeout_ms: 60_000,
             write_timeout_ms: 30_000,

@@ -58,7 +58,7 @@ impl Default for TelemetryConfig {
 }
 
 /// Deserializes a number from 0 to 1.
-fn ratio<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+pub(super) fn ratio<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     let ratio = f64::deserialize(deserializer)?;
     let is_valid = (0.0..=1.0).contains(&ratio);
     if is_valid { Ok(ratio) } else { Err(serde::de::Error::custom("a number from 0 to 1")) }

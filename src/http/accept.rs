@@ -27,11 +27,13 @@ use tower::ServiceExt as _;
 
 use super::guard::Peer;
 use super::kinds::Kind;
-use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, Pace, Rate, Streams};
+use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, Pace, Rate, STREAM_BUFFER, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::socket::Guarded;
 use super::stop::{self, Stop};
+use crate::client_shares::{ClientShares, Place};
 use crate::config::ServerConfig;
+use crate::memory_budget::{Budget, Buffers};
 use crate::telemetry::{CONNECTIONS, REJECTED};
 
 /// Time for the first request of a connection after the service begins to stop.
@@ -43,11 +45,11 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 const MAX_REFUSALS: usize = 64;
 /// HTTP/2 flow control windows per request and per connection, bytes: large enough for long distances.
 const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
-/// Send buffer of an HTTP/2 stream, bytes.
-const SEND_BUFFER: usize = 64 << 10;
 /// Send buffer of a socket, bytes. The system accepts more data only when a third of it is free, so with the default of
 /// megabytes a slow client seems to stall for a minute.
 const SOCKET_BUFFER: usize = 256 << 10;
+/// Receive buffer of a connection, bytes, as charged to the memory budget.
+const RECEIVE_BUFFER: usize = 64 << 10;
 /// Unsent bytes that the system buffers per connection: few enough to see the progress of a slow client every few
 /// seconds.
 #[cfg(target_os = "linux")]
@@ -60,13 +62,16 @@ const LAST_RESPONSES: Duration = Duration::from_secs(1);
 
 /// Serves `router` on `listener` until the drain; then lets requests finish until [`Stop::Now`], and those that end at
 /// once then for [`LAST_RESPONSES`]. Returns true if all of them finished before [`Stop::Now`].
+/// The buffers of connections are charged to `budget`.
 pub(super) async fn serve(
     listener: TcpListener,
     router: Router,
     config: Arc<ServerConfig>,
+    budget: Budget,
     mut stop: watch::Receiver<Stop>,
 ) -> bool {
     let places = Arc::new(Semaphore::new(config.connections));
+    let shares = ClientShares::new(config.connections, config.client_share);
     let refusals = Arc::new(Semaphore::new(MAX_REFUSALS));
     let mut connections = JoinSet::new();
     let mut stopping = false;
@@ -96,12 +101,16 @@ pub(super) async fn serve(
                 continue;
             }
         };
-        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
-            counter!(REJECTED, "reason" => Kind::TooManyConnections.row().slug).increment(1);
-            if let Ok(hold) = Arc::clone(&refusals).try_acquire_owned() {
-                refuse(stream, hold);
+        let peer = Peer(peer.ip());
+        let place = match place(&places, &shares, &config, peer) {
+            Ok(place) => place,
+            Err(problem) => {
+                counter!(REJECTED, "reason" => problem.slug()).increment(1);
+                if let Ok(hold) = Arc::clone(&refusals).try_acquire_owned() {
+                    refuse(stream, &problem, hold);
+                }
+                continue;
             }
-            continue;
         };
         if let Err(error) = set_up(&stream) {
             tracing::debug!(%error, "the client disconnected at once");
@@ -109,10 +118,10 @@ pub(super) async fn serve(
         }
         let stream = Guarded::new(
             stream,
-            (place, GaugeGuard::new(gauge!(CONNECTIONS))),
+            (place, GaugeGuard::new(gauge!(CONNECTIONS)), budget.buffers((SOCKET_BUFFER + RECEIVE_BUFFER) as u64)),
             MAX_TIME_FACTOR * Duration::from_millis(config.write_timeout_ms),
         );
-        connections.spawn(connection(stream, Peer(peer.ip()), router.clone(), Arc::clone(&config), stop.clone()));
+        connections.spawn(connection(stream, peer, router.clone(), Arc::clone(&config), budget.clone(), stop.clone()));
     }
     drop(listener);
     let mut all = std::pin::pin!(async { while connections.join_next().await.is_some() {} });
@@ -135,13 +144,28 @@ fn set_up(stream: &TcpStream) -> io::Result<()> {
     stream.set_nodelay(true)
 }
 
-/// Permit of `server.connections`, counted in the metrics.
-type ConnectionPermit = (OwnedSemaphorePermit, GaugeGuard);
+/// Place of a connection in the limits of all clients and of its client. A trusted proxy has many clients, so it has no
+/// share.
+type ConnectionPlace = (OwnedSemaphorePermit, Option<Place>);
 
-/// Answers a connection beyond the limit with 503, without reading its request.
-fn refuse(stream: TcpStream, hold: OwnedSemaphorePermit) {
-    let body =
-        Problem::new(Kind::TooManyConnections, "the server has reached its limit of connections").document("unknown");
+/// Takes the place of a connection.
+fn place(
+    places: &Arc<Semaphore>,
+    shares: &Arc<ClientShares>,
+    config: &ServerConfig,
+    peer: Peer,
+) -> Result<ConnectionPlace, Problem> {
+    let permit = Arc::clone(places)
+        .try_acquire_owned()
+        .map_err(|_full| Problem::new(Kind::TooManyConnections, "the server has reached its limit of connections"))?;
+    let is_proxy = config.trusted_proxies.as_ref().is_some_and(|proxies| proxies.contains(peer.0));
+    let share = if is_proxy { None } else { Some(shares.take(peer.client().0)?) };
+    Ok((permit, share))
+}
+
+/// Answers a connection beyond a limit with 503, without reading its request.
+fn refuse(stream: TcpStream, problem: &Problem, hold: OwnedSemaphorePermit) {
+    let body = problem.document("unknown");
     let head = format!(
         "HTTP/1.1 503 Service Unavailable\r\ncontent-type: {MEDIA_TYPE}\r\ncontent-length: {}\r\n\
          retry-after: 1\r\nconnection: close\r\n\r\n",
@@ -185,10 +209,11 @@ impl Drop for Working {
 
 /// Serves one connection.
 async fn connection(
-    stream: Guarded<ConnectionPermit>,
+    stream: Guarded<(ConnectionPlace, GaugeGuard, Buffers)>,
     peer: Peer,
     router: Router,
     config: Arc<ServerConfig>,
+    budget: Budget,
     mut stop: watch::Receiver<Stop>,
 ) {
     let activity = Arc::new(Activity::default());
@@ -211,7 +236,7 @@ async fn connection(
             Ok::<_, Infallible>(Pace::watch(answer, &pace, version))
         }
     });
-    let builder = builder(&config, Streams::new(rate, &broken));
+    let builder = builder(&config, Streams::new(rate, &broken, budget));
     let connection = builder.serve_connection(TokioIo::new(stream), service);
     tokio::pin!(connection);
     let (mut stopping, mut in_grace) = (false, false);
@@ -274,7 +299,7 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
         .initial_stream_window_size(WINDOWS[0])
         .initial_connection_window_size(WINDOWS[1])
         .max_concurrent_streams(config.streams)
-        .max_send_buf_size(SEND_BUFFER)
+        .max_send_buf_size(STREAM_BUFFER)
         .max_header_list_size(config.head_bytes);
     builder
 }

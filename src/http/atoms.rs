@@ -8,6 +8,7 @@ use bytes::Bytes;
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use super::guard::Caller;
 use super::kinds::Kind;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{ConditionHeaders, EntryPath, StructurePath};
@@ -68,12 +69,12 @@ problem_responses!(StructureProblems: [
     READING,
     [
         Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
-        Kind::StoreFailed,
+        Kind::ShareExceeded, Kind::StoreFailed,
     ],
 ]);
 problem_responses!(EntryProblems: [READING, [
     Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
-    Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
+    Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::ShareExceeded,
 ]]);
 
 /// List the atoms of a structure
@@ -91,10 +92,11 @@ problem_responses!(EntryProblems: [READING, [
     ))]
 pub(super) async fn of_structure(
     State(app): State<Shared>,
+    caller: Caller,
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source.document(&app, &headers, async |input| list(&app, input).await).await
+    source.document(&app, &caller, &headers, async |input| list(&app, input).await).await
 }
 
 /// List the atoms of an archive entry
@@ -112,10 +114,11 @@ pub(super) async fn of_structure(
     ))]
 pub(super) async fn of_entry(
     State(app): State<Shared>,
+    caller: Caller,
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source.document(&app, &headers, async |input| list(&app, input).await).await
+    source.document(&app, &caller, &headers, async |input| list(&app, input).await).await
 }
 
 /// Parses a structure and lists its atoms, on a blocking thread. The list is charged to the memory budget until it is

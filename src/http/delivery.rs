@@ -7,13 +7,12 @@ use axum::http::header::{self, HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use serde_json::Value;
-use tokio::sync::OwnedSemaphorePermit;
 use utoipa::ToSchema;
 use utoipa::openapi::schema::Type;
 
 use super::errors::{self, Finding};
 use super::problem::Problem;
-use super::state::App;
+use super::state::{App, Delivery};
 use super::stream;
 use super::timing::Timing;
 use crate::formats::Format;
@@ -85,7 +84,7 @@ pub(super) async fn mesh(
     format: Format,
     key: &ContentKey,
     mut timing: Timing,
-    permit: OwnedSemaphorePermit,
+    delivery: Delivery,
 ) -> Result<Response, Problem> {
     let report = &finished.product.report;
     let mut headers = summary_headers(&serde_json::to_value(report).map_err(Problem::internal)?);
@@ -93,7 +92,7 @@ pub(super) async fn mesh(
     headers.insert(header::CONTENT_DISPOSITION, disposition(report.id.as_deref(), format));
     headers.insert(header::ETAG, etag(key));
     let (length, body) =
-        stream::start(finished, format, app.config.limits.output_bytes, app.pool.settings().budget.clone(), permit)
+        stream::start(finished, format, app.config.limits.output_bytes, app.pool.settings().budget.clone(), delivery)
             .await?;
     if let Some(length) = length {
         headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));

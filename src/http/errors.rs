@@ -7,6 +7,7 @@ use utoipa::ToSchema;
 
 use super::kinds::Kind;
 use super::problem::Problem;
+use crate::client_shares::ShareExceeded;
 use crate::formats::FormatError;
 use crate::jobs::{AcceptError, EndError, Failure, Refusal, SaveError};
 use crate::picture::PictureError;
@@ -93,6 +94,13 @@ impl From<OutOfMemory> for Problem {
             OutOfMemory::Budget { held, limit, .. } => problem.with("limit", limit).with("actual", held),
             OutOfMemory::System { .. } => problem,
         }
+    }
+}
+
+impl From<ShareExceeded> for Problem {
+    fn from(ShareExceeded { limit }: ShareExceeded) -> Self {
+        let detail = format!("this client holds {limit} places, which is its share; the others are for other clients");
+        Self::new(Kind::ShareExceeded, detail).with("limit", limit).retry_after(Duration::from_secs(1))
     }
 }
 

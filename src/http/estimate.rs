@@ -87,7 +87,8 @@ pub(super) struct EstimateDocument {
 }
 
 problem_responses!(EstimateProblems: [BODY, NAMED_STRUCTURE, PARAMETERS, READING, [
-    Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::Deadline,
+    Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::ShareExceeded,
+    Kind::Deadline,
 ]]);
 
 /// Estimate a mesh
@@ -112,8 +113,8 @@ pub(super) async fn create(
     let ParsedRequest { source, request, format, declared, .. } = parsed;
     let job = request.job;
     // An estimate is about half the work of a mesh, so it takes a place as well.
-    let permit = app.delivery()?;
-    let Input { bytes, digest, lease } = source.load(&app).await?;
+    let permit = app.delivery(caller.client)?;
+    let Input { bytes, digest, lease } = source.load(&app, &caller).await?;
     drop(source);
     let seconds = app.pool.expected(&bytes, &job);
     let reading = app.read({

@@ -12,6 +12,7 @@ use axum::response::{IntoResponse, Response};
 use futures_util::stream;
 use tokio::sync::watch;
 
+use super::guard::Caller;
 use super::jobs;
 use super::kinds::Kind;
 use super::openapi::parameters::{JobPath, LastEventIdHeader};
@@ -46,8 +47,13 @@ problem_responses!(EventsProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::Re
         (status = 204, description = "`Last-Event-ID` names the final event; no more events follow."),
         EventsProblems,
     ))]
-pub(super) async fn show(State(app): State<Shared>, id: JobId, headers: HeaderMap) -> Result<Response, Problem> {
-    let watched = app.job_store.watch(&id).await?.ok_or_else(|| jobs::no_such_job(id.as_str()))?;
+pub(super) async fn show(
+    State(app): State<Shared>,
+    caller: Caller,
+    id: JobId,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let watched = app.job_store.watch(&id, caller.namespace).await?.ok_or_else(|| jobs::no_such_job(id.as_str()))?;
     let last = headers.get(LAST_EVENT_ID).and_then(|id| id.to_str().ok()?.trim().parse::<u64>().ok());
     // An id from the future is unknown: the clock was set back.
     let seen = last.filter(|last| *last <= watched.borrow().version).unwrap_or(0);

@@ -3,12 +3,14 @@
 //! Only permitted requests for operations that need a scope count towards a quota. Work is charged when it is done, to
 //! the client that requested it first.
 
+use std::convert::Infallible;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use axum::extract::{Request, State};
+use axum::extract::{FromRequestParts, Request, State};
 use axum::http::header::{self, AUTHORIZATION, HeaderMap, HeaderName, WWW_AUTHENTICATE};
+use axum::http::request::Parts;
 use axum::http::uri::{PathAndQuery, Uri};
 use axum::http::{Extensions, HeaderValue, Method};
 use axum::middleware::Next;
@@ -23,10 +25,11 @@ use super::problem::Problem;
 use super::scopes;
 use super::state::{App, Shared};
 use crate::access::{
-    Access, Account, Denied, Exceeded, Key, Quota, Scope, SignatureCheck, rate_limit, rate_limit_policy,
+    Access, Account, Denied, Exceeded, Key, Quota, Scope, Signature, SignatureCheck, rate_limit, rate_limit_policy,
     remove_signature,
 };
 use crate::jobs::{Client, rfc3339};
+use crate::store::Namespace;
 
 /// `X-Api-Key`, an alternative to `Authorization`.
 pub(super) const API_KEY: HeaderName = HeaderName::from_static("x-api-key");
@@ -38,11 +41,20 @@ pub(super) const RATE_LIMIT: HeaderName = HeaderName::from_static("ratelimit");
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Peer(pub(super) IpAddr);
 
+impl Peer {
+    /// Returns the identity of the peer, which is that of its requests if it is no proxy and they have no key.
+    pub(super) fn client(self) -> Client {
+        Client::named(&client_name(self.0.to_canonical()))
+    }
+}
+
 /// Client of a request.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Caller {
     /// Identity for the queue: a key, else an address.
     pub(super) client: Client,
+    /// Namespace of its structures, results and jobs.
+    pub(super) namespace: Namespace,
     /// Account of its quota; `None` without limits.
     account: Option<Account>,
 }
@@ -56,17 +68,34 @@ impl Caller {
     fn new(name: &str, is_key: bool, quota: Option<&Arc<Quota>>) -> Self {
         let client = Client::named(name);
         let quota = quota.filter(|quota| !quota.is_unlimited()).cloned();
-        Self { client, account: quota.map(|quota| Account { client: client.0, is_key, quota }) }
+        Self {
+            client,
+            namespace: Namespace::default(),
+            account: quota.map(|quota| Account { client: client.0, is_key, quota }),
+        }
     }
 
-    fn key(key: &Key) -> Self {
-        Self::new(&format!("key {}", key.id), true, Some(&key.quota))
+    fn key(app: &App, key: &Key) -> Self {
+        Self::new(&format!("key {}", key.id), true, Some(&key.quota)).within(app.namespace(&key.group))
     }
 
     fn address(access: &Access, request: &Request) -> Self {
         let Some(Peer(peer)) = request.extensions().get::<Peer>() else { return Self::default() };
         let values = request.headers().get_all(access.forwarded_header()).iter().filter_map(|v| v.to_str().ok());
         Self::new(&client_name(access.client(*peer, values)), false, access.address_quota())
+    }
+
+    fn within(self, namespace: Namespace) -> Self {
+        Self { namespace, ..self }
+    }
+}
+
+/// Reads the caller that [`check`] has found.
+impl<S: Sync> FromRequestParts<S> for Caller {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
+        Ok(Self::of(&parts.extensions))
     }
 }
 
@@ -88,7 +117,7 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     request.headers_mut().remove(AUTHORIZATION);
     request.headers_mut().remove(API_KEY);
     let Some(scope) = scopes::needed(&request) else { return next.run(request).await };
-    let (caller, signed_until) = match authorize(&app.access, scope, key, &mut request) {
+    let (caller, signature) = match authorize(&app, scope, key, &mut request) {
         Ok(authorized) => authorized,
         Err(problem) => {
             discard_body(request).await;
@@ -115,8 +144,8 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     if app.access.is_closed() {
         keep_private(response.headers_mut());
     }
-    if let Some(end) = signed_until {
-        end_with_signature(&app.access, end, response.headers_mut());
+    if let Some(signature) = signature {
+        end_with_signature(&app.access, &signature, response.headers_mut());
     }
     response
 }
@@ -173,14 +202,14 @@ fn presented(headers: &HeaderMap) -> Presented {
     }
 }
 
-/// Identifies and authorizes the client. Removes a signature from the address. Returns its expiry as well, s of Unix
-/// time.
+/// Identifies and authorizes the client. Removes a valid signature from the address and returns it.
 fn authorize(
-    access: &Access,
+    app: &App,
     scope: Scope,
     key: Presented,
     request: &mut Request,
-) -> Result<(Caller, Option<u64>), Problem> {
+) -> Result<(Caller, Option<Signature>), Problem> {
+    let access = &app.access;
     if !access.is_closed() {
         return Ok((Caller::address(access, request), None));
     }
@@ -196,7 +225,9 @@ fn authorize(
         Presented::Text(text) => access.verify(&text, now),
         Presented::Nonsense => Err(Denied::Unknown),
         Presented::Nothing => {
-            return by_signature(&signature).map(|end| (Caller::address(access, request), Some(end)));
+            let signature = by_signature(signature)?;
+            let caller = Caller::address(access, request).within(app.namespace(&signature.group));
+            return Ok((caller, Some(signature)));
         }
     };
     let key = found.map_err(no_key)?;
@@ -208,8 +239,8 @@ fn authorize(
             .with("scope", scope.name())
             .header(WWW_AUTHENTICATE, &challenge));
     }
-    let end = if let SignatureCheck::Valid(end) = signature { Some(end) } else { None };
-    Ok((Caller::key(&key), end))
+    let signature = if let SignatureCheck::Valid(signature) = signature { Some(signature) } else { None };
+    Ok((Caller::key(app, &key), signature))
 }
 
 /// Returns the address without its signature.
@@ -221,10 +252,10 @@ fn unsigned(uri: &Uri) -> Result<Uri, Problem> {
     Uri::from_parts(parts).map_err(Problem::internal)
 }
 
-/// Returns the expiry of a valid signature.
-fn by_signature(signature: &SignatureCheck) -> Result<u64, Problem> {
+/// Returns a valid signature.
+fn by_signature(signature: SignatureCheck) -> Result<Signature, Problem> {
     match signature {
-        SignatureCheck::Valid(end) => Ok(*end),
+        SignatureCheck::Valid(signature) => Ok(signature),
         SignatureCheck::Absent => Err(Problem::new(
             Kind::KeyRequired,
             "a key is required, in `Authorization: Bearer …` or `X-Api-Key`; a GET may use a signed URL instead",
@@ -305,14 +336,14 @@ fn keep_private(headers: &mut HeaderMap) {
     }
 }
 
-/// Limits the caching of a response to the time for which its signed URL is valid, and signs the address that it
-/// redirects to until then.
-fn end_with_signature(access: &Access, end: u64, headers: &mut HeaderMap) {
-    let end_time = UNIX_EPOCH.checked_add(Duration::from_secs(end)).unwrap_or_else(SystemTime::now);
+/// Limits the caching of a response to the time for which its signed URL is valid, and signs the URL that it
+/// redirects to in the same way.
+fn end_with_signature(access: &Access, signature: &Signature, headers: &mut HeaderMap) {
+    let end_time = UNIX_EPOCH.checked_add(Duration::from_secs(signature.until)).unwrap_or_else(SystemTime::now);
     let left = end_time.duration_since(SystemTime::now()).unwrap_or_default().as_secs();
     let text = |name| headers.get(name).and_then(|value: &HeaderValue| value.to_str().ok());
     let cached = text(header::CACHE_CONTROL).map(|value| cached_for(value, left));
-    let location = text(header::LOCATION).and_then(|target| access.sign(target, end));
+    let location = text(header::LOCATION).and_then(|target| access.sign(target, signature));
     for (name, value) in [(header::CACHE_CONTROL, cached), (header::LOCATION, location)] {
         if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
             headers.insert(name, value);

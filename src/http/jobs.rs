@@ -15,6 +15,7 @@ use serde_json::{Map, Value};
 use utoipa::{IntoParams, ToSchema};
 
 use super::delivery;
+use super::guard::Caller;
 use super::kinds::Kind;
 use super::openapi::parameters::JobPath;
 use super::openapi::problem_responses;
@@ -163,6 +164,7 @@ pub(super) fn no_such_job(id: &str) -> Problem {
     ))]
 pub(super) async fn show(
     State(app): State<Shared>,
+    caller: Caller,
     id: JobId,
     query: Result<Query<Poll>, QueryRejection>,
 ) -> Result<Response, Problem> {
@@ -178,7 +180,7 @@ pub(super) async fn show(
         let detail = format!("parameter `wait`: {wait} is more than {MAX_WAIT_S} s");
         return Err(bad(detail).with("value", wait).with("limit", MAX_WAIT_S));
     }
-    let mut watched = app.job_store.watch(&id).await?.ok_or_else(|| no_such_job(id.as_str()))?;
+    let mut watched = app.job_store.watch(&id, caller.namespace).await?.ok_or_else(|| no_such_job(id.as_str()))?;
     let mut stopping = app.stopping.clone();
     let ended = async {
         tokio::select! {
@@ -195,8 +197,8 @@ pub(super) async fn show(
 /// Cancel a job
 #[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "dismissJob", params(JobPath),
     responses((status = 200, description = "The job is cancelled.", body = JobDocument), DismissProblems))]
-pub(super) async fn dismiss(State(app): State<Shared>, id: JobId) -> Result<Response, Problem> {
-    let view = app.job_store.dismiss(&id).await?.ok_or_else(|| no_such_job(id.as_str()))?;
+pub(super) async fn dismiss(State(app): State<Shared>, caller: Caller, id: JobId) -> Result<Response, Problem> {
+    let view = app.job_store.dismiss(&id, caller.namespace).await?.ok_or_else(|| no_such_job(id.as_str()))?;
     if view.record.status != Status::Dismissed {
         let detail = format!("the job is {} and cannot be cancelled", view.record.status.name());
         return Err(Problem::new(Kind::JobEnded, detail).with("status_name", view.record.status.name()));
@@ -214,14 +216,14 @@ pub(super) async fn dismiss(State(app): State<Shared>, id: JobId) -> Result<Resp
             headers(("Location" = String, description = "Path of the mesh: `/v1/results/{file}`."))),
         ResultProblems,
     ))]
-pub(super) async fn result(State(app): State<Shared>, id: JobId) -> Result<Response, Problem> {
-    let view = app.job_store.view(&id).await?.ok_or_else(|| no_such_job(id.as_str()))?;
+pub(super) async fn result(State(app): State<Shared>, caller: Caller, id: JobId) -> Result<Response, Problem> {
+    let view = app.job_store.view(&id, caller.namespace).await?.ok_or_else(|| no_such_job(id.as_str()))?;
     let record = &view.record;
     match (record.status, &record.result) {
         (Status::Successful, Some(key)) => {
             let gone =
                 || Problem::new(Kind::ResultGone, "the result was removed after some time; request the mesh again");
-            let key: ContentKey = key.parse().map_err(|_bad| gone())?;
+            let key = ContentKey::parse(key, caller.namespace).map_err(|_bad| gone())?;
             let format = record.format.parse().map_err(|_bad| gone())?;
             if !is_stored(&app.store, format, &key).await? {
                 return Err(gone());

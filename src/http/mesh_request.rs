@@ -68,13 +68,13 @@ impl MeshRequest {
 
     /// Answers the request.
     pub(super) async fn answer(mut self) -> Result<Response, Problem> {
-        let digest = self.parsed.source.digest(&self.app).await?;
+        let digest = self.parsed.source.digest(&self.app, &self.preferences.caller).await?;
         self.timing.lap("receive");
         if let Some(response) = self.without_work(&digest).await? {
             return Ok(response);
         }
         self.timing.lap("lookup");
-        let input = self.parsed.source.load(&self.app).await?;
+        let input = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
         self.timing.lap("load");
         self.compute(input).await
     }
@@ -85,7 +85,8 @@ impl MeshRequest {
         let ParsedRequest { request, format, report, declared, .. } = &self.parsed;
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
-        let key = ContentKey::new(digest, &request.job, *format, &app.pool.maker(&request.job));
+        let namespace = self.preferences.caller.namespace;
+        let key = ContentKey::new(digest, &request.job, *format, &app.pool.maker(&request.job), namespace);
         let etag = delivery::etag(&key);
         // A report has no validator.
         if !report {
@@ -98,7 +99,7 @@ impl MeshRequest {
                 let caching = [(header::ETAG, etag), (header::CACHE_CONTROL, cache.clone())];
                 return Ok(Some((StatusCode::NOT_MODIFIED, caching).into_response()));
             }
-            let stored = match results::stored(app, &key, *format, method, headers).await {
+            let stored = match results::stored(app, &self.preferences.caller, &key, *format, method, headers).await {
                 // The store has logged its error. The mesh is computed again.
                 Err(problem) if problem.is(Kind::StoreFailed) => None,
                 stored => stored?,
@@ -133,7 +134,7 @@ impl MeshRequest {
         if self.preferences.respond_async && !report {
             return self.accept(input, None).await;
         }
-        let permit = app.delivery()?;
+        let permit = app.delivery(self.preferences.caller.client)?;
         let wait = self.preferences.wait.filter(|_| !report);
         let jobs = &app.config.jobs;
         let deadline = Duration::from_millis(jobs.deadline_ms);
@@ -155,7 +156,7 @@ impl MeshRequest {
                 }
             },
         };
-        let (digest, joined) = (input.digest, ticket.is_shared);
+        let (digest, joined, namespace) = (input.digest, ticket.is_shared, self.preferences.caller.namespace);
         // Dropping the last ticket of unfinished work cancels it.
         drop((ticket, input));
         let finished = outcome.map_err(|failure| self.failed(failure))?;
@@ -172,7 +173,7 @@ impl MeshRequest {
             return delivery::report(&finished, timing);
         }
         // Another backend may have computed the mesh, with other bytes.
-        let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.maker());
+        let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.maker(), namespace);
         let is_stored = results::save_later(&app, &finished, format, &key);
         let mut response = delivery::mesh(&app, Arc::clone(&finished), format, &key, timing, permit).await?;
         let headers = response.headers_mut();
@@ -189,6 +190,7 @@ impl MeshRequest {
         Task {
             input: input.bytes.clone(),
             digest: input.digest,
+            namespace: self.preferences.caller.namespace,
             strict: self.parsed.request.strict,
             job: self.parsed.request.job.clone(),
             rank: self.preferences.rank,

@@ -44,7 +44,8 @@ pub(super) async fn create(
 }
 
 problem_responses!(ReportProblems: [
-    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING, [Kind::QueueFull, Kind::TooManyDeliveries],
+    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING,
+    [Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded],
 ]);
 
 /// Mesh a structure and return the report

@@ -22,12 +22,15 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 
 use crate::config::ServerConfig;
+use crate::memory_budget::Budget;
 use crate::telemetry::{BODIES_OPEN, REJECTED};
 
 /// Size of a slice over HTTP/1.1, bytes: eight seconds at 8 KiB/s.
 const SLICE: usize = 64 << 10;
 /// Size of a slice over HTTP/2, bytes: one frame, so that the progress of many concurrent bodies is visible.
 const STREAM_SLICE: usize = 16 << 10;
+/// Send buffer of an HTTP/2 stream, bytes.
+pub(super) const STREAM_BUFFER: usize = 64 << 10;
 /// Size up to which a body is not watched, bytes.
 const SMALL: u64 = 1 << 10;
 
@@ -271,16 +274,18 @@ impl HttpBody for Paced {
 }
 
 /// Executor for the streams of an HTTP/2 connection, which ends a stream if its client is too slow. Such a stream is
-/// reset and its buffers are freed; if the reset cannot be sent either, `broken` is notified.
+/// reset and its buffers are freed; if the reset cannot be sent either, `broken` is notified. The send buffer of each
+/// stream is charged to `budget`.
 #[derive(Clone)]
 pub(super) struct Streams {
     rate: Rate,
     broken: Arc<Notify>,
+    budget: Budget,
 }
 
 impl Streams {
-    pub(super) fn new(rate: Rate, broken: &Arc<Notify>) -> Self {
-        Self { rate, broken: Arc::clone(broken) }
+    pub(super) fn new(rate: Rate, broken: &Arc<Notify>, budget: Budget) -> Self {
+        Self { rate, broken: Arc::clone(broken), budget }
     }
 }
 
@@ -291,6 +296,7 @@ where
 {
     fn execute(&self, stream: F) {
         let (pace, broken) = (Pace::new(self.rate), Arc::clone(&self.broken));
+        let buffers = self.budget.buffers(STREAM_BUFFER as u64);
         tokio::spawn(async move {
             let stalled = tokio::select! {
                 _ = STREAM.scope(Arc::clone(&pace), stream) => false,
@@ -302,6 +308,28 @@ where
                     broken.notify_one();
                 }
             }
+            drop(buffers);
         });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn streams_are_charged_to_the_memory_budget() {
+        let (budget, done) = (Budget::new(STREAM_BUFFER as u64), Arc::new(Notify::new()));
+        let streams = Streams::new(Rate::new(&ServerConfig::default()), &Arc::default(), budget.clone());
+        for _ in 0..2 {
+            let done = Arc::clone(&done);
+            streams.execute(async move { done.notified().await });
+        }
+        assert_eq!(budget.check().unwrap_err().held, 2 * STREAM_BUFFER as u64);
+        done.notify_waiters();
+        while budget.check().is_err() {
+            done.notify_one();
+            tokio::task::yield_now().await;
+        }
     }
 }

@@ -35,6 +35,7 @@ pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
 
 problem_responses!(ReportProblems: [PARAMETERS, READING, MESHING, [
     Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable, Kind::QueueFull, Kind::TooManyDeliveries,
+    Kind::ShareExceeded,
 ]]);
 
 /// Mesh an archive entry and return the report

@@ -48,6 +48,11 @@ impl Problem {
         self.kind == kind
     }
 
+    /// Returns the name of the kind.
+    pub(super) fn slug(&self) -> &'static str {
+        self.kind.row().slug
+    }
+
     /// Appends advice to the explanation.
     pub(super) fn advise(mut self, advice: &str) -> Self {
         self.detail.push_str("; ");

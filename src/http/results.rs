@@ -15,6 +15,7 @@ use metrics::counter;
 use serde_json::Value;
 use tracing::Instrument as _;
 
+use super::guard::Caller;
 use super::kinds::Kind;
 use super::openapi::meshes::{NotModified, StoredMesh};
 use super::openapi::parameters::{ConditionHeaders, RangeHeaders, ResultFile, ResultPath};
@@ -27,6 +28,7 @@ use super::{conditional, delivery};
 use crate::formats::Format;
 use crate::jobs::{self, ContentKey, Finished, REPORT};
 use crate::pipeline::Report;
+use crate::store::Namespace;
 use crate::telemetry::{RESULTS_NOT_STORED, SpanKind, SpanParent, TraceSpan};
 
 /// Caching of results, whose bytes follow from their key.
@@ -41,7 +43,7 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
 
 problem_responses!(ShowProblems: [[
     Kind::BadRequest, Kind::NotFound, Kind::PreconditionFailed, Kind::RangeNotSatisfiable, Kind::MemoryFull,
-    Kind::StoreFailed,
+    Kind::ShareExceeded, Kind::StoreFailed,
 ]]);
 problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::PreconditionFailed, Kind::StoreFailed]]);
 
@@ -58,12 +60,13 @@ problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::Pre
 )]
 pub(super) async fn show(
     State(app): State<Shared>,
+    caller: Caller,
     method: Method,
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let Path(file) = path?;
-    let (key, format) = parse(&file).ok_or_else(|| no_such_result(&file))?;
+    let (key, format) = parse(&file, caller.namespace).ok_or_else(|| no_such_result(&file))?;
     let etag = delivery::etag(&key);
     let expected = conditional::check_match(&headers, &etag);
     if expected.is_ok() && conditional::is_unchanged(&headers, &etag) {
@@ -72,7 +75,7 @@ pub(super) async fn show(
         );
     }
     wait_for_save(&app, &key).await;
-    let found = stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))?;
+    let found = stored(&app, &caller, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))?;
     expected.map(|()| found)
 }
 
@@ -86,11 +89,12 @@ pub(super) async fn show(
     ))]
 pub(super) async fn report(
     State(app): State<Shared>,
+    caller: Caller,
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let Path(text) = path?;
-    let key: ContentKey = text.parse().map_err(|_bad| no_such_result(&text))?;
+    let key = ContentKey::parse(&text, caller.namespace).map_err(|_bad| no_such_result(&text))?;
     wait_for_save(&app, &key).await;
     let bytes = app.store.get(&key.name(REPORT)?).await?.ok_or_else(|| no_such_result(&text))?.bytes;
     // A report holds the times of one run, so its validator is its own digest.
@@ -112,15 +116,16 @@ fn no_such_result(what: &str) -> Problem {
     )
 }
 
-fn parse(file: &str) -> Option<(ContentKey, Format)> {
+fn parse(file: &str, namespace: Namespace) -> Option<(ContentKey, Format)> {
     let (key, extension) = file.split_once('.')?;
     let format = Format::ALL.into_iter().find(|format| format.extension() == extension)?;
-    Some((key.parse().ok()?, format))
+    Some((ContentKey::parse(key, namespace).ok()?, format))
 }
 
 /// Returns a stored result, or the requested range of it; `None` if it is not stored.
 pub(super) async fn stored(
     app: &App,
+    caller: &Caller,
     key: &ContentKey,
     format: Format,
     method: &Method,
@@ -157,9 +162,12 @@ pub(super) async fn stored(
         let Some((_, part)) = app.store.read(&name, Some(part)).await? else { return Ok(None) };
         body = part;
     }
+    let share = app.delivery_shares.take(caller.client.0)?;
     // Pieces of running answers are charged regardless of the limit; new answers are refused while it is exceeded.
     let budget = app.pool.settings().budget.clone();
     let charged = body.map_ok(move |piece| {
+        // The share is held until the body is dropped.
+        _ = &share;
         let lease = budget.lease();
         lease.force(piece.len() as u64);
         lease.attach(piece)

@@ -19,6 +19,7 @@ use super::stop::{self, Stop};
 use super::{accept, capabilities, key_reload, metrics, results, router};
 use crate::access::{Access, AccessError};
 use crate::archive::Archive;
+use crate::client_shares::ClientShares;
 use crate::config::Config;
 use crate::jobs::{Budget, Client, EndError, JobStore, Pool, Settings};
 use crate::picture::SelectedRenderer;
@@ -149,6 +150,7 @@ impl Server {
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readers = Arc::new(Semaphore::new(config.jobs.workers));
+        let delivery_shares = ClientShares::new(config.jobs.deliveries, config.server.client_share);
         let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
         let (stop, stopping) = watch::channel(Stop::Serve);
         let app = Arc::new(App {
@@ -158,6 +160,7 @@ impl Server {
             archive,
             store,
             job_store,
+            secret,
             result_headers: Cache::new(CACHED_HEADERS),
             readers,
             save_permits,
@@ -165,6 +168,7 @@ impl Server {
             saves: SingleFlight::default(),
             stopping,
             deliveries,
+            delivery_shares,
             first_mesh: OnceLock::new(),
             probe: Probe::new(),
             tracer: traces.tracer(),
@@ -202,13 +206,14 @@ impl Server {
         let app = Arc::clone(&self.app);
         background.spawn_blocking(move || warm_up(&app));
         background.spawn(sweep(self.app.store.clone(), Duration::from_millis(self.app.config.store.sweep_ms)));
-        let serving = accept::serve(self.listener, router::router(&self.app), Arc::clone(&config), stopped.clone());
+        let (router, budget) = (router::router(&self.app), self.app.pool.settings().budget.clone());
+        let serving = accept::serve(self.listener, router, Arc::clone(&config), budget, stopped.clone());
         let serving = tokio::spawn(serving);
         let mut recorder = None;
         if let Some((listener, _)) = self.metrics_listener {
             let of_process = telemetry::recorder()?;
             let router = metrics::router(of_process.clone());
-            background.spawn(accept::serve(listener, router, config, stopped).map(drop));
+            background.spawn(accept::serve(listener, router, config, Budget::unlimited(), stopped).map(drop));
             recorder = Some(of_process);
         }
         background.spawn(publish(Arc::clone(&self.app), recorder));

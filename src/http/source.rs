@@ -1,6 +1,7 @@
 //! The structure that a request names: uploaded bytes, a stored structure or an archive entry.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::extract::FromRequestParts;
 use axum::extract::RawPathParams;
@@ -12,6 +13,7 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 
 use super::conditional;
+use super::guard::Caller;
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::state::Shared;
@@ -78,23 +80,26 @@ impl StructureSource {
     }
 
     /// Returns the digest of the file. Fails if there is no such structure.
-    pub(super) async fn digest(&self, app: &Shared) -> Result<Digest, Problem> {
+    pub(super) async fn digest(&self, app: &Shared, caller: &Caller) -> Result<Digest, Problem> {
         match self {
             Self::Uploaded(input) => Ok(input.digest),
-            Self::Stored(digest) => match app.store.head(&Name::input(digest)).await? {
+            Self::Stored(digest) => match app.store.head(&Name::input(digest).within(caller.namespace)).await? {
                 Some(_) => Ok(*digest),
                 None => Err(no_such_structure(&digest.to_string())),
             },
-            Self::Entry(id) => app.archive.digest(id).await.map_err(|error| archive_problem(&error)),
+            Self::Entry(id) => {
+                app.archive.for_client(caller.client.0).digest(id).await.map_err(|error| archive_problem(&error))
+            }
         }
     }
 
     /// Returns the file.
-    pub(super) async fn load(&self, app: &Shared) -> Result<Input, Problem> {
+    pub(super) async fn load(&self, app: &Shared, caller: &Caller) -> Result<Input, Problem> {
         match self {
             Self::Uploaded(input) => Ok(input.clone()),
             Self::Stored(digest) => {
-                let (name, absent) = (Name::input(digest), || no_such_structure(&digest.to_string()));
+                let (name, absent) =
+                    (Name::input(digest).within(caller.namespace), || no_such_structure(&digest.to_string()));
                 let size = app.store.head(&name).await?.ok_or_else(absent)?.size;
                 let lease = app.pool.settings().budget.lease();
                 lease.grow(size)?;
@@ -102,8 +107,8 @@ impl StructureSource {
                 Ok(Input { bytes, digest: *digest, lease: Arc::new(lease) })
             }
             Self::Entry(id) => {
-                let entry = app.archive.fetch(id).await.map_err(|error| archive_problem(&error))?;
-                let Entry { bytes, digest, .. } = entry;
+                let fetched = app.archive.for_client(caller.client.0).fetch(id).await;
+                let Entry { bytes, digest, .. } = fetched.map_err(|error| archive_problem(&error))?;
                 Input::new(app, bytes, digest)
             }
         }
@@ -113,19 +118,20 @@ impl StructureSource {
     pub(super) async fn document<F>(
         self,
         app: &Shared,
+        caller: &Caller,
         headers: &HeaderMap,
         write: impl FnOnce(Input) -> F,
     ) -> Result<Response, Problem>
     where
         F: Future<Output = Result<Response, Problem>>,
     {
-        let validators = validators(&self.digest(app).await?)?;
+        let validators = validators(&self.digest(app, caller).await?)?;
         conditional::check_match(headers, &validators[0].1)?;
         if conditional::is_unchanged(headers, &validators[0].1) {
             return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
         }
-        let _permit = app.delivery()?;
-        let input = self.load(app).await?;
+        let _permit = app.delivery(caller.client)?;
+        let input = self.load(app, caller).await?;
         let validators = self::validators(&input.digest)?;
         Ok((validators, write(input).await?).into_response())
     }
@@ -183,6 +189,10 @@ fn archive_problem(error: &FetchError) -> Problem {
             retry_after.iter().fold(problem, |problem, wait| problem.retry_after(*wait))
         }
         FetchError::Memory { error, .. } => (*error).into(),
+        FetchError::Share { limit, .. } => {
+            let wait = Duration::from_secs(1);
+            Problem::new(Kind::ShareExceeded, detail).with("limit", *limit).retry_after(wait)
+        }
         FetchError::Internal(_) => Problem::internal(detail),
     }
 }

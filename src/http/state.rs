@@ -15,11 +15,12 @@ use super::problem::Problem;
 use super::stop::Stop;
 use crate::access::Access;
 use crate::archive::Archive;
+use crate::client_shares::{ClientShares, Place};
 use crate::config::Config;
-use crate::jobs::{ContentKey, Failure, JobStore, Pool};
+use crate::jobs::{Client, ContentKey, Failure, JobStore, Pool};
 use crate::pipeline::Job;
 use crate::single_flight::SingleFlight;
-use crate::store::Store;
+use crate::store::{Namespace, Secret, Store};
 use crate::surface::{CancelToken, Control, FoundDevice};
 use crate::telemetry::Tracer;
 
@@ -40,6 +41,8 @@ pub(super) struct App {
     pub(super) archive: Archive,
     pub(super) store: Store,
     pub(super) job_store: JobStore,
+    /// Secret of the store.
+    pub(super) secret: Secret,
     /// Headers of recently requested results.
     pub(super) result_headers: Cache<ContentKey, Arc<HeaderMap>>,
     /// Permits to read structures outside of jobs: one per worker.
@@ -54,6 +57,8 @@ pub(super) struct App {
     pub(super) stopping: watch::Receiver<Stop>,
     /// Permits of `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
+    /// Shares of the clients in `jobs.deliveries`. Stored results that are being sent count as well.
+    pub(super) delivery_shares: Arc<ClientShares>,
     /// True if the first mesh was computed, false if it failed; unset before.
     pub(super) first_mesh: OnceLock<bool>,
     /// Health check of the store.
@@ -71,6 +76,11 @@ impl App {
     pub(super) fn accepts(&self, job: &Job) -> Result<(), Problem> {
         let refused = |error| Failure::Job { error, diagnostics: Vec::new() };
         job.check(&self.config.limits.job()).map_err(|error| refused(error).into())
+    }
+
+    /// Returns the namespace of a group of keys. Without keys all clients share the common one.
+    pub(super) fn namespace(&self, group: &str) -> Namespace {
+        if self.access.has_keys() { Namespace::of_group(&self.secret, group) } else { Namespace::default() }
     }
 
     /// Runs `work`, which reads a structure, on a blocking thread. Waits for a permit first; `jobs.deadline_ms` limits
@@ -100,9 +110,9 @@ impl App {
         timeout_at(end, reading).await.map_err(late)?.map_err(|error| panicked(error.to_string()))
     }
 
-    /// Takes a permit for one request for a mesh.
-    pub(super) fn delivery(&self) -> Result<OwnedSemaphorePermit, Problem> {
-        Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {
+    /// Takes a place for one request for a mesh.
+    pub(super) fn delivery(&self, client: Client) -> Result<Delivery, Problem> {
+        let permit = Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {
             let limit = self.config.jobs.deliveries;
             Problem::new(
                 Kind::TooManyDeliveries,
@@ -110,8 +120,15 @@ impl App {
             )
             .with("limit", limit)
             .retry_after(self.pool.estimated_wait())
-        })
+        })?;
+        Ok(Delivery { _permit: permit, _share: self.delivery_shares.take(client.0)? })
     }
+}
+
+/// Place of a request in `jobs.deliveries`, and in the share of its client.
+pub(super) struct Delivery {
+    _permit: OwnedSemaphorePermit,
+    _share: Place,
 }
 
 /// State as handlers extract it.

@@ -11,10 +11,11 @@ use axum::body::Body;
 use bytes::{BufMut as _, Bytes, BytesMut};
 use hyper::body::{Body as HttpBody, Frame, SizeHint};
 use metrics::histogram;
-use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot};
 
 use super::errors::{file_too_large, format_problem};
 use super::problem::Problem;
+use super::state::Delivery;
 use crate::formats::Format;
 use crate::jobs::{Budget, Finished};
 use crate::telemetry::{STAGE_DURATION, TraceSpan};
@@ -37,7 +38,7 @@ pub(super) async fn start(
     format: Format,
     limit: u64,
     budget: Budget,
-    permit: OwnedSemaphorePermit,
+    delivery: Delivery,
 ) -> Result<(Option<u64>, Body), Problem> {
     let (head, answer) = oneshot::channel();
     let (sender, receiver) = mpsc::channel(PIECES);
@@ -45,7 +46,7 @@ pub(super) async fn start(
     let (log, span) = (tracing::Span::current(), TraceSpan::current());
     tokio::task::spawn_blocking(move || {
         log.in_scope(|| write(&finished, format, limit, head, pieces, span.as_ref()));
-        drop(permit);
+        drop(delivery);
     });
     // The writer has panicked; the panic hook has logged it.
     let length = answer.await.map_err(|_dropped| Problem::internal("the writer failed"))??;

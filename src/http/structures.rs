@@ -11,6 +11,7 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::form::Upload;
+use super::guard::Caller;
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::bodies::StructureFile;
@@ -94,13 +95,14 @@ struct ChainDocument {
 }
 
 problem_responses!(CreateProblems: [
-    BODY, READING, [Kind::BadParameter, Kind::TooManyDeliveries, Kind::StoreFull, Kind::StoreFailed],
+    BODY, READING,
+    [Kind::BadParameter, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFull, Kind::StoreFailed],
 ]);
 problem_responses!(ShowProblems: [
     READING,
     [
         Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
-        Kind::StoreFailed,
+        Kind::ShareExceeded, Kind::StoreFailed,
     ],
 ]);
 problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
@@ -126,7 +128,12 @@ problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
             headers(("Location" = String, description = "Path of the structure."))),
         CreateProblems,
     ))]
-pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
+pub(super) async fn create(
+    State(app): State<Shared>,
+    caller: Caller,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, Problem> {
     if upload::is_json(&headers) {
         let detail =
             "a structure is uploaded as a file, not as JSON; `POST /v1/meshes` takes JSON that names a structure";
@@ -140,13 +147,14 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
         )
         .with("parameter", name.as_str()));
     }
-    let _permit = app.delivery()?;
+    let _permit = app.delivery(caller.client)?;
     let input = Input::uploaded(bytes, lease).await?;
     let digest = input.digest;
     // Parse before storing, so that only readable structures are stored.
     let summary = summarize(&app, input.clone()).await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(summary.format)?;
-    let created = app.store.put_new(&Name::input(&digest), input.bytes).await?;
+    let name = Name::input(&digest).within(caller.namespace);
+    let created = app.store.put_new(&name, input.bytes).await?;
     let status = if created { StatusCode::CREATED } else { StatusCode::OK };
     let location = delivery::text(&format!("/v1/structures/{digest}"));
     Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())
@@ -164,11 +172,12 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     ))]
 pub(super) async fn show(
     State(app): State<Shared>,
+    caller: Caller,
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let write = async |input| Ok(Json(summarize(&app, input).await?).into_response());
-    source.document(&app, &headers, write).await
+    source.document(&app, &caller, &headers, write).await
 }
 
 /// Mesh an uploaded structure
@@ -188,7 +197,7 @@ pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
 
 problem_responses!(ReportProblems: [
     PARAMETERS, READING, MESHING,
-    [Kind::NoSuchStructure, Kind::QueueFull, Kind::TooManyDeliveries, Kind::StoreFailed],
+    [Kind::NoSuchStructure, Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed],
 ]);
 
 /// Mesh an uploaded structure and return the report

@@ -12,9 +12,10 @@ use crate::store::Digest;
 use crate::surface::CancelToken;
 use crate::telemetry::TraceSpan;
 
-/// Returns the identity of the work of a task: input, parameters and strictness. Tasks with equal keys share one job.
+/// Returns the identity of the work of a task: namespace, input, parameters and strictness. Tasks with equal keys share one job.
 pub(super) fn work_key(task: &Task) -> Digest {
-    Digest::of(format!("{}\n{}\n{}\n", task.strict, params::canonical(&task.job), task.digest).as_bytes())
+    let Task { namespace, strict, digest, .. } = task;
+    Digest::of(format!("{namespace}\n{strict}\n{}\n{digest}\n", params::canonical(&task.job)).as_bytes())
 }
 
 /// Progress of a job, written by its worker.

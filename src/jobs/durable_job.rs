@@ -286,7 +286,7 @@ async fn save(jobs: &JobStore, record: &Record, finished: Arc<Finished>) -> Resu
     let (request, format) = record.request().map_err(lost)?;
     let report = &finished.product.report;
     let (resolution, digest) = (report.resolution, finished.digest);
-    let key = ContentKey::new(&digest, &request.job, format, &report.maker());
+    let key = ContentKey::new(&digest, &request.job, format, &report.maker(), record.namespace);
     let parent = record.requester.parent(&jobs.0.pool.settings().tracer);
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
     let save = || results::save(&jobs.0.store, Arc::clone(&finished), format, &key, jobs.0.output_bytes);

@@ -19,7 +19,7 @@ use super::retry::retry;
 use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
-use crate::store::{Digest, Name, Pin, Secret, Store, StoreError};
+use crate::store::{Digest, Name, Namespace, Pin, Secret, Store, StoreError};
 use crate::telemetry::JOBS_RECOVERED;
 
 /// Number of ended jobs that are held in memory; older ones are read from the store.
@@ -128,13 +128,14 @@ impl JobStore {
     /// already.
     pub(crate) async fn accept(&self, spec: JobSpec, ticket: Option<Ticket>) -> Result<JobView, AcceptError> {
         let inner = &self.0;
-        let client = spec.task.rank.client.0;
+        let (client, namespace) = (spec.task.rank.client.0, spec.task.namespace);
         let id = match &spec.idempotency_key {
-            Some(key) => JobId::of_key(&inner.secret, client, key),
+            Some(key) => JobId::of_key(&inner.secret, namespace, client, key),
             None => JobId::random(&inner.secret, client).map_err(AcceptError::Random)?,
         };
         let record = Record {
             id: id.clone(),
+            namespace,
             input: spec.task.digest.to_string(),
             parameters: spec.parameters,
             format: spec.format.extension().to_owned(),
@@ -150,7 +151,7 @@ impl JobStore {
             requester: Requester::of(&spec.task.parent),
         };
         if spec.idempotency_key.is_some()
-            && let Some(view) = self.view(&id).await?
+            && let Some(view) = self.view(&id, namespace).await?
         {
             return existing(&record, view);
         }
@@ -166,7 +167,7 @@ impl JobStore {
         // The job gets its place in the queue first: a record without one could not be run soon.
         let job = Arc::new(DurableJob::new(record));
         let (input, digest) = (spec.task.input.clone(), spec.task.digest);
-        let pin = inner.pin(&id, &digest)?;
+        let pin = inner.pin(&id, &digest, namespace)?;
         let (recorded, wait_for_record) = mpsc::sync_channel(1);
         let ticket = if let Some(ticket) = ticket {
             ticket
@@ -180,9 +181,9 @@ impl JobStore {
             ticket
         };
         let place = inner.admit(&id).await?;
-        inner.store.put_new(&Name::input(&digest), input).await?;
+        inner.store.put_new(&Name::input(&digest).within(namespace), input).await?;
         if !inner.write_new(&job.record()).await?
-            && let Some(view) = self.view(&id).await?
+            && let Some(view) = self.view(&id, namespace).await?
         {
             // A concurrent request with the same key stored its record first.
             return existing(&job.record(), view);
@@ -201,34 +202,43 @@ impl JobStore {
 
     /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
     pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<(String, Pin)>, StoreError> {
-        let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job));
+        let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job), task.namespace);
         let pin = self.0.store.pin(&key.name(format.extension())?);
         let found = !task.strict && results::is_stored(&self.0.store, format, &key).await?;
         Ok(found.then(|| (key.to_string(), pin)))
     }
 
-    /// Watches the state of a job; `None` if there is no such job.
-    pub(crate) async fn watch(&self, id: &JobId) -> Result<Option<watch::Receiver<JobView>>, StoreError> {
-        if let Some(job) = self.0.lock().get(id) {
+    /// Returns a job in memory, if it is of the namespace.
+    fn known(&self, id: &JobId, namespace: Namespace) -> Option<Arc<DurableJob>> {
+        self.0.lock().get(id).filter(|job| job.state.borrow().record.namespace == namespace).cloned()
+    }
+
+    /// Watches the state of a job; `None` if the namespace has no such job.
+    pub(crate) async fn watch(
+        &self,
+        id: &JobId,
+        namespace: Namespace,
+    ) -> Result<Option<watch::Receiver<JobView>>, StoreError> {
+        if let Some(job) = self.known(id, namespace) {
             return Ok(Some(job.state.subscribe()));
         }
-        let Some(record) = self.0.read(id).await? else { return Ok(None) };
+        let record = self.0.read(id).await?.filter(|record| record.namespace == namespace);
+        let Some(record) = record else { return Ok(None) };
         if record.status.is_final() {
             return Ok(Some(DurableJob::new(record).state.subscribe()));
         }
         Ok(Some(self.resume(record).await?.state.subscribe()))
     }
 
-    /// Returns the present state of a job; `None` if there is no such job.
-    pub(crate) async fn view(&self, id: &JobId) -> Result<Option<JobView>, StoreError> {
-        Ok(self.watch(id).await?.map(|watched| watched.borrow().clone()))
+    /// Returns the present state of a job; `None` if the namespace has no such job.
+    pub(crate) async fn view(&self, id: &JobId, namespace: Namespace) -> Result<Option<JobView>, StoreError> {
+        Ok(self.watch(id, namespace).await?.map(|watched| watched.borrow().clone()))
     }
 
-    /// Cancels a job unless it has ended, and returns its state; `None` if there is no such job. The job is cancelled
-    /// even if the store fails.
-    pub(crate) async fn dismiss(&self, id: &JobId) -> Result<Option<JobView>, StoreError> {
-        let job = self.0.lock().get(id).cloned();
-        let Some(job) = job else { return self.view(id).await };
+    /// Cancels a job unless it has ended, and returns its state; `None` if the namespace has no such job. The job is
+    /// cancelled even if the store fails.
+    pub(crate) async fn dismiss(&self, id: &JobId, namespace: Namespace) -> Result<Option<JobView>, StoreError> {
+        let Some(job) = self.known(id, namespace) else { return self.view(id, namespace).await };
         if job.end(Status::Dismissed, |_| {}) {
             job.dismissed.notify_one();
             self.0.write_job(&job).await?;
@@ -248,7 +258,7 @@ impl JobStore {
             self.finish(&fresh, Err(EndError::Lost { why: "its input has no valid digest".to_owned() })).await;
             return Ok(fresh);
         };
-        let pin = self.0.pin(&id, &digest)?;
+        let pin = self.0.pin(&id, &digest, fresh.record().namespace)?;
         let job = self.0.insert(&id, &fresh);
         if Arc::ptr_eq(&job, &fresh) {
             counter!(JOBS_RECOVERED).increment(1);
@@ -308,7 +318,7 @@ impl JobStore {
         record: &Record,
         digest: Digest,
     ) -> Result<Result<(Task, Format), String>, StoreError> {
-        let stored = self.0.store.get(&Name::input(&digest)).await?;
+        let stored = self.0.store.get(&Name::input(&digest).within(record.namespace)).await?;
         let Some(input) = stored.map(|stored| stored.bytes) else { return Ok(Err("its input was removed".to_owned())) };
         let settings = self.0.pool.settings();
         let lease = settings.budget.lease();
@@ -318,6 +328,7 @@ impl JobStore {
             let task = Task {
                 input,
                 digest,
+                namespace: record.namespace,
                 strict: request.strict,
                 job: request.job,
                 rank,

@@ -1,44 +1,42 @@
 //! Content keys: names of results that follow from input, parameters, format, arithmetic and version.
 
 use std::fmt;
-use std::str::FromStr;
 
 use crate::formats::Format;
 use crate::pipeline::{Job, params};
-use crate::store::{BadDigest, Digest, Name, StoreError};
+use crate::store::{BadDigest, Digest, Name, Namespace, StoreError};
 
-/// Name of a mesh file. Equal keys mean equal bytes.
+/// Name of a mesh file, with the namespace in which it is stored. Equal names mean equal bytes in every namespace.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(crate) struct ContentKey(Digest);
+pub(crate) struct ContentKey {
+    digest: Digest,
+    namespace: Namespace,
+}
 
 impl ContentKey {
     /// Returns the key of a result. `maker` names the arithmetic of the backend, followed by that of a picture's
     /// renderer. The version is part of the key, since a release may change the last bits.
-    pub(crate) fn new(input: &Digest, job: &Job, format: Format, maker: &str) -> Self {
+    pub(crate) fn new(input: &Digest, job: &Job, format: Format, maker: &str, namespace: Namespace) -> Self {
         let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));
         let text = format!("molmesh {version}\n{maker}\n{}\n{canonical}\n{input}\n", format.extension());
-        Self(Digest::of(text.as_bytes()))
+        Self { digest: Digest::of(text.as_bytes()), namespace }
     }
-}
 
-impl ContentKey {
+    /// Parses the name of a result in a namespace.
+    pub(crate) fn parse(text: &str, namespace: Namespace) -> Result<Self, BadDigest> {
+        Ok(Self { digest: text.parse()?, namespace })
+    }
+
     /// Returns the name in the store, of the file or of its report.
     pub(crate) fn name(&self, extension: &str) -> Result<Name, StoreError> {
-        Ok(Name::result(&self.0.to_string(), extension)?)
-    }
-}
-
-impl FromStr for ContentKey {
-    type Err = BadDigest;
-
-    fn from_str(text: &str) -> Result<Self, BadDigest> {
-        text.parse().map(Self)
+        Ok(Name::result(&self.digest.to_string(), extension)?.within(self.namespace))
     }
 }
 
 impl fmt::Display for ContentKey {
+    /// Writes the name, which is the same in every namespace.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.fmt(f)
+        self.digest.fmt(f)
     }
 }
 
@@ -54,18 +52,19 @@ mod tests {
         let png = params::parse([("format", "png")]).unwrap().job;
         let wide = params::parse([("format", "png"), ("width", "600")]).unwrap().job;
         let (a, b) = (Digest::of(b"a"), Digest::of(b"b"));
+        let key = |input, job, format, maker| ContentKey::new(input, job, format, maker, Namespace::default());
         let mut keys = vec![
-            ContentKey::new(&a, &plain, Format::Glb, "cpu"),
-            ContentKey::new(&b, &plain, Format::Glb, "cpu"),
-            ContentKey::new(&a, &fine, Format::Glb, "cpu"),
-            ContentKey::new(&a, &chain, Format::Glb, "cpu"),
-            ContentKey::new(&a, &plain, Format::Ply, "cpu"),
-            ContentKey::new(&a, &plain, Format::Glb, "gpu"),
-            ContentKey::new(&a, &png, Format::Png, "cpu+cpu"),
-            ContentKey::new(&a, &png, Format::Png, "cpu+gpu"),
-            ContentKey::new(&a, &wide, Format::Png, "cpu+cpu"),
+            key(&a, &plain, Format::Glb, "cpu"),
+            key(&b, &plain, Format::Glb, "cpu"),
+            key(&a, &fine, Format::Glb, "cpu"),
+            key(&a, &chain, Format::Glb, "cpu"),
+            key(&a, &plain, Format::Ply, "cpu"),
+            key(&a, &plain, Format::Glb, "gpu"),
+            key(&a, &png, Format::Png, "cpu+cpu"),
+            key(&a, &png, Format::Png, "cpu+gpu"),
+            key(&a, &wide, Format::Png, "cpu+cpu"),
         ];
-        assert_eq!(keys[0], ContentKey::new(&a, &Job::default(), Format::Glb, "cpu"));
+        assert_eq!(keys[0], key(&a, &Job::default(), Format::Glb, "cpu"));
         keys.sort_by_key(ToString::to_string);
         keys.dedup();
         assert_eq!(keys.len(), 9);

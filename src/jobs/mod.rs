@@ -45,7 +45,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 
 use crate::pipeline::{Job, Product};
-use crate::store::Digest;
+use crate::store::{Digest, Namespace};
 use crate::structure::strict_validator::Diagnostic;
 use crate::telemetry::SpanParent;
 
@@ -56,6 +56,8 @@ pub(crate) struct Task {
     pub(crate) input: Bytes,
     /// SHA-256 of `input`.
     pub(crate) digest: Digest,
+    /// Namespace of input and result. Only tasks of one namespace share work.
+    pub(crate) namespace: Namespace,
     /// Run the strict validator as well, and reject a file in which it finds errors.
     pub(crate) strict: bool,
     /// Parameters of the mesh.

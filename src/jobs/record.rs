@@ -5,15 +5,13 @@ use std::str::FromStr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
-use hmac::{Hmac, KeyInit as _, Mac as _};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
-use sha2::Sha256;
 use thiserror::Error;
 
 use crate::formats::Format;
 use crate::pipeline::params;
-use crate::store::{OWNER_DIGITS, Secret};
+use crate::store::{Namespace, OWNER_DIGITS, Secret, derive};
 use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, traceparent, tracestate};
 
 /// Error of a text that is not a job id.
@@ -24,7 +22,7 @@ pub(crate) struct BadJobId;
 /// Digits of a job id.
 const DIGITS: usize = 32;
 
-/// Id of a job. It is a secret: every client that knows it can see and cancel the job.
+/// Id of a job. It is a secret: every client of its namespace that knows it can see and cancel the job.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String")]
 pub(crate) struct JobId(String);
@@ -43,30 +41,22 @@ impl JobId {
         let hex = |bytes: &[u8; 32], digits: usize| -> String {
             bytes.iter().map(|byte| format!("{byte:02x}")).take(digits / 2).collect()
         };
-        let owner = hex(&hmac(secret, &format!("client\n{client:x}")), OWNER_DIGITS);
+        let owner = hex(&derive(secret, &format!("client\n{client:x}")), OWNER_DIGITS);
         Self(hex(unique, DIGITS - OWNER_DIGITS) + &owner)
     }
 
-    /// Returns the id for an idempotency key: the same for the same key of the same client, also after a restart.
-    /// The id is a truncated HMAC-SHA-256 under `secret`: client and key alone do not reveal it.
-    pub(super) fn of_key(secret: &Secret, client: u64, key: &str) -> Self {
-        Self::new(&hmac(secret, &format!("idempotency\n{client:x}\n{key}")), secret, client)
+    /// Returns the id for an idempotency key: the same for the same key of the same client in a namespace, also after a
+    /// restart. Client and key alone do not reveal it.
+    pub(super) fn of_key(secret: &Secret, namespace: Namespace, client: u64, key: &str) -> Self {
+        // A key has no line break, so the text is unambiguous.
+        let space = if namespace.is_common() { String::new() } else { format!("{namespace}\n") };
+        Self::new(&derive(secret, &format!("idempotency\n{client:x}\n{space}{key}")), secret, client)
     }
 
     /// Returns the whole id.
     pub(crate) fn as_str(&self) -> &str {
         &self.0
     }
-}
-
-/// Returns the HMAC-SHA-256 of `text`.
-fn hmac(secret: &Secret, text: &str) -> [u8; 32] {
-    // HMAC pads a key to the block length with zeros.
-    let mut block = [0; 64];
-    block[..secret.len()].copy_from_slice(secret);
-    let mut mac = Hmac::<Sha256>::new(&block.into());
-    mac.update(text.as_bytes());
-    mac.finalize().into_bytes().into()
 }
 
 impl fmt::Display for JobId {
@@ -132,6 +122,9 @@ impl Status {
 pub(crate) struct Record {
     /// Id of the job.
     pub(crate) id: JobId,
+    /// Namespace of the job, its input and its result.
+    #[serde(default, skip_serializing_if = "Namespace::is_common")]
+    pub(crate) namespace: Namespace,
     /// SHA-256 of the input.
     pub(crate) input: String,
     /// Names and values of the parameters, as the client wrote them.
@@ -283,7 +276,7 @@ mod tests {
         assert_eq!(a.as_str().parse(), Ok(a.clone()));
         let owner = |id: &JobId| id.as_str()[DIGITS - OWNER_DIGITS..].to_owned();
         assert!(owner(&a) == owner(&b) && owner(&a) != owner(&random(2)));
-        let of = |secret: u8, client, key| JobId::of_key(&[secret; 32], client, key);
+        let of = |secret: u8, client, key| JobId::of_key(&[secret; 32], Namespace::default(), client, key);
         assert_eq!(of(0, 1, "x"), of(0, 1, "x"));
         assert_eq!(of(0, 1, "x").as_str().parse(), Ok(of(0, 1, "x")));
         for other in [of(1, 1, "x"), of(0, 2, "x"), of(0, 1, "y")] {
@@ -299,6 +292,7 @@ mod tests {
     fn record(parameters: &[(&str, &str)]) -> Record {
         Record {
             id: JobId::random(&[0; 32], 1).unwrap(),
+            namespace: Namespace::default(),
             input: Digest::of(b"x").to_string(),
             parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect(),
             format: "glb".to_owned(),

@@ -9,15 +9,15 @@ use futures_util::{StreamExt as _, stream};
 use super::durable_job::DurableJob;
 use super::job_store::{Inner, JobStore};
 use super::record::{JobId, Record};
-use crate::store::{Digest, Folder, Name, Pin, RecordCaps, RecordPlace, StoreError};
+use crate::store::{Digest, Folder, Name, Namespace, Pin, RecordCaps, RecordPlace, StoreError};
 
 /// Concurrent reads of records at startup.
 const RECOVERY_READS: usize = 64;
 
 impl Inner {
     /// Protects input and record of an unfinished job from eviction.
-    pub(super) fn pin(&self, id: &JobId, input: &Digest) -> Result<[Pin; 2], StoreError> {
-        Ok([self.store.pin(&Name::input(input)), self.store.pin(&Name::job(id.as_str())?)])
+    pub(super) fn pin(&self, id: &JobId, input: &Digest, space: Namespace) -> Result<[Pin; 2], StoreError> {
+        Ok([self.store.pin(&Name::input(input).within(space)), self.store.pin(&Name::job(id.as_str())?)])
     }
 
     /// Makes room for the record of a new job. At a cap, forgets ended jobs.

@@ -20,7 +20,7 @@ use crate::formats::Format;
 use crate::picture::SelectedRenderer;
 use crate::pipeline::{JobLimits, params};
 use crate::store::faulty::{Faults, faulty_in};
-use crate::store::{Digest, Folder, Name, Store, StoreError};
+use crate::store::{Digest, Folder, Name, Namespace, Store, StoreError};
 use crate::surface::ReferenceBackend;
 use crate::telemetry::{SpanParent, Tracer};
 
@@ -71,6 +71,7 @@ impl Fixture {
         let task = Task {
             input,
             digest,
+            namespace: Namespace::default(),
             strict: false,
             job: request.job,
             rank,
@@ -86,6 +87,7 @@ impl Fixture {
     async fn inherit(&self) -> JobId {
         let record = Record {
             id: new_id(),
+            namespace: Namespace::default(),
             input: Digest::of(SAMPLE).to_string(),
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),
@@ -111,7 +113,7 @@ impl Fixture {
     }
 
     async fn watch(&self, id: &JobId) -> watch::Receiver<JobView> {
-        self.jobs.watch(id).await.unwrap().unwrap()
+        self.jobs.watch(id, Namespace::default()).await.unwrap().unwrap()
     }
 
     /// Waits until the store has failed `times` times.
@@ -290,7 +292,7 @@ async fn records_that_cannot_be_read_go_into_quarantine() {
     }
     // One is read by a request, the others by the recovery.
     let id = |name: &Name| name.to_string()[5..37].parse::<JobId>().unwrap();
-    let refused = fixture.jobs.view(&id(&names[0])).await;
+    let refused = fixture.jobs.view(&id(&names[0]), Namespace::default()).await;
     assert!(matches!(refused, Err(StoreError::Quarantined { .. })), "{refused:?}");
     assert_eq!(fixture.store.quarantined().await.unwrap(), 1);
     assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
@@ -298,14 +300,14 @@ async fn records_that_cannot_be_read_go_into_quarantine() {
     assert_eq!(fixture.store.quarantined().await.unwrap(), 3);
     let folder = fixture.dir.path().join("store/quarantine");
     for (name, bytes) in names.iter().zip(&bad) {
-        let refused = fixture.jobs.dismiss(&id(name)).await;
+        let refused = fixture.jobs.dismiss(&id(name), Namespace::default()).await;
         assert!(matches!(refused, Err(StoreError::Quarantined { .. })), "{refused:?}");
         let file = folder.join(format!("{}.json", id(name).as_str()));
         assert_eq!(&std::fs::read(&file).unwrap(), bytes, "kept as it was");
         std::fs::remove_file(file).unwrap();
     }
     assert_eq!(fixture.store.quarantined().await.unwrap(), 0);
-    assert_eq!(fixture.jobs.view(&id(&names[0])).await.unwrap(), None);
+    assert_eq!(fixture.jobs.view(&id(&names[0]), Namespace::default()).await.unwrap(), None);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -5,7 +5,7 @@ use std::fmt;
 use object_store::path::Path;
 use thiserror::Error;
 
-use super::Digest;
+use super::{Digest, Namespace};
 
 /// Error for a name that is too long or has invalid characters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
@@ -117,6 +117,13 @@ impl Name {
             return Err(BadName("an extension has 1 to 16 lower-case letters and digits, with single dots between"));
         }
         Ok(Self { folder: Folder::Results, file: format!("{key}.{extension}").into() })
+    }
+
+    /// Returns the name of an input or a result in a namespace. Job documents hold the namespace of their job.
+    #[must_use]
+    pub fn within(self, namespace: Namespace) -> Self {
+        let (stem, rest) = self.file.split_at(self.file.find('.').unwrap_or(self.file.len()));
+        Self { folder: self.folder, file: format!("{}{rest}", namespace.stem(stem)).into() }
     }
 
     /// Returns the folder.

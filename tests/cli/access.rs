@@ -32,9 +32,10 @@ fn keys_and_signed_urls_work_and_are_not_logged() {
     {
         assert!(lines.contains(line), "no {line} in\n{lines}");
     }
-    let (reader, more) = key(&["--id", "reader", "--scopes", "read", "--expires", "90d"]);
+    let (reader, more) = key(&["--id", "reader", "--group", "viewer-1", "--scopes", "read", "--expires", "90d"]);
+    assert!(more.contains("group = \"viewer-1\"") && !lines.contains("group"), "{lines}{more}");
     let file = folder.file("keys.toml", format!("{lines}{more}"));
-    let secret = stdout(&run(["key", "signing", "--id", "2030a"])).trim().to_owned();
+    let secret = stdout(&run(["key", "signing", "--id", "2030a", "--group", "viewer-1"])).trim().to_owned();
     let config = folder.file("molmesh.toml", format!("[access]\nsigning_secret = \"{secret}\"\n"));
     let (config, file) = (config.to_str().unwrap(), format!("access.keys_file={}", file.display()));
     let service =
@@ -104,6 +105,7 @@ fn hangup_reloads_the_keys() {
 fn invalid_keys_and_urls_are_rejected_with_a_reason() {
     for (args, why) in [
         (&["--id", "A b"][..], "lower-case letters"),
+        (&["--id", "a", "--group", "A b"], "parameter `group`"),
         (&["--id", "a", "--scopes", "admin"], "expected mesh, read"),
         (&["--id", "a", "--work", "long"], "parameter `work`"),
         (&["--id", "a", "--window", "1ms"], "parameter `window`"),

@@ -124,6 +124,7 @@ const LAYERS: &[Layer] = &[
         layers: &[("sync", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
+    Layer { name: "client_shares", layers: &[], crates: SERVICE },
     Layer {
         name: "memory_budget",
         layers: &[("surface", Only(&["MemoryMeter", "OutOfMemory"])), ("telemetry", Any)],
@@ -143,6 +144,7 @@ const LAYERS: &[Layer] = &[
             ("telemetry", Any),
             ("single_flight", Any),
             ("memory_budget", Any),
+            ("client_shares", Any),
             ("tls", Any),
             ("store", Any),
         ],
@@ -182,6 +184,7 @@ const LAYERS: &[Layer] = &[
             ("telemetry", Any),
             ("single_flight", Any),
             ("memory_budget", Any),
+            ("client_shares", Any),
             ("store", Any),
             ("archive", Any),
             ("jobs", Any),

@@ -365,7 +365,7 @@ fn a_key_is_one_client_at_any_address() {
     assert_ne!(submit("b", "198.51.100.1"), first);
 }
 
-const SECRETS: &str = "new:0123456789abcdef0123456789abcdef old:fedcba9876543210fedcba9876543210";
+const SECRETS: &str = "new@a:0123456789abcdef0123456789abcdef old@a:fedcba9876543210fedcba9876543210";
 
 fn now() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs()

@@ -11,6 +11,7 @@ type Row = (&'static str, &'static str, &'static str);
 
 const ROWS: &[Row] = &[
     ("server.connections", "too-many-connections", "http/limits::excess_connections_are_rejected_with_503"),
+    ("server.client_share", "share-exceeded", "http/shares::a_client_cannot_take_all_connections"),
     ("server.header_timeout_ms", "header-timeout", "http/limits::slow_heads_and_idle_connections_are_closed"),
     ("server.body_timeout_ms", "body-timeout", "http/limits::slow_bodies_time_out"),
     (

@@ -15,6 +15,9 @@ fn fake(change: impl FnOnce(&mut Config)) -> Running {
     start(Fake::new(Mode::Octahedra), change)
 }
 
+/// Bytes of the memory budget that a connection takes.
+const CONNECTION_BYTES: u64 = 320 << 10;
+
 fn rejected(server: &Running, reason: &str) -> f64 {
     server.metric("molmesh_requests_rejected_total", &[&format!("reason=\"{reason}\"")])
 }
@@ -164,10 +167,10 @@ fn an_endless_head_of_a_part_uses_little_memory_and_time() {
     assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 16_384);
     assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
     // The parser's buffer counts as memory: if it does not fit, a form is rejected and a plain file is not.
-    let server = fake(|c| c.limits.memory_bytes = 60_000);
+    let server = fake(|c| c.limits.memory_bytes = CONNECTION_BYTES + 60_000);
     let kind = ("content-type", "multipart/form-data; boundary=XX");
     server.post("/v1/meshes", &[kind], b"--XX\r\n").problem(503, "memory-full");
-    assert_eq!(server.post("/v1/meshes", &[], &carbons(10)).status, 200);
+    wait_for("a plain file is accepted", || server.post("/v1/meshes", &[], &carbons(10)).status == 200);
 }
 
 #[test]
@@ -353,7 +356,7 @@ fn slow_heads_and_idle_connections_are_closed() {
 
 #[test]
 fn excess_connections_are_rejected_with_503() {
-    let server = fake(|c| c.server.connections = 4);
+    let server = fake(|c| (c.server.connections, c.server.client_share) = (4, 1.0));
     wait_for("earlier connections to be gone", || server.metric("molmesh_connections", &[]) >= 0.0);
     let mut held = Vec::new();
     let refused = loop {
@@ -395,10 +398,11 @@ fn a_client_that_does_not_read_is_disconnected_and_its_mesh_freed() {
 
 #[test]
 fn memory_is_shared_and_limited() {
-    let server = fake(|c| c.limits.memory_bytes = 200_000);
+    let limit = CONNECTION_BYTES + 200_000;
+    let server = fake(|c| c.limits.memory_bytes = limit);
     let problem = server.post("/v1/meshes", &[], &carbons(3_000)).problem(503, "memory-full");
-    assert_eq!(problem["limit"], 200_000);
-    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    assert_eq!(problem["limit"], limit);
+    wait_for("a small structure is accepted", || server.post("/v1/meshes", &[], SAMPLE).status == 200);
     assert!(rejected(&server, "memory-full") >= 1.0);
 }
 
@@ -447,6 +451,19 @@ fn abandoned_uploads_are_read_one_at_a_time_and_cancelled() {
     // A reading holds 50 MB while its text grows from 17 to 34 MB, or 34 MB and 18 MB of atoms.
     assert!(most > 10e6 && most < 60e6 + 4.0 * body.len() as f64 && body.len() < 8_000_000, "{most}");
     assert_eq!(server.post("/v1/structures", &[], &carbons(1000)).status, 201);
+}
+
+#[test]
+fn buffers_of_connections_count_as_memory() {
+    let server = fake(|c| c.limits.memory_bytes = 10 * CONNECTION_BYTES);
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    let idle: Vec<_> = (0..10).map(|_| connect(server.addr)).collect();
+    wait_for("the budget is used up", || server.post("/v1/meshes", &[], SAMPLE).status == 503);
+    let problem = server.post("/v1/meshes", &[], SAMPLE).problem(503, "memory-full");
+    assert!(problem["actual"].as_u64().unwrap() >= 10 * CONNECTION_BYTES, "{problem}");
+    assert_eq!(server.get("/livez").status, 200);
+    drop(idle);
+    wait_for("the buffers are freed", || server.post("/v1/meshes", &[], SAMPLE).status == 200);
 }
 
 #[test]

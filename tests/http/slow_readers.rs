@@ -32,6 +32,8 @@ fn serialize() -> MutexGuard<'static, ()> {
 fn serve(change: impl FnOnce(&mut Config)) -> Running {
     start(Fake::new(Mode::Octahedra), |config| {
         config.server.write_timeout_ms = 1000;
+        // All readers have one address.
+        config.server.client_share = 1.0;
         change(config);
     })
 }

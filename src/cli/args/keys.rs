@@ -30,6 +30,9 @@ pub(crate) struct NewKeyArgs {
     /// Name of the key in logs: lower-case letters, digits and hyphens
     #[arg(long, value_name = "NAME")]
     pub(crate) id: String,
+    /// Group whose keys share structures, results and jobs [default: the name of the key]
+    #[arg(long, value_name = "NAME")]
+    pub(crate) group: Option<String>,
     /// Permissions: mesh (compute meshes), read (read existing objects), or both
     #[arg(long, value_name = "A,B", default_value = "mesh,read")]
     pub(crate) scopes: String,
@@ -59,6 +62,9 @@ pub(crate) struct SigningKeyArgs {
     /// Name of the key in URLs: lower-case letters, digits and hyphens
     #[arg(long, value_name = "NAME")]
     pub(crate) id: String,
+    /// Group of keys whose structures, results and jobs the signed URLs open [default: the name of the key]
+    #[arg(long, value_name = "NAME")]
+    pub(crate) group: Option<String>,
 }
 
 // `molmesh sign`.

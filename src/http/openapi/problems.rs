@@ -52,6 +52,7 @@ pub(in crate::http) const SUBMITTING: &[Kind] = &[
     Kind::QueueFull,
     Kind::TooManyJobs,
     Kind::TooManyDeliveries,
+    Kind::ShareExceeded,
     Kind::StoreFull,
     Kind::StoreFailed,
 ];

@@ -1,0 +1,156 @@
+//! Shares of clients in connections, deliveries and archive fetches: a client that holds its share is refused, another
+//! one is answered. The second client has another loopback address.
+#![cfg(target_os = "linux")]
+
+use crate::access_support::Keys;
+use crate::archive_support::{Remote, Response, ok};
+use crate::http_support;
+
+use std::io::{Read as _, Write as _};
+use std::net::{SocketAddr, TcpStream};
+use std::time::Duration;
+
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, carbons, read_reply, start, wait_for};
+use molmesh::config::Config;
+use socket2::{Domain, Socket, Type};
+
+const FIRST: &str = "127.0.0.1";
+const SECOND: &str = "127.0.0.2";
+const SMALL: &str = "/v1/meshes?resolution=2";
+
+fn serve(change: impl FnOnce(&mut Config)) -> Running {
+    start(Fake::new(Mode::Octahedra), change)
+}
+
+/// Connects from an address and sends a request. Small buffers, so that an unread answer stays with the server.
+fn begin(from: &str, server: &Running, method: &str, path: &str, headers: &str, body: &[u8]) -> TcpStream {
+    let socket = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
+    socket.set_recv_buffer_size(16 << 10).unwrap();
+    socket.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+    socket.bind(&SocketAddr::new(from.parse().unwrap(), 0).into()).unwrap();
+    socket.connect(&server.addr.into()).unwrap();
+    let mut stream = TcpStream::from(socket);
+    let head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n{headers}");
+    let head = format!("{head}content-length: {}\r\n\r\n", body.len());
+    // A refused connection may be closed before the request is sent.
+    drop(stream.write_all(&[head.as_bytes(), body].concat()));
+    stream
+}
+
+fn ask(from: &str, server: &Running, method: &str, path: &str, body: &[u8]) -> Reply {
+    read_reply(&mut begin(from, server, method, path, "", body), method == "HEAD")
+}
+
+/// Sends a request and reads the begin of its answer, whose rest stays with the server.
+fn hold(from: &str, server: &Running, method: &str, path: &str, headers: &str, body: &[u8]) -> TcpStream {
+    let mut stream = begin(from, server, method, path, headers, body);
+    let mut start = [0; 12];
+    stream.read_exact(&mut start).unwrap();
+    assert_eq!(&start, b"HTTP/1.1 200");
+    stream
+}
+
+fn rejected(server: &Running) -> f64 {
+    server.metric("molmesh_requests_rejected_total", &["reason=\"share-exceeded\""])
+}
+
+#[track_caller]
+fn is_refused(reply: &Reply, limit: usize) {
+    assert_eq!(reply.problem(503, "share-exceeded")["limit"], limit);
+    assert_eq!(reply.header("retry-after"), Some("1"));
+}
+
+#[test]
+fn a_client_cannot_take_all_connections() {
+    let server = serve(|c| (c.server.connections, c.server.client_share) = (16, 0.25));
+    let before = rejected(&server);
+    let mut held = Vec::new();
+    let refused = loop {
+        let mut stream = http_support::connect(server.addr);
+        stream.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n").unwrap();
+        let mut start = [0; 12];
+        stream.read_exact(&mut start).unwrap();
+        if &start == b"HTTP/1.1 503" {
+            let mut rest = String::new();
+            stream.read_to_string(&mut rest).unwrap();
+            break rest;
+        }
+        held.push(stream);
+        assert!(held.len() <= 4, "more than a quarter of the connections");
+    };
+    assert!(refused.contains("/problems/share-exceeded") && refused.contains("retry-after: 1"), "{refused}");
+    assert_eq!(ask(SECOND, &server, "GET", "/livez", b"").status, 200);
+    assert!(rejected(&server) > before);
+    drop(held);
+    wait_for("a connection is accepted", || ask(FIRST, &server, "GET", "/livez", b"").status == 200);
+    // A proxy has many clients.
+    let proxied = serve(|c| {
+        (c.server.connections, c.server.client_share) = (16, 0.25);
+        c.server.trusted_proxies = "127.0.0.1".parse().ok();
+    });
+    let _held: Vec<TcpStream> = (0..8).map(|_| http_support::connect(proxied.addr)).collect();
+    assert_eq!(ask(FIRST, &proxied, "GET", "/livez", b"").status, 200);
+}
+
+#[test]
+fn a_client_cannot_take_all_deliveries() {
+    let server = serve(|c| (c.jobs.deliveries, c.server.client_share) = (8, 0.25));
+    let (large, stl) = (carbons(60_000), "/v1/meshes?format=stl");
+    let meshes = [(); 2].map(|()| hold(FIRST, &server, "POST", stl, "", &large));
+    is_refused(&ask(FIRST, &server, "POST", SMALL, SAMPLE), 2);
+    for path in ["/v1/structures", "/v1/estimate", "/v1/report"] {
+        is_refused(&ask(FIRST, &server, "POST", path, SAMPLE), 2);
+    }
+    assert_eq!(ask(SECOND, &server, "POST", SMALL, SAMPLE).status, 200);
+    drop(meshes);
+    wait_for("the deliveries have ended", || ask(FIRST, &server, "POST", SMALL, SAMPLE).status == 200);
+    // Stored results that are being sent count as well.
+    let reply = ask(SECOND, &server, "POST", stl, &large);
+    let stored = reply.header("content-location").unwrap();
+    wait_for("the result is stored", || ask(SECOND, &server, "HEAD", stored, b"").status == 200);
+    let results = [(); 2].map(|()| hold(FIRST, &server, "GET", stored, "", b""));
+    is_refused(&ask(FIRST, &server, "GET", stored, b""), 2);
+    is_refused(&ask(FIRST, &server, "POST", SMALL, &carbons(10)), 2);
+    assert_eq!(ask(SECOND, &server, "GET", stored, b"").status, 200);
+    drop(results);
+    wait_for("the results were sent", || ask(FIRST, &server, "GET", stored, b"").status == 200);
+}
+
+#[test]
+fn a_key_is_one_client_with_one_share_at_any_address() {
+    let keys = Keys::new(&[("a", "read,mesh", ""), ("b", "read,mesh", "")]);
+    let server = serve(|c| {
+        (c.jobs.deliveries, c.server.client_share) = (4, 0.25);
+        c.access.keys_file = Some(keys.path());
+    });
+    let key = |id| format!("x-api-key: {}\r\n", keys.text(id));
+    let status = |from, id| {
+        let mut stream = begin(from, &server, "POST", SMALL, &key(id), SAMPLE);
+        read_reply(&mut stream, false)
+    };
+    let _mesh = hold(FIRST, &server, "POST", "/v1/meshes?format=stl", &key("a"), &carbons(60_000));
+    is_refused(&status(SECOND, "a"), 1);
+    assert_eq!(status(FIRST, "b").status, 200);
+}
+
+#[test]
+fn a_client_cannot_take_all_fetches_of_the_archive() {
+    let remote = Remote::start(|_, n| match n {
+        0 => Response::After(Duration::from_secs(5), Box::new(ok(SAMPLE))),
+        _ => ok(SAMPLE),
+    });
+    let url = remote.url("/d/{id}.cif").parse().unwrap();
+    let server = serve(|c| {
+        c.archive.url = Some(url);
+        (c.archive.concurrent, c.server.client_share) = (4, 0.25);
+    });
+    let path = |entry: &str| format!("/v1/pdb/{entry}/atoms");
+    let mut slow = begin(FIRST, &server, "GET", &path("1aaa"), "", b"");
+    wait_for("the first fetch runs", || remote.count() == 1);
+    is_refused(&ask(FIRST, &server, "GET", &path("2aaa"), b""), 1);
+    assert_eq!((ask(SECOND, &server, "GET", &path("2aaa"), b"").status, remote.count()), (200, 2));
+    // Its copy needs no fetch.
+    assert_eq!(ask(FIRST, &server, "GET", &path("2aaa"), b"").status, 200);
+    assert_eq!(read_reply(&mut slow, false).status, 200);
+    assert_eq!(ask(FIRST, &server, "GET", &path("3aaa"), b"").status, 200);
+}
