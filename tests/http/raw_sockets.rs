@@ -125,8 +125,9 @@ fn heads_must_be_well_formed() {
     ] {
         assert_eq!(statuses(head), [400], "{head:?}");
     }
-    let many =
-        |n: usize| format!("GET /livez HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n{}\r\n", "a: b\r\n".repeat(n));
+    let many = |n: usize| {
+        format!("GET /livez HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n{}\r\n", "a: b\r\n".repeat(n))
+    };
     assert_eq!((statuses(&many(90)), statuses(&many(120))), (vec![200], vec![431]), "100 lines");
 }
 
