@@ -21,7 +21,7 @@ use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket, resu
 use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Secret, Store, StoreError};
-use crate::telemetry::JOBS_RECOVERED;
+use crate::telemetry::{JOBS_RECOVERED, shorten};
 
 /// Number of ended jobs that are held in memory; older ones are read from the store.
 const MAX_ENDED: usize = 10_000;
@@ -105,7 +105,8 @@ impl Inner {
         match self.store.get(name).await?.map(|stored| Record::from_bytes(&stored.bytes)) {
             Some(Ok(record)) => return Ok(Some(record)),
             Some(Err(error)) => {
-                tracing::error!(%name, %error, "the record of a job cannot be read; moving it into quarantine");
+                let short = shorten(&name.to_string());
+                tracing::error!(name = short, %error, "the record of a job cannot be read; moving it into quarantine");
                 self.store.quarantine(name).await?;
             }
             None if self.store.is_quarantined(name).await? => {}
