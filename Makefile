@@ -9,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test fuzz chaos soak nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
+.PHONY: help run test interleavings fuzz chaos soak nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -19,7 +19,7 @@ run: web-if-possible ## Build (the first time takes minutes) and serve on http:/
 
 # The steps add a line to this file for each check that they skip; the last step prints it.
 test: export SKIPPED := $(CURDIR)/target/skipped
-test: nothing-skipped tools web fmt-check lint deny-if-installed matrix static-if-possible tests ## All checks and tests; installs what they need
+test: nothing-skipped tools web fmt-check lint deny-if-installed matrix static-if-possible interleavings tests ## All checks and tests; installs what they need
 
 nothing-skipped:
 	@mkdir -p target && : >"$$SKIPPED"
@@ -51,6 +51,9 @@ matrix: ## Clippy on the other supported combinations of features
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
+
+interleavings: ## Explore interleavings of threads and tasks in the queue, the device pool and the store (Shuttle)
+	$(CARGO) test --quiet --locked --lib --features shuttle interleavings
 
 deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (three minutes) when absent
 	@command -v cargo-deny >/dev/null || $(CARGO) install cargo-deny --locked

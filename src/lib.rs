@@ -45,6 +45,8 @@ pub mod memory_budget;
 mod single_flight;
 #[cfg(feature = "server")]
 pub mod store;
+#[cfg(any(feature = "server", feature = "gpu"))]
+mod sync;
 #[cfg(feature = "server")]
 pub mod telemetry;
 #[cfg(feature = "server")]

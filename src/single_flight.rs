@@ -4,9 +4,11 @@
 
 use std::collections::HashMap;
 use std::hash::Hash;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, PoisonError};
 
 use tokio::sync::watch;
+
+use crate::sync::{Handle, Mutex, MutexGuard};
 
 /// Sending end of a shared result. Dropping it without a result ends every wait.
 pub(crate) type ResultSender<T> = watch::Sender<Option<T>>;
@@ -70,7 +72,7 @@ where
         drop(running);
         let entry = Entry { running: Arc::clone(&self.0), key: key.clone() };
         let work = start();
-        tokio::spawn(async move {
+        Handle::current().spawn(async move {
             let result = work.await;
             drop(entry);
             sender.send_replace(Some(result));
@@ -130,5 +132,43 @@ mod tests {
         let mut receiver = flights.run(&1, || async { std::panic::resume_unwind(Box::new(())) });
         assert_eq!(receiver.recv().await, None);
         assert!(flights.running(&1).is_none());
+    }
+}
+
+#[cfg(test)]
+#[cfg(feature = "shuttle")]
+mod interleavings {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use shuttle::future::{block_on, yield_now};
+
+    use super::SingleFlight;
+    use crate::sync::thread;
+
+    #[test]
+    fn at_most_one_run_of_a_key_is_in_progress() {
+        shuttle::check_random(
+            || {
+                let (flights, running) = (Arc::new(SingleFlight::<u8, u8>::default()), Arc::<AtomicUsize>::default());
+                let callers: Vec<_> = (0..4)
+                    .map(|n| {
+                        let (flights, running) = (Arc::clone(&flights), Arc::clone(&running));
+                        thread::spawn(move || {
+                            let mut receiver = flights.run(&1, || async move {
+                                assert_eq!(running.fetch_add(1, Ordering::SeqCst), 0, "two runs at once");
+                                yield_now().await;
+                                running.fetch_sub(1, Ordering::SeqCst);
+                                n
+                            });
+                            // The last caller leaves.
+                            n == 3 || block_on(receiver.recv()).is_some()
+                        })
+                    })
+                    .collect();
+                assert!(callers.into_iter().all(|caller| caller.join().unwrap()));
+            },
+            10_000,
+        );
     }
 }

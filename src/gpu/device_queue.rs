@@ -1,13 +1,13 @@
 //! Queue of jobs for one device, with the device's state and counters.
 
 use std::collections::VecDeque;
-use std::sync::mpsc::SyncSender;
 use std::time::Duration;
 
 use super::error::GpuError;
 use super::job::{GpuJob, JobResult};
 use super::partition_handle::PartitionHandle;
 use crate::surface::DeviceStatus;
+use crate::sync::mpsc::SyncSender;
 
 /// Load of a large job or of a partition, in small jobs.
 const LARGE_LOAD: u64 = 16;
@@ -159,8 +159,8 @@ pub(super) fn reject(jobs: VecDeque<QueuedJob>, why: &str) {
 
 #[cfg(test)]
 mod tests {
+    use crate::sync::mpsc::sync_channel;
     use std::sync::Arc;
-    use std::sync::mpsc::sync_channel;
 
     use super::*;
     use crate::gpu::job::{Finished, Prepared};

@@ -34,6 +34,9 @@ pub mod engine;
 pub mod error;
 pub mod executor;
 mod hardware;
+#[cfg(test)]
+#[cfg(feature = "shuttle")]
+mod interleavings;
 pub mod job;
 mod job_state;
 pub mod manifests;

@@ -2,7 +2,7 @@
 //! offsets, and the records of the bricks that it imports from later partitions.
 
 use std::ops::Range;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
 use super::error::GpuError;
@@ -11,6 +11,7 @@ use super::plan::Partition;
 use super::plan::partition::total_len;
 use crate::surface::SurfaceError;
 use crate::surface::column::SharedBytes;
+use crate::sync::{Condvar, Mutex, MutexGuard};
 
 /// Interval at which a waiting partition checks for cancellation and deadline. Published counts wake it at once.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);

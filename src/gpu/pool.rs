@@ -7,8 +7,6 @@
 
 use std::io;
 use std::sync::Arc;
-use std::sync::mpsc::RecvTimeoutError;
-use std::thread::JoinHandle;
 use std::time::Duration;
 
 use super::error::GpuError;
@@ -18,6 +16,8 @@ use super::partition_handle::PartitionHandle;
 use super::scheduler::{EnqueueError, PoolSettings, Scheduler, Ticket};
 use super::worker::{self, Build};
 use crate::surface::{DeviceStatus, Stage, SurfaceError};
+use crate::sync::mpsc::RecvTimeoutError;
+use crate::sync::thread::{self, JoinHandle};
 
 /// Interval at which a waiting caller checks for cancellation and deadline. Results wake it at once.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
@@ -101,7 +101,7 @@ impl DevicePool {
         let mut pool = Self { scheduler, threads, names };
         for (n, device) in devices.into_iter().enumerate() {
             let scheduler = Arc::clone(&pool.scheduler);
-            let thread = std::thread::Builder::new().name(format!("molmesh-gpu-{}", device.number));
+            let thread = thread::Builder::new().name(format!("molmesh-gpu-{}", device.number));
             let started = thread.spawn(move || worker::work(&scheduler, n, &device.build));
             let failed = |e: io::Error| GpuError::Failed(format!("the thread of a device cannot be started: {e}"));
             pool.threads.push(started.map_err(failed)?);
@@ -144,11 +144,10 @@ impl DevicePool {
         mut last_error: Option<GpuError>,
     ) -> Result<CompletedJob, GpuError> {
         loop {
-            let ticket = match self.scheduler.enqueue(job, &failures, MAX_ATTEMPTS) {
+            let ticket = match self.scheduler.enqueue(job, &failures, MAX_ATTEMPTS, POLL_INTERVAL) {
                 Ok(ticket) => ticket,
                 Err(EnqueueError::Full) => {
                     job.check()?;
-                    self.scheduler.wait_for_change(POLL_INTERVAL);
                     continue;
                 }
                 // The error of this job is more specific than the reasons of the devices.

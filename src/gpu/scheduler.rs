@@ -2,8 +2,7 @@
 
 use std::cmp::Reverse;
 use std::collections::VecDeque;
-use std::sync::mpsc::{Receiver, sync_channel};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::PoisonError;
 use std::time::{Duration, Instant};
 
 use super::device_queue::{DeviceQueue, DeviceState, QueuedJob, RunOutcome, down_reasons, reject};
@@ -12,6 +11,8 @@ use super::job::{GpuJob, JobResult};
 use super::partition_handle::PartitionHandle;
 use crate::surface::devices::MIN_PARTITION_BRICKS;
 use crate::surface::{DeviceStatus, SurfaceError};
+use crate::sync::mpsc::{Receiver, sync_channel};
+use crate::sync::{Condvar, Mutex, MutexGuard};
 
 /// Settings of a pool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,7 +65,7 @@ pub(super) struct Ticket {
 
 /// Reason why a job was not enqueued.
 pub(super) enum EnqueueError {
-    /// The queues of all eligible devices are full.
+    /// The queues of all eligible devices are still full after a wait.
     Full,
     /// No device is eligible; with the reasons of those that are down.
     NoDevice(String),
@@ -100,12 +101,14 @@ impl Scheduler {
     }
 
     /// Enqueues `job` at the least loaded device that is up and on which it has failed fewer than `max_failures` times.
-    /// Prefers a device that already failed this job: it has just been rebuilt, and the others are probably busy.
+    /// Prefers a device that already failed this job: it has just been rebuilt, and the others are probably busy. If
+    /// all queues are full, waits until a queue or a device changes, at most for `timeout`.
     pub(super) fn enqueue(
         &self,
         job: &GpuJob,
         failures: &[usize],
         max_failures: usize,
+        timeout: Duration,
     ) -> Result<Ticket, EnqueueError> {
         let mut state = self.lock();
         let queues = &state.queues;
@@ -116,7 +119,10 @@ impl Scheduler {
         let best = (0..queues.len())
             .filter(|n| eligible(n) && queues[*n].waiting.len() < self.settings.queue)
             .min_by_key(|&n| (Reverse(failures[n]), queues[n].load, queues[n].counters.finished));
-        let Some(n) = best else { return Err(EnqueueError::Full) };
+        let Some(n) = best else {
+            drop(self.changed.wait_timeout(state, timeout));
+            return Err(EnqueueError::Full);
+        };
         let ticket = state.push(n, job, None, failures.iter().any(|n| *n > 0));
         drop(state);
         self.added[n].notify_one();
@@ -150,11 +156,6 @@ impl Scheduler {
             self.added[ticket.device].notify_one();
         }
         Some(tickets)
-    }
-
-    /// Waits until a queue or a device has changed, at most for `timeout`.
-    pub(super) fn wait_for_change(&self, timeout: Duration) {
-        drop(self.changed.wait_timeout(self.lock(), timeout));
     }
 
     /// Removes a job from its queue. A running job checks its cancellation token by itself.

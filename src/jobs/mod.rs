@@ -12,6 +12,9 @@ mod cost;
 mod devices;
 mod durable_job;
 mod error;
+#[cfg(test)]
+#[cfg(feature = "shuttle")]
+mod interleavings;
 mod job_store;
 mod key;
 mod pool;

@@ -1,6 +1,6 @@
 //! Queued and running jobs behind one lock. A job that nobody waits for is removed, or cancelled if it runs.
 
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 
 use metrics::gauge;
@@ -13,6 +13,7 @@ use super::{Outcome, Refusal, Task, Ticket};
 use crate::pipeline;
 use crate::single_flight::{self, ResultReceiver};
 use crate::surface::CancelToken;
+use crate::sync::{Condvar, Mutex, MutexGuard};
 use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, SpanKind, TraceSpan};
 
 struct State {

@@ -11,7 +11,6 @@ use metrics::counter;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 use object_store::{GetOptions, GetRange, GetResult, ObjectMeta, ObjectStore, ObjectStoreExt as _, PutMode};
-use tokio::task::spawn_blocking;
 
 use super::error::StoreError;
 use super::lock::{create_folder, sync_folder};
@@ -22,6 +21,7 @@ use super::s3::{self, Bucket};
 use super::secret::{self, Secret};
 use super::stale;
 use crate::config::StoreConfig;
+use crate::sync::spawn_blocking;
 use crate::telemetry::STORE_ERRORS;
 
 /// Size of a part of a large object on S3, bytes. S3 requires at least 5 MiB and accepts 10,000 parts: 80 GB.

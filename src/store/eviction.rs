@@ -50,6 +50,11 @@ impl Reservation {
         }
         Ok(())
     }
+
+    /// Returns the reserved bytes, which the caller releases.
+    pub(super) fn take(&mut self) -> u64 {
+        std::mem::take(&mut self.bytes)
+    }
 }
 
 impl Drop for Reservation {

@@ -7,16 +7,16 @@ use std::hash::{Hash as _, Hasher as _};
 use std::ops::Range;
 use std::path::Path;
 use std::sync::atomic::AtomicUsize;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, PoisonError};
 use std::time::SystemTime;
 
 use bytes::Bytes;
 use metrics::counter;
-use tokio::runtime::Handle;
 use tokio::sync::Mutex as AsyncMutex;
 
 use super::backend::Backend;
 use super::error::StoreError;
+use super::eviction::Reservation;
 use super::index::{Index, Seen};
 use super::memory::Memory;
 use super::name::{Folder, Name};
@@ -24,6 +24,7 @@ use super::object::{ByteStream, Meta, Pin, Stored, Usage};
 use super::secret::Secret;
 use super::stream;
 use crate::config::StoreConfig;
+use crate::sync::{Handle, Mutex, MutexGuard};
 use crate::telemetry::CACHE_REQUESTS;
 
 /// Number of locks for writing and removing. Names share them by hash.
@@ -292,11 +293,13 @@ impl Store {
         &self.0.write_locks[ix]
     }
 
-    /// Indexes an object that was just written under the lock of its name. Caches small results in memory.
-    pub(super) fn commit(&self, name: &Name, size: u64, bytes: Option<&Bytes>) {
+    /// Indexes an object that was just written under the lock of its name, and ends its reservation in the same step,
+    /// so that it never counts twice. Caches small results in memory.
+    pub(super) fn commit(&self, name: &Name, size: u64, bytes: Option<&Bytes>, reservation: &mut Reservation) {
         let now = SystemTime::now();
         let mut index = self.index();
         index.commit(name, size, now);
+        index.release(reservation.take());
         match bytes {
             Some(bytes) => self.0.memory.put(name, Stored { bytes: bytes.clone(), meta: Meta { size, modified: now } }),
             None => self.0.memory.remove(name),

@@ -16,6 +16,9 @@ mod eviction;
 pub(crate) mod faulty;
 mod handle;
 mod index;
+#[cfg(test)]
+#[cfg(feature = "shuttle")]
+mod interleavings;
 mod lock;
 mod memory;
 mod name;

@@ -4,6 +4,7 @@ use bytes::Bytes;
 use object_store::{ObjectStoreExt as _, WriteMultipart};
 
 use super::error::StoreError;
+use super::eviction::Reservation;
 use super::handle::Store;
 use super::name::{Folder, Name};
 
@@ -59,9 +60,9 @@ impl Store {
             let size = bytes.len() as u64;
             let mut reservation = store.empty_reservation(&name);
             reservation.grow(size).await?;
-            match store.write_reserved(&name, &bytes, new).await {
+            match store.write_reserved(&name, &bytes, new, &mut reservation).await {
                 Err(StoreError::NoSpace { .. }) if store.evict_for(size).await => {
-                    store.write_reserved(&name, &bytes, new).await
+                    store.write_reserved(&name, &bytes, new, &mut reservation).await
                 }
                 done => done,
             }
@@ -69,7 +70,13 @@ impl Store {
         .await
     }
 
-    async fn write_reserved(&self, name: &Name, bytes: &Bytes, new: bool) -> Result<bool, StoreError> {
+    async fn write_reserved(
+        &self,
+        name: &Name,
+        bytes: &Bytes,
+        new: bool,
+        reservation: &mut Reservation,
+    ) -> Result<bool, StoreError> {
         let _lock = self.write_lock(name).lock().await;
         let backend = &self.0.backend;
         // Content-addressed objects are equal anyway; only job documents need an atomic check.
@@ -84,7 +91,7 @@ impl Store {
         } else {
             put_in_parts(self, name, bytes.clone()).await?;
         }
-        self.commit(name, bytes.len() as u64, Some(bytes));
+        self.commit(name, bytes.len() as u64, Some(bytes), reservation);
         Ok(true)
     }
 }

@@ -68,11 +68,11 @@ impl Writer {
         let _lock = self.store.write_lock(&self.name).lock().await;
         if let Some(upload) = self.upload.take() {
             upload.finish().await?;
-            self.store.commit(&self.name, self.uploaded, None);
+            self.store.commit(&self.name, self.uploaded, None, &mut self.reservation);
         } else {
             // An object of one part needs no multipart upload, and may be cached.
             self.store.0.backend.put(&self.name, last.clone(), false).await?;
-            self.store.commit(&self.name, last.len() as u64, Some(&last));
+            self.store.commit(&self.name, last.len() as u64, Some(&last), &mut self.reservation);
         }
         Ok(())
     }

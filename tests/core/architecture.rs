@@ -58,7 +58,12 @@ const NOT_CORE: &[&str] = &[
 const LAYERS: &[Layer] = &[
     Layer { name: "surface", layers: &[], crates: NOT_CORE },
     Layer { name: "picture", layers: &[("surface", Any)], crates: NOT_CORE },
-    Layer { name: "gpu", layers: &[("surface", Any), ("picture", Any)], crates: SERVICE },
+    Layer {
+        name: "sync",
+        layers: &[],
+        crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
+    },
+    Layer { name: "gpu", layers: &[("surface", Any), ("picture", Any), ("sync", Any)], crates: SERVICE },
     Layer {
         name: "structure",
         layers: &[("surface", Only(&["Spheres", "SurfaceError", "spheres"]))],
@@ -104,7 +109,7 @@ const LAYERS: &[Layer] = &[
     },
     Layer {
         name: "single_flight",
-        layers: &[],
+        layers: &[("sync", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
     Layer {
@@ -114,7 +119,7 @@ const LAYERS: &[Layer] = &[
     },
     Layer {
         name: "store",
-        layers: &[("config", Any), ("telemetry", Any), ("tls", Any)],
+        layers: &[("config", Any), ("telemetry", Any), ("tls", Any), ("sync", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
     Layer {
@@ -143,6 +148,7 @@ const LAYERS: &[Layer] = &[
             ("single_flight", Any),
             ("memory_budget", Any),
             ("store", Any),
+            ("sync", Any),
         ],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap"],
     },

@@ -1,0 +1,138 @@
+//! Interleavings of requests, workers and shutdown.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
+
+use bytes::Bytes;
+use shuttle::future::block_on;
+
+use super::queue::Queue;
+use super::rank::{Client, DEFAULT_URGENCY, Rank};
+use super::{Failure, Refusal, Task, Ticket};
+use crate::pipeline::params;
+use crate::store::Digest;
+use crate::sync::thread::{self, JoinHandle};
+use crate::telemetry::SpanParent;
+
+/// Number of schedules of a test.
+const SCHEDULES: usize = 10_000;
+
+/// Creates a task; tasks of the same number are identical.
+fn task(number: u8, batch: bool) -> Task {
+    let input = Bytes::from(vec![number]);
+    Task {
+        digest: Digest::of(&input),
+        input,
+        strict: false,
+        job: params::parse(std::iter::empty::<(&str, &str)>()).unwrap().job,
+        rank: Rank { client: Client::named("a"), batch, urgency: DEFAULT_URGENCY },
+        lease: None,
+        parent: SpanParent::default(),
+        id: None,
+    }
+}
+
+fn push(queue: &Arc<Queue>, number: u8, batch: bool) -> Result<Ticket, Refusal> {
+    queue.push(task(number, batch), Duration::from_hours(1), None)
+}
+
+/// Waits for the end of a job. Returns true if it ran.
+fn ran(mut ticket: Ticket) -> bool {
+    ticket.outcome.take().is_some_and(|mut outcome| block_on(outcome.recv()).is_some())
+}
+
+/// Starts two workers, which count their runs.
+fn workers(queue: &Arc<Queue>, runs: &Arc<AtomicUsize>) -> Vec<JoinHandle<()>> {
+    let worker = || {
+        let (queue, runs) = (Arc::clone(queue), Arc::clone(runs));
+        thread::spawn(move || {
+            while let Some(entry) = queue.pop() {
+                runs.fetch_add(1, Ordering::SeqCst);
+                thread::yield_now();
+                let outcome = Err(Failure::Panicked { message: "scripted".to_owned() });
+                queue.done(entry.id, Some(outcome), None);
+            }
+        })
+    };
+    vec![worker(), worker()]
+}
+
+fn join(workers: Vec<JoinHandle<()>>) {
+    for worker in workers {
+        worker.join().unwrap();
+    }
+}
+
+#[test]
+fn every_waiting_request_gets_an_outcome_although_others_leave() {
+    shuttle::check_random(
+        || {
+            let (queue, runs) = (Arc::new(Queue::new(8, 2, Duration::ZERO)), Arc::default());
+            let workers = workers(&queue, &runs);
+            let requests: Vec<_> = (0..4)
+                .map(|n| {
+                    let queue = Arc::clone(&queue);
+                    thread::spawn(move || {
+                        let ticket = push(&queue, n % 2, false).unwrap();
+                        // The last one disconnects.
+                        n == 3 || ran(ticket)
+                    })
+                })
+                .collect();
+            assert!(requests.into_iter().all(|request| request.join().unwrap()));
+            block_on(queue.idle());
+            queue.close();
+            join(workers);
+            assert!((1..=4).contains(&runs.load(Ordering::SeqCst)));
+        },
+        SCHEDULES,
+    );
+}
+
+#[test]
+fn no_request_waits_for_ever_when_the_service_stops() {
+    shuttle::check_random(
+        || {
+            let (queue, runs) = (Arc::new(Queue::new(8, 2, Duration::ZERO)), Arc::default());
+            let workers = workers(&queue, &runs);
+            let requests: Vec<_> = (0..3)
+                .map(|n| {
+                    let queue = Arc::clone(&queue);
+                    // A refusal ends the request as well.
+                    thread::spawn(move || push(&queue, n, false).is_ok_and(ran))
+                })
+                .collect();
+            queue.close();
+            queue.cancel_all();
+            let ran = requests.into_iter().map(|request| request.join().unwrap()).filter(|ran| *ran).count();
+            join(workers);
+            block_on(queue.idle());
+            assert!(ran <= runs.load(Ordering::SeqCst));
+        },
+        SCHEDULES,
+    );
+}
+
+#[test]
+fn durable_jobs_run_or_are_left_to_the_next_process() {
+    shuttle::check_random(
+        || {
+            let (queue, runs) = (Arc::new(Queue::new(8, 2, Duration::ZERO)), Arc::default());
+            let workers = workers(&queue, &runs);
+            let requests: Vec<_> = (0..3)
+                .map(|n| {
+                    let queue = Arc::clone(&queue);
+                    thread::spawn(move || ran(push(&queue, n, true).unwrap()))
+                })
+                .collect();
+            queue.leave();
+            let ran = requests.into_iter().map(|request| request.join().unwrap()).filter(|ran| *ran).count();
+            block_on(queue.idle());
+            queue.close();
+            join(workers);
+            assert_eq!(ran, runs.load(Ordering::SeqCst), "each job that ran has told its request so");
+        },
+        SCHEDULES,
+    );
+}

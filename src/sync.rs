@@ -1,0 +1,49 @@
+//! Locks, channels, threads and tasks of the concurrent modules: those of `std` and Tokio, or, with the feature
+//! `shuttle`, those of Shuttle, whose scheduler explores their interleavings in the tests named `interleavings`.
+
+#[cfg(all(feature = "server", not(feature = "shuttle")))]
+pub(crate) use tokio::{runtime::Handle, task::spawn_blocking};
+#[cfg(feature = "shuttle")]
+pub(crate) use {
+    shuttle::sync::{Condvar, Mutex, MutexGuard, mpsc},
+    shuttle::thread,
+};
+#[cfg(not(feature = "shuttle"))]
+pub(crate) use {
+    std::sync::{Condvar, Mutex, MutexGuard, mpsc},
+    std::thread,
+};
+
+/// Counterpart of Tokio's handle: the scheduler of Shuttle runs all tasks.
+#[cfg(feature = "shuttle")]
+#[derive(Debug, Clone)]
+pub(crate) struct Handle;
+
+#[cfg(feature = "shuttle")]
+impl Handle {
+    /// Returns the handle.
+    pub(crate) fn current() -> Self {
+        Self
+    }
+
+    /// Starts a task, which runs to its end even if the returned handle is dropped.
+    #[expect(clippy::unused_self, reason = "has the signature of Tokio's handle")]
+    pub(crate) fn spawn<T: Send + 'static>(
+        &self,
+        task: impl Future<Output = T> + Send + 'static,
+    ) -> shuttle::future::JoinHandle<T> {
+        shuttle::future::spawn(task)
+    }
+
+    /// Runs a task on the current thread.
+    #[expect(clippy::unused_self, reason = "has the signature of Tokio's handle")]
+    pub(crate) fn block_on<T>(&self, task: impl Future<Output = T>) -> T {
+        shuttle::future::block_on(task)
+    }
+}
+
+/// Runs `work` at once: threads outside of the scheduler would be invisible to it.
+#[cfg(feature = "shuttle")]
+pub(crate) async fn spawn_blocking<T>(work: impl FnOnce() -> T) -> std::io::Result<T> {
+    Ok(work())
+}
