@@ -114,13 +114,13 @@ pub(super) fn extension() -> &'static str {
 pub(super) mod tests {
     use std::cell::Cell;
 
-    use super::super::lattice::Lattice;
-    use super::super::occupancy::Occupancy;
-    use super::super::{
+    use super::*;
+    use crate::surface::lattice::Lattice;
+    use crate::surface::occupancy::Occupancy;
+    use crate::surface::{
         Backend as _, Control, CpuBackend, Kernel, Measures, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
         Validation,
     };
-    use super::*;
 
     /// Instruction set of the dispatched functions.
     #[derive(Debug, Clone, Copy)]
