@@ -96,7 +96,7 @@ pub fn load(
     if let Some(path) = file {
         let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Read { path: path.to_owned(), error })?;
         let table: Value = toml::from_str(&text)
-            .map_err(|e| ConfigError::Syntax { path: path.to_owned(), reason: e.to_string().trim().to_owned() })?;
+            .map_err(|e| ConfigError::Syntax { path: path.to_owned(), reason: tree.syntax(&text, &e) })?;
         let source = Source::File { path: path.to_owned() };
         for (section, entries) in table.as_object().into_iter().flatten() {
             let Some(entries) = entries.as_object() else {
@@ -134,6 +134,17 @@ impl Tree {
         let config = Config::default();
         let defaults = serde_json::to_value(&config).unwrap_or(Value::Null);
         Self { values: defaults.clone(), defaults, config, sources: BTreeMap::new() }
+    }
+
+    /// Returns the position, the key if it is known, and the message of a syntax error. The line may hold a secret.
+    fn syntax(&self, text: &str, error: &toml::de::Error) -> String {
+        let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+        let line = before.split('\n').count();
+        let column = before.rsplit('\n').next().unwrap_or_default().chars().count() + 1;
+        let key = text.split('\n').nth(line - 1).and_then(|line| line.split('=').next()).unwrap_or_default().trim();
+        let is_known = self.keys().iter().any(|known| known.split('.').next_back() == Some(key));
+        let key = if is_known { format!(", key `{key}`") } else { String::new() };
+        format!("line {line}, column {column}{key}: {}", error.message())
     }
 
     /// Returns a warning for a variable such as `MOLMESH_LIMITS_ATOMS`, which lacks an underscore and is ignored.

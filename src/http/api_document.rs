@@ -76,3 +76,38 @@ pub(super) async fn yaml() -> Result<Response, Problem> {
 pub(super) async fn json() -> Result<Response, Problem> {
     answer(1, "application/json")
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::super::scopes::TABLE;
+    use super::*;
+
+    /// Operations outside the document: the web page, the document itself and the page that shows it.
+    const PAGES: [&str; 10] = [
+        "GET /",
+        "GET /assets/{file}",
+        "GET /docs",
+        "GET /docs.js",
+        "GET /molmesh-viewer.js",
+        "GET /openapi.json",
+        "GET /openapi.yaml",
+        "GET /sample.pdb",
+        "GET /swagger-ui-bundle.js",
+        "GET /swagger-ui.css",
+    ];
+
+    #[test]
+    fn the_document_has_every_operation() {
+        let document = serde_json::to_value(Description::openapi()).unwrap();
+        let paths = document["paths"].as_object().unwrap().iter();
+        let described = paths.flat_map(|(path, item)| {
+            item.as_object().unwrap().keys().map(move |method| format!("{} {path}", method.to_uppercase()))
+        });
+        let described: BTreeSet<String> = described.chain(PAGES.map(str::to_owned)).collect();
+        let listed: BTreeSet<String> = TABLE.iter().map(|row| format!("{} {}", row.method, row.path)).collect();
+        assert_eq!(described, listed);
+        assert_eq!(listed.len(), TABLE.len(), "no duplicates");
+    }
+}

@@ -81,12 +81,7 @@ fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Resp
 
 /// Answers with a file that is compressed with gzip. Inflates it for clients that do not accept gzip.
 fn gzip_file(request: &HeaderMap, bytes: &'static [u8]) -> Result<Response, Problem> {
-    let accepts_gzip = |coding: &str| {
-        let (name, weight) = coding.split_once(';').unwrap_or((coding, "q=1"));
-        matches!(name.trim(), "gzip" | "*") && weight.trim().strip_prefix("q=").is_none_or(|q| q.parse() != Ok(0.0))
-    };
-    let accepted = request.get_all(ACCEPT_ENCODING).iter().filter_map(|value| value.to_str().ok());
-    if accepted.flat_map(|value| value.split(',')).any(accepts_gzip) {
+    if accepts_gzip(request) {
         let coding = [(CONTENT_ENCODING, "gzip"), (VARY, "accept-encoding")];
         return Ok((coding, Bytes::from_static(bytes)).into_response());
     }
@@ -106,6 +101,19 @@ fn inflated(bytes: &'static [u8]) -> io::Result<Bytes> {
     let plain = Bytes::from(plain);
     files.insert(bytes.as_ptr().addr(), plain.clone());
     Ok(plain)
+}
+
+/// Returns true if `Accept-Encoding` accepts gzip: by its name, or by `*` if the header does not name it.
+fn accepts_gzip(request: &HeaderMap) -> bool {
+    let values = request.get_all(ACCEPT_ENCODING).iter().filter_map(|value| value.to_str().ok());
+    let codings =
+        values.flat_map(|value| value.split(',')).map(|coding| coding.split_once(';').unwrap_or((coding, "")));
+    let codings: Vec<_> = codings.collect();
+    let accepts = |coding: &str| {
+        let (_, weight) = codings.iter().find(|(name, _)| name.trim().eq_ignore_ascii_case(coding))?;
+        Some(weight.trim().strip_prefix("q=").is_none_or(|q| q.parse() != Ok(0.0)))
+    };
+    accepts("gzip").or_else(|| accepts("*")).unwrap_or(false)
 }
 
 /// Serves the viewer.
@@ -170,6 +178,28 @@ mod tests {
         let [first, second] = [(); 2].map(|()| inflated(file).unwrap());
         assert!(first.len() > file.len());
         assert_eq!(first.as_ptr(), second.as_ptr());
+    }
+
+    #[test]
+    fn gzip_is_accepted_by_name_or_by_wildcard() {
+        for (header, accepted) in [
+            ("gzip", true),
+            ("br, GZIP;q=0.5", true),
+            ("*", true),
+            ("br;q=1, *;q=0.1", true),
+            ("*;q=0, gzip", true),
+            ("", false),
+            ("br", false),
+            ("gzip;q=0", false),
+            ("gzip; q=0.000", false),
+            ("*;q=0", false),
+            ("gzip;q=0, *", false),
+            ("*, gzip;q=0", false),
+        ] {
+            let headers = HeaderMap::from_iter([(ACCEPT_ENCODING, header.parse().unwrap())]);
+            assert_eq!(accepts_gzip(&headers), accepted, "{header}");
+        }
+        assert!(!accepts_gzip(&HeaderMap::new()));
     }
 
     #[test]

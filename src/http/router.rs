@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::middleware::from_fn;
-use axum::routing::{get, post};
+use axum::routing::{MethodRouter, get, post};
 
 use super::state::Shared;
 use super::{
@@ -21,44 +21,64 @@ pub(super) fn router(app: &Shared) -> Router {
     let longest = Duration::from_millis(app.config.jobs.deadline_ms).max(Duration::from_secs(jobs::MAX_WAIT_S));
     let input = Duration::from_millis(app.config.server.body_timeout_ms.max(app.config.archive.timeout_ms));
     let timeout = input + longest + MARGIN;
-    let router = Router::new()
-        // Meshes.
-        .route("/v1/meshes", post(meshes::create))
-        .route("/v1/report", post(meshes::report))
-        .route("/v1/pdb/{id}/{file}", get(pdb::surface))
-        .route("/v1/pdb/{id}/report.json", get(pdb::report))
-        .route("/v1/pdb/{id}/atoms", get(atoms::of_entry))
-        .route("/v1/structures", post(structures::create))
-        .route("/v1/structures/{digest}", get(structures::show))
-        .route("/v1/structures/{digest}/atoms", get(atoms::of_structure))
-        .route("/v1/structures/{digest}/{file}", get(structures::surface))
-        .route("/v1/structures/{digest}/report.json", get(structures::report))
-        .route("/v1/estimate", post(estimate::create))
-        // Jobs and results.
-        .route("/v1/jobs/{id}", get(jobs::show).delete(jobs::dismiss))
-        .route("/v1/jobs/{id}/events", get(events::show))
-        .route("/v1/jobs/{id}/result", get(jobs::result))
-        .route("/v1/results/{file}", get(results::show))
-        .route("/v1/results/{key}/report.json", get(results::report))
-        // The service itself.
-        .route("/v1/capabilities", get(capabilities::show))
-        .route("/problems", get(problems::list))
-        .route("/problems/{slug}", get(problems::one))
-        .route("/livez", get(health::live))
-        .route("/readyz", get(health::ready))
-        .route("/version", get(health::version))
-        .route("/openapi.yaml", get(api_document::yaml))
-        .route("/openapi.json", get(api_document::json))
-        .route("/docs", get(page::docs))
-        .route("/docs.js", get(page::docs_script))
-        .route("/swagger-ui.css", get(page::swagger_style))
-        .route("/swagger-ui-bundle.js", get(page::swagger_script))
-        // The web page.
-        .route("/", get(page::index))
-        .route("/assets/{file}", get(page::asset))
-        .route("/molmesh-viewer.js", get(page::component))
-        .route("/sample.pdb", get(page::sample))
-        .layer(from_fn(negotiate::relabel))
-        .with_state(Arc::clone(app));
+    let router = routes().into_iter().fold(Router::new(), |router, (path, methods)| router.route(path, methods));
+    let router = router.layer(from_fn(negotiate::relabel)).with_state(Arc::clone(app));
     middleware::apply(router, timeout, app)
+}
+
+/// Paths with their methods. [`scopes::TABLE`](super::scopes::TABLE) has their scopes.
+fn routes() -> Vec<(&'static str, MethodRouter<Shared>)> {
+    vec![
+        // Meshes.
+        ("/v1/meshes", post(meshes::create)),
+        ("/v1/report", post(meshes::report)),
+        ("/v1/pdb/{id}/{file}", get(pdb::surface)),
+        ("/v1/pdb/{id}/report.json", get(pdb::report)),
+        ("/v1/pdb/{id}/atoms", get(atoms::of_entry)),
+        ("/v1/structures", post(structures::create)),
+        ("/v1/structures/{digest}", get(structures::show)),
+        ("/v1/structures/{digest}/atoms", get(atoms::of_structure)),
+        ("/v1/structures/{digest}/{file}", get(structures::surface)),
+        ("/v1/structures/{digest}/report.json", get(structures::report)),
+        ("/v1/estimate", post(estimate::create)),
+        // Jobs and results.
+        ("/v1/jobs/{id}", get(jobs::show).delete(jobs::dismiss)),
+        ("/v1/jobs/{id}/events", get(events::show)),
+        ("/v1/jobs/{id}/result", get(jobs::result)),
+        ("/v1/results/{file}", get(results::show)),
+        ("/v1/results/{key}/report.json", get(results::report)),
+        // The service itself.
+        ("/v1/capabilities", get(capabilities::show)),
+        ("/problems", get(problems::list)),
+        ("/problems/{slug}", get(problems::one)),
+        ("/livez", get(health::live)),
+        ("/readyz", get(health::ready)),
+        ("/version", get(health::version)),
+        ("/openapi.yaml", get(api_document::yaml)),
+        ("/openapi.json", get(api_document::json)),
+        ("/docs", get(page::docs)),
+        ("/docs.js", get(page::docs_script)),
+        ("/swagger-ui.css", get(page::swagger_style)),
+        ("/swagger-ui-bundle.js", get(page::swagger_script)),
+        // The web page.
+        ("/", get(page::index)),
+        ("/assets/{file}", get(page::asset)),
+        ("/molmesh-viewer.js", get(page::component)),
+        ("/sample.pdb", get(page::sample)),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::super::scopes::TABLE;
+    use super::routes;
+
+    #[test]
+    fn every_route_has_a_scope() {
+        let routed: BTreeSet<&str> = routes().into_iter().map(|(path, _)| path).collect();
+        let listed: BTreeSet<&str> = TABLE.iter().map(|row| row.path).collect();
+        assert_eq!(routed, listed);
+    }
 }

@@ -1,4 +1,4 @@
-//! Scopes that the operations need. The OpenAPI document uses this table, and a test compares it with the router.
+//! Scopes that the operations need. The OpenAPI document uses this table, and tests compare it with the router.
 
 use axum::extract::{MatchedPath, Request};
 use axum::http::Method;
@@ -79,31 +79,7 @@ fn of(method: &Method, path: &str) -> Option<Scope> {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
-
     use super::*;
-
-    /// Operations of the router.
-    fn routes() -> BTreeSet<String> {
-        let lines = include_str!("router.rs").lines().filter_map(|line| line.trim().strip_prefix(".route(\""));
-        let operations = lines.flat_map(|line| {
-            let (path, handlers) = line.split_once("\", ").unwrap_or_default();
-            let methods = ["get", "post", "put", "patch", "delete"].into_iter();
-            let is = |method: &&str| {
-                handlers.starts_with(&format!("{method}(")) || handlers.contains(&format!(".{method}("))
-            };
-            methods.filter(is).map(|method| format!("{} {path}", method.to_uppercase())).collect::<Vec<_>>()
-        });
-        operations.collect()
-    }
-
-    #[test]
-    fn every_route_has_a_row_and_every_row_a_route() {
-        let rows: BTreeSet<String> = TABLE.iter().map(|row| format!("{} {}", row.method, row.path)).collect();
-        assert_eq!(rows.len(), TABLE.len());
-        assert_eq!(routes(), rows);
-        assert!(rows.contains("DELETE /v1/jobs/{id}"));
-    }
 
     #[test]
     fn heads_are_gets_and_what_is_unknown_is_closed() {

@@ -10,6 +10,7 @@ use super::durable_job::DurableJob;
 use super::job_store::{Inner, JobStore};
 use super::record::{JobId, Record};
 use crate::store::{Digest, Folder, Name, Namespace, Pin, RecordCaps, RecordPlace, StoreError};
+use crate::telemetry::shorten;
 
 /// Concurrent reads of records at startup.
 const RECOVERY_READS: usize = 64;
@@ -74,7 +75,8 @@ impl Inner {
         match self.store.get(name).await?.map(|stored| Record::from_bytes(&stored.bytes)) {
             Some(Ok(record)) => return Ok(Some(record)),
             Some(Err(error)) => {
-                tracing::error!(%name, %error, "the record of a job cannot be read; moving it into quarantine");
+                let short = shorten(&name.to_string());
+                tracing::error!(name = short, %error, "the record of a job cannot be read; moving it into quarantine");
                 self.store.quarantine(name).await?;
             }
             None if self.store.is_quarantined(name).await? => {}

@@ -10,7 +10,7 @@ use super::handle::Store;
 use super::index::{EvictionCandidate, ReserveError};
 use super::name::{Folder, Name};
 use super::stale::STALE;
-use crate::telemetry::STORE_REMOVED;
+use crate::telemetry::{STORE_REMOVED, shorten};
 
 /// Attempts to free space. Other requests may use the candidates or take the freed space in between.
 const ATTEMPTS: usize = 16;
@@ -179,7 +179,7 @@ impl Store {
                 Ok(false) => {}
                 Err(error) => {
                     *failed += 1;
-                    tracing::warn!(%error, "an object could not be removed");
+                    tracing::warn!(error = shorten(&error.to_string()), "an object could not be removed");
                 }
             }
         }

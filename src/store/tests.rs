@@ -109,12 +109,18 @@ async fn the_last_use_survives_a_restart() {
 
 #[tokio::test]
 async fn objects_that_cannot_be_removed_still_count() {
-    let (_dir, faults, store) = faulty(1000).await;
+    let (dir, faults, store) = faulty(1000).await;
     store.put(&name(1), body(600)).await.unwrap();
     faults.stuck.store(true, Ordering::Relaxed);
     let far = SystemTime::now() + Duration::from_secs(1 << 30);
+    let log = std::sync::Mutex::new(std::fs::File::create(dir.path().join("log")).unwrap());
+    let logging = tracing::subscriber::set_default(tracing_subscriber::fmt().with_writer(log).finish());
     let swept = store.sweep(far).await;
+    drop(logging);
     assert_eq!((swept.expired, swept.bytes, swept.failed), (0, 0, 1));
+    let log = std::fs::read_to_string(dir.path().join("log")).unwrap();
+    assert!(log.contains("an object could not be removed") && log.contains('…'), "{log}");
+    assert!(!log.contains(&name(1).to_string()), "{log}");
     assert!(matches!(store.delete(&name(1)).await, Err(StoreError::Denied { op: "delete", .. })));
     let refused = store.put(&name(2), body(600)).await;
     assert!(matches!(refused, Err(StoreError::Full { bytes: 600, .. })), "{refused:?}");

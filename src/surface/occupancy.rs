@@ -15,6 +15,7 @@ use super::cpu;
 use super::error::SurfaceError;
 use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_i32, to_u32};
 use super::params::SurfaceLimits;
+use super::simd::dispatched;
 
 /// Maximum number of atoms of a run, which one thread marks.
 const RUN: usize = 1024;
@@ -243,9 +244,10 @@ impl TileNeighbourhood {
     }
 }
 
+// AVX-512 takes 1.7 times as long, because each comparison moves its mask bit by bit.
+dispatched! {
+without AVX-512:
 /// Marks the bricks that `atoms`, all in one tile, reach.
-// AVX-512 is left out: it takes 1.7 times as long, because each comparison moves its mask bit by bit.
-#[multiversion::multiversion(targets("x86_64+avx2+fma+bmi1+bmi2+lzcnt+popcnt"))]
 fn mark_run(atoms: &[LatticeAtom], reaches: &[f32], max_reach: f32) -> Vec<TileOccupancy> {
     let Some(first) = atoms.first() else { return Vec::new() };
     let own = tile_of(first.cell);
@@ -273,6 +275,7 @@ fn mark_run(atoms: &[LatticeAtom], reaches: &[f32], max_reach: f32) -> Vec<TileO
         around.tile(own).occupied[local as usize >> 6] |= 1 << (local & 63);
     }
     around.marked
+}
 }
 
 /// Number of tiles between an atom's tile and the tile that holds `local`, a coordinate relative to the first.

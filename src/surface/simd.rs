@@ -1,17 +1,54 @@
 //! SIMD-friendly primitives, inlined into `multiversion` functions, which compile them per instruction set.
 
 /// Compiles a function once per instruction set and picks the best one at run time, so that a portable build runs
-/// at native speed.
+/// at native speed. `without AVX-512:` before the function leaves that set out.
 macro_rules! dispatched {
+    (without AVX-512: $($function:tt)*) => {
+        $crate::surface::simd::versions! { ["x86_64+avx2+fma+bmi1+bmi2+lzcnt+popcnt"] $($function)* }
+    };
     ($($function:tt)*) => {
-        #[multiversion::multiversion(targets(
-            "x86_64+avx512f+avx512bw+avx512cd+avx512dq+avx512vl+avx512vbmi2+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
-            "x86_64+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
-        ))]
-        $($function)*
+        $crate::surface::simd::versions! {
+            [
+                "x86_64+avx512f+avx512bw+avx512cd+avx512dq+avx512vl+avx512vbmi2+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
+                "x86_64+avx2+fma+bmi1+bmi2+lzcnt+popcnt"
+            ]
+            $($function)*
+        }
     };
 }
 pub(super) use dispatched;
+
+#[cfg(not(test))]
+macro_rules! versions {
+    ([$($target:tt),*] $($function:tt)*) => {
+        #[multiversion::multiversion(targets($($target),*))]
+        $($function)*
+    };
+}
+/// In unit tests, [`tests::LEVEL`] of the thread chooses the instruction set.
+#[cfg(test)]
+macro_rules! versions {
+    ([$($target:tt),*] $(#[$attribute:meta])* $visibility:vis fn $name:ident($($argument:ident: $type:ty),* $(,)?)
+        $(-> $result:ty)? { $($body:tt)* }) => {
+        $(#[$attribute])*
+        $visibility fn $name($($argument: $type),*) $(-> $result)? {
+            #[multiversion::multiversion(targets($($target),*))]
+            fn best($($argument: $type),*) $(-> $result)? { $($body)* }
+            #[multiversion::multiversion(targets("x86_64+avx2+fma+bmi1+bmi2+lzcnt+popcnt"))]
+            fn avx2($($argument: $type),*) $(-> $result)? { $($body)* }
+            // All aarch64 processors have NEON, so this is the version without extensions on every architecture.
+            #[multiversion::multiversion(targets("aarch64+neon"))]
+            fn baseline($($argument: $type),*) $(-> $result)? { $($body)* }
+
+            match $crate::surface::simd::tests::LEVEL.get() {
+                $crate::surface::simd::tests::Level::Best => best($($argument),*),
+                $crate::surface::simd::tests::Level::Avx2 => avx2($($argument),*),
+                $crate::surface::simd::tests::Level::Baseline => baseline($($argument),*),
+            }
+        }
+    };
+}
+pub(super) use versions;
 
 /// `a·b + c`, fused where the target has the instruction. Without it `mul_add` is a slow library call.
 #[inline(always)]
@@ -74,8 +111,65 @@ pub(super) fn extension() -> &'static str {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
+    use std::cell::Cell;
+
     use super::*;
+    use crate::surface::lattice::Lattice;
+    use crate::surface::occupancy::Occupancy;
+    use crate::surface::{
+        Backend as _, Control, CpuBackend, Kernel, Measures, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
+        Validation,
+    };
+
+    /// Instruction set of the dispatched functions.
+    #[derive(Debug, Clone, Copy)]
+    pub(in crate::surface) enum Level {
+        /// The best of this processor.
+        Best,
+        /// AVX2 on x86-64 with AVX2, else [`Self::Baseline`].
+        Avx2,
+        /// The least that the architecture has.
+        Baseline,
+    }
+
+    thread_local! {
+        /// Level of the dispatched functions that this thread calls.
+        pub(in crate::surface) static LEVEL: Cell<Level> = const { Cell::new(Level::Best) };
+    }
+
+    /// Returns the arithmetic of a level and the results of all stages as text, which distinguishes all numbers.
+    fn results(level: Level, spheres: &Spheres, limits: &SurfaceLimits) -> (String, Vec<String>) {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).start_handler(move |_| LEVEL.set(level));
+        let run = |kernel| {
+            let options =
+                SurfaceOptions { kernel: Some(kernel), resolution: Some(0.7), atom_ids: true, ..Default::default() };
+            let (params, control) = (SurfaceParams::new(&options).unwrap(), Control::default());
+            let output = CpuBackend::default().write(spheres, &params, limits, &control, None).unwrap();
+            let measures = Measures::of(&output.mesh, Validation::Checksum, &control).unwrap();
+            let occupancy = Occupancy::new(&Lattice::new(spheres, &params).unwrap(), limits, &control).unwrap();
+            format!("{output:?}\n{measures:?}\n{occupancy:?}")
+        };
+        pool.build().unwrap().install(|| (arithmetic(), Kernel::ALL.iter().copied().map(run).collect()))
+    }
+
+    #[test]
+    fn instruction_sets_of_one_arithmetic_give_the_same_bytes() {
+        // Overlapping spheres at irregular places, and some at grid points.
+        let column = |factor: f64| (0..400).map(|i| f64::from(i) * factor % 23.0).collect();
+        let radii = (0..400_u16).map(|i| 1.0 + f32::from(i % 7) / 8.0).collect();
+        let spheres = Spheres::new(column(7.13), column(3.71), column(1.4), radii).unwrap();
+        let limits = SurfaceLimits::default();
+        let [best, avx2, baseline] =
+            [Level::Best, Level::Avx2, Level::Baseline].map(|level| results(level, &spheres, &limits));
+        for level in [&avx2, &baseline] {
+            // The numbers of classes differ in their last bits, so the forced level was used.
+            assert_eq!(level.0 == best.0, level.1 == best.1, "{} and {}", level.0, best.0);
+        }
+        let [fused, least] = [&best, &baseline].map(|(arithmetic, _)| arithmetic.ends_with(" fma"));
+        assert_eq!(fused, is_fused());
+        assert_eq!(least, cfg!(any(target_feature = "fma", target_arch = "aarch64")), "{}", baseline.0);
+    }
 
     #[test]
     fn the_arithmetic_matches_the_dispatch() {

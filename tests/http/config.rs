@@ -268,3 +268,26 @@ fn variables_without_two_underscores_are_reported() {
     }
     assert_eq!(load(None, pairs(&[("MOLMESH_LIMITS_ATOMS", "7")]), &[]).unwrap().config, Config::default());
 }
+
+#[test]
+fn syntax_errors_do_not_quote_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let error = |text: &str| {
+        let path = folder.path().join("molmesh.toml");
+        std::fs::write(&path, text).unwrap();
+        let message = load(Some(&path), pairs(&[]), &[]).unwrap_err().to_string();
+        assert!(!message.contains("hush"), "{message}");
+        message.split_once(" is not valid TOML: ").unwrap().1.to_owned()
+    };
+    for (text, position) in [
+        ("[store]\nsecret_access_key = \"hush\n", "line 2, column 26, key `secret_access_key`: "),
+        ("[store]\nsecret_access_key = hush\n", "line 2, column 21, key `secret_access_key`: "),
+        ("[access]\nsigning_secret = \"é\" hush", "line 2, column 22, key `signing_secret`: "),
+        ("hush = = 1", "line 1, column 8: "),
+        ("hush", "line 1, column "),
+        ("\n\n[hush", "line 3, column "),
+    ] {
+        let message = error(text);
+        assert!(message.starts_with(position), "{text:?}: {message}");
+    }
+}

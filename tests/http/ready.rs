@@ -74,6 +74,8 @@ fn unreadable_job_records_make_the_service_unready_until_they_are_deleted() {
     wait_for("the first mesh", || failing(&server.get("/readyz").json()) == ["records"]);
     let problem = server.get("/readyz").problem(503, "not-ready");
     assert!(problem["detail"].as_str().unwrap().starts_with("2 job records"), "{problem}");
+    let log = log_lines("the record of a job cannot be read").concat();
+    assert!(ids.iter().all(|id| log.contains(&format!("jobs/{}….json", &id[..8])) && !log.contains(id)), "{log}");
     for path in ["", "/events", "/result"] {
         server.get(&format!("/v1/jobs/{}{path}", ids[0])).problem(500, "record-unreadable");
     }

@@ -188,7 +188,7 @@ pub(super) fn config(bytes: &[u8]) {
     let variables = variables.map(|(name, value)| (name.to_owned(), value.to_owned()));
     match config::load(Some(&path), variables, &[]) {
         Ok(loaded) => assert!(loaded.config.limits.atoms > 0 && loaded.config.jobs.workers > 0, "a limit of zero"),
-        // Errors quote the line of the file, which may be long.
+        // Errors quote keys and values, which may be long.
         Err(error) => assert!(!error.to_string().is_empty()),
     }
 }
