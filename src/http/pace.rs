@@ -316,6 +316,7 @@ where
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::surface::OutOfMemory;
 
     #[tokio::test]
     async fn streams_are_charged_to_the_memory_budget() {
@@ -325,7 +326,8 @@ mod tests {
             let done = Arc::clone(&done);
             streams.execute(async move { done.notified().await });
         }
-        assert_eq!(budget.check().unwrap_err().held, 2 * STREAM_BUFFER as u64);
+        let Err(OutOfMemory::Budget { held, .. }) = budget.check() else { panic!("within the limit") };
+        assert_eq!(held, 2 * STREAM_BUFFER as u64);
         done.notify_waiters();
         while budget.check().is_err() {
             done.notify_one();

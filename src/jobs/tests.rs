@@ -372,11 +372,11 @@ async fn records_are_limited_in_total_and_for_each_client() {
     for (client, oldest) in [("a", &open[0]), ("c", &open[1])] {
         let new = fixture.accept_from(client).await.unwrap().record;
         assert_eq!(new.status, Status::Successful);
-        assert_eq!(fixture.jobs.view(oldest).await.unwrap(), None, "{client}");
-        assert!(fixture.jobs.view(&new.id).await.unwrap().is_some());
+        assert_eq!(fixture.jobs.view(oldest, Namespace::default()).await.unwrap(), None, "{client}");
+        assert!(fixture.jobs.view(&new.id, Namespace::default()).await.unwrap().is_some());
         assert_eq!(fixture.store.usage(Folder::Jobs).objects, 3);
     }
-    assert!(fixture.jobs.view(&open[2]).await.unwrap().is_some());
+    assert!(fixture.jobs.view(&open[2], Namespace::default()).await.unwrap().is_some());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
