@@ -12,7 +12,7 @@ use molmesh::config::Secret;
 const ASYNC: (&str, &str) = ("prefer", "respond-async");
 const SECRETS: &str = "b:0123456789abcdef0123456789abcdef a1@a:fedcba9876543210fedcba9876543210";
 
-/// Key texts, a server on which `a` and `b` are groups, and things of `a`.
+/// Server with the groups `a` and `b`, and a structure, a job and a result of `a`.
 struct Setup {
     keys: Keys,
     server: Running,

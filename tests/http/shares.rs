@@ -41,7 +41,7 @@ fn ask(from: &str, server: &Running, method: &str, path: &str, body: &[u8]) -> R
     read_reply(&mut begin(from, server, method, path, "", body), method == "HEAD")
 }
 
-/// Sends a request and reads the begin of its answer, whose rest stays with the server.
+/// Sends a request and reads the first bytes of its answer; the rest stays with the server.
 fn hold(from: &str, server: &Running, method: &str, path: &str, headers: &str, body: &[u8]) -> TcpStream {
     let mut stream = begin(from, server, method, path, headers, body);
     let mut start = [0; 12];
