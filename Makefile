@@ -79,7 +79,7 @@ container: $(if $(BINARY),,release) ## Build and test the images (two to four mi
 tests: ## Run only the tests
 	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)
 
-# The wrapper compiles the library with counters that guide the fuzzer. Dependencies are those of the tests.
+# The wrapper compiles the library with counters that guide the fuzzer.
 fuzz: override SECONDS := $(or $(SECONDS),30)
 fuzz: ## Fuzz readers, configuration, keys, records and requests, 30 s per target
 	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/fuzz/rustc.sh $(CARGO) build --locked --package molmesh-fuzz --target-dir target

@@ -18,7 +18,8 @@ extern "C" fn __sanitizer_cov_8bit_counters_init(start: *mut u8, stop: *mut u8) 
     }
 }
 
-/// Counters of the program, and the coverage of all inputs so far.
+/// Counters of the program, and the coverage of all inputs so far. Without counters, no coverage is new.
+#[derive(Default)]
 pub(crate) struct Coverage {
     counters: Vec<&'static [AtomicU8]>,
     /// One byte per counter, with one bit per range of counts.

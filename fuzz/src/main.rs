@@ -55,7 +55,9 @@ fn main() -> ExitCode {
     let seed = args.seed.unwrap_or_else(|| fastrand::u64(..));
     let done = match &args.command {
         None => all(args.seconds, seed, args.parallel.max(1)),
-        Some(Action::Target { name }) => one(name, args.seconds, seed),
+        Some(Action::Target { name }) => Coverage::new()
+            .ok_or("built without coverage: use `make fuzz`, or set RUSTC_WORKSPACE_WRAPPER".to_owned())
+            .and_then(|coverage| one(name, args.seconds, seed, coverage)),
         Some(Action::Replay { name, files }) => replay(name, files),
     };
     match done {
@@ -115,10 +117,8 @@ fn all(seconds: u64, seed: u64, parallel: usize) -> Result<bool, String> {
 }
 
 /// Fuzzes one target. Returns true if it did not fail.
-fn one(name: &str, seconds: u64, seed: u64) -> Result<bool, String> {
+fn one(name: &str, seconds: u64, seed: u64, mut coverage: Coverage) -> Result<bool, String> {
     let target = target(name)?;
-    let mut coverage =
-        Coverage::new().ok_or("built without coverage: use `make fuzz`, or set RUSTC_WORKSPACE_WRAPPER")?;
     let (folder, text) = (out(name), |error: io::Error| format!("{name}: {error}"));
     fs::create_dir_all(&folder).map_err(text)?;
     engine::record_panics();
