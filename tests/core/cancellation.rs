@@ -17,7 +17,7 @@ use crate::tools::files::MemoryFile;
 
 /// Maximum time from the cancellation to the end of a job.
 const LIMIT: Duration = Duration::from_millis(500);
-/// Time from the begin of the stage to the cancellation.
+/// Time from the start of the stage to the cancellation.
 const DELAY: Duration = Duration::from_millis(5);
 
 /// Cancels a job soon after one of its stages has begun.
@@ -32,7 +32,7 @@ impl CancelIn {
         Self { stage, cancel: CancelToken::default(), begun: Mutex::default() }
     }
 
-    fn begin(&self, stage: &'static str) {
+    fn start(&self, stage: &'static str) {
         let mut begun = self.begun.lock().unwrap();
         if stage == self.stage && begun.is_none() {
             *begun = Some(Instant::now());
@@ -57,13 +57,13 @@ impl CancelIn {
 
 impl ProgressSink for CancelIn {
     fn progress(&self, stage: &'static str, _fraction: f64) {
-        self.begin(stage);
+        self.start(stage);
     }
 }
 
 impl Observer for CancelIn {
     fn span(&self, stage: Stage, work: &mut dyn FnMut()) {
-        self.begin(stage.name());
+        self.start(stage.name());
         work();
     }
 }
@@ -114,7 +114,7 @@ fn jobs_end_soon_after_cancellation_in_any_stage() {
     let mut product =
         pipeline::run(&few, &quick, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
     let at = CancelIn::new("encode");
-    at.begin("encode");
+    at.start("encode");
     let written = product.file(Format::Obj).unwrap().write(&mut Output(at.cancel.clone()));
     at.assert_in_time();
     assert_eq!(written.unwrap_err().kind(), io::ErrorKind::BrokenPipe);
@@ -122,7 +122,7 @@ fn jobs_end_soon_after_cancellation_in_any_stage() {
     // Meshes of devices have one part.
     product.mesh.parts.clear();
     let at = CancelIn::new("measure");
-    at.begin("measure");
+    at.start("measure");
     let stopped = Measures::of(&product.mesh, Validation::Exact, &at.control());
     at.assert_in_time();
     assert_eq!(stopped.unwrap_err(), SurfaceError::Cancelled);

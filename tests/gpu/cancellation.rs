@@ -8,11 +8,11 @@ use molmesh::surface::{Backend as _, CancelToken, Control, Kernel, Observer, Sta
 
 use crate::gpu_support::{engine_with, params, spheres};
 
-/// Notes the begin of the first stage.
+/// Records the start of the first stage.
 #[derive(Default)]
-struct Begin(OnceLock<Instant>);
+struct Start(OnceLock<Instant>);
 
-impl Observer for Begin {
+impl Observer for Start {
     fn span(&self, _stage: Stage, work: &mut dyn FnMut()) {
         self.0.get_or_init(Instant::now);
         work();
@@ -30,17 +30,17 @@ fn jobs_end_soon_after_cancellation_at_any_time() {
     let (spheres, params) = (spheres(&rows), params(Kernel::Gaussian, 0.4));
     // In stage bin, and while the device works.
     for delay in [0, 5, 100, 400].map(Duration::from_millis) {
-        let (begin, cancel) = (Begin::default(), CancelToken::default());
-        let control = Control { cancel: cancel.clone(), observer: &begin, ..Control::default() };
+        let (start, cancel) = (Start::default(), CancelToken::default());
+        let control = Control { cancel: cancel.clone(), observer: &start, ..Control::default() };
         let stopped = std::thread::scope(|scope| {
             scope.spawn(|| {
-                let begun = *begin.0.wait();
-                std::thread::sleep(delay.saturating_sub(begun.elapsed()));
+                let started = *start.0.wait();
+                std::thread::sleep(delay.saturating_sub(started.elapsed()));
                 cancel.cancel();
             });
             backend.run(&spheres, &params, &SurfaceLimits::default(), &control)
         });
-        let time = begin.0.get().unwrap().elapsed();
+        let time = start.0.get().unwrap().elapsed();
         assert_eq!(stopped.map(|_| ()).unwrap_err(), SurfaceError::Cancelled, "{delay:?}");
         assert!(time < delay + Duration::from_millis(500), "{delay:?}: {time:?}");
     }
