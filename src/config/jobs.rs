@@ -34,9 +34,9 @@ pub struct JobsConfig {
     /// Number of results of synchronous requests that are stored concurrently. Default 4: more would compete with
     /// meshing; a result that is not stored is computed again for the next request.
     pub concurrent_saves: usize,
-    /// Number of asynchronous jobs on record, open and ended. Default 100,000: the records take 400 MB of disk in blocks
-    /// of 4 KiB, and listing them at the start takes seconds. At the limit, the record of the ended job that was not
-    /// used for the longest time is removed; if all jobs are open, new ones get a 503.
+    /// Number of asynchronous jobs on record, open and ended. Default 100,000: the records take 400 MB of disk in
+    /// blocks of 4 KiB, and listing them at the start takes seconds. At the limit, the record of the ended job that was
+    /// not used for the longest time is removed; if all jobs are open, new ones get a 503.
     pub records: usize,
     /// Number of asynchronous jobs of one client on record. Default 10,000: one client cannot displace the records of
     /// the others. At the limit as for `records`, among the jobs of the client.

@@ -4,8 +4,8 @@
 //! cancellation and panics are handled here, so callers only wait for a [`Ticket`]. This module knows no HTTP and no
 //! graphics API.
 //!
-//! `queue` holds `coalesced_job`s: identical requests share one. `job_store` keeps `durable_job`s, whose `records` survive
-//! the process.
+//! `queue` holds `coalesced_job`s: identical requests share one. `job_store` keeps `durable_job`s, whose `records`
+//! survive the process.
 
 mod coalesced_job;
 mod cost;

@@ -21,7 +21,7 @@ impl Inner {
         Ok([self.store.pin(&Name::input(input).within(space)), self.store.pin(&Name::job(id.as_str())?)])
     }
 
-    /// Makes room for the record of a new job. At a cap, forgets ended jobs.
+    /// Admits the record of a new job. At a cap, forgets ended jobs.
     pub(super) async fn admit(&self, id: &JobId) -> Result<RecordPlace, StoreError> {
         let caps = RecordCaps { total: self.config.records, per_client: self.config.records_per_client };
         let (place, removed) = self.store.admit_record(&Name::job(id.as_str())?, caps).await?;

@@ -1,5 +1,5 @@
 //! Caps on the number of jobs on record, in total and for each client. At a cap, the record of the ended job that was
-//! not used for the longest time makes room.
+//! not used for the longest time is removed.
 
 use std::collections::BTreeMap;
 

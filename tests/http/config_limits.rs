@@ -61,7 +61,11 @@ const ROWS: &[Row] = &[
     ),
     ("jobs.concurrent_saves", "molmesh_results_not_stored_total", "http/limits::concurrent_saves_are_limited"),
     ("jobs.records", "too-many-jobs", "http/jobs_durable::open_jobs_are_limited"),
-    ("jobs.records_per_client", "too-many-jobs", "src/jobs/tests::records_are_limited_in_total_and_for_each_client"),
+    (
+        "jobs.records_per_client",
+        "too-many-jobs",
+        "src/jobs/tests/records::records_are_limited_in_total_and_for_each_client",
+    ),
     ("devices.jobs", "molmesh_device_jobs", "http/devices::devices_are_listed_with_their_reasons"),
     ("devices.batch", "molmesh_device_shared_submissions_total", "gpu/pool::small_jobs_share_a_submission"),
     (

@@ -1,0 +1,115 @@
+//! Number of job records, and faults while they are read and written.
+
+use std::sync::atomic::Ordering;
+
+use super::{Fixture, PATIENT, ended, new_id};
+use crate::config::JobsConfig;
+use crate::jobs::record::{Record, now_ms};
+use crate::jobs::{AcceptError, JobId, Status};
+use crate::store::{Folder, Namespace, StoreError};
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn records_are_limited_in_total_and_for_each_client() {
+    let config = JobsConfig { records: 3, records_per_client: 2, ..JobsConfig::default() };
+    let fixture = Fixture::open(tempfile::tempdir().unwrap(), config).await;
+    // Results cannot be stored, so the jobs stay open.
+    fixture.faults.seal(Folder::Results);
+    let mut open = Vec::new();
+    for client in ["a", "a", "b"] {
+        open.push(fixture.accept_from(client).await.unwrap().record.id);
+    }
+    for (client, limit, key) in
+        [("a", 2, "jobs.records_per_client"), ("b", 3, "jobs.records"), ("c", 3, "jobs.records")]
+    {
+        let refused = fixture.accept_from(client).await;
+        let Err(AcceptError::Store(StoreError::TooManyRecords { limit: l, key: k })) = refused else {
+            panic!("{refused:?}")
+        };
+        assert_eq!((l, k), (limit, key), "the request would join the work of the others");
+    }
+    fixture.faults.silence(None);
+    fixture.jobs.settled().await;
+    // In the order of their use.
+    for id in &open {
+        assert_eq!(fixture.on_record(id).await.status, Status::Successful);
+    }
+    // The result exists. The oldest ended job of the client is removed, then the oldest of all.
+    for (client, oldest) in [("a", &open[0]), ("c", &open[1])] {
+        let new = fixture.accept_from(client).await.unwrap().record;
+        assert_eq!(new.status, Status::Successful);
+        assert_eq!(fixture.jobs.view(oldest, Namespace::default()).await.unwrap(), None, "{client}");
+        assert!(fixture.jobs.view(&new.id, Namespace::default()).await.unwrap().is_some());
+        assert_eq!(fixture.store.usage(Folder::Jobs).objects, 3);
+    }
+    assert!(fixture.jobs.view(&open[2], Namespace::default()).await.unwrap().is_some());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_start_reads_the_records_of_open_jobs_only() {
+    const ENDED: usize = 20_000;
+    let config = JobsConfig { records_per_client: ENDED, ..JobsConfig::default() };
+    let fixture = Fixture::open(tempfile::tempdir().unwrap(), config.clone()).await;
+    let open = [fixture.inherit().await, fixture.inherit().await];
+    // A process that dies between the two steps of ending a job leaves both documents.
+    let half_ended = fixture.inherit().await;
+    let folder = fixture.dir.path().join("store/jobs");
+    let write = |id: &JobId| std::fs::write(folder.join(format!("{}.ended.json", id.as_str())), b"{}").unwrap();
+    write(&half_ended);
+    (1..ENDED).for_each(|_| write(&new_id()));
+    let fixture = Fixture::open(fixture.dir, config).await;
+    assert_eq!(fixture.jobs.recover().await.unwrap(), open.len());
+    assert_eq!(fixture.faults.job_reads.load(Ordering::SeqCst), open.len());
+    assert!(!folder.join(format!("{}.json", half_ended.as_str())).exists());
+    for id in &open {
+        ended(&mut fixture.watch(id).await).await;
+    }
+    fixture.jobs.settled().await;
+    let count = || fixture.store.usage(Folder::Jobs).objects;
+    assert_eq!(count(), ENDED as u64 + 2);
+    // The names alone tell the client: its ended records are removed down to the cap.
+    fixture.accept().await.unwrap();
+    assert_eq!(count(), ENDED as u64);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_record_of_an_ended_job_prevents_another_one() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    let open = fixture.on_record(&id).await;
+    let ended = Record { status: Status::Dismissed, finished_ms: Some(now_ms()), ..open.clone() };
+    assert!(!fixture.jobs.0.write_new(&open).await.unwrap(), "the job is open");
+    fixture.jobs.0.write(&ended).await.unwrap();
+    assert!(!fixture.jobs.0.write_new(&open).await.unwrap(), "the job has ended");
+    assert_eq!((fixture.on_record(&id).await, fixture.jobs.recover().await.unwrap()), (ended, 0));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn occasional_errors_of_the_store_end_no_job() {
+    let fixture = Fixture::new(3, PATIENT).await;
+    fixture.faults.error_every.store(10, Ordering::SeqCst);
+    let mut accepted = Vec::new();
+    for client in 0..30 {
+        match fixture.accept_from(&client.to_string()).await {
+            Ok(view) => accepted.push(view.record.id),
+            Err(AcceptError::Store(StoreError::Failed { .. })) => {}
+            Err(error) => panic!("{error:?}"),
+        }
+    }
+    fixture.jobs.settled().await;
+    assert!(accepted.len() < 30 && accepted.len() >= 5, "{} jobs are accepted", accepted.len());
+    fixture.faults.error_every.store(0, Ordering::SeqCst);
+    for id in &accepted {
+        assert_eq!(fixture.on_record(id).await.status, Status::Successful);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_truncated_read_of_a_record_is_no_damage() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    fixture.faults.truncate.store(true, Ordering::SeqCst);
+    let refused = fixture.jobs.0.read(&id).await;
+    assert!(matches!(refused, Err(StoreError::Failed { .. })), "{refused:?}");
+    fixture.faults.truncate.store(false, Ordering::SeqCst);
+    assert_eq!((fixture.on_record(&id).await.id, fixture.store.quarantined().await.unwrap()), (id, 0));
+}
