@@ -1,5 +1,5 @@
-//! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, meshes that are not
-//! yet sent, and the buffers of connections.
+//! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, meshes that are
+//! not yet sent, and the buffers of connections.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

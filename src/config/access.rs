@@ -19,7 +19,8 @@ pub struct AccessConfig {
     /// reloaded when it changes, and on SIGHUP.
     pub keys_file: Option<PathBuf>,
     /// Keys that sign URLs, as `ID:SECRET` or `ID@GROUP:SECRET` separated by white space. The first one signs, all are
-    /// accepted, so that keys can be rotated. A signed URL opens what the keys of the group hold. Default `none`: no signature is accepted.
+    /// accepted, so that keys can be rotated. A signed URL opens what the keys of the group hold. Default `none`: no
+    /// signature is accepted.
     pub signing_secret: Option<Secret>,
     /// File that contains the value of `signing_secret`. Default `none`.
     pub signing_secret_file: Option<PathBuf>,

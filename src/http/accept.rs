@@ -126,11 +126,12 @@ pub(super) async fn serve(
     drop(listener);
     let mut all = std::pin::pin!(async { while connections.join_next().await.is_some() {} });
     tokio::select! {
-        () = &mut all => true,
+        biased;
         () = stop::reached(&mut stop, Stop::Now) => {
             drop(tokio::time::timeout(LAST_RESPONSES, all).await);
             false
         }
+        () = &mut all => true,
     }
 }
 

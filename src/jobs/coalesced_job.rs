@@ -12,7 +12,8 @@ use crate::store::Digest;
 use crate::surface::CancelToken;
 use crate::telemetry::TraceSpan;
 
-/// Returns the identity of the work of a task: namespace, input, parameters and strictness. Tasks with equal keys share one job.
+/// Returns the identity of the work of a task: namespace, input, parameters and strictness. Tasks with equal keys share
+/// one job.
 pub(super) fn work_key(task: &Task) -> Digest {
     let Task { namespace, strict, digest, .. } = task;
     Digest::of(format!("{namespace}\n{strict}\n{}\n{digest}\n", params::canonical(&task.job)).as_bytes())

@@ -78,7 +78,7 @@ fn unknown_output_formats_exit_with_2() {
     assert_code(&mesh(&input, &folder.path("out.glb"), &["--format", "pdf"]), 2);
     let packed = mesh(&input, &folder.path("out.ply"), &["--compress", "quantize"]);
     assert_code(&packed, 2);
-    assert!(stderr(&packed).contains("`quantize` with ply"), "{}", stderr(&packed));
+    assert!(stderr(&packed).contains("`quantize` is not allowed; expected none for ply"), "{}", stderr(&packed));
     assert_eq!(folder.entries(), ["in.pdb"]);
 }
 
