@@ -1,17 +1,16 @@
 //! Locks, channels, threads and tasks of the concurrent modules: those of `std` and Tokio, or, with the feature
 //! `shuttle`, those of Shuttle, whose scheduler explores their interleavings in the tests named `interleavings`.
 
+#[cfg(not(feature = "shuttle"))]
+pub(crate) use std::sync::{Condvar, Mutex, MutexGuard};
+#[cfg(all(feature = "gpu", not(feature = "shuttle")))]
+pub(crate) use std::{sync::mpsc, thread};
 #[cfg(all(feature = "server", not(feature = "shuttle")))]
 pub(crate) use tokio::{runtime::Handle, task::spawn_blocking, time::timeout};
 #[cfg(feature = "shuttle")]
 pub(crate) use {
     shuttle::sync::{Condvar, Mutex, MutexGuard, mpsc},
     shuttle::thread,
-};
-#[cfg(not(feature = "shuttle"))]
-pub(crate) use {
-    std::sync::{Condvar, Mutex, MutexGuard, mpsc},
-    std::thread,
 };
 
 /// Counterpart of Tokio's handle: the scheduler of Shuttle runs all tasks.

@@ -11,7 +11,7 @@ use super::queue::Queue;
 use super::rank::{Client, DEFAULT_URGENCY, Rank};
 use super::{Failure, Refusal, Task, Ticket};
 use crate::pipeline::params;
-use crate::store::Digest;
+use crate::store::{Digest, Namespace};
 use crate::sync::thread::{self, JoinHandle};
 use crate::telemetry::SpanParent;
 
@@ -24,6 +24,7 @@ fn task(number: u8, batch: bool) -> Task {
     Task {
         digest: Digest::of(&input),
         input,
+        namespace: Namespace::default(),
         strict: false,
         job: params::parse(std::iter::empty::<(&str, &str)>()).unwrap().job,
         rank: Rank { client: Client::named("a"), batch, urgency: DEFAULT_URGENCY },

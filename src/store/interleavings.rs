@@ -82,7 +82,7 @@ async fn put(store: &Store, number: u8) -> std::result::Result<(), StoreError> {
 /// Opens a store of `objects` objects of [`SIZE`] bytes. Caches nothing.
 async fn open(objects: u64) -> Store {
     let config = StoreConfig { max_bytes: objects * SIZE as u64, memory_object_bytes: 1, ..StoreConfig::default() };
-    let backend = Backend::over(Arc::new(Yielding(InMemory::new())), PathBuf::from("/nonexistent"));
+    let backend = Backend::over(Arc::new(Yielding(InMemory::new())), PathBuf::from("/nonexistent"), &config);
     Store::open_backend(backend, &config).await.unwrap()
 }
 

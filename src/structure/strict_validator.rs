@@ -4,8 +4,8 @@
 //! against the format and lists all findings. They accompany a read error, or answer a strict check. pdbtbx cannot be
 //! stopped, is slow (quadratic in the residues of a chain) and panics on hostile input. Therefore:
 //!
-//! * It checks at most [`MAX_BYTES`] of text whose [`Cost`] is low, or [`MAX_UNREAD_BYTES`] of text that this crate
-//!   cannot read. Call it on a thread that may block for about a second.
+//! * It checks at most [`MAX_BYTES`] of text that pdbtbx checks fast enough, or [`MAX_UNREAD_BYTES`] of text that this
+//!   crate cannot read. Call it on a thread that may block for about a second.
 //! * Panics are caught and become a diagnostic. The panic hook is shared by the whole process, so a library cannot
 //!   replace it without races. Call [`quiet_panics`] from `main` before starting threads: it wraps the hook once and
 //!   silences panics of threads inside [`check`]. Without that call, a caught panic also prints to standard error.
