@@ -23,7 +23,7 @@ from mixed import AWAY, Expected, Server, fetch, folder
 
 OPEN = ("accepted", "running")
 # Time for all jobs to end at last, s.
-PATIENCE = 300
+FINISH_TIMEOUT = 300
 
 
 class Clients:
@@ -118,7 +118,7 @@ def main():
         with_jobs += open_jobs(data) > 0
     clients.finish()
     server.start()
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + FINISH_TIMEOUT
     ends = collections.Counter(outcome(args.port, job, mesh, deadline) for job, mesh in clients.jobs.items())
     code, _ = server.stop()
     print(f"{args.kills} kills: {dict(phases)}; jobs were open at {with_jobs} of them")

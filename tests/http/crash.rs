@@ -1,5 +1,5 @@
 //! Power failures: the system calls of a service are recorded, and the data folder that each prefix of them leaves on
-//! disk is opened again. Everything that was promised must be there.
+//! disk is opened again. Every accepted job must be there.
 
 use crate::http_support;
 use crate::tools;
@@ -51,7 +51,7 @@ enum Step {
     Link(PathBuf, PathBuf),
     Unlink(PathBuf),
     /// A 202 with the path of its job.
-    Promise(String),
+    Accepted(String),
 }
 
 /// Decodes `\xNN\xNN…`.
@@ -89,7 +89,7 @@ fn parse(call: &str) -> Option<Step> {
             match std::str::from_utf8(&bytes).ok().filter(|text| text.starts_with("HTTP/1.1 202")) {
                 Some(head) => {
                     let location = head.lines().find_map(|line| line.strip_prefix("location: "));
-                    Step::Promise(location.unwrap().to_owned())
+                    Step::Accepted(location.unwrap().to_owned())
                 }
                 None => Step::Write { fd: fd()?, at: None, bytes },
             }
@@ -106,7 +106,7 @@ fn parse(call: &str) -> Option<Step> {
     })
 }
 
-/// Parses a log of strace. A call takes effect when it returns, but an answer is promised when it is sent.
+/// Parses a log of strace. A call takes effect when it returns, but an answer counts when it is sent.
 fn steps(log: &str) -> Vec<Step> {
     let mut begun = HashMap::new();
     let mut steps = Vec::new();
@@ -115,8 +115,8 @@ fn steps(log: &str) -> Vec<Step> {
         let call = call.trim_start();
         if let Some(first) = call.strip_suffix(" <unfinished ...>") {
             let sent = ["write", "sendto"].iter().any(|name| first.starts_with(name));
-            if sent && let Some(promise @ Step::Promise(_)) = parse(&format!("{first}) = {}", first.len())) {
-                steps.push(promise);
+            if sent && let Some(accepted @ Step::Accepted(_)) = parse(&format!("{first}) = {}", first.len())) {
+                steps.push(accepted);
             }
             begun.insert(pid, first);
         } else if let Some((_, rest)) = call.strip_prefix("<... ").and_then(|rest| rest.split_once(" resumed>")) {
@@ -240,7 +240,7 @@ impl Disk {
             Step::Unlink(path) => {
                 self.remove(path);
             }
-            Step::Promise(_) => {}
+            Step::Accepted(_) => {}
         }
     }
 
@@ -272,11 +272,11 @@ struct Request {
     mesh: Vec<u8>,
 }
 
-/// Hashes of states that were found to be whole, with the jobs that were promised.
+/// Hashes of states that were found to be whole, with the jobs that were accepted.
 type Whole = BTreeSet<u64>;
 
 /// Opens the folder `data` of `tree` and looks for the jobs. Panics if one is lost.
-fn check(tree: &Tree, data: &Path, promised: &[String], requests: &[Request]) {
+fn check(tree: &Tree, data: &Path, accepted: &[String], requests: &[Request]) {
     let dir = tempfile::tempdir().unwrap();
     for (path, bytes) in tree {
         match bytes {
@@ -287,7 +287,7 @@ fn check(tree: &Tree, data: &Path, promised: &[String], requests: &[Request]) {
     let data = dir.path().join(data);
     let server =
         start_cold(Arc::new(CpuBackend::new(None).unwrap()), |config| data.clone_into(&mut config.server.data_dir));
-    for (job, request) in promised.iter().zip(requests) {
+    for (job, request) in accepted.iter().zip(requests) {
         let state = server.get(&format!("{job}?wait=50")).json();
         assert_eq!(state["status"], "successful", "{state}");
         let mesh = server.get(server.get(&format!("{job}/result")).header("location").unwrap());
@@ -309,20 +309,20 @@ fn replay<'a>(
     whole: &mut Whole,
     check: &dyn Fn(&Tree, &[String]),
 ) {
-    let mut promised = Vec::new();
+    let mut accepted = Vec::new();
     for step in steps {
         disk.apply(step);
-        if let Step::Promise(job) = step
-            && !promised.contains(job)
+        if let Step::Accepted(job) = step
+            && !accepted.contains(job)
         {
-            promised.push(job.clone());
+            accepted.push(job.clone());
         }
         for all in choices {
             let tree = disk.tree(*all);
             let mut hasher = DefaultHasher::new();
-            (&tree, &promised).hash(&mut hasher);
+            (&tree, &accepted).hash(&mut hasher);
             if !whole.contains(&hasher.finish()) {
-                check(&tree, &promised);
+                check(&tree, &accepted);
                 whole.insert(hasher.finish());
             }
         }
@@ -414,7 +414,7 @@ fn power_failures_lose_no_accepted_job() {
         }
         let Some(steps) = record(&root, &root.join(below), requests) else { return };
         let mut whole = Whole::new();
-        let check = |tree: &Tree, promised: &[String]| check(tree, below, promised, requests);
+        let check = |tree: &Tree, accepted: &[String]| check(tree, below, accepted, requests);
         replay(before(), steps.iter(), choices, &mut whole, &check);
         assert!(steps.len() > 50 && whole.len() > 10, "{} steps, {} states", steps.len(), whole.len());
         for control in synced {

@@ -1,7 +1,8 @@
 #!/bin/sh
-# Installs what the tests need: Mesa's software Vulkan, Chromium and strace into the system, if they are missing, and promtool,
-# Python and Node packages into target/test-tools. Prints one line per step. Without root, skips what needs it and names
-# it at the end; the tests that need it are then skipped too. SKIPPED=FILE collects these names.
+# Installs what the tests need: Mesa's software Vulkan, Chromium and strace into the system, if they are missing, and
+# promtool, Python and Node packages into target/test-tools. Prints one line per step. Without root, skips what needs
+# it and names it at the end; the tests that need it are then skipped too. SKIPPED=FILE collects these names.
+
 set -eu
 
 here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
