@@ -68,7 +68,8 @@ fn component_polls_jobs_and_shows_its_fallback() {
 
 #[test]
 fn page_polls_long_jobs() {
-    drive("jobs.mjs", &[], &[]);
+    // A job that is cancelled must run for a second.
+    drive("jobs.mjs", &["--set", "limits.grid_points=200000000"], &[]);
 }
 
 #[test]

@@ -7,7 +7,7 @@ use crate::trace_support;
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use http_support::{Fake, Mode, Reply, Running, SAMPLE, log_lines, sample, send, start, start_on};
 use metrics_support::{Held, until};
@@ -389,7 +389,11 @@ fn server_timing_adds_up_to_the_response_time() {
             assert!(without < parts, "{what}: {timing}");
         }
     }
-    let again = server.get("/v1/pdb/4pti/surface.glb?resolution=0.5");
-    let timing = again.header("server-timing").unwrap();
-    assert!(timing.starts_with("cache;desc=hit, total;dur="), "{timing}");
+    // A result is not stored while too many others are: then the next request computes it again.
+    let cached = (0..50).any(|_| {
+        std::thread::sleep(Duration::from_millis(100));
+        let again = server.get("/v1/pdb/4pti/surface.glb?resolution=0.5");
+        again.header("server-timing").unwrap().starts_with("cache;desc=hit, total;dur=")
+    });
+    assert!(cached);
 }
