@@ -15,13 +15,44 @@ use crate::telemetry::MEMORY_HELD;
 pub struct Budget {
     limit: u64,
     held: Arc<AtomicU64>,
+    /// Budget that this one is a part of.
+    whole: Option<Arc<Self>>,
 }
 
 impl Budget {
     /// Creates a budget of `limit` bytes.
     #[must_use]
     pub fn new(limit: u64) -> Self {
-        Self { limit, held: Arc::default() }
+        Self { limit, held: Arc::default(), whole: None }
+    }
+
+    /// Creates a budget of at most `limit` bytes of this one: its leases count in both.
+    #[must_use]
+    pub fn part(&self, limit: u64) -> Self {
+        Self { whole: Some(Arc::new(self.clone())), ..Self::new(limit) }
+    }
+
+    /// Adds `bytes`. A failure changes nothing.
+    fn try_add(&self, bytes: u64) -> Result<(), OutOfMemory> {
+        let Self { limit, held, whole } = self;
+        held.try_update(Ordering::Relaxed, Ordering::Relaxed, |now| now.checked_add(bytes).filter(|sum| sum <= limit))
+            .map_err(|held| OutOfMemory::Budget { needed: bytes, held, limit: *limit })?;
+        if let Some(Err(error)) = whole.as_ref().map(|whole| whole.try_add(bytes)) {
+            held.fetch_sub(bytes, Ordering::Relaxed);
+            return Err(error);
+        }
+        Ok(())
+    }
+
+    /// Adds `bytes` regardless of the limit.
+    fn add(&self, bytes: u64) {
+        self.held.fetch_add(bytes, Ordering::Relaxed);
+        self.whole.iter().for_each(|whole| whole.add(bytes));
+    }
+
+    fn subtract(&self, bytes: u64) {
+        self.held.fetch_sub(bytes, Ordering::Relaxed);
+        self.whole.iter().for_each(|whole| whole.subtract(bytes));
     }
 
     /// Creates a budget without a limit.
@@ -43,7 +74,7 @@ impl Budget {
     /// metric of the budget does not count them.
     #[must_use]
     pub fn buffers(&self, bytes: u64) -> Buffers {
-        self.held.fetch_add(bytes, Ordering::Relaxed);
+        self.add(bytes);
         Buffers { budget: self.clone(), bytes }
     }
 
@@ -63,7 +94,7 @@ pub struct Buffers {
 
 impl Drop for Buffers {
     fn drop(&mut self) {
-        self.budget.held.fetch_sub(self.bytes, Ordering::Relaxed);
+        self.budget.subtract(self.bytes);
     }
 }
 
@@ -80,9 +111,7 @@ impl Lease {
     /// # Errors
     /// [`OutOfMemory::Budget`].
     pub fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
-        let Budget { limit, held } = &self.budget;
-        held.try_update(Ordering::Relaxed, Ordering::Relaxed, |now| now.checked_add(bytes).filter(|sum| sum <= limit))
-            .map_err(|held| OutOfMemory::Budget { needed: bytes, held, limit: *limit })?;
+        self.budget.try_add(bytes)?;
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
         publish(bytes, 1.0);
         Ok(())
@@ -90,14 +119,14 @@ impl Lease {
 
     /// Adds `bytes` regardless of the limit, for memory that is allocated already.
     pub fn force(&self, bytes: u64) {
-        self.budget.held.fetch_add(bytes, Ordering::Relaxed);
+        self.budget.add(bytes);
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
         publish(bytes, 1.0);
     }
 
     /// Subtracts `bytes` of freed memory.
     pub fn shrink(&self, bytes: u64) {
-        self.budget.held.fetch_sub(bytes, Ordering::Relaxed);
+        self.budget.subtract(bytes);
         self.bytes.fetch_sub(bytes, Ordering::Relaxed);
         publish(bytes, -1.0);
     }
@@ -173,6 +202,24 @@ mod tests {
         drop(b);
         budget.check().unwrap();
         drop(a);
+        budget.lease().grow(100).unwrap();
+    }
+
+    #[test]
+    fn a_part_is_limited_and_counts_in_the_whole() {
+        let budget = Budget::new(100);
+        let part = budget.part(50);
+        let (of_part, of_whole) = (part.lease(), budget.lease());
+        of_part.grow(50).unwrap();
+        assert_eq!(held(of_part.grow(1).unwrap_err()), 50);
+        assert_eq!(held(of_whole.grow(51).unwrap_err()), 50);
+        of_part.shrink(20);
+        of_whole.grow(60).unwrap();
+        // A failure in the whole changes neither.
+        assert_eq!(held(of_part.grow(20).unwrap_err()), 90);
+        of_part.grow(10).unwrap();
+        drop((of_part, of_whole));
+        part.lease().grow(50).unwrap();
         budget.lease().grow(100).unwrap();
     }
 

@@ -149,6 +149,7 @@ impl Server {
         let archive = Archive::new(&config, pool.settings().budget.clone());
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
+        let uploads = pool.settings().budget.part(config.limits.memory_bytes / 2);
         let readers = Arc::new(Semaphore::new(config.jobs.workers));
         let delivery_shares = ClientShares::new(config.jobs.deliveries, config.server.client_share);
         let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
@@ -162,6 +163,7 @@ impl Server {
             job_store,
             secret,
             result_headers: Cache::new(CACHED_HEADERS),
+            uploads,
             readers,
             save_permits,
             save_start: Mutex::new(()),

@@ -17,7 +17,7 @@ use crate::access::Access;
 use crate::archive::Archive;
 use crate::client_shares::{ClientShares, Place};
 use crate::config::Config;
-use crate::jobs::{Client, ContentKey, Failure, JobStore, Pool};
+use crate::jobs::{Budget, Client, ContentKey, Failure, JobStore, Pool};
 use crate::pipeline::Job;
 use crate::single_flight::SingleFlight;
 use crate::store::{Namespace, Secret, Store};
@@ -45,6 +45,8 @@ pub(super) struct App {
     pub(super) secret: Secret,
     /// Headers of recently requested results.
     pub(super) result_headers: Cache<ContentKey, Arc<HeaderMap>>,
+    /// Part of the memory budget for request bodies: the rest is enough to mesh those that were received.
+    pub(super) uploads: Budget,
     /// Permits to read structures outside of jobs: one per worker.
     pub(super) readers: Arc<Semaphore>,
     /// Permits of `jobs.concurrent_saves`.

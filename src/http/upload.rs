@@ -40,10 +40,10 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
             return Err(bad_encoding("a form cannot be compressed as a whole; compress the file in it"));
         }
         let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
-        let form = form::read(&app.config.limits, limit, content_type, body, app.pool.settings().budget.lease());
+        let form = form::read(&app.config.limits, limit, content_type, body, app.uploads.lease());
         in_time(app, form).await?
     } else {
-        let lease = app.pool.settings().budget.lease();
+        let lease = app.uploads.lease();
         let bytes = in_time(app, collect(body, announced, limit, &lease)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
         Upload { bytes, lease, fields: Vec::new(), declared }
@@ -62,7 +62,7 @@ pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> 
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
-    let lease = app.pool.settings().budget.lease();
+    let lease = app.uploads.lease();
     in_time(app, collect(body, announced, limit, &lease)).await
 }
 

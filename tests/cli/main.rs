@@ -23,6 +23,7 @@ mod exit_codes;
 mod gallery;
 mod help;
 mod interrupt;
+mod memory;
 mod mesh;
 mod readme;
 mod render;

@@ -41,7 +41,18 @@ impl Folder {
 
 /// Returns a command of the binary, without the environment variables that change its output.
 pub fn molmesh() -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_molmesh"));
+    prepared(Command::new(env!("CARGO_BIN_EXE_molmesh")))
+}
+
+/// Returns a command of the binary whose address space is limited to `bytes`.
+pub fn limited(bytes: u64) -> Command {
+    let mut shell = Command::new("sh");
+    let kib = (bytes >> 10).to_string();
+    shell.args(["-c", "ulimit -v \"$0\" && exec \"$@\"", &kib, env!("CARGO_BIN_EXE_molmesh")]);
+    prepared(shell)
+}
+
+fn prepared(mut command: Command) -> Command {
     for name in ["RUST_BACKTRACE", "RUST_LOG", "MOLMESH__DEVICES__USE", "COLUMNS", "CLICOLOR_FORCE"] {
         command.env_remove(name);
     }
@@ -134,8 +145,17 @@ pub struct Service {
 impl Service {
     /// Starts a service on free ports and waits until it is ready.
     pub fn start(folder: &Folder, more: &[&str]) -> Self {
+        Self::start_as(molmesh(), folder, more)
+    }
+
+    /// Starts a service as [`Self::start`] does, with an address space of `bytes`.
+    pub fn start_limited(folder: &Folder, bytes: u64, more: &[&str]) -> Self {
+        Self::start_as(limited(bytes), folder, more)
+    }
+
+    fn start_as(mut command: Command, folder: &Folder, more: &[&str]) -> Self {
         use std::io::{BufRead, BufReader};
-        let mut child = molmesh()
+        let mut child = command
             .args(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--data-dir"])
             .arg(folder.path("data"))
             .args(more)

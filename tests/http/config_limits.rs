@@ -42,7 +42,7 @@ const ROWS: &[Row] = &[
     ),
     ("limits.mesh_bytes", "mesh-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
     ("limits.output_bytes", "mesh-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
-    ("limits.memory_bytes", "memory-full", "http/limits::memory_is_shared_and_limited"),
+    ("limits.memory_bytes", "memory-full", "cli/memory::a_burst_of_large_uploads_stays_within_the_memory_limit"),
     ("limits.picture_side", "picture-too-large", "http/pictures::pictures_are_limited_before_any_work"),
     ("jobs.workers", "molmesh_queue_depth", "http/limits::a_full_queue_rejects_with_retry_after"),
     ("jobs.queue", "queue-full", "http/limits::a_full_queue_rejects_with_retry_after"),

@@ -406,6 +406,16 @@ fn memory_is_shared_and_limited() {
     assert!(rejected(&server, "memory-full") >= 1.0);
 }
 
+#[test]
+fn bodies_leave_half_of_the_memory_to_jobs() {
+    let limit = 2 * CONNECTION_BYTES + 2_000_000;
+    let server = fake(|c| c.limits.memory_bytes = limit);
+    let within = server.post("/v1/structures", &[], &carbons(1000));
+    let beyond = server.post("/v1/structures", &[], &carbons(18_000));
+    assert_eq!(within.status, 201);
+    assert_eq!(beyond.problem(503, "memory-full")["limit"], limit / 2);
+}
+
 /// Returns atoms, 81 bytes each, in a small file.
 fn compressed_atoms(n: usize) -> Vec<u8> {
     let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
