@@ -1,4 +1,4 @@
-//! `molmesh-bench`: benchmarks of molmesh on GPUs, and the tables and figures of the 2010 paper on current hardware.
+//! `molmesh-bench`: benchmarks of molmesh on GPUs and of its service, and the tables and figures of the 2010 paper on current hardware.
 
 mod device;
 mod error;
@@ -9,6 +9,7 @@ mod machine;
 mod paper;
 mod program_2010;
 mod rates;
+mod service;
 mod stand_in;
 mod stats;
 mod structures;
@@ -31,6 +32,8 @@ struct Args {
 enum Command {
     /// Time the stages on GPUs and compare them with lower bounds for each device
     Gpu(Box<gpu::GpuArgs>),
+    /// Time whole requests to a service, one client and many, on several backends
+    Service(Box<service::ServiceArgs>),
     /// Measure the tables of Dias, Bora and Gomes (HPDC 2010) on this machine
     Paper(Box<paper::PaperArgs>),
     /// Download the structures of the 2010 paper
@@ -42,6 +45,7 @@ enum Command {
 fn main() -> ExitCode {
     let done = match Args::parse().command {
         Command::Gpu(args) => gpu::run(&args),
+        Command::Service(args) => service::run(&args),
         Command::Paper(args) => paper::run(&args),
         Command::Fetch(args) => paper::fetch::run(&args),
         Command::Figures(args) => paper::redraw::run(&args),

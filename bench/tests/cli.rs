@@ -193,3 +193,34 @@ fn network_errors_suggest_copying_the_files() {
     assert!(stderr.contains("cannot be connected to") && stderr.contains("copy the files"), "{stderr}");
     assert_eq!(names(folder.path()), Vec::<String>::new(), "no file remains");
 }
+
+#[test]
+fn whole_requests_are_measured() {
+    let folder = tempfile::tempdir().unwrap();
+    let json = folder.path().join("service.json");
+    // The product's binary lies in the same folder once the workspace is built.
+    let binary = Path::new(env!("CARGO_BIN_EXE_molmesh-bench")).with_file_name("molmesh");
+    assert!(binary.is_file(), "build the workspace first: {}", binary.display());
+    let flags = ["--backends", "cpu", "--requests", "2", "--clients", "2", "--seconds", "1", "--json"];
+    let [said, _] = run(
+        0,
+        command().args(["service", "--binary"]).arg(&binary).args(flags).arg(&json).args([
+            "--",
+            "--set",
+            "jobs.workers=2",
+        ]),
+    );
+    assert!(said.contains("| backend |") && said.contains("\n| cpu |"), "{said}");
+    let results: Value = serde_json::from_str(&fs::read_to_string(&json).unwrap()).unwrap();
+    let row = &results["rows"][0];
+    let [times, known] = ["milliseconds", "known_structure_milliseconds"].map(|name| &row[name][0]);
+    let median = |times: &Value, part: &str| times[part]["median"].as_f64().unwrap();
+    for (times, parts) in [(times, ["total", "field", "emit"]), (known, ["total", "field", "encode"])] {
+        assert!(parts.iter().all(|part| median(times, part) > 0.0), "{times}");
+        assert!(median(times, "request") >= median(times, "total"), "{times}");
+    }
+    assert!(row["meshes_per_second"][0].as_f64().unwrap() > 0.0, "{row}");
+    // A service that does not start is an error with its messages.
+    let [_, error] = run(1, command().args(["service", "--backends", "none", "--binary"]).arg(&binary));
+    assert!(error.contains("did not start") && error.contains("none"), "{error}");
+}

@@ -1,0 +1,67 @@
+//! A running `molmesh serve`.
+
+use std::io::{BufRead as _, BufReader};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+use crate::error::{Error, Result};
+
+/// Service in its own process, with its own folder. Dropping it ends the process and removes the folder.
+pub(super) struct Service {
+    child: Child,
+    folder: PathBuf,
+    /// Address.
+    pub(super) addr: SocketAddr,
+}
+
+impl Service {
+    /// Starts a service on a free port and waits until it listens.
+    ///
+    /// # Errors
+    /// [`Error::File`] if the binary cannot be started, [`Error::Failed`] with its messages if it ends.
+    pub(super) fn start(binary: &Path, backend: &str, more: &[String]) -> Result<Self> {
+        let folder = std::env::temp_dir().join(format!("molmesh-bench-{}-{backend}", std::process::id()));
+        let mut child = Command::new(binary)
+            .args(["serve", "--listen", "127.0.0.1:0", "--backend", backend, "--data-dir"])
+            .arg(&folder)
+            .args([
+                "--set",
+                "archive.url=none",
+                "--set",
+                "server.metrics_listen=none",
+                "--set",
+                "server.client_share=1",
+            ])
+            .args(["--set", "server.termination_notice_ms=none"])
+            .args(more)
+            .stdin(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .map_err(Error::file(binary))?;
+        let lines = child.stderr.take().map(|stderr| BufReader::new(stderr).lines());
+        let mut lines = lines.ok_or_else(|| Error::failed("the service has no standard error"))?;
+        let (mut said, mut addr) = (String::new(), None);
+        // The address stands in the banner, whose last line begins with `try`.
+        for line in lines.by_ref().map_while(std::result::Result::ok) {
+            addr = addr.or_else(|| line.split_once("http://")?.1.trim_end_matches('/').parse().ok());
+            if line.trim_start().starts_with("try ") {
+                break;
+            }
+            said += &format!("{line}\n");
+        }
+        // A full pipe would block the service.
+        std::thread::spawn(move || lines.map_while(std::result::Result::ok).for_each(drop));
+        match addr {
+            Some(addr) => Ok(Self { child, folder, addr }),
+            None => Err(Error::failed(format!("the service with --backend {backend} did not start:\n{said}"))),
+        }
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        drop((self.child.kill(), self.child.wait()));
+        drop(std::fs::remove_dir_all(&self.folder));
+    }
+}
