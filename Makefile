@@ -52,7 +52,7 @@ matrix: ## Clippy on the other supported combinations of features
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
 
-interleavings: ## Explore interleavings of threads and tasks in the queue, the device pool and the store (Shuttle)
+interleavings: ## Explore interleavings of threads and tasks in the queue, durable jobs, the device pool and the store (Shuttle)
 	$(CARGO) test --quiet --locked --lib --features shuttle interleavings
 
 deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (three minutes) when absent

@@ -20,7 +20,7 @@ mod handle;
 mod index;
 #[cfg(test)]
 #[cfg(feature = "shuttle")]
-mod interleavings;
+pub(crate) mod interleavings;
 mod lock;
 mod memory;
 mod name;
