@@ -260,7 +260,8 @@ fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Respons
 /// Returns the problem of a failed job. Its instance is the request that created the job.
 fn problem(record: &Record) -> Option<Value> {
     let mut problem = record.problem.clone()?;
-    problem["instance"] = record.requester.request.as_deref().unwrap_or(record.id.as_str()).into();
+    let request = record.requester.request.as_deref().unwrap_or(record.id.as_str());
+    problem.as_object_mut()?.insert("instance".to_owned(), request.into());
     Some(problem)
 }
 
