@@ -9,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test interleavings fuzz chaos soak nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
+.PHONY: help run test interleavings fuzz chaos soak nightly nightly-data nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -52,7 +52,7 @@ matrix: ## Clippy on the other supported combinations of features
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
 
-interleavings: ## Explore interleavings of threads and tasks in the queue, the device pool and the store (Shuttle)
+interleavings: ## Explore interleavings of threads and tasks in the queue, durable jobs, the device pool and the store (Shuttle)
 	$(CARGO) test --quiet --locked --lib --features shuttle interleavings
 
 deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (three minutes) when absent
@@ -94,6 +94,13 @@ soak: override HOURS := $(or $(HOURS),1)
 soak: $(if $(BINARY),,release) ## Mixed load for HOURS=1, and check that nothing grows
 	python3 benches/load/soak.py $(or $(BINARY),target/release/molmesh) samples/4pti.pdb samples/1crn.cif \
 		--minutes $$(python3 -c 'print(60 * $(HOURS))')
+
+# BINARY=FILE uses an existing binary; NAMES="1aon 7cgo" selects structures.
+nightly: nightly-data tools $(if $(BINARY),,release) ## Check meshes of the large structures in DATA=FOLDER with trimesh
+	target/test-tools/venv/bin/python tests/tools/nightly.py $(or $(BINARY),target/release/molmesh) "$(DATA)" $(NAMES)
+
+nightly-data:
+	@[ -d "$(DATA)" ] || { echo "make nightly: DATA=FOLDER must name a folder of structures; none is downloaded" >&2; exit 1; }
 
 bench: ## Run the benchmarks
 	$(CARGO) bench

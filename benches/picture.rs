@@ -65,10 +65,10 @@ fn picture(criterion: &mut Criterion) {
             }
             let mut image = draw(&size).image;
             group.bench_function(BenchmarkId::new("png", side), |b| {
-                b.iter(|| png::encode(black_box(&image)).unwrap().len());
+                b.iter(|| png::encode(black_box(&image), &Control::default()).unwrap().len());
             });
             group.bench_function(BenchmarkId::new("all", side), |b| {
-                b.iter(|| png::encode(&draw(&size).image).unwrap().len());
+                b.iter(|| png::encode(&draw(&size).image, &Control::default()).unwrap().len());
             });
             group.bench_function(BenchmarkId::new("floor", side), |b| b.iter(|| floor(black_box(&mesh), &mut image)));
         }

@@ -1,20 +1,26 @@
 #!/usr/bin/env python3
 """Meshes a structure and compares the measures of the service with those of trimesh.
 
-Usage: measure.py FILE [SERVER]      (pip install requests trimesh)
+Needs the packages requests and trimesh: pip install requests trimesh
 """
 
+import argparse
 import io
 import sys
 
-import requests
-import trimesh
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("file", help="structure: PDB, mmCIF or BinaryCIF")
+parser.add_argument("server", nargs="?", default="http://127.0.0.1:8080", help="service (default: %(default)s)")
+args = parser.parse_args()
 
-file = sys.argv[1]
-server = sys.argv[2] if len(sys.argv) > 2 else "http://127.0.0.1:8080"
+try:
+    import requests
+    import trimesh
+except ModuleNotFoundError as missing:
+    sys.exit(f"measure.py: the package {missing.name} is not installed: pip install requests trimesh")
 
-with open(file, "rb") as structure:
-    answer = requests.post(f"{server}/v1/meshes", params={"resolution": 0.5}, data=structure, timeout=60)
+with open(args.file, "rb") as structure:
+    answer = requests.post(f"{args.server}/v1/meshes", params={"resolution": 0.5}, data=structure, timeout=60)
 if not answer.ok:
     problem = answer.json()
     sys.exit(f"{problem['title']}: {problem['detail']}")

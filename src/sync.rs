@@ -2,11 +2,17 @@
 //! `shuttle`, those of Shuttle, whose scheduler explores their interleavings in the tests named `interleavings`.
 
 #[cfg(not(feature = "shuttle"))]
+pub(crate) use std::sync::mpsc;
+#[cfg(not(feature = "shuttle"))]
 pub(crate) use std::sync::{Condvar, Mutex, MutexGuard};
 #[cfg(all(feature = "gpu", not(feature = "shuttle")))]
-pub(crate) use std::{sync::mpsc, thread};
+pub(crate) use std::thread;
 #[cfg(all(feature = "server", not(feature = "shuttle")))]
-pub(crate) use tokio::{runtime::Handle, task::spawn_blocking, time::timeout};
+pub(crate) use tokio::{
+    runtime::Handle,
+    task::spawn_blocking,
+    time::{sleep, timeout},
+};
 #[cfg(feature = "shuttle")]
 pub(crate) use {
     shuttle::sync::{Condvar, Mutex, MutexGuard, mpsc},
@@ -45,6 +51,12 @@ impl Handle {
 #[cfg(feature = "shuttle")]
 pub(crate) async fn spawn_blocking<T>(work: impl FnOnce() -> T) -> std::io::Result<T> {
     Ok(work())
+}
+
+/// Lets other tasks run: the scheduler has no clock.
+#[cfg(feature = "shuttle")]
+pub(crate) async fn sleep(_: std::time::Duration) {
+    shuttle::future::yield_now().await;
 }
 
 /// Runs `work` without a limit: the scheduler has no clock.

@@ -12,7 +12,7 @@ use super::client::Answer;
 use super::disk::{Disk, Found, Stored};
 use super::error::FetchError;
 use super::remote::Remote;
-use crate::client_shares::{ClientShares, ShareExceeded};
+use crate::client_shares::{ClientShares, Place, ShareExceeded};
 use crate::config::Config;
 use crate::memory_budget::Budget;
 use crate::single_flight::SingleFlight;
@@ -71,6 +71,7 @@ struct Shared {
     disk: Disk,
     remote: Option<Remote>,
     shares: Arc<ClientShares>,
+    timeout: Duration,
     fetches: SingleFlight<EntryId, Result<Entry, FetchError>>,
     known: Cache<EntryId, Known>,
     /// Entries that no remote archive has, each with the time until which it is not requested again.
@@ -91,6 +92,7 @@ impl Archive {
             disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
             remote: Remote::new(config, memory),
             shares: ClientShares::new(archive.concurrent, config.server.client_share),
+            timeout: Duration::from_millis(archive.timeout_ms),
             fetches: SingleFlight::default(),
             known: Cache::new(CACHED_DIGESTS),
             absent: Cache::new(CACHED_DIGESTS),
@@ -107,17 +109,43 @@ impl Archive {
         Self { shared: Arc::clone(&self.shared), client: Some(client) }
     }
 
-    /// Returns the bytes of an entry from the first source that has it. Waits at most `archive.timeout_ms` for the
-    /// remote archive. Must run on a tokio runtime with timers.
+    /// Returns the bytes of an entry from the first source that has it. Waits at most `archive.timeout_ms`, half
+    /// of it for a place in the share of the client. Must run on a tokio runtime with timers.
     ///
     /// # Errors
     /// Returns any [`FetchError`].
     pub async fn fetch(&self, id: &EntryId) -> Result<Entry, FetchError> {
+        let start = tokio::time::Instant::now();
+        let deadline = start + self.shared.timeout;
+        let mut place = None;
+        loop {
+            match (self.run(id, &mut place, deadline).await, self.client) {
+                // The share of this client, or of the first caller, is exceeded. Each caller waits for its own share,
+                // so that no client waits for the requests of another one.
+                (Err(FetchError::Share { .. }), Some(client)) if place.is_none() => {
+                    // The other half of the time is for the fetch.
+                    let taken = self.shared.shares.wait(client, start + self.shared.timeout / 2).await;
+                    place = Some(taken.map_err(|ShareExceeded { limit }| FetchError::Share { id: id.clone(), limit })?);
+                }
+                // Another caller without a place was the first again.
+                (Err(FetchError::Share { .. }), _) => {}
+                (found, _) => return found,
+            }
+        }
+    }
+
+    /// Runs or joins the fetch of an entry. A new fetch takes `place`, or fails if it needs one and there is none.
+    async fn run(
+        &self,
+        id: &EntryId,
+        place: &mut Option<Place>,
+        deadline: tokio::time::Instant,
+    ) -> Result<Entry, FetchError> {
         let (shared, wanted, client) = (Arc::clone(&self.shared), id.clone(), self.client);
         // The fetch outlives its first caller, but is traced under that caller's request.
-        let mut fetch = self.shared.fetches.run(id, move || {
-            let span = TraceSpan::current();
-            let find = async move { shared.find(&wanted, client).await };
+        let mut fetch = self.shared.fetches.run(id, || {
+            let (span, place) = (TraceSpan::current(), place.take());
+            let find = async move { shared.find(&wanted, client, place, deadline).await };
             let find = async move {
                 match span {
                     Some(span) => span.run(find).await,
@@ -170,7 +198,13 @@ impl Archive {
 }
 
 impl Shared {
-    async fn find(self: &Arc<Self>, id: &EntryId, client: Option<u64>) -> Result<Entry, FetchError> {
+    async fn find(
+        self: &Arc<Self>,
+        id: &EntryId,
+        client: Option<u64>,
+        place: Option<Place>,
+        deadline: tokio::time::Instant,
+    ) -> Result<Entry, FetchError> {
         let checked = Instant::now();
         if let Some((bytes, digest, stamp)) = self.local(id).await? {
             self.remember(id, Known { digest, stamp: Some(stamp), checked, fresh_until: None });
@@ -192,9 +226,9 @@ impl Shared {
             count("cache", "absent");
             return Err(FetchError::NotFound { id: id.clone() });
         }
-        let place = client.map(|client| self.shares.take(client)).transpose();
+        let place = place.map_or_else(|| client.map(|client| self.shares.take(client)).transpose(), |p| Ok(Some(p)));
         let _place = place.map_err(|ShareExceeded { limit }| FetchError::Share { id: id.clone(), limit })?;
-        let answer = remote.fetch(id, stored.as_ref().map(|stored| &stored.origin)).await;
+        let answer = remote.fetch(id, stored.as_ref().map(|stored| &stored.origin), deadline).await;
         let result = match &answer {
             Ok(Answer::Unchanged) => "unchanged",
             Ok(_) => "found",

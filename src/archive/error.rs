@@ -49,7 +49,7 @@ pub enum FetchError {
         /// Limit and use of the memory.
         error: OutOfMemory,
     },
-    /// The client is fetching its share of entries.
+    /// The client was fetching its share of entries for half of `archive.timeout_ms`.
     #[error("entry {id} cannot be fetched now: this client is fetching {limit} entries, which is its share")]
     Share {
         /// Requested entry.

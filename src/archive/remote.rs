@@ -81,9 +81,13 @@ impl Remote {
         reached
     }
 
-    /// Requests the entry from every URL in order until one has it.
-    pub(super) async fn fetch(&self, id: &EntryId, copy: Option<&Origin>) -> Result<Answer, FetchError> {
-        let deadline = Instant::now() + Duration::from_millis(self.config.timeout_ms);
+    /// Requests the entry from every URL in order until one has it, at most until `deadline`.
+    pub(super) async fn fetch(
+        &self,
+        id: &EntryId,
+        copy: Option<&Origin>,
+        deadline: Instant,
+    ) -> Result<Answer, FetchError> {
         let mut failure = None;
         for (template, breaker) in &self.sources {
             match self.fetch_from(id, template, breaker, copy, deadline).await {

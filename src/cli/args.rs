@@ -11,6 +11,7 @@ use std::path::PathBuf;
 
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum};
 
+use molmesh::pipeline::integer::{parse_integer, whole_number};
 use molmesh::surface::DeviceChoice;
 
 use super::error::EXIT_CODES;
@@ -219,8 +220,8 @@ pub(crate) struct SurfaceArgs {
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Atoms")]
 pub(crate) struct SelectionArgs {
-    /// Comma-separated classes of atoms: polymer, ligand, water, hydrogens, all [default: polymer]
-    #[arg(long, value_name = "CLASSES")]
+    /// Comma-separated kinds of atoms: polymer, ligand, water, hydrogens, all [default: polymer]
+    #[arg(long, value_name = "KINDS")]
     pub(crate) select: Option<String>,
     /// Include ligands
     #[arg(long)]
@@ -248,21 +249,29 @@ pub(crate) struct SelectionArgs {
 #[command(next_help_heading = "Limits")]
 pub(crate) struct LimitArgs {
     /// Atoms in the file, all models [default: 20000000]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_atoms: Option<u64>,
     /// Atoms of one model at exactly the same position [default: 1000]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_duplicates: Option<u64>,
-    /// Bytes of the input after decompression [default: 4 GiB]
-    #[arg(long, value_name = "BYTES")]
+    /// Bytes of the input after decompression, such as 64MiB [default: 4GiB]
+    #[arg(long, value_name = "BYTES", value_parser = size)]
     pub(crate) max_input_bytes: Option<u64>,
     /// Grid points in occupied bricks [default: 4294967296]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_grid_points: Option<u64>,
     /// Pairs of an atom and a brick that its support reaches [default: 1073741824]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_candidates: Option<u64>,
-    /// Bytes of vertices and triangles [default: 8 GiB]
-    #[arg(long, value_name = "BYTES")]
+    /// Bytes of vertices and triangles, such as 64MiB [default: 8GiB]
+    #[arg(long, value_name = "BYTES", value_parser = size)]
     pub(crate) max_mesh_bytes: Option<u64>,
+}
+
+fn count(text: &str) -> Result<u64, String> {
+    parse_integer(text, false).ok_or_else(|| format!("expected {}", whole_number(false)))
+}
+
+fn size(text: &str) -> Result<u64, String> {
+    parse_integer(text, true).ok_or_else(|| format!("expected {}", whole_number(true)))
 }

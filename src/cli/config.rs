@@ -54,8 +54,8 @@ pub(super) fn load(args: &ServeArgs) -> Result<Loaded, CliError> {
         LogStyle::Json => "json".to_owned(),
     });
     let named = [
-        ("server.listen", args.listen.map(|a| a.to_string())),
-        ("server.metrics_listen", args.metrics_listen.map(|a| a.to_string())),
+        ("server.listen", args.listen.clone()),
+        ("server.metrics_listen", args.metrics_listen.clone()),
         ("server.data_dir", args.data_dir.as_ref().map(path)),
         ("devices.use", args.devices.clone()),
         ("archive.dir", args.archive.as_ref().map(path)),

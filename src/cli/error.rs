@@ -246,18 +246,18 @@ fn format_code(error: &FormatError) -> i32 {
 }
 
 fn surface_hint(error: &SurfaceError) -> Option<String> {
-    let coarser = error.suggested_resolution().map_or(String::new(), |h| format!("try --resolution {h}, "));
+    let coarser_or = |other: &str| {
+        Some(error.suggested_resolution().map_or(other.to_owned(), |h| format!("try --resolution {h}, or {other}")))
+    };
     match error {
-        SurfaceError::GridTooLarge { .. } => Some(format!("{coarser}or raise --max-grid-points")),
-        SurfaceError::MeshTooLarge { .. } => Some(format!("{coarser}or raise --max-mesh-bytes")),
-        SurfaceError::TooManyCandidates { suggested_resolution: Some(_), .. } => {
-            Some(format!("{coarser}or raise --max-candidates"))
-        }
+        SurfaceError::GridTooLarge { .. } => coarser_or("raise --max-grid-points"),
+        SurfaceError::MeshTooLarge { .. } => coarser_or("raise --max-mesh-bytes"),
+        SurfaceError::TooManyCandidates { suggested_resolution: Some(_), .. } => coarser_or("raise --max-candidates"),
         SurfaceError::TooManyCandidates { .. } => {
             Some("try a coarser --resolution or smaller radii, or raise --max-candidates".to_owned())
         }
         SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
-        SurfaceError::DeviceMemory { .. } => Some(format!("{coarser}or try --backend cpu")),
+        SurfaceError::DeviceMemory { .. } => coarser_or("try --backend cpu"),
         SurfaceError::Device { .. } => Some(format!("try --backend cpu{DOCTOR}")),
         SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
         _ => None,

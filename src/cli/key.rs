@@ -33,8 +33,12 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
         requests: args.requests,
         work_s: args.work.as_deref().map(|text| seconds("work", text)).transpose()?,
         concurrent: args.concurrent,
-        window_s: seconds("window", &args.window)?,
+        window_s: seconds("window", args.window.as_deref().unwrap_or("1m"))?,
     };
+    if let Some(window) = args.window.as_ref().filter(|_| quota.requests.is_none() && quota.work_s.is_none()) {
+        let expected = "expected a quota per window as well, --requests or --work";
+        return Err(CliError::usage(format!("parameter `window`: `{window}` is not allowed; {expected}")));
+    }
     let key_text = access::new_key(id).map_err(|error| CliError::Internal(error.to_string()))?;
     let expires = args.expires.as_deref().map(end).transpose()?;
     let key = Key {

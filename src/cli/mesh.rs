@@ -17,14 +17,8 @@ use super::request;
 
 /// Runs the command.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
-    let Request { mut job, format: requested, strict, .. } = request::of_mesh(args)?;
-    let format = requested.map_or_else(|| format(&args.output), Ok)?;
-    if format.is_picture() {
-        return Err(CliError::Usage {
-            message: format!("{format} is a picture, not a mesh"),
-            hint: Some("molmesh render writes pictures".to_owned()),
-        });
-    }
+    let format = args.format.as_ref().map_or_else(|| format_of(&args.output), |name| named(name))?;
+    let Request { mut job, strict, .. } = request::of_mesh(args)?;
     request::set_format(&mut job, format)?;
     let paths = (args.input.as_path(), args.output.as_path());
     let (job, mut output) = CommandJob::prepare(job, strict, paths, format, &args.job)?;
@@ -46,18 +40,32 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     job.finish(output, report, format, writing)
 }
 
-/// Format of an output by its file extension; GLB on stdout.
-fn format(output: &Path) -> Result<Format, CliError> {
-    let hint = || Some("name the format with --format".to_owned());
-    let name = output.display();
-    match output.extension() {
-        Some(extension) => Format::from_str(&extension.to_string_lossy())
-            .map_err(|e| CliError::Usage { message: format!("cannot tell the format of `{name}`: {e}"), hint: hint() }),
-        None if is_stdio(output) => Ok(Format::default()),
-        None => Err(CliError::Usage {
-            message: format!("cannot tell the format of `{name}`: it has no extension"),
-            hint: hint(),
+/// Mesh format by its name.
+fn named(name: &str) -> Result<Format, CliError> {
+    match Format::from_str(name) {
+        Ok(format) if format.is_picture() => Err(CliError::Usage {
+            message: format!("{format} is a picture, not a mesh"),
+            hint: Some("molmesh render writes pictures".to_owned()),
         }),
+        Ok(format) => Ok(format),
+        Err(_unknown) => {
+            let expected = Format::MESHES.map(Format::extension).join(", ");
+            Err(CliError::usage(format!("parameter `format`: `{name}` is not allowed; expected one of {expected}")))
+        }
+    }
+}
+
+/// Format of an output by its file extension; GLB on stdout.
+fn format_of(output: &Path) -> Result<Format, CliError> {
+    let unknown = |why: &str| CliError::Usage {
+        message: format!("cannot tell the format of `{}`: {why}", output.display()),
+        hint: Some(format!("name the format with --format: {}", Format::MESHES.map(Format::extension).join(", "))),
+    };
+    match output.extension().map(|extension| extension.to_string_lossy()) {
+        Some(extension) if extension.parse::<Format>().is_ok() => named(&extension),
+        Some(extension) => Err(unknown(&format!("`{extension}` is not a mesh format"))),
+        None if is_stdio(output) => Ok(Format::default()),
+        None => Err(unknown("it has no extension")),
     }
 }
 

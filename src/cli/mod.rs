@@ -36,8 +36,8 @@ mod survey;
 
 use std::io::{self, Write};
 
-use clap::Parser;
-use clap::error::ErrorKind;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::{CommandFactory as _, Parser as _};
 
 use args::{Args, Command};
 use error::{CliError, code};
@@ -53,7 +53,7 @@ pub(crate) fn main() -> i32 {
 fn run() -> i32 {
     let args = match Args::try_parse() {
         Ok(args) => args,
-        Err(error) => return usage(&error),
+        Err(error) => return usage(error),
     };
     let result = match args.command {
         Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
@@ -98,7 +98,8 @@ const NO_SERVICE: &str = if cfg!(feature = "server") {
 };
 
 /// Prints help to stdout and usage errors to stderr. Returns the exit code.
-fn usage(error: &clap::Error) -> i32 {
+fn usage(error: clap::Error) -> i32 {
+    let error = with_owners(error);
     let text = error.render().to_string();
     let (written, code) = match error.kind() {
         ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => (io::stdout().write_all(text.as_bytes()), code::OK),
@@ -112,6 +113,29 @@ fn usage(error: &clap::Error) -> i32 {
     // A closed stream is ignored.
     drop(written);
     code
+}
+
+/// Names the commands that have an option, if the given command does not have it.
+fn with_owners(mut error: clap::Error) -> clap::Error {
+    if error.kind() != ErrorKind::UnknownArgument {
+        return error;
+    }
+    let Some(ContextValue::String(given)) = error.get(ContextKind::InvalidArg) else { return error };
+    let option = given.split('=').next().unwrap_or_default().to_owned();
+    let mut all = Args::command();
+    all.build();
+    let has = |command: &&clap::Command| {
+        command.get_arguments().any(|known| known.get_long().is_some_and(|long| option == format!("--{long}")))
+    };
+    let owners: Vec<_> =
+        all.get_subcommands().filter(has).map(|command| format!("`molmesh {}`", command.get_name())).collect();
+    if !owners.is_empty() {
+        let tip = format!("'{option}' is an option of {}", owners.join(", "));
+        error.remove(ContextKind::SuggestedArg);
+        error.remove(ContextKind::Usage);
+        error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![tip.into()]));
+    }
+    error
 }
 
 /// `molmesh version`.

@@ -10,6 +10,7 @@ use serde_json::Value;
 use super::secrets;
 use super::store::HIDDEN;
 use super::{Config, ConfigError};
+use crate::pipeline::integer::{parse_integer, whole_number};
 use crate::pipeline::nearest::nearest;
 
 /// Prefix of environment variables; sections and keys follow, separated by two underscores.
@@ -211,6 +212,10 @@ impl Tree {
         }
         let why = |e: serde_json::Error| match default {
             Value::Number(_) if clears => bad(whole_number(key.ends_with("_bytes"))),
+            _ if key.ends_with("listen") => {
+                let none = if default.is_null() { ", or none" } else { "" };
+                bad(format!("an address such as 127.0.0.1:8080{none}"))
+            }
             _ => bad(format!("another value: {e}")),
         };
         self.config = serde_json::from_value(self.values.clone()).map_err(why)?;
@@ -260,19 +265,4 @@ pub(super) fn minimum(key: &str) -> u64 {
         "server.head_bytes" => 8 << 10,
         _ => 1,
     }
-}
-
-/// Describes the values of an integer key.
-fn whole_number(is_size: bool) -> String {
-    if is_size { "a whole number, or a size such as 64MiB".to_owned() } else { "a whole number".to_owned() }
-}
-
-/// Parses an integer with optional underscores and, for sizes, an optional binary suffix.
-fn parse_integer(text: &str, size: bool) -> Option<u64> {
-    let text = text.trim();
-    let (digits, factor) = [("KiB", 1 << 10), ("MiB", 1 << 20), ("GiB", 1u64 << 30)]
-        .into_iter()
-        .find_map(|(suffix, factor)| Some((text.strip_suffix(suffix).filter(|_| size)?, factor)))
-        .unwrap_or((text, 1));
-    digits.trim().replace('_', "").parse::<u64>().ok()?.checked_mul(factor)
 }

@@ -33,7 +33,8 @@ pub struct ServerConfig {
     /// Fraction of a pool that one client may hold, from 0 to 1, at least one place: of `server.connections` by the
     /// address of the peer, except for `trusted_proxies`; of `jobs.deliveries` and `archive.concurrent` by key, or by
     /// address without a key. Default 0.25: one client cannot occupy the service, and three others find places. With 1
-    /// a client may hold all places. Requests and connections beyond the share get a 503.
+    /// a client may hold all places. Connections and deliveries beyond the share get a 503, fetches wait for
+    /// half of `archive.timeout_ms` first.
     #[serde(deserialize_with = "telemetry::ratio")]
     #[schemars(range(min = 0, max = 1))]
     pub client_share: f64,

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Store of inputs, results and job documents.
+/// Store of inputs, results and job records.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct StoreConfig {
@@ -51,7 +51,7 @@ pub struct StoreConfig {
     /// Time that an input is kept after its last use, ms. Default 604,800,000 (7 days): users mesh a structure again
     /// with other parameters.
     pub input_ttl_ms: u64,
-    /// Time that a job document is kept after it was last written or read, ms. Default 86,400,000 (a day), as for
+    /// Time that a job record is kept after it was last written or read, ms. Default 86,400,000 (a day), as for
     /// results.
     pub job_ttl_ms: u64,
     /// Memory for cached small results, bytes. Default 256 MiB: thousands of small proteins.

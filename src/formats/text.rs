@@ -53,7 +53,7 @@ pub(super) fn facts(mesh: &Mesh, meta: &Meta, units: Units, precision: Option<&s
     facts.push(format!("centre {x} {y} {z} (already in the coordinates)"));
     for (key, value) in &meta.extras {
         match value {
-            Value::String(text) => facts.push(one_line(&format!("{key} {text}"))),
+            Value::String(text) => facts.push(one_line(&format!("{key} {}", text.replace('Å', "angstrom")))),
             Value::Bool(_) | Value::Number(_) => facts.push(one_line(&format!("{key} {value}"))),
             // Lists and maps are written to glTF only.
             Value::Null | Value::Array(_) | Value::Object(_) => {}
@@ -85,7 +85,7 @@ mod tests {
     #[test]
     fn facts_hold_plain_extras_only() {
         let Value::Object(extras) =
-            serde_json::json!({"kernel": "gaussian", "atoms": 3, "closed": true, "list": [1], "none": null})
+            serde_json::json!({"radii": "2.0 Å", "atoms": 3, "closed": true, "list": [1], "none": null})
         else {
             unreachable!()
         };
@@ -97,7 +97,7 @@ mod tests {
                 "name 4PTI",
                 "units angstrom",
                 "centre 1.5 -2 0 (already in the coordinates)",
-                "kernel gaussian",
+                "radii 2.0 angstrom",
                 "atoms 3",
                 "closed true"
             ]

@@ -1,7 +1,9 @@
 //! Renderer on a device. Draws the mesh four times, once per sample of a pixel, and resolves and shades the samples
 //! with the parameters of the CPU renderer.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, TryLockError};
+use std::thread;
+use std::time::Duration;
 
 use wgpu::Adapter;
 
@@ -12,6 +14,9 @@ use super::picture_targets::Requirements;
 use crate::picture::camera::Camera;
 use crate::picture::{CpuRenderer, Image, PictureError, PictureParams, Rendered, Renderer};
 use crate::surface::{BackendIdentity, Control, Mesh, Vertices};
+
+/// Interval of attempts to lock the passes, and of checks for cancellation meanwhile.
+const LOCK_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Renderer on one device, with an optional fallback to the CPU.
 pub struct GpuRenderer {
@@ -44,9 +49,15 @@ impl GpuRenderer {
         let check = || control.check().map_err(|error| DrawError::Picture(error.into()));
         let camera = Camera::new(positions, &mesh.triangles, params);
         check()?;
-        let mut passes = self.passes.lock().unwrap_or_else(PoisonError::into_inner);
-        // Other pictures may have held the lock for long.
-        check()?;
+        // Another picture may hold the lock for long.
+        let mut passes = loop {
+            match self.passes.try_lock() {
+                Ok(passes) => break passes,
+                Err(TryLockError::Poisoned(poisoned)) => break poisoned.into_inner(),
+                Err(TryLockError::WouldBlock) => thread::sleep(LOCK_INTERVAL),
+            }
+            check()?;
+        };
         let opened = match passes.take() {
             Some(opened) => opened,
             None => open(&self.adapter).map_err(|error| DrawError::Device(error.to_string()))?,
@@ -54,10 +65,11 @@ impl GpuRenderer {
         let fits = Requirements::new(mesh, params).check(&opened.limits());
         let drawn = fits
             .map_err(GpuError::Failed)
-            .and_then(|()| opened.draw(positions, normals, &mesh.triangles, params, &camera));
+            .and_then(|()| opened.draw(positions, normals, &mesh.triangles, params, &camera, &control.cancel));
         if !matches!(drawn, Err(GpuError::Lost(_))) {
             *passes = Some(opened);
         }
+        check()?;
         let pixels = drawn.map_err(|error| DrawError::Device(error.to_string()))?;
         Ok((Image { width: params.width, height: params.height, pixels }, camera.pixel()))
     }

@@ -1,10 +1,11 @@
 //! Passes of a picture on a device: four draw passes, one that resolves the samples, and one that shades the pixels.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use wgpu::{
     BindGroup, BindGroupEntry, BindGroupLayout, BindingResource, Buffer, BufferUsages, CommandEncoder, ComputePipeline,
-    Device, Limits, LoadOp, MapMode, Operations, PollType, Queue, RenderPassColorAttachment,
+    Device, Limits, LoadOp, MapMode, Operations, PollError, PollType, Queue, RenderPassColorAttachment,
     RenderPassDepthStencilAttachment, RenderPipeline, ShaderModule, StoreOp, TextureUsages, TextureViewDescriptor,
     VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
 };
@@ -19,7 +20,10 @@ use crate::picture::PictureParams;
 use crate::picture::camera::Camera;
 use crate::picture::finish::Finish;
 use crate::picture::light::Levels;
+use crate::surface::CancelToken;
 
+/// Interval of checks for cancellation while the device works.
+const CANCEL_INTERVAL: Duration = Duration::from_millis(20);
 /// Width and height of a workgroup in pixels, as in the shaders.
 const GROUP: u32 = 8;
 
@@ -62,7 +66,7 @@ impl PicturePasses {
         self.device.limits()
     }
 
-    /// Draws a mesh. Returns the pixels in rows from the top. The caller has checked the
+    /// Draws a mesh. Returns the pixels in rows from the top; none after a cancellation. The caller has checked the
     /// [`Requirements`](super::picture_targets::Requirements).
     ///
     /// # Errors
@@ -74,6 +78,7 @@ impl PicturePasses {
         triangles: &[[u32; 3]],
         params: &PictureParams,
         camera: &Camera,
+        cancel: &CancelToken,
     ) -> Result<Vec<[u8; 4]>, GpuError> {
         let (device, queue) = (&self.device, &self.queue);
         let n_pixels = u64::from(params.width) * u64::from(params.height);
@@ -132,13 +137,20 @@ impl PicturePasses {
         compute(device, &mut encoder, &self.finish, &resources, groups);
         encoder.copy_buffer_to_buffer(&pixels, 0, &readback, 0, 4 * n_pixels);
         queue.submit([encoder.finish()]);
-        self.read(&readback)
+        self.read(&readback, cancel)
     }
 
-    /// Waits for all submissions and returns the contents of a buffer.
-    fn read(&self, readback: &Buffer) -> Result<Vec<[u8; 4]>, GpuError> {
+    /// Waits for all submissions and returns the contents of a buffer. After a cancellation, the device finishes its
+    /// submission, and the result is empty.
+    fn read(&self, readback: &Buffer, cancel: &CancelToken) -> Result<Vec<[u8; 4]>, GpuError> {
         readback.map_async(MapMode::Read, .., |_mapped| {});
-        let waited = self.device.poll(PollType::wait_indefinitely());
+        let waited = loop {
+            match self.device.poll(PollType::Wait { submission_index: None, timeout: Some(CANCEL_INTERVAL) }) {
+                Err(PollError::Timeout) if cancel.is_cancelled() => return Ok(Vec::new()),
+                Err(PollError::Timeout) => {}
+                waited => break waited,
+            }
+        };
         self.check_errors()?;
         waited.map_err(|error| GpuError::Failed(error.to_string()))?;
         let view = readback.get_mapped_range(..).map_err(|error| GpuError::Failed(error.to_string()))?;

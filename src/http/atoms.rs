@@ -68,8 +68,8 @@ struct ResidueColumns {
 problem_responses!(StructureProblems: [
     READING,
     [
-        Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
-        Kind::ShareExceeded, Kind::StoreFailed,
+        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull,
+        Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
     ],
 ]);
 problem_responses!(EntryProblems: [READING, [

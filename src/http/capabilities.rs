@@ -8,6 +8,8 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
+use super::kinds::Kind;
+use super::openapi::problem_responses;
 use super::page;
 use super::state::Shared;
 use crate::config::Config;
@@ -238,9 +240,11 @@ struct Radii {
     values: Map<String, Value>,
 }
 
+problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter]]);
+
 /// List formats, parameters, limits and devices
 #[utoipa::path(get, path = "/v1/capabilities", tag = "service", operation_id = "capabilities",
-    responses((status = 200, description = "Formats, parameters, limits and devices.", body = Capabilities)))]
+    responses((status = 200, description = "Formats, parameters, limits and devices.", body = Capabilities), ShowProblems))]
 pub(super) async fn show(State(app): State<Shared>) -> Response {
     let headers = [(CONTENT_TYPE, "application/json"), (CACHE_CONTROL, "no-cache")];
     let body =

@@ -23,6 +23,7 @@ use super::openapi::problem_responses;
 use super::openapi::problems::{BODY, NAMED_STRUCTURE, PARAMETERS, ProblemDocument, READING};
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::problem::Problem;
+use super::request_id::RequestId;
 use super::source::Input;
 use super::state::Shared;
 use crate::pipeline::{self, Choice, Estimate};
@@ -106,6 +107,7 @@ pub(super) async fn create(
     body: Body,
 ) -> Result<Response, Problem> {
     let caller = Caller::of(&extensions);
+    let instance = extensions.get::<RequestId>().cloned().unwrap_or_default();
     app.admit_work(&caller)?;
     // The answer is no mesh, so `Accept` does not choose a format.
     headers.remove(ACCEPT);
@@ -136,7 +138,7 @@ pub(super) async fn create(
     let mesh = estimate.mesh.as_ref().ok();
     let document = EstimateDocument {
         accepted: problem.is_none(),
-        problem: problem.map(|problem| problem.record()),
+        problem: problem.map(|problem| problem.record(instance.as_str())),
         atoms: estimate.atoms,
         atoms_in_file: estimate.atoms_in_file,
         resolution: estimate.resolution,

@@ -33,7 +33,9 @@ struct Listener {
     over: bool,
 }
 
-problem_responses!(EventsProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed]]);
+problem_responses!(EventsProblems: [[
+    Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed,
+]]);
 
 /// Follow a job as server-sent events
 ///

@@ -23,7 +23,7 @@ use super::openapi::problems::{MESHING, ProblemDocument, READING};
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::{ContentKey, JobId, JobView, Status, is_stored, rfc3339};
+use crate::jobs::{ContentKey, JobId, JobView, Record, Status, is_stored, rfc3339};
 
 /// Longest poll, s. Proxies commonly cut an exchange after a minute.
 pub(super) const MAX_WAIT_S: u64 = 55;
@@ -129,9 +129,9 @@ impl Poll {
 }
 
 problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed]]);
-problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::RecordUnreadable, Kind::StoreFull, Kind::StoreFailed]]);
+problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::JobEnded, Kind::RecordUnreadable, Kind::StoreFull, Kind::StoreFailed]]);
 problem_responses!(ResultProblems: [READING, MESHING, [
-    Kind::BadRequest, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed, Kind::ResultGone, Kind::JobAbandoned,
+    Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed, Kind::ResultGone, Kind::JobAbandoned,
     Kind::RecordUnreadable,
     Kind::StoreFull, Kind::StoreFailed,
 ]]);
@@ -257,6 +257,14 @@ fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Respons
     response
 }
 
+/// Returns the problem of a failed job. Its instance is the request that created the job.
+fn problem(record: &Record) -> Option<Value> {
+    let mut problem = record.problem.clone()?;
+    let request = record.requester.request.as_deref().unwrap_or(record.id.as_str());
+    problem.as_object_mut()?.insert("instance".to_owned(), request.into());
+    Some(problem)
+}
+
 /// Returns the document of a job.
 pub(super) fn document(view: &JobView) -> JobDocument {
     let record = &view.record;
@@ -289,7 +297,7 @@ pub(super) fn document(view: &JobView) -> JobDocument {
         structure: record.input.clone(),
         format: record.format.clone(),
         parameters,
-        problem: record.problem.clone(),
+        problem: problem(record),
         result: record.result.as_ref().map(|key| format!("{key}.{}", record.format)),
         links,
     }

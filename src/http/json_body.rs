@@ -92,7 +92,7 @@ mod tests {
         for value in ["{}", "{\"b\": 1}", "[]", "[[]]", "[[1]]", "[null]", "[1, {}]"] {
             let problem = members(format!("{{\"a\": {value}}}").as_bytes()).unwrap_err();
             assert!(problem.is(Kind::BadParameter), "{value}");
-            assert_eq!(problem.record()["parameter"], "a", "{value}");
+            assert_eq!(problem.record("")["parameter"], "a", "{value}");
         }
         for bad in ["[]", "3", "{", "", "{\"a\": }", "{\"a\": 1} x"] {
             assert!(members(bad.as_bytes()).unwrap_err().is(Kind::BadRequest), "{bad}");

@@ -84,9 +84,9 @@ impl Problem {
         self
     }
 
-    /// Returns the document for the record of a job, which [`Self::recorded`] reads.
-    pub(super) fn record(&self) -> Value {
-        serde_json::from_slice(&self.document("")).unwrap_or_default()
+    /// Returns the document as a part of another one, such as the record of a job, which [`Self::recorded`] reads.
+    pub(super) fn record(&self, instance: &str) -> Value {
+        serde_json::from_slice(&self.document(instance)).unwrap_or_default()
     }
 
     /// Restores the problem of a job's record.

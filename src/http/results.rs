@@ -42,10 +42,12 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
 }
 
 problem_responses!(ShowProblems: [[
-    Kind::BadRequest, Kind::NotFound, Kind::PreconditionFailed, Kind::RangeNotSatisfiable, Kind::MemoryFull,
-    Kind::ShareExceeded, Kind::StoreFailed,
+    Kind::BadRequest, Kind::BadParameter, Kind::NotFound, Kind::PreconditionFailed, Kind::RangeNotSatisfiable,
+    Kind::MemoryFull, Kind::ShareExceeded, Kind::StoreFailed,
 ]]);
-problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::PreconditionFailed, Kind::StoreFailed]]);
+problem_responses!(ReportProblems: [[
+    Kind::BadRequest, Kind::BadParameter, Kind::NotFound, Kind::PreconditionFailed, Kind::StoreFailed,
+]]);
 
 /// Get a stored mesh
 ///

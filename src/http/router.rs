@@ -4,13 +4,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
-use axum::middleware::from_fn;
+use axum::extract::Request;
+use axum::middleware::{Next, from_fn};
+use axum::response::{IntoResponse as _, Response};
 use axum::routing::{MethodRouter, get, post};
 
 use super::state::Shared;
 use super::{
-    api_document, atoms, capabilities, estimate, events, health, jobs, meshes, middleware, negotiate, page, pdb,
-    problems, results, structures,
+    api_document, atoms, capabilities, estimate, events, guard, health, jobs, meshes, middleware, negotiate, page, pdb,
+    problems, results, scopes, structures,
 };
 
 /// Margin of the backstop timeout over the sum of the regular timeouts.
@@ -22,8 +24,20 @@ pub(super) fn router(app: &Shared) -> Router {
     let input = Duration::from_millis(app.config.server.body_timeout_ms.max(app.config.archive.timeout_ms));
     let timeout = input + longest + MARGIN;
     let router = routes().into_iter().fold(Router::new(), |router, (path, methods)| router.route(path, methods));
-    let router = router.layer(from_fn(negotiate::relabel)).with_state(Arc::clone(app));
+    let router = router.layer(from_fn(negotiate::relabel)).layer(from_fn(reject_parameters));
+    let router = router.with_state(Arc::clone(app));
     middleware::apply(router, timeout, app)
+}
+
+/// Middleware: rejects query parameters of operations that have none.
+async fn reject_parameters(request: Request, next: Next) -> Response {
+    match scopes::check_parameters(&request) {
+        Ok(()) => next.run(request).await,
+        Err(problem) => {
+            guard::discard_body(request).await;
+            problem.into_response()
+        }
+    }
 }
 
 /// Paths with their methods. [`scopes::TABLE`](super::scopes::TABLE) has their scopes.

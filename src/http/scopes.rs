@@ -1,8 +1,11 @@
-//! Scopes that the operations need. The OpenAPI document uses this table, and tests compare it with the router.
+//! Scopes that the operations need, and their query parameters. The OpenAPI document uses this table, and tests compare
+//! it with the router.
 
-use axum::extract::{MatchedPath, Request};
+use axum::extract::{MatchedPath, Query, Request};
 use axum::http::Method;
 
+use super::kinds::Kind;
+use super::problem::Problem;
 use crate::access::Scope;
 
 /// Operation with the scope that it needs; `None`: open to everybody.
@@ -10,6 +13,30 @@ pub(super) struct Row {
     pub(super) method: Method,
     pub(super) path: &'static str,
     pub(super) scope: Option<Scope>,
+}
+
+/// Query parameters of an operation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Parameters {
+    /// Those of a mesh.
+    Mesh,
+    /// `wait`.
+    Wait,
+    None,
+}
+
+impl Row {
+    /// Returns the query parameters of the operation.
+    pub(super) fn parameters(&self) -> Parameters {
+        let is_result = self.path.starts_with("/v1/results/");
+        let is_file = self.path.ends_with("/{file}") || self.path.ends_with("/report.json");
+        match self.path {
+            "/v1/meshes" | "/v1/report" | "/v1/estimate" => Parameters::Mesh,
+            "/v1/jobs/{id}" if self.method == Method::GET => Parameters::Wait,
+            _ if is_file && !is_result => Parameters::Mesh,
+            _ => Parameters::None,
+        }
+    }
 }
 
 const fn row(method: Method, path: &'static str, scope: Option<Scope>) -> Row {
@@ -58,6 +85,22 @@ pub(super) const TABLE: &[Row] = &[
     row(Method::GET, "/molmesh-viewer.js", OPEN),
     row(Method::GET, "/sample.pdb", OPEN),
 ];
+
+/// Rejects a query parameter of an operation that has none.
+pub(super) fn check_parameters(request: &Request) -> Result<(), Problem> {
+    let Some(path) = request.extensions().get::<MatchedPath>() else { return Ok(()) };
+    let method = if request.method() == Method::HEAD { &Method::GET } else { request.method() };
+    let mut rows = TABLE.iter().filter(|row| row.path == path.as_str() && row.method == *method);
+    if !rows.any(|row| row.scope.is_some() && row.parameters() == Parameters::None) {
+        return Ok(());
+    }
+    let pairs = Query::<Vec<(String, String)>>::try_from_uri(request.uri());
+    let Query(pairs) = pairs.map_err(|error| Problem::new(Kind::BadRequest, error.body_text()))?;
+    let Some((name, _)) = pairs.first() else { return Ok(()) };
+    let name: String = name.chars().take(64).collect();
+    let detail = format!("unknown parameter `{name}`; this path has none");
+    Err(Problem::new(Kind::BadParameter, detail).with("parameter", name))
+}
 
 /// Returns the scope that a request needs; `None`: it is open.
 pub(super) fn needed(request: &Request) -> Option<Scope> {

@@ -138,7 +138,7 @@ impl Server {
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
-        let describe = |error: &EndError| Problem::from(error.clone()).record();
+        let describe = |error: &EndError| Problem::from(error.clone()).record("");
         let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
         let job_store = JobStore::new(store.clone(), Arc::clone(&pool), jobs, output_bytes, secret, describe);
         // The inputs of open jobs are pinned before a request can evict them.

@@ -4,7 +4,7 @@ use axum::extract::Query;
 use axum::http::{Method, Uri};
 
 use super::jobs::{MAX_WAIT_S, Poll};
-use super::scopes::{Row, TABLE};
+use super::scopes::{Parameters, Row, TABLE};
 use crate::formats::Format;
 use crate::pipeline::params;
 
@@ -59,17 +59,16 @@ fn is_result(row: &Row) -> bool {
 
 fn check_parameters(row: &Row, uri: &Uri) -> Result<(), String> {
     let Query(pairs) = Query::<Vec<(String, String)>>::try_from_uri(uri).map_err(|error| error.body_text())?;
-    if row.path == "/v1/jobs/{id}" {
-        let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;
-        return if poll.wait() <= MAX_WAIT_S { Ok(()) } else { Err(format!("`wait` is more than {MAX_WAIT_S} s")) };
-    }
-    let is_mesh = !is_result(row) && (row.path.ends_with("/{file}") || row.path.ends_with("/report.json"));
-    if is_mesh {
-        return params::parse(pairs).map(drop).map_err(|error| error.to_string());
-    }
-    match pairs.first() {
-        Some((name, _)) => Err(format!("unknown parameter `{name}`; this path has none")),
-        None => Ok(()),
+    match row.parameters() {
+        Parameters::Mesh => params::parse(pairs).map(drop).map_err(|error| error.to_string()),
+        Parameters::Wait => {
+            let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;
+            if poll.wait() <= MAX_WAIT_S { Ok(()) } else { Err(format!("`wait` is more than {MAX_WAIT_S} s")) }
+        }
+        Parameters::None => match pairs.first() {
+            Some((name, _)) => Err(format!("unknown parameter `{name}`; this path has none")),
+            None => Ok(()),
+        },
     }
 }
 

@@ -101,8 +101,8 @@ problem_responses!(CreateProblems: [
 problem_responses!(ShowProblems: [
     READING,
     [
-        Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
-        Kind::ShareExceeded, Kind::StoreFailed,
+        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull,
+        Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
     ],
 ]);
 problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [

@@ -15,6 +15,7 @@ use super::{ContentKey, EndError, Failure, Finished, Refusal, Ticket};
 use crate::pipeline::JobError;
 use crate::store::{Digest, Pin};
 use crate::surface::SurfaceError;
+use crate::sync::{Handle, sleep};
 use crate::telemetry::{JOBS_OPEN, SpanKind, TraceSpan};
 
 /// Interval at which the progress of a running job is published.
@@ -36,7 +37,7 @@ impl DurableJob {
         let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
         // Later than every version of an earlier process, unless the job has ended.
         let version = record.finished_ms.unwrap_or_else(now_ms);
-        let (state, _) = watch::channel(JobView { record, stage: None, fraction, version });
+        let (state, _) = watch::channel(JobView { record, stage: None, fraction, version, end: None });
         Self { state, dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
     }
 
@@ -44,8 +45,10 @@ impl DurableJob {
         self.state.borrow().record.id.clone()
     }
 
+    /// Returns the latest record, which has an end that is not visible yet.
     pub(super) fn record(&self) -> Record {
-        self.state.borrow().record.clone()
+        let view = self.state.borrow();
+        view.end.as_deref().unwrap_or(&view.record).clone()
     }
 
     pub(super) fn view(&self) -> JobView {
@@ -63,7 +66,8 @@ impl DurableJob {
     fn update(&self, change: impl FnOnce(&mut JobView, u64) -> bool) -> bool {
         self.state.send_if_modified(|view| {
             let now = now_ms().max(view.version + 1);
-            let changed = !view.record.status.is_final() && change(view, now);
+            let is_open = !view.record.status.is_final() && view.end.is_none();
+            let changed = is_open && change(view, now);
             if changed {
                 view.version = now;
             }
@@ -96,18 +100,34 @@ impl DurableJob {
         })
     }
 
-    /// Ends the job with `status` and changes its record with `and`. Returns false if it had already ended.
+    /// Decides the end of the job: `status`, and the changes of its record by `and`. Returns false if the end was
+    /// decided before. [`Self::publish_end`] makes it visible.
     pub(super) fn end(&self, status: Status, and: impl FnOnce(&mut Record)) -> bool {
+        let mut decided = false;
         self.update(|view, now| {
-            view.record.status = status;
-            view.record.finished_ms = Some(now);
-            and(&mut view.record);
+            let mut record = view.record.clone();
+            record.status = status;
+            record.finished_ms = Some(now);
+            and(&mut record);
+            view.end = Some(Box::new(record));
+            decided = true;
+            false
+        });
+        decided
+    }
+
+    /// Makes a decided end visible.
+    pub(super) fn publish_end(&self) {
+        self.state.send_if_modified(|view| {
+            let Some(record) = view.end.take() else { return false };
+            view.version = record.finished_ms.unwrap_or(view.version + 1);
             view.stage = None;
-            if status == Status::Successful {
+            if record.status == Status::Successful {
                 view.fraction = 1.0;
             }
+            view.record = *record;
             true
-        })
+        });
     }
 
     /// Publishes the stage and the finished fraction of the running work if they have advanced.
@@ -153,7 +173,7 @@ impl JobStore {
             gauge!(JOBS_OPEN).decrement(1.0);
             jobs.0.open.send_modify(|open| *open -= 1);
         };
-        tokio::spawn(run.instrument(log));
+        Handle::current().spawn(run.instrument(log));
     }
 
     /// Waits until every job has ended or is left, and its record is written. The pool must be drained.
@@ -192,10 +212,10 @@ impl Runner {
                 }
                 Attempt::Retry => {
                     pause = retry::FIRST_PAUSE;
-                    tokio::time::sleep(PAUSE).await;
+                    sleep(PAUSE).await;
                 }
                 Attempt::StoreFailed => {
-                    tokio::time::sleep(pause).await;
+                    sleep(pause).await;
                     pause = (pause * 2).min(retry::MAX_PAUSE);
                 }
                 Attempt::Left => {
@@ -225,7 +245,7 @@ async fn attempt(jobs: &JobStore, job: &Arc<DurableJob>, ticket: &mut Option<Tic
     let outcome = loop {
         tokio::select! {
             outcome = ticket.wait() => break outcome,
-            () = tokio::time::sleep(TICK) => {
+            () = sleep(TICK) => {
                 if let Some((stage, fraction)) = ticket.progress.now() {
                     job.publish_stage(stage, fraction);
                 }

@@ -1,5 +1,7 @@
 //! Interleavings of requests, workers and shutdown.
 
+mod durable;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;

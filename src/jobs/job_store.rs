@@ -5,12 +5,13 @@
 //! computing one twice is harmless; a crash costs time and never loses a job.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use metrics::counter;
 use serde_json::Value;
 use tokio::sync::watch;
+use tracing::Instrument as _;
 
 use super::durable_job::{DurableJob, Runner};
 use super::rank::{Client, Rank};
@@ -20,6 +21,7 @@ use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket, resu
 use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::store::{Digest, Name, Namespace, Pin, Secret, Store, StoreError};
+use crate::sync::{Handle, mpsc};
 use crate::telemetry::JOBS_RECOVERED;
 
 /// Number of ended jobs that are held in memory; older ones are read from the store.
@@ -49,6 +51,8 @@ pub(crate) struct JobView {
     pub(crate) fraction: f64,
     /// Number of this state: the time of the change, ms since 1970. Grows with every change, also after a restart.
     pub(crate) version: u64,
+    /// Record of an end that was decided but is not written yet. The end is visible once it is on record.
+    pub(super) end: Option<Box<Record>>,
 }
 
 /// Converts the error of a failed job into the document that clients get.
@@ -235,14 +239,25 @@ impl JobStore {
         Ok(self.watch(id, namespace).await?.map(|watched| watched.borrow().clone()))
     }
 
-    /// Cancels a job unless it has ended, and returns its state; `None` if the namespace has no such job. The job is
-    /// cancelled even if the store fails.
+    /// Cancels a job unless it has ended, and returns its final state; `None` if the namespace has no such job. The job
+    /// is cancelled even if the store fails.
     pub(crate) async fn dismiss(&self, id: &JobId, namespace: Namespace) -> Result<Option<JobView>, StoreError> {
         let Some(job) = self.known(id, namespace) else { return self.view(id, namespace).await };
         if job.end(Status::Dismissed, |_| {}) {
             job.dismissed.notify_one();
-            self.0.write_job(&job).await?;
+            let (inner, ended) = (Arc::clone(&self.0), Arc::clone(&job));
+            let write = async move {
+                let written = inner.write_job(&ended).await;
+                ended.publish_end();
+                written
+            };
+            // The write ends even if the client leaves.
+            if let Ok(written) = Handle::current().spawn(write.in_current_span()).await {
+                written?;
+            }
         }
+        // Another end may have been decided, but not be on record yet. The job holds the sender.
+        drop(job.state.subscribe().wait_for(|view| view.record.status.is_final()).await);
         Ok(Some(job.view()))
     }
 
@@ -271,7 +286,7 @@ impl JobStore {
     /// is detected. It first waits for a message on `recorded`, which says that the job itself is on record.
     pub(super) fn on_start(&self, job: &Arc<DurableJob>, recorded: Option<mpsc::Receiver<()>>) -> OnStart {
         let (jobs, job) = (self.clone(), Arc::clone(job));
-        let runtime = tokio::runtime::Handle::current();
+        let runtime = Handle::current();
         Box::new(move || {
             // The sender is dropped if the job could not be recorded; the work is cancelled then.
             if recorded.is_some_and(|recorded| recorded.recv().is_err()) {
@@ -285,7 +300,8 @@ impl JobStore {
         })
     }
 
-    /// Records the end of a job, unless it was dismissed meanwhile. Its result is pinned until then.
+    /// Records the end of a job and makes it visible, unless it was dismissed meanwhile. Its result is pinned until
+    /// then.
     pub(super) async fn finish(&self, job: &DurableJob, ending: Result<(String, Pin), EndError>) {
         let id = job.id();
         let changed = match &ending {
@@ -309,6 +325,7 @@ impl JobStore {
         // Without the record a restart runs the job again: wasted work, but nothing is lost.
         if let Err(error) = retry(&id, self.0.retry_time(), StoreError::is_temporary, write).await {
             tracing::error!(job_id = %id, %error, "cannot record the end of a job");
+            job.publish_end();
         }
     }
 

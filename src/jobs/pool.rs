@@ -57,21 +57,24 @@ impl Shared {
 
 /// A running pool. Dropping it cancels running jobs.
 pub(crate) struct Pool {
-    shared: Arc<Shared>,
+    pub(super) shared: Arc<Shared>,
 }
 
 impl Pool {
     /// Starts the workers. `reason` says why this backend was chosen, for reports.
     pub(crate) fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
-        let workers = settings.workers;
-        let queue = Arc::new(Queue::new(settings.queue, workers, settings.batch_max_delay));
-        let shared = Shared { queue, backend, reason, settings, monitor: DeviceMonitor::default() };
-        let pool = Self { shared: Arc::new(shared) };
-        for n in 0..workers {
+        let pool = Self::without_workers(settings, backend, reason);
+        for n in 0..pool.shared.settings.workers {
             let shared = Arc::clone(&pool.shared);
             std::thread::Builder::new().name(format!("molmesh-job-{n}")).spawn(move || worker::work(&shared))?;
         }
         Ok(pool)
+    }
+
+    /// Creates a pool whose workers have not started.
+    pub(super) fn without_workers(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> Self {
+        let queue = Arc::new(Queue::new(settings.queue, settings.workers, settings.batch_max_delay));
+        Self { shared: Arc::new(Shared { queue, backend, reason, settings, monitor: DeviceMonitor::default() }) }
     }
 
     /// Accepts a task whose mesh must be finished within `allowed`, time in the queue included. `on_start` is called

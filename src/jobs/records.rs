@@ -41,11 +41,16 @@ impl Inner {
         self.store.delete(&Name::job(id)?).await
     }
 
-    /// Writes the present record of a job. Writers of one job take turns, so the last write has the latest state, and a
-    /// job that was dismissed while it started stays dismissed after a restart.
+    /// Writes the latest record of a job, and makes its end visible. Writers of one job take turns, so the last write
+    /// has the latest state, and a job that was dismissed while it started stays dismissed after a restart.
     pub(super) async fn write_job(&self, job: &DurableJob) -> Result<(), StoreError> {
         let _turn = job.writing.lock().await;
-        self.write(&job.record()).await
+        let record = job.record();
+        self.write(&record).await?;
+        if record.status.is_final() {
+            job.publish_end();
+        }
+        Ok(())
     }
 
     /// Writes the record of a new, open job. Returns false if there is a job with its id, open or ended.

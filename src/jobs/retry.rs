@@ -7,6 +7,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::JobId;
+use crate::sync::sleep;
 
 /// Pause before the second attempt; each further pause is twice as long.
 pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(250);
@@ -28,7 +29,7 @@ pub(super) async fn retry<T, E: Display, F: Future<Output = Result<T, E>>>(
             done => return done,
         };
         tracing::warn!(job_id = %id, %error, "the store rejected a write; retrying");
-        tokio::time::sleep(pause).await;
+        sleep(pause).await;
         pause = (pause * 2).min(MAX_PAUSE);
     }
 }

@@ -222,15 +222,17 @@ async fn the_end_of_a_job_is_recorded_once_the_store_works_again() {
     let mut seen = fixture.watch(&id).await;
     fixture.unanswered(1).await;
     fixture.faults.silence(Some(Folder::Jobs));
-    ended(&mut seen).await;
-    is(&seen, |record| record.status, &Status::Successful);
     fixture.unanswered(2).await;
+    // The end is not visible before it is on record.
+    is(&seen, |record| record.status, &Status::Running);
     // Until then nothing removes the result.
     let expire = async || fixture.store.sweep(SystemTime::now() + Duration::from_hours(10_000)).await;
     expire().await;
     assert_eq!(fixture.store.usage(Folder::Results).objects, 2);
     fixture.faults.silence(None);
-    until("the record", || async { fixture.on_record(&id).await.status == Status::Successful }).await;
+    ended(&mut seen).await;
+    is(&seen, |record| record.status, &Status::Successful);
+    assert_eq!(fixture.on_record(&id).await, seen.borrow().record);
     fixture.jobs.settled().await;
     expire().await;
     assert_eq!(fixture.store.usage(Folder::Results).objects, 0, "control: an unused result expires");
@@ -340,6 +342,7 @@ async fn versions_of_states_continue_after_a_restart() {
     let next = DurableJob::new(job.record());
     versions.push(next.view().version);
     assert!(next.end(Status::Failed, |_| {}));
+    next.publish_end();
     versions.push(next.view().version);
     assert!(versions.is_sorted_by(|a, b| a < b), "{versions:?}");
     assert_eq!(DurableJob::new(next.record()).view().version, *versions.last().unwrap(), "no event follows the last");

@@ -7,6 +7,7 @@ use super::coalesced_job::Progress;
 use super::queue::Queue;
 use super::{Failure, Outcome};
 use crate::single_flight::ResultReceiver;
+use crate::sync::timeout;
 use crate::telemetry::TraceSpan;
 
 /// Handle of an accepted job.
@@ -32,7 +33,7 @@ impl Ticket {
     /// Waits for the outcome, at most until the deadline. Cancel safe.
     pub(crate) async fn wait(&mut self) -> Outcome {
         let Some(outcome) = &mut self.outcome else { return Err(Failure::Stopped) };
-        match tokio::time::timeout_at(self.deadline.into(), outcome.recv()).await {
+        match timeout(self.deadline.saturating_duration_since(Instant::now()), outcome.recv()).await {
             Err(_elapsed) => Err(Failure::Deadline { limit: self.allowed }),
             Ok(Some(outcome)) => outcome,
             Ok(None) => Err(Failure::Stopped),

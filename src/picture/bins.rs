@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::camera::Camera;
+use crate::surface::{Control, SurfaceError};
 
 /// Width of a tile in pixels.
 pub(super) const TILE_WIDTH: usize = 64;
@@ -61,10 +62,23 @@ struct Chunk {
 pub(super) struct Bins(Vec<Chunk>);
 
 impl Bins {
-    pub(super) fn new(positions: &[[f32; 3]], triangles: &[[u32; 3]], camera: &Camera, tiles: Tiles) -> Self {
+    /// Sorts triangles into tiles.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
+    pub(super) fn new(
+        positions: &[[f32; 3]],
+        triangles: &[[u32; 3]],
+        camera: &Camera,
+        tiles: Tiles,
+        control: &Control<'_>,
+    ) -> Result<Self, SurfaceError> {
         let chunk = triangles.len().div_ceil(MAX_CHUNKS).max(MIN_CHUNK);
-        let of_chunk = |(n, part): (usize, &[[u32; 3]])| bin(positions, part, n * chunk, camera, tiles);
-        Self(triangles.par_chunks(chunk).enumerate().map(of_chunk).collect())
+        let of_chunk = |(n, part): (usize, &[[u32; 3]])| {
+            control.check()?;
+            Ok(bin(positions, part, n * chunk, camera, tiles))
+        };
+        triangles.par_chunks(chunk).enumerate().map(of_chunk).collect::<Result<_, _>>().map(Self)
     }
 
     /// Returns the triangles of a tile.

@@ -36,22 +36,17 @@ impl Renderer for CpuRenderer {
         let tiles = Tiles::of(width, height);
         // A pair of tile and triangle, before and after sorting; few triangles lie in several tiles.
         let memory = control.reserve(BIN_BYTES * shape.triangles.len() as u64)?;
-        let bins = Bins::new(positions, shape.triangles, &camera, tiles);
-        control.check()?;
+        let bins = Bins::new(positions, shape.triangles, &camera, tiles, control)?;
         let mut layers = Layers::empty(width, height);
         let rows = TILE_HEIGHT * width;
         let bands = layers.depth.par_chunks_mut(rows).zip(layers.light.par_chunks_mut(rows));
         let bands = bands.zip(layers.facing.par_chunks_mut(rows)).enumerate();
         bands.try_for_each_init(Samples::default, |samples, (n, ((depth, light), facing))| {
-            control.check()?;
             let mut band = Band { top: n * TILE_HEIGHT, width, depth, light, facing };
-            fill(shape, &camera, &bins, tiles, &mut band, samples);
-            Ok::<_, PictureError>(())
+            fill(shape, &camera, &bins, tiles, &mut band, samples, control)
         })?;
         drop((bins, memory));
-        control.check()?;
-        let image = finish(&layers, &Finish::new(params, &camera), params);
-        control.check()?;
+        let image = finish(&layers, &Finish::new(params, &camera), params, control)?;
         Ok(Rendered { image, pixel: camera.pixel(), made_by: None })
     }
 }

@@ -7,6 +7,7 @@ use super::camera::Camera;
 use super::layers::{Layers, NOTHING};
 use super::light::{self, Levels};
 use super::{Background, Image, PictureParams, Style};
+use crate::surface::{Control, SurfaceError};
 
 /// Directions from a pixel in a quarter of the circle, at equal angles.
 const QUARTER: [[f64; 2]; 4] = {
@@ -112,16 +113,27 @@ fn taps(radius: f64, pixel: f64) -> Vec<Tap> {
 }
 
 /// Shades `layers`.
-pub(super) fn finish(layers: &Layers, shading: &Finish, params: &PictureParams) -> Image {
+///
+/// # Errors
+/// [`SurfaceError::Cancelled`].
+pub(super) fn finish(
+    layers: &Layers,
+    shading: &Finish,
+    params: &PictureParams,
+    control: &Control<'_>,
+) -> Result<Image, SurfaceError> {
     let levels = Levels::get();
     let mut pixels = vec![[0; 4]; layers.width * layers.height];
-    pixels.par_chunks_mut(layers.width.max(1)).enumerate().for_each_init(Row::default, |row, (y, out)| {
+    let rows = pixels.par_chunks_mut(layers.width.max(1)).enumerate();
+    rows.try_for_each_init(Row::default, |row, (y, out)| {
+        control.check()?;
         row.shade(layers, shading, y);
         for (x, pixel) in out.iter_mut().enumerate() {
             *pixel = color(layers, shading, levels, row.open.get(x).copied(), x, y);
         }
-    });
-    Image { width: params.width, height: params.height, pixels }
+        Ok::<_, SurfaceError>(())
+    })?;
+    Ok(Image { width: params.width, height: params.height, pixels })
 }
 
 /// Colour of a pixel; `open` is the share of the light that is not occluded, if occlusion is enabled.

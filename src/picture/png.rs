@@ -1,14 +1,22 @@
 //! PNG encoder: eight bits, straight alpha, marked as sRGB.
 
+use std::io::{self, Write as _};
+
 use png::{BitDepth, ColorType, DeflateCompression, Encoder, Filter, SrgbRenderingIntent};
 
 use super::{Image, PictureError};
+use crate::surface::Control;
+
+/// Number of pixels that are compressed between two checks of the cancellation flag: a few milliseconds.
+const PIXELS_PER_CHECK: usize = 1 << 16;
+/// Size of a chunk of compressed data, bytes.
+const CHUNK_BYTES: usize = 1 << 20;
 
 /// Encodes an image as PNG. Equal images give equal bytes.
 ///
 /// # Errors
-/// [`PictureError::Png`] if the number of pixels does not match the size.
-pub fn encode(image: &Image) -> Result<Vec<u8>, PictureError> {
+/// [`PictureError::Png`] if the number of pixels does not match the size, and [`PictureError::Cancelled`].
+pub fn encode(image: &Image, control: &Control<'_>) -> Result<Vec<u8>, PictureError> {
     let failed = |error: png::EncodingError| PictureError::Png(error.to_string());
     let opaque = image.pixels.iter().all(|pixel| pixel[3] == u8::MAX);
     let mut bytes = Vec::new();
@@ -21,12 +29,18 @@ pub fn encode(image: &Image) -> Result<Vec<u8>, PictureError> {
     // The filter `Up` compresses as well as any other.
     encoder.set_filter(Filter::Up);
     let mut writer = encoder.write_header().map_err(failed)?;
-    if opaque {
-        let rgb: Vec<[u8; 3]> = image.pixels.iter().map(|[r, g, b, _]| [*r, *g, *b]).collect();
-        writer.write_image_data(rgb.as_flattened()).map_err(failed)?;
-    } else {
-        writer.write_image_data(image.pixels.as_flattened()).map_err(failed)?;
+    let mut stream = writer.stream_writer_with_size(CHUNK_BYTES).map_err(failed)?;
+    for pixels in image.pixels.chunks(PIXELS_PER_CHECK) {
+        control.check()?;
+        let written = if opaque {
+            let rgb: Vec<[u8; 3]> = pixels.iter().map(|[r, g, b, _]| [*r, *g, *b]).collect();
+            stream.write_all(rgb.as_flattened())
+        } else {
+            stream.write_all(pixels.as_flattened())
+        };
+        written.map_err(|error: io::Error| PictureError::Png(error.to_string()))?;
     }
+    stream.finish().map_err(failed)?;
     writer.finish().map_err(failed)?;
     Ok(bytes)
 }
@@ -40,7 +54,7 @@ mod tests {
         for alpha in [255, 128] {
             let pixels: Vec<_> = (0..6_u8).map(|n| [n, 2 * n, 255 - n, if n == 3 { alpha } else { 255 }]).collect();
             let image = Image { width: 3, height: 2, pixels };
-            let bytes = encode(&image).unwrap();
+            let bytes = encode(&image, &Control::default()).unwrap();
             let mut reader = png::Decoder::new(std::io::Cursor::new(&bytes)).read_info().unwrap();
             let mut out = vec![0; reader.output_buffer_size().unwrap()];
             let info = reader.next_frame(&mut out).unwrap();
@@ -51,7 +65,9 @@ mod tests {
             }
             assert_eq!(reader.info().srgb, Some(SrgbRenderingIntent::Perceptual));
         }
-        let short = Image { width: 3, height: 2, pixels: vec![[0; 4]; 5] };
-        assert!(matches!(encode(&short), Err(PictureError::Png(_))));
+        for n in [5, 7] {
+            let wrong = Image { width: 3, height: 2, pixels: vec![[0; 4]; n] };
+            assert!(matches!(encode(&wrong, &Control::default()), Err(PictureError::Png(_))), "{n}");
+        }
     }
 }

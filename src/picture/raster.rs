@@ -4,6 +4,7 @@ use super::bins::{Bins, PARTS, TILE_HEIGHT, TILE_WIDTH, Tiles, corner, twice_are
 use super::camera::{Camera, dot};
 use super::layers::{Facing, NOTHING, SAMPLES, UNIT};
 use super::light::lambert;
+use crate::surface::{Control, SurfaceError};
 
 /// Positions of the samples within a pixel, in subpixels: the standard pattern of graphics devices.
 const PATTERN: [[i32; 2]; SAMPLES] = [[96, 32], [224, 96], [32, 160], [160, 224]];
@@ -149,7 +150,13 @@ impl Facet {
     }
 }
 
+/// Number of triangles that are drawn between two checks of the cancellation flag. Large ones fill their tile.
+const TRIANGLES_PER_CHECK: usize = 1 << 10;
+
 /// Draws `shape` in a row of tiles.
+///
+/// # Errors
+/// [`SurfaceError::Cancelled`].
 pub(super) fn fill(
     shape: Shape<'_>,
     camera: &Camera,
@@ -157,7 +164,8 @@ pub(super) fn fill(
     tiles: Tiles,
     band: &mut Band<'_>,
     samples: &mut Samples,
-) {
+    control: &Control<'_>,
+) -> Result<(), SurfaceError> {
     let height = band.depth.len() / band.width;
     for column in 0..tiles.across {
         let left = column * TILE_WIDTH;
@@ -169,7 +177,10 @@ pub(super) fn fill(
         samples.depth.fill(NOTHING);
         let signed = |n: [usize; 2]| n.map(|n| i64::try_from(n).unwrap_or(i64::MAX));
         let (corner, size) = (signed([left, band.top]), signed([width, height]));
-        for triangle in triangles {
+        for (n, triangle) in triangles.enumerate() {
+            if n % TRIANGLES_PER_CHECK == 0 {
+                control.check()?;
+            }
             Facet::new(shape, triangle, camera).draw(shape, camera, corner, size, samples);
         }
         for y in 0..height {
@@ -179,6 +190,7 @@ pub(super) fn fill(
             }
         }
     }
+    Ok(())
 }
 
 /// Resolves the samples of a pixel.

@@ -27,7 +27,7 @@ pub fn draw(
     })?;
     // Free the mesh before the PNG is allocated.
     drop::<Mesh>(mesh);
-    let bytes = clock.time("png", || png::encode(&drawn.image))?;
+    let bytes = clock.time("png", || png::encode(&drawn.image, control))?;
     product.report.picture = Some(PictureReport::new(params, renderer, &drawn));
     for (stage, ms) in clock.finish() {
         Report::add_timing(&mut product.report, stage, ms);

@@ -9,6 +9,7 @@ use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
 use crate::surface::cpu::scan;
 use crate::surface::lattice::Lattice;
 use crate::surface::occupancy::Occupancy;
+use crate::surface::params::MAX_RESOLUTION;
 use crate::surface::{Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// Estimated size of a job.
@@ -73,6 +74,7 @@ pub fn estimate(
     let lattice = Lattice::new(&spheres, &params)?;
     let (resolution, box_cells) = (params.resolution, lattice.box_cells);
     let mesh = refused.map_or_else(|| of_mesh(&lattice, &spheres, &params, &limits.surface, choice, control), Err);
+    let mesh = mesh.map_err(|error| with_finest_fit(error, &spheres, &params, &limits.surface, control));
     let mesh = match (mesh, job.spacing) {
         (Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)), _) => return Err(error.into()),
         (Ok(mesh), Spacing::MaxTriangles(limit)) => Ok(mesh.at_most(limit, &params)),
@@ -120,6 +122,46 @@ fn of_mesh(
     Ok(estimate)
 }
 
+/// Maximum number of grids that [`with_finest_fit`] plans.
+const MAX_PLANS: u32 = 6;
+
+/// Replaces the suggested spacing of [`SurfaceError::GridTooLarge`], which is an upper bound, with the finest hundredth
+/// of an Å whose planned grid fits.
+pub(super) fn with_finest_fit(
+    error: SurfaceError,
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> SurfaceError {
+    let SurfaceError::GridTooLarge { samples, limit, resolution, suggested_resolution: bound } = error else {
+        return error;
+    };
+    let samples_at = |spacing: f64| {
+        let lattice = Lattice::new(spheres, &SurfaceParams { resolution: spacing, ..params.clone() })?;
+        Ok(512 * Occupancy::new(&lattice, limits, control)?.n_reached())
+    };
+    let (mut fits, mut next) = (None, bound);
+    for _ in 0..MAX_PLANS {
+        match samples_at(next) {
+            Ok(needed) => {
+                fits = Some(next);
+                // The bricks of a finer grid cover less volume, so the grid at this spacing fits as well.
+                let finer = (next * (needed as f64 / limit as f64).cbrt() * 100.0).ceil() / 100.0;
+                if finer >= next {
+                    break;
+                }
+                next = finer;
+            }
+            Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)) => return error,
+            Err(_too_large) => break,
+        }
+    }
+    // The bound ends at the coarsest spacing, which need not fit.
+    let suggested_resolution = fits.unwrap_or(if bound < MAX_RESOLUTION { bound } else { f64::INFINITY });
+    SurfaceError::GridTooLarge { samples, limit, resolution, suggested_resolution }
+}
+
 /// Returns the area of a mesh, Å².
 fn area(mesh: &Mesh) -> f64 {
     let corner = |i: u32| glam::Vec3::from(mesh.positions[i as usize]);
@@ -165,6 +207,38 @@ mod tests {
         let (single, rounded) = (of("none"), of("quantize"));
         assert_eq!((single.vertices, single.triangles), (rounded.vertices, rounded.triangles));
         assert_eq!(single.bytes - rounded.bytes, 12 * single.vertices);
+    }
+
+    #[test]
+    fn the_finest_spacing_that_fits_is_suggested() {
+        let backend = CpuBackend::new(None).unwrap();
+        let choice = Choice { backend: &backend, reason: "" };
+        let suggested = |resolution: f64, max_samples: u64| {
+            let text = resolution.to_string();
+            let job = params::parse([("resolution", text.as_str())]).unwrap().job;
+            let surface = SurfaceLimits { max_samples, ..SurfaceLimits::default() };
+            let limits = JobLimits { surface, ..JobLimits::default() };
+            let refused = run(SAMPLE, &job, &limits, &choice, &Control::default(), &(), None).map(drop);
+            let planned = estimate(SAMPLE, &job, &limits, &choice, &Control::default()).unwrap().mesh.map(drop);
+            let spacing = |error: SurfaceError| match error {
+                SurfaceError::GridTooLarge { suggested_resolution, .. } => suggested_resolution,
+                error => panic!("{error}"),
+            };
+            let planned = planned.map_err(spacing);
+            let refused = refused.map_err(|error| match error {
+                JobError::Surface(error) => spacing(error),
+                error => panic!("{error}"),
+            });
+            assert_eq!(refused, planned);
+            refused
+        };
+        for (resolution, limit) in [(0.05, 20_000_000), (0.02, 1_000_000), (0.3, 200_000), (0.9, 40_000)] {
+            let fits = suggested(resolution, limit).unwrap_err();
+            assert!(fits > resolution && suggested(fits, limit).is_ok(), "{limit}: {fits}");
+            // Control: a slightly finer grid does not fit.
+            assert!(suggested(0.97 * fits - 0.01, limit).is_err(), "{limit}: {fits}");
+        }
+        assert!(suggested(1.0, 511).unwrap_err().is_infinite(), "a grid has one brick");
     }
 
     #[test]

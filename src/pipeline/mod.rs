@@ -6,6 +6,7 @@ mod draw;
 mod estimate;
 mod file;
 mod fit;
+pub mod integer;
 pub mod nearest;
 pub mod params;
 mod progress;
@@ -197,7 +198,9 @@ pub fn run(
             sink.set_storage(storage);
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
-        (clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink))?, None, storage)
+        let written = clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink));
+        let explain = |error| estimate::with_finest_fit(error, &spheres, &params, &limits.surface, &control);
+        (written.map_err(explain)?, None, storage)
     };
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, made_by } = output;

@@ -71,10 +71,10 @@ pub enum StoreError {
     /// A writer is used after one of its writes failed. Nothing is stored.
     #[error("an earlier write of the object failed")]
     WriterFailed,
-    /// A job document could not be read and is in quarantine.
+    /// A job record could not be read and is in quarantine.
     #[error("{name} cannot be read and is in the folder `quarantine` of the store")]
     Quarantined {
-        /// Name of the document.
+        /// Name of the record.
         name: String,
     },
     /// The limit of jobs on record is reached, and all of them are open.

@@ -162,7 +162,7 @@ impl Store {
         missing == 0 && self.0.backend.free_bytes().await.is_none_or(|free| free / 2 >= bytes)
     }
 
-    /// Removes the documents of an ended job, unless they were used meanwhile. Returns true if they were removed.
+    /// Removes the records of an ended job, unless they were used meanwhile. Returns true if they were removed.
     pub(super) async fn evict_record(&self, candidate: &EvictionCandidate) -> Result<bool, StoreError> {
         let removed = self.remove_candidate(candidate.clone()).await?;
         counter!(STORE_REMOVED, "reason" => "records").increment(u64::from(removed));

@@ -43,7 +43,7 @@ pub(crate) struct Faults {
     pub(crate) errors: AtomicUsize,
     /// Reads return half of the bytes.
     pub(crate) truncate: AtomicBool,
-    /// Number of reads of job documents.
+    /// Number of reads of job records.
     pub(crate) job_reads: AtomicUsize,
     /// Number of operations that timed out.
     pub(crate) unanswered: AtomicUsize,

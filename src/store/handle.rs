@@ -47,7 +47,7 @@ pub(super) struct Inner {
     /// staged files.
     pub(super) last_cleanup: AsyncMutex<SystemTime>,
     pub(super) clock: Clock,
-    /// Number of job documents in quarantine at the last count.
+    /// Number of job records in quarantine at the last count.
     pub(super) quarantined: AtomicUsize,
     pub(super) runtime: Handle,
 }

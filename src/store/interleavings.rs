@@ -26,7 +26,7 @@ const SIZE: usize = 10;
 
 /// Objects in memory; other tasks may run before and after each operation.
 #[derive(Debug)]
-struct Yielding(InMemory);
+struct Yielding(Arc<InMemory>);
 
 impl std::fmt::Display for Yielding {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -81,9 +81,15 @@ async fn put(store: &Store, number: u8) -> std::result::Result<(), StoreError> {
 
 /// Opens a store of `objects` objects of [`SIZE`] bytes. Caches nothing.
 async fn open(objects: u64) -> Store {
-    let config = StoreConfig { max_bytes: objects * SIZE as u64, memory_object_bytes: 1, ..StoreConfig::default() };
-    let backend = Backend::over(Arc::new(Yielding(InMemory::new())), PathBuf::from("/nonexistent"), &config);
-    Store::open_backend(backend, &config).await.unwrap()
+    open_bytes(objects * SIZE as u64).await.0
+}
+
+/// Opens an empty store of `max_bytes`, and returns its objects as well. Caches nothing.
+pub(crate) async fn open_bytes(max_bytes: u64) -> (Store, Arc<InMemory>) {
+    let config = StoreConfig { max_bytes, memory_object_bytes: 1, ..StoreConfig::default() };
+    let objects = Arc::new(InMemory::new());
+    let backend = Backend::over(Arc::new(Yielding(Arc::clone(&objects))), PathBuf::from("/nonexistent"), &config);
+    (Store::open_backend(backend, &config).await.unwrap(), objects)
 }
 
 /// Checks that the index agrees with the objects, and that no reservation is left.

@@ -3,7 +3,7 @@
 //! [`Store`] is the whole interface. `backend.rs` accesses folder or bucket, `index.rs` tracks objects and their use,
 //! `clock.rs` gives the times of use, `memory.rs` caches small results, `eviction.rs` frees space, `upload.rs` writes
 //! objects, large ones in parts, and `writer.rs` accepts data from blocking threads. `records.rs` limits the number of
-//! job documents, `quarantine.rs` keeps unreadable ones, and `lock.rs` protects the data folder against a second
+//! job records, `quarantine.rs` keeps unreadable ones, and `lock.rs` protects the data folder against a second
 //! service.
 //!
 //! A write or removal reserves space first and then holds the lock of the name (`Store::write_lock`), so it never waits
@@ -20,7 +20,7 @@ mod handle;
 mod index;
 #[cfg(test)]
 #[cfg(feature = "shuttle")]
-mod interleavings;
+pub(crate) mod interleavings;
 mod lock;
 mod memory;
 mod name;

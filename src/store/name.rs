@@ -17,7 +17,7 @@ pub struct BadName(&'static str);
 pub enum Folder {
     /// Uploaded structure files, by digest.
     Inputs,
-    /// Job documents, by job id. The documents of ended jobs have names of their own.
+    /// Job records, by job id. The records of ended jobs have names of their own.
     Jobs,
     /// Mesh files and reports, by content key.
     Results,
@@ -43,9 +43,9 @@ impl Folder {
     }
 }
 
-/// End of the file name of an open job's document.
+/// End of the file name of an open job's record.
 const OPEN: &str = ".json";
-/// End of the file name of an ended job's document.
+/// End of the file name of an ended job's record.
 const ENDED: &str = ".ended.json";
 /// Digits of a job id that name its client.
 pub(crate) const OWNER_DIGITS: usize = 8;
@@ -64,23 +64,23 @@ impl Name {
         Self { folder: Folder::Inputs, file: digest.to_string().into() }
     }
 
-    /// Returns the name of a job document.
+    /// Returns the name of a job record.
     ///
     /// # Errors
     /// Returns [`BadName`] unless the id has 1 to 64 lower-case hexadecimal digits.
     pub fn job(id: &str) -> Result<Self, BadName> {
-        Self::job_document(id, OPEN)
+        Self::job_record(id, OPEN)
     }
 
-    /// Returns the name of the document of an ended job, which replaces the other one.
+    /// Returns the name of the record of an ended job, which replaces the other one.
     ///
     /// # Errors
     /// As for [`job`](Self::job).
     pub fn ended_job(id: &str) -> Result<Self, BadName> {
-        Self::job_document(id, ENDED)
+        Self::job_record(id, ENDED)
     }
 
-    fn job_document(id: &str, extension: &str) -> Result<Self, BadName> {
+    fn job_record(id: &str, extension: &str) -> Result<Self, BadName> {
         let good = |c: u8| matches!(c, b'0'..=b'9' | b'a'..=b'f');
         if id.is_empty() || id.len() > 64 || !id.bytes().all(good) {
             return Err(BadName("a job's id has 1 to 64 hexadecimal digits in lower case"));
@@ -88,7 +88,7 @@ impl Name {
         Ok(Self { folder: Folder::Jobs, file: format!("{id}{extension}").into() })
     }
 
-    /// Returns true for the document of an ended job.
+    /// Returns true for the record of an ended job.
     pub(crate) fn is_ended_job(&self) -> bool {
         self.folder == Folder::Jobs && self.file.ends_with(ENDED)
     }
@@ -119,7 +119,7 @@ impl Name {
         Ok(Self { folder: Folder::Results, file: format!("{key}.{extension}").into() })
     }
 
-    /// Returns the name of an input or a result in a namespace. Job documents hold the namespace of their job.
+    /// Returns the name of an input or a result in a namespace. Job records hold the namespace of their job.
     #[must_use]
     pub fn within(self, namespace: Namespace) -> Self {
         let (stem, rest) = self.file.split_at(self.file.find('.').unwrap_or(self.file.len()));
@@ -133,7 +133,7 @@ impl Name {
     }
 
     /// Returns the name of the group of objects that are used, pinned and removed together: a mesh and its report, or
-    /// the documents of a job. An input is a group of its own.
+    /// the records of a job. An input is a group of its own.
     pub(super) fn group(&self) -> Self {
         Self { folder: self.folder, file: self.stem().into() }
     }

@@ -1,4 +1,4 @@
-//! Quarantine of job documents that cannot be read. Only an operator removes them.
+//! Quarantine of job records that cannot be read. Only an operator removes them.
 
 use std::sync::atomic::Ordering;
 
@@ -12,7 +12,7 @@ use super::handle::Store;
 use super::name::Name;
 use crate::telemetry::RECORDS_QUARANTINED;
 
-/// Folder of the documents, beside those of the objects.
+/// Folder of the records, beside those of the objects.
 pub(super) const QUARANTINE: &str = "quarantine";
 
 fn quarantine_path(name: &Name) -> Path {
@@ -20,7 +20,7 @@ fn quarantine_path(name: &Name) -> Path {
 }
 
 impl Store {
-    /// Moves a job document into quarantine. Succeeds if it does not exist any more.
+    /// Moves a job record into quarantine. Succeeds if it does not exist any more.
     pub(crate) async fn quarantine(&self, name: &Name) -> Result<(), StoreError> {
         let (store, name) = (self.clone(), name.clone());
         let moved = async move {
@@ -36,7 +36,7 @@ impl Store {
         self.run_to_completion(moved).await.map(drop)
     }
 
-    /// Returns true if the document of this name is in quarantine.
+    /// Returns true if the record of this name is in quarantine.
     pub(crate) async fn is_quarantined(&self, name: &Name) -> Result<bool, StoreError> {
         let backend = &self.0.backend;
         match backend.timed(backend.objects().head(&quarantine_path(name))).await {
@@ -46,13 +46,13 @@ impl Store {
         }
     }
 
-    /// Returns the number of documents in quarantine.
+    /// Returns the number of records in quarantine.
     pub(crate) async fn quarantined(&self) -> Result<usize, StoreError> {
-        // Without documents, no request to the disk or the service is needed.
+        // Without records, no request to the disk or the service is needed.
         if self.0.quarantined.load(Ordering::Relaxed) == 0 { Ok(0) } else { self.count_quarantined().await }
     }
 
-    /// Counts the documents in quarantine, which an operator may have removed.
+    /// Counts the records in quarantine, which an operator may have removed.
     pub(super) async fn count_quarantined(&self) -> Result<usize, StoreError> {
         let backend = &self.0.backend;
         let listed = backend.objects().list(Some(&Path::from(QUARANTINE)));

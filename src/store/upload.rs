@@ -83,7 +83,7 @@ impl Store {
     ) -> Result<bool, StoreError> {
         let _lock = self.write_lock(name).lock().await;
         let backend = &self.0.backend;
-        // Content-addressed objects are equal anyway; only job documents need an atomic check.
+        // Content-addressed objects are equal anyway; only job records need an atomic check.
         let create = new && name.folder() == Folder::Jobs;
         if new && !create && backend.head(name).await?.is_some() {
             return Ok(false);

@@ -4,6 +4,7 @@ use super::contents::Kind;
 use super::duplicates;
 use super::error::StructureError;
 use super::kinds::{self, Sequence};
+use super::radii;
 use super::read::Reading;
 use super::texts::{Interner, TextColumn};
 use crate::surface::OutOfMemory;
@@ -276,6 +277,18 @@ impl Columns {
         (self.model[row], [self.x[row], self.y[row], self.z[row]])
     }
 
+    /// Returns a warning about the atoms of unknown elements, if there are any.
+    fn unknown_elements(&self, tables: &Tables) -> Option<String> {
+        let mut unknown = (0..self.len()).filter(|&i| self.element[i] == 0 && self.kind[i] != Kind::VirtualSite);
+        let first = unknown.next()?;
+        let (name, residue) = (tables.name.text(self.name[first]), tables.residue.text(self.residue[first]));
+        let (atom, radius) = (format!("atom {} (`{name}` of residue `{residue}`)", first + 1), radii::FALLBACK);
+        Some(match unknown.count() {
+            0 => format!("{atom} has no known element; its radius is {radius} Å"),
+            more => format!("{atom} and {more} more have no known element; their radius is {radius} Å"),
+        })
+    }
+
     /// Returns the finished structure, if not too many atoms have the same position.
     pub(super) fn finish(
         mut self,
@@ -289,6 +302,7 @@ impl Columns {
             self.label_chain = Vec::new();
         }
         self.shrink();
+        let warnings = source.warnings.into_iter().chain(self.unknown_elements(&tables)).collect();
         reading.check()?;
         Ok(Structure {
             format: source.format,
@@ -310,7 +324,7 @@ impl Columns {
             model: self.model,
             hetero: self.hetero,
             kind: self.kind,
-            warnings: source.warnings,
+            warnings,
         })
     }
 }

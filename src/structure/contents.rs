@@ -141,23 +141,20 @@ impl Contents {
     /// Lists chains for a message.
     #[must_use]
     pub(super) fn chain_list(&self) -> String {
-        let names = self.chains.iter().map(|c| shown(&c.name));
-        format!("{} {}", plural(self.chains.len(), "chain"), list(names, self.chains.len()))
+        named(self.chains.iter().map(|c| shown(&c.name)), self.chains.len(), "chain")
     }
 
     /// Lists models for a message.
     #[must_use]
     pub(super) fn model_list(&self) -> String {
-        format!(
-            "{} {}",
-            plural(self.models.len(), "model"),
-            list(self.models.iter().map(ToString::to_string), self.models.len())
-        )
+        named(self.models.iter().map(ToString::to_string), self.models.len(), "model")
     }
 }
 
-fn plural(n: usize, what: &str) -> String {
-    format!("{n} {what}{}", if n == 1 { "" } else { "s" })
+/// Names the only item, or counts and lists several.
+fn named(names: impl Iterator<Item = String>, n: usize, what: &str) -> String {
+    let list = list(names, n);
+    if n == 1 { format!("{what} {list}") } else { format!("{n} {what}s: {list}") }
 }
 
 fn shown(chain: &str) -> String {

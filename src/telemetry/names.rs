@@ -97,7 +97,7 @@ metrics! {
     STORE_BYTES = "molmesh_store_bytes", Gauge, folder: "folders of the store";
     /// Objects in the store.
     STORE_OBJECTS = "molmesh_store_objects", Gauge, folder: "folders of the store";
-    /// Job documents in quarantine because they cannot be read.
+    /// Job records in quarantine because they cannot be read.
     RECORDS_QUARANTINED = "molmesh_records_quarantined", Gauge;
     /// Objects that the store evicted or that expired.
     STORE_REMOVED = "molmesh_store_removed_total", Counter, reason: "ttl|cap|records";

@@ -111,6 +111,10 @@ fn invalid_keys_and_urls_are_rejected_with_a_reason() {
         (&["--id", "a", "--window", "1ms"], "parameter `window`"),
         (&["--id", "a", "--expires", "soon"], "parameter `expires`"),
         (&["--id", "a", "--expires", "2001-01-01T00:00:00Z"], "is in the past"),
+        (&["--id", "a", "--expires", "-1h"], "parameter `expires`: `-1h` is not allowed; expected a time from now"),
+        (&["--id", "a", "--work", "-1h"], "parameter `work`: `-1h` is not allowed"),
+        (&["--id", "a", "--window", "1h"], "parameter `window`: `1h` is not allowed; expected a quota per window"),
+        (&["--id", "a", "--window", "1h", "--concurrent", "2"], "--requests or --work"),
         (&["--id", "a", "--requests", "0"], "--requests"),
     ] {
         let refused = run(["key", "new"].iter().chain(args));
@@ -126,6 +130,7 @@ fn invalid_keys_and_urls_are_rejected_with_a_reason() {
         (&["/x?signature=1", "--set", secret], "already"),
         (&["/x", "--set", secret, "--key-id", "b"], "expected one of a"),
         (&["/x", "--set", secret, "--expires", "0s"], "parameter `expires`"),
+        (&["/x", "--set", secret, "--expires", "-1h"], "`-1h` is not allowed; expected a time from now such as 1h"),
         (&["/v1/capabilities", "--set", secret, "--expires", "2001-01-01T00:00:00Z"], "is in the past"),
         (&["/nonexistent", "--set", secret], "no such path"),
         (&["http://host/v1/meshes", "--set", secret], "GET only"),

@@ -61,6 +61,24 @@ fn bad_flags_exit_with_2() {
         assert!(stderr(&done).starts_with("molmesh: "), "{args:?}: {}", stderr(&done));
         assert_eq!(stdout(&done), "", "{args:?}");
     }
+    for (args, part) in [
+        (&["mesh", "a.pdb", "-o", "b.glb", "--max-input-bytes", "64kb"][..], "or a size such as 64MiB"),
+        (
+            &["mesh", "a.pdb", "-o", "b.glb", "--max-atoms", "1MiB"],
+            "'1MiB' for '--max-atoms <N>': expected a whole number",
+        ),
+        (&["render", "a.pdb", "-o", "b.png", "--units", "nanometer"], "'--units' is an option of `molmesh mesh`"),
+        (&["mesh", "a.pdb", "-o", "b.glb", "--width", "9"], "'--width' is an option of `molmesh render`"),
+        (&["mesh", "a.pdb", "-o", "b.xyz"], "--format: glb, gltf, ply, stl, obj\n"),
+        (&["mesh", "a.pdb", "-o", "b.glb", "--format", "xyz"], "expected one of glb, gltf, ply, stl, obj\n"),
+        (&["mesh", "a.pdb", "-o", "b.glb", "--format", "png"], "molmesh render writes pictures"),
+        (&["serve", "--metrics-listen", "9090"], "expected an address such as 127.0.0.1:8080, or none"),
+        (&["serve", "--listen", "none"], "`server.listen` is \"none\"; expected an address such as 127.0.0.1:8080\n"),
+    ] {
+        let done = run(args);
+        assert_eq!(done.status.code(), Some(2), "{args:?}");
+        assert!(stderr(&done).contains(part), "{args:?}: {}", stderr(&done));
+    }
     let bare = molmesh().output().unwrap();
     assert_eq!(bare.status.code(), Some(2));
     assert!(stderr(&bare).contains("Usage: molmesh"));
@@ -113,12 +131,16 @@ fn invalid_structures_exit_with_4() {
 fn exceeded_limits_exit_with_5_and_are_named() {
     let message = fails(rod(), &["--max-atoms", "9"], 5);
     assert!(message.contains('9') && message.contains("hint: raise it with --max-atoms"), "{message}");
+    let message = fails(rod(), &["--max-grid-points", "20_000", "--resolution", "0.1"], 5);
+    assert!(message.contains("limit is 20000") && message.contains("hint: try --resolution "), "{message}");
     let message = fails(rod(), &["--max-grid-points", "100"], 5);
-    assert!(message.contains("limit is 100") && message.contains("hint: try --resolution "), "{message}");
+    assert!(message.contains("limit is 100; no grid spacing") && message.contains("hint: raise"), "{message}");
     let message = fails(rod(), &["--max-mesh-bytes", "1000"], 5);
     assert!(message.contains("limit is 1000") && message.contains("hint: try --resolution "), "{message}");
     let message = fails(rod(), &["--max-input-bytes", "100"], 5);
     assert!(message.contains("100 bytes"), "{message}");
+    let message = fails(rod().repeat(200), &["--max-input-bytes", "64KiB"], 5);
+    assert!(message.contains("65536 bytes"), "{message}");
     assert_code(&piped(&["mesh", "-", "-o", "-", "--max-input-bytes", "100"], rod().as_bytes()), 5);
 }
 

@@ -124,7 +124,11 @@ const LAYERS: &[Layer] = &[
         layers: &[("sync", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
-    Layer { name: "client_shares", layers: &[], crates: SERVICE },
+    Layer {
+        name: "client_shares",
+        layers: &[],
+        crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
+    },
     Layer {
         name: "memory_budget",
         layers: &[("surface", Only(&["MemoryMeter", "OutOfMemory"])), ("telemetry", Any)],

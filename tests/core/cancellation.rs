@@ -6,6 +6,7 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
+use molmesh::picture::{PictureParams, SelectedRenderer};
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, ProgressSink, params};
 use molmesh::structure::{self, ReadLimits, Selection};
 use molmesh::surface::{
@@ -23,22 +24,23 @@ const DELAY: Duration = Duration::from_millis(5);
 /// Cancels a job soon after one of its stages has begun.
 struct CancelIn {
     stage: &'static str,
+    delay: Duration,
     cancel: CancelToken,
     begun: Mutex<Option<Instant>>,
 }
 
 impl CancelIn {
     fn new(stage: &'static str) -> Self {
-        Self { stage, cancel: CancelToken::default(), begun: Mutex::default() }
+        Self { stage, delay: DELAY, cancel: CancelToken::default(), begun: Mutex::default() }
     }
 
     fn start(&self, stage: &'static str) {
         let mut begun = self.begun.lock().unwrap();
         if stage == self.stage && begun.is_none() {
             *begun = Some(Instant::now());
-            let cancel = self.cancel.clone();
+            let (cancel, delay) = (self.cancel.clone(), self.delay);
             std::thread::spawn(move || {
-                std::thread::sleep(DELAY);
+                std::thread::sleep(delay);
                 cancel.cancel();
             });
         }
@@ -51,7 +53,7 @@ impl CancelIn {
     /// Checks that the job has just ended in time.
     fn assert_in_time(&self) {
         let begun = self.begun.lock().unwrap().expect("the stage has begun");
-        assert!(begun.elapsed() < DELAY + LIMIT, "{}: {:?}", self.stage, begun.elapsed());
+        assert!(begun.elapsed() < self.delay + LIMIT, "{}: {:?}", self.stage, begun.elapsed());
     }
 }
 
@@ -126,6 +128,31 @@ fn jobs_end_soon_after_cancellation_in_any_stage() {
     let stopped = Measures::of(&product.mesh, Validation::Exact, &at.control());
     at.assert_in_time();
     assert_eq!(stopped.unwrap_err(), SurfaceError::Cancelled);
+}
+
+#[test]
+fn pictures_end_soon_after_cancellation_at_any_time() {
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "set by a test" };
+    let coarse = job(&[("resolution", "0.7")]);
+    let product =
+        pipeline::run(&lattice(20), &coarse, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
+    let picture = PictureParams { width: 4096, height: 4096, ..PictureParams::default() };
+    let renderer = SelectedRenderer::cpu("set by a test");
+    let draw = |at: &CancelIn| pipeline::draw(&mut product.clone(), &picture, &renderer, &at.control(), at);
+    let mut whole = product.clone();
+    pipeline::draw(&mut whole, &picture, &renderer, &Control::default(), &()).unwrap();
+    for (stage, parts) in [("draw", &[0.0, 0.2, 0.5, 0.8][..]), ("png", &[0.0, 0.5])] {
+        let time = Duration::from_secs_f64(whole.report.timings_ms[stage].as_f64().unwrap() / 1e3);
+        for part in parts {
+            let at = CancelIn { delay: time.mul_f64(*part), ..CancelIn::new(stage) };
+            let stopped = draw(&at);
+            at.assert_in_time();
+            // The last part may be over already.
+            let cancelled = matches!(stopped, Err(JobError::Surface(SurfaceError::Cancelled)));
+            assert!(cancelled || (*part > 0.3 && stopped.is_ok()), "{stage} after {part} of {time:?}: {stopped:?}");
+        }
+    }
 }
 
 #[test]

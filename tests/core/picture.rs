@@ -227,13 +227,13 @@ fn the_same_pixels_on_any_number_of_threads() {
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let rendered = pool.install(|| CpuRenderer.render(&mesh, &params, &Control::default()));
-        png::encode(&rendered.unwrap().image).unwrap()
+        png::encode(&rendered.unwrap().image, &Control::default()).unwrap()
     };
     let one = on(1);
     assert_eq!(one, on(2));
     assert_eq!(one, on(7));
     let other = image(&mesh, &PictureParams { azimuth: 1.0, ..params });
-    assert_ne!(one, png::encode(&other).unwrap());
+    assert_ne!(one, png::encode(&other, &Control::default()).unwrap());
 }
 
 #[test]
@@ -292,7 +292,7 @@ fn another_program_reads_the_same_pixels() {
     for (name, background) in [("clear", Background::TRANSPARENT), ("blue", Background([32, 64, 96, 255]))] {
         let image = image(&lump(), &PictureParams { width: 61, height: 47, background, ..PictureParams::default() });
         let path = folder.path().join(format!("{name}.png"));
-        std::fs::write(&path, png::encode(&image).unwrap()).unwrap();
+        std::fs::write(&path, png::encode(&image, &Control::default()).unwrap()).unwrap();
         paths.push(path);
         images.push(image);
     }

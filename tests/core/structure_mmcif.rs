@@ -236,6 +236,19 @@ fn unreadable_optional_values_are_warnings() {
 }
 
 #[test]
+fn unknown_elements_are_warnings_in_every_format() {
+    let nameless = |n: usize| file(&format!("{ROW}{}", ROW.replace(" C \"C1'\" ", " ? \"1\" ").repeat(n)));
+    let s = cif(nameless(1));
+    assert_eq!(s.element, [6, 0]);
+    assert_eq!(s.warnings, ["atom 2 (`1` of residue `LIG`) has no known element; its radius is 2 Å"]);
+    let s = cif(nameless(3));
+    assert_eq!(s.warnings, ["atom 2 (`1` of residue `LIG`) and 2 more have no known element; their radius is 2 Å"]);
+    let pdb = "HETATM    1  1   LIG A   1      11.104  -6.134   0.500  1.00  0.00           X\n";
+    let s = read(pdb.as_bytes(), &ReadLimits::default()).unwrap();
+    assert_eq!(s.warnings, ["atom 1 (`1` of residue `LIG`) has no known element; its radius is 2 Å"]);
+}
+
+#[test]
 fn warnings_are_the_same_on_any_number_of_threads() {
     let pool = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     let bad = ROW.replace("0.50 20.25", "inf 20.25");

@@ -124,11 +124,11 @@ fn models_chains_and_alternatives() {
 fn errors_list_the_available_values() {
     assert_eq!(
         refusal(&Selection { model: Some(2), ..Selection::default() }),
-        "model 2 is not in the file; it has 2 models 1, 5"
+        "model 2 is not in the file; it has 2 models: 1, 5"
     );
     assert_eq!(
         refusal(&Selection { chains: chains(&["A", "Z"]), ..Selection::default() }),
-        "chain `Z` is not in the file; it has 3 chains A, B, W"
+        "chain `Z` is not in the file; it has 3 chains: A, B, W"
     );
     assert_eq!(
         refusal(&Selection { altloc: Some('Z'), ..Selection::default() }),
@@ -141,7 +141,7 @@ fn errors_list_the_available_values() {
     assert_eq!(
         refusal(&Selection { chains: chains(&["W"]), ..Selection::default() }),
         "the selection holds no atoms: polymer of chains W was asked for; model 1 has 8 polymer, 2 ligand, 2 water and 3 \
-         hydrogen atoms in 3 chains A, B, W; the file has 2 models 1, 5; `select=polymer,ligand,water` takes them"
+         hydrogen atoms in 3 chains: A, B, W; the file has 2 models: 1, 5; `select=polymer,ligand,water` takes them"
             .replace("8 polymer", "10 polymer")
     );
     let hydrogen = "HETATM   14  H1  LIG B 102      14.000   0.000   0.000  1.00  0.00           H\n";

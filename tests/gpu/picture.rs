@@ -2,6 +2,8 @@
 
 use crate::tools;
 
+use std::time::{Duration, Instant};
+
 use molmesh::gpu::{DiscoveryMode, GpuRenderer, discover};
 use molmesh::picture::{CpuRenderer, Image, PictureError, PictureParams, Renderer, Style, View};
 use molmesh::surface::{CancelToken, Control, DeviceChoice, Mesh, Step};
@@ -76,6 +78,38 @@ fn a_device_draws_the_picture_of_the_cpu() {
     // The bytes do not depend on earlier pictures.
     let params = params(Style::Surface, View::Front);
     assert_eq!(of(&gpu, &mesh, &params), of(&gpu, &mesh, &params));
+}
+
+#[test]
+fn pictures_end_soon_after_cancellation() {
+    let Some(gpu) = gpu(false) else { return };
+    let large = PictureParams { width: 2800, height: 2800, ..params(Style::Surface, View::Front) };
+    let mesh = balls();
+    let begun = Instant::now();
+    gpu.render(&mesh, &large, &Control::default()).unwrap();
+    let whole = begun.elapsed();
+    let (cancel, other) = (CancelToken::default(), CancelToken::default());
+    let render = |cancel: &CancelToken| {
+        let control = Control { cancel: cancel.clone(), ..Control::default() };
+        let stopped = gpu.render(&mesh, &large, &control);
+        (stopped.map(|_| ()), Instant::now())
+    };
+    // The second picture waits for the first one.
+    let (cancelled, [first, second]) = std::thread::scope(|scope| {
+        let drawn = [&cancel, &other].map(|cancel| scope.spawn(move || render(cancel)));
+        std::thread::sleep(whole / 4);
+        let cancelled = Instant::now();
+        cancel.cancel();
+        other.cancel();
+        (cancelled, drawn.map(|thread| thread.join().unwrap()))
+    });
+    for (stopped, ended) in [first, second] {
+        assert_eq!(stopped, Err(PictureError::Cancelled));
+        let time = ended.saturating_duration_since(cancelled);
+        assert!(time < Duration::from_millis(500), "{time:?} of {whole:?}");
+    }
+    let small = params(Style::Surface, View::Front);
+    assert_eq!(differences(&of(&CpuRenderer, &mesh, &small), &of(&gpu, &mesh, &small)).0, 0, "the device still works");
 }
 
 #[test]

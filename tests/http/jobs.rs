@@ -127,9 +127,14 @@ fn failures_are_reported_as_for_synchronous_requests() {
     let backend = Fake::new(Mode::GridTooLarge);
     let server = start(Arc::clone(&backend) as _, |_| {});
     let now = server.post("/v1/meshes", &[], SAMPLE).problem(422, "grid-too-large");
-    let job = submit(&server, "/v1/meshes", &[], SAMPLE);
+    let job = submit(&server, "/v1/meshes", &[("x-request-id", "mine-44")], SAMPLE);
     let document = ended(&server, &job, "failed");
     assert_eq!(document["problem"]["type"], "/problems/grid-too-large");
+    assert_eq!(document["problem"]["instance"], "mine-44");
+    for path in ["/result", "/events"] {
+        server.get(&format!("{job}{path}?wait=1")).problem(400, "bad-parameter");
+    }
+    send(server.addr, "DELETE", &format!("{job}?now"), &[], b"").problem(400, "bad-parameter");
     let told = server.get(&format!("{job}/result")).problem(422, "grid-too-large");
     for member in ["detail", "limit", "actual", "suggested_resolution"] {
         assert_eq!(told[member], now[member], "{member}");

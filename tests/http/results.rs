@@ -38,6 +38,11 @@ fn a_synchronous_result_is_stored_at_its_content_location() {
     assert!(again.header("server-timing").unwrap().contains("hit"));
     assert!(again.header("cache-control").is_none(), "answers to POST are not cached");
     let report = location.replace(".ply", "/report.json");
+    for path in [&location, &report] {
+        let refused = server.get(&format!("{path}?resolution=1")).problem(400, "bad-parameter");
+        assert_eq!(refused["parameter"], "resolution", "{path}");
+        assert_eq!(server.get(&format!("{path}?")).status, 200, "an empty query has no parameter");
+    }
     assert_eq!(server.get(&report).json()["atoms"], 454);
     let etag = server.get(&report).header("etag").unwrap().to_owned();
     assert_eq!(send(server.addr, "GET", &report, &[("if-none-match", &etag)], b"").status, 304);
@@ -255,6 +260,8 @@ fn estimates_report_the_cost_and_a_spacing_that_fits() {
         (&refused["accepted"], &refused["problem"]["type"]),
         (&false.into(), &"/problems/mesh-too-large".into())
     );
+    let named = server.post("/v1/estimate?resolution=0.3", &[("x-request-id", "mine-43")], SAMPLE).json();
+    assert_eq!(named["problem"]["instance"], "mine-43");
     let suggested = refused["problem"]["suggested_resolution"].as_f64().unwrap();
     assert_eq!(estimate(&format!("?resolution={suggested}"))["accepted"], true);
     server.post("/v1/estimate", &[], b"nothing").problem(422, "unreadable-structure");

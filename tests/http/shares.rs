@@ -147,10 +147,38 @@ fn a_client_cannot_take_all_fetches_of_the_archive() {
     let path = |entry: &str| format!("/v1/pdb/{entry}/atoms");
     let mut slow = begin(FIRST, &server, "GET", &path("1aaa"), "", b"");
     wait_for("the first fetch runs", || remote.count() == 1);
-    is_refused(&ask(FIRST, &server, "GET", &path("2aaa"), b""), 1);
+    // The client waits for its own share; another one that requests the same entry does not wait for it.
+    let mut waits = begin(FIRST, &server, "GET", &path("2aaa"), "", b"");
+    std::thread::sleep(Duration::from_millis(300));
+    assert_eq!(remote.count(), 1);
     assert_eq!((ask(SECOND, &server, "GET", &path("2aaa"), b"").status, remote.count()), (200, 2));
     // Its copy needs no fetch.
     assert_eq!(ask(FIRST, &server, "GET", &path("2aaa"), b"").status, 200);
     assert_eq!(read_reply(&mut slow, false).status, 200);
+    assert_eq!(read_reply(&mut waits, false).status, 200);
     assert_eq!(ask(FIRST, &server, "GET", &path("3aaa"), b"").status, 200);
+}
+
+#[test]
+fn fetches_beyond_the_share_wait_in_line_until_the_deadline() {
+    let slow = |ms| Response::After(Duration::from_millis(ms), Box::new(ok(SAMPLE)));
+    let remote = Remote::start(move |request, _| if request.path.contains("9aaa") { slow(60_000) } else { slow(200) });
+    let url: molmesh::config::Templates = remote.url("/d/{id}.cif").parse().unwrap();
+    let patient = serve(|c| c.archive.url = Some(url.clone()));
+    // A page with six entries that are not in the cache; its share is two fetches.
+    let mut page: Vec<_> = (1..7)
+        .map(|n| begin(FIRST, &patient, "GET", &format!("/v1/pdb/{n}aaa/surface.glb?resolution=2"), "", b""))
+        .collect();
+    for reply in &mut page {
+        assert_eq!(read_reply(reply, false).status, 200);
+    }
+    assert_eq!(remote.count(), 6);
+    let impatient = serve(|c| {
+        c.archive.url = Some(url);
+        (c.archive.concurrent, c.server.client_share) = (4, 0.25);
+        c.archive.timeout_ms = 10_000;
+    });
+    let _held = begin(FIRST, &impatient, "GET", "/v1/pdb/9aaa/atoms", "", b"");
+    wait_for("the slow fetch runs", || remote.count() == 7);
+    is_refused(&ask(FIRST, &impatient, "GET", "/v1/pdb/8aaa/atoms", b""), 1);
 }

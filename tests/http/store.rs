@@ -287,7 +287,7 @@ async fn least_recently_used_objects_are_evicted(mut place: TestStore) {
     for i in 1..=4 {
         put(&store, &result(i), 250).await;
     }
-    // Job documents do not count.
+    // Job records do not count.
     put(&store, &job(1), 5000).await;
     assert_eq!(store.usage(Folder::Results), usage(1000, 4));
     // 1 and 2 are used in two ways, so 3 is the least recently used.

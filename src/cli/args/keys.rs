@@ -37,7 +37,7 @@ pub(crate) struct NewKeyArgs {
     #[arg(long, value_name = "A,B", default_value = "mesh,read")]
     pub(crate) scopes: String,
     /// Expiry: a time from now such as 90d, or a date [default: never]
-    #[arg(long, value_name = "TIME")]
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     pub(crate) expires: Option<String>,
     /// Comment in the keys file
     #[arg(long, value_name = "TEXT")]
@@ -46,14 +46,14 @@ pub(crate) struct NewKeyArgs {
     #[arg(long, value_name = "N", help_heading = "Quota", value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) requests: Option<u64>,
     /// Worker time per window, such as 10m [default: unlimited]
-    #[arg(long, value_name = "TIME", help_heading = "Quota")]
+    #[arg(long, value_name = "TIME", help_heading = "Quota", allow_hyphen_values = true)]
     pub(crate) work: Option<String>,
     /// Concurrent requests [default: unlimited]
     #[arg(long, value_name = "N", help_heading = "Quota", value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) concurrent: Option<u64>,
-    /// Length of a window
-    #[arg(long, value_name = "TIME", help_heading = "Quota", default_value = "1m")]
-    pub(crate) window: String,
+    /// Length of a window; needs --requests or --work [default: 1m]
+    #[arg(long, value_name = "TIME", help_heading = "Quota", allow_hyphen_values = true)]
+    pub(crate) window: Option<String>,
 }
 
 /// `molmesh key signing`.
@@ -74,7 +74,7 @@ pub(crate) struct SignArgs {
     /// URL, or its path and query; behind a proxy that changes paths, the one that the service receives
     pub(crate) url: String,
     /// Expiry: a time from now such as 1h, or a date such as 2030-01-31T00:00:00Z
-    #[arg(long, value_name = "TIME", default_value = "1h")]
+    #[arg(long, value_name = "TIME", default_value = "1h", allow_hyphen_values = true)]
     pub(crate) expires: String,
     /// Name of the signing key [default: the first in `access.signing_secret`]
     #[arg(long, value_name = "NAME")]

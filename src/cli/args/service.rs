@@ -1,6 +1,5 @@
 //! Flags of the commands of the service.
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args as ClapArgs, Subcommand, ValueEnum};
@@ -19,10 +18,10 @@ Exit codes:
 pub(crate) struct ServeArgs {
     /// Address of the service; port 0 selects a free port [default: 127.0.0.1:8080]
     #[arg(long, value_name = "ADDR")]
-    pub(crate) listen: Option<SocketAddr>,
-    /// Address of the metrics [default: none]
+    pub(crate) listen: Option<String>,
+    /// Address of the metrics, or none [default: none]
     #[arg(long, value_name = "ADDR")]
-    pub(crate) metrics_listen: Option<SocketAddr>,
+    pub(crate) metrics_listen: Option<String>,
     /// Data folder of the service
     #[arg(long, value_name = "DIR")]
     pub(crate) data_dir: Option<PathBuf>,
