@@ -139,7 +139,7 @@ pub(super) async fn create(
             "a structure is uploaded as a file, not as JSON; `POST /v1/meshes` takes JSON that names a structure";
         return Err(Problem::new(Kind::UnsupportedMediaType, detail).with("declared", "application/json"));
     }
-    let Upload { bytes, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
+    let Upload { bytes, digest, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
     if let Some((name, _)) = fields.first() {
         return Err(Problem::new(
             Kind::BadParameter,
@@ -148,8 +148,7 @@ pub(super) async fn create(
         .with("parameter", name.as_str()));
     }
     let _permit = app.delivery(caller.client)?;
-    let input = Input::uploaded(bytes, lease).await?;
-    let digest = input.digest;
+    let input = Input::uploaded(bytes, digest, lease);
     // Parse before storing, so that only readable structures are stored.
     let summary = summarize(&app, input.clone()).await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(summary.format)?;
