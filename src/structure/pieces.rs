@@ -43,7 +43,7 @@ pub(super) fn map<T: Send, R: Send>(items: &mut [T], work: impl Fn(&mut T) -> R 
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, reason = "tests fail by panicking")]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use std::path::Path;
 

@@ -24,6 +24,11 @@ impl Default for ReadLimits {
 }
 
 impl ReadLimits {
+    /// Checks the number of atoms in all models.
+    pub(crate) fn check_atoms(&self, n: usize) -> Result<(), StructureError> {
+        if n > self.max_rows() { Err(StructureError::TooManyAtoms { limit: self.max_atoms }) } else { Ok(()) }
+    }
+
     /// Atoms in all models, as a number of rows: rows are counted in 32 bits.
     pub(super) fn max_rows(&self) -> usize {
         usize::try_from(self.max_atoms.min(u64::from(u32::MAX))).unwrap_or(usize::MAX)

@@ -44,9 +44,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         found[last].fault.take()
     });
     let n_atoms: usize = found.iter().map(|records| records.atoms.len()).sum();
-    if n_atoms > reading.limits.max_rows() {
-        return Err(StructureError::TooManyAtoms { limit: reading.limits.max_atoms });
-    }
+    reading.limits.check_atoms(n_atoms)?;
     let memory = reading.reserve(Columns::bytes(n_atoms))?;
     let mut columns = Columns::zeroed(n_atoms);
     let mut rest = columns.slices();

@@ -16,7 +16,7 @@ use crate::surface::MemoryMeter as _;
 
 /// Beginning of an ATOM or HETATM record. Columns beyond the first 96 are left out: they are not read.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Line(u64);
+pub(super) struct Line(usize);
 
 impl Line {
     const LEN_BITS: u32 = 7;
@@ -24,13 +24,12 @@ impl Line {
 
     fn new(start: usize, end: usize) -> Self {
         let len = (end - start).min(Self::MAX_LEN);
-        Self(((start << Self::LEN_BITS) | len) as u64)
+        Self((start << Self::LEN_BITS) | len)
     }
 
     pub(super) fn range(self) -> Range<usize> {
-        let bits = self.0 as usize;
-        let start = bits >> Self::LEN_BITS;
-        start..start + (bits & ((1 << Self::LEN_BITS) - 1))
+        let start = self.0 >> Self::LEN_BITS;
+        start..start + (self.0 & ((1 << Self::LEN_BITS) - 1))
     }
 }
 
