@@ -4,6 +4,7 @@ use std::time::UNIX_EPOCH;
 
 use crate::access::{self, KeyFileError, SignatureCheck, SigningKeys};
 use crate::jobs::Record;
+use crate::structure::{ReadLimits, Structure, StructureError};
 
 /// Parses a key file.
 ///
@@ -18,6 +19,14 @@ pub fn key_file(text: &str) -> Result<(), KeyFileError> {
 pub fn has_valid_signature(keys: &SigningKeys, target: &str) -> bool {
     let (path, query) = target.split_once('?').map_or((target, None), |(path, query)| (path, Some(query)));
     matches!(keys.check(path, query, UNIX_EPOCH), SignatureCheck::Valid(_))
+}
+
+/// Reads a structure in at most `n` pieces.
+///
+/// # Errors
+/// Returns the errors of [`crate::structure::read`].
+pub fn structure(bytes: &[u8], limits: &ReadLimits, n: usize) -> Result<Structure, StructureError> {
+    crate::structure::read::read_in_pieces(bytes, limits, n)
 }
 
 /// Reads the record of a job with its parameters, and returns it as it would be written.

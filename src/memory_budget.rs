@@ -1,14 +1,21 @@
 //! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, meshes that are
-//! not yet sent, and the buffers of connections.
+//! not yet sent, the buffers of connections, and structures that are kept for further requests.
 
-use std::sync::Arc;
+use std::fmt::Debug;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock, Weak};
 
 use bytes::Bytes;
 use metrics::gauge;
 
 use crate::surface::{MemoryMeter, OutOfMemory};
 use crate::telemetry::MEMORY_HELD;
+
+/// Owner of memory that it gives back when the budget is short.
+pub(crate) trait Reclaim: Debug + Send + Sync {
+    /// Frees at least `bytes` if possible. Returns true if it freed some.
+    fn reclaim(&self, bytes: u64) -> bool;
+}
 
 /// Memory budget in bytes. Clones share one budget.
 #[derive(Debug, Clone)]
@@ -17,31 +24,20 @@ pub struct Budget {
     held: Arc<AtomicU64>,
     /// Budget that this one is a part of.
     whole: Option<Arc<Self>>,
+    reclaim: Arc<OnceLock<Weak<dyn Reclaim>>>,
 }
 
 impl Budget {
     /// Creates a budget of `limit` bytes.
     #[must_use]
     pub fn new(limit: u64) -> Self {
-        Self { limit, held: Arc::default(), whole: None }
+        Self { limit, held: Arc::default(), reclaim: Arc::default(), whole: None }
     }
 
     /// Creates a budget of at most `limit` bytes of this one: its leases count in both.
     #[must_use]
     pub fn part(&self, limit: u64) -> Self {
         Self { whole: Some(Arc::new(self.clone())), ..Self::new(limit) }
-    }
-
-    /// Adds `bytes`. A failure changes nothing.
-    fn try_add(&self, bytes: u64) -> Result<(), OutOfMemory> {
-        let Self { limit, held, whole } = self;
-        held.try_update(Ordering::Relaxed, Ordering::Relaxed, |now| now.checked_add(bytes).filter(|sum| sum <= limit))
-            .map_err(|held| OutOfMemory::Budget { needed: bytes, held, limit: *limit })?;
-        if let Some(Err(error)) = whole.as_ref().map(|whole| whole.try_add(bytes)) {
-            held.fetch_sub(bytes, Ordering::Relaxed);
-            return Err(error);
-        }
-        Ok(())
     }
 
     /// Adds `bytes` regardless of the limit.
@@ -61,13 +57,38 @@ impl Budget {
         Self::new(u64::MAX)
     }
 
+    /// Sets the owner that is asked for memory before anything is rejected. Only the first call has an effect.
+    pub(crate) fn reclaim_from(&self, owner: Weak<dyn Reclaim>) {
+        self.reclaim.get_or_init(|| owner);
+    }
+
     /// Checks that at most the limit is in use.
     ///
     /// # Errors
     /// [`OutOfMemory::Budget`].
     pub fn check(&self) -> Result<(), OutOfMemory> {
-        let held = self.held.load(Ordering::Relaxed);
-        if held > self.limit { Err(OutOfMemory::Budget { needed: 0, held, limit: self.limit }) } else { Ok(()) }
+        self.take(0)
+    }
+
+    /// Takes `bytes`, within the limit. A failure changes nothing.
+    fn take(&self, bytes: u64) -> Result<(), OutOfMemory> {
+        let limit = self.limit;
+        let take = |held: u64| held.checked_add(bytes).filter(|sum| *sum <= limit);
+        let mut reclaimed = true;
+        loop {
+            let Err(held) = self.held.try_update(Ordering::Relaxed, Ordering::Relaxed, take) else { break };
+            // Another thread may have freed memory even if this one could not.
+            if !reclaimed {
+                return Err(OutOfMemory::Budget { needed: bytes, held, limit });
+            }
+            let missing = held.saturating_add(bytes).saturating_sub(limit);
+            reclaimed = self.reclaim.get().and_then(Weak::upgrade).is_some_and(|owner| owner.reclaim(missing));
+        }
+        if let Some(Err(error)) = self.whole.as_ref().map(|whole| whole.take(bytes)) {
+            self.held.fetch_sub(bytes, Ordering::Relaxed);
+            return Err(error);
+        }
+        Ok(())
     }
 
     /// Takes `bytes` regardless of the limit until the result is dropped, for buffers that are bounded elsewhere. The
@@ -111,10 +132,16 @@ impl Lease {
     /// # Errors
     /// [`OutOfMemory::Budget`].
     pub fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
-        self.budget.try_add(bytes)?;
+        self.budget.take(bytes)?;
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
         publish(bytes, 1.0);
         Ok(())
+    }
+
+    /// Returns the size of the lease, bytes.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        self.bytes.load(Ordering::Relaxed)
     }
 
     /// Adds `bytes` regardless of the limit, for memory that is allocated already.
@@ -133,9 +160,16 @@ impl Lease {
 
     /// Sets the lease to `bytes` regardless of the limit, for memory that remains of a finished job.
     pub fn set(&self, bytes: u64) {
-        let before = self.bytes.load(Ordering::Relaxed);
+        let before = self.bytes();
         self.force(bytes.saturating_sub(before));
         self.shrink(before.saturating_sub(bytes));
+    }
+
+    /// Converts the lease, for memory that no request uses. The lease then has 0 bytes.
+    pub(crate) fn to_buffers(&self) -> Buffers {
+        let bytes = self.bytes.swap(0, Ordering::Relaxed);
+        publish(bytes, -1.0);
+        Buffers { budget: self.budget.clone(), bytes }
     }
 
     /// Returns `memory` as bytes that hold this lease until the last reference to them is dropped.
@@ -168,7 +202,7 @@ impl MemoryMeter for Lease {
 
 impl Drop for Lease {
     fn drop(&mut self) {
-        self.shrink(self.bytes.load(Ordering::Relaxed));
+        self.shrink(self.bytes());
     }
 }
 

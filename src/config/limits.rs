@@ -49,6 +49,10 @@ pub struct LimitsConfig {
     /// buffers of connections. Default 8 GiB. Memory is counted before it is allocated. A request or job that would
     /// exceed the limit is rejected and may be repeated later. Responses may exceed it by their next chunk.
     pub memory_bytes: u64,
+    /// Part of `memory_bytes` for structures that are kept after they were read, bytes. Default 512 MiB: 8 million
+    /// atoms. Further requests for the same file do not read it again. The least recently used structures are evicted,
+    /// also before a request is rejected for lack of memory. 0 keeps none.
+    pub structure_cache_bytes: u64,
     /// Width and height of a picture, pixels. Default 4,096: at 40 bytes a pixel the largest picture needs 640 MiB, and
     /// rendering takes seconds.
     pub picture_side: u32,
@@ -70,6 +74,7 @@ impl Default for LimitsConfig {
             mesh_bytes: 2 << 30,
             output_bytes: 3 << 30,
             memory_bytes: 8 << 30,
+            structure_cache_bytes: 512 << 20,
             picture_side: 4096,
         }
     }

@@ -17,7 +17,7 @@ use super::openapi::problems::READING;
 use super::problem::Problem;
 use super::source::{Input, StructureSource};
 use super::state::Shared;
-use crate::structure::{self, Structure, element};
+use crate::structure::{Structure, element};
 
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
 const BYTES_PER_ATOM: u64 = 24;
@@ -96,7 +96,7 @@ pub(super) async fn of_structure(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source.document(&app, &caller, &headers, async |input| list(&app, input).await).await
+    source.document(&app, &caller, &headers, async |input| list(&app, &caller, input).await).await
 }
 
 /// List the atoms of an archive entry
@@ -118,17 +118,18 @@ pub(super) async fn of_entry(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source.document(&app, &caller, &headers, async |input| list(&app, input).await).await
+    source.document(&app, &caller, &headers, async |input| list(&app, &caller, input).await).await
 }
 
 /// Parses a structure and lists its atoms, on a blocking thread. The list is charged to the memory budget until it is
 /// sent.
-async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
+async fn list(app: &Shared, caller: &Caller, input: Input) -> Result<Response, Problem> {
     let mut limits = app.config.limits.job().read;
     limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
     let lease = app.pool.settings().budget.lease();
+    let (structures, namespace) = (app.structures(), caller.namespace);
     let listing = app.read(move |control| {
-        let structure = structure::read_with(&input.bytes, &limits, control)?;
+        let structure = structures.get(namespace, input.digest, &input.bytes, &limits, control)?;
         lease.grow(BYTES_PER_ATOM * structure.len() as u64)?;
         let text = serde_json::to_vec(&document(&structure)).map_err(Problem::internal)?;
         Ok::<Bytes, Problem>(lease.attach(text))
@@ -178,7 +179,7 @@ fn same_residue(structure: &Structure, a: usize, b: usize) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::structure::ReadLimits;
+    use crate::structure::{self, ReadLimits};
 
     #[test]
     fn rows_are_those_of_the_file() {

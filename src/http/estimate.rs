@@ -27,6 +27,7 @@ use super::request_id::RequestId;
 use super::source::Input;
 use super::state::Shared;
 use crate::pipeline::{self, Choice, Estimate};
+use crate::surface::Control;
 
 /// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and samples are exact; the size of the mesh and
 /// the times are estimates.
@@ -124,7 +125,10 @@ pub(super) async fn create(
         move |control| {
             let start = Instant::now();
             let choice = Choice { backend: app.pool.backend().as_ref(), reason: app.pool.reason() };
-            let estimate = pipeline::estimate(&bytes, &job, &app.config.limits.job(), &choice, control);
+            let limits = app.config.limits.job();
+            let read =
+                |control: &Control<'_>| app.structures().get(caller.namespace, digest, &bytes, &limits.read, control);
+            let estimate = pipeline::estimate(read, &job, &limits, &choice, control);
             app.charge(&caller, start.elapsed());
             drop((lease, permit));
             estimate

@@ -17,6 +17,7 @@ use super::limit::Limit;
 use super::problem::Problem;
 use crate::config::LimitsConfig;
 use crate::jobs::Lease;
+use crate::store::{Digest, Hasher};
 
 /// Maximum size of a parameter field, bytes.
 const MAX_FIELD_BYTES: usize = 4096;
@@ -107,6 +108,8 @@ impl Bounds {
 /// Received structure file.
 pub(super) struct Upload {
     pub(super) bytes: Bytes,
+    /// SHA-256 of `bytes`.
+    pub(super) digest: Digest,
     pub(super) lease: Lease,
     /// Parameters from the other fields of a form.
     pub(super) fields: Vec<(String, String)>,
@@ -154,16 +157,19 @@ pub(super) async fn read(
             return Err(Problem::new(Kind::BadRequest, "the form has more than one file").with("parameter", name));
         }
         let declared = DeclaredType::new(field.content_type().map_or("", |mime| mime.as_ref()));
-        let mut content = BytesMut::new();
+        let (mut content, mut hasher) = (BytesMut::new(), Hasher::default());
         while let Some(chunk) = field.chunk().await.map_err(|e| bounds.problem(&e))? {
             lease.grow(chunk.len() as u64)?;
             content.extend_from_slice(&chunk);
+            if is_file {
+                hasher.update(&chunk);
+            }
             if !is_file && content.len() > MAX_FIELD_BYTES {
                 return Err(field_too_long(&name));
             }
         }
         if is_file {
-            file = Some((content.freeze(), declared));
+            file = Some((content.freeze(), hasher.digest(), declared));
         } else {
             fields.push((name, String::from_utf8_lossy(&content).into_owned()));
         }
@@ -174,11 +180,11 @@ pub(super) async fn read(
     while let Some(piece) = feed.next().await {
         piece.map_err(|e| bounds.problem(&multer::Error::StreamReadFailed(e.into())))?;
     }
-    let Some((bytes, declared)) = file else {
+    let Some((bytes, digest, declared)) = file else {
         let detail = "the form has no file; it belongs in a field named `file` or `structure`";
         return Err(Problem::new(Kind::BadRequest, detail).with("expected", "file"));
     };
-    Ok(Upload { bytes, lease, fields, declared })
+    Ok(Upload { bytes, digest, lease, fields, declared })
 }
 
 /// Returns the size of a part's headers, bytes.

@@ -72,8 +72,8 @@ impl ParsedRequest {
             // The type of the document says nothing about the structure.
             (source, fields, DeclaredType::Neutral)
         } else {
-            let Upload { bytes, lease, fields, declared } = upload::receive(app, headers, body).await?;
-            (StructureSource::Uploaded(Input::uploaded(bytes, lease).await?), fields, declared)
+            let Upload { bytes, digest, lease, fields, declared } = upload::receive(app, headers, body).await?;
+            (StructureSource::Uploaded(Input::uploaded(bytes, digest, lease)), fields, declared)
         };
         if body_has_parameters {
             pairs.extend(fields);

@@ -21,7 +21,7 @@ use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::client_shares::ClientShares;
 use crate::config::Config;
-use crate::jobs::{Budget, Client, EndError, JobStore, Pool, Settings};
+use crate::jobs::{Budget, Client, EndError, JobStore, Pool, Settings, Structures};
 use crate::picture::SelectedRenderer;
 use crate::single_flight::SingleFlight;
 use crate::store::{FolderLock, LockError, Store, StoreError};
@@ -122,12 +122,14 @@ impl Server {
             telemetry::recorder()?;
         }
         let traces = Traces::start(&config.telemetry)?;
+        let budget = Budget::new(config.limits.memory_bytes);
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
             batch_max_delay: Duration::from_millis(config.jobs.batch_max_delay_ms),
             limits: config.limits.job(),
-            budget: Budget::new(config.limits.memory_bytes),
+            structures: Structures::new(config.limits.structure_cache_bytes, &budget),
+            budget,
             renderer,
             meter: Some(Arc::new({
                 let access = Arc::clone(&access);

@@ -26,9 +26,6 @@ use crate::structure::{ArchiveError, EntryId};
 /// without revalidation is acceptable.
 pub(super) const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=86400, stale-while-revalidate=604800");
 
-/// Inputs up to this size are hashed on the runtime's threads, which takes about 1 ns per byte.
-const MAX_INLINE_HASH: usize = 128 << 10;
-
 /// Structure that a request names.
 pub(super) enum StructureSource {
     /// Uploaded with this request.
@@ -56,15 +53,9 @@ impl Input {
         Ok(Self { bytes, digest, lease: Arc::new(lease) })
     }
 
-    /// Hashes uploaded bytes, which `lease` is charged with already.
-    pub(super) async fn uploaded(bytes: Bytes, lease: Lease) -> Result<Self, Problem> {
-        let digest = if bytes.len() <= MAX_INLINE_HASH {
-            Digest::of(&bytes)
-        } else {
-            let bytes = bytes.clone();
-            tokio::task::spawn_blocking(move || Digest::of(&bytes)).await.map_err(Problem::internal)?
-        };
-        Ok(Self { bytes, digest, lease: Arc::new(lease) })
+    /// Uploaded bytes, which `lease` is charged with already.
+    pub(super) fn uploaded(bytes: Bytes, digest: Digest, lease: Lease) -> Self {
+        Self { bytes, digest, lease: Arc::new(lease) }
     }
 }
 

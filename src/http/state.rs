@@ -17,7 +17,7 @@ use crate::access::Access;
 use crate::archive::Archive;
 use crate::client_shares::{ClientShares, Place};
 use crate::config::Config;
-use crate::jobs::{Budget, Client, ContentKey, Failure, JobStore, Pool};
+use crate::jobs::{Budget, Client, ContentKey, Failure, JobStore, Pool, Structures};
 use crate::pipeline::Job;
 use crate::single_flight::SingleFlight;
 use crate::store::{Namespace, Secret, Store};
@@ -83,6 +83,11 @@ impl App {
     /// Returns the namespace of a group of keys. Without keys all clients share the common one.
     pub(super) fn namespace(&self, group: &str) -> Namespace {
         if self.access.has_keys() { Namespace::of_group(&self.secret, group) } else { Namespace::default() }
+    }
+
+    /// Returns the structures that are kept in memory.
+    pub(super) fn structures(&self) -> Arc<Structures> {
+        Arc::clone(&self.pool.settings().structures)
     }
 
     /// Runs `work`, which reads a structure, on a blocking thread. Waits for a permit first; `jobs.deadline_ms` limits

@@ -30,7 +30,7 @@ use crate::jobs::Failure;
 use crate::pipeline::JobError;
 use crate::store::{Digest, Name};
 use crate::structure::contents::Counts;
-use crate::structure::{self, Contents, Structure};
+use crate::structure::{Contents, Structure, StructureError};
 
 /// Maximum number of listed chains.
 const MAX_CHAINS: usize = 1000;
@@ -139,7 +139,7 @@ pub(super) async fn create(
             "a structure is uploaded as a file, not as JSON; `POST /v1/meshes` takes JSON that names a structure";
         return Err(Problem::new(Kind::UnsupportedMediaType, detail).with("declared", "application/json"));
     }
-    let Upload { bytes, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
+    let Upload { bytes, digest, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
     if let Some((name, _)) = fields.first() {
         return Err(Problem::new(
             Kind::BadParameter,
@@ -148,10 +148,9 @@ pub(super) async fn create(
         .with("parameter", name.as_str()));
     }
     let _permit = app.delivery(caller.client)?;
-    let input = Input::uploaded(bytes, lease).await?;
-    let digest = input.digest;
+    let input = Input::uploaded(bytes, digest, lease);
     // Parse before storing, so that only readable structures are stored.
-    let summary = summarize(&app, input.clone()).await.map_err(|failure| declared.explain(failure))?;
+    let summary = summarize(&app, &caller, input.clone()).await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(summary.format)?;
     let name = Name::input(&digest).within(caller.namespace);
     let created = app.store.put_new(&name, input.bytes).await?;
@@ -176,7 +175,7 @@ pub(super) async fn show(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let write = async |input| Ok(Json(summarize(&app, input).await?).into_response());
+    let write = async |input| Ok(Json(summarize(&app, &caller, input).await?).into_response());
     source.document(&app, &caller, &headers, write).await
 }
 
@@ -214,13 +213,14 @@ pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
 }
 
 /// Parses a structure and describes its contents, on a blocking thread.
-async fn summarize(app: &Shared, input: Input) -> Result<StructureDocument, Failure> {
+async fn summarize(app: &Shared, caller: &Caller, input: Input) -> Result<StructureDocument, Failure> {
     let limits = app.config.limits.job().read;
+    let (structures, namespace) = (app.structures(), caller.namespace);
     let parsing = app.read(move |control| {
-        let structure = structure::read_with(&input.bytes, &limits, control)?;
-        Ok(summary(&input.digest, input.bytes.len(), &structure))
+        let kept = structures.get(namespace, input.digest, &input.bytes, &limits, control)?;
+        Ok(summary(&input.digest, input.bytes.len(), &kept))
     });
-    parsing.await?.map_err(|error: structure::StructureError| JobError::from(error).into())
+    parsing.await?.map_err(|error: StructureError| JobError::from(error).into())
 }
 
 fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDocument {

@@ -15,6 +15,7 @@ use super::limit::Limit;
 use super::problem::Problem;
 use super::state::App;
 use crate::jobs::Lease;
+use crate::store::{Digest, Hasher};
 
 /// Limit of memory that is reserved because of a `Content-Length` header alone.
 const MAX_RESERVED_BYTES: u64 = 1 << 20;
@@ -44,9 +45,9 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
         in_time(app, form).await?
     } else {
         let lease = app.uploads.lease();
-        let bytes = in_time(app, collect(body, announced, limit, &lease)).await?;
+        let (bytes, digest) = in_time(app, collect(body, announced, limit, &lease)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
-        Upload { bytes, lease, fields: Vec::new(), declared }
+        Upload { bytes, digest, lease, fields: Vec::new(), declared }
     };
     if let Some((name, _)) = coding.filter(|(_, magic)| !upload.bytes.starts_with(magic)) {
         return Err(bad_encoding(&format!("the body is declared as {name}, but is not {name} data")));
@@ -63,7 +64,7 @@ pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> 
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
     let lease = app.uploads.lease();
-    in_time(app, collect(body, announced, limit, &lease)).await
+    in_time(app, collect(body, announced, limit, &lease)).await.map(|(bytes, _digest)| bytes)
 }
 
 /// Returns the length that the headers announce, 0 if they do not.
@@ -91,10 +92,10 @@ fn broken(error: &dyn std::fmt::Display) -> Problem {
     Problem::new(Kind::BadRequest, format!("the body cannot be read: {error}"))
 }
 
-/// Reads a body into one buffer; a body of one frame is not copied.
-async fn collect(body: Body, announced: u64, limit: Limit, lease: &Lease) -> Result<Bytes, Problem> {
+/// Reads a body into one buffer and hashes it while it arrives; a body of one frame is not copied.
+async fn collect(body: Body, announced: u64, limit: Limit, lease: &Lease) -> Result<(Bytes, Digest), Problem> {
     let mut stream = body.into_data_stream();
-    let (mut first, mut all, mut length) = (Bytes::new(), BytesMut::new(), 0u64);
+    let (mut first, mut all, mut length, mut hasher) = (Bytes::new(), BytesMut::new(), 0u64, Hasher::default());
     while let Some(data) = stream.next().await {
         let data = data.map_err(|e| broken(&e))?;
         length += data.len() as u64;
@@ -102,6 +103,7 @@ async fn collect(body: Body, announced: u64, limit: Limit, lease: &Lease) -> Res
             return Err(limit.exceeded_by_body());
         }
         lease.grow(data.len() as u64)?;
+        hasher.update(&data);
         if first.is_empty() && all.is_empty() {
             first = data;
             continue;
@@ -112,7 +114,7 @@ async fn collect(body: Body, announced: u64, limit: Limit, lease: &Lease) -> Res
         }
         all.extend_from_slice(&data);
     }
-    Ok(if all.is_empty() { first } else { all.freeze() })
+    Ok((if all.is_empty() { first } else { all.freeze() }, hasher.digest()))
 }
 
 /// Content coding that the structure reader supports: its name and the first bytes of a compressed file.

@@ -24,6 +24,7 @@ mod record;
 mod records;
 mod results;
 mod retry;
+mod structures;
 #[cfg(test)]
 mod tests;
 mod ticket;
@@ -38,6 +39,7 @@ pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
 pub(crate) use record::{JobId, Record, Status, rfc3339};
 pub(crate) use results::{REPORT, SaveError, is_stored, save};
+pub(crate) use structures::Structures;
 pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;

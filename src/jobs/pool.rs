@@ -8,7 +8,7 @@ use metrics::counter;
 
 use super::devices::DeviceMonitor;
 use super::queue::Queue;
-use super::{Budget, Client, OnStart, Refusal, Task, Ticket, worker};
+use super::{Budget, Client, OnStart, Refusal, Structures, Task, Ticket, worker};
 use crate::picture::SelectedRenderer;
 use crate::pipeline::{self, Job, JobLimits, maker};
 use crate::surface::Backend;
@@ -27,6 +27,8 @@ pub(crate) struct Settings {
     pub(crate) limits: JobLimits,
     /// Memory budget for uploads and meshes.
     pub(crate) budget: Budget,
+    /// Structures of recent jobs and requests.
+    pub(crate) structures: Arc<Structures>,
     /// Renderer of pictures.
     pub(crate) renderer: SelectedRenderer,
     /// Receiver of the time that each job took.

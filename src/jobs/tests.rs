@@ -16,7 +16,9 @@ use tokio::sync::watch;
 use super::durable_job::DurableJob;
 use super::rank::{Client, DEFAULT_URGENCY, Rank};
 use super::record::{Record, Requester, now_ms};
-use super::{AcceptError, Budget, EndError, JobId, JobSpec, JobStore, JobView, Pool, Settings, Status, Task};
+use super::{
+    AcceptError, Budget, EndError, JobId, JobSpec, JobStore, JobView, Pool, Settings, Status, Structures, Task,
+};
 use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::picture::SelectedRenderer;
@@ -46,12 +48,14 @@ impl Fixture {
 
     async fn open(dir: TempDir, config: JobsConfig) -> Self {
         let (faults, store) = faulty_in(dir.path(), 1 << 30).await;
+        let budget = Budget::new(1 << 30);
         let settings = Settings {
             workers: 1,
             queue: 8,
             batch_max_delay: Duration::from_secs(10),
             limits: JobLimits::default(),
-            budget: Budget::new(1 << 30),
+            structures: Structures::new(1 << 20, &budget),
+            budget,
             renderer: SelectedRenderer::cpu("a test"),
             meter: None,
             tracer: Tracer::default(),

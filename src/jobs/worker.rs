@@ -63,16 +63,13 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
             } else {
                 (None, None)
             };
-            let mut product = pipeline::run(
-                &task.input,
-                &task.job,
-                &shared.settings.limits,
-                &choice,
-                &control,
-                progress.as_ref(),
-                None,
-            )
-            .map_err(|error| explained(shared, &task.input, error, &control))?;
+            let limits = &shared.settings.limits;
+            let read = |control: &Control<'_>| {
+                let structures = &shared.settings.structures;
+                structures.get(task.namespace, task.digest, &task.input, &limits.read, control)
+            };
+            let mut product = pipeline::run_with(read, &task.job, limits, &choice, &control, progress.as_ref(), None)
+                .map_err(|error| explained(shared, &task.input, error, &control))?;
             if let Some(picture) = &task.job.picture {
                 pipeline::draw(&mut product, picture, &shared.settings.renderer, &control, progress.as_ref())?;
             }

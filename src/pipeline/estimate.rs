@@ -4,8 +4,11 @@
 //! |nx| + |ny| + |nz| over all normals is 1.5. Each crossing is a vertex, and a closed mesh has about two triangles per
 //! vertex. A coarser mesh gives the area.
 
+use std::ops::Deref;
+
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
+use crate::structure::{Structure, StructureError};
 use crate::surface::cpu::scan;
 use crate::surface::lattice::Lattice;
 use crate::surface::occupancy::Occupancy;
@@ -44,19 +47,19 @@ pub struct MeshEstimate {
     pub bytes: u64,
 }
 
-/// Estimates a job.
+/// Estimates a job on the structure that `read` returns.
 ///
 /// # Errors
 /// Returns a [`JobError`] if reading or selecting fails, or the job is cancelled.
-pub fn estimate(
-    bytes: &[u8],
+pub fn estimate<S: Deref<Target = Structure>>(
+    read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
     job: &Job,
     limits: &JobLimits,
     choice: &Choice<'_>,
     control: &Control<'_>,
 ) -> Result<Estimate, JobError> {
     let clock = StageClock::new(&());
-    let (structure, selected, spheres) = super::read(bytes, job, limits, &clock, control)?;
+    let (structure, selected, spheres) = super::load(read, job, &clock, control)?;
     let mut params = job.params_for(spheres.len());
     let mut refused = None;
     if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -176,9 +179,14 @@ fn area(mesh: &Mesh) -> f64 {
 mod tests {
     use super::*;
     use crate::pipeline::{params, run};
+    use crate::structure::{ReadLimits, read_with};
     use crate::surface::CpuBackend;
 
     const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
+
+    fn read(control: &Control<'_>) -> Result<Box<Structure>, StructureError> {
+        read_with(SAMPLE, &ReadLimits::default(), control).map(Box::new)
+    }
 
     #[test]
     fn grid_counts_are_exact_and_mesh_counts_are_close() {
@@ -187,7 +195,7 @@ mod tests {
         for resolution in ["0.3", "0.5", "1", "2"] {
             let job = params::parse([("resolution", resolution)]).unwrap().job;
             let (limits, control) = (JobLimits::default(), Control::default());
-            let estimate = estimate(SAMPLE, &job, &limits, &choice, &control).unwrap();
+            let estimate = estimate(read, &job, &limits, &choice, &control).unwrap();
             let report = run(SAMPLE, &job, &limits, &choice, &control, &(), None).unwrap().report;
             let mesh = estimate.mesh.unwrap();
             assert_eq!((mesh.samples, estimate.atoms), (report.samples, report.atoms));
@@ -202,7 +210,7 @@ mod tests {
         let choice = Choice { backend: &backend, reason: "" };
         let of = |compress: &str| {
             let job = params::parse([("compress", compress)]).unwrap().job;
-            estimate(SAMPLE, &job, &JobLimits::default(), &choice, &Control::default()).unwrap().mesh.unwrap()
+            estimate(read, &job, &JobLimits::default(), &choice, &Control::default()).unwrap().mesh.unwrap()
         };
         let (single, rounded) = (of("none"), of("quantize"));
         assert_eq!((single.vertices, single.triangles), (rounded.vertices, rounded.triangles));
@@ -247,10 +255,10 @@ mod tests {
         let choice = Choice { backend: &backend, reason: "" };
         let small = SurfaceLimits { max_mesh_bytes: 100_000, ..SurfaceLimits::default() };
         let limits = JobLimits { surface: small, ..JobLimits::default() };
-        let refused = estimate(SAMPLE, &Job::default(), &limits, &choice, &Control::default()).unwrap();
+        let refused = estimate(read, &Job::default(), &limits, &choice, &Control::default()).unwrap();
         let Err(SurfaceError::MeshTooLarge { suggested_resolution, .. }) = refused.mesh else { panic!("{refused:?}") };
         let text = suggested_resolution.to_string();
         let job = params::parse([("resolution", text.as_str())]).unwrap().job;
-        assert!(estimate(SAMPLE, &job, &limits, &choice, &Control::default()).unwrap().mesh.is_ok());
+        assert!(estimate(read, &job, &limits, &choice, &Control::default()).unwrap().mesh.is_ok());
     }
 }

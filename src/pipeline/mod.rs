@@ -14,6 +14,8 @@ mod report;
 pub mod spacing;
 mod work;
 
+use std::ops::Deref;
+
 use thiserror::Error;
 
 pub use clock::{ProgressSink, StageClock};
@@ -181,10 +183,27 @@ pub fn run(
     progress: &dyn ProgressSink,
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
+    let read = |control: &Control<'_>| structure::read_with(bytes, &limits.read, control).map(Box::new);
+    run_with(read, job, limits, choice, control, progress, sink)
+}
+
+/// Runs a job as [`run`] does, on the structure that `read` returns.
+///
+/// # Errors
+/// Returns the errors of [`run`].
+pub fn run_with<S: Deref<Target = Structure>>(
+    read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
+    job: &Job,
+    limits: &JobLimits,
+    choice: &Choice<'_>,
+    control: &Control<'_>,
+    progress: &dyn ProgressSink,
+    sink: Option<&GlbSink<'_>>,
+) -> Result<Product, JobError> {
     job.check(limits)?;
     let clock = StageClock::new(progress);
     let control = Control { observer: &clock, ..control.clone() };
-    let (structure, selected, spheres) = read(bytes, job, limits, &clock, &control)?;
+    let (structure, selected, spheres) = load(read, job, &clock, &control)?;
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -245,23 +264,23 @@ const INDEX_BYTES: u64 = 8;
 const SPHERE_BYTES: u64 = 28;
 
 /// Reads a structure and selects its spheres.
-fn read(
-    bytes: &[u8],
+fn load<S: Deref<Target = Structure>>(
+    read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
     job: &Job,
-    limits: &JobLimits,
     clock: &StageClock<'_>,
     control: &Control<'_>,
-) -> Result<(Structure, Selected, Spheres), JobError> {
-    let structure = clock.time("read", || structure::read_with(bytes, &limits.read, control))?;
+) -> Result<(S, Selected, Spheres), JobError> {
+    let read = clock.time("read", || read(control))?;
+    let structure = &*read;
     control.check()?;
     // Selecting holds an index for each atom, and a sphere for each selected one.
     control.memory.grow(INDEX_BYTES * structure.len() as u64).map_err(SurfaceError::from)?;
     let (selected, spheres) = clock.time("select", || -> Result<_, JobError> {
-        let selected = structure::select_with(&structure, &job.selection, control)?;
+        let selected = structure::select_with(structure, &job.selection, control)?;
         control.check()?;
         control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
-        let spheres = selected.spheres(&structure)?;
+        let spheres = selected.spheres(structure)?;
         Ok((selected, spheres))
     })?;
-    Ok((structure, selected, spheres))
+    Ok((read, selected, spheres))
 }

@@ -37,6 +37,7 @@ mod tests;
 mod upload;
 mod writer;
 
+pub(crate) use digest::Hasher;
 pub use digest::{BadDigest, Digest};
 pub use error::StoreError;
 pub use eviction::Swept;

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use super::atoms::{Atom, Slices, Tables};
+use super::atoms::{self, Atom, Slices, Tables};
 use super::contents::Kind;
 use super::element::{self, Name, atomic_number};
 use super::error::StructureError;
@@ -107,6 +107,16 @@ impl Layout {
     }
 }
 
+/// Joins the string tables and warnings of readers of consecutive rows, and translates the ids in these rows.
+pub(super) fn join<F>(parts: Vec<(Slices<'_>, AtomSite<F>)>) -> (Tables, Warnings<F>) {
+    let mut warnings = Warnings::default();
+    let tables = atoms::join(parts.into_iter().map(|(rows, site)| {
+        warnings.append(site.warnings);
+        (rows, site.tables)
+    }));
+    (tables, warnings)
+}
+
 /// A range of a text: `text[start..end]`. Fast number parsing may read beyond it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Span<'a> {
@@ -182,12 +192,6 @@ pub(super) struct AtomSite<F> {
 impl<F> AtomSite<F> {
     pub(super) fn new(layout: Layout) -> Self {
         Self { layout, tables: Tables::default(), warnings: Warnings::default(), guesses: HashMap::new() }
-    }
-
-    /// Appends the string tables and warnings of `later`, which read the following rows, `rows`.
-    pub(super) fn append(&mut self, later: Self, rows: &mut Slices<'_>) {
-        rows.adopt(&later.tables, &mut self.tables);
-        self.warnings.append(later.warnings);
     }
 
     /// Converts a row.

@@ -4,9 +4,10 @@ use super::contents::Kind;
 use super::duplicates;
 use super::error::StructureError;
 use super::kinds::{self, Sequence};
+use super::pieces;
 use super::radii;
 use super::read::Reading;
-use super::texts::{Interner, TextColumn};
+use super::texts::{Interner, TextColumn, translate};
 use crate::surface::OutOfMemory;
 
 /// The file format that a structure was read from.
@@ -142,6 +143,16 @@ impl Tables {
     pub(super) fn n_texts(&self) -> usize {
         [&self.name, &self.residue, &self.chain, &self.label_chain].map(|table| table.texts().len()).iter().sum()
     }
+
+    /// Adds the texts of `other`. Returns, for each table, the new ids by the ids in `other`.
+    fn adopt(&mut self, other: &Self) -> [Vec<u32>; 4] {
+        [
+            self.name.adopt(&other.name),
+            self.residue.adopt(&other.residue),
+            self.chain.adopt(&other.chain),
+            self.label_chain.adopt(&other.label_chain),
+        ]
+    }
 }
 
 macro_rules! columns {
@@ -233,28 +244,28 @@ columns! {
 }
 
 impl Slices<'_> {
-    /// Returns the number of rows that have been filled.
-    pub(super) fn n_filled(&self) -> usize {
-        self.next
-    }
-
-    /// Returns model and position of a row.
-    pub(super) fn place(&self, row: usize) -> (i32, [f64; 3]) {
-        (self.model[row], [self.x[row], self.y[row], self.z[row]])
-    }
-
     /// Returns true if every row has been filled.
     pub(super) fn is_full(&self) -> bool {
         self.next == self.element.len()
     }
 
-    /// Translates ids of the tables `from` into ids of `tables`, which receive the missing texts.
-    pub(super) fn adopt(&mut self, from: &Tables, tables: &mut Tables) {
-        tables.name.adopt(&from.name, self.name);
-        tables.residue.adopt(&from.residue, self.residue);
-        tables.chain.adopt(&from.chain, self.chain);
-        tables.label_chain.adopt(&from.label_chain, self.label_chain);
+    /// Starts again with the first row.
+    pub(super) fn rewind(&mut self) {
+        self.next = 0;
     }
+}
+
+/// Joins the string tables of consecutive rows, and translates the ids in these rows.
+pub(super) fn join<'r>(parts: impl IntoIterator<Item = (Slices<'r>, Tables)>) -> Tables {
+    let mut all = Tables::default();
+    let mut parts: Vec<_> = parts.into_iter().map(|(rows, tables)| (rows, all.adopt(&tables))).collect();
+    pieces::map(&mut parts, |(rows, [name, residue, chain, label_chain])| {
+        translate(rows.name, name);
+        translate(rows.residue, residue);
+        translate(rows.chain, chain);
+        translate(rows.label_chain, label_chain);
+    });
+    all
 }
 
 impl Columns {

@@ -1,7 +1,6 @@
 //! Columns that grow while a file is read: limits, memory and cancellation are checked once per chunk of rows.
 
 use super::atoms::{Atom, Columns, Tables};
-use super::duplicates;
 use super::error::StructureError;
 use super::read::Reading;
 
@@ -48,11 +47,11 @@ impl GrowingColumns {
         fits
     }
 
-    /// Checks the rows added last and reserves memory for more, for `expected` rows in an empty column.
+    /// Reserves memory for more rows, for `expected` rows in an empty column.
     ///
     /// # Errors
-    /// Returns [`StructureError::TooManyAtoms`] at the limit, [`StructureError::TooManyDuplicates`],
-    /// [`StructureError::Memory`] and [`StructureError::Cancelled`].
+    /// Returns [`StructureError::TooManyAtoms`] at the limit, [`StructureError::Memory`] and
+    /// [`StructureError::Cancelled`].
     pub(super) fn reserve_chunk(
         &mut self,
         tables: &Tables,
@@ -67,8 +66,6 @@ impl GrowingColumns {
         if n >= limit {
             return Err(StructureError::TooManyAtoms { limit: reading.limits.max_atoms });
         }
-        let first = n.saturating_sub(CHUNK);
-        duplicates::check(n - first, |i| self.columns.place(first + i), reading)?;
         reading.keep_texts(tables.n_texts() - self.n_texts)?;
         self.n_texts = tables.n_texts();
         if n == self.columns.capacity() {

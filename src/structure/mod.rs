@@ -23,6 +23,7 @@ mod kinds;
 mod mmcif;
 mod number;
 mod pdb;
+mod pieces;
 pub mod radii;
 pub mod read;
 mod residue;

@@ -2,8 +2,8 @@
 
 use super::atoms::{SourceFormat, Structure};
 use super::error::StructureError;
-use super::{bcif, inflate, mmcif, pdb, sniff};
-use crate::surface::{Control, Reservation};
+use super::{bcif, inflate, mmcif, pdb, pieces, sniff};
+use crate::surface::{Control, MemoryMeter as _, Reservation};
 
 /// Limits of reading, checked before memory is allocated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,6 +24,11 @@ impl Default for ReadLimits {
 }
 
 impl ReadLimits {
+    /// Checks the number of atoms in all models.
+    pub(crate) fn check_atoms(&self, n: usize) -> Result<(), StructureError> {
+        if n > self.max_rows() { Err(StructureError::TooManyAtoms { limit: self.max_atoms }) } else { Ok(()) }
+    }
+
     /// Atoms in all models, as a number of rows: rows are counted in 32 bits.
     pub(super) fn max_rows(&self) -> usize {
         usize::try_from(self.max_atoms.min(u64::from(u32::MAX))).unwrap_or(usize::MAX)
@@ -37,13 +42,20 @@ const BYTES_PER_TEXT: u64 = 96;
 pub(super) struct Reading<'a> {
     pub(super) limits: &'a ReadLimits,
     control: &'a Control<'a>,
-    /// Memory that is freed when the file has been read: text and decoded columns.
+    /// Memory that is freed when the file has been read: text, decoded columns, and what pieces hold besides rows.
     pub(super) text: Reservation,
+    /// Number of pieces to read; `None` to choose it by size.
+    pieces: Option<usize>,
 }
 
 impl<'a> Reading<'a> {
     pub(super) fn new(limits: &'a ReadLimits, control: &'a Control<'a>) -> Self {
-        Self { limits, control, text: Reservation::new(&control.memory) }
+        Self { limits, control, text: Reservation::new(&control.memory), pieces: None }
+    }
+
+    /// Returns the number of pieces for a text of this size.
+    pub(super) fn n_pieces(&self, bytes: usize) -> usize {
+        self.pieces.unwrap_or_else(|| pieces::number(bytes))
     }
 
     /// Fails if the caller cancelled.
@@ -54,6 +66,11 @@ impl<'a> Reading<'a> {
     /// Reserves memory until the reservation is dropped.
     pub(super) fn reserve(&self, bytes: u64) -> Result<Reservation, StructureError> {
         Ok(self.control.reserve(bytes)?)
+    }
+
+    /// Adds the memory of `n` more distinct texts of a piece.
+    pub(super) fn hold_texts(&self, n: usize) -> Result<(), StructureError> {
+        Ok(self.text.grow(BYTES_PER_TEXT * n as u64)?)
     }
 
     /// Adds the memory of `n` more distinct texts, which belong to the structure.
@@ -85,14 +102,23 @@ pub fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, StructureErr
 /// # Errors
 /// Returns the errors of [`read`], [`StructureError::Memory`] and [`StructureError::Cancelled`].
 pub fn read_with(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result<Structure, StructureError> {
-    let reading = Reading::new(limits, control);
+    of_bytes(bytes, &Reading::new(limits, control))
+}
+
+/// Reads a structure in a fixed number of pieces.
+#[cfg(any(test, feature = "server"))]
+pub(crate) fn read_in_pieces(bytes: &[u8], limits: &ReadLimits, n: usize) -> Result<Structure, StructureError> {
+    of_bytes(bytes, &Reading { pieces: Some(n), ..Reading::new(limits, &Control::default()) })
+}
+
+fn of_bytes(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     reading.check()?;
-    let plain = inflate::inflate(bytes, limits.max_inflated_bytes, &reading)?;
+    let plain = inflate::inflate(bytes, reading.limits.max_inflated_bytes, reading)?;
     let text = without_mark(&plain);
     match sniff::sniff(text)? {
-        SourceFormat::Pdb => pdb::read(text, &reading),
-        SourceFormat::Mmcif => mmcif::read(text, &reading),
-        SourceFormat::BinaryCif => bcif::read(text, &reading),
+        SourceFormat::Pdb => pdb::read(text, reading),
+        SourceFormat::Mmcif => mmcif::read(text, reading),
+        SourceFormat::BinaryCif => bcif::read(text, reading),
     }
 }
 

@@ -30,6 +30,14 @@ impl Fault {
         Box::new(Self { at, found: found.into(), expected: expected.into() })
     }
 
+    /// Moves the fault to a text in which this one begins at `offset`.
+    #[cold]
+    #[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
+    pub(super) fn shifted(mut self: Box<Self>, offset: usize) -> Box<Self> {
+        self.at += offset;
+        self
+    }
+
     /// Converts the fault to an error with line and column.
     pub(super) fn locate(self, text: &[u8]) -> StructureError {
         let (line, column) = line_and_column(text, self.at);

@@ -54,6 +54,15 @@ impl TextColumn {
     }
 }
 
+/// Replaces each id `i` by `map[i]`.
+pub(super) fn translate(ids: &mut [u32], map: &[u32]) {
+    if map.iter().zip(0..).any(|(&id, i)| i != id) {
+        for id in ids {
+            *id = map[*id as usize];
+        }
+    }
+}
+
 const CACHE_BITS: u32 = 8;
 
 /// Converts the length of a cacheable text, 1 to 8.
@@ -137,14 +146,9 @@ impl Interner {
         u32::try_from(id).unwrap_or(u32::MAX)
     }
 
-    /// Adds the texts of `other` and translates `ids` to the new ids.
-    pub(super) fn adopt(&mut self, other: &Self, ids: &mut [u32]) {
-        let map: Vec<u32> = other.texts().map(|text| self.number(text)).collect();
-        if map.iter().enumerate().any(|(i, &id)| i != id as usize) {
-            for id in ids {
-                *id = map[*id as usize];
-            }
-        }
+    /// Adds the texts of `other`, and returns the new ids of its texts by their ids.
+    pub(super) fn adopt(&mut self, other: &Self) -> Vec<u32> {
+        other.texts().map(|text| self.number(text)).collect()
     }
 
     pub(super) fn column(self, ids: Vec<u32>) -> TextColumn {
@@ -192,7 +196,7 @@ mod tests {
             id(&mut a, t);
         }
         let mut ids: Vec<u32> = ["Y", "Z", "X"].iter().map(|t| id(&mut b, t)).collect();
-        a.adopt(&b, &mut ids);
+        translate(&mut ids, &a.adopt(&b));
         let column = a.column(ids);
         assert_eq!((0..3).map(|i| column.get(i)).collect::<Vec<_>>(), ["Y", "Z", "X"]);
         assert_eq!(column.texts().len(), 3);

@@ -93,6 +93,10 @@ metrics! {
     DEVICE_PARTITIONS = "molmesh_device_partitions_total", Counter, device: "numbers of devices in use";
     /// Lookups of results. The store is asked if the memory cache misses.
     CACHE_REQUESTS = "molmesh_cache_requests_total", Counter, tier: "memory|store", result: "hit|miss";
+    /// Lookups of structures in memory. A miss reads the file.
+    STRUCTURE_CACHE_REQUESTS = "molmesh_structure_cache_requests_total", Counter, result: "hit|miss";
+    /// Bytes of structures that are kept in memory.
+    STRUCTURE_CACHE_BYTES = "molmesh_structure_cache_bytes", Gauge;
     /// Bytes in the store.
     STORE_BYTES = "molmesh_store_bytes", Gauge, folder: "folders of the store";
     /// Objects in the store.

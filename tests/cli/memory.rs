@@ -26,7 +26,8 @@ fn upload(n: u32) -> Vec<u8> {
 fn a_burst_of_large_uploads_stays_within_the_memory_limit() {
     let folder = Folder::new();
     let budget = format!("limits.memory_bytes={BUDGET}MiB");
-    let settings = ["--devices", "cpu", "--set", &budget, "--set", "jobs.workers=4", "--set", "server.client_share=1"];
+    let sets = [&budget, "limits.structure_cache_bytes=16MiB", "jobs.workers=4", "server.client_share=1"];
+    let settings = [&["--devices", "cpu"][..], &sets.map(|set| ["--set", set]).concat()].concat();
     // The address space holds 1 GiB that the allocator reserves, and the stacks of all threads.
     let service = Service::start_limited(&folder, 4 << 30, &settings);
     let addr = service.addr.parse().unwrap();

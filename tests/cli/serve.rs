@@ -241,7 +241,7 @@ fn identical_atoms_are_rejected_before_allocation() {
 #[test]
 fn memory_of_a_structure_is_returned() {
     let folder = Folder::new();
-    let service = Service::start(&folder, &["--devices", "cpu"]);
+    let service = Service::start(&folder, &["--devices", "cpu", "--set", "limits.structure_cache_bytes=0"]);
     let before = service.memory("VmRSS");
     let atoms: Vec<[f64; 3]> =
         (0..1_000_000_u32).map(|i| [i % 100, i / 100 % 100, i / 10_000].map(f64::from)).collect();

@@ -43,6 +43,11 @@ const ROWS: &[Row] = &[
     ("limits.mesh_bytes", "mesh-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
     ("limits.output_bytes", "mesh-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
     ("limits.memory_bytes", "memory-full", "cli/memory::a_burst_of_large_uploads_stays_within_the_memory_limit"),
+    (
+        "limits.structure_cache_bytes",
+        "molmesh_structure_cache_requests_total",
+        "src/jobs/structures::the_limit_is_respected_and_the_least_recently_used_structure_is_evicted",
+    ),
     ("limits.picture_side", "picture-too-large", "http/pictures::pictures_are_limited_before_any_work"),
     ("jobs.workers", "molmesh_queue_depth", "http/limits::a_full_queue_rejects_with_retry_after"),
     ("jobs.queue", "queue-full", "http/limits::a_full_queue_rejects_with_retry_after"),

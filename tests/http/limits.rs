@@ -416,6 +416,30 @@ fn bodies_leave_half_of_the_memory_to_jobs() {
     assert_eq!(beyond.problem(503, "memory-full")["limit"], limit / 2);
 }
 
+#[test]
+fn structures_in_memory_are_not_read_again() {
+    let server = fake(|_| {});
+    let cache = |result: &str| server.metric("molmesh_structure_cache_requests_total", &[result]);
+    let structure = server.post("/v1/structures", &[], &carbons(1000)).header("location").unwrap().to_owned();
+    let (hits, misses) = (cache("hit"), cache("miss"));
+    assert!(misses >= 1.0 && server.metric("molmesh_structure_cache_bytes", &[]) >= 61_000.0);
+    for query in ["?isovalue=0.9", "?isovalue=1.1", "?resolution=2"] {
+        let reply = server.get(&format!("{structure}/surface.glb{query}"));
+        assert_eq!(reply.status, 200, "{query}");
+    }
+    assert_eq!(server.get(&format!("{structure}/atoms")).status, 200);
+    assert!(cache("hit") >= hits + 4.0, "{} hits, {} misses", cache("hit"), cache("miss"));
+    // Control: another file is read, and without a cache every request reads.
+    assert_eq!(server.post("/v1/meshes", &[], &carbons(1001)).status, 200);
+    assert!(cache("miss") > misses);
+    let without = fake(|c| c.limits.structure_cache_bytes = 0);
+    let misses = without.metric("molmesh_structure_cache_requests_total", &["miss"]);
+    for query in ["?isovalue=0.9", "?isovalue=1.1"] {
+        assert_eq!(without.post(&format!("/v1/meshes{query}"), &[], &carbons(1000)).status, 200);
+    }
+    assert!(without.metric("molmesh_structure_cache_requests_total", &["miss"]) >= misses + 2.0);
+}
+
 /// Returns atoms, 81 bytes each, in a small file.
 fn compressed_atoms(n: usize) -> Vec<u8> {
     let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());

@@ -1,6 +1,7 @@
 //! Structure files: from bytes to a mesh and a mesh file.
 
 use molmesh::formats::{Compress, Format};
+use molmesh::fuzzing;
 use molmesh::pipeline::{self, Choice, Job, JobLimits, Spacing};
 use molmesh::structure::{ReadLimits, Selection};
 use molmesh::surface::{Control, CpuBackend, SurfaceLimits, SurfaceOptions, SurfaceParams, Validation};
@@ -88,11 +89,13 @@ const LIMITS: JobLimits = JobLimits {
     picture: molmesh::picture::PictureLimits { max_side: 64 },
 };
 
-/// Reads a structure, meshes it on a coarse grid, checks the mesh exactly and writes it in every format.
+/// Reads a structure in one and in several pieces, meshes it on a coarse grid, checks the mesh exactly and writes it in every format.
 pub(super) fn mesh(bytes: &[u8]) {
     // Some bits of the input choose the job, so that each input has one.
     let bits = bytes.iter().fold(bytes.len(), |hash, byte| hash.wrapping_mul(31).wrapping_add(usize::from(*byte)));
     let has = |bit: u32| bits >> bit & 1 == 1;
+    let read = |n| fuzzing::structure(bytes, &LIMITS.read, n);
+    assert!(read(1) == read(2 + bits % 7), "the pieces differ from the whole");
     let options = SurfaceOptions { resolution: Some(2.0), atom_ids: has(0), ..SurfaceOptions::default() };
     let Ok(params) = SurfaceParams::new(&options) else { unreachable!("valid parameters") };
     let job = Job {

@@ -252,12 +252,8 @@ impl<'a> Block<'a> {
         // A step of decoding holds its input and its output.
         reading.text.grow(2 * decoded)?;
         let memory = reading.reserve(Columns::bytes(bounds.rows))?;
-        let stop = || reading.check().is_err();
-        let atoms = rows::read(&raw, layout, bounds, &stop).map_err(within);
-        reading.check()?;
-        let atoms = atoms?;
+        let atoms = rows::read(&raw, layout, bounds, reading)?.map_err(within)?;
         memory.keep();
-        reading.keep_texts(atoms.1.n_texts())?;
         Ok(Some(atoms))
     }
 }

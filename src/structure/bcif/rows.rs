@@ -1,16 +1,19 @@
-//! Converts rows of decoded columns to atoms, on several threads if there are many.
-
-use rayon::prelude::*;
+//! Decodes columns and converts their rows to atoms, on several threads if there are many rows.
 
 use super::super::atom_site::{self, AtomSite, Layout, Span, Wrong};
 use super::super::atoms::{Columns, Tables};
+use super::super::error::StructureError;
+use super::super::pieces;
+use super::super::read::Reading;
 use super::super::text::{decode, quote};
 use super::super::warnings::Warnings;
 use super::column::{Bounds, Cells, Column, Raw};
 use super::fault::Fault;
 
-/// Rows per task.
-const CHUNK: usize = 64 << 10;
+/// Bytes of text that take the time of a row.
+const BYTES_PER_ROW: usize = 80;
+/// Rows between two checks of the cancellation flag and charges of memory: a few milliseconds.
+const ROWS_PER_CHECK: usize = 1 << 14;
 
 /// Columns of `atom_site` in file order. Only the required ones are decoded.
 struct Table<'a> {
@@ -96,64 +99,78 @@ pub(super) fn decoded_bytes(layout: &Layout, rows: usize) -> u64 {
 /// Atoms, their string tables, and warnings about replaced values.
 pub(super) type Atoms = (Columns, Tables, Warnings<Box<Fault>>);
 
-/// Decodes the columns of the layout and converts their rows to atoms. Ends early, with any result, once `stop` returns
-/// true.
+/// Decodes the columns of the layout and converts their rows to atoms. Returns the first fault in file order.
+///
+/// # Errors
+/// Returns the errors of cancellation and memory.
 pub(super) fn read(
     raw: &[Raw<'_>],
     layout: Layout,
     bounds: Bounds,
-    stop: &(dyn Fn() -> bool + Sync),
-) -> Result<Atoms, Box<Fault>> {
-    let table = Table { raw, columns: load(raw, &layout, bounds)? };
+    reading: &Reading<'_>,
+) -> Result<Result<Atoms, Box<Fault>>, StructureError> {
+    let n_pieces = reading.n_pieces(BYTES_PER_ROW * bounds.rows);
+    let table = match load(raw, &layout, bounds, n_pieces > 1) {
+        Ok(columns) => Table { raw, columns },
+        Err(fault) => return Ok(Err(fault)),
+    };
     let mut columns = Columns::zeroed(bounds.rows);
     let mut rest = columns.slices();
-    let mut parts = Vec::with_capacity(bounds.rows / CHUNK + 1);
-    for first in (0..bounds.rows).step_by(CHUNK) {
-        let n = CHUNK.min(bounds.rows - first);
+    let mut parts = Vec::with_capacity(n_pieces);
+    let size = bounds.rows.div_ceil(n_pieces);
+    for first in (0..bounds.rows).step_by(size) {
+        let n = size.min(bounds.rows - first);
         let (slices, others) = rest.split(n);
-        parts.push((first..first + n, slices, AtomSite::new(layout)));
+        parts.push((first..first + n, (slices, AtomSite::new(layout))));
         rest = others;
     }
-    let done: Vec<Result<(), Box<Fault>>> = parts
-        .par_iter_mut()
-        .map(|(rows, slices, site)| {
-            if stop() {
-                return Ok(());
+    let read = pieces::map(&mut parts, |(rows, (slices, site))| -> Result<_, StructureError> {
+        let mut n_texts = 0;
+        for index in rows.clone() {
+            if index % ROWS_PER_CHECK == 0 {
+                reading.check()?;
+                reading.hold_texts(site.tables.n_texts() - n_texts)?;
+                n_texts = site.tables.n_texts();
             }
-            for index in rows.clone() {
-                slices.put(&site.atom(&Row { table: &table, index })?);
-            }
-            Ok(())
-        })
-        .collect();
-    // Reports the first fault in file order, independent of the threads.
-    done.into_iter().collect::<Result<(), _>>()?;
-    let mut all = AtomSite::new(layout);
-    for (_, mut slices, site) in parts {
-        all.append(site, &mut slices);
+            match site.atom(&Row { table: &table, index }) {
+                Ok(atom) => slices.put(&atom),
+                Err(fault) => return Ok(Err(fault)),
+            };
+        }
+        Ok(Ok(()))
+    });
+    for piece in read {
+        if let Err(fault) = piece? {
+            return Ok(Err(fault));
+        }
     }
-    Ok((columns, all.tables, all.warnings))
+    let (tables, warnings) = atom_site::join(parts.into_iter().map(|(_, part)| part).collect());
+    reading.keep_texts(tables.n_texts())?;
+    Ok(Ok((columns, tables, warnings)))
 }
 
 /// A column and its fallback, if required.
 type Pair<'a> = [Option<Column<'a>>; 2];
 
-/// Decodes columns. The second of a pair is required only if the first has rows without a value.
-fn load<'a>(raw: &[Raw<'a>], layout: &Layout, bounds: Bounds) -> Result<Vec<Option<Column<'a>>>, Box<Fault>> {
+/// Decodes columns, in parallel if asked to. The second of a pair is required only if the first has rows without a value.
+fn load<'a>(
+    raw: &[Raw<'a>],
+    layout: &Layout,
+    bounds: Bounds,
+    parallel: bool,
+) -> Result<Vec<Option<Column<'a>>>, Box<Fault>> {
     let texts = layout.texts().map(|pair| (pair, true));
     let numbers = layout.numbers().map(|pair| (pair, false));
-    let wanted: Vec<_> = texts.into_iter().chain(numbers).collect();
-    let loaded: Vec<Result<Pair<'a>, Box<Fault>>> = wanted
-        .par_iter()
-        .map(|&([first, second], texts)| {
-            let load = |column: usize| raw.get(column).map(|raw| raw.load(bounds, texts)).transpose();
-            let (first, mut fallback) = (load(first)?, None);
-            if first.as_ref().is_some_and(Column::has_nulls) {
-                fallback = load(second)?;
-            }
-            Ok([first, fallback])
-        })
-        .collect();
+    let mut wanted: Vec<_> = texts.into_iter().chain(numbers).collect();
+    let load = |&mut ([first, second], texts): &mut ([usize; 2], bool)| -> Result<Pair<'a>, Box<Fault>> {
+        let load = |column: usize| raw.get(column).map(|raw| raw.load(bounds, texts)).transpose();
+        let (first, mut fallback) = (load(first)?, None);
+        if first.as_ref().is_some_and(Column::has_nulls) {
+            fallback = load(second)?;
+        }
+        Ok([first, fallback])
+    };
+    let loaded = if parallel { pieces::map(&mut wanted, load) } else { wanted.iter_mut().map(load).collect() };
     let mut columns: Vec<Option<Column<'a>>> = Vec::new();
     columns.resize_with(raw.len(), || None);
     for ((places, _), pair) in wanted.into_iter().zip(loaded) {

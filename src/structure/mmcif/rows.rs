@@ -1,20 +1,18 @@
 //! Reads the rows of the `atom_site` loop: a fast path for plain rows, the full grammar for all others.
 //!
 //! Almost all rows are plain tokens separated by blanks, which [`Edges`] finds. Rows with comments, text fields, quoted
-//! blanks or a possible end of the loop go through the tokenizer one at a time. Several threads read long loops with
-//! one line per row, each into its own rows of the columns. If a thread meets anything else, the whole range is read
-//! again in order, so that results and errors are the same.
+//! blanks or a possible end of the loop go through the tokenizer one at a time. A loop with one line per row is read in
+//! pieces, each into its own rows of the columns. If a piece holds anything else, the whole loop is read again in
+//! order, so that results and errors are the same.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use rayon::prelude::*;
-
-use super::super::atom_site::{AtomSite, Layout};
+use super::super::atom_site::{self, AtomSite, Layout};
 use super::super::atoms::{Atom, Columns, Tables};
 use super::super::cif::{Kind, Tokenizer, bare_kind};
-use super::super::duplicates;
 use super::super::error::StructureError;
 use super::super::growing::GrowingColumns;
+use super::super::pieces;
 use super::super::read::Reading;
 use super::super::scan::Edges;
 use super::super::text::Fault;
@@ -25,17 +23,15 @@ use super::row::Row;
 /// Bytes scanned at a time. The window is short after a special row, because the bytes after it are scanned again.
 const MIN_WINDOW: usize = 1 << 8;
 const MAX_WINDOW: usize = 16 << 10;
-/// Smallest text that is divided among threads, bytes.
-const PARALLEL_BYTES: usize = 2 << 20;
-/// Bytes per thread, at least.
-const CHUNK_BYTES: usize = 512 << 10;
+/// Bytes between two charges of the memory of texts.
+const BYTES_PER_CHARGE: usize = 1 << 20;
 
 pub(super) struct Rows<'a> {
     text: &'a [u8],
     site: AtomSite<Box<Fault>>,
     columns: GrowingColumns,
     reading: &'a Reading<'a>,
-    /// Number of rows that the text holds, estimated.
+    /// Number of rows that the text holds, if each has a line.
     expected: usize,
 }
 
@@ -55,12 +51,14 @@ impl<'a> Rows<'a> {
 
     /// Reads rows from the first value on. Returns the end of the loop.
     pub(super) fn read(&mut self, first: usize) -> Result<usize, Stop> {
-        let large = self.text.len() - first >= PARALLEL_BYTES && rayon::current_num_threads() > 1;
-        let parallel = if large { self.read_parallel(first)? } else { None };
-        let mut at = parallel.unwrap_or_else(|| {
-            self.expected = estimate(&self.text[first..]);
-            first
-        });
+        let mut at = match self.read_plain(first)? {
+            Some(end) => end,
+            None => {
+                // Untouched memory is not allocated.
+                self.expected = memchr::memchr_iter(b'\n', &self.text[first..]).count() + 1;
+                first
+            }
+        };
         let mut scanner = Scanner::new(self.text);
         loop {
             self.reading.check()?;
@@ -110,15 +108,14 @@ impl<'a> Rows<'a> {
         Ok(())
     }
 
-    /// Reads rows from `first` on by several threads, and returns the end of what they read. Returns `None`, and
-    /// changes nothing, if the text does not have one plain row per line.
+    /// Reads rows from `first` on in pieces, and returns the end of what it read. Returns `None`, and changes nothing,
+    /// if the text does not have one plain row per line.
     ///
     /// # Errors
     /// Returns the errors of cancellation and memory.
-    fn read_parallel(&mut self, first: usize) -> Result<Option<usize>, StructureError> {
-        let text = self.text;
-        let reading = self.reading;
-        let Some(stretches) = stretches(text, first) else { return Ok(None) };
+    fn read_plain(&mut self, first: usize) -> Result<Option<usize>, StructureError> {
+        let (text, reading) = (self.text, self.reading);
+        let stretches = stretches(text, first, reading.n_pieces(text.len() - first));
         let n_rows: usize = stretches.iter().map(|s| s.lines).sum();
         let Some(end) = stretches.last().map(|last| last.to) else { return Ok(None) };
         if n_rows > reading.limits.max_rows() {
@@ -130,51 +127,42 @@ impl<'a> Rows<'a> {
         let mut parts = Vec::with_capacity(stretches.len());
         for stretch in stretches {
             let (slices, others) = rest.split(stretch.lines);
-            parts.push((stretch, slices, AtomSite::new(self.site.layout)));
+            parts.push((stretch, (slices, AtomSite::new(self.site.layout))));
             rest = others;
         }
         let failed = AtomicBool::new(false);
-        parts.par_iter_mut().for_each_init(
-            || Scanner::new(text),
-            |scanner, (stretch, slices, site)| {
-                let stop = || failed.load(Ordering::Relaxed) || reading.check().is_err();
-                let done = scanner.rows(site, |atom| slices.put(atom), stretch.from, stretch.to, &stop);
-                let whole =
-                    done.is_ok_and(|done| text[done..stretch.to].iter().all(|&b| b <= b' ')) && slices.is_full();
-                // The sequential path reports the error.
-                let duplicates = duplicates::check(slices.n_filled(), |row| slices.place(row), reading);
-                if !whole || duplicates.is_err() {
-                    failed.store(true, Ordering::Relaxed);
+        let read = pieces::map(&mut parts, |(stretch, (slices, site))| {
+            let stop = || failed.load(Ordering::Relaxed) || reading.check().is_err();
+            let (mut scanner, mut at, mut n_texts) = (Scanner::new(text), stretch.from, 0);
+            let mut whole = false;
+            while !stop() {
+                let to = stretch.to.min(at + BYTES_PER_CHARGE);
+                let done = scanner.rows(site, |atom| slices.put(atom), at, to, &stop).unwrap_or(at);
+                reading.hold_texts(site.tables.n_texts() - n_texts)?;
+                n_texts = site.tables.n_texts();
+                if to == stretch.to || done == at {
+                    whole = slices.is_full() && text[done..stretch.to].iter().all(|&b| b <= b' ');
+                    break;
                 }
-            },
-        );
+                at = done;
+            }
+            failed.fetch_or(!whole, Ordering::Relaxed);
+            Ok(())
+        });
         reading.check()?;
+        read.into_iter().collect::<Result<(), StructureError>>()?;
         if failed.into_inner() {
             return Ok(None);
         }
-        for (_, mut slices, site) in parts {
-            reading.keep_texts(site.tables.n_texts())?;
-            self.site.append(site, &mut slices);
-        }
+        (self.site.tables, self.site.warnings) = atom_site::join(parts.into_iter().map(|(_, part)| part).collect());
+        reading.keep_texts(self.site.tables.n_texts())?;
         memory.keep();
         self.columns = GrowingColumns::filled(columns, &self.site.tables);
         Ok(Some(end))
     }
 }
 
-/// Estimates the number of rows from three samples of line length, with a margin. An overestimate costs nothing,
-/// because untouched memory is not allocated. An underestimate makes the columns grow.
-fn estimate(rest: &[u8]) -> usize {
-    const SAMPLE: usize = 64 << 10;
-    if rest.len() <= 4 * SAMPLE {
-        return memchr::memchr_iter(b'\n', rest).count() + 1;
-    }
-    let starts = [0, rest.len() / 2, rest.len() - SAMPLE];
-    let lines: usize = starts.iter().map(|&s| memchr::memchr_iter(b'\n', &rest[s..s + SAMPLE]).count()).sum();
-    (lines + 1) * (rest.len() / (3 * SAMPLE) + 1) / 16 * 17
-}
-
-/// Whole lines read by one thread.
+/// Whole lines of a piece.
 #[derive(Debug, Clone, Copy)]
 struct Stretch {
     from: usize,
@@ -182,38 +170,22 @@ struct Stretch {
     lines: usize,
 }
 
-/// Divides the text from `first` on into stretches, up to the first underscore. Rows without underscores contain
-/// neither tags nor reserved words. Leaves out comments and blank lines before the end.
-///
-/// Returns `None` if lines are as long as chunks.
-fn stretches(text: &[u8], first: usize) -> Option<Vec<Stretch>> {
-    let line_start = |at: usize| {
-        if at == first || at >= text.len() {
-            return Some(at.min(text.len()));
-        }
-        let near = &text[at..text.len().min(at + CHUNK_BYTES)];
-        memchr::memchr(b'\n', near).map(|i| at + i + 1)
-    };
-    let starts: Vec<usize> = (first..text.len()).step_by(CHUNK_BYTES).collect();
-    let found: Option<Vec<(Stretch, bool)>> = starts
-        .par_iter()
-        .map(|&start| {
-            let from = line_start(start)?;
-            let to = line_start(start + CHUNK_BYTES)?;
-            let chunk = &text[from..to];
-            let underscore = memchr::memchr(b'_', chunk);
-            // The text may end with comments or within its last line, which the sequential path reads.
-            let until = underscore.or((to == text.len()).then_some(chunk.len()));
-            let to = from + until.map_or(chunk.len(), |i| whole_rows(&chunk[..i]));
-            let lines = memchr::memchr_iter(b'\n', &text[from..to]).count();
-            Some((Stretch { from, to, lines }, underscore.is_some()))
-        })
-        .collect();
-    let mut found = found?;
+/// Divides the text from `first` on into at most `n` stretches, up to the first underscore. Rows without underscores
+/// contain neither tags nor reserved words. Leaves out comments and blank lines before the end.
+fn stretches(text: &[u8], first: usize, n: usize) -> Vec<Stretch> {
+    let mut found = pieces::map(&mut pieces::cut(text, first, n), |piece| {
+        let chunk = &text[piece.clone()];
+        let underscore = memchr::memchr(b'_', chunk);
+        // The text may end with comments or within its last line, which the general path reads.
+        let until = underscore.or((piece.end == text.len()).then_some(chunk.len()));
+        let to = piece.start + until.map_or(chunk.len(), |i| whole_rows(&chunk[..i]));
+        let lines = memchr::memchr_iter(b'\n', &text[piece.start..to]).count();
+        (Stretch { from: piece.start, to, lines }, underscore.is_some())
+    });
     if let Some(last) = found.iter().position(|(_, underscore)| *underscore) {
         found.truncate(last + 1);
     }
-    Some(found.into_iter().map(|(stretch, _)| stretch).filter(|s| s.lines > 0).collect())
+    found.into_iter().map(|(stretch, _)| stretch).filter(|s| s.lines > 0).collect()
 }
 
 /// Returns the length of `chunk` up to the end of its last row. A tag or the end of the text must follow `chunk`.
@@ -348,7 +320,7 @@ mod tests {
         let control = Control::default();
         let reading = Reading::new(&limits, &control);
         let mut table = Rows::new(text.as_bytes(), layout(&text), &reading);
-        let stop = table.read_parallel(TAGS.len()).unwrap()?;
+        let stop = table.read_plain(TAGS.len()).unwrap()?;
         Some((table.columns.columns().len(), stop - TAGS.len()))
     }
 

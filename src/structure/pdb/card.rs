@@ -15,6 +15,19 @@ pub(super) fn card(line: &[u8]) -> Card {
     padded
 }
 
+/// Columns up to the end of the coordinates.
+pub(super) const MIN_COLUMNS: usize = 54;
+
+/// Checks that a line has coordinates.
+#[inline]
+pub(super) fn check_length(line: &[u8]) -> Result<(), Box<Fault>> {
+    if line.len() < MIN_COLUMNS {
+        let found = format!("a line of {} columns", line.len());
+        return Err(Fault::words(line.len(), found, "coordinates in columns 31 to 54"));
+    }
+    Ok(())
+}
+
 /// Returns true if columns 73-80 contain the entry id and a line number, as in files before 1996: `4PTI  88`, `2HHBA
 /// 206`.
 pub(super) fn numbered_line(card: &Card) -> bool {

@@ -21,8 +21,6 @@ pub(super) struct TwoLetterChains {
     verdicts: HashMap<Pair, bool>,
     /// The verdict on all pairs, if all are equal.
     all: Option<bool>,
-    /// Columns 18-22 of the latest query, and its answer.
-    latest: ([u8; 5], bool),
 }
 
 impl TwoLetterChains {
@@ -33,20 +31,12 @@ impl TwoLetterChains {
         let verdicts = evidence.verdicts();
         let first = verdicts.values().next().copied();
         let all = first.filter(|first| verdicts.values().all(|chain| chain == first));
-        Self { verdicts, all, latest: ([0; 5], false) }
+        Self { verdicts, all }
     }
 
-    /// Returns true if column 21 of an ATOM record, which must not be blank, belongs to the chain name.
-    #[inline]
-    pub(super) fn has(&mut self, card: &Card) -> bool {
-        let columns = [card[17], card[18], card[19], card[20], card[21]];
-        if self.latest.0 != columns {
-            self.latest = (columns, self.decide(columns));
-        }
-        self.latest.1
-    }
-
-    fn decide(&self, columns: [u8; 5]) -> bool {
+    /// Returns true if column 21 of an ATOM record, given by its columns 18 to 22, belongs to the chain name. Column 21
+    /// must not be blank.
+    pub(super) fn has(&self, columns: [u8; 5]) -> bool {
         let [a, b, c, first, second] = columns;
         if second <= b' ' {
             return false;

@@ -1,0 +1,330 @@
+//! Structures that are kept in memory after they were read, for further requests for the same file.
+//!
+//! A structure is found by the digest of a file that the request has loaded already, and within its namespace only. It
+//! is charged to the memory budget, which takes the memory back before it rejects anything.
+
+use std::collections::HashSet;
+use std::ops::Deref;
+use std::sync::{Arc, PoisonError};
+use std::time::Duration;
+
+use metrics::{counter, gauge};
+
+use super::Lease;
+use crate::memory_budget::{Budget, Buffers, Reclaim};
+use crate::store::{Digest, Namespace};
+use crate::structure::{self, ReadLimits, Structure, StructureError};
+use crate::surface::Control;
+use crate::sync::{Condvar, Mutex, MutexGuard};
+use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
+
+/// Namespace and digest of a file. All other input of the reader is the same for the whole service, except limits.
+type Key = (Namespace, Digest);
+
+/// Time between two checks of a request that waits for another one to read its structure.
+const POLL: Duration = Duration::from_millis(20);
+
+/// A structure, and the memory that it is charged to.
+#[derive(Debug)]
+struct Charged {
+    structure: Structure,
+    /// Memory of the structure, bytes.
+    bytes: u64,
+    _charge: Charge,
+}
+
+/// Charge of a structure that is kept, which the metric of the budget does not count, or of one that is not.
+#[derive(Debug)]
+enum Charge {
+    Kept { _buffers: Buffers },
+    Used { _lease: Arc<Lease> },
+}
+
+/// A structure that other requests may use as well. Clones share it.
+#[derive(Debug, Clone)]
+pub(crate) struct KeptStructure(Arc<Charged>);
+
+impl KeptStructure {
+    fn bytes(&self) -> u64 {
+        self.0.bytes
+    }
+
+    /// Returns true if a request uses the structure.
+    fn is_used(&self) -> bool {
+        Arc::strong_count(&self.0) > 1
+    }
+}
+
+impl Deref for KeptStructure {
+    type Target = Structure;
+
+    fn deref(&self) -> &Structure {
+        &self.0.structure
+    }
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// Least recently used first.
+    kept: Vec<(Key, KeptStructure)>,
+    /// Structures that a request is reading.
+    reading: HashSet<Key>,
+}
+
+impl State {
+    fn bytes(&self) -> u64 {
+        self.kept.iter().map(|(_, kept)| kept.bytes()).sum()
+    }
+
+    /// Removes the least recently used structure that `is_candidate` accepts, and returns its memory in bytes.
+    fn evict(&mut self, is_candidate: impl Fn(&KeptStructure) -> bool) -> Option<u64> {
+        let found = self.kept.iter().position(|(_, kept)| is_candidate(kept))?;
+        Some(self.kept.remove(found).1.bytes())
+    }
+
+    /// Finds a structure, and makes it the most recently used one.
+    fn find(&mut self, key: &Key) -> Option<KeptStructure> {
+        let found = self.kept.iter().position(|(known, _)| known == key)?;
+        self.kept[found..].rotate_left(1);
+        self.kept.last().map(|(_, kept)| kept.clone())
+    }
+}
+
+/// Structures by namespace and digest, within a limit of memory.
+#[derive(Debug)]
+pub(crate) struct Structures {
+    limit: u64,
+    budget: Budget,
+    state: Mutex<State>,
+    /// Notified when a request has ended reading.
+    ended: Condvar,
+}
+
+impl Structures {
+    /// Keeps at most `limit` bytes, charged to `budget`.
+    pub(crate) fn new(limit: u64, budget: &Budget) -> Arc<Self> {
+        let (state, ended) = (Mutex::default(), Condvar::default());
+        let structures = Arc::new(Self { limit, budget: budget.clone(), state, ended });
+        let owner: Arc<dyn Reclaim> = Arc::<Self>::clone(&structures);
+        budget.reclaim_from(Arc::downgrade(&owner));
+        structures
+    }
+
+    /// Returns the structure of the file `bytes` with this digest, reading it if necessary. Concurrent calls read it
+    /// once. Memory is charged to the budget until the last reference is dropped, not to the meter of `control`.
+    ///
+    /// # Errors
+    /// Returns the errors of [`structure::read_with`].
+    pub(crate) fn get(
+        &self,
+        namespace: Namespace,
+        digest: Digest,
+        bytes: &[u8],
+        limits: &ReadLimits,
+        control: &Control<'_>,
+    ) -> Result<KeptStructure, StructureError> {
+        let key = (namespace, digest);
+        let mut state = self.lock();
+        loop {
+            if let Some(kept) = state.find(&key) {
+                counter!(STRUCTURE_CACHE_REQUESTS, "result" => "hit").increment(1);
+                return limits.check_atoms(kept.len()).map(|()| kept);
+            }
+            if state.reading.insert(key) {
+                break;
+            }
+            state = self.ended.wait_timeout(state, POLL).unwrap_or_else(PoisonError::into_inner).0;
+            if control.cancel.is_cancelled() {
+                return Err(StructureError::Cancelled);
+            }
+        }
+        drop(state);
+        let _reading = Reading { structures: self, key };
+        counter!(STRUCTURE_CACHE_REQUESTS, "result" => "miss").increment(1);
+        let lease = Arc::new(self.budget.lease());
+        let charged = Control { memory: Arc::<Lease>::clone(&lease), ..control.clone() };
+        let structure = structure::read_with(bytes, limits, &charged)?;
+        let bytes = lease.bytes();
+        if bytes > self.limit {
+            let charge = Charge::Used { _lease: lease };
+            return Ok(KeptStructure(Arc::new(Charged { structure, bytes, _charge: charge })));
+        }
+        let charge = Charge::Kept { _buffers: lease.to_buffers() };
+        let kept = KeptStructure(Arc::new(Charged { structure, bytes, _charge: charge }));
+        self.keep(key, &kept);
+        Ok(kept)
+    }
+
+    /// Keeps a structure, and evicts others.
+    fn keep(&self, key: Key, kept: &KeptStructure) {
+        let mut state = self.lock();
+        state.kept.push((key, kept.clone()));
+        while state.bytes() > self.limit && state.evict(|_| true).is_some() {}
+        publish(&state);
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Reclaim for Structures {
+    /// Frees structures that no request uses until `bytes` are free, least recently used first.
+    fn reclaim(&self, bytes: u64) -> bool {
+        let mut state = self.lock();
+        let mut freed = 0;
+        while freed < bytes
+            && let Some(more) = state.evict(|kept| !kept.is_used())
+        {
+            freed += more;
+        }
+        publish(&state);
+        freed > 0
+    }
+}
+
+/// Lets others read the structure when a request has ended reading, also with an error or a panic.
+struct Reading<'a> {
+    structures: &'a Structures,
+    key: Key,
+}
+
+impl Drop for Reading<'_> {
+    fn drop(&mut self) {
+        self.structures.lock().reading.remove(&self.key);
+        self.structures.ended.notify_all();
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
+fn publish(state: &State) {
+    gauge!(STRUCTURE_CACHE_BYTES).set(state.bytes() as f64);
+}
+
+#[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
+mod tests {
+    use std::sync::Barrier;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+    use crate::surface::{CancelToken, OutOfMemory};
+
+    /// Returns a file of `n` atoms and its digest.
+    fn file(n: usize) -> (String, Digest) {
+        let line = |i: usize| format!("ATOM      1  CA  ALA A{:>4}    {i:>8}   2.000   3.000\n", i % 10_000);
+        let text: String = (0..n).map(line).collect();
+        let digest = Digest::of(text.as_bytes());
+        (text, digest)
+    }
+
+    type Got = Result<KeptStructure, StructureError>;
+
+    fn get_with(structures: &Structures, (text, digest): &(String, Digest), control: &Control<'_>) -> Got {
+        structures.get(Namespace::default(), *digest, text.as_bytes(), &ReadLimits::default(), control)
+    }
+
+    fn get(structures: &Structures, file: &(String, Digest)) -> KeptStructure {
+        get_with(structures, file, &Control::default()).unwrap()
+    }
+
+    fn is_kept(structures: &Structures, file: &(String, Digest)) -> bool {
+        structures.lock().kept.iter().any(|((_, digest), _)| *digest == file.1)
+    }
+
+    fn size(file: &(String, Digest)) -> u64 {
+        get(&Structures::new(0, &Budget::unlimited()), file).bytes()
+    }
+
+    fn held(budget: &Budget) -> u64 {
+        match budget.lease().grow(u64::MAX) {
+            Err(OutOfMemory::Budget { held, .. }) => held,
+            other => unreachable!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_structure_is_read_once_within_its_namespace() {
+        let structures = Structures::new(1 << 20, &Budget::unlimited());
+        let file = file(10);
+        let first = get(&structures, &file);
+        assert!(Arc::ptr_eq(&first.0, &get(&structures, &file).0));
+        let other = Namespace::of_group(&[1; 32], "other");
+        let elsewhere =
+            structures.get(other, file.1, file.0.as_bytes(), &ReadLimits::default(), &Control::default()).unwrap();
+        assert!(!Arc::ptr_eq(&first.0, &elsewhere.0));
+        assert_eq!(*first, *elsewhere);
+        let tight = ReadLimits { max_atoms: 9, ..ReadLimits::default() };
+        let refused = structures.get(Namespace::default(), file.1, file.0.as_bytes(), &tight, &Control::default());
+        assert_eq!(refused.unwrap_err(), StructureError::TooManyAtoms { limit: 9 });
+    }
+
+    #[test]
+    fn the_limit_is_respected_and_the_least_recently_used_structure_is_evicted() {
+        let files = [file(100), file(101), file(102), file(100_000)];
+        let budget = Budget::unlimited();
+        let limit = size(&files[0]) + size(&files[2]);
+        let structures = Structures::new(limit, &budget);
+        for i in [0, 1, 0, 2, 3] {
+            get(&structures, &files[i]);
+            assert!(structures.lock().bytes() <= limit);
+        }
+        assert_eq!([0, 1, 2, 3].map(|i| is_kept(&structures, &files[i])), [true, false, true, false]);
+    }
+
+    #[test]
+    fn memory_is_given_back_before_anything_is_rejected() {
+        let files = [file(1000), file(1001), file(1002)];
+        let budget = Budget::new(1 << 20);
+        let structures = Structures::new(1 << 20, &budget);
+        let in_use = get(&structures, &files[0]);
+        [1, 2].into_iter().for_each(|i| drop(get(&structures, &files[i])));
+        let (held, lease) = (structures.lock().bytes(), budget.lease());
+        // Only the least recently used structure that no request uses is freed.
+        lease.grow((1 << 20) - held + 1).unwrap();
+        assert_eq!([0, 1, 2].map(|i| is_kept(&structures, &files[i])), [true, false, true]);
+        // A structure in use cannot be freed.
+        let most = (1 << 20) - in_use.bytes();
+        assert!(lease.grow(most + 1 - lease.bytes()).is_err());
+        lease.grow(most - lease.bytes()).unwrap();
+        drop(in_use);
+        lease.grow((1 << 20) - lease.bytes()).unwrap();
+        assert_eq!(structures.lock().bytes(), 0);
+        // Memory that is taken regardless of the limit does not make the check fail either.
+        drop(lease);
+        get(&structures, &files[0]);
+        let buffers = budget.buffers(1 << 20);
+        budget.check().unwrap();
+        assert!(!is_kept(&structures, &files[0]));
+        drop(buffers);
+    }
+
+    #[test]
+    fn concurrent_requests_read_once_and_a_cancelled_one_does_not_fail_the_others() {
+        let budget = Budget::unlimited();
+        let structures = Structures::new(1 << 30, &budget);
+        let file = file(50_000);
+        let (start, cancelled) = (Barrier::new(8), AtomicUsize::new(0));
+        let got: Vec<KeptStructure> = std::thread::scope(|scope| {
+            let spawn = |i: usize| {
+                let (structures, file, start, cancelled) = (&structures, &file, &start, &cancelled);
+                scope.spawn(move || {
+                    let cancel = CancelToken::default();
+                    start.wait();
+                    if i < 2 {
+                        cancel.cancel();
+                    }
+                    let got = get_with(structures, file, &Control { cancel, ..Control::default() });
+                    cancelled.fetch_add(usize::from(matches!(got, Err(StructureError::Cancelled))), Ordering::Relaxed);
+                    got.ok()
+                })
+            };
+            let threads: Vec<_> = (0..8).map(spawn).collect();
+            threads.into_iter().filter_map(|thread| thread.join().unwrap()).collect()
+        });
+        assert!(got.len() >= 6 && got.len() + cancelled.into_inner() == 8);
+        assert!(got.iter().all(|kept| Arc::ptr_eq(&kept.0, &got[0].0)));
+        assert!(structures.lock().reading.is_empty());
+        assert_eq!(held(&budget), structures.lock().bytes());
+    }
+}
