@@ -77,7 +77,7 @@ mod shaders {
 
     /// Generated tables: names of the table and its layouts, folder of the shaders, and shaders in execution order.
     const TABLES: [(&str, &str, &str, &[&str]); 2] = [
-        ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "interpolate", "emit"]),
+        ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "interpolate", "emit", "measure"]),
         ("PICTURE", "PICTURE_LAYOUTS", "picture/", &["vertex", "fragment", "resolve", "finish"]),
     ];
 

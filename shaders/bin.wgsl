@@ -7,15 +7,7 @@
 #include shared/bits.wgsl
 #include shared/tiles.wgsl
 #include shared/chunk.wgsl
-
-struct Counters {
-    // Number of list entries, including those beyond the capacity.
-    list_end: atomic<u32>,
-    vertices: u32,
-    triangles: u32,
-    // Number of vertices without a gradient.
-    flat: u32,
-}
+#include shared/counters.wgsl
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> atoms: array<Atom>;

@@ -8,16 +8,11 @@
 #include shared/kernel.wgsl
 #include shared/record.wgsl
 #include shared/quantize.wgsl
+#include shared/crossing.wgsl
+#include shared/counters.wgsl
 
 // Computes the nearest atom of each vertex if true.
 override NEAREST: bool = false;
-
-struct Counters {
-    list_end: u32,
-    vertices: u32,
-    triangles: u32,
-    flat: atomic<u32>,
-}
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> atoms: array<Atom>;
@@ -39,8 +34,6 @@ struct Counters {
 const LANES: u32 = 128u;
 // Number of candidates staged at once.
 const PIECE: u32 = 128u;
-// Same value as `EDGE_MARGIN` in `surface/lattice.rs`.
-const EDGE_MARGIN: f32 = 1.0 / 1024.0;
 
 var<workgroup> crossing: array<u32, 48>;
 var<workgroup> layers: array<u32, 8>;
@@ -48,6 +41,32 @@ var<workgroup> layers: array<u32, 8>;
 var<workgroup> slots: array<u32, 4>;
 // Centre relative to the first sample of the brick, and 1/ρ².
 var<workgroup> staged: array<vec4<f32>, 128>;
+
+// Keys of the highest position per axis so far, and of the highest negative position.
+var<workgroup> bounds: array<atomic<u32>, 6>;
+
+// Integer with the order of the floating-point number; more than 0 for every number.
+fn order_key(v: f32) -> u32 {
+    let bits = bitcast<u32>(v);
+    return bits ^ select(0x80000000u, 0xffffffffu, bits >> 31u == 1u);
+}
+
+fn raise_bound(i: u32, v: f32) {
+    let key = order_key(v);
+    if (key > atomicLoad(&bounds[i])) {
+        atomicMax(&bounds[i], key);
+    }
+}
+
+// Extends the bounds by a position.
+fn raise_bounds(p: vec3<f32>) {
+    raise_bound(0u, p.x);
+    raise_bound(1u, p.y);
+    raise_bound(2u, p.z);
+    raise_bound(3u, -p.x);
+    raise_bound(4u, -p.y);
+    raise_bound(5u, -p.z);
+}
 
 // Contribution of an atom to the gradient at p, which is relative to the first sample of the brick.
 fn gradient_of(p: vec3<f32>, atom: vec4<f32>) -> vec3<f32> {
@@ -133,6 +152,8 @@ fn main(
         slots[lane - 55u] = slot_of(records[id].neighbours[1u << (lane - 56u)]);
     } else if (lane == 59u) {
         slots[0] = id - params.first_brick;
+    } else if (lane < 66u) {
+        atomicStore(&bounds[lane - 60u], atomicLoad(&counters.bounds[lane - 60u]));
     }
     stage_piece(lane, head, 0u, origin);
     workgroupBarrier();
@@ -158,8 +179,7 @@ fn main(
             if (mine && start == 0u) {
                 let edge = edge_of(vertex);
                 let inner = field[slots[0] * 512u + edge.z * 64u + edge.bit];
-                let drop = inner - density_beyond(edge);
-                let t = clamp((inner - params.isovalue) / drop, EDGE_MARGIN, 1.0 - EDGE_MARGIN);
+                let t = crossing_at(inner, density_beyond(edge));
                 let along = select(vec3<f32>(0.0), vec3<f32>(t), vec3<u32>(0u, 1u, 2u) == vec3<u32>(edge.axis));
                 p = vec3<f32>(vec3<u32>(edge.bit & 7u, edge.bit >> 3u, edge.z)) + along;
             }
@@ -200,6 +220,7 @@ fn main(
                 let rounded = quantized_position(position * params.steps_per_angstrom);
                 positions[2u * at] = rounded.x;
                 positions[2u * at + 1u] = rounded.y;
+                raise_bounds(vec3<f32>(steps_of(rounded)));
                 normals[at] = quantized_normal(normal);
             } else {
                 let at = 3u * (first + vertex);
@@ -208,10 +229,15 @@ fn main(
                 positions[at] = words.x;
                 positions[at + 1u] = words.y;
                 positions[at + 2u] = words.z;
+                raise_bounds(position);
                 normals[at] = unit.x;
                 normals[at + 1u] = unit.y;
                 normals[at + 2u] = unit.z;
             }
         }
+    }
+    workgroupBarrier();
+    if (lane < 6u && atomicLoad(&bounds[lane]) > atomicLoad(&counters.bounds[lane])) {
+        atomicMax(&counters.bounds[lane], atomicLoad(&bounds[lane]));
     }
 }

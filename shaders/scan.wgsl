@@ -1,13 +1,7 @@
 // Stage `scan`: exclusive scan over bricks, which gives the first vertex and the first triangle of each. One workgroup
 // per group of 1024 bricks. `classify` has added up the groups, so workgroups do not depend on each other.
 #include shared/params.wgsl
-
-struct Counters {
-    list_end: u32,
-    vertices: u32,
-    triangles: u32,
-    flat: u32,
-}
+#include shared/counters.wgsl
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> counts: array<u32>;
@@ -67,8 +61,8 @@ fn main(
     store(first + 3u, start + c0 + c1 + c2);
     if ((group + 1u) * 1024u >= params.n_own && lane == 0u) {
         let end = before + sums[LANES - 1u];
-        counters.vertices = end.x;
-        counters.triangles = end.y;
+        atomicStore(&counters.vertices, end.x);
+        atomicStore(&counters.triangles, end.y);
     }
 }
 

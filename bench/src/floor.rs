@@ -47,7 +47,8 @@ impl Work {
                 ((2048.0 + 248.0) * surface + lists + 32.0 * atoms + each * vertices, 10.0 * vertices * reach)
             }
             Stage::Emit => (300.0 * surface + 12.0 * triangles, 0.0),
-            Stage::Write | Stage::Measure => (0.0, 0.0),
+            Stage::Measure => ((2048.0 + 64.0 + 68.0) * surface, 0.0),
+            Stage::Write => (0.0, 0.0),
         };
         Self { bytes, fmas }
     }

@@ -1,5 +1,8 @@
 // The 64 (x, y) bits of a layer are two words of 32: bit 8·y + x, the second word from y = 4 on.
 
+// Marks a tile or brick that does not exist.
+const NONE: u32 = 0xffffffffu;
+
 // Mask of the bits below `bit`, which is at most 31.
 fn below(bit: u32) -> u32 {
     return (1u << bit) - 1u;

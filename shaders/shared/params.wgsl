@@ -26,9 +26,10 @@ struct Params {
     // Number of bricks before and behind a brick, per axis, whose atoms may reach it.
     back: u32,
     ahead: u32,
-    // Number of tiles and bricks of the job.
+    // Number of tiles of the job.
     n_tiles: u32,
-    n_bricks: u32,
+    // Capacity of the sheets, in words.
+    sheet_capacity: u32,
     // Own bricks of the chunk, halo bricks, and entries of the table of halo slots.
     first_brick: u32,
     n_own: u32,

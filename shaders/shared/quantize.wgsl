@@ -22,6 +22,12 @@ fn quantized_position(steps: vec3<f32>) -> vec2<u32> {
     );
 }
 
+// Integers of a quantized position.
+fn steps_of(rounded: vec2<u32>) -> vec3<i32> {
+    let words = bitcast<vec2<i32>>(rounded);
+    return vec3<i32>(words.x << 16u, words.x, words.y << 16u) >> vec3<u32>(16u);
+}
+
 // Unit normal, or zero, as four 8-bit integers; the last is 0.
 fn quantized_normal(normal: vec3<f32>) -> u32 {
     var n = vec3<i32>(round(clamp(normal * 127.0, vec3<f32>(-127.0), vec3<f32>(127.0))));

@@ -11,8 +11,6 @@ struct Tile {
     around: array<u32, 28>,
 }
 
-const NONE: u32 = 0xffffffffu;
-
 // Number of bricks of the job before position `local` (9 bits: z, y, x) of a tile.
 fn bricks_before(tile: u32, local: u32) -> u32 {
     let z = local >> 6u;

@@ -117,7 +117,11 @@ impl Backend for GpuBackend {
         let memory = Arc::new(Reservation::new(&control.memory));
         let of_job = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
         let job = Self::job(spheres, params, limits, &of_job)?;
-        let error = match self.pool.run(&job) {
+        let completed = self.pool.run(&job).and_then(|mut completed| {
+            control.span(Stage::Measure, || completed.finished.measure(&job.prepared))?;
+            Ok(completed)
+        });
+        let error = match completed {
             Ok(completed) => {
                 memory.keep();
                 completed.finished.stages.iter().for_each(|(stage, ns)| control.observer.elapsed(*stage, *ns));

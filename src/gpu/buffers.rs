@@ -44,13 +44,15 @@ pub enum BufferId {
     Sources,
     /// Triangle indices.
     Triangles,
+    /// Blocks of `measure`, one per brick that the surface intersects.
+    Sheets,
     /// Case table, shared by all jobs.
     Cases,
 }
 
 impl BufferId {
     /// Buffers that each job has for itself: all but [`Self::Cases`], in the order of the variants.
-    pub(super) const OF_JOB: [Self; 20] = [
+    pub(super) const OF_JOB: [Self; 21] = [
         Self::Params,
         Self::Atoms,
         Self::Reaches,
@@ -71,6 +73,7 @@ impl BufferId {
         Self::Normals,
         Self::Sources,
         Self::Triangles,
+        Self::Sheets,
     ];
 
     /// Returns the index of the buffer in [`Self::OF_JOB`]; [`Self::Cases`] comes after them.

@@ -4,17 +4,12 @@ use super::buffers::BufferId;
 use super::engine::Engine;
 use super::error::GpuError;
 use super::job_state::{ChunkCounts, JobState};
-use super::output_layout::BODY_OFFSET;
+use super::output_layout::{BODY_OFFSET, narrow};
 use super::plan::layout::Params;
 use super::submit::PendingSubmission;
 
 /// Number of the stages that run before the size of the output is known: `bin` to `scan`.
 pub(super) const N_COUNT_STAGES: usize = 4;
-
-/// Converts a number of rows to 32 bits; buffers are smaller than that.
-pub(super) fn narrow(n: u64) -> Result<u32, GpuError> {
-    u32::try_from(n).map_err(|e| GpuError::Failed(format!("{n} rows: {e}")))
-}
 
 impl Engine {
     /// Submits the stages `bin` to `scan` of a chunk.

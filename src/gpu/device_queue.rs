@@ -165,6 +165,7 @@ mod tests {
     use super::*;
     use crate::gpu::job::{Finished, Prepared};
     use crate::gpu::plan::Partition;
+    use crate::gpu::sheets::SheetBlocks;
     use crate::surface::backend::one_atom;
     use crate::surface::{
         CancelToken, Control, GridStats, Mesh, MeshOutput, SurfaceError, SurfaceLimits, SurfaceParams,
@@ -191,7 +192,11 @@ mod tests {
         job.reply(Err(SurfaceError::Deadline.into()));
         assert_eq!(other.check(), cancelled, "failed");
         let (job, other) = queued();
-        job.reply(Ok(Finished { meshed: MeshOutput::new(Mesh::default(), GridStats::default()), stages: Vec::new() }));
+        job.reply(Ok(Finished {
+            meshed: MeshOutput::new(Mesh::default(), GridStats::default()),
+            stages: Vec::new(),
+            sheets: SheetBlocks::default(),
+        }));
         assert_eq!(other.check(), Ok(()), "succeeded");
     }
 }

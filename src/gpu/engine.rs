@@ -13,14 +13,14 @@ use super::buffers::BufferId;
 use super::device_errors::DeviceErrors;
 use super::error::GpuError;
 use super::job::GpuJob;
-use super::output_layout::VertexBytes;
+use super::output_layout::{OutputRows, VertexBytes};
 use super::pipelines::{Pipelines, Variant};
 use super::plan::layout::{self, Params};
 use super::plan::{Chunk, ChunkLimits, Partition};
 use super::readback::ReadbackPool;
 use super::recording::{Dispatch, Recording, StageTimer};
-use super::workspace::{BufferSizes, OutputCapacity, ROW, Workspace};
-use crate::surface::lattice::{LatticeAtom, slightly_coarser};
+use super::workspace::{BufferSizes, ROW, Workspace};
+use crate::surface::lattice::{LatticeAtom, slightly_coarser, to_u32};
 
 /// Resources that the engine may use of its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -41,6 +41,9 @@ pub struct Budget {
     /// Number of vertices and triangles per brick that the buffers of a small job hold. A surface crosses a brick of
     /// 8 × 8 × 8 cells with about 90 vertices and 180 triangles.
     pub rows_per_brick: [u64; 2],
+    /// Number of words per brick that the surface intersects which the buffers of sheets hold at first. A brick of one
+    /// sheet takes 17; one of several takes 12 more per sheet, and one per shared vertex.
+    pub sheet_words_per_brick: u64,
 }
 
 impl Budget {
@@ -56,6 +59,7 @@ impl Budget {
             idle_bytes: [8 << 30, 2 << 30],
             small_bytes: 16 << 20,
             rows_per_brick: [128, 256],
+            sheet_words_per_brick: 64,
         }
     }
 }
@@ -89,6 +93,11 @@ pub(super) struct LoadedJob<'a> {
 }
 
 impl LoadedJob<'_> {
+    /// Number of bricks of the job.
+    pub(super) fn n_bricks(&self) -> u32 {
+        to_u32(self.job.prepared.plan.bricks.len())
+    }
+
     pub(super) fn dispatch(&self, row: u64, workgroups: u32) -> Dispatch<'_> {
         Dispatch { workspace: &self.workspace, row, workgroups, variant: self.variant }
     }
@@ -180,7 +189,7 @@ impl Engine {
         job: &'a GpuJob,
         partition: Option<&Partition>,
         chunks: Vec<Chunk>,
-        capacity: OutputCapacity,
+        capacity: OutputRows,
     ) -> Result<LoadedJob<'a>, GpuError> {
         job.check()?;
         let (plan, lattice, params) = (&job.prepared.plan, &job.prepared.lattice, &job.prepared.params);

@@ -11,6 +11,7 @@ use super::job::{Finished, GpuJob, JobResult, Prepared};
 use super::partition_handle::{PartitionCounts, PartitionHandle};
 use super::pool::{DevicePool, PoolDevice};
 use super::scheduler::{EnqueueError, PoolSettings, Scheduler};
+use super::sheets::SheetBlocks;
 use crate::surface::{
     CancelToken, Control, DeviceStatus, GridStats, Mesh, MeshOutput, Spheres, SurfaceLimits, SurfaceParams,
 };
@@ -33,7 +34,11 @@ impl Flaky {
         if failed.is_ok() {
             return Err(GpuError::Lost("scripted".to_owned()));
         }
-        Ok(Finished { meshed: MeshOutput::new(Mesh::default(), GridStats::default()), stages: Vec::new() })
+        Ok(Finished {
+            meshed: MeshOutput::new(Mesh::default(), GridStats::default()),
+            stages: Vec::new(),
+            sheets: SheetBlocks::default(),
+        })
     }
 }
 

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use super::error::GpuError;
 use super::plan::Plan;
+use super::sheets::SheetBlocks;
 use crate::surface::cpu::{LATTICE_BYTES, scan};
 use crate::surface::lattice::Lattice;
 use crate::surface::{
@@ -112,6 +113,23 @@ pub struct Finished {
     pub meshed: MeshOutput,
     /// Device time per stage in ns, in stage order; empty if the device has no timestamps.
     pub stages: Vec<(Stage, u64)>,
+    /// Sums over the sheets of the mesh's bricks.
+    pub sheets: SheetBlocks,
+}
+
+impl Finished {
+    /// Adds the measures of the mesh, unless it is not closed.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`] if the device's sums contradict each other or the mesh.
+    pub fn measure(&mut self, prepared: &Prepared) -> Result<(), GpuError> {
+        let Prepared { plan, lattice, params, .. } = prepared;
+        let unit = params.quantize.map_or(lattice.spacing, |step| f64::from(step.length()));
+        self.meshed.measures = self.sheets.measures(plan, unit, self.meshed.size())?;
+        // Frees the readback buffers that hold nothing else.
+        self.sheets = SheetBlocks::default();
+        Ok(())
+    }
 }
 
 /// Result of a job.

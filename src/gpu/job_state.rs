@@ -6,12 +6,16 @@ use bytemuck::Pod;
 use super::engine::LoadedJob;
 use super::error::GpuError;
 use super::job::{Finished, JobResult};
-use super::output_layout::{COUNTERS_OFFSET, ReadbackLayout, ReadbackRows, byte_range, values};
+use super::output_layout::{
+    COUNTERS_OFFSET, OutputPiece, OutputRows, ReadbackLayout, ReadbackRows, byte_range, values,
+};
 use super::pipelines::{N_STAGES, STAGES};
 use super::plan::layout::{self, Counters};
 use super::readback::ReadbackBuffer;
+use super::sheets::SheetBlocks;
 use super::submit::{PendingSubmission, StageTimes};
-use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage};
+use crate::surface::mesh::joined_bounds;
+use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage, Step};
 
 /// Counts of a chunk.
 #[derive(Debug, Default)]
@@ -26,10 +30,12 @@ pub(super) struct ChunkCounts {
 pub(super) struct PendingOutput {
     pub(super) submission: PendingSubmission,
     pub(super) layout: ReadbackLayout,
-    /// Number of vertices and triangles, one of which is 0.
-    pub(super) rows: [u64; 2],
-    /// Stage that makes the piece: `interpolate` or `emit`.
+    /// Rows that the readback buffer holds.
+    pub(super) rows: OutputRows,
+    /// Stage that makes the piece: `interpolate`, `emit` or `measure`.
     pub(super) stage: Stage,
+    pub(super) chunk: usize,
+    pub(super) piece: OutputPiece,
 }
 
 /// State of a job.
@@ -40,10 +46,13 @@ pub(super) struct JobState<'a> {
     pub(super) has_flat_vertices: bool,
     pub(super) vertices: Vec<ReadbackRows>,
     pub(super) triangles: Vec<ReadbackRows>,
+    pub(super) sheets: Vec<ReadbackRows>,
+    checksum: u64,
+    degenerate: bool,
+    /// Bounds of the positions, in Å or steps.
+    bounds: Option<[[f32; 3]; 2]>,
     /// Output that was submitted last.
     pub(super) pending: Option<PendingOutput>,
-    /// First vertex and first triangle of each group of bricks.
-    parts: Vec<(usize, usize)>,
     surface_bricks: u64,
     /// Number of vertices and triangles counted so far.
     pub(super) total: [u64; 2],
@@ -57,8 +66,11 @@ impl<'a> JobState<'a> {
             has_flat_vertices: false,
             vertices: Vec::new(),
             triangles: Vec::new(),
+            sheets: Vec::new(),
+            checksum: 0,
+            degenerate: false,
+            bounds: None,
             pending: None,
-            parts: Vec::new(),
             surface_bricks: 0,
             total: [0; 2],
         }
@@ -83,9 +95,6 @@ impl<'a> JobState<'a> {
         let groups: Vec<[u32; 4]> = values(readback.as_ref(), offset, chunk.n_groups())?.to_vec();
         let first = self.total;
         for &[vertices, triangles, bricks, _] in &groups {
-            if let [Ok(vertex), Ok(triangle)] = self.total.map(usize::try_from) {
-                self.parts.push((vertex, triangle));
-            }
             self.total[0] += u64::from(vertices);
             self.total[1] += u64::from(triangles);
             self.surface_bricks += u64::from(bricks);
@@ -107,10 +116,13 @@ impl<'a> JobState<'a> {
         Ok(self.loaded.job.prepared.check_mesh(self.total)?)
     }
 
-    /// Reads the counters of a finished output.
-    pub(super) fn note_flat_vertices(&mut self, readback: &ReadbackBuffer) -> Result<(), GpuError> {
-        self.has_flat_vertices |= counters(readback)?.flat > 0;
-        Ok(())
+    /// Adds the counters of a finished output.
+    pub(super) fn add_counters(&mut self, counters: &Counters) {
+        let [low, high] = counters.checksum.map(u64::from);
+        self.has_flat_vertices |= counters.flat > 0;
+        self.checksum = self.checksum.wrapping_add(high << 32 | low);
+        self.degenerate |= counters.degenerate > 0;
+        self.bounds = self.bounds.into_iter().chain(counters.position_bounds()).reduce(joined_bounds);
     }
 
     /// Assembles the mesh and computes the normals of vertices without a gradient.
@@ -131,6 +143,8 @@ impl<'a> JobState<'a> {
     /// Those of [`Self::finish`].
     pub(super) fn assemble(&mut self) -> JobResult {
         let mesh = self.mesh()?;
+        let words = column(&self.sheets, |r| (r.layout.sheets, r.rows.sheet_words))?;
+        let sheets = SheetBlocks { words, checksum: self.checksum, degenerate: self.degenerate };
         let (plan, lattice) = (&self.loaded.job.prepared.plan, &self.loaded.job.prepared.lattice);
         let grid = GridStats {
             bricks: plan.n_reached,
@@ -141,7 +155,9 @@ impl<'a> JobState<'a> {
         };
         let timed = self.times.iter().any(|&ns| ns > 0);
         let stages = if timed { STAGES.into_iter().zip(self.times).collect() } else { Vec::new() };
-        Ok(Finished { meshed: MeshOutput::new(mesh, grid), stages })
+        let unit = self.loaded.job.prepared.params.quantize.map_or(1.0, Step::length);
+        let bounds = self.bounds.map(|bounds| bounds.map(|corner| corner.map(|c| c * unit)));
+        Ok(Finished { meshed: MeshOutput { bounds, ..MeshOutput::new(mesh, grid) }, stages, sheets })
     }
 
     fn mesh(&mut self) -> Result<Mesh, GpuError> {
@@ -149,14 +165,13 @@ impl<'a> JobState<'a> {
         let params = &prepared.params;
         let vertices = &self.vertices;
         let of_vertices =
-            |offset: fn(&ReadbackLayout) -> u64| move |r: &ReadbackRows| (offset(&r.layout), r.n_vertices);
+            |offset: fn(&ReadbackLayout) -> u64| move |r: &ReadbackRows| (offset(&r.layout), r.rows.vertices);
         let (positions, normals) = (of_vertices(|layout| layout.positions), of_vertices(|layout| layout.normals));
         let sources = of_vertices(|layout| layout.sources);
         let mut mesh = Mesh {
             centre: prepared.lattice.centre(),
-            triangles: column(&self.triangles, |r| (r.layout.triangles, r.n_triangles))?,
+            triangles: column(&self.triangles, |r| (r.layout.triangles, r.rows.triangles))?,
             atom_ids: params.atom_ids.then(|| column(vertices, sources)).transpose()?,
-            parts: std::mem::take(&mut self.parts),
             ..Mesh::default()
         };
         if let Some(step) = params.quantize {
@@ -181,7 +196,7 @@ fn column<T: Pod>(pieces: &[ReadbackRows], place: impl Fn(&ReadbackRows) -> (u64
 }
 
 /// Counters in a readback buffer.
-fn counters(readback: &ReadbackBuffer) -> Result<Counters, GpuError> {
+pub(super) fn counters(readback: &ReadbackBuffer) -> Result<Counters, GpuError> {
     let rows: &[Counters] = values(readback.as_ref(), COUNTERS_OFFSET, 1)?;
     rows.first().copied().ok_or_else(|| GpuError::Failed("a readback buffer without counters".to_owned()))
 }

@@ -8,7 +8,8 @@
 //!
 //! ```text
 //! error, buffers, plan, readback, hardware, manifests, choose, picture_targets
-//! job, shaders, device_errors, discover
+//! sheets, shaders, device_errors, discover
+//! job
 //! partition_handle, pipelines, multi_device, picture_passes
 //! executor, output_layout, device_queue
 //! workspace, scheduler
@@ -58,6 +59,7 @@ mod run;
 mod run_partition;
 mod scheduler;
 mod shaders;
+mod sheets;
 mod submit;
 mod worker;
 mod workspace;
@@ -74,4 +76,5 @@ pub use picture::GpuRenderer;
 pub use pool::{CompletedJob, DevicePool, DeviceWork, PoolDevice};
 pub use scheduler::PoolSettings;
 pub use shaders::stage_shaders;
+pub use sheets::SheetBlocks;
 pub use worker::{Build, MAX_REBUILDS};

@@ -4,6 +4,8 @@
 //! makes its triangles with the final vertex numbers. The mesh has the same bytes as that of one device.
 
 use super::job::Finished;
+use super::sheets::SheetBlocks;
+use crate::surface::mesh::joined_bounds;
 use crate::surface::{GridStats, Mesh, MeshOutput, Stage};
 
 /// Number of devices for a job of `n_bricks`, given `idle` devices and a minimum of bricks per partition. A job runs on
@@ -19,7 +21,11 @@ pub(super) fn join(partitions: Vec<Finished>, has_flat_vertices: bool) -> Finish
     let stages = max_times(&partitions);
     let mut mesh = Mesh::default();
     let mut grid = GridStats::default();
-    for Finished { meshed, .. } in partitions {
+    let mut sheets = SheetBlocks::default();
+    let mut bounds = None;
+    for Finished { meshed, sheets: next, .. } in partitions {
+        bounds = bounds.into_iter().chain(meshed.bounds).reduce(joined_bounds);
+        sheets.append(next);
         let surface_bricks = grid.surface_bricks + meshed.grid.surface_bricks;
         grid = GridStats { surface_bricks, ..meshed.grid };
         mesh.append(meshed.mesh);
@@ -27,7 +33,7 @@ pub(super) fn join(partitions: Vec<Finished>, has_flat_vertices: bool) -> Finish
     if has_flat_vertices {
         mesh.fill_flat_normals();
     }
-    Finished { meshed: MeshOutput::new(mesh, grid), stages }
+    Finished { meshed: MeshOutput { bounds, ..MeshOutput::new(mesh, grid) }, stages, sheets }
 }
 
 /// Maximum time per stage over all partitions, which run side by side.
@@ -60,6 +66,7 @@ mod tests {
         let finished = |stages: &[(Stage, u64)]| Finished {
             meshed: MeshOutput::new(Mesh::default(), GridStats::default()),
             stages: stages.to_vec(),
+            sheets: SheetBlocks::default(),
         };
         let all = [
             finished(&[(Stage::Bin, 5), (Stage::Field, 9)]),

@@ -1,25 +1,22 @@
 //! Second half of a job: its output, in pieces that fit a binding, each in a readback buffer. A piece is submitted
 //! before the previous one is collected.
 
-use super::count::narrow;
+use super::buffers::BufferId;
 use super::engine::Engine;
 use super::error::GpuError;
-use super::job_state::{ChunkCounts, JobState, PendingOutput};
-use super::output_layout::{OutputPiece, ReadbackLayout, ReadbackRows, TRIANGLE_BYTES, VertexBytes, pieces};
+use super::job_state::{ChunkCounts, JobState, PendingOutput, counters};
+use super::output_layout::{
+    OutputPiece, OutputRows, ReadbackLayout, ReadbackRows, TRIANGLE_BYTES, VertexBytes, narrow, pieces,
+};
 use super::pipelines::stage_index;
 use super::plan::layout::Params;
-use super::workspace::{BufferSizes, OutputCapacity};
+use super::workspace::BufferSizes;
 use crate::surface::Stage;
 
-/// Rows of parameters: one for the chunk and one for the output piece.
-pub(super) const PARAM_ROWS: u64 = 2;
-/// Capacity of the buffers before the output is counted.
-pub(super) const NO_OUTPUT: OutputCapacity = OutputCapacity { vertices: 0, triangles: 0, params: PARAM_ROWS };
-
 impl Engine {
-    /// Counts every chunk and submits its vertices, because its samples are overwritten by the next chunk; triangles
-    /// need the vertex numbers of all chunks. `accept` is called with the index of each counted chunk and returns
-    /// whether to make its vertices.
+    /// Counts every chunk and submits its vertices and sheets, because its samples are overwritten by the next chunk;
+    /// triangles need the vertex numbers of all chunks. `accept` is called with the index of each counted chunk and
+    /// returns whether to make its output.
     pub(super) fn count_chunks(
         &mut self,
         state: &mut JobState<'_>,
@@ -34,6 +31,8 @@ impl Engine {
             self.collect_output(state)?;
             let counts = self.wait_for_counts(state, chunk, submission)?;
             if accept(self, state, chunk)? {
+                // Sheets that do not fit are made again before the next chunk, so their piece is not the last.
+                self.make_output(state, &[(chunk, &counts)], Stage::Measure)?;
                 self.make_output(state, &[(chunk, &counts)], Stage::Interpolate)?;
             }
             all.push(counts);
@@ -49,7 +48,7 @@ impl Engine {
     }
 
     /// Submits the output of `stage` for chunks, given with their indices, and collects all pieces but the last. The
-    /// samples of the first chunk must be present for vertices.
+    /// samples of the first chunk must be present for vertices and sheets.
     pub(super) fn make_output(
         &mut self,
         state: &mut JobState<'_>,
@@ -73,7 +72,8 @@ impl Engine {
         let max = self.max_rows(state.loaded.vertex);
         let cut = |&(chunk, counts): &(usize, &ChunkCounts)| {
             let own = &state.loaded.chunks[chunk];
-            pieces([own.first_brick, own.n_own], &counts.groups, counts.first, max)
+            let sheet_words = self.budget.sheet_words_per_brick;
+            pieces([own.first_brick, own.n_own], &counts.groups, counts.first, max, sheet_words)
         };
         counts.iter().flat_map(cut).collect()
     }
@@ -86,10 +86,11 @@ impl Engine {
 
     /// Grows the output buffers to the largest of `pieces`.
     fn ensure_capacity(&mut self, state: &mut JobState<'_>, pieces: &[OutputPiece]) -> Result<(), GpuError> {
-        let capacity = OutputCapacity {
-            vertices: pieces.iter().map(|p| p.n_vertices).max().unwrap_or_default(),
-            triangles: pieces.iter().map(|p| p.n_triangles).max().unwrap_or_default(),
-            ..NO_OUTPUT
+        let max = |of: fn(&OutputPiece) -> u64| pieces.iter().map(of).max().unwrap_or_default();
+        let capacity = OutputRows {
+            vertices: max(|p| p.n_vertices),
+            triangles: max(|p| p.n_triangles),
+            sheet_words: max(|p| p.sheet_words),
         };
         let loaded = &mut state.loaded;
         let sizes = BufferSizes::new(&loaded.job.prepared.plan, &loaded.chunks, loaded.vertex, capacity);
@@ -105,7 +106,12 @@ impl Engine {
         stage: Stage,
     ) -> Result<PendingOutput, GpuError> {
         let loaded = &state.loaded;
-        let rows = if stage == Stage::Emit { [0, piece.n_triangles] } else { [piece.n_vertices, 0] };
+        let none = OutputRows::default();
+        let rows = match stage {
+            Stage::Emit => OutputRows { triangles: piece.n_triangles, ..none },
+            Stage::Measure => OutputRows { sheet_words: piece.sheet_words, ..none },
+            _ => OutputRows { vertices: piece.n_vertices, ..none },
+        };
         let params = Params {
             piece_brick: piece.brick,
             piece_bricks: piece.n_bricks,
@@ -113,6 +119,7 @@ impl Engine {
             piece_triangle: narrow(piece.triangle & u64::from(u32::MAX))?,
             vertex_capacity: narrow(piece.n_vertices)?,
             triangle_capacity: narrow(piece.n_triangles)?,
+            sheet_capacity: narrow(piece.sheet_words)?,
             ..loaded.chunks[chunk].params(&loaded.params)
         };
         self.write_params(&loaded.workspace, 1, &params);
@@ -120,23 +127,37 @@ impl Engine {
         let readback = self.readback.acquire(&self.device, layout.end);
         let target = &readback.buffer;
         let mut recording = self.recording();
+        recording.encoder.clear_buffer(loaded.workspace.buffer(BufferId::Counters), 0, None);
         recording.stage(stage, &[loaded.dispatch(1, piece.n_bricks)]);
         recording.copy_output(&loaded.workspace, loaded.vertex, rows, target, &layout);
         recording.copy_timestamps(target);
         recording.copy_counters(&loaded.workspace, target);
         let submission = self.submit(recording, vec![(readback, layout.end)]);
-        Ok(PendingOutput { submission, layout, rows, stage })
+        Ok(PendingOutput { submission, layout, rows, stage, chunk, piece: *piece })
     }
 
-    /// Waits for the pending output, if any, and adds it to the job.
-    pub(super) fn collect_output(&self, state: &mut JobState<'_>) -> Result<(), GpuError> {
-        let Some(PendingOutput { submission, layout, rows, stage }) = state.pending.take() else { return Ok(()) };
-        let readback = self.wait_one(submission)?;
-        state.note_flat_vertices(&readback)?;
-        self.add_times(&mut state.times, &readback, stage_index(stage)..stage_index(stage) + 1)?;
-        let [n_vertices, n_triangles] = rows;
-        let columns = if stage == Stage::Emit { &mut state.triangles } else { &mut state.vertices };
-        columns.push(ReadbackRows { readback, layout, n_vertices, n_triangles });
+    /// Waits for the pending output, if any, and adds it to the job. Makes sheets again if they did not fit.
+    pub(super) fn collect_output(&mut self, state: &mut JobState<'_>) -> Result<(), GpuError> {
+        while let Some(PendingOutput { submission, layout, mut rows, stage, chunk, piece }) = state.pending.take() {
+            let readback = self.wait_one(submission)?;
+            let counters = counters(&readback)?;
+            self.add_times(&mut state.times, &readback, stage_index(stage)..stage_index(stage) + 1)?;
+            let made = u64::from(counters.sheet_words);
+            if made > rows.sheet_words {
+                let piece = OutputPiece { sheet_words: made, ..piece };
+                self.ensure_capacity(state, &[piece])?;
+                state.pending = Some(self.submit_piece(state, chunk, &piece, stage)?);
+                continue;
+            }
+            rows.sheet_words = made;
+            state.add_counters(&counters);
+            let columns = match stage {
+                Stage::Emit => &mut state.triangles,
+                Stage::Measure => &mut state.sheets,
+                _ => &mut state.vertices,
+            };
+            columns.push(ReadbackRows { readback, layout, rows });
+        }
         Ok(())
     }
 }

@@ -29,6 +29,8 @@ pub(super) struct OutputPiece {
     /// Number of triangles before the piece.
     pub(super) triangle: u64,
     pub(super) n_triangles: u64,
+    /// Capacity of the sheets, in words.
+    pub(super) sheet_words: u64,
 }
 
 /// Cuts a chunk into pieces of at most `max_vertices` and `max_triangles`, by the counts of its groups of bricks. A
@@ -38,11 +40,12 @@ pub(super) fn pieces(
     groups: &[[u32; 4]],
     [vertex, triangle]: [u64; 2],
     [max_vertices, max_triangles]: [u64; 2],
+    sheet_words_per_brick: u64,
 ) -> Vec<OutputPiece> {
     let mut pieces: Vec<OutputPiece> = Vec::new();
     let mut at = OutputPiece { brick: first_brick, vertex, triangle, ..OutputPiece::default() };
     let mut left = n_bricks;
-    for &[v, t, ..] in groups {
+    for &[v, t, b, _] in groups {
         let (v, t, n) = (u64::from(v), u64::from(t), left.min(GROUP));
         if at.n_vertices + v > max_vertices || at.n_triangles + t > max_triangles {
             pieces.extend(Some(at).filter(|p| p.n_bricks > 0));
@@ -56,6 +59,7 @@ pub(super) fn pieces(
         at.n_bricks += n;
         at.n_vertices += v;
         at.n_triangles += t;
+        at.sheet_words += u64::from(b) * sheet_words_per_brick;
         left -= n;
     }
     pieces.extend(Some(at).filter(|p| p.n_bricks > 0));
@@ -89,30 +93,41 @@ pub(super) struct ReadbackLayout {
     pub(super) normals: u64,
     pub(super) sources: u64,
     pub(super) triangles: u64,
+    pub(super) sheets: u64,
     /// Total bytes.
     pub(super) end: u64,
 }
 
 impl ReadbackLayout {
-    /// Layout of `n_vertices` and `n_triangles`.
-    pub(super) fn new([n_vertices, n_triangles]: [u64; 2], vertex: VertexBytes) -> Self {
+    /// Layout of the given numbers of rows.
+    pub(super) fn new(rows: OutputRows, vertex: VertexBytes) -> Self {
+        let OutputRows { vertices: n_vertices, triangles: n_triangles, sheet_words } = rows;
         let positions = BODY_OFFSET;
         let normals = positions + vertex.positions * n_vertices;
         let sources = normals + vertex.normals * n_vertices;
         let triangles = sources + vertex.sources * n_vertices;
+        let sheets = triangles + TRIANGLE_BYTES * n_triangles;
         // The size of a mapped range is a multiple of 8 bytes.
-        let end = (triangles + TRIANGLE_BYTES * n_triangles).next_multiple_of(8);
-        Self { positions, normals, sources, triangles, end }
+        let end = (sheets + 4 * sheet_words).next_multiple_of(8);
+        Self { positions, normals, sources, triangles, sheets, end }
     }
 }
 
-/// Vertices and triangles in a mapped readback buffer.
+/// Numbers of output rows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct OutputRows {
+    pub(super) vertices: u64,
+    pub(super) triangles: u64,
+    /// Words of sheets.
+    pub(super) sheet_words: u64,
+}
+
+/// Output in a mapped readback buffer.
 #[derive(Clone)]
 pub(super) struct ReadbackRows {
     pub(super) readback: Arc<ReadbackBuffer>,
     pub(super) layout: ReadbackLayout,
-    pub(super) n_vertices: u64,
-    pub(super) n_triangles: u64,
+    pub(super) rows: OutputRows,
 }
 
 /// Returns `n` values at byte `offset` of a readback buffer.
@@ -120,6 +135,11 @@ pub(super) fn values<T: Pod>(bytes: &[u8], offset: u64, n: u64) -> Result<&[T], 
     let range = byte_range::<T>(offset, n)?;
     let values = bytes.get(range.clone()).and_then(|bytes| bytemuck::try_cast_slice(bytes).ok());
     values.ok_or_else(|| GpuError::Failed(format!("no values in bytes {range:?} of {}", bytes.len())))
+}
+
+/// Converts a number of rows to 32 bits; buffers are smaller than that.
+pub(super) fn narrow(n: u64) -> Result<u32, GpuError> {
+    u32::try_from(n).map_err(|e| GpuError::Failed(format!("{n} rows: {e}")))
 }
 
 /// Returns the byte range of `n` values at byte `offset`.
@@ -141,7 +161,9 @@ mod tests {
         for atom_ids in [false, true] {
             let [single, rounded] = [&single, &rounded]
                 .map(|params| VertexBytes::new(&SurfaceParams { atom_ids, ..params.clone() }))
-                .map(|vertex| ReadbackLayout::new([1000, 2001], vertex));
+                .map(|vertex| {
+                    ReadbackLayout::new(OutputRows { vertices: 1000, triangles: 2001, sheet_words: 0 }, vertex)
+                });
             assert_eq!(single.triangles - rounded.triangles, 12 * 1000);
             assert_eq!(single.end - rounded.end, 12 * 1000);
             let columns = [rounded.positions, rounded.normals, rounded.sources, rounded.triangles];
@@ -155,7 +177,7 @@ mod tests {
         let groups: Vec<[u32; 4]> = (0..37).map(|i| [100 + 17 * (i % 5), 200 + 31 * (i % 7), 9, 0]).collect();
         let n_bricks = 36 * GROUP + 5;
         for most in [[168, 386], [500, 1000], [1 << 20, 1 << 20]] {
-            let cut = pieces([7, n_bricks], &groups, [11, 13], most);
+            let cut = pieces([7, n_bricks], &groups, [11, 13], most, 2);
             let mut at = (7, 11, 13);
             for p in &cut {
                 assert_eq!((p.brick, p.vertex, p.triangle), at);
@@ -164,8 +186,9 @@ mod tests {
             }
             let sums = groups.iter().fold((0, 0), |s, g| (s.0 + u64::from(g[0]), s.1 + u64::from(g[1])));
             assert_eq!(at, (7 + n_bricks, 11 + sums.0, 13 + sums.1));
+            assert_eq!(cut.iter().map(|p| p.sheet_words).sum::<u64>(), 2 * 9 * 37);
         }
-        assert_eq!(pieces([0, n_bricks], &groups, [0, 0], [1 << 20, 1 << 20]).len(), 1);
-        assert!(pieces([0, n_bricks], &groups, [0, 0], [168, 386]).len() > 18);
+        assert_eq!(pieces([0, n_bricks], &groups, [0, 0], [1 << 20, 1 << 20], 2).len(), 1);
+        assert!(pieces([0, n_bricks], &groups, [0, 0], [168, 386], 2).len() > 18);
     }
 }

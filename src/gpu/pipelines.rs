@@ -7,10 +7,10 @@ use super::shaders::{Binding, SHADERS, Shader};
 use crate::surface::{Kernel, Stage};
 
 /// Number of stages that run on a device.
-pub(super) const N_STAGES: usize = 6;
+pub(super) const N_STAGES: usize = 7;
 /// Stages that run on a device, in order.
 pub(super) const STAGES: [Stage; N_STAGES] =
-    [Stage::Bin, Stage::Field, Stage::Classify, Stage::Scan, Stage::Interpolate, Stage::Emit];
+    [Stage::Bin, Stage::Field, Stage::Classify, Stage::Scan, Stage::Interpolate, Stage::Emit, Stage::Measure];
 
 /// Bytes of the timestamps of a submission: begin and end of every stage.
 pub(super) const TIMESTAMP_BYTES: u64 = 16 * N_STAGES as u64;

@@ -4,13 +4,16 @@ pub use super::buffers::BufferId;
 use super::engine::Engine;
 use super::error::GpuError;
 use super::job::GpuJob;
-use super::output_layout::VertexBytes;
+use super::output_layout::{OutputRows, VertexBytes};
 use super::pipelines::Variant;
 use super::plan::Chunk;
 use super::plan::layout::Params;
 use super::recording::{Dispatch, workgroups};
-use super::workspace::{BufferSizes, OutputCapacity, Workspace};
+use super::workspace::{BufferSizes, Workspace};
 use crate::surface::Stage;
+
+/// Capacity of the sheets: no brick needs more words per triangle than one with a single triangle.
+const WORDS_PER_TRIANGLE: u32 = 17;
 
 /// Buffers of a job on a device, and its stages.
 #[derive(Debug)]
@@ -33,12 +36,17 @@ impl StageProbe {
         let chunks = engine.chunks(job, None)?;
         let [chunk] = &chunks[..] else { return Err(GpuError::Failed("more than one chunk".to_owned())) };
         let chunk = chunk.clone();
-        let capacity = OutputCapacity { vertices: vertices.into(), triangles: triangles.into(), params: 1 };
+        let capacity = OutputRows {
+            vertices: vertices.into(),
+            triangles: triangles.into(),
+            sheet_words: u64::from(triangles) * u64::from(WORDS_PER_TRIANGLE),
+        };
         let loaded = engine.load(job, None, chunks, capacity)?;
         let params = Params {
-            piece_bricks: loaded.params.n_bricks,
+            piece_bricks: loaded.n_bricks(),
             vertex_capacity: vertices,
             triangle_capacity: triangles,
+            sheet_capacity: triangles * WORDS_PER_TRIANGLE,
             ..chunk.params(&loaded.params)
         };
         let (workspace, variant, vertex) = (loaded.workspace, loaded.variant, loaded.vertex);
@@ -48,10 +56,10 @@ impl StageProbe {
     /// Bytes that the job needs of a buffer; the buffer may be larger.
     #[must_use]
     pub fn size(&self, job: &GpuJob, id: BufferId) -> u64 {
-        let capacity = OutputCapacity {
+        let capacity = OutputRows {
             vertices: self.params.vertex_capacity.into(),
             triangles: self.params.triangle_capacity.into(),
-            params: 1,
+            sheet_words: self.params.sheet_capacity.into(),
         };
         BufferSizes::new(&job.prepared.plan, std::slice::from_ref(&self.chunk), self.vertex, capacity).get(id)
     }

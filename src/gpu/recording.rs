@@ -5,7 +5,7 @@ use std::ops::Range;
 use wgpu::{Buffer, CommandEncoder, Device, QuerySet, Queue};
 
 use super::buffers::BufferId;
-use super::output_layout::{COUNTERS_OFFSET, ReadbackLayout, TRIANGLE_BYTES, VertexBytes};
+use super::output_layout::{COUNTERS_OFFSET, OutputRows, ReadbackLayout, TRIANGLE_BYTES, VertexBytes};
 use super::pipelines::{N_STAGES, Pipelines, TIMESTAMP_BYTES, Variant, stage_index};
 use super::plan::layout::{Counters, GROUP, Params};
 use super::workspace::{ROW, Workspace};
@@ -135,20 +135,21 @@ impl<'a> Recording<'a> {
         self.copy_start(from, target, COUNTERS_OFFSET, size_of::<Counters>() as u64);
     }
 
-    /// Copies the first `n_vertices` and `n_triangles` of the output buffers to their columns.
+    /// Copies the first rows of the output buffers to their columns.
     pub(super) fn copy_output(
         &mut self,
         workspace: &Workspace,
         vertex: VertexBytes,
-        [n_vertices, n_triangles]: [u64; 2],
+        rows: OutputRows,
         target: &Buffer,
         layout: &ReadbackLayout,
     ) {
         for (id, offset, bytes) in [
-            (BufferId::Positions, layout.positions, vertex.positions * n_vertices),
-            (BufferId::Normals, layout.normals, vertex.normals * n_vertices),
-            (BufferId::Sources, layout.sources, vertex.sources * n_vertices),
-            (BufferId::Triangles, layout.triangles, TRIANGLE_BYTES * n_triangles),
+            (BufferId::Positions, layout.positions, vertex.positions * rows.vertices),
+            (BufferId::Normals, layout.normals, vertex.normals * rows.vertices),
+            (BufferId::Sources, layout.sources, vertex.sources * rows.vertices),
+            (BufferId::Triangles, layout.triangles, TRIANGLE_BYTES * rows.triangles),
+            (BufferId::Sheets, layout.sheets, 4 * rows.sheet_words),
         ] {
             self.copy_start(workspace.buffer(id), target, offset, bytes);
         }

@@ -3,24 +3,21 @@
 use std::sync::Arc;
 
 use super::buffers::BufferId;
-use super::count::narrow;
 use super::engine::{Engine, LoadedJob};
 use super::error::GpuError;
 use super::executor::Executor;
 use super::job::{GpuJob, JobResult};
-use super::job_state::JobState;
-use super::output::{NO_OUTPUT, PARAM_ROWS};
-use super::output_layout::{ReadbackLayout, ReadbackRows, TRIANGLE_BYTES, VertexBytes};
+use super::job_state::{JobState, counters};
+use super::output_layout::{OutputRows, ReadbackLayout, ReadbackRows, TRIANGLE_BYTES, VertexBytes, narrow};
 use super::partition_handle::PartitionHandle;
 use super::pipelines::N_STAGES;
 use super::plan::Chunk;
 use super::plan::layout::Params;
 use super::readback::ReadbackBuffer;
-use super::workspace::OutputCapacity;
 use crate::surface::Stage;
 
 /// Small job with the capacity of its output buffers.
-type SmallJob<'a> = (LoadedJob<'a>, OutputCapacity);
+type SmallJob<'a> = (LoadedJob<'a>, OutputRows);
 
 impl Executor for Engine {
     fn run(&mut self, jobs: &[GpuJob]) -> Vec<JobResult> {
@@ -29,7 +26,7 @@ impl Executor for Engine {
         for (result, job) in results.iter_mut().zip(jobs) {
             let loaded = self.chunks(job, None).and_then(|chunks| {
                 let estimate = self.small_capacity(job, &chunks);
-                let loaded = self.load(job, None, chunks, estimate.unwrap_or(NO_OUTPUT))?;
+                let loaded = self.load(job, None, chunks, estimate.unwrap_or_default())?;
                 Ok((loaded, estimate))
             });
             match loaded {
@@ -61,16 +58,17 @@ impl Executor for Engine {
 
 impl Engine {
     /// Estimated output of a job. `None` unless the job is small.
-    fn small_capacity(&self, job: &GpuJob, chunks: &[Chunk]) -> Option<OutputCapacity> {
+    fn small_capacity(&self, job: &GpuJob, chunks: &[Chunk]) -> Option<OutputRows> {
         // The surface of a small structure crosses a larger share of its bricks; 8 bricks more cover that.
         let n = job.prepared.plan.bricks.len() as u64 + 8;
         let [vertices, triangles] = self.budget.rows_per_brick.map(|each| each * n);
         let vertex = VertexBytes::new(&job.prepared.params);
-        let bytes = ReadbackLayout::new([vertices, triangles], vertex).end;
+        let rows = OutputRows { vertices, triangles, sheet_words: self.budget.sheet_words_per_brick * n };
+        let bytes = ReadbackLayout::new(rows, vertex).end;
         let largest = (vertex.positions * vertices).max(TRIANGLE_BYTES * triangles);
         let fits = largest <= self.budget.piece_bytes && bytes <= self.budget.readback_bytes;
         let small = chunks.len() == 1 && bytes <= self.budget.small_bytes && fits;
-        small.then_some(OutputCapacity { vertices, triangles, params: PARAM_ROWS })
+        small.then_some(rows)
     }
 
     /// Runs small jobs in one submission. Returns their results in order.
@@ -78,7 +76,7 @@ impl Engine {
         if jobs.is_empty() {
             return Vec::new();
         }
-        let n_bricks = jobs.iter().map(|(loaded, _)| f64::from(loaded.params.n_bricks)).sum::<f64>();
+        let n_bricks = jobs.iter().map(|(loaded, _)| f64::from(loaded.n_bricks())).sum::<f64>();
         let readbacks = match self.submit_small(&jobs) {
             Ok(readbacks) => readbacks.into_iter().map(Ok).collect(),
             Err(error) => vec![Err(error); jobs.len()],
@@ -86,7 +84,7 @@ impl Engine {
         let mut results = Vec::with_capacity(jobs.len());
         for ((loaded, capacity), readback) in jobs.into_iter().zip(readbacks) {
             // The times of the submission are divided in proportion to the bricks.
-            let share = f64::from(loaded.params.n_bricks) / n_bricks;
+            let share = f64::from(loaded.n_bricks()) / n_bricks;
             let mut state = JobState::new(loaded);
             results.push(readback.and_then(|readback| self.finish_small(&mut state, capacity, &readback, share)));
             self.workspaces.push(state.loaded.workspace);
@@ -100,29 +98,30 @@ impl Engine {
         let mut dispatches = Vec::with_capacity(jobs.len());
         for (loaded, capacity) in jobs {
             let params = Params {
-                piece_bricks: loaded.params.n_bricks,
+                piece_bricks: loaded.n_bricks(),
                 vertex_capacity: narrow(capacity.vertices)?,
                 triangle_capacity: narrow(capacity.triangles)?,
+                sheet_capacity: narrow(capacity.sheet_words)?,
                 ..loaded.chunks[0].params(&loaded.params)
             };
             self.write_params(&loaded.workspace, 0, &params);
-            dispatches.push((loaded.dispatch(0, params.n_bricks), params));
+            dispatches.push((loaded.dispatch(0, params.piece_bricks), params));
         }
         recording.count_stages(&dispatches);
         let dispatches: Vec<_> = dispatches.into_iter().map(|(dispatch, _)| dispatch).collect();
         recording.stage(Stage::Interpolate, &dispatches);
         recording.stage(Stage::Emit, &dispatches);
+        recording.stage(Stage::Measure, &dispatches);
         let mut readbacks = Vec::with_capacity(jobs.len());
-        for (loaded, capacity) in jobs {
-            let rows = [capacity.vertices, capacity.triangles];
-            let layout = ReadbackLayout::new(rows, loaded.vertex);
+        for (loaded, rows) in jobs {
+            let layout = ReadbackLayout::new(*rows, loaded.vertex);
             let groups = 16 * loaded.chunks[0].n_groups();
             let readback = self.readback.acquire(&self.device, layout.end + groups);
             let target = &readback.buffer;
             recording.copy_timestamps(target);
             recording.copy_counters(&loaded.workspace, target);
             recording.copy_start(loaded.workspace.buffer(BufferId::Groups), target, layout.end, groups);
-            recording.copy_output(&loaded.workspace, loaded.vertex, rows, target, &layout);
+            recording.copy_output(&loaded.workspace, loaded.vertex, *rows, target, &layout);
             readbacks.push((readback, layout.end + groups));
         }
         self.wait(self.submit(recording, readbacks))
@@ -132,25 +131,33 @@ impl Engine {
     fn finish_small(
         &mut self,
         state: &mut JobState<'_>,
-        capacity: OutputCapacity,
+        capacity: OutputRows,
         readback: &Arc<ReadbackBuffer>,
         share: f64,
     ) -> JobResult {
-        let layout = ReadbackLayout::new([capacity.vertices, capacity.triangles], state.loaded.vertex);
+        let layout = ReadbackLayout::new(capacity, state.loaded.vertex);
         let counts = state.add_counts(readback, 0, layout.end)?;
         state.check_complete()?;
         let mut times = [0; N_STAGES];
         self.add_times(&mut times, readback, 0..N_STAGES)?;
         state.times = times.map(|ns| portion(ns, share));
-        let [n_vertices, n_triangles] = state.total;
-        if n_vertices > capacity.vertices || n_triangles > capacity.triangles {
+        let counters = counters(readback)?;
+        let [vertices, triangles] = state.total;
+        let made = OutputRows { vertices, triangles, sheet_words: counters.sheet_words.into() };
+        let rows = ReadbackRows { readback: readback.clone(), layout, rows: made };
+        if made.sheet_words > capacity.sheet_words {
+            self.make_output(state, &[(0, &counts)], Stage::Measure)?;
+        } else {
+            state.sheets.push(rows.clone());
+        }
+        if vertices > capacity.vertices || triangles > capacity.triangles {
             self.make_output(state, &[(0, &counts)], Stage::Interpolate)?;
             self.make_triangles(state, &[counts])?;
         } else {
-            state.note_flat_vertices(readback)?;
-            let rows = ReadbackRows { readback: readback.clone(), layout, n_vertices, n_triangles };
+            state.add_counters(&counters);
             state.vertices.push(rows.clone());
             state.triangles.push(rows);
+            self.collect_output(state)?;
         }
         state.finish()
     }

@@ -4,13 +4,11 @@
 use std::ops::Range;
 
 use super::buffers::BufferId;
-use super::count::narrow;
 use super::engine::{Engine, LoadedJob};
 use super::error::GpuError;
 use super::job::{GpuJob, JobResult};
 use super::job_state::JobState;
-use super::output::NO_OUTPUT;
-use super::output_layout::values;
+use super::output_layout::{OutputRows, narrow, values};
 use super::partition_handle::{Import, PartitionCounts, PartitionHandle};
 use super::plan::layout::Record;
 use super::plan::partition::total_len;
@@ -30,7 +28,7 @@ impl Engine {
     pub(super) fn run_partition_of(&mut self, job: &GpuJob, handle: &PartitionHandle) -> JobResult {
         job.check()?;
         let chunks = self.chunks(job, Some(handle.partition()))?;
-        let loaded = self.load(job, Some(handle.partition()), chunks, NO_OUTPUT)?;
+        let loaded = self.load(job, Some(handle.partition()), chunks, OutputRows::default())?;
         let mut state = JobState::new(loaded);
         let result = self.run_loaded_partition(&mut state, handle);
         self.workspaces.push(state.loaded.workspace);

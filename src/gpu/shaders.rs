@@ -110,7 +110,7 @@ mod tests {
                 back,
                 ahead,
                 n_tiles,
-                n_bricks,
+                sheet_capacity,
                 first_brick,
                 n_own,
                 n_halo,
@@ -129,7 +129,7 @@ mod tests {
                 steps_per_angstrom
             ),
             host!("Record", Record, crossing, layers, neighbours),
-            host!("Counters", Counters, list_end, vertices, triangles, flat),
+            host!("Counters", Counters, list_end, vertices, triangles, flat, checksum, degenerate, sheet_words, bounds),
             host!("Tile", Tile, coord, base, bricks, before, around),
         ]
     }
@@ -206,7 +206,7 @@ mod tests {
     #[test]
     fn shaders_are_in_stage_order() {
         let names: Vec<_> = SHADERS.iter().map(|shader| shader.stage).collect();
-        let stages: Vec<_> = Stage::ALL[..6].iter().map(|stage| stage.name()).collect();
+        let stages: Vec<_> = Stage::ALL[..7].iter().map(|stage| stage.name()).collect();
         assert_eq!(names, stages);
         assert!(SHADERS.iter().all(|shader| shader.bindings[0].access == Access::Uniform));
     }

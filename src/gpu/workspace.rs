@@ -3,7 +3,7 @@
 use wgpu::{BindGroup, Buffer, BufferUsages, Device};
 
 use super::buffers::BufferId;
-use super::output_layout::{TRIANGLE_BYTES, VertexBytes};
+use super::output_layout::{OutputRows, TRIANGLE_BYTES, VertexBytes};
 use super::pipelines::{Pipelines, STAGES, stage_index};
 use super::plan::layout::{Counters, Params, Record, SAMPLES, Tile};
 use super::plan::{Chunk, Plan};
@@ -15,28 +15,22 @@ use crate::surface::lattice::LatticeAtom;
 /// Distance of two rows of parameters: the largest alignment that a device requires of bindings.
 pub(super) const ROW: u64 = 256;
 
+/// Rows of parameters: one for the chunk and one for the output piece.
+const PARAM_ROWS: u64 = 2;
+
 /// Bytes that a job needs of each of its buffers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct BufferSizes([u64; BufferId::OF_JOB.len()]);
 
-/// Number of output rows that the buffers hold at once.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct OutputCapacity {
-    pub(super) vertices: u64,
-    pub(super) triangles: u64,
-    /// Rows of parameters.
-    pub(super) params: u64,
-}
-
 impl BufferSizes {
     /// Sizes for a job of `plan` in `chunks`.
-    pub(super) fn new(plan: &Plan, chunks: &[Chunk], vertex: VertexBytes, capacity: OutputCapacity) -> Self {
+    pub(super) fn new(plan: &Plan, chunks: &[Chunk], vertex: VertexBytes, capacity: OutputRows) -> Self {
         let max = |of: &dyn Fn(&Chunk) -> u64| chunks.iter().map(of).max().unwrap_or_default();
         let bytes = |n: usize, each: usize| (n * each) as u64;
         let n_bricks = plan.bricks.len();
         let slots = max(&Chunk::n_slots);
         let size = |id: BufferId| match id {
-            BufferId::Params => ROW * capacity.params,
+            BufferId::Params => ROW * PARAM_ROWS,
             BufferId::Atoms => bytes(plan.reaches.len(), size_of::<LatticeAtom>()),
             BufferId::Reaches => bytes(plan.reaches.len(), 4),
             BufferId::Tiles => bytes(plan.tiles.len(), size_of::<Tile>()),
@@ -55,6 +49,7 @@ impl BufferSizes {
             BufferId::Normals => vertex.normals * capacity.vertices,
             BufferId::Sources => vertex.sources * capacity.vertices,
             BufferId::Triangles => TRIANGLE_BYTES * capacity.triangles,
+            BufferId::Sheets => 4 * capacity.sheet_words,
             // Not a buffer of the job.
             BufferId::Cases => 0,
         };

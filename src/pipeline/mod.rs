@@ -222,16 +222,19 @@ pub fn run_with<S: Deref<Target = Structure>>(
         (written.map_err(explain)?, None, storage)
     };
     let [n_vertices, n_triangles] = output.size();
-    let MeshOutput { mut mesh, streamed, grid, measures, made_by } = output;
+    let MeshOutput { mut mesh, streamed, grid, measures, made_by, .. } = output;
     if let Some(ids) = &mut mesh.atom_ids {
         // Convert indices of spheres to indices of atoms in the file.
         ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
     }
-    let measures = match measures.filter(|measures| measures.validation == job.validation) {
-        Some(measures) => measures,
-        None => clock.time(Stage::Measure.name(), || {
+    let measures = match measures {
+        Some(measures) if measures.validation == job.validation => measures,
+        measures => clock.time(Stage::Measure.name(), || {
             mesh.make_geometry_contiguous();
-            Measures::of(&mesh, job.validation, &control)
+            match measures {
+                Some(measures) => measures.validated(job.validation, &mesh.triangles, &control),
+                None => Measures::of(&mesh, job.validation, &control),
+            }
         })?,
     };
     let (resolution, centre) = (params.resolution, mesh.centre);

@@ -37,6 +37,8 @@ pub struct MeshOutput {
     /// Measures of the vertices as delivered, validated by [`Validation::Checksum`]; `None` if the backend did not
     /// measure. Always present if a sink took the mesh.
     pub measures: Option<Measures>,
+    /// Lowest and highest position of `mesh` relative to its centre, per axis, if the backend knows them, Å.
+    pub bounds: Option<[[f32; 3]; 2]>,
     /// The backend that made the mesh, if that is known only after the run.
     pub made_by: Option<BackendIdentity>,
 }
@@ -56,7 +58,7 @@ impl MeshOutput {
     /// Result of a backend that keeps the mesh in memory and has not measured it.
     #[must_use]
     pub const fn new(mesh: Mesh, grid: GridStats) -> Self {
-        Self { mesh, streamed: None, grid, measures: None, made_by: None }
+        Self { mesh, streamed: None, grid, measures: None, bounds: None, made_by: None }
     }
 
     /// Number of vertices and triangles, in memory or in a sink.
@@ -80,8 +82,8 @@ impl MeshOutput {
         sink: Option<&dyn MeshSink>,
     ) -> Result<Self, SurfaceError> {
         if params.quantize.is_some_and(|step| self.mesh.quantize(step)) {
-            // The measures are those of the vertices before rounding.
-            self.measures = None;
+            // They are those of the vertices before rounding.
+            (self.measures, self.bounds) = (None, None);
         }
         let Some(sink) = sink else { return Ok(self) };
         self.mesh.make_contiguous();
@@ -93,7 +95,8 @@ impl MeshOutput {
         let [n_vertices, n_triangles] = [mesh.n_vertices(), mesh.n_triangles()];
         sink.begin(n_vertices, n_triangles).map_err(failed)?;
         sink.part(&MeshPart::whole(&mesh)).map_err(failed)?;
-        self.streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds: mesh.bounds() });
+        let bounds = self.bounds.unwrap_or_else(|| mesh.bounds());
+        self.streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds });
         self.mesh.centre = mesh.centre;
         Ok(self)
     }

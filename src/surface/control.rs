@@ -22,16 +22,16 @@ pub enum Stage {
     Interpolate,
     /// Triangle indices.
     Emit,
-    /// Writing finished parts of the mesh to a sink.
-    Write,
     /// Area, volume, components and the check that the mesh is watertight.
     Measure,
+    /// Writing finished parts of the mesh to a sink.
+    Write,
 }
 
 impl Stage {
     /// Every stage, in the order in which they run.
     pub const ALL: [Self; 8] =
-        [Self::Bin, Self::Field, Self::Classify, Self::Scan, Self::Interpolate, Self::Emit, Self::Write, Self::Measure];
+        [Self::Bin, Self::Field, Self::Classify, Self::Scan, Self::Interpolate, Self::Emit, Self::Measure, Self::Write];
 
     /// The stage's name, as shaders, reports and `Server-Timing` spell it.
     #[must_use]

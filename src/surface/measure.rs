@@ -1,20 +1,15 @@
 //! Measures of a mesh (area, volume, components) and the validation that it is closed.
-//!
-//! Sums run over the parts of the mesh, merged in order: the same mesh gives the same digits on any number of threads.
 
 use std::fmt;
 use std::str::FromStr;
 
-use rayon::prelude::*;
-
-use super::column::Column;
 use super::control::Control;
 use super::error::SurfaceError;
-use super::labels::{self, Labels, PartLabels, TRIANGLES_PER_CHECK};
 use super::mesh::Mesh;
 use super::params::named;
-use super::sums::{self, Positions, Sums};
+use super::sums::edge_shares;
 use super::topology::{self, Topology};
+use super::union_find::UnionFind;
 
 /// Method of validating closedness and manifoldness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -76,38 +71,60 @@ pub struct Measures {
 }
 
 impl Measures {
-    /// Measures `mesh` with its vertices as stored, including rounding.
+    /// Measures `mesh` with its vertices as stored, including rounding, on one thread: for meshes that their backend did
+    /// not measure.
     ///
     /// # Errors
     /// [`SurfaceError::Cancelled`].
     pub fn of(mesh: &Mesh, validation: Validation, control: &Control<'_>) -> Result<Self, SurfaceError> {
         control.check()?;
-        let labels = control.reserve(size_of::<u32>() as u64 * mesh.n_vertices() as u64)?;
-        let Totals { components, used, checksum, degenerate } = Totals::of(mesh, control)?;
+        let labels = control.reserve(2 * size_of::<u32>() as u64 * mesh.n_vertices() as u64)?;
+        let components = components_of(mesh, control)?;
         drop(labels);
-        control.check()?;
-        let (faces, balanced) = (mesh.n_triangles() as u64, checksum == 0 && !degenerate);
-        let exact = validation == Validation::Exact || !balanced;
-        let _edges = control.reserve(if exact { topology::BYTES_PER_TRIANGLE * faces } else { 0 })?;
+        let size = [components.iter().map(|c| c.vertices).sum(), mesh.n_triangles() as u64];
+        let (checksum, degenerate) = edge_shares(&mesh.triangles);
+        if checksum == 0 && !degenerate {
+            return Self::balanced(components, size).validated(validation, &mesh.triangles, control);
+        }
+        let topology = examine(&mesh.triangles, control)?;
         let topology = match validation {
-            Validation::Checksum if balanced => Topology::of_closed(faces),
-            Validation::Exact => topology::check(&mesh.triangles, control)?,
-            Validation::Checksum => {
-                let Topology { edges, .. } = topology::check(&mesh.triangles, control)?;
-                Topology { edges, closed: false, oriented: false, manifold: false }
-            }
+            Validation::Exact => topology,
+            Validation::Checksum => Topology { closed: false, oriented: false, manifold: false, ..topology },
         };
-        Ok(Self::new(components, used, faces, topology, validation))
+        Ok(Self::new(components, size, topology, validation))
     }
 
-    /// Measures from components whose checksum of directed edges is zero; every vertex is used.
-    pub(super) fn balanced(mut components: Vec<Component>, vertices: u64, faces: u64) -> Self {
+    /// Returns the measures of a mesh of `triangles` with the result of `validation`.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
+    pub fn validated(
+        self,
+        validation: Validation,
+        triangles: &[[u32; 3]],
+        control: &Control<'_>,
+    ) -> Result<Self, SurfaceError> {
+        if validation == self.validation {
+            return Ok(self);
+        }
+        let size = [self.components.iter().map(|c| c.vertices).sum(), triangles.len() as u64];
+        Ok(Self::new(self.components, size, examine(triangles, control)?, validation))
+    }
+
+    /// Measures from components whose checksum of directed edges is zero, and the numbers of vertices and triangles;
+    /// every vertex is used.
+    pub(super) fn balanced(mut components: Vec<Component>, size: [u64; 2]) -> Self {
         components.retain(|c| c.triangles > 0);
-        components.sort_by(|a, b| b.area.total_cmp(&a.area));
-        Self::new(components, vertices, faces, Topology::of_closed(faces), Validation::Checksum)
+        Self::new(components, size, Topology::of_closed(size[1]), Validation::Checksum)
     }
 
-    fn new(components: Vec<Component>, vertices: u64, faces: u64, topology: Topology, validation: Validation) -> Self {
+    fn new(
+        mut components: Vec<Component>,
+        [vertices, faces]: [u64; 2],
+        topology: Topology,
+        validation: Validation,
+    ) -> Self {
+        components.sort_by(|a, b| b.area.total_cmp(&a.area));
         let Topology { edges, closed, oriented, manifold } = topology;
         Self {
             area: components.iter().map(|c| c.area).sum(),
@@ -122,57 +139,52 @@ impl Measures {
     }
 }
 
-/// Result of one pass over the parts of a mesh.
-struct Totals {
-    /// Largest area first.
-    components: Vec<Component>,
-    /// Vertices that some triangle uses.
-    used: u64,
-    checksum: u64,
-    degenerate: bool,
+/// Examines every edge and fan of triangles.
+fn examine(triangles: &[[u32; 3]], control: &Control<'_>) -> Result<Topology, SurfaceError> {
+    let _edges = control.reserve(topology::BYTES_PER_TRIANGLE * triangles.len() as u64)?;
+    topology::check(triangles, control)
 }
 
-impl Totals {
-    /// Labels and sums each part while it is in cache, then joins the parts.
-    fn of(mesh: &Mesh, control: &Control<'_>) -> Result<Self, SurfaceError> {
-        let mut of_vertex = Column::zeroed(mesh.n_vertices());
-        let positions = Positions::from(mesh);
-        let parts: Vec<(PartLabels, Sums)> = labels::split(mesh, &mut of_vertex)
-            .into_par_iter()
-            .with_max_len(1)
-            .map(|mut part| {
-                let joined = part.label(control)?;
-                let mut sums = Sums::new(joined.equal.len());
-                for chunk in part.triangles.chunks(TRIANGLES_PER_CHECK) {
-                    control.check()?;
-                    sums::add(&mut sums, positions, chunk, part.first, part.labels);
-                }
-                Ok((joined, sums))
-            })
-            .collect::<Result<_, SurfaceError>>()?;
-        let (joined, sums): (Vec<_>, Vec<_>) = parts.into_iter().unzip();
-        let labels = Labels::join(mesh, of_vertex, &joined);
-        let mut components = labels.count_vertices();
-        let used = components.iter().map(|c| c.vertices).sum();
-        let mut add = |label: u32, part: &Component| {
-            let component = &mut components[labels.component_of(label) as usize];
-            component.triangles += part.triangles;
-            component.area += part.area;
-            component.volume += part.volume;
-            component.moment.iter_mut().zip(part.moment).for_each(|(sum, part)| *sum += part);
-        };
-        let (mut checksum, mut degenerate) = (0_u64, false);
-        for (sums, label) in sums.iter().flat_map(|s| s.by_label.iter()).zip(0..) {
-            add(label, sums);
+/// Triangles between two checks of the cancellation flag: a fraction of a millisecond.
+const TRIANGLES_PER_CHECK: usize = 1 << 14;
+
+/// Returns the connected components of `mesh`, in double precision.
+fn components_of(mesh: &Mesh, control: &Control<'_>) -> Result<Vec<Component>, SurfaceError> {
+    let mut joined = UnionFind::new(mesh.n_vertices());
+    for chunk in mesh.triangles.chunks(TRIANGLES_PER_CHECK) {
+        control.check()?;
+        for &[a, b, c] in chunk {
+            joined.union(a, b);
+            joined.union(b, c);
         }
-        for part in &sums {
-            checksum = checksum.wrapping_add(part.checksum);
-            degenerate |= part.degenerate;
-            part.unlabelled.iter().for_each(|(v, triangle)| add(labels.label(*v), triangle));
+    }
+    let mut of_vertex = Vec::new();
+    let mut components = vec![Component::default(); joined.number_sets(&mut of_vertex) as usize];
+    of_vertex.iter().for_each(|component| components[*component as usize].vertices += 1);
+    for chunk in mesh.triangles.chunks(TRIANGLES_PER_CHECK) {
+        control.check()?;
+        for triangle in chunk {
+            let corners = triangle.map(|v| mesh.position(v as usize).map(f64::from));
+            components[of_vertex[triangle[0] as usize] as usize].add(corners);
         }
-        components.retain(|c| c.triangles > 0);
-        components.sort_by(|a, b| b.area.total_cmp(&a.area));
-        Ok(Self { components, used, checksum, degenerate })
+    }
+    components.retain(|component| component.triangles > 0);
+    Ok(components)
+}
+
+impl Component {
+    /// Adds a triangle. By the divergence theorem, its part of the volume's moment along an axis is the integral of half
+    /// the squared coordinate times the normal.
+    fn add(&mut self, [a, b, c]: [[f64; 3]; 3]) {
+        let [u, v] = [b, c].map(|p| [p[0] - a[0], p[1] - a[1], p[2] - a[2]]);
+        let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+        self.triangles += 1;
+        self.area += 0.5 * n.iter().map(|c| c * c).sum::<f64>().sqrt();
+        for (k, n) in n.into_iter().enumerate() {
+            let [a, b, c] = [a[k], b[k], c[k]];
+            self.volume += a * n / 6.0;
+            self.moment[k] += n * (a * (a + b + c) + b * (b + c) + c * c) / 24.0;
+        }
     }
 }
 

@@ -33,9 +33,6 @@ pub struct Mesh {
     pub atom_ids: Option<Column<u32>>,
     /// Per vertex an sRGB colour with alpha, if the caller set one. Backends leave it empty.
     pub colors: Option<Column<[u8; 4]>>,
-    /// Starts of the connected parts of the mesh, as (first vertex, first triangle), ascending from (0, 0): most
-    /// triangles of a part use vertices of that part. A hint for parallel work; an empty list is always valid.
-    pub parts: Vec<(usize, usize)>,
 }
 
 /// Vertices in 12 bytes. The fourth number of a row is 0.
@@ -71,7 +68,7 @@ pub(super) fn bounds_of<T: Copy + PartialOrd + Send + Sync, const N: usize>(rows
 }
 
 /// The bounds of both.
-pub(super) fn joined_bounds<T: Copy + PartialOrd>([a, b]: [[T; 3]; 2], [c, d]: [[T; 3]; 2]) -> [[T; 3]; 2] {
+pub(crate) fn joined_bounds<T: Copy + PartialOrd>([a, b]: [[T; 3]; 2], [c, d]: [[T; 3]; 2]) -> [[T; 3]; 2] {
     let choose = |take: bool, new, old| if take { new } else { old };
     [std::array::from_fn(|k| choose(c[k] < a[k], c[k], a[k])), std::array::from_fn(|k| choose(d[k] > b[k], d[k], b[k]))]
 }
@@ -186,8 +183,6 @@ impl Mesh {
     /// centre of `next` and, if it is empty, its representation.
     #[cfg(feature = "gpu")]
     pub(crate) fn append(&mut self, next: Self) {
-        let before = (self.n_vertices(), self.n_triangles());
-        self.parts.extend(next.parts.iter().map(|(v, t)| (before.0 + v, before.1 + t)));
         self.centre = next.centre;
         self.positions.append(next.positions);
         self.normals.append(next.normals);

@@ -16,11 +16,6 @@ impl UnionFind {
         Self { parent: (0..to_u32(n)).collect() }
     }
 
-    /// Number of integers.
-    pub(super) fn len(&self) -> usize {
-        self.parent.len()
-    }
-
     /// Removes all integers and keeps the memory.
     pub(super) fn clear(&mut self) {
         self.parent.clear();
@@ -32,13 +27,6 @@ impl UnionFind {
         let next = to_u32(self.parent.len());
         self.parent.push(next);
         next
-    }
-
-    /// Adds the sets of `other`, whose integers then begin at the returned one.
-    pub(super) fn append(&mut self, other: &Self) -> u32 {
-        let first = to_u32(self.parent.len());
-        self.parent.extend(other.parent.iter().map(|parent| parent + first));
-        first
     }
 
     /// Merges the sets of `a` and `b`.
@@ -99,16 +87,5 @@ mod tests {
         let expected = [0, 0, 0, 3, 4, 5, 6, 3, 3, 3];
         assert_eq!(joined(&mut pairs.iter()), expected);
         assert_eq!(joined(&mut pairs.iter().rev()), expected);
-    }
-
-    #[test]
-    fn appended_sets_stay_apart() {
-        let (mut all, mut more) = (UnionFind::new(2), UnionFind::default());
-        assert_eq!([more.push(), more.push(), more.push()], [0, 1, 2]);
-        more.union(0, 2);
-        assert_eq!((all.append(&more), all.len()), (2, 5));
-        assert_eq!(all.into_representatives(), [0, 1, 2, 3, 2]);
-        more.clear();
-        assert_eq!(more.len(), 0);
     }
 }

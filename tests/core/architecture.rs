@@ -215,7 +215,7 @@ const MAX_LONG_COMMENTS: usize = 0;
 /// Lines of Markdown prose that are still too long. The aim is 0.
 const MAX_LONG_PROSE: usize = 0;
 
-const STAGES: &[&str] = &["bin", "field", "classify", "scan", "interpolate", "emit"];
+const STAGES: &[&str] = &["bin", "field", "classify", "scan", "interpolate", "emit", "measure"];
 /// Limit for the lines of a source file, without its tests.
 const MAX_LINES: usize = 400;
 /// Data tables, which may exceed [`MAX_LINES`].

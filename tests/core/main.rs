@@ -4,6 +4,8 @@
 
 #[path = "../bcif_support/mod.rs"]
 mod bcif_support;
+#[path = "../measure_support/mod.rs"]
+mod measure_support;
 #[path = "../tools/mod.rs"]
 mod tools;
 

@@ -8,6 +8,8 @@ mod cli_support;
 mod gpu_fakes;
 #[path = "../gpu_support/mod.rs"]
 mod gpu_support;
+#[path = "../measure_support/mod.rs"]
+mod measure_support;
 #[path = "../tools/mod.rs"]
 mod tools;
 

@@ -2,6 +2,7 @@
 #![expect(clippy::unwrap_used, clippy::float_cmp, reason = "tests may panic and compare exactly")]
 
 use crate::gpu_support;
+use crate::measure_support::agree;
 
 use std::sync::Arc;
 
@@ -47,10 +48,23 @@ fn assert_equal(gpu: &MeshOutput, spheres: &Spheres, params: &SurfaceParams, wha
     assert!(a.closed && a.oriented && a.manifold, "{what}: {a:?}");
     assert_eq!((a.euler, a.components.len()), (b.euler, b.components.len()), "{what}");
     assert!((a.area / b.area - 1.0).abs() < 1e-5 && (a.volume / b.volume - 1.0).abs() < 1e-5, "{what}");
+    assert_measured(gpu, what);
     for n in &gpu.mesh.normals {
         let length = n.iter().map(|c| f64::from(*c).powi(2)).sum::<f64>().sqrt();
         assert!((length - 1.0).abs() < 1e-5, "{what}: normal {n:?}");
     }
+}
+
+/// Asserts that the device's measures are those of the mesh.
+#[track_caller]
+fn assert_measured(gpu: &MeshOutput, what: &str) {
+    let (taken, found) = (gpu.measures.as_ref().unwrap(), measures(gpu));
+    assert!(agree(taken, &found, &gpu.mesh), "{what}: {taken:?} {found:?}");
+    assert_eq!(gpu.bounds, Some(gpu.mesh.bounds()), "{what}");
+    // Negative control: the measures of one component less.
+    let mut fewer = taken.clone();
+    fewer.components.pop();
+    assert!(!agree(&fewer, &found, &gpu.mesh));
 }
 
 #[test]
@@ -86,6 +100,7 @@ fn assert_quantized(engine: &mut Engine, spheres: &Spheres, params: &SurfacePara
         mesh != expected
     };
     assert!(changed(&|q| q.positions[5][2] += 1) && changed(&|q| q.normals[5][0] ^= 1));
+    assert_measured(&meshed, what);
     meshed
 }
 
@@ -140,7 +155,8 @@ fn quantized_vertices_in_chunks_pieces_and_readback_buffers_have_the_same_bytes(
             let meshed = mesh_of(&mut engine, &crowd, params);
             assert_eq!(meshed.mesh.quantized.is_some(), params.quantize.is_some());
             if params.quantize.is_some() {
-                assert!(meshed.mesh == Mesh { parts: meshed.mesh.parts.clone(), ..whole.mesh.clone() }, "{what}");
+                assert!(meshed.mesh == whole.mesh, "{what}");
+                assert_eq!(meshed.measures, whole.measures, "{what}");
             }
         }
     }
@@ -375,7 +391,7 @@ fn chunks_pieces_and_readback_buffers_change_no_byte() {
         let mut engine = engine_with(change);
         let meshed = mesh_of(&mut engine, &crowd, &params);
         assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{what}");
-        assert_eq!(meshed.grid, whole.grid, "{what}");
+        assert_eq!((&meshed.grid, &meshed.measures), (&whole.grid, &whole.measures), "{what}");
         // Atoms in reverse order, with reused buffers.
         let backwards: Vec<[f64; 4]> = cloud.iter().rev().copied().collect();
         let other = mesh_of(&mut engine, &spheres(&backwards), &params);
@@ -406,6 +422,54 @@ fn output_is_made_again_if_the_estimate_is_too_low() {
         let mut engine = engine_with(|b| b.rows_per_brick = rows);
         let meshed = mesh_of(&mut engine, &spheres, &params);
         assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{rows:?}");
+        assert_eq!(meshed.measures, whole.measures, "{rows:?}");
+    }
+}
+
+#[test]
+fn sheets_are_made_again_if_the_estimate_is_too_low() {
+    let crowd = spheres(&Random(11).cloud(900, 60.0));
+    let params = params(KERNELS[0], 0.6);
+    let whole = mesh_of(&mut engine(), &crowd, &params);
+    assert_measured(&whole, "whole");
+    let changes: [Change; 3] = [|b| b.small_bytes = 1 << 30, |b| b.small_bytes = 0, |b| b.chunk_bricks = 900];
+    for (i, change) in changes.into_iter().enumerate() {
+        let mut last = 0;
+        for words in [64, 2] {
+            let mut engine = engine_with(|b| {
+                b.sheet_words_per_brick = words;
+                change(b);
+            });
+            let meshed = mesh_of(&mut engine, &crowd, &params);
+            assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{i} {words}");
+            assert_eq!(meshed.measures, whole.measures, "{i} {words}");
+            assert!(engine.submissions() > last, "{i}: {} submissions with {words} words", engine.submissions());
+            last = engine.submissions();
+        }
+    }
+}
+
+#[test]
+fn measures_equal_those_of_the_cpu() {
+    let relative = |a: f64, b: f64| (a / b - 1.0).abs();
+    let crowd = spheres(&Random(11).cloud(4000, 70.0));
+    for (name, spheres, h) in [("4pti", sample("4pti.pdb"), 0.4), ("crowd", crowd, 0.7)] {
+        for kernel in KERNELS {
+            let single = params(kernel, h);
+            for params in [quantized(&spheres, &single), single] {
+                let what = format!("{name} {kernel} {:?}", params.quantize);
+                let found = mesh_of(&mut engine(), &spheres, &params).measures.unwrap();
+                let expected = cpu(&spheres, &params).measures.unwrap();
+                assert_eq!(
+                    (found.euler, found.components.len()),
+                    (expected.euler, expected.components.len()),
+                    "{what}"
+                );
+                assert!(found.closed && found.manifold && found.validation == expected.validation);
+                assert!(relative(found.area, expected.area) < 1e-6, "{what}: {} {}", found.area, expected.area);
+                assert!(relative(found.volume, expected.volume) < 1e-6, "{what}: {} {}", found.volume, expected.volume);
+            }
+        }
     }
 }
 
@@ -422,7 +486,7 @@ fn jobs_that_share_a_submission_are_independent() {
     jobs[10].cancel.cancel();
     jobs.push(job(&clouds[3], &params(KERNELS[0], 0.5)));
     jobs[11].deadline = Some(std::time::Instant::now());
-    let mut answers = engine().run(&jobs);
+    let mut answers = gpu_support::run_all(&mut engine(), &jobs);
     assert_eq!(answers.len(), 12);
     assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(SurfaceError::Deadline));
     assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(molmesh::surface::SurfaceError::Cancelled));
@@ -485,7 +549,7 @@ fn stage_times_are_reported_if_the_device_has_timestamps() {
         let finished = run(&mut engine, &job(&spheres, &params)).unwrap();
         if has_timestamps {
             let stages: Vec<_> = finished.stages.iter().map(|(stage, _)| *stage).collect();
-            assert_eq!(stages, molmesh::surface::Stage::ALL[..6]);
+            assert_eq!(stages, molmesh::surface::Stage::ALL[..7]);
             assert!(finished.stages.iter().all(|(_, ns)| *ns < 60_000_000_000), "{:?}", finished.stages);
             assert!(finished.stages.iter().map(|(_, ns)| ns).sum::<u64>() > 1000, "{:?}", finished.stages);
         } else {

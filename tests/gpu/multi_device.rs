@@ -3,6 +3,7 @@
 
 use crate::gpu_support;
 
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
@@ -60,6 +61,10 @@ fn difference(a: &Mesh, b: &Mesh) -> Option<&'static str> {
 #[track_caller]
 fn assert_same(ran: &CompletedJob, job: &GpuJob, devices: usize, what: &str) -> Mesh {
     let alone = run(&mut engine(), job).unwrap().meshed;
+    let mut together = ran.finished.clone();
+    together.measure(&job.prepared).unwrap();
+    assert!(alone.measures.is_some());
+    assert_eq!((&together.meshed.measures, together.meshed.bounds), (&alone.measures, alone.bounds), "{what}");
     assert_eq!(ran.devices.len(), devices, "{what}");
     assert_eq!(difference(&ran.finished.meshed.mesh, &alone.mesh), None, "{what}");
     assert_eq!(ran.finished.meshed.grid, alone.grid, "{what}");
@@ -77,17 +82,25 @@ fn with_ids(kernel: Kernel, resolution: f64) -> SurfaceParams {
     SurfaceParams::new(&SurfaceOptions { kernel, resolution, atom_ids: true, ..SurfaceOptions::default() }).unwrap()
 }
 
-/// Number of triangles with a vertex of a later partition.
+/// Number of triangles with vertices of several partitions.
 fn n_across(mesh: &Mesh, job: &GpuJob, n: usize) -> usize {
-    // Each partition begins a group of bricks, which is a part of the mesh.
-    let mut groups = 0;
-    let mut across = 0;
-    for part in job.prepared.plan.partitions(n) {
-        groups += part.bricks.len().div_ceil(1024);
-        let end = mesh.parts.get(groups).map_or((mesh.n_vertices(), mesh.n_triangles()), |end| *end);
-        across += mesh.triangles[..end.1].iter().filter(|t| t.iter().any(|v| *v as usize >= end.0)).count();
-    }
-    across
+    let (plan, lattice) = (&job.prepared.plan, &job.prepared.lattice);
+    let parts = plan.partitions(n);
+    let partition = |brick: u32| parts.iter().position(|part| part.bricks.contains(&brick)).unwrap();
+    let coord = |brick: u32| {
+        let tile = plan.tiles[(brick >> 9) as usize].coord;
+        std::array::from_fn(|k| 8 * tile[k] + (brick >> (3 * k) & 7).cast_signed())
+    };
+    let of_brick: HashMap<[i32; 3], usize> =
+        plan.bricks.iter().zip(0..).map(|(brick, id)| (coord(*brick), partition(id))).collect();
+    // A vertex belongs to the brick of the last sample before it.
+    #[expect(clippy::cast_possible_truncation, reason = "a few samples")]
+    let of_vertex = |v: u32| {
+        let p = mesh.positions[v as usize].map(|c| (f64::from(c) / lattice.spacing + 1e-4).floor() as i32);
+        of_brick[&std::array::from_fn(|k| (p[k] + lattice.centre[k]).div_euclid(8))]
+    };
+    let across = |t: &&[u32; 3]| t.iter().any(|v| of_vertex(*v) != of_vertex(t[0]));
+    mesh.triangles.iter().filter(across).count()
 }
 
 #[test]

@@ -1,5 +1,5 @@
 //! Single stages of a device, run on the results of the CPU's previous stages and compared with the CPU's stage: `bin`,
-//! `classify`, `scan` and `emit` bit by bit, `field` and `interpolate` within bounds. Outputs are poisoned before a
+//! `classify`, `scan` and `emit` bit by bit, `field`, `interpolate` and `measure` within bounds. Outputs are poisoned before a
 //! stage runs.
 
 use crate::gpu_support;
@@ -12,7 +12,7 @@ use molmesh::gpu::GpuJob;
 use molmesh::gpu::plan::Plan;
 use molmesh::gpu::plan::layout::{Counters, GROUP, NONE, Record};
 use molmesh::gpu::probe::{BufferId, StageProbe};
-use molmesh::surface::cpu::probe::{Probe, ProbedBrick, ProbedSurface, probe};
+use molmesh::surface::cpu::probe::{Probe, ProbedBrick, ProbedSheet, ProbedSurface, checksum, probe};
 use molmesh::surface::lattice::LatticeAtom;
 use molmesh::surface::quantize::{BEYOND, normal};
 use molmesh::surface::{Kernel, Spheres, Stage, Step, SurfaceLimits};
@@ -483,17 +483,200 @@ fn interpolate_shortens_the_same_normals_as_the_host() {
 fn emit_makes_the_same_triangles() {
     for (name, setup) in setups() {
         setup.stages.poison(BufferId::Triangles);
-        let inputs = [
-            (BufferId::Inside, raw(&setup.inside())),
-            (BufferId::Records, raw(&setup.records())),
-            (BufferId::Counts, raw(&setup.counts())),
-            (BufferId::Offsets, raw(&setup.offsets())),
-        ];
-        let out = setup.run(Stage::Emit, &inputs, &[BufferId::Triangles]);
+        let inputs = |counts: &[u32]| {
+            [
+                (BufferId::Inside, raw(&setup.inside())),
+                (BufferId::Records, raw(&setup.records())),
+                (BufferId::Counts, raw(counts)),
+                (BufferId::Offsets, raw(&setup.offsets())),
+                (BufferId::Counters, raw(&[Counters::default()])),
+            ]
+        };
+        let mut counts = setup.counts();
+        let out = setup.run(Stage::Emit, &inputs(&counts), &[BufferId::Triangles, BufferId::Counters]);
         let got: Vec<[u32; 3]> = cast(&out[0]);
         assert_eq!(unequal(&got, &setup.probe.mesh.triangles), None, "{name}");
+        let counters = cast::<Counters>(&out[1])[0];
+        assert_eq!((counters.checksum, counters.degenerate), ([0, 0], 0), "{name}: a closed mesh");
         let mut wrong = got.clone();
         wrong[got.len() - 1].rotate_left(1);
         assert!(unequal(&wrong, &setup.probe.mesh.triangles).is_some());
+        // Without the last triangle the mesh has a hole, and the checksum is that of the host.
+        let last = counts.iter().rposition(|count| count >> 16 > 0).unwrap();
+        counts[last] -= 1 << 16;
+        let out = setup.run(Stage::Emit, &inputs(&counts), &[BufferId::Counters]);
+        let counters = cast::<Counters>(&out[0])[0];
+        let expected = checksum(&got[..got.len() - 1]);
+        assert_eq!((counters.checksum, counters.degenerate), (halves(expected), 0), "{name}: a hole");
+        assert_ne!(expected, 0);
     }
+}
+
+#[test]
+fn emit_counts_triangles_with_a_corner_twice() {
+    let setup = Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5);
+    // Without crossing edges before a word, several vertices have the same number.
+    let mut records = setup.records();
+    records.iter_mut().for_each(|record| record.crossing = [0; 48]);
+    let inputs = [
+        (BufferId::Inside, raw(&setup.inside())),
+        (BufferId::Records, raw(&records)),
+        (BufferId::Counts, raw(&setup.counts())),
+        (BufferId::Offsets, raw(&setup.offsets())),
+        (BufferId::Counters, raw(&[Counters::default()])),
+    ];
+    let out = setup.run(Stage::Emit, &inputs, &[BufferId::Triangles, BufferId::Counters]);
+    let twice = cast::<[u32; 3]>(&out[0]).iter().filter(|[a, b, c]| a == b || b == c || c == a).count();
+    assert_eq!((twice > 0, cast::<Counters>(&out[1])[0].degenerate as usize), (true, twice));
+}
+
+/// Block that `measure` writes for a brick.
+#[derive(Debug, Clone, PartialEq)]
+struct Block {
+    sheets: Vec<ProbedSheet>,
+    /// Owner, key and sheet of each shared vertex, if there are several sheets.
+    vertices: Vec<[u32; 3]>,
+}
+
+/// Blocks by brick.
+fn blocks(mut words: &[u32]) -> HashMap<u32, Block> {
+    let mut blocks = HashMap::new();
+    while let Some((&[brick, counts, x, y, z], rest)) = words.split_first_chunk() {
+        let (sheets, rest) = rest.split_at(12 * (counts & 0xffff) as usize);
+        let (vertices, rest) = rest.split_at((counts >> 16) as usize);
+        words = rest;
+        let sheet = |words: &[u32; 12]| ProbedSheet {
+            origin: [x, y, z].map(u32::cast_signed),
+            count: [words[0] & 0xffff, words[0] >> 16],
+            near: std::array::from_fn(|k| words[1].to_le_bytes()[k]),
+            sums: std::array::from_fn(|k| f64::from(f32::from_bits(words[2 + k]))),
+        };
+        let block = Block {
+            sheets: sheets.as_chunks().0.iter().map(sheet).collect(),
+            vertices: vertices.iter().map(|word| [word & 7, word >> 3 & 0x7ff, word >> 14]).collect(),
+        };
+        assert!(blocks.insert(brick, block).is_none(), "brick {brick} has two blocks");
+    }
+    blocks
+}
+
+/// Returns true if two sheets have the same sums, up to rounding in single precision.
+fn same_sheet(a: &ProbedSheet, b: &ProbedSheet, several: bool) -> bool {
+    // Positions are at most 8: products are up to 24 times the area, moments up to 384 times.
+    let bound = |k: usize| b.sums[0].max(0.01) * [2e-6, 4e-5, 6e-4][k.saturating_sub(1) / 3];
+    let close = (0..10).all(|k| (a.sums[k] - b.sums[k]).abs() <= bound(k));
+    let below = !several || a.near[1] == b.near[1];
+    close && below && (a.origin, a.count, a.near[0]) == (b.origin, b.count, b.near[0])
+}
+
+/// Returns the first difference of a block from the CPU's sheets of a brick. Backends number sheets in different orders.
+fn block_difference(block: &Block, brick: &ProbedSurface) -> Option<String> {
+    let several = brick.sheets.len() > 1;
+    if block.sheets.len() != brick.sheets.len() || !several && !block.vertices.is_empty() {
+        return Some(format!("{} sheets of {}", block.sheets.len(), brick.sheets.len()));
+    }
+    let own: HashMap<u32, usize> =
+        block.vertices.iter().filter(|[owner, ..]| *owner == 0).map(|[_, key, on]| (*key, *on as usize)).collect();
+    let mut number: Vec<Option<usize>> = vec![None; block.sheets.len()];
+    for [key, theirs] in &brick.shared {
+        let Some(sheet) = own.get(&u32::from(*key)) else { return Some(format!("no vertex {key:#x}")) };
+        if *number[*sheet].get_or_insert(usize::from(*theirs)) != usize::from(*theirs) {
+            return Some(format!("vertex {key:#x} is on sheet {sheet}"));
+        }
+    }
+    if own.len() != brick.shared.len() {
+        return Some(format!("{} shared vertices of {}", own.len(), brick.shared.len()));
+    }
+    // Sheets without such a vertex are recognized by their sums.
+    let taken: Vec<usize> = number.iter().flatten().copied().collect();
+    let mut left: Vec<usize> = (0..brick.sheets.len()).filter(|sheet| !taken.contains(sheet)).collect();
+    for (sheet, number) in block.sheets.iter().zip(&number) {
+        let same = |theirs: usize| same_sheet(sheet, &brick.sheets[theirs], several);
+        let found =
+            number.map_or_else(|| left.iter().position(|&theirs| same(theirs)).map(|at| left.swap_remove(at)), Some);
+        if !found.is_some_and(same) {
+            return Some(format!("{sheet:?}, expected {:?}", found.map_or(brick.sheets[0], |at| brick.sheets[at])));
+        }
+    }
+    None
+}
+
+/// Inputs of `measure`.
+fn measure_inputs(setup: &Setup) -> Vec<(BufferId, Vec<u8>)> {
+    vec![
+        (BufferId::Field, raw(&setup.samples())),
+        (BufferId::Inside, raw(&setup.inside())),
+        (BufferId::Records, raw(&setup.records())),
+        (BufferId::Counts, raw(&setup.counts())),
+        (BufferId::Counters, raw(&[Counters::default()])),
+    ]
+}
+
+/// Structures with several sheets per brick: small atoms on a coarse grid, whose cells have every case of the table,
+/// and a shell around a void.
+fn many_sheets() -> Vec<(String, Setup)> {
+    let dust: Vec<[f64; 4]> = Random(23).cloud(500, 60.0).iter().map(|[x, y, z, _]| [*x, *y, *z, 1.2]).collect();
+    let turn = |i: u32| f64::from(i) * 2.399_963;
+    let shell: Vec<[f64; 4]> = (0..400)
+        .map(|i| (1.0 - f64::from(i) / 199.5, turn(i)))
+        .map(|(z, a)| (9.0 * z, 9.0 * (1.0 - z * z).max(0.0).sqrt(), a))
+        .map(|(z, r, a)| [r * a.cos(), r * a.sin(), z, 1.6])
+        .collect();
+    let dust = |h| (format!("dust {h}"), Setup::new(&spheres(&dust), Kernel::SoftObject, h));
+    vec![dust(1.3), dust(2.1), ("shell".to_owned(), Setup::new(&spheres(&shell), Kernel::Gaussian, 1.1))]
+}
+
+#[test]
+fn measure_finds_the_same_sheets_and_sums() {
+    let mut most = 0;
+    for (name, setup) in setups().into_iter().chain(many_sheets()) {
+        setup.poison(&[BufferId::Sheets]);
+        let out = setup.run(Stage::Measure, &measure_inputs(&setup), &[BufferId::Sheets, BufferId::Counters]);
+        let (words, made) = (cast::<u32>(&out[0]), cast::<Counters>(&out[1])[0].sheet_words as usize);
+        assert!(words[made..].iter().all(|&word| word == 0xa5a5_a5a5), "{name}: beyond the last block");
+        let blocks = blocks(&words[..made]);
+        assert_eq!(blocks.len(), setup.probe.surface.len(), "{name}");
+        for (id, brick) in (0..).zip(&setup.surface) {
+            // An empty brick has no block.
+            assert_eq!(blocks.contains_key(&id), brick.is_some(), "{name}");
+            let Some(brick) = brick else { continue };
+            assert_eq!(block_difference(&blocks[&id], brick), None, "{name}: brick {id}");
+            most = most.max(brick.sheets.len());
+        }
+        // Negative controls: sums that are off by ten times their bound, and a vertex on another sheet.
+        let (id, brick) = (0..).zip(&setup.surface).find_map(|(id, b)| Some((id, b.as_ref()?))).unwrap();
+        for (k, bound) in [(0, 2e-6), (3, 2e-6), (5, 4e-5), (9, 6e-4)] {
+            let mut wrong = blocks[&id].clone();
+            wrong.sheets[0].sums[k] += 10.0 * bound * brick.sheets[0].sums[0].max(0.01);
+            assert!(block_difference(&wrong, brick).is_some(), "{name}: {k}");
+        }
+        let several = (0..).zip(&setup.surface).find(|(_, b)| b.as_ref().is_some_and(|b| b.shared.len() > 1));
+        if let Some((id, Some(brick))) = several {
+            let mut wrong = blocks[&id].clone();
+            let own = wrong.vertices.iter().position(|[owner, ..]| *owner == 0).unwrap();
+            wrong.vertices[own][2] = (wrong.vertices[own][2] + 1) % u32_of(brick.sheets.len());
+            assert!(block_difference(&wrong, brick).is_some(), "{name}");
+        }
+    }
+    assert!(most > 10, "at most {most} sheets in a brick");
+}
+
+#[test]
+fn measure_counts_blocks_that_do_not_fit_and_writes_nothing_beyond_the_capacity() {
+    let mut setup = Setup::new(&sample("1crn.cif"), Kernel::Gaussian, 0.7);
+    let inputs = measure_inputs(&setup);
+    let run = |setup: &Setup| {
+        setup.poison(&[BufferId::Sheets]);
+        let out = setup.run(Stage::Measure, &inputs, &[BufferId::Counters, BufferId::Sheets]);
+        (cast::<Counters>(&out[0])[0].sheet_words, cast::<u32>(&out[1]))
+    };
+    let (all, _) = run(&setup);
+    let size = setup.stages.params.sheet_capacity as usize;
+    setup.stages.params.sheet_capacity = all / 2;
+    let (counted, words) = run(&setup);
+    setup.stages.params.sheet_capacity = u32_of(size);
+    assert_eq!((counted, words.len()), (all, all as usize / 2));
+    assert!(words.iter().any(|&word| word != 0xa5a5_a5a5));
+    let beyond = setup.stages.read(BufferId::Sheets, 4 * u64::from(all)).unwrap();
+    assert!(cast::<u32>(&beyond)[words.len()..].iter().all(|&word| word == 0xa5a5_a5a5));
 }

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
-use molmesh::gpu::{DevicePool, Executor, Finished, GpuError, GpuJob, PoolDevice, PoolSettings, Prepared};
+use molmesh::gpu::{DevicePool, Executor, Finished, GpuError, GpuJob, PoolDevice, PoolSettings, Prepared, SheetBlocks};
 use molmesh::surface::{
     CancelToken, Control, GridStats, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
 };
@@ -115,6 +115,7 @@ impl Executor for FakeExecutor {
             Step::Finish | Step::Block | Step::OmitResult => Ok(Finished {
                 meshed: MeshOutput::new(Mesh::default(), GridStats { samples: 7, ..GridStats::default() }),
                 stages: vec![(Stage::Field, 2_000), (Stage::Emit, 1_000)],
+                sheets: SheetBlocks::default(),
             }),
             Step::Lose => Err(GpuError::Lost(LOST.to_owned())),
             Step::Fail => Err(GpuError::Failed("scripted failure".to_owned())),

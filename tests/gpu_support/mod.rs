@@ -52,8 +52,18 @@ pub(crate) fn job(spheres: &Spheres, params: &SurfaceParams) -> GpuJob {
     GpuJob { prepared: Arc::new(prepared), cancel: CancelToken::default(), deadline: None }
 }
 
+/// Runs jobs together and measures their meshes.
+pub(crate) fn run_all(engine: &mut Engine, jobs: &[GpuJob]) -> Vec<Result<Finished, GpuError>> {
+    let measured = |(result, job): (Result<Finished, GpuError>, &GpuJob)| {
+        let mut finished = result?;
+        finished.measure(&job.prepared)?;
+        Ok(finished)
+    };
+    engine.run(jobs).into_iter().zip(jobs).map(measured).collect()
+}
+
 pub(crate) fn run(engine: &mut Engine, job: &GpuJob) -> Result<Finished, GpuError> {
-    engine.run(std::slice::from_ref(job)).pop().expect("one answer")
+    run_all(engine, std::slice::from_ref(job)).pop().expect("one answer")
 }
 
 pub(crate) fn mesh_of(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams) -> MeshOutput {

@@ -139,7 +139,7 @@ impl Plan {
     }
 
     /// Neighbour of a brick, given as in [`Plan::bricks`], towards +x (bit 0 of `n`), +y (bit 1) and +z (bit 2).
-    fn neighbour(&self, brick: u32, n: u32) -> Option<u32> {
+    pub(in crate::gpu) fn neighbour(&self, brick: u32, n: u32) -> Option<u32> {
         let (tile, local) = (&self.tiles[(brick >> 9) as usize], brick & 511);
         let moved = [0, 3, 6].map(|shift| (local >> shift & 7) + (n >> (shift / 3) & 1));
         let around = 13 + 9 * (moved[2] >> 3) + 3 * (moved[1] >> 3) + (moved[0] >> 3);

@@ -46,8 +46,8 @@ pub struct Params {
     pub ahead: u32,
     /// Number of tiles of the job.
     pub n_tiles: u32,
-    /// Number of bricks of the job.
-    pub n_bricks: u32,
+    /// Capacity of the sheets, in words.
+    pub sheet_capacity: u32,
     /// First brick of the chunk.
     pub first_brick: u32,
     /// Number of the chunk's own bricks.
@@ -123,6 +123,26 @@ pub struct Counters {
     pub triangles: u32,
     /// Number of vertices without a gradient.
     pub flat: u32,
+    /// Sum of the shares of all directed edges, lower half first.
+    pub checksum: [u32; 2],
+    /// Number of triangles with a corner twice.
+    pub degenerate: u32,
+    /// Number of words of sheets, including those beyond the capacity.
+    pub sheet_words: u32,
+    /// Keys of the highest position per axis, and of the highest negative position: integers with the order of the
+    /// numbers, in Å or steps.
+    pub bounds: [u32; 6],
+}
+
+impl Counters {
+    /// Returns the lowest and highest position per axis; `None` without vertices.
+    #[must_use]
+    pub fn position_bounds(&self) -> Option<[[f32; 3]; 2]> {
+        let number = |key: u32| f32::from_bits(key ^ if key >> 31 == 1 { 1 << 31 } else { u32::MAX });
+        let [x, y, z, low_x, low_y, low_z] = self.bounds.map(number);
+        // Every number has a key above 0.
+        self.bounds.iter().all(|&key| key > 0).then_some([[-low_x, -low_y, -low_z], [x, y, z]])
+    }
 }
 
 /// Number of samples of a brick.

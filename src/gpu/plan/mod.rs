@@ -94,7 +94,6 @@ impl Plan {
             back: bricks(self.max_reach + 7.51),
             ahead: bricks(self.max_reach + 8.51),
             n_tiles: to_u32(self.tiles.len()),
-            n_bricks: to_u32(self.bricks.len()),
             steps_per_angstrom: params.quantize.map_or(0.0, Step::per_angstrom),
             ..bytemuck::Zeroable::zeroed()
         }

@@ -43,6 +43,19 @@ impl Edge {
         self.0 >> 8 & 7
     }
 
+    /// Returns the axes (bits: 0 x, 1 y, 2 z) along which both its ends lie in the brick's first layer.
+    #[inline(always)]
+    pub(super) fn first_layers(self) -> usize {
+        let first = [self.x(), self.y(), self.z()].map(|c| usize::from(c == 0));
+        (first[0] | first[1] << 1 | first[2] << 2) & !(1 << self.axis())
+    }
+
+    /// Returns the edge's place in the order of the brick's vertices: layer (3 bits), axis (2 bits) and bit (6 bits).
+    #[inline(always)]
+    pub(super) fn key(self) -> u16 {
+        self.0 & 7 << 8 | self.axis() << 6 | self.0 >> 2 & 63
+    }
+
     /// Index among the brick's samples and cells: `(z·8 + y)·8 + x`.
     #[inline(always)]
     pub(super) fn sample(self) -> usize {

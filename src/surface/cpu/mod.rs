@@ -1,9 +1,9 @@
-//! Native CPU backend: six stages over occupied bricks, parallel over tiles, with SIMD.
+//! Native CPU backend: seven stages over occupied bricks, parallel over tiles, with SIMD.
 //!
 //! First pass (`sample.rs`): `bin` assigns atoms to tiles. Each tile, or a slab of it, finds the candidates of its
 //! bricks, evaluates `field` into a scratch that fits the core's cache, and `classify` keeps crossing bits, edge
 //! parameters and cases. The field is never stored beyond a tile. `scan` numbers the tiles. Second pass (`write.rs`):
-//! `interpolate` and `emit` write vertices and triangles to memory or to a sink.
+//! `interpolate` and `emit` write vertices and triangles to memory or to a sink; `measure` sums over them.
 //!
 //! The same input gives the same bytes on any number of threads.
 
@@ -14,9 +14,8 @@ mod edge;
 mod emit;
 pub(crate) mod field;
 mod interpolate;
-mod join;
+mod measure;
 mod neighbours;
-mod piece_sums;
 #[doc(hidden)]
 pub mod probe;
 mod sample;
@@ -131,7 +130,6 @@ struct Tile {
     bricks: Vec<u16>,
     first_vertex: usize,
     first_triangle: usize,
-    first_brick: usize,
     first_piece: usize,
 }
 
@@ -161,11 +159,10 @@ const PIECE_BRICKS: usize = 32;
 
 /// Splits the tiles into pieces, in order.
 fn pieces(done: &mut [Tile]) -> Vec<Piece> {
-    let (mut pieces, mut bricks) = (Vec::new(), 0);
+    let mut pieces = Vec::new();
     for (t, tile) in done.iter_mut().enumerate() {
         let n = tile.found.bricks.len();
-        (tile.first_piece, tile.first_brick) = (pieces.len(), bricks);
-        bricks += n;
+        tile.first_piece = pieces.len();
         let starts = (0..n).step_by(PIECE_BRICKS);
         pieces.extend(starts.map(|first| Piece { tile: t, bricks: first..n.min(first + PIECE_BRICKS) }));
     }
@@ -244,8 +241,8 @@ impl Tile {
         let end = self.found.bricks.get(ix + 1).map_or(self.found.vertices, |next| next.vertex);
         let own = brick.vertex as usize..end as usize;
         let (t, edges) = (&self.found.t[own.clone()], &self.found.edges[own]);
-        // `scan` checked that ids fit 32 bits; there are fewer bricks than vertices.
-        let (id, first) = (to_u32(self.first_brick + ix), to_u32(self.first_vertex) + brick.vertex);
-        Some((ix, NumberedBrick { brick, id, first, t, edges }))
+        // `scan` checked that ids fit 32 bits.
+        let first = to_u32(self.first_vertex) + brick.vertex;
+        Some((ix, NumberedBrick { brick, first, t, edges }))
     }
 }

@@ -4,13 +4,11 @@ use super::bin::{SIDE, slot_brick};
 use super::classify::SurfaceBrick;
 use super::edge::Edge;
 
-/// A surface brick with its number and the numbers of its vertices.
+/// A surface brick with the numbers of its vertices.
 #[derive(Clone, Copy)]
 pub(super) struct NumberedBrick<'a> {
     /// The brick.
     pub(super) brick: &'a SurfaceBrick,
-    /// Its index among all surface bricks.
-    pub(super) id: u32,
     /// Global id of its first vertex.
     pub(super) first: u32,
     /// Parameters of its vertices along their edges.

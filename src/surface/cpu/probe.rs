@@ -4,12 +4,16 @@
 use super::bin::{Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, SurfaceBrick};
 use super::field::{self, Constants, SampleRange, Samples};
-use super::{RunContext, Tile, write};
+use super::write::{self, Destination};
+use super::{RunContext, Tile};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
+use crate::surface::join::Sheet;
 use crate::surface::lattice::{BRICK, BRICK_SAMPLES, Lattice, to_f32};
 use crate::surface::mesh::Mesh;
 use crate::surface::params::{SurfaceLimits, SurfaceParams};
+use crate::surface::sink::{MeshPart, MeshSink, SinkFailed};
+use crate::surface::sums::edge_shares;
 
 /// A brick with candidates.
 #[derive(Debug, Clone)]
@@ -39,6 +43,51 @@ pub struct ProbedSurface {
     pub first: [u32; 2],
     /// Vertices and triangles.
     pub count: [u32; 2],
+    /// Sheets.
+    pub sheets: Vec<ProbedSheet>,
+    /// Key and sheet of each vertex that other bricks use, if there are several sheets.
+    pub shared: Vec<[u16; 2]>,
+}
+
+/// Sums over the triangles of a sheet, in spacings.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ProbedSheet {
+    /// Offset of the origin from the mesh's centre.
+    pub origin: [i32; 3],
+    /// Triangles, and vertices of the brick itself.
+    pub count: [u32; 2],
+    /// Neighbours that share vertices: those that own them, and those that use them.
+    pub near: [u8; 2],
+    /// Twice the area, then three components each of the vector, product and moment.
+    pub sums: [f64; 10],
+}
+
+impl ProbedSheet {
+    fn new(sheet: &Sheet) -> Self {
+        let Sheet { origin, triangles, vertices, above, below, area, vector, product, moment } = *sheet;
+        let [[x, y, z], [px, py, pz], [mx, my, mz]] = [vector, product, moment];
+        let sums = [area, x, y, z, px, py, pz, mx, my, mz];
+        Self { origin, count: [triangles, vertices], near: [above, below], sums }
+    }
+}
+
+/// Sink of rows that nobody reads.
+struct Discard;
+
+impl MeshSink for Discard {
+    fn begin(&self, _: usize, _: usize) -> Result<(), SinkFailed> {
+        Ok(())
+    }
+
+    fn part(&self, _: &MeshPart<'_>) -> Result<(), SinkFailed> {
+        Ok(())
+    }
+}
+
+/// Returns the checksum of the directed edges of `triangles`.
+#[must_use]
+pub fn checksum(triangles: &[[u32; 3]]) -> u64 {
+    edge_shares(triangles).0
 }
 
 /// Intermediate results of all stages.
@@ -83,7 +132,16 @@ pub fn probe(lattice: &Lattice, params: &SurfaceParams, limits: &SurfaceLimits) 
     let scanned =
         super::scan_lattice(lattice.clone(), RunContext { params, limits, control: &control, free_threads: 1 })?;
     let mesh = write::write(&scanned, params.atom_ids, &control, None)?.mesh;
-    Ok(Probe { bricks, surface: scanned.done.iter().flat_map(surface_of).collect(), mesh })
+    let mut surface: Vec<ProbedSurface> = scanned.done.iter().flat_map(surface_of).collect();
+    let written = write::write_pieces(&scanned, &control, &Destination::Sink(&Discard))?;
+    let runs = written.iter().flat_map(|piece| (0..piece.sums.bricks.len()).map(|ix| (&piece.sums, ix)));
+    for (probed, (sums, ix)) in surface.iter_mut().zip(runs) {
+        let brick = &sums.bricks[ix];
+        let sheets = &sums.sheets[brick.first as usize..][..usize::from(brick.n)];
+        probed.sheets = sheets.iter().map(ProbedSheet::new).collect();
+        probed.shared = sums.shared_by(ix)[0].iter().map(|vertex| [vertex.key, vertex.sheet]).collect();
+    }
+    Ok(Probe { bricks, surface, mesh })
 }
 
 fn surface_of(tile: &Tile) -> Vec<ProbedSurface> {
@@ -96,6 +154,8 @@ fn surface_of(tile: &Tile) -> Vec<ProbedSurface> {
         before: brick.before,
         first: [first(tile.first_vertex, brick.vertex), first(tile.first_triangle, brick.triangle)],
         count: [end[0] - brick.vertex, end[1] - brick.triangle],
+        sheets: Vec::new(),
+        shared: Vec::new(),
     };
     found.bricks.iter().zip(ends).map(probed).collect()
 }

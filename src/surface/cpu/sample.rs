@@ -167,7 +167,7 @@ impl Pass<'_> {
             let all = counters.all_slabs(so_far, self.slabs.len());
             return Err(scan::too_large(all, self.lattice.spacing, self.context.limits.max_mesh_bytes));
         }
-        Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0, first_brick: 0, first_piece: 0 })
+        Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0, first_piece: 0 })
     }
 }
 

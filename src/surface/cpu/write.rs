@@ -11,16 +11,15 @@ use super::bin::{Tiles, slot_origin};
 use super::emit;
 use super::field::Constants;
 use super::interpolate::{self, BrickVertices, VertexBatch, VertexRows, VertexTarget, take};
-use super::join;
 use super::neighbours::{self, NumberedBrick};
-use super::piece_sums::PieceSums;
 use super::sheets::Sheets;
 use super::table::{BrickTable, Rounding};
-use super::{Piece, Scanned, Tile, threads};
+use super::{PIECE_BRICKS, Piece, Scanned, Tile, threads};
 use crate::surface::backend::{MeshOutput, StreamedMesh};
 use crate::surface::column::Column;
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
+use crate::surface::join::{self, SheetSums};
 use crate::surface::lattice::Lattice;
 use crate::surface::measure::{Measures, Validation};
 use crate::surface::mesh::{Mesh, Quantized, joined_bounds};
@@ -57,14 +56,14 @@ struct ScratchRows {
 }
 
 /// Rows of the mesh that a piece fills.
-struct PieceRows<'a> {
+pub(super) struct PieceRows<'a> {
     rows: VertexRows<'a>,
     triangles: &'a mut [[u32; 3]],
     atom_ids: Option<&'a mut [u32]>,
 }
 
 /// Destination of the rows.
-enum Destination<'a> {
+pub(super) enum Destination<'a> {
     /// Rows of each piece. The locks only hand them to the thread that fills them.
     Memory(Vec<Mutex<PieceRows<'a>>>),
     Sink(&'a dyn MeshSink),
@@ -75,7 +74,7 @@ pub(super) struct PieceSummary {
     /// Vertices whose gradient vanishes.
     flat: usize,
     /// Sums over its triangles.
-    pub(super) sums: PieceSums,
+    pub(super) sums: SheetSums,
     /// Bounds of its positions, Å; computed for a sink only.
     bounds: Option<[[f32; 3]; 2]>,
 }
@@ -95,7 +94,7 @@ pub(super) fn write(
     let [n_vertices, n_triangles] = [scanned.totals.vertices, scanned.totals.triangles];
     sink.begin(n_vertices, n_triangles).map_err(failed)?;
     let written = write_pieces(scanned, control, &Destination::Sink(sink))?;
-    let measures = control.span(Stage::Measure, || join::measures(scanned, &written));
+    let measures = control.span(Stage::Measure, || measures(scanned, &written));
     let measures = match measures {
         Some(measures) if written.iter().all(|piece| piece.flat == 0) => measures,
         // A normal without a gradient depends on the triangles around it, and measuring a mesh that is not closed needs
@@ -117,7 +116,7 @@ const SINGLE_BYTES: usize = 24;
 const QUANTIZED_BYTES: usize = 12;
 
 fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
-    let Scanned { lattice, done, totals, pieces, .. } = scanned;
+    let Scanned { lattice, totals, pieces, .. } = scanned;
     let of_ids = if atom_ids { size_of::<u32>() * totals.vertices } else { 0 };
     let of_vertex = if scanned.quantize.is_some() { QUANTIZED_BYTES } else { SINGLE_BYTES };
     let bytes = of_vertex * totals.vertices + size_of::<[u32; 3]>() * totals.triangles + of_ids;
@@ -131,7 +130,6 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
         triangles: Column::zeroed(totals.triangles),
         atom_ids: atom_ids.then(|| Column::zeroed(totals.vertices)),
         colors: None,
-        parts: done.iter().map(|tile| (tile.first_vertex, tile.first_triangle)).collect(),
     };
     let mut rows = match &mut mesh.quantized {
         Some(Quantized { step, positions, normals }) => VertexRows::Quantized { step: *step, positions, normals },
@@ -147,12 +145,12 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
     if written.iter().any(|piece| piece.flat > 0) {
         control.span(Stage::Interpolate, || mesh.fill_flat_normals());
     }
-    let measures = control.span(Stage::Measure, || join::measures(scanned, &written));
+    let measures = control.span(Stage::Measure, || measures(scanned, &written));
     Ok(MeshOutput { measures, ..MeshOutput::new(mesh, scanned.grid) })
 }
 
 /// Writes all pieces, in parallel.
-fn write_pieces(
+pub(super) fn write_pieces(
     scanned: &Scanned,
     control: &Control<'_>,
     destination: &Destination<'_>,
@@ -173,6 +171,22 @@ fn write_pieces(
         control.observer.progress(Stage::Emit, n, pieces.len());
         Ok(written)
     })
+}
+
+/// Measures of the mesh that the pieces make up; `None` if it is not closed.
+fn measures(scanned: &Scanned, written: &[PieceSummary]) -> Option<Measures> {
+    let Scanned { lattice, tiles, done, totals, pieces, .. } = scanned;
+    let sums: Vec<&SheetSums> = written.iter().map(|piece| &piece.sums).collect();
+    let near = |piece: usize| {
+        let Piece { tile, bricks } = &pieces[piece];
+        let found = &done[*tile].found.bricks[bricks.clone()];
+        let near = TileNeighbours::new(tiles, done, done[*tile].coord);
+        move |brick: usize, n: usize| {
+            let (other, ix, _) = near.of(usize::from(found[brick].slot), n)?;
+            Some((done[other].first_piece + ix / PIECE_BRICKS, ix % PIECE_BRICKS))
+        }
+    };
+    join::measures(&sums, near, lattice.spacing, [totals.vertices, totals.triangles])
 }
 
 /// Shared inputs of the second pass.
@@ -267,13 +281,13 @@ impl Writer<'_> {
     }
 
     /// Writes the triangles. Returns the sums over them.
-    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], stages: &mut Stages) -> PieceSums {
+    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], stages: &mut Stages) -> SheetSums {
         let (scanned, Stages { table, sheets, .. }) = (self.scanned, stages);
         let tile = &scanned.done[piece.tile];
         let near = TileNeighbours::new(&scanned.tiles, &scanned.done, tile.coord);
         let found = &tile.found;
         let base = found.before(piece.bricks.start).triangles;
-        let mut sums = PieceSums::with_capacity(piece.bricks.len());
+        let mut sums = SheetSums::with_capacity(piece.bricks.len());
         for i in piece.bricks.clone() {
             let (brick, before, end) = (&found.bricks[i], found.before(i), found.before(i + 1));
             let around: [Option<NumberedBrick<'_>>; 8] =
@@ -287,7 +301,8 @@ impl Writer<'_> {
             let origin = slot_origin(tile.coord, usize::from(brick.slot));
             let rounding = scanned.quantize.map(|step| scanned.rounding(step, origin));
             emit::emit(table, sheets, &around, cases, own_sheets, rounding, out);
-            sums.add(table, sheets, &around, origin, out);
+            let from_centre = std::array::from_fn(|k| origin[k] - scanned.lattice.centre[k]);
+            sums.add(table, sheets, &around, from_centre, out);
         }
         sums
     }
