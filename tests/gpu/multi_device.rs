@@ -209,7 +209,7 @@ fn the_number_of_devices_depends_on_settings_and_job_size() {
 
 #[test]
 fn all_devices_are_reported() {
-    let backend = GpuBackend::with_pool(pool(2, |_| (), SETTINGS), None);
+    let backend = GpuBackend::with_pool(pool(2, |_| (), SETTINGS));
     let meshed =
         backend.run(&crowd(200), &params(KERNELS[0], 1.0), &SurfaceLimits::default(), &Control::default()).unwrap();
     assert_eq!(meshed.made_by.unwrap().device, "2 devices: device 0, device 1");

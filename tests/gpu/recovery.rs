@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use molmesh::gpu::{
     DevicePool, DiscoveryMode, Engine, Executor, GpuBackend, GpuError, PoolDevice, PoolSettings, discover,
 };
+use molmesh::pipeline::AutoBackend;
 use molmesh::surface::{Backend, Control, CpuBackend, MeshOutput, SurfaceError, SurfaceLimits, SurfaceParams};
 
 fn run(backend: &dyn Backend) -> Result<MeshOutput, SurfaceError> {
@@ -18,8 +19,7 @@ fn run(backend: &dyn Backend) -> Result<MeshOutput, SurfaceError> {
 #[test]
 fn a_discovered_device_gives_the_mesh_of_the_cpu() {
     let choice = "software".parse().unwrap();
-    let backend =
-        GpuBackend::start(&discover(&choice, DiscoveryMode::Thorough), &PoolSettings::default(), None).unwrap();
+    let backend = GpuBackend::start(&discover(&choice, DiscoveryMode::Thorough), &PoolSettings::default()).unwrap();
     backend.warm_up().unwrap();
     let (cpu, gpu) = (run(&CpuBackend::new(None).unwrap()).unwrap(), run(&backend).unwrap());
     assert_eq!(gpu.mesh.n_triangles(), cpu.mesh.n_triangles());
@@ -34,8 +34,7 @@ fn a_discovered_device_gives_the_mesh_of_the_cpu() {
 #[test]
 fn callers_share_submissions_and_get_the_mesh_of_a_single_job() {
     let choice = "software".parse().unwrap();
-    let backend =
-        GpuBackend::start(&discover(&choice, DiscoveryMode::Thorough), &PoolSettings::default(), None).unwrap();
+    let backend = GpuBackend::start(&discover(&choice, DiscoveryMode::Thorough), &PoolSettings::default()).unwrap();
     let alone = run(&backend).unwrap().mesh;
     std::thread::scope(|scope| {
         for _ in 0..12 {
@@ -48,7 +47,7 @@ fn callers_share_submissions_and_get_the_mesh_of_a_single_job() {
 }
 
 /// Starts a backend whose device is destroyed before each of the first `n_losses` jobs.
-fn losing(n_losses: usize, fallback: Option<Box<dyn Backend>>) -> GpuBackend {
+fn losing(n_losses: usize) -> GpuBackend {
     /// Engine whose device is destroyed before its next job.
     struct LosingEngine(Engine, Mutex<Option<wgpu::Device>>);
     impl Executor for LosingEngine {
@@ -70,15 +69,15 @@ fn losing(n_losses: usize, fallback: Option<Box<dyn Backend>>) -> GpuBackend {
         Ok(Box::new(LosingEngine(engine, Mutex::new(loses.then_some(device)))) as Box<dyn Executor>)
     };
     let device = PoolDevice { number: 0, name: "losing".to_owned(), build: Box::new(build) };
-    GpuBackend::with_pool(DevicePool::start(vec![device], &PoolSettings::default()).unwrap(), fallback)
+    GpuBackend::with_pool(DevicePool::start(vec![device], &PoolSettings::default()).unwrap())
 }
 
 #[test]
 fn a_lost_device_is_rebuilt_and_gives_the_same_mesh() {
-    let working = losing(0, None);
+    let working = losing(0);
     let expected = run(&working).unwrap().mesh;
     assert_eq!(working.devices()[0].rebuilds, 0);
-    let backend = losing(1, None);
+    let backend = losing(1);
     assert!(run(&backend).unwrap().mesh == expected, "another mesh");
     let status = backend.devices().remove(0);
     assert_eq!((status.finished, status.failed, status.rebuilds, status.down), (1, 1, 1, None));
@@ -87,7 +86,7 @@ fn a_lost_device_is_rebuilt_and_gives_the_same_mesh() {
 #[test]
 fn the_cpu_replaces_a_device_that_is_lost_permanently() {
     let cpu = run(&CpuBackend::new(None).unwrap()).unwrap().mesh;
-    let backend = losing(usize::MAX, Some(Box::new(CpuBackend::new(None).unwrap())));
+    let backend = AutoBackend::new(Box::new(CpuBackend::new(None).unwrap()), Box::new(losing(usize::MAX)));
     for _ in 0..3 {
         let meshed = run(&backend).unwrap();
         assert!(meshed.mesh == cpu, "not the CPU's mesh");
