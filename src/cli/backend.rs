@@ -3,6 +3,8 @@
 use std::num::NonZero;
 #[cfg(feature = "gpu")]
 use std::sync::Arc;
+#[cfg(all(feature = "gpu", feature = "server"))]
+use std::time::Duration;
 
 #[cfg(feature = "server")]
 use molmesh::config::DevicesConfig;
@@ -246,6 +248,8 @@ fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
             queue: config.jobs,
             batch: config.batch,
             min_partition_bricks: config.min_partition_bricks,
+            hang_timeout: Duration::from_millis(config.hang_timeout_ms),
+            cool_down: Duration::from_millis(config.cool_down_ms),
             ..PoolSettings::default()
         },
         _ => PoolSettings::default(),

@@ -10,9 +10,12 @@
 //! error, buffers, plan, readback, hardware, manifests, choose, picture_targets
 //! job, shaders, device_errors, discover
 //! partition_handle, pipelines, multi_device, picture_passes
-//! executor, output_layout, device_queue
-//! workspace, scheduler
-//! recording, worker
+//! executor, output_layout, queued_job
+//! workspace, running_batch
+//! device_queue
+//! scheduler
+//! recording, lifecycle
+//! worker
 //! pool
 //! engine
 //! submit
@@ -39,6 +42,7 @@ mod hardware;
 mod interleavings;
 pub mod job;
 mod job_state;
+mod lifecycle;
 pub mod manifests;
 mod multi_device;
 mod output;
@@ -52,10 +56,12 @@ pub mod plan;
 pub mod pool;
 #[doc(hidden)]
 pub mod probe;
+mod queued_job;
 mod readback;
 mod recording;
 mod run;
 mod run_partition;
+mod running_batch;
 mod scheduler;
 mod shaders;
 mod submit;

@@ -23,6 +23,8 @@ const SETTINGS: PoolSettings = PoolSettings {
     batch: 16,
     rebuild_pause: Duration::ZERO,
     idle: Duration::from_secs(5),
+    hang_timeout: Duration::MAX,
+    cool_down: Duration::MAX,
     min_partition_bricks: Some(1),
 };
 

@@ -231,6 +231,7 @@ impl Backend for Devices {
             finished: 11,
             failed: 2,
             lost: 5,
+            hung: 5,
             rebuilds: 3,
             shared: 4,
             partitions: 3,
