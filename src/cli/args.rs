@@ -75,7 +75,7 @@ pub(crate) enum Command {
 /// Values of `--backend`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum BackendName {
-    /// A GPU if one can be used, else the CPU; for a single mesh, the one with the shorter estimated time
+    /// The CPU or a GPU, whichever is estimated to finish each mesh first; the CPU if no GPU can be used
     Auto,
     /// All cores, with the widest vector instructions of the processor
     Cpu,

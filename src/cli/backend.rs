@@ -3,17 +3,22 @@
 use std::num::NonZero;
 #[cfg(feature = "gpu")]
 use std::sync::Arc;
+#[cfg(all(feature = "gpu", feature = "server"))]
+use std::time::Duration;
 
 #[cfg(feature = "server")]
 use molmesh::config::DevicesConfig;
 #[cfg(feature = "gpu")]
 use molmesh::picture::CpuRenderer;
 use molmesh::picture::SelectedRenderer;
+#[cfg(feature = "gpu")]
+use molmesh::pipeline::AutoBackend;
 use molmesh::surface::cpu::CpuBackend;
 use molmesh::surface::reference::ReferenceBackend;
 use molmesh::surface::{Backend, DeviceChoice, FoundDevice};
 
 use super::args::{BackendName, JobArgs};
+use super::calibration::Calibration;
 use super::error::CliError;
 use super::estimate::Estimate;
 
@@ -121,24 +126,57 @@ pub(crate) fn select(requested: &BackendRequest<'_>) -> Result<SelectedBackend, 
     })
 }
 
-/// Returns the estimate for a command if both backend and devices are `auto`.
-fn estimate(requested: &BackendRequest<'_>) -> Option<Estimate> {
-    let free = requested.backend == BackendName::Auto && *requested.devices == DeviceChoice::Auto;
-    requested.work.filter(|_| free).map(|work| Estimate::new(work, requested.n_threads()))
+/// Estimate for a command, with the calibration that it is based on.
+struct CommandEstimate {
+    estimate: Estimate,
+    calibration: Option<Calibration>,
+    /// Reason why a calibration is ignored.
+    ignored: Option<String>,
+}
+
+impl CommandEstimate {
+    /// Returns the estimate for a command if both backend and devices are `auto`.
+    fn new(requested: &BackendRequest<'_>) -> Option<Self> {
+        let free = requested.backend == BackendName::Auto && *requested.devices == DeviceChoice::Auto;
+        let work = requested.work.filter(|_| free)?;
+        let (calibration, ignored) = match Calibration::load() {
+            Ok(found) => (found, None),
+            Err(why) => (None, Some(why)),
+        };
+        let costs = calibration.as_ref().map(Calibration::costs).unwrap_or_default();
+        Some(Self { estimate: Estimate::new(&costs, work, requested.n_threads()), calibration, ignored })
+    }
+
+    /// Notes that another device than those in use was measured. It is not known before they are discovered.
+    fn check_device(&mut self, devices: &[FoundDevice]) {
+        let gpu = self.calibration.as_ref().and_then(|calibration| calibration.gpu.as_ref());
+        if let Some(gpu) = gpu.filter(|gpu| !gpu.is_among(devices)) {
+            self.ignored = Some(format!("the calibration is of another GPU, {} ({})", gpu.device, gpu.driver));
+        }
+    }
+
+    /// Describes the estimate for reports.
+    fn text(&self) -> String {
+        let ignored = self.ignored.iter().map(|why| format!("; {why}"));
+        std::iter::once(self.estimate.to_string()).chain(ignored).collect()
+    }
 }
 
 /// Selects a GPU, or the CPU if the request allows any backend.
 fn gpu_or_cpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliError> {
-    let estimate = estimate(requested);
-    if let Some(estimate) = estimate.filter(|estimate| !estimate.favours_gpu()) {
-        let why = format!("a GPU is not expected to be faster ({estimate})");
+    let mut estimate = CommandEstimate::new(requested);
+    if let Some(estimate) = estimate.as_ref().filter(|of_command| !of_command.estimate.favours_gpu()) {
+        let why = format!("a GPU is not expected to be faster ({})", estimate.text());
         return instead_of_gpu(requested, format!("auto: {why}"), NoGpu { why, devices: Vec::new() });
     }
     let auto = requested.backend == BackendName::Auto;
     let listed = matches!(requested.devices, DeviceChoice::Listed(_));
     match gpu(requested) {
         Ok(mut selected) => {
-            let estimate = estimate.map(|estimate| format!(", {estimate}")).unwrap_or_default();
+            if let Some(estimate) = &mut estimate {
+                estimate.check_device(&selected.devices);
+            }
+            let estimate = estimate.map(|estimate| format!(", {}", estimate.text())).unwrap_or_default();
             selected.reason = if listed {
                 format!("--devices {}", requested.devices)
             } else if auto {
@@ -155,7 +193,10 @@ fn gpu_or_cpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliErro
         Err(none) => {
             let reason = match requested.devices {
                 DeviceChoice::Cpu => "--devices cpu".to_owned(),
-                _ => format!("auto: no GPU: {}", none.why),
+                _ => {
+                    let estimate = estimate.map(|estimate| format!(", {}", estimate.text())).unwrap_or_default();
+                    format!("auto: no GPU: {}{estimate}", none.why)
+                }
             };
             instead_of_gpu(requested, reason, none)
         }
@@ -207,14 +248,13 @@ fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
             queue: config.jobs,
             batch: config.batch,
             min_partition_bricks: config.min_partition_bricks,
+            hang_timeout: Duration::from_millis(config.hang_timeout_ms),
+            cool_down: Duration::from_millis(config.cool_down_ms),
             ..PoolSettings::default()
         },
         _ => PoolSettings::default(),
     };
-    // A request for the GPU has no fallback.
-    let fallback = if auto { CpuBackend::new(requested.threads).ok() } else { None };
-    let fallback = fallback.map(|cpu| Box::new(cpu) as Box<dyn Backend>);
-    let started = GpuBackend::start(&discovery, &settings, fallback);
+    let started = GpuBackend::start(&discovery, &settings);
     let renderer = match renderer(requested, &discovery) {
         Ok(renderer) => renderer,
         Err(why) => return Err(NoGpu { why, devices: discovery.devices }),
@@ -233,7 +273,13 @@ fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
                 [one] => format!("a GPU ({one})"),
                 _ => format!("{} GPUs", up.len()),
             };
-            Ok(SelectedBackend { backend: Box::new(backend), reason, renderer, devices, no_gpu: None })
+            // A request for the GPU has no fallback.
+            let cpu = if auto { CpuBackend::new(requested.threads).ok() } else { None };
+            let backend: Box<dyn Backend> = match cpu {
+                Some(cpu) => Box::new(AutoBackend::new(Box::new(cpu), Box::new(backend))),
+                None => Box::new(backend),
+            };
+            Ok(SelectedBackend { backend, reason, renderer, devices, no_gpu: None })
         }
         Err(error) => {
             let why = match error {

@@ -6,6 +6,7 @@ mod args;
 mod backend;
 #[cfg(feature = "server")]
 mod banner;
+mod calibration;
 #[cfg(feature = "server")]
 mod config;
 #[cfg(feature = "server")]

@@ -25,11 +25,25 @@ pub struct DevicesConfig {
     /// divides jobs. Default 32,768, about 130,000 atoms at 1 Å: below that, the transfer costs more than another
     /// device saves.
     pub min_partition_bricks: Option<u64>,
+    /// Maximum time of a submission in ms. A device that takes longer is considered hung: its jobs are repeated
+    /// elsewhere, and it cools down. Large submissions to a slow device may take a hundred times their estimate.
+    /// Default 10,000: a submission takes less than a second.
+    pub hang_timeout_ms: u64,
+    /// Pause in ms before a device that hung or failed repeatedly is used again. Doubled each time until the device
+    /// finishes a job, to 64 times at most. Default 60,000.
+    pub cool_down_ms: u64,
 }
 
 impl Default for DevicesConfig {
     fn default() -> Self {
-        Self { choice: DeviceChoice::Auto, jobs: 16, batch: 16, min_partition_bricks: Some(MIN_PARTITION_BRICKS) }
+        Self {
+            choice: DeviceChoice::Auto,
+            jobs: 16,
+            batch: 16,
+            min_partition_bricks: Some(MIN_PARTITION_BRICKS),
+            hang_timeout_ms: 10_000,
+            cool_down_ms: 60_000,
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! GPU backend: a device pool, and a fallback backend for jobs that no device could run.
+//! GPU backend: a device pool behind the `Backend` trait.
 
 use std::sync::Arc;
 
@@ -18,8 +18,6 @@ use crate::surface::{
 /// Backend that meshes on devices.
 pub struct GpuBackend {
     pool: DevicePool,
-    /// Backend for jobs that no device could run. [`MeshOutput::made_by`] reports it.
-    fallback: Option<Box<dyn Backend>>,
 }
 
 impl GpuBackend {
@@ -27,11 +25,7 @@ impl GpuBackend {
     ///
     /// # Errors
     /// [`GpuError::NoDevice`] with the reasons of all devices if none is selected or none could be built.
-    pub fn start(
-        discovery: &Discovery,
-        settings: &PoolSettings,
-        fallback: Option<Box<dyn Backend>>,
-    ) -> Result<Self, GpuError> {
+    pub fn start(discovery: &Discovery, settings: &PoolSettings) -> Result<Self, GpuError> {
         if let Some(why) = discovery.no_device_reason() {
             return Err(GpuError::NoDevice(why));
         }
@@ -48,13 +42,13 @@ impl GpuBackend {
         let identical = devices.windows(2).all(|pair| pair[0].name == pair[1].name);
         let min_partition_bricks = settings.min_partition_bricks.filter(|_| identical);
         let pool = DevicePool::start(devices, &PoolSettings { min_partition_bricks, ..*settings })?;
-        Ok(Self::with_pool(pool, fallback))
+        Ok(Self::with_pool(pool))
     }
 
     /// Creates a backend with a running pool.
     #[must_use]
-    pub fn with_pool(pool: DevicePool, fallback: Option<Box<dyn Backend>>) -> Self {
-        Self { pool, fallback }
+    pub const fn with_pool(pool: DevicePool) -> Self {
+        Self { pool }
     }
 
     /// Returns the device pool.
@@ -92,11 +86,21 @@ impl Backend for GpuBackend {
     fn arithmetic(&self) -> String {
         let status = self.pool.status();
         let up = status.iter().find(|device| device.down.is_none());
-        match (up, &self.fallback) {
-            (Some(device), _) => arithmetic(self.name(), &device.name),
-            (None, Some(fallback)) => fallback.arithmetic(),
-            (None, None) => arithmetic(self.name(), "no device"),
+        arithmetic(self.name(), up.map_or("no device", |device| device.name.as_str()))
+    }
+
+    fn arithmetics(&self) -> Vec<String> {
+        let mut status = self.pool.status();
+        // Results of a device that is down stay valid.
+        status.sort_by_key(|device| device.down.is_some());
+        let mut names: Vec<String> = Vec::new();
+        for device in status {
+            let name = arithmetic(self.name(), &device.name);
+            if !names.contains(&name) {
+                names.push(name);
+            }
         }
+        names
     }
 
     fn describe(&self) -> String {
@@ -134,21 +138,13 @@ impl Backend for GpuBackend {
             }
             Err(error) => error,
         };
-        // Frees the input before the fallback runs.
-        drop((job, of_job, memory));
-        match (error, &self.fallback) {
-            (GpuError::Surface(error), _) => Err(error),
-            (GpuError::OutOfMemory { needed, available, suggested_resolution }, _) => {
-                Err(SurfaceError::DeviceMemory { needed, available, suggested_resolution })
+        Err(match error {
+            GpuError::Surface(error) => error,
+            GpuError::OutOfMemory { needed, available, suggested_resolution } => {
+                SurfaceError::DeviceMemory { needed, available, suggested_resolution }
             }
-            (error, None) => Err(SurfaceError::Device { why: single_line(&error.to_string()) }),
-            (error, Some(fallback)) => {
-                let output = fallback.write(spheres, params, limits, control, sink)?;
-                let fallback_reason = Some(single_line(&format!("the GPU failed: {error}")));
-                let made_by = BackendIdentity { fallback_reason, ..fallback.identity() };
-                Ok(MeshOutput { made_by: Some(made_by), ..output })
-            }
-        }
+            error => SurfaceError::Device { why: single_line(&error.to_string()) },
+        })
     }
 
     fn warm_up(&self) -> Result<(), SurfaceError> {
@@ -160,14 +156,11 @@ impl Backend for GpuBackend {
         if self.pool.status().iter().any(|device| device.down.is_none()) {
             return Ok(());
         }
-        match &self.fallback {
-            Some(fallback) => fallback.warm_up(),
-            None => Err(SurfaceError::Device { why: self.describe() }),
-        }
+        Err(SurfaceError::Device { why: self.describe() })
     }
 
     fn is_available(&self) -> bool {
-        self.fallback.is_some() || self.pool.status().iter().any(|device| device.down.is_none())
+        self.pool.status().iter().any(|device| device.down.is_none())
     }
 
     fn devices(&self) -> Vec<DeviceStatus> {

@@ -1,56 +1,19 @@
 //! Queue of jobs for one device, with the device's state and counters.
 
 use std::collections::VecDeque;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::error::GpuError;
-use super::job::{GpuJob, JobResult};
-use super::partition_handle::PartitionHandle;
+use super::queued_job::{LARGE_LOAD, QueuedJob};
+use super::running_batch::RunningBatch;
 use crate::surface::DeviceStatus;
-use crate::sync::mpsc::SyncSender;
 
-/// Load of a large job or of a partition, in small jobs.
-const LARGE_LOAD: u64 = 16;
-
-/// Job in a device's queue.
-pub(super) struct QueuedJob {
-    pub(super) id: u64,
-    pub(super) job: GpuJob,
-    /// Partition to run; `None` for the whole job.
-    pub(super) partition: Option<PartitionHandle>,
-    /// True if an earlier attempt failed, so that the job must not share a submission.
-    pub(super) retry: bool,
-    pub(super) reply: SyncSender<JobResult>,
-}
-
-impl QueuedJob {
-    /// Returns true if the job may share a submission.
-    pub(super) fn is_batchable(&self) -> bool {
-        !self.retry && self.partition.is_none() && self.job.prepared.is_small()
-    }
-
-    /// Load that the job adds to its device, in small jobs.
-    pub(super) fn load(&self) -> u64 {
-        if self.partition.is_none() && self.job.prepared.is_small() { 1 } else { LARGE_LOAD }
-    }
-
-    /// Sends the result.
-    pub(super) fn reply(mut self, result: JobResult) {
-        if result.is_ok() {
-            self.partition = None;
-        }
-        // The caller may have given up waiting.
-        drop(self.reply.send(result));
-    }
-}
-
-impl Drop for QueuedJob {
-    /// Aborts the other partitions of the job unless this one succeeded.
-    fn drop(&mut self) {
-        if let Some(partition) = &self.partition {
-            partition.abort();
-        }
-    }
+/// Thread of a device. A thread that hangs is replaced by one of the next generation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct DeviceThread {
+    /// Index of the device.
+    pub(super) device: usize,
+    pub(super) generation: u64,
 }
 
 /// Outcome of a run on a device.
@@ -76,26 +39,38 @@ pub(super) enum DeviceState {
 /// Queue, state and counters of a device.
 pub(super) struct DeviceQueue {
     pub(super) waiting: VecDeque<QueuedJob>,
-    /// Number of jobs that run now.
-    pub(super) running: usize,
+    /// Jobs that run now; an empty batch while the device is rebuilt.
+    pub(super) running: Option<RunningBatch>,
     /// Load of the jobs that wait or run.
     pub(super) load: u64,
     pub(super) state: DeviceState,
     /// Number of rebuilds since the last finished job.
     pub(super) consecutive_rebuilds: usize,
+    /// Pause before the next attempt to use the device after it went down.
+    pub(super) cool_down: Duration,
+    /// Number of threads of this device that hung and were replaced.
+    pub(super) generation: u64,
+    /// True while the thread of this generation runs.
+    pub(super) has_thread: bool,
+    /// Shortest time per brick of any finished batch, s.
+    pub(super) fastest: Option<f64>,
     /// Name and counters. [`Self::status`] adds the other fields.
     pub(super) counters: DeviceStatus,
 }
 
 impl DeviceQueue {
     /// Creates the queue of a device that is starting.
-    pub(super) fn new(number: usize, name: String, limit: usize) -> Self {
+    pub(super) fn new(number: usize, name: String, limit: usize, cool_down: Duration) -> Self {
         Self {
             waiting: VecDeque::with_capacity(limit),
-            running: 0,
+            running: None,
             load: 0,
             state: DeviceState::Starting,
             consecutive_rebuilds: 0,
+            cool_down,
+            generation: 0,
+            has_thread: false,
+            fastest: None,
             counters: DeviceStatus { number, name, ..DeviceStatus::default() },
         }
     }
@@ -119,9 +94,28 @@ impl DeviceQueue {
                 DeviceState::Up => None,
                 DeviceState::Down(why) => Some(why.clone()),
             },
-            waiting: self.waiting.len() + self.running,
+            waiting: self.waiting.len() + self.running.as_ref().map_or(0, RunningBatch::len),
             ..self.counters.clone()
         }
+    }
+
+    /// Takes the device down if the batch that it runs has hung. Returns the batch, the waiting jobs and the error.
+    pub(super) fn take_hung(
+        &mut self,
+        minimum: Duration,
+        now: Instant,
+    ) -> Option<(RunningBatch, VecDeque<QueuedJob>, GpuError)> {
+        let fastest = self.fastest;
+        let running = self.running.take_if(|running| running.has_hung(running.limit(minimum, fastest), now))?;
+        let after = running.limit(minimum, fastest);
+        let error = GpuError::Hung { after_ms: u64::try_from(after.as_millis()).unwrap_or(u64::MAX) };
+        self.generation += 1;
+        self.has_thread = false;
+        self.counters.hung += 1;
+        self.counters.failed += running.len() as u64;
+        let left = self.mark_down(&error.to_string());
+        self.load = 0;
+        Some((running, left, error))
     }
 
     /// Marks the device as down, unless it is, and returns the waiting jobs.
@@ -154,49 +148,5 @@ pub(super) fn single_line(text: &str) -> String {
 pub(super) fn reject(jobs: VecDeque<QueuedJob>, why: &str) {
     for job in jobs {
         job.reply(Err(GpuError::NoDevice(why.to_owned())));
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use crate::sync::mpsc::sync_channel;
-    use std::sync::Arc;
-
-    use super::*;
-    use crate::gpu::job::{Finished, Prepared};
-    use crate::gpu::plan::Partition;
-    use crate::gpu::sheets::SheetBlocks;
-    use crate::surface::backend::one_atom;
-    use crate::surface::{
-        CancelToken, Control, GridStats, Mesh, MeshOutput, SurfaceError, SurfaceLimits, SurfaceParams,
-    };
-
-    /// Two partitions; the first is queued.
-    fn queued() -> (QueuedJob, PartitionHandle) {
-        let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
-        let prepared = Prepared::new(&one_atom().unwrap(), &params, &limits, &Control::default()).unwrap();
-        let job = GpuJob { prepared: Arc::new(prepared), cancel: CancelToken::default(), deadline: None };
-        let mut handles = PartitionHandle::for_partitions(vec![Partition::default(); 2]);
-        let (other, partition) = (handles.pop().unwrap(), handles.pop());
-        (QueuedJob { id: 0, job, partition, retry: false, reply: sync_channel(1).0 }, other)
-    }
-
-    #[test]
-    fn a_partition_that_does_not_succeed_aborts_the_others() {
-        let cancelled = Err(GpuError::Surface(SurfaceError::Cancelled));
-        let (job, other) = queued();
-        assert_eq!(other.check(), Ok(()));
-        drop(job);
-        assert_eq!(other.check(), cancelled, "dropped without a result");
-        let (job, other) = queued();
-        job.reply(Err(SurfaceError::Deadline.into()));
-        assert_eq!(other.check(), cancelled, "failed");
-        let (job, other) = queued();
-        job.reply(Ok(Finished {
-            meshed: MeshOutput::new(Mesh::default(), GridStats::default()),
-            stages: Vec::new(),
-            sheets: SheetBlocks::default(),
-        }));
-        assert_eq!(other.check(), Ok(()), "succeeded");
     }
 }

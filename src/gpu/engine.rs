@@ -4,8 +4,8 @@
 //! counted first and their output is made in buffers of exact size. Jobs that do not fit at once are cut into chunks of
 //! tiles.
 
-use std::cell::Cell;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use wgpu::{Buffer, Device, Queue};
 
@@ -79,7 +79,8 @@ pub struct Engine {
     pub(super) workspaces: Vec<Workspace>,
     pub(super) readback: ReadbackPool,
     errors: Arc<DeviceErrors>,
-    pub(super) submissions: Cell<u64>,
+    /// Number of submissions so far.
+    pub(super) submissions: Arc<AtomicU64>,
 }
 
 /// Job whose buffers are allocated and filled.
@@ -140,7 +141,7 @@ impl Engine {
             pipelines,
             cases,
             errors,
-            submissions: Cell::new(0),
+            submissions: Arc::default(),
         };
         engine.check_errors()?;
         Ok(engine)
@@ -148,8 +149,8 @@ impl Engine {
 
     /// Returns the number of submissions so far.
     #[must_use]
-    pub const fn submissions(&self) -> u64 {
-        self.submissions.get()
+    pub fn submissions(&self) -> u64 {
+        self.submissions.load(Ordering::Relaxed)
     }
 
     /// Bytes of device memory, in use and pooled.

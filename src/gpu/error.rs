@@ -26,6 +26,12 @@ pub enum GpuError {
     /// The device was lost; the job may succeed on the rebuilt device.
     #[error("the device was lost: {0}")]
     Lost(String),
+    /// The device made no progress; the job may succeed elsewhere.
+    #[error("the device hung: no submission finished within {after_ms} ms")]
+    Hung {
+        /// Time limit of a submission, ms.
+        after_ms: u64,
+    },
     /// The graphics API rejected a call, or a result is inconsistent: a defect of this program or of the driver.
     #[error("the device failed: {0}")]
     Failed(String),

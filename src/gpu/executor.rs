@@ -1,6 +1,9 @@
 //! Interface between the device pool and the code that runs jobs on one device. Tests implement it with executors that
 //! fail on purpose.
 
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+
 use super::error::GpuError;
 use super::job::{GpuJob, JobResult};
 use super::partition_handle::PartitionHandle;
@@ -19,6 +22,11 @@ pub trait Executor: Send {
     fn run_partition(&mut self, job: &GpuJob, partition: &PartitionHandle) -> JobResult {
         let _ = (job, partition);
         Err(GpuError::Failed("this program does not support partitions".to_owned()))
+    }
+
+    /// Counter of submissions so far. A device on which it stands still for too long is considered hung.
+    fn submission_counter(&self) -> Arc<AtomicU64> {
+        Arc::default()
     }
 
     /// Frees large buffers that are kept for the next job. The pool calls it once the device has been idle for a while.

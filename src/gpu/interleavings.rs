@@ -20,8 +20,15 @@ use crate::sync::thread;
 /// Number of schedules of a test.
 const SCHEDULES: usize = 10_000;
 
-const SETTINGS: PoolSettings =
-    PoolSettings { queue: 1, batch: 2, rebuild_pause: Duration::ZERO, idle: Duration::MAX, min_partition_bricks: None };
+const SETTINGS: PoolSettings = PoolSettings {
+    queue: 1,
+    batch: 2,
+    rebuild_pause: Duration::ZERO,
+    idle: Duration::MAX,
+    hang_timeout: Duration::MAX,
+    cool_down: Duration::MAX,
+    min_partition_bricks: None,
+};
 
 /// Executor that fails while failures are left and otherwise returns empty meshes.
 struct Flaky {
@@ -123,6 +130,35 @@ fn every_caller_gets_a_mesh_although_a_device_is_given_up() {
 }
 
 #[test]
+fn every_caller_gets_a_mesh_although_a_running_device_is_considered_hung() {
+    let job = job();
+    shuttle::check_random(
+        move || {
+            let status = run(&job, 3, 0, SETTINGS, |pool| pool.check_devices(0..1, Duration::ZERO));
+            assert!(status.iter().all(|device| device.waiting == 0) && status[1].down.is_none());
+            assert_eq!(status[0].hung > 0, status[0].down.is_some());
+        },
+        SCHEDULES,
+    );
+}
+
+#[test]
+fn a_device_that_hung_is_used_again() {
+    let job = job();
+    let settings = PoolSettings { cool_down: Duration::ZERO, ..SETTINGS };
+    shuttle::check_random(
+        move || {
+            for min_partition_bricks in [None, Some(1)] {
+                let settings = PoolSettings { min_partition_bricks, ..settings };
+                let status = run(&job, 2, 1, settings, |pool| pool.check_devices(0..1, Duration::ZERO));
+                assert!(status.iter().all(|device| device.waiting == 0));
+            }
+        },
+        SCHEDULES,
+    );
+}
+
+#[test]
 fn partitions_of_several_jobs_never_wait_for_each_other() {
     let job = job();
     let settings = PoolSettings { queue: 2, min_partition_bricks: Some(1), ..SETTINGS };
@@ -143,14 +179,15 @@ fn a_cancelled_job_leaves_no_load() {
     shuttle::check_random(
         move || {
             let scheduler = Arc::new(Scheduler::new(&[(0, "device".to_owned())], SETTINGS));
-            scheduler.mark_up(0);
+            let thread = scheduler.begin_thread(0);
+            scheduler.mark_up(thread);
             let device = thread::spawn({
                 let scheduler = Arc::clone(&scheduler);
                 move || {
-                    while let Some(batch) = scheduler.next_batch(0) {
+                    while let Some(batch) = scheduler.next_batch(thread, &Arc::default()) {
                         let results = batch.iter().map(|_| Err(GpuError::Failed("scripted".to_owned()))).collect();
                         let outcome = RunOutcome { time: Duration::ZERO, held_bytes: 0, failed: false, down: None };
-                        scheduler.finish_batch(0, batch, results, outcome);
+                        scheduler.finish_batch(thread, batch, results, outcome);
                     }
                 }
             });

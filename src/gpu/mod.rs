@@ -11,9 +11,12 @@
 //! sheets, shaders, device_errors, discover
 //! job
 //! partition_handle, pipelines, multi_device, picture_passes
-//! executor, output_layout, device_queue
-//! workspace, scheduler
-//! recording, worker
+//! executor, output_layout, queued_job
+//! workspace, running_batch
+//! device_queue
+//! scheduler
+//! recording, lifecycle
+//! worker
 //! pool
 //! engine
 //! submit
@@ -40,6 +43,7 @@ mod hardware;
 mod interleavings;
 pub mod job;
 mod job_state;
+mod lifecycle;
 pub mod manifests;
 mod multi_device;
 mod output;
@@ -53,10 +57,12 @@ pub mod plan;
 pub mod pool;
 #[doc(hidden)]
 pub mod probe;
+mod queued_job;
 mod readback;
 mod recording;
 mod run;
 mod run_partition;
+mod running_batch;
 mod scheduler;
 mod shaders;
 mod sheets;

@@ -91,6 +91,12 @@ impl PartitionHandle {
         self.lock().counts.iter().flatten().count()
     }
 
+    /// Returns true while this partition waits for the counts of others.
+    pub(super) fn is_waiting(&self) -> bool {
+        let state = self.lock();
+        state.counts[self.index].is_some() && state.counts.iter().any(Option::is_none)
+    }
+
     /// Aborts the multi-device run: all partitions fail at their next check.
     pub fn abort(&self) {
         self.lock().aborted = true;

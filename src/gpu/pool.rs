@@ -1,14 +1,17 @@
 //! Device pool: one thread and one bounded queue per device.
 //!
 //! A job goes to the least loaded device. If the device fails, the job is retried once there, alone and on the rebuilt
-//! device, then on the others; a device that fails too often in a row is given up. A large job runs on several idle
-//! devices, and if that fails, on one. Cancellation and deadline are checked here while a job waits, and by the
-//! executor while it runs.
+//! device, then on the others; a device that fails too often in a row cools down before it is used again. So does a
+//! device that hangs, which callers notice while they wait; its thread is abandoned and replaced. A large job runs on
+//! several idle devices, and if that fails, on one. Cancellation and deadline are checked here while a job waits, and
+//! by the executor while it runs.
 
 use std::io;
-use std::sync::Arc;
+use std::ops::Range;
+use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
+use super::device_queue::DeviceThread;
 use super::error::GpuError;
 use super::job::{Finished, GpuJob, JobResult};
 use super::multi_device::{join, n_partitions};
@@ -16,6 +19,7 @@ use super::partition_handle::PartitionHandle;
 use super::scheduler::{EnqueueError, PoolSettings, Scheduler, Ticket};
 use super::worker::{self, Build};
 use crate::surface::{DeviceStatus, Stage, SurfaceError};
+use crate::sync::Mutex;
 use crate::sync::mpsc::RecvTimeoutError;
 use crate::sync::thread::{self, JoinHandle};
 
@@ -23,6 +27,8 @@ use crate::sync::thread::{self, JoinHandle};
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 /// Maximum number of attempts at a job on one device.
 const MAX_ATTEMPTS: usize = 2;
+/// Maximum number of devices on which a job may hang: it may be the cause.
+const MAX_HANGS: usize = 2;
 
 /// Device of a pool.
 pub struct PoolDevice {
@@ -34,12 +40,15 @@ pub struct PoolDevice {
     pub build: Build,
 }
 
-/// Devices with their threads. Dropping the pool stops and joins the threads.
+/// Devices with their threads. Dropping the pool stops and joins the threads, except those that hang.
 pub struct DevicePool {
     scheduler: Arc<Scheduler>,
-    threads: Vec<JoinHandle<()>>,
-    names: Vec<String>,
+    devices: Vec<SharedDevice>,
+    threads: Mutex<Vec<(DeviceThread, JoinHandle<()>)>>,
 }
+
+/// Device that successive threads share.
+type SharedDevice = Arc<PoolDevice>;
 
 /// Finished job with the devices that made it.
 #[derive(Debug, Clone)]
@@ -96,20 +105,40 @@ impl DevicePool {
     pub fn start(devices: Vec<PoolDevice>, settings: &PoolSettings) -> Result<Self, GpuError> {
         let known: Vec<(usize, String)> = devices.iter().map(|d| (d.number, d.name.clone())).collect();
         let scheduler = Arc::new(Scheduler::new(&known, *settings));
-        let names = known.into_iter().map(|(_, name)| name).collect();
-        let threads = Vec::with_capacity(devices.len());
-        let mut pool = Self { scheduler, threads, names };
-        for (n, device) in devices.into_iter().enumerate() {
-            let scheduler = Arc::clone(&pool.scheduler);
-            let thread = thread::Builder::new().name(format!("molmesh-gpu-{}", device.number));
-            let started = thread.spawn(move || worker::work(&scheduler, n, &device.build));
+        let pool =
+            Self { scheduler, devices: devices.into_iter().map(Arc::new).collect(), threads: Mutex::new(Vec::new()) };
+        for n in 0..pool.devices.len() {
             let failed = |e: io::Error| GpuError::Failed(format!("the thread of a device cannot be started: {e}"));
-            pool.threads.push(started.map_err(failed)?);
+            pool.spawn(n).map_err(failed)?;
         }
         if pool.scheduler.wait_until_started() {
             Ok(pool)
         } else {
             Err(GpuError::NoDevice(pool.scheduler.down_reasons()))
+        }
+    }
+
+    /// Starts the present thread of device `n`.
+    fn spawn(&self, n: usize) -> io::Result<()> {
+        let (scheduler, device) = (Arc::clone(&self.scheduler), Arc::clone(&self.devices[n]));
+        let thread = self.scheduler.begin_thread(n);
+        let builder = thread::Builder::new().name(format!("molmesh-gpu-{}", device.number));
+        let started = builder.spawn(move || worker::work(&scheduler, thread, &device.build));
+        let handle = started.inspect_err(|_failed| self.scheduler.end_thread(thread))?;
+        self.threads.lock().unwrap_or_else(PoisonError::into_inner).push((thread, handle));
+        Ok(())
+    }
+
+    /// Takes hung devices down, fails their jobs, and starts the threads that will use the devices after the cool-down.
+    fn check_for_hangs(&self) {
+        self.check_devices(0..self.devices.len(), self.scheduler.settings.hang_timeout);
+    }
+
+    /// Does the work of [`Self::check_for_hangs`] for some devices.
+    pub(super) fn check_devices(&self, devices: Range<usize>, hang_timeout: Duration) {
+        for n in self.scheduler.take_hung(devices, hang_timeout) {
+            // Without a thread the device stays down.
+            drop(self.spawn(n));
         }
     }
 
@@ -122,7 +151,7 @@ impl DevicePool {
             MultiDeviceOutcome::Done(completed) => Ok(*completed),
             MultiDeviceOutcome::JobFailed(error) => Err(error),
             MultiDeviceOutcome::DevicesFailed(failures, why) => self.run_on_one(job, failures, Some(why)),
-            MultiDeviceOutcome::NotApplicable => self.run_on_one(job, vec![0; self.names.len()], None),
+            MultiDeviceOutcome::NotApplicable => self.run_on_one(job, vec![0; self.devices.len()], None),
         }
     }
 
@@ -131,7 +160,7 @@ impl DevicePool {
     /// # Errors
     /// Those of [`Self::run`].
     pub fn run_on_device(&self, n: usize, job: &GpuJob) -> JobResult {
-        let failures = (0..self.names.len()).map(|other| if other == n { 0 } else { MAX_ATTEMPTS }).collect();
+        let failures = (0..self.devices.len()).map(|other| if other == n { 0 } else { MAX_ATTEMPTS }).collect();
         self.run_on_one(job, failures, None).map(|completed| completed.finished)
     }
 
@@ -143,6 +172,8 @@ impl DevicePool {
         mut failures: Vec<usize>,
         mut last_error: Option<GpuError>,
     ) -> Result<CompletedJob, GpuError> {
+        let is_hang = |error: &GpuError| matches!(error, GpuError::Hung { .. });
+        let mut hangs = usize::from(last_error.as_ref().is_some_and(is_hang));
         loop {
             let ticket = match self.scheduler.enqueue(job, &failures, MAX_ATTEMPTS, POLL_INTERVAL) {
                 Ok(ticket) => ticket,
@@ -161,6 +192,10 @@ impl DevicePool {
                 }
                 Some(Err(error)) if error.is_device_failure() && !matches!(error, GpuError::OutOfMemory { .. }) => {
                     failures[n] += 1;
+                    hangs += usize::from(is_hang(&error));
+                    if hangs >= MAX_HANGS {
+                        return Err(error);
+                    }
                     last_error = Some(error);
                 }
                 Some(Err(error)) => return Err(error),
@@ -185,7 +220,7 @@ impl DevicePool {
         };
         let results = self.wait_for_all(job, &tickets);
         let (mut partitions, mut devices, mut job_errors) = (Vec::new(), Vec::new(), Vec::new());
-        let (mut failures, mut device_error) = (vec![0; self.names.len()], None);
+        let (mut failures, mut device_error) = (vec![0; self.devices.len()], None);
         for (ticket, result) in tickets.iter().zip(results) {
             match result {
                 Ok(finished) => {
@@ -226,6 +261,7 @@ impl DevicePool {
                 Ok(result) => results.push(result),
                 Err(RecvTimeoutError::Disconnected) => results.push(Err(thread_ended())),
                 Err(RecvTimeoutError::Timeout) => {
+                    self.check_for_hangs();
                     if let Err(error) = job.check() {
                         for ticket in &tickets[results.len()..] {
                             self.scheduler.cancel(ticket);
@@ -239,17 +275,18 @@ impl DevicePool {
     }
 
     fn work_of(&self, n: usize, finished: &Finished) -> DeviceWork {
-        DeviceWork { device: self.names[n].clone(), stages: finished.stages.clone() }
+        DeviceWork { device: self.devices[n].name.clone(), stages: finished.stages.clone() }
     }
 
     /// Gives up device `n`, an index in the pool.
     pub fn give_up(&self, n: usize, why: &str) {
-        self.scheduler.mark_down(n, why);
+        self.scheduler.give_up(n, why);
     }
 
     /// Status of every device.
     #[must_use]
     pub fn status(&self) -> Vec<DeviceStatus> {
+        self.check_for_hangs();
         self.scheduler.status()
     }
 }
@@ -262,9 +299,13 @@ fn thread_ended() -> GpuError {
 impl Drop for DevicePool {
     fn drop(&mut self) {
         self.scheduler.close();
-        for thread in self.threads.drain(..) {
-            // The thread catches its own panics.
-            drop(thread.join());
+        self.scheduler.wait_until_ended(self.scheduler.settings.hang_timeout);
+        for (thread, handle) in self.threads.lock().unwrap_or_else(PoisonError::into_inner).drain(..) {
+            // A thread that hangs ends with the process.
+            if self.scheduler.has_ended(thread) {
+                // The thread catches its own panics.
+                drop(handle.join());
+            }
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Runs whole jobs: small ones together in one submission, large ones alone.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 
 use super::buffers::BufferId;
 use super::engine::{Engine, LoadedJob};
@@ -49,6 +50,10 @@ impl Executor for Engine {
 
     fn release_idle_memory(&mut self) {
         self.readback.release_idle();
+    }
+
+    fn submission_counter(&self) -> Arc<AtomicU64> {
+        Arc::clone(&self.submissions)
     }
 
     fn held_bytes(&self) -> u64 {

@@ -2,13 +2,16 @@
 
 use std::cmp::Reverse;
 use std::collections::VecDeque;
-use std::sync::PoisonError;
+use std::sync::atomic::AtomicU64;
+use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::device_queue::{DeviceQueue, DeviceState, QueuedJob, RunOutcome, down_reasons, reject};
+use super::device_queue::{DeviceQueue, DeviceState, DeviceThread, RunOutcome, down_reasons, reject};
 use super::error::GpuError;
 use super::job::{GpuJob, JobResult};
 use super::partition_handle::PartitionHandle;
+use super::queued_job::QueuedJob;
+use super::running_batch::RunningBatch;
 use crate::surface::devices::MIN_PARTITION_BRICKS;
 use crate::surface::{DeviceStatus, SurfaceError};
 use crate::sync::mpsc::{Receiver, sync_channel};
@@ -25,6 +28,10 @@ pub struct PoolSettings {
     pub rebuild_pause: Duration,
     /// Time without work after which a device releases the memory that it keeps for the next large job.
     pub idle: Duration,
+    /// Minimum time without a submission after which a running device is considered hung.
+    pub hang_timeout: Duration,
+    /// Pause before a device that went down is used again, doubled each time until it finishes a job.
+    pub cool_down: Duration,
     /// Minimum number of bricks per partition of a multi-device job. `None` disables multi-device jobs.
     pub min_partition_bricks: Option<u64>,
 }
@@ -32,16 +39,25 @@ pub struct PoolSettings {
 impl Default for PoolSettings {
     /// Returns the defaults. With 64 waiting jobs, memory runs out before callers block. With 16 jobs per submission,
     /// the fixed cost is negligible. A driver restarts in about half a second: it is retried after 200 ms. The gaps
-    /// between consecutive large jobs of one caller are shorter than 5 s.
+    /// between consecutive large jobs of one caller are shorter than 5 s. A submission takes less than a second, and
+    /// resetting a device less than a minute.
     fn default() -> Self {
-        let (rebuild_pause, idle) = (Duration::from_millis(200), Duration::from_secs(5));
-        Self { queue: 64, batch: 16, rebuild_pause, idle, min_partition_bricks: Some(MIN_PARTITION_BRICKS) }
+        Self {
+            queue: 64,
+            batch: 16,
+            rebuild_pause: Duration::from_millis(200),
+            idle: Duration::from_secs(5),
+            hang_timeout: Duration::from_secs(10),
+            cool_down: Duration::from_mins(1),
+            min_partition_bricks: Some(MIN_PARTITION_BRICKS),
+        }
     }
 }
 
-struct State {
-    queues: Vec<DeviceQueue>,
-    closed: bool,
+/// State behind the lock.
+pub(super) struct State {
+    pub(super) queues: Vec<DeviceQueue>,
+    pub(super) closed: bool,
     next_id: u64,
 }
 
@@ -49,9 +65,9 @@ struct State {
 pub(super) struct Scheduler {
     state: Mutex<State>,
     /// Notified when a queue or the state of a device has changed.
-    changed: Condvar,
+    pub(super) changed: Condvar,
     /// Notified when a job was added, one per device.
-    added: Vec<Condvar>,
+    pub(super) added: Vec<Condvar>,
     pub(super) settings: PoolSettings,
 }
 
@@ -72,6 +88,11 @@ pub(super) enum EnqueueError {
 }
 
 impl State {
+    /// Returns the queue of a thread unless the thread was replaced.
+    pub(super) fn queue_of(&mut self, thread: DeviceThread) -> Option<&mut DeviceQueue> {
+        self.queues.get_mut(thread.device).filter(|queue| queue.generation == thread.generation)
+    }
+
     /// Adds a job to the queue of device `n`.
     fn push(&mut self, n: usize, job: &GpuJob, partition: Option<PartitionHandle>, retry: bool) -> Ticket {
         let (reply, result) = sync_channel(1);
@@ -86,7 +107,9 @@ impl Scheduler {
     /// Creates the queues of `devices`, given by number and name.
     pub(super) fn new(devices: &[(usize, String)], settings: PoolSettings) -> Self {
         let settings = PoolSettings { queue: settings.queue.max(1), batch: settings.batch.max(1), ..settings };
-        let queue = |(number, name): &(usize, String)| DeviceQueue::new(*number, name.clone(), settings.queue);
+        let queue = |(number, name): &(usize, String)| {
+            DeviceQueue::new(*number, name.clone(), settings.queue, settings.cool_down)
+        };
         Self {
             state: Mutex::new(State { queues: devices.iter().map(queue).collect(), closed: false, next_id: 0 }),
             changed: Condvar::new(),
@@ -95,7 +118,7 @@ impl Scheduler {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, State> {
         // No code panics between two changes under the lock, so a poisoned state is consistent.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -171,14 +194,16 @@ impl Scheduler {
         drop(removed);
     }
 
-    /// Waits for the next batch of device `n`: one job, or several small ones. The batch is empty if none came for
-    /// [`PoolSettings::idle`]. Returns `None` once the device is down or the scheduler is closed.
-    pub(super) fn next_batch(&self, n: usize) -> Option<Vec<QueuedJob>> {
+    /// Waits for the next batch of a device: one job, or several small ones. The batch is empty if none came for
+    /// [`PoolSettings::idle`]. Returns `None` once the device is down, its thread replaced, or the scheduler closed.
+    /// `submissions` counts those of the executor.
+    pub(super) fn next_batch(&self, thread: DeviceThread, submissions: &Arc<AtomicU64>) -> Option<Vec<QueuedJob>> {
         let mut state = self.lock();
+        state.queue_of(thread)?.running = None;
         let mut timed_out = false;
         loop {
             let closed = state.closed;
-            let queue = &mut state.queues[n];
+            let queue = state.queue_of(thread)?;
             if closed || matches!(queue.state, DeviceState::Down(_)) {
                 return None;
             }
@@ -197,7 +222,7 @@ impl Scheduler {
                 break;
             }
             if !batch.is_empty() {
-                queue.running = batch.len();
+                queue.running = Some(RunningBatch::new(&batch, Arc::clone(submissions), Instant::now()));
                 queue.counters.shared += u64::from(batch.len() > 1);
                 drop(state);
                 self.changed.notify_all();
@@ -206,14 +231,18 @@ impl Scheduler {
             if timed_out {
                 return Some(batch);
             }
-            let waited = self.added[n].wait_timeout(state, self.settings.idle).unwrap_or_else(PoisonError::into_inner);
+            let waited = self.added[thread.device]
+                .wait_timeout(state, self.settings.idle)
+                .unwrap_or_else(PoisonError::into_inner);
             (state, timed_out) = (waited.0, waited.1.timed_out());
         }
     }
 
-    /// Sets the bytes of memory that device `n` holds.
-    pub(super) fn set_held_bytes(&self, n: usize, bytes: u64) {
-        self.lock().queues[n].counters.held_bytes = bytes;
+    /// Sets the bytes of memory that a device holds.
+    pub(super) fn set_held_bytes(&self, thread: DeviceThread, bytes: u64) {
+        if let Some(queue) = self.lock().queue_of(thread) {
+            queue.counters.held_bytes = bytes;
+        }
     }
 
     /// Moves small jobs from anywhere in `waiting` to `batch`. A large job ahead of them becomes the next batch.
@@ -228,14 +257,20 @@ impl Scheduler {
         }
     }
 
-    /// Records the results of a batch of device `n` and then sends them. Callers that retry find the state of the
-    /// device updated.
-    pub(super) fn finish_batch(&self, n: usize, batch: Vec<QueuedJob>, results: Vec<JobResult>, outcome: RunOutcome) {
+    /// Records the results of a batch and then sends them. Callers that retry find the state of the device updated. If
+    /// the thread was replaced, its callers have an error already, and the results are dropped.
+    pub(super) fn finish_batch(
+        &self,
+        thread: DeviceThread,
+        batch: Vec<QueuedJob>,
+        results: Vec<JobResult>,
+        outcome: RunOutcome,
+    ) {
         let RunOutcome { time, held_bytes, failed, down } = outcome;
         let mut left = VecDeque::new();
         {
             let mut state = self.lock();
-            let queue = &mut state.queues[n];
+            let Some(queue) = state.queue_of(thread) else { return };
             for (job, result) in batch.iter().zip(&results) {
                 queue.load -= job.load();
                 match result {
@@ -249,8 +284,17 @@ impl Scheduler {
             }
             if results.iter().any(proves_device_works) {
                 queue.consecutive_rebuilds = 0;
+                queue.cool_down = self.settings.cool_down;
             }
-            queue.running = 0;
+            let bricks = queue.running.take().map_or(0, |running| running.bricks());
+            if bricks > 0 && results.iter().all(Result::is_ok) {
+                let per_brick = time.as_secs_f64() / bricks as f64;
+                queue.fastest = Some(queue.fastest.map_or(per_brick, |fastest| fastest.min(per_brick)));
+            }
+            if failed && down.is_none() {
+                // A rebuild can hang as well.
+                queue.running = Some(RunningBatch::new(&[], Arc::default(), Instant::now()));
+            }
             queue.counters.busy += time;
             queue.counters.lost += u64::from(failed);
             queue.counters.held_bytes = held_bytes;
@@ -261,65 +305,6 @@ impl Scheduler {
         self.changed.notify_all();
         batch.into_iter().zip(results).for_each(|(job, result)| job.reply(result));
         reject(left, &down.unwrap_or_default());
-    }
-
-    /// Counts a rebuild of device `n`. Returns false, without counting, after `max` consecutive rebuilds.
-    pub(super) fn count_rebuild(&self, n: usize, max: usize) -> bool {
-        let queue = &mut self.lock().queues[n];
-        let allowed = queue.consecutive_rebuilds < max;
-        queue.consecutive_rebuilds += usize::from(allowed);
-        queue.counters.rebuilds += u64::from(allowed);
-        allowed
-    }
-
-    /// Number of rebuilds of device `n` since it last finished a job.
-    pub(super) fn consecutive_rebuilds(&self, n: usize) -> usize {
-        self.lock().queues[n].consecutive_rebuilds
-    }
-
-    /// Marks device `n` as up.
-    pub(super) fn mark_up(&self, n: usize) {
-        let mut state = self.lock();
-        if matches!(state.queues[n].state, DeviceState::Starting) {
-            state.queues[n].state = DeviceState::Up;
-        }
-        drop(state);
-        self.changed.notify_all();
-    }
-
-    /// Marks device `n` as down and rejects its waiting jobs.
-    pub(super) fn mark_down(&self, n: usize, why: &str) {
-        let left = self.lock().queues[n].mark_down(why);
-        self.changed.notify_all();
-        self.added[n].notify_all();
-        reject(left, why);
-    }
-
-    /// Waits until every device is up or down. Returns true if one is up.
-    pub(super) fn wait_until_started(&self) -> bool {
-        let mut state = self.lock();
-        while state.queues.iter().any(|queue| matches!(queue.state, DeviceState::Starting)) {
-            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
-        }
-        state.queues.iter().any(|queue| matches!(queue.state, DeviceState::Up))
-    }
-
-    /// Waits for `time`. Returns false if the scheduler is closed.
-    pub(super) fn pause(&self, n: usize, time: Duration) -> bool {
-        let end = Instant::now() + time;
-        let mut state = self.lock();
-        while !state.closed {
-            let Some(left) = end.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) else {
-                return true;
-            };
-            state = self.added[n].wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
-        }
-        false
-    }
-
-    /// Reasons of all devices that are down.
-    pub(super) fn down_reasons(&self) -> String {
-        down_reasons(&self.lock().queues)
     }
 
     /// Stops all device threads and rejects all waiting jobs.

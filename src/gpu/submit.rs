@@ -3,6 +3,7 @@
 
 use std::ops::Range;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use super::engine::Engine;
 use super::error::GpuError;
@@ -27,7 +28,7 @@ impl Engine {
         for (readback, bytes) in &readbacks {
             readback.map(*bytes);
         }
-        self.submissions.update(|n| n + 1);
+        self.submissions.fetch_add(1, Ordering::Relaxed);
         PendingSubmission { index, readbacks }
     }
 

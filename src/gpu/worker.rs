@@ -4,58 +4,68 @@ use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Instant;
 
-use super::device_queue::{QueuedJob, RunOutcome};
+use super::device_queue::{DeviceThread, RunOutcome};
 use super::error::GpuError;
 use super::executor::Executor;
 use super::job::{GpuJob, JobResult};
+use super::queued_job::QueuedJob;
 use super::scheduler::{Scheduler, proves_device_works};
 
 /// Builds the executor of a device, at the start and after each failure.
 pub type Build = Box<dyn Fn() -> Result<Box<dyn Executor>, GpuError> + Send + Sync>;
 
 /// Maximum number of consecutive rebuilds without a finished job. Drivers that recover do so at the first or second
-/// attempt, and a job that crashes devices must not keep one busy forever.
+/// attempt, and a job that crashes devices must not keep one busy forever. Then the device cools down.
 pub const MAX_REBUILDS: usize = 3;
 
-/// Runs jobs on device `n` until the scheduler is closed or the device is given up.
-pub(super) fn work(scheduler: &Scheduler, n: usize, build: &Build) {
-    // Only the executor is expected to panic. Any other panic must not leave callers waiting.
-    let ended = catch_unwind(AssertUnwindSafe(|| run(scheduler, n, build)));
-    if let Err(payload) = ended {
-        scheduler.mark_down(n, &format!("its thread panicked: {}", message(&*payload)));
+/// Runs jobs on a device until the scheduler is closed or the thread is replaced. A device that goes down is used again
+/// after its cool-down.
+pub(super) fn work(scheduler: &Scheduler, thread: DeviceThread, build: &Build) {
+    // The first thread starts at once. A thread that replaces another one follows a hang.
+    let mut starts = thread.generation == 0;
+    while starts || scheduler.cool_down(thread) {
+        starts = false;
+        // Only the executor is expected to panic. Any other panic must not leave callers waiting.
+        let ended = catch_unwind(AssertUnwindSafe(|| run(scheduler, thread, build)));
+        if let Err(payload) = ended {
+            scheduler.mark_down(thread, &format!("its thread panicked: {}", message(&*payload)));
+        }
     }
+    scheduler.end_thread(thread);
 }
 
-fn run(scheduler: &Scheduler, n: usize, build: &Build) {
+/// Builds the executor and runs jobs until the device is down, its thread replaced, or the scheduler closed.
+fn run(scheduler: &Scheduler, thread: DeviceThread, build: &Build) {
     let mut executor = match try_build(build) {
         Ok(executor) => executor,
-        Err(error) => return scheduler.mark_down(n, &error.to_string()),
+        Err(error) => return scheduler.mark_down(thread, &error.to_string()),
     };
-    scheduler.mark_up(n);
-    while let Some(batch) = scheduler.next_batch(n) {
+    scheduler.mark_up(thread);
+    while let Some(batch) = scheduler.next_batch(thread, &executor.submission_counter()) {
         if batch.is_empty() {
             executor.release_idle_memory();
-            scheduler.set_held_bytes(n, executor.held_bytes());
+            scheduler.set_held_bytes(thread, executor.held_bytes());
             continue;
         }
         let start = Instant::now();
         let results = run_batch(executor.as_mut(), &batch);
         let (time, held_bytes) = (start.elapsed(), executor.held_bytes());
         let Some(why) = results.iter().find_map(device_failure) else {
-            scheduler.finish_batch(n, batch, results, RunOutcome { time, held_bytes, failed: false, down: None });
+            scheduler.finish_batch(thread, batch, results, RunOutcome { time, held_bytes, failed: false, down: None });
             continue;
         };
         let given_up = |why: &str| format!("given up after {MAX_REBUILDS} rebuilds without a finished job: {why}");
-        let give_up = scheduler.consecutive_rebuilds(n) >= MAX_REBUILDS && !results.iter().any(proves_device_works);
+        let give_up =
+            scheduler.consecutive_rebuilds(thread) >= MAX_REBUILDS && !results.iter().any(proves_device_works);
         let down = give_up.then(|| given_up(&why));
-        scheduler.finish_batch(n, batch, results, RunOutcome { time, held_bytes, failed: true, down });
+        scheduler.finish_batch(thread, batch, results, RunOutcome { time, held_bytes, failed: true, down });
         discard(executor);
         if give_up {
             return;
         }
-        match rebuild(scheduler, n, build, why) {
+        match rebuild(scheduler, thread, build, why) {
             Ok(rebuilt) => executor = rebuilt,
-            Err(why) => return scheduler.mark_down(n, &given_up(&why)),
+            Err(why) => return scheduler.mark_down(thread, &given_up(&why)),
         }
     }
     discard(executor);
@@ -63,14 +73,19 @@ fn run(scheduler: &Scheduler, n: usize, build: &Build) {
 
 /// Rebuilds the executor. The pause between attempts doubles, because a driver takes time to restart. Fails with the
 /// last reason.
-fn rebuild(scheduler: &Scheduler, n: usize, build: &Build, mut why: String) -> Result<Box<dyn Executor>, String> {
+fn rebuild(
+    scheduler: &Scheduler,
+    thread: DeviceThread,
+    build: &Build,
+    mut why: String,
+) -> Result<Box<dyn Executor>, String> {
     let mut pause = scheduler.settings.rebuild_pause;
-    while scheduler.count_rebuild(n, MAX_REBUILDS) {
+    while scheduler.count_rebuild(thread, MAX_REBUILDS) {
         match try_build(build) {
             Ok(executor) => return Ok(executor),
             Err(error) => why = error.to_string(),
         }
-        if !scheduler.pause(n, pause) {
+        if !scheduler.pause(thread.device, pause) {
             return Err("the devices are being closed".to_owned());
         }
         pause *= 2;

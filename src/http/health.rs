@@ -110,10 +110,14 @@ fn devices(app: &Shared) -> Check {
         Some(true) => {
             let devices = backend.devices();
             let up = devices.iter().filter(|device| device.down.is_none()).count();
-            Ok(match devices.len() {
-                0 => format!("{} has computed its first mesh", backend.name()),
-                all => format!("{} has computed its first mesh; {up} of {all} devices are in service", backend.name()),
-            })
+            let mut detail = format!("{} has computed its first mesh", backend.name());
+            if !devices.is_empty() {
+                detail += &format!("; {up} of {} devices are in service", devices.len());
+            }
+            for device in &devices {
+                detail.extend(device.down.iter().map(|why| format!("; {}: {why}", device.number)));
+            }
+            Ok(detail)
         }
     };
     Check::new("devices", found)

@@ -86,35 +86,52 @@ impl MeshRequest {
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
         let namespace = self.preferences.caller.namespace;
-        let key = ContentKey::new(digest, &request.job, *format, &app.pool.maker(&request.job), namespace);
-        let etag = delivery::etag(&key);
+        let key = |maker: String| ContentKey::new(digest, &request.job, *format, &maker, namespace);
+        // The file may be made by any backend, and each gives it another key.
+        let mut keys: Vec<ContentKey> = app.pool.makers(&request.job).into_iter().map(key).collect();
         // A report has no validator.
         if !report {
-            conditional::check_match(headers, &etag)?;
+            let mut rejected = Ok(());
+            keys.retain(|key| match conditional::check_match(headers, &delivery::etag(key)) {
+                Ok(()) => true,
+                Err(problem) => {
+                    rejected = Err(problem);
+                    false
+                }
+            });
+            if keys.is_empty() {
+                rejected?;
+            }
         }
         if is_reusable {
             if let Some(cache) = &self.cache
-                && conditional::is_unchanged(headers, &etag)
+                && let Some(etag) =
+                    keys.iter().map(delivery::etag).find(|etag| conditional::is_unchanged(headers, etag))
             {
                 let caching = [(header::ETAG, etag), (header::CACHE_CONTROL, cache.clone())];
                 return Ok(Some((StatusCode::NOT_MODIFIED, caching).into_response()));
             }
-            let stored = match results::stored(app, &self.preferences.caller, &key, *format, method, headers).await {
-                // The store has logged its error. The mesh is computed again.
-                Err(problem) if problem.is(Kind::StoreFailed) => None,
-                stored => stored?,
-            };
-            if let Some(mut response) = stored {
-                response.headers_mut().remove(header::CACHE_CONTROL);
-                return Ok(Some(self.cached(response)));
+            for key in &keys {
+                let stored = match results::stored(app, &self.preferences.caller, key, *format, method, headers).await {
+                    // The store has logged its error. The mesh is computed again.
+                    Err(problem) if problem.is(Kind::StoreFailed) => break,
+                    stored => stored?,
+                };
+                if let Some(mut response) = stored {
+                    response.headers_mut().remove(header::CACHE_CONTROL);
+                    return Ok(Some(self.cached(response)));
+                }
             }
         }
         if *method != Method::HEAD || *report {
             return Ok(None);
         }
-        // The summary headers would need a run.
+        // The summary headers would need a run, as would the `ETag` if several backends may make the file.
         let media_type = HeaderValue::from_static(format.media_type());
-        let response = [(header::CONTENT_TYPE, media_type), (header::ETAG, etag)].into_response();
+        let mut response = [(header::CONTENT_TYPE, media_type)].into_response();
+        if let [key] = &keys[..] {
+            response.headers_mut().insert(header::ETAG, delivery::etag(key));
+        }
         Ok(Some(self.cached(response)))
     }
 
@@ -160,7 +177,9 @@ impl MeshRequest {
         // Dropping the last ticket of unfinished work cancels it.
         drop((ticket, input));
         let finished = outcome.map_err(|failure| self.failed(failure))?;
-        let Self { parsed: ParsedRequest { source, request, format, declared, .. }, cache, mut timing, .. } = self;
+        let Self {
+            parsed: ParsedRequest { source, request, format, declared, .. }, headers, cache, mut timing, ..
+        } = self;
         drop(source);
         if joined {
             // The stages belong to another request as well, and some ended before this one began.
@@ -175,13 +194,15 @@ impl MeshRequest {
         // Another backend may have computed the mesh, with other bytes.
         let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.maker(), namespace);
         let is_stored = results::save_later(&app, &finished, format, &key);
+        // Only now is it known which of several possible files the current one is.
+        conditional::check_match(&headers, &delivery::etag(&key))?;
         let mut response = delivery::mesh(&app, Arc::clone(&finished), format, &key, timing, permit).await?;
-        let headers = response.headers_mut();
-        if is_stored && results::will_be_stored(&app, &key, format, headers).await? {
-            headers.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, format.extension())));
+        let answered = response.headers_mut();
+        if is_stored && results::will_be_stored(&app, &key, format, answered).await? {
+            answered.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, format.extension())));
         }
         if let Some(cache) = cache {
-            headers.insert(header::CACHE_CONTROL, cache);
+            answered.insert(header::CACHE_CONTROL, cache);
         }
         Ok(response)
     }

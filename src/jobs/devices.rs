@@ -27,7 +27,9 @@ impl DeviceMonitor {
             gauge!(DEVICE_MEMORY, "device" => number.clone()).set(device.held_bytes as f64);
             gauge!(DEVICE_WAITING, "device" => number.clone()).set(device.waiting as f64);
             gauge!(DEVICE_BUSY, "device" => number.clone()).set(device.busy.as_secs_f64());
-            counter!(DEVICE_LOST, "device" => number.clone()).absolute(device.lost);
+            for (reason, count) in [("failed", device.lost), ("hung", device.hung)] {
+                counter!(DEVICE_LOST, "device" => number.clone(), "reason" => reason).absolute(count);
+            }
             counter!(DEVICE_REBUILDS, "device" => number.clone()).absolute(device.rebuilds);
             counter!(DEVICE_SHARED, "device" => number.clone()).absolute(device.shared);
             counter!(DEVICE_PARTITIONS, "device" => number.clone()).absolute(device.partitions);
@@ -40,6 +42,7 @@ impl DeviceMonitor {
             }
             match &device.down {
                 Some(why) if known.1 => tracing::error!(device = number, name, why, "a device is down"),
+                None if !known.1 => tracing::info!(device = number, name, "a device is used again"),
                 _ => {}
             }
             *known = (*rebuilds, up);

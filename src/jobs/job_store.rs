@@ -206,10 +206,15 @@ impl JobStore {
 
     /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
     pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<(String, Pin)>, StoreError> {
-        let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job), task.namespace);
-        let pin = self.0.store.pin(&key.name(format.extension())?);
-        let found = !task.strict && results::is_stored(&self.0.store, format, &key).await?;
-        Ok(found.then(|| (key.to_string(), pin)))
+        let makers = if task.strict { Vec::new() } else { self.0.pool.makers(&task.job) };
+        for maker in makers {
+            let key = ContentKey::new(&task.digest, &task.job, format, &maker, task.namespace);
+            let pin = self.0.store.pin(&key.name(format.extension())?);
+            if results::is_stored(&self.0.store, format, &key).await? {
+                return Ok(Some((key.to_string(), pin)));
+            }
+        }
+        Ok(None)
     }
 
     /// Returns a job in memory, if it is of the namespace.

@@ -114,10 +114,11 @@ impl Pool {
         &self.shared.reason
     }
 
-    /// Returns the arithmetic of a job's file, provided that neither backend nor renderer falls back to another one.
-    pub(crate) fn maker(&self, job: &Job) -> String {
+    /// Returns the arithmetics that a job's file may have, provided that the renderer does not fall back.
+    pub(crate) fn makers(&self, job: &Job) -> Vec<String> {
         let renderer = job.picture.map(|_| self.shared.settings.renderer.renderer.arithmetic());
-        maker(&self.shared.backend.arithmetic(), renderer.as_deref())
+        let backends = self.shared.backend.arithmetics();
+        backends.iter().map(|backend| maker(backend, renderer.as_deref())).collect()
     }
 
     /// Updates metrics and log with the state of the queue and the devices, as every finished job does.

@@ -227,7 +227,7 @@ mod tests {
             let surface = SurfaceLimits { max_samples, ..SurfaceLimits::default() };
             let limits = JobLimits { surface, ..JobLimits::default() };
             let refused = run(SAMPLE, &job, &limits, &choice, &Control::default(), &(), None).map(drop);
-            let planned = estimate(SAMPLE, &job, &limits, &choice, &Control::default()).unwrap().mesh.map(drop);
+            let planned = estimate(read, &job, &limits, &choice, &Control::default()).unwrap().mesh.map(drop);
             let spacing = |error: SurfaceError| match error {
                 SurfaceError::GridTooLarge { suggested_resolution, .. } => suggested_resolution,
                 error => panic!("{error}"),

@@ -1,6 +1,8 @@
 //! Complete run of one job: structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
+mod auto;
 mod clock;
+pub mod cost;
 #[cfg(feature = "png")]
 mod draw;
 mod estimate;
@@ -18,6 +20,7 @@ use std::ops::Deref;
 
 use thiserror::Error;
 
+pub use auto::AutoBackend;
 pub use clock::{ProgressSink, StageClock};
 #[cfg(feature = "png")]
 pub use draw::draw;
@@ -28,7 +31,7 @@ pub use report::{
     ComponentReport, LeftOutReport, PictureReport, Quantization, Report, ResidueCount, VoidReport, maker,
 };
 pub use spacing::Spacing;
-pub use work::estimate_work;
+pub use work::{estimate_work, mesh_work};
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureLimits, PictureParams};

@@ -20,6 +20,18 @@ const TRIES: f64 = 1.5;
 /// Work of a pixel of a picture, in atoms: 100 ns on one core, where an atom takes 4 µs on two cores.
 const PIXEL: f64 = 0.0125;
 
+/// Estimates the work of meshing, without reading, in atoms at 0.5 Å.
+#[must_use]
+pub fn mesh_work(atoms: f64, resolution: f64) -> f64 {
+    // Grid points scale with the inverse cube of the spacing, the surface with the inverse square.
+    (atoms + MIN_WORK) * (0.5 / resolution).powf(2.5)
+}
+
+/// Estimates the work of a search for a spacing, in atoms at 0.5 Å. `resolution` is the expected result.
+pub(super) fn search_work(atoms: f64, resolution: f64) -> f64 {
+    TRIES * mesh_work(atoms, resolution)
+}
+
 /// Estimates the work of a job, in atoms at 0.5 Å.
 #[must_use]
 pub fn estimate_work(input: &[u8], job: &Job) -> f64 {
@@ -33,12 +45,11 @@ pub fn estimate_work(input: &[u8], job: &Job) -> f64 {
         (false, false) => len,
     };
     let atoms = bytes / BYTES_PER_ATOM;
-    // Grid points scale with the inverse cube of the spacing, the surface with the inverse square, reading with
-    // neither.
-    let fineness = 0.5 / job.spacing.expected(&job.params, atoms);
-    let again = if job.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
+    let resolution = job.spacing.expected(&job.params, atoms);
+    let mesh = if job.spacing.max_triangles().is_some() { search_work } else { mesh_work };
     let pixels = job.picture.map_or(0.0, |picture| f64::from(picture.width) * f64::from(picture.height));
-    (atoms + MIN_WORK) * (0.3 + 0.7 * again * fineness.powf(2.5)) + PIXEL * pixels
+    // Reading does not depend on the spacing.
+    0.3 * (atoms + MIN_WORK) + 0.7 * mesh(atoms, resolution) + PIXEL * pixels
 }
 
 #[cfg(test)]

@@ -111,6 +111,8 @@ pub struct BackendIdentity {
     pub arithmetic: String,
     /// The hardware that it ran on, for display.
     pub device: String,
+    /// Predicted times that decided between several backends, if there was a choice.
+    pub prediction: Option<String>,
     /// The reason why this backend replaced the requested one; `None` if it did not.
     pub fallback_reason: Option<String>,
 }
@@ -119,13 +121,15 @@ impl BackendIdentity {
     /// Creates the identity of a backend or renderer that did not replace another one.
     #[must_use]
     pub fn new(backend: &'static str, arithmetic: String, device: String) -> Self {
-        Self { backend, arithmetic, device, fallback_reason: None }
+        Self { backend, arithmetic, device, prediction: None, fallback_reason: None }
     }
 
-    /// Adds the reason for a fallback, if there was one, to the reason for the choice of a backend.
+    /// Adds the prediction and the reason for a fallback, if there are any, to the reason for the choice of a backend.
     #[must_use]
     pub fn reason(&self, choice: &str) -> String {
-        self.fallback_reason.as_ref().map_or_else(|| choice.to_owned(), |why| format!("{choice}; but {why}"))
+        let prediction = self.prediction.iter().map(|prediction| format!("; {prediction}"));
+        let fallback = self.fallback_reason.iter().map(|why| format!("; but {why}"));
+        std::iter::once(choice.to_owned()).chain(prediction).chain(fallback).collect()
     }
 }
 
@@ -138,6 +142,11 @@ pub trait Backend: Send + Sync {
     /// one that accepts jobs. Part of the keys of cached results.
     fn arithmetic(&self) -> String {
         format!("{} {}", self.name(), simd::arithmetic())
+    }
+
+    /// Arithmetics of all backends and devices that may run a job. A result under any of them answers a request.
+    fn arithmetics(&self) -> Vec<String> {
+        vec![self.arithmetic()]
     }
 
     /// Description of the hardware for display: threads and vector extension, or the adapter's name.
@@ -173,6 +182,13 @@ pub trait Backend: Send + Sync {
         control: &Control<'_>,
     ) -> Result<MeshOutput, SurfaceError> {
         self.write(spheres, params, limits, control, None)
+    }
+
+    /// Returns a backend for a job of several meshes, `work` atoms at 0.5 Å in all, which must come from one backend;
+    /// `None` if this is a single backend.
+    fn for_job(&self, work: f64) -> Option<Box<dyn Backend + '_>> {
+        let _ = work;
+        None
     }
 
     /// Makes a first, tiny mesh on all threads and devices: starts threads, loads code and detects failures.

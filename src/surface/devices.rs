@@ -170,6 +170,8 @@ pub struct DeviceStatus {
     pub busy: Duration,
     /// Number of failures after which its executor was discarded.
     pub lost: u64,
+    /// Number of hangs after which its thread was replaced.
+    pub hung: u64,
     /// Number of rebuilds after failures.
     pub rebuilds: u64,
     /// Number of submissions that several jobs shared.

@@ -78,7 +78,7 @@ metrics! {
     /// Time that a device spent on jobs: upload, computation and readback.
     DEVICE_BUSY = "molmesh_device_busy_seconds_total", Seconds, device: "numbers of devices in use";
     /// Failures of a device after which its state was discarded.
-    DEVICE_LOST = "molmesh_device_lost_total", Counter, device: "numbers of devices in use";
+    DEVICE_LOST = "molmesh_device_lost_total", Counter, device: "numbers of devices in use", reason: "failed|hung";
     /// Rebuilds of a device after failures, including failed attempts.
     DEVICE_REBUILDS = "molmesh_device_rebuilds_total", Counter, device: "numbers of devices in use";
     /// Bytes of device memory held, in use and pooled.

@@ -96,3 +96,43 @@ fn banner_names_the_devices() {
     assert!(service.banner.contains("cpu: ") && service.banner.contains("(--devices cpu)"), "{}", service.banner);
     assert!(service.banner.contains("not gpu: "), "{}", service.banner);
 }
+
+#[test]
+fn a_calibration_is_stored_and_used() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let file = folder.path("cache/molmesh/calibration.json");
+    let calibrate = |devices: &str| -> serde_json::Value {
+        let args = ["doctor", "--calibrate", "--devices", devices, "--listen", "127.0.0.1:0", "--data-dir"];
+        let mut command = molmesh();
+        command.env("XDG_CACHE_HOME", folder.path("cache")).args(args).arg(folder.path("data"));
+        let done = command.output().unwrap();
+        assert_code(&done, 0);
+        let text = stdout(&done);
+        assert!(text.contains("per atom and thread") && text.contains("calibration.json"), "{text}");
+        serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap()
+    };
+    let reason = || -> String {
+        let mut command = molmesh();
+        command.env("XDG_CACHE_HOME", folder.path("cache")).arg("mesh").arg(&input).arg("-o");
+        let done = command.arg(folder.path("out.glb")).args(["--report", "json"]).output().unwrap();
+        assert_code(&done, 0);
+        let report: serde_json::Value = serde_json::from_str(&stdout(&done)).unwrap();
+        report["backend_reason"].as_str().unwrap().to_owned()
+    };
+    assert!(reason().contains("not calibrated"), "{}", reason());
+    let found = calibrate("cpu");
+    assert!(found["cpu"]["per_unit"].as_f64().unwrap() > 0.0 && found["gpu"].is_null(), "{found}");
+    assert!(reason().contains("; calibrated"), "{}", reason());
+    assert_eq!(std::fs::read_dir(folder.path("cache/molmesh")).unwrap().count(), 1, "a staged file remains");
+    let software = stdout(&doctor(&["--report", "json"])).contains("\"software\"");
+    assert!(software || !cfg!(feature = "gpu") || std::env::var_os("CI").is_none(), "CI has software Vulkan");
+    if software {
+        let found = calibrate("software");
+        let cost = &found["gpu"]["cost"];
+        assert!(cost["start"].as_f64().unwrap() > 0.0 && cost["warm"]["per_unit"].as_f64().unwrap() > 0.0, "{found}");
+        assert!(found["gpu"]["device"].as_str().is_some_and(|name| !name.is_empty()), "{found}");
+    }
+    std::fs::write(&file, "{").unwrap();
+    assert!(reason().contains("calibration.json is ignored: "), "{}", reason());
+}

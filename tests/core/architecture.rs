@@ -173,7 +173,7 @@ const LAYERS: &[Layer] = &[
     },
     Layer {
         name: "fuzzing",
-        layers: &[("access", Any), ("jobs", Any)],
+        layers: &[("structure", Any), ("access", Any), ("jobs", Any)],
         crates: &["tokio", "axum", "hyper", "wgpu", "clap"],
     },
     Layer {

@@ -11,14 +11,19 @@ use std::time::Instant;
 use gpu_fakes::Step::{Block, Finish, Lose, OutOfMemory};
 use gpu_fakes::{FakeDevice, SETTINGS, devices, spheres};
 use molmesh::gpu::{DevicePool, DiscoveryMode, GpuBackend, GpuError, discover};
+use molmesh::pipeline::AutoBackend;
 use molmesh::surface::{
     Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, MeshOutput, Observer, Stage, Step,
     SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
-fn backend_with(fakes: &[Arc<FakeDevice>], fallback: bool) -> GpuBackend {
-    let fallback = fallback.then(|| Box::new(CpuBackend::new(None).unwrap()) as Box<dyn Backend>);
-    GpuBackend::with_pool(DevicePool::start(devices(fakes), &SETTINGS).unwrap(), fallback)
+fn gpu(fakes: &[Arc<FakeDevice>]) -> GpuBackend {
+    GpuBackend::with_pool(DevicePool::start(devices(fakes), &SETTINGS).unwrap())
+}
+
+/// Returns devices with the CPU as fallback.
+fn gpu_and_cpu(fakes: &[Arc<FakeDevice>]) -> AutoBackend {
+    AutoBackend::new(Box::new(CpuBackend::new(None).unwrap()), Box::new(gpu(fakes)))
 }
 
 fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
@@ -27,19 +32,21 @@ fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<MeshOutput, Surfa
 
 #[test]
 fn the_device_of_a_job_is_reported() {
-    let backend = backend_with(&[FakeDevice::new(&[]), FakeDevice::new(&[])], true);
+    let backend = gpu_and_cpu(&[FakeDevice::new(&[]), FakeDevice::new(&[])]);
     let made_by: Vec<_> = (0..2).map(|_| run(&backend, &Control::default()).unwrap().made_by.unwrap()).collect();
     assert_eq!([&made_by[0].device, &made_by[1].device], ["fake 0", "fake 1"]);
-    // Results of different devices have different keys. A look-up uses the key of the first device.
+    // Results of different devices have different keys. A look-up tries all of them and that of the CPU.
     assert_eq!(made_by[0].arithmetic, backend.arithmetic());
     assert_ne!(made_by[0].arithmetic, made_by[1].arithmetic);
+    let cpu = CpuBackend::new(None).unwrap().arithmetic();
+    assert_eq!(backend.arithmetics(), [made_by[0].arithmetic.clone(), made_by[1].arithmetic.clone(), cpu]);
     assert_eq!((backend.name(), backend.describe().as_str()), ("gpu", "2 devices: fake 0, fake 1"));
 }
 
 #[test]
 fn the_cpu_is_the_fallback_and_is_reported() {
     let fake = FakeDevice::new(&[Lose]);
-    let backend = backend_with(std::slice::from_ref(&fake), true);
+    let backend = gpu_and_cpu(std::slice::from_ref(&fake));
     let cpu = run(&CpuBackend::new(None).unwrap(), &Control::default()).unwrap();
     // The device fails the first two jobs; then it is given up.
     for n in 0..4 {
@@ -62,27 +69,27 @@ fn the_cpu_is_the_fallback_and_is_reported() {
     let fallback = backend.run(&spheres(2), &small, &SurfaceLimits::default(), &Control::default()).unwrap();
     assert!(fallback.mesh.quantized.is_some() && fallback.measures.is_some());
     // Negative control: a device that works.
-    let working = run(&backend_with(&[FakeDevice::new(&[])], true), &Control::default()).unwrap().made_by.unwrap();
+    let working = run(&gpu_and_cpu(&[FakeDevice::new(&[])]), &Control::default()).unwrap().made_by.unwrap();
     assert_eq!((working.backend, working.fallback_reason), ("gpu", None));
 }
 
 #[test]
 fn without_a_fallback_the_failure_is_an_error() {
-    let error = run(&backend_with(&[FakeDevice::new(&[Lose])], false), &Control::default()).unwrap_err();
+    let error = run(&gpu(&[FakeDevice::new(&[Lose])]), &Control::default()).unwrap_err();
     let SurfaceError::Device { why } = error else { panic!("{error}") };
     assert!(why.contains("scripted"), "{why}");
 }
 
 #[test]
 fn a_lack_of_memory_is_an_error_with_numbers_and_without_fallback() {
-    let error = run(&backend_with(&[FakeDevice::new(&[OutOfMemory])], true), &Control::default()).unwrap_err();
+    let error = run(&gpu_and_cpu(&[FakeDevice::new(&[OutOfMemory])]), &Control::default()).unwrap_err();
     assert_eq!(error, SurfaceError::DeviceMemory { needed: 9, available: 5, suggested_resolution: 1.5 });
 }
 
 #[test]
 fn deadline_and_cancellation_reach_the_device() {
     let fake = FakeDevice::new(&[Block]);
-    let backend = backend_with(std::slice::from_ref(&fake), true);
+    let backend = gpu_and_cpu(std::slice::from_ref(&fake));
     let deadline = Some(Instant::now() + std::time::Duration::from_millis(30));
     assert_eq!(
         run(&backend, &Control { deadline, ..Control::default() }).map(|_| ()).unwrap_err(),
@@ -121,7 +128,7 @@ fn the_observer_receives_stage_times() {
         }
     }
     let watch = Watch::default();
-    run(&backend_with(&[FakeDevice::new(&[])], true), &Control { observer: &watch, ..Control::default() }).unwrap();
+    run(&gpu_and_cpu(&[FakeDevice::new(&[])]), &Control { observer: &watch, ..Control::default() }).unwrap();
     assert_eq!(*watch.told.lock().unwrap(), [(Stage::Field, 2_000), (Stage::Emit, 1_000)]);
     assert!(watch.binned.into_inner());
 }
@@ -129,21 +136,21 @@ fn the_observer_receives_stage_times() {
 #[test]
 fn warm_runs_every_device_and_gives_up_those_that_fail() {
     let fakes = [FakeDevice::new(&[Finish]), FakeDevice::new(&[Lose]), FakeDevice::new(&[Finish])];
-    let backend = backend_with(&fakes, true);
+    let backend = gpu(&fakes);
     backend.warm_up().unwrap();
     assert_eq!(fakes.each_ref().map(|fake| fake.calls().len()), [1, 2, 1]);
     let down: Vec<bool> = backend.devices().iter().map(|device| device.down.is_some()).collect();
     assert_eq!(down, [false, true, false]);
     assert!(backend.devices()[1].down.as_deref().unwrap().contains("first mesh failed"));
     // Without a device the fallback must work; without a fallback warming up fails.
-    backend_with(&[FakeDevice::new(&[Lose])], true).warm_up().unwrap();
-    assert!(matches!(backend_with(&[FakeDevice::new(&[Lose])], false).warm_up(), Err(SurfaceError::Device { .. })));
+    gpu_and_cpu(&[FakeDevice::new(&[Lose])]).warm_up().unwrap();
+    assert!(matches!(gpu(&[FakeDevice::new(&[Lose])]).warm_up(), Err(SurfaceError::Device { .. })));
 }
 
 #[test]
 fn many_callers_share_one_device() {
     let fake = FakeDevice::new(&[]);
-    let backend = backend_with(std::slice::from_ref(&fake), false);
+    let backend = gpu(std::slice::from_ref(&fake));
     let (done, samples) = (AtomicUsize::new(0), AtomicU64::new(0));
     std::thread::scope(|scope| {
         for _ in 0..16 {
@@ -198,7 +205,7 @@ fn a_missing_device_is_reported_and_cannot_be_started() {
     let choice: DeviceChoice = "77".parse().unwrap();
     let found = discover(&choice, DiscoveryMode::Quick);
     assert_eq!(found.missing(&choice), ["there is no device 77"]);
-    let Err(GpuError::NoDevice(why)) = GpuBackend::start(&found, &SETTINGS, None) else { panic!("it started") };
+    let Err(GpuError::NoDevice(why)) = GpuBackend::start(&found, &SETTINGS) else { panic!("it started") };
     assert!(!why.is_empty());
     let quick = discover(&DeviceChoice::Cpu, DiscoveryMode::Quick);
     assert_eq!((quick.devices.len(), quick.no_device_reason().as_deref()), (0, Some("the CPU was requested")));

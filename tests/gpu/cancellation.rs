@@ -23,7 +23,7 @@ impl Observer for Start {
 fn jobs_end_soon_after_cancellation_at_any_time() {
     let build = || Ok(Box::new(engine_with(|_| ())) as Box<dyn Executor>);
     let device = PoolDevice { number: 0, name: "device".to_owned(), build: Box::new(build) };
-    let backend = GpuBackend::with_pool(DevicePool::start(vec![device], &PoolSettings::default()).unwrap(), None);
+    let backend = GpuBackend::with_pool(DevicePool::start(vec![device], &PoolSettings::default()).unwrap());
     // 27,000 separate atoms have about 14 million triangles.
     let at = |i: usize| [i % 30, i / 30 % 30, i / 900].map(|k| 4.0 * k as f64);
     let rows: Vec<[f64; 4]> = (0..27_000).map(at).map(|[x, y, z]| [x, y, z, 1.7]).collect();

@@ -24,6 +24,8 @@ const SETTINGS: PoolSettings = PoolSettings {
     batch: 16,
     rebuild_pause: Duration::ZERO,
     idle: Duration::from_secs(5),
+    hang_timeout: Duration::MAX,
+    cool_down: Duration::MAX,
     min_partition_bricks: Some(1),
 };
 
@@ -222,7 +224,7 @@ fn the_number_of_devices_depends_on_settings_and_job_size() {
 
 #[test]
 fn all_devices_are_reported() {
-    let backend = GpuBackend::with_pool(pool(2, |_| (), SETTINGS), None);
+    let backend = GpuBackend::with_pool(pool(2, |_| (), SETTINGS));
     let meshed =
         backend.run(&crowd(200), &params(KERNELS[0], 1.0), &SurfaceLimits::default(), &Control::default()).unwrap();
     assert_eq!(meshed.made_by.unwrap().device, "2 devices: device 0, device 1");

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use gpu_fakes::Step::{Block, Fail, Finish, Lose, OmitResult, OutOfMemory, Panic};
+use gpu_fakes::Step::{Block, Fail, Finish, Hang, Lose, OmitResult, OutOfMemory, Panic};
 use gpu_fakes::{FakeDevice, LOST, Running, SETTINGS, devices, job, pool, start, wait_for, wait_for_load};
 use molmesh::gpu::{DevicePool, GpuError, MAX_REBUILDS, PoolSettings};
 use molmesh::surface::SurfaceError;
@@ -299,4 +299,121 @@ fn a_dropped_pool_joins_its_threads() {
     drop(Arc::into_inner(running).unwrap());
     // Each thread owns its executor, so the threads have ended.
     assert_eq!(fakes.each_ref().map(|fake| fake.drops.load(Ordering::SeqCst)), [1, 1]);
+}
+
+#[test]
+fn a_hung_device_is_taken_out_and_its_job_retried() {
+    let fakes = [FakeDevice::new(&[Hang]), FakeDevice::new(&[])];
+    let hang_timeout = Duration::from_millis(50);
+    let pool = pool(&fakes, PoolSettings { hang_timeout, ..SETTINGS });
+    let begun = Instant::now();
+    // The first job hangs on the first device; the others run on the second one.
+    let first = start(&pool, &job(1));
+    wait_for("the first job to run", || fakes[0].calls() == [1]);
+    for _ in 0..3 {
+        assert_eq!(pool.run(&job(1)).unwrap().device(), "fake 1");
+    }
+    assert_eq!(first.join().unwrap().unwrap(), "fake 1");
+    assert!(begun.elapsed() >= hang_timeout);
+    let status = pool.status().remove(0);
+    let why = status.down.unwrap();
+    assert!(why.contains("hung") && why.contains("50 ms"), "{why}");
+    assert_eq!((status.hung, status.lost, status.finished, status.waiting), (1, 0, 0, 0));
+    // A result that comes later is dropped with the executor.
+    fakes[0].release();
+    wait_for("the old thread to end", || fakes[0].drops.load(Ordering::SeqCst) == 1);
+    let status = pool.status().remove(0);
+    assert_eq!((status.finished, status.down.is_some(), fakes[0].calls().len()), (0, true, 1));
+}
+
+#[test]
+fn a_device_that_hangs_while_it_is_rebuilt_is_taken_out() {
+    let fakes = [FakeDevice::hanging_in_build(&[Lose], 1), FakeDevice::new(&[])];
+    let pool = pool(&fakes, PoolSettings { hang_timeout: Duration::from_millis(50), ..SETTINGS });
+    // The retry waits for the device until the rebuild has taken too long.
+    assert_eq!(pool.run(&job(1)).unwrap().device(), "fake 1");
+    let status = pool.status().remove(0);
+    assert!(status.down.unwrap().contains("hung") && status.hung == 1 && status.waiting == 0);
+    fakes[0].release();
+}
+
+#[test]
+fn a_slow_device_that_submits_is_not_hung() {
+    let fake = FakeDevice::new(&[Block, Finish]);
+    let pool = pool(std::slice::from_ref(&fake), PoolSettings { hang_timeout: Duration::from_millis(300), ..SETTINGS });
+    let running = start(&pool, &job(1));
+    wait_for("the job to run", || fake.calls() == [1]);
+    let begun = Instant::now();
+    while begun.elapsed() < Duration::from_millis(900) {
+        fake.submissions.fetch_add(1, Ordering::Relaxed);
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert_eq!(pool.status()[0].down, None);
+    fake.release();
+    assert_eq!(running.join().unwrap().unwrap(), "fake 0");
+}
+
+#[test]
+fn a_job_that_hangs_everywhere_leaves_devices_to_others() {
+    let fakes = [(); 3].map(|()| FakeDevice::new(&[Hang]));
+    let pool = pool(&fakes, PoolSettings { hang_timeout: Duration::from_millis(30), ..SETTINGS });
+    let error = pool.run(&job(1)).map(|_| ()).unwrap_err();
+    assert_eq!(error, GpuError::Hung { after_ms: 30 });
+    assert_eq!(pool.status().iter().filter(|device| device.down.is_some()).count(), 2);
+    fakes.iter().for_each(|fake| fake.release());
+}
+
+#[test]
+fn a_device_is_used_again_after_its_cool_down() {
+    let settings =
+        PoolSettings { hang_timeout: Duration::from_millis(50), cool_down: Duration::from_millis(100), ..SETTINGS };
+    let fake = FakeDevice::new(&[Hang, Finish]);
+    let hung = pool(std::slice::from_ref(&fake), settings);
+    let begun = Instant::now();
+    assert_eq!(hung.run(&job(1)).map(|_| ()).unwrap_err(), GpuError::Hung { after_ms: 50 });
+    wait_for("the device to be up", || hung.status()[0].down.is_none());
+    assert!(begun.elapsed() >= settings.hang_timeout + settings.cool_down);
+    // The first thread still hangs.
+    assert_eq!((hung.run(&job(1)).unwrap().device().as_str(), fake.drops.load(Ordering::SeqCst)), ("fake 0", 0));
+    let status = hung.status().remove(0);
+    assert_eq!((status.hung, status.rebuilds, status.finished), (1, 1, 1));
+    fake.release();
+    // A device that failed too often returns as well.
+    let fake = FakeDevice::new(&[Lose, Lose, Lose, Lose, Finish]);
+    let given_up = pool(std::slice::from_ref(&fake), settings);
+    for _ in 0..2 {
+        given_up.run(&job(1)).map(|_| ()).unwrap_err();
+    }
+    wait_for("the device to be up", || given_up.status()[0].down.is_none());
+    given_up.run(&job(1)).unwrap();
+}
+
+#[test]
+fn each_cool_down_is_longer() {
+    let fake = FakeDevice::building(&[Lose], 1);
+    let settings = PoolSettings { cool_down: Duration::from_millis(10), ..SETTINGS };
+    let pool = pool(std::slice::from_ref(&fake), settings);
+    assert!(pool.run(&job(1)).is_err());
+    wait_for("three cool-downs", || fake.builds.load(Ordering::SeqCst) > MAX_REBUILDS + 3);
+    std::thread::sleep(Duration::from_secs(1));
+    // Pauses of 10 ms would allow a hundred builds by now.
+    assert!(fake.builds.load(Ordering::SeqCst) < MAX_REBUILDS + 15);
+}
+
+#[test]
+fn a_pool_with_a_hung_device_ends_in_bounded_time() {
+    for is_noticed in [false, true] {
+        let fake = FakeDevice::new(&[Hang]);
+        let hang_timeout = Duration::from_millis(if is_noticed { 30 } else { 200 });
+        let pool = pool(std::slice::from_ref(&fake), PoolSettings { hang_timeout, ..SETTINGS });
+        let mut job = job(1);
+        job.deadline = Some(Instant::now() + Duration::from_millis(if is_noticed { 20_000 } else { 10 }));
+        let error = pool.run(&job).map(|_| ()).unwrap_err();
+        assert_eq!(matches!(error, GpuError::Hung { .. }), is_noticed, "{error}");
+        let begun = Instant::now();
+        drop(Arc::into_inner(pool).unwrap());
+        assert!(begun.elapsed() < Duration::from_secs(10), "{:?}", begun.elapsed());
+        assert_eq!(fake.drops.load(Ordering::SeqCst), 0, "it did not hang");
+        fake.release();
+    }
 }

@@ -38,7 +38,7 @@ fn devices(n: usize) -> GpuBackend {
         PoolDevice { number, name: format!("device {number}"), build: Box::new(build) }
     };
     let settings = PoolSettings { min_partition_bricks: Some(1), ..PoolSettings::default() };
-    GpuBackend::with_pool(DevicePool::start((0..n).map(device).collect(), &settings).unwrap(), None)
+    GpuBackend::with_pool(DevicePool::start((0..n).map(device).collect(), &settings).unwrap())
 }
 
 fn made(backend: &dyn Backend, job: &Job) -> Product {

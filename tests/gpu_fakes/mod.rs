@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, unreachable_pub, reason = "tests say what they expect by panicking")]
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
@@ -21,6 +21,8 @@ pub enum Step {
     Finish,
     /// Blocks until released, or until every job of the call is cancelled or late, and then finishes.
     Block,
+    /// Blocks until released, whatever happens to the jobs.
+    Hang,
     Lose,
     Fail,
     Panic,
@@ -38,10 +40,14 @@ pub struct FakeDevice {
     calls: Mutex<Vec<Vec<usize>>>,
     released: Mutex<bool>,
     changed: Condvar,
+    /// Number of submissions, for the watch over hangs.
+    pub submissions: Arc<AtomicU64>,
     pub builds: AtomicUsize,
     pub drops: AtomicUsize,
     /// Number of calls to release idle memory.
     pub idle_releases: AtomicUsize,
+    /// Build that blocks until released; `None`: none.
+    pub hanging_build: Option<usize>,
     /// Number of builds that succeed; `None`: all.
     pub good_builds: Option<usize>,
 }
@@ -55,6 +61,12 @@ impl FakeDevice {
     pub fn building(script: &[Step], good_builds: usize) -> Arc<Self> {
         let script = Mutex::new(script.iter().copied().collect());
         Arc::new(Self { script, good_builds: Some(good_builds), ..Self::default() })
+    }
+
+    /// Creates a device whose build number `build`, counted from 0, blocks until released.
+    pub fn hanging_in_build(script: &[Step], build: usize) -> Arc<Self> {
+        let script = Mutex::new(script.iter().copied().collect());
+        Arc::new(Self { script, hanging_build: Some(build), ..Self::default() })
     }
 
     /// Number of jobs in every call so far.
@@ -90,6 +102,15 @@ impl FakeDevice {
     }
 }
 
+impl FakeDevice {
+    fn hang(&self) {
+        let mut released = self.released.lock().unwrap();
+        while !*released {
+            released = self.changed.wait(released).unwrap();
+        }
+    }
+}
+
 struct FakeExecutor(Arc<FakeDevice>);
 
 impl Drop for FakeExecutor {
@@ -102,8 +123,10 @@ impl Executor for FakeExecutor {
     fn run(&mut self, jobs: &[GpuJob]) -> Vec<Result<Finished, GpuError>> {
         self.0.calls.lock().unwrap().push(jobs.iter().map(|j| j.prepared.lattice.atoms.len()).collect());
         let step = self.0.step();
-        if step == Step::Block {
-            self.0.block(jobs);
+        match step {
+            Step::Block => self.0.block(jobs),
+            Step::Hang => self.0.hang(),
+            _ => {}
         }
         let result = |job: &GpuJob| match step {
             Step::Finish | Step::Block | Step::OmitResult if job.cancel.is_cancelled() => {
@@ -112,7 +135,7 @@ impl Executor for FakeExecutor {
             Step::Finish | Step::Block | Step::OmitResult if job.deadline.is_some_and(|d| d <= Instant::now()) => {
                 Err(GpuError::Surface(SurfaceError::Deadline))
             }
-            Step::Finish | Step::Block | Step::OmitResult => Ok(Finished {
+            Step::Finish | Step::Block | Step::Hang | Step::OmitResult => Ok(Finished {
                 meshed: MeshOutput::new(Mesh::default(), GridStats { samples: 7, ..GridStats::default() }),
                 stages: vec![(Stage::Field, 2_000), (Stage::Emit, 1_000)],
                 sheets: SheetBlocks::default(),
@@ -124,6 +147,10 @@ impl Executor for FakeExecutor {
         };
         let n = if step == Step::OmitResult { jobs.len() - 1 } else { jobs.len() };
         jobs[..n].iter().map(result).collect()
+    }
+
+    fn submission_counter(&self) -> Arc<AtomicU64> {
+        Arc::clone(&self.0.submissions)
     }
 
     fn release_idle_memory(&mut self) {
@@ -141,6 +168,8 @@ pub const SETTINGS: PoolSettings = PoolSettings {
     batch: 16,
     rebuild_pause: Duration::ZERO,
     idle: Duration::MAX,
+    hang_timeout: Duration::MAX,
+    cool_down: Duration::MAX,
     min_partition_bricks: None,
 };
 
@@ -150,6 +179,9 @@ pub fn devices(fakes: &[Arc<FakeDevice>]) -> Vec<PoolDevice> {
         let fake = Arc::clone(fake);
         let build = move || {
             let n = fake.builds.fetch_add(1, Ordering::SeqCst);
+            if fake.hanging_build == Some(n) {
+                fake.hang();
+            }
             if fake.good_builds.is_some_and(|good| n >= good) {
                 return Err(GpuError::Failed("scripted build failure".to_owned()));
             }

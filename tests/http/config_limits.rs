@@ -78,6 +78,12 @@ const ROWS: &[Row] = &[
         "molmesh_device_partitions_total",
         "gpu/multi_device::concurrent_callers_neither_deadlock_nor_mix_partitions",
     ),
+    (
+        "devices.hang_timeout_ms",
+        "molmesh_device_lost_total",
+        "gpu/pool::a_hung_device_is_taken_out_and_its_job_retried",
+    ),
+    ("devices.cool_down_ms", "molmesh_device_up", "gpu/pool::a_device_is_used_again_after_its_cool_down"),
     ("archive.local_check_interval_ms", "", "http/archive_http::digests_are_cached"),
     (
         "archive.connect_timeout_ms",

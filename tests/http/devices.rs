@@ -70,7 +70,8 @@ impl Backend for Devices {
             Some(_) => "cpu".to_owned(),
             None => self.served.lock().unwrap().map_or_else(|| self.arithmetic(), str::to_owned),
         };
-        let made_by = Some(BackendIdentity { backend, arithmetic, device: device.to_owned(), fallback_reason });
+        let made_by =
+            Some(BackendIdentity { backend, arithmetic, device: device.to_owned(), prediction: None, fallback_reason });
         Ok(MeshOutput { made_by, ..self.fake.write(spheres, params, limits, control, sink)? })
     }
 
@@ -91,6 +92,7 @@ impl Backend for Devices {
             waiting: 0,
             busy: Duration::from_millis(1500),
             lost: 5,
+            hung: 5,
             finished: 11,
             failed: 2,
             shared: 4,
@@ -143,6 +145,8 @@ fn devices_are_listed_with_their_reasons() {
     backend.second_is_down.store(true, Ordering::SeqCst);
     let device = &server.get("/v1/capabilities").json()["devices"][1];
     assert_eq!((&device["up"], &device["reason"]), (&false.into(), &"device lost by a test".into()));
+    let ready = server.get("/readyz").text();
+    assert!(ready.contains("1 of 2 devices are in service; 1: device lost by a test"), "{ready}");
 }
 
 #[test]

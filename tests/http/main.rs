@@ -22,6 +22,7 @@ mod tools;
 mod access;
 mod api;
 mod archive_http;
+mod auto;
 mod bad_input;
 mod config;
 mod config_limits;

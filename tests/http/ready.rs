@@ -159,6 +159,7 @@ impl Backend for OneDevice {
             failed: 0,
             busy: Duration::ZERO,
             lost: 0,
+            hung: 0,
             rebuilds: 0,
             shared: 0,
             partitions: 0,

@@ -161,7 +161,7 @@ fn on_more_devices(
     let numbers: Vec<DeviceName> = found.selected().map(|device| DeviceName::Number(device.number)).collect();
     for n in (1..=numbers.len()).filter(|n| n.is_power_of_two() || *n == numbers.len()) {
         let some = discover(&DeviceChoice::Listed(numbers[..n].to_vec()), DiscoveryMode::Thorough);
-        let backend = GpuBackend::start(&some, settings, None).map_err(Error::failed)?;
+        let backend = GpuBackend::start(&some, settings).map_err(Error::failed)?;
         backend.warm_up().map_err(Error::failed)?;
         measure(&backend, n)?;
     }

@@ -89,7 +89,8 @@ const LIMITS: JobLimits = JobLimits {
     picture: molmesh::picture::PictureLimits { max_side: 64 },
 };
 
-/// Reads a structure in one and in several pieces, meshes it on a coarse grid, checks the mesh exactly and writes it in every format.
+/// Reads a structure in one and in several pieces, meshes it on a coarse grid, checks the mesh exactly and writes it in
+/// every format.
 pub(super) fn mesh(bytes: &[u8]) {
     // Some bits of the input choose the job, so that each input has one.
     let bits = bytes.iter().fold(bytes.len(), |hash, byte| hash.wrapping_mul(31).wrapping_add(usize::from(*byte)));

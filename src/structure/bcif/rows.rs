@@ -152,7 +152,8 @@ pub(super) fn read(
 /// A column and its fallback, if required.
 type Pair<'a> = [Option<Column<'a>>; 2];
 
-/// Decodes columns, in parallel if asked to. The second of a pair is required only if the first has rows without a value.
+/// Decodes columns, in parallel if asked to. The second of a pair is required only if the first has rows without a
+/// value.
 fn load<'a>(
     raw: &[Raw<'a>],
     layout: &Layout,

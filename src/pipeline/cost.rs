@@ -1,0 +1,336 @@
+//! Cost model of two backends, the CPU and a GPU: predicts the end of a job on each and assigns it to the first one.
+
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use super::work::mesh_work;
+use crate::surface::{Backend, Control, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+
+/// Minimum remaining part of the estimates of unfinished jobs: they may take longer than estimated.
+const MIN_REMAINING: f64 = 0.1;
+/// Atoms of the smaller structure that is measured.
+const SMALL_ATOMS: usize = 1_000;
+/// Maximum ratio of the larger structure to the smaller one.
+const MAX_RATIO: f64 = 32.0;
+
+/// Time of a mesh on a backend that has been started, s.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Cost {
+    /// Time per job.
+    pub per_job: f64,
+    /// Time per unit of work, an atom at 0.5 Å.
+    pub per_unit: f64,
+}
+
+impl Cost {
+    /// Returns the time of a job of `work` units, s.
+    #[must_use]
+    pub fn seconds(self, work: f64) -> f64 {
+        self.per_job + self.per_unit * work
+    }
+
+    /// Fits the times, s, of a small and a large job, given as pairs of work and time.
+    #[must_use]
+    pub fn fitted(small: (f64, f64), large: (f64, f64)) -> Self {
+        let slope = (large.1 - small.1) / (large.0 - small.0);
+        // Noise must not make a part negative.
+        let per_unit = if slope.is_finite() { slope.clamp(0.0, large.1 / large.0) } else { large.1 / large.0 };
+        Self { per_job: (large.1 - per_unit * large.0).max(0.0), per_unit }
+    }
+
+    /// Returns true if both parts are numbers that a measurement can give.
+    #[must_use]
+    pub fn is_valid(self) -> bool {
+        [self.per_job, self.per_unit].iter().all(|part| part.is_finite() && *part >= 0.0)
+    }
+
+    /// Measures `backend` on generated structures of two sizes, in about `time` unless a single small mesh takes
+    /// longer.
+    ///
+    /// # Errors
+    /// Those of [`Backend::write`].
+    pub fn measure(backend: &dyn Backend, time: Duration) -> Result<Self, SurfaceError> {
+        let begun = Instant::now();
+        // The first mesh starts threads and allocates buffers.
+        let first = time_mesh(backend, SMALL_ATOMS)?;
+        let again = if begun.elapsed() < time / 4 { time_mesh(backend, SMALL_ATOMS)? } else { first };
+        let small = if again.1 < first.1 { again } else { first };
+        let left = time.saturating_sub(begun.elapsed()).as_secs_f64();
+        let ratio = (left / (2.0 * small.1)).min(MAX_RATIO);
+        if ratio < 2.0 {
+            return Ok(Self { per_job: 0.0, per_unit: small.1 / small.0 });
+        }
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "2,000 to 32,000 atoms")]
+        let atoms = (SMALL_ATOMS as f64 * ratio) as usize;
+        time_mesh(backend, atoms)?;
+        Ok(Self::fitted(small, time_mesh(backend, atoms)?))
+    }
+}
+
+/// Meshes a generated structure of `atoms` atoms. Returns its work and the time, s.
+///
+/// # Errors
+/// Those of [`Backend::write`].
+pub fn time_mesh(backend: &dyn Backend, atoms: usize) -> Result<(f64, f64), SurfaceError> {
+    let (spheres, params) = (generated(atoms)?, SurfaceParams::default());
+    let begun = Instant::now();
+    drop(backend.run(&spheres, &params, &SurfaceLimits::default(), &Control::default())?);
+    Ok((mesh_work(atoms as f64, params.resolution), begun.elapsed().as_secs_f64()))
+}
+
+/// Generates a ball-like structure with about the density of a protein: a cubic lattice of 2.6 Å with displaced atoms.
+fn generated(atoms: usize) -> Result<Spheres, SurfaceError> {
+    let side = (1..).find(|side| side * side * side >= atoms).unwrap_or(1);
+    let mut random = 1_u32;
+    let mut coordinate = |cell: usize| {
+        random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        2.6 * cell as f64 + f64::from(random >> 16) / 65_536.0
+    };
+    let mut columns = [Vec::with_capacity(atoms), Vec::with_capacity(atoms), Vec::with_capacity(atoms)];
+    for n in 0..atoms {
+        for (column, cell) in columns.iter_mut().zip([n % side, n / side % side, n / (side * side)]) {
+            column.push(coordinate(cell));
+        }
+    }
+    let [x, y, z] = columns;
+    Spheres::new(x, y, z, vec![1.7; atoms])
+}
+
+/// Unfinished jobs of a backend. Moments are in s since any fixed one.
+#[derive(Debug, Clone, Copy, Default)]
+struct Load {
+    jobs: usize,
+    /// Sum of the estimates of unfinished jobs, divided by the number of devices.
+    estimates: f64,
+    /// Predicted end of all unfinished jobs.
+    end: f64,
+}
+
+impl Load {
+    /// Returns the time until the unfinished jobs have ended, s. Jobs that are late are assumed to take as long again
+    /// as they are late.
+    fn remaining(&self, now: f64) -> f64 {
+        let late = now - self.end;
+        if self.jobs == 0 {
+            0.0
+        } else if late > 0.0 {
+            late.max(MIN_REMAINING * self.estimates)
+        } else {
+            (-late).clamp(MIN_REMAINING * self.estimates, self.estimates)
+        }
+    }
+
+    fn add(&mut self, now: f64, estimate: f64) {
+        self.end = now + self.remaining(now) + estimate;
+        self.estimates += estimate;
+        self.jobs += 1;
+    }
+
+    fn remove(&mut self, estimate: f64) {
+        self.jobs = self.jobs.saturating_sub(1);
+        self.estimates = if self.jobs == 0 { 0.0 } else { (self.estimates - estimate).max(0.0) };
+    }
+}
+
+/// Backend of a [`Model`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Side {
+    /// The CPU.
+    Cpu,
+    /// The GPUs.
+    Gpu,
+}
+
+/// Assignment of a job to a backend.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Assignment {
+    /// Backend.
+    pub side: Side,
+    /// Predicted time until the end on the CPU and on the GPUs, s. `None` if there is no choice.
+    pub ends: Option<[f64; 2]>,
+    /// Time that the job adds to the load of its backend, s.
+    added: f64,
+}
+
+/// Predicts the ends of jobs on both backends.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Model {
+    costs: Option<[Cost; 2]>,
+    loads: [Load; 2],
+}
+
+impl Model {
+    /// Sets the costs of the CPU and of one GPU. Until then, GPUs get all jobs.
+    pub const fn set_costs(&mut self, cpu: Cost, gpu: Cost) {
+        self.costs = Some([cpu, gpu]);
+    }
+
+    /// Assigns a job of `work` units at the moment `now`, s, to the backend where it is predicted to end first.
+    /// `gpus` is the number of GPUs that accept jobs; without one, the CPU gets the job.
+    pub fn assign(&mut self, now: f64, work: f64, gpus: usize) -> Assignment {
+        let ends = self.costs.filter(|_| gpus > 0).map(|costs| {
+            let wait = |side: Side, devices: usize| {
+                let load = self.loads[side as usize];
+                // An idle GPU starts the job at once.
+                if load.jobs < devices { 0.0 } else { load.remaining(now) }
+            };
+            [wait(Side::Cpu, 1) + costs[0].seconds(work), wait(Side::Gpu, gpus) + costs[1].seconds(work)]
+        });
+        let side = match ends {
+            _ if gpus == 0 => Side::Cpu,
+            Some([cpu, gpu]) if cpu < gpu => Side::Cpu,
+            _ => Side::Gpu,
+        };
+        Assignment { ends, ..self.assign_to(side, now, work, gpus) }
+    }
+
+    /// Assigns a job to a given backend.
+    pub fn assign_to(&mut self, side: Side, now: f64, work: f64, gpus: usize) -> Assignment {
+        let devices = if side == Side::Gpu { gpus.max(1) } else { 1 };
+        let added = self.costs.map_or(0.0, |costs| costs[side as usize].seconds(work)) / devices as f64;
+        self.loads[side as usize].add(now, added);
+        Assignment { side, ends: None, added }
+    }
+
+    /// Removes the load of a finished job.
+    pub fn finish(&mut self, assignment: &Assignment) {
+        self.loads[assignment.side as usize].remove(assignment.added);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CPU: Cost = Cost { per_job: 0.001, per_unit: 4e-6 };
+
+    #[test]
+    fn two_times_determine_the_cost() {
+        let fitted = Cost::fitted((1e3, 0.012), (1e4, 0.03));
+        assert!((fitted.per_job - 0.01).abs() < 1e-9 && (fitted.per_unit - 2e-6).abs() < 1e-12, "{fitted:?}");
+        // Noise: the large job took less time, or more than in proportion.
+        assert_eq!(Cost::fitted((1e3, 0.05), (1e4, 0.03)), Cost { per_job: 0.03, per_unit: 0.0 });
+        assert_eq!(Cost::fitted((1e3, 0.001), (1e4, 0.03)), Cost { per_job: 0.0, per_unit: 3e-6 });
+        assert!(Cost::fitted((1e3, 0.01), (1e3, 0.01)).is_valid());
+    }
+
+    #[test]
+    fn a_backend_is_measured_within_the_time() {
+        let cpu = crate::surface::cpu::CpuBackend::new(Some(1)).unwrap();
+        let begun = Instant::now();
+        let cost = Cost::measure(&cpu, Duration::from_millis(400)).unwrap();
+        let taken = begun.elapsed();
+        assert!(cost.is_valid() && cost.per_unit > 0.0 && cost.per_unit < 1e-3, "{cost:?}");
+        assert!(taken < Duration::from_secs(20), "{taken:?}");
+        assert_eq!(generated(1_234).unwrap().len(), 1_234);
+    }
+
+    /// Runs jobs that arrive at `arrivals` and take exactly the estimated times. Returns the mean time from arrival to
+    /// end, and the number of jobs per backend. `forced` gives all jobs to one backend.
+    fn simulate(gpu: Cost, jobs: &[(f64, f64)], forced: Option<Side>) -> (f64, [usize; 2]) {
+        let costs = [CPU, gpu];
+        let mut model = Model::default();
+        model.set_costs(CPU, gpu);
+        let (mut free, mut total, mut counts) = ([0.0_f64; 2], 0.0, [0; 2]);
+        let mut running: Vec<(f64, Assignment)> = Vec::new();
+        for &(now, work) in jobs {
+            running.retain(|(end, assignment)| {
+                if *end <= now {
+                    model.finish(assignment);
+                }
+                *end > now
+            });
+            let assignment = match forced {
+                Some(side) => model.assign_to(side, now, work, 1),
+                None => model.assign(now, work, 1),
+            };
+            let side = assignment.side as usize;
+            let end = free[side].max(now) + costs[side].seconds(work);
+            free[side] = end;
+            total += end - now;
+            counts[side] += 1;
+            running.push((end, assignment));
+        }
+        (total / jobs.len() as f64, counts)
+    }
+
+    /// Works from 1,000 to about 1,000,000 units, one job each `gap` seconds.
+    fn jobs(gap: f64) -> Vec<(f64, f64)> {
+        let work = |n: u32| 1e3 * 10_f64.powf(3.0 * f64::from(n * 37 % 101) / 101.0);
+        (0..300).map(|n| (gap * f64::from(n), work(n))).collect()
+    }
+
+    #[test]
+    fn never_much_slower_than_the_better_backend() {
+        for per_job in [0.0, 0.005, 0.1, 2.0] {
+            for per_unit in [1e-8, 1e-6, 4e-6, 1e-4] {
+                for gap in [0.0, 0.1, 0.5, 100.0] {
+                    let (gpu, jobs) = (Cost { per_job, per_unit }, jobs(gap));
+                    let of = |forced| simulate(gpu, &jobs, forced).0;
+                    let best = of(Some(Side::Cpu)).min(of(Some(Side::Gpu)));
+                    assert!(of(None) <= 1.1 * best, "{gpu:?} each {gap} s: {} instead of {best}", of(None));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn load_uses_both_backends_and_an_idle_machine_the_faster_one() {
+        let gpu = Cost { per_job: 0.005, per_unit: 2e-6 };
+        let (together, counts) = simulate(gpu, &jobs(0.0), None);
+        assert!(counts.iter().all(|n| *n > 20), "{counts:?}");
+        let (alone, _) = simulate(gpu, &jobs(0.0), Some(Side::Gpu));
+        assert!(together < 0.9 * alone, "{together} {alone}");
+        // Small jobs end first on the CPU, large ones on the GPU.
+        let mut model = Model::default();
+        model.set_costs(CPU, gpu);
+        for (work, side) in [(1e3, Side::Cpu), (1e6, Side::Gpu)] {
+            let assignment = model.assign(0.0, work, 1);
+            assert_eq!(assignment.side, side, "{work}");
+            model.finish(&assignment);
+        }
+    }
+
+    #[test]
+    fn a_gpu_that_is_down_gets_nothing() {
+        let mut model = Model::default();
+        assert_eq!(model.assign(0.0, 1e6, 0).side, Side::Cpu);
+        // Without costs, a GPU that is up gets everything.
+        assert_eq!(model.assign(0.0, 1.0, 1).side, Side::Gpu);
+        model.set_costs(CPU, Cost { per_job: 0.0, per_unit: 1e-9 });
+        for _ in 0..100 {
+            assert_eq!(model.assign(0.0, 1e6, 0).side, Side::Cpu);
+        }
+        assert_eq!(model.assign(0.0, 1e6, 1).side, Side::Gpu);
+    }
+
+    #[test]
+    fn more_gpus_end_a_queue_sooner() {
+        let gpu = Cost { per_job: 0.0, per_unit: 1e-6 };
+        let end = |gpus: usize| {
+            let mut model = Model::default();
+            model.set_costs(Cost { per_job: 1e3, per_unit: 1.0 }, gpu);
+            (0..10).map(|_| model.assign(0.0, 1e6, gpus).ends.unwrap()[1]).last().unwrap()
+        };
+        assert!((end(1) - 10.0).abs() < 1e-9, "{}", end(1));
+        assert!(end(4) < 4.0 && end(16) < 1.01, "{} {}", end(4), end(16));
+    }
+
+    #[test]
+    fn late_jobs_and_early_ends_correct_the_load() {
+        let mut model = Model::default();
+        model.set_costs(Cost { per_job: 1e3, per_unit: 0.0 }, Cost { per_job: 1.0, per_unit: 0.0 });
+        let first = model.assign(0.0, 0.0, 1);
+        let second = model.assign(0.0, 0.0, 1);
+        let wait = |model: &Model, now: f64| { *model }.assign(now, 0.0, 1).ends.unwrap()[1] - 1.0;
+        // Both are late, slightly and by 48 s.
+        assert!((wait(&model, 2.1) - 0.2).abs() < 1e-9);
+        assert!((wait(&model, 50.0) - 48.0).abs() < 1e-9);
+        // One has ended early: at most the estimate of the other remains.
+        model.finish(&first);
+        assert!((wait(&model, 0.0) - 1.0).abs() < 1e-9);
+        model.finish(&second);
+        assert!(wait(&model, 0.0).abs() < 1e-9);
+    }
+}
