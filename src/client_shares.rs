@@ -114,7 +114,7 @@ mod tests {
             .map(|n| {
                 let (shares, order) = (Arc::clone(&shares), Arc::clone(&order));
                 tokio::spawn(async move {
-                    let _place = shares.wait(1, Instant::now() + Duration::from_secs(60)).await.unwrap();
+                    let _place = shares.wait(1, Instant::now() + Duration::from_mins(1)).await.unwrap();
                     order.lock().unwrap().push(n);
                 })
             })

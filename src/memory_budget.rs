@@ -75,8 +75,7 @@ impl Budget {
         let limit = self.limit;
         let take = |held: u64| held.checked_add(bytes).filter(|sum| *sum <= limit);
         let mut reclaimed = true;
-        loop {
-            let Err(held) = self.held.try_update(Ordering::Relaxed, Ordering::Relaxed, take) else { break };
+        while let Err(held) = self.held.try_update(Ordering::Relaxed, Ordering::Relaxed, take) {
             // Another thread may have freed memory even if this one could not.
             if !reclaimed {
                 return Err(OutOfMemory::Budget { needed: bytes, held, limit });

@@ -111,9 +111,7 @@ fn devices(app: &Shared) -> Check {
             let devices = backend.devices();
             let up = devices.iter().filter(|device| device.down.is_none()).count();
             let mut detail = format!("{} has computed its first mesh", backend.name());
-            if !devices.is_empty() {
-                detail += &format!("; {up} of {} devices are in service", devices.len());
-            }
+            detail.extend((!devices.is_empty()).then(|| format!("; {up} of {} devices are in service", devices.len())));
             for device in &devices {
                 detail.extend(device.down.iter().map(|why| format!("; {}: {why}", device.number)));
             }

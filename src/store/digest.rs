@@ -78,7 +78,9 @@ mod tests {
     #[test]
     fn parts_have_the_digest_of_the_whole() {
         let mut hasher = Hasher::default();
-        [&b"a"[..], b"", b"bc"].into_iter().for_each(|part| hasher.update(part));
+        for part in [&b"a"[..], b"", b"bc"] {
+            hasher.update(part);
+        }
         assert_eq!(hasher.digest(), Digest::of(b"abc"));
     }
 

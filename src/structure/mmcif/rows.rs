@@ -51,13 +51,12 @@ impl<'a> Rows<'a> {
 
     /// Reads rows from the first value on. Returns the end of the loop.
     pub(super) fn read(&mut self, first: usize) -> Result<usize, Stop> {
-        let mut at = match self.read_plain(first)? {
-            Some(end) => end,
-            None => {
-                // Untouched memory is not allocated.
-                self.expected = memchr::memchr_iter(b'\n', &self.text[first..]).count() + 1;
-                first
-            }
+        let mut at = if let Some(end) = self.read_plain(first)? {
+            end
+        } else {
+            // Untouched memory is not allocated.
+            self.expected = memchr::memchr_iter(b'\n', &self.text[first..]).count() + 1;
+            first
         };
         let mut scanner = Scanner::new(self.text);
         loop {

@@ -19,7 +19,7 @@ use std::collections::HashSet;
 
 use self::atoms::{Atoms, File};
 use self::lines::Lines;
-use self::records::{Line, Mark, Records};
+use self::records::{Boundary, Line, Mark, Records};
 use super::atoms::{Columns, Slices, Source, SourceFormat, Structure, join};
 use super::error::StructureError;
 use super::kinds::Sequence;
@@ -114,12 +114,12 @@ fn number_models(found: &[Records], mut rows: &mut [i32]) {
     let mut models = Models::default();
     for records in found {
         let mut first = 0;
-        for &Mark { row, begins } in &records.marks {
+        for &Mark { row, boundary } in &records.marks {
             rows = models.fill(rows, row - first);
             first = row;
-            match begins {
-                Some(number) => models.begin(number),
-                None => models.current = None,
+            match boundary {
+                Boundary::Begins(number) => models.begin(number),
+                Boundary::Ends => models.current = None,
             }
         }
         rows = models.fill(rows, records.atoms.len() - first);

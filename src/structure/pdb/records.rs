@@ -33,13 +33,21 @@ impl Line {
     }
 }
 
-/// Beginning or end of a model.
+/// Record at the beginning or end of a model.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Boundary {
+    /// MODEL, with its number if it has one.
+    Begins(Option<i32>),
+    /// ENDMDL or END.
+    Ends,
+}
+
+/// Place of a boundary among the atoms.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Mark {
     /// Number of atoms before it in its piece.
     pub(super) row: usize,
-    /// Number in the MODEL record, if it has one; `None` for the end of a model.
-    pub(super) begins: Option<Option<i32>>,
+    pub(super) boundary: Boundary,
 }
 
 /// Memory of a mark, and of its model among the known ones, bytes.
@@ -107,10 +115,10 @@ impl Records {
         let word = &line[..line.len().min(6)];
         match word.trim_ascii_end() {
             b"MODEL" => {
-                let begins = Some(model_number(start, line)?);
-                self.marks.push(Mark { row: self.atoms.len(), begins });
+                let boundary = Boundary::Begins(model_number(start, line)?);
+                self.marks.push(Mark { row: self.atoms.len(), boundary });
             }
-            b"ENDMDL" | b"END" => self.marks.push(Mark { row: self.atoms.len(), begins: None }),
+            b"ENDMDL" | b"END" => self.marks.push(Mark { row: self.atoms.len(), boundary: Boundary::Ends }),
             b"SEQRES" => sequence::of_chain(line, &mut self.listed),
             b"MODRES" => sequence::of_residue(line, &mut self.listed),
             b"HEADER" if self.id.is_none() => {
