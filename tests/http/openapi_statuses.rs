@@ -66,6 +66,7 @@ fn plain(seen: &Seen, server: &Running) {
         let path = path.replace("{slug}", "%ff").replace("{key}", "%ff");
         seen.expect(400, server.addr, (method, &path), &[], b"");
     }
+    seen.expect(400, server.addr, ("GET", "/v1/capabilities?x=1"), &[], b"");
     seen.expect(200, server.addr, ("GET", "/problems/internal"), &[], b"");
     seen.expect(404, server.addr, ("GET", "/problems/none"), &[], b"");
     // The web page is not a part of the document.
