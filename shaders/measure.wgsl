@@ -2,8 +2,9 @@
 // brick. The vertices that the brick's cells use are numbered and joined along the triangles.
 //
 // A brick writes one block of words: brick, number of sheets and of shared vertices (16 bits each), origin; for each
-// sheet its numbers of triangles and vertices (16 bits each), the neighbours above and below that share vertices (8 bits
-// each), and ten sums; and with several sheets, for each shared vertex its owner (3 bits), key (11 bits) and sheet.
+// sheet its numbers of triangles and vertices (16 bits each), the neighbours above and below that share vertices
+// (8 bits each), and ten sums; and with several sheets, for each shared vertex its owner (3 bits), key (11 bits) and
+// sheet.
 #include shared/params.wgsl
 #include shared/bits.wgsl
 #include shared/tiles.wgsl
@@ -43,8 +44,8 @@ var<workgroup> labels: array<atomic<u32>, 1944>;
 // Bits of the vertices that name a sheet.
 var<workgroup> names: array<atomic<u32>, 61>;
 var<workgroup> n_sheets: atomic<u32>;
-// Number that one lane tells all others.
-var<workgroup> told: u32;
+// Value that one lane passes to all others.
+var<workgroup> passed: u32;
 // Triangles, vertices and neighbours of a sheet.
 var<workgroup> counted: array<atomic<u32>, 3>;
 // Sums of half of the lanes: twice the area and the vector; the product and the moment.
@@ -100,8 +101,10 @@ fn shared_edges(word: Word, crossing: u32) -> u32 {
     if (word.owner > 0u) {
         return crossing;
     }
-    return crossing & (select(0u, 0x01010101u, word.axis != 0u) | select(0u, 0xffu, word.axis != 1u && word.quarter == 0u)
-        | select(0u, 0xffffffffu, word.axis != 2u && word.z == 0u));
+    let first_x = select(0u, 0x01010101u, word.axis != 0u);
+    let first_y = select(0u, 0xffu, word.axis != 1u && word.quarter == 0u);
+    let first_z = select(0u, 0xffffffffu, word.axis != 2u && word.z == 0u);
+    return crossing & (first_x | first_y | first_z);
 }
 
 // Joins the sets of two vertices. The lowest vertex names a set.
@@ -242,8 +245,8 @@ fn users(word: Word, on: u32) -> u32 {
     return mask;
 }
 
-// Writes the owner, key and sheet of each shared vertex of a word from `at` on. The first vertex of the word is `first`.
-// A key has the layer (3 bits), axis (2 bits) and bit (6 bits) of an edge in its own brick, so keys are in the order of
+// Writes the owner, key and sheet of each shared vertex of a word from `at` on. The word's first vertex is `first`. A
+// key has the layer (3 bits), axis (2 bits) and bit (6 bits) of an edge in its own brick, so keys are in the order of
 // the brick's vertices.
 fn write_vertices(at: u32, word: Word, crossing: u32, first: u32) {
     let layer = (word.z & 7u) << 8u | word.axis << 6u | (word.quarter & 1u) << 5u;
@@ -319,15 +322,15 @@ fn main(
         edges[3u * lane + 2u] = vec2<u32>(used.z, place.z);
     }
     if (lane == LANES - 1u) {
-        told = sum >> 16u;
+        passed = sum >> 16u;
     }
-    let n_vertices = workgroupUniformLoad(&told);
+    let n_vertices = workgroupUniformLoad(&passed);
     let own_shared = n_shared.x + n_shared.y + n_shared.z;
     let shared_sum = scan_lanes(lane, own_shared);
     if (lane == LANES - 1u) {
-        told = shared_sum;
+        passed = shared_sum;
     }
-    let all_shared = workgroupUniformLoad(&told);
+    let all_shared = workgroupUniformLoad(&passed);
     for (var v = lane; v < n_vertices; v += LANES) {
         atomicStore(&labels[v], v);
     }
@@ -343,15 +346,15 @@ fn main(
     }
     number_sheets(lane, n_vertices);
     if (lane == 0u) {
-        told = atomicLoad(&n_sheets);
+        passed = atomicLoad(&n_sheets);
     }
-    let n_found = workgroupUniformLoad(&told);
+    let n_found = workgroupUniformLoad(&passed);
     let n_written = select(0u, all_shared, n_found > 1u);
     let size = HEADER + SHEET * n_found + n_written;
     if (lane == 0u) {
-        told = atomicAdd(&counters.sheet_words, size);
+        passed = atomicAdd(&counters.sheet_words, size);
     }
-    let block = workgroupUniformLoad(&told);
+    let block = workgroupUniformLoad(&passed);
     // A block beyond the capacity is not written. The host detects it by the counter.
     if (block + size > params.sheet_capacity) {
         return;

@@ -31,7 +31,7 @@ impl Engine {
             self.collect_output(state)?;
             let counts = self.wait_for_counts(state, chunk, submission)?;
             if accept(self, state, chunk)? {
-                // Sheets that do not fit are made again before the next chunk, so their piece is not the last.
+                // First, so that sheets that do not fit are made again before the next chunk replaces the samples.
                 self.make_output(state, &[(chunk, &counts)], Stage::Measure)?;
                 self.make_output(state, &[(chunk, &counts)], Stage::Interpolate)?;
             }

@@ -71,8 +71,8 @@ pub struct Measures {
 }
 
 impl Measures {
-    /// Measures `mesh` with its vertices as stored, including rounding, on one thread: for meshes that their backend did
-    /// not measure.
+    /// Measures `mesh` with its vertices as stored, including rounding, on one thread. Backends measure most meshes
+    /// themselves; this is for the others.
     ///
     /// # Errors
     /// [`SurfaceError::Cancelled`].
@@ -175,8 +175,8 @@ fn components_of(mesh: &Mesh, control: &Control<'_>) -> Result<Vec<Component>, S
 }
 
 impl Component {
-    /// Adds a triangle. By the divergence theorem, its part of the volume's moment along an axis is the integral of half
-    /// the squared coordinate times the normal.
+    /// Adds a triangle. By the divergence theorem, its part of the volume's moment along an axis is the integral of
+    /// half the squared coordinate times the normal.
     fn add(&mut self, [a, b, c]: [[f64; 3]; 3]) {
         let [u, v] = [b, c].map(|p| [p[0] - a[0], p[1] - a[1], p[2] - a[2]]);
         let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];

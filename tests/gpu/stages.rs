@@ -1,6 +1,6 @@
 //! Single stages of a device, run on the results of the CPU's previous stages and compared with the CPU's stage: `bin`,
-//! `classify`, `scan` and `emit` bit by bit, `field`, `interpolate` and `measure` within bounds. Outputs are poisoned before a
-//! stage runs.
+//! `classify`, `scan` and `emit` bit by bit, `field`, `interpolate` and `measure` within bounds. Outputs are poisoned
+//! before a stage runs.
 
 use crate::gpu_support;
 
@@ -569,7 +569,8 @@ fn same_sheet(a: &ProbedSheet, b: &ProbedSheet, several: bool) -> bool {
     close && below && (a.origin, a.count, a.near[0]) == (b.origin, b.count, b.near[0])
 }
 
-/// Returns the first difference of a block from the CPU's sheets of a brick. Backends number sheets in different orders.
+/// Returns the first difference of a block from the CPU's sheets of a brick. Backends number sheets in different
+/// orders.
 fn block_difference(block: &Block, brick: &ProbedSurface) -> Option<String> {
     let several = brick.sheets.len() > 1;
     if block.sheets.len() != brick.sheets.len() || !several && !block.vertices.is_empty() {

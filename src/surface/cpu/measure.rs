@@ -107,8 +107,8 @@ fn note_vertices(
 }
 }
 
-/// Neighbours that use a vertex, by the axes (bits: 0 x, 1 y, 2 z) along which it lies in the brick's first layer: bit n
-/// for the brick that has this one as neighbour n.
+/// Neighbours that use a vertex, by the axes (bits: 0 x, 1 y, 2 z) along which it lies in the brick's first layer.
+/// Bit n stands for the brick that has this one as neighbour n.
 const USERS: [u8; 8] = [0, 1 << 1, 1 << 2, 0b1110, 1 << 4, 0b11_0010, 0b101_0100, 0];
 
 /// Returns true if a brick is known to have one sheet before its triangles exist.
