@@ -360,7 +360,9 @@ fn a_job_that_hangs_everywhere_leaves_devices_to_others() {
     let error = pool.run(&job(1)).map(|_| ()).unwrap_err();
     assert_eq!(error, GpuError::Hung { after_ms: 30 });
     assert_eq!(pool.status().iter().filter(|device| device.down.is_some()).count(), 2);
-    fakes.iter().for_each(|fake| fake.release());
+    for fake in &fakes {
+        fake.release();
+    }
 }
 
 #[test]

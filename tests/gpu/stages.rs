@@ -517,7 +517,9 @@ fn emit_counts_triangles_with_a_corner_twice() {
     let setup = Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5);
     // Without crossing edges before a word, several vertices have the same number.
     let mut records = setup.records();
-    records.iter_mut().for_each(|record| record.crossing = [0; 48]);
+    for record in &mut records {
+        record.crossing = [0; 48];
+    }
     let inputs = [
         (BufferId::Inside, raw(&setup.inside())),
         (BufferId::Records, raw(&records)),
