@@ -160,7 +160,9 @@ fn components_of(mesh: &Mesh, control: &Control<'_>) -> Result<Vec<Component>, S
     }
     let mut of_vertex = Vec::new();
     let mut components = vec![Component::default(); joined.number_sets(&mut of_vertex) as usize];
-    of_vertex.iter().for_each(|component| components[*component as usize].vertices += 1);
+    for component in &of_vertex {
+        components[*component as usize].vertices += 1;
+    }
     for chunk in mesh.triangles.chunks(TRIANGLES_PER_CHECK) {
         control.check()?;
         for triangle in chunk {
