@@ -110,14 +110,12 @@ fn devices(app: &Shared) -> Check {
         Some(true) => {
             let devices = backend.devices();
             let up = devices.iter().filter(|device| device.down.is_none()).count();
-            let mut detail = format!("{} has computed its first mesh", backend.name());
+            let mut parts = vec![format!("{} has computed its first mesh", backend.name())];
             if !devices.is_empty() {
-                detail += &format!("; {up} of {} devices are in service", devices.len());
+                parts.push(format!("{up} of {} devices are in service", devices.len()));
             }
-            for device in &devices {
-                detail.extend(device.down.iter().map(|why| format!("; {}: {why}", device.number)));
-            }
-            Ok(detail)
+            parts.extend(devices.iter().filter_map(|d| d.down.as_ref().map(|why| format!("{}: {why}", d.number))));
+            Ok(parts.join("; "))
         }
     };
     Check::new("devices", found)

@@ -81,7 +81,7 @@ pub fn time_mesh(backend: &dyn Backend, atoms: usize) -> Result<(f64, f64), Surf
 
 /// Generates a ball-like structure with about the density of a protein: a cubic lattice of 2.6 Å with displaced atoms.
 fn generated(atoms: usize) -> Result<Spheres, SurfaceError> {
-    let side = (1..).find(|side| side * side * side >= atoms).unwrap_or(1);
+    let side = (1..=atoms).find(|side| side * side * side >= atoms).unwrap_or(1);
     let mut random = 1_u32;
     let mut coordinate = |cell: usize| {
         random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
