@@ -2,6 +2,7 @@
 
 use molmesh::pipeline::spacing::{COARSEST, FINEST};
 use molmesh::pipeline::{Choice, Estimate, JobError, JobLimits, Product, Report, estimate, params, run};
+use molmesh::structure::{ReadLimits, read_with};
 use molmesh::surface::{Control, CpuBackend, SurfaceError, SurfaceLimits};
 
 const PTI: &[u8] = include_bytes!("../../samples/4pti.pdb");
@@ -53,7 +54,8 @@ fn expected(input: &[u8], pairs: &[(&str, &str)]) -> Estimate {
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     let backend = CpuBackend::new(None).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
-    estimate(input, &job, &JobLimits::default(), &choice, &Control::default()).unwrap()
+    let read = |control: &Control<'_>| read_with(input, &ReadLimits::default(), control).map(Box::new);
+    estimate(read, &job, &JobLimits::default(), &choice, &Control::default()).unwrap()
 }
 
 #[test]
