@@ -382,7 +382,7 @@ fn main(
         var n_own = 0u;
         for (var window = 0u; window < n; window += WINDOW) {
             workgroupBarrier();
-            // Otherwise all are still listed.
+            // If all triangles fit one window, they are still listed.
             if (n > WINDOW) {
                 list_row(row, start - window);
             }

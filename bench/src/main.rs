@@ -1,4 +1,5 @@
-//! `molmesh-bench`: benchmarks of molmesh on GPUs and of its service, and the tables and figures of the 2010 paper on current hardware.
+//! `molmesh-bench`: benchmarks of molmesh on GPUs and of its service, and the tables and figures of the 2010 paper on
+//! current hardware.
 
 mod device;
 mod error;

@@ -20,7 +20,7 @@ var<workgroup> rows: array<u32, 81>;
 var<workgroup> edges: array<vec2<u32>, 162>;
 // Triangle counts of eight cases per word; from 32 on, the edges of a cell as offsets from the cell's sample.
 var<workgroup> packed_counts: array<u32, 48>;
-// Triangles: cell, and corners from bit 12 on. Used for sums over lanes before.
+// Triangles: cell, and corners from bit 12 on. Before that, holds sums over lanes.
 var<workgroup> listed: array<u32, 256>;
 
 // Row of eight cells: the cases of four cells per word, the first cell, and the number of triangles.

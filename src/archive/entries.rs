@@ -127,7 +127,7 @@ impl Archive {
                     let taken = self.shared.shares.wait(client, start + self.shared.timeout / 2).await;
                     place = Some(taken.map_err(|ShareExceeded { limit }| FetchError::Share { id: id.clone(), limit })?);
                 }
-                // Another caller without a place was the first again.
+                // The fetch that this caller joined had no place either. Tries again.
                 (Err(FetchError::Share { .. }), _) => {}
                 (found, _) => return found,
             }

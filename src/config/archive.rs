@@ -37,8 +37,8 @@ pub struct ArchiveConfig {
     /// Time for the head of a response, and the longest pause within its body, ms. Default 10,000: archives serve
     /// stored files.
     pub first_byte_timeout_ms: u64,
-    /// Total time for an entry, ms: waiting for other fetches, half of it for those of the same client, all attempts and
-    /// pauses. Default 60,000: 100 MB at 14 Mbit/s.
+    /// Total time for an entry, ms: waiting for other fetches, half of it for those of the same client, all attempts
+    /// and pauses. Default 60,000: 100 MB at 14 Mbit/s.
     pub timeout_ms: u64,
     /// Attempts per URL, the first included. Default 3. Retries only temporary failures: no connection, timeouts,
     /// damaged files, 429 and 5xx.

@@ -24,7 +24,7 @@ pub trait Executor: Send {
         Err(GpuError::Failed("this program does not support partitions".to_owned()))
     }
 
-    /// Counter of submissions so far. A device on which it stands still for too long is considered hung.
+    /// Counter of submissions so far. A device on which it does not change for too long is considered hung.
     fn submission_counter(&self) -> Arc<AtomicU64> {
         Arc::default()
     }

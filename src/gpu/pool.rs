@@ -27,7 +27,7 @@ use crate::sync::thread::{self, JoinHandle};
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 /// Maximum number of attempts at a job on one device.
 const MAX_ATTEMPTS: usize = 2;
-/// Maximum number of devices on which a job may hang: it may be the cause.
+/// Maximum number of devices on which a job may hang, because the job may be the cause.
 const MAX_HANGS: usize = 2;
 
 /// Device of a pool.

@@ -10,7 +10,7 @@ use super::partition_handle::PartitionHandle;
 use super::queued_job::QueuedJob;
 use crate::sync::mpsc::SyncSender;
 
-/// A slow device may take this many times the estimated time of a batch.
+/// Maximum time of a submission on a slow device, as a multiple of the estimated time of its batch.
 const MAX_SLOWDOWN: f64 = 100.0;
 
 /// Batch that a device runs.
@@ -26,7 +26,7 @@ pub(super) struct RunningBatch {
 }
 
 impl RunningBatch {
-    /// Creates the watch of a batch that starts at `now` on an executor that counts `submissions`.
+    /// Starts to watch a batch that begins at `now` on an executor that counts `submissions`.
     pub(super) fn new(batch: &[QueuedJob], submissions: Arc<AtomicU64>, now: Instant) -> Self {
         let seen = (submissions.load(Ordering::Relaxed), now);
         let partition = batch.iter().find_map(|queued| queued.partition.clone());
@@ -51,7 +51,7 @@ impl RunningBatch {
         Duration::try_from_secs_f64(MAX_SLOWDOWN * estimate).map_or(Duration::MAX, |limit| limit.max(minimum))
     }
 
-    /// Returns true if no submission was made for longer than `limit`. A partition that waits for others is idle.
+    /// Returns true if no submission was made for longer than `limit`. A partition that waits for others never hangs.
     pub(super) fn has_hung(&mut self, limit: Duration, now: Instant) -> bool {
         let submissions = self.submissions.load(Ordering::Relaxed);
         if submissions != self.seen.0 || self.partition.as_ref().is_some_and(PartitionHandle::is_waiting) {

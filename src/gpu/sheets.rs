@@ -85,7 +85,7 @@ impl SheetBlocks {
     }
 }
 
-/// Enters the blocks in `words` by brick.
+/// Stores the blocks in `words` at the indices of their bricks.
 fn place<'a>(mut words: &'a [u32], blocks: &mut [Option<Block<'a>>]) -> Result<(), GpuError> {
     while let Some((&[brick, counts, x, y, z], rest)) = words.split_first_chunk::<HEADER>() {
         let [n_sheets, n_vertices] = [counts & 0xffff, counts >> 16].map(|n| n as usize);
@@ -133,7 +133,7 @@ fn narrow(n: u32) -> Result<u16, GpuError> {
     u16::try_from(n).map_err(|e| GpuError::Failed(format!("{n} in a block: {e}")))
 }
 
-/// Sheet in the words of `measure.wgsl`.
+/// Converts the words of a sheet, as `measure.wgsl` writes them.
 fn sheet(origin: [i32; 3], words: &[u32; SHEET]) -> Sheet {
     let [counts, near, sums @ ..] = words;
     let [area, x, y, z, px, py, pz, mx, my, mz] = sums.map(|word| f64::from(f32::from_bits(word)));

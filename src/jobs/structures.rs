@@ -33,7 +33,7 @@ struct Charged {
     _charge: Charge,
 }
 
-/// Charge of a structure that is kept, which the metric of the budget does not count, or of one that is not.
+/// Charge of a structure. The metric of the budget counts it only if the structure is not kept.
 #[derive(Debug)]
 enum Charge {
     Kept { _buffers: Buffers },
@@ -111,7 +111,9 @@ impl Structures {
     }
 
     /// Returns the structure of the file `bytes` with this digest, reading it if necessary. Concurrent calls read it
-    /// once. Memory is charged to the budget until the last reference is dropped, not to the meter of `control`.
+    /// once if it is kept, else one after the other.
+    ///
+    /// Memory is charged to the budget until the last reference is dropped, not to the meter of `control`.
     ///
     /// # Errors
     /// Returns the errors of [`structure::read_with`].
@@ -130,7 +132,7 @@ impl Structures {
                 counter!(STRUCTURE_CACHE_REQUESTS, "result" => "hit").increment(1);
                 return limits.check_atoms(kept.len()).map(|()| kept);
             }
-            if state.reading.insert(key) {
+            if self.limit == 0 || state.reading.insert(key) {
                 break;
             }
             state = self.ended.wait_timeout(state, POLL).unwrap_or_else(PoisonError::into_inner).0;
@@ -183,7 +185,7 @@ impl Reclaim for Structures {
     }
 }
 
-/// Lets others read the structure when a request has ended reading, also with an error or a panic.
+/// Mark of a structure that a request is reading. Dropping it, also after an error or a panic, lets others read.
 struct Reading<'a> {
     structures: &'a Structures,
     key: Key,

@@ -160,6 +160,11 @@ impl Backend for AssignedBackend<'_> {
         self.auto.side(side).name()
     }
 
+    fn arithmetic(&self) -> String {
+        let side = self.state().0.side;
+        self.auto.side(side).arithmetic()
+    }
+
     fn describe(&self) -> String {
         let side = self.state().0.side;
         self.auto.side(side).describe()

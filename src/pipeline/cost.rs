@@ -1,4 +1,5 @@
-//! Cost model of two backends, the CPU and a GPU: predicts the end of a job on each and assigns it to the first one.
+//! Cost model of two backends, the CPU and the GPUs: predicts the end of a job on each and assigns the job to the
+//! backend where it ends first.
 
 use std::time::{Duration, Instant};
 

@@ -304,7 +304,8 @@ fn rejects_the_same_values_as_text_with_the_same_message() {
 
 #[test]
 fn unreadable_optional_values_are_warnings() {
-    let warnings = |column: Pack| bcif(&atoms(2, vec![column])).warnings.join("\n");
+    let elements = || texts("type_symbol", &["C", "C"]);
+    let warnings = |column: Pack| bcif(&atoms(2, vec![column, elements()])).warnings.join("\n");
     for (column, said) in [
         (reals("occupancy", &[1.0, f64::NAN]), "occupancy, row 2: found NaN, expected an occupancy, ? or .; read as 1"),
         (
@@ -324,7 +325,8 @@ fn entities_or_sequence_numbers_decide_which_hetatm_records_are_polymer() {
         let group = texts("group_PDB", &["HETATM", "HETATM"]);
         let names = texts("auth_comp_id", &["MSE", "LIG"]);
         let chains = texts("label_asym_id", &["A", "B"]);
-        category("_atom_site", 2, [places(2), vec![group, names, chains, numbers]].concat())
+        let elements = texts("type_symbol", &["C", "C"]);
+        category("_atom_site", 2, [places(2), vec![group, names, chains, numbers, elements]].concat())
     };
     let numbered = || masked(ints("label_seq_id", &[7, 0]), &[0, 1]);
     let entity = |types: &[&str]| category("_entity", 2, vec![ints("id", &[1, 2]), texts("type", types)]);

@@ -58,6 +58,8 @@ const ROWS: &[Row] = &[
     (t::DEVICE_SHARED, &["device=\"0\""], devices),
     (t::DEVICE_PARTITIONS, &["device=\"0\""], devices),
     (t::CACHE_REQUESTS, &["tier=\"memory\"", "result=\"hit\""], meshes),
+    (t::STRUCTURE_CACHE_REQUESTS, &["result=\"miss\""], meshes),
+    (t::STRUCTURE_CACHE_BYTES, &[], meshes),
     (t::STORE_BYTES, &["folder=\"results\""], meshes),
     (t::STORE_OBJECTS, &["folder=\"results\""], meshes),
     (t::STORE_REMOVED, &["reason=\"cap\""], full_store),

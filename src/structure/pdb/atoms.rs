@@ -16,7 +16,7 @@ use super::card::{Card, card, check_length, coordinate, expand_tabs, number, num
 use super::chains::TwoLetterChains;
 use super::records::Line;
 
-/// A file, and what all of its pieces share.
+/// File with the state that its pieces share.
 pub(super) struct File<'a> {
     pub(super) text: &'a [u8],
     pub(super) tabs: bool,

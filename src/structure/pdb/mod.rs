@@ -99,7 +99,7 @@ fn read_atoms<'f>(
         read.into_iter().collect::<Result<Vec<_>, _>>()
     };
     let mut read = pass(parts, false)?;
-    // What a piece finds out about the alignment of names applies to all guesses after it.
+    // An unreliable alignment of names in one piece affects the guesses of all later pieces.
     if let Some(first) = read.iter().position(|atoms| atoms.left_justified)
         && read[first + 1..].iter().any(Atoms::has_guesses)
     {

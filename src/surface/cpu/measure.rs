@@ -135,7 +135,8 @@ fn lengths(normals: &[Vec3A]) -> [f32; LANES] {
 }
 
 dispatched! {
-/// As [`sum`], for a brick of several sheets, whose triangles are not ordered by sheet: adds each to its own sheet.
+/// Adds each triangle to the sums of its sheet. Replaces [`sum`] for a brick of several sheets, whose triangles are not
+/// ordered by sheet.
 fn sum_by_sheet(table: &BrickTable, sheets: &Sheets, sums: &mut [Sheet]) {
     let (mut normals, mut others) = ([Vec3A::ZERO; LANES], [[Vec3A::ZERO; 2]; LANES]);
     for batch in table.corners().chunks(LANES) {
