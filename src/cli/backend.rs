@@ -191,12 +191,11 @@ fn gpu_or_cpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliErro
             Err(CliError::NoBackend { requested: "gpu", why: format!("no GPU can be used: {why}") })
         }
         Err(none) => {
-            let reason = match requested.devices {
-                DeviceChoice::Cpu => "--devices cpu".to_owned(),
-                _ => {
-                    let estimate = estimate.map(|estimate| format!(", {}", estimate.text())).unwrap_or_default();
-                    format!("auto: no GPU: {}{estimate}", none.why)
-                }
+            let reason = if *requested.devices == DeviceChoice::Cpu {
+                "--devices cpu".to_owned()
+            } else {
+                let estimate = estimate.map(|estimate| format!(", {}", estimate.text())).unwrap_or_default();
+                format!("auto: no GPU: {}{estimate}", none.why)
             };
             instead_of_gpu(requested, reason, none)
         }

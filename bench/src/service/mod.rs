@@ -203,14 +203,14 @@ fn table(name: &str, backends: &[String], latency: &[Parts], known: &[Parts], ra
     let parts: Vec<&String> =
         latency.iter().flat_map(BTreeMap::keys).collect::<std::collections::BTreeSet<_>>().into_iter().collect();
     let mut text = format!("\n{name}, median ms\n\n| backend |");
-    parts.iter().for_each(|part| text += &format!(" {part} |"));
+    text.extend(parts.iter().map(|part| format!(" {part} |")));
     text += " known: request | total | read | meshes/s |\n|---|";
     text += &"---|".repeat(parts.len() + 4);
     let of = |parts: &Parts, part: &str| parts.get(part).map_or_else(|| "–".to_owned(), |s| format!("{:.2}", s.median));
     for (n, backend) in backends.iter().enumerate() {
-        text += &format!("\n| {backend} |");
-        parts.iter().for_each(|part| text += &format!(" {} |", of(&latency[n], part)));
-        ["request", "total", "read"].iter().for_each(|part| text += &format!(" {} |", of(&known[n], part)));
+        text.extend([format!("\n| {backend} |")]);
+        text.extend(parts.iter().map(|part| format!(" {} |", of(&latency[n], part))));
+        text.extend(["request", "total", "read"].map(|part| format!(" {} |", of(&known[n], part))));
         text += &rates.get(n).map_or_else(|| " – |".to_owned(), |rate| format!(" {rate:.1} |"));
     }
     text + "\n"

@@ -48,7 +48,7 @@ impl Service {
             if line.trim_start().starts_with("try ") {
                 break;
             }
-            said += &format!("{line}\n");
+            said.extend([line.as_str(), "\n"]);
         }
         // A full pipe would block the service.
         std::thread::spawn(move || lines.map_while(std::result::Result::ok).for_each(drop));

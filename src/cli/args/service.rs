@@ -82,7 +82,7 @@ pub(crate) struct DoctorArgs {
     #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
     pub(crate) report: DoctorStyle,
     /// Measure the CPU and the GPU for `--backend auto` of later commands, and store the result in the cache folder
-    /// ($XDG_CACHE_HOME or ~/.cache)
+    /// (`$XDG_CACHE_HOME` or `~/.cache`)
     #[arg(long)]
     pub(crate) calibrate: bool,
     /// Seconds to wait for the store and for the remote archive
