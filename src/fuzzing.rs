@@ -24,7 +24,7 @@ pub fn has_valid_signature(keys: &SigningKeys, target: &str) -> bool {
 /// Reads a structure in at most `n` pieces.
 ///
 /// # Errors
-/// Returns the errors of [`crate::structure::read`].
+/// Returns the errors of [`crate::structure::read()`].
 pub fn structure(bytes: &[u8], limits: &ReadLimits, n: usize) -> Result<Structure, StructureError> {
     crate::structure::read::read_in_pieces(bytes, limits, n)
 }
