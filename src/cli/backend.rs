@@ -83,7 +83,6 @@ pub(crate) struct SelectedBackend {
     /// Renderer of pictures with its reason; the CPU if no pictures are needed.
     pub(crate) renderer: SelectedRenderer,
     /// All discovered devices, used or not.
-    #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) devices: Vec<FoundDevice>,
     /// Reason for not using a GPU, if none is used.
     #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
