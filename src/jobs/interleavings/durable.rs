@@ -18,6 +18,7 @@ use super::super::coalesced_job::Entry;
 use super::super::queue::Queue;
 use super::super::{
     Budget, ContentKey, EndError, Failure, JobId, JobSpec, JobStore, JobView, Pool, REPORT, Record, Settings, Status,
+    Structures,
 };
 use super::task;
 use crate::config::JobsConfig;
@@ -53,12 +54,14 @@ struct Fixture {
 impl Fixture {
     fn new() -> Self {
         let (store, objects) = block_on(open_bytes(1 << 20));
+        let budget = Budget::new(1 << 30);
         let settings = Settings {
             workers: 2,
             queue: 8,
             batch_max_delay: Duration::ZERO,
             limits: JobLimits::default(),
-            budget: Budget::new(1 << 30),
+            structures: Structures::new(1 << 20, &budget),
+            budget,
             renderer: SelectedRenderer::cpu("a test"),
             meter: None,
             tracer: Tracer::default(),
@@ -93,7 +96,7 @@ impl Fixture {
 
     /// Stores a result of the job.
     fn store_result(&self, entry: &Entry) {
-        let maker = self.jobs.0.pool.maker(&entry.task.job);
+        let maker = self.jobs.0.pool.makers(&entry.task.job).remove(0);
         let key = ContentKey::new(&entry.task.digest, &entry.task.job, Format::Stl, &maker, Namespace::default());
         for extension in [REPORT, "stl"] {
             block_on(self.store.put(&key.name(extension).unwrap(), Bytes::from_static(b"x"))).unwrap();
