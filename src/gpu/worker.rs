@@ -54,7 +54,7 @@ fn run(scheduler: &Scheduler, thread: DeviceThread, build: &Build) {
             scheduler.finish_batch(thread, batch, results, RunOutcome { time, held_bytes, failed: false, down: None });
             continue;
         };
-        let given_up = |why: &str| format!("given up after {MAX_REBUILDS} rebuilds without a finished job: {why}");
+        let given_up = |why: &str| format!("down after {MAX_REBUILDS} rebuilds without a finished job: {why}");
         let give_up =
             scheduler.consecutive_rebuilds(thread) >= MAX_REBUILDS && !results.iter().any(proves_device_works);
         let down = give_up.then(|| given_up(&why));

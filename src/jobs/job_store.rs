@@ -21,11 +21,13 @@ use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket, resu
 use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::store::{Digest, Name, Namespace, Pin, Secret, Store, StoreError};
-use crate::sync::{Handle, mpsc};
+use crate::sync::{Handle, mpsc, timeout};
 use crate::telemetry::JOBS_RECOVERED;
 
 /// Number of ended jobs that are held in memory; older ones are read from the store.
 const MAX_ENDED: usize = 10_000;
+/// Maximum time that the acceptance of a job whose result is stored waits for its end to be recorded.
+const STORED_WAIT: Duration = Duration::from_secs(5);
 
 /// Request for a durable job.
 #[derive(Debug)]
@@ -51,7 +53,8 @@ pub(crate) struct JobView {
     pub(crate) fraction: f64,
     /// Number of this state: the time of the change, ms since 1970. Grows with every change, also after a restart.
     pub(crate) version: u64,
-    /// Record of an end that was decided but is not written yet. The end is visible once it is on record.
+    /// Record of an end that was decided but is not written yet. The end is visible once it is on record, or
+    /// after the store has rejected the record for `jobs.save_retry_ms`.
     pub(super) end: Option<Box<Record>>,
 }
 
@@ -159,21 +162,18 @@ impl JobStore {
         {
             return existing(&record, view);
         }
-        if ticket.is_none()
-            && let Some((key, _pin)) = self.stored_result(&spec.task, spec.format).await?
-        {
-            let ended = Some(now_ms());
-            let record = Record { status: Status::Successful, result: Some(key), finished_ms: ended, ..record };
-            let _place = inner.admit(&id).await?;
-            inner.write(&record).await?;
-            return Ok(inner.insert(&id, &Arc::new(DurableJob::new(record))).view());
-        }
-        // The job gets its place in the queue first: a record without one could not be run soon.
+        // Its pin keeps the result until the job has ended.
+        let stored = match &ticket {
+            Some(_) => None,
+            None => self.stored_result(&spec.task, spec.format).await?,
+        };
+        // The job gets its place in the queue first: a record without one could not be run soon. A job with a stored
+        // result needs none.
         let job = Arc::new(DurableJob::new(record));
         let (input, digest) = (spec.task.input.clone(), spec.task.digest);
         let pin = inner.pin(&id, &digest, namespace)?;
         let (recorded, wait_for_record) = mpsc::sync_channel(1);
-        let ticket = if let Some(ticket) = ticket {
+        let ticket = if ticket.is_some() || stored.is_some() {
             ticket
         } else {
             let on_start = self.on_start(&job, Some(wait_for_record));
@@ -182,7 +182,7 @@ impl JobStore {
             if ticket.joined_running {
                 job.begin();
             }
-            ticket
+            Some(ticket)
         };
         let place = inner.admit(&id).await?;
         inner.store.put_new(&Name::input(&digest).within(namespace), input).await?;
@@ -196,12 +196,16 @@ impl JobStore {
         // Releases the worker that waits in `on_start`; no worker does if the job was joined while it ran.
         _ = recorded.send(());
         let inserted = inner.insert(&id, &job);
-        let view = inserted.view();
         // Otherwise a request for the job has resumed it from its record; it shares the same work.
         if Arc::ptr_eq(&inserted, &job) {
-            self.spawn(Runner { job, ticket: Some(ticket), pin, digest, earlier_attempts: 0 });
+            self.spawn(Runner { job, ticket, pin, digest, earlier_attempts: 0 });
+            if stored.is_some() {
+                // The client gets the end at once, unless the store fails.
+                let mut watched = inserted.state.subscribe();
+                drop(timeout(STORED_WAIT, watched.wait_for(|view| view.record.status.is_final())).await);
+            }
         }
-        Ok(view)
+        Ok(inserted.view())
     }
 
     /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
@@ -233,10 +237,13 @@ impl JobStore {
         }
         let record = self.0.read(id).await?.filter(|record| record.namespace == namespace);
         let Some(record) = record else { return Ok(None) };
-        if record.status.is_final() {
-            return Ok(Some(DurableJob::new(record).state.subscribe()));
-        }
-        Ok(Some(self.resume(record).await?.state.subscribe()))
+        let job = match self.known(id, namespace) {
+            // The job began during the read. Its end may be on record and not be visible to others yet.
+            Some(job) => job,
+            None if record.status.is_final() => Arc::new(DurableJob::new(record)),
+            None => self.resume(record).await?,
+        };
+        Ok(Some(job.state.subscribe()))
     }
 
     /// Returns the present state of a job; `None` if the namespace has no such job.

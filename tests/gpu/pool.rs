@@ -241,12 +241,12 @@ fn a_finished_job_resets_the_count_of_rebuilds() {
 fn the_error_of_a_job_takes_precedence_over_the_reasons_of_devices() {
     let fake = FakeDevice::new(&[Lose]);
     let pool = pool(std::slice::from_ref(&fake), SETTINGS);
-    // Two attempts each; the device is given up after the fourth loss.
+    // Two attempts each; the device is down after the fourth loss.
     for _ in 0..2 {
         assert_eq!(pool.run(&job(1)).map(|_| ()).unwrap_err(), GpuError::Lost(LOST.to_owned()));
     }
     let error = pool.run(&job(1)).map(|_| ()).unwrap_err().to_string();
-    assert!(error.contains("no device is up") && error.contains("0 fake 0: given up after 3"), "{error}");
+    assert!(error.contains("no device is up") && error.contains("0 fake 0: down after 3"), "{error}");
 }
 
 #[test]
