@@ -8,6 +8,9 @@ use molmesh::surface::{Backend as _, CancelToken, Control, Kernel, Observer, Sta
 
 use crate::gpu_support::{engine_with, params, spheres};
 
+/// Maximum time from the cancellation to the end of a job. Tests without optimization run beside others.
+const LIMIT: Duration = Duration::from_millis(if cfg!(debug_assertions) { 500 } else { 50 });
+
 /// Records the start of the first stage.
 #[derive(Default)]
 struct Start(OnceLock<Instant>);
@@ -42,6 +45,6 @@ fn jobs_end_soon_after_cancellation_at_any_time() {
         });
         let time = start.0.get().unwrap().elapsed();
         assert_eq!(stopped.map(|_| ()).unwrap_err(), SurfaceError::Cancelled, "{delay:?}");
-        assert!(time < delay + Duration::from_millis(500), "{delay:?}: {time:?}");
+        assert!(time < delay + LIMIT, "{delay:?}: {time:?}");
     }
 }

@@ -172,7 +172,7 @@ fn a_device_in_a_long_loop_is_hung_and_used_again() {
         Ok(Box::new(Looping(engine, loops.then_some((device, queue)))) as Box<dyn Executor>)
     };
     let device = PoolDevice { number: 0, name: "looping".to_owned(), build: Box::new(build) };
-    let times = [200, 100].map(Duration::from_millis);
+    let times = [1000, 100].map(Duration::from_millis);
     let settings = PoolSettings { hang_timeout: times[0], cool_down: times[1], ..PoolSettings::default() };
     let gpu = GpuBackend::with_pool(DevicePool::start(vec![device], &settings).unwrap());
     let cpu = CpuBackend::new(None).unwrap();
