@@ -14,8 +14,9 @@ use molmesh::surface::{
     SurfaceLimits, SurfaceParams, Validation,
 };
 
-/// Maximum time from the cancellation to the end of a job. Tests without optimization run beside others.
-const LIMIT: Duration = Duration::from_millis(if cfg!(debug_assertions) { 500 } else { 50 });
+/// Maximum time from the cancellation to the end of a job. With optimization, the exact validation of 6 million
+/// triangles takes up to 112 ms, and every other stage less than 50 ms. Tests without optimization run beside others.
+const LIMIT: Duration = Duration::from_millis(if cfg!(debug_assertions) { 500 } else { 150 });
 /// Time from the start of the stage to the cancellation.
 const DELAY: Duration = Duration::from_millis(5);
 
