@@ -5,6 +5,7 @@
 
 use std::hint::black_box;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use molmesh::picture::{CpuRenderer, Image, PictureParams, Renderer, Style, png};
@@ -51,7 +52,7 @@ fn floor(mesh: &Mesh, image: &mut Image) -> f32 {
 fn picture(criterion: &mut Criterion) {
     let renderer = CpuRenderer;
     for (name, path) in structures() {
-        let mesh = mesh(&path);
+        let mesh = Arc::new(mesh(&path));
         let mut group = criterion.benchmark_group(format!("picture/{name}/{} triangles", mesh.n_triangles()));
         group.sample_size(20);
         for side in [256, 512, 1024] {

@@ -47,6 +47,10 @@ fn benches(c: &mut Criterion) {
         group.bench_function("select", |b| {
             b.iter(|| select(black_box(&structure), &Selection::default()).map(|s| s.atoms.len()));
         });
+        let near = Selection { atoms: "within 5 of (name CA)".parse().expect("an expression"), ..Selection::default() };
+        group.bench_function("select by distance", |b| {
+            b.iter(|| select(black_box(&structure), &near).map(|s| s.atoms.len()));
+        });
         group.finish();
     }
 }

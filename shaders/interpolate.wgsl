@@ -75,6 +75,11 @@ fn gradient_of(p: vec3<f32>, atom: vec4<f32>) -> vec3<f32> {
     return select(0.0, slope(u, params.u_min * atom.w) * atom.w, u < params.support) * d;
 }
 
+// Radius of a staged atom: ρ, or half of it for kernels whose support is twice the radius.
+fn radius_of(atom: vec4<f32>) -> f32 {
+    return select(0.5, 1.0, KERNEL == GAUSSIAN) * inverseSqrt(atom.w);
+}
+
 // Crossing edge: bit and layer of its owner, and axis.
 struct Edge {
     bit: u32,
@@ -192,10 +197,9 @@ fn main(
                 }
                 if (NEAREST) {
                     for (var i = 0u; i < in_piece; i++) {
-                        let d = p - staged[i].xyz;
-                        let d2 = dot(d, d);
-                        if (d2 < nearest) {
-                            nearest = d2;
+                        let d = length(p - staged[i].xyz) - radius_of(staged[i]);
+                        if (d < nearest) {
+                            nearest = d;
                             source = start + i;
                         }
                     }

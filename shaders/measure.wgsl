@@ -11,10 +11,12 @@
 #include shared/chunk.wgsl
 #include shared/record.wgsl
 #include shared/counters.wgsl
-#include shared/quantize.wgsl
 #include shared/crossing.wgsl
 #include shared/triangles.wgsl
+#include shared/block.wgsl
 #include shared/sheets.wgsl
+#include shared/places.wgsl
+#include shared/sums.wgsl
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> tiles: array<Tile>;
@@ -31,150 +33,126 @@
 // Words of a block before its sheets, and words of a sheet.
 const HEADER: u32 = 5u;
 const SHEET: u32 = 12u;
-// Number of samples of the block.
-const BLOCK: u32 = 729u;
 
-// Slots of the brick and of its neighbours.
-var<workgroup> slots: array<u32, 8>;
-// Densities of the block.
-var<workgroup> samples: array<f32, 729>;
 // Value that one lane passes to all others.
 var<workgroup> passed: u32;
+// Block of the brick, or NONE if it does not fit.
+var<workgroup> block: u32;
+// Number of vertices that the brick shares with others.
+var<workgroup> all_shared: atomic<u32>;
 // Triangles, vertices and neighbours of a sheet.
 var<workgroup> counted: array<atomic<u32>, 3>;
-// Sums of half of the lanes: twice the area and the vector; the product and the moment.
-var<workgroup> halves: array<vec4<f32>, 32>;
-var<workgroup> more_halves: array<vec4<f32>, 32>;
-var<workgroup> last_halves: array<vec2<f32>, 32>;
 
-// Sums over triangles.
-struct Sums {
-    // Twice the area, and the normals.
-    area: vec4<f32>,
-    product: vec3<f32>,
-    moment: vec3<f32>,
+// Triangles of a brick: their number, and the lane's row with the number of triangles before it.
+struct Triangles {
+    n: u32,
+    row: Row,
+    start: u32,
 }
 
-// A word of `edges`: the neighbour that owns it, and its place in the block.
-struct Word {
-    owner: u32,
-    axis: u32,
-    z: u32,
-    // Every fourth y.
-    quarter: u32,
+// First triangle of the window that a pass visits as number `k`. Passes alternate between ascending and descending
+// order, so the first window of each pass but the first is still listed.
+fn window_at(pass_: u32, k: u32, n: u32) -> u32 {
+    return WINDOW * select(k, (n - 1u) / WINDOW - k, (pass_ & 1u) == 1u);
 }
 
-// Word `3·lane + quarter`.
-fn word_of(lane: u32, quarter: u32) -> Word {
-    let z = lane % 9u;
-    let owner = lane / 27u | select(0u, 2u, quarter == 2u) | select(0u, 4u, z == 8u);
-    return Word(owner, lane / 9u % 3u, z, quarter);
+// Lists the triangles of a window. Starts and ends with a barrier.
+fn list_window(t: Triangles, window: u32) {
+    workgroupBarrier();
+    list_row(t.row, t.start - window);
+    workgroupBarrier();
 }
 
-// Crossing edges of a word within the block. They follow from the inside bits: the records of later bricks may not
-// exist yet.
-fn crossing_edges(word: Word) -> u32 {
-    var crossing = 0u;
-    if ((word.owner >> word.axis & 1u) == 1u) {
-        return crossing;
-    }
-    for (var i = 0u; i < select(4u, 1u, word.quarter == 2u); i++) {
-        let at = 9u * word.z + 4u * word.quarter + i;
-        var next = rows[at] >> 1u;
-        if (word.axis > 0u) {
-            next = rows[at + select(9u, 1u, word.axis == 1u)];
-        }
-        let row = (rows[at] ^ next) & 511u;
-        crossing |= select(row & 255u, row >> 8u, (word.owner & 1u) == 1u) << (8u * i);
-    }
-    return crossing;
-}
-
-// Edges of a word whose vertices other bricks use too.
-fn shared_edges(word: Word, crossing: u32) -> u32 {
-    if (word.owner > 0u) {
-        return crossing;
-    }
-    let first_x = select(0u, 0x01010101u, word.axis != 0u);
-    let first_y = select(0u, 0xffu, word.axis != 1u && word.quarter == 0u);
-    let first_z = select(0u, 0xffffffffu, word.axis != 2u && word.z == 0u);
-    return crossing & (first_x | first_y | first_z);
-}
-
-// Rounded position in steps; the last sample of `p` is 8 along each axis.
-fn steps_at(first: vec3<i32>, p: vec3<f32>) -> vec3<i32> {
-    return steps_of(quantized_position((vec3<f32>(first) + p) * params.spacing * params.steps_per_angstrom));
-}
-
-// Position of the vertex on an edge, relative to `origin`. `first` is the brick's first sample, relative to the centre.
-fn position_on(edge: u32, first: vec3<i32>, origin: vec3<i32>) -> vec3<f32> {
-    let word = edge >> 6u;
-    let axis = word / 27u;
-    let at = vec3<u32>(edge & 15u, 4u * (word % 3u) + (edge >> 4u & 3u), word / 3u % 9u);
-    let sample = 81u * at.z + 9u * at.y + at.x;
-    let t = crossing_at(samples[sample], samples[sample + select(select(81u, 9u, axis == 1u), 1u, axis == 0u)]);
-    let p = vec3<f32>(at) + select(vec3<f32>(0.0), vec3<f32>(t), vec3<u32>(0u, 1u, 2u) == vec3<u32>(axis));
-    if (params.steps_per_angstrom > 0.0) {
-        return vec3<f32>(steps_at(first, p) - origin);
-    }
-    return p;
-}
-
-// Adds a triangle.
-fn with_triangle(sums: Sums, a: vec3<f32>, b: vec3<f32>, c: vec3<f32>) -> Sums {
-    let n = cross(b - a, c - a);
-    let sum = a + b + c;
-    return Sums(
-        sums.area + vec4<f32>(length(n), n),
-        sums.product + n * sum,
-        sums.moment + n * (a * sum + b * (b + c) + c * c),
-    );
-}
-
-// Sums over all lanes, in the first lane. Starts and ends with a barrier.
-fn sum_lanes(lane: u32, own: Sums) -> Sums {
-    var sums = own;
-    for (var half = 32u; half > 0u; half = half >> 1u) {
-        workgroupBarrier();
-        if (lane >= half && lane < 2u * half) {
-            halves[lane - half] = sums.area;
-            more_halves[lane - half] = vec4<f32>(sums.product, sums.moment.x);
-            last_halves[lane - half] = sums.moment.yz;
-        }
-        workgroupBarrier();
-        if (lane < half) {
-            sums.area += halves[lane];
-            sums.product += more_halves[lane].xyz;
-            sums.moment += vec3<f32>(more_halves[lane].w, last_halves[lane]);
+// Joins the vertices along all triangles. Returns the number of sheets. Starts and ends with a barrier.
+fn join_vertices(lane: u32, t: Triangles, n_vertices: u32) -> u32 {
+    for (var k = 0u; k * WINDOW < t.n; k++) {
+        let window = window_at(0u, k, t.n);
+        list_window(t, window);
+        for (var i = lane; i < min(WINDOW, t.n - window); i += LANES) {
+            label_corners(i);
         }
     }
+    workgroupBarrier();
+    follow_labels(lane, n_vertices);
+    workgroupBarrier();
+    for (var k = 0u; k * WINDOW < t.n; k++) {
+        let window = window_at(1u, k, t.n);
+        if (k > 0u) {
+            list_window(t, window);
+        }
+        for (var i = lane; i < min(WINDOW, t.n - window); i += LANES) {
+            let v = vertices_on(edges_of(i));
+            join(v.x, v.y);
+            join(v.x, v.z);
+        }
+    }
+    workgroupBarrier();
+    follow_labels(lane, n_vertices);
+    count_names(lane, n_vertices);
+    workgroupBarrier();
+    if (lane == 0u) {
+        passed = atomicLoad(&n_sheets);
+    }
+    return workgroupUniformLoad(&passed);
+}
+
+// Adds up the lane's triangles of a sheet, and counts them.
+fn sum_triangles(lane: u32, t: Triangles, sheet: u32, first: vec3<f32>, origin: vec3<f32>) -> Sums {
+    var sums = Sums(vec4<f32>(0.0), vec3<f32>(0.0), vec3<f32>(0.0));
+    var n_own = 0u;
+    for (var k = 0u; k * WINDOW < t.n; k++) {
+        let window = window_at(sheet, k, t.n);
+        if (k > 0u) {
+            list_window(t, window);
+        }
+        for (var i = lane; i < min(WINDOW, t.n - window); i += LANES) {
+            let e = edges_of(i);
+            let word = atomicLoad(&vertices[vertex_on(e.x)]);
+            if ((word & below(sheet_bits)) == sheet) {
+                let a = position_of(e.x, word, first, origin);
+                let b = position_of(e.y, atomicLoad(&vertices[vertex_on(e.y)]), first, origin);
+                let c = position_of(e.z, atomicLoad(&vertices[vertex_on(e.z)]), first, origin);
+                sums = with_triangle(sums, a, b, c);
+                n_own += 1u;
+            }
+        }
+    }
+    atomicAdd(&counted[0], n_own);
     return sums;
 }
 
-// Vertices of a word that are on `sheet`.
-fn edges_on(used: u32, before: u32, sheet: u32, only: bool) -> u32 {
-    if (only) {
-        return used;
+// Writes the sums of all lanes and the counts of a sheet at `at`, unless it is NONE. Clears the counts.
+fn write_sheet(lane: u32, at: u32) {
+    if (lane < N_SUMS && at != NONE) {
+        sheets[at + 2u + lane] = bitcast<u32>(sum_at(lane));
     }
+    if (lane == N_SUMS) {
+        let n = atomicExchange(&counted[0], 0u) | atomicExchange(&counted[1], 0u) << 16u;
+        let near = atomicExchange(&counted[2], 0u);
+        if (at != NONE) {
+            sheets[at] = n;
+            sheets[at + 1u] = near;
+        }
+    }
+}
+
+// Vertices of a word that are on `sheet`. The word's first vertex is `first`.
+fn edges_on(crossing: u32, first: u32, sheet: u32) -> u32 {
     var on = 0u;
-    var vertex = before;
-    for (var rest = used; rest != 0u; rest &= rest - 1u) {
+    var vertex = first;
+    for (var rest = crossing; rest != 0u; rest &= rest - 1u) {
         on |= select(0u, rest & ~(rest - 1u), sheet_of(vertex) == sheet);
         vertex += 1u;
     }
     return on;
 }
 
-// Neighbours below that use vertices of the brick itself: bit n for the brick that has this one as neighbour n.
-fn users(word: Word, on: u32) -> u32 {
-    var mask = 0u;
-    for (var n = 1u; n < 7u; n++) {
-        let used = on & select(0xffffffffu, 0x01010101u, (n & 1u) == 1u)
-            & select(0xffffffffu, select(0u, 0xffu, word.quarter == 0u), (n & 2u) == 2u)
-            & select(0xffffffffu, 0u, (n & 4u) == 4u && word.z > 0u);
-        mask |= select(0u, 1u << n, used != 0u && (n >> word.axis & 1u) == 0u);
+// Counts the brick's own vertices on some edges of a word, and notes the neighbours that use any.
+fn count_vertices(word: Word, on: u32) {
+    if (on != 0u) {
+        atomicAdd(&counted[1], select(0u, countOneBits(on), word.owner == 0u));
+        atomicOr(&counted[2], users(word, on));
     }
-    return mask;
 }
 
 // Writes the owner, key and sheet of each shared vertex of a word from `at` on. The word's first vertex is `first`. A
@@ -206,7 +184,9 @@ fn main(
     if (n == 0u) {
         return;
     }
-    let first = tiles[bricks[id] >> 9u].coord * 64 + local_brick(bricks[id] & 511u) * 8 - params.centre;
+    let first = vec3<f32>(
+        tiles[bricks[id] >> 9u].coord * 64 + local_brick(bricks[id] & 511u) * 8 - params.centre,
+    );
     var origin = first;
     if (params.steps_per_angstrom > 0.0) {
         origin = steps_at(first, vec3<f32>(4.0));
@@ -214,37 +194,37 @@ fn main(
     load_rows(id, lane);
     if (lane < 61u) {
         atomicStore(&names[lane], 0u);
-    } else if (lane == 61u) {
-        atomicStore(&n_sheets, 0u);
+    } else {
+        atomicStore(&counted[lane - 61u], 0u);
     }
     if (lane < 8u) {
         slots[lane] = slot_of(records[id].neighbours[lane]);
+    } else if (lane == 8u) {
+        atomicStore(&n_sheets, 0u);
+    } else if (lane == 9u) {
+        atomicStore(&all_shared, 0u);
     }
     workgroupBarrier();
-    for (var i = lane; i < BLOCK; i += LANES) {
-        let at = vec3<u32>(i % 9u, i / 9u % 9u, i / 81u);
-        let slot = slots[at.x >> 3u | at.y >> 3u << 1u | at.z >> 3u << 2u];
-        var density = 0.0;
-        if (slot != NONE) {
-            density = field[slot * 512u + (at.z & 7u) * 64u + (at.y & 7u) * 8u + (at.x & 7u)];
-        }
-        samples[i] = density;
-    }
     let row = row_of(lane);
     // Crossing edges of the lane's words, and how many of them are shared.
     var used = vec3<u32>(0u);
     var n_shared = vec3<u32>(0u);
+    let w0 = word_of(lane, 0u);
+    let w1 = word_of(lane, 1u);
+    let w2 = word_of(lane, 2u);
     if (lane < 54u) {
-        for (var j = 0u; j < 3u; j++) {
-            let word = word_of(lane, j);
-            used[j] = crossing_edges(word);
-            n_shared[j] = countOneBits(shared_edges(word, used[j]));
-        }
+        used = vec3<u32>(crossing_edges(w0), crossing_edges(w1), crossing_edges(w2));
+        n_shared = countOneBits(
+            vec3<u32>(shared_edges(w0, used.x), shared_edges(w1, used.y), shared_edges(w2, used.z)),
+        );
     }
+    let own_shared = n_shared.x + n_shared.y + n_shared.z;
+    atomicAdd(&all_shared, own_shared);
     let n_used = countOneBits(used);
     // Number of triangles, and number of vertices shifted by 16.
     let own = row.n | (n_used.x + n_used.y + n_used.z) << 16u;
     let sum = scan_lanes(lane, own);
+    let n_vertices = listed[LANES - 1u] >> 16u;
     let start = (sum - own) & 0xffffu;
     // Number of vertices before each word.
     let place = vec3<u32>((sum - own) >> 16u) + vec3<u32>(0u, n_used.x, n_used.x + n_used.y);
@@ -253,116 +233,64 @@ fn main(
         edges[3u * lane + 1u] = vec2<u32>(used.y, place.y);
         edges[3u * lane + 2u] = vec2<u32>(used.z, place.z);
     }
-    if (lane == LANES - 1u) {
-        passed = sum >> 16u;
-    }
-    let n_vertices = workgroupUniformLoad(&passed);
-    let own_shared = n_shared.x + n_shared.y + n_shared.z;
-    let shared_sum = scan_lanes(lane, own_shared);
-    if (lane == LANES - 1u) {
-        passed = shared_sum;
-    }
-    let all_shared = workgroupUniformLoad(&passed);
     for (var v = lane; v < n_vertices; v += LANES) {
-        atomicStore(&labels[v], v);
+        atomicStore(&vertices[v], ~LABEL | v);
     }
-    for (var window = 0u; window < n; window += WINDOW) {
+    let triangles = Triangles(n, row, start);
+    let n_found = join_vertices(lane, triangles, n_vertices);
+    let n_written = select(0u, atomicLoad(&all_shared), n_found > 1u);
+    var reserved = 0u;
+    if (lane == 0u) {
+        reserved = atomicAdd(&counters.sheet_words, HEADER + SHEET * n_found + n_written);
+    }
+    sheet_bits = 32u - countLeadingZeros(n_found - 1u);
+    place_unit = ldexp(1.0, i32(sheet_bits) - 32);
+    if (n_found > 1u) {
+        number_names(lane, n_vertices);
         workgroupBarrier();
-        list_row(row, start - window);
-        workgroupBarrier();
-        for (var i = lane; i < min(WINDOW, n - window); i += LANES) {
-            let vertex = vertex_on(edge_at(i, 1u));
-            join(vertex_on(edge_at(i, 0u)), vertex);
-            join(vertex_on(edge_at(i, 2u)), vertex);
-        }
     }
-    number_sheets(lane, n_vertices);
-    if (lane == 0u) {
-        passed = atomicLoad(&n_sheets);
-    }
-    let n_found = workgroupUniformLoad(&passed);
-    let n_written = select(0u, all_shared, n_found > 1u);
-    let size = HEADER + SHEET * n_found + n_written;
-    if (lane == 0u) {
-        passed = atomicAdd(&counters.sheet_words, size);
-    }
-    let block = workgroupUniformLoad(&passed);
-    // A block beyond the capacity is not written. The host detects it by the counter.
-    if (block + size > params.sheet_capacity) {
-        return;
+    for (var v = lane; v < n_vertices; v += LANES) {
+        let word = atomicLoad(&vertices[v]);
+        let at = place_on((word & ~NUMBERED) >> EDGE_BIT, first, origin);
+        atomicStore(&vertices[v], at << sheet_bits | number_of(word));
     }
     if (lane == 0u) {
-        sheets[block] = id;
-        sheets[block + 1u] = n_found | n_written << 16u;
-        let words = bitcast<vec3<u32>>(origin);
-        sheets[block + 2u] = words.x;
-        sheets[block + 3u] = words.y;
-        sheets[block + 4u] = words.z;
-    }
-    if (n_found > 1u && lane < 54u) {
-        var at = block + HEADER + SHEET * n_found + shared_sum - own_shared;
-        for (var j = 0u; j < 3u; j++) {
-            write_vertices(at, word_of(lane, j), used[j], place[j]);
-            at += n_shared[j];
+        // A block beyond the capacity is not written. The host detects it by the counter.
+        let fits = reserved + HEADER + SHEET * n_found + n_written <= params.sheet_capacity;
+        block = select(NONE, reserved, fits);
+        if (fits) {
+            sheets[reserved] = id;
+            sheets[reserved + 1u] = n_found | n_written << 16u;
+            let words = bitcast<vec3<u32>>(vec3<i32>(origin));
+            sheets[reserved + 2u] = words.x;
+            sheets[reserved + 3u] = words.y;
+            sheets[reserved + 4u] = words.z;
         }
     }
     for (var sheet = 0u; sheet < n_found; sheet++) {
-        if (lane < 3u) {
-            atomicStore(&counted[lane], 0u);
-        }
-        var sums = Sums(vec4<f32>(0.0), vec3<f32>(0.0), vec3<f32>(0.0));
-        var n_own = 0u;
-        for (var window = 0u; window < n; window += WINDOW) {
-            workgroupBarrier();
-            // If all triangles fit one window, they are still listed.
-            if (n > WINDOW) {
-                list_row(row, start - window);
-            }
-            workgroupBarrier();
-            for (var i = lane; i < min(WINDOW, n - window); i += LANES) {
-                let a = edge_at(i, 0u);
-                if (n_found == 1u || sheet_of(vertex_on(a)) == sheet) {
-                    let b = position_on(edge_at(i, 1u), first, origin);
-                    let c = position_on(edge_at(i, 2u), first, origin);
-                    sums = with_triangle(sums, position_on(a, first, origin), b, c);
-                    n_own += 1u;
-                }
-            }
-        }
-        var n_on = 0u;
-        // Neighbours above, and neighbours below shifted by 8.
-        var near = 0u;
-        if (lane < 54u) {
-            for (var j = 0u; j < 3u; j++) {
-                let word = word_of(lane, j);
-                let on = edges_on(used[j], place[j], sheet, n_found == 1u);
-                if (word.owner == 0u) {
-                    n_on += countOneBits(on);
-                    near |= users(word, on) << 8u;
-                } else {
-                    near |= select(0u, 1u << word.owner, on != 0u);
-                }
-            }
-        }
-        atomicAdd(&counted[0], n_own);
-        atomicAdd(&counted[1], n_on);
-        atomicOr(&counted[2], near);
-        let all = sum_lanes(lane, sums);
-        if (lane == 0u) {
-            let at = block + HEADER + SHEET * sheet;
-            sheets[at] = atomicLoad(&counted[0]) | atomicLoad(&counted[1]) << 16u;
-            sheets[at + 1u] = atomicLoad(&counted[2]);
-            let area = bitcast<vec4<u32>>(all.area);
-            let product = bitcast<vec3<u32>>(all.product);
-            let moment = bitcast<vec3<u32>>(all.moment);
-            for (var k = 0u; k < 4u; k++) {
-                sheets[at + 2u + k] = area[k];
-            }
-            for (var k = 0u; k < 3u; k++) {
-                sheets[at + 6u + k] = product[k];
-                sheets[at + 9u + k] = moment[k];
-            }
-        }
         workgroupBarrier();
+        let sums = sum_triangles(lane, triangles, sheet, first, origin);
+        var on = used;
+        if (n_found > 1u) {
+            on = vec3<u32>(
+                edges_on(used.x, place.x, sheet),
+                edges_on(used.y, place.y, sheet),
+                edges_on(used.z, place.z, sheet),
+            );
+        }
+        count_vertices(w0, on.x);
+        count_vertices(w1, on.y);
+        count_vertices(w2, on.z);
+        sum_lanes(lane, sums);
+        write_sheet(lane, select(block + HEADER + SHEET * sheet, NONE, block == NONE));
+    }
+    if (n_found > 1u) {
+        let before = scan_lanes(lane, own_shared) - own_shared;
+        if (block != NONE) {
+            let at = block + HEADER + SHEET * n_found + before;
+            write_vertices(at, w0, used.x, place.x);
+            write_vertices(at + n_shared.x, w1, used.y, place.y);
+            write_vertices(at + n_shared.x + n_shared.y, w2, used.z, place.z);
+        }
     }
 }

@@ -11,6 +11,7 @@
 //! | scan | 4 B per brick | 8 B per brick | – |
 //! | interpolate | 2 KiB, 248 B and the lists of a brick with surface, 32 B per atom | 24 B per vertex, quantized 12 B | 10 per vertex and atom that reaches the vertex's brick |
 //! | emit | 300 B per brick with surface | 12 B per triangle | – |
+//! | measure | 96 B per brick with surface, 4 B per vertex | 68 B per brick with surface | – |
 
 use molmesh::gpu::Prepared;
 use molmesh::surface::{MeshOutput, Stage};
@@ -47,7 +48,7 @@ impl Work {
                 ((2048.0 + 248.0) * surface + lists + 32.0 * atoms + each * vertices, 10.0 * vertices * reach)
             }
             Stage::Emit => (300.0 * surface + 12.0 * triangles, 0.0),
-            Stage::Measure => ((2048.0 + 64.0 + 68.0) * surface, 0.0),
+            Stage::Measure => ((64.0 + 32.0 + 68.0) * surface + 4.0 * vertices, 0.0),
             Stage::Write => (0.0, 0.0),
         };
         Self { bytes, fmas }

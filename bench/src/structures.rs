@@ -62,7 +62,7 @@ fn atoms(bytes: &[u8], kinds: Option<&str>) -> Result<Spheres> {
     let structure = structure::read(bytes, &ReadLimits::default()).map_err(Error::failed)?;
     let mut selection = Selection::default();
     if let Some(kinds) = kinds {
-        selection.set_kinds(kinds).map_err(Error::failed)?;
+        selection.atoms = kinds.parse().map_err(Error::failed)?;
     }
     let selected = structure::select(&structure, &selection).map_err(Error::failed)?;
     selected.spheres(&structure).map_err(Error::failed)

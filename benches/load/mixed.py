@@ -82,7 +82,7 @@ class Expected:
                 self.inputs.append((file.read(), remark))
             for resolution in RESOLUTIONS:
                 for kernel in KERNELS:
-                    command = [binary, "mesh", path, "--format", "glb", "-o", "-", "--resolution", resolution, "--kernel", kernel]
+                    command = [binary, "mesh", path, "--format", "glb", "-o", "-", "--resolution", resolution, "--surface", kernel]
                     made = subprocess.run(command + ["--backend", "cpu"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, check=True)
                     self.files[number, resolution, kernel] = made.stdout
 
@@ -90,7 +90,7 @@ class Expected:
         """Returns a structure with a unique remark, a query, and the expected bytes."""
         number, resolution, kernel = key = dice.choice(list(self.files))
         structure, remark = self.inputs[number]
-        return structure + remark % dice.getrandbits(128), f"resolution={resolution}&kernel={kernel}", self.files[key]
+        return structure + remark % dice.getrandbits(128), f"resolution={resolution}&surface={kernel}", self.files[key]
 
 
 class Load:

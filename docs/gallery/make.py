@@ -61,7 +61,7 @@ def rows(binary, folder, entries, out, only):
             continue
         reports = []
         for kernel in KERNELS:
-            flags = [*VIEW, "--kernel", kernel, *more]
+            flags = [*VIEW, "--surface", kernel, *more]
             picture = out / f"{pdb_id.lower()}-{kernel}.png"
             reports.append((kernel, flags, picture, draw(binary, path, flags, picture)))
             print(f"{picture.name}: {picture.stat().st_size:,} bytes")

@@ -116,7 +116,9 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
         pixels[i] = 0u;
         return;
     }
-    let color = (params.color.xyz * light * share + params.background.xyz * (1.0 - share)) / alpha;
+    let tint = unpacked_tint(vec2(seen[i].w, normals[i].w));
+    let surface = select(params.color.xyz, tint, params.color.w > 0.0);
+    let color = (surface * light * share + params.background.xyz * (1.0 - share)) / alpha;
     let a = u32(min(alpha, 1.0) * 255.0 + 0.5);
     pixels[i] = level(color.x) | (level(color.y) << 8u) | (level(color.z) << 16u) | (a << 24u);
 }

@@ -22,12 +22,23 @@ struct Corner {
     // Normal in view space, and light.
     @location(0) @interpolate(linear) shade: vec4<f32>,
     @location(1) @interpolate(linear) depth: f32,
+    // Linear colour.
+    @location(2) @interpolate(linear) tint: vec4<f32>,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
 
+// Converts sRGB to linear light, like `light::linear`.
+fn linear(level: vec3<f32>) -> vec3<f32> {
+    return select(pow((level + 0.055) / 1.055, vec3(2.4)), level / 12.92, level <= vec3(0.04045));
+}
+
 @vertex
-fn main(@location(0) position: vec3<f32>, @location(1) normal: vec3<f32>) -> Corner {
+fn main(
+    @location(0) position: vec3<f32>,
+    @location(1) normal: vec3<f32>,
+    @location(2) color: vec4<f32>,
+) -> Corner {
     let right = dot(view.right.xyz, position) + view.right.w;
     let up = dot(view.up.xyz, position) + view.up.w;
     let depth = view.toward.w - dot(view.toward.xyz, position);
@@ -38,5 +49,5 @@ fn main(@location(0) position: vec3<f32>, @location(1) normal: vec3<f32>) -> Cor
     let light = view.light.w + view.diffuse * max(dot(seen, view.light.xyz), 0.0);
     // The margin keeps rounding from clipping the nearest and the farthest point.
     let z = 0.0005 + 0.999 * depth / max(view.reach, 1e-6);
-    return Corner(vec4(clip, z, 1.0), vec4(seen, light), depth);
+    return Corner(vec4(clip, z, 1.0), vec4(seen, light), depth, vec4(linear(color.xyz), 1.0));
 }

@@ -146,6 +146,8 @@ pub(crate) struct JobArgs {
     #[command(flatten)]
     pub(crate) surface: SurfaceArgs,
     #[command(flatten)]
+    pub(crate) color: ColorArgs,
+    #[command(flatten)]
     pub(crate) selection: SelectionArgs,
     #[command(flatten)]
     pub(crate) limits: LimitArgs,
@@ -170,9 +172,13 @@ pub(crate) struct DeviceArgs {
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Surface")]
 pub(crate) struct SurfaceArgs {
-    /// Density of an atom: gaussian, soft-object or inverse-square [default: gaussian]
-    #[arg(long, value_name = "KERNEL")]
-    pub(crate) kernel: Option<String>,
+    /// Surface: gaussian, soft-object or inverse-square (isosurfaces of densities), vdw (van der Waals), sas
+    /// (solvent-accessible) or ses (solvent-excluded) [default: gaussian]
+    #[arg(long, value_name = "SURFACE")]
+    pub(crate) surface: Option<String>,
+    /// Radius of the probe in Å, for `--surface sas` and `ses` [default: 1.4]
+    #[arg(long, value_name = "Å")]
+    pub(crate) probe: Option<String>,
     /// Values of parameters that are not given: default, ses-like, vdw-like, molstar, blinn or quicksurf. `ses-like`
     /// approximates the solvent-excluded surface: its area is off by -6.5 to +6.0 % and its volume by -0.6 to +5.1 %
     /// over eight proteins, more for small structures (area +13.5 % for a DNA dodecamer)
@@ -216,14 +222,32 @@ pub(crate) struct SurfaceArgs {
     pub(crate) atom_ids: bool,
 }
 
+// Colours.
+#[derive(Debug, ClapArgs)]
+#[command(next_help_heading = "Colours")]
+pub(crate) struct ColorArgs {
+    /// Colour vertices by their nearest atom: uniform:#RRGGBB, element, chain, entity, residue, bfactor, occupancy,
+    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge or none [default: none]
+    #[arg(long, value_name = "SCHEME")]
+    pub(crate) color: Option<String>,
+    /// Palette of a numeric scheme: viridis, cividis, blue-white-red or red-white-blue [default: depends on the scheme]
+    #[arg(long, value_name = "PALETTE")]
+    pub(crate) palette: Option<String>,
+    /// Values at the ends of the palette [default: depends on the scheme]
+    #[arg(long, value_name = "MIN,MAX", allow_hyphen_values = true)]
+    pub(crate) color_range: Option<String>,
+}
+
 // Atom selection.
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Atoms")]
 pub(crate) struct SelectionArgs {
-    /// Comma-separated kinds of atoms: polymer, ligand, water, hydrogens, all [default: polymer]
-    #[arg(long, value_name = "KINDS")]
+    /// Atoms to mesh: an expression such as `polymer,ligand` or `protein and within 5 of (resn HEM)`, made of kinds
+    /// (polymer, protein, nucleic, ligand, cofactor, glycan, ion, water, hydrogen, all), chain, resi, resn, name, elem,
+    /// within, byres, and, or, not [default: polymer]
+    #[arg(long, value_name = "ATOMS")]
     pub(crate) select: Option<String>,
-    /// Include ligands
+    /// Include ligands, cofactors and glycans
     #[arg(long)]
     pub(crate) ligands: bool,
     /// Include waters
@@ -241,6 +265,9 @@ pub(crate) struct SelectionArgs {
     /// Alternative location [default: the one with the highest occupancy in each residue]
     #[arg(long, value_name = "X")]
     pub(crate) altloc: Option<String>,
+    /// Id of the biological assembly to build [default: asymmetric-unit, the atoms as they are in the file]
+    #[arg(long, value_name = "ID")]
+    pub(crate) assembly: Option<String>,
 }
 
 // Limits.
@@ -248,12 +275,15 @@ pub(crate) struct SelectionArgs {
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Limits")]
 pub(crate) struct LimitArgs {
-    /// Atoms in the file, all models [default: 20000000]
+    /// Atoms in all models of the file, and in the assembly [default: 20000000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_atoms: Option<u64>,
-    /// Atoms of one model at exactly the same position [default: 1000]
+    /// Atoms of one model, or of the assembly, at exactly the same position [default: 1000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_duplicates: Option<u64>,
+    /// Copies of chains in the assembly [default: 10000]
+    #[arg(long, value_name = "N", value_parser = count)]
+    pub(crate) max_copies: Option<u64>,
     /// Bytes of the input after decompression, such as 64MiB [default: 4GiB]
     #[arg(long, value_name = "BYTES", value_parser = size)]
     pub(crate) max_input_bytes: Option<u64>,

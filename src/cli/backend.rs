@@ -231,7 +231,7 @@ fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
     let auto = requested.backend == BackendName::Auto;
     // For a single mesh, skip drivers without a device, unless a GPU was requested.
     let mode = if requested.is_command() && auto { DiscoveryMode::Quick } else { DiscoveryMode::Thorough };
-    let discovery = discover(requested.devices, mode);
+    let mut discovery = discover(requested.devices, mode);
     let missing = discovery.missing(requested.devices);
     if !missing.is_empty() {
         let detail = discovery.no_device_reason().map(|why| format!(" ({why})")).unwrap_or_default();
@@ -248,60 +248,65 @@ fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
             min_partition_bricks: config.min_partition_bricks,
             hang_timeout: Duration::from_millis(config.hang_timeout_ms),
             cool_down: Duration::from_millis(config.cool_down_ms),
+            readback_bytes: Some(config.readback_bytes),
             ..PoolSettings::default()
         },
         _ => PoolSettings::default(),
     };
-    let started = GpuBackend::start(&discovery, &settings);
-    let renderer = match renderer(requested, &discovery) {
-        Ok(renderer) => renderer,
-        Err(why) => return Err(NoGpu { why, devices: discovery.devices }),
-    };
-    let mut devices = discovery.devices;
-    match started {
-        Ok(backend) => {
-            for status in backend.devices() {
-                let found = devices.iter_mut().find(|found| found.number == status.number);
-                if let (Some(found), Some(why)) = (found, status.down) {
-                    (found.selected, found.reason) = (false, why);
-                }
-            }
-            let up: Vec<&str> = devices.iter().filter(|d| d.selected).map(|d| d.reason.as_str()).collect();
-            let reason = match up[..] {
-                [one] => format!("a GPU ({one})"),
-                _ => format!("{} GPUs", up.len()),
-            };
-            // A request for the GPU has no fallback.
-            let cpu = if auto { CpuBackend::new(requested.threads).ok() } else { None };
-            let backend: Box<dyn Backend> = match cpu {
-                Some(cpu) => Box::new(AutoBackend::new(Box::new(cpu), Box::new(backend))),
-                None => Box::new(backend),
-            };
-            Ok(SelectedBackend { backend, reason, renderer, devices, no_gpu: None })
-        }
+    let backend = match GpuBackend::start(&discovery, &settings) {
+        Ok(backend) => backend,
         Err(error) => {
             let why = match error {
                 GpuError::NoDevice(why) => why,
                 error => error.to_string(),
             };
+            let mut devices = discovery.devices;
             for device in devices.iter_mut().filter(|device| device.selected) {
                 (device.selected, device.reason) = (false, format!("the pipelines could not be built: {why}"));
             }
-            Err(NoGpu { why, devices })
+            return Err(NoGpu { why, devices });
+        }
+    };
+    for status in backend.devices() {
+        let found = discovery.devices.iter_mut().find(|found| found.number == status.number);
+        if let (Some(found), Some(why)) = (found, status.down) {
+            (found.selected, found.reason) = (false, why);
         }
     }
+    let renderer = match renderer(requested, &discovery, &settings) {
+        Ok(renderer) => renderer,
+        Err(why) => return Err(NoGpu { why, devices: discovery.devices }),
+    };
+    let devices = discovery.devices;
+    let up: Vec<&str> = devices.iter().filter(|d| d.selected).map(|d| d.reason.as_str()).collect();
+    let reason = match up[..] {
+        [one] => format!("a GPU ({one})"),
+        _ => format!("{} GPUs", up.len()),
+    };
+    // A request for the GPU has no fallback.
+    let cpu = if auto { CpuBackend::new(requested.threads).ok() } else { None };
+    let backend: Box<dyn Backend> = match cpu {
+        Some(cpu) => Box::new(AutoBackend::new(Box::new(cpu), Box::new(backend))),
+        None => Box::new(backend),
+    };
+    Ok(SelectedBackend { backend, reason, renderer, devices, no_gpu: None })
 }
 
-/// Starts the renderer on the GPUs that make the meshes. With `--backend auto`, falls back to the CPU with the reason.
+/// Starts the renderer on one of the GPUs that make the meshes. With `--backend auto`, falls back to the CPU with the
+/// reason.
 #[cfg(feature = "gpu")]
-fn renderer(requested: &BackendRequest<'_>, discovery: &molmesh::gpu::Discovery) -> Result<SelectedRenderer, String> {
+fn renderer(
+    requested: &BackendRequest<'_>,
+    discovery: &molmesh::gpu::Discovery,
+    settings: &molmesh::gpu::PoolSettings,
+) -> Result<SelectedRenderer, String> {
     use molmesh::gpu::GpuRenderer;
 
     if matches!(requested.purpose, Purpose::Mesh) {
         return Ok(SelectedRenderer::cpu("no pictures were requested"));
     }
     let auto = requested.backend == BackendName::Auto;
-    match GpuRenderer::start(discovery, auto.then_some(CpuRenderer)) {
+    match GpuRenderer::start(discovery, settings, auto.then_some(CpuRenderer)) {
         Ok(renderer) => {
             let reason = "the device that makes the meshes".to_owned();
             Ok(SelectedRenderer { renderer: Arc::new(renderer), reason })

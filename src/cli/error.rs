@@ -79,7 +79,7 @@ pub(crate) enum CliError {
         name: String,
         source: JobError,
         /// Worst finding of the strict validator in the same file.
-        strict_finding: Option<String>,
+        strict_finding: Option<Box<str>>,
     },
     /// The requested strict check found errors.
     #[error("{name}: the strict check found {errors} errors")]
@@ -150,6 +150,7 @@ impl CliError {
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
             Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
+            Self::Job { source: JobError::Color(_), .. } => code::STRUCTURE,
             Self::Strict { .. } => code::STRUCTURE,
             Self::Format(error) => format_code(error),
             Self::NoBackend { .. } => code::BACKEND,
@@ -173,10 +174,13 @@ impl CliError {
             Self::InputTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
             Self::Job { source: JobError::Surface(error), .. } => surface_hint(error),
             Self::Job { source: JobError::Structure(error), strict_finding, .. } => match error {
-                StructureError::TooManyAtoms { .. } => Some("raise it with --max-atoms".to_owned()),
+                StructureError::TooManyAtoms { .. } | StructureError::AssemblyTooLarge { .. } => {
+                    Some("raise it with --max-atoms".to_owned())
+                }
+                StructureError::TooManyCopies { .. } => Some("raise it with --max-copies".to_owned()),
                 StructureError::TooManyDuplicates { .. } => Some("raise it with --max-duplicates".to_owned()),
                 StructureError::InflatedTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
-                _ => strict_finding.clone(),
+                _ => strict_finding.as_deref().map(str::to_owned),
             },
             Self::NoBackend { .. } => Some(format!("try --backend auto{DOCTOR}")),
             #[cfg(feature = "server")]
@@ -202,6 +206,8 @@ fn structure_code(error: &StructureError) -> i32 {
         StructureError::InflatedTooLarge { .. }
         | StructureError::TooManyAtoms { .. }
         | StructureError::TooManyDuplicates { .. }
+        | StructureError::TooManyCopies { .. }
+        | StructureError::AssemblyTooLarge { .. }
         | StructureError::Memory(_) => code::LIMIT,
         _ => code::STRUCTURE,
     }
@@ -214,6 +220,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         SurfaceError::BadParameter { .. } | SurfaceError::NoSurface { .. } => code::USAGE,
         SurfaceError::GridTooLarge { .. }
         | SurfaceError::TooManyCandidates { .. }
+        | SurfaceError::TooManyOverlaps { .. }
         | SurfaceError::MeshTooLarge { .. }
         | SurfaceError::TooManyTriangles { .. }
         | SurfaceError::DeviceMemory { .. }
@@ -259,6 +266,8 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
         SurfaceError::DeviceMemory { .. } => coarser_or("try --backend cpu"),
         SurfaceError::Device { .. } => Some(format!("try --backend cpu{DOCTOR}")),
+        SurfaceError::TooManyOverlaps { .. } => Some("try a smaller --probe, or raise --max-candidates".to_owned()),
+        SurfaceError::NoSurface { isovalue: None } => Some("try a finer --resolution".to_owned()),
         SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
         _ => None,
     }

@@ -83,7 +83,7 @@ impl<'a> CommandJob<'a> {
         match source {
             JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
             source => {
-                let strict_finding = worst_finding(&source, &self.input, &self.limits);
+                let strict_finding = worst_finding(&source, &self.input, &self.limits).map(String::into_boxed_str);
                 CliError::Job { name: name_of(self.path), strict_finding, source }
             }
         }

@@ -44,7 +44,18 @@ fn refusal(error: &ParamError) -> CliError {
     match error {
         ParamError::Unknown { .. } | ParamError::Repeated { .. } => CliError::Internal(error.to_string()),
         ParamError::BadValue { .. } => CliError::Usage { message: error.to_string(), hint: None },
+        ParamError::BadExpression { text, error: bad, .. } => {
+            CliError::Usage { message: format!("{error}\n{}", with_caret(text, bad.column)), hint: None }
+        }
     }
+}
+
+/// Returns the text around a column (from 1), and a second line with a caret below that column.
+fn with_caret(text: &str, column: usize) -> String {
+    const BEFORE: usize = 60;
+    let skipped = (column - 1).saturating_sub(BEFORE);
+    let part: String = text.chars().skip(skipped).take(BEFORE + 20).collect();
+    format!("    {part}\n    {:>1$}", '^', column - skipped)
 }
 
 /// Returns the default limits, changed by the flags.
@@ -53,6 +64,7 @@ pub(super) fn limits(args: &LimitArgs) -> JobLimits {
     let set = |limit: &mut u64, flag: Option<u64>| *limit = flag.unwrap_or(*limit);
     set(&mut limits.read.max_atoms, args.max_atoms);
     set(&mut limits.read.max_duplicates, args.max_duplicates);
+    set(&mut limits.read.max_copies, args.max_copies);
     set(&mut limits.read.max_inflated_bytes, args.max_input_bytes);
     set(&mut limits.surface.max_samples, args.max_grid_points);
     set(&mut limits.surface.max_candidates, args.max_candidates);
@@ -64,7 +76,8 @@ pub(super) fn limits(args: &LimitArgs) -> JobLimits {
 fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'static str, String)> {
     let (surface, atoms) = (&args.surface, &args.selection);
     let given = [
-        ("kernel", &surface.kernel),
+        ("surface", &surface.surface),
+        ("probe", &surface.probe),
         ("preset", &surface.preset),
         ("resolution", &surface.resolution),
         ("detail", &surface.detail),
@@ -77,9 +90,13 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("paper_a", &surface.paper_a),
         ("paper_b", &surface.paper_b),
         ("paper_c", &surface.paper_c),
+        ("color", &args.color.color),
+        ("palette", &args.color.palette),
+        ("color_range", &args.color.color_range),
         ("chains", &atoms.chains),
         ("model", &atoms.model),
         ("altloc", &atoms.altloc),
+        ("assembly", &atoms.assembly),
         ("validation", &args.validation),
     ];
     let mut pairs: Vec<_> =
@@ -124,11 +141,12 @@ mod tests {
     fn short_flags_add_to_the_selection() {
         let selection = |flags: &[&str]| request(flags).unwrap().job.selection;
         let plain = selection(&[]);
-        assert!(plain.polymer && !plain.ligands && !plain.waters && !plain.hydrogens);
+        assert_eq!(plain.atoms.to_string(), "polymer");
         let more = selection(&["--ligands", "--hydrogens"]);
-        assert!(more.polymer && more.ligands && !more.waters && more.hydrogens);
+        assert_eq!(more.atoms.to_string(), "polymer or ligand,hydrogens");
         let water = selection(&["--select", "ligand", "--waters"]);
-        assert!(!water.polymer && water.ligands && water.waters);
+        assert_eq!(water.atoms.to_string(), "ligand or water");
+        assert_eq!(selection(&["--select", "chain A", "--waters"]), selection(&["--select", "water or chain A"]));
     }
 
     #[test]
@@ -142,18 +160,22 @@ mod tests {
                 "normals" => vec![&flag, "none"],
                 "units" => vec![&flag, "nanometer"],
                 "max_triangles" => vec![&flag, "5000"],
-                "kernel" => vec![&flag, "soft-object"],
+                "surface" => vec![&flag, "soft-object"],
+                "probe" => vec![&flag, "2", "--surface", "ses"],
                 "preset" => vec![&flag, "blinn"],
                 "select" => vec![&flag, "water"],
                 "format" => vec![&flag, "ply"],
                 "paper_a" => vec![&flag, "1", "--paper-b", "2"],
                 "paper_b" => vec![&flag, "2", "--paper-a", "1"],
-                "paper_c" => vec![&flag, "0.5", "--paper-b", "3", "--kernel", "inverse-square"],
+                "paper_c" => vec![&flag, "0.5", "--paper-b", "3", "--surface", "inverse-square"],
                 "radius_offset" => vec![&flag, "-0.1"],
                 "cutoff_tolerance" => vec![&flag, "0.02"],
                 "view" => vec![&flag, "top"],
                 "background" => vec![&flag, "#102030"],
                 "style" => vec![&flag, "gouraud"],
+                "color" => vec![&flag, "bfactor"],
+                "palette" => vec![&flag, "cividis", "--color", "bfactor"],
+                "color_range" => vec![&flag, "0,50", "--color", "bfactor"],
                 _ => vec![&flag, "2"],
             };
             let key = |r: &Request| (params::canonical(&r.job), r.format, r.strict);
@@ -189,7 +211,7 @@ mod tests {
         ] {
             assert_eq!(drawn(&flags).unwrap_err().code(), 2, "{flags:?}");
         }
-        for flags in [["--resolution", "0"], ["--resolution", "nan"], ["--kernel", "x"], ["--chains", ",,"]] {
+        for flags in [["--resolution", "0"], ["--resolution", "nan"], ["--surface", "x"], ["--chains", ",,"]] {
             assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");
         }
     }

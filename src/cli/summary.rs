@@ -1,6 +1,6 @@
 //! Summary of a report, as text of at most one screen.
 
-use molmesh::pipeline::{LeftOutReport, PictureReport, Report};
+use molmesh::pipeline::{ColorReport, LeftOutReport, PictureReport, Report};
 use molmesh::surface::Validation;
 
 use super::page::Page;
@@ -24,6 +24,9 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
     let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
     page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, model {})", report.source_format, report.model));
+    if let Some(assembly) = &report.assembly {
+        page.row("assembly", &format!("{} of {} copies", assembly.id, grouped(assembly.copies)));
+    }
     if report.left_out.total > 0 {
         page.row("left out", &left_out(&report.left_out));
     }
@@ -40,6 +43,9 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
     if let Some(quantization) = report.quantization {
         page.row("vertices", &format!("quantized in steps of {} Å", quantization.step));
+    }
+    if let Some(color) = &report.color {
+        page.row("colours", &colors(color));
     }
     if let Some(picture) = &report.picture {
         page.row("picture", &drawn(picture));
@@ -82,13 +88,23 @@ fn surface(report: &Report) -> String {
         }
         (None, None) => String::new(),
     };
-    format!("{}, {} Å{from}, isovalue {}{smoothness}{preset}", report.kernel, report.resolution, report.isovalue)
+    let isovalue = report.isovalue.map(|level| format!(", isovalue {level}")).unwrap_or_default();
+    let probe = report.probe.map(|radius| format!(", probe {radius} Å")).unwrap_or_default();
+    format!("{}, {} Å{from}{isovalue}{smoothness}{probe}{preset}", report.surface, report.resolution)
 }
 
 /// Formats the numbers of atoms that were left out, by residue name and reason.
 fn left_out(left_out: &LeftOutReport) -> String {
-    let LeftOutReport { total, other_chains, virtual_sites, residues, other_residues, hydrogens, alternatives } =
-        left_out;
+    let LeftOutReport {
+        total,
+        other_chains,
+        virtual_sites,
+        kinds: _,
+        residues,
+        other_residues,
+        hydrogens,
+        alternatives,
+    } = left_out;
     let named = residues.iter().map(|residue| format!("{} {}", residue.name, grouped(residue.atoms)));
     let counted = [
         ("other residues", other_residues),
@@ -99,6 +115,18 @@ fn left_out(left_out: &LeftOutReport) -> String {
     ];
     let counted = counted.into_iter().filter(|(_, n)| **n > 0).map(|(what, n)| format!("{what} {}", grouped(*n)));
     format!("{} atoms: {}", grouped(*total), named.chain(counted).collect::<Vec<_>>().join(", "))
+}
+
+/// Formats the colours and the first entries of their legend.
+fn colors(color: &ColorReport) -> String {
+    const MOST: usize = 6;
+    let palette = color.palette.map(|palette| format!(", {palette}")).unwrap_or_default();
+    let range = color.range.map(|[low, high]| format!(" from {low} to {high}")).unwrap_or_default();
+    let entries = color.legend.iter().filter(|_| color.range.is_none()).take(MOST);
+    let entries: Vec<String> = entries.map(|entry| format!("{} {}", entry.label, entry.color)).collect();
+    let more = if color.range.is_none() && color.legend.len() > MOST { ", …" } else { "" };
+    let legend = if entries.is_empty() { String::new() } else { format!(": {}{more}", entries.join(", ")) };
+    format!("{}{palette}{range}{legend}", color.scheme)
 }
 
 fn drawn(picture: &PictureReport) -> String {
@@ -187,6 +215,7 @@ fn decimal(value: f64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use molmesh::pipeline::color::LegendEntry;
     use molmesh::pipeline::{Quantization, ResidueCount};
 
     use super::*;
@@ -213,23 +242,25 @@ mod tests {
             atoms: 454,
             atoms_in_file: 514,
             model: 1,
+            assembly: None,
             left_out: LeftOutReport {
                 total: 60,
                 virtual_sites: 2,
-                residues: vec![ResidueCount { name: "HOH".into(), atoms: 53 }],
+                residues: vec![ResidueCount { name: "HOH".into(), kind: "water", atoms: 53 }],
                 hydrogens: 5,
                 ..LeftOutReport::default()
             },
             warnings: vec!["line 9, column 55: found `   inf`; read as 1".into()],
             radii: "table",
-            kernel: "gaussian",
+            surface: "gaussian",
+            probe: None,
             preset: "default",
             resolution: 0.5,
             resolution_from: "max_triangles",
             detail: None,
             max_triangles: Some(40_000),
             tries: Some(2),
-            isovalue: 1.0,
+            isovalue: Some(1.0),
             smoothness: Some(1.25),
             bricks: 300,
             surface_bricks: 250,
@@ -253,6 +284,12 @@ mod tests {
             file_units: "nanometer",
             normals: "none",
             quantization: Some(Quantization { step: 0.000_976_562_5 }),
+            color: Some(ColorReport {
+                scheme: "chain".into(),
+                palette: None,
+                range: None,
+                legend: vec![LegendEntry { label: "A".into(), color: "#4fa59b".into() }],
+            }),
             backend: "cpu",
             arithmetic: String::new(),
             device: "2 threads".into(),
@@ -291,6 +328,7 @@ mod tests {
             "in nanometers, without normals",
             "20,000 vertices",
             "steps of 0.0009765625 Å",
+            "colours    chain: A #4fa59b",
             "39,996 triangles",
             "watertight (by edge checksum), oriented, NOT manifold, Euler number 2",
             "2 components, of which 1 void",

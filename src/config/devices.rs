@@ -25,8 +25,13 @@ pub struct DevicesConfig {
     /// divides jobs. Default 32,768, about 130,000 atoms at 1 Å: below that, the transfer costs more than another
     /// device saves.
     pub min_partition_bricks: Option<u64>,
+    /// Readback buffers per device, bytes of host memory: allocated before the first job and kept while the device is
+    /// idle. Default 2 GiB: meshes of up to 40 million triangles. The driver takes half a second to allocate it, for
+    /// which the first large mesh would wait. 0: none.
+    pub readback_bytes: u64,
     /// Maximum time of a submission in ms. A device that takes longer is considered hung: its jobs are repeated
-    /// elsewhere, and it cools down. Large submissions to a slow device may take a hundred times their estimate.
+    /// elsewhere, and it cools down. Large submissions to a slow device may take a hundred times their estimate;
+    /// opening a device may take three times this limit.
     /// Default 10,000: a submission takes less than a second.
     pub hang_timeout_ms: u64,
     /// Pause in ms before a device that hung or failed repeatedly is used again. Doubled each time until the device
@@ -41,6 +46,7 @@ impl Default for DevicesConfig {
             jobs: 16,
             batch: 16,
             min_partition_bricks: Some(MIN_PARTITION_BRICKS),
+            readback_bytes: 2 << 30,
             hang_timeout_ms: 10_000,
             cool_down_ms: 60_000,
         }

@@ -24,14 +24,16 @@ pub struct LimitsConfig {
     /// Size of a structure file after decompression, bytes. Default 2 GiB: the largest entries inflate to about 1 GB.
     /// Stops compression bombs.
     pub inflated_bytes: u64,
-    /// Number of atoms in all models of a structure. Default 10,000,000: four times the largest PDB entry; at 80 bytes
-    /// each 800 MB.
+    /// Number of atoms in all models of a structure, and of an assembly. Default 10,000,000: four times the largest PDB
+    /// entry; at 80 bytes each 800 MB.
     pub atoms: u64,
-    /// Number of atoms of one model at exactly the same position. Default 1,000: structures have at most a few, and the
-    /// work of a mesh grows with the square of their number.
+    /// Number of atoms of one model, or of an assembly, at exactly the same position. Default 1,000: structures have at
+    /// most a few, and the work of a mesh grows with the square of their number.
     pub duplicate_atoms: u64,
-    /// Number of atoms whose names are listed, for web pages that show them. Default 1,000,000: about 10 MB of JSON,
-    /// the most that is useful in a browser.
+    /// Number of copies of chains in an assembly. Default 10,000: six times as many as in the largest virus of the PDB.
+    pub assembly_copies: u64,
+    /// Number of atoms whose names or colours are listed, for web pages that show them. Default 1,000,000: about 10 MB
+    /// of JSON, the most that is useful in a browser.
     pub labels: u64,
     /// Number of grid points in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; 4 GiB as 32-bit
     /// numbers.
@@ -68,6 +70,7 @@ impl Default for LimitsConfig {
             inflated_bytes: 2 << 30,
             atoms: 10_000_000,
             duplicate_atoms: 1000,
+            assembly_copies: 10_000,
             labels: 1_000_000,
             grid_points: 1 << 30,
             candidate_pairs: 1 << 28,
@@ -89,6 +92,7 @@ impl LimitsConfig {
                 max_inflated_bytes: self.inflated_bytes,
                 max_atoms: self.atoms,
                 max_duplicates: self.duplicate_atoms,
+                max_copies: self.assembly_copies,
             },
             surface: SurfaceLimits {
                 max_samples: self.grid_points,

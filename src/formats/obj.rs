@@ -1,4 +1,5 @@
-//! Wavefront OBJ: text, one line per vertex, normal and triangle; indices count from 1.
+//! Wavefront OBJ: text, one line per vertex, normal and triangle; indices count from 1. Colours follow the
+//! coordinates of a vertex, an extension that most programs read.
 //!
 //! Coordinates are rounded to 1e-4 Å (five decimals in nanometres), a tenth of the precision of structure files.
 //! Vertices closer than that may get equal coordinates; they stay separate vertices, and the surface stays closed.
@@ -14,11 +15,14 @@ use crate::surface::Mesh;
 /// Decimals of a normal's component.
 const NORMAL_DECIMALS: Decimals = Decimals::Four;
 
+/// Decimals of a colour component.
+const COLOR_DECIMALS: Decimals = Decimals::Four;
+
 /// Largest coordinate, in the file's units.
 const MAX_COORDINATE: f64 = 1e9;
 
 /// Capacity for the longest line: `f` and three times `4294967296//4294967296` take 71 bytes, `v` and three coordinates
-/// of 17 characters 56.
+/// of 17 characters and colours of 6 characters 77.
 const LINE_BYTES: usize = 80;
 
 /// Decimals of a number.
@@ -79,7 +83,8 @@ impl ObjPlan {
         let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
         // Adds 1 because rounding up can add a digit.
         let number = |largest: f64, decimals: Decimals| format!("-{:.*}", decimals.count(), largest + 1.0).len() as u64;
-        let vertex = "v   \n".len() as u64 + 3 * number(extreme, decimals);
+        let color = if mesh.colors.is_some() { 3 * " 0.0000".len() as u64 } else { 0 };
+        let vertex = "v   \n".len() as u64 + 3 * number(extreme, decimals) + color;
         let normal = if smooth { "vn   \n".len() as u64 + 3 * number(1.0, NORMAL_DECIMALS) } else { 0 };
         let digits = n_vertices.to_string().len() as u64;
         let face = if smooth { "f //  //  //\n".len() as u64 + 6 * digits } else { "f   \n".len() as u64 + 3 * digits };
@@ -98,8 +103,17 @@ impl ObjPlan {
         let mut lines = Lines::new(out, self.len_bound);
         let Storage { normals, units, .. } = self.storage;
         let (place, decimals) = (Place { centre: mesh.centre, scale: units.scale() }, Decimals::of(units));
-        for &position in &mesh.positions[..] {
-            lines.push(|line| line.vector(b"v", place.absolute(position), decimals))?;
+        match mesh.colors.as_deref() {
+            None => {
+                for &position in &mesh.positions[..] {
+                    lines.push(|line| line.vector(b"v", place.absolute(position), decimals))?;
+                }
+            }
+            Some(colors) => {
+                for (&position, &color) in mesh.positions.iter().zip(colors) {
+                    lines.push(|line| line.colored(place.absolute(position), decimals, color))?;
+                }
+            }
         }
         let smooth = normals == Normals::Smooth;
         for &normal in mesh.normals.iter().filter(|_| smooth) {
@@ -171,6 +185,18 @@ impl Line<'_> {
         for value in row {
             self.put(b" ");
             self.fixed(value, decimals);
+        }
+        self.put(b"\n");
+    }
+
+    /// Appends a vertex with its colour, sRGB from 0 to 1.
+    fn colored(&mut self, row: [f32; 3], decimals: Decimals, [r, g, b, _]: [u8; 4]) {
+        self.vector(b"v", row, decimals);
+        // Replaces the line feed.
+        self.used -= 1;
+        for level in [r, g, b] {
+            self.put(b" ");
+            self.fixed(f32::from(level) / 255.0, COLOR_DECIMALS);
         }
         self.put(b"\n");
     }
@@ -315,6 +341,10 @@ mod tests {
         line.used = 0;
         line.vector(b"vn", [-1e9; 3], Decimals::Five);
         assert_eq!(line.used, "vn".len() + 3 * " -1000000000.00000".len() + 1);
+        line.used = 0;
+        line.colored([-1e9; 3], Decimals::Five, [255, 0, 10, 255]);
+        let end = format!("v{} 1.0000 0.0000 0.0392\n", " -1000000000.00000".repeat(3));
+        assert_eq!(&line.bytes[..line.used], end.as_bytes());
     }
 
     #[test]

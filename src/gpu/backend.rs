@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::device_queue::single_line;
 use super::discover::{self, Discovery, arithmetic, describe};
-use super::engine::Engine;
+use super::engine::{Budget, Engine};
 use super::error::GpuError;
 use super::executor::Executor;
 use super::job::{GpuJob, Prepared};
@@ -12,7 +12,7 @@ use super::pool::{self, DevicePool, PoolDevice};
 use super::scheduler::PoolSettings;
 use crate::surface::{
     Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Reservation, Spheres, Stage, SurfaceError,
-    SurfaceLimits, SurfaceParams, backend::one_atom,
+    SurfaceKind, SurfaceLimits, SurfaceParams, backend::one_atom,
 };
 
 /// Backend that meshes on devices.
@@ -30,10 +30,14 @@ impl GpuBackend {
             return Err(GpuError::NoDevice(why));
         }
         let devices = discovery.selected_adapters().map(|(device, adapter)| {
-            let adapter = adapter.clone();
+            let (adapter, readback_bytes) = (adapter.clone(), settings.readback_bytes);
             let build = Box::new(move || {
                 let (device, queue) = discover::open(&adapter)?;
-                Ok(Box::new(Engine::new(device, queue)?) as Box<dyn Executor>)
+                let mut budget = Budget::of(&device.limits());
+                if let Some(bytes) = readback_bytes {
+                    budget.idle_bytes = [budget.idle_bytes[0].max(bytes), bytes];
+                }
+                Ok(Box::new(Engine::with_budget(device, queue, budget)?) as Box<dyn Executor>)
             });
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
@@ -107,6 +111,10 @@ impl Backend for GpuBackend {
         let status = self.pool.status();
         let up: Vec<&str> = status.iter().filter(|d| d.down.is_none()).map(|d| d.name.as_str()).collect();
         pool::describe(&up)
+    }
+
+    fn makes(&self, surface: SurfaceKind) -> bool {
+        surface.kernel().is_some()
     }
 
     fn write(

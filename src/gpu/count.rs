@@ -6,14 +6,14 @@ use super::error::GpuError;
 use super::job_state::{ChunkCounts, JobState};
 use super::output_layout::{BODY_OFFSET, narrow};
 use super::plan::layout::Params;
-use super::submit::PendingSubmission;
+use super::recording::PendingSubmission;
 
 /// Number of the stages that run before the size of the output is known: `bin` to `scan`.
 pub(super) const N_COUNT_STAGES: usize = 4;
 
 impl Engine {
     /// Submits the stages `bin` to `scan` of a chunk.
-    pub(super) fn submit_count(&self, state: &JobState<'_>, chunk: usize) -> Result<PendingSubmission, GpuError> {
+    pub(super) fn submit_count(&self, state: &JobState, chunk: usize) -> Result<PendingSubmission, GpuError> {
         let loaded = &state.loaded;
         let own = &loaded.chunks[chunk];
         let [first_vertex, first_triangle] = state.total.map(|n| n & u64::from(u32::MAX));
@@ -39,7 +39,7 @@ impl Engine {
     /// Waits for the counts of a chunk.
     pub(super) fn wait_for_counts(
         &self,
-        state: &mut JobState<'_>,
+        state: &mut JobState,
         chunk: usize,
         submission: PendingSubmission,
     ) -> Result<ChunkCounts, GpuError> {

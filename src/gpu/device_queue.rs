@@ -39,7 +39,7 @@ pub(super) enum DeviceState {
 /// Queue, state and counters of a device.
 pub(super) struct DeviceQueue {
     pub(super) waiting: VecDeque<QueuedJob>,
-    /// Jobs that run now; an empty batch while the device is rebuilt.
+    /// Jobs that run now; an empty batch while the device is built.
     pub(super) running: Option<RunningBatch>,
     /// Load of the jobs that wait or run.
     pub(super) load: u64,

@@ -12,13 +12,14 @@ use wgpu::{Buffer, Device, Queue};
 use super::buffers::BufferId;
 use super::device_errors::DeviceErrors;
 use super::error::GpuError;
+use super::executor::NextJob;
 use super::job::GpuJob;
 use super::output_layout::{OutputRows, VertexBytes};
 use super::pipelines::{Pipelines, Variant};
 use super::plan::layout::{self, Params};
 use super::plan::{Chunk, ChunkLimits, Partition};
 use super::readback::ReadbackPool;
-use super::recording::{Dispatch, Recording, StageTimer};
+use super::recording::{Dispatch, PendingSubmission, Recording, StageTimer};
 use super::workspace::{BufferSizes, ROW, Workspace};
 use crate::surface::lattice::{LatticeAtom, slightly_coarser, to_u32};
 
@@ -65,7 +66,6 @@ impl Budget {
 }
 
 /// Runs jobs on one device.
-#[derive(Debug)]
 pub struct Engine {
     pub(super) device: Device,
     pub(super) queue: Queue,
@@ -78,14 +78,18 @@ pub struct Engine {
     /// Idle workspaces.
     pub(super) workspaces: Vec<Workspace>,
     pub(super) readback: ReadbackPool,
+    /// Source of the job that follows the running one.
+    pub(super) next_job: Option<NextJob>,
+    /// Next job with the submission that counts its first chunk.
+    pub(super) begun: Option<(LoadedJob, PendingSubmission)>,
     errors: Arc<DeviceErrors>,
     /// Number of submissions so far.
     pub(super) submissions: Arc<AtomicU64>,
 }
 
 /// Job whose buffers are allocated and filled.
-pub(super) struct LoadedJob<'a> {
-    pub(super) job: &'a GpuJob,
+pub(super) struct LoadedJob {
+    pub(super) job: GpuJob,
     pub(super) workspace: Workspace,
     pub(super) chunks: Vec<Chunk>,
     pub(super) params: Params,
@@ -93,7 +97,7 @@ pub(super) struct LoadedJob<'a> {
     pub(super) vertex: VertexBytes,
 }
 
-impl LoadedJob<'_> {
+impl LoadedJob {
     /// Number of bricks of the job.
     pub(super) fn n_bricks(&self) -> u32 {
         to_u32(self.job.prepared.plan.bricks.len())
@@ -134,6 +138,8 @@ impl Engine {
             max_binding: max_binding(&limits),
             workspaces: Vec::new(),
             readback: ReadbackPool::new(budget.idle_bytes),
+            next_job: None,
+            begun: None,
             timer: StageTimer::new(&device, &queue),
             device,
             queue,
@@ -155,7 +161,9 @@ impl Engine {
 
     /// Bytes of device memory, in use and pooled.
     pub(super) fn device_bytes(&self) -> u64 {
-        self.workspaces.iter().map(Workspace::bytes).sum::<u64>() + self.readback.held_bytes() + self.cases.size()
+        let begun = self.begun.iter().map(|(loaded, _)| &loaded.workspace);
+        let workspaces = self.workspaces.iter().chain(begun).map(Workspace::bytes).sum::<u64>();
+        workspaces + self.readback.held_bytes() + self.cases.size()
     }
 
     /// Fails if the graphics API has reported an error since the last check.
@@ -185,13 +193,13 @@ impl Engine {
     }
 
     /// Allocates the buffers of a job and uploads its input, or that of one partition.
-    pub(super) fn load<'a>(
+    pub(super) fn load(
         &mut self,
-        job: &'a GpuJob,
+        job: &GpuJob,
         partition: Option<&Partition>,
         chunks: Vec<Chunk>,
         capacity: OutputRows,
-    ) -> Result<LoadedJob<'a>, GpuError> {
+    ) -> Result<LoadedJob, GpuError> {
         job.check()?;
         let (plan, lattice, params) = (&job.prepared.plan, &job.prepared.lattice, &job.prepared.params);
         let vertex = VertexBytes::new(params);
@@ -204,8 +212,8 @@ impl Engine {
             self.workspaces.clear();
             return Err(error);
         }
-        let variant = Variant { kernel: params.kernel, nearest: params.atom_ids };
-        let params = plan.params(lattice, params);
+        let variant = Variant { kernel: job.prepared.profile.kernel, nearest: params.atom_ids };
+        let params = plan.params(lattice, &job.prepared.profile, params);
         let write = |id: BufferId, offset: usize, bytes: &[u8]| {
             if !bytes.is_empty() {
                 self.queue.write_buffer(workspace.buffer(id), offset as u64, bytes);
@@ -223,7 +231,7 @@ impl Engine {
         write(BufferId::Tiles, 0, bytemuck::cast_slice(&plan.tiles));
         write(BufferId::Bricks, 0, bytemuck::cast_slice(&plan.bricks));
         write(BufferId::FirstAtoms, 0, bytemuck::cast_slice(&plan.first_atoms));
-        Ok(LoadedJob { job, workspace, chunks, params, variant, vertex })
+        Ok(LoadedJob { job: job.clone(), workspace, chunks, params, variant, vertex })
     }
 
     /// Returns a workspace of at least `sizes`: the idle one that needs the fewest new bytes, or a new one.
@@ -240,11 +248,11 @@ impl Engine {
     }
 
     /// Grows the buffers of a job.
-    pub(super) fn grow(&mut self, loaded: &mut LoadedJob<'_>, sizes: &BufferSizes) -> Result<(), GpuError> {
-        self.check_sizes(loaded.job, sizes)?;
+    pub(super) fn grow(&mut self, loaded: &mut LoadedJob, sizes: &BufferSizes) -> Result<(), GpuError> {
+        self.check_sizes(&loaded.job, sizes)?;
         self.free_workspaces(sizes.total());
         loaded.workspace.ensure(&self.device, &self.pipelines, sizes, self.max_binding);
-        self.check_allocation(loaded.job, sizes.total())
+        self.check_allocation(&loaded.job, sizes.total())
     }
 
     /// Rejects buffers that exceed the budget or the largest binding.
@@ -259,7 +267,7 @@ impl Engine {
     }
 
     /// Frees idle workspaces until `bytes` more fit the budget.
-    fn free_workspaces(&mut self, bytes: u64) {
+    pub(super) fn free_workspaces(&mut self, bytes: u64) {
         while !self.workspaces.is_empty()
             && bytes + self.workspaces.iter().map(Workspace::bytes).sum::<u64>() > self.budget.memory
         {

@@ -27,9 +27,9 @@ pub enum GpuError {
     #[error("the device was lost: {0}")]
     Lost(String),
     /// The device made no progress; the job may succeed elsewhere.
-    #[error("the device hung: no submission finished within {after_ms} ms")]
+    #[error("the device hung: it made no progress for {after_ms} ms")]
     Hung {
-        /// Time limit of a submission, ms.
+        /// Time limit, ms.
         after_ms: u64,
     },
     /// The graphics API rejected a call, or a result is inconsistent: a defect of this program or of the driver.

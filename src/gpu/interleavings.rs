@@ -27,6 +27,7 @@ const SETTINGS: PoolSettings = PoolSettings {
     idle: Duration::MAX,
     hang_timeout: Duration::MAX,
     cool_down: Duration::MAX,
+    readback_bytes: None,
     min_partition_bricks: None,
 };
 

@@ -8,6 +8,7 @@ use super::error::GpuError;
 use super::plan::Plan;
 use super::sheets::SheetBlocks;
 use crate::surface::cpu::{LATTICE_BYTES, scan};
+use crate::surface::kernel::Profile;
 use crate::surface::lattice::Lattice;
 use crate::surface::{
     CancelToken, Control, MemoryMeter, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
@@ -24,6 +25,8 @@ pub struct Prepared {
     pub lattice: Lattice,
     /// Bricks of the lattice.
     pub plan: Plan,
+    /// Density of an atom.
+    pub profile: Profile,
     /// Surface parameters.
     pub params: SurfaceParams,
     /// Limits.
@@ -46,13 +49,22 @@ impl Prepared {
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
         control.check()?;
+        let profile = Profile::new(params.kernel_for("gpu")?, params);
         candidates::check(spheres, params, limits)?;
         control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
         let lattice = Lattice::new(spheres, params)?;
         control.check()?;
         let plan = Plan::new(&lattice, limits, control)?;
         let memory = Arc::clone(&control.memory);
-        Ok(Self { lattice, plan, params: params.clone(), limits: *limits, memory, is_counted: AtomicBool::new(false) })
+        Ok(Self {
+            lattice,
+            plan,
+            profile,
+            params: params.clone(),
+            limits: *limits,
+            memory,
+            is_counted: AtomicBool::new(false),
+        })
     }
 
     /// Checks the size of a mesh, given as numbers of vertices and triangles, against the limits.
@@ -64,7 +76,7 @@ impl Prepared {
     /// mesh to the meter.
     pub(super) fn check_mesh(&self, size: [u64; 2]) -> Result<(), SurfaceError> {
         if size[1] == 0 {
-            Err(SurfaceError::NoSurface { isovalue: self.params.isovalue })
+            Err(SurfaceError::NoSurface { isovalue: Some(self.params.isovalue) })
         } else {
             self.check_size(size)?;
             if !self.is_counted.swap(true, Ordering::Relaxed) {

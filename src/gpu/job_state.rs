@@ -12,8 +12,9 @@ use super::output_layout::{
 use super::pipelines::{N_STAGES, STAGES};
 use super::plan::layout::{self, Counters};
 use super::readback::ReadbackBuffer;
+use super::recording::PendingSubmission;
 use super::sheets::SheetBlocks;
-use super::submit::{PendingSubmission, StageTimes};
+use super::submit::StageTimes;
 use crate::surface::mesh::joined_bounds;
 use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage, Step};
 
@@ -39,8 +40,10 @@ pub(super) struct PendingOutput {
 }
 
 /// State of a job.
-pub(super) struct JobState<'a> {
-    pub(super) loaded: LoadedJob<'a>,
+pub(super) struct JobState {
+    pub(super) loaded: LoadedJob,
+    /// Submission that counts the first chunk, if it was made before the job's turn.
+    pub(super) counting: Option<PendingSubmission>,
     pub(super) times: StageTimes,
     /// True if some vertex has no gradient.
     pub(super) has_flat_vertices: bool,
@@ -58,10 +61,11 @@ pub(super) struct JobState<'a> {
     pub(super) total: [u64; 2],
 }
 
-impl<'a> JobState<'a> {
-    pub(super) fn new(loaded: LoadedJob<'a>) -> Self {
+impl JobState {
+    pub(super) fn new(loaded: LoadedJob) -> Self {
         Self {
             loaded,
+            counting: None,
             times: [0; N_STAGES],
             has_flat_vertices: false,
             vertices: Vec::new(),

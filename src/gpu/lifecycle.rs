@@ -4,18 +4,26 @@ use std::ops::Range;
 use std::sync::PoisonError;
 use std::time::{Duration, Instant};
 
-use super::device_queue::{DeviceState, DeviceThread, down_reasons, reject};
+use super::device_queue::{DeviceQueue, DeviceState, DeviceThread, down_reasons, reject};
+use super::running_batch::RunningBatch;
 use super::scheduler::Scheduler;
 
 /// Maximum cool-down, as a multiple of the first one.
-const MAX_COOL_DOWN: u32 = 64;
+pub(super) const MAX_COOL_DOWN: u32 = 64;
 
 impl Scheduler {
-    /// Registers the present thread of device `n`, which is about to start.
+    /// Registers the current thread of device `n`, which is about to start.
     pub(super) fn begin_thread(&self, n: usize) -> DeviceThread {
         let queue = &mut self.lock().queues[n];
         queue.has_thread = true;
         DeviceThread { device: n, generation: queue.generation }
+    }
+
+    /// Records that a thread begins to build its executor, and starts to watch it for a hang.
+    pub(super) fn begin_build(&self, thread: DeviceThread) {
+        if let Some(queue) = self.lock().queue_of(thread) {
+            queue.running = Some(RunningBatch::build(Instant::now()));
+        }
     }
 
     /// Notes that a thread ends.
@@ -94,6 +102,7 @@ impl Scheduler {
     pub(super) fn cool_down(&self, thread: DeviceThread) -> bool {
         let maximum = self.settings.cool_down.saturating_mul(MAX_COOL_DOWN);
         let time = self.lock().queue_of(thread).map(|queue| {
+            queue.running = None;
             let time = queue.cool_down;
             queue.cool_down = time.saturating_mul(2).min(maximum);
             time
@@ -116,13 +125,20 @@ impl Scheduler {
         self.lock().queue_of(thread).map_or(0, |queue| queue.consecutive_rebuilds)
     }
 
-    /// Waits until every device is up or down. Returns true if one is up.
-    pub(super) fn wait_until_started(&self) -> bool {
-        let mut state = self.lock();
-        while state.queues.iter().any(|queue| matches!(queue.state, DeviceState::Starting)) {
-            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+    /// Waits until every device is up or down, at most for `time`. Returns false if the time was too short.
+    pub(super) fn wait_until_started(&self, time: Duration) -> bool {
+        let is_starting = |queue: &DeviceQueue| matches!(queue.state, DeviceState::Starting);
+        let state = self.lock();
+        if !state.queues.iter().any(is_starting) {
+            return true;
         }
-        state.queues.iter().any(|queue| matches!(queue.state, DeviceState::Up))
+        let state = self.changed.wait_timeout(state, time).unwrap_or_else(PoisonError::into_inner).0;
+        !state.queues.iter().any(is_starting)
+    }
+
+    /// Returns true if a device is up.
+    pub(super) fn is_any_up(&self) -> bool {
+        self.lock().queues.iter().any(|queue| matches!(queue.state, DeviceState::Up))
     }
 
     /// Waits for `time`. Returns false if the scheduler is closed.

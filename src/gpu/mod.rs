@@ -7,7 +7,7 @@
 //! A module names only modules of earlier lines:
 //!
 //! ```text
-//! error, buffers, plan, readback, hardware, manifests, choose, picture_targets
+//! error, buffers, plan, readback, hang_limit, hardware, manifests, choose, picture_targets
 //! sheets, shaders, device_errors, discover
 //! job
 //! partition_handle, pipelines, multi_device, picture_passes
@@ -37,6 +37,7 @@ pub mod discover;
 pub mod engine;
 pub mod error;
 pub mod executor;
+mod hang_limit;
 mod hardware;
 #[cfg(test)]
 #[cfg(feature = "shuttle")]
@@ -74,11 +75,11 @@ pub use backend::GpuBackend;
 pub use discover::{Discovery, DiscoveryMode, discover};
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
-pub use executor::Executor;
+pub use executor::{Executor, NextJob};
 pub use job::{Finished, GpuJob, JobResult, Prepared};
 pub use manifests::{Manifest, manifests};
 pub use partition_handle::PartitionHandle;
-pub use picture::GpuRenderer;
+pub use picture::{GpuRenderer, PictureBuild, PictureExecutor, PictureJob};
 pub use pool::{CompletedJob, DevicePool, DeviceWork, PoolDevice};
 pub use scheduler::PoolSettings;
 pub use shaders::stage_shaders;

@@ -19,15 +19,18 @@ impl Engine {
     /// returns whether to make its output.
     pub(super) fn count_chunks(
         &mut self,
-        state: &mut JobState<'_>,
-        mut accept: impl FnMut(&Self, &JobState<'_>, usize) -> Result<bool, GpuError>,
+        state: &mut JobState,
+        mut accept: impl FnMut(&Self, &JobState, usize) -> Result<bool, GpuError>,
     ) -> Result<Vec<ChunkCounts>, GpuError> {
         let n_chunks = state.loaded.chunks.len();
         let mut all = Vec::with_capacity(n_chunks);
         for chunk in 0..n_chunks {
             state.loaded.job.check()?;
             // The vertices of the previous chunk are read back meanwhile.
-            let submission = self.submit_count(state, chunk)?;
+            let submission = match state.counting.take() {
+                Some(submission) => submission,
+                None => self.submit_count(state, chunk)?,
+            };
             self.collect_output(state)?;
             let counts = self.wait_for_counts(state, chunk, submission)?;
             if accept(self, state, chunk)? {
@@ -40,18 +43,17 @@ impl Engine {
         Ok(all)
     }
 
-    /// Makes the triangles of all chunks.
-    pub(super) fn make_triangles(&mut self, state: &mut JobState<'_>, counts: &[ChunkCounts]) -> Result<(), GpuError> {
+    /// Makes the triangles of all chunks. The caller collects the last piece with [`Self::collect_output`].
+    pub(super) fn make_triangles(&mut self, state: &mut JobState, counts: &[ChunkCounts]) -> Result<(), GpuError> {
         let all: Vec<_> = counts.iter().enumerate().collect();
-        self.make_output(state, &all, Stage::Emit)?;
-        self.collect_output(state)
+        self.make_output(state, &all, Stage::Emit)
     }
 
     /// Submits the output of `stage` for chunks, given with their indices, and collects all pieces but the last. The
     /// samples of the first chunk must be present for vertices and sheets.
     pub(super) fn make_output(
         &mut self,
-        state: &mut JobState<'_>,
+        state: &mut JobState,
         counts: &[(usize, &ChunkCounts)],
         stage: Stage,
     ) -> Result<(), GpuError> {
@@ -68,7 +70,7 @@ impl Engine {
     }
 
     /// Cuts the output of chunks into pieces that fit a binding.
-    fn pieces(&self, state: &JobState<'_>, counts: &[(usize, &ChunkCounts)]) -> Vec<OutputPiece> {
+    fn pieces(&self, state: &JobState, counts: &[(usize, &ChunkCounts)]) -> Vec<OutputPiece> {
         let max = self.max_rows(state.loaded.vertex);
         let cut = |&(chunk, counts): &(usize, &ChunkCounts)| {
             let own = &state.loaded.chunks[chunk];
@@ -85,7 +87,7 @@ impl Engine {
     }
 
     /// Grows the output buffers to the largest of `pieces`.
-    fn ensure_capacity(&mut self, state: &mut JobState<'_>, pieces: &[OutputPiece]) -> Result<(), GpuError> {
+    fn ensure_capacity(&mut self, state: &mut JobState, pieces: &[OutputPiece]) -> Result<(), GpuError> {
         let max = |of: fn(&OutputPiece) -> u64| pieces.iter().map(of).max().unwrap_or_default();
         let capacity = OutputRows {
             vertices: max(|p| p.n_vertices),
@@ -100,7 +102,7 @@ impl Engine {
     /// Submits `stage` for a piece and the copies of its output.
     fn submit_piece(
         &self,
-        state: &JobState<'_>,
+        state: &JobState,
         chunk: usize,
         piece: &OutputPiece,
         stage: Stage,
@@ -137,7 +139,7 @@ impl Engine {
     }
 
     /// Waits for the pending output, if any, and adds it to the job. Makes sheets again if they did not fit.
-    pub(super) fn collect_output(&mut self, state: &mut JobState<'_>) -> Result<(), GpuError> {
+    pub(super) fn collect_output(&mut self, state: &mut JobState) -> Result<(), GpuError> {
         while let Some(PendingOutput { submission, layout, mut rows, stage, chunk, piece }) = state.pending.take() {
             let readback = self.wait_one(submission)?;
             let counters = counters(&readback)?;

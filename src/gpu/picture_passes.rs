@@ -27,6 +27,16 @@ const CANCEL_INTERVAL: Duration = Duration::from_millis(20);
 /// Width and height of a workgroup in pixels, as in the shaders.
 const GROUP: u32 = 8;
 
+/// Columns of a mesh.
+#[derive(Clone, Copy)]
+pub(super) struct Columns<'a> {
+    pub(super) positions: &'a [[f32; 3]],
+    pub(super) normals: &'a [[f32; 3]],
+    pub(super) triangles: &'a [[u32; 3]],
+    /// sRGB colours, if the mesh has colours of its own.
+    pub(super) colors: Option<&'a [[u8; 4]]>,
+}
+
 /// Open device with the compiled passes. The bind group layouts follow from the shaders.
 pub(super) struct PicturePasses {
     device: Device,
@@ -71,26 +81,27 @@ impl PicturePasses {
     ///
     /// # Errors
     /// [`GpuError::Failed`] or [`GpuError::Lost`] as reported by the device.
-    pub(super) fn draw(
+    pub(super) fn draw_mesh(
         &self,
-        positions: &[[f32; 3]],
-        normals: &[[f32; 3]],
-        triangles: &[[u32; 3]],
+        columns: Columns<'_>,
         params: &PictureParams,
         camera: &Camera,
         cancel: &CancelToken,
     ) -> Result<Vec<[u8; 4]>, GpuError> {
         let (device, queue) = (&self.device, &self.queue);
+        let Columns { positions, normals, triangles, colors } = columns;
         let n_pixels = u64::from(params.width) * u64::from(params.height);
         let column = |label: &str, bytes: &[u8], usage| filled(device, queue, label, bytes, usage);
         let position_buffer = column("positions", bytemuck::cast_slice(positions), BufferUsages::VERTEX);
         let normal_buffer = column("normals", bytemuck::cast_slice(normals), BufferUsages::VERTEX);
+        let color_buffer = colors.map(|colors| column("colors", bytemuck::cast_slice(colors), BufferUsages::VERTEX));
         let index_buffer = column("triangles", bytemuck::cast_slice(triangles), BufferUsages::INDEX);
         let n_indices = u32::try_from(3 * triangles.len()).map_err(|_too_many| {
             GpuError::Failed(format!("{} triangles are too many for one draw", triangles.len()))
         })?;
         let shades = layered(device, "molmesh.picture.shades", SHADE, params);
         let depths = layered(device, "molmesh.picture.depths", DEPTH, params);
+        let tints = layered(device, "molmesh.picture.tints", SHADE, params);
         let attachment = TextureUsages::RENDER_ATTACHMENT;
         let nearest = texture(device, "molmesh.picture.nearest", DEPTH_BUFFER, params, 1, attachment);
         let nearest = nearest.create_view(&TextureViewDescriptor::default());
@@ -102,17 +113,19 @@ impl PicturePasses {
             let view = View::new(camera, offset);
             let view = column("view", bytemuck::bytes_of(&view), BufferUsages::UNIFORM);
             let group = bind(device, &self.draw.get_bind_group_layout(0), &[view.as_entire_binding()]);
-            let views = [layer(&shades, sample), layer(&depths, sample)];
+            let views = [layer(&shades, sample), layer(&depths, sample), layer(&tints, sample)];
             let mut pass = begin_draw(&mut encoder, &views, &nearest);
             pass.set_pipeline(&self.draw);
             pass.set_bind_group(0, &group, &[]);
             pass.set_vertex_buffer(0, position_buffer.slice(..));
             pass.set_vertex_buffer(1, normal_buffer.slice(..));
+            // Without colours, the shader ignores the values, so any column of sufficient length will do.
+            pass.set_vertex_buffer(2, color_buffer.as_ref().unwrap_or(&position_buffer).slice(..));
             pass.set_index_buffer(index_buffer.slice(..), wgpu::IndexFormat::Uint32);
             pass.draw_indexed(0..n_indices, 0, 0..1);
         }
         let finish = Finish::new(params, camera);
-        let finish_params = FinishParams::new(&finish, params);
+        let finish_params = FinishParams::new(&finish, params, colors.is_some());
         let finish_params = column("params", bytemuck::bytes_of(&finish_params), BufferUsages::UNIFORM);
         let taps = column("taps", bytemuck::cast_slice(&taps_of(&finish)), BufferUsages::STORAGE);
         let rows = |label| buffer(device, label, 16 * n_pixels, BufferUsages::STORAGE);
@@ -122,14 +135,15 @@ impl PicturePasses {
         let mappable = BufferUsages::COPY_DST | BufferUsages::MAP_READ;
         let readback = buffer(device, "molmesh.picture.readback", 4 * n_pixels, mappable);
         let groups = [params.width.div_ceil(GROUP), params.height.div_ceil(GROUP)];
-        let [all_shades, all_depths] =
-            [&shades, &depths].map(|texture| texture.create_view(&TextureViewDescriptor::default()));
+        let [all_shades, all_depths, all_tints] =
+            [&shades, &depths, &tints].map(|texture| texture.create_view(&TextureViewDescriptor::default()));
         let resources = [
             finish_params.as_entire_binding(),
             BindingResource::TextureView(&all_shades),
             BindingResource::TextureView(&all_depths),
             seen.as_entire_binding(),
             resolved_normals.as_entire_binding(),
+            BindingResource::TextureView(&all_tints),
         ];
         compute(device, &mut encoder, &self.resolve, &resources, groups);
         let resources =
@@ -184,7 +198,7 @@ fn compute(
 /// Begins a pass that draws one sample of every pixel onto cleared targets.
 fn begin_draw<'a>(
     encoder: &'a mut CommandEncoder,
-    views: &[wgpu::TextureView; 2],
+    views: &[wgpu::TextureView; 3],
     nearest: &wgpu::TextureView,
 ) -> wgpu::RenderPass<'a> {
     let cleared =
@@ -193,7 +207,7 @@ fn begin_draw<'a>(
         |view, r| Some(RenderPassColorAttachment { view, depth_slice: None, resolve_target: None, ops: cleared(r) });
     encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
         label: Some("molmesh.picture"),
-        color_attachments: &[color(&views[0], 0.0), color(&views[1], NO_SURFACE_DEPTH)],
+        color_attachments: &[color(&views[0], 0.0), color(&views[1], NO_SURFACE_DEPTH), color(&views[2], 0.0)],
         depth_stencil_attachment: Some(RenderPassDepthStencilAttachment {
             view: nearest,
             depth_ops: Some(Operations { load: LoadOp::Clear(1.0), store: StoreOp::Discard }),
@@ -207,11 +221,12 @@ fn begin_draw<'a>(
 
 /// Compiles the pipeline of the draw passes.
 fn draw_pipeline(device: &Device, [vertex, fragment]: [&Shader; 2]) -> RenderPipeline {
-    let attributes =
-        [0, 1].map(|shader_location| [VertexAttribute { format: VertexFormat::Float32x3, offset: 0, shader_location }]);
-    let columns = attributes
-        .each_ref()
-        .map(|attributes| Some(VertexBufferLayout { array_stride: 12, step_mode: VertexStepMode::Vertex, attributes }));
+    let formats = [(0, VertexFormat::Float32x3), (1, VertexFormat::Float32x3), (2, VertexFormat::Unorm8x4)];
+    let attributes = formats.map(|(shader_location, format)| [VertexAttribute { format, offset: 0, shader_location }]);
+    let columns = attributes.each_ref().map(|attributes| {
+        let array_stride = attributes[0].format.size();
+        Some(VertexBufferLayout { array_stride, step_mode: VertexStepMode::Vertex, attributes })
+    });
     let [vertex, fragment] = [vertex, fragment].map(|shader| module(device, shader));
     let target = |format| Some(wgpu::ColorTargetState { format, blend: None, write_mask: wgpu::ColorWrites::ALL });
     device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
@@ -240,7 +255,7 @@ fn draw_pipeline(device: &Device, [vertex, fragment]: [&Shader; 2]) -> RenderPip
             module: &fragment,
             entry_point: Some("main"),
             compilation_options: wgpu::PipelineCompilationOptions::default(),
-            targets: &[target(SHADE), target(DEPTH)],
+            targets: &[target(SHADE), target(DEPTH), target(SHADE)],
         }),
         multiview_mask: None,
         cache: None,

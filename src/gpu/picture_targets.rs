@@ -14,7 +14,7 @@ use crate::surface::Mesh;
 
 /// Positions of the samples within a pixel, as in the CPU renderer.
 pub(super) const PATTERN: [[f32; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
-/// Format of the normal and the light of a sample.
+/// Format of the normal and the light of a sample, and of its colour.
 pub(super) const SHADE: TextureFormat = TextureFormat::Rgba16Float;
 /// Format of the depth of a sample, Å.
 pub(super) const DEPTH: TextureFormat = TextureFormat::R32Float;
@@ -81,11 +81,12 @@ pub(super) struct FinishParams {
 }
 
 impl FinishParams {
-    pub(super) fn new(finish: &Finish, params: &PictureParams) -> Self {
+    /// `is_colored`: the mesh has colours of its own.
+    pub(super) fn new(finish: &Finish, params: &PictureParams, is_colored: bool) -> Self {
         let [r, g, b] = finish.color;
         let [step_min, step_max] = finish.steps;
         Self {
-            color: [r, g, b, 0.0],
+            color: [r, g, b, if is_colored { 1.0 } else { 0.0 }],
             background: finish.background,
             size: [params.width, params.height],
             n_taps: u32::try_from(finish.taps.len()).unwrap_or(0),

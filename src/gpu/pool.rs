@@ -97,7 +97,8 @@ enum MultiDeviceOutcome {
 }
 
 impl DevicePool {
-    /// Starts one thread per device and waits until every device is up or down.
+    /// Starts one thread per device and waits until every device is up or down. A device that hangs during its
+    /// build is down.
     ///
     /// # Errors
     /// [`GpuError::NoDevice`] with the reasons of all devices if none is up; [`GpuError::Failed`] if a thread cannot be
@@ -111,14 +112,13 @@ impl DevicePool {
             let failed = |e: io::Error| GpuError::Failed(format!("the thread of a device cannot be started: {e}"));
             pool.spawn(n).map_err(failed)?;
         }
-        if pool.scheduler.wait_until_started() {
-            Ok(pool)
-        } else {
-            Err(GpuError::NoDevice(pool.scheduler.down_reasons()))
+        while !pool.scheduler.wait_until_started(POLL_INTERVAL) {
+            pool.check_for_hangs();
         }
+        if pool.scheduler.is_any_up() { Ok(pool) } else { Err(GpuError::NoDevice(pool.scheduler.down_reasons())) }
     }
 
-    /// Starts the present thread of device `n`.
+    /// Starts the current thread of device `n`.
     fn spawn(&self, n: usize) -> io::Result<()> {
         let (scheduler, device) = (Arc::clone(&self.scheduler), Arc::clone(&self.devices[n]));
         let thread = self.scheduler.begin_thread(n);

@@ -16,7 +16,6 @@ use crate::surface::Stage;
 const WORDS_PER_TRIANGLE: u32 = 17;
 
 /// Buffers of a job on a device, and its stages.
-#[derive(Debug)]
 pub struct StageProbe {
     engine: Engine,
     workspace: Workspace,

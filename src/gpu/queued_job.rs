@@ -24,6 +24,11 @@ impl QueuedJob {
         !self.retry && self.partition.is_none() && self.job.prepared.is_small()
     }
 
+    /// Returns true if the job is large, whole and tried for the first time.
+    pub(super) fn is_alone(&self) -> bool {
+        !self.retry && self.partition.is_none() && !self.job.prepared.is_small()
+    }
+
     /// Number of bricks of the job or of the partition.
     pub(super) fn bricks(&self) -> u64 {
         match &self.partition {

@@ -32,6 +32,16 @@ pub(super) struct ReadbackBuffer {
 }
 
 impl Idle {
+    fn create(&mut self, device: &Device, size: u64) -> Buffer {
+        self.held += size;
+        device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("molmesh.readback"),
+            size,
+            usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        })
+    }
+
     /// Frees the longest idle buffers until the others are at most `limit` bytes.
     fn shrink(&mut self, limit: u64) {
         let sizes: Vec<u64> = self.buffers.iter().map(Buffer::size).collect();
@@ -53,18 +63,32 @@ impl ReadbackPool {
         let mut idle = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let fits = |b: &Buffer| (size..=2 * size).contains(&b.size());
         let best = (0..idle.buffers.len()).filter(|&i| fits(&idle.buffers[i])).min_by_key(|&i| idle.buffers[i].size());
-        let buffer = if let Some(i) = best {
-            idle.buffers.remove(i)
-        } else {
-            idle.held += size;
-            device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("molmesh.readback"),
-                size,
-                usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
-                mapped_at_creation: false,
-            })
+        let buffer = match best {
+            Some(i) => idle.buffers.remove(i),
+            None => idle.create(device, size),
         };
         ReadbackBuffer { buffer, view: None, pool: self.clone() }
+    }
+
+    /// Adds an idle buffer. Discards it if `check`, called after the allocation, fails.
+    ///
+    /// # Errors
+    /// Those of `check`.
+    pub(super) fn reserve(
+        &self,
+        device: &Device,
+        size: u64,
+        check: impl FnOnce() -> Result<(), GpuError>,
+    ) -> Result<(), GpuError> {
+        let mut idle = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let buffer = idle.create(device, size);
+        let checked = check();
+        if checked.is_ok() {
+            idle.buffers.push(buffer);
+        } else {
+            idle.held -= size;
+        }
+        checked
     }
 
     /// Bytes of all buffers, idle and in use.
@@ -106,6 +130,15 @@ fn n_to_free(sizes: &[u64], limit: u64) -> usize {
 pub(super) fn size_class(bytes: u64) -> u64 {
     let step = (bytes.max(4096).next_power_of_two() / 8).max(1024);
     bytes.max(4096).next_multiple_of(step)
+}
+
+/// Returns the sizes of the buffers to reserve within `bytes`, largest first: two of each power of two.
+/// [`ReadbackPool::acquire`] then finds one buffer for the vertices and one for the triangles of any mesh whose columns
+/// fit the largest size.
+pub(super) fn reserved_sizes(bytes: u64) -> impl Iterator<Item = u64> {
+    // The sum of all sizes is less than four times the largest.
+    let sizes = (12..64).rev().map(|k| 1 << k).filter(move |size| *size <= bytes / 4);
+    sizes.flat_map(|size| [size; 2])
 }
 
 impl ReadbackBuffer {
@@ -160,5 +193,18 @@ mod tests {
             assert!(bytes < 8192 || class * 3 <= bytes * 4, "{bytes}: {class}");
             assert_eq!(size_class(class), class);
         }
+    }
+
+    #[test]
+    fn reserved_buffers_fit_every_size_twice_and_keep_to_the_limit() {
+        for bytes in [16_384, 20_000, 1 << 20, 3 << 20, (1 << 31) - 1, 2 << 30, 2 << 40] {
+            let sizes: Vec<u64> = reserved_sizes(bytes).collect();
+            assert!(sizes.iter().sum::<u64>() <= bytes && sizes[0] * 8 > bytes, "{bytes}: {sizes:?}");
+            for wanted in (12..40).flat_map(|k| [1 << k, (1 << k) + 1]).map(size_class).filter(|n| *n <= sizes[0]) {
+                let n_fit = sizes.iter().filter(|size| (wanted..=2 * wanted).contains(size)).count();
+                assert!(n_fit >= 2, "{bytes}: {wanted}");
+            }
+        }
+        assert_eq!((reserved_sizes(0).count(), reserved_sizes(16_383).count()), (0, 0));
     }
 }

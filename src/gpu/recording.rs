@@ -8,6 +8,7 @@ use super::buffers::BufferId;
 use super::output_layout::{COUNTERS_OFFSET, OutputRows, ReadbackLayout, TRIANGLE_BYTES, VertexBytes};
 use super::pipelines::{N_STAGES, Pipelines, TIMESTAMP_BYTES, Variant, stage_index};
 use super::plan::layout::{Counters, GROUP, Params};
+use super::readback::ReadbackBuffer;
 use super::workspace::{ROW, Workspace};
 use crate::surface::Stage;
 
@@ -62,6 +63,13 @@ pub(super) fn ticks_to_ns(ticks: u64, period: f64) -> u64 {
 
 fn query_number(n: usize) -> u32 {
     u32::try_from(n).unwrap_or(u32::MAX)
+}
+
+/// Submission that was sent to the device and has not been waited for.
+pub(super) struct PendingSubmission {
+    pub(super) index: wgpu::SubmissionIndex,
+    /// Readback buffers, each with the number of bytes to map.
+    pub(super) readbacks: Vec<(ReadbackBuffer, u64)>,
 }
 
 /// Submission that is being recorded.

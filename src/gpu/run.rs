@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicU64;
 use super::buffers::BufferId;
 use super::engine::{Engine, LoadedJob};
 use super::error::GpuError;
-use super::executor::Executor;
+use super::executor::{Executor, NextJob};
 use super::job::{GpuJob, JobResult};
 use super::job_state::{JobState, counters};
 use super::output_layout::{OutputRows, ReadbackLayout, ReadbackRows, TRIANGLE_BYTES, VertexBytes, narrow};
@@ -14,14 +14,18 @@ use super::partition_handle::PartitionHandle;
 use super::pipelines::N_STAGES;
 use super::plan::Chunk;
 use super::plan::layout::Params;
-use super::readback::ReadbackBuffer;
+use super::readback::{ReadbackBuffer, reserved_sizes};
+use super::workspace::BufferSizes;
 use crate::surface::Stage;
 
 /// Small job with the capacity of its output buffers.
-type SmallJob<'a> = (LoadedJob<'a>, OutputRows);
+type SmallJob = (LoadedJob, OutputRows);
 
 impl Executor for Engine {
     fn run(&mut self, jobs: &[GpuJob]) -> Vec<JobResult> {
+        if let Some(state) = self.take_begun(jobs) {
+            return vec![self.run_large(state)];
+        }
         let mut results: Vec<Option<JobResult>> = jobs.iter().map(|_| None).collect();
         let mut small = Vec::new();
         for (result, job) in results.iter_mut().zip(jobs) {
@@ -32,7 +36,7 @@ impl Executor for Engine {
             });
             match loaded {
                 Ok((loaded, Some(capacity))) => small.push((result, (loaded, capacity))),
-                Ok((loaded, None)) => *result = Some(self.run_large(loaded)),
+                Ok((loaded, None)) => *result = Some(self.run_large(JobState::new(loaded))),
                 Err(error) => *result = Some(Err(error)),
             }
         }
@@ -48,7 +52,22 @@ impl Executor for Engine {
         self.run_partition_of(job, partition)
     }
 
+    fn reserve_memory(&mut self, bytes: u64) {
+        let sizes = reserved_sizes(bytes).filter(|size| *size <= self.budget.readback_bytes);
+        for size in sizes {
+            // If the device is lost, the next job reports it.
+            if self.readback.reserve(&self.device, size, || self.check_errors()).is_err() {
+                return;
+            }
+        }
+    }
+
+    fn set_next_job(&mut self, next: NextJob) {
+        self.next_job = Some(next);
+    }
+
     fn release_idle_memory(&mut self) {
+        self.discard_begun();
         self.readback.release_idle();
     }
 
@@ -77,7 +96,7 @@ impl Engine {
     }
 
     /// Runs small jobs in one submission. Returns their results in order.
-    fn run_small(&mut self, jobs: Vec<SmallJob<'_>>) -> Vec<JobResult> {
+    fn run_small(&mut self, jobs: Vec<SmallJob>) -> Vec<JobResult> {
         if jobs.is_empty() {
             return Vec::new();
         }
@@ -98,7 +117,7 @@ impl Engine {
     }
 
     /// Submits all stages of all jobs and the copies of their estimated output, and waits.
-    fn submit_small(&self, jobs: &[SmallJob<'_>]) -> Result<Vec<Arc<ReadbackBuffer>>, GpuError> {
+    fn submit_small(&self, jobs: &[SmallJob]) -> Result<Vec<Arc<ReadbackBuffer>>, GpuError> {
         let mut recording = self.recording();
         let mut dispatches = Vec::with_capacity(jobs.len());
         for (loaded, capacity) in jobs {
@@ -135,7 +154,7 @@ impl Engine {
     /// Assembles the mesh of a small job. Its output is made again if the estimate was too low.
     fn finish_small(
         &mut self,
-        state: &mut JobState<'_>,
+        state: &mut JobState,
         capacity: OutputRows,
         readback: &Arc<ReadbackBuffer>,
         share: f64,
@@ -162,24 +181,79 @@ impl Engine {
             state.add_counters(&counters);
             state.vertices.push(rows.clone());
             state.triangles.push(rows);
-            self.collect_output(state)?;
         }
+        self.collect_output(state)?;
         state.finish()
     }
 
     /// Runs one job of any size.
-    fn run_large(&mut self, loaded: LoadedJob<'_>) -> JobResult {
-        let mut state = JobState::new(loaded);
+    fn run_large(&mut self, mut state: JobState) -> JobResult {
         let result = self.run_chunks(&mut state);
-        self.workspaces.push(state.loaded.workspace);
-        result
+        if !matches!(result, Err(GpuError::OutOfMemory { .. })) {
+            self.workspaces.push(state.loaded.workspace);
+            return result;
+        }
+        if self.workspaces.is_empty() {
+            return result;
+        }
+        // An idle workspace may hold the missing memory.
+        self.workspaces.clear();
+        let job = state.loaded.job.clone();
+        drop(state);
+        let chunks = self.chunks(&job, None)?;
+        let loaded = self.load(&job, None, chunks, OutputRows::default())?;
+        self.run_large(JobState::new(loaded))
     }
 
-    fn run_chunks(&mut self, state: &mut JobState<'_>) -> JobResult {
+    fn run_chunks(&mut self, state: &mut JobState) -> JobResult {
         let counts = self.count_chunks(state, |_, state, _| state.check_limits().map(|()| true))?;
         state.check_complete()?;
         self.make_triangles(state, &counts)?;
+        // Errors after this check belong to the next job.
+        self.check_errors()?;
+        self.begin_next(state.loaded.workspace.bytes());
+        self.collect_output(state)?;
         state.finish()
+    }
+
+    /// Loads and counts the next job of the pool while the device transfers the results of the current one, whose
+    /// workspace takes `in_use` bytes. Does nothing if the next job is small, or if the memory cannot hold both. A next
+    /// job that fails here starts again when its turn comes.
+    fn begin_next(&mut self, in_use: u64) -> Option<()> {
+        let job = self.next_job.as_ref().and_then(|next| next())?;
+        let chunks = self.chunks(&job, None).ok()?;
+        if self.small_capacity(&job, &chunks).is_some() {
+            return None;
+        }
+        let (plan, vertex) = (&job.prepared.plan, VertexBytes::new(&job.prepared.params));
+        let bytes = in_use + BufferSizes::new(plan, &chunks, vertex, OutputRows::default()).total();
+        if bytes > self.budget.memory {
+            return None;
+        }
+        self.free_workspaces(bytes);
+        let loaded = self.load(&job, None, chunks, OutputRows::default()).ok()?;
+        let state = JobState::new(loaded);
+        let counting = self.submit_count(&state, 0).ok()?;
+        self.check_errors().ok()?;
+        self.begun = Some((state.loaded, counting));
+        Some(())
+    }
+
+    /// Returns the state of the only job in `jobs` if [`Self::begin_next`] has begun it.
+    fn take_begun(&mut self, jobs: &[GpuJob]) -> Option<JobState> {
+        let is_of = |loaded: &LoadedJob| matches!(jobs, [job] if Arc::ptr_eq(&job.prepared, &loaded.job.prepared));
+        if let Some((loaded, counting)) = self.begun.take_if(|(loaded, _)| is_of(loaded)) {
+            let mut state = JobState::new(loaded);
+            state.counting = Some(counting);
+            return Some(state);
+        }
+        self.discard_begun();
+        None
+    }
+
+    /// Discards the job that [`Self::begin_next`] has begun. Keeps its workspace for other jobs.
+    pub(super) fn discard_begun(&mut self) {
+        self.workspaces.extend(self.begun.take().map(|(loaded, _)| loaded.workspace));
     }
 }
 

@@ -12,7 +12,7 @@ use super::output_layout::{OutputRows, narrow, values};
 use super::partition_handle::{Import, PartitionCounts, PartitionHandle};
 use super::plan::layout::Record;
 use super::plan::partition::total_len;
-use super::submit::PendingSubmission;
+use super::recording::PendingSubmission;
 
 /// Bytes that are exported per brick: its record, and its first vertex and triangle.
 const RECORD: u64 = size_of::<Record>() as u64;
@@ -27,6 +27,7 @@ impl Engine {
     /// Runs the partition of `handle`.
     pub(super) fn run_partition_of(&mut self, job: &GpuJob, handle: &PartitionHandle) -> JobResult {
         job.check()?;
+        self.discard_begun();
         let chunks = self.chunks(job, Some(handle.partition()))?;
         let loaded = self.load(job, Some(handle.partition()), chunks, OutputRows::default())?;
         let mut state = JobState::new(loaded);
@@ -35,8 +36,8 @@ impl Engine {
         result
     }
 
-    fn run_loaded_partition(&mut self, state: &mut JobState<'_>, handle: &PartitionHandle) -> JobResult {
-        let job = state.loaded.job;
+    fn run_loaded_partition(&mut self, state: &mut JobState, handle: &PartitionHandle) -> JobResult {
+        let job = state.loaded.job.clone();
         let last = state.loaded.chunks.len().saturating_sub(1);
         let mut export = None;
         let counts = self.count_chunks(state, |engine, state, chunk| {
@@ -52,7 +53,7 @@ impl Engine {
         let [vertices, triangles] = state.total;
         handle.publish(PartitionCounts { vertices, triangles, exported });
         // The vertices are read back meanwhile.
-        let numbering = handle.await_counts(job)?;
+        let numbering = handle.await_counts(&job)?;
         job.prepared.check_mesh(numbering.total)?;
         let base = narrow(numbering.first[0])?;
         for import in &numbering.imports {
@@ -60,6 +61,7 @@ impl Engine {
         }
         state.loaded.params.base_vertex = base;
         self.make_triangles(state, &counts)?;
+        self.collect_output(state)?;
         if state.has_flat_vertices {
             handle.set_flat_vertices();
         }
@@ -67,7 +69,7 @@ impl Engine {
     }
 
     /// Submits the copies of the records and offsets that earlier partitions import.
-    fn submit_export(&self, loaded: &LoadedJob<'_>, handle: &PartitionHandle) -> PendingSubmission {
+    fn submit_export(&self, loaded: &LoadedJob, handle: &PartitionHandle) -> PendingSubmission {
         let runs = handle.exports();
         let bytes = export_bytes(&runs);
         let readback = self.readback.acquire(&self.device, bytes);
@@ -85,7 +87,7 @@ impl Engine {
     }
 
     /// Writes the imported records and offsets. `base` is the number of vertices before this partition.
-    fn write_import(&self, loaded: &LoadedJob<'_>, import: &Import, base: u32) -> Result<(), GpuError> {
+    fn write_import(&self, loaded: &LoadedJob, import: &Import, base: u32) -> Result<(), GpuError> {
         let Import { bricks, position, n_exported, exported, first_vertex } = import;
         let (n, first) = (u64::from(bricks.end - bricks.start), u64::from(bricks.start));
         let exported: &[u8] = (**exported).as_ref();

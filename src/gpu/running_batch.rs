@@ -1,20 +1,20 @@
-//! Batch that a device runs, watched for a hang: no submission for longer than a limit.
+//! Batch that a device runs, or build of its executor, watched for a hang: no submission for longer than a limit.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use super::error::GpuError;
+use super::hang_limit;
 use super::job::JobResult;
 use super::partition_handle::PartitionHandle;
 use super::queued_job::QueuedJob;
 use crate::sync::mpsc::SyncSender;
 
-/// Maximum time of a submission on a slow device, as a multiple of the estimated time of its batch.
-const MAX_SLOWDOWN: f64 = 100.0;
-
-/// Batch that a device runs.
+/// Batch that a device runs, or build of its executor.
 pub(super) struct RunningBatch {
+    is_build: bool,
+    is_retry: bool,
     replies: Vec<SyncSender<JobResult>>,
     /// Partition that the batch consists of, if it does.
     partition: Option<PartitionHandle>,
@@ -31,7 +31,19 @@ impl RunningBatch {
         let seen = (submissions.load(Ordering::Relaxed), now);
         let partition = batch.iter().find_map(|queued| queued.partition.clone());
         let replies = batch.iter().map(|queued| queued.reply.clone()).collect();
-        Self { replies, partition, bricks: batch.iter().map(QueuedJob::bricks).sum(), submissions, seen }
+        let bricks = batch.iter().map(QueuedJob::bricks).sum();
+        let is_retry = batch.iter().any(|queued| queued.retry);
+        Self { is_build: false, is_retry, replies, partition, bricks, submissions, seen }
+    }
+
+    /// Creates the record of a build that begins at `now`.
+    pub(super) fn build(now: Instant) -> Self {
+        Self { is_build: true, ..Self::new(&[], Arc::default(), now) }
+    }
+
+    /// Returns true if a job of the batch has failed before.
+    pub(super) const fn is_retry(&self) -> bool {
+        self.is_retry
     }
 
     /// Number of jobs.
@@ -44,11 +56,14 @@ impl RunningBatch {
         self.bricks
     }
 
-    /// Returns the time limit of a submission: at least `minimum`, and more for a large batch on a slow device, whose
-    /// shortest time per brick so far is `fastest`, s.
+    /// Returns the time limit of a submission, or of the build. `minimum` and `fastest` have the meaning that they have
+    /// in [`hang_limit::of_submission`].
     pub(super) fn limit(&self, minimum: Duration, fastest: Option<f64>) -> Duration {
-        let estimate = fastest.map_or(0.0, |per_brick| per_brick * self.bricks as f64);
-        Duration::try_from_secs_f64(MAX_SLOWDOWN * estimate).map_or(Duration::MAX, |limit| limit.max(minimum))
+        if self.is_build {
+            hang_limit::of_build(minimum)
+        } else {
+            hang_limit::of_submission(minimum, self.bricks, fastest)
+        }
     }
 
     /// Returns true if no submission was made for longer than `limit`. A partition that waits for others never hangs.
@@ -76,24 +91,9 @@ impl RunningBatch {
 mod tests {
     use super::*;
 
-    fn batch(bricks: u64) -> RunningBatch {
-        let mut batch = RunningBatch::new(&[], Arc::default(), Instant::now());
-        batch.bricks = bricks;
-        batch
-    }
-
-    #[test]
-    fn slow_devices_have_more_time_for_large_batches() {
-        let limit = |bricks, fastest| batch(bricks).limit(Duration::from_secs(10), fastest);
-        assert_eq!(limit(1 << 40, None), Duration::from_secs(10), "nothing is known about the device");
-        assert_eq!(limit(50_000, Some(1e-7)), Duration::from_secs(10));
-        assert_eq!(limit(50_000, Some(1e-4)), Duration::from_secs(500));
-        assert_eq!(limit(u64::MAX, Some(1e9)), Duration::MAX);
-    }
-
     #[test]
     fn each_submission_has_the_whole_limit() {
-        let (mut batch, limit) = (batch(1), Duration::from_secs(10));
+        let (mut batch, limit) = (RunningBatch::new(&[], Arc::default(), Instant::now()), Duration::from_secs(10));
         let begun = batch.seen.1;
         let at = |s: u64| begun + Duration::from_secs(s);
         assert!(!batch.has_hung(limit, at(10)));

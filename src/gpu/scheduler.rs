@@ -32,6 +32,9 @@ pub struct PoolSettings {
     pub hang_timeout: Duration,
     /// Pause before a device that went down is used again, doubled each time until it finishes a job.
     pub cool_down: Duration,
+    /// Bytes of readback buffers that a device allocates before its first job and keeps while it is idle. `None`
+    /// allocates none, and keeps up to 2 GiB of buffers from jobs.
+    pub readback_bytes: Option<u64>,
     /// Minimum number of bricks per partition of a multi-device job. `None` disables multi-device jobs.
     pub min_partition_bricks: Option<u64>,
 }
@@ -49,6 +52,7 @@ impl Default for PoolSettings {
             idle: Duration::from_secs(5),
             hang_timeout: Duration::from_secs(10),
             cool_down: Duration::from_mins(1),
+            readback_bytes: None,
             min_partition_bricks: Some(MIN_PARTITION_BRICKS),
         }
     }
@@ -238,6 +242,16 @@ impl Scheduler {
         }
     }
 
+    /// Returns the job that a device will run alone after the current batch. `None` if there is no such job yet, or if
+    /// the current batch has failed before and therefore must not overlap with another job.
+    pub(super) fn next_job(&self, thread: DeviceThread) -> Option<GpuJob> {
+        let mut state = self.lock();
+        let queue = state.queue_of(thread)?;
+        let next = queue.waiting.front().filter(|next| next.is_alone())?;
+        let runs_retry = queue.running.as_ref().is_none_or(RunningBatch::is_retry);
+        (!runs_retry).then(|| next.job.clone())
+    }
+
     /// Sets the bytes of memory that a device holds.
     pub(super) fn set_held_bytes(&self, thread: DeviceThread, bytes: u64) {
         if let Some(queue) = self.lock().queue_of(thread) {
@@ -292,8 +306,7 @@ impl Scheduler {
                 queue.fastest = Some(queue.fastest.map_or(per_brick, |fastest| fastest.min(per_brick)));
             }
             if failed && down.is_none() {
-                // A rebuild can hang as well.
-                queue.running = Some(RunningBatch::new(&[], Arc::default(), Instant::now()));
+                queue.running = Some(RunningBatch::build(Instant::now()));
             }
             queue.counters.busy += time;
             queue.counters.lost += u64::from(failed);

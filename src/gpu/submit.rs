@@ -10,16 +10,10 @@ use super::error::GpuError;
 use super::output_layout::values;
 use super::pipelines::N_STAGES;
 use super::readback::ReadbackBuffer;
-use super::recording::{Recording, ticks_to_ns};
+use super::recording::{PendingSubmission, Recording, ticks_to_ns};
 
 /// Device time per stage, ns.
 pub(super) type StageTimes = [u64; N_STAGES];
-
-/// Submission that was sent to the device and has not been waited for.
-pub(super) struct PendingSubmission {
-    index: wgpu::SubmissionIndex,
-    readbacks: Vec<(ReadbackBuffer, u64)>,
-}
 
 impl Engine {
     /// Submits a recording and requests to map the given number of bytes of each readback buffer.

@@ -2,6 +2,7 @@
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::time::Instant;
 
 use super::device_queue::{DeviceThread, RunOutcome};
@@ -20,7 +21,7 @@ pub const MAX_REBUILDS: usize = 3;
 
 /// Runs jobs on a device until the scheduler is closed or the thread is replaced. A device that goes down is used again
 /// after its cool-down.
-pub(super) fn work(scheduler: &Scheduler, thread: DeviceThread, build: &Build) {
+pub(super) fn work(scheduler: &Arc<Scheduler>, thread: DeviceThread, build: &Build) {
     // The first thread starts at once. A thread that replaces another one follows a hang.
     let mut starts = thread.generation == 0;
     while starts || scheduler.cool_down(thread) {
@@ -35,12 +36,17 @@ pub(super) fn work(scheduler: &Scheduler, thread: DeviceThread, build: &Build) {
 }
 
 /// Builds the executor and runs jobs until the device is down, its thread replaced, or the scheduler closed.
-fn run(scheduler: &Scheduler, thread: DeviceThread, build: &Build) {
-    let mut executor = match try_build(build) {
+fn run(scheduler: &Arc<Scheduler>, thread: DeviceThread, build: &Build) {
+    scheduler.begin_build(thread);
+    let mut executor = match try_build(scheduler, thread, build) {
         Ok(executor) => executor,
         Err(error) => return scheduler.mark_down(thread, &error.to_string()),
     };
     scheduler.mark_up(thread);
+    if let Some(bytes) = scheduler.settings.readback_bytes {
+        executor.reserve_memory(bytes);
+        scheduler.set_held_bytes(thread, executor.held_bytes());
+    }
     while let Some(batch) = scheduler.next_batch(thread, &executor.submission_counter()) {
         if batch.is_empty() {
             executor.release_idle_memory();
@@ -74,14 +80,14 @@ fn run(scheduler: &Scheduler, thread: DeviceThread, build: &Build) {
 /// Rebuilds the executor. The pause between attempts doubles, because a driver takes time to restart. Fails with the
 /// last reason.
 fn rebuild(
-    scheduler: &Scheduler,
+    scheduler: &Arc<Scheduler>,
     thread: DeviceThread,
     build: &Build,
     mut why: String,
 ) -> Result<Box<dyn Executor>, String> {
     let mut pause = scheduler.settings.rebuild_pause;
     while scheduler.count_rebuild(thread, MAX_REBUILDS) {
-        match try_build(build) {
+        match try_build(scheduler, thread, build) {
             Ok(executor) => return Ok(executor),
             Err(error) => why = error.to_string(),
         }
@@ -93,8 +99,13 @@ fn rebuild(
     Err(why)
 }
 
-fn try_build(build: &Build) -> Result<Box<dyn Executor>, GpuError> {
-    catch_unwind(AssertUnwindSafe(build)).unwrap_or_else(|payload| Err(panicked(&*payload)))
+fn try_build(scheduler: &Arc<Scheduler>, thread: DeviceThread, build: &Build) -> Result<Box<dyn Executor>, GpuError> {
+    let built = catch_unwind(AssertUnwindSafe(build)).unwrap_or_else(|payload| Err(panicked(&*payload)));
+    built.map(|mut executor| {
+        let scheduler = Arc::clone(scheduler);
+        executor.set_next_job(Box::new(move || scheduler.next_job(thread)));
+        executor
+    })
 }
 
 /// Runs a batch. Returns one result per job even if the executor panics or returns too few.

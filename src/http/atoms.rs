@@ -61,7 +61,8 @@ struct ResidueColumns {
     chain: Vec<String>,
     /// Model number.
     model: Vec<i32>,
-    /// Kind of the first atom: `polymer`, `ligand`, `water` or `virtual` (a site that is not an atom).
+    /// Kind of the first atom: `protein`, `nucleic`, `polymer` (any other polymer), `cofactor`, `glycan`, `ligand`
+    /// (any other ligand), `ion`, `water` or `virtual` (a site that is not an atom).
     kind: Vec<&'static str>,
 }
 
@@ -96,7 +97,7 @@ pub(super) async fn of_structure(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source.document(&app, &caller, &headers, async |input| list(&app, &caller, input).await).await
+    source.document(&app, &caller, &headers, "", async |input| list(&app, &caller, input).await).await
 }
 
 /// List the atoms of an archive entry
@@ -118,7 +119,7 @@ pub(super) async fn of_entry(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source.document(&app, &caller, &headers, async |input| list(&app, &caller, input).await).await
+    source.document(&app, &caller, &headers, "", async |input| list(&app, &caller, input).await).await
 }
 
 /// Parses a structure and lists its atoms, on a blocking thread. The list is charged to the memory budget until it is
@@ -205,7 +206,7 @@ mod tests {
                 assert_eq!(listed.residues.number[r].to_string(), number, "{line}");
             }
         }
-        assert_eq!(listed.residues.kind.first(), Some(&"polymer"));
+        assert_eq!(listed.residues.kind.first(), Some(&"protein"));
         assert_eq!(listed.residues.kind.last(), Some(&"water"));
         // The charged memory suffices.
         let bytes = serde_json::to_vec(&listed).unwrap().len() as u64;

@@ -10,6 +10,7 @@ use axum::middleware::Next;
 use axum::response::Response;
 use tower_http::cors::{AllowHeaders, AllowOrigin, Any, CorsLayer};
 
+use super::colors::LEGEND;
 use super::guard::{API_KEY, RATE_LIMIT, RATE_LIMIT_POLICY};
 use super::observe::TRACEPARENT;
 use super::preferences::{IDEMPOTENCY_KEY, PREFER, PREFERENCE_APPLIED, PRIORITY};
@@ -58,6 +59,7 @@ pub(super) fn cors(access: &Arc<Access>) -> CorsLayer {
         RATE_LIMIT,
         RATE_LIMIT_POLICY,
         request_id::HEADER,
+        LEGEND,
     ];
     let summary = delivery::SUMMARY.iter().chain(&delivery::PICTURE);
     let exposed = exposed.into_iter().chain(summary.map(|header| HeaderName::from_static(header.name)));

@@ -17,7 +17,7 @@ use crate::formats::Format;
 use crate::jobs::Pool;
 use crate::pipeline::params::{Domain, Parameter, TABLE};
 use crate::structure::{element, radii};
-use crate::surface::{DeviceStatus, FoundDevice, Kernel, Preset, SurfaceOptions, SurfaceParams};
+use crate::surface::{DeviceStatus, FoundDevice, Preset, SurfaceKind, SurfaceOptions, SurfaceParams};
 
 /// Formats, parameters, limits and devices of the service.
 #[derive(Debug, Serialize, ToSchema)]
@@ -34,8 +34,8 @@ pub(super) struct Capabilities {
     formats: Vec<FormatDocument>,
     /// Format of a request that names none.
     default_format: &'static str,
-    /// Density kernels.
-    kernels: Vec<&'static str>,
+    /// Surfaces.
+    surfaces: Vec<&'static str>,
     /// Smoothness and isovalue of each preset.
     #[schema(value_type = std::collections::BTreeMap<String, PresetValues>)]
     presets: Map<String, Value>,
@@ -266,7 +266,7 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
         },
         formats: Format::ALL.map(|f| FormatDocument { name: f.extension(), media_type: f.media_type() }).into(),
         default_format: Format::default().extension(),
-        kernels: Kernel::ALL.iter().map(|k| k.name()).collect(),
+        surfaces: SurfaceKind::ALL.iter().map(|k| k.name()).collect(),
         presets: presets(),
         parameters: TABLE.iter().map(parameter).collect(),
         limits: limits(config, pool),
@@ -331,7 +331,6 @@ fn parameter(parameter: &Parameter) -> ParameterDocument {
         Domain::Integer { min, max } => ("integer", Some([min.into(), max.into()]), None, None),
         Domain::Flag => ("boolean", None, None, None),
         Domain::Choice(values) => ("choice", None, None, Some(values)),
-        Domain::Set(values) => ("set", None, None, Some(values)),
         Domain::Text { .. } => ("text", None, None, None),
     };
     let (min, max) = bounds.map(|[min, max]: [Value; 2]| (min, max)).unzip();

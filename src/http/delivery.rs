@@ -1,5 +1,6 @@
 //! Answer of a finished job: the mesh, with a summary in headers, or the report.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use axum::http::HeaderValue;
@@ -11,6 +12,7 @@ use utoipa::ToSchema;
 use utoipa::openapi::schema::Type;
 
 use super::errors::{self, Finding};
+use super::kinds::Kind;
 use super::problem::Problem;
 use super::state::{App, Delivery};
 use super::stream;
@@ -45,12 +47,12 @@ pub(super) static SUMMARY: [SummaryHeader; 17] = [
     summary("molmesh-manifold", "manifold", Type::Boolean, "`true` if all edges and vertices are manifold, by a check or by construction: `manifold_from` in the report."),
     summary("molmesh-euler", "euler", Type::Integer, "Euler characteristic: vertices − edges + triangles."),
     summary("molmesh-components", "components", Type::Integer, "Connected components of the mesh."),
-    summary("molmesh-kernel", "kernel", Type::String, "Density kernel."),
+    summary("molmesh-surface", "surface", Type::String, "Type of the surface."),
     summary("molmesh-preset", "preset", Type::String, "Preset."),
     summary("molmesh-resolution", "resolution", Type::Number, "Grid spacing in Å."),
     summary("molmesh-resolution-from", "resolution_from", Type::String,
         "Parameter that set the spacing: `resolution`, `detail` or `max_triangles`."),
-    summary("molmesh-isovalue", "isovalue", Type::Number, "Isovalue of the density."),
+    summary("molmesh-isovalue", "isovalue", Type::Number, "Isovalue of the density; isosurfaces only."),
     summary("molmesh-radii", "radii", Type::String, "Table of van der Waals radii."),
     summary("molmesh-backend", "backend", Type::String, "Backend that computed the mesh: `cpu`, `gpu` or `reference`."),
     summary("molmesh-backend-reason", "backend_reason", Type::String, "Reason for the choice of the backend."),
@@ -75,6 +77,18 @@ pub(super) struct ReportDocument {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     diagnostics: Option<Vec<Finding>>,
+}
+
+/// Returns the value of `Content-Range` for a part of a file of `length` bytes.
+pub(super) fn content_range(part: &Range<u64>, length: u64) -> HeaderValue {
+    text(&format!("bytes {}-{}/{length}", part.start, part.end - 1))
+}
+
+/// Returns the problem of a range outside a file of `length` bytes.
+pub(super) fn range_outside(length: u64) -> Problem {
+    Problem::new(Kind::RangeNotSatisfiable, format!("the file has {length} bytes"))
+        .with("actual", length)
+        .header(header::CONTENT_RANGE, &format!("bytes */{length}"))
 }
 
 /// Sends the mesh as `format`. `permit` is dropped after the last byte was written.
@@ -138,10 +152,11 @@ pub(super) fn text(value: &str) -> HeaderValue {
     HeaderValue::from_str(&plain).unwrap_or_else(|_| HeaderValue::from_static("?"))
 }
 
-/// Returns the summary headers of a report, from its JSON.
+/// Returns the summary headers of a report, from its JSON. A member that is null has no header.
 pub(super) fn summary_headers(report: &Value) -> HeaderMap {
     let header = |summary: &SummaryHeader, members: &Value| {
         let value = match &members[summary.member] {
+            Value::Null => return None,
             Value::String(text) => text.replace('Å', "A"),
             // Areas and volumes to a thousandth.
             Value::Number(number) if ["area", "volume"].contains(&summary.member) => {
@@ -149,11 +164,11 @@ pub(super) fn summary_headers(report: &Value) -> HeaderMap {
             }
             other => other.to_string(),
         };
-        (HeaderName::from_static(summary.name), text(&value))
+        Some((HeaderName::from_static(summary.name), text(&value)))
     };
-    let mut headers: HeaderMap = SUMMARY.iter().map(|summary| header(summary, report)).collect();
+    let mut headers: HeaderMap = SUMMARY.iter().filter_map(|summary| header(summary, report)).collect();
     if let Some(picture) = report.get("picture") {
-        headers.extend(PICTURE.iter().map(|summary| header(summary, picture)));
+        headers.extend(PICTURE.iter().filter_map(|summary| header(summary, picture)));
     }
     headers
 }

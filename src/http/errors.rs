@@ -12,6 +12,7 @@ use crate::formats::FormatError;
 use crate::jobs::{AcceptError, EndError, Failure, Refusal, SaveError};
 use crate::picture::PictureError;
 use crate::pipeline::JobError;
+use crate::pipeline::color::{self, ColorError};
 use crate::pipeline::params::ParamError;
 use crate::store::StoreError;
 use crate::structure::StructureError;
@@ -83,6 +84,12 @@ impl From<ParamError> for Problem {
             ParamError::BadValue { name, value, expected } => {
                 problem.with("parameter", name).with("value", value.trim_matches('`')).with("expected", expected)
             }
+            ParamError::BadExpression { name, text, error } => problem
+                .with("parameter", name)
+                .with("value", text)
+                .with("column", error.column)
+                .with("found", error.found.trim_matches('`'))
+                .with("expected", error.expected),
         }
     }
 }
@@ -127,6 +134,7 @@ impl From<Failure> for Problem {
             Failure::Job { error: JobError::Structure(error), diagnostics } => diagnosed(error.into(), &diagnostics),
             Failure::Job { error: JobError::Surface(error), .. } => error.into(),
             Failure::Job { error: JobError::Picture(error), .. } => error.into(),
+            Failure::Job { error: JobError::Color(error), .. } => error.into(),
             Failure::Check { ref diagnostics } => {
                 let problem = Self::new(Kind::UnreadableStructure, error.to_string()).with("parameter", "check");
                 diagnosed(problem, diagnostics)
@@ -217,6 +225,14 @@ impl From<StructureError> for Problem {
                 .with("expected", expected),
             E::Decompress { encoding, .. } => Self::new(Kind::UnreadableStructure, detail).with("encoding", encoding),
             E::InflatedTooLarge { limit } => Self::new(Kind::InflatedTooLarge, detail).with("limit", limit),
+            E::BadAssembly { id, found, expected } => Self::new(Kind::UnreadableStructure, detail)
+                .with("place", format!("assembly {id}"))
+                .with("found", found)
+                .with("expected", expected),
+            E::TooManyCopies { limit, .. } => Self::new(Kind::TooManyCopies, detail).with("limit", limit),
+            E::AssemblyTooLarge { atoms, limit, .. } => {
+                Self::new(Kind::TooManyAtoms, detail).with("limit", limit).with("actual", atoms)
+            }
             E::TooManyAtoms { limit } => Self::new(Kind::TooManyAtoms, detail).with("limit", limit),
             E::TooManyDuplicates { limit, x, y, z } => {
                 Self::new(Kind::TooManyDuplicates, detail).with("limit", limit).with("position", vec![x, y, z])
@@ -225,11 +241,27 @@ impl From<StructureError> for Problem {
             E::Cancelled => Self::from(Failure::Stopped),
             E::NoAtoms { found } => Self::new(Kind::NoAtoms, detail).with("found", found),
             E::EmptySelection { holds } => Self::new(Kind::EmptySelection, detail).with("found", holds),
-            E::NotFound { what, asked, available } => Self::new(Kind::EmptySelection, detail)
-                .with("parameter", if what == "chain" { "chains" } else { what })
-                .with("value", asked.trim_matches('`'))
-                .with("expected", available),
+            E::NotFound { what, asked, available } => {
+                let parameter = match what {
+                    "chain" => "chains",
+                    "selected chain" => "select",
+                    other => other,
+                };
+                Self::new(Kind::EmptySelection, detail)
+                    .with("parameter", parameter)
+                    .with("value", asked.trim_matches('`'))
+                    .with("expected", available)
+            }
         }
+    }
+}
+
+impl From<ColorError> for Problem {
+    fn from(error: ColorError) -> Self {
+        Self::new(Kind::BadParameter, error.to_string())
+            .with("parameter", "color")
+            .with("value", error.scheme)
+            .with("expected", color::EXPECTED)
     }
 }
 
@@ -280,9 +312,15 @@ impl From<SurfaceError> for Problem {
                 .with("limit", limit)
                 .with("actual", triangles)
                 .with("resolution", resolution),
-            E::NoSurface { isovalue } => {
-                Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
+            E::TooManyOverlaps { overlaps, limit } => {
+                Self::new(Kind::TooManyCandidates, detail).with("limit", limit).with("actual", overlaps)
             }
+            E::NoSurface { isovalue } => match isovalue {
+                Some(isovalue) => {
+                    Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
+                }
+                None => Self::new(Kind::NoSurface, detail).with("parameter", "resolution"),
+            },
             E::DeviceMemory { needed, available, .. } => {
                 fitting(Self::new(Kind::DeviceMemory, detail).with("limit", available).with("actual", needed))
             }

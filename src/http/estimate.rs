@@ -34,7 +34,7 @@ use crate::surface::Control;
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(example = json!({
     "accepted": true, "problem": null, "atoms": 454, "atoms_in_file": 514, "resolution": 0.5,
-    "resolution_from": "resolution", "kernel": "gaussian", "format": "glb", "box_cells": 464_940, "bricks": 391,
+    "resolution_from": "resolution", "surface": "gaussian", "format": "glb", "box_cells": 464_940, "bricks": 391,
     "samples": 200_192, "area": 3475.0, "vertices": 20_850, "triangles": 41_700, "mesh_bytes": 1_000_800,
     "structure": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "seconds": 0.01,
     "wait_seconds": 0.0, "backend": "cpu",
@@ -45,7 +45,7 @@ pub(super) struct EstimateDocument {
     /// Error that `POST /v1/meshes` would return; null if it would accept the request.
     #[schema(required, value_type = Option<ProblemDocument>)]
     problem: Option<Value>,
-    /// Selected atoms.
+    /// Atoms to mesh, including all copies in an assembly.
     atoms: u64,
     /// Atoms in all models of the file.
     atoms_in_file: u64,
@@ -53,8 +53,8 @@ pub(super) struct EstimateDocument {
     resolution: f64,
     /// Parameter that sets the spacing: `resolution`, `detail` or `max_triangles`.
     resolution_from: &'static str,
-    /// Density kernel.
-    kernel: &'static str,
+    /// Type of the surface.
+    surface: &'static str,
     /// Mesh format, as a file name extension.
     format: &'static str,
     /// Cells of a dense grid over the bounding box.
@@ -89,7 +89,7 @@ pub(super) struct EstimateDocument {
 }
 
 problem_responses!(EstimateProblems: [BODY, NAMED_STRUCTURE, PARAMETERS, READING, [
-    Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::ShareExceeded,
+    Kind::EmptySelection, Kind::TooManyCopies, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::ShareExceeded,
     Kind::Deadline,
 ]]);
 
@@ -135,6 +135,8 @@ pub(super) async fn create(
         }
     });
     let estimate = reading.await?.map_err(|error| declared.explain(error.into()))?;
+    // The estimate from the file size does not include the copies in an assembly.
+    let seconds = seconds * estimate.atoms as f64 / estimate.distinct_atoms as f64;
     let wait = app.pool.estimated_wait().as_secs_f64();
     // The size of a picture does not depend on the mesh.
     let limit = if format.is_picture() { u64::MAX } else { app.config.limits.output_bytes };
@@ -147,7 +149,7 @@ pub(super) async fn create(
         atoms_in_file: estimate.atoms_in_file,
         resolution: estimate.resolution,
         resolution_from: job.spacing.parameter(),
-        kernel: job.params.kernel.name(),
+        surface: job.params.surface.name(),
         format: format.extension(),
         box_cells: estimate.box_cells,
         bricks: mesh.map(|m| m.bricks),

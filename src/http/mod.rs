@@ -33,6 +33,7 @@ mod state;
 mod guard;
 
 // Requests: preferences, bodies, structures, parameters.
+mod color_parameters;
 mod form;
 mod preferences;
 mod source;
@@ -56,6 +57,7 @@ mod mesh_request;
 mod signing;
 
 mod atoms;
+mod colors;
 mod estimate;
 mod events;
 mod health;

@@ -141,18 +141,13 @@ pub(super) async fn stored(
     let wanted = match range::wanted(headers, &delivery::etag(key), meta.size) {
         Wanted::All => None,
         Wanted::Part(range) => Some(range),
-        Wanted::Nothing => {
-            return Err(Problem::new(Kind::RangeNotSatisfiable, format!("the file has {} bytes", meta.size))
-                .with("actual", meta.size)
-                .header(header::CONTENT_RANGE, &format!("bytes */{}", meta.size)));
-        }
+        Wanted::Nothing => return Err(delivery::range_outside(meta.size)),
     };
     let length = wanted.as_ref().map_or(meta.size, |r: &Range<u64>| r.end - r.start);
     out.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
     let status = match &wanted {
         Some(r) => {
-            let text = format!("bytes {}-{}/{}", r.start, r.end - 1, meta.size);
-            out.insert(header::CONTENT_RANGE, delivery::text(&text));
+            out.insert(header::CONTENT_RANGE, delivery::content_range(r, meta.size));
             StatusCode::PARTIAL_CONTENT
         }
         None => StatusCode::OK,

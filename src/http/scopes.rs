@@ -20,6 +20,8 @@ pub(super) struct Row {
 pub(super) enum Parameters {
     /// Those of a mesh.
     Mesh,
+    /// Parameters of the colours of atoms.
+    Colors,
     /// `wait`.
     Wait,
     None,
@@ -33,6 +35,7 @@ impl Row {
         match self.path {
             "/v1/meshes" | "/v1/report" | "/v1/estimate" => Parameters::Mesh,
             "/v1/jobs/{id}" if self.method == Method::GET => Parameters::Wait,
+            path if path.ends_with("/colors") => Parameters::Colors,
             _ if is_file && !is_result => Parameters::Mesh,
             _ => Parameters::None,
         }
@@ -55,9 +58,11 @@ pub(super) const TABLE: &[Row] = &[
     row(Method::GET, "/v1/pdb/{id}/{file}", MESH),
     row(Method::GET, "/v1/pdb/{id}/report.json", MESH),
     row(Method::GET, "/v1/pdb/{id}/atoms", MESH),
+    row(Method::GET, "/v1/pdb/{id}/colors", MESH),
     row(Method::POST, "/v1/structures", MESH),
     row(Method::GET, "/v1/structures/{digest}", READ),
     row(Method::GET, "/v1/structures/{digest}/atoms", READ),
+    row(Method::GET, "/v1/structures/{digest}/colors", READ),
     row(Method::GET, "/v1/structures/{digest}/{file}", MESH),
     row(Method::GET, "/v1/structures/{digest}/report.json", MESH),
     row(Method::POST, "/v1/estimate", MESH),

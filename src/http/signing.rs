@@ -3,6 +3,7 @@
 use axum::extract::Query;
 use axum::http::{Method, Uri};
 
+use super::color_parameters;
 use super::jobs::{MAX_WAIT_S, Poll};
 use super::scopes::{Parameters, Row, TABLE};
 use crate::formats::Format;
@@ -61,6 +62,7 @@ fn check_parameters(row: &Row, uri: &Uri) -> Result<(), String> {
     let Query(pairs) = Query::<Vec<(String, String)>>::try_from_uri(uri).map_err(|error| error.body_text())?;
     match row.parameters() {
         Parameters::Mesh => params::parse(pairs).map(drop).map_err(|error| error.to_string()),
+        Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Wait => {
             let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;
             if poll.wait() <= MAX_WAIT_S { Ok(()) } else { Err(format!("`wait` is more than {MAX_WAIT_S} s")) }

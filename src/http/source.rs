@@ -105,25 +105,27 @@ impl StructureSource {
         }
     }
 
-    /// Answers with a document that `write` makes of the structure. The digest is its `ETag`; 304 if the client has it.
+    /// Returns a response with the document that `write` makes of the structure, or 304 if the client has it. The
+    /// `ETag` is derived from the digest and from `variant`, the parameters of the document.
     pub(super) async fn document<F>(
         self,
         app: &Shared,
         caller: &Caller,
         headers: &HeaderMap,
+        variant: &str,
         write: impl FnOnce(Input) -> F,
     ) -> Result<Response, Problem>
     where
         F: Future<Output = Result<Response, Problem>>,
     {
-        let validators = validators(&self.digest(app, caller).await?)?;
+        let validators = validators(&self.digest(app, caller).await?, variant)?;
         conditional::check_match(headers, &validators[0].1)?;
         if conditional::is_unchanged(headers, &validators[0].1) {
             return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
         }
         let _permit = app.delivery(caller.client)?;
         let input = self.load(app, caller).await?;
-        let validators = self::validators(&input.digest)?;
+        let validators = self::validators(&input.digest, variant)?;
         Ok((validators, write(input).await?).into_response())
     }
 }
@@ -149,9 +151,14 @@ pub(super) async fn path_parameters(parts: &mut Parts, app: &Shared) -> Result<R
     RawPathParams::from_request_parts(parts, app).await.map_err(bad)
 }
 
-fn validators(digest: &Digest) -> Result<[(HeaderName, HeaderValue); 2], Problem> {
-    let etag = HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)?;
-    Ok([(header::ETAG, etag), (header::CACHE_CONTROL, CACHE)])
+fn validators(digest: &Digest, variant: &str) -> Result<[(HeaderName, HeaderValue); 2], Problem> {
+    Ok([(header::ETAG, etag(digest, variant)?), (header::CACHE_CONTROL, CACHE)])
+}
+
+/// Returns the `ETag` of a document of a structure: the digest of its file, combined with the parameters `variant`.
+pub(super) fn etag(digest: &Digest, variant: &str) -> Result<HeaderValue, Problem> {
+    let digest = if variant.is_empty() { *digest } else { Digest::of(format!("{digest}&{variant}").as_bytes()) };
+    HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)
 }
 
 fn no_such_structure(digest: &str) -> Problem {

@@ -32,20 +32,27 @@ use crate::store::{Digest, Name};
 use crate::structure::contents::Counts;
 use crate::structure::{Contents, Structure, StructureError};
 
-/// Maximum number of listed chains.
-const MAX_CHAINS: usize = 1000;
+/// Maximum number of listed chains, and of listed assemblies.
+const MAX_LISTED: usize = 1000;
 
 /// Contents of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(example = json!({
     "digest": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "bytes": 71_928, "format": "pdb",
     "id": "4PTI", "title": "THE GEOMETRY OF THE REACTIVE SITE", "atoms": 514, "models": [1], "model": 1,
-    "atoms_in_model": { "polymer": 454, "ligand": 0, "water": 60, "hydrogens": 0, "virtual_sites": 0 },
+    "atoms_in_model": {
+        "polymer": 454, "protein": 454, "nucleic": 0, "ligand": 0, "cofactor": 0, "glycan": 0, "ion": 0, "water": 60,
+        "hydrogens": 0, "virtual_sites": 0,
+    },
     "alternatives": 0, "unknown_elements": 0, "warnings": [], "chain_count": 1,
     "chains": [{
         "name": "A", "atoms": 514,
-        "of": { "polymer": 454, "ligand": 0, "water": 60, "hydrogens": 0, "virtual_sites": 0 },
+        "of": {
+        "polymer": 454, "protein": 454, "nucleic": 0, "ligand": 0, "cofactor": 0, "glycan": 0, "ion": 0, "water": 60,
+        "hydrogens": 0, "virtual_sites": 0,
+    },
     }],
+    "assemblies": [{ "id": "1", "copies": 1 }],
     "surface": "/v1/structures/edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087/surface.glb",
 }))]
 pub(super) struct StructureDocument {
@@ -79,6 +86,8 @@ pub(super) struct StructureDocument {
     chain_count: usize,
     /// The first 1,000 chains.
     chains: Vec<ChainDocument>,
+    /// The first 1,000 assemblies, in file order.
+    assemblies: Vec<AssemblyDocument>,
     /// Path of the mesh with default parameters.
     surface: String,
 }
@@ -92,6 +101,16 @@ struct ChainDocument {
     atoms: u64,
     /// Atoms by kind.
     of: Counts,
+}
+
+/// Assembly of a structure.
+#[derive(Debug, Serialize, ToSchema)]
+struct AssemblyDocument {
+    /// Value of the parameter `assembly`.
+    id: String,
+    /// Number of copies of chains; null if it exceeds the limit or cannot be read from the file.
+    #[schema(required)]
+    copies: Option<u64>,
 }
 
 problem_responses!(CreateProblems: [
@@ -176,7 +195,7 @@ pub(super) async fn show(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let write = async |input| Ok(Json(summarize(&app, &caller, input).await?).into_response());
-    source.document(&app, &caller, &headers, write).await
+    source.document(&app, &caller, &headers, "", write).await
 }
 
 /// Mesh an uploaded structure
@@ -218,18 +237,19 @@ async fn summarize(app: &Shared, caller: &Caller, input: Input) -> Result<Struct
     let (structures, namespace) = (app.structures(), caller.namespace);
     let parsing = app.read(move |control| {
         let kept = structures.get(namespace, input.digest, &input.bytes, &limits, control)?;
-        Ok(summary(&input.digest, input.bytes.len(), &kept))
+        Ok(summary(&input.digest, input.bytes.len(), &kept, limits.max_copies))
     });
     parsing.await?.map_err(|error: StructureError| JobError::from(error).into())
 }
 
-fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDocument {
+fn summary(digest: &Digest, bytes: usize, structure: &Structure, max_copies: u64) -> StructureDocument {
     let contents = Contents::of(structure, None);
-    let chains = contents.chains.iter().take(MAX_CHAINS).map(|chain| ChainDocument {
+    let chains = contents.chains.iter().take(MAX_LISTED).map(|chain| ChainDocument {
         name: chain.name.clone(),
         atoms: chain.counts.total(),
         of: chain.counts,
     });
+    let assemblies = structure.assemblies.list(max_copies).into_iter().take(MAX_LISTED);
     StructureDocument {
         digest: digest.to_string(),
         bytes,
@@ -245,6 +265,7 @@ fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDoc
         warnings: structure.warnings.clone(),
         chain_count: contents.chains.len(),
         chains: chains.collect(),
+        assemblies: assemblies.map(|(id, copies)| AssemblyDocument { id: id.to_owned(), copies }).collect(),
         surface: format!("/v1/structures/{digest}/surface.glb"),
     }
 }

@@ -1,5 +1,7 @@
 //! CPU renderer, parallel over tiles.
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 
 use super::bins::{Bins, TILE_HEIGHT, Tiles};
@@ -27,9 +29,14 @@ impl Renderer for CpuRenderer {
         format!("CPU rasterizer, {threads} thread{}", if threads == 1 { "" } else { "s" })
     }
 
-    fn render(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Rendered, PictureError> {
+    fn render(
+        &self,
+        mesh: &Arc<Mesh>,
+        params: &PictureParams,
+        control: &Control<'_>,
+    ) -> Result<Rendered, PictureError> {
         let Vertices::Single { positions, normals } = mesh.vertices() else { return Err(PictureError::Quantized) };
-        let shape = Shape { positions, normals, triangles: &mesh.triangles };
+        let shape = Shape { positions, normals, triangles: &mesh.triangles, colors: mesh.colors.as_deref() };
         let camera = Camera::new(positions, shape.triangles, params);
         control.check()?;
         let (width, height) = (params.width as usize, params.height as usize);
@@ -37,12 +44,12 @@ impl Renderer for CpuRenderer {
         // A pair of tile and triangle, before and after sorting; few triangles lie in several tiles.
         let memory = control.reserve(BIN_BYTES * shape.triangles.len() as u64)?;
         let bins = Bins::new(positions, shape.triangles, &camera, tiles, control)?;
-        let mut layers = Layers::empty(width, height);
+        let mut layers = Layers::empty(width, height, shape.colors.is_some());
         let rows = TILE_HEIGHT * width;
         let bands = layers.depth.par_chunks_mut(rows).zip(layers.light.par_chunks_mut(rows));
-        let bands = bands.zip(layers.facing.par_chunks_mut(rows)).enumerate();
-        bands.try_for_each_init(Samples::default, |samples, (n, ((depth, light), facing))| {
-            let mut band = Band { top: n * TILE_HEIGHT, width, depth, light, facing };
+        let bands = bands.zip(layers.facing.par_chunks_mut(rows)).zip(layers.color.par_chunks_mut(rows)).enumerate();
+        bands.try_for_each_init(Samples::default, |samples, (n, (((depth, light), facing), color))| {
+            let mut band = Band { top: n * TILE_HEIGHT, width, depth, light, facing, color };
             fill(shape, &camera, &bins, tiles, &mut band, samples, control)
         })?;
         drop((bins, memory));

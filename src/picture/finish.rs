@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use super::camera::Camera;
-use super::layers::{Layers, NOTHING};
+use super::layers::{FULL, Layers, NOTHING};
 use super::light::{self, Levels};
 use super::{Background, Image, PictureParams, Style};
 use crate::surface::{Control, SurfaceError};
@@ -61,7 +61,7 @@ pub struct Finish {
     pub line_width: i32,
     /// Steps in depth at which an outline begins and at which it has full strength, Å.
     pub steps: [f32; 2],
-    /// Colour of the surface in full light, linear.
+    /// Colour in full light of a surface without colours of its own, linear.
     pub color: [f32; 3],
     /// Colour of the background, linear and premultiplied, and its alpha.
     pub background: [f32; 4],
@@ -153,8 +153,9 @@ fn color(layers: &Layers, shading: &Finish, levels: &Levels, open: Option<f32>, 
     if alpha <= 0.0 {
         return [0; 4];
     }
+    let surface = if layers.is_colored { layers.color[at].map(|c| f32::from(c) / FULL) } else { shading.color };
     let level = |k: usize| {
-        let premultiplied = shading.color[k] * light * share + shading.background[k] * (1.0 - share);
+        let premultiplied = surface[k] * light * share + shading.background[k] * (1.0 - share);
         levels.of(premultiplied / alpha)
     };
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 255")]

@@ -7,6 +7,9 @@ pub(super) const NOTHING: f32 = f32::INFINITY;
 /// Scale of the components of normals.
 pub(super) const UNIT: f32 = 32_767.0;
 
+/// Integer of full intensity in linear colours.
+pub(super) const FULL: f32 = 65_535.0;
+
 /// Normal and coverage of a pixel.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Facing {
@@ -40,12 +43,25 @@ pub(super) struct Layers {
     /// Mean light of the covered samples, 0 to 1.
     pub(super) light: Vec<f32>,
     pub(super) facing: Vec<Facing>,
+    /// True if the surface has colours of its own.
+    pub(super) is_colored: bool,
+    /// Mean colour of the covered samples, linear, in units of 1/65535; zeros unless `is_colored`.
+    pub(super) color: Vec<[u16; 3]>,
 }
 
 impl Layers {
     /// Layers without a surface.
-    pub(super) fn empty(width: usize, height: usize) -> Self {
+    pub(super) fn empty(width: usize, height: usize, is_colored: bool) -> Self {
         let n = width * height;
-        Self { width, height, depth: vec![NOTHING; n], light: vec![0.0; n], facing: vec![Facing::default(); n] }
+        Self {
+            width,
+            height,
+            depth: vec![NOTHING; n],
+            light: vec![0.0; n],
+            facing: vec![Facing::default(); n],
+            is_colored,
+            // Takes no memory unless written: the system provides zeroed pages on the first write.
+            color: vec![[0; 3]; n],
+        }
     }
 }

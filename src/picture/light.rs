@@ -10,7 +10,7 @@ pub const LIGHT: [f32; 3] = [-2.0 / 7.0, 3.0 / 7.0, 6.0 / 7.0];
 pub const AMBIENT: f32 = 0.15;
 /// Diffuse light from [`LIGHT`].
 pub const DIFFUSE: f32 = 0.85;
-/// Colour of the surface in full light, sRGB.
+/// Colour in full light of a surface without colours of its own, sRGB.
 pub const COLOR: [u8; 3] = [0xb4, 0xd2, 0xf0];
 /// Number of steps of the sRGB table. At the dark end, where the function is steepest, a step is less than half a
 /// level.
@@ -28,6 +28,14 @@ pub fn lambert(normal: [f32; 3]) -> f32 {
 pub fn linear(level: u8) -> f64 {
     let value = f64::from(level) / 255.0;
     if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+}
+
+/// Returns the linear light of each sRGB level, 0 to 1.
+#[must_use]
+pub fn linear_levels() -> &'static [f32; 256] {
+    #[expect(clippy::cast_possible_truncation, reason = "0 to 255, and 0 to 1")]
+    static TABLE: LazyLock<[f32; 256]> = LazyLock::new(|| std::array::from_fn(|level| linear(level as u8) as f32));
+    &TABLE
 }
 
 /// Converts linear light to an sRGB level, not rounded, 0 to 255.

@@ -123,7 +123,8 @@ pub trait Renderer: Send + Sync {
     ///
     /// # Errors
     /// Any [`PictureError`] but [`PictureError::Png`] and [`PictureError::TooLarge`], which are detected earlier.
-    fn render(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Rendered, PictureError>;
+    fn render(&self, mesh: &Arc<Mesh>, params: &PictureParams, control: &Control<'_>)
+    -> Result<Rendered, PictureError>;
 }
 
 /// Renderer in use, with the reason for its choice.

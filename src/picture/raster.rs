@@ -2,8 +2,8 @@
 
 use super::bins::{Bins, PARTS, TILE_HEIGHT, TILE_WIDTH, Tiles, corner, twice_area};
 use super::camera::{Camera, dot};
-use super::layers::{Facing, NOTHING, SAMPLES, UNIT};
-use super::light::lambert;
+use super::layers::{FULL, Facing, NOTHING, SAMPLES, UNIT};
+use super::light::{lambert, linear_levels};
 use crate::surface::{Control, SurfaceError};
 
 /// Positions of the samples within a pixel, in subpixels: the standard pattern of graphics devices.
@@ -17,6 +17,8 @@ pub(super) struct Shape<'a> {
     pub(super) positions: &'a [[f32; 3]],
     pub(super) normals: &'a [[f32; 3]],
     pub(super) triangles: &'a [[u32; 3]],
+    /// sRGB colours, if the mesh has colours of its own.
+    pub(super) colors: Option<&'a [[u8; 4]]>,
 }
 
 /// Row of tiles of the layers.
@@ -27,6 +29,7 @@ pub(super) struct Band<'a> {
     pub(super) depth: &'a mut [f32],
     pub(super) light: &'a mut [f32],
     pub(super) facing: &'a mut [Facing],
+    pub(super) color: &'a mut [[u16; 3]],
 }
 
 /// Samples of a tile.
@@ -34,11 +37,14 @@ pub(super) struct Samples {
     depth: Vec<f32>,
     light: Vec<f32>,
     normal: Vec<[f32; 3]>,
+    /// Linear colour, if the mesh has colours of its own.
+    color: Vec<[f32; 3]>,
 }
 
 impl Default for Samples {
     fn default() -> Self {
-        Self { depth: vec![NOTHING; N], light: vec![0.0; N], normal: vec![[0.0; 3]; N] }
+        let zeros = || vec![[0.0; 3]; N];
+        Self { depth: vec![NOTHING; N], light: vec![0.0; N], normal: zeros(), color: zeros() }
     }
 }
 
@@ -88,11 +94,14 @@ impl Facet {
         Self { vertices, corners, depths: placed.map(|place| place[2] * share), share }
     }
 
-    /// Light and normal of each corner, divided by twice the area.
-    fn shades(&self, shape: Shape<'_>, camera: &Camera) -> [[f32; 4]; 3] {
+    /// Light, normal and linear colour of each corner, divided by twice the area.
+    fn shades(&self, shape: Shape<'_>, camera: &Camera) -> [[f32; 7]; 3] {
+        let levels = linear_levels();
         self.vertices.map(|v| {
-            let normal = camera.turn(shape.normals[v as usize]);
-            [lambert(normal), normal[0], normal[1], normal[2]].map(|x| x * self.share)
+            let [x, y, z] = camera.turn(shape.normals[v as usize]);
+            let [r, g, b, _] = shape.colors.map_or([0; 4], |colors| colors[v as usize]);
+            let [r, g, b] = [r, g, b].map(|level| levels[usize::from(level)]);
+            [lambert([x, y, z]), x, y, z, r, g, b].map(|value| value * self.share)
         })
     }
 
@@ -137,6 +146,9 @@ impl Facet {
                     samples.depth[i] = depth;
                     samples.light[i] = value(0);
                     samples.normal[i] = [value(1), value(2), value(3)];
+                    if shape.colors.is_some() {
+                        samples.color[i] = [value(4), value(5), value(6)];
+                    }
                 }
                 for edge in &mut edges {
                     edge.step(edge.column);
@@ -187,10 +199,24 @@ pub(super) fn fill(
             for x in 0..width {
                 let (pixel, at) = (y * TILE_WIDTH + x, y * band.width + left + x);
                 (band.depth[at], band.light[at], band.facing[at]) = resolve(samples, pixel);
+                if shape.colors.is_some() {
+                    band.color[at] = mean_color(samples, pixel);
+                }
             }
         }
     }
     Ok(())
+}
+
+/// Returns the mean colour of the covered samples of a pixel.
+fn mean_color(samples: &Samples, pixel: usize) -> [u16; 3] {
+    let (mut sum, mut covered) = ([0.0_f32; 3], 0.0_f32);
+    for i in (pixel * SAMPLES..(pixel + 1) * SAMPLES).filter(|i| samples.depth[*i] < NOTHING) {
+        (0..3).for_each(|k| sum[k] += samples.color[i][k]);
+        covered += 1.0;
+    }
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate")]
+    sum.map(|sum| (sum / covered.max(1.0) * FULL + 0.5) as u16)
 }
 
 /// Resolves the samples of a pixel.

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use super::cost::{Assignment, Cost, Model, Side};
 use super::work::mesh_work;
 use crate::surface::{
-    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits,
-    SurfaceParams,
+    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceKind,
+    SurfaceLimits, SurfaceParams,
 };
 
 /// Time for the measurement of each backend.
@@ -52,7 +52,11 @@ impl AutoBackend {
         if devices.is_empty() { usize::from(self.gpu.is_available()) } else { up }
     }
 
-    fn assign(&self, work: f64) -> AssignedBackend<'_> {
+    fn assign(&self, surface: SurfaceKind, work: f64) -> AssignedBackend<'_> {
+        if !self.gpu.makes(surface) {
+            let assignment = self.model().assign_to(Side::Cpu, self.now(), work, 0);
+            return AssignedBackend { auto: self, work, state: Mutex::new((assignment, None)) };
+        }
         let gpus = self.gpus();
         let assignment = self.model().assign(self.now(), work, gpus);
         let down = (gpus == 0).then(|| format!("no device is up: {}", self.down_reasons()));
@@ -95,12 +99,12 @@ impl Backend for AutoBackend {
         control: &Control<'_>,
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
-        let assigned = self.assign(mesh_work(spheres.len() as f64, params.resolution));
+        let assigned = self.assign(params.surface, mesh_work(spheres.len() as f64, params.resolution));
         assigned.write(spheres, params, limits, control, sink)
     }
 
-    fn for_job(&self, work: f64) -> Option<Box<dyn Backend + '_>> {
-        Some(Box::new(self.assign(work)))
+    fn for_job(&self, surface: SurfaceKind, work: f64) -> Option<Box<dyn Backend + '_>> {
+        Some(Box::new(self.assign(surface, work)))
     }
 
     /// Warms both backends up and measures them. If the GPUs fail, the CPU gets every job.

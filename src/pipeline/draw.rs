@@ -1,9 +1,11 @@
 //! Pictures of finished meshes.
 
+use std::sync::Arc;
+
 use super::report::{PictureReport, Report};
 use super::{JobError, Product, ProgressSink, StageClock};
 use crate::picture::{PictureParams, Rendered, SelectedRenderer, png};
-use crate::surface::{Control, Mesh};
+use crate::surface::Control;
 
 /// Draws the mesh of `product` and replaces it with the PNG.
 ///
@@ -23,10 +25,9 @@ pub fn draw(
         // The renderer needs random access to vertices.
         mesh.make_contiguous();
         let control = Control { observer: &clock, ..control.clone() };
-        renderer.renderer.render(&mesh, params, &control)
+        // The mesh is freed before the PNG is allocated.
+        renderer.renderer.render(&Arc::new(mesh), params, &control)
     })?;
-    // Free the mesh before the PNG is allocated.
-    drop::<Mesh>(mesh);
     let bytes = clock.time("png", || png::encode(&drawn.image, control))?;
     product.report.picture = Some(PictureReport::new(params, renderer, &drawn));
     for (stage, ms) in clock.finish() {

@@ -6,6 +6,7 @@
 
 use std::ops::Deref;
 
+use super::color::AtomColors;
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
 use crate::structure::{Structure, StructureError};
@@ -20,6 +21,8 @@ use crate::surface::{Control, Mesh, Spheres, SurfaceError, SurfaceLimits, Surfac
 pub struct Estimate {
     /// Atoms that would be meshed.
     pub atoms: u64,
+    /// Atoms that would be meshed, each counted once even if an assembly copies it.
+    pub distinct_atoms: u64,
     /// Atoms in the file, all models.
     pub atoms_in_file: u64,
     /// Grid spacing, Å. It is an estimate if the job would search for it, else exact.
@@ -43,7 +46,7 @@ pub struct MeshEstimate {
     pub vertices: u64,
     /// Number of triangles.
     pub triangles: u64,
-    /// Bytes of the mesh in memory, and of the binary part of a GLB.
+    /// Bytes of the binary part of a GLB. Without colours and atom indices, the mesh in memory has the same size.
     pub bytes: u64,
 }
 
@@ -59,7 +62,10 @@ pub fn estimate<S: Deref<Target = Structure>>(
     control: &Control<'_>,
 ) -> Result<Estimate, JobError> {
     let clock = StageClock::new(&());
-    let (structure, selected, spheres) = super::load(read, job, &clock, control)?;
+    let (structure, selected, spheres) = super::load(read, job, &limits.read, &clock, control)?;
+    if let Some(coloring) = &job.color {
+        AtomColors::new(&structure, &selected.atoms, coloring)?;
+    }
     let mut params = job.params_for(spheres.len());
     let mut refused = None;
     if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -83,8 +89,10 @@ pub fn estimate<S: Deref<Target = Structure>>(
         (Ok(mesh), Spacing::MaxTriangles(limit)) => Ok(mesh.at_most(limit, &params)),
         (mesh, _) => mesh,
     };
+    let mesh = mesh.map(|mesh| MeshEstimate { bytes: mesh.bytes + job.attribute_bytes() * mesh.vertices, ..mesh });
     let (atoms, atoms_in_file) = (selected.atoms.len() as u64, structure.len() as u64);
-    Ok(Estimate { atoms, atoms_in_file, resolution, box_cells, mesh })
+    let distinct_atoms = selected.n_distinct as u64;
+    Ok(Estimate { atoms, distinct_atoms, atoms_in_file, resolution, box_cells, mesh })
 }
 
 impl MeshEstimate {
@@ -215,6 +223,28 @@ mod tests {
         let (single, rounded) = (of("none"), of("quantize"));
         assert_eq!((single.vertices, single.triangles), (rounded.vertices, rounded.triangles));
         assert_eq!(single.bytes - rounded.bytes, 12 * single.vertices);
+    }
+
+    #[test]
+    fn colours_and_atom_indices_add_their_bytes() {
+        let backend = CpuBackend::new(None).unwrap();
+        let choice = Choice { backend: &backend, reason: "" };
+        let of = |pairs: &[(&str, &str)]| {
+            let job = params::parse(pairs.iter().copied()).unwrap().job;
+            let (limits, control) = (JobLimits::default(), Control::default());
+            let estimate = estimate(read, &job, &limits, &choice, &control).unwrap().mesh.unwrap();
+            let product = run(SAMPLE, &job, &limits, &choice, &control, &(), None).unwrap();
+            let bytes = product.file(crate::formats::Format::Glb).unwrap().bytes().unwrap();
+            // The number of vertices is an estimate. At this spacing, indices have 32 bits, as in memory.
+            let ratio = bytes as f64 / estimate.bytes as f64;
+            assert!((0.8..1.25).contains(&ratio), "{pairs:?}: {ratio}");
+            estimate
+        };
+        let plain = of(&[("resolution", "0.2")]);
+        let colored = of(&[("resolution", "0.2"), ("color", "chain")]);
+        let both = of(&[("resolution", "0.2"), ("color", "chain"), ("atom_ids", "true")]);
+        assert_eq!(colored.bytes - plain.bytes, 8 * plain.vertices);
+        assert_eq!(both.bytes - colored.bytes, 4 * plain.vertices);
     }
 
     #[test]

@@ -177,7 +177,7 @@ pub(super) fn mesh(
 ) -> Result<Fitted, SurfaceError> {
     let mut search = Search::new(limit, &job.params, spheres.len());
     let expected = Spacing::MaxTriangles(limit).expected(&job.params, spheres.len() as f64);
-    let assigned = choice.backend.for_job(search_work(spheres.len() as f64, expected));
+    let assigned = choice.backend.for_job(job.params.surface, search_work(spheres.len() as f64, expected));
     let backend = assigned.as_deref().unwrap_or(choice.backend);
     // The last mesh with its memory.
     let mut last: Option<(f64, MeshOutput, Arc<Reservation>)> = None;
@@ -198,7 +198,7 @@ pub(super) fn mesh(
         };
         // Hold only one mesh at a time.
         last = None;
-        let mut params = SurfaceParams { resolution: spacing, ..job.params.clone() };
+        let mut params = SurfaceParams { resolution: spacing, ..job.params_for(spheres.len()) };
         let _storage = super::storage(job, &mut params, spheres);
         let without_progress = WithoutProgress(clock);
         let observer: &dyn Observer = if search.tries() == 0 { &without_progress } else { clock };
@@ -270,7 +270,7 @@ fn unless_empty(made: Result<MeshOutput, SurfaceError>) -> Result<Option<MeshOut
 /// Returns the error for a search without a result.
 fn no_fit(params: &SurfaceParams, limit: u64, resolution: f64, triangles: u64) -> SurfaceError {
     match triangles {
-        0 => SurfaceError::NoSurface { isovalue: params.isovalue },
+        0 => SurfaceError::NoSurface { isovalue: params.level() },
         _ => SurfaceError::TooManyTriangles { triangles, limit, resolution },
     }
 }

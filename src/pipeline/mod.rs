@@ -2,6 +2,7 @@
 
 mod auto;
 mod clock;
+pub mod color;
 pub mod cost;
 #[cfg(feature = "png")]
 mod draw;
@@ -9,6 +10,7 @@ mod estimate;
 mod file;
 mod fit;
 pub mod integer;
+mod left_out;
 pub mod nearest;
 pub mod params;
 mod progress;
@@ -22,14 +24,14 @@ use thiserror::Error;
 
 pub use auto::AutoBackend;
 pub use clock::{ProgressSink, StageClock};
+pub use color::{AtomColors, ColorError, ColorReport, Coloring};
 #[cfg(feature = "png")]
 pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::File;
+pub use left_out::{KindCount, LeftOutReport, ResidueCount};
 pub use progress::Tracker;
-pub use report::{
-    ComponentReport, LeftOutReport, PictureReport, Quantization, Report, ResidueCount, VoidReport, maker,
-};
+pub use report::{AssemblyReport, ComponentReport, PictureReport, Quantization, Report, VoidReport, maker};
 pub use spacing::Spacing;
 pub use work::{estimate_work, mesh_work};
 
@@ -59,6 +61,8 @@ pub struct Job {
     pub normals: Normals,
     /// Units of the file's coordinates.
     pub units: Units,
+    /// Colours of the vertices; `None` for a mesh without colours.
+    pub color: Option<Coloring>,
     /// Parameters of a picture of the mesh; `None` for a mesh file.
     pub picture: Option<PictureParams>,
 }
@@ -72,13 +76,23 @@ impl Job {
         self.picture.map_or(Ok(()), |picture| picture.check(limits.picture)).map_err(JobError::Picture)
     }
 
-    /// Returns true if the mesh can be written while it is computed. Atom ids, the exact validation, a limit on
-    /// triangles and pictures need the whole mesh in memory.
+    /// Returns true if the nearest atom of every vertex must be found, for its index or its colour.
+    fn needs_atoms(&self) -> bool {
+        self.params.atom_ids || self.color.is_some()
+    }
+
+    /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
+    /// on triangles and pictures need the whole mesh in memory.
     fn can_stream(&self) -> bool {
-        !self.params.atom_ids
+        !self.needs_atoms()
             && self.validation == Validation::Checksum
             && self.spacing.max_triangles().is_none()
             && self.picture.is_none()
+    }
+
+    /// Returns the bytes that colours and atom indices add to a vertex of a GLB.
+    fn attribute_bytes(&self) -> u64 {
+        4 * u64::from(self.params.atom_ids) + 8 * u64::from(self.color.is_some())
     }
 
     /// Returns the parameters for a number of atoms. With [`Spacing::MaxTriangles`], the resolution is not final.
@@ -87,7 +101,7 @@ impl Job {
             Spacing::Detail(level) => spacing::of_detail(level, atoms as f64),
             Spacing::Given | Spacing::MaxTriangles(_) => self.params.resolution,
         };
-        SurfaceParams { resolution, ..self.params.clone() }
+        SurfaceParams { resolution, atom_ids: self.needs_atoms(), ..self.params.clone() }
     }
 }
 
@@ -145,6 +159,9 @@ pub enum JobError {
     /// Drawing failed.
     #[error(transparent)]
     Picture(PictureError),
+    /// The structure lacks the values of the colour scheme.
+    #[error(transparent)]
+    Color(#[from] ColorError),
 }
 
 impl From<StructureError> for JobError {
@@ -206,7 +223,8 @@ pub fn run_with<S: Deref<Target = Structure>>(
     job.check(limits)?;
     let clock = StageClock::new(progress);
     let control = Control { observer: &clock, ..control.clone() };
-    let (structure, selected, spheres) = load(read, job, &clock, &control)?;
+    let (structure, selected, spheres) = load(read, job, &limits.read, &clock, &control)?;
+    let colors = Colors::new(&structure, &selected, job, &control)?;
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -226,6 +244,9 @@ pub fn run_with<S: Deref<Target = Structure>>(
     };
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, made_by, .. } = output;
+    if let Some(Colors { of_spheres, .. }) = &colors {
+        clock.time("color", || color(&mut mesh, of_spheres, job.params.atom_ids, &control))?;
+    }
     if let Some(ids) = &mut mesh.atom_ids {
         // Convert indices of spheres to indices of atoms in the file.
         ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
@@ -242,7 +263,8 @@ pub fn run_with<S: Deref<Target = Structure>>(
     };
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, made_by, storage };
-    let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
+    let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
+    report.color = colors.map(|colors| colors.report);
     let mut product = Product { mesh, storage, report, picture: None, streamed_bytes: None };
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
         let clock = StageClock::new(progress);
@@ -264,6 +286,42 @@ fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage 
     Storage { packing, normals: job.normals, units: job.units }
 }
 
+/// Colours of a job.
+struct Colors {
+    /// Colour of each sphere.
+    of_spheres: Vec<[u8; 4]>,
+    report: ColorReport,
+}
+
+impl Colors {
+    /// Returns the colours of the selected atoms; `None` if the job has none.
+    fn new(
+        structure: &Structure,
+        selected: &Selected,
+        job: &Job,
+        control: &Control<'_>,
+    ) -> Result<Option<Self>, JobError> {
+        let Some(coloring) = &job.color else { return Ok(None) };
+        control.memory.grow(COLOR_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
+        let colors = AtomColors::new(structure, &selected.atoms, coloring)?;
+        let of_spheres = selected.atoms.iter().map(|&i| colors.of(i as usize)).collect();
+        Ok(Some(Self { of_spheres, report: colors.report(&selected.atoms) }))
+    }
+}
+
+/// Sets the colours of the vertices from their nearest spheres, which are kept only if `keep_atoms`.
+fn color(mesh: &mut Mesh, of_spheres: &[[u8; 4]], keep_atoms: bool, control: &Control<'_>) -> Result<(), SurfaceError> {
+    control.check()?;
+    control.memory.grow(COLOR_BYTES * mesh.n_vertices() as u64)?;
+    mesh.colors = mesh.atom_ids.as_deref().map(|ids| color::of_vertices(of_spheres, ids));
+    if !keep_atoms {
+        mesh.atom_ids = None;
+    }
+    Ok(())
+}
+
+/// Memory of a colour, bytes.
+const COLOR_BYTES: u64 = 4;
 /// Memory of selecting, bytes per atom of the structure.
 const INDEX_BYTES: u64 = 8;
 /// Memory of a sphere, bytes.
@@ -273,6 +331,7 @@ const SPHERE_BYTES: u64 = 28;
 fn load<S: Deref<Target = Structure>>(
     read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
     job: &Job,
+    limits: &ReadLimits,
     clock: &StageClock<'_>,
     control: &Control<'_>,
 ) -> Result<(S, Selected, Spheres), JobError> {
@@ -282,10 +341,11 @@ fn load<S: Deref<Target = Structure>>(
     // Selecting holds an index for each atom, and a sphere for each selected one.
     control.memory.grow(INDEX_BYTES * structure.len() as u64).map_err(SurfaceError::from)?;
     let (selected, spheres) = clock.time("select", || -> Result<_, JobError> {
-        let selected = structure::select_with(structure, &job.selection, control)?;
+        let selected = structure::select_with(structure, &job.selection, limits, control)?;
         control.check()?;
         control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
         let spheres = selected.spheres(structure)?;
+        selected.check_duplicates(&spheres, limits, control)?;
         Ok((selected, spheres))
     })?;
     Ok((read, selected, spheres))

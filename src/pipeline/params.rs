@@ -13,13 +13,14 @@ use thiserror::Error;
 use table::flag;
 pub use table::{Domain, Parameter, TABLE, usual_range};
 
+use super::color::{Coloring, Palette, Scheme};
 use super::nearest::nearest;
 use super::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use super::{Job, Spacing};
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, PictureParams, Style, View};
-use crate::structure::Selection;
-use crate::surface::{Kernel, PaperParams, Preset, SurfaceError, SurfaceOptions, SurfaceParams, Validation};
+use crate::structure::{BadExpression, Selection};
+use crate::surface::{PaperParams, Preset, SurfaceError, SurfaceKind, SurfaceOptions, SurfaceParams, Validation};
 
 /// Errors of parsing parameters.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -47,6 +48,16 @@ pub enum ParamError {
         value: String,
         /// Description of valid values.
         expected: String,
+    },
+    /// The value is an invalid expression.
+    #[error("parameter `{name}`, {error}")]
+    BadExpression {
+        /// Name of the parameter.
+        name: &'static str,
+        /// The given expression.
+        text: String,
+        /// Position and expectation.
+        error: BadExpression,
     },
 }
 
@@ -94,8 +105,9 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
             return Err(contradiction(parameter.name, value, other));
         }
     }
-    let Values { options, selection, mut request } = values;
-    request.job = Job { selection, params: SurfaceParams::new(&options)?, ..request.job };
+    let color = values.coloring()?;
+    let Values { options, selection, mut request, .. } = values;
+    request.job = Job { selection, params: SurfaceParams::new(&options)?, color, ..request.job };
     if let Some(format) = request.format {
         set_format(&mut request.job, format)?;
     }
@@ -168,7 +180,7 @@ impl From<SurfaceError> for ParamError {
         match error {
             SurfaceError::BadParameter { name, value, expected } => Self::BadValue { name, value, expected },
             other => {
-                Self::BadValue { name: "kernel", value: other.to_string(), expected: "valid parameters".to_owned() }
+                Self::BadValue { name: "surface", value: other.to_string(), expected: "valid parameters".to_owned() }
             }
         }
     }
@@ -179,10 +191,31 @@ impl From<SurfaceError> for ParamError {
 struct Values {
     options: SurfaceOptions,
     selection: Selection,
+    scheme: Option<Scheme>,
+    palette: Option<Palette>,
+    color_range: Option<[f64; 2]>,
     request: Request,
 }
 
 impl Values {
+    /// Combines `color`, `palette` and `color_range`.
+    fn coloring(&self) -> Result<Option<Coloring>, ParamError> {
+        let Self { scheme, palette, color_range: range, .. } = *self;
+        let has_numbers = scheme.is_some_and(|scheme| scheme.palette().is_some());
+        let unused = match (palette, range) {
+            (Some(palette), _) => Some(("palette", palette.name().to_owned())),
+            (_, Some([low, high])) => Some(("color_range", format!("{low},{high}"))),
+            _ => None,
+        };
+        if let Some((name, value)) = unused.filter(|_| !has_numbers) {
+            let shown = scheme.map_or("none".to_owned(), |scheme| scheme.to_string());
+            let expected =
+                format!("no value with color={shown}, or color=bfactor, occupancy, hydrophobicity or charge");
+            return Err(ParamError::BadValue { name, value: format!("`{value}`"), expected });
+        }
+        Ok(scheme.map(|scheme| Coloring { scheme, palette, range }))
+    }
+
     /// Returns the picture parameters of the job. The first call creates them.
     fn picture(&mut self) -> &mut PictureParams {
         self.request.job.picture.get_or_insert_default()
@@ -191,7 +224,7 @@ impl Values {
     /// Parses the value of one parameter.
     fn set(&mut self, parameter: &Parameter, text: &str) -> Result<(), ParamError> {
         let bad = || parameter.invalid(text);
-        // The core checks ranges, because they may depend on the kernel.
+        // The core checks ranges, because they may depend on the surface.
         let number = || text.trim().parse::<f64>().ok().filter(|v| v.is_finite()).map(Some).ok_or_else(bad);
         let side = || whole(text).and_then(|n| u32::try_from(n).ok()).filter(|n| (1..=MAX_SIDE).contains(n));
         let angle = || {
@@ -200,7 +233,8 @@ impl Values {
         };
         match parameter.name {
             "preset" => self.options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
-            "kernel" => self.options.kernel = Some(Kernel::from_str(text).ok().ok_or_else(bad)?),
+            "surface" => self.options.surface = Some(SurfaceKind::from_str(text).ok().ok_or_else(bad)?),
+            "probe" => self.options.probe = number()?,
             "resolution" => self.options.resolution = number()?,
             "detail" => {
                 let level = whole(text).filter(|level| *level < DETAILS.len() as u64);
@@ -220,15 +254,23 @@ impl Values {
             "paper_b" => self.options.paper_b = number()?,
             "paper_c" => self.options.paper_c = number()?,
             "atom_ids" => self.options.atom_ids = flag(text).ok_or_else(bad)?,
+            "color" if text == "none" => self.scheme = None,
+            "color" => self.scheme = Some(text.parse().ok().ok_or_else(bad)?),
+            "palette" => self.palette = Some(named(&Palette::ALL, Palette::name, text).ok_or_else(bad)?),
+            "color_range" => self.color_range = Some(range(text).ok_or_else(bad)?),
             "model" => self.selection.model = Some(text.trim().parse().ok().ok_or_else(bad)?),
             "chains" => {
                 self.selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect());
             }
-            "select" => self.selection.set_kinds(text).map_err(|e| ParamError::BadValue {
-                name: "select",
-                value: format!("`{}`", e.value),
-                expected: e.expected,
-            })?,
+            "select" => {
+                let bad = |error| ParamError::BadExpression { name: "select", text: text.to_owned(), error };
+                self.selection.atoms = text.parse().map_err(bad)?;
+            }
+            "assembly" => {
+                let id = Some(text.trim()).filter(|id| !id.is_empty() && !id.chars().any(char::is_control));
+                let id = id.ok_or_else(bad)?;
+                self.selection.assembly = (id != parameter.default).then(|| id.to_owned());
+            }
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
             "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
             "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
@@ -264,6 +306,14 @@ fn list(text: &str) -> Option<Vec<&str>> {
     words.iter().all(|w| !w.is_empty() && !w.chars().any(char::is_control)).then_some(words)
 }
 
+/// Parses two numbers, the lower one first.
+fn range(text: &str) -> Option<[f64; 2]> {
+    let (low, high) = text.split_once(',')?;
+    let [low, high] = [low, high].map(|end| end.trim().parse::<f64>().ok().filter(|end| end.is_finite()));
+    // Adding 0 turns −0 into 0, so both have one canonical form.
+    Some([low? + 0.0, high? + 0.0]).filter(|[low, high]| low < high)
+}
+
 fn one_char(text: &str) -> Option<char> {
     let mut chars = text.chars();
     chars.next().filter(|c| chars.next().is_none() && !c.is_control())
@@ -274,10 +324,11 @@ fn one_char(text: &str) -> Option<char> {
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that a new field must be added here.
-    let Job { selection, params, spacing, validation, compress, normals, units, picture } = job;
-    let Selection { model, chains, polymer, ligands, waters, hydrogens, altloc } = selection;
+    let Job { selection, params, spacing, validation, compress, normals, units, color, picture } = job;
+    let Selection { model, chains, atoms, altloc, assembly } = selection;
     let SurfaceParams {
-        kernel,
+        surface,
+        probe,
         resolution,
         isovalue,
         smoothness,
@@ -297,10 +348,11 @@ pub fn canonical(job: &Job) -> String {
         Spacing::MaxTriangles(most) => format!("max_triangles={most}"),
     };
     let mut text = format!(
-        "kernel={kernel}&{spacing}&isovalue={isovalue}&smoothness={smoothness}\
+        "surface={surface}&probe={probe}&{spacing}&isovalue={isovalue}&smoothness={smoothness}\
          &radius_scale={radius_scale}&radius_offset={radius_offset}&cutoff_tolerance={cutoff_tolerance}\
-         &preset={preset}&atom_ids={atom_ids}&model={model:?}&chains={chains:?}&polymer={polymer}\
-         &ligands={ligands}&waters={waters}&hydrogens={hydrogens}&altloc={altloc:?}&validation={}&compress={}&normals={}&units={}",
+         &preset={preset}&atom_ids={atom_ids}&model={model:?}&chains={chains:?}&select={:?}&altloc={altloc:?}\
+         &assembly={assembly:?}&validation={}&compress={}&normals={}&units={}",
+        atoms.to_string(),
         validation.name(),
         compress.name(),
         normals.name(),
@@ -313,6 +365,10 @@ pub fn canonical(job: &Job) -> String {
         }
         Some(PaperParams::InverseSquare { c, b }) => write!(text, "&paper_c={c}&paper_b={b}"),
     };
+    if let Some(color) = color {
+        text.push('&');
+        text.push_str(&color.canonical());
+    }
     if let Some(picture) = picture {
         text.push('&');
         text.push_str(&picture.canonical());

@@ -8,7 +8,7 @@ use super::ProgressSink;
 const UNIT: f64 = 1000.0;
 
 /// Stages with their typical shares of the time, in execution order.
-const STAGES: [(&str, f64); 13] = [
+const STAGES: [(&str, f64); 14] = [
     ("read", 0.10),
     ("select", 0.02),
     ("bin", 0.03),
@@ -18,7 +18,8 @@ const STAGES: [(&str, f64); 13] = [
     ("interpolate", 0.10),
     ("emit", 0.10),
     ("write", 0.05),
-    ("measure", 0.05),
+    ("color", 0.01),
+    ("measure", 0.04),
     ("draw", 0.03),
     ("png", 0.01),
     ("encode", 0.04),

@@ -3,10 +3,12 @@
 use serde::Serialize;
 use serde_json::{Map, Value};
 
+use super::color::ColorReport;
+use super::left_out::LeftOutReport;
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
-use crate::structure::{LeftOut, Selected, Structure, radii};
-use crate::surface::{BackendIdentity, Component, GridStats, Measures, Validation};
+use crate::structure::{Selected, Structure, radii};
+use crate::surface::{BackendIdentity, Component, GridStats, Measures, SurfaceKind, Validation};
 
 /// Connected component of the mesh.
 #[derive(Debug, Clone, Serialize)]
@@ -49,49 +51,14 @@ impl VoidReport {
     }
 }
 
-/// Number of atoms with one residue name.
+/// Biological assembly.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
-pub struct ResidueCount {
-    /// Residue name.
-    pub name: String,
-    /// Number of atoms.
-    pub atoms: u64,
-}
-
-/// Atoms of the model that are not meshed. Each atom is counted once, under the first field that applies.
-#[derive(Debug, Clone, Default, Serialize)]
-#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
-pub struct LeftOutReport {
-    /// Sum of all counts below.
-    pub total: u64,
-    /// Atoms of chains that are not selected.
-    pub other_chains: u64,
-    /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
-    pub virtual_sites: u64,
-    /// Atoms of kinds that are not selected, by residue name; the ten most frequent names.
-    pub residues: Vec<ResidueCount>,
-    /// Atoms of kinds that are not selected, all other residue names.
-    pub other_residues: u64,
-    /// Hydrogen atoms of meshed residues.
-    pub hydrogens: u64,
-    /// Alternative locations of meshed residues other than the selected one.
-    pub alternatives: u64,
-}
-
-impl LeftOutReport {
-    fn new(left_out: &LeftOut) -> Self {
-        let residues = left_out.residues.iter();
-        Self {
-            total: left_out.total(),
-            other_chains: left_out.other_chains,
-            virtual_sites: left_out.virtual_sites,
-            residues: residues.map(|(name, atoms)| ResidueCount { name: name.clone(), atoms: *atoms }).collect(),
-            other_residues: left_out.other_residues,
-            hydrogens: left_out.hydrogens,
-            alternatives: left_out.alternatives,
-        }
-    }
+pub struct AssemblyReport {
+    /// Id in the file.
+    pub id: String,
+    /// Number of copies of chains.
+    pub copies: u64,
 }
 
 /// Quantization of the vertices in the file.
@@ -149,12 +116,15 @@ pub struct Report {
     pub title: Option<String>,
     /// Format of the structure file: `pdb`, `mmcif` or `bcif`.
     pub source_format: &'static str,
-    /// Meshed atoms.
+    /// Meshed atoms, including all copies in an assembly.
     pub atoms: u64,
     /// Atoms in all models of the file.
     pub atoms_in_file: u64,
     /// Number of the meshed model.
     pub model: i32,
+    /// Assembly; absent for the asymmetric unit.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub assembly: Option<AssemblyReport>,
     /// Atoms of the model that are not meshed.
     pub left_out: LeftOutReport,
     /// Unreadable values that do not affect the mesh, at most 12; absent if there are none.
@@ -163,8 +133,11 @@ pub struct Report {
     pub warnings: Vec<String>,
     /// Table of van der Waals radii.
     pub radii: &'static str,
-    /// Density kernel.
-    pub kernel: &'static str,
+    /// Type of the surface.
+    pub surface: &'static str,
+    /// Radius of the probe in Å; solvent-accessible and solvent-excluded surfaces only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub probe: Option<f64>,
     /// Preset.
     pub preset: &'static str,
     /// Grid spacing in Å.
@@ -180,9 +153,10 @@ pub struct Report {
     /// Meshes computed to find the spacing; absent if the spacing was given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tries: Option<u32>,
-    /// Isovalue of the density.
-    pub isovalue: f64,
-    /// Smoothness of the gaussian kernel; absent for other kernels and raw parameters.
+    /// Isovalue of the density; absent for surfaces of spheres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub isovalue: Option<f64>,
+    /// Smoothness of the gaussian kernel; absent for other surfaces and raw parameters.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub smoothness: Option<f64>,
     /// Grid bricks (8 × 8 × 8 points) within reach of an atom.
@@ -232,6 +206,9 @@ pub struct Report {
     /// Quantization of the vertices in the mesh file; absent if they are not quantized.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub quantization: Option<Quantization>,
+    /// Colours of the vertices; absent if they have none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub color: Option<ColorReport>,
     /// Backend that computed the mesh: `cpu`, `gpu` or `reference`.
     pub backend: &'static str,
     /// Arithmetic of the backend, part of the key of the file.
@@ -276,7 +253,7 @@ impl Report {
         timings: Vec<(&'static str, f64)>,
     ) -> Self {
         let params = &job.params;
-        let gaussian = params.kernel == crate::surface::Kernel::Gaussian && params.paper.is_none();
+        let gaussian = params.surface == SurfaceKind::Gaussian && params.paper.is_none();
         let made_by = counts.made_by.clone().unwrap_or_else(|| choice.backend.identity());
         let mut voids: Vec<&Component> = measures.components.iter().filter(|c| c.volume < 0.0).collect();
         voids.sort_by(|a, b| a.volume.total_cmp(&b.volume));
@@ -287,17 +264,23 @@ impl Report {
             atoms: selected.atoms.len() as u64,
             atoms_in_file: structure.len() as u64,
             model: selected.model,
+            assembly: job
+                .selection
+                .assembly
+                .clone()
+                .map(|id| AssemblyReport { id, copies: selected.copies.len() as u64 }),
             left_out: LeftOutReport::new(&selected.left_out),
             warnings: structure.warnings.clone(),
             radii: radii::TABLE,
-            kernel: params.kernel.name(),
+            surface: params.surface.name(),
+            probe: params.surface.has_probe().then_some(params.probe),
             preset: params.preset.name(),
             resolution: counts.resolution,
             resolution_from: job.spacing.parameter(),
             detail: job.spacing.detail(),
             max_triangles: job.spacing.max_triangles(),
             tries: counts.tries,
-            isovalue: params.isovalue,
+            isovalue: params.level(),
             smoothness: gaussian.then_some(params.smoothness),
             bricks: counts.grid.bricks,
             surface_bricks: counts.grid.surface_bricks,
@@ -325,6 +308,7 @@ impl Report {
             file_units: counts.storage.units.name(),
             normals: counts.storage.normals.name(),
             quantization: counts.storage.packing.step().map(|step| Quantization { step: step.length() }),
+            color: None,
             backend_reason: made_by.reason(choice.reason),
             backend: made_by.backend,
             arithmetic: made_by.arithmetic,

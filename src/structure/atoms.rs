@@ -1,5 +1,6 @@
 //! Atoms of a structure file, stored as a structure of arrays.
 
+use super::assembly::Assemblies;
 use super::contents::Kind;
 use super::duplicates;
 use super::error::StructureError;
@@ -59,6 +60,8 @@ pub struct Structure {
     pub chain: TextColumn,
     /// mmCIF chain ids (`label_asym_id`). Empty for PDB files and for files without this column.
     pub label_chain: TextColumn,
+    /// Entity of each text of `label_chain`, empty if it is unknown.
+    pub entities: Vec<String>,
     /// Author residue numbers; 0 if the file has none.
     pub residue_number: Vec<i32>,
     /// Insertion codes as Latin-1 characters; 0 if there is none.
@@ -73,8 +76,10 @@ pub struct Structure {
     pub model: Vec<i32>,
     /// True for HETATM records.
     pub hetero: Vec<bool>,
-    /// Kinds: polymer, ligand, water or virtual site.
+    /// Kinds.
     pub kind: Vec<Kind>,
+    /// Assemblies that the file describes.
+    pub assemblies: Assemblies,
     /// Messages about unreadable values that were replaced by a default. Their number is bounded.
     pub warnings: Vec<String>,
 }
@@ -126,6 +131,7 @@ pub(super) struct Source {
     pub(super) id: Option<String>,
     pub(super) title: Option<String>,
     pub(super) sequence: Sequence,
+    pub(super) assemblies: Assemblies,
     pub(super) warnings: Vec<String>,
 }
 
@@ -312,7 +318,10 @@ impl Columns {
         if tables.label_chain.is_empty() {
             self.label_chain = Vec::new();
         }
+        let entity = |chain: &str| source.sequence.entity_ids.get(chain).cloned().unwrap_or_default();
+        let entities = tables.label_chain.texts().map(entity).collect();
         self.shrink();
+        reading.keep(source.assemblies.bytes())?;
         let warnings = source.warnings.into_iter().chain(self.unknown_elements(&tables)).collect();
         reading.check()?;
         Ok(Structure {
@@ -327,6 +336,7 @@ impl Columns {
             residue: tables.residue.column(self.residue),
             chain: tables.chain.column(self.chain),
             label_chain: tables.label_chain.column(self.label_chain),
+            entities,
             residue_number: self.residue_number,
             insertion_code: self.insertion_code,
             altloc: self.altloc,
@@ -335,6 +345,7 @@ impl Columns {
             model: self.model,
             hetero: self.hetero,
             kind: self.kind,
+            assemblies: source.assemblies,
             warnings,
         })
     }

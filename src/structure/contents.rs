@@ -3,16 +3,27 @@
 use std::fmt;
 
 use super::atoms::Structure;
+use super::kind_set::KindSet;
 use super::text::list;
 
 /// Kind of molecule that an atom belongs to.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Kind {
-    /// Chains of amino acids and nucleotides: ATOM records, and the HETATM residues of a chain.
+    /// Proteins and peptides: their ATOM records, and the HETATM residues of a chain.
+    Protein,
+    /// Nucleic acids: their ATOM records, and the HETATM residues of a chain.
+    Nucleic,
+    /// Other polymers, and ATOM records of unknown residues.
     #[default]
     Polymer,
-    /// Other HETATM records, and single ions in any record.
+    /// Known cofactors in any record, unless they are part of a polymer.
+    Cofactor,
+    /// Saccharides in any record, unless they are part of a polymer; branched entities.
+    Glycan,
+    /// Other HETATM records.
     Ligand,
+    /// Monatomic metals and halogens in any record.
+    Ion,
     /// Water in any record.
     Water,
     /// Sites of a force field that are not atoms, such as the charge site of TIP4P water. They are never selected.
@@ -20,11 +31,16 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// Returns `polymer`, `ligand`, `water` or `virtual`.
+    /// Returns the name: `protein`, `nucleic`, `polymer`, `cofactor`, `glycan`, `ligand`, `ion`, `water` or `virtual`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
+            Self::Protein => "protein",
+            Self::Nucleic => "nucleic",
             Self::Polymer => "polymer",
+            Self::Cofactor => "cofactor",
+            Self::Glycan => "glycan",
+            Self::Ion => "ion",
             Self::Ligand => "ligand",
             Self::Water => "water",
             Self::VirtualSite => "virtual",
@@ -37,10 +53,20 @@ impl Kind {
 #[cfg_attr(feature = "server", derive(serde::Serialize, utoipa::ToSchema))]
 #[cfg_attr(feature = "server", schema(as = KindCounts))]
 pub struct Counts {
-    /// Heavy atoms of polymers.
+    /// Heavy atoms of polymers, including proteins and nucleic acids.
     pub polymer: u64,
-    /// Heavy atoms of ligands.
+    /// Heavy atoms of proteins.
+    pub protein: u64,
+    /// Heavy atoms of nucleic acids.
+    pub nucleic: u64,
+    /// Heavy atoms of ligands, including cofactors and glycans.
     pub ligand: u64,
+    /// Heavy atoms of cofactors.
+    pub cofactor: u64,
+    /// Heavy atoms of glycans.
+    pub glycan: u64,
+    /// Atoms of ions.
+    pub ion: u64,
     /// Heavy atoms of water.
     pub water: u64,
     /// Hydrogen atoms.
@@ -53,25 +79,35 @@ impl Counts {
     /// Returns the total number of atoms and virtual sites.
     #[must_use]
     pub fn total(&self) -> u64 {
-        self.polymer + self.ligand + self.water + self.hydrogens + self.virtual_sites
+        self.polymer + self.ligand + self.ion + self.water + self.hydrogens + self.virtual_sites
     }
 
     fn add(&mut self, kind: Kind, hydrogen: bool) {
         let slot = match (hydrogen, kind) {
             (_, Kind::VirtualSite) => &mut self.virtual_sites,
             (true, _) => &mut self.hydrogens,
-            (_, Kind::Polymer) => &mut self.polymer,
-            (_, Kind::Ligand) => &mut self.ligand,
+            (_, Kind::Ion) => &mut self.ion,
             (_, Kind::Water) => &mut self.water,
+            (_, kind) if KindSet::POLYMER.has(kind) => &mut self.polymer,
+            _ => &mut self.ligand,
         };
         *slot += 1;
+        let part = match kind {
+            _ if hydrogen => return,
+            Kind::Protein => &mut self.protein,
+            Kind::Nucleic => &mut self.nucleic,
+            Kind::Cofactor => &mut self.cofactor,
+            Kind::Glycan => &mut self.glycan,
+            _ => return,
+        };
+        *part += 1;
     }
 }
 
 impl fmt::Display for Counts {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { polymer, ligand, water, hydrogens, virtual_sites } = self;
-        write!(f, "{polymer} polymer, {ligand} ligand, {water} water and {hydrogens} hydrogen atoms")?;
+        let Self { polymer, ligand, ion, water, hydrogens, virtual_sites, .. } = self;
+        write!(f, "{polymer} polymer, {ligand} ligand, {ion} ion, {water} water and {hydrogens} hydrogen atoms")?;
         if *virtual_sites > 0 { write!(f, " and {virtual_sites} virtual sites") } else { Ok(()) }
     }
 }

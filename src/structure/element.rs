@@ -48,6 +48,18 @@ pub fn atomic_number(symbol: &[u8]) -> u8 {
     }
 }
 
+/// Returns the symbol of an element by atomic number; `?` if there is none.
+#[must_use]
+pub fn symbol(z: u8) -> &'static str {
+    z.checked_sub(1).and_then(|i| SYMBOLS.get(usize::from(i)).copied()).unwrap_or("?")
+}
+
+/// Returns true for metals and halogens, by atomic number.
+pub(super) const fn forms_ions(z: u8) -> bool {
+    // Neither hydrogen, the noble gases, nor B, C, N, O, Si, P, S, Ge, As, Se, Sb, Te.
+    !matches!(z, 0..=2 | 5..=8 | 10 | 14..=16 | 18 | 32..=34 | 36 | 51 | 52 | 54 | 86 | 118..)
+}
+
 /// Two-letter elements that an atom name alone identifies, as in `CL1`, `FE`, `BR12`. Their letters cannot be read as
 /// carbon, nitrogen, oxygen, sulphur, phosphorus or hydrogen followed by a remoteness letter.
 const SURE: &[&[u8; 2]] = &[
@@ -117,10 +129,6 @@ fn aligned_left(two: &[u8], residue: &str) -> Option<u8> {
 #[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
-
-    fn symbol(z: u8) -> &'static str {
-        if z == 0 { "?" } else { SYMBOLS[usize::from(z) - 1] }
-    }
 
     fn pdb(columns: &[u8; 4], residue: &str) -> &'static str {
         symbol(guess(Name { text: columns.trim_ascii(), columns: Some(*columns) }, residue))

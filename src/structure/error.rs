@@ -69,6 +69,34 @@ pub enum StructureError {
         /// Coordinates, Å.
         z: f64,
     },
+    /// The requested assembly is invalid in the file.
+    #[error("assembly {id}: found {found}, expected {expected}")]
+    BadAssembly {
+        /// Id of the assembly.
+        id: String,
+        /// The content found in the file.
+        found: String,
+        /// The expected content.
+        expected: String,
+    },
+    /// The requested assembly has more copies than allowed.
+    #[error("assembly {id} has more than {limit} copies of chains")]
+    TooManyCopies {
+        /// Id of the assembly.
+        id: String,
+        /// Limit, number of copies.
+        limit: u64,
+    },
+    /// The requested assembly has more selected atoms than allowed.
+    #[error("assembly {id} has {atoms} selected atoms, the limit is {limit}")]
+    AssemblyTooLarge {
+        /// Id of the assembly.
+        id: String,
+        /// Number of atoms.
+        atoms: u64,
+        /// Limit, number of atoms.
+        limit: u64,
+    },
     /// Memory is not available now.
     #[error(transparent)]
     Memory(#[from] OutOfMemory),
@@ -87,10 +115,10 @@ pub enum StructureError {
         /// Contents of the file and the parameters that select them.
         holds: String,
     },
-    /// The requested model, chain or alternative location does not exist.
+    /// The requested model, chain, alternative location or assembly does not exist.
     #[error("{what} {asked} is not in the file; it has {available}")]
     NotFound {
-        /// `model` or `chain`.
+        /// `model`, `chain`, `selected chain` (of an expression), `alternative location` or `assembly`.
         what: &'static str,
         /// The requested value.
         asked: String,

@@ -1,4 +1,4 @@
-//! Assigns a kind to every atom: polymer, ligand, water or virtual site.
+//! Assigns a kind to every atom: first polymer, ligand, water or virtual site, then a more specific kind.
 //!
 //! ATOM records are polymer, except for water and single ions. A HETATM residue is polymer if the file declares it to
 //! be: by the entity of its chain or its `label_seq_id` (mmCIF), or by a SEQRES or MODRES record (PDB). Otherwise it is
@@ -8,18 +8,34 @@
 use std::collections::{HashMap, HashSet};
 
 use super::atoms::{Columns, Tables};
+use super::categories::{Categories, Entity};
 use super::contents::Kind;
 use super::error::StructureError;
 use super::read::Reading;
-use super::{residue, sites};
+use super::{chemistry, residue, sites};
 
 /// Sequence information of a file, by chain.
 #[derive(Debug, Default)]
 pub(super) struct Sequence {
     /// Chains and residue names of SEQRES and MODRES records, standard residues excepted.
     pub(super) listed: HashSet<Listed>,
-    /// Chains (`label_asym_id`) with a known entity; true if that is a polymer.
-    pub(super) polymer_chains: HashMap<String, bool>,
+    /// Types of chains (`label_asym_id`) with a known entity.
+    pub(super) entities: HashMap<String, Entity>,
+    /// Entity of each chain (`label_asym_id`), if the file describes it.
+    pub(super) entity_ids: HashMap<String, String>,
+}
+
+impl Sequence {
+    /// Returns the sequence information of an mmCIF or BinaryCIF file.
+    pub(super) fn of(categories: &Categories) -> Self {
+        Self { entities: categories.of_chains(), entity_ids: categories.entity_ids(), ..Self::default() }
+    }
+
+    /// Returns true if a record lists the residue name for the chain.
+    pub(super) fn lists(&self, chain: &str, residue: &str) -> bool {
+        !self.listed.is_empty()
+            && listed(chain.as_bytes(), residue.as_bytes()).is_some_and(|pair| self.listed.contains(&pair))
+    }
 }
 
 /// Columns of a chain (two) and a residue name (three), right-aligned.
@@ -57,6 +73,8 @@ pub(super) fn assign(
     } else {
         solvent.mark(columns);
     }
+    reading.check()?;
+    chemistry::refine(columns, tables, sequence);
     reading.check()?;
     sites::mark(columns, tables);
     reading.check()
@@ -101,20 +119,16 @@ impl Solvent {
 /// the chain decided.
 fn sequenced(columns: &mut Columns, tables: &Tables, sequence: &Sequence, solvent: &Solvent) -> Vec<bool> {
     let chains: Vec<Option<bool>> =
-        tables.label_chain.texts().map(|chain| sequence.polymer_chains.get(chain).copied()).collect();
+        tables.label_chain.texts().map(|chain| Some(*sequence.entities.get(chain)? == Entity::Polymer)).collect();
     let numbered = has_sequence_numbers(columns, solvent);
-    let is_listed = |chain: u32, residue: u32| {
-        let (chain, residue) = (tables.chain.text(chain), tables.residue.text(residue));
-        listed(chain.as_bytes(), residue.as_bytes()).is_some_and(|pair| sequence.listed.contains(&pair))
-    };
+    let is_listed = |chain: u32, residue: u32| sequence.lists(tables.chain.text(chain), tables.residue.text(residue));
     for i in 0..columns.len() {
         if !columns.hetero[i] {
             continue;
         }
         let of_entity = chains.get(columns.label_chain[i] as usize).copied().flatten();
         let polymer = of_entity.unwrap_or_else(|| {
-            (numbered && columns.kind[i] == Kind::Polymer)
-                || (!sequence.listed.is_empty() && is_listed(columns.chain[i], columns.residue[i]))
+            (numbered && columns.kind[i] == Kind::Polymer) || is_listed(columns.chain[i], columns.residue[i])
         });
         columns.kind[i] = if polymer { Kind::Polymer } else { Kind::Ligand };
     }
@@ -220,7 +234,7 @@ fn bonded(columns: &mut Columns, tables: &Tables, decided: &[bool]) {
     }
 }
 
-fn same_chain(columns: &Columns, a: usize, b: usize) -> bool {
+pub(super) fn same_chain(columns: &Columns, a: usize, b: usize) -> bool {
     columns.chain[a] == columns.chain[b] && columns.model[a] == columns.model[b]
 }
 
@@ -229,7 +243,7 @@ fn residue_start(columns: &Columns, i: usize) -> usize {
     (0..i).rev().find(|&before| !same_residue(columns, before, i)).map_or(0, |before| before + 1)
 }
 
-fn same_residue(columns: &Columns, a: usize, b: usize) -> bool {
+pub(super) fn same_residue(columns: &Columns, a: usize, b: usize) -> bool {
     columns.residue_number[a] == columns.residue_number[b]
         && columns.residue[a] == columns.residue[b]
         && columns.insertion_code[a] == columns.insertion_code[b]

@@ -8,17 +8,21 @@
 
 mod altloc;
 pub mod archive;
+mod assembly;
 mod atom_site;
 pub mod atoms;
 mod bcif;
+mod categories;
+mod chemistry;
 mod cif;
 pub mod contents;
+mod copies;
 mod duplicates;
 pub mod element;
-mod entities;
 pub mod error;
 mod growing;
 mod inflate;
+mod kind_set;
 mod kinds;
 mod mmcif;
 mod number;
@@ -41,10 +45,13 @@ mod texts;
 mod warnings;
 
 pub use archive::{Archive, ArchiveError, EntryId, Stamp};
+pub use assembly::{Assemblies, Operator};
 pub use atoms::{SourceFormat, Structure};
 pub use contents::{Contents, Kind};
+pub use copies::PlacedCopy;
 pub use error::StructureError;
+pub use kind_set::KindSet;
 pub use read::{ReadLimits, read, read_with};
-pub use select::{BadKinds, LeftOut, Selected, Selection, select, select_with};
+pub use select::{BadExpression, Expression, LeftOut, Selected, Selection, select, select_with};
 pub use survey::{Survey, survey};
 pub use texts::TextColumn;

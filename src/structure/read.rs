@@ -11,15 +11,17 @@ use crate::surface::{Control, MemoryMeter as _, Reservation};
 pub struct ReadLimits {
     /// Bytes after decompression.
     pub max_inflated_bytes: u64,
-    /// Atoms in all models.
+    /// Atoms in all models, and of an assembly.
     pub max_atoms: u64,
-    /// Atoms of one model at exactly the same position.
+    /// Atoms of one model, or of an assembly, at exactly the same position.
     pub max_duplicates: u64,
+    /// Copies of chains in an assembly.
+    pub max_copies: u64,
 }
 
 impl Default for ReadLimits {
     fn default() -> Self {
-        Self { max_inflated_bytes: 4 << 30, max_atoms: 20_000_000, max_duplicates: 1000 }
+        Self { max_inflated_bytes: 4 << 30, max_atoms: 20_000_000, max_duplicates: 1000, max_copies: 10_000 }
     }
 }
 
@@ -73,9 +75,14 @@ impl<'a> Reading<'a> {
         Ok(self.text.grow(BYTES_PER_TEXT * n as u64)?)
     }
 
+    /// Reserves memory that belongs to the structure.
+    pub(super) fn keep(&self, bytes: u64) -> Result<(), StructureError> {
+        Ok(self.control.memory.grow(bytes)?)
+    }
+
     /// Adds the memory of `n` more distinct texts, which belong to the structure.
     pub(super) fn keep_texts(&self, n: usize) -> Result<(), StructureError> {
-        Ok(self.control.memory.grow(BYTES_PER_TEXT * n as u64)?)
+        self.keep(BYTES_PER_TEXT * n as u64)
     }
 }
 

@@ -1,18 +1,42 @@
-//! Residue names of polymers, water and single ions, including those of simulation packages.
+//! Residue names of polymers, water, single ions, cofactors and saccharides, including those of simulation packages.
 
-/// Amino acids, nucleotides and their common variants and modifications. Their atoms C*, N*, O*, H* are never metals.
-/// Sources: chemical component dictionary; AMBER, CHARMM and GROMOS for protonation states and old nucleic acid names.
-const POLYMER: &[&str] = &[
+use std::collections::HashSet;
+use std::sync::LazyLock;
+
+/// Amino acids, their common variants and modifications, and caps of chains. Their atoms C*, N*, O*, H* are never
+/// metals. Sources: chemical component dictionary; AMBER, CHARMM and GROMOS for protonation states and old nucleic acid
+/// names.
+const AMINO_ACIDS: &[&str] = &[
     "ALA", "ARG", "ASN", "ASP", "CYS", "GLN", "GLU", "GLY", "HIS", "ILE", "LEU", "LYS", "MET", "PHE", "PRO", "SER",
     "THR", "TRP", "TYR", "VAL", "ASX", "GLX", "UNK", "XLE", "MSE", "SEC", "PYL", "HID", "HIE", "HIP", "HSD", "HSE",
     "HSP", "HISA", "HISB", "HISD", "HISE", "HISH", "CYX", "CYM", "CYS2", "CYSH", "CSS", "ASH", "ASPH", "GLH", "GLUH",
     "LYN", "LYSH", "LSN", "ARGN", "PCA", "SEP", "TPO", "PTR", "HYP", "CSO", "CSD", "CME", "CSX", "OCS", "KCX", "MLY",
     "M3L", "MLZ", "ALY", "CGU", "DAL", "DAR", "DSG", "DAS", "DCY", "DGN", "DGL", "DHI", "DIL", "DLE", "DLY", "MED",
     "DPN", "DPR", "DSN", "DTH", "DTR", "DTY", "DVA", "AIB", "NLE", "ORN", "ABA", "SAR", "ACE", "NME", "NMA", "NH2",
-    "FOR", "A", "C", "G", "U", "T", "I", "N", "DA", "DC", "DG", "DT", "DU", "DI", "DN", "RA", "RC", "RG", "RU", "A3",
-    "A5", "C3", "C5", "G3", "G5", "U3", "U5", "DA3", "DA5", "DC3", "DC5", "DG3", "DG5", "DT3", "DT5", "RA3", "RA5",
-    "RC3", "RC5", "RG3", "RG5", "RU3", "RU5", "ADE", "CYT", "GUA", "THY", "URA", "PSU", "5MU", "5MC", "1MA", "2MG",
-    "7MG", "H2U", "OMC", "OMG", "OMU", "4SU", "M2G", "YYG", "+A", "+C", "+G", "+U", "+T", "+I",
+    "FOR",
+];
+
+/// Nucleotides, from the same sources as [`AMINO_ACIDS`].
+const NUCLEOTIDES: &[&str] = &[
+    "A", "C", "G", "U", "T", "I", "N", "DA", "DC", "DG", "DT", "DU", "DI", "DN", "RA", "RC", "RG", "RU", "A3", "A5",
+    "C3", "C5", "G3", "G5", "U3", "U5", "DA3", "DA5", "DC3", "DC5", "DG3", "DG5", "DT3", "DT5", "RA3", "RA5", "RC3",
+    "RC5", "RG3", "RG5", "RU3", "RU5", "ADE", "CYT", "GUA", "THY", "URA", "PSU", "5MU", "5MC", "1MA", "2MG", "7MG",
+    "H2U", "OMC", "OMG", "OMU", "4SU", "M2G", "YYG", "+A", "+C", "+G", "+U", "+T", "+I",
+];
+
+/// Cofactors, by their names in the component dictionary: nicotinamide and flavin nucleotides, haems, pyridoxal and
+/// thiamine phosphates, coenzymes A, B and M, adenosylmethionine, cobalamins, biotin, lipoate, folates, biopterins,
+/// glutathione, molybdopterins, quinones, ascorbate, coenzymes F420 and F430, chlorophylls, iron–sulphur clusters.
+const COFACTORS: &[&str] = &[
+    "NAD", "NAI", "NAP", "NDP", "NAJ", "TXD", "TXP", "FAD", "FDA", "FMN", "FNR", "RBF", "HEM", "HEA", "HEB", "HEC",
+    "HEO", "HAS", "HEV", "HDD", "HDE", "HDM", "DHE", "SRM", "COH", "ZNH", "MNH", "MNR", "FDE", "FEC", "HIF", "HNI",
+    "HP5", "HEG", "HES", "MH0", "PLP", "PMP", "PLR", "TPP", "TDP", "TPW", "THD", "TPU", "TZD", "COA", "ACO", "CAO",
+    "COZ", "SCA", "MLC", "COD", "CMC", "3CP", "COF", "CO6", "COS", "CAA", "HMG", "MCA", "BCO", "FAQ", "PNS", "SAM",
+    "SAH", "SMM", "B12", "CNC", "COB", "COY", "CBY", "BTN", "BTI", "LPA", "LPB", "LPM", "THG", "THF", "FFO", "C2F",
+    "MEF", "THH", "FOZ", "DHF", "H4B", "BH4", "H2B", "HBI", "BIO", "THB", "GSH", "GDS", "GTT", "MTE", "PCD", "MGD",
+    "MSS", "2MD", "XAX", "PQQ", "UQ1", "UQ2", "UQ5", "UQ6", "UQ7", "UQ8", "UQ9", "U10", "MQ7", "MQ8", "MQ9", "PQN",
+    "PL9", "ASC", "F43", "F42", "COM", "TP7", "CLA", "CHL", "BCL", "BCB", "CL7", "BPB", "BPH", "PHO", "CL1", "CL2",
+    "CL0", "SF4", "FES", "F3S", "CFM", "ICS", "CLF", "1CL", "SF3", "FS1", "FSO",
 ];
 
 /// Water, by names of the component dictionary and of simulation packages.
@@ -51,8 +75,39 @@ const FOUR_LETTERS: &[&str] = &[
     "LYSH", "ARGN", "ALAD", "NMET", "CMET", "NLEU",
 ];
 
+/// Saccharides: components of the component dictionary whose type contains `saccharide`, ascorbate excepted.
+static SACCHARIDES: LazyLock<HashSet<&'static str>> =
+    LazyLock::new(|| include_str!("saccharides.txt").split_ascii_whitespace().collect());
+
+/// Class of a residue by its name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Class {
+    /// Amino acid or cap of a peptide.
+    AminoAcid,
+    /// Nucleotide.
+    Nucleotide,
+    /// Cofactor.
+    Cofactor,
+    /// Saccharide.
+    Saccharide,
+    /// Any other residue.
+    Other,
+}
+
+impl Class {
+    pub(super) fn of(residue: &str) -> Self {
+        match residue {
+            name if AMINO_ACIDS.contains(&name) => Self::AminoAcid,
+            name if NUCLEOTIDES.contains(&name) => Self::Nucleotide,
+            name if COFACTORS.contains(&name) => Self::Cofactor,
+            name if SACCHARIDES.contains(name) => Self::Saccharide,
+            _ => Self::Other,
+        }
+    }
+}
+
 pub(super) fn is_polymer(residue: &str) -> bool {
-    POLYMER.contains(&residue)
+    matches!(Class::of(residue), Class::AminoAcid | Class::Nucleotide)
 }
 
 pub(super) fn is_water(residue: &str) -> bool {

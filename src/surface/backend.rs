@@ -5,7 +5,7 @@ use super::devices::DeviceStatus;
 use super::error::SurfaceError;
 use super::measure::{Measures, Validation};
 use super::mesh::Mesh;
-use super::params::{SurfaceLimits, SurfaceParams};
+use super::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
 use super::simd;
 use super::sink::{MeshPart, MeshSink, SinkFailed};
 use super::spheres::Spheres;
@@ -157,6 +157,12 @@ pub trait Backend: Send + Sync {
         BackendIdentity::new(self.name(), self.arithmetic(), self.describe())
     }
 
+    /// Returns true if the backend can make this surface. [`Self::write`] rejects others.
+    fn makes(&self, surface: SurfaceKind) -> bool {
+        let _ = surface;
+        true
+    }
+
     /// Meshes `spheres`, in memory or, if there is a `sink`, into that. Both get the same rows.
     ///
     /// # Errors
@@ -184,10 +190,10 @@ pub trait Backend: Send + Sync {
         self.write(spheres, params, limits, control, None)
     }
 
-    /// Returns a backend for a job of several meshes, `work` atoms at 0.5 Å in all, which must come from one backend;
-    /// `None` if this is a single backend.
-    fn for_job(&self, work: f64) -> Option<Box<dyn Backend + '_>> {
-        let _ = work;
+    /// Returns a backend for a job of several meshes of `surface`, `work` atoms at 0.5 Å in all, which must come from
+    /// one backend; `None` if this is a single backend.
+    fn for_job(&self, surface: SurfaceKind, work: f64) -> Option<Box<dyn Backend + '_>> {
+        let _ = (surface, work);
         None
     }
 

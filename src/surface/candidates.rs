@@ -5,9 +5,10 @@
 //! share bricks.
 
 use std::f64::consts::PI;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::error::SurfaceError;
-use super::kernel::Profile;
+use super::kernel::Shape;
 use super::lattice::{BRICK, Lattice, effective_radius, to_u64};
 use super::params::{MAX_RESOLUTION, SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
@@ -26,23 +27,46 @@ pub(super) fn limit(limits: &SurfaceLimits) -> u64 {
 /// # Errors
 /// [`SurfaceError::TooManyCandidates`].
 pub(crate) fn check(spheres: &Spheres, params: &SurfaceParams, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
-    let profile = Profile::new(params);
-    let reach = |radius: f32| profile.reach(profile.length(effective_radius(radius, params)));
+    let shape = Shape::new(params);
+    let reach = |radius: f32| shape.reach(shape.length(effective_radius(radius, params)));
     let brick = f64::from(BRICK) * params.resolution;
     // Bricks fill space, so a sphere reaches at least as many as its volume holds, and at least one.
     let bricks = |radius: &f32| (4.0 / 3.0 * PI * (reach(*radius) / brick).powi(3)).max(1.0);
-    let least = to_u64(spheres.radii().iter().map(bricks).sum());
-    if least <= limit(limits) {
+    let (n, (_, largest), limit) = (spheres.len(), spheres.radius_range(), limit(limits));
+    // The sum is not needed if it fits for spheres of the largest radius.
+    if n as f64 * bricks(&largest) <= limit as f64 {
         return Ok(());
     }
-    let longest = reach(spheres.radius_range().1);
-    Err(error(least, limit(limits), spheres.len(), longest, params.resolution))
+    let least = to_u64(spheres.radii().iter().map(bricks).sum());
+    if least <= limit { Ok(()) } else { Err(error(least, limit, n, reach(largest), params.resolution)) }
 }
 
 /// Returns the error of a run on `lattice` that has at least `candidates` pairs.
 pub(super) fn exceeded(lattice: &Lattice, candidates: u64, limits: &SurfaceLimits) -> SurfaceError {
     let longest = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
     error(candidates, limit(limits), lattice.atoms.len(), longest, lattice.spacing)
+}
+
+/// Number of pairs of overlapping spheres, which determines the time for finding their boundary.
+pub(super) struct OverlapCount {
+    so_far: AtomicU64,
+    limit: u64,
+}
+
+impl OverlapCount {
+    /// Starts at 0. The limit is the one of candidate pairs.
+    pub(super) fn new(limits: &SurfaceLimits) -> Self {
+        Self { so_far: AtomicU64::new(0), limit: limit(limits) }
+    }
+
+    /// Adds `n` ordered pairs.
+    ///
+    /// # Errors
+    /// [`SurfaceError::TooManyOverlaps`].
+    pub(super) fn add(&self, n: usize) -> Result<(), SurfaceError> {
+        let overlaps = self.so_far.fetch_add(n as u64, Ordering::Relaxed) + n as u64;
+        if overlaps <= self.limit { Ok(()) } else { Err(SurfaceError::TooManyOverlaps { overlaps, limit: self.limit }) }
+    }
 }
 
 fn error(candidates: u64, limit: u64, n_spheres: usize, reach: f64, resolution: f64) -> SurfaceError {

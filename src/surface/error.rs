@@ -64,6 +64,17 @@ pub enum SurfaceError {
         /// A spacing that is certain to fit, in Å, if there is one.
         suggested_resolution: Option<f64>,
     },
+    /// Too many pairs of spheres enlarged by the probe overlap.
+    #[error(
+        "at least {overlaps} pairs of spheres overlap when enlarged by the probe, the limit is {limit}; use a smaller \
+         probe or smaller radii"
+    )]
+    TooManyOverlaps {
+        /// Ordered pairs of overlapping spheres. A lower bound, because counting stops soon after the limit.
+        overlaps: u64,
+        /// Pairs allowed.
+        limit: u64,
+    },
     /// The mesh would take more bytes than allowed.
     #[error("the mesh would take about {bytes} bytes, the limit is {limit}{}", fitting(*suggested_resolution))]
     MeshTooLarge {
@@ -84,11 +95,14 @@ pub enum SurfaceError {
         /// Spacing with that number of triangles, Å.
         resolution: f64,
     },
-    /// No grid point reaches the isovalue.
-    #[error("no grid point reaches the isovalue {isovalue}; a lower isovalue or a finer grid may have a surface")]
+    /// No grid point lies inside the surface.
+    #[error("{}", isovalue.map_or_else(
+        || "no grid point lies inside the surface; a finer grid may have one".to_owned(),
+        |level| format!("no grid point reaches the isovalue {level}; a lower isovalue or a finer grid may have a surface"),
+    ))]
     NoSurface {
-        /// The isovalue asked for.
-        isovalue: f64,
+        /// Isovalue of the request, if the surface has one.
+        isovalue: Option<f64>,
     },
     /// The sink of the mesh failed. It keeps the cause.
     #[error("the mesh sink failed")]

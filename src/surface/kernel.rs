@@ -30,10 +30,9 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// Returns the profile of validated parameters.
+    /// Returns the profile of `kernel` with validated parameters.
     #[must_use]
-    pub fn new(params: &SurfaceParams) -> Self {
-        let kernel = params.kernel;
+    pub fn new(kernel: Kernel, params: &SurfaceParams) -> Self {
         let plain = Self { kernel, scale: 1.0, fixed: None, amplitude: 1.0, decay: 0.0, tolerance: 0.0 };
         // (1 − 4/9 s)(1 − s)² is 1/2 and (1 − s)²/s is 9/4 where the support is twice the radius (s = 1/4).
         let s = SUPPORT_RADII.powi(-2);
@@ -59,6 +58,13 @@ impl Profile {
     #[must_use]
     pub fn length(&self, radius: f64) -> f64 {
         self.fixed.unwrap_or(self.scale * radius)
+    }
+
+    /// Returns the radius of an atom as a fraction of its ρ. With the paper's raw parameters, all atoms have the same
+    /// radius, so its value does not affect comparisons of atoms.
+    #[must_use]
+    pub fn radius_per_length(&self) -> f64 {
+        self.scale.recip()
     }
 
     /// `u` from which on the density is 0.
@@ -117,21 +123,67 @@ impl Profile {
     }
 }
 
+/// Field of one atom: a density, or the distance to its sphere.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Shape {
+    /// Density with this profile. The surface is an isosurface.
+    Density(Profile),
+    /// Sphere with an enlarged radius. The surface is a level set of the distance to a union of spheres.
+    Sphere {
+        /// Length by which the radius is enlarged, Å.
+        enlarged: f64,
+    },
+}
+
+impl Shape {
+    /// Returns the shape of validated parameters.
+    #[must_use]
+    pub fn new(params: &SurfaceParams) -> Self {
+        let enlarged = if params.surface.has_probe() { params.probe } else { 0.0 };
+        params.surface.kernel().map_or(Self::Sphere { enlarged }, |kernel| Self::Density(Profile::new(kernel, params)))
+    }
+
+    /// Returns the length scale ρ of an atom of `radius` (after scale and offset), Å. That of a sphere is its enlarged
+    /// radius.
+    #[must_use]
+    pub fn length(&self, radius: f64) -> f64 {
+        match self {
+            Self::Density(profile) => profile.length(radius),
+            Self::Sphere { enlarged } => radius + enlarged,
+        }
+    }
+
+    /// Returns the value of `u` at which the effect of an atom ends.
+    #[must_use]
+    pub fn support(&self) -> f64 {
+        match self {
+            Self::Density(profile) => profile.support(),
+            Self::Sphere { .. } => 1.0,
+        }
+    }
+
+    /// Returns the distance at which the effect of an atom with length scale ρ ends, Å.
+    #[must_use]
+    pub fn reach(&self, length: f64) -> f64 {
+        length * self.support().sqrt()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::params::SurfaceOptions;
+    use crate::surface::params::{SurfaceKind, SurfaceOptions};
 
     fn profiles() -> Vec<(Profile, f64)> {
         let raw = |kernel, a, b, c, iso| SurfaceOptions {
-            kernel: Some(kernel),
+            surface: Some(SurfaceKind::from(kernel)),
             paper_a: a,
             paper_b: b,
             paper_c: c,
             isovalue: Some(iso),
             ..SurfaceOptions::default()
         };
-        let plain = |kernel| SurfaceOptions { kernel: Some(kernel), ..SurfaceOptions::default() };
+        let plain = |kernel| SurfaceOptions { surface: Some(SurfaceKind::from(kernel)), ..SurfaceOptions::default() };
         [
             plain(Kernel::Gaussian),
             SurfaceOptions { smoothness: Some(5.0), cutoff_tolerance: Some(1e-3), ..plain(Kernel::Gaussian) },
@@ -143,7 +195,7 @@ mod tests {
             raw(Kernel::InverseSquare, None, Some(5.0), Some(0.8), 0.2),
         ]
         .map(|o| SurfaceParams::new(&o).unwrap())
-        .map(|p| (Profile::new(&p), p.isovalue))
+        .map(|p| (Profile::new(p.surface.kernel().unwrap(), &p), p.isovalue))
         .to_vec()
     }
 

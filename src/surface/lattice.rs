@@ -4,12 +4,14 @@
 //! centre is a lattice cell plus a fraction: the offset of a sample from a centre then depends on these two alone, bit
 //! for bit, in every brick and tile, without 64-bit arithmetic.
 
+use std::ops::Range;
+
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::column::Column;
 use super::error::SurfaceError;
-use super::kernel::Profile;
+use super::kernel::Shape;
 use super::params::SurfaceParams;
 use super::simd::dispatched;
 use super::spheres::Spheres;
@@ -59,9 +61,9 @@ pub struct Lattice {
     pub centre: [i32; 3],
     /// The spheres.
     pub atoms: Column<LatticeAtom>,
-    /// The kernel's constants.
-    pub profile: Profile,
-    /// u from which on a sphere's density is 0.
+    /// Field of each sphere.
+    pub shape: Shape,
+    /// Value of u at which the effect of a sphere ends.
     pub support: f64,
     /// Cells of the box around all supports.
     pub box_cells: u64,
@@ -80,19 +82,19 @@ impl Lattice {
             return Err(SurfaceError::BadParameter { name: "spheres", value: spheres.len().to_string(), expected });
         }
         let spacing = params.resolution;
-        let profile = Profile::new(params);
+        let shape = Shape::new(params);
         let (smallest, largest) = spheres.radius_range();
         params.check_radius(smallest)?;
         let largest = effective_radius(largest, params);
-        let atoms = Placing { spheres, params, profile: &profile }.in_canonical_order([lo, hi]);
-        let margin = 2.0 * profile.reach(profile.length(largest));
+        let atoms = Placing { spheres, params, shape: &shape }.in_canonical_order([lo, hi]);
+        let margin = 2.0 * shape.reach(shape.length(largest));
         let box_cells = (0..3).map(|k| ((hi[k] - lo[k] + margin) / spacing).ceil()).product::<f64>();
         Ok(Self {
             spacing,
             centre: std::array::from_fn(|k| to_i32((0.5 * (lo[k] + hi[k]) / spacing).round())),
             atoms,
-            profile,
-            support: profile.support(),
+            shape,
+            support: shape.support(),
             // Saturates: a sparse assembly's box may hold more cells than any integer type.
             box_cells: to_u64(box_cells),
         })
@@ -116,9 +118,9 @@ impl Lattice {
 #[must_use]
 pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
-    let profile = Profile::new(params);
+    let shape = Shape::new(params);
     let (_, largest) = spheres.radius_range();
-    let reach = profile.reach(profile.length(effective_radius(largest, params)));
+    let reach = shape.reach(shape.length(effective_radius(largest, params)));
     let half = (0..3).map(|k| 0.5 * (hi[k] - lo[k])).fold(0.0, f64::max);
     // The centre is a sample, half a spacing from the middle at most; a vertex lies on an edge that begins within
     // reach. Half a spacing more is far above every rounding.
@@ -134,14 +136,14 @@ pub(super) fn effective_radius(r: f32, params: &SurfaceParams) -> f64 {
 struct Placing<'a> {
     spheres: &'a Spheres,
     params: &'a SurfaceParams,
-    profile: &'a Profile,
+    shape: &'a Shape,
 }
 
 impl Placing<'_> {
     #[inline(always)]
     fn atom(&self, i: usize) -> LatticeAtom {
         let spacing = self.params.resolution;
-        let length = self.profile.length(effective_radius(self.spheres.radius(i), self.params)) / spacing;
+        let length = self.shape.length(effective_radius(self.spheres.radius(i), self.params)) / spacing;
         let scaled = self.spheres.centre(i).map(|c| c / spacing);
         let cell = scaled.map(f64::round);
         LatticeAtom {
@@ -157,66 +159,146 @@ impl Placing<'_> {
         c.map(|c| to_i32((c / self.params.resolution).round()))
     }
 
-    /// Returns the sort key of atom `i`: tile, brick and cell.
-    #[inline(always)]
-    fn key(&self, rank: &TileRanks, i: usize) -> u64 {
-        let cell = self.cell(self.spheres.centre(i));
-        let local = cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
-        let brick = local.map(|c| c / BRICK.unsigned_abs());
-        let cell_in_brick = local.map(|c| c % BRICK.unsigned_abs());
-        let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
-        rank.of(tile_of(cell)) << PLACE_BITS | pack(brick) << 9 | pack(cell_in_brick)
-    }
-
     /// The atoms by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order
     /// last. `bounds`: lowest and highest coordinates.
     fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
         let n = self.spheres.len();
         // Rounding is monotone, so the outermost tiles are those of the outermost coordinates.
-        let rank =
-            TileRanks::new(bounds.map(|c| tile_of(self.cell(c))), n, |i| tile_of(self.cell(self.spheres.centre(i))));
+        let tiles = bounds.map(|c| tile_of(self.cell(c)));
+        let keys = SortKeys::new(TileRanks::new(tiles, n, |i| tile_of(self.cell(self.spheres.centre(i)))), n);
+        // Independent of the number of threads. The tables of all parts together take at most a byte per atom.
+        let part = PART.max(n / MAX_PARTS);
+        let parts: Vec<SortedPart> = (0..n.div_ceil(part))
+            .into_par_iter()
+            .map(|i| by_bucket(self, &keys, i * part..n.min((i + 1) * part)))
+            .collect();
         let mut atoms = Column::zeroed(n);
-        let mut keys: Column<u128> = Column::zeroed(n);
-        keys.par_chunks_mut(PART).enumerate().for_each(|(part, keys)| write_keys(self, &rank, part * PART, keys));
-        keys.par_sort_unstable();
-        atoms.par_chunks_mut(PART).zip(keys.par_chunks(PART)).for_each(|(atoms, keys)| place(self, keys, atoms));
-        let same = |a: &LatticeAtom, b: &LatticeAtom| a.cell == b.cell;
-        let order = |same: &mut [LatticeAtom]| {
-            same.sort_unstable_by(|a, b| {
-                let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
-                let size = a.inv_length2.total_cmp(&b.inv_length2);
-                axis(2).then(axis(1)).then(axis(0)).then(size).then(a.source.cmp(&b.source))
-            });
+        let mut rest = &mut atoms[..];
+        let mut buckets = Vec::with_capacity(keys.n_buckets);
+        for bucket in 0..keys.n_buckets {
+            let (own, others) = rest.split_at_mut(parts.iter().map(|part| part.bucket(bucket).len()).sum());
+            buckets.push(own);
+            rest = others;
+        }
+        let place = |scratch: &mut Vec<_>, (bucket, atoms): (usize, &mut [LatticeAtom])| {
+            place(self, &keys, &parts, bucket, scratch, atoms);
         };
-        atoms.par_chunk_by_mut(same).filter(|same| same.len() > 1).for_each(order);
+        buckets.into_par_iter().enumerate().for_each_init(Vec::new, place);
         atoms
     }
 }
 
-/// Atoms per placement task.
-const PART: usize = 4096;
+/// Minimum number of atoms that one task sorts by bucket.
+const PART: usize = 1 << 13;
+/// Maximum number of such tasks.
+const MAX_PARTS: usize = 64;
+/// Mean number of atoms of a bucket: those fit the L1 cache.
+const BUCKET: usize = 512;
 /// Bits of an atom's brick and cell within its tile.
 const PLACE_BITS: u32 = 18;
 
-dispatched! {
-/// Writes the sort keys of the atoms from `first` on: their places above their indices.
-fn write_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut [u128]) {
-    for (i, key) in (first..).zip(keys) {
-        *key = u128::from(placing.key(rank, i)) << 64 | i as u128;
+/// Sort keys of atoms: tile, brick and cell. Their highest bits number buckets, which are sorted independently.
+struct SortKeys {
+    rank: TileRanks,
+    n_buckets: usize,
+    /// Number of bits below those that number buckets: at most 32, because [`TileRanks`] are bounded.
+    shift: u32,
+}
+
+impl SortKeys {
+    /// Keys of `n` atoms.
+    fn new(rank: TileRanks, n: usize) -> Self {
+        let n_buckets = n.div_ceil(BUCKET).next_power_of_two();
+        let bits = PLACE_BITS + rank.count().next_power_of_two().trailing_zeros();
+        Self { rank, n_buckets, shift: bits.saturating_sub(n_buckets.trailing_zeros()) }
     }
+
+    /// Returns the key of an atom in `cell`.
+    #[inline(always)]
+    fn of(&self, cell: [i32; 3]) -> u64 {
+        let local = cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
+        let brick = local.map(|c| c / BRICK.unsigned_abs());
+        let cell_in_brick = local.map(|c| c % BRICK.unsigned_abs());
+        let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
+        self.rank.of(tile_of(cell)) << PLACE_BITS | pack(brick) << 9 | pack(cell_in_brick)
+    }
+}
+
+/// Spheres of a part of the input, sorted by bucket.
+struct SortedPart {
+    /// Indices of the spheres, ascending within a bucket.
+    indices: Vec<u32>,
+    /// Start of each bucket in `indices`, and the number of indices last.
+    starts: Vec<u32>,
+}
+
+impl SortedPart {
+    /// Indices of the spheres of a bucket.
+    #[inline(always)]
+    fn bucket(&self, bucket: usize) -> &[u32] {
+        &self.indices[self.starts[bucket] as usize..self.starts[bucket + 1] as usize]
+    }
+}
+
+dispatched! {
+/// Sorts the `spheres` by bucket, with a counting sort.
+fn by_bucket(placing: &Placing<'_>, keys: &SortKeys, spheres: Range<usize>) -> SortedPart {
+    let mut starts = vec![0; keys.n_buckets + 1];
+    let bucket = |i| u32::try_from(keys.of(placing.cell(placing.spheres.centre(i))) >> keys.shift).unwrap_or(u32::MAX);
+    let buckets: Vec<u32> = spheres.clone().map(bucket).collect();
+    for &bucket in &buckets {
+        starts[bucket as usize] += 1;
+    }
+    // Ends of buckets, which the loop below turns into starts.
+    let mut end = 0;
+    for start in &mut starts {
+        end += *start;
+        *start = end;
+    }
+    let mut indices = vec![0; buckets.len()];
+    for (i, &bucket) in spheres.zip(&buckets).rev() {
+        let start = &mut starts[bucket as usize];
+        *start -= 1;
+        indices[*start as usize] = to_u32(i);
+    }
+    SortedPart { indices, starts }
 }
 }
 
 dispatched! {
-/// Writes the atoms whose sort keys are `keys`.
-fn place(placing: &Placing<'_>, keys: &[u128], atoms: &mut [LatticeAtom]) {
-    for (key, atom) in keys.iter().zip(atoms) {
-        *atom = placing.atom(usize::try_from(key & u128::from(u64::MAX)).unwrap_or(usize::MAX));
+/// Writes the atoms of a bucket in canonical order.
+fn place(
+    placing: &Placing<'_>,
+    keys: &SortKeys,
+    parts: &[SortedPart],
+    bucket: usize,
+    scratch: &mut Vec<LatticeAtom>,
+    atoms: &mut [LatticeAtom],
+) {
+    scratch.clear();
+    for part in parts {
+        scratch.extend(part.bucket(bucket).iter().map(|&i| placing.atom(i as usize)));
+    }
+    let mask = (1 << keys.shift) - 1;
+    // Keys are equal above the mask. Spheres with equal keys keep their order.
+    let mut order: Vec<u64> =
+        scratch.iter().zip(0_u64..).map(|(atom, i)| (keys.of(atom.cell) & mask) << 32 | i).collect();
+    order.sort_unstable();
+    for (atom, key) in atoms.iter_mut().zip(&order) {
+        *atom = scratch[usize::try_from(key & u64::from(u32::MAX)).unwrap_or(usize::MAX)];
+    }
+    let same = |a: &LatticeAtom, b: &LatticeAtom| a.cell == b.cell;
+    for same in atoms.chunk_by_mut(same).filter(|same| same.len() > 1) {
+        same.sort_unstable_by(|a, b| {
+            let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
+            let size = a.inv_length2.total_cmp(&b.inv_length2);
+            axis(2).then(axis(1)).then(axis(0)).then(size).then(a.source.cmp(&b.source))
+        });
     }
 }
 }
 
-/// Numbers that order tiles, below 2⁴⁶.
+/// Numbers that order tiles: at most 16 per atom, and 4,096 more.
 enum TileRanks {
     /// Ranks within the box with these sides from the lowest tile on.
     Box { lo: [i32; 3], side: [u64; 3] },
@@ -229,13 +311,21 @@ impl TileRanks {
     fn new([lo, hi]: [[i32; 3]; 2], n: usize, of_atom: impl Fn(usize) -> [i32; 3] + Sync) -> Self {
         let side: [u64; 3] = std::array::from_fn(|k| u64::from(lo[k].abs_diff(hi[k])) + 1);
         // Each side is below 2²⁰, as coordinates are bounded.
-        if side.iter().product::<u64>() < 1 << 46 {
+        if side.iter().product::<u64>() <= 16 * n as u64 + 4096 {
             return Self::Box { lo, side };
         }
         let mut order: Vec<[i32; 3]> = (0..n).into_par_iter().map(|i| tile_order(of_atom(i))).collect();
         order.par_sort_unstable();
         order.dedup();
         Self::Listed(order)
+    }
+
+    /// Number of ranks.
+    fn count(&self) -> u64 {
+        match self {
+            Self::Box { side, .. } => side.iter().product(),
+            Self::Listed(order) => order.len() as u64,
+        }
     }
 
     #[inline(always)]
@@ -326,7 +416,11 @@ mod tests {
             let radii = (0..20_000_u32).map(|i| if i.is_multiple_of(3) { 1.5 } else { 1.7 }).collect();
             let spheres = Spheres::new(column(0.37), column(1.13), column(2.71), radii).unwrap();
             let options = SurfaceOptions { resolution: Some(resolution), ..SurfaceOptions::default() };
-            let lattice = Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap()).unwrap();
+            let params = SurfaceParams::new(&options).unwrap();
+            let on = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let [lattice, other] =
+                [1, 3].map(|threads| on(threads).install(|| Lattice::new(&spheres, &params).unwrap()));
+            assert_eq!(lattice.atoms, other.atoms, "the number of threads matters");
             let sorted = |atoms: &[LatticeAtom]| atoms.windows(2).all(|pair| order(&pair[0], &pair[1]).is_lt());
             assert!(sorted(&lattice.atoms), "{resolution}");
             let mut sources: Vec<u32> = lattice.atoms.iter().map(|atom| atom.source).collect();

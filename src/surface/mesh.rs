@@ -29,7 +29,7 @@ pub struct Mesh {
     pub quantized: Option<Quantized>,
     /// Vertex indices, counter-clockwise seen from outside.
     pub triangles: Column<[u32; 3]>,
-    /// Per vertex the index of the nearest sphere in the input, if requested.
+    /// Index of the nearest sphere of the input for each vertex, if requested.
     pub atom_ids: Option<Column<u32>>,
     /// Per vertex an sRGB colour with alpha, if the caller set one. Backends leave it empty.
     pub colors: Option<Column<[u8; 4]>>,

@@ -1,9 +1,9 @@
 //! Parameters of a surface: the caller's options, and the validated form that the core uses.
 
 use std::fmt;
-use std::str::FromStr;
 
 use super::error::SurfaceError;
+pub use super::kind::{Kernel, Preset, SurfaceKind};
 use super::mesh::Mesh;
 use super::quantize::Step;
 
@@ -15,80 +15,10 @@ pub const MAX_RESOLUTION: f64 = 20.0;
 pub const MIN_RADIUS: f64 = 0.05;
 /// Radius of support of the soft-object and inverse-square kernels, in radii.
 pub const SUPPORT_RADII: f64 = 2.0;
-
-/// The density that one atom contributes, as a function of the distance to its centre.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum Kernel {
-    /// Blinn 1982: exp(−a(d²/r² − 1)), with a C¹ cut-off.
-    #[default]
-    Gaussian,
-    /// Wyvill, `McPheeters`, Wyvill 1986: a sextic with compact support.
-    SoftObject,
-    /// C/d², windowed.
-    InverseSquare,
-}
-
-/// A named set of parameters.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum Preset {
-    /// Smoothness 1.25 at isovalue 1: close to the solvent-excluded surface in volume.
-    #[default]
-    Default,
-    /// Smoothness 0.75 at isovalue 1.9: an approximation of the solvent-excluded surface (1.4 Å probe), without a
-    /// probe. Over eight proteins its area was −6.5 to +6.0 % off and its volume −0.6 to +5.1 %. Small structures are
-    /// worse: the area of a DNA dodecamer was +13.5 % off.
-    SesLike,
-    /// Smoothness 5 at isovalue 1.06: close to the union of van der Waals spheres.
-    VdwLike,
-    /// Smoothness 1.5.
-    Molstar,
-    /// Smoothness 2.5.
-    Blinn,
-    /// Smoothness 0.5 at isovalue 0.824: the density that VMD's `QuickSurf` draws by default.
-    Quicksurf,
-}
-
-/// Implements names, [`Display`](fmt::Display) and [`FromStr`] for an enum of named values.
-macro_rules! named {
-    ($type:ident, $what:literal, $($variant:ident => $name:literal),+ $(,)?) => {
-        impl $type {
-            /// Every value, in documentation order.
-            pub const ALL: &'static [Self] = &[$(Self::$variant),+];
-            /// Names of all values.
-            pub const NAMES: &'static [&'static str] = &[$($name),+];
-
-            /// The value's name in query, JSON and on the command line.
-            #[must_use]
-            pub const fn name(self) -> &'static str {
-                match self { $(Self::$variant => $name),+ }
-            }
-        }
-
-        impl fmt::Display for $type {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str(self.name())
-            }
-        }
-
-        impl FromStr for $type {
-            type Err = SurfaceError;
-
-            fn from_str(text: &str) -> Result<Self, Self::Err> {
-                Self::ALL.iter().copied().find(|v| v.name() == text).ok_or_else(|| SurfaceError::BadParameter {
-                    name: $what,
-                    value: format!("`{text}`"),
-                    expected: format!("one of {}", Self::NAMES.join(", ")),
-                })
-            }
-        }
-    };
-}
-
-pub(super) use named;
-
-named!(Kernel, "kernel", Gaussian => "gaussian", SoftObject => "soft-object", InverseSquare => "inverse-square");
-named!(Preset, "preset", Default => "default", SesLike => "ses-like", VdwLike => "vdw-like", Molstar => "molstar",
-    Blinn => "blinn", Quicksurf => "quicksurf");
+/// Default probe radius, that of a water molecule, Å.
+pub const DEFAULT_PROBE: f64 = 1.4;
+/// Largest probe radius that is accepted, Å.
+pub const MAX_PROBE: f64 = 10.0;
 
 /// The raw parameters of Dias, Bora and Gomes (HPDC 2010): the same formula with the same constants for every
 /// atom, radii unused. The threshold T is the isovalue.
@@ -120,8 +50,10 @@ pub enum PaperParams {
 /// Options of a surface; `None` selects the value of the preset or the default.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SurfaceOptions {
-    /// Kernel function; Gaussian by default.
-    pub kernel: Option<Kernel>,
+    /// Surface to triangulate; the Gaussian surface by default.
+    pub surface: Option<SurfaceKind>,
+    /// Radius of the probe, Å; 1.4 by default. Solvent-accessible and solvent-excluded surfaces only.
+    pub probe: Option<f64>,
     /// Grid spacing, Å; 0.5 by default.
     pub resolution: Option<f64>,
     /// Level of the density that is the surface; 1 is the surface of an isolated atom at its radius.
@@ -142,15 +74,17 @@ pub struct SurfaceOptions {
     pub paper_b: Option<f64>,
     /// The paper's `c` (inverse square: strength in Å²).
     pub paper_c: Option<f64>,
-    /// Find the nearest atom of every vertex.
+    /// Find the atom whose sphere is nearest to every vertex.
     pub atom_ids: bool,
 }
 
 /// Parameters of a run, validated.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SurfaceParams {
-    /// Kernel function.
-    pub kernel: Kernel,
+    /// Surface to triangulate.
+    pub surface: SurfaceKind,
+    /// Radius of the probe, Å.
+    pub probe: f64,
     /// Grid spacing, Å.
     pub resolution: f64,
     /// Level of the density that is the surface.
@@ -167,7 +101,7 @@ pub struct SurfaceParams {
     pub preset: Preset,
     /// The paper's raw parameters, which replace radii and smoothness.
     pub paper: Option<PaperParams>,
-    /// Find the nearest atom of every vertex.
+    /// Find the atom whose sphere is nearest to every vertex.
     pub atom_ids: bool,
     /// Deliver vertices as [`Quantized`](super::mesh::Quantized) ones with this step, which reaches as far as the
     /// surface does; else in single precision. A backend that cannot delivers single precision, which the caller may
@@ -212,6 +146,27 @@ fn reject(name: &'static str, value: Option<impl fmt::Display>, expected: &str) 
     value.map_or(Ok(()), |value| Err(bad(name, value, expected)))
 }
 
+fn quoted(preset: Preset) -> String {
+    format!("`{preset}`")
+}
+
+/// Rejects values other than the default of the parameters that shape densities.
+fn reject_density_parameters(surface: SurfaceKind, options: &SurfaceOptions) -> Result<(), SurfaceError> {
+    let why = format!("no value with surface {surface}: it shapes densities, and this surface has none");
+    reject("preset", options.preset.filter(|&preset| preset != Preset::Default).map(quoted), &why)?;
+    for (name, value, default) in [
+        ("isovalue", options.isovalue, Some(1.0)),
+        ("smoothness", options.smoothness, Some(1.25)),
+        ("cutoff_tolerance", options.cutoff_tolerance, Some(0.01)),
+        ("paper_a", options.paper_a, None),
+        ("paper_b", options.paper_b, None),
+        ("paper_c", options.paper_c, None),
+    ] {
+        reject(name, value.filter(|_| value != default), &why)?;
+    }
+    Ok(())
+}
+
 /// `value` if it is finite and within `[lo, hi]`.
 fn within(name: &'static str, value: f64, lo: f64, hi: f64) -> Result<f64, SurfaceError> {
     if (lo..=hi).contains(&value) { Ok(value) } else { Err(bad(name, value, format!("a number from {lo} to {hi}"))) }
@@ -222,18 +177,28 @@ impl SurfaceParams {
     ///
     /// # Errors
     /// [`SurfaceError::BadParameter`] names the first parameter that is out of range or does not go with the
-    /// kernel or with the paper's raw parameters.
+    /// surface or with the paper's raw parameters.
     pub fn new(options: &SurfaceOptions) -> Result<Self, SurfaceError> {
-        let kernel = options.kernel.unwrap_or_default();
+        let surface = options.surface.unwrap_or_default();
         let preset = options.preset.unwrap_or_default();
-        let paper = paper_params(kernel, options)?;
-        if kernel != Kernel::Gaussian {
-            let preset = options.preset.filter(|&p| p != Preset::Default).map(|preset| format!("`{preset}`"));
-            let why = format!("no preset with kernel {kernel}: presets set the Gaussian's smoothness");
-            reject("preset", preset, &why)?;
-            let why = format!("no value with kernel {kernel}: it shapes the gaussian kernel only");
-            reject("smoothness", options.smoothness, &why)?;
-            reject("cutoff_tolerance", options.cutoff_tolerance, &why)?;
+        let paper = match surface.kernel() {
+            Some(kernel) => paper_params(kernel, options)?,
+            None => None,
+        };
+        match surface.kernel() {
+            Some(Kernel::Gaussian) => {}
+            Some(kernel) => {
+                let why = format!("no preset with surface {kernel}: presets set the Gaussian's smoothness");
+                reject("preset", options.preset.filter(|&p| p != Preset::Default).map(quoted), &why)?;
+                let why = format!("no value with surface {kernel}: it shapes the gaussian kernel only");
+                reject("smoothness", options.smoothness, &why)?;
+                reject("cutoff_tolerance", options.cutoff_tolerance, &why)?;
+            }
+            None => reject_density_parameters(surface, options)?,
+        }
+        if !surface.has_probe() {
+            let why = format!("no value with surface {surface}: only sas and ses have a probe");
+            reject("probe", options.probe.filter(|&probe| probe != DEFAULT_PROBE), &why)?;
         }
         if paper.is_some() {
             let why = "no value together with paper_a, paper_b or paper_c: they replace radii and smoothness";
@@ -250,7 +215,8 @@ impl SurfaceParams {
             Preset::Quicksurf => (0.5, 0.824),
         };
         Ok(Self {
-            kernel,
+            surface,
+            probe: within("probe", options.probe.unwrap_or(DEFAULT_PROBE), 0.0, MAX_PROBE)?,
             resolution: within("resolution", options.resolution.unwrap_or(0.5), MIN_RESOLUTION, MAX_RESOLUTION)?,
             isovalue: within("isovalue", options.isovalue.unwrap_or(isovalue), 1e-3, 1e6)?,
             smoothness: within("smoothness", options.smoothness.unwrap_or(smoothness), 0.1, 40.0)?,
@@ -262,6 +228,22 @@ impl SurfaceParams {
             atom_ids: options.atom_ids,
             quantize: None,
         })
+    }
+
+    /// Returns the kernel of the surface for a backend that makes isosurfaces only.
+    ///
+    /// # Errors
+    /// [`SurfaceError::BadParameter`] names `surface` if that is a surface of spheres.
+    pub(crate) fn kernel_for(&self, backend: &str) -> Result<Kernel, SurfaceError> {
+        let expected =
+            || format!("one of {} from the {backend} backend; the cpu backend makes all", Kernel::NAMES.join(", "));
+        self.surface.kernel().ok_or_else(|| bad("surface", format!("`{}`", self.surface), expected()))
+    }
+
+    /// Returns the isovalue of an isosurface; `None` for a surface of spheres.
+    #[must_use]
+    pub fn level(&self) -> Option<f64> {
+        self.surface.kernel().map(|_| self.isovalue)
     }
 
     /// Bytes of the vertices and triangles of such a mesh, nearest atoms aside.

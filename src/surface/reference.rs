@@ -11,7 +11,7 @@ use super::error::SurfaceError;
 use super::kernel::{MIN_DISTANCE2, Profile};
 use super::lattice::{EDGE_MARGIN, slightly_coarser, to_f32, to_i32, to_u64};
 use super::mesh::Mesh;
-use super::params::{SurfaceLimits, SurfaceParams};
+use super::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
 use super::sink::MeshSink;
 use super::spheres::Spheres;
 
@@ -32,11 +32,13 @@ pub struct Density {
 
 impl Density {
     /// The density of `spheres` under `params`.
-    #[must_use]
-    pub fn new(spheres: &Spheres, params: &SurfaceParams) -> Self {
-        let profile = Profile::new(params);
+    ///
+    /// # Errors
+    /// [`SurfaceError::BadParameter`] if the surface has no density.
+    pub fn new(spheres: &Spheres, params: &SurfaceParams) -> Result<Self, SurfaceError> {
+        let profile = Profile::new(params.kernel_for("reference")?, params);
         let length = |i| profile.length(f64::from(spheres.radius(i)) * params.radius_scale + params.radius_offset);
-        Self { profile, spheres: (0..spheres.len()).map(|i| (spheres.centre(i), length(i))).collect() }
+        Ok(Self { profile, spheres: (0..spheres.len()).map(|i| (spheres.centre(i), length(i))).collect() })
     }
 
     /// F at `x` (Å).
@@ -64,10 +66,13 @@ impl Density {
         sum
     }
 
-    /// Index of the sphere whose centre is nearest to `x`.
+    /// Returns the index of the sphere that is nearest to `x`: the distance to its centre minus its radius is smallest.
     fn nearest(&self, x: [f64; 3]) -> u32 {
-        let distance2 = |c: &[f64; 3]| (0..3).map(|k| (x[k] - c[k]).powi(2)).sum::<f64>();
-        let best = (0_u32..).zip(&self.spheres).min_by(|(_, a), (_, b)| distance2(&a.0).total_cmp(&distance2(&b.0)));
+        let radius_per_length = self.profile.radius_per_length();
+        let distance = |(c, length): &([f64; 3], f64)| {
+            (0..3).map(|k| (x[k] - c[k]).powi(2)).sum::<f64>().sqrt() - radius_per_length * length
+        };
+        let best = (0_u32..).zip(&self.spheres).min_by(|(_, a), (_, b)| distance(a).total_cmp(&distance(b)));
         best.map_or(0, |(i, _)| i)
     }
 
@@ -121,10 +126,10 @@ impl Grid {
 /// Cells along each axis of the box that the reference samples. Nothing is allocated.
 ///
 /// # Errors
-/// [`SurfaceError::NoSpheres`].
+/// [`SurfaceError::NoSpheres`], and [`SurfaceError::BadParameter`] if the surface has no density.
 pub fn cells(spheres: &Spheres, params: &SurfaceParams) -> Result<[u64; 3], SurfaceError> {
     let unlimited = SurfaceLimits { max_samples: u64::MAX, max_mesh_bytes: u64::MAX, max_candidates: u64::MAX };
-    let grid = Grid::new(spheres, &Density::new(spheres, params), params.resolution, &unlimited)?;
+    let grid = Grid::new(spheres, &Density::new(spheres, params)?, params.resolution, &unlimited)?;
     Ok(grid.n.map(|n| n as u64 - 1))
 }
 
@@ -137,6 +142,10 @@ impl Backend for ReferenceBackend {
         "sequential reference, 1 thread, double precision".to_owned()
     }
 
+    fn makes(&self, surface: SurfaceKind) -> bool {
+        surface.kernel().is_some()
+    }
+
     fn write(
         &self,
         spheres: &Spheres,
@@ -146,7 +155,7 @@ impl Backend for ReferenceBackend {
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
         params.check_radius(spheres.radius_range().0)?;
-        let density = Density::new(spheres, params);
+        let density = Density::new(spheres, params)?;
         let grid = Grid::new(spheres, &density, params.resolution, limits)?;
         let h = params.resolution;
         let mut field = vec![0.0_f64; grid.len()];
@@ -171,7 +180,7 @@ impl Backend for ReferenceBackend {
         control.check()?;
         control.span(Stage::Emit, || mesh.triangles = triangles(&grid, &cases, &ids).into());
         if mesh.n_triangles() == 0 {
-            return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
+            return Err(SurfaceError::NoSurface { isovalue: Some(params.isovalue) });
         }
         scan::check_size(params, limits, mesh.n_vertices() as u64, mesh.n_triangles() as u64)?;
         let n = grid.len() as u64;

@@ -50,6 +50,24 @@ macro_rules! versions {
 }
 pub(super) use versions;
 
+/// Points that are evaluated together: one AVX-512 vector, two AVX ones.
+pub(super) const LANES: usize = 16;
+
+/// Returns the lowest and highest of a vector's lanes.
+#[inline(always)]
+pub(super) fn extent(lanes: &[f32; LANES]) -> [f32; 2] {
+    let (mut lo, mut hi) = (*lanes, *lanes);
+    let mut half = LANES / 2;
+    while half > 0 {
+        for i in 0..half {
+            lo[i] = if lo[i] < lo[i + half] { lo[i] } else { lo[i + half] };
+            hi[i] = if hi[i] > hi[i + half] { hi[i] } else { hi[i + half] };
+        }
+        half /= 2;
+    }
+    [lo[0], hi[0]]
+}
+
 /// `a·b + c`, fused where the target has the instruction. Without it `mul_add` is a slow library call.
 #[inline(always)]
 pub(super) fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
@@ -118,8 +136,8 @@ pub(super) mod tests {
     use crate::surface::lattice::Lattice;
     use crate::surface::occupancy::Occupancy;
     use crate::surface::{
-        Backend as _, Control, CpuBackend, Kernel, Measures, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
-        Validation,
+        Backend as _, Control, CpuBackend, Measures, Spheres, SurfaceKind, SurfaceLimits, SurfaceOptions,
+        SurfaceParams, Validation,
     };
 
     /// Instruction set of the dispatched functions.
@@ -141,16 +159,16 @@ pub(super) mod tests {
     /// Returns the arithmetic of a level and the results of all stages as text, which distinguishes all numbers.
     fn results(level: Level, spheres: &Spheres, limits: &SurfaceLimits) -> (String, Vec<String>) {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(2).start_handler(move |_| LEVEL.set(level));
-        let run = |kernel| {
+        let run = |surface| {
             let options =
-                SurfaceOptions { kernel: Some(kernel), resolution: Some(0.7), atom_ids: true, ..Default::default() };
+                SurfaceOptions { surface: Some(surface), resolution: Some(0.7), atom_ids: true, ..Default::default() };
             let (params, control) = (SurfaceParams::new(&options).unwrap(), Control::default());
             let output = CpuBackend::default().write(spheres, &params, limits, &control, None).unwrap();
             let measures = Measures::of(&output.mesh, Validation::Checksum, &control).unwrap();
             let occupancy = Occupancy::new(&Lattice::new(spheres, &params).unwrap(), limits, &control).unwrap();
             format!("{output:?}\n{measures:?}\n{occupancy:?}")
         };
-        pool.build().unwrap().install(|| (arithmetic(), Kernel::ALL.iter().copied().map(run).collect()))
+        pool.build().unwrap().install(|| (arithmetic(), SurfaceKind::ALL.iter().copied().map(run).collect()))
     }
 
     #[test]

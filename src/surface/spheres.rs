@@ -73,8 +73,7 @@ impl Spheres {
 
     /// The smallest and the largest radius, Å.
     pub(super) fn radius_range(&self) -> (f32, f32) {
-        let range = |part: &[f32]| part.iter().fold((f32::MAX, 0.0_f32), |(lo, hi), &r| (lo.min(r), hi.max(r)));
-        let parts = self.r.par_chunks(PART).map(range);
+        let parts = self.r.par_chunks(PART).map(|part| range(part, (f32::MAX, 0.0)));
         parts.reduce(|| (f32::MAX, 0.0), |a, b| (a.0.min(b.0), a.1.max(b.1)))
     }
 
@@ -82,11 +81,27 @@ impl Spheres {
     #[must_use]
     pub fn bounds(&self) -> Option<[[f64; 3]; 2]> {
         let bounds = [&self.x, &self.y, &self.z].map(|column| {
-            let range = |part: &[f64]| part.iter().fold((f64::MAX, f64::MIN), |(lo, hi), &v| (lo.min(v), hi.max(v)));
-            column.par_chunks(PART).map(range).reduce(|| (f64::MAX, f64::MIN), |a, b| (a.0.min(b.0), a.1.max(b.1)))
+            let parts = column.par_chunks(PART).map(|part| range(part, (f64::MAX, f64::MIN)));
+            parts.reduce(|| (f64::MAX, f64::MIN), |a, b| (a.0.min(b.0), a.1.max(b.1)))
         });
         (!self.is_empty()).then(|| [bounds.map(|(lo, _)| lo), bounds.map(|(_, hi)| hi)])
     }
+}
+
+/// Lowest and highest of `values` and those of `none`.
+fn range<T: Copy + PartialOrd>(values: &[T], none: (T, T)) -> (T, T) {
+    // Independent lanes: a single chain of comparisons would wait for each result.
+    let mut lanes = [none; 8];
+    for values in values.chunks(8) {
+        for ((lo, hi), &v) in lanes.iter_mut().zip(values) {
+            // `min` handles NaN, which spheres do not contain, and takes longer.
+            *lo = if v < *lo { v } else { *lo };
+            *hi = if v > *hi { v } else { *hi };
+        }
+    }
+    lanes
+        .into_iter()
+        .fold(none, |all, own| (if own.0 < all.0 { own.0 } else { all.0 }, if own.1 > all.1 { own.1 } else { all.1 }))
 }
 
 /// Spheres per task.

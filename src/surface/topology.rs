@@ -1,7 +1,5 @@
 //! The exact check of a triangle mesh's topology: every edge, and the fan of triangles around every vertex.
 
-use std::cmp::Ordering;
-
 use rayon::prelude::*;
 
 use super::control::Control;
@@ -25,77 +23,124 @@ impl Topology {
     pub(super) const fn of_closed(n_triangles: u64) -> Self {
         Self { edges: n_triangles * 3 / 2, closed: true, oriented: true, manifold: true }
     }
-}
 
-/// A directed edge with the third corner of its triangle, in an order that groups edges by their first vertex.
-type Corner = (u64, u32);
-
-fn key(from: u32, to: u32) -> u64 {
-    u64::from(from) << 32 | u64::from(to)
-}
-
-/// The two vertices of a key.
-fn ends(key: u64) -> [u32; 2] {
-    let half = |v: u64| u32::try_from(v & u64::from(u32::MAX)).unwrap_or_default();
-    [half(key >> 32), half(key)]
-}
-
-/// Memory of [`check`], bytes per triangle: 32 for each of its edges.
-pub(super) const BYTES_PER_TRIANGLE: u64 = 3 * 32;
-
-/// Checks `triangles`.
-///
-/// # Errors
-/// [`SurfaceError::Cancelled`].
-pub fn check(triangles: &[[u32; 3]], control: &Control<'_>) -> Result<Topology, SurfaceError> {
-    let corners = |&[a, b, c]: &[u32; 3]| [(key(a, b), c), (key(b, c), a), (key(c, a), b)];
-    let proceeds = |_: &_| !control.cancel.is_cancelled();
-    let mut forward: Vec<Corner> = triangles.par_iter().take_any_while(proceeds).flat_map_iter(corners).collect();
-    sort(&mut forward, control)?;
-    let mut backward: Vec<u64> = forward.par_iter().map(|(edge, _)| edge.rotate_left(32)).collect();
-    sort(&mut backward, control)?;
-    let degenerate = triangles.par_iter().any(|[a, b, c]| a == b || b == c || c == a);
-    let closed = !degenerate && forward.par_iter().map(|(edge, _)| edge).eq(backward.par_iter());
-    let oriented = forward.par_windows(2).all(|pair| pair[0].0 != pair[1].0);
-    let fans = || forward.par_chunk_by(|a, b| a.0 >> 32 == b.0 >> 32).all(one_fan);
-    let edges = count_edges(&forward, control)?;
-    control.check()?;
-    Ok(Topology { edges, closed, oriented, manifold: closed && oriented && fans() })
-}
-
-/// Distinct undirected edges.
-fn count_edges(forward: &[Corner], control: &Control<'_>) -> Result<u64, SurfaceError> {
-    let undirected = |edge: u64| {
-        let [from, to] = ends(edge);
-        key(from.min(to), from.max(to))
-    };
-    let mut edges: Vec<u64> = forward.par_iter().map(|(edge, _)| undirected(*edge)).collect();
-    sort(&mut edges, control)?;
-    edges.dedup();
-    Ok(edges.len() as u64)
-}
-
-/// Sorts `items`. Once the run is cancelled, all items compare as equal, so that the sort ends soon.
-fn sort<T: Ord + Send>(items: &mut [T], control: &Control<'_>) -> Result<(), SurfaceError> {
-    items.par_sort_unstable_by(|a, b| if control.cancel.is_cancelled() { Ordering::Equal } else { a.cmp(b) });
-    control.check()
-}
-
-/// Returns true if the triangles around one vertex form one cycle. `fan`: its outgoing edges, each with the third
-/// corner.
-fn one_fan(fan: &[Corner]) -> bool {
-    let Some(&(start, _)) = fan.first() else { return true };
-    let [vertex, first] = ends(start);
-    let mut at = first;
-    for step in 1..=fan.len() {
-        // The triangle (vertex, at, next) is followed by the one that leaves along (vertex, next).
-        match fan.binary_search_by_key(&key(vertex, at), |(edge, _)| *edge) {
-            Ok(i) => at = fan[i].1,
-            Err(_) => return false,
-        }
-        if at == first {
-            return step == fan.len();
+    /// Returns the topology of two meshes without a common edge.
+    fn and(self, other: Self) -> Self {
+        Self {
+            edges: self.edges + other.edges,
+            closed: self.closed && other.closed,
+            oriented: self.oriented && other.oriented,
+            manifold: self.manifold && other.manifold,
         }
     }
-    false
+}
+
+/// A corner of a triangle: its vertex, then the triangle's other vertices in order.
+type Corner = [u32; 3];
+
+/// Memory of `n` corners, bytes.
+fn memory(n: usize) -> u64 {
+    (n * size_of::<Corner>()) as u64
+}
+
+/// Triangles per part. Sorting their corners takes a few milliseconds.
+const PART: usize = 1 << 15;
+
+/// Checks `triangles`. Sorts the corners of each part of the triangles by vertex, then examines the vertices in as many
+/// ranges.
+///
+/// # Errors
+/// [`SurfaceError::Cancelled`], [`SurfaceError::Memory`].
+pub fn check(triangles: &[[u32; 3]], control: &Control<'_>) -> Result<Topology, SurfaceError> {
+    let _parts = control.reserve(memory(3 * triangles.len()))?;
+    let corners = |part: &[[u32; 3]]| {
+        control.check()?;
+        let mut corners: Vec<Corner> = part.iter().flat_map(|&[a, b, c]| [[a, b, c], [b, c, a], [c, a, b]]).collect();
+        corners.sort_unstable_by_key(|corner| corner[0]);
+        Ok(corners)
+    };
+    let parts: Vec<Vec<Corner>> = triangles.par_chunks(PART).map(corners).collect::<Result<_, SurfaceError>>()?;
+    let last = parts.iter().filter_map(|part| part.last()).map(|corner| corner[0] as usize).max();
+    let width = last.map_or(0, |last| last / parts.len() + 1);
+    let examined = (0..parts.len()).into_par_iter().map(|range| {
+        control.check()?;
+        let pieces = parts.iter().map(|part| {
+            let start = |range| part.partition_point(|corner| (corner[0] as usize) < range * width);
+            &part[start(range)..start(range + 1)]
+        });
+        let pieces: Vec<&[Corner]> = pieces.collect();
+        // The sort needs as much again.
+        let _corners = control.reserve(2 * memory(pieces.iter().map(|piece| piece.len()).sum()))?;
+        let mut corners = pieces.concat();
+        // The stable sort merges sorted pieces.
+        corners.sort_by_key(|corner| corner[0]);
+        let fans = corners.chunk_by_mut(|a, b| a[0] == b[0]).map(of_fan);
+        Ok(fans.fold(Topology::of_closed(0), Topology::and))
+    });
+    examined.try_reduce(|| Topology::of_closed(0), |a, b| Ok(a.and(b)))
+}
+
+/// Returns the topology of the edges at one vertex, each counted at its lower end. `fan`: all corners there.
+fn of_fan(fan: &mut [Corner]) -> Topology {
+    fan.sort_unstable();
+    let [vertex, ..] = fan[0];
+    let mut ends: Vec<u32> = fan.iter().map(|corner| corner[2]).collect();
+    ends.sort_unstable();
+    let degenerate = fan.iter().any(|[a, b, c]| a == b || b == c || c == a);
+    let closed = !degenerate && fan.iter().map(|corner| &corner[1]).eq(&ends);
+    let oriented = fan.windows(2).all(|pair| pair[0][1] != pair[1][1]);
+    if !closed {
+        ends.extend(fan.iter().map(|corner| corner[1]));
+        ends.sort_unstable();
+    }
+    ends.dedup();
+    let edges = ends.iter().filter(|end| **end >= vertex).count() as u64;
+    Topology { edges, closed, oriented, manifold: closed && oriented && is_cycle(fan) }
+}
+
+/// Returns true if the triangles around one vertex form one cycle. `fan`: its corners, in order.
+fn is_cycle(fan: &[Corner]) -> bool {
+    let [_, first, mut at] = fan[0];
+    let mut n = 1;
+    while at != first {
+        // The triangle (vertex, _, at) is followed by the one that leaves along (vertex, at).
+        let Ok(next) = fan.binary_search_by_key(&at, |corner| corner[1]) else { return false };
+        at = fan[next][2];
+        n += 1;
+    }
+    n == fan.len()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defects_of_a_mesh_of_several_parts() {
+        let n = 300;
+        let id = |i: u32, j: u32| (i * 7 % n) * n + j % n;
+        let cells = (0..n).flat_map(|i| (0..n).map(move |j| [i, j]));
+        let torus: Vec<[u32; 3]> = cells
+            .flat_map(|[i, j]| {
+                let [a, b, c, d] = [id(i, j), id(i + 1, j), id(i + 1, j + 1), id(i, j + 1)];
+                [[a, b, c], [a, c, d]]
+            })
+            .collect();
+        assert!(torus.len() > 4 * PART);
+        let whole = Topology::of_closed(torus.len() as u64);
+        let defect = |change: fn(&mut Vec<[u32; 3]>)| {
+            let mut triangles = torus.clone();
+            change(&mut triangles);
+            check(&triangles, &Control::default()).unwrap()
+        };
+        assert_eq!(defect(|_| {}), whole);
+        let open = Topology { closed: false, manifold: false, ..whole };
+        assert_eq!(defect(|triangles| triangles.truncate(triangles.len() - 1)), open);
+        let twice = Topology { oriented: false, ..open };
+        assert_eq!(defect(|triangles| triangles.push(triangles[0])), twice);
+        assert_eq!(defect(|triangles| triangles.push([9, 9, 9])), Topology { edges: whole.edges + 1, ..twice });
+        let pair = Topology { edges: whole.edges + 3, manifold: false, ..whole };
+        // Two more triangles, back to back, with one vertex of the torus.
+        assert_eq!(defect(|triangles| triangles.extend([[0, 90_000, 90_001], [0, 90_001, 90_000]])), pair);
+    }
 }

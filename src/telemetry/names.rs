@@ -81,7 +81,7 @@ metrics! {
     DEVICE_LOST = "molmesh_device_lost_total", Counter, device: "numbers of devices in use", reason: "failed|hung";
     /// Rebuilds of a device after failures, including failed attempts.
     DEVICE_REBUILDS = "molmesh_device_rebuilds_total", Counter, device: "numbers of devices in use";
-    /// Bytes of device memory held, in use and pooled.
+    /// Bytes of device memory and readback buffers held, in use, pooled and reserved.
     DEVICE_MEMORY = "molmesh_device_memory_bytes", Gauge, device: "numbers of devices in use";
     /// Jobs waiting for or running on a device.
     DEVICE_WAITING = "molmesh_device_jobs", Gauge, device: "numbers of devices in use";

@@ -48,10 +48,10 @@ await run({
     assert.deepEqual(await controls(page), names(api).sort());
     const parameters = api.paths["/v1/meshes"].post.parameters;
     parameters.push({ name: "wobble", in: "query", description: "How much it wobbles.", schema: { type: "number", minimum: 0, maximum: 1, default: 0.5 } });
-    api.components.schemas.Kernel.enum.push("cubic");
+    api.components.schemas.Surface.enum.push("cubic");
     const other = await start(chromium, { before: (p) => p.route("**/openapi.json", (route) => route.fulfill({ json: api })) });
     assert.deepEqual(await controls(other), names(api).sort());
-    assert.ok((await other.locator("#p-kernel option").allTextContents()).includes("cubic"));
+    assert.ok((await other.locator("#p-surface option").allTextContents()).includes("cubic"));
     // The service does not know it, and says so; the page offers to take it back.
     await other.locator("#parameters details.more summary").click();
     await slide(other, "wobble", 800);

@@ -57,6 +57,11 @@ fn page_works() {
 }
 
 #[test]
+fn surfaces_are_coloured_and_recoloured() {
+    drive("colors.mjs", &[], &[]);
+}
+
+#[test]
 fn failed_request_keeps_the_previous_surface() {
     drive("former.mjs", &[], &[]);
 }

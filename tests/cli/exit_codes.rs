@@ -27,10 +27,10 @@ fn bad_parameters_exit_with_2() {
         (&["--resolution", "fine"], "`fine`"),
         (&["--resolution", "NaN"], "resolution"),
         (&["--resolution", "0.000001"], "resolution"),
-        (&["--kernel", "sphere"], "gaussian, soft-object, inverse-square"),
+        (&["--surface", "sphere"], "gaussian, soft-object, inverse-square"),
         (&["--preset", "best"], "preset"),
         (&["--isovalue", "1e300"], "isovalue"),
-        (&["--kernel", "soft-object", "--smoothness", "2"], "smoothness"),
+        (&["--surface", "soft-object", "--smoothness", "2"], "smoothness"),
         (&["--paper-a", "1"], "paper_b"),
         (&["--altloc", "AB"], "altloc"),
         (&["--select", "everything"], "select"),
@@ -39,6 +39,9 @@ fn bad_parameters_exit_with_2() {
         (&["--compress", "quantize", "--format", "stl"], "glb, gltf"),
         (&["--isovalue", "900000"], "isovalue"),
     ];
+    let message = fails(rod(), &["--select", "polymer and (chain A or resi 1-)"], 2);
+    let pointed = "\n    polymer and (chain A or resi 1-)\n                                 ^";
+    assert!(message.contains("parameter `select`, character 30: found `1-`") && message.contains(pointed), "{message}");
     for (flags, part) in cases {
         let message = fails(rod(), flags, 2);
         assert!(message.contains(part), "{flags:?}: {message}");

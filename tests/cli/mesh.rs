@@ -205,7 +205,7 @@ fn json_report_has_its_fields() {
     assert_eq!(report["atoms"], 10);
     assert_eq!([&report["closed"], &report["manifold"], &report["oriented"]], [&Value::Bool(true); 3]);
     assert_eq!((&report["euler"], &report["components"]), (&2.into(), &1.into()));
-    assert_eq!((&report["kernel"], &report["resolution"]), (&"gaussian".into(), &0.5.into()));
+    assert_eq!((&report["surface"], &report["resolution"]), (&"gaussian".into(), &0.5.into()));
     // The start of a GPU would take longer than this job.
     assert_eq!(report["backend"], "cpu");
     let reason = report["backend_reason"].as_str().unwrap();
@@ -290,15 +290,15 @@ fn parameters_reach_the_mesh() {
         assert_code(&done, 0);
         json(&stdout(&done))
     };
-    assert_eq!(report(&["--kernel", "soft-object"])["kernel"], "soft-object");
+    assert_eq!(report(&["--surface", "soft-object"])["surface"], "soft-object");
     assert_eq!(report(&["--preset", "vdw-like"])["isovalue"], 1.06);
     let [fine, coarse] = ["0.25", "1"].map(|r| report(&["--resolution", r])["triangles"].as_u64().unwrap());
     assert!(fine > 10 * coarse, "{fine} {coarse}");
     let [plain, more] = ["0", "1.0"].map(|o| report(&["--radius-offset", o])["volume"].as_f64().unwrap());
     assert!(more > 1.5 * plain, "{plain} {more}");
     assert!(report(&["--radius-offset", "-0.2"])["volume"].as_f64().unwrap() < plain);
-    let raw = ["--kernel", "inverse-square", "--paper-c", "0.9", "--paper-b", "3", "--isovalue", "0.3"];
-    assert_eq!(report(&raw)["kernel"], "inverse-square");
+    let raw = ["--surface", "inverse-square", "--paper-c", "0.9", "--paper-b", "3", "--isovalue", "0.3"];
+    assert_eq!(report(&raw)["surface"], "inverse-square");
 }
 
 #[test]

@@ -56,7 +56,7 @@ fn flags_change_the_picture_and_streams_equal_files() {
         &["--background", "white"],
         &["--view", "back"],
         &["--elevation", "45"],
-        &["--kernel", "soft-object"],
+        &["--surface", "soft-object"],
         &["--radius-scale", "1.2"],
     ];
     let mut all: Vec<_> = others.iter().map(|flags| of(flags)).collect();

@@ -68,9 +68,9 @@ fn writes_the_same_bytes_as_the_usual_executable() {
     for sample in ["4pti.pdb", "1crn.cif"] {
         for (format, more) in [
             ("glb", &["--resolution", "0.5"][..]),
-            ("glb", &["--kernel", "soft-object", "--threads", "3"]),
+            ("glb", &["--surface", "soft-object", "--threads", "3"]),
             ("glb", &["--compress", "quantize", "--ligands", "--waters"]),
-            ("ply", &["--kernel", "inverse-square", "--atom-ids", "--resolution", "1"]),
+            ("ply", &["--surface", "inverse-square", "--atom-ids", "--resolution", "1"]),
             ("stl", &["--validation", "exact"]),
             ("obj", &["--normals", "none"]),
             ("obj", &["--units", "nanometer"]),

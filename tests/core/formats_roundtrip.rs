@@ -79,8 +79,12 @@ fn assert_gltf(name: &str, mesh: &Mesh, json: &Value, bin: &[u8]) {
     assert!(found == expected, "{name}");
     assert_eq!(found.colors.is_some(), mesh.colors.is_some() && !nothing, "{name}");
     for (linear, srgb) in found.colors.iter().flatten().zip(mesh.colors.iter().flatten()) {
-        assert_eq!((linear[3], linear[0] == 255, linear[1] <= srgb[1]), (srgb[3], srgb[0] == 255, true), "{name}");
-        assert_eq!(linear[2], 55, "{name}: sRGB 128 is 21.6 % in linear light");
+        assert_eq!(linear[3], 257 * u16::from(srgb[3]), "{name}");
+        for (linear, srgb) in linear.iter().zip(&srgb[..3]) {
+            let share = f64::from(*srgb) / 255.0;
+            let expected = if share <= 0.040_45 { share / 12.92 } else { ((share + 0.055) / 1.055).powf(2.4) };
+            assert!((f64::from(*linear) - 65_535.0 * expected).abs() <= 0.5, "{name}: {linear} for {srgb}");
+        }
     }
     let asset = &json["asset"];
     assert_eq!(asset["version"], "2.0");
@@ -143,7 +147,7 @@ fn ply_round_trips_every_column() {
             normals: mesh.normals.to_vec(),
             triangles: mesh.triangles.to_vec(),
             atoms: mesh.atom_ids.as_deref().map(<[_]>::to_vec),
-            colors: mesh.colors.as_deref().map(<[_]>::to_vec),
+            colors: mesh.colors.as_deref().map(|colors| colors.iter().map(|c| c.map(u16::from)).collect()),
         };
         assert!(read_ply(&bytes) == expected, "{name}");
         let (header, _) = ply_header(&bytes);
@@ -184,6 +188,9 @@ fn obj_round_trips_coordinates_to_its_decimals() {
         };
         close(&found.positions, &absolute(&mesh));
         close(&found.normals, &mesh.normals);
+        let opaque = |[r, g, b, _]: &[u8; 4]| [*r, *g, *b, 255].map(u16::from);
+        let colors = mesh.colors.as_deref().filter(|colors| !colors.is_empty());
+        assert_eq!(found.colors, colors.map(|colors| colors.iter().map(opaque).collect::<Vec<_>>()), "{name}");
     }
 }
 

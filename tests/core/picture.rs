@@ -6,6 +6,7 @@
 use crate::tools;
 
 use std::f64::consts::PI;
+use std::sync::Arc;
 
 use molmesh::picture::light::{AMBIENT, COLOR, DIFFUSE, LIGHT, linear, srgb};
 use molmesh::picture::{
@@ -19,7 +20,7 @@ fn params(style: Style, view: View) -> PictureParams {
 }
 
 fn render(mesh: &Mesh, params: &PictureParams) -> Rendered {
-    CpuRenderer.render(mesh, params, &Control::default()).unwrap()
+    CpuRenderer.render(&Arc::new(mesh.clone()), params, &Control::default()).unwrap()
 }
 
 fn image(mesh: &Mesh, params: &PictureParams) -> Image {
@@ -222,12 +223,41 @@ fn an_inverted_surface_gives_a_different_picture() {
 }
 
 #[test]
+fn vertex_colours_are_the_colours_of_the_picture() {
+    let plain = lump();
+    let of = |color: [u8; 4]| Mesh { colors: Some(vec![color; plain.n_vertices()].into()), ..plain.clone() };
+    for style in [Style::Gouraud, Style::Surface] {
+        let params = params(style, View::Front);
+        let expected = image(&plain, &params);
+        // The colour of a surface without colours of its own.
+        let [r, g, b] = molmesh::picture::light::COLOR;
+        let same = image(&of([r, g, b, 255]), &params);
+        let differs = |a: &[u8; 4], b: &[u8; 4]| a.iter().zip(b).any(|(a, b)| a.abs_diff(*b) > 1);
+        assert_eq!(expected.pixels.iter().zip(&same.pixels).filter(|(a, b)| differs(a, b)).count(), 0);
+        let green = image(&of([0, 255, 0, 255]), &params);
+        assert_eq!(silhouette(&green), silhouette(&expected));
+        assert!(green.pixels.iter().all(|p| p[0] == 0 && p[2] == 0));
+        assert!(green.pixels.iter().any(|p| p[1] > 230));
+        // Half of the vertices red, the others blue: each half of the picture has its colour.
+        let halves = plain.positions.iter().map(|p| if p[0] < 0.0 { [255, 0, 0, 255] } else { [0, 0, 255, 255] });
+        let halved = image(&Mesh { colors: Some(halves.collect()), ..plain.clone() }, &params);
+        let side = |k: usize| {
+            let covered = (0..halved.height).flat_map(|y| (0..halved.width).map(move |x| (x, y)));
+            let of_color = covered.filter(|(x, y)| halved.pixel(*x, *y)[k] > 60).map(|(x, _)| f64::from(x));
+            let all: Vec<f64> = of_color.collect();
+            all.iter().sum::<f64>() / all.len() as f64
+        };
+        assert!(side(0) + 20.0 < side(2), "{} {}", side(0), side(2));
+    }
+}
+
+#[test]
 fn the_same_pixels_on_any_number_of_threads() {
     let (mesh, params) = (lump(), params(Style::Surface, View::Principal));
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let rendered = pool.install(|| CpuRenderer.render(&mesh, &params, &Control::default()));
-        png::encode(&rendered.unwrap().image, &Control::default()).unwrap()
+        let rendered = pool.install(|| image(&mesh, &params));
+        png::encode(&rendered, &Control::default()).unwrap()
     };
     let one = on(1);
     assert_eq!(one, on(2));
@@ -279,10 +309,10 @@ fn cancelled_runs_and_quantized_meshes_are_errors() {
     cancel.cancel();
     let control = Control { cancel, ..Control::default() };
     let params = params(Style::Surface, View::Principal);
-    assert_eq!(CpuRenderer.render(&mesh, &params, &control), Err(PictureError::Cancelled));
+    assert_eq!(CpuRenderer.render(&Arc::new(mesh.clone()), &params, &control), Err(PictureError::Cancelled));
     let mut packed = mesh.clone();
     packed.quantize(Step::covering(20.0));
-    let refused = CpuRenderer.render(&packed, &params, &Control::default());
+    let refused = CpuRenderer.render(&Arc::new(packed), &params, &Control::default());
     assert_eq!(refused, Err(PictureError::Quantized));
 }
 

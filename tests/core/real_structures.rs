@@ -1,4 +1,4 @@
-//! End-to-end tests of real structures. Every kernel yields a closed, oriented manifold by the exact check and by
+//! End-to-end tests of real structures. Every surface yields a closed, oriented manifold by the exact check and by
 //! trimesh; the same bytes with 1, 2 and 7 threads; the same surface with permuted atoms; valid glTF.
 //!
 //! The samples always run. Structures in a folder beside the repository run too: those of up to [`EVERYDAY`] atoms on
@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use molmesh::formats::{Format, Meta};
 use molmesh::structure::{self, ReadLimits, Selection, StructureError};
 use molmesh::surface::{
-    Backend, Control, CpuBackend, Kernel, Measures, Mesh, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    Backend, Control, CpuBackend, Measures, Mesh, Spheres, SurfaceKind, SurfaceLimits, SurfaceOptions, SurfaceParams,
     Validation,
 };
 use tools::files::encoded;
@@ -69,8 +69,8 @@ fn cases() -> Vec<Case> {
     cases
 }
 
-fn mesh(spheres: &Spheres, kernel: Kernel, resolution: f64, threads: usize) -> Mesh {
-    let options = SurfaceOptions { kernel: Some(kernel), resolution: Some(resolution), ..SurfaceOptions::default() };
+fn mesh(spheres: &Spheres, surface: SurfaceKind, resolution: f64, threads: usize) -> Mesh {
+    let options = SurfaceOptions { surface: Some(surface), resolution: Some(resolution), ..SurfaceOptions::default() };
     let params = SurfaceParams::new(&options).unwrap();
     let backend = CpuBackend::new(Some(threads)).unwrap();
     backend.run(spheres, &params, &SurfaceLimits::default(), &Control::default()).unwrap().mesh
@@ -90,14 +90,14 @@ fn gcd(a: usize, b: usize) -> usize {
 }
 
 #[test]
-fn every_structure_and_kernel_gives_a_closed_oriented_manifold() {
+fn every_structure_and_surface_gives_a_closed_oriented_manifold() {
     let dir = tempfile::tempdir().unwrap();
     for case in cases() {
         let mut files = Vec::new();
-        for kernel in Kernel::ALL.iter().copied() {
+        for surface in SurfaceKind::ALL.iter().copied() {
             for resolution in [1.0, 0.5] {
-                let what = format!("{} {kernel} {resolution}", case.name);
-                let mesh = mesh(&case.spheres, kernel, resolution, 2);
+                let what = format!("{} {surface} {resolution}", case.name);
+                let mesh = mesh(&case.spheres, surface, resolution, 2);
                 let exact = Measures::of(&mesh, Validation::Exact, &Control::default()).unwrap();
                 let quick = Measures::of(&mesh, Validation::Checksum, &Control::default()).unwrap();
                 assert!(exact.closed && exact.oriented && exact.manifold, "{what}: {exact:?}");
@@ -112,7 +112,7 @@ fn every_structure_and_kernel_gives_a_closed_oriented_manifold() {
                     eprintln!("SKIPPED: trimesh on {what}: {} triangles", mesh.n_triangles());
                     continue;
                 }
-                let path = dir.path().join(format!("{}-{kernel}-{resolution}.ply", case.name));
+                let path = dir.path().join(format!("{}-{surface}-{resolution}.ply", case.name));
                 std::fs::write(&path, encoded(Format::Ply, &mesh, &Meta::default())).unwrap();
                 files.push((path, exact));
             }
@@ -150,20 +150,20 @@ fn outward(mesh: &Mesh) -> f64 {
 #[test]
 fn the_same_bytes_with_1_2_and_7_threads_and_the_same_surface_permuted() {
     for case in cases() {
-        for kernel in Kernel::ALL.iter().copied() {
-            let one = mesh(&case.spheres, kernel, 1.0, 1);
+        for surface in SurfaceKind::ALL.iter().copied() {
+            let one = mesh(&case.spheres, surface, 1.0, 1);
             for threads in [2, 7] {
-                assert!(one == mesh(&case.spheres, kernel, 1.0, threads), "{} {kernel} {threads} threads", case.name);
+                assert!(one == mesh(&case.spheres, surface, 1.0, threads), "{} {surface} {threads} threads", case.name);
             }
-            let other = mesh(&permuted(&case.spheres), kernel, 1.0, 2);
-            assert!(one.triangles == other.triangles, "{} {kernel}: topology", case.name);
+            let other = mesh(&permuted(&case.spheres), surface, 1.0, 2);
+            assert!(one.triangles == other.triangles, "{} {surface}: topology", case.name);
             let furthest = one
                 .positions
                 .iter()
                 .zip(&other.positions)
                 .flat_map(|(p, q)| (0..3).map(|k| (p[k] - q[k]).abs()))
                 .fold(0.0, f32::max);
-            assert!(furthest <= 1e-4, "{} {kernel}: {furthest} Å", case.name);
+            assert!(furthest <= 1e-4, "{} {surface}: {furthest} Å", case.name);
         }
     }
 }
@@ -174,7 +174,7 @@ fn every_structure_gives_valid_gltf() {
     let mut paths = Vec::new();
     for case in cases() {
         for format in [Format::Glb, Format::Gltf] {
-            let mesh = mesh(&case.spheres, Kernel::Gaussian, 1.0, 2);
+            let mesh = mesh(&case.spheres, SurfaceKind::Gaussian, 1.0, 2);
             let path = dir.path().join(format!("{}.{}", case.name, format.extension()));
             std::fs::write(&path, encoded(format, &mesh, &Meta::default())).unwrap();
             paths.push(path);

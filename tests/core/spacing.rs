@@ -66,7 +66,7 @@ fn the_limit_holds_for_every_structure_and_kernel() {
             for limit in [40_u64, 700, 9000, 60_000] {
                 let text = limit.to_string();
                 let case = format!("{name} {kernel} {limit}");
-                let bounded = product(&input, &[("kernel", kernel), ("max_triangles", &text)]);
+                let bounded = product(&input, &[("surface", kernel), ("max_triangles", &text)]);
                 let Product { mesh, report, .. } = match bounded {
                     Ok(product) => product,
                     Err(JobError::Surface(SurfaceError::TooManyTriangles {
@@ -80,7 +80,7 @@ fn the_limit_holds_for_every_structure_and_kernel() {
                         assert!(reported == limit && triangles > limit, "{case}: {triangles}");
                         assert!(name == "scattered" || resolution.total_cmp(&COARSEST).is_eq(), "{case}: {resolution}");
                         let text = resolution.to_string();
-                        let at_resolution = report(&input, &[("kernel", kernel), ("resolution", &text)]);
+                        let at_resolution = report(&input, &[("surface", kernel), ("resolution", &text)]);
                         assert_eq!(at_resolution.triangles, triangles, "{case}");
                         continue;
                     }
@@ -102,7 +102,7 @@ fn the_limit_holds_for_every_structure_and_kernel() {
                 }
                 // The same spacing as an explicit parameter gives the same mesh.
                 let resolution = report.resolution.to_string();
-                let same = product(&input, &[("kernel", kernel), ("resolution", &resolution)]).unwrap().mesh;
+                let same = product(&input, &[("surface", kernel), ("resolution", &resolution)]).unwrap().mesh;
                 assert!(same.positions[..] == mesh.positions[..] && same.triangles[..] == mesh.triangles[..], "{case}");
             }
         }

@@ -335,7 +335,7 @@ fn entities_or_sequence_numbers_decide_which_hetatm_records_are_polymer() {
         let s = bcif(&file(vec![block("a", categories)]));
         (s.kind, s.warnings.join("\n"))
     };
-    let (first, second) = (vec![Kind::Polymer, Kind::Ligand], vec![Kind::Ligand, Kind::Polymer]);
+    let (first, second) = (vec![Kind::Protein, Kind::Ligand], vec![Kind::Ligand, Kind::Polymer]);
     let none = String::new();
     assert_eq!(kinds(vec![site(numbered())]), (first.clone(), none.clone()));
     assert_eq!(
@@ -606,7 +606,8 @@ fn checks_limits_before_allocation() {
         let all = ["Cartn_x", "Cartn_y", "Cartn_z", "auth_seq_id"].map(runs).to_vec();
         file(vec![block("x", vec![category("_atom_site", rows, all)])])
     };
-    let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 10_000, max_duplicates: 10_000 };
+    let limits =
+        ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 10_000, max_duplicates: 10_000, max_copies: 1000 };
     assert!(bomb(n).len() < 1500);
     assert_eq!(read(&bomb(n), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
     assert_eq!(read(&bomb(i64::MAX), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));

@@ -26,7 +26,7 @@ fn gzip(data: &[u8]) -> Vec<u8> {
 }
 
 fn limits() -> ReadLimits {
-    ReadLimits { max_inflated_bytes: 64 << 20, max_atoms: 2_000_000, max_duplicates: u64::MAX }
+    ReadLimits { max_inflated_bytes: 64 << 20, max_atoms: 2_000_000, max_duplicates: u64::MAX, max_copies: 1000 }
 }
 
 /// Serializes the tests that measure time.
@@ -228,7 +228,7 @@ fn reads_a_hundred_thousand_of_everything() {
         let missing =
             select(&s, &Selection { chains: Some(vec!["none".to_owned()]), ..Selection::default() }).unwrap_err();
         let no_model = select(&s, &Selection { model: Some(-1), ..Selection::default() }).unwrap_err();
-        let empty = select(&s, &Selection { polymer: false, waters: true, ..Selection::default() }).unwrap_err();
+        let empty = select(&s, &Selection { atoms: "water".parse().unwrap(), ..Selection::default() }).unwrap_err();
         for error in [missing, no_model, empty] {
             assert!(error.to_string().len() < 8000, "{name}: {error}");
         }
@@ -407,7 +407,7 @@ proptest::proptest! {
                 let columns = [s.x.len(), s.name.len(), s.residue.len(), s.chain.len(), s.altloc.len(), s.hetero.len()];
                 proptest::prop_assert!(columns.iter().all(|&n| n == s.len()));
                 proptest::prop_assert!(s.x.iter().chain(&s.y).chain(&s.z).all(|v| v.abs() <= 100_000.0));
-                drop(select(&s, &Selection { hydrogens: true, ligands: true, waters: true, ..Selection::default() }));
+                drop(select(&s, &Selection { atoms: "all".parse().unwrap(), ..Selection::default() }));
             }
         }
     }

@@ -58,8 +58,9 @@ fn names(s: &Structure) -> Vec<(String, String)> {
     (0..s.len()).map(|i| (s.chain.get(i).to_owned(), s.residue.get(i).to_owned())).collect()
 }
 
-/// Reads a file with gemmi. Returns chain, residue name and selection of each atom of the first model, in file order.
-fn gemmi(text: &str, extension: &str) -> Option<Vec<(String, String, bool)>> {
+/// Reads a file with gemmi. Returns chain, residue name, selection and kind of each atom of the first model, in file
+/// order.
+fn gemmi(text: &str, extension: &str) -> Option<Vec<(String, String, bool, String)>> {
     let python = tools::python_interpreter().or_else(|| tools::missing("gemmi"))?;
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join(format!("input.{extension}"));
@@ -69,7 +70,7 @@ fn gemmi(text: &str, extension: &str) -> Option<Vec<(String, String, bool)>> {
     let rows = String::from_utf8(output.stdout).unwrap();
     let rows = rows.lines().skip(1).map(|row| {
         let fields: Vec<&str> = row.split('\t').collect();
-        (fields[0].to_owned(), fields[3].to_owned(), fields[13] == "1")
+        (fields[0].to_owned(), fields[3].to_owned(), fields[13] == "1", fields[14].to_owned())
     });
     Some(rows.collect())
 }
@@ -82,7 +83,8 @@ fn ours(s: &Structure) -> Vec<(String, String, bool)> {
 
 /// Compares with gemmi, ignoring the order, since gemmi moves water to the end of its chain.
 fn agrees_with_gemmi(text: &str, extension: &str) -> Option<bool> {
-    let mut theirs = gemmi(text, extension)?;
+    let rows = gemmi(text, extension)?.into_iter();
+    let mut theirs: Vec<_> = rows.map(|(chain, residue, taken, _)| (chain, residue, taken)).collect();
     let mut ours = ours(&structure(text));
     theirs.sort();
     ours.sort();
@@ -227,7 +229,8 @@ fn a_residue_with_peptide_bonds_is_polymer() {
     // Control: the same residue 10 Å away is a ligand, unless the file lists it.
     let apart = structure(modified("MSE", "", 10.0));
     assert_eq!(selected(&apart).len(), POLYMER - 8);
-    assert_eq!(left_out(&apart).residues, [("HOH".to_owned(), 60), ("MSE".to_owned(), 8)]);
+    assert_eq!(left_out(&apart).residues, [("HOH".to_owned(), Kind::Water, 60), ("MSE".to_owned(), Kind::Ligand, 8)]);
+    assert_eq!(left_out(&apart).kinds, [(Kind::Water, 60), (Kind::Ligand, 8)]);
     for listed in ["SEQRES   5 A   58  ARG MSE CYS GLY GLY ALA\n", "MODRES 4PTI MSE A   52  MET  SELENOMETHIONINE\n"] {
         assert_eq!(selected(&structure(modified("MSE", listed, 10.0))).len(), POLYMER, "{listed}");
         let other_chain = listed.replace(" A   5", " B   5");
@@ -377,14 +380,154 @@ fn line(record: &str, name: &str, residue: &str, number: i32, x: f64, element: &
 }
 
 #[test]
-fn single_ions_are_ligands_in_any_record() {
-    for (name, residue) in [("NA  ", "NA"), ("CL  ", "CL-"), ("SOD ", "SOD"), (" K  ", "K+"), ("ZN  ", "ZN2")] {
-        let s = structure(line("ATOM", name, residue, 1, 0.0, ""));
-        assert_eq!(s.kind, [Kind::Ligand], "{residue}");
+fn single_ions_are_ions_in_any_record() {
+    for (name, residue) in [
+        ("NA  ", "NA"),
+        ("CL  ", "CL-"),
+        ("SOD ", "SOD"),
+        ("CLA ", "CLA"),
+        (" K  ", "K+"),
+        ("ZN  ", "ZN2"),
+        ("FE  ", "FE2"),
+        ("YB  ", "YB"),
+        (" I  ", "IOD"),
+    ] {
+        for record in ["ATOM", "HETATM"] {
+            let s = structure(line(record, name, residue, 1, 0.0, ""));
+            assert_eq!(s.kind, [Kind::Ion], "{record} {residue}");
+        }
     }
-    for residue in ["ALA", "DC", "RU", "C", "LIG", "POPC"] {
-        assert_eq!(structure(line("ATOM", " C1 ", residue, 1, 0.0, "")).kind, [Kind::Polymer], "{residue}");
+    // Two ions with the same residue number, and a chlorophyll with the name of CHARMM's chloride.
+    let pair = line("HETATM", "NA  ", "NA", 1, 0.0, "NA") + &line("HETATM", "CL  ", "CL", 1, 9.0, "CL");
+    assert_eq!(structure(pair).kind, [Kind::Ion; 2]);
+    let chlorophyll = line("HETATM", "MG  ", "CLA", 1, 0.0, "MG") + &line("HETATM", " CHA", "CLA", 1, 3.0, "C");
+    assert_eq!(structure(chlorophyll).kind, [Kind::Cofactor; 2]);
+    // Control: a residue of neither metals nor halogens, and alpha carbons.
+    for (name, residue, element, kind) in [
+        (" O  ", "O", "O", Kind::Ligand),
+        ("XE  ", "XE", "XE", Kind::Ligand),
+        ("SE  ", "MSE", "SE", Kind::Ligand),
+        ("BR  ", "5BU", "C", Kind::Ligand),
+    ] {
+        assert_eq!(structure(line("HETATM", name, residue, 1, 0.0, element)).kind, [kind], "{residue}");
     }
+    for (residue, kind) in [
+        ("ALA", Kind::Protein),
+        ("DC", Kind::Nucleic),
+        ("RU", Kind::Nucleic),
+        ("C", Kind::Nucleic),
+        ("LIG", Kind::Polymer),
+        ("POPC", Kind::Polymer),
+        ("HEM", Kind::Cofactor),
+        ("NAG", Kind::Glycan),
+    ] {
+        assert_eq!(structure(line("ATOM", " C1 ", residue, 1, 0.0, "")).kind, [kind], "{residue}");
+    }
+}
+
+#[test]
+fn residues_of_polymers_are_protein_or_nucleic_by_name_backbone_or_neighbour() {
+    let residue = |record: &str, name: &str, number: i32, atoms: &[&str]| -> String {
+        let x = 3.8 * f64::from(number);
+        // The last atom of each residue lies 1.3 Å before the first one of the next.
+        let at = |i: usize| if i + 1 == atoms.len() { x + 2.5 } else { x + 0.1 * i as f64 };
+        atoms
+            .iter()
+            .enumerate()
+            .map(|(i, atom)| line(record, &format!(" {atom:<3}"), name, number, at(i), "C"))
+            .collect()
+    };
+    let kinds = |text: String| {
+        let mut kinds = structure(text).kind;
+        kinds.dedup();
+        kinds
+    };
+    let amino = ["N", "CA", "C"];
+    let nucleotide = ["P", "C1'", "O3'"];
+    assert_eq!(kinds(residue("ATOM", "XAA", 1, &amino)), [Kind::Protein], "an unknown amino acid");
+    assert_eq!(kinds(residue("ATOM", "XAA", 1, &["CA"])), [Kind::Protein], "an alpha carbon alone");
+    assert_eq!(kinds(residue("ATOM", "XN", 1, &nucleotide)), [Kind::Nucleic], "an unknown nucleotide");
+    assert_eq!(kinds(residue("ATOM", "XSP", 1, &["N", "CA", "P", "C"])), [Kind::Protein], "a phosphorylated residue");
+    assert_eq!(kinds(residue("ATOM", "QQQ", 1, &["C1", "C2"])), [Kind::Polymer]);
+    // A chromophore has neither backbone. It has the kind of the preceding residue if the file declares it polymer.
+    let chromophore = |record| residue("ATOM", "GLY", 1, &amino) + &residue(record, "CRO", 2, &["N1", "CA1", "C3"]);
+    let listed = "SEQRES   1 A    2  GLY CRO\n".to_owned();
+    assert_eq!(kinds(listed.clone() + &chromophore("HETATM")), [Kind::Protein]);
+    assert_eq!(kinds(listed + &chromophore("ATOM")), [Kind::Protein]);
+    assert_eq!(kinds(chromophore("ATOM")), [Kind::Protein, Kind::Polymer]);
+    assert_eq!(kinds(chromophore("HETATM")), [Kind::Protein, Kind::Ligand]);
+    // A cofactor or saccharide in the sequence of the file is part of the polymer.
+    for name in ["PNS", "NAG"] {
+        let text = residue("ATOM", "GLY", 1, &amino) + &residue("ATOM", name, 2, &["C1", "C2"]);
+        let other = if name == "NAG" { Kind::Glycan } else { Kind::Cofactor };
+        assert_eq!(kinds(text.clone()), [Kind::Protein, other]);
+        assert_eq!(kinds(format!("SEQRES   1 A    2  GLY {name}\n{text}")), [Kind::Protein]);
+    }
+}
+
+#[test]
+fn branched_entities_are_glycans() {
+    let items = "id group_PDB type_symbol label_atom_id label_comp_id label_asym_id label_entity_id auth_asym_id \
+                 auth_seq_id label_alt_id label_seq_id pdbx_PDB_model_num Cartn_x Cartn_y Cartn_z";
+    let tags: String = items.split_whitespace().map(|item| format!("_atom_site.{item}\n")).collect();
+    let rows = "1 HETATM C C1 QQQ B 1 B 1 . . 1 0 0 0\n2 HETATM O O1 QQQ B 1 B 1 . . 1 1.4 0 0\n";
+    let file = |kind: &str| {
+        let entities = format!("loop_\n_entity.id\n_entity.type\n1 {kind}\n");
+        format!("data_x\n{entities}loop_\n_struct_asym.id\n_struct_asym.entity_id\nB 1\nloop_\n{tags}{rows}")
+    };
+    for (entity, kind) in [("branched", Kind::Glycan), ("non-polymer", Kind::Ligand), ("polymer", Kind::Polymer)] {
+        assert_eq!(structure(file(entity)).kind, [kind; 2], "{entity}");
+        if let Some(rows) = gemmi(&file(entity), "cif") {
+            assert!(rows.iter().all(|row| row.3 == kind.name()), "{entity}: {rows:?}");
+        }
+    }
+}
+
+/// A protein, a nucleotide, a cofactor, a saccharide, a ligand, two ions and water, in records of both types.
+fn mixture() -> String {
+    let mut text = PDB.replace("END", "REMARK");
+    for (record, name, residue, number, element) in [
+        ("ATOM", " P  ", " DA", 300, "P"),
+        ("ATOM", " C1'", " DA", 300, "C"),
+        ("HETATM", "FE  ", "HEM", 400, "FE"),
+        ("HETATM", " NA ", "HEM", 400, "N"),
+        ("HETATM", " C1 ", "NAG", 401, "C"),
+        ("HETATM", " O1 ", "NAG", 401, "O"),
+        ("HETATM", " C1 ", "STI", 402, "C"),
+        ("HETATM", " N1 ", "STI", 402, "N"),
+        ("HETATM", "ZN  ", " ZN", 403, "ZN"),
+        ("ATOM", "CL  ", " CL", 404, "CL"),
+        ("HETATM", " S  ", "SO4", 405, "S"),
+        ("HETATM", " O1 ", "SO4", 405, "O"),
+    ] {
+        text += &line(record, name, residue, number, 100.0 + 10.0 * f64::from(text.len() as u32 % 97), element);
+    }
+    text
+}
+
+#[test]
+fn gemmi_and_biotite_assign_the_same_kinds() {
+    let mut expected: Vec<(String, String)> = Vec::new();
+    let s = structure(mixture());
+    let all: Vec<Kind> = s.kind.iter().copied().filter(|kind| *kind != Kind::Water).collect();
+    use Kind::{Cofactor, Glycan, Ion, Ligand, Nucleic};
+    let tail = [Nucleic, Nucleic, Cofactor, Cofactor, Glycan, Glycan, Ligand, Ligand, Ion, Ion, Ligand, Ligand];
+    assert_eq!(all[POLYMER..], tail);
+    assert!(all[..POLYMER].iter().all(|kind| *kind == Kind::Protein));
+    let counts = Contents::of(&s, None).counts;
+    assert_eq!((counts.polymer, counts.protein, counts.nucleic), (456, 454, 2));
+    assert_eq!((counts.ligand, counts.cofactor, counts.glycan, counts.ion, counts.water), (8, 2, 2, 2, 60));
+    let found = left_out(&s);
+    assert_eq!(found.kinds[..2], [(Kind::Water, 60), (Kind::Ligand, 4)]);
+    assert_eq!(found.total(), 70);
+    for (kind, (_, residue)) in s.kind.iter().zip(names(&s)) {
+        expected.push((residue, kind.name().replace("cofactor", "ligand")));
+    }
+    let Some(rows) = gemmi(&mixture(), "pdb") else { return };
+    let mut theirs: Vec<_> = rows.into_iter().map(|(_, residue, _, kind)| (residue, kind)).collect();
+    theirs.sort();
+    expected.sort();
+    assert_eq!(theirs, expected);
 }
 
 #[test]
@@ -407,8 +550,7 @@ fn virtual_sites_are_not_atoms() {
         for record in ["ATOM", "HETATM"] {
             let s = structure(line(record, name, residue, 1, 0.0, ""));
             assert_eq!(s.kind, [Kind::VirtualSite], "{name} in {residue}");
-            let mut all = Selection::default();
-            all.set_kinds("all").unwrap();
+            let all = Selection { atoms: "all".parse().unwrap(), ..Selection::default() };
             assert!(select(&s, &all).unwrap_err().to_string().contains("1 virtual sites"), "{name} in {residue}");
         }
     }
@@ -452,7 +594,7 @@ fn counts_virtual_sites_of_mmcif_separately() {
     assert_eq!((counts.polymer, counts.water, counts.hydrogens, counts.virtual_sites, counts.total()), (1, 1, 2, 1, 5));
     let left_out = left_out(&s);
     assert_eq!((left_out.total(), left_out.virtual_sites), (4, 1));
-    assert_eq!(left_out.residues, [("SOL".to_owned(), 3)]);
+    assert_eq!(left_out.residues, [("SOL".to_owned(), Kind::Water, 3)]);
 }
 
 // ---- what is left out ----
@@ -470,7 +612,10 @@ fn counts_atoms_left_out_once_and_bounds_the_names() {
     let s = structure(&text);
     let found = left_out(&s);
     assert_eq!(found.residues.len(), 10);
-    assert_eq!(found.residues[..3], [("HOH".to_owned(), 60), ("L14".to_owned(), 15), ("L13".to_owned(), 14)]);
+    let named = |name: &str, kind, n| (name.to_owned(), kind, n);
+    let first = [named("HOH", Kind::Water, 60), named("L14", Kind::Ligand, 15), named("L13", Kind::Ligand, 14)];
+    assert_eq!(found.residues[..3], first);
+    assert_eq!(found.kinds, [(Kind::Ligand, (1..=15).sum::<u64>()), (Kind::Water, 60)]);
     assert_eq!(found.other_residues, (1..=6).sum::<u64>());
     assert_eq!((found.hydrogens, found.alternatives, found.other_chains, found.virtual_sites), (1, 1, 0, 0));
     assert_eq!(found.total() as usize + selected(&s).len(), s.len());

@@ -183,6 +183,7 @@ const DISAGREEMENTS: &[(&str, &str, usize, &str)] = &[
     ("md_1tw7_charmm.pdb.gz", "code", 17_178, "the same: no insertion code is a digit"),
     ("md_1tw7_charmm.pdb.gz", "residue", 47_175, "TIP3 is a name of four letters, gemmi cuts it to three"),
     ("md_1tw7_charmm.pdb.gz", "element", 8, "CLA in CLA is CHARMM's chloride, gemmi takes it for carbon"),
+    ("md_1tw7_charmm.pdb.gz", "kind", 8, "the same: chlorides are ions"),
     (
         "odd_a_structure.pdb.gz",
         "element",
@@ -195,12 +196,13 @@ const DISAGREEMENTS: &[(&str, &str, usize, &str)] = &[
         8,
         "a pyroglutamic acid in HETATM records that is alone in its model is a ligand",
     ),
+    ("odd_a_structure.pdb.gz", "kind", 9, "the same: gemmi decides by the name"),
     ("odd_occupancy.pdb.gz", "b", 1, "a B-factor that is left out is 0 here and 20 in gemmi"),
 ];
 
 /// Compared fields of an atom by name, except the position.
-const FIELDS: [&str; 11] =
-    ["chain", "number", "code", "residue", "name", "altloc", "element", "occupancy", "b", "hetero", "selected"];
+const FIELDS: [&str; 12] =
+    ["chain", "number", "code", "residue", "name", "altloc", "element", "occupancy", "b", "hetero", "selected", "kind"];
 
 type Rows = Vec<([i64; 3], Vec<String>)>;
 
@@ -228,6 +230,8 @@ fn ours(s: &Structure) -> Rows {
                 format!("{:.4}", s.b_factor[i]),
                 flag(s.hetero[i]),
                 flag(selected.binary_search(&(i as u32)).is_ok()),
+                // The other programs do not distinguish cofactors.
+                s.kind[i].name().replace("cofactor", "ligand"),
             ];
             (place(s.x[i], s.y[i], s.z[i]), fields)
         })

@@ -27,7 +27,8 @@ fn spheres(rows: &[[f64; 4]]) -> Spheres {
 }
 
 fn params(kernel: Kernel, resolution: f64) -> SurfaceParams {
-    let options = SurfaceOptions { kernel: Some(kernel), resolution: Some(resolution), ..SurfaceOptions::default() };
+    let options =
+        SurfaceOptions { surface: Some(kernel.into()), resolution: Some(resolution), ..SurfaceOptions::default() };
     SurfaceParams::new(&options).unwrap()
 }
 
@@ -166,7 +167,7 @@ fn two_atom_truth(density: &Density, iso: f64, half_length: f64) -> (f64, f64) {
 fn two_overlapping_atoms_converge_to_the_integrated_truth() {
     let at = spheres(&[[-0.8, 0.0, 0.0, 1.7], [0.8, 0.0, 0.0, 1.7]]);
     for kernel in KERNELS {
-        let density = Density::new(&at, &params(kernel, 0.5));
+        let density = Density::new(&at, &params(kernel, 0.5)).unwrap();
         let (area, volume) = two_atom_truth(&density, 1.0, 2.5);
         let (mut areas, mut volumes) = (Vec::new(), Vec::new());
         for h in [0.4, 0.2, 0.1, 0.05] {
@@ -187,7 +188,7 @@ fn vertices_and_normals_agree_with_the_brute_force_field() {
     for kernel in KERNELS {
         for h in [0.5, 0.37, 1.0] {
             let params = params(kernel, h);
-            let density = Density::new(&at, &params);
+            let density = Density::new(&at, &params).unwrap();
             let meshed = run(&at, &params);
             assert_sound(&meshed, kernel.name());
             let mut worst = (0.0_f64, 0.0_f64);
@@ -226,7 +227,7 @@ fn the_gradient_is_the_derivative_of_the_field() {
     let at = spheres(&rows);
     let mut random = Random(5);
     for kernel in KERNELS {
-        let density = Density::new(&at, &params(kernel, 0.5));
+        let density = Density::new(&at, &params(kernel, 0.5)).unwrap();
         for _ in 0..200 {
             let x: [f64; 3] = std::array::from_fn(|_| random.next() * 9.0);
             let g = density.gradient(x);
@@ -388,19 +389,34 @@ fn a_hollow_shell_has_a_void() {
 
 #[test]
 fn atom_indices_name_the_nearest_atom_of_each_vertex() {
-    let rows = Random(13).cloud(400, 20.0);
+    let mut random = Random(13);
+    let rows: Vec<[f64; 4]> =
+        random.cloud(400, 20.0).into_iter().map(|[x, y, z, r]| [x, y, z, 1.5 * r - 0.7]).collect();
     let at = spheres(&rows);
-    let params = SurfaceParams { atom_ids: true, ..params(Kernel::Gaussian, 0.5) };
-    let mesh = run(&at, &params).mesh;
-    let ids = mesh.atom_ids.as_ref().unwrap();
-    assert_eq!(ids.len(), mesh.n_vertices());
-    let mut right = 0;
-    for (p, &id) in mesh.positions.iter().zip(ids.iter()) {
-        let d2 = |row: &[f64; 4]| (0..3).map(|k| (f64::from(p[k]) + mesh.centre[k] - row[k]).powi(2)).sum::<f64>();
-        let best = rows.iter().map(d2).fold(f64::MAX, f64::min);
-        right += usize::from(d2(&rows[id as usize]) <= best + 1e-4);
+    for kernel in [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare] {
+        let params = SurfaceParams { atom_ids: true, radius_scale: 1.1, radius_offset: 0.2, ..params(kernel, 0.5) };
+        let run_on = |backend: &dyn Backend| {
+            backend.run(&at, &params, &SurfaceLimits::default(), &Control::default()).unwrap().mesh
+        };
+        for mesh in [run_on(&CpuBackend::new(Some(2)).unwrap()), run_on(&ReferenceBackend)] {
+            let ids = mesh.atom_ids.as_ref().unwrap();
+            assert_eq!(ids.len(), mesh.n_vertices());
+            let (mut wrong, mut not_nearest_centre) = (0, 0);
+            for (p, &id) in mesh.positions.iter().zip(ids.iter()) {
+                let centre = |row: &[f64; 4]| {
+                    (0..3).map(|k| (f64::from(p[k]) + mesh.centre[k] - row[k]).powi(2)).sum::<f64>().sqrt()
+                };
+                let surface = |row: &[f64; 4]| centre(row) - (1.1 * f64::from(row[3] as f32) + 0.2);
+                let least = |distance: &dyn Fn(&[f64; 4]) -> f64| rows.iter().map(distance).fold(f64::MAX, f64::min);
+                let named = &rows[id as usize];
+                wrong += usize::from(surface(named) > least(&surface) + 1e-4);
+                not_nearest_centre += usize::from(centre(named) > least(&centre) + 1e-4);
+            }
+            assert_eq!(wrong, 0, "{kernel:?}");
+            // The two distances give different atoms.
+            assert!(not_nearest_centre * 20 > ids.len(), "{kernel:?}: {not_nearest_centre} of {}", ids.len());
+        }
     }
-    assert_eq!(right, ids.len());
 }
 
 /// Returns the grid spacing that an error suggests.
@@ -605,8 +621,11 @@ fn every_vertex_is_within_the_extent_known_in_advance() {
     for at in [spheres(&[[0.3, 0.2, 0.1, 1.7]]), spheres(&Random(8).cloud(60, 25.0)), far] {
         for kernel in Kernel::ALL {
             for h in [0.31, 1.0] {
-                let mut options =
-                    SurfaceOptions { kernel: Some(*kernel), resolution: Some(h), ..SurfaceOptions::default() };
+                let mut options = SurfaceOptions {
+                    surface: Some((*kernel).into()),
+                    resolution: Some(h),
+                    ..SurfaceOptions::default()
+                };
                 // At a low level the surface is closest to the support of the densities.
                 for isovalue in [None, Some(0.001)] {
                     options.isovalue = isovalue;
@@ -659,7 +678,7 @@ fn empty_and_invalid_input_is_rejected() {
     assert_eq!(run(&empty, &params(Kernel::Gaussian, 0.5)), SurfaceError::NoSpheres);
     let one = spheres(&[[0.3, 0.3, 0.3, 1.7]]);
     let high = SurfaceParams { isovalue: 50.0, ..params(Kernel::Gaussian, 0.5) };
-    assert_eq!(run(&one, &high), SurfaceError::NoSurface { isovalue: 50.0 });
+    assert_eq!(run(&one, &high), SurfaceError::NoSurface { isovalue: Some(50.0) });
     let shrunk = SurfaceParams { radius_offset: -1.7, ..params(Kernel::Gaussian, 0.5) };
     assert!(matches!(run(&one, &shrunk), SurfaceError::BadParameter { name: "radius_offset", .. }));
     for bad in [
@@ -704,8 +723,8 @@ fn distant_atoms_cost_only_their_own_bricks() {
 #[test]
 fn raw_parameters_of_the_paper_give_a_mesh() {
     let rows = Random(31).cloud(100, 12.0);
-    let raw = |kernel, a, b, c, iso| SurfaceOptions {
-        kernel: Some(kernel),
+    let raw = |kernel: Kernel, a, b, c, iso| SurfaceOptions {
+        surface: Some(kernel.into()),
         paper_a: a,
         paper_b: b,
         paper_c: c,

@@ -8,9 +8,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use gpu_fakes::Step::{Block, Finish, Lose, OutOfMemory};
+use gpu_fakes::Step::{Block, Finish, Hang, Lose, OutOfMemory};
 use gpu_fakes::{FakeDevice, SETTINGS, devices, spheres};
-use molmesh::gpu::{DevicePool, DiscoveryMode, GpuBackend, GpuError, discover};
+use molmesh::gpu::{DevicePool, DiscoveryMode, GpuBackend, GpuError, PoolSettings, discover};
 use molmesh::pipeline::AutoBackend;
 use molmesh::surface::{
     Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, MeshOutput, Observer, Stage, Step,
@@ -142,6 +142,13 @@ fn warm_runs_every_device_and_gives_up_those_that_fail() {
     let down: Vec<bool> = backend.devices().iter().map(|device| device.down.is_some()).collect();
     assert_eq!(down, [false, true, false]);
     assert!(backend.devices()[1].down.as_deref().unwrap().contains("first mesh failed"));
+    // A device that hangs is taken out as well.
+    let fakes = [FakeDevice::new(&[Hang]), FakeDevice::new(&[])];
+    let settings = PoolSettings { hang_timeout: std::time::Duration::from_millis(50), ..SETTINGS };
+    let hung = GpuBackend::with_pool(DevicePool::start(devices(&fakes), &settings).unwrap());
+    hung.warm_up().unwrap();
+    assert!(hung.devices()[0].down.as_deref().unwrap().contains("hung") && hung.devices()[1].down.is_none());
+    fakes[0].release();
     // Without a device the fallback must work; without a fallback warming up fails.
     gpu_and_cpu(&[FakeDevice::new(&[Lose])]).warm_up().unwrap();
     assert!(matches!(gpu(&[FakeDevice::new(&[Lose])]).warm_up(), Err(SurfaceError::Device { .. })));

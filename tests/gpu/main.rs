@@ -17,6 +17,7 @@ mod backend;
 mod cancellation;
 mod meshes;
 mod multi_device;
+mod overlap;
 mod picture;
 mod pool;
 mod recovery;

@@ -13,8 +13,8 @@ use molmesh::gpu::plan::ChunkLimits;
 use molmesh::gpu::{Budget, Engine, Executor, GpuError, GpuJob, Prepared};
 use molmesh::surface::quantize::BEYOND;
 use molmesh::surface::{
-    Backend, Control, CpuBackend, Mesh, MeshOutput, Quantized, Spheres, SurfaceError, SurfaceLimits, SurfaceOptions,
-    SurfaceParams,
+    Backend, Control, CpuBackend, Mesh, MeshOutput, Quantized, Spheres, SurfaceError, SurfaceKind, SurfaceLimits,
+    SurfaceOptions, SurfaceParams,
 };
 
 fn cpu(spheres: &Spheres, params: &SurfaceParams) -> MeshOutput {
@@ -211,6 +211,52 @@ fn idle_readback_buffers_are_kept_between_jobs_and_released_on_request() {
 }
 
 #[test]
+fn a_device_with_reserved_memory_allocates_no_readback_buffer() {
+    const RESERVE: u64 = 64 << 20;
+    let spheres = sample("1crn.cif");
+    let wanted = params(KERNELS[0], 0.4);
+    let ways: [Change; 2] = [|_| (), |b| b.small_bytes = 0];
+    for way in ways {
+        let engine = || {
+            engine_with(|b| {
+                b.idle_bytes = [1 << 30, 0];
+                way(b);
+            })
+        };
+        // Returns the bytes held before the job, while its mesh lives, and after the release of the idle buffers.
+        let held = |mut engine: Engine| {
+            let before = engine.held_bytes();
+            let mesh = mesh_of(&mut engine, &spheres, &wanted).mesh;
+            let in_use = engine.held_bytes();
+            drop(mesh);
+            engine.release_idle_memory();
+            [before, in_use, engine.held_bytes()]
+        };
+        let [before, in_use, after] = held(engine());
+        let workspace = after - before;
+        assert!(in_use > after, "negative control: without a reserve the job allocates readback buffers");
+        let mut reserved = engine();
+        reserved.reserve_memory(RESERVE);
+        let reserve = reserved.held_bytes() - before;
+        assert!(reserve > RESERVE / 4 && reserve <= RESERVE, "{reserve}");
+        let [full, in_use, after] = held(reserved);
+        assert_eq!(in_use - full, workspace, "the job allocates a workspace only");
+        assert_eq!(after - before, workspace, "the reserve is released");
+        // A small limit holds, and no reserve is possible below the smallest buffers.
+        for bytes in [0, 10_000, 40_000, 5 << 20] {
+            let mut small = engine();
+            small.reserve_memory(bytes);
+            assert!(small.held_bytes() - before <= bytes, "{bytes}");
+            assert_eq!(small.held_bytes() > before, bytes >= 16_384);
+        }
+        // No buffer is larger than the device allows.
+        let mut limited = engine_with(|b| b.readback_bytes = 1 << 20);
+        limited.reserve_memory(1 << 40);
+        assert_eq!(limited.held_bytes() - before, (4 << 20) - 8192);
+    }
+}
+
+#[test]
 fn a_quantized_mesh_takes_less_memory_and_less_of_a_limit() {
     let spheres = sample("1crn.cif");
     let plain = params(KERNELS[0], 0.4);
@@ -328,14 +374,14 @@ fn parameters_of_the_paper_and_presets_are_equal_to_the_cpu() {
         SurfaceOptions { smoothness: Some(40.0), cutoff_tolerance: Some(1e-6), ..SurfaceOptions::default() },
         SurfaceOptions { paper_a: Some(0.5), paper_b: Some(4.0), isovalue: Some(0.7), ..SurfaceOptions::default() },
         SurfaceOptions {
-            kernel: Some(Kernel::SoftObject),
+            surface: Some(Kernel::SoftObject.into()),
             paper_a: Some(1.5),
             paper_b: Some(3.0),
             isovalue: Some(0.6),
             ..SurfaceOptions::default()
         },
         SurfaceOptions {
-            kernel: Some(Kernel::InverseSquare),
+            surface: Some(Kernel::InverseSquare.into()),
             paper_c: Some(0.8),
             paper_b: Some(5.0),
             isovalue: Some(0.9),
@@ -474,6 +520,18 @@ fn measures_equal_those_of_the_cpu() {
 }
 
 #[test]
+fn surfaces_of_spheres_are_rejected_with_the_backend_that_makes_them() {
+    for surface in [SurfaceKind::Vdw, SurfaceKind::Sas, SurfaceKind::Ses] {
+        let options = SurfaceOptions { surface: Some(surface), ..SurfaceOptions::default() };
+        let params = SurfaceParams::new(&options).unwrap();
+        let one = spheres(&[[0.0, 0.0, 0.0, 1.7]]);
+        let error = Prepared::new(&one, &params, &SurfaceLimits::default(), &Control::default()).err().unwrap();
+        assert!(matches!(error, SurfaceError::BadParameter { name: "surface", .. }), "{error:?}");
+        assert!(error.to_string().contains("gaussian") && error.to_string().contains("cpu backend"), "{error}");
+    }
+}
+
+#[test]
 fn jobs_that_share_a_submission_are_independent() {
     let mut random = Random(5);
     let clouds: Vec<Spheres> = (1..=9).map(|n| spheres(&random.cloud(n * n * 7, 6.0 * n as f64))).collect();
@@ -490,7 +548,7 @@ fn jobs_that_share_a_submission_are_independent() {
     assert_eq!(answers.len(), 12);
     assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(SurfaceError::Deadline));
     assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(molmesh::surface::SurfaceError::Cancelled));
-    let none = molmesh::surface::SurfaceError::NoSurface { isovalue: 1e6 };
+    let none = molmesh::surface::SurfaceError::NoSurface { isovalue: Some(1e6) };
     assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(none));
     for ((answer, job), cloud) in answers.into_iter().zip(&jobs).zip(&clouds) {
         let together = answer.unwrap();

@@ -26,6 +26,7 @@ const SETTINGS: PoolSettings = PoolSettings {
     idle: Duration::from_secs(5),
     hang_timeout: Duration::MAX,
     cool_down: Duration::MAX,
+    readback_bytes: None,
     min_partition_bricks: Some(1),
 };
 
@@ -80,8 +81,8 @@ fn crowd(n: usize) -> Spheres {
 }
 
 fn with_ids(kernel: Kernel, resolution: f64) -> SurfaceParams {
-    let (kernel, resolution) = (Some(kernel), Some(resolution));
-    SurfaceParams::new(&SurfaceOptions { kernel, resolution, atom_ids: true, ..SurfaceOptions::default() }).unwrap()
+    let (surface, resolution) = (Some(kernel.into()), Some(resolution));
+    SurfaceParams::new(&SurfaceOptions { surface, resolution, atom_ids: true, ..SurfaceOptions::default() }).unwrap()
 }
 
 /// Number of triangles with vertices of several partitions.

@@ -62,6 +62,16 @@ fn an_idle_device_releases_memory() {
 }
 
 #[test]
+fn a_service_reserves_readback_memory_before_the_first_job() {
+    for readback_bytes in [None, Some(1 << 20)] {
+        let fake = FakeDevice::new(&[Finish]);
+        let pool = pool(std::slice::from_ref(&fake), PoolSettings { readback_bytes, ..SETTINGS });
+        pool.run(&job(1)).unwrap();
+        assert_eq!(*fake.reserved.lock().unwrap(), readback_bytes.map(|bytes| (bytes, 0)));
+    }
+}
+
+#[test]
 fn a_large_job_runs_alone_and_keeps_its_place() {
     let fake = FakeDevice::new(&[Block, Finish]);
     let pool = pool(std::slice::from_ref(&fake), SETTINGS);
@@ -335,6 +345,42 @@ fn a_device_that_hangs_while_it_is_rebuilt_is_taken_out() {
     let status = pool.status().remove(0);
     assert!(status.down.unwrap().contains("hung") && status.hung == 1 && status.waiting == 0);
     fakes[0].release();
+}
+
+#[test]
+fn a_device_that_hangs_while_it_is_built_is_left_out() {
+    let settings = PoolSettings { hang_timeout: Duration::from_millis(50), ..SETTINGS };
+    let fakes = [FakeDevice::hanging_in_build(&[], 0), FakeDevice::new(&[])];
+    let begun = Instant::now();
+    let started = pool(&fakes, settings);
+    assert!(begun.elapsed() >= 3 * settings.hang_timeout, "a build has more time than a submission");
+    assert_eq!(started.run(&job(1)).unwrap().device(), "fake 1");
+    let status = started.status().remove(0);
+    let why = status.down.unwrap();
+    assert!(why.contains("hung") && why.contains("150 ms") && status.hung == 1, "{why}");
+    let ending = Instant::now();
+    drop(Arc::into_inner(started).unwrap());
+    assert!(ending.elapsed() < Duration::from_secs(10), "it waits for the hung thread");
+    assert_eq!(fakes[0].drops.load(Ordering::SeqCst), 0, "it did not hang");
+    fakes[0].release();
+    // Without another device there is no pool, and the reason is given.
+    let alone = FakeDevice::hanging_in_build(&[], 0);
+    let failed = DevicePool::start(devices(std::slice::from_ref(&alone)), &settings).map(|_| ()).unwrap_err();
+    assert!(matches!(&failed, GpuError::NoDevice(why) if why.contains("the device hung")), "{failed}");
+    alone.release();
+}
+
+#[test]
+fn a_device_that_hung_while_it_was_built_is_built_again() {
+    let fakes = [FakeDevice::hanging_in_build(&[], 0), FakeDevice::new(&[])];
+    let times = [50, 20].map(Duration::from_millis);
+    let pool = pool(&fakes, PoolSettings { hang_timeout: times[0], cool_down: times[1], ..SETTINGS });
+    wait_for("the device to be up", || pool.status()[0].down.is_none());
+    assert_eq!((pool.status()[0].hung, fakes[0].builds.load(Ordering::SeqCst)), (1, 2));
+    // The end of the first build, after its time limit, has no effect.
+    fakes[0].release();
+    wait_for("the old thread to end", || fakes[0].drops.load(Ordering::SeqCst) == 1);
+    assert_eq!(pool.status()[0].down, None);
 }
 
 #[test]

@@ -185,8 +185,8 @@ fn external_readers_accept_vertices_quantized_by_devices() {
     let two = devices(2);
     for (name, more) in [
         ("gaussian", vec![("resolution", "0.5")]),
-        ("soft", vec![("kernel", "soft-object"), ("resolution", "0.6")]),
-        ("inverse", vec![("kernel", "inverse-square"), ("resolution", "0.6"), ("atom_ids", "true")]),
+        ("soft", vec![("surface", "soft-object"), ("resolution", "0.6")]),
+        ("inverse", vec![("surface", "inverse-square"), ("resolution", "0.6"), ("atom_ids", "true")]),
     ] {
         let product = made(&two, &job(&more));
         files.add(&format!("{name}.glb"), &glb(&product));

@@ -532,6 +532,9 @@ fn emit_counts_triangles_with_a_corner_twice() {
     assert_eq!((twice > 0, cast::<Counters>(&out[1])[0].degenerate as usize), (true, twice));
 }
 
+/// Number of triangles that a workgroup lists at once.
+const WINDOW: u32 = 256;
+
 /// Block that `measure` writes for a brick.
 #[derive(Debug, Clone, PartialEq)]
 struct Block {
@@ -560,6 +563,11 @@ fn blocks(mut words: &[u32]) -> HashMap<u32, Block> {
         assert!(blocks.insert(brick, block).is_none(), "brick {brick} has two blocks");
     }
     blocks
+}
+
+/// Twice the area of all sheets.
+fn twice_the_area(blocks: &HashMap<u32, Block>) -> f64 {
+    blocks.values().flat_map(|block| &block.sheets).map(|sheet| sheet.sums[0]).sum()
 }
 
 /// Returns true if two sheets have the same sums, up to rounding in single precision.
@@ -631,7 +639,7 @@ fn many_sheets() -> Vec<(String, Setup)> {
 
 #[test]
 fn measure_finds_the_same_sheets_and_sums() {
-    let mut most = 0;
+    let (mut most, mut long) = (0, false);
     for (name, setup) in setups().into_iter().chain(many_sheets()) {
         setup.poison(&[BufferId::Sheets]);
         let out = setup.run(Stage::Measure, &measure_inputs(&setup), &[BufferId::Sheets, BufferId::Counters]);
@@ -645,7 +653,11 @@ fn measure_finds_the_same_sheets_and_sums() {
             let Some(brick) = brick else { continue };
             assert_eq!(block_difference(&blocks[&id], brick), None, "{name}: brick {id}");
             most = most.max(brick.sheets.len());
+            long |= brick.sheets.len() > 1 && brick.count[1] > WINDOW;
         }
+        let sheets = setup.surface.iter().flatten().flat_map(|brick| &brick.sheets);
+        let (found, expected) = (twice_the_area(&blocks), sheets.map(|sheet| sheet.sums[0]).sum::<f64>());
+        assert!((found / expected - 1.0).abs() < 1e-6, "{name}: {found}, expected {expected}");
         // Negative controls: sums that are off by ten times their bound, and a vertex on another sheet.
         let (id, brick) = (0..).zip(&setup.surface).find_map(|(id, b)| Some((id, b.as_ref()?))).unwrap();
         for (k, bound) in [(0, 2e-6), (3, 2e-6), (5, 4e-5), (9, 6e-4)] {
@@ -662,6 +674,42 @@ fn measure_finds_the_same_sheets_and_sums() {
         }
     }
     assert!(most > 10, "at most {most} sheets in a brick");
+    assert!(long, "no brick with several sheets takes several windows");
+}
+
+#[test]
+fn measure_sums_the_positions_that_interpolate_rounds() {
+    let mut setup = Setup::new(&sample("4pti.pdb"), Kernel::Gaussian, 0.7);
+    let [positions, _] = single(&mut setup);
+    let inputs = measure_inputs(&setup);
+    let triangles = setup.probe.mesh.triangles.clone();
+    let mut area_in_steps = |step: Step| {
+        setup.stages.params.steps_per_angstrom = step.per_angstrom();
+        let out = setup.run(Stage::Measure, &inputs, &[BufferId::Sheets, BufferId::Counters]);
+        setup.stages.params.steps_per_angstrom = 0.0;
+        let made = cast::<Counters>(&out[1])[0].sheet_words as usize;
+        twice_the_area(&blocks(&cast::<u32>(&out[0])[..made]))
+    };
+    for reach in [100.0, 5_000.0] {
+        let step = Step::covering(reach);
+        let rounded: Vec<[f64; 3]> = positions.iter().map(|p| step.position(*p).map(f64::from)).collect();
+        let exact: Vec<[f64; 3]> =
+            positions.iter().map(|p| p.map(|c| f64::from(c) * f64::from(step.per_angstrom()))).collect();
+        let area = |positions: &[[f64; 3]]| -> f64 {
+            let twice = |t: &[u32; 3]| {
+                let [a, b, c] = t.map(|v| positions[v as usize]);
+                let [u, v] = [b, c].map(|p| [p[0] - a[0], p[1] - a[1], p[2] - a[2]]);
+                let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+                n.iter().map(|c| c * c).sum::<f64>().sqrt()
+            };
+            triangles.iter().map(twice).sum()
+        };
+        let (expected, unrounded) = (area(&rounded), area(&exact));
+        let found = area_in_steps(step);
+        assert!((found / expected - 1.0).abs() < 1e-6, "{step:?}: {found}, expected {expected}");
+        // Negative control: positions that are not rounded.
+        assert!((unrounded / expected - 1.0).abs() > 2e-6, "{step:?}: {unrounded}, {expected}");
+    }
 }
 
 #[test]

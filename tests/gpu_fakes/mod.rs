@@ -7,7 +7,10 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
-use molmesh::gpu::{DevicePool, Executor, Finished, GpuError, GpuJob, PoolDevice, PoolSettings, Prepared, SheetBlocks};
+use molmesh::gpu::{
+    DevicePool, Executor, Finished, GpuError, GpuJob, NextJob, PictureBuild, PictureExecutor, PictureJob, PoolDevice,
+    PoolSettings, Prepared, SheetBlocks,
+};
 use molmesh::surface::{
     CancelToken, Control, GridStats, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
 };
@@ -44,6 +47,9 @@ pub struct FakeDevice {
     pub submissions: Arc<AtomicU64>,
     pub builds: AtomicUsize,
     pub drops: AtomicUsize,
+    /// Bytes that were reserved, and number of calls before.
+    pub reserved: Mutex<Option<(u64, usize)>>,
+    next_job: Mutex<Option<NextJob>>,
     /// Number of calls to release idle memory.
     pub idle_releases: AtomicUsize,
     /// Build that blocks until released; `None`: none.
@@ -77,6 +83,11 @@ impl FakeDevice {
     /// Number of atoms of every job in every call so far.
     pub fn atoms(&self) -> Vec<Vec<usize>> {
         self.calls.lock().unwrap().clone()
+    }
+
+    /// Returns the job that would run next.
+    pub fn next_job(&self) -> Option<GpuJob> {
+        self.next_job.lock().unwrap().as_ref().and_then(|next| next())
     }
 
     pub fn release(&self) {
@@ -153,12 +164,72 @@ impl Executor for FakeExecutor {
         Arc::clone(&self.0.submissions)
     }
 
+    fn set_next_job(&mut self, next: NextJob) {
+        *self.0.next_job.lock().unwrap() = Some(next);
+    }
+
+    fn reserve_memory(&mut self, bytes: u64) {
+        *self.0.reserved.lock().unwrap() = Some((bytes, self.0.calls().len()));
+    }
+
     fn release_idle_memory(&mut self) {
         self.0.idle_releases.fetch_add(1, Ordering::SeqCst);
     }
 
     fn held_bytes(&self) -> u64 {
         if self.0.idle_releases.load(Ordering::SeqCst) == 0 { 4096 } else { 1024 }
+    }
+}
+
+/// Device for pictures with scripted behaviour. Its pictures are black.
+pub struct FakePictures(Arc<FakeDevice>);
+
+impl FakePictures {
+    pub fn new(script: &[Step]) -> Arc<Self> {
+        Arc::new(Self(FakeDevice::new(script)))
+    }
+
+    /// Creates a device whose first build blocks until released.
+    pub fn hanging_in_build() -> Arc<Self> {
+        Arc::new(Self(FakeDevice::hanging_in_build(&[], 0)))
+    }
+
+    pub fn build(&self) -> PictureBuild {
+        let fake = Arc::clone(&self.0);
+        Arc::new(move || {
+            let n = fake.builds.fetch_add(1, Ordering::SeqCst);
+            if fake.hanging_build == Some(n) {
+                fake.hang();
+            }
+            Ok(Box::new(FakeExecutor(Arc::clone(&fake))))
+        })
+    }
+
+    pub fn builds(&self) -> usize {
+        self.0.builds.load(Ordering::SeqCst)
+    }
+
+    /// Number of pictures that were begun.
+    pub fn calls(&self) -> usize {
+        self.0.calls().len()
+    }
+
+    pub fn release(&self) {
+        self.0.release();
+    }
+}
+
+impl PictureExecutor for FakeExecutor {
+    fn draw(&mut self, _: &PictureJob) -> Result<Vec<[u8; 4]>, GpuError> {
+        self.0.calls.lock().unwrap().push(Vec::new());
+        match self.0.step() {
+            Step::Hang => self.0.hang(),
+            Step::Lose => return Err(GpuError::Lost(LOST.to_owned())),
+            Step::Fail => return Err(GpuError::Failed("scripted failure".to_owned())),
+            Step::Panic => panic!("scripted failure"),
+            _ => {}
+        }
+        Ok(Vec::new())
     }
 }
 
@@ -170,6 +241,7 @@ pub const SETTINGS: PoolSettings = PoolSettings {
     idle: Duration::MAX,
     hang_timeout: Duration::MAX,
     cool_down: Duration::MAX,
+    readback_bytes: None,
     min_partition_bricks: None,
 };
 

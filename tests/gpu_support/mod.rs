@@ -78,7 +78,8 @@ pub(crate) fn spheres(rows: &[[f64; 4]]) -> Spheres {
 }
 
 pub(crate) fn params(kernel: Kernel, resolution: f64) -> SurfaceParams {
-    let options = SurfaceOptions { kernel: Some(kernel), resolution: Some(resolution), ..SurfaceOptions::default() };
+    let options =
+        SurfaceOptions { surface: Some(kernel.into()), resolution: Some(resolution), ..SurfaceOptions::default() };
     SurfaceParams::new(&options).expect("valid")
 }
 

@@ -70,7 +70,7 @@ fn a_plain_curl_upload_is_meshed_by_the_real_backend() {
 
 #[test]
 fn the_report_is_returned_instead_of_the_mesh() {
-    let reply = SERVER.post("/v1/report?kernel=soft-object&isovalue=1.5", &[("accept", "text/html")], SAMPLE);
+    let reply = SERVER.post("/v1/report?surface=soft-object&isovalue=1.5", &[("accept", "text/html")], SAMPLE);
     assert_eq!(reply.status, 200);
     assert_eq!(reply.header("content-type"), Some("application/json"));
     assert_eq!(reply.header("etag"), None);
@@ -86,14 +86,14 @@ fn the_report_is_returned_instead_of_the_mesh() {
         "area",
         "volume",
         "resolution",
-        "kernel",
+        "surface",
         "backend",
         "timings_ms",
     ] {
         assert!(!report[key].is_null(), "{key} in {report}");
     }
     assert_eq!((&report["atoms"], &report["triangles"]), (&454.into(), &(454 * 8).into()));
-    assert_eq!((report["kernel"].as_str(), report["isovalue"].as_f64()), (Some("soft-object"), Some(1.5)));
+    assert_eq!((report["surface"].as_str(), report["isovalue"].as_f64()), (Some("soft-object"), Some(1.5)));
     assert!(report["timings_ms"]["queue"].as_f64().is_some());
 }
 
@@ -151,6 +151,9 @@ fn forms_contain_a_file_and_parameters() {
         assert_eq!(reply.header("content-type"), Some("application/ply"));
         assert_eq!((reply.header("molmesh-resolution"), reply.header("molmesh-isovalue")), (Some("0.75"), Some("1.2")));
     }
+    // A value that the surface does not have has no header.
+    let reply = SERVER.post("/v1/meshes?surface=vdw&resolution=1", &[], SAMPLE);
+    assert_eq!((reply.header("molmesh-surface"), reply.header("molmesh-isovalue")), (Some("vdw"), None));
     let post = |body: &[u8]| SERVER.post("/v1/meshes", &[kind], body);
     assert_eq!(post(&form(&[("name=\"resolution\"", b"1")])).problem(400, "bad-request")["expected"], "file");
     post(&form(&[("name=\"file\"", SAMPLE), ("name=\"file\"", SAMPLE)])).problem(400, "bad-request");
@@ -234,7 +237,7 @@ fn a_media_type_that_contradicts_the_content_is_rejected() {
 fn errors_name_bad_parameters_and_expected_values() {
     for (query, parameter, nearest) in [
         ("resolutoin=1", "resolutoin", Some("resolution")),
-        ("Kernel=gaussian", "Kernel", Some("kernel")),
+        ("Surface=gaussian", "Surface", Some("surface")),
         ("isovlaue=1", "isovlaue", Some("isovalue")),
         ("xyzzyxyzzyxyzzy=1", "xyzzyxyzzyxyzzy", None),
         ("resolution=1&resolution=1", "resolution", None),
@@ -246,18 +249,23 @@ fn errors_name_bad_parameters_and_expected_values() {
         ("resolution=inf", "resolution", None),
         ("resolution=1%20apple", "resolution", None),
         ("isovalue=0", "isovalue", None),
-        ("kernel=cubic", "kernel", None),
+        ("surface=cubic", "surface", None),
         ("preset=nice", "preset", None),
-        ("preset=blinn&kernel=soft-object", "preset", None),
-        ("smoothness=1&kernel=inverse-square", "smoothness", None),
+        ("preset=blinn&surface=soft-object", "preset", None),
+        ("smoothness=1&surface=inverse-square", "smoothness", None),
+        ("surface=ses&isovalue=2", "isovalue", None),
+        ("surface=vdw&smoothness=2", "smoothness", None),
+        ("surface=sas&preset=ses-like", "preset", None),
+        ("surface=vdw&probe=1.5", "probe", None),
+        ("surface=ses&probe=10.5", "probe", None),
         ("paper_a=1", "paper_a", None),
-        ("kernel=inverse-square&paper_c=2&paper_b=5", "paper_c", None),
+        ("surface=inverse-square&paper_c=2&paper_b=5", "paper_c", None),
         ("atom_ids=maybe", "atom_ids", None),
         ("model=first", "model", None),
         ("chains=", "chains", None),
         ("chains=A,,B", "chains", None),
         ("select=proteins", "select", None),
-        ("select=hydrogens", "select", None),
+        ("select=chain%20A%20and", "select", None),
         ("altloc=AB", "altloc", None),
         ("format=usdz", "format", None),
         ("check=lax", "check", None),
@@ -293,6 +301,9 @@ fn errors_name_bad_parameters_and_expected_values() {
         let known = !query.starts_with("xyzzy") && nearest.is_none();
         assert_eq!(problem["expected"].is_string(), known && !repeated, "{query}: {problem}");
     }
+    let problem = SERVER.post("/v1/meshes?select=chain%20Z", &[], SAMPLE).problem(422, "empty-selection");
+    assert_eq!(problem["parameter"], "select");
+    assert_eq!(problem["value"], "Z");
 }
 
 #[test]
@@ -517,7 +528,7 @@ fn health_version_and_capabilities() {
     assert_eq!(SERVER.get("/version").json()["version"], env!("CARGO_PKG_VERSION"));
     let can = SERVER.get("/v1/capabilities").json();
     assert_eq!(can["formats"].as_array().unwrap().len(), 6);
-    assert_eq!(can["kernels"].as_array().unwrap().len(), 3);
+    assert_eq!(can["surfaces"].as_array().unwrap().len(), 6);
     assert_eq!(can["presets"]["ses-like"]["isovalue"], 1.9);
     assert_eq!(can["backends"][0]["reason"], "set by a test");
     assert_eq!(can["radii"]["values"]["C"], 1.7);
@@ -608,10 +619,80 @@ fn atoms_are_listed_with_the_indices_of_meshes() {
         .collect();
     let rows = |column: &str| list["residues"][column].as_array().unwrap();
     let residue = |atom: u64| rows("first").iter().rposition(|first| first.as_u64().unwrap() <= atom).unwrap();
-    let others: Vec<u64> = named.iter().copied().filter(|atom| rows("kind")[residue(*atom)] != "polymer").collect();
+    let others: Vec<u64> = named.iter().copied().filter(|atom| rows("kind")[residue(*atom)] != "protein").collect();
     assert!(others.is_empty(), "{others:?} of {named:?}");
     assert!(named.iter().any(|atom| rows("name")[residue(*atom)] == "LYS" && rows("number")[residue(*atom)] == 15));
     assert!(rows("kind").iter().any(|kind| kind == "water"));
+}
+
+#[test]
+fn colours_of_atoms_are_those_of_the_vertices() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    for (scheme, more) in [("element", ""), ("bfactor", "&palette=cividis"), ("charge", "&chains=A")] {
+        let path = format!("{structure}/colors?scheme={scheme}{more}");
+        let reply = server.get(&path);
+        assert_eq!((reply.status, reply.header("content-type")), (200, Some("application/octet-stream")), "{scheme}");
+        let (colors, rest) = reply.body.as_chunks::<4>();
+        assert_eq!((colors.len(), rest.len()), (514, 0));
+        let legend: serde_json::Value = serde_json::from_str(reply.header("molmesh-colors").unwrap()).unwrap();
+        let query = format!("color={scheme}{more}&atom_ids=true&resolution=1");
+        let report = server.get(&format!("{structure}/report.json?{query}")).json();
+        assert_eq!(legend, report["color"], "{scheme}");
+        // Vertices of 32 bytes: position, normal, colour and atom.
+        let ply = server.get(&format!("{structure}/surface.ply?{query}")).body;
+        let head = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+        let text = std::str::from_utf8(&ply[..head]).unwrap();
+        assert!(text.contains("property uchar red\n") && text.contains("property uint atom\n"), "{text}");
+        let n: usize = text.lines().find_map(|l| l.strip_prefix("element vertex ")).unwrap().parse().unwrap();
+        let mut distinct = std::collections::BTreeSet::new();
+        for vertex in ply[head..head + 32 * n].as_chunks::<32>().0 {
+            let atom = u32::from_le_bytes(vertex[28..].try_into().unwrap());
+            assert_eq!(colors[atom as usize], vertex[24..28], "{scheme}: atom {atom}");
+            distinct.insert(colors[atom as usize]);
+        }
+        assert!(distinct.len() >= 3, "{scheme}: {distinct:?}");
+        // Validators and ranges.
+        let etag = reply.header("etag").unwrap();
+        let ask = |headers: &[(&str, &str)]| send(server.addr, "GET", &path, headers, b"");
+        assert_eq!(ask(&[("if-none-match", etag)]).status, 304);
+        let part = ask(&[("range", "bytes=4-11"), ("if-range", etag)]);
+        assert_eq!((part.status, part.header("content-range")), (206, Some("bytes 4-11/2056")));
+        assert_eq!(part.body, reply.body[4..12]);
+        assert_eq!(ask(&[("range", "bytes=4-11"), ("if-range", "\"x\"")]).status, 200);
+        let beyond = ask(&[("range", "bytes=9999-")]);
+        assert_eq!(beyond.problem(416, "range-not-satisfiable")["actual"], 2056);
+        let other = server.get(&format!("{structure}/colors?scheme=chain"));
+        assert_ne!(other.header("etag").unwrap(), etag);
+    }
+}
+
+#[test]
+fn requests_for_unavailable_colours_are_rejected_with_the_valid_names() {
+    let structure = SERVER.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    for (path, parameter) in [
+        ("colors", "scheme"),
+        ("colors?scheme=none", "scheme"),
+        ("colors?scheme=rainbow", "scheme"),
+        ("colors?scheme=chain&scheme=chain", "scheme"),
+        ("colors?scheme=entity", "scheme"),
+        ("colors?scheme=chain&palette=viridis", "palette"),
+        ("colors?scheme=bfactor&color_range=5", "color_range"),
+        ("colors?scheme=chain&resolution=1", "resolution"),
+        ("surface.glb?color=rainbow", "color"),
+        ("surface.glb?color=entity", "color"),
+        ("report.json?color=chain&palette=viridis", "palette"),
+    ] {
+        let problem = SERVER.get(&format!("{structure}/{path}")).problem(400, "bad-parameter");
+        assert_eq!(problem["parameter"], parameter, "{path}: {problem}");
+        if parameter == "scheme" && !path.contains("&scheme") || parameter == "color" {
+            assert!(problem["expected"].as_str().unwrap().contains("uniform:#RRGGBB, element, chain"), "{problem}");
+        }
+    }
+    let empty = SERVER.get(&format!("{structure}/colors?scheme=chain&chains=Z"));
+    assert_eq!(empty.problem(422, "empty-selection")["parameter"], "chains");
+    let estimate = SERVER.post("/v1/estimate?color=entity", &[], SAMPLE);
+    assert_eq!(estimate.problem(400, "bad-parameter")["parameter"], "color");
 }
 
 #[test]

@@ -9,7 +9,9 @@ use std::time::Duration;
 
 use http_support::{Fake, Mode, Reply, Running, SAMPLE, sample, send, start, wait_for};
 use molmesh::pipeline::AutoBackend;
-use molmesh::surface::{Backend, Control, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+use molmesh::surface::{
+    Backend, Control, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams,
+};
 
 /// Fake backend with a name and, derived from it, an arithmetic of its own.
 struct Named(&'static str, Arc<Fake>);
@@ -21,6 +23,11 @@ impl Backend for Named {
 
     fn describe(&self) -> String {
         format!("the {}", self.0)
+    }
+
+    /// The GPU makes isosurfaces only.
+    fn makes(&self, surface: SurfaceKind) -> bool {
+        self.0 != "gpu" || surface.kernel().is_some()
     }
 
     fn write(
@@ -64,6 +71,12 @@ fn both_backends_work_under_load_and_either_result_is_found() {
         assert_eq!(header(&reply, "molmesh-backend"), "gpu");
         let reason = header(&reply, "molmesh-backend-reason");
         assert!(reason.contains("ms on the CPU") && reason.contains("ms on a GPU"), "{reason}");
+    }
+    // A surface that the GPU does not make does not count as a failure of the GPU.
+    for surface in ["vdw", "sas", "ses"] {
+        let reply = server.post(&format!("/v1/meshes?surface={surface}"), &[], SAMPLE);
+        assert_eq!(header(&reply, "molmesh-backend"), "cpu");
+        assert!(!header(&reply, "molmesh-backend-reason").contains("but"), "{surface}");
     }
     let together: Vec<Reply> = std::thread::scope(|scope| {
         let clients: Vec<_> = (10..18).map(|n| scope.spawn(move || post(n))).collect();

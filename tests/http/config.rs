@@ -172,7 +172,9 @@ fn the_table_and_the_core_agree_on_every_range() {
             continue;
         }
         numbers += 1;
-        let give = |value: f64| parse([(parameter.name, value.to_string())]);
+        // Only some surfaces have a probe.
+        let surface = (parameter.name == "probe").then(|| ("surface", "ses".to_owned()));
+        let give = |value: f64| parse(surface.clone().into_iter().chain([(parameter.name, value.to_string())]));
         for good in [min, max] {
             give(good).unwrap_or_else(|e| panic!("{e}"));
         }
@@ -180,7 +182,7 @@ fn the_table_and_the_core_agree_on_every_range() {
             assert!(matches!(give(bad), Err(ParamError::BadValue { .. })), "{} {bad}", parameter.name);
         }
     }
-    assert_eq!(numbers, 8);
+    assert_eq!(numbers, 9);
     let mut integers = 0;
     for parameter in TABLE {
         let Domain::Integer { min, max } = parameter.domain else { continue };
@@ -196,7 +198,7 @@ fn the_table_and_the_core_agree_on_every_range() {
     let hull = |name: &str| TABLE.iter().find(|p| p.name == name).unwrap().domain;
     for (kernel, a, b) in [("gaussian", [1e-3, 100.0], [1e-2, 1e6]), ("soft-object", [1e-2, 1e6], [0.1, 50.0])] {
         for (x, y) in [(a[0], b[0]), (a[1], b[1])] {
-            let given = [("kernel", kernel.to_owned()), ("paper_a", x.to_string()), ("paper_b", y.to_string())];
+            let given = [("surface", kernel.to_owned()), ("paper_a", x.to_string()), ("paper_b", y.to_string())];
             parse(given).unwrap_or_else(|e| panic!("{e}"));
             for (name, value) in [("paper_a", x), ("paper_b", y)] {
                 let Domain::Number { min, max, .. } = hull(name) else { panic!() };
@@ -213,8 +215,9 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
     // The same job with equivalent parameters.
     for same in [
         &[("resolution", "0.50")][..],
-        &[("kernel", "gaussian"), ("preset", "default")],
+        &[("surface", "gaussian"), ("preset", "default")],
         &[("select", "polymer")],
+        &[("select", "nucleic or (protein or polymer)")],
         &[("format", "stl")],
         &[("compress", "none")],
         &[("normals", "smooth")],
@@ -229,10 +232,14 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         &[("preset", "blinn")],
         &[("select", "polymer,ligand")],
         &[("select", "all")],
+        &[("select", "polymer,hydrogens")],
+        &[("select", "chain A")],
+        &[("select", "resn \"A&chains=B\"")],
         &[("chains", "A")],
         &[("chains", "A,B")],
         &[("model", "2")],
         &[("altloc", "B")],
+        &[("assembly", "1")],
         &[("atom_ids", "true")],
         &[("validation", "exact")],
         &[("compress", "quantize")],
@@ -246,7 +253,11 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         &[("max_triangles", "40001")],
         &[("paper_a", "1"), ("paper_b", "2")],
         &[("paper_a", "2"), ("paper_b", "1")],
-        &[("kernel", "inverse-square")],
+        &[("surface", "inverse-square")],
+        &[("surface", "vdw")],
+        &[("surface", "sas")],
+        &[("surface", "ses")],
+        &[("surface", "ses"), ("probe", "1.5")],
     ] {
         let text = text(other);
         assert!(!seen.contains(&text), "{other:?}");

@@ -33,6 +33,7 @@ const ROWS: &[Row] = &[
     ("limits.inflated_bytes", "inflated-too-large", "http/limits::compression_bombs_stop_at_the_inflated_limit"),
     ("limits.atoms", "too-many-atoms", "http/limits::atoms_are_limited"),
     ("limits.duplicate_atoms", "too-many-duplicates", "http/limits::atoms_at_one_position_are_limited"),
+    ("limits.assembly_copies", "too-many-copies", "http/limits::assemblies_are_limited"),
     ("limits.labels", "too-many-atoms", "http/limits::listed_atoms_are_limited"),
     ("limits.grid_points", "grid-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
     (
@@ -82,6 +83,11 @@ const ROWS: &[Row] = &[
         "devices.hang_timeout_ms",
         "molmesh_device_lost_total",
         "gpu/pool::a_hung_device_is_taken_out_and_its_job_retried",
+    ),
+    (
+        "devices.readback_bytes",
+        "molmesh_device_memory_bytes",
+        "gpu/meshes::a_device_with_reserved_memory_allocates_no_readback_buffer",
     ),
     ("devices.cool_down_ms", "molmesh_device_up", "gpu/pool::a_device_is_used_again_after_its_cool_down"),
     ("archive.local_check_interval_ms", "", "http/archive_http::digests_are_cached"),

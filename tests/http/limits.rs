@@ -228,6 +228,64 @@ fn atoms_at_one_position_are_limited() {
     assert!(rejected(&server, "too-many-duplicates") >= 3.0);
 }
 
+/// Returns a file of ten atoms with an assembly of six copies.
+fn hexamer() -> String {
+    let operator = |n: usize| {
+        let row = |k: usize| {
+            let m = [0, 1, 2].map(|j| if j + 1 == k { "1.000000" } else { "0.000000" }).join("  ");
+            format!("REMARK 350   BIOMT{k} {n:>3}  {m}  {:>13.5}\n", if k == 1 { 100.0 * n as f64 } else { 0.0 })
+        };
+        [1, 2, 3].map(row).concat()
+    };
+    let operators: String = (1..=6).map(operator).collect();
+    let head = "REMARK 350 BIOMOLECULE: 1\nREMARK 350 APPLY THE FOLLOWING TO CHAINS: A\n";
+    format!("{head}{operators}{}", String::from_utf8(carbons(10)).unwrap())
+}
+
+#[test]
+fn assemblies_are_limited() {
+    let text = hexamer();
+    let ask =
+        |server: &Running, path: &str| server.post(&format!("{path}?assembly=1&resolution=2"), &[], text.as_bytes());
+    let few = fake(|c| c.limits.assembly_copies = 5);
+    let small = fake(|c| c.limits.atoms = 59);
+    let exact = fake(|c| (c.limits.assembly_copies, c.limits.atoms) = (6, 60));
+    for path in ["/v1/meshes", "/v1/estimate", "/v1/report"] {
+        assert_eq!(ask(&few, path).problem(422, "too-many-copies")["limit"], 5);
+        let problem = ask(&small, path).problem(422, "too-many-atoms");
+        assert_eq!((&problem["limit"], &problem["actual"]), (&59.into(), &60.into()), "{path}");
+        assert_eq!(ask(&exact, path).status, 200, "{path}");
+    }
+    // Without an assembly, its limits do not apply.
+    assert_eq!(few.post("/v1/meshes", &[], text.as_bytes()).status, 200);
+    assert!(rejected(&few, "too-many-copies") >= 3.0 && rejected(&small, "too-many-atoms") >= 3.0);
+    assert_eq!(ask(&exact, "/v1/report").json()["assembly"], serde_json::json!({ "id": "1", "copies": 6 }));
+}
+
+#[test]
+fn assemblies_of_a_structure_in_memory_are_listed_counted_and_meshed() {
+    let server = fake(|_| {});
+    let text = hexamer();
+    let uploaded = server.post("/v1/structures", &[], text.as_bytes()).json();
+    assert_eq!(uploaded["assemblies"], serde_json::json!([{ "id": "1", "copies": 6 }]));
+    let path = format!("/v1/structures/{}", uploaded["digest"].as_str().unwrap());
+    let hits = || server.metric("molmesh_structure_cache_requests_total", &["result=\"hit\""]);
+    let before = hits();
+    let report = server.get(&format!("{path}/report.json?assembly=1")).json();
+    assert_eq!(
+        (&report["atoms"], &report["atoms_in_file"], &report["assembly"]["copies"]),
+        (&60.into(), &10.into(), &6.into())
+    );
+    assert!(hits() > before, "the file was read again");
+    let unknown = server.get(&format!("{path}/surface.glb?assembly=2")).problem(422, "empty-selection");
+    assert_eq!((&unknown["parameter"], &unknown["value"]), (&"assembly".into(), &"2".into()));
+    assert_eq!(unknown["expected"], "the assemblies 1");
+    let estimate = |query: &str| server.post(&format!("/v1/estimate?{query}"), &[], text.as_bytes()).json();
+    let [unit, all] = ["assembly=asymmetric-unit", "assembly=1"].map(estimate);
+    assert_eq!((&unit["atoms"], &all["atoms"]), (&10.into(), &60.into()));
+    assert!((all["seconds"].as_f64().unwrap() / unit["seconds"].as_f64().unwrap() - 6.0).abs() < 0.5, "{all}");
+}
+
 #[test]
 fn listed_atoms_are_limited() {
     let server = fake(|c| c.limits.labels = 100);
@@ -237,6 +295,12 @@ fn listed_atoms_are_limited() {
     };
     assert_eq!(listed(101).problem(422, "too-many-atoms")["limit"], 100);
     assert_eq!(listed(100).json()["count"], 100);
+    let colored = |atoms| {
+        let structure = server.post("/v1/structures", &[], &carbons(atoms)).header("location").unwrap().to_owned();
+        server.get(&format!("{structure}/colors?scheme=chain"))
+    };
+    assert_eq!(colored(101).problem(422, "too-many-atoms")["limit"], 100);
+    assert_eq!(colored(100).body.len(), 400);
     assert!(rejected(&server, "too-many-atoms") >= 1.0);
     // The limit does not apply to meshes.
     assert_eq!(server.post("/v1/meshes", &[], &carbons(101)).status, 200);

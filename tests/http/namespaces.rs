@@ -98,6 +98,7 @@ fn what_another_group_holds_is_answered_as_if_it_never_existed() {
     let routes = [
         ("GET", structure.clone()),
         ("GET", format!("{structure}/atoms")),
+        ("GET", format!("{structure}/colors?scheme=chain")),
         ("GET", format!("{structure}/surface.glb")),
         ("GET", format!("{structure}/surface.png?width=100&height=100")),
         ("GET", format!("{structure}/report.json")),

@@ -139,6 +139,14 @@ fn surfaces(seen: &Seen, server: &Running) {
         }
         get(&format!("{base}/surface.ply"), &other[..1], 412);
         get(&format!("{base}/report.json"), &[("if-match", "\"other\"")], 200);
+        let colors = format!("{base}/colors?scheme=chain");
+        let tag = get(&colors, &[], 200).header("etag").unwrap().to_owned();
+        get(&colors, &[("if-none-match", &tag)], 304);
+        get(&colors, &[("if-match", "\"other\"")], 412);
+        get(&colors, &[("range", "bytes=0-9")], 206);
+        get(&colors, &[("range", "bytes=99999999-")], 416);
+        get(&format!("{base}/colors"), &[], 400);
+        get(&format!("{colors}&chains=Z"), &[], 422);
         let atoms = format!("{base}/atoms");
         let tag = get(&atoms, &[], 200).header("etag").unwrap().to_owned();
         get(&atoms, &[("if-none-match", &tag)], 304);
@@ -154,6 +162,8 @@ fn surfaces(seen: &Seen, server: &Running) {
     get(&format!("/v1/structures/{ZERO}"), &[], 404);
     get(&format!("/v1/structures/{ZERO}/atoms"), &[], 404);
     get("/v1/pdb/9xyz/atoms", &[], 404);
+    get(&format!("/v1/structures/{ZERO}/colors?scheme=chain"), &[], 404);
+    get("/v1/pdb/9xyz/colors?scheme=chain", &[], 404);
     get("/v1/pdb/9xyz/report.json", &[], 404);
     get(&format!("/v1/structures/{ZERO}/report.json"), &[], 404);
     get(&format!("/v1/results/{ZERO}.glb"), &[], 404);
@@ -219,6 +229,7 @@ fn sizes(seen: &Seen) {
     }
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/surface.glb"), &[], b"");
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
+    seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/colors?scheme=chain"), &[], b"");
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/report.json"), &[], b"");
     let remote = Remote::saying(status(500));
     let away = fake(Mode::Octahedra, |c| {
@@ -228,6 +239,7 @@ fn sizes(seen: &Seen) {
     });
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/surface.glb"), &[], b"");
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/atoms"), &[], b"");
+    seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/colors?scheme=chain"), &[], b"");
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/report.json"), &[], b"");
     let few = fake(Mode::Octahedra, |c| c.limits.labels = 10);
     seen.expect(422, few.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
@@ -265,6 +277,7 @@ fn failures(seen: &Seen) {
     });
     let crowded = fake(Mode::Octahedra, |c| c.limits.memory_bytes = 1_000);
     seen.expect(503, crowded.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
+    seen.expect(503, crowded.addr, ("GET", "/v1/pdb/4pti/colors?scheme=chain"), &[], b"");
     for path in UPLOADS {
         seen.expect(503, crowded.addr, ("POST", path), &[], SAMPLE);
     }
@@ -292,6 +305,7 @@ fn restarts(seen: &Seen) {
     let server = begin(|c| c.limits.inflated_bytes = 1_000);
     get(&server, &structure, 413);
     get(&server, &format!("{structure}/atoms"), 413);
+    get(&server, &format!("{structure}/colors?scheme=chain"), 413);
     get(&server, &format!("{surface}?resolution=2"), 413);
     get(&server, &format!("{structure}/report.json"), 413);
     assert!(server.join());
@@ -302,6 +316,7 @@ fn restarts(seen: &Seen) {
     let server = begin(|c| c.limits.memory_bytes = 1_000);
     get(&server, &structure, 503);
     get(&server, &format!("{structure}/atoms"), 503);
+    get(&server, &format!("{structure}/colors?scheme=chain"), 503);
     get(&server, &format!("{surface}?resolution=2"), 503);
     get(&server, &format!("{structure}/report.json"), 503);
     assert!(server.join());

@@ -125,7 +125,7 @@ impl Backend for Fake {
                     suggested_resolution: 1.1,
                 });
             }
-            Mode::NoSurface => return Err(SurfaceError::NoSurface { isovalue: params.isovalue }),
+            Mode::NoSurface => return Err(SurfaceError::NoSurface { isovalue: params.level() }),
         }
         let mut mesh = octahedra(spheres);
         if mode == Mode::Broken {

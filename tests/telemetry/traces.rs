@@ -211,11 +211,11 @@ fn a_trace_continues_after_a_restart() {
     let held = Held::new();
     let (before, after) = (Collector::start(CollectorMode::Accept), Collector::start(CollectorMode::Accept));
     let folder = tempfile::tempdir().unwrap();
-    let keep = |config: &mut Config| {
-        folder.path().clone_into(&mut config.server.data_dir);
+    let keep = |config: &mut Config| folder.path().clone_into(&mut config.server.data_dir);
+    let server = traced(Arc::clone(&held) as _, &before, |config| {
+        keep(config);
         config.server.drain_timeout_ms = 1;
-    };
-    let server = traced(Arc::clone(&held) as _, &before, keep);
+    });
     let headers = [("prefer", "respond-async"), ("traceparent", PARENT), ("tracestate", "rojo=1")];
     let reply = server.post("/v1/meshes", &headers, SAMPLE);
     assert_eq!(reply.status, 202);

@@ -171,6 +171,18 @@ pub struct Png {
     pub pixels: Vec<[u8; 4]>,
 }
 
+/// Solvent-accessible area as `FreeSASA` computes it.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Sasa {
+    /// Area of all spheres, Å².
+    pub area: f64,
+}
+
+/// Computes solvent-accessible areas of files with a sphere per line.
+pub fn sasa(paths: &[impl AsRef<Path>]) -> Option<Vec<Sasa>> {
+    python("sasa.py", paths)
+}
+
 /// Reads PNG files.
 pub fn png(paths: &[impl AsRef<Path>]) -> Option<Vec<Png>> {
     python("read_png.py", paths)

@@ -15,8 +15,8 @@ pub struct Contents {
     pub normals: Vec<[f32; 3]>,
     pub triangles: Vec<[u32; 3]>,
     pub atoms: Option<Vec<u32>>,
-    /// As in the file: linear in glTF, sRGB in PLY.
-    pub colors: Option<Vec<[u8; 4]>>,
+    /// As in the file: linear, to 65,535, in glTF; sRGB, to 255, in PLY and OBJ, which has no alpha.
+    pub colors: Option<Vec<[u16; 4]>>,
 }
 
 /// JSON and binary chunk of a GLB.
@@ -94,7 +94,8 @@ pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
     }
     if let Some(accessor) = attributes.get("COLOR_0") {
         assert_eq!(accessor_of(json, accessor)["normalized"], true);
-        contents.colors = Some(rows(accessor, 5121, "VEC4", 4).iter().map(|r| (*r).try_into().unwrap()).collect());
+        let color = |r: &&[u8]| std::array::from_fn(|k| u16::from_le_bytes([r[2 * k], r[2 * k + 1]]));
+        contents.colors = Some(rows(accessor, 5123, "VEC4", 8).iter().map(color).collect());
     }
     if let Some(accessor) = attributes.get("_ATOM") {
         contents.atoms = Some(match accessor_of(json, accessor)["componentType"].as_u64().unwrap() {
@@ -199,7 +200,8 @@ pub fn read_ply(bytes: &[u8]) -> Contents {
             contents.normals.push(f32x3(take(12)));
         }
         if let Some(colors) = &mut contents.colors {
-            colors.push(take(4).try_into().unwrap());
+            let color: [u8; 4] = take(4).try_into().unwrap();
+            colors.push(color.map(u16::from));
         }
         if let Some(atoms) = &mut contents.atoms {
             atoms.push(u32_at(take(4), 0));
@@ -237,6 +239,12 @@ pub fn read_obj(bytes: &[u8]) -> Contents {
             all.try_into().unwrap()
         };
         match keyword {
+            "v" if rest.split(' ').count() == 6 => {
+                let all: Vec<f32> = rest.split(' ').map(|w| w.parse().unwrap()).collect();
+                contents.positions.push([all[0], all[1], all[2]]);
+                let level = |k: usize| (all[k] * 255.0).round() as u16;
+                contents.colors.get_or_insert_default().push([level(3), level(4), level(5), 255]);
+            }
             "v" => contents.positions.push(floats()),
             "vn" => contents.normals.push(floats()),
             "f" => {

@@ -10,7 +10,7 @@ Usage: write_bcif.py VARIANT INPUT.cif[.gz] OUTPUT.bcif. Variants:
 * texts: every column a StringArray, numbers too
 * compressed: the encodings that biotite finds smallest
 
-`entry`, `struct`, `entity`, `struct_asym` and `atom_site` are written. For every file one line of JSON: {"atoms": N, "encodings": [names]}.
+The categories in CATEGORIES are written. For every file one line of JSON: {"atoms": N, "encodings": [names]}.
 Without arguments, lines of VARIANT, INPUT and OUTPUT separated by tabs are read from standard input.
 """
 
@@ -22,6 +22,16 @@ import sys
 import biotite.structure.io.pdbx as pdbx
 import numpy as np
 
+CATEGORIES = (
+    "entry",
+    "struct",
+    "entity",
+    "entity_poly",
+    "struct_asym",
+    "pdbx_struct_assembly_gen",
+    "pdbx_struct_oper_list",
+    "atom_site",
+)
 BYTE_ARRAY = pdbx.ByteArrayEncoding
 PLACES = {"Cartn_x": 3, "Cartn_y": 3, "Cartn_z": 3, "occupancy": 2, "B_iso_or_equiv": 2}
 WHOLE = {"id", "auth_seq_id", "label_seq_id", "pdbx_PDB_model_num"}
@@ -99,7 +109,7 @@ def write(variant, source, target):
     with opener(source, "rt") as file:
         block = pdbx.CIFFile.read(io.StringIO(file.read())).block
     out = pdbx.BinaryCIFBlock()
-    for name in ("entry", "struct", "entity", "struct_asym", "atom_site"):
+    for name in CATEGORIES:
         if name in block:
             columns = {key: column(variant, name, key, value) for key, value in block[name].items()}
             out[name] = pdbx.BinaryCIFCategory(columns)

@@ -4,16 +4,22 @@ import { bytesOf } from "./api/bytes";
 import { Client } from "./api/client";
 import { fetchFile, type Job } from "./api/jobs";
 import { asProblem, Problem } from "./api/problem";
+import { Colors } from "./colors";
 import { load } from "./scene/load";
 import { contextOf, Viewer } from "./scene/viewer";
+import { chooseScheme, fillSchemes, showLegend } from "./ui/legend";
 
-const ATTRIBUTES = ["src", "color", "background", "turn", "alt"] as const;
+const ATTRIBUTES = ["src", "color", "scheme", "menu", "background", "turn", "alt"] as const;
 
 const STYLE = `
 :host { display: block; position: relative; min-height: 12rem }
-[hidden] { display: none }
+[hidden] { display: none !important }
 canvas { position: absolute; inset: 0; width: 100%; height: 100%; display: block; touch-action: none }
 canvas:focus-visible { outline: 2px solid Highlight; outline-offset: -2px }
+select { position: absolute; right: .5rem; bottom: .5rem; font: inherit }
+.legend { position: absolute; left: .5rem; bottom: .5rem; display: flex; flex-wrap: wrap; gap: 0 .6rem; align-items: center; max-width: 60%; padding: .1rem .4rem; background: Canvas; color: CanvasText; font-size: .8rem }
+.swatch { display: inline-block; width: .7rem; height: .7rem; margin-right: .3rem }
+.scale { width: 6rem; height: .7rem }
 p { margin: 0; padding: 1rem; overflow-wrap: anywhere }
 `;
 
@@ -23,6 +29,9 @@ export class MolmeshViewer extends HTMLElement {
   private viewer: Viewer | null = null;
   private abort: AbortController | null = null;
   private readonly canvas = document.createElement("canvas");
+  private readonly menu = document.createElement("select");
+  private readonly legend = document.createElement("div");
+  private colors: Colors | null = null;
   /** The content between the tags, shown instead of a surface. */
   private readonly fallback = document.createElement("slot");
   /** The reason why there is no surface, shown if there is no content between the tags. */
@@ -43,7 +52,11 @@ export class MolmeshViewer extends HTMLElement {
     this.canvas.addEventListener("click", (event) => this.clicked(event));
     this.canvas.addEventListener("keydown", (event) => this.pressed(event));
     this.reason.setAttribute("role", "alert");
-    root.append(this.canvas, this.fallback, this.reason);
+    fillSchemes(this.menu);
+    this.menu.setAttribute("aria-label", "Colours");
+    this.menu.addEventListener("change", () => this.setAttribute("scheme", this.menu.value));
+    this.legend.className = "legend";
+    root.append(this.canvas, this.legend, this.menu, this.fallback, this.reason);
     this.arrange();
   }
 
@@ -55,6 +68,7 @@ export class MolmeshViewer extends HTMLElement {
     } catch (error) {
       return this.fail(error);
     }
+    this.colors ??= new Colors(this.client, this.viewer, this.legend);
     this.dress();
     void this.load(this.src);
   }
@@ -63,11 +77,13 @@ export class MolmeshViewer extends HTMLElement {
     this.abort?.abort();
     this.viewer?.dispose();
     this.viewer = null;
+    this.colors = null;
   }
 
   attributeChangedCallback(name: (typeof ATTRIBUTES)[number], before: string | null, after: string | null): void {
     if (!this.viewer || before === after) return;
     if (name === "src") void this.load(after ?? "");
+    else if (name === "scheme") this.paint();
     else this.dress();
   }
 
@@ -91,6 +107,7 @@ export class MolmeshViewer extends HTMLElement {
       signal.throwIfAborted();
       // The canvas has a size only while it is visible.
       this.arrange();
+      this.paint();
       await this.viewer?.show(loaded, true);
       signal.throwIfAborted();
       if (this.hasAttribute("turn")) this.viewer?.turn(true);
@@ -136,7 +153,23 @@ export class MolmeshViewer extends HTMLElement {
     this.viewer?.move(...move);
   }
 
+  /** Applies the attribute `scheme` to a surface of this service. */
+  private paint(): void {
+    const scheme = this.getAttribute("scheme") ?? "none";
+    chooseScheme(this.menu, scheme);
+    const { pathname, searchParams, origin } = new URL(this.src, document.baseURI);
+    const structure = /^(.*\/v1\/(?:pdb|structures)\/[^/]+)\/surface\.glb$/.exec(pathname)?.[1];
+    this.menu.hidden = !this.hasAttribute("menu") || !structure;
+    if (!structure) return showLegend(this.legend, null);
+    const choices = new Map([...searchParams, ["color", scheme]] as [string, string][]);
+    this.colors?.apply(origin + structure, choices).catch((error: unknown) => {
+      const { document } = asProblem(error);
+      this.tell("error", { message: document.detail ?? document.title, problem: error instanceof Problem ? document : null });
+    });
+  }
+
   private dress(): void {
+    this.paint();
     this.canvas.setAttribute("aria-label", this.getAttribute("alt") ?? "A molecular surface; arrow keys turn it");
     this.style.background = this.getAttribute("background") ?? "";
     this.viewer?.theme(this.getAttribute("background") ?? "#ffffff", this.getAttribute("color") ?? "#58ad9d");

@@ -5,6 +5,7 @@ import type { Job } from "./api/jobs";
 import { asProblem, Problem } from "./api/problem";
 import type { Parameter } from "./api/schema";
 import { entry, type Labels, labels, type Source, type Summary, upload } from "./api/structures";
+import { Colors } from "./colors";
 import { Downloads } from "./downloads";
 import { drops } from "./drop";
 import { keyboard } from "./keyboard";
@@ -14,6 +15,7 @@ import { addressOf, type Choices, coarser, curl, currentAddress, drawn, readAddr
 import { Stage } from "./stage";
 import { $, copy, el, number, show } from "./ui/dom";
 import { Form } from "./ui/form";
+import { chooseScheme, fillSchemes } from "./ui/legend";
 import { problem as showProblem } from "./ui/problem";
 import { report, timingsOf } from "./ui/report";
 
@@ -24,6 +26,8 @@ export class Page {
   readonly stage: Stage;
   private readonly remesher: Remesher;
   private readonly picker: Picker | null;
+  private readonly colors: Colors | null;
+  private readonly menu = $<HTMLSelectElement>("colour");
   private form: Form | null = null;
   /**
    * The shown surface with its structure and parameters. Caption, address, command line, report and downloads describe
@@ -43,6 +47,8 @@ export class Page {
     this.stage = new Stage(client, (turning) => $("turn").setAttribute("aria-pressed", String(turning)));
     const { viewer } = this.stage;
     this.picker = viewer && new Picker(viewer, (words) => this.say(words));
+    this.colors = viewer && new Colors(client, viewer, $("legend"));
+    fillSchemes(this.menu);
     if (viewer && this.picker) keyboard($("view-home"), viewer, this.picker);
     for (const id of ["turn", "home", "colour"]) show($(id), viewer !== null);
     $("turn").addEventListener("click", () => viewer?.turn(!viewer.isTurning, true));
@@ -136,6 +142,7 @@ export class Page {
       this.changed(false);
     });
     $("format").addEventListener("change", () => this.commands());
+    this.menu.addEventListener("change", () => this.recolour(this.menu.value));
     window.addEventListener("popstate", () => {
       // A step to another fragment of the same address opens nothing.
       if (this.shown && addressOf(this.shown.source, this.shown.choices) === currentAddress()) return;
@@ -207,12 +214,27 @@ export class Page {
     this.remesher.want({ source, choices, path: drawn(source, form.mesh(choices)), live, since });
   }
 
-  /** Updates downloads and command line after a parameter of pictures was set. The surface stays. */
+  /** Sets a colour scheme. Resets palette and range, which may not apply to the new scheme. */
+  private recolour(scheme: string): void {
+    for (const name of ["palette", "color_range"]) this.form?.put(name, undefined);
+    this.form?.set("color", scheme === "none" ? undefined : scheme);
+  }
+
+  /** Applies the colours of the parameters to the surface shown. */
+  private paint(): void {
+    const { shown } = this;
+    if (!shown) return;
+    chooseScheme(this.menu, shown.choices.get("color") ?? "none");
+    this.colors?.apply(shown.source.path, shown.choices).catch((error: unknown) => this.problem(error, () => this.paint(), shown.source.name));
+  }
+
+  /** Updates colours, downloads and command line after a change of a parameter that does not affect the mesh. */
   private pictured(): void {
     const { form, shown } = this;
     this.resettable();
     if (!form || !shown) return;
     shown.choices = new Map([...form.mesh(shown.choices), ...form.apart(form.all)]);
+    this.paint();
     this.commands();
   }
 
@@ -319,8 +341,10 @@ export class Page {
     if (isOther) {
       const chains = source.summary?.chains.map((c) => c.name || "_").slice(0, 12).join(",");
       form.hint("chains", chains ? `all: ${chains}` : "all");
+      form.offer("assembly", source.summary?.assemblies.map(({ id }) => id) ?? []);
       this.label(source);
     }
+    this.paint();
     form.tell(extras);
     report($("report"), extras, timingsOf(headers));
     $("now").textContent = `${Number(extras["triangles"]).toLocaleString("en")} triangles`;

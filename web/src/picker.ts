@@ -1,8 +1,6 @@
 /** Atom selection: under the pointer, pinned by a click, or found by name. */
 
 import { type Atom, type Labels, nameOf } from "./api/structures";
-import { chainColors, elementColors } from "./scene/colors";
-import { palette } from "./scene/material";
 import type { Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
 
@@ -36,7 +34,6 @@ export class Picker {
       event.preventDefault();
       this.find($<HTMLInputElement>("find").value);
     });
-    this.colour.addEventListener("change", () => this.paint());
   }
 
   /** Sets the labels of the shown structure; null while they are not available. */
@@ -45,7 +42,6 @@ export class Picker {
     this.pin(null, false);
     this.hover(null);
     this.colour.disabled = !labels;
-    this.paint();
   }
 
   /** Pins the atom in the middle of the canvas. */
@@ -115,13 +111,6 @@ export class Picker {
 
   private tell(nodes: Node[]): void {
     $("picked").replaceChildren(...nodes);
-  }
-
-  private paint(): void {
-    const by = this.colour.value;
-    if (!this.labels || (by !== "chain" && by !== "element")) return this.viewer.colour(null, 0);
-    const { of, names } = this.labels.classes(by);
-    this.viewer.colour(palette(of, by === "chain" ? chainColors(names) : elementColors(names)), of.length);
   }
 }
 

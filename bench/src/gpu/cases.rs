@@ -47,7 +47,7 @@ pub(super) fn selected(atoms: usize, only: &str) -> Vec<Case> {
     let all = [
         Case { name: "ball-0.5", source: Source::Ball(atoms), spacing: Spacing::Is(0.5) },
         file("2hhb-7.27M", "2hhb", "polymer", 1, Spacing::Cells(PAPER_CUBES)),
-        file("1aon-0.5", "1aon", "polymer,ligand", 1, Spacing::Is(0.5)),
+        file("1aon-0.5", "1aon", "polymer,ligand,ion", 1, Spacing::Is(0.5)),
         file("7cgo-0.5", "7cgo", "polymer", 1, Spacing::Is(0.5)),
         file("7cgo-1.0", "7cgo", "polymer", 1, Spacing::Is(1.0)),
         file("7cgo-x9-1.0", "7cgo", "polymer", 3, Spacing::Is(1.0)),

@@ -63,7 +63,7 @@ pub(crate) fn surface(kernel: Kernel, spacing: f64) -> Result<SurfaceParams> {
         Kernel::InverseSquare => (None, Some(4.0), Some(1.0), 0.232),
     };
     let options = SurfaceOptions {
-        kernel: Some(kernel),
+        surface: Some(kernel.into()),
         resolution: Some(spacing),
         isovalue: Some(isovalue),
         paper_a: a,
@@ -102,7 +102,7 @@ mod tests {
     fn raw_parameters_give_the_radius_and_support_of_an_atom() {
         for kernel in KERNELS {
             let params = surface(kernel, 0.4).unwrap();
-            let profile = Profile::new(&params);
+            let profile = Profile::new(kernel, &params);
             let length = profile.length(1.5);
             assert_eq!(length, profile.length(2.0), "radii are not used");
             assert!((profile.reach(length) - 4.0).abs() < 0.02, "{kernel}: {}", profile.reach(length));

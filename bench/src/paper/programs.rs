@@ -178,7 +178,7 @@ pub(super) fn reference_estimate(spheres: &Spheres, params: &SurfaceParams, cube
     /// Pairs of the trial, which takes about ten milliseconds.
     const PAIRS: usize = 4_000_000;
     let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
-    let density = Density::new(spheres, params);
+    let Ok(density) = Density::new(spheres, params) else { return 0.0 };
     let n = (PAIRS / spheres.len().max(1)).clamp(16, 100_000);
     let start = Instant::now();
     for i in 0..n {

@@ -51,7 +51,7 @@ fn params(options: &SurfaceOptions) -> SurfaceParams {
 }
 
 fn of(kernel: Kernel, resolution: f64) -> SurfaceParams {
-    params(&SurfaceOptions { kernel: Some(kernel), resolution: Some(resolution), ..SurfaceOptions::default() })
+    params(&SurfaceOptions { surface: Some(kernel.into()), resolution: Some(resolution), ..SurfaceOptions::default() })
 }
 
 fn spheres(rows: &[[f64; 4]]) -> Spheres {
@@ -141,9 +141,9 @@ fn surfaces_equal_those_of_the_cpu_for_all_kernels() {
 #[test]
 fn raw_kernel_parameters_give_the_surface_of_the_cpu() {
     let crambin = crambin();
-    let raw = |kernel, [a, b, c]: [Option<f64>; 3], iso| {
+    let raw = |kernel: Kernel, [a, b, c]: [Option<f64>; 3], iso| {
         params(&SurfaceOptions {
-            kernel: Some(kernel),
+            surface: Some(kernel.into()),
             paper_a: a,
             paper_b: b,
             paper_c: c,
@@ -158,7 +158,7 @@ fn raw_kernel_parameters_give_the_surface_of_the_cpu() {
         raw(Kernel::InverseSquare, [None, Some(5.0), Some(0.8)], 0.4),
     ] {
         let (soup, cpu) = (run(&crambin, &params).unwrap(), cpu(&crambin, &params));
-        assert_eq!(difference(&soup, &cpu), Vec::<String>::new(), "{}", params.kernel);
+        assert_eq!(difference(&soup, &cpu), Vec::<String>::new(), "{}", params.surface);
     }
 }
 

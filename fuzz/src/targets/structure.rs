@@ -83,8 +83,12 @@ pub(super) const BINARYCIF: &[&str] = &[
     "\u{1}\u{0}",
 ];
 
+/// Selections of the jobs.
+const EXPRESSIONS: [&str; 4] =
+    ["polymer", "all", "byres within 4 of (ligand or ion)", "not water and not (resi 1-9 or elem C),hydrogens"];
+
 const LIMITS: JobLimits = JobLimits {
-    read: ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 5_000, max_duplicates: 1_000 },
+    read: ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 5_000, max_duplicates: 1_000, max_copies: 100 },
     surface: SurfaceLimits { max_samples: 1 << 19, max_mesh_bytes: 8 << 20, max_candidates: 1 << 18 },
     picture: molmesh::picture::PictureLimits { max_side: 64 },
 };
@@ -100,7 +104,7 @@ pub(super) fn mesh(bytes: &[u8]) {
     let options = SurfaceOptions { resolution: Some(2.0), atom_ids: has(0), ..SurfaceOptions::default() };
     let Ok(params) = SurfaceParams::new(&options) else { unreachable!("valid parameters") };
     let job = Job {
-        selection: Selection { ligands: has(1), waters: has(1), hydrogens: has(2), ..Selection::default() },
+        selection: Selection { atoms: EXPRESSIONS[bits >> 1 & 3].parse().unwrap_or_default(), ..Selection::default() },
         params,
         spacing: if has(3) { Spacing::Detail(0) } else { Spacing::Given },
         validation: Validation::Exact,

@@ -37,6 +37,7 @@ pub(super) const PARAMETERS: &[&str] = &[
     "chains=",
     "select=",
     "altloc=",
+    "assembly=",
     "validation=",
     "check=",
     "format=",
@@ -56,10 +57,19 @@ pub(super) const PARAMETERS: &[&str] = &[
     "png",
     "obj",
     "polymer",
-    "ligands",
-    "water",
+    "ligand,water",
     "hydrogens",
     "all",
+    "chain A",
+    "resi 10-20,52A",
+    "resn HEM",
+    "name \"O5\"",
+    "elem Fe",
+    "within 5 of (",
+    "byres ",
+    " and ",
+    " or ",
+    "not ",
     "exact",
     "meter",
     "none",
@@ -170,6 +180,9 @@ pub(super) fn parameters(bytes: &[u8]) {
             // The order of parameters does not matter.
             let reversed = params::parse(pairs.iter().rev().copied()).expect("the same parameters in another order");
             assert_eq!(canonical, params::canonical(&reversed.job));
+            // The canonical form of an expression is an expression with the same meaning.
+            let atoms = request.job.selection.atoms;
+            assert_eq!(atoms.to_string().parse(), Ok(atoms));
         }
         Err(error) => assert_short(&error.to_string()),
     }

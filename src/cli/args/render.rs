@@ -10,7 +10,7 @@ const RENDER_EXAMPLES: &str = "\
 Examples:
   molmesh render 4pti.pdb -o 4pti.png
   molmesh render 1gbt.cif.gz -o - --width 256 --height 256 --background white > thumbnail.png
-  molmesh render 4pti.pdb -o 4pti.png --kernel soft-object --style gouraud --view front --azimuth 30";
+  molmesh render 4pti.pdb -o 4pti.png --surface ses --style gouraud --view front --azimuth 30";
 
 // `molmesh render`.
 #[derive(Debug, ClapArgs)]

@@ -95,13 +95,14 @@ pub(super) fn first_mesh(backend: &dyn Backend) -> Check {
 }
 
 /// Checks that the memory budgets fit into the memory.
-pub(super) fn memory(machine: &Machine, config: &Config, workers: usize) -> Check {
+pub(super) fn memory(machine: &Machine, config: &Config, workers: usize, devices: usize) -> Check {
     let (limits, archive) = (&config.limits, &config.archive);
-    let workers = u64::try_from(workers).unwrap_or(u64::MAX);
+    let [workers, devices] = [workers, devices].map(|n| u64::try_from(n).unwrap_or(u64::MAX));
     let fetches = if archive.url.is_some() { archive.concurrent as u64 } else { 0 };
     let parts = [
         ("limits.memory_bytes", limits.memory_bytes),
-        ("meshes of running jobs", limits.mesh_bytes.saturating_mul(workers)),
+        ("meshes of jobs", limits.mesh_bytes.saturating_mul(workers)),
+        ("readback buffers", config.devices.readback_bytes.saturating_mul(devices)),
         ("store.memory_bytes", config.store.memory_bytes),
         ("fetched entries", archive.max_bytes.saturating_mul(fetches)),
     ];
@@ -181,14 +182,15 @@ mod tests {
         config.limits.memory_bytes = 1 << 30;
         config.limits.mesh_bytes = 1 << 20;
         config.store.memory_bytes = 1 << 20;
+        config.devices.readback_bytes = 1 << 20;
         config.archive.url = None;
         let machine = |limit| Machine { limit, ..Machine::default() };
-        let state = |limit| memory(&machine(limit), &config, 2).state;
-        let enough = (1 << 30) + (3 << 20);
+        let state = |limit| memory(&machine(limit), &config, 2, 1).state;
+        let enough = (1 << 30) + (4 << 20);
         assert_eq!(state(Some((enough, "this control group"))), State::Ok);
         assert_eq!(state(Some((enough - 1, "this control group"))), State::Warning);
         assert_eq!(state(None), State::Ok);
-        let detail = memory(&machine(Some((enough - 1, "this control group"))), &config, 2).detail;
-        assert!(detail.contains("1027MiB at most") && detail.contains("this control group"), "{detail}");
+        let detail = memory(&machine(Some((enough - 1, "this control group"))), &config, 2, 1).detail;
+        assert!(detail.contains("1028MiB at most") && detail.contains("this control group"), "{detail}");
     }
 }

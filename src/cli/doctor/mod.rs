@@ -62,13 +62,14 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
             backends = survey::backends(&selected);
             let SelectedBackend { backend, reason, devices: found, .. } = selected;
             checks.push(checks::first_mesh(backend.as_ref()));
-            let workers = config.jobs.workers.max(config.devices.jobs * backend.devices().len());
-            checks.push(checks::memory(&machine, &config, workers));
+            let n_devices = backend.devices().len();
+            let workers = config.jobs.workers.max(config.devices.jobs * n_devices);
+            checks.push(checks::memory(&machine, &config, workers, n_devices));
             (devices, taken) = (found, Some((backend.name(), reason)));
         }
         Err(error @ CliError::NoBackend { .. }) => {
             checks.push(Check::new(checks::DEVICES, State::Failed, error.to_string()));
-            checks.push(checks::memory(&machine, &config, config.jobs.workers));
+            checks.push(checks::memory(&machine, &config, config.jobs.workers, 0));
         }
         Err(error) => return Err(error),
     }

@@ -1,68 +1,129 @@
-//! The bytes of the buffer, in the order of the layout.
+//! Bytes of the buffer, as rows of its columns. Each row has a fixed offset, so an output with random access receives
+//! rows in any order.
 
 use std::io::{self, Write};
 
-use super::layout::{AtomType, IndexType, Layout};
+use super::layout::{ATOM_BYTES, AtomType, COLOR_BYTES, IndexType, Layout};
 use crate::formats::block::{convert_words, write_rows};
 use crate::formats::{Packing, quantize};
-use crate::surface::Mesh;
+use crate::surface::{Mesh, MeshPart, Vertices};
 
-/// Writes the buffer of `mesh`: `layout.len` bytes.
+/// Consecutive rows of one column of a mesh.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Rows<'a> {
+    /// Positions relative to the mesh's centre, Å.
+    Positions(&'a [[f32; 3]]),
+    /// Positions relative to the mesh's centre, in steps.
+    QuantizedPositions(&'a [[i16; 4]]),
+    /// Unit normals.
+    Normals(&'a [[f32; 3]]),
+    /// Unit normals, in units of 1/127.
+    QuantizedNormals(&'a [[i8; 4]]),
+    /// Colours: sRGB and alpha.
+    Colors(&'a [[u8; 4]]),
+    /// Atom indices.
+    Atoms(&'a [u32]),
+    /// Vertex indices.
+    Triangles(&'a [[u32; 3]]),
+}
+
+impl<'a> Rows<'a> {
+    /// Returns the columns of a part, each with the index of its first row in the mesh.
+    pub(super) fn of_part(part: &MeshPart<'a>) -> [(u64, Self); 3] {
+        let (positions, normals) = match part.vertices {
+            Vertices::Single { positions, normals } => (Self::Positions(positions), Self::Normals(normals)),
+            Vertices::Quantized { positions, normals, .. } => {
+                (Self::QuantizedPositions(positions), Self::QuantizedNormals(normals))
+            }
+        };
+        let [vertex, triangle] = [part.first_vertex as u64, part.first_triangle as u64];
+        [(vertex, positions), (vertex, normals), (triangle, Self::Triangles(part.triangles))]
+    }
+
+    /// Returns the chunks of the columns of a mesh in the order of the layout, each with the index of its first row.
+    fn of_mesh(mesh: &'a Mesh) -> Vec<(u64, Self)> {
+        let mut all = Vec::new();
+        if let Some(quantized) = &mesh.quantized {
+            append(&mut all, quantized.positions.pieces(), Self::QuantizedPositions);
+            append(&mut all, quantized.normals.pieces(), Self::QuantizedNormals);
+        } else {
+            append(&mut all, mesh.positions.pieces(), Self::Positions);
+            append(&mut all, mesh.normals.pieces(), Self::Normals);
+        }
+        if let Some(colors) = &mesh.colors {
+            append(&mut all, colors.pieces(), Self::Colors);
+        }
+        if let Some(atoms) = &mesh.atom_ids {
+            append(&mut all, atoms.pieces(), Self::Atoms);
+        }
+        append(&mut all, mesh.triangles.pieces(), Self::Triangles);
+        all
+    }
+
+    /// Returns the byte offset of these rows in the buffer; `None` if the layout lacks the column. `first` is the index
+    /// of the first row in the mesh.
+    pub(super) fn offset(self, layout: &Layout, first: u64) -> Option<u64> {
+        let packing = layout.storage.packing;
+        let (span, row_bytes) = match self {
+            Self::Positions(_) | Self::QuantizedPositions(_) => (layout.positions, packing.position_bytes()),
+            Self::Normals(_) | Self::QuantizedNormals(_) => (layout.normals?, packing.normal_bytes()),
+            Self::Colors(_) => (layout.colors?, COLOR_BYTES),
+            Self::Atoms(_) => (layout.atoms?.1, ATOM_BYTES),
+            Self::Triangles(_) => (layout.indices.1, 3 * layout.indices.0.bytes()),
+        };
+        Some(span.offset + row_bytes * first)
+    }
+
+    /// Writes these rows in the types of the layout.
+    pub(super) fn write(self, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
+        match (self, layout.storage.packing) {
+            (Self::QuantizedPositions(rows), _) => write_rows(out, rows),
+            (Self::QuantizedNormals(rows), _) => write_rows(out, rows),
+            (Self::Positions(rows) | Self::Normals(rows), Packing::Full) => write_rows(out, rows),
+            (Self::Positions(rows), Packing::Quantized(step)) => convert_words(out, rows, |row| {
+                let [x, y, z] = step.position(row).map(i16::to_le_bytes);
+                [x[0], x[1], y[0], y[1], z[0], z[1], 0, 0]
+            }),
+            (Self::Normals(rows), Packing::Quantized(_)) => convert_words(out, rows, |row| {
+                let [x, y, z] = quantize::normal(row).map(|v| v.to_le_bytes()[0]);
+                [x, y, z, 0]
+            }),
+            (Self::Colors(rows), _) => {
+                let linear = linear_of_srgb();
+                convert_words(out, rows, |[r, g, b, a]| {
+                    // 255 · 257 = 65,535
+                    let [r, g, b] = [r, g, b].map(|byte| linear[usize::from(byte)]);
+                    let [[r0, r1], [g0, g1], [b0, b1], [a0, a1]] = [r, g, b, 257 * u16::from(a)].map(u16::to_le_bytes);
+                    [r0, r1, g0, g1, b0, b1, a0, a1]
+                })
+            }
+            (Self::Atoms(rows), _) => match layout.atoms {
+                Some((AtomType::F32, _)) => convert_words(out, rows, exact_f32_bytes),
+                // A small 32-bit integer, low byte first, is a 16-bit integer and two zero bytes.
+                _ => write_rows(out, rows),
+            },
+            (Self::Triangles(rows), _) => write_indices(out, layout.indices.0, rows.as_flattened()),
+        }
+    }
+}
+
+/// Appends the chunks of a column.
+fn append<'a, T>(all: &mut Vec<(u64, Rows<'a>)>, chunks: impl Iterator<Item = &'a [T]>, rows: fn(&'a [T]) -> Rows<'a>) {
+    let mut first = 0;
+    for chunk in chunks {
+        all.push((first, rows(chunk)));
+        first += chunk.len() as u64;
+    }
+}
+
+/// Writes the buffer of `mesh` in order: `layout.len` bytes.
 pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
-    // Writes each chunk of a column directly, without joining the chunks.
-    let packing = layout.storage.packing;
-    let normals = layout.normals.is_some();
-    if let Some(quantized) = &mesh.quantized {
-        quantized.positions.pieces().try_for_each(|rows| write_rows(out, rows))?;
-        if normals {
-            quantized.normals.pieces().try_for_each(|rows| write_rows(out, rows))?;
-        }
-    } else {
-        mesh.positions.pieces().try_for_each(|rows| write_positions(out, packing, rows))?;
-        if normals {
-            mesh.normals.pieces().try_for_each(|rows| write_normals(out, packing, rows))?;
-        }
-    }
-    if let Some(colors) = &mesh.colors {
-        let linear = linear_of_srgb();
-        convert_words(out, &colors[..], |[r, g, b, a]| {
-            [linear[usize::from(r)], linear[usize::from(g)], linear[usize::from(b)], a]
-        })?;
-    }
-    if let (Some(ids), Some((atom_type, _))) = (&mesh.atom_ids, layout.atoms) {
-        match atom_type {
-            // A small 32-bit integer, low byte first, is a 16-bit integer and two zero bytes.
-            AtomType::U16 => ids.pieces().try_for_each(|rows| write_rows(out, rows))?,
-            AtomType::F32 => ids.pieces().try_for_each(|rows| convert_words(out, rows, exact_f32_bytes))?,
-        }
-    }
-    mesh.triangles.pieces().try_for_each(|rows| write_indices(out, layout.indices.0, rows.as_flattened()))
-}
-
-/// Writes positions relative to the mesh's centre, Å, in the packing of the layout.
-pub(super) fn write_positions(out: &mut dyn Write, packing: Packing, rows: &[[f32; 3]]) -> io::Result<()> {
-    match packing {
-        Packing::Full => write_rows(out, rows),
-        Packing::Quantized(step) => convert_words(out, rows, |row| {
-            let [x, y, z] = step.position(row).map(i16::to_le_bytes);
-            [x[0], x[1], y[0], y[1], z[0], z[1], 0, 0]
-        }),
-    }
-}
-
-/// Writes unit normals in the packing of the layout.
-pub(super) fn write_normals(out: &mut dyn Write, packing: Packing, rows: &[[f32; 3]]) -> io::Result<()> {
-    match packing {
-        Packing::Full => write_rows(out, rows),
-        Packing::Quantized(_) => convert_words(out, rows, |row| {
-            let [x, y, z] = quantize::normal(row).map(|v| v.to_le_bytes()[0]);
-            [x, y, z, 0]
-        }),
-    }
+    let columns = Rows::of_mesh(mesh).into_iter().filter(|(first, rows)| rows.offset(layout, *first).is_some());
+    columns.map(|(_, rows)| rows).try_for_each(|rows| rows.write(layout, out))
 }
 
 /// Writes indices in the type of the layout.
-pub(super) fn write_indices(out: &mut dyn Write, index_type: IndexType, indices: &[u32]) -> io::Result<()> {
+fn write_indices(out: &mut dyn Write, index_type: IndexType, indices: &[u32]) -> io::Result<()> {
     match index_type {
         IndexType::U8 => convert_words(out, indices, |index| [index.to_le_bytes()[0]]),
         IndexType::U16 => convert_words(out, indices, |index| {
@@ -78,13 +139,19 @@ fn exact_f32_bytes(value: u32) -> [u8; 4] {
     (value as f32).to_le_bytes()
 }
 
-/// sRGB to linear light, both as bytes: glTF multiplies linear colours (transfer function of IEC 61966-2-1).
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a number from 0 to 255 that was rounded")]
-fn linear_of_srgb() -> [u8; 256] {
+/// Returns 16 bits of linear light for each byte of sRGB (transfer function of IEC 61966-2-1). glTF multiplies linear
+/// colours; 8 bits would merge dark tones.
+#[expect(
+    clippy::cast_precision_loss,
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "0 to 255, and 0 to 65,535 after rounding"
+)]
+fn linear_of_srgb() -> [u16; 256] {
     std::array::from_fn(|byte| {
-        let s = f64::from(u8::try_from(byte).unwrap_or(u8::MAX)) / 255.0;
+        let s = byte as f64 / 255.0;
         let linear = if s <= 0.04045 { s / 12.92 } else { ((s + 0.055) / 1.055).powf(2.4) };
-        (linear * 255.0).round() as u8
+        (linear * 65_535.0).round() as u16
     })
 }
 
@@ -95,8 +162,9 @@ mod tests {
     #[test]
     fn colours_become_linear_light() {
         let table = linear_of_srgb();
-        assert_eq!((table[0], table[128], table[188], table[255]), (0, 55, 128, 255));
-        assert!(table.is_sorted());
+        // Values of the standard's formula.
+        assert_eq!([0, 1, 10, 128, 188, 255].map(|i: usize| table[i]), [0, 20, 199, 14_146, 32_957, 65_535]);
+        assert!(table.is_sorted_by(|a, b| a < b), "no two levels are merged");
     }
 
     #[test]

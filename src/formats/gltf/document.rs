@@ -102,12 +102,13 @@ fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
     let mut attribute = |semantic: Semantic, span: Span, component: ComponentType, shape: Type| {
         let stride = match component {
             ComponentType::I16 => Some(Stride(8)),
-            ComponentType::I8 | ComponentType::U16 => Some(Stride(4)),
+            ComponentType::I8 => Some(Stride(4)),
+            ComponentType::U16 if shape == Type::Scalar => Some(Stride(4)),
             _ => None,
         };
         let view = view(root, buffer, span, stride, Target::ArrayBuffer);
         let mut accessor = accessor(view, n, component, shape);
-        accessor.normalized = matches!(component, ComponentType::U8 | ComponentType::I8);
+        accessor.normalized = matches!((component, shape), (ComponentType::I8, _) | (ComponentType::U16, Type::Vec4));
         if semantic == Semantic::Positions {
             // These are exactly values of the buffer: rounding preserves the order, and doubles hold floats exactly.
             let [low, high] = summary.bounds.map(|row| match layout.storage.packing {
@@ -125,7 +126,7 @@ fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
     let mut attributes = BTreeMap::from([attribute(Semantic::Positions, layout.positions, position, Type::Vec3)]);
     // Without normals viewers shade each triangle flat, as the standard requires.
     attributes.extend(layout.normals.map(|span| attribute(Semantic::Normals, span, normal, Type::Vec3)));
-    attributes.extend(layout.colors.map(|span| attribute(Semantic::Colors(0), span, ComponentType::U8, Type::Vec4)));
+    attributes.extend(layout.colors.map(|span| attribute(Semantic::Colors(0), span, ComponentType::U16, Type::Vec4)));
     attributes.extend(layout.atoms.map(|(atom_type, span)| {
         let component = match atom_type {
             AtomType::U16 => ComponentType::U16,

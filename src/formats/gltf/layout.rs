@@ -7,6 +7,11 @@ use crate::surface::Mesh;
 /// Limit up to which every integer is exact in a 32-bit float.
 const MAX_EXACT_F32: u32 = 1 << 24;
 
+/// Length of a colour: four 16-bit integers.
+pub(super) const COLOR_BYTES: u64 = 8;
+/// Length of an atom index in either type.
+pub(super) const ATOM_BYTES: u64 = 4;
+
 /// Component type of the indices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum IndexType {
@@ -113,8 +118,8 @@ impl Layout {
         };
         let positions = span(storage.packing.position_bytes() * n_vertices);
         let normals = storage.normal_bytes().map(|bytes| span(bytes * n_vertices));
-        let colors = colors.then(|| span(4 * n_vertices));
-        let atoms = atoms.map(|atom_type| (atom_type, span(4 * n_vertices)));
+        let colors = colors.then(|| span(COLOR_BYTES * n_vertices));
+        let atoms = atoms.map(|atom_type| (atom_type, span(ATOM_BYTES * n_vertices)));
         let indices = (index_type, span(3 * n_triangles * index_type.bytes()));
         Ok(Self { n_vertices, n_triangles, storage, positions, normals, colors, atoms, indices, len: end })
     }
@@ -182,7 +187,7 @@ mod tests {
                 assert_eq!((span.offset, span.offset % 4), (end, 0));
                 end += span.len;
             }
-            assert_eq!((end, layout.len), (vertices + 20 + 20 + 9, vertices + 49));
+            assert_eq!((end, layout.len), (vertices + 40 + 20 + 9, vertices + 69));
         }
     }
 }

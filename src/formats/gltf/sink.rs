@@ -8,10 +8,9 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use thiserror::Error;
 
-use super::buffer::{write_indices, write_normals, write_positions};
+use super::buffer::Rows;
 use super::glb::{GlbPlan, HEAD_BYTES, LARGE_BUFFER_BYTES};
 use super::layout::Layout;
-use crate::formats::block::write_rows;
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::{MeshPart, MeshSink, SinkFailed, Vertices};
@@ -120,46 +119,28 @@ impl<'a> GlbSink<'a> {
 
     fn try_part(&self, part: &MeshPart<'_>) -> Result<(), GlbSinkError> {
         let Some(layout) = self.layout.get().copied().flatten() else { return Ok(()) };
-        let packing = layout.storage.packing;
-        let row = part.first_vertex as u64;
-        let positions = layout.positions.offset + packing.position_bytes() * row;
-        let normals = layout.normals.map(|normals| normals.offset + packing.normal_bytes() * row);
-        match part.vertices {
-            Vertices::Single { positions: rows, normals: units } => {
-                self.write_at(&layout, positions, |out| write_positions(out, packing, rows))?;
-                if let Some(normals) = normals {
-                    self.write_at(&layout, normals, |out| write_normals(out, packing, units))?;
-                }
-            }
-            Vertices::Quantized { step, positions: rows, normals: units } if packing.step() == Some(step) => {
-                self.write_at(&layout, positions, |out| write_rows(out, rows))?;
-                if let Some(normals) = normals {
-                    self.write_at(&layout, normals, |out| write_rows(out, units))?;
-                }
-            }
-            Vertices::Quantized { step, .. } => {
-                return Err(FormatError::AlreadyQuantized { step: step.length() }.into());
+        if let Vertices::Quantized { step, .. } = part.vertices
+            && layout.storage.packing.step() != Some(step)
+        {
+            return Err(FormatError::AlreadyQuantized { step: step.length() }.into());
+        }
+        for (first, rows) in Rows::of_part(part) {
+            if let Some(offset) = rows.offset(&layout, first) {
+                self.write_at(&layout, offset, rows)?;
             }
         }
-        let (index_type, indices) = layout.indices;
-        let indices = indices.offset + 3 * index_type.bytes() * part.first_triangle as u64;
-        Ok(self.write_at(&layout, indices, |out| write_indices(out, index_type, part.triangles.as_flattened()))?)
+        Ok(())
     }
 
     /// Writes rows from byte `offset` of the buffer on.
-    fn write_at(
-        &self,
-        layout: &Layout,
-        offset: u64,
-        write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
-    ) -> io::Result<()> {
+    fn write_at(&self, layout: &Layout, offset: u64, rows: Rows<'_>) -> io::Result<()> {
         if layout.len >= LARGE_BUFFER_BYTES {
-            return write(&mut WriterAt { out: self.out, offset: HEAD_BYTES + offset });
+            return rows.write(layout, &mut WriterAt { out: self.out, offset: HEAD_BYTES + offset });
         }
         let mut small = lock(&self.small);
         let mut cursor = Cursor::new(&mut small[..]);
         cursor.set_position(offset);
-        write(&mut cursor)
+        rows.write(layout, &mut cursor)
     }
 
     fn note<T>(&self, done: Result<T, GlbSinkError>) -> Result<T, SinkFailed> {

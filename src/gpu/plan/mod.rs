@@ -15,8 +15,9 @@ use self::layout::{NONE, Params, Tile, halves};
 pub use self::partition::Partition;
 use crate::surface::cpu;
 use crate::surface::cpu::field::Constants;
-use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, tile_of, tile_order, to_f32, to_u32, to_u64};
-use crate::surface::occupancy::{BrickBits, Occupancy, TileOccupancy, count_ones, local_brick};
+use crate::surface::kernel::Profile;
+use crate::surface::lattice::{BRICK, Lattice, tile_order, to_f32, to_u32, to_u64};
+use crate::surface::occupancy::{BrickBits, Occupancy, TileOccupancy, count_ones};
 use crate::surface::{Control, Step, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// Bricks of a job.
@@ -48,11 +49,11 @@ impl Plan {
     /// limits, [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let occupancy = Occupancy::new(lattice, limits, control)?;
-        let bases = tile_bases(&occupancy.tiles)
+        let (bases, n_bricks) = tile_bases(&occupancy.tiles)
             .ok_or_else(|| cpu::grid_too_large(lattice, u64::from(u32::MAX) * 512, limits))?;
         let occupied = &occupancy.tiles;
         let tiles: Vec<Tile> = occupied.par_iter().zip(&bases).map(|(own, &base)| tile(occupied, own, base)).collect();
-        let (bricks, first_atoms) = list_bricks(&occupancy, &lattice.atoms);
+        let (bricks, first_atoms) = list_bricks(&occupancy, n_bricks);
         Ok(Self {
             tiles,
             bricks,
@@ -72,8 +73,8 @@ impl Plan {
 
     /// Parameters that all dispatches of the job have in common.
     #[must_use]
-    pub fn params(&self, lattice: &Lattice, params: &SurfaceParams) -> Params {
-        let field = Constants::new(&lattice.profile, lattice.spacing);
+    pub fn params(&self, lattice: &Lattice, profile: &Profile, params: &SurfaceParams) -> Params {
+        let field = Constants::new(profile, lattice.spacing);
         // An atom lies at most half a spacing outside the samples of its brick.
         let bricks = |reach: f32| u32::try_from(to_u64(f64::from(reach) / f64::from(BRICK))).unwrap_or(u32::MAX);
         Params {
@@ -100,8 +101,9 @@ impl Plan {
     }
 }
 
-/// First brick of each tile. `None` if there are more tiles or bricks than the shaders can number.
-fn tile_bases(tiles: &[TileOccupancy]) -> Option<Vec<u32>> {
+/// First brick of each tile, and the number of bricks. `None` if there are more tiles or bricks than the shaders can
+/// number.
+fn tile_bases(tiles: &[TileOccupancy]) -> Option<(Vec<u32>, usize)> {
     if tiles.len() >= 1 << 23 {
         return None;
     }
@@ -111,7 +113,7 @@ fn tile_bases(tiles: &[TileOccupancy]) -> Option<Vec<u32>> {
         bases.push(next);
         next = next.checked_add(u32::try_from(count_ones(&tile.occupied)).ok()?)?;
     }
-    Some(bases)
+    Some((bases, next as usize))
 }
 
 /// Entry of the tile table for `own`, whose first brick is `base`.
@@ -138,25 +140,21 @@ fn tile(tiles: &[TileOccupancy], own: &TileOccupancy, base: u32) -> Tile {
 }
 
 /// Columns [`Plan::bricks`] and [`Plan::first_atoms`].
-fn list_bricks(occupancy: &Occupancy, atoms: &[LatticeAtom]) -> (Vec<u32>, Vec<u32>) {
-    let of_tile = |(t, own): (usize, &TileOccupancy)| -> Vec<(u32, u32)> {
-        let starts = &occupancy.tile_starts;
-        let earlier = |&start: &usize| tile_order(tile_of(atoms[start].cell)) < tile_order(own.tile);
-        let index = starts.partition_point(earlier);
-        let [mut at, next] = [index, index + 1].map(|t| starts.get(t).copied().unwrap_or(atoms.len()));
-        // The bricks of a tile without atoms begin where the next tile's atoms begin.
-        let end = if atoms.get(at).is_some_and(|atom| tile_of(atom.cell) == own.tile) { next } else { at };
-        let brick = |local: u32| {
-            let entry = (to_u32(t) << 9 | local, to_u32(at));
-            // Every atom's own brick is occupied, so this loop passes every atom.
-            at += atoms[at..end].iter().take_while(|atom| local_brick(atom) == local).count();
-            entry
-        };
-        set_bits(&own.occupied).map(brick).collect()
-    };
-    let lists: Vec<Vec<(u32, u32)>> = occupancy.tiles.par_iter().enumerate().map(of_tile).collect();
-    let (bricks, mut first_atoms): (Vec<u32>, Vec<u32>) = lists.into_iter().flatten().unzip();
-    first_atoms.push(to_u32(atoms.len()));
+fn list_bricks(occupancy: &Occupancy, n_bricks: usize) -> (Vec<u32>, Vec<u32>) {
+    let (mut bricks, mut first_atoms) = (Vec::with_capacity(n_bricks), Vec::with_capacity(n_bricks + 1));
+    let mut homes = occupancy.homes.iter().peekable();
+    let mut at = 0;
+    for (t, own) in (0..).zip(&occupancy.tiles) {
+        for local in set_bits(&own.occupied) {
+            bricks.push(t << 9 | local);
+            first_atoms.push(at);
+            // Every atom's own brick is occupied, so this passes every atom.
+            while let Some(home) = homes.next_if(|home| home.local == local && home.tile == own.tile) {
+                at += home.n_atoms;
+            }
+        }
+    }
+    first_atoms.push(at);
     (bricks, first_atoms)
 }
 
@@ -177,6 +175,7 @@ mod tests {
     use std::collections::HashMap;
 
     use super::*;
+    use crate::surface::lattice::LatticeAtom;
     use crate::surface::{Spheres, SurfaceOptions};
 
     fn lattice(n: u32, side: f64, resolution: f64) -> Lattice {

@@ -64,9 +64,11 @@ fn parameter_name(path: &str, parameter: &Value) -> String {
 fn response_name(status: &str, response: &Value) -> Option<String> {
     let Some(types) = response["x-problem-types"].as_array() else {
         return match status {
-            "200" if response["content"].get("application/octet-stream").is_some() => Some("Mesh".to_owned()),
+            "200" if response["content"].get("model/*").is_some() => Some("Mesh".to_owned()),
+            "200" if response["content"].get("application/octet-stream").is_some() => Some("AtomColors".to_owned()),
             "202" => Some("JobAccepted".to_owned()),
-            "206" => Some("PartialMesh".to_owned()),
+            "206" if response["content"].get("model/*").is_some() => Some("PartialMesh".to_owned()),
+            "206" => Some("PartialAtomColors".to_owned()),
             "304" => Some("NotModified".to_owned()),
             _ => None,
         };

@@ -92,6 +92,29 @@ fn part() -> RefOr<Response> {
     RefOr::T(response.header("Content-Range", text("`bytes FIRST-LAST/LENGTH`.")).build())
 }
 
+/// Returns a response with the colours of atoms.
+fn list_of_colors(doc: &str) -> ResponseBuilder {
+    let list = ContentBuilder::new().schema(Some(binary("Red, green, blue and alpha of each atom."))).build();
+    let legend = "JSON object with `scheme`, for numeric schemes `palette` and `range`, and at most 24 entries of the \
+                  `legend`, each with `label` and `color`.";
+    ResponseBuilder::new()
+        .description(doc)
+        .content(OCTETS, list)
+        .header("ETag", text("Strong validator of the colours."))
+        .header("Cache-Control", text("Caching rules."))
+        .header("Accept-Ranges", text("`bytes`."))
+        .header("molmesh-colors", text(legend))
+}
+
+fn colors() -> RefOr<Response> {
+    RefOr::T(list_of_colors("The colours, four bytes per atom.").build())
+}
+
+fn part_of_colors() -> RefOr<Response> {
+    let response = list_of_colors("The requested part of the colours.");
+    RefOr::T(response.header("Content-Range", text("`bytes FIRST-LAST/LENGTH`.")).build())
+}
+
 /// 304: the client has the current version.
 fn unchanged() -> RefOr<Response> {
     let response = ResponseBuilder::new()
@@ -126,6 +149,10 @@ answers!(
 answers!(
     /// Responses of a stored result.
     StoredMesh: "200": whole(), "206": part(), "304": unchanged()
+);
+answers!(
+    /// Responses with the colours of atoms.
+    AtomColorsResponse: "200": colors(), "206": part_of_colors(), "304": unchanged()
 );
 answers!(
     /// Response of a conditional request for a document.

@@ -2,13 +2,14 @@
 
 use serde_json::Value;
 use utoipa::openapi::extensions::Extensions;
-use utoipa::openapi::path::{Parameter, ParameterBuilder, ParameterIn, ParameterStyle};
+use utoipa::openapi::path::{Parameter, ParameterBuilder, ParameterIn};
 use utoipa::openapi::schema::{SchemaFormat, Type};
-use utoipa::openapi::{ArrayBuilder, KnownFormat, ObjectBuilder, OpenApi, Ref, RefOr, Required, Schema};
+use utoipa::openapi::{KnownFormat, ObjectBuilder, OpenApi, Ref, RefOr, Required, Schema};
 use utoipa::{IntoParams, Modify};
 
 use super::components::pascal_case;
 use crate::formats::Format;
+use crate::http::color_parameters;
 use crate::pipeline::params::{self, Domain, TABLE};
 
 const DIGEST_PATTERN: &str = "^[0-9a-f]{64}$";
@@ -29,28 +30,21 @@ impl Modify for ChoiceSchemas {
             .enum_values(Some(files));
         schemas.insert(SURFACE_FILE.to_owned(), RefOr::T(files.into()));
         for parameter in TABLE {
-            let (Domain::Choice(values) | Domain::Set(values)) = parameter.domain else { continue };
+            let Domain::Choice(values) = parameter.domain else { continue };
             let default = values.contains(&parameter.default).then(|| Value::from(parameter.default));
-            let is_list = matches!(parameter.domain, Domain::Set(_));
             let object = ObjectBuilder::new()
                 .schema_type(Type::String)
                 .description(Some(parameter.doc))
                 .enum_values(Some(values.iter().map(|value| Value::from(*value))))
-                .default(default.filter(|_| !is_list));
-            schemas.insert(choice_name(parameter), RefOr::T(object.into()));
+                .default(default);
+            schemas.insert(pascal_case(parameter.name), RefOr::T(object.into()));
         }
     }
-}
-
-fn choice_name(parameter: &params::Parameter) -> String {
-    // Other names are those of their parameters; this one is of an item of a list.
-    if parameter.name == "select" { "AtomKind".to_owned() } else { pascal_case(parameter.name) }
 }
 
 /// Returns the schema of a parameter's values.
 fn schema(parameter: &params::Parameter) -> RefOr<Schema> {
     let object = |kind: Type| ObjectBuilder::new().schema_type(kind);
-    let choice = || Ref::from_schema_name(choice_name(parameter));
     match parameter.domain {
         Domain::Number { min, max, .. } => {
             let default = parameter.default.parse::<f64>().ok().map(Value::from);
@@ -62,8 +56,7 @@ fn schema(parameter: &params::Parameter) -> RefOr<Schema> {
             object(Type::Integer).format(Some(format)).minimum(Some(min)).maximum(Some(max)).into()
         }
         Domain::Flag => object(Type::Boolean).default(parameter.default.parse::<bool>().ok().map(Value::from)).into(),
-        Domain::Choice(_) => RefOr::Ref(choice()),
-        Domain::Set(_) => ArrayBuilder::new().items(choice()).min_items(Some(1)).into(),
+        Domain::Choice(_) => RefOr::Ref(Ref::from_schema_name(pascal_case(parameter.name))),
         Domain::Text { expected } => object(Type::String)
             .min_length(Some(1))
             .max_length(Some(params::MAX_VALUE_BYTES))
@@ -111,15 +104,12 @@ fn hints(parameter: &params::Parameter) -> Option<Extensions> {
 }
 
 fn query(parameter: &params::Parameter) -> Parameter {
-    let lists = matches!(parameter.domain, Domain::Set(_));
     ParameterBuilder::new()
         .name(parameter.name)
         .parameter_in(ParameterIn::Query)
         .required(Required::False)
         .description(Some(describe(parameter)))
         .schema(Some(schema(parameter)))
-        .style(lists.then_some(ParameterStyle::Form))
-        .explode(lists.then_some(false))
         .extensions(hints(parameter))
         .build()
 }
@@ -175,6 +165,17 @@ parameters!(
         let doc = "`surface.` and the extension of the mesh format; `surface.png` is a picture of the mesh.";
         let file = path("file", doc).schema(Some(Ref::from_schema_name(SURFACE_FILE))).build();
         std::iter::once(file).chain(TABLE.iter().filter(|p| p.name != "format").map(query)).collect()
+    }
+);
+parameters!(
+    /// Query parameters of the colours of atoms.
+    ColorParameters: {
+        let of_mesh = |name: &&str| TABLE.iter().find(|p| p.name == *name).map(query);
+        let value = ObjectBuilder::new().schema_type(Type::String).title(Some(color_parameters::expected())).examples(["chain"]);
+        let doc = format!("Colour scheme. Value: {}.", color_parameters::expected());
+        let scheme = ParameterBuilder::new().name("scheme").parameter_in(ParameterIn::Query);
+        let scheme = scheme.required(Required::True).description(Some(doc)).schema(Some(value)).build();
+        std::iter::once(scheme).chain(color_parameters::NAMES.iter().filter_map(of_mesh)).collect()
     }
 );
 parameters!(
@@ -248,8 +249,8 @@ parameters!(
     RangeHeaders: headers(&[
         (
             "Range", None, "bytes=0-1023",
-            "Part of the file to return. Applies to stored results; other responses, and requests for several ranges, \
-             return the whole file.",
+            "Part of the file to return. Applies to stored results and colours; other responses, and requests for \
+             several ranges, return the whole file.",
         ),
         ("If-Range", None, "\"ba7816bf\"", "`ETag` that the `Range` refers to. If it differs, the whole file is sent."),
     ])

@@ -34,6 +34,7 @@ pub(in crate::http) const READING: &[Kind] =
 /// Problems of a job after the structure was read.
 pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::EmptySelection,
+    Kind::TooManyCopies,
     Kind::GridTooLarge,
     Kind::TooManyCandidates,
     Kind::MeshTooLarge,
@@ -155,11 +156,11 @@ const MEMBERS: &[Member] = &[
     ("isovalue", Some(Type::Number), "Isovalue that the density does not reach."),
     ("estimated_wait_s", Some(Type::Number), "Estimated time in the queue in s."),
     ("line", Some(Type::Integer), "Line in the file, from 1."),
-    ("column", Some(Type::Integer), "Column in the line, from 1."),
+    ("column", Some(Type::Integer), "Column in the line, or position in the expression, from 1."),
     (
         "place",
         Some(Type::String),
-        "Position in a binary file: category, column, encoding, row (from 1) or byte (from 0).",
+        "Position in a binary file: category, column, encoding, row (from 1) or byte (from 0). For an invalid assembly, its id.",
     ),
     ("atom", Some(Type::Integer), "Index of the atom, from 0."),
     ("found", None, "Content found instead of the expected one."),

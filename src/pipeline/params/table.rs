@@ -5,10 +5,10 @@ use std::str::FromStr;
 use super::ParamError;
 use crate::formats::{Compress, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, Style, View};
+use crate::pipeline::color::{self, Palette};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
-use crate::structure::select::KIND_NAMES;
-use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
-use crate::surface::{Kernel, Preset, Validation};
+use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
+use crate::surface::{Preset, SurfaceKind, Validation};
 
 /// Domain of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -33,8 +33,6 @@ pub enum Domain {
     Flag,
     /// One of these values.
     Choice(&'static [&'static str]),
-    /// A comma-separated list of these values.
-    Set(&'static [&'static str]),
     /// Free text.
     Text {
         /// Description of valid values.
@@ -52,7 +50,6 @@ impl Domain {
             Self::Integer { min, max } => format!("a whole number from {min} to {max}"),
             Self::Flag => "true or false".to_owned(),
             Self::Choice(words) => format!("one of {}", words.join(", ")),
-            Self::Set(words) => format!("one or more of {}, separated by commas", words.join(", ")),
             Self::Text { expected } => (*expected).to_owned(),
         }
     }
@@ -92,7 +89,7 @@ impl Parameter {
             Domain::Integer { .. } => same_number::<i64>(text, self.default),
             Domain::Flag => flag(text).is_some_and(|value| flag(self.default) == Some(value)),
             Domain::Choice(words) => text == self.default && words.contains(&text),
-            Domain::Set(_) | Domain::Text { .. } => false,
+            Domain::Text { .. } => false,
         }
     }
 }
@@ -129,6 +126,7 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
         "resolution" => [0.2, 2.0],
         "isovalue" => [0.2, 4.0],
         "smoothness" => [0.4, 10.0],
+        "probe" => [1.0, 2.0],
         "radius_scale" => [0.5, 2.0],
         "radius_offset" => [-1.0, 3.0],
         "cutoff_tolerance" => [1e-4, 0.1],
@@ -142,6 +140,9 @@ const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
 const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
 const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
+
+const PALETTES: &[&str] =
+    &[Palette::Viridis.name(), Palette::Cividis.name(), Palette::BlueWhiteRed.name(), Palette::RedWhiteBlue.name()];
 
 const fn view_names(all: [View; 7]) -> [&'static str; 7] {
     let [a, b, c, d, e, f, g] = all;
@@ -158,11 +159,12 @@ pub const TABLE: &[Parameter] = &[
         doc: "A named pair of smoothness and isovalue for the gaussian kernel. ses-like approximates the solvent-excluded surface without a probe: area within −6.5 to +6.0 % and volume within −0.6 to +5.1 % on eight proteins, worse for small structures (area +13.5 % for a DNA dodecamer).",
     },
     Parameter {
-        name: "kernel",
-        domain: Domain::Choice(Kernel::NAMES),
+        name: "surface",
+        domain: Domain::Choice(SurfaceKind::NAMES),
         default: "gaussian",
-        doc: "Density kernel: the contribution of an atom as a function of the distance.",
+        doc: "Surface to triangulate. gaussian, soft-object and inverse-square: isosurface of atomic densities with this kernel. vdw: van der Waals surface; sas: solvent-accessible surface; ses: solvent-excluded surface.",
     },
+    number("probe", [0.0, MAX_PROBE], "Å", "1.4", "Radius of the probe (a solvent molecule); sas and ses only."),
     number(
         "resolution",
         [MIN_RESOLUTION, MAX_RESOLUTION],
@@ -227,6 +229,24 @@ pub const TABLE: &[Parameter] = &[
         doc: "Store the index of the nearest atom with every vertex.",
     },
     Parameter {
+        name: "color",
+        domain: Domain::Text { expected: color::EXPECTED },
+        default: "none",
+        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7. STL has no colours.",
+    },
+    Parameter {
+        name: "palette",
+        domain: Domain::Choice(PALETTES),
+        default: "viridis for bfactor and occupancy, blue-white-red for hydrophobicity, red-white-blue for charge",
+        doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity and charge only.",
+    },
+    Parameter {
+        name: "color_range",
+        domain: Domain::Text { expected: "two numbers separated by a comma, the lower one first" },
+        default: "the lowest and highest value of the meshed atoms; −4.5,4.5 or −2.02,2.02 for hydrophobicity, −1,1 for charge",
+        doc: "Values at the ends of the palette. Values beyond an end have its colour.",
+    },
+    Parameter {
         name: "model",
         domain: Domain::Integer { min: i32::MIN as i64, max: i32::MAX as i64 },
         default: "the first model of the file",
@@ -240,15 +260,23 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "select",
-        domain: Domain::Set(&KIND_NAMES),
+        domain: Domain::Text {
+            expected: "an expression such as polymer,ligand or (protein and chain A) within 5 of ion",
+        },
         default: "polymer",
-        doc: "Kinds of atoms to mesh. hydrogens adds the hydrogen atoms of the other selected kinds.",
+        doc: "Atoms to mesh: kinds (polymer, protein, nucleic, ligand, cofactor, glycan, ion, water, hydrogen, all), chain, resi, resn, name, elem, within, byres, and, or, not. Commas separate alternatives. The alternative hydrogens adds the hydrogen atoms of the others.",
     },
     Parameter {
         name: "altloc",
         domain: Domain::Text { expected: "one character" },
         default: "the location with the highest occupancy in each residue",
         doc: "Alternative location to mesh, one character.",
+    },
+    Parameter {
+        name: "assembly",
+        domain: Domain::Text { expected: "asymmetric-unit, or the id of an assembly of the file, such as 1" },
+        default: "asymmetric-unit",
+        doc: "Biological assembly to mesh: the selected atoms, copied by the operators of the file. asymmetric-unit meshes the atoms as they are in the file.",
     },
     Parameter {
         name: "validation",

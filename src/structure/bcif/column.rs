@@ -64,6 +64,16 @@ impl Column<'_> {
         Some(&texts.joined[start..end])
     }
 
+    /// Returns the value of a row as text, which is empty if it has none. Numbers are written with all digits.
+    pub(super) fn shown(&self, row: usize) -> Cow<'_, [u8]> {
+        match &self.cells {
+            _ if self.is_null(row) => Cow::Borrowed(b""),
+            Cells::Int(values) => Cow::Owned(values[row].to_string().into_bytes()),
+            Cells::Real(values) => Cow::Owned(values[row].to_string().into_bytes()),
+            Cells::Text(_) => Cow::Borrowed(self.text(row).unwrap_or_default()),
+        }
+    }
+
     /// Returns true if some row has no value.
     pub(super) fn has_nulls(&self) -> bool {
         self.mask.is_some() || matches!(&self.cells, Cells::Text(texts) if texts.ids.iter().any(|&id| id < 0))

@@ -18,7 +18,7 @@ use self::fault::Fault;
 use self::msgpack::Cursor;
 use super::atom_site::{Layout, Passed};
 use super::atoms::{Columns, Source, SourceFormat, Structure};
-use super::entities::{self, Entities};
+use super::categories::{self, Categories};
 use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
@@ -106,28 +106,21 @@ impl<'a> Category<'a> {
         Ok(columns)
     }
 
-    /// Decodes the texts of an item. Returns `None` if the category does not have it.
-    fn column(&self, item: &str, max_rows: usize) -> Result<Option<Column<'a>>, Box<Fault>> {
+    /// Decodes an item; integers become texts if `texts` is true. Returns `None` if the category lacks the item.
+    fn column(&self, item: &str, max_rows: usize, texts: bool) -> Result<Option<Column<'a>>, Box<Fault>> {
         let columns = self.columns()?;
         let named = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item.as_bytes()));
         let Some(raw) = named else { return Ok(None) };
         let Some(rows) = usize::try_from(self.rows).ok().filter(|&n| n <= max_rows) else {
             return Err(Fault::new(format!("{} rows", self.rows), format!("at most {max_rows}")).within("rowCount"));
         };
-        raw.load(Bounds { rows, texts: max_rows }, true).map(Some)
+        raw.load(Bounds { rows, texts: max_rows }, texts).map(Some)
     }
 
     /// Returns the first value of an item, normalized, of at most `max` characters.
     fn value(&self, item: &str, max: usize, limits: &ReadLimits) -> Result<Option<String>, Box<Fault>> {
-        let column = self.column(item, limits.max_rows())?.filter(|_| self.rows > 0);
+        let column = self.column(item, limits.max_rows(), true)?.filter(|_| self.rows > 0);
         Ok(column.as_ref().and_then(|column| column.text(0)).and_then(|text| normalize(text, max)))
-    }
-
-    /// Returns the values of an item, with empty texts for missing values; none if the category lacks the item.
-    fn values(&self, item: &str, max_rows: usize) -> Result<Vec<String>, Box<Fault>> {
-        let Some(column) = self.column(item, max_rows)? else { return Ok(Vec::new()) };
-        let rows = 0..usize::try_from(self.rows).unwrap_or(0);
-        Ok(rows.map(|row| decode(column.text(row).unwrap_or_default()).into_owned()).collect())
     }
 
     /// Returns the limits of decoding, or `None` if there are more rows than allowed atoms.
@@ -138,8 +131,8 @@ impl<'a> Category<'a> {
     }
 }
 
-/// Names of the required categories.
-const CATEGORIES: [&[u8]; 6] = [b"atom_site", b"entry", b"struct", b"entity", b"entity_poly", b"struct_asym"];
+/// Names of the required categories that [`Categories`] does not include.
+const CATEGORIES: [&[u8]; 3] = [b"atom_site", b"entry", b"struct"];
 
 /// A data block with its required categories.
 #[derive(Debug, Default)]
@@ -175,7 +168,8 @@ impl<'a> Block<'a> {
             passed.category(decode(category.name));
         }
         let known = |c: &Category<'_>| c.name.eq_ignore_ascii_case(category.name);
-        let required = CATEGORIES.iter().any(|name| category.name.eq_ignore_ascii_case(name));
+        let required = Categories::include(category.name)
+            || CATEGORIES.iter().any(|name| category.name.eq_ignore_ascii_case(name));
         if required && !self.categories.iter().any(known) {
             self.categories.push(category);
         }
@@ -188,8 +182,8 @@ impl<'a> Block<'a> {
 
     /// Returns the structure, if the block has atoms with coordinates.
     fn structure(&self, reading: &Reading<'_>, passed: &mut Passed) -> Result<Option<Structure>, StructureError> {
-        let (entities, unread) = self.entities();
-        let Some((columns, tables, warnings)) = self.atoms(entities.are_known(), reading, passed)? else {
+        let (categories, unread) = self.categories(reading)?;
+        let Some((columns, tables, warnings)) = self.atoms(categories.entities_are_known(), reading, passed)? else {
             return Ok(None);
         };
         let value = |category, item, max| -> Result<Option<String>, StructureError> {
@@ -203,26 +197,37 @@ impl<'a> Block<'a> {
             format: SourceFormat::BinaryCif,
             id: entry.or_else(|| self.name.clone()),
             title,
-            sequence: Sequence { polymer_chains: entities.polymer_chains(), ..Sequence::default() },
+            sequence: Sequence::of(&categories),
+            assemblies: categories.assemblies(),
             warnings: warnings.messages(|fault| fault.within(&place).into()).into_iter().chain(unread).collect(),
         };
         columns.finish(tables, source, reading).map(Some)
     }
 
-    /// Returns the entities of the block, and a warning if they cannot be read.
-    fn entities(&self) -> (Entities, Option<String>) {
-        let mut known = Entities::default();
-        for (place, (name, item)) in entities::ITEMS.into_iter().enumerate() {
+    /// Returns entities and assemblies, and a warning for those that cannot be read.
+    fn categories(&self, reading: &Reading<'_>) -> Result<(Categories, Vec<String>), StructureError> {
+        let (mut known, mut unread) = (Categories::default(), Vec::new());
+        let mut places = (0..categories::ITEMS.len()).peekable();
+        while let Some(place) = places.next() {
+            let (name, item) = categories::ITEMS[place];
             let Some(category) = self.category(name) else { continue };
-            match category.values(item, entities::MAX_VALUES) {
-                Ok(values) => values.into_iter().for_each(|value| known.add(place, value)),
+            match category.column(item, categories::MAX_VALUES, false) {
+                Ok(None) => {}
+                Ok(Some(column)) => {
+                    for row in 0..usize::try_from(category.rows).unwrap_or(0) {
+                        known.add(place, &column.shown(row), reading)?;
+                    }
+                }
                 Err(fault) => {
                     let error = StructureError::from(fault.within(category.place()));
-                    return (Entities::default(), Some(format!("{error}; entities are unknown")));
+                    let what = known.forget(place);
+                    unread.push(format!("{error}; {what} are unknown"));
+                    // The other items of the same group are useless without this one.
+                    while places.next_if(|&next| categories::describe_the_same(next, place)).is_some() {}
                 }
             }
         }
-        (known, None)
+        Ok((known, unread))
     }
 
     /// Returns the atoms, if the block has some with coordinates.

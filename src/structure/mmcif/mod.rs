@@ -1,4 +1,5 @@
-//! Reader of PDBx/mmCIF: the `atom_site` category of the first data block that has one, entry id, title and entities.
+//! Reader of PDBx/mmCIF: the `atom_site` category of the first data block that has one, entry id, title, entities and
+//! assemblies.
 //!
 //! Dictionary: PDBx/mmCIF, category `atom_site`. Author names and numbers (`auth_*`) take precedence. The identifiers
 //! of the dictionary (`label_*`) are the fallback.
@@ -9,8 +10,8 @@ mod rows;
 use self::rows::Rows;
 use super::atom_site::{Layout, Passed};
 use super::atoms::{Source, SourceFormat, Structure};
+use super::categories::Categories;
 use super::cif::{self, Kind, Token, Tokenizer};
-use super::entities::Entities;
 use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
@@ -56,7 +57,7 @@ struct Block {
     name: Option<String>,
     entry: Option<String>,
     title: Option<String>,
-    entities: Entities,
+    categories: Categories,
     in_frame: bool,
     /// Tags and values of an `atom_site` without a loop, as in files with one atom: byte ranges.
     tags: Vec<(usize, usize)>,
@@ -96,8 +97,7 @@ impl<'a> Reader<'a> {
                 Kind::Loop => {
                     token = self.category()?;
                     if self.rows.is_some() {
-                        self.rest_of_block(token);
-                        return Ok(());
+                        return self.rest_of_block(token);
                     }
                     continue;
                 }
@@ -130,25 +130,25 @@ impl<'a> Reader<'a> {
             self.block.values.push((value.start, value.end));
         } else {
             self.note_value(name, &value);
-            if let Some(place) = self.entity_item(tag) {
-                self.note_entity(place, &value);
+            if let Some(place) = self.described_item(tag) {
+                self.describe(place, &value)?;
             }
         }
         Ok(())
     }
 
-    /// Returns the index of an item that describes entities.
-    fn entity_item(&self, tag: &Token) -> Option<usize> {
+    /// Returns the index of an item that describes entities or assemblies.
+    fn described_item(&self, tag: &Token) -> Option<usize> {
         if self.block.in_frame {
             return None;
         }
-        Entities::find(&self.text[tag.start + 1..tag.end])
+        Categories::find(&self.text[tag.start + 1..tag.end])
     }
 
-    /// Stores a value that describes entities.
-    fn note_entity(&mut self, place: usize, value: &Token) {
+    /// Stores a value that describes entities or assemblies.
+    fn describe(&mut self, place: usize, value: &Token) -> Result<(), StructureError> {
         let (start, end, _) = cif::unquote(self.text, value.start, value.end);
-        self.block.entities.add(place, decode(&self.text[start..end]).into_owned());
+        self.block.categories.add(place, &self.text[start..end], self.reading)
     }
 
     /// Stores the id or title of the entry.
@@ -190,16 +190,16 @@ impl<'a> Reader<'a> {
                 return Ok(self.tokens.next()?);
             }
         }
-        let places: Vec<Option<usize>> = tags.iter().map(|tag| self.entity_item(tag)).collect();
-        let of_entities = places.iter().any(Option::is_some);
+        let places: Vec<Option<usize>> = tags.iter().map(|tag| self.described_item(tag)).collect();
+        let describes = places.iter().any(Option::is_some);
         let mut i = 0;
         while token.kind == Kind::Value {
             // Uses the first row of a loop over entries or titles.
             if let Some(tag) = tags.get(i) {
                 self.note_value(&self.text[tag.start..tag.end], &token);
             }
-            if of_entities && let Some(place) = places[i % places.len()] {
-                self.note_entity(place, &token);
+            if describes && let Some(place) = places[i % places.len()] {
+                self.describe(place, &token)?;
             }
             i += 1;
             if i % VALUES_PER_CHECK == 0 {
@@ -234,11 +234,14 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// Reads the title and, if HETATM records need them, the entities after the atoms. Ignores errors, because the
-    /// atoms are complete.
-    fn rest_of_block(&mut self, mut token: Token) {
+    /// Reads the title, the assemblies and, if HETATM records need them, the entities after the atoms. Ignores syntax
+    /// errors, because the atoms are complete.
+    fn rest_of_block(&mut self, mut token: Token) -> Result<(), Stop> {
         let hetero = self.rows.as_ref().is_some_and(Rows::has_hetero);
-        let wanted = |reader: &Self| reader.block.title.is_none() || (hetero && !reader.block.entities.are_known());
+        let wanted = |reader: &Self| {
+            let known = &reader.block.categories;
+            reader.block.title.is_none() || !known.assemblies_are_known() || (hetero && !known.entities_are_known())
+        };
         while wanted(self) && !matches!(token.kind, Kind::End | Kind::Data) {
             let next = match token.kind {
                 Kind::Tag => self.item(&token).and_then(|()| Ok(self.tokens.next()?)),
@@ -251,10 +254,11 @@ impl<'a> Reader<'a> {
             };
             match next {
                 Ok(next) => token = next,
-                // Cancelled runs end in `finish`.
-                Err(_) => return,
+                Err(Stop::Fault(_)) => return Ok(()),
+                Err(error) => return Err(error),
             }
         }
+        Ok(())
     }
 
     fn note_category(&mut self, tag: &Token) {
@@ -270,13 +274,15 @@ impl<'a> Reader<'a> {
         if columns.len() == 0 {
             return Err(self.passed.no_atoms("mmCIF", self.block.name));
         }
-        let too_many = self.block.entities.warning();
+        let categories = self.block.categories;
+        let too_many = categories.warning();
         let warnings = warnings.messages(|fault| fault.locate(self.text));
         let source = Source {
             format: SourceFormat::Mmcif,
             id: self.block.entry.or(self.block.name),
             title: self.block.title,
-            sequence: Sequence { polymer_chains: self.block.entities.polymer_chains(), ..Sequence::default() },
+            sequence: Sequence::of(&categories),
+            assemblies: categories.assemblies(),
             warnings: warnings.into_iter().chain(too_many).collect(),
         };
         columns.finish(tables, source, self.reading)

@@ -1,13 +1,14 @@
 //! Reader of PDB files, including common deviations from the format.
 //!
 //! Code counts columns from 0; comments and messages count from 1, as the format description (wwPDB, version 3.3) does.
-//! The reader uses ATOM, HETATM, MODEL, ENDMDL, END, HEADER, TITLE, SEQRES and MODRES records. It ignores atom serial
-//! numbers, so their overflow is harmless. Supported deviations: lines that end after the coordinates, hybrid-36 and
-//! five-digit residue numbers, four-letter residue names, two-letter chain names, missing element columns, entry id and
-//! line number in columns 73-80 (before 1996), tabs, any line ending.
+//! The reader uses ATOM, HETATM, MODEL, ENDMDL, END, HEADER, TITLE, SEQRES, MODRES and REMARK 350 records. It ignores
+//! atom serial numbers, so their overflow is harmless. Supported deviations: lines that end after the coordinates,
+//! hybrid-36 and five-digit residue numbers, four-letter residue names, two-letter chain names, missing element
+//! columns, entry id and line number in columns 73-80 (before 1996), tabs, any line ending.
 //!
 //! A first pass over the pieces of the file finds its [`records`], a second one reads the [`atoms`].
 
+mod assemblies;
 mod atoms;
 mod card;
 mod chains;
@@ -17,6 +18,7 @@ mod sequence;
 
 use std::collections::HashSet;
 
+use self::assemblies::Remark350;
 use self::atoms::{Atoms, File};
 use self::lines::Lines;
 use self::records::{Boundary, Line, Mark, Records};
@@ -70,16 +72,21 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
     memory.keep();
     number_models(&found, &mut columns.model);
     let (mut id, mut title, mut listed) = (None, Vec::new(), HashSet::new());
+    let mut assemblies = Remark350::default();
     for records in found {
         id = id.or(records.id);
         title.extend(records.title);
         listed.extend(records.listed);
+        for (start, end) in records.assemblies {
+            assemblies.line(&text[start..end], reading)?;
+        }
     }
     let source = Source {
         format: SourceFormat::Pdb,
         id,
         title: normalize(&title, MAX_TITLE),
         sequence: Sequence { listed, ..Sequence::default() },
+        assemblies: assemblies.finish(reading)?,
         warnings: warnings.messages(|fault| fault.locate(text)),
     };
     columns.finish(tables, source, reading)

@@ -50,7 +50,7 @@ pub(super) struct Mark {
     pub(super) boundary: Boundary,
 }
 
-/// Memory of a mark, and of its model among the known ones, bytes.
+/// Memory of a mark and its model among the known ones, or of a REMARK 350 record, bytes.
 const BYTES_PER_MARK: u64 = 64;
 
 /// Records of a piece.
@@ -61,6 +61,8 @@ pub(super) struct Records {
     pub(super) marks: Vec<Mark>,
     pub(super) id: Option<String>,
     pub(super) title: Vec<u8>,
+    /// REMARK 350 records, as ranges of the text.
+    pub(super) assemblies: Vec<(usize, usize)>,
     /// Chains and residue names in SEQRES and MODRES records.
     pub(super) listed: HashSet<Listed>,
     /// The first fault. Records after it are missing.
@@ -82,8 +84,8 @@ impl Records {
         for (n, (start, end)) in Lines::new(text).enumerate() {
             if n % LINES_PER_CHECK == 0 {
                 reading.check()?;
-                reading.text.grow(BYTES_PER_MARK * (records.marks.len() - n_marks) as u64)?;
-                n_marks = records.marks.len();
+                reading.text.grow(BYTES_PER_MARK * (records.n_noted() - n_marks) as u64)?;
+                n_marks = records.n_noted();
             }
             if let Err(fault) = records.line(file, offset + start, offset + end) {
                 records.fault = Some(fault);
@@ -91,6 +93,11 @@ impl Records {
             }
         }
         Ok(records)
+    }
+
+    /// Returns the number of marks and REMARK 350 records.
+    fn n_noted(&self) -> usize {
+        self.marks.len() + self.assemblies.len()
     }
 
     #[inline]
@@ -106,6 +113,7 @@ impl Records {
                 self.atoms.push(Line::new(start, end));
             }
             [b'M' | b'E' | b'H' | b'T' | b'S', ..] => self.other(start, line)?,
+            _ if line.starts_with(b"REMARK 350") => self.assemblies.push((start, end)),
             _ => {}
         }
         Ok(())

@@ -254,9 +254,14 @@ impl Bricks {
         atoms: &[u32],
         mut count: impl FnMut(u64) -> Result<(), SurfaceError>,
     ) -> Result<(), SurfaceError> {
+        self.clear();
+        atoms.chunks(ATOMS_PER_CHECK).try_for_each(|atoms| count(find(self, lattice, tile, layers, atoms)))
+    }
+
+    /// Removes all candidates.
+    pub(super) fn clear(&mut self) {
         self.lists.iter_mut().for_each(Vec::clear);
         self.reaching.iter_mut().for_each(|n| *n = 0);
-        atoms.chunks(ATOMS_PER_CHECK).try_for_each(|atoms| count(find(self, lattice, tile, layers, atoms)))
     }
 
     /// Frees lists that are much longer than those of a typical structure.

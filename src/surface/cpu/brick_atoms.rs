@@ -2,9 +2,7 @@
 
 use super::bin::NORMAL_ONLY;
 use crate::surface::lattice::LatticeAtom;
-
-/// Vertices are shaded in batches of this many: one AVX-512 vector, two AVX ones.
-pub(super) const LANES: usize = 16;
+use crate::surface::simd::LANES;
 
 /// Factor above the difference by rounding between u of a vertex and of the box around it.
 const MARGIN: f32 = 1.0 + 1e-4;
@@ -68,26 +66,10 @@ impl BrickAtoms {
     }
 }
 
-/// Returns the lowest and highest of a vector's lanes.
-#[inline(always)]
-pub(super) fn extent(lanes: &[f32]) -> [f32; 2] {
-    let (mut lo, mut hi) = ([0.0; LANES], [0.0; LANES]);
-    lo.copy_from_slice(lanes);
-    hi.copy_from_slice(lanes);
-    let mut half = LANES / 2;
-    while half > 0 {
-        for i in 0..half {
-            lo[i] = if lo[i] < lo[i + half] { lo[i] } else { lo[i + half] };
-            hi[i] = if hi[i] > hi[i + half] { hi[i] } else { hi[i + half] };
-        }
-        half /= 2;
-    }
-    [lo[0], hi[0]]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::surface::simd::extent;
     use proptest::prelude::*;
 
     fn atom(centre: [f32; 3], length: f32) -> LatticeAtom {

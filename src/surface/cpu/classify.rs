@@ -9,6 +9,7 @@ use super::field::Samples;
 use crate::surface::cases::CASES;
 use crate::surface::lattice::{BRICK_SAMPLES, EDGE_MARGIN, to_u32};
 use crate::surface::simd::dispatched;
+use crate::surface::sphere_union::Feature;
 
 /// Inside bits of a brick: word z, bit `8·y + x`.
 pub(super) type Inside = [u64; 8];
@@ -56,6 +57,10 @@ pub(super) struct ClassifiedBricks {
     pub(super) triangles: u32,
     /// Candidates of the bricks with surface.
     pub(super) candidates: Vec<u32>,
+    /// For surfaces of spheres, the part of their boundary that is nearest to each vertex.
+    pub(super) features: Vec<Feature>,
+    /// For surfaces of spheres, the sphere that is nearest to each vertex, if requested.
+    pub(super) spheres: Vec<u32>,
     /// Cells of the sheets of bricks with several: word z, bit `8·y + x`.
     pub(super) sheets: Vec<[u64; 8]>,
 }
@@ -131,8 +136,9 @@ impl ClassifiedBricks {
     pub(super) fn bytes(&self) -> u64 {
         let of_vertex = size_of::<f32>() + size_of::<Edge>();
         let of_bricks = size_of::<SurfaceBrick>() * self.bricks.len() + size_of::<u32>() * self.candidates.len();
+        let of_features = size_of::<Feature>() * self.features.len() + size_of::<u32>() * self.spheres.len();
         let of_cells = self.cases.len() + size_of::<[u64; 8]>() * self.sheets.len();
-        (of_bricks + of_vertex * self.t.len() + of_cells) as u64
+        (of_bricks + of_vertex * self.t.len() + of_features + of_cells) as u64
     }
 
     /// Returns the memory that is set aside for the records of `bricks` bricks in reach of an atom, bytes, without
@@ -149,6 +155,8 @@ impl ClassifiedBricks {
         self.edges.shrink_to_fit();
         self.cases.shrink_to_fit();
         self.candidates.shrink_to_fit();
+        self.features.shrink_to_fit();
+        self.spheres.shrink_to_fit();
         self.sheets.shrink_to_fit();
     }
 
@@ -168,6 +176,8 @@ impl ClassifiedBricks {
         self.edges.extend_from_slice(&next.edges);
         self.cases.extend_from_slice(&next.cases);
         self.candidates.extend_from_slice(&next.candidates);
+        self.features.extend_from_slice(&next.features);
+        self.spheres.extend_from_slice(&next.spheres);
         self.sheets.extend_from_slice(&next.sheets);
         self.vertices += next.vertices;
         self.triangles += next.triangles;
@@ -313,10 +323,19 @@ fn ones(word: u64) -> u16 {
     u16::try_from(word.count_ones()).unwrap_or_default()
 }
 
+/// Returns the samples at both ends of an edge.
+#[inline(always)]
+pub(super) fn at_ends(edge: Edge, samples: &[&Samples; 8]) -> [f32; 2] {
+    const STEP: [usize; 3] = [1, 8, 64];
+    let (axis, at) = (usize::from(edge.axis()), edge.sample());
+    let coordinate = [at & 7, at >> 3 & 7, at >> 6][axis];
+    let (far, next) = if coordinate == 7 { (1 << axis, at - 7 * STEP[axis]) } else { (0, at + STEP[axis]) };
+    [samples[0][at & 511], samples[far][next & 511]]
+}
+
 /// Computes the crossing edges, and the point along each at which the density is `iso`, by linear interpolation.
 #[inline(always)]
 fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, found: &mut ClassifiedBricks) {
-    const STEP: [usize; 3] = [1, 8, 64];
     let ClassifiedBricks { t, edges, .. } = found;
     let first = t.len();
     // Densities at both ends first, one division per vector afterwards: `t` holds F(owner) − iso meanwhile.
@@ -331,12 +350,10 @@ fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f
         while left != 0 {
             let bit = left.trailing_zeros() as usize;
             left &= left - 1;
-            let at = z * 64 + bit;
-            let coordinate = [bit & 7, bit >> 3, z][axis];
-            let (far, next) = if coordinate == 7 { (1 << axis, at - 7 * STEP[axis]) } else { (0, at + STEP[axis]) };
-            let (f0, f1) = (samples[0][at & 511], samples[far][next & 511]);
+            let own = Edge::new(z, bit, axis);
+            let [f0, f1] = at_ends(own, samples);
             if let Some(((above, drop), edge)) = ends.next() {
-                (*above, *drop, *edge) = (f0 - iso, f0 - f1, Edge::new(z, bit, axis));
+                (*above, *drop, *edge) = (f0 - iso, f0 - f1, own);
             }
         }
     }

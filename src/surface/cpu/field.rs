@@ -39,6 +39,8 @@ pub(crate) struct Constants {
     /// as it does not affect a direction, so numbers stay near 1.
     pub(crate) slope_offset: f32,
     pub(crate) slope_tail: f32,
+    /// Radius of an atom as a fraction of its ρ.
+    pub(crate) radius_per_length: f32,
 }
 
 impl Constants {
@@ -62,6 +64,7 @@ impl Constants {
             u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
             slope_offset: to_f32(rate),
             slope_tail: to_f32(profile.tolerance),
+            radius_per_length: to_f32(profile.radius_per_length()),
         }
     }
 }

@@ -2,8 +2,9 @@
 
 use std::ops::Range;
 
+use super::Field;
 use super::bin::NORMAL_ONLY;
-use super::brick_atoms::{BrickAtoms, LANES, extent};
+use super::brick_atoms::BrickAtoms;
 use super::edge::Edge;
 use super::field::Constants;
 use crate::surface::control::Control;
@@ -12,7 +13,8 @@ use crate::surface::lattice::{Lattice, LatticeAtom, to_f32};
 use crate::surface::mesh::{normal_row, position_row};
 use crate::surface::params::Kernel;
 use crate::surface::quantize::Step;
-use crate::surface::simd::{dispatched, exp2, fma};
+use crate::surface::simd::{LANES, dispatched, exp2, extent, fma};
+use crate::surface::sphere_union::Feature;
 
 /// Vertices of one brick in its own coordinates, spacings from its first sample, and the atoms around them.
 #[derive(Debug, Default)]
@@ -56,6 +58,10 @@ pub(super) struct BrickVertices<'a> {
     pub(super) origin: [i32; 3],
     /// The brick's candidate atoms.
     pub(super) candidates: &'a [u32],
+    /// Part of the boundary that is nearest to each vertex, for surfaces of spheres.
+    pub(super) features: &'a [Feature],
+    /// Sphere that is nearest to each vertex, for surfaces of spheres, if requested.
+    pub(super) spheres: &'a [u32],
     /// Parameter of each vertex along its edge.
     pub(super) t: &'a [f32],
     /// Those edges.
@@ -122,22 +128,33 @@ const BLOCK: usize = 4096;
 /// [`SurfaceError::Cancelled`].
 pub(super) fn interpolate(
     lattice: &Lattice,
-    constants: &Constants,
+    field: &Field,
     source: &BrickVertices<'_>,
     batch: &mut VertexBatch,
     target: VertexTarget<'_>,
     control: &Control<'_>,
 ) -> Result<usize, SurfaceError> {
-    let BrickVertices { origin, candidates, t, edges } = *source;
+    let BrickVertices { origin, candidates, features, spheres, t, edges } = *source;
     batch.place(edges, t);
-    batch.n.iter_mut().for_each(|column| column.fill(0.0));
-    for block in candidates.chunks(BLOCK) {
-        control.check()?;
-        batch.atoms.fill(&lattice.atoms, block, origin);
-        gradients(constants, &mut batch.atoms, &batch.p, &mut batch.n);
-    }
-    if let Some(ids) = target.atom_ids {
-        nearest_atoms(&lattice.atoms, candidates, origin, &batch.p, ids);
+    match field {
+        Field::Density(constants) => {
+            batch.n.iter_mut().for_each(|column| column.fill(0.0));
+            for block in candidates.chunks(BLOCK) {
+                control.check()?;
+                batch.atoms.fill(&lattice.atoms, block, origin);
+                gradients(constants, &mut batch.atoms, &batch.p, &mut batch.n);
+            }
+            if let Some(ids) = target.atom_ids {
+                nearest_atoms(&lattice.atoms, constants.radius_per_length, candidates, origin, &batch.p, ids);
+            }
+        }
+        Field::Distance(distance) => {
+            control.check()?;
+            distance.normals(&lattice.atoms, features, origin, &batch.p, &mut batch.n);
+            if let Some(ids) = target.atom_ids {
+                ids.iter_mut().zip(spheres).for_each(|(id, sphere)| *id = lattice.atoms[*sphere as usize].source);
+            }
+        }
     }
     let offset: [f64; 3] = std::array::from_fn(|k| f64::from(origin[k] - lattice.centre[k]));
     Ok(match target.rows {
@@ -220,7 +237,7 @@ fn round(
 fn sum_gradients<const FMA: bool>(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
     let [px, py, pz] = p;
     let [nx, ny, nz] = n;
-    let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
+    let lanes = px.as_chunks::<LANES>().0.iter().zip(py.as_chunks::<LANES>().0).zip(pz.as_chunks::<LANES>().0);
     let outs = nx.chunks_exact_mut(LANES).zip(ny.chunks_exact_mut(LANES)).zip(nz.chunks_exact_mut(LANES));
     for (((px, py), pz), ((nx, ny), nz)) in lanes.zip(outs) {
         let mut sum = [[0.0_f32; LANES]; 3];
@@ -272,8 +289,16 @@ fn gradients(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut 
 }
 
 dispatched! {
-/// Finds the candidate whose centre is nearest to each vertex; of equals the first in canonical order.
-fn nearest_atoms(atoms: &[LatticeAtom], candidates: &[u32], origin: [i32; 3], p: &[Vec<f32>; 3], ids: &mut [u32]) {
+/// Finds the candidate whose sphere is nearest to each vertex: the distance to its centre minus its radius is smallest.
+/// Among equals, takes the first in canonical order.
+fn nearest_atoms(
+    atoms: &[LatticeAtom],
+    radius_per_length: f32,
+    candidates: &[u32],
+    origin: [i32; 3],
+    p: &[Vec<f32>; 3],
+    ids: &mut [u32],
+) {
     let [px, py, pz] = p;
     let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
     for (ids, ((px, py), pz)) in ids.chunks_mut(LANES).zip(lanes) {
@@ -281,11 +306,12 @@ fn nearest_atoms(atoms: &[LatticeAtom], candidates: &[u32], origin: [i32; 3], p:
         for &candidate in candidates {
             let atom = &atoms[(candidate & !NORMAL_ONLY) as usize];
             let a: [f32; 3] = std::array::from_fn(|k| (atom.cell[k] - origin[k]) as f32 + atom.frac[k]);
+            let radius = radius_per_length / atom.inv_length2.sqrt();
             for i in 0..LANES {
                 let (dx, dy, dz) = (px[i] - a[0], py[i] - a[1], pz[i] - a[2]);
-                let d2 = dx * dx + dy * dy + dz * dz;
-                let closer = d2 < best[i];
-                best[i] = if closer { d2 } else { best[i] };
+                let distance = (dx * dx + dy * dy + dz * dz).sqrt() - radius;
+                let closer = distance < best[i];
+                best[i] = if closer { distance } else { best[i] };
                 source[i] = if closer { atom.source } else { source[i] };
             }
         }

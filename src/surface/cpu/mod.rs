@@ -10,6 +10,7 @@
 mod bin;
 mod brick_atoms;
 mod classify;
+mod distance;
 mod edge;
 mod emit;
 pub(crate) mod field;
@@ -34,6 +35,7 @@ pub(crate) use self::bin::{check_lower_bound, too_large as grid_too_large};
 
 use self::bin::{Tiles, slot_brick};
 use self::classify::{ClassifiedBricks, CountsBefore};
+use self::distance::DistanceField;
 use self::field::Constants;
 use self::neighbours::NumberedBrick;
 use self::sample::Pass;
@@ -42,6 +44,7 @@ use super::backend::{Backend, GridStats, MeshOutput};
 use super::candidates;
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
+use super::kernel::Shape;
 use super::lattice::{Lattice, TILE, to_f32, to_u32};
 use super::memory::Reservation;
 use super::params::{SurfaceLimits, SurfaceParams};
@@ -121,6 +124,31 @@ impl Backend for CpuBackend {
     }
 }
 
+/// Function whose level set is the surface.
+enum Field {
+    /// Sum of densities.
+    Density(Constants),
+    /// Distance to the boundary of a union of spheres.
+    Distance(Box<DistanceField>),
+}
+
+impl Field {
+    fn new(lattice: &Lattice, context: RunContext<'_>) -> Result<Self, SurfaceError> {
+        Ok(match &lattice.shape {
+            Shape::Density(profile) => Self::Density(Constants::new(profile, lattice.spacing)),
+            Shape::Sphere { .. } => Self::Distance(Box::new(DistanceField::new(lattice, context)?)),
+        })
+    }
+
+    /// Returns the value of the samples at the surface.
+    fn level(&self, params: &SurfaceParams) -> f32 {
+        match self {
+            Self::Density(_) => to_f32(params.isovalue),
+            Self::Distance(_) => distance::SURFACE,
+        }
+    }
+}
+
 /// A tile between the stages.
 #[derive(Debug)]
 struct Tile {
@@ -138,6 +166,7 @@ const NO_BRICK: u16 = u16::MAX;
 /// Result of the stages up to `scan`, on which the second pass depends.
 struct Scanned {
     lattice: Lattice,
+    field: Field,
     tiles: Tiles,
     done: Vec<Tile>,
     totals: Totals,
@@ -169,8 +198,8 @@ fn pieces(done: &mut [Tile]) -> Vec<Piece> {
     pieces
 }
 
-/// Memory of placing an atom on the lattice, bytes: the atom, and its key before and after sorting.
-pub(crate) const LATTICE_BYTES: u64 = 64;
+/// Memory of placing an atom on the lattice, bytes: the atom, its bucket and its index, and the tables of buckets.
+pub(crate) const LATTICE_BYTES: u64 = 41;
 
 fn scan(spheres: &Spheres, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
     let lattice = context.control.span(Stage::Bin, || {
@@ -192,14 +221,16 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
     });
     let tiles = tiles?;
     control.check()?;
+    let field = control.span(Stage::Bin, || Field::new(&lattice, context))?;
+    control.check()?;
     let slabs = slabs::cut(&tiles, free_threads);
     let pass = Pass {
         lattice: &lattice,
         tiles: &tiles,
         slabs: &slabs,
         partial_tiles: slabs::PartialTiles::default(),
-        constants: Constants::new(&lattice.profile, lattice.spacing),
-        iso: to_f32(params.isovalue),
+        field: &field,
+        iso: field.level(params),
         context,
         counters: sample::PassCounters::default(),
     };
@@ -212,7 +243,7 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
     control.check()?;
     let totals = control.span(Stage::Scan, || scan::scan(&mut done, params, limits))?;
     if totals.triangles == 0 {
-        return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
+        return Err(SurfaceError::NoSurface { isovalue: params.level() });
     }
     let surface_bricks = done.iter().map(|tile| tile.found.bricks.len() as u64).sum();
     let grid = GridStats {
@@ -223,7 +254,7 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
         candidates: counters.candidates.into_inner(),
     };
     let pieces = pieces(&mut done);
-    Ok(Scanned { lattice, tiles, done, totals, grid, pieces, quantize: params.quantize })
+    Ok(Scanned { lattice, field, tiles, done, totals, grid, pieces, quantize: params.quantize })
 }
 
 impl Tile {

@@ -9,6 +9,7 @@ use super::{RunContext, Tile};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::join::Sheet;
+use crate::surface::kernel::Profile;
 use crate::surface::lattice::{BRICK, BRICK_SAMPLES, Lattice, to_f32};
 use crate::surface::mesh::Mesh;
 use crate::surface::params::{SurfaceLimits, SurfaceParams};
@@ -108,7 +109,7 @@ pub struct Probe {
 pub fn probe(lattice: &Lattice, params: &SurfaceParams, limits: &SurfaceLimits) -> Result<Probe, SurfaceError> {
     let control = Control::default();
     let tiles = Tiles::new(lattice, limits, &control)?;
-    let constants = Constants::new(&lattice.profile, lattice.spacing);
+    let constants = Constants::new(&Profile::new(params.kernel_for("gpu")?, params), lattice.spacing);
     let iso = to_f32(params.isovalue);
     let mut bricks = Vec::new();
     for t in 0..tiles.len() {

@@ -7,18 +7,22 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use super::bin::{self, Bricks, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, ClassifiedBricks, Inside, Neighbourhood};
-use super::field::{self, Constants, SampleRange, Samples};
+use super::field::{self, SampleRange, Samples};
 use super::slabs::{PartialTiles, Slab};
-use super::{NO_BRICK, RunContext, Tile, scan};
+use super::{Field, NO_BRICK, RunContext, Tile, scan};
 use crate::surface::candidates;
 use crate::surface::control::Stage;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK_SAMPLES, Lattice};
 use crate::surface::memory::{MemoryMeter as _, Reservation};
+use crate::surface::sphere_union::BrickUnion;
 
 /// Buffers that a thread reuses from tile to tile.
 struct Scratch {
     bricks: Bricks,
+    /// Arcs of the boundary near the bricks, for surfaces of spheres.
+    arcs: Bricks,
+    spheres: BrickUnion,
     /// Two layers of bricks, with even and odd z: no more are needed at a time, and untouched memory is never mapped.
     layers: [Layer; 2],
     /// Index into its layer per slot, or `NO_BRICK`.
@@ -41,7 +45,13 @@ struct Layer {
 
 impl Default for Scratch {
     fn default() -> Self {
-        Self { bricks: Bricks::default(), layers: Default::default(), slots: vec![NO_BRICK; SLOTS] }
+        Self {
+            bricks: Bricks::default(),
+            arcs: Bricks::default(),
+            spheres: BrickUnion::default(),
+            layers: Default::default(),
+            slots: vec![NO_BRICK; SLOTS],
+        }
     }
 }
 
@@ -93,7 +103,7 @@ pub(super) struct Pass<'a> {
     pub(super) tiles: &'a Tiles,
     pub(super) slabs: &'a [Slab],
     pub(super) partial_tiles: PartialTiles,
-    pub(super) constants: Constants,
+    pub(super) field: &'a Field,
     pub(super) iso: f32,
     pub(super) context: RunContext<'a>,
     pub(super) counters: PassCounters,
@@ -111,6 +121,7 @@ impl Pass<'_> {
         let tile = SCRATCH.with_borrow_mut(|scratch| {
             let tile = self.sample_into(slab, scratch);
             scratch.bricks.free_long_lists();
+            scratch.arcs.free_long_lists();
             tile
         })?;
         let tile = self.context.control.span(Stage::Classify, || self.partial_tiles.add(slab, tile));
@@ -137,6 +148,13 @@ impl Pass<'_> {
         self.context
             .control
             .span(Stage::Bin, || scratch.bricks.fill(self.lattice, coord, layers, atoms, |n| self.count(n, &memory)))?;
+        match self.field {
+            Field::Density(_) => scratch.arcs.clear(),
+            Field::Distance(field) => {
+                let count = |n| self.count(n, &memory);
+                self.context.control.span(Stage::Bin, || field.fill_arcs(&mut scratch.arcs, coord, layers, count))?;
+            }
+        }
         let reached = count_occupied(&scratch.bricks, layers, counters);
         let occupied = reached as u64 * BRICK_SAMPLES as u64;
         let samples = counters.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
@@ -155,7 +173,7 @@ impl Pass<'_> {
             if z > layers.start {
                 self.context
                     .control
-                    .span(Stage::Classify, || scratch.classify(self.iso, z - 1, &mut found, &mut bricks));
+                    .span(Stage::Classify, || scratch.classify(self, coord, z - 1, &mut found, &mut bricks))?;
             }
         }
         self.context.control.span(Stage::Classify, || found.shrink_to_fit());
@@ -178,7 +196,7 @@ impl Scratch {
     /// # Errors
     /// Returns [`SurfaceError::Cancelled`].
     fn evaluate(&mut self, pass: &Pass<'_>, tile: [i32; 3], own: &Range<usize>, z: usize) -> Result<(), SurfaceError> {
-        let Self { bricks, layers, slots, .. } = self;
+        let Self { bricks, arcs, spheres, layers, slots } = self;
         let layer = &mut layers[z % 2];
         let mut n = 0;
         for (slot, index) in slots.iter_mut().enumerate().skip(z * SIDE * SIDE).take(SIDE * SIDE) {
@@ -193,9 +211,18 @@ impl Scratch {
             let range = SampleRange { y_pairs: rows(y == SIDE - 1, 4), z_layers: rows(z == own.end, 8) };
             field.fill(0.0);
             let (atoms, origin) = (&pass.lattice.atoms, slot_origin(tile, slot));
-            for candidates in bricks.of(slot).chunks(CANDIDATES_PER_CHECK) {
-                pass.context.control.check()?;
-                field::evaluate(&pass.constants, atoms, candidates, origin, range, field);
+            match pass.field {
+                Field::Density(constants) => {
+                    for candidates in bricks.of(slot).chunks(CANDIDATES_PER_CHECK) {
+                        pass.context.control.check()?;
+                        field::evaluate(constants, atoms, candidates, origin, range, field);
+                    }
+                }
+                Field::Distance(distance) => {
+                    pass.context.control.check()?;
+                    distance.load(spheres, atoms, bricks.of(slot), arcs.of(slot), origin);
+                    distance.sample(spheres, range, field);
+                }
             }
             // A layer has 81 bricks.
             *index = u16::try_from(n).unwrap_or(NO_BRICK);
@@ -214,9 +241,19 @@ impl Scratch {
 
     /// Classifies every brick of layer z that has, or borders on, samples inside; requires the layer above to be the
     /// last one evaluated. Writes the index of each local brick's record to `local`.
-    fn classify(&self, iso: f32, z: usize, found: &mut ClassifiedBricks, local: &mut [u16]) {
+    ///
+    /// # Errors
+    /// Returns [`SurfaceError::Cancelled`].
+    fn classify(
+        &mut self,
+        pass: &Pass<'_>,
+        tile: [i32; 3],
+        z: usize,
+        found: &mut ClassifiedBricks,
+        local: &mut [u16],
+    ) -> Result<(), SurfaceError> {
         const NOTHING: Samples = [0.0; BRICK_SAMPLES];
-        let Self { bricks, layers, slots } = self;
+        let Self { bricks, arcs, spheres, layers, slots } = self;
         for y in 0..SIDE - 1 {
             let rows = layers.iter().fold(0, |rows, layer| rows | layer.rows[y] | layer.rows[y + 1]);
             let mut left = (rows | rows >> 1) & ((1 << (SIDE - 1)) - 1);
@@ -230,11 +267,18 @@ impl Scratch {
                     inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NONE_INSIDE)),
                     samples: near.map(|(i, layer)| layer.fields.get(i).map_or(&NOTHING, |AlignedSamples(field)| field)),
                 };
-                if let Some(record) = found.add(slot, &around, iso, bricks.of(slot)) {
-                    local[(z * 8 + y) * 8 + x] = record;
+                let first = found.t.len();
+                let Some(record) = found.add(slot, &around, pass.iso, bricks.of(slot)) else { continue };
+                local[(z * 8 + y) * 8 + x] = record;
+                if let Field::Distance(distance) = pass.field {
+                    pass.context.control.check()?;
+                    let origin = slot_origin(tile, slot);
+                    distance.load(spheres, &pass.lattice.atoms, bricks.of(slot), arcs.of(slot), origin);
+                    distance.refine(spheres, &around.samples, first, found);
                 }
             }
         }
+        Ok(())
     }
 }
 

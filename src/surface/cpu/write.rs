@@ -9,7 +9,6 @@ use std::sync::{Mutex, PoisonError};
 
 use super::bin::{Tiles, slot_origin};
 use super::emit;
-use super::field::Constants;
 use super::interpolate::{self, BrickVertices, VertexBatch, VertexRows, VertexTarget, take};
 use super::neighbours::{self, NumberedBrick};
 use super::sheets::Sheets;
@@ -155,8 +154,8 @@ pub(super) fn write_pieces(
     control: &Control<'_>,
     destination: &Destination<'_>,
 ) -> Result<Vec<PieceSummary>, SurfaceError> {
-    let Scanned { lattice, pieces, .. } = scanned;
-    let writer = Writer { scanned, constants: Constants::new(&lattice.profile, lattice.spacing), control };
+    let Scanned { pieces, .. } = scanned;
+    let writer = Writer { scanned, control };
     let finished = AtomicUsize::new(0);
     threads::each(pieces.len(), |i| {
         control.check()?;
@@ -192,7 +191,6 @@ fn measures(scanned: &Scanned, written: &[PieceSummary]) -> Option<Measures> {
 /// Shared inputs of the second pass.
 struct Writer<'a> {
     scanned: &'a Scanned,
-    constants: Constants,
     control: &'a Control<'a>,
 }
 
@@ -271,11 +269,13 @@ impl Writer<'_> {
             let source = BrickVertices {
                 origin: slot_origin(tile.coord, usize::from(brick.slot)),
                 candidates: &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize],
+                features: found.features.get(all.clone()).unwrap_or_default(),
+                spheres: found.spheres.get(all.clone()).unwrap_or_default(),
                 t: &found.t[all.clone()],
                 edges: &found.edges[all],
             };
-            let lattice = &self.scanned.lattice;
-            flat += interpolate::interpolate(lattice, &self.constants, &source, batch, target, self.control)?;
+            let Scanned { lattice, field, .. } = self.scanned;
+            flat += interpolate::interpolate(lattice, field, &source, batch, target, self.control)?;
         }
         Ok(flat)
     }

@@ -386,7 +386,9 @@ fn parameters() -> Vec<Row> {
         parameter("an isovalue of zero", "isovalue=0", "isovalue", "0"),
         parameter("a smoothness below zero", "smoothness=-2", "smoothness", "-2"),
         parameter("radii below zero", "radius_offset=-5", "radius_offset", "-5"),
-        parameter("an unknown kernel", "kernel=sphere", "kernel", "sphere"),
+        parameter("an unknown surface", "surface=sphere", "surface", "sphere"),
+        parameter("an isovalue of a surface of spheres", "surface=ses&isovalue=2", "isovalue", "2"),
+        parameter("a probe that is too large", "surface=ses&probe=11", "probe", "11"),
         parameter("half of the paper's parameters", "paper_a=1", "paper_a", "1"),
         parameter("a chain without a name", "chains=,", "chains", ","),
         Row {
@@ -405,6 +407,16 @@ fn parameters() -> Vec<Row> {
         parameter("a model beyond 32 bits", "model=99999999999", "model", "99999999999"),
         parameter("an altloc of two letters", "altloc=AB", "altloc", "AB"),
         parameter("an unknown kind of atoms", "select=everything", "select", "everything"),
+        Row {
+            named: vec![
+                ("parameter", Is::Equal("select".into())),
+                ("value", Is::Equal("chain A and (resi 1-x or water)".into())),
+                ("column", Is::Equal(json!(19))),
+                ("found", Is::Equal("1-x".into())),
+                ("expected", Is::Contains("a range such as 10-20")),
+            ],
+            ..parameter("a range that is none", "select=chain%20A%20and%20(resi%201-x%20or%20water)", "", "")
+        },
         parameter("an unknown format", "format=exe", "format", "exe"),
         Row { named: misspelt, ..parameter("a misspelt parameter", "resolutoin=1", "", "") },
         Row { named: twice, ..parameter("a repeated parameter", "resolution=1&resolution=2", "", "") },

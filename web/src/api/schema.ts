@@ -1,6 +1,6 @@
 /** Mesh parameters, read from the OpenAPI document of the service. */
 
-export type Kind = "number" | "integer" | "boolean" | "choice" | "set" | "text";
+export type Kind = "number" | "integer" | "boolean" | "choice" | "text";
 
 export interface Parameter {
   name: string;
@@ -16,7 +16,7 @@ export interface Parameter {
   fallback: string | undefined;
   /** Default value in words. */
   fallbackWords: string;
-  /** Values of choices and sets. */
+  /** Values of choices. */
   values: string[];
   /** Allowed values, in words. */
   expected: string;
@@ -37,7 +37,6 @@ interface Schema extends Reference {
   minimum?: number;
   maximum?: number;
   enum?: string[];
-  items?: Schema;
 }
 
 interface Described extends Reference {
@@ -76,16 +75,14 @@ export function formatsOf(api: OpenApi): string[] {
   return (format && resolved(api, format).enum) ?? ["glb"];
 }
 
-function kindOf(schema: Schema, items: Schema): Kind {
+function kindOf(schema: Schema): Kind {
   const type = Array.isArray(schema.type) ? schema.type.find((t) => t !== "null") : schema.type;
-  if (type === "array") return items.enum ? "set" : "text";
   if (type === "boolean" || type === "number" || type === "integer") return type;
   return schema.enum ? "choice" : "text";
 }
 
 function parameterOf(api: OpenApi, parameter: Described): Parameter {
   const schema = resolved(api, parameter.schema ?? {});
-  const items = resolved(api, schema.items ?? {});
   const text = parameter.description ?? "";
   const min = schema.minimum ?? Number.NEGATIVE_INFINITY;
   const max = schema.maximum ?? Number.POSITIVE_INFINITY;
@@ -96,14 +93,14 @@ function parameterOf(api: OpenApi, parameter: Described): Parameter {
     name: parameter.name,
     // The form shows the range and the default beside the control.
     doc: text.replace(/ (Range|Value|Default): .*$/s, ""),
-    kind: kindOf(schema, items),
+    kind: kindOf(schema),
     min,
     max,
     usual: span ?? usual(min, max, Number(value)),
     unit: unit ?? "",
     fallback: value === undefined || value === null ? undefined : String(value),
     fallbackWords: words ?? (value === undefined ? "absent" : String(value)),
-    values: schema.enum ?? items.enum ?? [],
+    values: schema.enum ?? [],
     expected: schema.title ?? "",
     format: format ?? "",
     insteadOf: insteadOf ?? [],

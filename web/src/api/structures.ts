@@ -26,6 +26,7 @@ export interface Summary {
   atoms: number;
   models: number[];
   chains: { name: string; atoms: number }[];
+  assemblies: { id: string; copies: number | null }[];
   atoms_in_model: { polymer: number; ligand: number; water: number; hydrogens: number };
 }
 
@@ -110,21 +111,6 @@ export class Labels {
     const [first, end] = [residues.first[at] ?? 0, residues.first[at + 1] ?? this.count];
     for (let row = first; row < end; row += 1) if (["CA", "P", "C1'"].includes(names[atoms.name[row] ?? -1] ?? "")) return this.of(row);
     return this.of(first);
-  }
-
-  /** Returns a number per atom for colours: its chain, in order of appearance, or its element. */
-  classes(by: "chain" | "element"): { of: Uint16Array; names: string[] } {
-    const { residues, atoms, elements, count } = this.document;
-    if (by === "element") return { of: Uint16Array.from(atoms.element), names: elements };
-    const names: string[] = [];
-    const of = new Uint16Array(count);
-    residues.first.forEach((first, i) => {
-      const chain = residues.chain[i] ?? "";
-      let at = names.indexOf(chain);
-      if (at < 0) at = names.push(chain) - 1;
-      of.fill(at, first, residues.first[i + 1] ?? count);
-    });
-    return { of, names };
   }
 }
 

@@ -1,6 +1,6 @@
 /** Material of the surface: hemisphere light, two camera lights, darker hollows and edges, and distance fog. */
 
-import { Color, DataTexture, FloatType, GLSL3, NearestFilter, RGBAFormat, ShaderMaterial, Vector2, type BufferGeometry } from "three";
+import { Color, DataTexture, GLSL3, NearestFilter, RGBAFormat, ShaderMaterial, SRGBColorSpace, UnsignedByteType, Vector2, type BufferGeometry } from "three";
 
 /** Atoms per row of the palette, a texture width that every device supports. */
 const PALETTE_WIDTH = 1024;
@@ -23,6 +23,10 @@ void main() {
   vec4 eye = modelViewMatrix * vec4(position, 1.0);
   vEye = eye.xyz;
   vColor = plain;
+  // Vertex colours of the file.
+  #if defined(USE_COLOR_ALPHA) || defined(USE_COLOR)
+  vColor = color.rgb;
+  #endif
   vGlow = 0.0;
   #ifdef NORMALS
   vNormal = normalMatrix * normal;
@@ -84,6 +88,7 @@ export class SurfaceMaterial extends ShaderMaterial {
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
       defines,
+      vertexColors: geometry.hasAttribute("color"),
       uniforms: {
         plain: { value: new Color("#5fb3a1") },
         glow: { value: new Color("#ffb020") },
@@ -106,18 +111,16 @@ export class SurfaceMaterial extends ShaderMaterial {
   }
 }
 
-/** Texture with a colour per atom, read by vertices. */
-export function palette(of: Uint16Array, colors: Color[]): DataTexture {
-  const height = Math.max(1, Math.ceil(of.length / PALETTE_WIDTH));
-  const data = new Float32Array(PALETTE_WIDTH * height * 4);
-  for (let i = 0; i < of.length; i += 1) {
-    const color = colors[(of[i] ?? 0) % colors.length];
-    if (color) data.set([color.r, color.g, color.b, 1], 4 * i);
-  }
-  const texture = new DataTexture(data, PALETTE_WIDTH, height, RGBAFormat, FloatType);
+/** Returns a texture with one colour per atom, for the vertex shader. `rgba` has four sRGB bytes per atom. */
+export function palette(rgba: Uint8Array): DataTexture {
+  const height = Math.max(1, Math.ceil(rgba.length / 4 / PALETTE_WIDTH));
+  const data = new Uint8Array(PALETTE_WIDTH * height * 4);
+  data.set(rgba);
+  const texture = new DataTexture(data, PALETTE_WIDTH, height, RGBAFormat, UnsignedByteType);
+  texture.colorSpace = SRGBColorSpace;
   texture.minFilter = texture.magFilter = NearestFilter;
   texture.needsUpdate = true;
   return texture;
 }
 
-const EMPTY = palette(new Uint16Array(1), [new Color("#ffffff")]);
+const EMPTY = palette(new Uint8Array(4).fill(255));

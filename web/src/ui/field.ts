@@ -1,4 +1,4 @@
-/** Control of one parameter: slider, menu, switch, check boxes or text, depending on its schema. */
+/** Control of one parameter: slider, menu, switch or text, depending on its schema. */
 
 import type { Parameter } from "../api/schema";
 import { el, number } from "./dom";
@@ -11,6 +11,8 @@ export interface Field {
   value: string | undefined;
   /** Shows the value that the service used by default. */
   effective(value: string | number | undefined): void;
+  /** Sets the suggested values of a text field. */
+  offer?(values: string[]): void;
 }
 
 /** Called when a value is set or reset (undefined); `live` while a slider is dragged. */
@@ -21,16 +23,16 @@ export function field(parameter: Parameter, changed: Changed): Field {
   if (kind === "number" || kind === "integer") return numeric(parameter, changed);
   if (kind === "choice") return menu(parameter, changed);
   if (kind === "boolean") return toggle(parameter, changed);
-  return kind === "set" ? boxes(parameter, changed) : text(parameter, changed);
+  return text(parameter, changed);
 }
 
 const title = (parameter: Parameter) => parameter.name.replaceAll("_", " ");
 
 /** Builds the common part of all controls: name, description and reset button. */
-function frame(parameter: Parameter, changed: Changed, group = false) {
+function frame(parameter: Parameter, changed: Changed) {
   const id = `p-${parameter.name}`;
   const reset = el("button", { type: "button", class: "reset", hidden: true, "aria-label": `Reset ${title(parameter)} to its default`, title: "Reset to default" }, "↺");
-  const name = group ? el("span", { class: "name", id: `${id}-name` }, title(parameter)) : el("label", { class: "name", for: id }, title(parameter));
+  const name = el("label", { class: "name", for: id }, title(parameter));
   const head = el("div", { class: "field-head" }, name, reset);
   const doc = el("p", { class: "doc", id: `${id}-doc` }, `${parameter.doc} Default: ${parameter.fallbackWords}.`);
   const help = el("button", { type: "button", class: "help", "aria-label": `About ${title(parameter)}`, "aria-expanded": "false", "aria-controls": `${id}-doc` }, "?");
@@ -40,7 +42,7 @@ function frame(parameter: Parameter, changed: Changed, group = false) {
     help.setAttribute("aria-expanded", String(!doc.hidden));
   });
   name.after(help);
-  const element = el("div", { class: "field", "data-parameter": parameter.name, ...(group ? { role: "group", "aria-labelledby": `${id}-name` } : {}) }, head, doc);
+  const element = el("div", { class: "field", "data-parameter": parameter.name }, head, doc);
   reset.addEventListener("click", () => changed(parameter.name, undefined, false));
   const mark = (set: boolean) => {
     reset.hidden = !set;
@@ -129,32 +131,12 @@ function toggle(parameter: Parameter, changed: Changed): Field {
   return { parameter, element, get value() { return value; }, set value(next) { value = next; say(); }, effective: () => undefined };
 }
 
-function boxes(parameter: Parameter, changed: Changed): Field {
-  const { element, mark } = frame(parameter, changed, true);
-  const standard = parameter.fallbackWords.split(",").filter((word) => parameter.values.includes(word));
-  const inputs = parameter.values.map((word) => el("input", { type: "checkbox", value: word }));
-  element.append(el("div", { class: "chips" }, ...inputs.map((input) => el("label", { class: "chip" }, input, el("span", {}, input.value)))));
-  const taken = () => inputs.filter((input) => input.checked).map((input) => input.value);
-  for (const input of inputs) {
-    input.addEventListener("change", () => {
-      const words = taken();
-      changed(parameter.name, words.length === 0 || words.join() === standard.join() ? undefined : words.join(","), false);
-    });
-  }
-  let value: string | undefined;
-  const say = () => {
-    const words = value?.split(",") ?? standard;
-    for (const input of inputs) input.checked = words.includes(input.value);
-    mark(value !== undefined);
-  };
-  say();
-  return { parameter, element, get value() { return value; }, set value(next) { value = next; say(); }, effective: () => undefined };
-}
-
 function text(parameter: Parameter, changed: Changed): Field {
   const { id, element, head, mark } = frame(parameter, changed);
   const input = el("input", { type: "text", id, class: "wide", autocomplete: "off", spellcheck: "false", placeholder: parameter.fallbackWords, "aria-describedby": `${id}-doc` });
-  head.append(input);
+  const list = el("datalist", { id: `${id}-list` });
+  input.setAttribute("list", list.id);
+  head.append(input, list);
   input.addEventListener("change", () => changed(parameter.name, input.value.trim() === "" ? undefined : input.value.trim(), false));
   let value: string | undefined;
   const say = () => {
@@ -168,6 +150,9 @@ function text(parameter: Parameter, changed: Changed): Field {
     set value(next) { value = next; say(); },
     effective(next) {
       input.placeholder = next === undefined ? parameter.fallbackWords : String(next);
+    },
+    offer(values) {
+      list.replaceChildren(...values.map((value) => el("option", { value })));
     },
   };
 }

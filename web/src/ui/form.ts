@@ -9,10 +9,18 @@ import { field, type Field } from "./field";
 const STORAGE = ["compress", "normals", "units", "atom_ids"];
 
 /** Parameters whose values name parts of one structure. */
-const PARTS = ["model", "chains", "altloc"];
+const PARTS = ["model", "chains", "altloc", "assembly"];
+
+/** Parameters of colours, which change the shown surface without a new mesh. */
+const COLORS = ["color", "palette", "color_range"];
+
+/** Returns true if a parameter changes the displayed mesh. */
+const isOfMesh = ({ name, format }: Parameter) => format === "" && !COLORS.includes(name);
 
 /** Parameters at the top. Others follow below. */
-const FIRST = ["preset", "kernel", "resolution", "isovalue", "smoothness", "select", "chains"];
+const FIRST = [
+  "preset", "surface", "probe", "resolution", "isovalue", "smoothness", "select", "chains", "assembly",
+];
 
 export class Form {
   private readonly fields = new Map<string, Field>();
@@ -40,12 +48,12 @@ export class Form {
 
   /** Returns the values in `choices` that affect the mesh. */
   mesh(choices: Choices): Choices {
-    return this.chosen(choices, (parameter) => parameter.format === "");
+    return this.chosen(choices, isOfMesh);
   }
 
-  /** Returns the values in `choices` that apply to a single format. */
+  /** Returns the values in `choices` that do not change the displayed mesh: colours, and parameters of a single format. */
   apart(choices: Choices): Choices {
-    return this.chosen(choices, (parameter) => parameter.format !== "");
+    return this.chosen(choices, (parameter) => !isOfMesh(parameter));
   }
 
   /** Returns the values in `choices` that apply to a file of `format`. */
@@ -69,7 +77,7 @@ export class Form {
   set(name: string, value: string | undefined, live = false): void {
     const field = this.fields.get(name);
     if (!field) return;
-    const mesh = field.parameter.format === "";
+    const mesh = isOfMesh(field.parameter);
     if (field.value === value && !live) return this.changed(mesh, live);
     field.value = value;
     if (value !== undefined) for (const other of field.parameter.insteadOf) this.put(other, undefined);
@@ -79,7 +87,7 @@ export class Form {
   /** Sets all values without calling `changed`. */
   fill(choices: Choices): void {
     for (const [name] of this.fields) this.put(name, choices.get(name));
-    if ([...choices.keys()].some((name) => this.fields.get(name)?.parameter.format === "" && !FIRST.includes(name))) this.home.querySelector("details")?.setAttribute("open", "");
+    if ([...choices.keys()].some((name) => this.fields.get(name)?.parameter.format === "" && ![...FIRST, ...COLORS].includes(name))) this.home.querySelector("details")?.setAttribute("open", "");
   }
 
   /** Resets parameters that name parts of the former structure, without an event. */
@@ -101,7 +109,13 @@ export class Form {
     this.fields.get(name)?.effective(words);
   }
 
-  private put(name: string, value: string | undefined): void {
+  /** Sets the values that a text field suggests for this structure. */
+  offer(name: string, values: string[]): void {
+    this.fields.get(name)?.offer?.(values);
+  }
+
+  /** Sets a value without calling `changed`. */
+  put(name: string, value: string | undefined): void {
     const field = this.fields.get(name);
     if (field && field.value !== value) field.value = value;
   }

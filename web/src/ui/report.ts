@@ -5,7 +5,7 @@ import { el, number } from "./dom";
 export type Report = Record<string, unknown>;
 
 const UNITS: Record<string, string> = { area: "Å²", volume: "Å³", resolution: "Å" };
-const ROWS = ["atoms", "triangles", "vertices", "area", "volume", "components", "voids", "euler", "resolution", "isovalue", "smoothness", "kernel", "preset"];
+const ROWS = ["atoms", "triangles", "vertices", "area", "volume", "components", "voids", "euler", "resolution", "isovalue", "smoothness", "surface", "probe", "preset"];
 const PROOFS = ["closed", "oriented", "manifold"];
 
 /** Writes a report; `timings` are pairs of stage and ms. */

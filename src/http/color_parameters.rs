@@ -1,0 +1,73 @@
+//! Parameters of `…/colors`: those of a mesh that affect the colours, with `scheme` instead of `color`.
+
+use crate::pipeline::nearest::nearest;
+use crate::pipeline::params::{self, ParamError};
+use crate::pipeline::{Coloring, Job, color};
+
+/// Names of the parameters.
+pub(super) const NAMES: [&str; 7] = ["scheme", "palette", "color_range", "model", "chains", "select", "altloc"];
+
+/// Parses the parameters.
+///
+/// # Errors
+/// Returns a [`ParamError`], also if there is no scheme or a parameter applies to meshes only.
+pub(super) fn parse(pairs: &[(String, String)]) -> Result<(Job, Coloring), ParamError> {
+    if let Some((name, _)) = pairs.iter().find(|(name, _)| !NAMES.contains(&name.as_str())) {
+        let name = name.chars().take(64).collect::<String>();
+        return Err(ParamError::Unknown { nearest: nearest(&name, NAMES), name });
+    }
+    let renamed = pairs.iter().map(|(name, value)| (if name == "scheme" { "color" } else { name }, value));
+    let job = params::parse(renamed).map_err(of_scheme)?.job;
+    let missing = || bad_scheme("none".to_owned());
+    let coloring = job.color.ok_or_else(missing)?;
+    Ok((job, coloring))
+}
+
+/// Replaces `color` by `scheme` in an error.
+fn of_scheme(error: ParamError) -> ParamError {
+    match error {
+        ParamError::BadValue { name: "color", value, .. } => bad_scheme(value),
+        ParamError::Repeated { name: "color" } => ParamError::Repeated { name: "scheme" },
+        other => other,
+    }
+}
+
+fn bad_scheme(value: String) -> ParamError {
+    ParamError::BadValue { name: "scheme", value, expected: expected() }
+}
+
+/// Returns the description of the valid values of `scheme`.
+pub(super) fn expected() -> String {
+    color::EXPECTED.replace("none, ", "")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parsed(pairs: &[(&str, &str)]) -> Result<(Job, Coloring), ParamError> {
+        let pairs: Vec<_> = pairs.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect();
+        parse(&pairs)
+    }
+
+    #[test]
+    fn parameters_are_those_of_a_mesh_with_scheme_instead_of_color() {
+        assert_eq!(parsed(&[("scheme", "bfactor"), ("chains", "A")]).unwrap().1.scheme, color::Scheme::BFactor);
+        for (pairs, name) in [
+            (&[][..], "scheme"),
+            (&[("scheme", "none")], "scheme"),
+            (&[("scheme", "chains")], "scheme"),
+            (&[("scheme", "chain"), ("palette", "viridis")], "palette"),
+        ] {
+            let Err(ParamError::BadValue { name: found, expected, .. }) = parsed(pairs) else { panic!("{pairs:?}") };
+            assert_eq!(found, name);
+            assert!(name != "scheme" || expected.starts_with("uniform:#RRGGBB, element"), "{expected}");
+        }
+        let twice = parsed(&[("scheme", "chain"), ("scheme", "chain")]);
+        assert_eq!(twice.unwrap_err(), ParamError::Repeated { name: "scheme" });
+        for (name, similar) in [("color", None), ("resolution", None), ("schema", Some("scheme"))] {
+            let Err(ParamError::Unknown { nearest, .. }) = parsed(&[(name, "chain")]) else { panic!("{name}") };
+            assert!(similar.is_none() || nearest == similar, "{name}: {nearest:?}");
+        }
+    }
+}

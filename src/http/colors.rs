@@ -1,0 +1,190 @@
+//! `…/colors`: the colour of every atom of a structure, so that clients can recolour a mesh that has `_ATOM`.
+
+use std::fmt::Write as _;
+
+use axum::body::Body;
+use axum::extract::State;
+use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
+use axum::http::{Response as HttpResponse, StatusCode};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+
+use super::color_parameters::{self, expected};
+use super::delivery;
+use super::guard::Caller;
+use super::kinds::Kind;
+use super::openapi::meshes::AtomColorsResponse;
+use super::openapi::parameters::{ColorParameters, ConditionHeaders, EntryPath, RangeHeaders, StructurePath};
+use super::openapi::problem_responses;
+use super::openapi::problems::READING;
+use super::parsed_request::Pairs;
+use super::problem::Problem;
+use super::range::{self, Wanted};
+use super::source::{self, Input, StructureSource};
+use super::state::Shared;
+use crate::pipeline::{AtomColors, ColorError, Coloring, Job, params};
+use crate::structure;
+
+/// Header with scheme, palette, range and legend.
+pub(super) const LEGEND: HeaderName = HeaderName::from_static("molmesh-colors");
+/// Bytes per colour.
+const COLOR_BYTES: u64 = 4;
+/// Largest number of entries of the legend, which must fit into a header.
+const MAX_ENTRIES: usize = 24;
+
+problem_responses!(StructureProblems: [
+    READING,
+    [
+        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed,
+        Kind::RangeNotSatisfiable, Kind::EmptySelection, Kind::MemoryFull, Kind::TooManyDeliveries,
+        Kind::ShareExceeded, Kind::StoreFailed,
+    ],
+]);
+problem_responses!(EntryProblems: [READING, [
+    Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
+    Kind::PreconditionFailed, Kind::RangeNotSatisfiable, Kind::EmptySelection, Kind::MemoryFull,
+    Kind::TooManyDeliveries, Kind::ShareExceeded,
+]]);
+
+/// Get the colours of the atoms of a structure
+///
+/// Four bytes for each atom of the file, in file order: red, green, blue (sRGB) and alpha. A mesh with `atom_ids=true`
+/// has a vertex attribute `_ATOM` (`atom` in PLY), the index of the atom in this list, so a client can recolour the
+/// vertices without requesting a new mesh. The header `Molmesh-Colors` describes the colours.
+#[utoipa::path(
+    get,
+    path = "/v1/structures/{digest}/colors",
+    tag = "structures",
+    operation_id = "colorAtoms",
+    params(StructurePath, ColorParameters, ConditionHeaders, RangeHeaders),
+    responses(AtomColorsResponse, StructureProblems)
+)]
+pub(super) async fn of_structure(
+    State(app): State<Shared>,
+    caller: Caller,
+    source: StructureSource,
+    query: Pairs,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    answer(&app, &caller, source, query, &headers).await
+}
+
+/// Get the colours of the atoms of an archive entry
+///
+/// Four bytes for each atom of the file, in file order: red, green, blue (sRGB) and alpha. A mesh with `atom_ids=true`
+/// has a vertex attribute `_ATOM` (`atom` in PLY), the index of the atom in this list, so a client can recolour the
+/// vertices without requesting a new mesh. The header `Molmesh-Colors` describes the colours.
+#[utoipa::path(
+    get,
+    path = "/v1/pdb/{id}/colors",
+    tag = "structures",
+    operation_id = "colorEntryAtoms",
+    params(EntryPath, ColorParameters, ConditionHeaders, RangeHeaders),
+    responses(AtomColorsResponse, EntryProblems)
+)]
+pub(super) async fn of_entry(
+    State(app): State<Shared>,
+    caller: Caller,
+    source: StructureSource,
+    query: Pairs,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    answer(&app, &caller, source, query, &headers).await
+}
+
+async fn answer(
+    app: &Shared,
+    caller: &Caller,
+    source: StructureSource,
+    query: Pairs,
+    headers: &HeaderMap,
+) -> Result<Response, Problem> {
+    let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let (job, coloring) = color_parameters::parse(&pairs)?;
+    let variant = params::canonical(&job);
+    let write = async |input: Input| {
+        let etag = source::etag(&input.digest, &variant)?;
+        let (colors, legend) = list(app, caller, input, job, coloring).await?;
+        let described =
+            [(header::CONTENT_TYPE, HeaderValue::from_static("application/octet-stream")), (LEGEND, legend)];
+        Ok((described, part_of(&colors, headers, &etag)?).into_response())
+    };
+    source.document(app, caller, headers, &variant, write).await
+}
+
+/// Parses a structure and lists the colours of its atoms, on a blocking thread. The list counts towards the memory
+/// budget until it is sent.
+async fn list(
+    app: &Shared,
+    caller: &Caller,
+    input: Input,
+    job: Job,
+    coloring: Coloring,
+) -> Result<(Bytes, HeaderValue), Problem> {
+    let mut limits = app.config.limits.job().read;
+    limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
+    let lease = app.pool.settings().budget.lease();
+    let (structures, namespace) = (app.structures(), caller.namespace);
+    let listing = app.read(move |control| {
+        let structure = structures.get(namespace, input.digest, &input.bytes, &limits, control)?;
+        let selected = structure::select_with(&structure, &job.selection, &limits, control)?.atoms;
+        let colors = AtomColors::new(&structure, &selected, &coloring).map_err(not_colorable)?;
+        lease.grow(COLOR_BYTES * structure.len() as u64)?;
+        let list: Vec<u8> = (0..structure.len()).flat_map(|i| colors.of(i)).collect();
+        let mut report = colors.report(&selected);
+        report.legend.truncate(MAX_ENTRIES);
+        let legend = serde_json::to_string(&report).map_err(Problem::internal)?;
+        Ok::<_, Problem>((lease.attach(list), HeaderValue::from_str(&ascii(&legend)).map_err(Problem::internal)?))
+    });
+    listing.await?
+}
+
+fn not_colorable(error: ColorError) -> Problem {
+    Problem::new(Kind::BadParameter, format!("parameter `scheme`: `{}` cannot be applied: {}", error.scheme, error.why))
+        .with("parameter", "scheme")
+        .with("value", error.scheme)
+        .with("expected", expected())
+}
+
+/// Escapes the characters of a JSON text that a header cannot contain.
+fn ascii(json: &str) -> String {
+    let mut text = String::with_capacity(json.len());
+    for c in json.chars() {
+        match c {
+            ' '..='~' => text.push(c),
+            _ => c.encode_utf16(&mut [0; 2]).iter().for_each(|unit| {
+                // Writing to a string cannot fail.
+                write!(text, "\\u{unit:04x}").unwrap_or_default();
+            }),
+        }
+    }
+    text
+}
+
+/// Returns a response with the list or the requested part of it.
+fn part_of(list: &Bytes, headers: &HeaderMap, etag: &HeaderValue) -> Result<HttpResponse<Body>, Problem> {
+    let length = list.len() as u64;
+    let (status, range) = match range::wanted(headers, etag, length) {
+        Wanted::All => (StatusCode::OK, 0..length),
+        Wanted::Part(range) => (StatusCode::PARTIAL_CONTENT, range),
+        Wanted::Nothing => return Err(delivery::range_outside(length)),
+    };
+    let accepted = [(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"))];
+    let place = (status == StatusCode::PARTIAL_CONTENT)
+        .then(|| [(header::CONTENT_RANGE, delivery::content_range(&range, length))]);
+    let [from, to] = [range.start, range.end].map(|at| usize::try_from(at).unwrap_or(list.len()));
+    Ok((status, accepted, place.map_or_else(HeaderMap::new, HeaderMap::from_iter), Body::from(list.slice(from..to)))
+        .into_response())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn legends_fit_a_header() {
+        let text = ascii(r#"{"label":"Ä🧬 b"}"#);
+        assert_eq!(text, r#"{"label":"\u00c4\ud83e\uddec b"}"#);
+        assert_eq!(serde_json::from_str::<serde_json::Value>(&text).unwrap()["label"], "Ä🧬 b");
+    }
+}

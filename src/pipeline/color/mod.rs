@@ -1,0 +1,446 @@
+//! Colours of atoms: the parameters `color`, `palette` and `color_range`, and the colours that they give the atoms of a
+//! structure. A vertex has the colour of the atom whose sphere is nearest to it.
+
+mod palette;
+mod scheme;
+mod tables;
+
+use std::collections::HashSet;
+
+use indexmap::IndexSet;
+use rayon::prelude::*;
+use serde::Serialize;
+use thiserror::Error;
+
+pub use palette::Palette;
+pub use scheme::{EXPECTED, Hydrophobicity, Scheme};
+
+use crate::structure::{Structure, element};
+use crate::surface::Column;
+use palette::Rgb;
+use tables::{OTHER, PLDDT};
+
+/// Vertices per task.
+const ROWS: usize = 1 << 16;
+/// Largest number of entries of a legend.
+const MAX_ENTRIES: usize = 100;
+/// Number of values in the legend of a palette.
+const STOPS: u32 = 5;
+
+/// Parameters of the colours of a mesh.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Coloring {
+    /// Scheme.
+    pub scheme: Scheme,
+    /// Palette of a numeric scheme; the default of the scheme if `None`.
+    pub palette: Option<Palette>,
+    /// Values at the ends of the palette; the default of the scheme if `None`.
+    pub range: Option<[f64; 2]>,
+}
+
+impl Coloring {
+    /// Returns a canonical text of the parameters, equal for equal colours.
+    #[must_use]
+    pub fn canonical(&self) -> String {
+        let palette = self.palette.or(self.scheme.palette()).map_or("", Palette::name);
+        format!("color={}&palette={palette}&color_range={:?}", self.scheme, self.range)
+    }
+}
+
+/// Entry of a legend.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct LegendEntry {
+    /// Value, or name of the element, chain, entity, residue or pLDDT class.
+    pub label: String,
+    /// Colour, `#rrggbb`, sRGB.
+    pub color: String,
+}
+
+/// Colours of a mesh.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct ColorReport {
+    /// Scheme, the value of the parameter `color`.
+    pub scheme: String,
+    /// Palette of a numeric scheme; absent for other schemes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub palette: Option<&'static str>,
+    /// Values at the ends of the palette of a numeric scheme; absent for other schemes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub range: Option<[f64; 2]>,
+    /// Colours of five equidistant values, or of the categories that occur, at most 100.
+    pub legend: Vec<LegendEntry>,
+}
+
+/// The structure lacks the values of a scheme.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[error("parameter `color`: `{scheme}` cannot be applied: {why}; expected one of {EXPECTED}")]
+pub struct ColorError {
+    /// Name of the scheme.
+    pub scheme: String,
+    /// Reason.
+    pub why: String,
+}
+
+/// Colours of the atoms of a structure.
+pub struct AtomColors<'a> {
+    structure: &'a Structure,
+    scheme: Scheme,
+    palette: Palette,
+    range: [f64; 2],
+    /// Colours by residue name, or of entities by `label_chain`.
+    colors: Vec<Rgb>,
+    /// Values by residue name.
+    values: Vec<Option<f64>>,
+    /// Factor that converts B-factors to pLDDT from 0 to 100.
+    plddt_scale: f64,
+}
+
+impl<'a> AtomColors<'a> {
+    /// Prepares the colours of all atoms. `selected` are the atoms that the default range and the legend describe.
+    ///
+    /// # Errors
+    /// Returns a [`ColorError`] if the file lacks the values of the scheme.
+    pub fn new(structure: &'a Structure, selected: &[u32], coloring: &Coloring) -> Result<Self, ColorError> {
+        let Coloring { scheme, palette, range } = *coloring;
+        let fail = |why: String| ColorError { scheme: scheme.to_string(), why };
+        let residues = || structure.residue.texts();
+        let values = match scheme {
+            Scheme::Hydrophobicity(scale) => {
+                residues().map(|name| Some(tables::hydrophobicity(name)?[scale as usize])).collect()
+            }
+            Scheme::Charge => residues().map(tables::charge).collect(),
+            _ => Vec::new(),
+        };
+        let colors = match scheme {
+            Scheme::Residue => residues().map(tables::residue).collect(),
+            Scheme::Entity => entities(structure).ok_or_else(|| {
+                fail("the file does not assign chains to entities; only mmCIF and BinaryCIF files can".to_owned())
+            })?,
+            _ => Vec::new(),
+        };
+        let plddt_scale = if scheme == Scheme::Plddt { plddt_scale(structure).map_err(fail)? } else { 1.0 };
+        let column = match scheme {
+            Scheme::BFactor => Some(&structure.b_factor),
+            Scheme::Occupancy => Some(&structure.occupancy),
+            _ => None,
+        };
+        let range = range.or(scheme.range()).or_else(|| Some(range_of(column?, selected))).unwrap_or_default();
+        let palette = palette.or(scheme.palette()).unwrap_or(Palette::Viridis);
+        Ok(Self { structure, scheme, palette, range, colors, values, plddt_scale })
+    }
+
+    /// Returns the colour of atom `i`, sRGB and opaque.
+    #[must_use]
+    pub fn of(&self, i: usize) -> [u8; 4] {
+        let [_, r, g, b] = self.rgb(i).to_be_bytes();
+        [r, g, b, u8::MAX]
+    }
+
+    fn rgb(&self, i: usize) -> Rgb {
+        let structure = self.structure;
+        match self.scheme {
+            Scheme::Uniform(color) => color,
+            Scheme::Element => tables::element(structure.element[i]),
+            Scheme::Chain => tables::category(structure.chain.id(i)),
+            Scheme::Entity => self.colors[structure.label_chain.id(i) as usize],
+            Scheme::Residue => self.colors[structure.residue.id(i) as usize],
+            Scheme::BFactor => self.scaled(f64::from(structure.b_factor[i])),
+            Scheme::Occupancy => self.scaled(f64::from(structure.occupancy[i])),
+            Scheme::Plddt => PLDDT[self.plddt_class(i)].2,
+            Scheme::Hydrophobicity(_) | Scheme::Charge => {
+                self.values[structure.residue.id(i) as usize].map_or(OTHER, |value| self.scaled(value))
+            }
+        }
+    }
+
+    /// Returns the colour of a value. In an empty range, all values have the colour of the palette's middle.
+    fn scaled(&self, value: f64) -> Rgb {
+        let [low, high] = self.range;
+        self.palette.at(if high > low { (value - low) / (high - low) } else { 0.5 })
+    }
+
+    fn plddt_class(&self, i: usize) -> usize {
+        let value = f64::from(self.structure.b_factor[i]) * self.plddt_scale;
+        PLDDT.iter().position(|(bound, ..)| value <= *bound).unwrap_or(PLDDT.len() - 1)
+    }
+
+    /// Returns the scheme, the range and the legend of the `selected` atoms.
+    #[must_use]
+    pub fn report(&self, selected: &[u32]) -> ColorReport {
+        let entry = |label: String, color: Rgb| LegendEntry { label, color: format!("#{color:06x}") };
+        let [low, high] = self.range;
+        let value = |stop: u32| round(low + (high - low) * f64::from(stop) / f64::from(STOPS - 1));
+        let legend = match self.scheme {
+            Scheme::Uniform(_) => Vec::new(),
+            Scheme::Plddt => PLDDT.iter().map(|(_, label, color)| entry((*label).to_owned(), *color)).collect(),
+            _ if self.scheme.palette().is_some() => {
+                (0..STOPS).map(value).map(|value| entry(value.to_string(), self.scaled(value))).collect()
+            }
+            _ => self.categories(selected).into_iter().map(|(label, color)| entry(label, color)).collect(),
+        };
+        let has_numbers = self.scheme.palette().is_some();
+        ColorReport {
+            scheme: self.scheme.to_string(),
+            palette: has_numbers.then(|| self.palette.name()),
+            range: has_numbers.then_some(self.range),
+            legend,
+        }
+    }
+
+    /// Returns the categories of the `selected` atoms with their colours, in order of first appearance.
+    fn categories(&self, selected: &[u32]) -> Vec<(String, Rgb)> {
+        let structure = self.structure;
+        let mut seen = HashSet::new();
+        let mut found = Vec::new();
+        for i in selected.iter().map(|&i| i as usize) {
+            let id = match self.scheme {
+                Scheme::Element => u32::from(structure.element[i]),
+                Scheme::Residue => structure.residue.id(i),
+                Scheme::Entity => structure.label_chain.id(i),
+                _ => structure.chain.id(i),
+            };
+            if found.len() == MAX_ENTRIES || !seen.insert(id) {
+                continue;
+            }
+            let label = match self.scheme {
+                Scheme::Element => {
+                    usize::from(structure.element[i]).checked_sub(1).map_or("?", |z| element::SYMBOLS[z])
+                }
+                Scheme::Residue => structure.residue.get(i),
+                Scheme::Entity => {
+                    structure.entities.get(id as usize).filter(|name| !name.is_empty()).map_or("?", String::as_str)
+                }
+                _ => structure.chain.get(i),
+            };
+            // Several chains may belong to one entity.
+            if self.scheme != Scheme::Entity || !found.iter().any(|(known, _)| known == label) {
+                found.push((label.to_owned(), self.rgb(i)));
+            }
+        }
+        found
+    }
+}
+
+/// Returns the colour of each vertex. `ids` are indices into `colors`.
+#[must_use]
+pub(super) fn of_vertices(colors: &[[u8; 4]], ids: &[u32]) -> Column<[u8; 4]> {
+    let mut column = Column::zeroed(ids.len());
+    column.par_chunks_mut(ROWS).zip(ids.par_chunks(ROWS)).for_each(|(out, ids)| {
+        out.iter_mut().zip(ids).for_each(|(out, &id)| *out = colors[id as usize]);
+    });
+    column
+}
+
+/// Returns the colour of the entity of each `label_chain`; `None` if none is known.
+fn entities(structure: &Structure) -> Option<Vec<Rgb>> {
+    // Entities are numbered in order of first appearance.
+    let mut names: IndexSet<&str> = IndexSet::new();
+    let colors = structure.entities.iter().map(|name| match name.as_str() {
+        "" => OTHER,
+        name => tables::category(u32::try_from(names.insert_full(name).0).unwrap_or(0)),
+    });
+    let colors = colors.collect();
+    (!names.is_empty()).then_some(colors)
+}
+
+/// Returns the factor that converts the B-factors of a predicted structure to pLDDT from 0 to 100. Some programs write
+/// pLDDT from 0 to 1.
+fn plddt_scale(structure: &Structure) -> Result<f64, String> {
+    let [low, high] = extremes(structure.b_factor.iter().copied());
+    if low < 0.0 || high <= 0.0 || high > 100.0 {
+        return Err(format!("the B-factors are {low} to {high}, but pLDDT ranges from 0 to 100, or from 0 to 1"));
+    }
+    Ok(if high <= 1.0 { 100.0 } else { 1.0 })
+}
+
+/// Returns the lowest and the highest value of the `selected` atoms, to three decimals.
+fn range_of(column: &[f32], selected: &[u32]) -> [f64; 2] {
+    extremes(selected.iter().map(|&i| column[i as usize])).map(round)
+}
+
+fn extremes(values: impl Iterator<Item = f32>) -> [f64; 2] {
+    let all = values.map(f64::from).fold([f64::MAX, f64::MIN], |[low, high], v| [low.min(v), high.max(v)]);
+    if all[0] > all[1] { [0.0; 2] } else { all }
+}
+
+fn round(value: f64) -> f64 {
+    (value * 1e3).round() / 1e3
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::{Choice, JobError, JobLimits, Product, params, run};
+    use crate::structure::{ReadLimits, read};
+    use crate::surface::{Control, CpuBackend};
+
+    /// Two chains of the entity 1, a sulphate of the entity 2, and a water of an unknown entity.
+    const CIF: &str = "data_x
+loop_
+_struct_asym.id
+_struct_asym.entity_id
+A 1
+B 1
+C 2
+loop_
+_atom_site.group_PDB
+_atom_site.type_symbol
+_atom_site.label_atom_id
+_atom_site.label_comp_id
+_atom_site.label_asym_id
+_atom_site.auth_asym_id
+_atom_site.B_iso_or_equiv
+_atom_site.occupancy
+_atom_site.Cartn_x
+_atom_site.Cartn_y
+_atom_site.Cartn_z
+ATOM C CA LYS A H 40.0 1.0 0 0 0
+ATOM O OD1 ASP B L 55.0 0.5 4 0 0
+ATOM N N MSE B L 90.0 1.0 8 0 0
+HETATM S S SO4 C H 100.0 1.0 12 0 0
+HETATM Xx X XYZ D W 71.0 1.0 16 0 0
+";
+
+    fn structure(text: &str) -> Structure {
+        read(text.as_bytes(), &ReadLimits::default()).unwrap()
+    }
+
+    fn coloring(pairs: &[(&str, &str)]) -> Coloring {
+        params::parse(pairs.iter().copied()).unwrap().job.color.unwrap()
+    }
+
+    const ALL: [u32; 5] = [0, 1, 2, 3, 4];
+
+    fn colors(structure: &Structure, pairs: &[(&str, &str)]) -> Vec<String> {
+        let colors = AtomColors::new(structure, &ALL, &coloring(pairs)).unwrap();
+        (0..structure.len()).map(|i| format!("{:06x}", colors.rgb(i))).collect()
+    }
+
+    #[test]
+    fn every_scheme_gives_the_colours_of_its_source() {
+        let structure = structure(CIF);
+        let found = |scheme: &str| colors(&structure, &[("color", scheme)]);
+        assert_eq!(found("uniform:#102030"), ["102030"; 5]);
+        assert_eq!(found("element"), ["909090", "ff0d0d", "3050f8", "ffff30", "b0b0b0"]);
+        assert_eq!(found("chain"), ["4fa59b", "e08e5a", "e08e5a", "4fa59b", "7f8fd0"]);
+        assert_eq!(found("entity"), ["4fa59b", "4fa59b", "4fa59b", "e08e5a", "b0b0b0"]);
+        assert_eq!(found("residue"), ["145aff", "e60a0a", "e6e600", "b0b0b0", "b0b0b0"]);
+        assert_eq!(found("plddt"), ["ff7d45", "ffdb13", "65cbf3", "0053d6", "65cbf3"]);
+        // −3.9 and −3.5 are near the blue end, 1.9 is between white and red.
+        let [lys, asp, met, other, unknown] = found("hydrophobicity").try_into().unwrap();
+        assert_eq!((other.as_str(), unknown.as_str()), ("b0b0b0", "b0b0b0"));
+        let byte = |color: &str, k: usize| u8::from_str_radix(&color[2 * k..2 * k + 2], 16).unwrap();
+        assert!(byte(&lys, 2) > byte(&lys, 0) && byte(&asp, 2) > byte(&asp, 0) && byte(&met, 0) > byte(&met, 2));
+        // Red is negative; the sulphate has −2 and the colour of the end.
+        assert_eq!(found("charge")[..4], ["2166ac", "b2182b", "f7f7f7", "b2182b"]);
+        assert_eq!(found("occupancy")[..2], ["fde725", "440154"]);
+        assert_eq!(found("bfactor")[0], "440154");
+        assert_eq!(found("bfactor")[3], "fde725");
+        let cividis = [("color", "bfactor"), ("palette", "cividis"), ("color_range", "55,200")];
+        assert_eq!(colors(&structure, &cividis)[..2], ["00224e", "00224e"]);
+    }
+
+    #[test]
+    fn default_ranges_and_legends_describe_the_selected_atoms() {
+        let structure = structure(CIF);
+        let report = |pairs: &[(&str, &str)], selected: &[u32]| {
+            AtomColors::new(&structure, selected, &coloring(pairs)).unwrap().report(selected)
+        };
+        let labels = |report: &ColorReport| report.legend.iter().map(|e| e.label.clone()).collect::<Vec<_>>();
+        let b = report(&[("color", "bfactor")], &[0, 1]);
+        assert_eq!(
+            (b.range, b.palette, labels(&b).join(" ")),
+            (Some([40.0, 55.0]), Some("viridis"), "40 43.75 47.5 51.25 55".into())
+        );
+        assert_eq!((b.legend[0].color.as_str(), b.legend[4].color.as_str()), ("#440154", "#fde725"));
+        let charge = report(&[("color", "charge"), ("color_range", "-2,2")], &ALL);
+        assert_eq!((charge.range, charge.legend[2].color.as_str()), (Some([-2.0, 2.0]), "#f7f7f7"));
+        assert_eq!(labels(&report(&[("color", "entity")], &ALL)), ["1", "2", "?"]);
+        assert_eq!(labels(&report(&[("color", "chain")], &[3, 1])), ["H", "L"]);
+        assert_eq!(labels(&report(&[("color", "element")], &[1, 4])), ["O", "?"]);
+        assert_eq!(report(&[("color", "plddt")], &ALL).legend.len(), 4);
+        let one = report(&[("color", "occupancy")], &[0, 2]);
+        assert_eq!((one.range, one.legend[0].color.as_str()), (Some([1.0, 1.0]), one.legend[4].color.as_str()));
+    }
+
+    #[test]
+    fn plddt_may_be_written_as_a_fraction_and_must_be_plausible() {
+        let with = |from: &str, to: &str| structure(&CIF.replace(from, to));
+        let fractions =
+            CIF.replace("40.0 1.0", "0.4 1.0").replace("55.0 0.5", "0.55 0.5").replace("90.0 1.0", "0.9 1.0");
+        let fractions = structure(&fractions.replace("100.0 1.0", "1.0 1.0").replace("71.0 1.0", "0.71 1.0"));
+        let plddt = [("color", "plddt")];
+        assert_eq!(colors(&fractions, &plddt), colors(&structure(CIF), &plddt));
+        for (text, low) in [(" 100.0 ", " 100.5 "), (" 100.0 ", " -1.0 ")] {
+            let error = AtomColors::new(&with(text, low), &ALL, &coloring(&plddt)).err().unwrap();
+            assert!(error.to_string().contains("the B-factors are"), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_file_without_entities_is_named() {
+        let structure = structure(&CIF.replace("struct_asym", "other"));
+        let error = AtomColors::new(&structure, &ALL, &coloring(&[("color", "entity")])).err().unwrap();
+        let text = error.to_string();
+        assert!(
+            text.contains("`entity` cannot be applied") && text.contains("expected one of none, uniform"),
+            "{text}"
+        );
+    }
+
+    const SAMPLE: &[u8] = include_bytes!("../../../samples/4pti.pdb");
+
+    fn product(pairs: &[(&str, &str)]) -> Result<Product, JobError> {
+        let backend = CpuBackend::new(None).unwrap();
+        let job = params::parse(pairs.iter().copied()).unwrap().job;
+        let choice = Choice { backend: &backend, reason: "" };
+        run(SAMPLE, &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
+    }
+
+    #[test]
+    fn vertices_have_the_colour_of_their_atom_and_the_same_mesh() {
+        let plain = product(&[("resolution", "0.8")]).unwrap();
+        let structure = read(SAMPLE, &ReadLimits::default()).unwrap();
+        for scheme in ["element", "bfactor"] {
+            let both = product(&[("resolution", "0.8"), ("color", scheme), ("atom_ids", "true")]).unwrap();
+            let only = product(&[("resolution", "0.8"), ("color", scheme)]).unwrap();
+            assert_eq!((&both.mesh.positions, &both.mesh.triangles), (&plain.mesh.positions, &plain.mesh.triangles));
+            assert!(plain.mesh.colors.is_none() && only.mesh.atom_ids.is_none());
+            assert_eq!(both.mesh.colors, only.mesh.colors);
+            let (ids, found) = (both.mesh.atom_ids.unwrap(), both.mesh.colors.unwrap());
+            let selected: Vec<u32> = (0..454).collect();
+            let atoms = AtomColors::new(&structure, &selected, &coloring(&[("color", scheme)])).unwrap();
+            assert!(ids.iter().zip(found.iter()).all(|(&id, color)| atoms.of(id as usize) == *color));
+            let distinct: HashSet<_> = found.iter().collect();
+            assert!(distinct.len() > 3, "{scheme}: {distinct:?}");
+            assert_eq!(only.report.color.unwrap().scheme, scheme);
+        }
+        assert!(matches!(product(&[("color", "entity")]), Err(JobError::Color(_))));
+    }
+
+    #[test]
+    fn palettes_and_ranges_need_numbers() {
+        let refuse = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap_err().to_string();
+        for pairs in [
+            &[("palette", "cividis")][..],
+            &[("color", "chain"), ("palette", "cividis")],
+            &[("color", "plddt"), ("color_range", "0,100")],
+            &[("color_range", "0,1"), ("color", "none")],
+        ] {
+            let text = refuse(pairs);
+            assert!(text.contains("or color=bfactor, occupancy, hydrophobicity or charge"), "{text}");
+        }
+        for range in ["1", "1,1", "2,1", "1,2,3", "a,b", "0,inf", "nan,1", ""] {
+            let text = refuse(&[("color", "bfactor"), ("color_range", range)]);
+            assert!(text.contains("two numbers separated by a comma"), "{text}");
+        }
+        assert!(refuse(&[("color", "chains")]).contains("expected none, uniform:#RRGGBB, element"));
+        let key = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+        assert_eq!(key(&[("color", "bfactor")]), key(&[("color", "bfactor"), ("palette", "viridis")]));
+        assert_ne!(key(&[("color", "bfactor")]), key(&[("color", "bfactor"), ("palette", "cividis")]));
+        assert_ne!(key(&[("color", "chain")]), key(&[("color", "element")]));
+        assert_eq!(key(&[]), key(&[("color", "none")]));
+    }
+}

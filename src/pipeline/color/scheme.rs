@@ -1,0 +1,130 @@
+//! Colour schemes and their names.
+
+use std::fmt;
+use std::str::FromStr;
+
+use super::palette::{Palette, Rgb};
+
+/// Description of the valid values of the parameter `color`.
+pub const EXPECTED: &str = "none, uniform:#RRGGBB, element, chain, entity, residue, bfactor, occupancy, plddt, \
+                            hydrophobicity, hydrophobicity:wimley-white, charge";
+
+/// Hydrophobicity scale.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Hydrophobicity {
+    /// Kyte and Doolittle 1982.
+    KyteDoolittle,
+    /// Wimley and White 1996.
+    WimleyWhite,
+}
+
+/// Colour scheme: gives every atom a colour.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scheme {
+    /// One colour, `0xRRGGBB`.
+    Uniform(Rgb),
+    /// Colour of the element.
+    Element,
+    /// Colour of the author chain.
+    Chain,
+    /// Colour of the entity: chains of the same molecule have the same colour.
+    Entity,
+    /// Colour of the residue name.
+    Residue,
+    /// B-factor.
+    BFactor,
+    /// Occupancy.
+    Occupancy,
+    /// Confidence of a predicted structure, in the B-factor column.
+    Plddt,
+    /// Hydrophobicity of the residue.
+    Hydrophobicity(Hydrophobicity),
+    /// Formal charge of the residue at pH 7.
+    Charge,
+}
+
+/// Schemes by name, except [`Scheme::Uniform`].
+const NAMED: [(&str, Scheme); 10] = [
+    ("element", Scheme::Element),
+    ("chain", Scheme::Chain),
+    ("entity", Scheme::Entity),
+    ("residue", Scheme::Residue),
+    ("bfactor", Scheme::BFactor),
+    ("occupancy", Scheme::Occupancy),
+    ("plddt", Scheme::Plddt),
+    ("hydrophobicity", Scheme::Hydrophobicity(Hydrophobicity::KyteDoolittle)),
+    ("hydrophobicity:wimley-white", Scheme::Hydrophobicity(Hydrophobicity::WimleyWhite)),
+    ("charge", Scheme::Charge),
+];
+
+impl Scheme {
+    /// Returns the default palette of a numeric scheme; `None` for other schemes.
+    #[must_use]
+    pub const fn palette(self) -> Option<Palette> {
+        match self {
+            Self::BFactor | Self::Occupancy => Some(Palette::Viridis),
+            Self::Hydrophobicity(_) => Some(Palette::BlueWhiteRed),
+            Self::Charge => Some(Palette::RedWhiteBlue),
+            _ => None,
+        }
+    }
+
+    /// Returns the default range of a numeric scheme; `None` if it is that of the values, and for other schemes.
+    #[must_use]
+    pub(super) const fn range(self) -> Option<[f64; 2]> {
+        match self {
+            Self::Hydrophobicity(Hydrophobicity::KyteDoolittle) => Some([-4.5, 4.5]),
+            Self::Hydrophobicity(Hydrophobicity::WimleyWhite) => Some([-2.02, 2.02]),
+            Self::Charge => Some([-1.0, 1.0]),
+            _ => None,
+        }
+    }
+}
+
+/// Error: no scheme has this name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct UnknownScheme;
+
+impl FromStr for Scheme {
+    type Err = UnknownScheme;
+
+    fn from_str(text: &str) -> Result<Self, UnknownScheme> {
+        if let Some(color) = text.strip_prefix("uniform:") {
+            let digits = color.strip_prefix('#').unwrap_or(color);
+            let is_color = digits.len() == 6 && digits.bytes().all(|c| c.is_ascii_hexdigit());
+            return Rgb::from_str_radix(digits, 16).ok().filter(|_| is_color).map(Self::Uniform).ok_or(UnknownScheme);
+        }
+        NAMED.iter().find(|(name, _)| *name == text).map(|(_, scheme)| *scheme).ok_or(UnknownScheme)
+    }
+}
+
+impl fmt::Display for Scheme {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Uniform(color) => write!(f, "uniform:#{color:06x}"),
+            scheme => NAMED.iter().find(|(_, known)| known == scheme).map_or(Ok(()), |(name, _)| f.write_str(name)),
+        }
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::unreadable_literal, reason = "colours are written as in style sheets")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_scheme_parses_its_own_name_and_is_documented() {
+        for (name, scheme) in NAMED {
+            assert_eq!((name.parse(), scheme.to_string().as_str()), (Ok(scheme), name));
+            assert!(EXPECTED.split(", ").any(|word| word == name), "{name}");
+        }
+        for text in ["uniform:#0a0B0c", "uniform:0a0b0c"] {
+            let scheme: Scheme = text.parse().unwrap();
+            assert_eq!((scheme, scheme.to_string().as_str()), (Scheme::Uniform(0x0a0b0c), "uniform:#0a0b0c"));
+        }
+        for bad in ["", "Chain", "chains", "uniform", "uniform:", "uniform:#fff", "uniform:+fffff", "uniform:#ffffffff"]
+        {
+            assert_eq!(bad.parse::<Scheme>(), Err(UnknownScheme), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,275 @@
+//! Categories of an mmCIF file other than `atom_site`: entities, which tell which chains (`label_asym_id`) are
+//! polymers, and assemblies.
+//!
+//! Dictionary: PDBx/mmCIF, categories `entity`, `entity_poly`, `struct_asym`, `pdbx_struct_assembly_gen` and
+//! `pdbx_struct_oper_list`.
+
+use std::collections::{HashMap, HashSet};
+
+use super::assembly::{Assemblies, Operator};
+use super::error::StructureError;
+use super::number;
+use super::read::Reading;
+use super::text::decode;
+use crate::surface::MemoryMeter as _;
+
+const ENTITY: &str = "entity";
+const CHAIN: &str = "struct_asym";
+const GENERATOR: &str = "pdbx_struct_assembly_gen";
+const OPERATOR: &str = "pdbx_struct_oper_list";
+
+/// Items to read, by category and name. The first [`N_ENTITY_ITEMS`] describe entities, the others assemblies.
+pub(super) const ITEMS: [(&str, &str); 21] = [
+    (ENTITY, "id"),
+    (ENTITY, "type"),
+    ("entity_poly", "entity_id"),
+    (CHAIN, "id"),
+    (CHAIN, "entity_id"),
+    (GENERATOR, "assembly_id"),
+    (GENERATOR, "oper_expression"),
+    (GENERATOR, "asym_id_list"),
+    (OPERATOR, "id"),
+    (OPERATOR, "matrix[1][1]"),
+    (OPERATOR, "matrix[1][2]"),
+    (OPERATOR, "matrix[1][3]"),
+    (OPERATOR, "vector[1]"),
+    (OPERATOR, "matrix[2][1]"),
+    (OPERATOR, "matrix[2][2]"),
+    (OPERATOR, "matrix[2][3]"),
+    (OPERATOR, "vector[2]"),
+    (OPERATOR, "matrix[3][1]"),
+    (OPERATOR, "matrix[3][2]"),
+    (OPERATOR, "matrix[3][3]"),
+    (OPERATOR, "vector[3]"),
+];
+
+/// Number of items that describe entities.
+const N_ENTITY_ITEMS: usize = 5;
+
+/// Largest number of values of an item. The largest entries of the PDB have about ten thousand chains.
+pub(super) const MAX_VALUES: usize = 1 << 18;
+
+/// Returns true if both items, given by index, describe entities, or both describe assemblies.
+pub(super) fn describe_the_same(a: usize, b: usize) -> bool {
+    (a < N_ENTITY_ITEMS) == (b < N_ENTITY_ITEMS)
+}
+
+/// Type of an entity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Entity {
+    /// Polymer.
+    Polymer,
+    /// Oligosaccharide.
+    Branched,
+    /// Any other type.
+    Other,
+}
+
+impl Entity {
+    fn of(name: &str) -> Self {
+        match name.to_ascii_lowercase().as_str() {
+            "polymer" => Self::Polymer,
+            "branched" => Self::Branched,
+            _ => Self::Other,
+        }
+    }
+}
+
+/// Values of the [`ITEMS`], in file order.
+#[derive(Debug, Default)]
+pub(super) struct Categories {
+    values: [Vec<String>; ITEMS.len()],
+    /// Bytes of all values.
+    bytes: u64,
+    full: bool,
+}
+
+impl Categories {
+    /// Returns the index in [`ITEMS`] of an item, given as `category.item` in any case.
+    pub(super) fn find(tag: &[u8]) -> Option<usize> {
+        let mut parts = tag.splitn(2, |&b| b == b'.');
+        let (category, item) = (parts.next()?, parts.next()?);
+        let is = |text: &str, raw: &[u8]| text.as_bytes().eq_ignore_ascii_case(raw);
+        ITEMS.iter().position(|(c, i)| is(c, category) && is(i, item))
+    }
+
+    /// Returns true if one of the [`ITEMS`] belongs to the category, given by its name in any case.
+    pub(super) fn include(category: &[u8]) -> bool {
+        ITEMS.iter().any(|(known, _)| known.as_bytes().eq_ignore_ascii_case(category))
+    }
+
+    /// Adds a value of the item with index `place`. All values count towards the limit of decompressed data, because a
+    /// BinaryCIF file may repeat one long text.
+    ///
+    /// # Errors
+    /// Returns [`StructureError::InflatedTooLarge`] and [`StructureError::Memory`].
+    pub(super) fn add(&mut self, place: usize, value: &[u8], reading: &Reading<'_>) -> Result<(), StructureError> {
+        let values = &mut self.values[place];
+        if values.len() >= MAX_VALUES {
+            self.full = true;
+            return Ok(());
+        }
+        let bytes = (size_of::<String>() + value.len()) as u64;
+        let limit = reading.limits.max_inflated_bytes;
+        self.bytes += value.len() as u64;
+        if self.bytes > limit {
+            return Err(StructureError::InflatedTooLarge { limit });
+        }
+        reading.text.grow(bytes)?;
+        // A list may be a text field of several lines.
+        let spaces: Vec<u8> = value.iter().map(|&b| if b.is_ascii_whitespace() { b' ' } else { b }).collect();
+        values.push(decode(&spaces).into_owned());
+        Ok(())
+    }
+
+    /// Removes the entities, or the assemblies, to which the item with index `place` belongs. Returns the name of these
+    /// data.
+    pub(super) fn forget(&mut self, place: usize) -> &'static str {
+        let values = self.values.iter_mut().enumerate();
+        values.filter(|(other, _)| describe_the_same(*other, place)).for_each(|(_, values)| values.clear());
+        if place < N_ENTITY_ITEMS { "entities" } else { "assemblies" }
+    }
+
+    /// Returns true if the types of entities and the entities of chains are known.
+    pub(super) fn entities_are_known(&self) -> bool {
+        let [_, types, polymers, _, of_chains, ..] = &self.values;
+        !(of_chains.is_empty() || types.is_empty() && polymers.is_empty())
+    }
+
+    /// Returns true if every item that describes assemblies has values.
+    pub(super) fn assemblies_are_known(&self) -> bool {
+        self.values[N_ENTITY_ITEMS..].iter().all(|values| !values.is_empty())
+    }
+
+    /// Returns a warning if there were too many values.
+    pub(super) fn warning(&self) -> Option<String> {
+        self.full.then(|| {
+            format!(
+                "more than {MAX_VALUES} entities, chains or operators of assemblies; the rest are treated as unknown"
+            )
+        })
+    }
+
+    /// Returns the type of the entity of each chain, if it is known.
+    pub(super) fn of_chains(&self) -> HashMap<String, Entity> {
+        let [ids, types, listed, chains, of_chains, ..] = &self.values;
+        let listed: HashSet<&String> = listed.iter().collect();
+        let types: HashMap<&String, Entity> = ids.iter().zip(types.iter().map(|name| Entity::of(name))).collect();
+        let of = |id: &String| listed.contains(id).then_some(Entity::Polymer).or(types.get(id).copied());
+        let known = chains.iter().zip(of_chains);
+        known.filter_map(|(chain, id)| of(id).map(|entity| (chain.clone(), entity))).collect()
+    }
+
+    /// Returns the entity of each chain.
+    pub(super) fn entity_ids(&self) -> HashMap<String, String> {
+        let [_, _, _, chains, of_chains, ..] = &self.values;
+        chains.iter().cloned().zip(of_chains.iter().cloned()).collect()
+    }
+
+    /// Returns the assemblies.
+    pub(super) fn assemblies(self) -> Assemblies {
+        let mut assemblies = Assemblies::default();
+        let mut values = self.values.into_iter().skip(N_ENTITY_ITEMS);
+        let mut column = || values.next().unwrap_or_default();
+        let [of, expressions, chains, ids] = [column(), column(), column(), column()];
+        let numbers: Vec<Vec<String>> = values.collect();
+        for (row, id) in ids.into_iter().enumerate() {
+            let number = |item: usize| {
+                let text = numbers.get(item)?.get(row)?.as_bytes();
+                number::real(text, 0, text.len())
+            };
+            let rows = [0, 4, 8].map(|first| [0, 1, 2, 3].map(|k| number(first + k)));
+            assemblies.add_operator(id, Operator::of(rows));
+        }
+        for ((assembly, expression), chains) in of.into_iter().zip(expressions).zip(chains) {
+            assemblies.add_generator(assembly, expression, chains);
+        }
+        assemblies
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests fail by panicking")]
+mod tests {
+    use super::*;
+    use crate::structure::ReadLimits;
+    use crate::surface::Control;
+
+    fn with(values: &[(&str, &str)]) -> Categories {
+        let (limits, control) = (ReadLimits::default(), Control::default());
+        let (mut known, reading) = (Categories::default(), Reading::new(&limits, &control));
+        for (tag, value) in values {
+            known.add(Categories::find(tag.as_bytes()).unwrap(), value.as_bytes(), &reading).unwrap();
+        }
+        known
+    }
+
+    #[test]
+    fn chains_have_the_type_of_their_entity() {
+        let known = with(&[
+            ("entity.id", "1"),
+            ("entity.type", "polymer"),
+            ("ENTITY.ID", "2"),
+            ("Entity.Type", "Branched"),
+            ("entity_poly.entity_id", "3"),
+            ("struct_asym.id", "A"),
+            ("struct_asym.entity_id", "1"),
+            ("struct_asym.id", "B"),
+            ("struct_asym.entity_id", "2"),
+            ("struct_asym.id", "C"),
+            ("struct_asym.entity_id", "3"),
+            ("struct_asym.id", "D"),
+            ("struct_asym.entity_id", "4"),
+        ]);
+        assert!(known.entities_are_known());
+        let chains = known.of_chains();
+        let ids = known.entity_ids();
+        assert_eq!(["A", "B", "C", "D"].map(|c| ids.get(c).map(String::as_str)), ["1", "2", "3", "4"].map(Some));
+        assert_eq!(
+            ["A", "B", "C", "D"].map(|c| chains.get(c).copied()),
+            [Some(Entity::Polymer), Some(Entity::Branched), Some(Entity::Polymer), None]
+        );
+        assert!(!with(&[("entity.id", "1"), ("struct_asym.entity_id", "1")]).entities_are_known());
+        assert_eq!([&b"entity.details"[..], b"entity", b"entity_poly.id"].map(Categories::find), [None; 3]);
+    }
+
+    #[test]
+    fn values_are_bounded_and_the_bound_is_reported() {
+        let (limits, control) = (ReadLimits { max_inflated_bytes: 1000, ..ReadLimits::default() }, Control::default());
+        let (mut many, reading) = (Categories::default(), Reading::new(&limits, &control));
+        (0..MAX_VALUES).for_each(|_| many.add(3, b"", &reading).unwrap());
+        assert_eq!(many.warning(), None);
+        many.add(3, b"", &reading).unwrap();
+        assert!(many.warning().unwrap().starts_with("more than 262144 entities"));
+        assert_eq!(many.values[3].len(), MAX_VALUES);
+        // Each repetition of a long text counts.
+        let long = [b'x'; 100];
+        let added = (0..11).map(|_| many.add(6, &long, &reading)).collect::<Vec<_>>();
+        assert!(added[..10].iter().all(Result::is_ok));
+        assert_eq!(added[10], Err(StructureError::InflatedTooLarge { limit: 1000 }));
+    }
+
+    #[test]
+    fn assemblies_are_rules_and_operators() {
+        let mut values = vec![("pdbx_struct_oper_list.id", "7"), ("PDBX_STRUCT_OPER_LIST.ID", "8")];
+        for (row, (name, item)) in ITEMS.into_iter().skip(9).enumerate() {
+            assert_eq!(name, "pdbx_struct_oper_list");
+            let item: &'static str = format!("{name}.{item}").leak();
+            // The identity with a translation of 4.5, -1 and 0 Å, and an operator without a number.
+            let number = ["1", "0", "0", "4.5", "0", "1", "0", "-1", "0", "0", "1", "0"][row];
+            values.extend([(item, number), (item, if row == 11 { "?" } else { number })]);
+        }
+        assert!(!with(&values).assemblies_are_known());
+        for value in [("assembly_id", "1"), ("oper_expression", "7"), ("asym_id_list", "A,\nB C")] {
+            values.push((format!("pdbx_struct_assembly_gen.{}", value.0).leak(), value.1));
+        }
+        let known = with(&values);
+        assert!(known.assemblies_are_known());
+        let assemblies = known.assemblies();
+        let image = assemblies.expand("7").unwrap()[0].apply([1.0, 2.0, 3.0]);
+        assert_eq!(image.map(|v| v.to_string()), ["5.5", "1", "3"]);
+        assert!(assemblies.expand("8").unwrap_err().expected.contains("twelve numbers"));
+        let rules: Vec<Vec<&str>> = assemblies.generators("1").map(|rule| rule.chains().collect()).collect();
+        assert_eq!(rules, [["A", "B", "C"]]);
+    }
+}

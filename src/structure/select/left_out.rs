@@ -1,0 +1,84 @@
+//! Counts of the atoms that a selection leaves out.
+
+use std::collections::{BTreeMap, HashMap};
+
+use crate::structure::{Kind, Structure};
+
+/// Largest number of residue names that are counted separately.
+const MAX_NAMES: usize = 10;
+
+/// Atoms of the model that were not selected. Each is counted under the first reason that applies, in field order.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct LeftOut {
+    /// Atoms of other chains.
+    pub other_chains: u64,
+    /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
+    pub virtual_sites: u64,
+    /// Atoms of residues that are not selected, by kind, most frequent first.
+    pub kinds: Vec<(Kind, u64)>,
+    /// The atoms of `kinds` by residue name and kind, most frequent first; at most ten.
+    pub residues: Vec<(String, Kind, u64)>,
+    /// The atoms of `kinds` that `residues` does not list.
+    pub other_residues: u64,
+    /// Hydrogen and deuterium of selected residues.
+    pub hydrogens: u64,
+    /// Other alternative locations of selected residues.
+    pub alternatives: u64,
+}
+
+impl LeftOut {
+    /// Returns the number of atoms and sites that were not selected.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        let of_kinds: u64 = self.kinds.iter().map(|(_, n)| n).sum();
+        of_kinds + self.other_chains + self.virtual_sites + self.hydrogens + self.alternatives
+    }
+
+    /// Sets the counts of kinds and residue names.
+    pub(super) fn name_residues(&mut self, structure: &Structure, tally: Tally) {
+        let counts = tally.finish();
+        let texts: Vec<&str> = structure.residue.texts().collect();
+        let mut names: Vec<(&str, Kind, u64)> =
+            counts.into_iter().map(|((residue, kind), n)| (texts[residue as usize], kind, n)).collect();
+        names.sort_unstable_by(|(a, i, m), (b, j, n)| n.cmp(m).then(a.cmp(b)).then(i.cmp(j)));
+        let mut kinds: BTreeMap<Kind, u64> = BTreeMap::new();
+        for (_, kind, n) in &names {
+            *kinds.entry(*kind).or_default() += n;
+        }
+        self.kinds = kinds.into_iter().collect();
+        self.kinds.sort_by_key(|(_, n)| std::cmp::Reverse(*n));
+        let shown = names.len().min(MAX_NAMES);
+        self.other_residues = names[shown..].iter().map(|(.., n)| n).sum();
+        self.residues = names[..shown].iter().map(|(name, kind, n)| ((*name).to_owned(), *kind, *n)).collect();
+    }
+}
+
+/// Counts of atoms by residue name id and kind.
+#[derive(Debug, Default)]
+pub(super) struct Tally {
+    counts: HashMap<(u32, Kind), u64>,
+    /// Latest residue name and kind, and the number of its atoms that are not counted yet. Equal ones are consecutive.
+    latest: (u32, Kind),
+    pending: u64,
+}
+
+impl Tally {
+    pub(super) fn add(&mut self, residue: u32, kind: Kind) {
+        if self.latest != (residue, kind) {
+            self.flush();
+            self.latest = (residue, kind);
+        }
+        self.pending += 1;
+    }
+
+    fn flush(&mut self) {
+        if self.pending > 0 {
+            *self.counts.entry(self.latest).or_default() += std::mem::take(&mut self.pending);
+        }
+    }
+
+    fn finish(mut self) -> HashMap<(u32, Kind), u64> {
+        self.flush();
+        self.counts
+    }
+}

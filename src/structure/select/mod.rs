@@ -1,0 +1,263 @@
+//! Selection of the atoms to mesh: an expression, chains, a model and alternative locations.
+
+mod evaluate;
+mod expression;
+mod left_out;
+mod near;
+mod parse;
+
+use std::collections::HashSet;
+
+use evaluate::Evaluation;
+pub use expression::Expression;
+pub use left_out::LeftOut;
+use left_out::Tally;
+pub use parse::{BadExpression, MAX_DEPTH, MAX_DISTANCE, MAX_WITHIN};
+use rayon::prelude::*;
+
+use super::altloc::{ATOMS_PER_CHECK, Alternatives};
+use super::atoms::Structure;
+use super::contents::{Contents, Kind};
+use super::copies::{Assembly, PlacedCopy};
+use super::duplicates;
+use super::error::StructureError;
+use super::radii;
+use super::read::{ReadLimits, Reading, check};
+use super::text::list;
+use crate::surface::{Control, Spheres, SurfaceError};
+
+/// Selection of atoms. Default: first model, polymer, no hydrogens, alternative locations with the highest occupancy.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Selection {
+    /// Model number in the file; the first model by default.
+    pub model: Option<i32>,
+    /// Author names of chains; all by default. The empty string and `_` select the blank chain.
+    pub chains: Option<Vec<String>>,
+    /// Condition on atoms.
+    pub atoms: Expression,
+    /// Preferred alternative location, for residues that have it.
+    pub altloc: Option<char>,
+    /// Id of the assembly to build from the selected atoms; the asymmetric unit by default.
+    pub assembly: Option<String>,
+}
+
+/// Result of a selection.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Selected {
+    /// Indices of the selected atoms in the columns of the structure: ascending, or by copy in an assembly.
+    pub atoms: Vec<u32>,
+    /// Copies that make up the assembly; empty for the asymmetric unit.
+    pub copies: Vec<PlacedCopy>,
+    /// Number of selected atoms before they were copied.
+    pub n_distinct: usize,
+    /// The selected model.
+    pub model: i32,
+    /// Counts of the other atoms of that model.
+    pub left_out: LeftOut,
+}
+
+/// Minimum number of atoms of a copy that a task moves.
+const ATOMS_PER_TASK: usize = 1 << 14;
+
+/// Selects atoms.
+///
+/// # Errors
+/// Returns [`StructureError::EmptySelection`] if no atom is selected, and [`StructureError::NotFound`] for a model,
+/// chain, alternative location or assembly that does not exist. Returns [`StructureError::BadAssembly`],
+/// [`StructureError::TooManyCopies`] and [`StructureError::AssemblyTooLarge`] for an assembly that cannot be built
+/// within the default limits.
+pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, StructureError> {
+    select_with(structure, selection, &ReadLimits::default(), &Control::default())
+}
+
+/// Selects atoms as [`select`] does, within `limits`. Checks for cancellation every few milliseconds, and adds the
+/// memory of an assembly to the meter of `control`.
+///
+/// # Errors
+/// Returns the errors of [`select`], [`StructureError::Memory`] and [`StructureError::Cancelled`].
+pub fn select_with(
+    structure: &Structure,
+    selection: &Selection,
+    limits: &ReadLimits,
+    control: &Control<'_>,
+) -> Result<Selected, StructureError> {
+    let assembly = selection.assembly.as_deref().map(|id| Assembly::find(structure, id)).transpose()?;
+    let model = model(structure, selection)?;
+    let chains = match &selection.chains {
+        Some(names) => Some(chains(structure, names.iter().map(String::as_str), "chain")?),
+        None => None,
+    };
+    let wanted = alternative(structure, selection, model)?;
+    let alternatives = Alternatives::choose(structure, model, wanted, control)?;
+    let Expression { condition, hydrogens } = &selection.atoms;
+    let mut names = Vec::new();
+    condition.chains(&mut names);
+    // Fails for chains that do not exist.
+    self::chains(structure, names, SELECTED_CHAIN)?;
+    let mut evaluation = Evaluation { structure, control, usable: None };
+    if condition.depends_on_others() {
+        evaluation.usable = Some(evaluation.each(|i| {
+            structure.model[i] == model
+                && structure.kind[i] != Kind::VirtualSite
+                && (*hydrogens || !structure.is_hydrogen(i))
+                && alternatives.keeps(structure, i)
+        })?);
+    }
+    let marks = evaluation.marks(condition)?;
+    let (mut left_out, mut residues) = (LeftOut::default(), Tally::default());
+    let mut atoms: Vec<u32> = Vec::new();
+    // The reader limits the number of atoms, so indices have 32 bits.
+    for (i, index) in (0..structure.len()).zip(0_u32..) {
+        if i % ATOMS_PER_CHECK == 0 {
+            check(control)?;
+        }
+        if structure.model[i] != model {
+            continue;
+        }
+        if chains.as_ref().is_some_and(|chains| !chains[structure.chain.id(i) as usize])
+            || assembly.as_ref().is_some_and(|assembly| !assembly.covers(i))
+        {
+            left_out.other_chains += 1;
+        } else if structure.kind[i] == Kind::VirtualSite {
+            left_out.virtual_sites += 1;
+        } else if !marks.atoms[i] {
+            residues.add(structure.residue.id(i), structure.kind[i]);
+        } else if !hydrogens && structure.is_hydrogen(i) {
+            left_out.hydrogens += 1;
+        } else if !alternatives.keeps(structure, i) {
+            left_out.alternatives += 1;
+        } else {
+            atoms.push(index);
+        }
+    }
+    if atoms.is_empty() {
+        return Err(StructureError::EmptySelection { holds: holds(structure, selection, model) });
+    }
+    left_out.name_residues(structure, residues);
+    let selected = Selected { n_distinct: atoms.len(), atoms, copies: Vec::new(), model, left_out };
+    match assembly {
+        Some(assembly) => assembly.copy(selected, limits, control),
+        None => Ok(selected),
+    }
+}
+
+fn model(structure: &Structure, selection: &Selection) -> Result<i32, StructureError> {
+    match selection.model {
+        None => Ok(structure.model.first().copied().unwrap_or(1)),
+        Some(asked) if structure.model.contains(&asked) => Ok(asked),
+        Some(asked) => Err(StructureError::NotFound {
+            what: "model",
+            asked: asked.to_string(),
+            available: Contents::of(structure, None).model_list(),
+        }),
+    }
+}
+
+/// Name of chains in an expression, in [`StructureError::NotFound`].
+const SELECTED_CHAIN: &str = "selected chain";
+
+/// Returns, for each text of the chain column, true if it is one of `asked`. `_` is the blank chain unless a chain has
+/// this name.
+fn chains<'a>(
+    structure: &'a Structure,
+    asked: impl IntoIterator<Item = &'a str>,
+    what: &'static str,
+) -> Result<Vec<bool>, StructureError> {
+    let known: HashSet<&str> = structure.chain.texts().collect();
+    let mut names: HashSet<&str> = HashSet::new();
+    for name in asked {
+        let name = if name == "_" && !known.contains("_") { "" } else { name };
+        if !known.contains(name) {
+            return Err(StructureError::NotFound {
+                what,
+                asked: format!("`{}`", name.chars().take(40).collect::<String>()),
+                available: Contents::of(structure, None).chain_list(),
+            });
+        }
+        names.insert(name);
+    }
+    Ok(structure.chain.texts().map(|text| names.contains(text)).collect())
+}
+
+fn alternative(structure: &Structure, selection: &Selection, model: i32) -> Result<Option<u8>, StructureError> {
+    let Some(asked) = selection.altloc else { return Ok(None) };
+    let mut present = [false; 256];
+    for (altloc, _) in structure.altloc.iter().zip(&structure.model).filter(|(_, m)| **m == model) {
+        present[usize::from(*altloc)] = true;
+    }
+    match u8::try_from(asked) {
+        Ok(letter) if letter != 0 && present[usize::from(letter)] => Ok(Some(letter)),
+        _ => {
+            let letters: Vec<String> =
+                (1..=u8::MAX).filter(|&b| present[usize::from(b)]).map(|b| char::from(b).into()).collect();
+            let n = letters.len();
+            let available = if n == 0 { "none".to_owned() } else { list(letters, n) };
+            Err(StructureError::NotFound { what: "alternative location", asked: format!("`{asked}`"), available })
+        }
+    }
+}
+
+/// Describes the contents of the file and the parameters that select them.
+fn holds(structure: &Structure, selection: &Selection, model: i32) -> String {
+    let contents = Contents::of(structure, Some(model));
+    let counts = contents.counts;
+    let mut kinds: Vec<&str> = Vec::new();
+    let of_kinds =
+        [("polymer", counts.polymer), ("ligand", counts.ligand), ("ion", counts.ion), ("water", counts.water)];
+    for (name, atoms) in of_kinds {
+        if atoms > 0 {
+            kinds.push(name);
+        }
+    }
+    let heavy = !kinds.is_empty();
+    if !heavy && counts.hydrogens > 0 {
+        kinds = vec!["all"];
+    }
+    let asked: String = selection.atoms.to_string().chars().take(200).collect();
+    let chains = match &selection.chains {
+        Some(names) => format!(" of chains {}", list(names.iter().cloned(), names.len())),
+        None => String::new(),
+    };
+    let assembly = selection.assembly.as_ref().map(|id| format!(" in assembly {id}")).unwrap_or_default();
+    format!(
+        "{asked}{chains}{assembly} was requested; model {model} has {counts} in {}; the file has {}; `select={}` selects them",
+        contents.chain_list(),
+        contents.model_list(),
+        kinds.join(",")
+    )
+}
+
+impl Selected {
+    /// Returns the selected atoms as spheres with van der Waals radii.
+    ///
+    /// # Errors
+    /// Returns [`SurfaceError::BadSphere`] if a coordinate is out of range.
+    pub fn spheres(&self, structure: &Structure) -> Result<Spheres, SurfaceError> {
+        let column = |c: &[f64]| self.atoms.iter().map(|&i| c[i as usize]).collect::<Vec<_>>();
+        let r = self.atoms.iter().map(|&i| radii::vdw_radius(structure.element[i as usize])).collect();
+        let (mut x, mut y, mut z) = (column(&structure.x), column(&structure.y), column(&structure.z));
+        for PlacedCopy { rows, operator } in &self.copies {
+            let rows = || rows.clone();
+            let moved = (&mut x[rows()], &mut y[rows()], &mut z[rows()]).into_par_iter().with_min_len(ATOMS_PER_TASK);
+            moved.for_each(|(x, y, z)| [*x, *y, *z] = operator.apply([*x, *y, *z]));
+        }
+        Spheres::new(x, y, z, r)
+    }
+
+    /// Rejects an assembly in which more atoms than allowed have the same position.
+    ///
+    /// # Errors
+    /// Returns [`StructureError::TooManyDuplicates`] and the errors of memory and cancellation.
+    pub fn check_duplicates(
+        &self,
+        spheres: &Spheres,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+    ) -> Result<(), StructureError> {
+        if self.copies.is_empty() {
+            // The reader has checked the atoms of the file.
+            return Ok(());
+        }
+        duplicates::check(spheres.len(), |i| (self.model, spheres.centre(i)), &Reading::new(limits, control))
+    }
+}
