@@ -250,9 +250,9 @@ columns! {
 }
 
 impl Slices<'_> {
-    /// Returns true if every row has been filled.
-    pub(super) fn is_full(&self) -> bool {
-        self.next == self.element.len()
+    /// Returns the number of rows that are not filled.
+    pub(super) fn space(&self) -> usize {
+        self.element.len() - self.next
     }
 
     /// Starts again with the first row.

@@ -31,20 +31,15 @@ impl GrowingColumns {
         self.columns
     }
 
-    /// Returns true if [`Self::push`] would succeed.
-    #[inline]
-    pub(super) fn has_space(&self) -> bool {
-        self.columns.len() < self.next_check
+    /// Returns the number of rows that [`Self::push`] may add before [`Self::reserve_chunk`] must be called.
+    pub(super) fn space(&self) -> usize {
+        self.next_check - self.columns.len()
     }
 
-    /// Adds an atom. Returns false if [`Self::reserve_chunk`] must be called first.
+    /// Adds an atom.
     #[inline]
-    pub(super) fn push(&mut self, atom: &Atom) -> bool {
-        let fits = self.has_space();
-        if fits {
-            self.columns.push(atom);
-        }
-        fits
+    pub(super) fn push(&mut self, atom: &Atom) {
+        self.columns.push(atom);
     }
 
     /// Reserves memory for more rows, for `expected` rows in an empty column.

@@ -120,6 +120,12 @@ mod tests {
             ("incomplete row", with("1 2 3\n")),
             ("loop ends", with("_entry.id Y\n")),
             ("another block", with("data_y\n")),
+            // Comments at the end are left out of a single piece; several pieces need the general path.
+            ("warning in the first row", {
+                let head = head.replace("_atom_site.Cartn_x\n", "_atom_site.occupancy\n_atom_site.Cartn_x\n");
+                let row = |occupancy: &str| format!("{occupancy} {}", rows[0]);
+                format!("{head}{}{}{}", row("x"), row("1").repeat(20), "# comment\n".repeat(60))
+            }),
         ]
     }
 

@@ -62,8 +62,8 @@ impl<'a> Rows<'a> {
         loop {
             self.reading.check()?;
             let (columns, reading) = (&mut self.columns, self.reading);
-            let put = |atom: &Atom| columns.push(atom);
-            at = scanner.rows(&mut self.site, put, at, self.text.len(), &|| reading.check().is_err())?;
+            let (space, put) = (columns.space(), |atom: &Atom| columns.push(atom));
+            at = scanner.rows(&mut self.site, space, put, at, self.text.len(), &|| reading.check().is_err())?;
             match self.special_row(at)? {
                 Some(next) => at = next,
                 None => return Ok(at),
@@ -136,11 +136,12 @@ impl<'a> Rows<'a> {
             let mut whole = false;
             while !stop() {
                 let to = stretch.to.min(at + BYTES_PER_CHARGE);
-                let done = scanner.rows(site, |atom| slices.put(atom), at, to, &stop).unwrap_or(at);
+                let space = slices.space();
+                let done = scanner.rows(site, space, |atom| _ = slices.put(atom), at, to, &stop).unwrap_or(at);
                 reading.hold_texts(site.tables.n_texts() - n_texts)?;
                 n_texts = site.tables.n_texts();
                 if to == stretch.to || done == at {
-                    whole = slices.is_full() && text[done..stretch.to].iter().all(|&b| b <= b' ');
+                    whole = slices.space() == 0 && text[done..stretch.to].iter().all(|&b| b <= b' ');
                     break;
                 }
                 at = done;
@@ -222,12 +223,13 @@ impl<'a> Scanner<'a> {
         Self { text, edges: Edges::default(), window: MAX_WINDOW }
     }
 
-    /// Reads rows from `at` to `end` and calls `put`, which returns false if the memory for rows is full. Stops before
-    /// the first row that is incomplete, not plain or not added, and returns the end of the row before it.
+    /// Reads at most `space` rows from `at` to `end` and calls `put` with each. Stops before the first row that is
+    /// incomplete or not plain, and returns the end of the row before it.
     fn rows(
         &mut self,
         site: &mut AtomSite<Box<Fault>>,
-        mut put: impl FnMut(&Atom) -> bool,
+        mut space: usize,
+        mut put: impl FnMut(&Atom),
         mut at: usize,
         end: usize,
         stop: &dyn Fn() -> bool,
@@ -243,6 +245,11 @@ impl<'a> Scanner<'a> {
             let mut done = at;
             let mut plain = true;
             for offsets in edges.offsets().chunks_exact(per_row) {
+                // Checked first: a row that is read twice would also warn twice.
+                if space == 0 {
+                    plain = false;
+                    break;
+                }
                 let atom = match special(window, offsets) {
                     0 if !words => site.atom(&Row::<false> { text: self.text, base: at, offsets })?,
                     special if special < 2 && values_only(window, offsets, words) => {
@@ -253,10 +260,8 @@ impl<'a> Scanner<'a> {
                         break;
                     }
                 };
-                if !put(&atom) {
-                    plain = false;
-                    break;
-                }
+                put(&atom);
+                space -= 1;
                 done = at + offsets[per_row - 1] as usize;
             }
             if !plain {
