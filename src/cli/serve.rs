@@ -1,6 +1,7 @@
 //! `molmesh serve`: starts the service and runs it until a shutdown signal.
 
 use std::io::{self, Write};
+use std::num::NonZero;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -21,8 +22,6 @@ use super::survey;
 /// Nice value of compute threads. They get a third of a core that they share with an HTTP thread.
 #[cfg(target_os = "linux")]
 const COMPUTE_NICE: i32 = 5;
-/// Threads of the async runtime, which serve sockets. Meshing has other threads.
-const RUNTIME_THREADS: usize = 2;
 /// Time after which an idle thread that read a structure ends. The allocator returns its memory then.
 const IDLE_THREAD: Duration = Duration::from_secs(1);
 
@@ -51,7 +50,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     raise_open_files();
     let failed = |e: io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(RUNTIME_THREADS)
+        .worker_threads(runtime_threads())
         .thread_name("http")
         .thread_keep_alive(IDLE_THREAD)
         .enable_all()
@@ -81,6 +80,14 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     // Do not wait for file reads and jobs that outlast the drain timeout.
     runtime.shutdown_timeout(Duration::from_millis(100));
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
+}
+
+/// Returns the number of threads of the async runtime, which serve sockets and hash uploads: a quarter of the cores.
+/// Meshing has other threads. Two threads are the bound of a service with several GPUs: an upload of 5 MB and its mesh
+/// keep one of them busy for 25 ms.
+fn runtime_threads() -> usize {
+    let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
+    (cores / 4).max(2)
 }
 
 /// Makes new files and folders accessible to the user of the service only.
