@@ -123,8 +123,8 @@ fn sums(bricks: &[(u32, Block<'_>)]) -> Result<SheetSums, GpuError> {
             let column = if owner == 0 { &mut sums.near } else { &mut sums.far };
             column.push(SharedVertex { owner, key, sheet });
         }
-        // Devices order vertices by axis first.
-        sums.near[start..].sort_unstable_by_key(|vertex| vertex.key);
+        // Devices order vertices by axis first. A stable sort merges these three ascending runs.
+        sums.near[start..].sort_by_key(|vertex| vertex.key);
     }
     Ok(sums)
 }
