@@ -17,7 +17,7 @@ use utoipa::ToSchema;
 use super::errors::file_too_large;
 use super::guard::Caller;
 use super::kinds::Kind;
-use super::openapi::bodies::{STRUCTURE_TO_MESH, StructureFile};
+use super::openapi::bodies::{AS_FOR_MESHES, StructureFile};
 use super::openapi::parameters::{ContentEncodingHeader, MeshParameters};
 use super::openapi::problem_responses;
 use super::openapi::problems::{BODY, NAMED_STRUCTURE, PARAMETERS, ProblemDocument, READING};
@@ -98,7 +98,7 @@ problem_responses!(EstimateProblems: [BODY, NAMED_STRUCTURE, PARAMETERS, READING
 /// Takes what `POST /v1/meshes` takes and returns the expected size, memory and time of the mesh without computing it.
 #[utoipa::path(post, path = "/v1/estimate", tag = "meshes", operation_id = "estimateMesh",
     params(MeshParameters, ContentEncodingHeader),
-    request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
+    request_body(content = StructureFile, description = AS_FOR_MESHES, content_type = "application/octet-stream"),
     responses((status = 200, description = "The estimate.", body = EstimateDocument), EstimateProblems))]
 pub(super) async fn create(
     State(app): State<Shared>,

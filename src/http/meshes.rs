@@ -10,7 +10,7 @@ use axum::response::Response;
 
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
-use super::openapi::bodies::{STRUCTURE_TO_MESH, StructureFile};
+use super::openapi::bodies::{AS_FOR_MESHES, STRUCTURE_TO_MESH, StructureFile};
 use super::openapi::meshes::{MeshOrJob, ReportResponse};
 use super::openapi::parameters::{ContentEncodingHeader, MeshParameters, PreferenceHeaders};
 use super::openapi::problem_responses;
@@ -54,7 +54,7 @@ problem_responses!(ReportProblems: [
 /// volume, components, voids, validation and times.
 #[utoipa::path(post, path = "/v1/report", tag = "meshes", operation_id = "createReport",
     params(MeshParameters, ContentEncodingHeader),
-    request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
+    request_body(content = StructureFile, description = AS_FOR_MESHES, content_type = "application/octet-stream"),
     responses(ReportResponse, ReportProblems))]
 pub(super) async fn report(
     State(app): State<Shared>,

@@ -2,6 +2,9 @@
 
 use serde_json::{Map, Value, json};
 
+/// Extension of an error response: the names of its problem types, which name the component. [`share`] removes it.
+pub(super) const PROBLEM_TYPES: &str = "x-problem-types";
+
 /// Replaces inline parameters, headers, error responses and mesh responses by references into `components`.
 pub(in crate::http) fn share(document: &mut Value) {
     let mut shared = Shared::default();
@@ -12,6 +15,10 @@ pub(in crate::http) fn share(document: &mut Value) {
     for (path, operation) in operations {
         let parameters = operation.get_mut("parameters").and_then(Value::as_array_mut);
         for parameter in parameters.into_iter().flatten() {
+            if let Some(parameter) = parameter.as_object_mut() {
+                // False is the default.
+                parameter.retain(|key, value| key != "required" || *value == true);
+            }
             shared.replace("parameters", &parameter_name(path, parameter), parameter);
         }
         for (status, response) in members(operation, "responses") {
@@ -19,12 +26,30 @@ pub(in crate::http) fn share(document: &mut Value) {
                 shared.replace("headers", name, header);
             }
             if let Some(name) = response_name(status, response) {
+                if let Some(response) = response.as_object_mut() {
+                    response.remove(PROBLEM_TYPES);
+                }
                 shared.replace("responses", &name, response);
             }
         }
     }
-    if let Some(Value::Object(components)) = document.get_mut("components") {
-        components.append(&mut shared.0);
+    if let Some(components) = document.get_mut("components") {
+        members(components, "schemas").for_each(|(_, schema)| remove_least_counts(schema));
+        if let Value::Object(components) = components {
+            components.append(&mut shared.0);
+        }
+    }
+}
+
+/// Removes `minimum: 0` from a schema and those in it: that no count is negative needs no line for each.
+fn remove_least_counts(schema: &mut Value) {
+    match schema {
+        Value::Object(members) => {
+            members.retain(|key, value| key != "minimum" || *value != 0);
+            members.values_mut().for_each(remove_least_counts);
+        }
+        Value::Array(items) => items.iter_mut().for_each(remove_least_counts),
+        _ => {}
     }
 }
 
@@ -62,7 +87,7 @@ fn parameter_name(path: &str, parameter: &Value) -> String {
 
 /// Returns the component name of a response; `None` if the response stays with its operation.
 fn response_name(status: &str, response: &Value) -> Option<String> {
-    let Some(types) = response["x-problem-types"].as_array() else {
+    let Some(types) = response[PROBLEM_TYPES].as_array() else {
         return match status {
             "200" if response["content"].get("model/*").is_some() => Some("Mesh".to_owned()),
             "200" if response["content"].get("application/octet-stream").is_some() => Some("AtomColors".to_owned()),

@@ -38,9 +38,12 @@ fn reference<T: ToSchema>() -> Content {
     ContentBuilder::new().schema(Some(Ref::from_schema_name(T::name()))).build()
 }
 
-/// Returns a response with the bytes of a mesh file. `model/*` stands for the types of GLB, glTF, STL and OBJ:
+/// 200: the whole file. `model/*` stands for the types of GLB, glTF, STL and OBJ:
 /// generators take types that end in `+json` for JSON documents.
-fn mesh(doc: &str) -> ResponseBuilder {
+fn whole() -> RefOr<Response> {
+    let doc = "The mesh. Its media type follows from the format: `model/gltf-binary` (glb), `model/gltf+json` (gltf), \
+               `application/ply`, `model/stl`, `model/obj` or `image/png`; \
+               `application/octet-stream` if `Accept` prefers it.";
     let etag = "Strong validator of the file. Equal tags mean equal bytes.";
     let response = ResponseBuilder::new()
         .description(doc)
@@ -57,15 +60,8 @@ fn mesh(doc: &str) -> ResponseBuilder {
     let types = Format::ALL.map(Format::media_type).into_iter();
     let others = types.filter(|media_type| !media_type.starts_with("model/"));
     let types = [OCTETS, "model/*"].into_iter().chain(others);
-    types.fold(summarized(timed(response)), |response, media_type| response.content(media_type, file()))
-}
-
-/// 200: the whole file.
-fn whole() -> RefOr<Response> {
-    let doc = "The mesh. Its media type follows from the format: `model/gltf-binary` (glb), `model/gltf+json` (gltf), \
-               `application/ply`, `model/stl`, `model/obj` or `image/png`; \
-               `application/octet-stream` if `Accept` prefers it.";
-    RefOr::T(mesh(doc).build())
+    let add = |response: ResponseBuilder, media_type| response.content(media_type, file());
+    RefOr::T(types.fold(summarized(timed(response)), add).build())
 }
 
 /// 202: a job, with links to the operations on it.
@@ -86,33 +82,37 @@ fn accepted() -> RefOr<Response> {
     RefOr::T(response.build())
 }
 
-/// 206: a part of the file.
-fn part() -> RefOr<Response> {
-    let response = mesh("The requested part of the file.");
-    RefOr::T(response.header("Content-Range", text("`bytes FIRST-LAST/LENGTH`.")).build())
+/// Returns the response with a part of the content of status 200.
+fn part_of(whole: RefOr<Response>) -> RefOr<Response> {
+    let RefOr::T(mut response) = whole else { return whole };
+    "The requested part of the file, with the headers of status 200.".clone_into(&mut response.description);
+    response.headers.clear();
+    response.headers.insert("Content-Range".to_owned(), text("`bytes FIRST-LAST/LENGTH`.").into());
+    RefOr::T(response)
 }
 
-/// Returns a response with the colours of atoms.
-fn list_of_colors(doc: &str) -> ResponseBuilder {
+/// 206: a part of the file.
+fn part() -> RefOr<Response> {
+    part_of(whole())
+}
+
+/// 200: the colours of atoms.
+fn colors() -> RefOr<Response> {
     let list = ContentBuilder::new().schema(Some(binary("Red, green, blue and alpha of each atom."))).build();
     let legend = "JSON object with `scheme`, for numeric schemes `palette` and `range`, and at most 24 entries of the \
                   `legend`, each with `label` and `color`.";
-    ResponseBuilder::new()
-        .description(doc)
+    let response = ResponseBuilder::new()
+        .description("The colours, four bytes per atom.")
         .content(OCTETS, list)
         .header("ETag", text("Strong validator of the colours."))
         .header("Cache-Control", text("Caching rules."))
         .header("Accept-Ranges", text("`bytes`."))
-        .header("molmesh-colors", text(legend))
-}
-
-fn colors() -> RefOr<Response> {
-    RefOr::T(list_of_colors("The colours, four bytes per atom.").build())
+        .header("molmesh-colors", text(legend));
+    RefOr::T(response.build())
 }
 
 fn part_of_colors() -> RefOr<Response> {
-    let response = list_of_colors("The requested part of the colours.");
-    RefOr::T(response.header("Content-Range", text("`bytes FIRST-LAST/LENGTH`.")).build())
+    part_of(colors())
 }
 
 /// 304: the client has the current version.

@@ -11,6 +11,7 @@ use utoipa::openapi::{
 };
 use utoipa::{PartialSchema, ToSchema};
 
+use super::components::PROBLEM_TYPES;
 use crate::http::kinds::{KINDS, Kind, Row};
 use crate::http::problem::MEDIA_TYPE;
 
@@ -85,7 +86,7 @@ pub(in crate::http) fn responses(groups: &[&[Kind]]) -> BTreeMap<String, RefOr<R
     by_status.into_iter().map(|(status, rows)| (status, RefOr::T(response(&rows)))).collect()
 }
 
-/// Returns the response for the kinds of one status. `x-problem-types` lists their names.
+/// Returns the response for the kinds of one status.
 fn response(rows: &[&Row]) -> Response {
     let described: Vec<String> = rows.iter().map(|row| format!("`{}`: {}.", row.slug, row.title)).collect();
     let names: Vec<&str> = rows.iter().map(|row| row.slug).collect();
@@ -93,7 +94,7 @@ fn response(rows: &[&Row]) -> Response {
     let mut response = ResponseBuilder::new()
         .description(described.join(" "))
         .content(MEDIA_TYPE, ContentBuilder::new().schema(Some(problem)).build())
-        .extensions(Some(Extensions::from_iter([("x-problem-types", Value::from(names))])));
+        .extensions(Some(Extensions::from_iter([(PROBLEM_TYPES, Value::from(names))])));
     let has = |kinds: &[Kind]| rows.iter().any(|row| kinds.contains(&row.kind));
     if rows.iter().any(|row| row.status.is_server_error())
         || has(&[Kind::NoResultYet, Kind::ArchiveUnavailable, Kind::QuotaExceeded])
