@@ -35,6 +35,7 @@ pub(in crate::http) const READING: &[Kind] =
 pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::EmptySelection,
     Kind::TooManyCopies,
+    Kind::TooManyParts,
     Kind::GridTooLarge,
     Kind::TooManyCandidates,
     Kind::MeshTooLarge,
