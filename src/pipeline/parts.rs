@@ -240,6 +240,10 @@ impl Joined {
         let offset = u32::try_from(first).unwrap_or(u32::MAX);
         let shifted = |v: u32| v.wrapping_add(offset);
         own.triangles.par_chunks_mut(ROWS).flatten_iter().for_each(|triangle| *triangle = triangle.map(shifted));
+        if let Some(ids) = &mut own.atom_ids {
+            // Indices of spheres of the part become indices of all spheres.
+            ids.par_chunks_mut(ROWS).flatten_iter().for_each(|id| *id = part.rows[*id as usize]);
+        }
         let triangles = self.mesh.n_triangles();
         let range = PartRange {
             name: part.name.clone(),
@@ -286,7 +290,8 @@ impl Joined {
         let limit = run.limits.max_candidates;
         match error {
             E::GridTooLarge { samples, resolution, suggested_resolution, .. } => E::GridTooLarge {
-                samples: self.grid.samples.saturating_add(samples),
+                // The number of a part is an estimate.
+                samples: self.grid.samples.saturating_add(samples).max(run.limits.max_samples.saturating_add(1)),
                 limit: run.limits.max_samples,
                 resolution,
                 suggested_resolution,

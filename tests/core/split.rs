@@ -131,7 +131,7 @@ fn every_rule_names_its_parts() {
         assert_eq!(report.parts.iter().map(|part| part.atoms).sum::<u64>(), report.atoms);
         assert_eq!(report.parts.iter().map(|part| part.triangles).sum::<u64>(), report.triangles);
         let area: f64 = report.parts.iter().map(|part| part.area).sum();
-        assert!((area / report.area - 1.0).abs() < 1e-9);
+        assert!((area / report.area - 1.0).abs() < 1e-6);
         names(&report).join(" ")
     };
     assert_eq!(of(&[("split", "chain")]), "A B");
@@ -209,7 +209,9 @@ fn other_readers_see_closed_parts_with_their_names() {
         assert_eq!(read.len(), parts.len(), "{format} {read:?}");
         for (read, part) in read.iter().zip(parts) {
             assert!(read.watertight, "{format} {read:?}");
-            assert_eq!((&read.name, read.faces, read.unused), (&part.name, part.triangles, 0), "{format}");
+            // trimesh prefixes groups with the name of the object.
+            let name = read.name.strip_prefix("surface_").unwrap_or(&read.name);
+            assert_eq!((name, read.faces, read.unused), (part.name.as_str(), part.triangles, 0), "{format}");
             assert!((read.area / part.area - 1.0).abs() < 1e-4, "{format} {read:?} {part:?}");
             assert!((read.volume / part.volume - 1.0).abs() < 1e-4, "{format} {read:?} {part:?}");
         }
