@@ -26,7 +26,7 @@ fn dimer() -> String {
         let het = |name: &str, element: &str, residue: &str, x: f64| {
             format!(
                 "HETATM 9999 {name:<4} {residue:>3} {chain} 900    {x:8.3}{:8.3}{:8.3}  1.00 10.00          {element:>2}",
-                60.0, 60.0
+                62.0, 62.0
             )
         };
         lines.push(het(" O", "O", "HOH", shift));
