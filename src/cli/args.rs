@@ -268,6 +268,10 @@ pub(crate) struct SelectionArgs {
     /// Id of the biological assembly to build [default: asymmetric-unit, the atoms as they are in the file]
     #[arg(long, value_name = "ID")]
     pub(crate) assembly: Option<String>,
+    /// Divide the mesh into parts that are closed on their own: chain (in an assembly per copy), entity, residue-group
+    /// (polymer, ligand, glycan, ion, water) or none [default: none]
+    #[arg(long, value_name = "RULE")]
+    pub(crate) split: Option<String>,
 }
 
 // Limits.
@@ -284,6 +288,9 @@ pub(crate) struct LimitArgs {
     /// Copies of chains in the assembly [default: 10000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_copies: Option<u64>,
+    /// Parts of a mesh with `--split` [default: 1000]
+    #[arg(long, value_name = "N", value_parser = count)]
+    pub(crate) max_parts: Option<u64>,
     /// Bytes of the input after decompression, such as 64MiB [default: 4GiB]
     #[arg(long, value_name = "BYTES", value_parser = size)]
     pub(crate) max_input_bytes: Option<u64>,

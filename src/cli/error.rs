@@ -178,6 +178,7 @@ impl CliError {
                     Some("raise it with --max-atoms".to_owned())
                 }
                 StructureError::TooManyCopies { .. } => Some("raise it with --max-copies".to_owned()),
+                StructureError::TooManyParts { .. } => Some("raise it with --max-parts".to_owned()),
                 StructureError::TooManyDuplicates { .. } => Some("raise it with --max-duplicates".to_owned()),
                 StructureError::InflatedTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
                 _ => strict_finding.as_deref().map(str::to_owned),
@@ -207,6 +208,7 @@ fn structure_code(error: &StructureError) -> i32 {
         | StructureError::TooManyAtoms { .. }
         | StructureError::TooManyDuplicates { .. }
         | StructureError::TooManyCopies { .. }
+        | StructureError::TooManyParts { .. }
         | StructureError::AssemblyTooLarge { .. }
         | StructureError::Memory(_) => code::LIMIT,
         _ => code::STRUCTURE,

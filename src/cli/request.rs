@@ -65,6 +65,7 @@ pub(super) fn limits(args: &LimitArgs) -> JobLimits {
     set(&mut limits.read.max_atoms, args.max_atoms);
     set(&mut limits.read.max_duplicates, args.max_duplicates);
     set(&mut limits.read.max_copies, args.max_copies);
+    set(&mut limits.read.max_parts, args.max_parts);
     set(&mut limits.read.max_inflated_bytes, args.max_input_bytes);
     set(&mut limits.surface.max_samples, args.max_grid_points);
     set(&mut limits.surface.max_candidates, args.max_candidates);
@@ -97,6 +98,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("model", &atoms.model),
         ("altloc", &atoms.altloc),
         ("assembly", &atoms.assembly),
+        ("split", &atoms.split),
         ("validation", &args.validation),
     ];
     let mut pairs: Vec<_> =
@@ -159,6 +161,7 @@ mod tests {
                 "compress" => vec![&flag, "quantize"],
                 "normals" => vec![&flag, "none"],
                 "units" => vec![&flag, "nanometer"],
+                "split" => vec![&flag, "chain"],
                 "max_triangles" => vec![&flag, "5000"],
                 "surface" => vec![&flag, "soft-object"],
                 "probe" => vec![&flag, "2", "--surface", "ses"],
@@ -211,7 +214,13 @@ mod tests {
         ] {
             assert_eq!(drawn(&flags).unwrap_err().code(), 2, "{flags:?}");
         }
-        for flags in [["--resolution", "0"], ["--resolution", "nan"], ["--surface", "x"], ["--chains", ",,"]] {
+        for flags in [
+            ["--resolution", "0"],
+            ["--resolution", "nan"],
+            ["--surface", "x"],
+            ["--chains", ",,"],
+            ["--split", "atom"],
+        ] {
             assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");
         }
     }

@@ -278,6 +278,7 @@ mod tests {
             voids: 1,
             void_list: Vec::new(),
             component_list: Vec::new(),
+            parts: Vec::new(),
             area: 3200.04,
             volume: 7100.0,
             report_units: "angstrom",

@@ -32,6 +32,9 @@ pub struct LimitsConfig {
     pub duplicate_atoms: u64,
     /// Number of copies of chains in an assembly. Default 10,000: six times as many as in the largest virus of the PDB.
     pub assembly_copies: u64,
+    /// Number of parts of a mesh with `split`. Default 1,000: more than most structures have chains. Each part is meshed
+    /// on its own and adds about a kilobyte to the header of a glTF.
+    pub mesh_parts: u64,
     /// Number of atoms whose names or colours are listed, for web pages that show them. Default 1,000,000: about 10 MB
     /// of JSON, the most that is useful in a browser.
     pub labels: u64,
@@ -71,6 +74,7 @@ impl Default for LimitsConfig {
             atoms: 10_000_000,
             duplicate_atoms: 1000,
             assembly_copies: 10_000,
+            mesh_parts: 1000,
             labels: 1_000_000,
             grid_points: 1 << 30,
             candidate_pairs: 1 << 28,
@@ -93,6 +97,7 @@ impl LimitsConfig {
                 max_atoms: self.atoms,
                 max_duplicates: self.duplicate_atoms,
                 max_copies: self.assembly_copies,
+                max_parts: self.mesh_parts,
             },
             surface: SurfaceLimits {
                 max_samples: self.grid_points,

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::error::FormatError;
 use super::format::Format;
-use crate::surface::Mesh;
+use crate::surface::{Mesh, PartRange};
 
 /// Rows per task; smaller meshes are checked on the calling thread.
 const CHUNK_ROWS: usize = 1 << 16;
@@ -65,11 +65,30 @@ pub(super) fn check(mesh: &Mesh, format: Format) -> Result<Summary, FormatError>
     if needs_indices(format, n) {
         in_range(&mesh.triangles[..], n)?;
     }
+    check_parts(mesh, n)?;
     Ok(Summary {
         bounds,
         max_atom: mesh.atom_ids.as_ref().map(|ids| maximum(&ids[..]).unwrap_or(0)),
         translucent: mesh.colors.as_ref().is_some_and(|colors| colors.iter().any(|c| c[3] != u8::MAX)),
     })
+}
+
+/// Rejects parts that do not cover the mesh in order, or whose triangles refer to vertices of other parts.
+fn check_parts(mesh: &Mesh, n_vertices: usize) -> Result<(), FormatError> {
+    let mut end = [0, 0];
+    for PartRange { name, vertices, triangles } in &mesh.parts {
+        let follows = [vertices.start, triangles.start] == end;
+        end = [vertices.end, triangles.end];
+        let own = |index: &u32| vertices.contains(&(*index as usize));
+        let is_own = |rows: &[[u32; 3]]| rows.par_iter().with_min_len(CHUNK_ROWS).all(|row| row.iter().all(own));
+        if !follows || !mesh.triangles.get(triangles.clone()).is_some_and(is_own) {
+            return Err(FormatError::BadPart { part: name.clone() });
+        }
+    }
+    if mesh.parts.is_empty() || end == [n_vertices, mesh.triangles.len()] {
+        return Ok(());
+    }
+    Err(FormatError::BadPart { part: mesh.parts.last().map(|part| part.name.clone()).unwrap_or_default() })
 }
 
 /// Rejects normals that are longer than unit vectors.

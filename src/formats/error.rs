@@ -25,6 +25,14 @@ pub enum FormatError {
         /// Number of vertices.
         vertices: u64,
     },
+    /// The rows of a part do not follow those of the part before, or its triangles refer to other rows.
+    #[error(
+        "part `{part}` is not a mesh of its own: its rows must follow the part before and refer to each other only"
+    )]
+    BadPart {
+        /// Name of the part.
+        part: String,
+    },
     /// A number is infinite or NaN.
     #[error("{column} {row} holds {value}; only finite numbers can be written")]
     NotFinite {

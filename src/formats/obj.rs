@@ -61,6 +61,8 @@ impl Decimals {
 #[derive(Debug)]
 pub(super) struct ObjPlan {
     header: String,
+    /// Line that begins the group of each part.
+    groups: Vec<String>,
     len_bound: u64,
     storage: Storage,
 }
@@ -88,8 +90,11 @@ impl ObjPlan {
         let normal = if smooth { "vn   \n".len() as u64 + 3 * number(1.0, NORMAL_DECIMALS) } else { 0 };
         let digits = n_vertices.to_string().len() as u64;
         let face = if smooth { "f //  //  //\n".len() as u64 + 6 * digits } else { "f   \n".len() as u64 + 3 * digits };
-        let len_bound = header.len() as u64 + (vertex + normal) * n_vertices + face * n_triangles;
-        Ok(Self { header, len_bound, storage })
+        let groups: Vec<String> =
+            mesh.parts.iter().map(|part| format!("g {}\n", text::word(Some(&part.name)))).collect();
+        let of_groups = groups.iter().map(|line| line.len() as u64).sum::<u64>();
+        let len_bound = header.len() as u64 + (vertex + normal) * n_vertices + face * n_triangles + of_groups;
+        Ok(Self { header, groups, len_bound, storage })
     }
 
     /// Returns an upper bound of the file's length, bytes.
@@ -119,8 +124,18 @@ impl ObjPlan {
         for &normal in mesh.normals.iter().filter(|_| smooth) {
             lines.push(|line| line.vector(b"vn", normal, NORMAL_DECIMALS))?;
         }
-        for &triangle in &mesh.triangles[..] {
-            lines.push(|line| line.face(triangle, smooth))?;
+        let whole = (None, 0..mesh.triangles.len());
+        let parts = self.groups.iter().map(Some).zip(mesh.parts.iter().map(|part| part.triangles.clone()));
+        for (group, triangles) in
+            parts.chain(mesh.parts.is_empty().then_some(whole)).filter(|(_, rows)| !rows.is_empty())
+        {
+            if let Some(group) = group {
+                lines.flush()?;
+                lines.out.write_all(group.as_bytes())?;
+            }
+            for &triangle in &mesh.triangles[triangles] {
+                lines.push(|line| line.face(triangle, smooth))?;
+            }
         }
         lines.flush()
     }
@@ -131,7 +146,7 @@ fn header(mesh: &Mesh, units: Units, meta: &Meta) -> String {
     let facts = text::facts(mesh, meta, units, Some(&precision));
     let mut header: String = facts.into_iter().flat_map(|fact| ["# ".to_owned(), fact, "\n".to_owned()]).collect();
     header += "o ";
-    header += &text::word(meta);
+    header += &text::word(meta.name.as_deref());
     header += "\n";
     header
 }

@@ -32,7 +32,8 @@ impl StlPlan {
         })?;
         let mut head = [b' '; HEADER_BYTES + 4];
         // A header that begins with "solid" marks a text STL; some programs read colours after "COLOR=".
-        let words = format!("{GENERATOR} units={} {}", units.name(), text::word(meta).replace('=', "_"));
+        let words =
+            format!("{GENERATOR} units={} {}", units.name(), text::word(meta.name.as_deref()).replace('=', "_"));
         let words = &words.as_bytes()[..words.len().min(HEADER_BYTES)];
         head[..words.len()].copy_from_slice(words);
         head[HEADER_BYTES..].copy_from_slice(&count.to_le_bytes());

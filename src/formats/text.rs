@@ -34,9 +34,9 @@ pub(super) fn one_line(text: &str) -> String {
     line
 }
 
-/// Returns the mesh's name as one word.
-pub(super) fn word(meta: &Meta) -> String {
-    let name = one_line(meta.name.as_deref().unwrap_or_default()).replace(' ', "_");
+/// Returns the name of a mesh or of a part as one word.
+pub(super) fn word(name: Option<&str>) -> String {
+    let name = one_line(name.unwrap_or_default()).replace(' ', "_");
     if name.is_empty() { NAMELESS.to_owned() } else { name }
 }
 
@@ -76,10 +76,10 @@ mod tests {
 
     #[test]
     fn names_are_one_word() {
-        let named = |name: &str| word(&Meta { name: Some(name.into()), ..Meta::default() });
+        let named = |name: &str| word(Some(name));
         assert_eq!(named("my\tprotein 1"), "my_protein_1");
         assert_eq!(named(" \n"), "surface");
-        assert_eq!(word(&Meta::default()), "surface");
+        assert_eq!(word(None), "surface");
     }
 
     #[test]

@@ -156,6 +156,7 @@ impl JobState {
             samples: plan.n_reached * layout::SAMPLES,
             box_cells: lattice.box_cells,
             candidates: plan.pairs,
+            overlaps: 0,
         };
         let timed = self.times.iter().any(|&ns| ns > 0);
         let stages = if timed { STAGES.into_iter().zip(self.times).collect() } else { Vec::new() };

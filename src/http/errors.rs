@@ -15,8 +15,8 @@ use crate::pipeline::JobError;
 use crate::pipeline::color::{self, ColorError};
 use crate::pipeline::params::ParamError;
 use crate::store::StoreError;
-use crate::structure::StructureError;
 use crate::structure::strict_validator::Diagnostic;
+use crate::structure::{Split, StructureError};
 use crate::surface::{OutOfMemory, SurfaceError};
 
 /// Finding of the strict validator.
@@ -230,6 +230,13 @@ impl From<StructureError> for Problem {
                 .with("found", found)
                 .with("expected", expected),
             E::TooManyCopies { limit, .. } => Self::new(Kind::TooManyCopies, detail).with("limit", limit),
+            E::TooManyParts { limit, .. } => {
+                Self::new(Kind::TooManyParts, detail).with("parameter", "split").with("limit", limit)
+            }
+            E::NoEntities => Self::new(Kind::BadParameter, detail)
+                .with("parameter", "split")
+                .with("value", Split::Entity.name())
+                .with("expected", "none, chain or residue-group"),
             E::AssemblyTooLarge { atoms, limit, .. } => {
                 Self::new(Kind::TooManyAtoms, detail).with("limit", limit).with("actual", atoms)
             }

@@ -89,8 +89,8 @@ pub(super) struct EstimateDocument {
 }
 
 problem_responses!(EstimateProblems: [BODY, NAMED_STRUCTURE, PARAMETERS, READING, [
-    Kind::EmptySelection, Kind::TooManyCopies, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::ShareExceeded,
-    Kind::Deadline,
+    Kind::EmptySelection, Kind::TooManyCopies, Kind::TooManyParts, Kind::PictureTooLarge, Kind::Internal,
+    Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::Deadline,
 ]]);
 
 /// Estimate a mesh

@@ -8,13 +8,14 @@ use std::ops::Deref;
 
 use super::color::AtomColors;
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
+use super::parts::{self, PartsBackend};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
-use crate::structure::{Structure, StructureError};
+use crate::structure::{AtomPart, Structure, StructureError};
 use crate::surface::cpu::scan;
-use crate::surface::lattice::Lattice;
+use crate::surface::lattice::{Lattice, slightly_coarser};
 use crate::surface::occupancy::Occupancy;
 use crate::surface::params::MAX_RESOLUTION;
-use crate::surface::{Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+use crate::surface::{Backend, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// Estimated size of a job.
 #[derive(Debug, Clone, PartialEq)]
@@ -66,6 +67,10 @@ pub fn estimate<S: Deref<Target = Structure>>(
     if let Some(coloring) = &job.color {
         AtomColors::new(&structure, &selected.atoms, coloring)?;
     }
+    let parts = selected.parts(&structure, job.split, &limits.read, control)?;
+    let divided = parts.as_deref().map(|parts| PartsBackend::new(choice.backend, parts));
+    let backend = divided.as_ref().map_or(choice.backend, |divided| divided as &dyn Backend);
+    let choice = &Choice { backend, reason: choice.reason };
     let mut params = job.params_for(spheres.len());
     let mut refused = None;
     if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -80,10 +85,13 @@ pub fn estimate<S: Deref<Target = Structure>>(
         }
     }
     let _storage = super::storage(job, &mut params, &spheres);
-    let lattice = Lattice::new(&spheres, &params)?;
-    let (resolution, box_cells) = (params.resolution, lattice.box_cells);
-    let mesh = refused.map_or_else(|| of_mesh(&lattice, &spheres, &params, &limits.surface, choice, control), Err);
-    let mesh = mesh.map_err(|error| with_finest_fit(error, &spheres, &params, &limits.surface, control));
+    let lattices = parts::spheres_of(&spheres, parts.as_deref()).map(|own| Lattice::new(&own, &params));
+    let lattices: Vec<Lattice> = lattices.collect::<Result<_, SurfaceError>>()?;
+    let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
+    let resolution = params.resolution;
+    let mesh = refused.map_or_else(|| of_mesh(&lattices, &spheres, &params, &limits.surface, choice, control), Err);
+    let explain = |error| with_finest_fit(error, &spheres, parts.as_deref(), &params, &limits.surface, control);
+    let mesh = mesh.map_err(explain);
     let mesh = match (mesh, job.spacing) {
         (Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)), _) => return Err(error.into()),
         (Ok(mesh), Spacing::MaxTriangles(limit)) => Ok(mesh.at_most(limit, &params)),
@@ -105,15 +113,23 @@ impl MeshEstimate {
 }
 
 fn of_mesh(
-    lattice: &Lattice,
+    lattices: &[Lattice],
     spheres: &Spheres,
     params: &SurfaceParams,
     limits: &SurfaceLimits,
     choice: &Choice<'_>,
     control: &Control<'_>,
 ) -> Result<MeshEstimate, SurfaceError> {
-    let bricks = Occupancy::new(lattice, limits, control)?.n_reached();
-    let h = params.resolution;
+    let (mut bricks, h) = (0, params.resolution);
+    for lattice in lattices {
+        bricks += Occupancy::new(lattice, limits, control)?.n_reached();
+    }
+    let (samples, limit) = (512 * bricks, limits.max_samples);
+    if samples > limit {
+        // Each part fits.
+        let suggested_resolution = slightly_coarser(h * (samples as f64 / limit as f64).cbrt());
+        return Err(SurfaceError::GridTooLarge { samples, limit, resolution: h, suggested_resolution });
+    }
     let single = SurfaceParams { atom_ids: false, quantize: None, ..params.clone() };
     let coarse = SurfaceParams { resolution: (COARSE_FACTOR * h).max(MIN_COARSE_SPACING).max(h), ..single.clone() };
     let mesh = match choice.backend.run(spheres, &coarse, limits, control) {
@@ -126,21 +142,26 @@ fn of_mesh(
     let vertices = (1.5 * area / (h * h)).round() as u64;
     let triangles = 2 * vertices;
     let bytes = params.mesh_bytes(vertices, triangles);
-    let estimate = MeshEstimate { bricks, samples: bricks * 512, area, vertices, triangles, bytes };
-    if bytes > limits.max_mesh_bytes {
-        return Err(scan::too_large(bytes, h, limits.max_mesh_bytes));
+    // Parts are quantized after they are joined.
+    let in_memory = if lattices.len() > 1 { single.mesh_bytes(vertices, triangles) } else { bytes };
+    let estimate = MeshEstimate { bricks, samples, area, vertices, triangles, bytes };
+    if in_memory > limits.max_mesh_bytes {
+        return Err(scan::too_large(in_memory, h, limits.max_mesh_bytes));
     }
     Ok(estimate)
 }
 
 /// Maximum number of grids that [`with_finest_fit`] plans.
 const MAX_PLANS: u32 = 6;
+/// Factor from a spacing that does not fit all parts to the next one.
+const COARSER: f64 = 1.5;
 
 /// Replaces the suggested spacing of [`SurfaceError::GridTooLarge`], which is an upper bound, with the finest hundredth
 /// of an Å whose planned grid fits.
 pub(super) fn with_finest_fit(
     error: SurfaceError,
     spheres: &Spheres,
+    parts: Option<&[AtomPart]>,
     params: &SurfaceParams,
     limits: &SurfaceLimits,
     control: &Control<'_>,
@@ -149,13 +170,17 @@ pub(super) fn with_finest_fit(
         return error;
     };
     let samples_at = |spacing: f64| {
-        let lattice = Lattice::new(spheres, &SurfaceParams { resolution: spacing, ..params.clone() })?;
-        Ok(512 * Occupancy::new(&lattice, limits, control)?.n_reached())
+        let params = SurfaceParams { resolution: spacing, ..params.clone() };
+        let counted = parts::spheres_of(spheres, parts).map(|own| {
+            let lattice = Lattice::new(&own, &params)?;
+            Ok(512 * Occupancy::new(&lattice, limits, control)?.n_reached())
+        });
+        counted.sum::<Result<u64, SurfaceError>>()
     };
     let (mut fits, mut next) = (None, bound);
     for _ in 0..MAX_PLANS {
         match samples_at(next) {
-            Ok(needed) => {
+            Ok(needed) if needed <= limit => {
                 fits = Some(next);
                 // The bricks of a finer grid cover less volume, so the grid at this spacing fits as well.
                 let finer = (next * (needed as f64 / limit as f64).cbrt() * 100.0).ceil() / 100.0;
@@ -165,11 +190,16 @@ pub(super) fn with_finest_fit(
                 next = finer;
             }
             Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)) => return error,
-            Err(_too_large) => break,
+            // The bound of one part need not fit all parts.
+            _too_large if parts.is_some() && fits.is_none() && next < MAX_RESOLUTION => {
+                next = (COARSER * next).min(MAX_RESOLUTION);
+            }
+            _too_large => break,
         }
     }
     // The bound ends at the coarsest spacing, which need not fit.
-    let suggested_resolution = fits.unwrap_or(if bound < MAX_RESOLUTION { bound } else { f64::INFINITY });
+    let unknown = parts.is_some() || bound >= MAX_RESOLUTION;
+    let suggested_resolution = fits.unwrap_or(if unknown { f64::INFINITY } else { bound });
     SurfaceError::GridTooLarge { samples, limit, resolution, suggested_resolution }
 }
 

@@ -275,8 +275,9 @@ fn no_fit(params: &SurfaceParams, limit: u64, resolution: f64, triangles: u64) -
     }
 }
 
-/// Observer that times stages but hides their progress: the first, coarse mesh does not advance the job.
-struct WithoutProgress<'a>(&'a StageClock<'a>);
+/// Observer that times stages but hides their progress: a first, coarse mesh does not advance the job, and a part only
+/// as a whole.
+pub(super) struct WithoutProgress<'a>(pub(super) &'a dyn Observer);
 
 impl Observer for WithoutProgress<'_> {
     fn span(&self, stage: Stage, work: &mut dyn FnMut()) {

@@ -13,6 +13,7 @@ pub mod integer;
 mod left_out;
 pub mod nearest;
 pub mod params;
+mod parts;
 mod progress;
 mod report;
 pub mod spacing;
@@ -30,6 +31,7 @@ pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::File;
 pub use left_out::{KindCount, LeftOutReport, ResidueCount};
+pub use parts::PartReport;
 pub use progress::Tracker;
 pub use report::{AssemblyReport, ComponentReport, PictureReport, Quantization, Report, VoidReport, maker};
 pub use spacing::Spacing;
@@ -37,11 +39,12 @@ pub use work::{estimate_work, mesh_work};
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureLimits, PictureParams};
-use crate::structure::{self, ReadLimits, Selected, Selection, Structure, StructureError};
+use crate::structure::{self, ReadLimits, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, Validation, lattice,
 };
+use parts::PartsBackend;
 use report::Counts;
 
 /// Parameters of a job: the surface, and how the mesh is stored.
@@ -51,6 +54,8 @@ pub struct Job {
     pub selection: Selection,
     /// Parameters of the surface. The resolution applies if `spacing` is [`Spacing::Given`].
     pub params: SurfaceParams,
+    /// Division of the mesh into parts.
+    pub split: Split,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -82,11 +87,12 @@ impl Job {
     }
 
     /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
-    /// on triangles and pictures need the whole mesh in memory.
+    /// on triangles, parts and pictures need the whole mesh in memory.
     fn can_stream(&self) -> bool {
         !self.needs_atoms()
             && self.validation == Validation::Checksum
             && self.spacing.max_triangles().is_none()
+            && self.split == Split::None
             && self.picture.is_none()
     }
 
@@ -225,6 +231,10 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let control = Control { observer: &clock, ..control.clone() };
     let (structure, selected, spheres) = load(read, job, &limits.read, &clock, &control)?;
     let colors = Colors::new(&structure, &selected, job, &control)?;
+    let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
+    let divided = parts.as_deref().map(|parts| PartsBackend::new(choice.backend, parts));
+    let backend = divided.as_ref().map_or(choice.backend, |divided| divided as &dyn Backend);
+    let choice = &Choice { backend, reason: choice.reason };
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -239,7 +249,8 @@ pub fn run_with<S: Deref<Target = Structure>>(
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
         let written = clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink));
-        let explain = |error| estimate::with_finest_fit(error, &spheres, &params, &limits.surface, &control);
+        let explain =
+            |error| estimate::with_finest_fit(error, &spheres, parts.as_deref(), &params, &limits.surface, &control);
         (written.map_err(explain)?, None, storage)
     };
     let [n_vertices, n_triangles] = output.size();
@@ -265,6 +276,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     report.color = colors.map(|colors| colors.report);
+    report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
     let mut product = Product { mesh, storage, report, picture: None, streamed_bytes: None };
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
         let clock = StageClock::new(progress);

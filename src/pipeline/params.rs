@@ -19,7 +19,7 @@ use super::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use super::{Job, Spacing};
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, PictureParams, Style, View};
-use crate::structure::{BadExpression, Selection};
+use crate::structure::{BadExpression, Selection, Split};
 use crate::surface::{PaperParams, Preset, SurfaceError, SurfaceKind, SurfaceOptions, SurfaceParams, Validation};
 
 /// Errors of parsing parameters.
@@ -271,6 +271,7 @@ impl Values {
                 let id = id.ok_or_else(bad)?;
                 self.selection.assembly = (id != parameter.default).then(|| id.to_owned());
             }
+            "split" => self.request.job.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
             "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
             "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
@@ -324,7 +325,7 @@ fn one_char(text: &str) -> Option<char> {
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that a new field must be added here.
-    let Job { selection, params, spacing, validation, compress, normals, units, color, picture } = job;
+    let Job { selection, params, split, spacing, validation, compress, normals, units, color, picture } = job;
     let Selection { model, chains, atoms, altloc, assembly } = selection;
     let SurfaceParams {
         surface,
@@ -358,6 +359,10 @@ pub fn canonical(job: &Job) -> String {
         normals.name(),
         units.name()
     );
+    if *split != Split::None {
+        text.push_str("&split=");
+        text.push_str(split.name());
+    }
     let paper = match paper {
         None => Ok(()),
         Some(PaperParams::Gaussian { a, b } | PaperParams::SoftObject { a, b }) => {

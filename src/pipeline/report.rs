@@ -5,6 +5,7 @@ use serde_json::{Map, Value};
 
 use super::color::ColorReport;
 use super::left_out::LeftOutReport;
+use super::parts::PartReport;
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
 use crate::structure::{Selected, Structure, radii};
@@ -193,6 +194,10 @@ pub struct Report {
     pub void_list: Vec<VoidReport>,
     /// Components with the largest areas, at most 100.
     pub component_list: Vec<ComponentReport>,
+    /// Parts that are closed on their own; absent if the request does not divide the mesh.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[cfg_attr(feature = "server", schema(required = false))]
+    pub parts: Vec<PartReport>,
     /// Surface area in Å², including the walls of voids.
     pub area: f64,
     /// Enclosed volume in Å³, voids subtracted.
@@ -302,6 +307,7 @@ impl Report {
             voids: voids.len() as u64,
             void_list: voids.iter().take(100).map(|void| VoidReport::new(void, counts.centre)).collect(),
             component_list: measures.components.iter().take(100).map(ComponentReport::new).collect(),
+            parts: Vec::new(),
             area: measures.area,
             volume: measures.volume,
             report_units: Units::Angstrom.name(),

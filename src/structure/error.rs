@@ -97,6 +97,20 @@ pub enum StructureError {
         /// Limit, number of atoms.
         limit: u64,
     },
+    /// The selected atoms have more parts than allowed.
+    #[error("split={split} divides the selected atoms into more than {limit} parts")]
+    TooManyParts {
+        /// Name of the rule by which atoms are divided.
+        split: &'static str,
+        /// Limit, number of parts.
+        limit: u64,
+    },
+    /// The atoms cannot be divided by entity.
+    #[error(
+        "parameter `split`: `entity` cannot be applied: the file does not assign chains to entities; only mmCIF and \
+         BinaryCIF files can; expected none, chain or residue-group"
+    )]
+    NoEntities,
     /// Memory is not available now.
     #[error(transparent)]
     Memory(#[from] OutOfMemory),

@@ -35,6 +35,7 @@ mod scan;
 pub mod select;
 mod sites;
 mod sniff;
+pub mod split;
 #[cfg(feature = "strict")]
 mod strict_cost;
 #[cfg(feature = "strict")]
@@ -53,5 +54,6 @@ pub use error::StructureError;
 pub use kind_set::KindSet;
 pub use read::{ReadLimits, read, read_with};
 pub use select::{BadExpression, Expression, LeftOut, Selected, Selection, select, select_with};
+pub use split::{AtomPart, Split};
 pub use survey::{Survey, survey};
 pub use texts::TextColumn;

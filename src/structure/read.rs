@@ -17,11 +17,19 @@ pub struct ReadLimits {
     pub max_duplicates: u64,
     /// Copies of chains in an assembly.
     pub max_copies: u64,
+    /// Parts into which the selected atoms are divided.
+    pub max_parts: u64,
 }
 
 impl Default for ReadLimits {
     fn default() -> Self {
-        Self { max_inflated_bytes: 4 << 30, max_atoms: 20_000_000, max_duplicates: 1000, max_copies: 10_000 }
+        Self {
+            max_inflated_bytes: 4 << 30,
+            max_atoms: 20_000_000,
+            max_duplicates: 1000,
+            max_copies: 10_000,
+            max_parts: 1000,
+        }
     }
 }
 

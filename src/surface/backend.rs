@@ -23,6 +23,8 @@ pub struct GridStats {
     pub box_cells: u64,
     /// Sphere–brick pairs; the field stage performs 512 evaluations for each.
     pub candidates: u64,
+    /// Ordered pairs of overlapping spheres, counted for solvent-excluded surfaces only.
+    pub overlaps: u64,
 }
 
 /// Result of a run.

@@ -95,7 +95,6 @@ impl<T: Pod> Column<T> {
     }
 
     /// Adds the rows of `next` without a copy.
-    #[cfg(feature = "gpu")]
     pub(crate) fn append(&mut self, next: Self) {
         *self = Self::from_chunks(vec![std::mem::take(self), next]);
     }

@@ -117,6 +117,24 @@ impl Measures {
         Ok(Self::new(self.components, size, topology::check(triangles, control)?, validation))
     }
 
+    /// Returns the measures of several meshes that share no vertex, with their components relative to one centre; `None`
+    /// without meshes.
+    #[must_use]
+    pub fn joined(meshes: Vec<Self>) -> Option<Self> {
+        let mut all = meshes.into_iter().reduce(|mut all, next| {
+            all.euler += next.euler;
+            all.closed &= next.closed;
+            all.oriented &= next.oriented;
+            all.manifold &= next.manifold;
+            all.components.extend(next.components);
+            all
+        })?;
+        all.components.sort_by(|a, b| b.area.total_cmp(&a.area));
+        all.area = all.components.iter().map(|c| c.area).sum();
+        all.volume = all.components.iter().map(|c| c.volume).sum();
+        Some(all)
+    }
+
     /// Measures from components whose checksum of directed edges is zero, and the numbers of vertices and triangles;
     /// every vertex is used.
     pub(super) fn balanced(mut components: Vec<Component>, size: [u64; 2]) -> Self {
@@ -175,9 +193,14 @@ fn components_of(mesh: &Mesh, control: &Control<'_>) -> Result<Vec<Component>, S
 }
 
 impl Component {
+    /// Moves the component by `shift`, Å.
+    pub(crate) fn shift(&mut self, shift: [f64; 3]) {
+        (0..3).for_each(|k| self.moment[k] += self.volume * shift[k]);
+    }
+
     /// Adds a triangle. By the divergence theorem, its part of the volume's moment along an axis is the integral of
     /// half the squared coordinate times the normal.
-    fn add(&mut self, [a, b, c]: [[f64; 3]; 3]) {
+    pub(crate) fn add(&mut self, [a, b, c]: [[f64; 3]; 3]) {
         let [u, v] = [b, c].map(|p| [p[0] - a[0], p[1] - a[1], p[2] - a[2]]);
         let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
         self.triangles += 1;

@@ -1,5 +1,7 @@
 //! The output of the core: an indexed triangle mesh with normals.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
@@ -33,6 +35,19 @@ pub struct Mesh {
     pub atom_ids: Option<Column<u32>>,
     /// Per vertex an sRGB colour with alpha, if the caller set one. Backends leave it empty.
     pub colors: Option<Column<[u8; 4]>>,
+    /// Parts that are closed on their own, in order: they cover all rows. Empty for a mesh that is not divided.
+    pub parts: Vec<PartRange>,
+}
+
+/// Rows of a part of a mesh. Its triangles refer to its own vertices only.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct PartRange {
+    /// Name.
+    pub name: String,
+    /// Rows of its vertices.
+    pub vertices: Range<usize>,
+    /// Rows of its triangles; empty if no grid point lies inside its surface.
+    pub triangles: Range<usize>,
 }
 
 /// Vertices in 12 bytes. The fourth number of a row is 0.
@@ -135,6 +150,21 @@ impl Mesh {
         }
     }
 
+    /// Lowest and highest relative position per axis of some vertices; zeros without vertices.
+    ///
+    /// # Panics
+    /// Panics if there are no such vertices.
+    #[must_use]
+    pub fn bounds_of(&self, vertices: Range<usize>) -> [[f32; 3]; 2] {
+        let bounds = match self.vertices() {
+            Vertices::Single { positions, .. } => bounds_of(&positions[vertices]),
+            Vertices::Quantized { step, positions, .. } => {
+                bounds_of(&positions[vertices]).map(|bounds| bounds.map(|row| step.decoded(row)))
+            }
+        };
+        bounds.unwrap_or_default()
+    }
+
     /// Rounds the vertices to integers. A mesh that already has this step is unchanged. Returns true if the mesh
     /// changed.
     pub fn quantize(&mut self, step: Step) -> bool {
@@ -181,7 +211,6 @@ impl Mesh {
 
     /// Adds the rows of `next` without a copy. Its triangles already refer to the joined vertices. The mesh takes the
     /// centre of `next` and, if it is empty, its representation.
-    #[cfg(feature = "gpu")]
     pub(crate) fn append(&mut self, next: Self) {
         self.centre = next.centre;
         self.positions.append(next.positions);

@@ -184,8 +184,7 @@ impl Backend for ReferenceBackend {
         }
         scan::check_size(params, limits, mesh.n_vertices() as u64, mesh.n_triangles() as u64)?;
         let n = grid.len() as u64;
-        let stats =
-            GridStats { bricks: 0, surface_bricks: 0, samples: n, box_cells: cases.len() as u64, candidates: 0 };
+        let stats = GridStats { samples: n, box_cells: cases.len() as u64, ..GridStats::default() };
         MeshOutput::new(mesh, stats).deliver(params, control, sink)
     }
 }

@@ -41,6 +41,17 @@ impl Spheres {
         Ok(Self { x, y, z, r })
     }
 
+    /// Returns the spheres with these indices, in this order.
+    ///
+    /// # Panics
+    /// Panics if there is no such sphere.
+    #[must_use]
+    pub fn subset(&self, rows: &[u32]) -> Self {
+        let column = |column: &[f64]| rows.iter().map(|&i| column[i as usize]).collect();
+        let r = rows.iter().map(|&i| self.r[i as usize]).collect();
+        Self { x: column(&self.x), y: column(&self.y), z: column(&self.z), r }
+    }
+
     /// Returns the number of spheres.
     #[must_use]
     pub fn len(&self) -> usize {

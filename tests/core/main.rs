@@ -22,6 +22,7 @@ mod picture;
 mod real_structures;
 mod spacing;
 mod sphere_surfaces;
+mod split;
 mod structure_archive;
 mod structure_assembly;
 mod structure_bcif;

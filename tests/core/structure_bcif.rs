@@ -606,8 +606,13 @@ fn checks_limits_before_allocation() {
         let all = ["Cartn_x", "Cartn_y", "Cartn_z", "auth_seq_id"].map(runs).to_vec();
         file(vec![block("x", vec![category("_atom_site", rows, all)])])
     };
-    let limits =
-        ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 10_000, max_duplicates: 10_000, max_copies: 1000 };
+    let limits = ReadLimits {
+        max_inflated_bytes: 1 << 20,
+        max_atoms: 10_000,
+        max_duplicates: 10_000,
+        max_copies: 1000,
+        max_parts: 100,
+    };
     assert!(bomb(n).len() < 1500);
     assert_eq!(read(&bomb(n), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
     assert_eq!(read(&bomb(i64::MAX), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));

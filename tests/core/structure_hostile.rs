@@ -26,7 +26,13 @@ fn gzip(data: &[u8]) -> Vec<u8> {
 }
 
 fn limits() -> ReadLimits {
-    ReadLimits { max_inflated_bytes: 64 << 20, max_atoms: 2_000_000, max_duplicates: u64::MAX, max_copies: 1000 }
+    ReadLimits {
+        max_inflated_bytes: 64 << 20,
+        max_atoms: 2_000_000,
+        max_duplicates: u64::MAX,
+        max_copies: 1000,
+        max_parts: 100,
+    }
 }
 
 /// Serializes the tests that measure time.

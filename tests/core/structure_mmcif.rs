@@ -10,8 +10,13 @@
 use molmesh::structure::{ReadLimits, Structure, StructureError, read};
 
 /// Limits of files that repeat one row.
-const REPEATED: ReadLimits =
-    ReadLimits { max_inflated_bytes: 1 << 30, max_atoms: 1_000_000, max_duplicates: u64::MAX, max_copies: 1000 };
+const REPEATED: ReadLimits = ReadLimits {
+    max_inflated_bytes: 1 << 30,
+    max_atoms: 1_000_000,
+    max_duplicates: u64::MAX,
+    max_copies: 1000,
+    max_parts: 100,
+};
 
 fn cif(text: impl AsRef<[u8]>) -> Structure {
     read(text.as_ref(), &REPEATED).unwrap_or_else(|e| panic!("{e}"))

@@ -149,6 +149,7 @@ fn a_default_is_valid_with_every_parameter() {
         &[("select", "ligand")],
         &[("altloc", "B")],
         &[("assembly", "1")],
+        &[("split", "chain")],
         &[("validation", "exact")],
         &[("check", "strict")],
         &[("compress", "quantize")],

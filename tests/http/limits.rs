@@ -243,6 +243,32 @@ fn hexamer() -> String {
 }
 
 #[test]
+fn parts_of_meshes_are_limited() {
+    let text = hexamer();
+    let ask = |server: &Running, path: &str| {
+        server.post(&format!("{path}?assembly=1&split=chain&resolution=2"), &[], text.as_bytes())
+    };
+    let few = fake(|c| c.limits.mesh_parts = 5);
+    let exact = fake(|c| c.limits.mesh_parts = 6);
+    for path in ["/v1/meshes", "/v1/estimate", "/v1/report"] {
+        let problem = ask(&few, path).problem(422, "too-many-parts");
+        assert_eq!((&problem["parameter"], &problem["limit"]), (&"split".into(), &5.into()), "{path}");
+        assert_eq!(ask(&exact, path).status, 200, "{path}");
+    }
+    // Without parts, the limit does not apply.
+    assert_eq!(few.post("/v1/meshes?assembly=1&resolution=2", &[], text.as_bytes()).status, 200);
+    assert!(rejected(&few, "too-many-parts") >= 3.0);
+    let parts = ask(&exact, "/v1/report").json()["parts"].clone();
+    let names: Vec<&str> = parts.as_array().unwrap().iter().map(|part| part["name"].as_str().unwrap()).collect();
+    assert_eq!(names, ["A-1", "A-2", "A-3", "A-4", "A-5", "A-6"]);
+    let bad = exact.post("/v1/meshes?split=atom", &[], text.as_bytes()).problem(400, "bad-parameter");
+    assert_eq!(bad["parameter"], "split");
+    assert!(bad["expected"].as_str().unwrap().contains("none, chain, entity, residue-group"), "{bad}");
+    let none = exact.post("/v1/meshes?split=entity", &[], text.as_bytes()).problem(400, "bad-parameter");
+    assert_eq!((&none["parameter"], &none["value"]), (&"split".into(), &"entity".into()));
+}
+
+#[test]
 fn assemblies_are_limited() {
     let text = hexamer();
     let ask =

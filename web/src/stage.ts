@@ -8,6 +8,7 @@ import type { Source } from "./api/structures";
 import { load, type Loaded } from "./scene/load";
 import { contextOf, Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
+import { listParts } from "./ui/parts";
 import { color } from "./ui/theme";
 
 const ABSENT = "This browser has no WebGL 2, so the surface cannot be turned. It is shown as a picture from the server. Report and downloads work as usual.";
@@ -28,6 +29,7 @@ export class Stage {
   private readonly canvas = $<HTMLCanvasElement>("view");
   private readonly image = $<HTMLImageElement>("picture");
   private readonly notice = $("no-webgl");
+  private readonly parts = $("parts");
   private readonly hint = el("p", { class: "hint" });
   private lost = false;
   /** The shown surface. */
@@ -53,6 +55,7 @@ export class Stage {
     this.scene = scene;
     this.fetching?.abort();
     const drawn = this.viewer?.show(scene.loaded, fresh) ?? Promise.resolve(performance.now());
+    if (this.viewer) listParts(this.parts, scene.loaded.parts.map(({ name }) => name), this.viewer);
     if (!preview) this.kept = scene;
     if (!this.draws) this.showPicture(scene);
     return drawn;

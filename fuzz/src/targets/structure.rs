@@ -88,7 +88,13 @@ const EXPRESSIONS: [&str; 4] =
     ["polymer", "all", "byres within 4 of (ligand or ion)", "not water and not (resi 1-9 or elem C),hydrogens"];
 
 const LIMITS: JobLimits = JobLimits {
-    read: ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 5_000, max_duplicates: 1_000, max_copies: 100 },
+    read: ReadLimits {
+        max_inflated_bytes: 1 << 20,
+        max_atoms: 5_000,
+        max_duplicates: 1_000,
+        max_copies: 100,
+        max_parts: 100,
+    },
     surface: SurfaceLimits { max_samples: 1 << 19, max_mesh_bytes: 8 << 20, max_candidates: 1 << 18 },
     picture: molmesh::picture::PictureLimits { max_side: 64 },
 };

@@ -23,8 +23,8 @@ pub(super) enum Rows<'a> {
     Colors(&'a [[u8; 4]]),
     /// Atom indices.
     Atoms(&'a [u32]),
-    /// Vertex indices.
-    Triangles(&'a [[u32; 3]]),
+    /// Vertex indices, and the vertex from which the file counts them.
+    Triangles(&'a [[u32; 3]], u32),
 }
 
 impl<'a> Rows<'a> {
@@ -37,7 +37,7 @@ impl<'a> Rows<'a> {
             }
         };
         let [vertex, triangle] = [part.first_vertex as u64, part.first_triangle as u64];
-        [(vertex, positions), (vertex, normals), (triangle, Self::Triangles(part.triangles))]
+        [(vertex, positions), (vertex, normals), (triangle, Self::Triangles(part.triangles, 0))]
     }
 
     /// Returns the chunks of the columns of a mesh in the order of the layout, each with the index of its first row.
@@ -56,7 +56,15 @@ impl<'a> Rows<'a> {
         if let Some(atoms) = &mesh.atom_ids {
             append(&mut all, atoms.pieces(), Self::Atoms);
         }
-        append(&mut all, mesh.triangles.pieces(), Self::Triangles);
+        if mesh.parts.is_empty() {
+            append(&mut all, mesh.triangles.pieces(), |rows| Self::Triangles(rows, 0));
+        }
+        for part in &mesh.parts {
+            // The layout has checked that indices fit 32 bits.
+            let first = u32::try_from(part.vertices.start).unwrap_or(u32::MAX);
+            let rows = Self::Triangles(&mesh.triangles[part.triangles.clone()], first);
+            all.push((part.triangles.start as u64, rows));
+        }
         all
     }
 
@@ -69,7 +77,7 @@ impl<'a> Rows<'a> {
             Self::Normals(_) | Self::QuantizedNormals(_) => (layout.normals?, packing.normal_bytes()),
             Self::Colors(_) => (layout.colors?, COLOR_BYTES),
             Self::Atoms(_) => (layout.atoms?.1, ATOM_BYTES),
-            Self::Triangles(_) => (layout.indices.1, 3 * layout.indices.0.bytes()),
+            Self::Triangles(..) => (layout.indices.1, 3 * layout.indices.0.bytes()),
         };
         Some(span.offset + row_bytes * first)
     }
@@ -102,7 +110,7 @@ impl<'a> Rows<'a> {
                 // A small 32-bit integer, low byte first, is a 16-bit integer and two zero bytes.
                 _ => write_rows(out, rows),
             },
-            (Self::Triangles(rows), _) => write_indices(out, layout.indices.0, rows.as_flattened()),
+            (Self::Triangles(rows, first), _) => write_indices(out, layout.indices.0, rows.as_flattened(), first),
         }
     }
 }
@@ -122,14 +130,17 @@ pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) ->
     columns.map(|(_, rows)| rows).try_for_each(|rows| rows.write(layout, out))
 }
 
-/// Writes indices in the type of the layout.
-fn write_indices(out: &mut dyn Write, index_type: IndexType, indices: &[u32]) -> io::Result<()> {
+/// Writes indices, counted from `first`, in the type of the layout.
+fn write_indices(out: &mut dyn Write, index_type: IndexType, indices: &[u32], first: u32) -> io::Result<()> {
+    // No index of a part is lower, as the check before writing found.
+    let bytes = |index: u32| index.wrapping_sub(first).to_le_bytes();
     match index_type {
-        IndexType::U8 => convert_words(out, indices, |index| [index.to_le_bytes()[0]]),
+        IndexType::U8 => convert_words(out, indices, |index| [bytes(index)[0]]),
         IndexType::U16 => convert_words(out, indices, |index| {
-            let [low, high, ..] = index.to_le_bytes();
+            let [low, high, ..] = bytes(index);
             [low, high]
         }),
+        IndexType::U32 if first > 0 => convert_words(out, indices, bytes),
         IndexType::U32 => write_rows(out, indices),
     }
 }

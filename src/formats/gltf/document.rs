@@ -1,6 +1,8 @@
-//! JSON document of a glTF: one scene, one node translated to the mesh's centre, one mesh with one primitive.
+//! JSON document of a glTF: one scene, one node translated to the mesh's centre, with one mesh of one primitive or a
+//! node and a mesh for each part.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use gltf_json::accessor::{ComponentType, GenericComponentType, Type};
 use gltf_json::buffer::{Stride, Target, View};
@@ -11,7 +13,7 @@ use gltf_json::validation::USize64;
 use gltf_json::{Accessor, Asset, Buffer, Index, Material, Mesh as GltfMesh, Node, Root, Scene};
 use serde_json::{Map, Value, json};
 
-use super::layout::{AtomType, IndexType, Layout, Span};
+use super::layout::{ATOM_BYTES, AtomType, COLOR_BYTES, Drawn, IndexType, Layout, Span};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, GENERATOR, Meta, Packing, Step, Storage, Units};
 
@@ -32,6 +34,7 @@ pub(super) fn document(
     summary: &Summary,
     storage: Storage,
     layout: Option<&Layout>,
+    drawn: &[Drawn<'_>],
     meta: &Meta,
 ) -> Result<Map<String, Value>, FormatError> {
     let name = meta.name.clone().filter(|name| !name.is_empty());
@@ -48,18 +51,19 @@ pub(super) fn document(
         root.extensions_used.push(QUANTIZED.to_owned());
         root.extensions_required.push(QUANTIZED.to_owned());
     }
-    let drawn = layout.map(|layout| {
-        let primitive = primitive(&mut root, layout, summary);
-        root.push(GltfMesh {
-            primitives: vec![primitive],
-            name: name.clone(),
-            weights: None,
-            extensions: None,
-            extras: None,
-        })
-    });
-    let node = root.push(Node { mesh: drawn, name, translation: Some([0.0; 3]), ..Node::default() });
+    let meshes = layout.map_or_else(Vec::new, |layout| meshes(&mut root, layout, drawn, name.as_deref(), summary));
+    let node = root.push(Node { name, translation: Some([0.0; 3]), ..Node::default() });
     root.push(Scene { nodes: vec![node], name: None, extensions: None, extras: None });
+    if let [Drawn { name: None, .. }] = drawn {
+        root.nodes[0].mesh = meshes.first().copied();
+    } else {
+        // Each part has a node below the one that places the mesh.
+        let nodes = meshes.into_iter().zip(drawn).map(|(mesh, part)| {
+            root.push(Node { mesh: Some(mesh), name: part.name.map(str::to_owned), ..Node::default() })
+        });
+        let nodes: Vec<Index<Node>> = nodes.collect();
+        root.nodes[0].children = (!nodes.is_empty()).then_some(nodes);
+    }
 
     let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };
     let mut value = serde_json::to_value(&root).map_err(json)?;
@@ -94,63 +98,140 @@ fn extras(centre: [f64; 3], units: Units, step: Option<Step>, meta: &Meta) -> Ma
     extras
 }
 
-/// Adds buffer, views, accessors and material, and returns the primitive that uses them.
-fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
-    let buffer =
-        root.push(Buffer { byte_length: USize64(layout.len), name: None, uri: None, extensions: None, extras: None });
-    let n = layout.n_vertices;
-    let mut attribute = |semantic: Semantic, span: Span, component: ComponentType, shape: Type| {
-        let stride = match component {
-            ComponentType::I16 => Some(Stride(8)),
-            ComponentType::I8 => Some(Stride(4)),
-            ComponentType::U16 if shape == Type::Scalar => Some(Stride(4)),
-            _ => None,
-        };
-        let view = view(root, buffer, span, stride, Target::ArrayBuffer);
-        let mut accessor = accessor(view, n, component, shape);
-        accessor.normalized = matches!((component, shape), (ComponentType::I8, _) | (ComponentType::U16, Type::Vec4));
-        if semantic == Semantic::Positions {
-            // These are exactly values of the buffer: rounding preserves the order, and doubles hold floats exactly.
-            let [low, high] = summary.bounds.map(|row| match layout.storage.packing {
-                Packing::Full => Value::from(row.map(f64::from).to_vec()),
-                Packing::Quantized(step) => Value::from(step.position(row).to_vec()),
-            });
-            (accessor.min, accessor.max) = (Some(low), Some(high));
+/// Adds buffer, views, accessors, material and a mesh for each of `drawn`, and returns the meshes.
+fn meshes(
+    root: &mut Root,
+    layout: &Layout,
+    drawn: &[Drawn<'_>],
+    name: Option<&str>,
+    summary: &Summary,
+) -> Vec<Index<GltfMesh>> {
+    let columns = Columns::new(root, layout, drawn.len() > 1, summary);
+    let mesh = |part: &Drawn<'_>| {
+        let primitive = columns.primitive(root, layout, part);
+        root.push(GltfMesh {
+            primitives: vec![primitive],
+            name: part.name.or(name).map(str::to_owned),
+            weights: None,
+            extensions: None,
+            extras: None,
+        })
+    };
+    drawn.iter().map(mesh).collect()
+}
+
+/// Column of the buffer.
+struct Column {
+    view: Index<View>,
+    /// Length of a row, bytes.
+    row_bytes: u64,
+    component: ComponentType,
+    shape: Type,
+}
+
+impl Column {
+    /// Returns an accessor of `count` values from row `first` on.
+    fn accessor(&self, first: u64, count: u64) -> Accessor {
+        let normalized =
+            matches!((self.component, self.shape), (ComponentType::I8, _) | (ComponentType::U16, Type::Vec4));
+        let offset = self.row_bytes * first;
+        Accessor {
+            buffer_view: Some(self.view),
+            byte_offset: (offset > 0).then_some(USize64(offset)),
+            count: USize64(count),
+            component_type: Valid(GenericComponentType(self.component)),
+            type_: Valid(self.shape),
+            min: None,
+            max: None,
+            normalized,
+            sparse: None,
+            name: None,
+            extensions: None,
+            extras: None,
         }
-        (Valid(semantic), root.push(accessor))
-    };
-    let [position, normal] = match layout.storage.packing {
-        Packing::Full => [ComponentType::F32, ComponentType::F32],
-        Packing::Quantized(_) => [ComponentType::I16, ComponentType::I8],
-    };
-    let mut attributes = BTreeMap::from([attribute(Semantic::Positions, layout.positions, position, Type::Vec3)]);
-    // Without normals viewers shade each triangle flat, as the standard requires.
-    attributes.extend(layout.normals.map(|span| attribute(Semantic::Normals, span, normal, Type::Vec3)));
-    attributes.extend(layout.colors.map(|span| attribute(Semantic::Colors(0), span, ComponentType::U16, Type::Vec4)));
-    attributes.extend(layout.atoms.map(|(atom_type, span)| {
-        let component = match atom_type {
-            AtomType::U16 => ComponentType::U16,
-            AtomType::F32 => ComponentType::F32,
+    }
+}
+
+/// Columns of the buffer, each with its view, and the material. All primitives share them.
+struct Columns {
+    attributes: Vec<(Semantic, Column)>,
+    indices: Column,
+    material: Index<Material>,
+}
+
+impl Columns {
+    /// Adds buffer, views and material. If the accessors of several parts share a view, it must have a stride.
+    fn new(root: &mut Root, layout: &Layout, shared: bool, summary: &Summary) -> Self {
+        let byte_length = USize64(layout.len);
+        let buffer = root.push(Buffer { byte_length, name: None, uri: None, extensions: None, extras: None });
+        let packing = layout.storage.packing;
+        let [position, normal] = match packing {
+            Packing::Full => [ComponentType::F32, ComponentType::F32],
+            Packing::Quantized(_) => [ComponentType::I16, ComponentType::I8],
         };
-        attribute(Semantic::Extras("ATOM".to_owned()), span, component, Type::Scalar)
-    }));
-    let (index_type, span) = layout.indices;
-    let component = match index_type {
-        IndexType::U8 => ComponentType::U8,
-        IndexType::U16 => ComponentType::U16,
-        IndexType::U32 => ComponentType::U32,
-    };
-    let indices = view(root, buffer, span, None, Target::ElementArrayBuffer);
-    let indices = root.push(accessor(indices, 3 * layout.n_triangles, component, Type::Scalar));
-    let material = root.push(material(layout.colors.is_some(), summary.translucent));
-    Primitive {
-        attributes,
-        indices: Some(indices),
-        material: Some(material),
-        mode: Valid(Mode::Triangles),
-        targets: None,
-        extensions: None,
-        extras: None,
+        let mut attribute = |semantic, span, row_bytes, component, shape| {
+            let stride = match component {
+                ComponentType::I16 => Some(Stride(8)),
+                ComponentType::I8 => Some(Stride(4)),
+                ComponentType::U16 if shape == Type::Scalar => Some(Stride(4)),
+                _ => shared.then(|| Stride(usize::try_from(row_bytes).unwrap_or(0))),
+            };
+            let view = view(root, buffer, span, stride, Target::ArrayBuffer);
+            (semantic, Column { view, row_bytes, component, shape })
+        };
+        let bytes = packing.position_bytes();
+        let mut attributes = vec![attribute(Semantic::Positions, layout.positions, bytes, position, Type::Vec3)];
+        // Without normals viewers shade each triangle flat, as the standard requires.
+        let bytes = packing.normal_bytes();
+        attributes.extend(layout.normals.map(|span| attribute(Semantic::Normals, span, bytes, normal, Type::Vec3)));
+        attributes.extend(
+            layout.colors.map(|span| attribute(Semantic::Colors(0), span, COLOR_BYTES, ComponentType::U16, Type::Vec4)),
+        );
+        attributes.extend(layout.atoms.map(|(atom_type, span)| {
+            let component = match atom_type {
+                AtomType::U16 => ComponentType::U16,
+                AtomType::F32 => ComponentType::F32,
+            };
+            attribute(Semantic::Extras("ATOM".to_owned()), span, ATOM_BYTES, component, Type::Scalar)
+        }));
+        let (index_type, span) = layout.indices;
+        let component = match index_type {
+            IndexType::U8 => ComponentType::U8,
+            IndexType::U16 => ComponentType::U16,
+            IndexType::U32 => ComponentType::U32,
+        };
+        let view = view(root, buffer, span, None, Target::ElementArrayBuffer);
+        let indices = Column { view, row_bytes: index_type.bytes(), component, shape: Type::Scalar };
+        let material = root.push(material(layout.colors.is_some(), summary.translucent));
+        Self { attributes, indices, material }
+    }
+
+    /// Adds the accessors of a part, and returns its primitive.
+    fn primitive(&self, root: &mut Root, layout: &Layout, part: &Drawn<'_>) -> Primitive {
+        let count = |rows: &Range<u64>| rows.end - rows.start;
+        let mut attributes = BTreeMap::new();
+        for (semantic, column) in &self.attributes {
+            let mut accessor = column.accessor(part.vertices.start, count(&part.vertices));
+            if *semantic == Semantic::Positions {
+                // These are exactly values of the buffer: rounding preserves the order, and doubles hold floats exactly.
+                let [low, high] = part.bounds.map(|row| match layout.storage.packing {
+                    Packing::Full => Value::from(row.map(f64::from).to_vec()),
+                    Packing::Quantized(step) => Value::from(step.position(row).to_vec()),
+                });
+                (accessor.min, accessor.max) = (Some(low), Some(high));
+            }
+            attributes.insert(Valid(semantic.clone()), root.push(accessor));
+        }
+        let indices = self.indices.accessor(3 * part.triangles.start, 3 * count(&part.triangles));
+        Primitive {
+            attributes,
+            indices: Some(root.push(indices)),
+            material: Some(self.material),
+            mode: Valid(Mode::Triangles),
+            targets: None,
+            extensions: None,
+            extras: None,
+        }
     }
 }
 
@@ -165,23 +246,6 @@ fn view(root: &mut Root, buffer: Index<Buffer>, span: Span, stride: Option<Strid
         extensions: None,
         extras: None,
     })
-}
-
-fn accessor(view: Index<View>, count: u64, component: ComponentType, shape: Type) -> Accessor {
-    Accessor {
-        buffer_view: Some(view),
-        byte_offset: None,
-        count: USize64(count),
-        component_type: Valid(GenericComponentType(component)),
-        type_: Valid(shape),
-        min: None,
-        max: None,
-        normalized: false,
-        sparse: None,
-        name: None,
-        extensions: None,
-        extras: None,
-    }
 }
 
 fn material(coloured: bool, translucent: bool) -> Material {

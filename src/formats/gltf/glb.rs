@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use super::buffer::write_buffer;
 use super::document::document;
-use super::layout::Layout;
+use super::layout::{Drawn, Layout};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::Mesh;
@@ -40,18 +40,20 @@ impl GlbPlan {
         summary: &Summary,
         meta: &Meta,
     ) -> Result<Self, FormatError> {
-        Self::placed(Layout::of(mesh, storage, summary)?, storage, mesh.centre, summary, meta)
+        let layout = Layout::of(mesh, storage, summary)?;
+        Self::placed(layout, &Drawn::of(mesh, summary), storage, mesh.centre, summary, meta)
     }
 
     /// Returns the layout of a mesh of which only the summary is known.
     pub(super) fn placed(
         layout: Option<Layout>,
+        drawn: &[Drawn<'_>],
         storage: Storage,
         centre: [f64; 3],
         summary: &Summary,
         meta: &Meta,
     ) -> Result<Self, FormatError> {
-        let document = document(centre, summary, storage, layout.as_ref(), meta)?;
+        let document = document(centre, summary, storage, layout.as_ref(), drawn, meta)?;
         let json = serde_json::to_vec(&document).map_err(|e| FormatError::Json { reason: e.to_string() })?;
         Self::wrap(json, layout)
     }

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::buffer::write_buffer;
 use super::document::document;
-use super::layout::Layout;
+use super::layout::{Drawn, Layout};
 use crate::formats::block::BLOCK_BYTES;
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
@@ -32,7 +32,7 @@ impl GltfPlan {
         meta: &Meta,
     ) -> Result<Self, FormatError> {
         let layout = Layout::of(mesh, storage, summary)?;
-        let mut document = document(mesh.centre, summary, storage, layout.as_ref(), meta)?;
+        let mut document = document(mesh.centre, summary, storage, layout.as_ref(), &Drawn::of(mesh, summary), meta)?;
         // The entry of the buffer comes last and is formatted here, so that `write` can insert the base64 into it.
         document.shift_remove("buffers");
         let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };

@@ -1,5 +1,7 @@
 //! Layout of the buffer of a glTF. Pure arithmetic on counts, so files of any size can be planned.
 
+use std::ops::Range;
+
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Storage};
 use crate::surface::Mesh;
@@ -72,11 +74,45 @@ pub(super) struct Span {
     pub(super) len: u64,
 }
 
+/// Rows of the mesh that one primitive draws.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Drawn<'a> {
+    /// Name of its node; that of the mesh if it is not divided.
+    pub(super) name: Option<&'a str>,
+    /// Rows of its vertices.
+    pub(super) vertices: Range<u64>,
+    /// Rows of its triangles, whose indices count from the first of its vertices.
+    pub(super) triangles: Range<u64>,
+    /// Lowest and highest relative position per axis, Å.
+    pub(super) bounds: [[f32; 3]; 2],
+}
+
+impl<'a> Drawn<'a> {
+    /// Returns the parts of a mesh that have triangles, or the whole mesh if it is not divided.
+    pub(super) fn of(mesh: &'a Mesh, summary: &Summary) -> Vec<Self> {
+        if mesh.parts.is_empty() {
+            return vec![Self::whole([mesh.n_vertices(), mesh.n_triangles()].map(|n| n as u64), summary)];
+        }
+        let rows = |range: &Range<usize>| range.start as u64..range.end as u64;
+        let parts = mesh.parts.iter().filter(|part| !part.triangles.is_empty()).map(|part| Self {
+            name: Some(&part.name),
+            vertices: rows(&part.vertices),
+            triangles: rows(&part.triangles),
+            // Adding zero turns −0, which JSON would show, into 0.
+            bounds: mesh.bounds_of(part.vertices.clone()).map(|row| row.map(|v| v + 0.0)),
+        });
+        parts.collect()
+    }
+
+    /// Returns the whole of a mesh with these numbers of vertices and triangles.
+    pub(super) fn whole([n_vertices, n_triangles]: [u64; 2], summary: &Summary) -> Self {
+        Self { name: None, vertices: 0..n_vertices, triangles: 0..n_triangles, bounds: summary.bounds }
+    }
+}
+
 /// Layout of the buffer: attributes in multiples of four bytes per vertex, then indices, which may end unaligned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Layout {
-    pub(super) n_vertices: u64,
-    pub(super) n_triangles: u64,
     pub(super) storage: Storage,
     pub(super) positions: Span,
     pub(super) normals: Option<Span>,
@@ -95,19 +131,23 @@ impl Layout {
             return Ok(None);
         }
         let atoms = summary.max_atom.map(AtomType::for_largest).transpose()?;
-        Self::new([n_vertices, n_triangles], storage, mesh.colors.is_some(), atoms).map(Some)
+        // Indices count from the first vertex of a part.
+        let most = mesh.parts.iter().map(|part| part.vertices.len() as u64).max();
+        let most = most.unwrap_or(n_vertices);
+        Self::new([n_vertices, n_triangles], most, storage, mesh.colors.is_some(), atoms).map(Some)
     }
 
     fn new(
         [n_vertices, n_triangles]: [u64; 2],
+        n_indexed: u64,
         storage: Storage,
         colors: bool,
         atoms: Option<AtomType>,
     ) -> Result<Self, FormatError> {
-        let index_type = IndexType::for_vertices(n_vertices).ok_or(FormatError::TooMany {
+        let index_type = IndexType::for_vertices(n_indexed).ok_or(FormatError::TooMany {
             format: "glTF",
             what: "vertices",
-            count: n_vertices,
+            count: n_indexed,
             limit: u64::from(u32::MAX),
         })?;
         let mut end = 0;
@@ -121,12 +161,12 @@ impl Layout {
         let colors = colors.then(|| span(COLOR_BYTES * n_vertices));
         let atoms = atoms.map(|atom_type| (atom_type, span(ATOM_BYTES * n_vertices)));
         let indices = (index_type, span(3 * n_triangles * index_type.bytes()));
-        Ok(Self { n_vertices, n_triangles, storage, positions, normals, colors, atoms, indices, len: end })
+        Ok(Self { storage, positions, normals, colors, atoms, indices, len: end })
     }
 
     /// Returns the layout of a mesh without colours and atoms; `None` if it has no triangles.
     pub(super) fn plain(counts: [u64; 2], storage: impl Into<Storage>) -> Result<Option<Self>, FormatError> {
-        if counts[1] == 0 { Ok(None) } else { Self::new(counts, storage.into(), false, None).map(Some) }
+        if counts[1] == 0 { Ok(None) } else { Self::new(counts, counts[0], storage.into(), false, None).map(Some) }
     }
 }
 
@@ -180,7 +220,7 @@ mod tests {
             (bare(Packing::Full), 60),
             (bare(quantized), 40),
         ] {
-            let layout = Layout::new([5, 3], storage, true, Some(AtomType::U16)).unwrap();
+            let layout = Layout::new([5, 3], 5, storage, true, Some(AtomType::U16)).unwrap();
             let rest = [layout.colors.unwrap(), layout.atoms.unwrap().1, layout.indices.1];
             let mut end = 0;
             for span in [layout.positions].into_iter().chain(layout.normals).chain(rest) {

@@ -10,7 +10,7 @@ use thiserror::Error;
 
 use super::buffer::Rows;
 use super::glb::{GlbPlan, HEAD_BYTES, LARGE_BUFFER_BYTES};
-use super::layout::Layout;
+use super::layout::{Drawn, Layout};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::{MeshPart, MeshSink, SinkFailed, Vertices};
@@ -46,6 +46,8 @@ pub struct GlbSink<'a> {
     out: &'a dyn RandomAccess,
     storage: OnceLock<Storage>,
     layout: OnceLock<Option<Layout>>,
+    /// Numbers of vertices and triangles.
+    size: OnceLock<[u64; 2]>,
     /// Contents of a small buffer.
     small: Mutex<Vec<u8>>,
     failure: Mutex<Option<GlbSinkError>>,
@@ -55,8 +57,8 @@ impl<'a> GlbSink<'a> {
     /// Creates a sink that writes to `out`, which must be empty.
     #[must_use]
     pub fn new(out: &'a dyn RandomAccess) -> Self {
-        let (storage, layout) = (OnceLock::new(), OnceLock::new());
-        Self { out, storage, layout, small: Mutex::default(), failure: Mutex::default() }
+        let (storage, layout, size) = (OnceLock::new(), OnceLock::new(), OnceLock::new());
+        Self { out, storage, layout, size, small: Mutex::default(), failure: Mutex::default() }
     }
 
     /// Sets the storage of the mesh in the file. Only the first call before the mesh begins has an effect.
@@ -84,7 +86,9 @@ impl<'a> GlbSink<'a> {
         let bounds = bounds.map(|row| row.map(|v| v + 0.0));
         let summary = Summary { bounds, max_atom: None, translucent: false };
         let layout = self.layout.get().copied().flatten();
-        let plan = GlbPlan::placed(layout, self.storage(), centre, &summary, meta)?;
+        let size = self.size.get().copied().unwrap_or_default();
+        let drawn = [Drawn::whole(size, &summary)];
+        let plan = GlbPlan::placed(layout, &drawn, self.storage(), centre, &summary, meta)?;
         let head = plan.head().len() as u64;
         let large = layout.is_some_and(|layout| layout.len >= LARGE_BUFFER_BYTES);
         if large && head != HEAD_BYTES {
@@ -105,7 +109,8 @@ impl<'a> GlbSink<'a> {
     }
 
     fn try_begin(&self, n_vertices: usize, n_triangles: usize) -> Result<(), GlbSinkError> {
-        let layout = Layout::plain([n_vertices as u64, n_triangles as u64], self.storage())?;
+        let size = *self.size.get_or_init(|| [n_vertices as u64, n_triangles as u64]);
+        let layout = Layout::plain(size, self.storage())?;
         if let Some(layout) = layout {
             GlbPlan::check_len(HEAD_BYTES + layout.len.next_multiple_of(4))?;
         }

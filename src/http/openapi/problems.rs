@@ -36,6 +36,7 @@ pub(in crate::http) const READING: &[Kind] =
 pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::EmptySelection,
     Kind::TooManyCopies,
+    Kind::TooManyParts,
     Kind::GridTooLarge,
     Kind::TooManyCandidates,
     Kind::MeshTooLarge,

@@ -7,6 +7,7 @@ use crate::formats::{Compress, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, Style, View};
 use crate::pipeline::color::{self, Palette};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
+use crate::structure::Split;
 use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{Preset, SurfaceKind, Validation};
 
@@ -134,6 +135,7 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
     })
 }
 
+const SPLITS: &[&str] = &[Split::None.name(), Split::Chain.name(), Split::Entity.name(), Split::ResidueGroup.name()];
 const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj", "png"];
 const VIEWS: &[&str] = &view_names(View::ALL);
 const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
@@ -277,6 +279,12 @@ pub const TABLE: &[Parameter] = &[
         domain: Domain::Text { expected: "asymmetric-unit, or the id of an assembly of the file, such as 1" },
         default: "asymmetric-unit",
         doc: "Biological assembly to mesh: the selected atoms, copied by the operators of the file. asymmetric-unit meshes the atoms as they are in the file.",
+    },
+    Parameter {
+        name: "split",
+        domain: Domain::Choice(SPLITS),
+        default: "none",
+        doc: "Divides the mesh into parts that are closed on their own: chain (in an assembly per copy), entity, or residue-group (polymer, ligand, glycan, ion, water).",
     },
     Parameter {
         name: "validation",

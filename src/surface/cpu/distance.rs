@@ -68,6 +68,11 @@ impl DistanceField {
         Ok(Self { boundary: Some(Boundary { union, bounds, tiles }), level: to_f32(level), tolerance, atom_ids })
     }
 
+    /// Number of ordered pairs of overlapping spheres; 0 unless the boundary of their union is needed.
+    pub(super) fn overlaps(&self) -> u64 {
+        self.boundary.as_ref().map_or(0, |boundary| boundary.union.n_overlaps)
+    }
+
     /// Finds the arcs near every brick in `layers` of a tile, and in the layer beyond, as [`Bricks::fill`] finds atoms.
     ///
     /// # Errors

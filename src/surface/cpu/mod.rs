@@ -140,6 +140,14 @@ impl Field {
         })
     }
 
+    /// Returns the number of pairs of overlapping spheres, if they were counted.
+    fn overlaps(&self) -> u64 {
+        match self {
+            Self::Density(_) => 0,
+            Self::Distance(field) => field.overlaps(),
+        }
+    }
+
     /// Returns the value of the samples at the surface.
     fn level(&self, params: &SurfaceParams) -> f32 {
         match self {
@@ -252,6 +260,7 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
         samples: counters.samples.into_inner(),
         box_cells: lattice.box_cells,
         candidates: counters.candidates.into_inner(),
+        overlaps: field.overlaps(),
     };
     let pieces = pieces(&mut done);
     Ok(Scanned { lattice, field, tiles, done, totals, grid, pieces, quantize: params.quantize })

@@ -129,6 +129,7 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
         triangles: Column::zeroed(totals.triangles),
         atom_ids: atom_ids.then(|| Column::zeroed(totals.vertices)),
         colors: None,
+        parts: Vec::new(),
     };
     let mut rows = match &mut mesh.quantized {
         Some(Quantized { step, positions, normals }) => VertexRows::Quantized { step: *step, positions, normals },

@@ -61,6 +61,8 @@ pub(super) struct SphereUnion {
     faces: Vec<Option<[u32; 2]>>,
     caps: Vec<CapGroup>,
     arcs: Vec<Arc>,
+    /// Ordered pairs of overlapping spheres.
+    pub(super) n_overlaps: u64,
 }
 
 /// Boundary of the spheres of one cell.
@@ -126,7 +128,7 @@ impl SphereUnion {
         let parts: Vec<Part> =
             (0..cells.len()).into_par_iter().map_init(Scratch::default, part).collect::<Result<_, SurfaceError>>()?;
         control.memory.grow((size_of::<Option<[u32; 2]>>() * atoms.len()) as u64)?;
-        let mut whole = Self { faces: vec![None; atoms.len()], ..Self::default() };
+        let mut whole = Self { faces: vec![None; atoms.len()], n_overlaps: overlaps.total(), ..Self::default() };
         let mut bounds = Vec::with_capacity(parts.iter().map(|part| part.arcs.len()).sum());
         whole.arcs.reserve_exact(bounds.capacity());
         whole.caps.reserve_exact(parts.iter().map(|part| part.caps.len()).sum());

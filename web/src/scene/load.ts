@@ -1,12 +1,19 @@
 /** Loads a GLB for drawing. Positions stay unchanged, also integers; the node transforms them. */
 
-import { Box3, Matrix4, Sphere, Vector3, type BufferAttribute, type BufferGeometry, type Group, type Mesh } from "three";
+import { Box3, type BufferAttribute, type BufferGeometry, type Group, type Matrix4, type Mesh, Sphere, Vector3 } from "three";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 
-export interface Loaded {
+/** Part of a surface, or the whole of a surface that is not divided. */
+export interface Part {
+  name: string;
   geometry: BufferGeometry;
   /** Transform from stored positions to file units. */
   matrix: Matrix4;
+}
+
+export interface Loaded {
+  /** At least one. All have the same attributes. */
+  parts: Part[];
   sphere: Sphere;
   /** Parameters and report in the file, without values that differ between runs. */
   extras: Record<string, unknown>;
@@ -23,24 +30,28 @@ export async function load(bytes: ArrayBuffer): Promise<Loaded> {
     loader.setMeshoptDecoder(MeshoptDecoder);
   }
   const gltf = await loader.parseAsync(bytes, "");
-  const mesh = firstMesh(gltf.scene);
-  if (!mesh) throw new Error("the file holds no surface");
   gltf.scene.updateMatrixWorld(true);
-  const matrix = mesh.matrixWorld.clone();
-  const { geometry } = mesh;
-  // Uses the bounds in the file instead of reading all vertices. Bounds of integers are in stored units.
-  const box = geometry.boundingBox ?? new Box3().setFromBufferAttribute(geometry.getAttribute("position") as BufferAttribute);
-  const sphere = box.clone().applyMatrix4(matrix).getBoundingSphere(new Sphere(new Vector3(), 1));
+  const parts = partsOf(gltf.scene);
+  if (!parts.length) throw new Error("the file holds no surface");
+  const box = new Box3();
+  for (const { geometry, matrix } of parts) {
+    // Uses the bounds in the file instead of reading all vertices. Bounds of integers are in stored units.
+    const own = geometry.boundingBox ?? new Box3().setFromBufferAttribute(geometry.getAttribute("position") as BufferAttribute);
+    box.union(own.clone().applyMatrix4(matrix));
+  }
+  const sphere = box.getBoundingSphere(new Sphere(new Vector3(), 1));
   const extras = ((gltf.asset as { extras?: Record<string, unknown> }).extras ?? {}) as Record<string, unknown>;
-  return { geometry, matrix, sphere, extras };
+  return { parts, sphere, extras };
 }
 
-function firstMesh(group: Group): Mesh | null {
-  let found: Mesh | null = null;
+/** Returns all meshes with the names in the file: three.js changes those of objects. */
+function partsOf(group: Group): Part[] {
+  const parts: Part[] = [];
   group.traverse((object) => {
-    if (!found && (object as Mesh).isMesh) found = object as Mesh;
+    const mesh = object as Mesh;
+    if (mesh.isMesh) parts.push({ name: String(mesh.userData["name"] ?? mesh.name), geometry: mesh.geometry, matrix: mesh.matrixWorld.clone() });
   });
-  return found;
+  return parts;
 }
 
 function usesMeshopt(bytes: ArrayBuffer): boolean {

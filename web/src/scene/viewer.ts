@@ -33,7 +33,11 @@ export class Viewer {
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly camera = new PerspectiveCamera(28, 1, 0.1, 1000);
-  private mesh: Mesh | null = null;
+  /** One mesh per part. They share a material. */
+  private meshes: Mesh[] = [];
+  private material: SurfaceMaterial | null = null;
+  /** Names of hidden parts. */
+  private readonly hidden = new Set<string>();
   private loaded: Loaded | null = null;
   private colors: { texture: DataTexture; atoms: number } | null = null;
   private haze = new Color("#ffffff");
@@ -68,21 +72,43 @@ export class Viewer {
   /** Shows a surface. Resets the view if `fresh`. Resolves in the frame after the one that shows it. */
   show(loaded: Loaded, fresh: boolean): Promise<number> {
     const first = !this.loaded;
-    this.mesh?.geometry.dispose();
-    (this.mesh?.material as SurfaceMaterial | undefined)?.dispose();
-    if (this.mesh) this.scene.remove(this.mesh);
-    const material = new SurfaceMaterial(loaded.geometry);
-    this.mesh = new Mesh(loaded.geometry, material);
-    this.mesh.matrixAutoUpdate = false;
-    this.mesh.matrix.copy(loaded.matrix);
-    this.mesh.frustumCulled = false;
+    this.scene.remove(...this.meshes);
+    this.release();
+    if (fresh) this.hidden.clear();
+    const material = (this.material = new SurfaceMaterial(loaded.parts[0]!.geometry));
+    this.meshes = loaded.parts.map(({ name, geometry, matrix }) => {
+      const mesh = new Mesh(geometry, material);
+      mesh.matrixAutoUpdate = false;
+      mesh.matrix.copy(matrix);
+      mesh.frustumCulled = false;
+      mesh.visible = !this.hidden.has(name);
+      return mesh;
+    });
     this.loaded = loaded;
     material.set("unit", loaded.sphere.radius / Math.max(radius(loaded), 1e-9));
-    this.scene.add(this.mesh);
+    this.scene.add(...this.meshes);
     this.dress();
     if (fresh || first) this.reset();
     else this.clip();
     return this.drawn();
+  }
+
+  /** Returns the names of the parts that are shown. */
+  get shownParts(): string[] {
+    return (this.loaded?.parts ?? []).map(({ name }) => name).filter((name) => !this.hidden.has(name));
+  }
+
+  /** Shows or hides the parts with a name. They stay so until a surface of another structure is shown. */
+  showPart(name: string, visible: boolean): void {
+    if (visible) this.hidden.delete(name);
+    else this.hidden.add(name);
+    this.meshes.forEach((mesh, i) => (mesh.visible = !this.hidden.has(this.loaded?.parts[i]?.name ?? "")));
+    this.invalidate();
+  }
+
+  private release(): void {
+    for (const { geometry } of this.meshes) geometry.dispose();
+    this.material?.dispose();
   }
 
   /** Resolves with the time in the frame after the next one that is drawn. */
@@ -139,13 +165,18 @@ export class Viewer {
     const caster = new Raycaster();
     this.camera.updateMatrixWorld();
     caster.setFromCamera(new Vector2(x, y), this.camera);
-    return pick(this.loaded.geometry, this.loaded.matrix, caster.ray);
+    const { ray } = caster;
+    const hits = this.loaded.parts.filter((_, i) => this.meshes[i]?.visible).map(({ geometry, matrix }) => pick(geometry, matrix, ray));
+    const distance = ({ point }: Hit) => point.distanceToSquared(ray.origin);
+    return hits.reduce((best, hit) => (hit && (!best || distance(hit) < distance(best)) ? hit : best), null);
   }
 
   /** Turns the surface of the atoms `first` to `last` to the camera. Returns false if they have none. */
   face(first: number, last: number): boolean {
-    const place = this.loaded && placeOf(this.loaded.geometry, this.loaded.matrix, first, last);
-    if (!place || !this.loaded) return false;
+    if (!this.loaded) return false;
+    const places = this.loaded.parts.map(({ geometry, matrix }) => placeOf(geometry, matrix, first, last));
+    const place = places.find((found) => found !== null);
+    if (!place) return false;
     this.turn(false);
     const distance = this.camera.position.distanceTo(this.controls.target);
     const direction = place.sub(this.loaded.sphere.center).normalize();
@@ -192,9 +223,9 @@ export class Viewer {
     if (!this.options.transparent) this.renderer.setClearColor(this.haze, 1);
   }
 
-  /** Returns the number of drawn triangles. */
+  /** Returns the number of triangles of all parts. */
   get triangles(): number {
-    return (this.loaded?.geometry.getIndex()?.count ?? 0) / 3;
+    return (this.loaded?.parts ?? []).reduce((sum, { geometry }) => sum + (geometry.getIndex()?.count ?? 0) / 3, 0);
   }
 
   /** Waits until drawing has finished, since the GPU works asynchronously. For measurements. */
@@ -207,7 +238,7 @@ export class Viewer {
     cancelAnimationFrame(this.frame);
     this.size.disconnect();
     this.controls.dispose();
-    this.mesh?.geometry.dispose();
+    this.release();
     this.colors?.texture.dispose();
     this.renderer.dispose();
   }
@@ -281,20 +312,21 @@ export class Viewer {
 
   /** Applies colours and marks to the surface. */
   private dress(): void {
-    const material = this.mesh?.material as SurfaceMaterial | undefined;
-    if (!material || !this.mesh) return;
+    const { material } = this;
+    if (!material) return;
     material.set("plain", this.plain);
     material.set("haze", this.haze);
     material.set("hovered", new Vector2(...this.marked.hovered));
     material.set("pinned", new Vector2(...this.marked.pinned));
     material.set("atoms", this.colors?.atoms ?? 0);
     if (this.colors) material.set("palette", this.colors.texture);
-    this.mesh.onBeforeRender = () => {
+    const prepare = () => {
       const distance = this.camera.position.distanceTo(this.loaded?.sphere.center ?? this.controls.target);
       const radius = this.loaded?.sphere.radius ?? 1;
       material.set("depths", new Vector2(distance - 0.5 * radius, distance + radius));
       material.uniformsNeedUpdate = true;
     };
+    for (const mesh of this.meshes) mesh.onBeforeRender = prepare;
   }
 }
 

@@ -1,0 +1,326 @@
+//! Meshes each part of the atoms on its own, and joins the meshes into one with the ranges of the parts.
+//!
+//! Grids are aligned with the origin, so a part has the mesh that its atoms would have alone.
+
+use std::borrow::Cow;
+use std::ops::Deref;
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::SPHERE_BYTES;
+use super::fit::WithoutProgress;
+use super::work::mesh_work;
+use crate::structure::AtomPart;
+use crate::surface::cpu::scan;
+use crate::surface::lattice::to_f32;
+use crate::surface::{
+    Backend, BackendIdentity, Component, Control, DeviceStatus, GridStats, Measures, Mesh, MeshOutput, MeshSink,
+    PartRange, Reservation, Spheres, Stage, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams,
+};
+
+/// Rows per task.
+const ROWS: usize = 1 << 16;
+/// Bytes of a quantized vertex.
+const QUANTIZED_BYTES: u64 = 12;
+
+/// Part of the mesh that is closed on its own.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct PartReport {
+    /// Name: the chain with the number of its copy in an assembly, the entity, or the group of residues.
+    pub name: String,
+    /// Number of atoms.
+    pub atoms: u64,
+    /// Number of vertices.
+    pub vertices: u64,
+    /// Number of triangles; 0 if no grid point lies inside the surface of the part.
+    pub triangles: u64,
+    /// Surface area in Å².
+    pub area: f64,
+    /// Enclosed volume in Å³.
+    pub volume: f64,
+}
+
+impl PartReport {
+    /// Returns the reports of all parts of `mesh`.
+    pub(super) fn all(parts: &[AtomPart], mesh: &Mesh) -> Vec<Self> {
+        let measured = parts.par_iter().zip(&mesh.parts).map(|(part, range)| {
+            let mut whole = Component::default();
+            for triangle in &mesh.triangles[range.triangles.clone()] {
+                whole.add(triangle.map(|v| mesh.position(v as usize).map(f64::from)));
+            }
+            let Component { triangles, area, volume, .. } = whole;
+            let (atoms, vertices) = (part.rows.len() as u64, range.vertices.len() as u64);
+            Self { name: part.name.clone(), atoms, vertices, triangles, area, volume }
+        });
+        measured.collect()
+    }
+}
+
+/// Returns the spheres of each part, or all spheres if they are not divided.
+pub(super) fn spheres_of<'s>(
+    spheres: &'s Spheres,
+    parts: Option<&'s [AtomPart]>,
+) -> impl Iterator<Item = Cow<'s, Spheres>> {
+    let whole = parts.is_none().then_some(Cow::Borrowed(spheres));
+    whole.into_iter().chain(parts.unwrap_or_default().iter().map(|part| Cow::Owned(spheres.subset(&part.rows))))
+}
+
+/// Backend that meshes parts on another backend.
+pub(super) struct PartsBackend<'a> {
+    inner: Inner<'a>,
+    parts: &'a [AtomPart],
+}
+
+/// Backend that meshes the parts.
+enum Inner<'a> {
+    Chosen(&'a dyn Backend),
+    Assigned(Box<dyn Backend + 'a>),
+}
+
+impl<'a> Deref for Inner<'a> {
+    type Target = dyn Backend + 'a;
+
+    fn deref(&self) -> &Self::Target {
+        match self {
+            Self::Chosen(backend) => *backend,
+            Self::Assigned(backend) => backend.as_ref(),
+        }
+    }
+}
+
+impl<'a> PartsBackend<'a> {
+    /// Creates a backend that meshes `parts` of the spheres on `inner`.
+    pub(super) fn new(inner: &'a dyn Backend, parts: &'a [AtomPart]) -> Self {
+        Self { inner: Inner::Chosen(inner), parts }
+    }
+
+    /// Meshes all parts on `backend`; `None` if different backends made them.
+    fn join(
+        &self,
+        backend: &dyn Backend,
+        spheres: &Spheres,
+        run: &Run<'_>,
+        control: &Control<'_>,
+    ) -> Result<Option<MeshOutput>, SurfaceError> {
+        let mut joined = Joined::new(centre(spheres, run.params));
+        let observer = control.observer;
+        let quiet = WithoutProgress(observer);
+        let control = Control { observer: &quiet, ..control.clone() };
+        let mut n_atoms = 0;
+        for part in self.parts {
+            control.check()?;
+            n_atoms += part.rows.len();
+            let meshed = {
+                let _spheres = control.reserve(SPHERE_BYTES * part.rows.len() as u64)?;
+                let own = spheres.subset(&part.rows);
+                backend.run(&own, run.params, &joined.left_of(run.limits), &control)
+            };
+            match meshed {
+                Ok(output) if !joined.made_by(output.made_by.as_ref(), backend) => return Ok(None),
+                Ok(output) => joined.push(part, output),
+                Err(SurfaceError::NoSurface { .. }) => joined.skip(part),
+                Err(error) => return Err(joined.error(error, run, n_atoms as f64 / spheres.len() as f64)),
+            }
+            let [n_vertices, n_triangles] = [joined.mesh.n_vertices(), joined.mesh.n_triangles()];
+            scan::check_size(run.params, run.limits, n_vertices as u64, n_triangles as u64)?;
+            for stage in [Stage::Field, Stage::Emit] {
+                observer.progress(stage, n_atoms, spheres.len());
+            }
+        }
+        joined.finish(run.params).map(Some)
+    }
+}
+
+impl Backend for PartsBackend<'_> {
+    fn name(&self) -> &'static str {
+        self.inner.name()
+    }
+
+    fn arithmetic(&self) -> String {
+        self.inner.arithmetic()
+    }
+
+    fn arithmetics(&self) -> Vec<String> {
+        self.inner.arithmetics()
+    }
+
+    fn describe(&self) -> String {
+        self.inner.describe()
+    }
+
+    fn makes(&self, surface: SurfaceKind) -> bool {
+        self.inner.makes(surface)
+    }
+
+    fn devices(&self) -> Vec<DeviceStatus> {
+        self.inner.devices()
+    }
+
+    fn for_job(&self, surface: SurfaceKind, work: f64) -> Option<Box<dyn Backend + '_>> {
+        let inner = Inner::Assigned(self.inner.for_job(surface, work)?);
+        Some(Box::new(PartsBackend { inner, parts: self.parts }))
+    }
+
+    /// Limits apply to all parts together. A mesh is quantized after the parts are joined, as they share one step.
+    fn write(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
+        let work = self.parts.iter().map(|part| mesh_work(part.rows.len() as f64, params.resolution)).sum();
+        let assigned = self.inner.for_job(params.surface, work);
+        let backend = assigned.as_deref().unwrap_or(&*self.inner);
+        let run = Run { params: &SurfaceParams { quantize: None, ..params.clone() }, limits };
+        // The content key names one backend. If it fails between two parts, its fallback repeats all of them.
+        for _attempt in 0..2 {
+            let memory = Arc::new(Reservation::new(&control.memory));
+            let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
+            if let Some(output) = self.join(backend, spheres, &run, &metered)? {
+                let rounded = if params.quantize.is_some() { QUANTIZED_BYTES * output.size()[0] as u64 } else { 0 };
+                let _rounding = control.reserve(rounded)?;
+                memory.keep();
+                return output.deliver(params, control, sink);
+            }
+        }
+        Err(SurfaceError::Device { why: "different backends meshed the parts".into() })
+    }
+}
+
+/// Parameters and limits of all parts.
+struct Run<'a> {
+    params: &'a SurfaceParams,
+    limits: &'a SurfaceLimits,
+}
+
+/// Returns the centre of the mesh of all spheres: the grid point nearest to the middle.
+fn centre(spheres: &Spheres, params: &SurfaceParams) -> [f64; 3] {
+    let [low, high] = spheres.bounds().unwrap_or_default();
+    let h = params.resolution;
+    std::array::from_fn(|k| (0.5 * (low[k] + high[k]) / h).round() * h)
+}
+
+/// Parts that are meshed.
+struct Joined {
+    mesh: Mesh,
+    grid: GridStats,
+    /// Measures of the parts; `None` if a part was not measured.
+    measures: Option<Vec<Measures>>,
+    made_by: Option<BackendIdentity>,
+    backend: Option<&'static str>,
+}
+
+impl Joined {
+    fn new(centre: [f64; 3]) -> Self {
+        let mesh = Mesh { centre, ..Mesh::default() };
+        Self { mesh, grid: GridStats::default(), measures: Some(Vec::new()), made_by: None, backend: None }
+    }
+
+    /// Records the backend of a part. Returns false if another one made the parts before.
+    fn made_by(&mut self, identity: Option<&BackendIdentity>, backend: &dyn Backend) -> bool {
+        let name = identity.map_or_else(|| backend.name(), |identity| identity.backend);
+        self.made_by = self.made_by.take().or_else(|| identity.cloned());
+        *self.backend.get_or_insert(name) == name
+    }
+
+    /// Adds the mesh of a part.
+    fn push(&mut self, part: &AtomPart, output: MeshOutput) {
+        let MeshOutput { mesh: mut own, grid, measures, .. } = output;
+        let shift: [f64; 3] = std::array::from_fn(|k| own.centre[k] - self.mesh.centre[k]);
+        own.positions.par_chunks_mut(ROWS).flatten_iter().for_each(|position| {
+            *position = std::array::from_fn(|k| to_f32(f64::from(position[k]) + shift[k]));
+        });
+        let [first, n] = [self.mesh.n_vertices(), own.n_vertices()];
+        // `check_size` has checked that indices fit 32 bits; those of this part are checked next.
+        let offset = u32::try_from(first).unwrap_or(u32::MAX);
+        let shifted = |v: u32| v.wrapping_add(offset);
+        own.triangles.par_chunks_mut(ROWS).flatten_iter().for_each(|triangle| *triangle = triangle.map(shifted));
+        if let Some(ids) = &mut own.atom_ids {
+            // Indices of spheres of the part become indices of all spheres.
+            ids.par_chunks_mut(ROWS).flatten_iter().for_each(|id| *id = part.rows[*id as usize]);
+        }
+        let triangles = self.mesh.n_triangles();
+        let range = PartRange {
+            name: part.name.clone(),
+            vertices: first..first + n,
+            triangles: triangles..triangles + own.n_triangles(),
+        };
+        own.centre = self.mesh.centre;
+        self.mesh.append(own);
+        self.mesh.parts.push(range);
+        let all = &mut self.grid;
+        all.bricks += grid.bricks;
+        all.surface_bricks += grid.surface_bricks;
+        all.samples += grid.samples;
+        all.box_cells = all.box_cells.saturating_add(grid.box_cells);
+        all.candidates += grid.candidates;
+        all.overlaps += grid.overlaps;
+        self.measures = self.measures.take().zip(measures).map(|(mut all, mut measures)| {
+            measures.components.iter_mut().for_each(|component| component.shift(shift));
+            all.push(measures);
+            all
+        });
+    }
+
+    /// Adds a part without a surface.
+    fn skip(&mut self, part: &AtomPart) {
+        let [vertices, triangles] = [self.mesh.n_vertices(), self.mesh.n_triangles()];
+        let name = part.name.clone();
+        self.mesh.parts.push(PartRange { name, vertices: vertices..vertices, triangles: triangles..triangles });
+    }
+
+    /// Returns the part of the limits that the next part may use.
+    fn left_of(&self, limits: &SurfaceLimits) -> SurfaceLimits {
+        SurfaceLimits {
+            max_samples: limits.max_samples.saturating_sub(self.grid.samples),
+            max_mesh_bytes: limits.max_mesh_bytes.saturating_sub(self.mesh.bytes()),
+            // One limit applies to both.
+            max_candidates: limits.max_candidates.saturating_sub(self.grid.candidates.max(self.grid.overlaps)),
+        }
+    }
+
+    /// Returns the error of a part as that of all parts. `fraction` of the atoms are meshed, including this part.
+    fn error(&self, error: SurfaceError, run: &Run<'_>, fraction: f64) -> SurfaceError {
+        use SurfaceError as E;
+        let limit = run.limits.max_candidates;
+        match error {
+            E::GridTooLarge { samples, resolution, suggested_resolution, .. } => E::GridTooLarge {
+                // The number of a part is an estimate.
+                samples: self.grid.samples.saturating_add(samples).max(run.limits.max_samples.saturating_add(1)),
+                limit: run.limits.max_samples,
+                resolution,
+                suggested_resolution,
+            },
+            // The spacing that fits one part need not fit all.
+            E::TooManyCandidates { candidates, resolution, .. } => E::TooManyCandidates {
+                candidates: self.grid.candidates + candidates,
+                limit,
+                resolution,
+                suggested_resolution: None,
+            },
+            E::TooManyOverlaps { overlaps, .. } => {
+                E::TooManyOverlaps { overlaps: self.grid.overlaps + overlaps, limit }
+            }
+            E::MeshTooLarge { bytes, .. } => {
+                #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "casts saturate")]
+                let all = (self.mesh.bytes().saturating_add(bytes) as f64 / fraction) as u64;
+                scan::too_large(all, run.params.resolution, run.limits.max_mesh_bytes)
+            }
+            other => other,
+        }
+    }
+
+    /// Returns the mesh of all parts.
+    fn finish(self, params: &SurfaceParams) -> Result<MeshOutput, SurfaceError> {
+        if self.mesh.n_triangles() == 0 {
+            return Err(SurfaceError::NoSurface { isovalue: params.level() });
+        }
+        let measures = self.measures.and_then(Measures::joined);
+        Ok(MeshOutput { measures, made_by: self.made_by, ..MeshOutput::new(self.mesh, self.grid) })
+    }
+}

@@ -1,0 +1,143 @@
+//! Division of the selected atoms into parts, each of which gets its own closed mesh.
+
+use rustc_hash::FxHashMap;
+
+use super::altloc::ATOMS_PER_CHECK;
+use super::atoms::Structure;
+use super::contents::Kind;
+use super::error::StructureError;
+use super::read::{ReadLimits, check};
+use super::select::Selected;
+use crate::surface::Control;
+
+/// Rule by which atoms are divided into parts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum Split {
+    /// One mesh of all atoms.
+    #[default]
+    None,
+    /// One part per author chain; in an assembly, one per copy of a chain.
+    Chain,
+    /// One part per entity.
+    Entity,
+    /// One part per group of kinds: polymer, ligand (with cofactors), glycan, ion, water.
+    ResidueGroup,
+}
+
+impl Split {
+    /// All values.
+    pub const ALL: [Self; 4] = [Self::None, Self::Chain, Self::Entity, Self::ResidueGroup];
+
+    /// Its name as a parameter.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Chain => "chain",
+            Self::Entity => "entity",
+            Self::ResidueGroup => "residue-group",
+        }
+    }
+}
+
+/// Atoms of one part.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AtomPart {
+    /// Name, at most [`MAX_NAME`] characters and the number of a copy.
+    pub name: String,
+    /// Rows of [`Selected::atoms`], ascending.
+    pub rows: Vec<u32>,
+}
+
+/// Maximum length of a name from the file, characters. Chains of the PDB have at most four.
+const MAX_NAME: usize = 40;
+
+/// Name of a blank chain, as in `chains`.
+const BLANK_CHAIN: &str = "_";
+/// Name of atoms whose entity is unknown.
+const UNKNOWN_ENTITY: &str = "unknown";
+
+/// Memory of an atom in a part, bytes: a row in a growing list and its key.
+const BYTES_PER_ROW: u64 = 16;
+
+impl Selected {
+    /// Divides the selected atoms into parts, in order of first appearance; `None` for [`Split::None`]. Adds their
+    /// memory to the meter of `control`.
+    ///
+    /// # Errors
+    /// Returns [`StructureError::TooManyParts`], [`StructureError::NoEntities`] for entities of a file that has none,
+    /// and the errors of memory and cancellation.
+    pub fn parts(
+        &self,
+        structure: &Structure,
+        split: Split,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+    ) -> Result<Option<Vec<AtomPart>>, StructureError> {
+        if split == Split::None {
+            return Ok(None);
+        }
+        if split == Split::Entity && structure.entities.iter().all(String::is_empty) {
+            return Err(StructureError::NoEntities);
+        }
+        control.memory.grow(BYTES_PER_ROW * self.atoms.len() as u64)?;
+        let mut parts = Vec::new();
+        let mut found: FxHashMap<(usize, &str), usize> = FxHashMap::default();
+        let mut copies = self.copies.iter().enumerate().peekable();
+        for (row, index) in (0_usize..).zip(0_u32..).take(self.atoms.len()) {
+            if row % ATOMS_PER_CHECK == 0 {
+                check(control)?;
+            }
+            while copies.peek().is_some_and(|(_, copy)| copy.rows.end <= row) {
+                copies.next();
+            }
+            let i = self.atoms[row] as usize;
+            let copy = copies.peek().filter(|_| split == Split::Chain).map_or(0, |(number, _)| number + 1);
+            let key = (copy, name(structure, split, i));
+            let part = match found.get(&key) {
+                Some(&part) => part,
+                None if parts.len() as u64 >= limits.max_parts => {
+                    return Err(StructureError::TooManyParts { split: split.name(), limit: limits.max_parts });
+                }
+                None => {
+                    found.insert(key, parts.len());
+                    parts.push(AtomPart { name: shown(key), rows: Vec::new() });
+                    parts.len() - 1
+                }
+            };
+            parts[part].rows.push(index);
+        }
+        Ok(Some(parts))
+    }
+}
+
+/// Returns the name of the part of atom `i`, without the number of a copy.
+fn name(structure: &Structure, split: Split, i: usize) -> &str {
+    let (name, if_empty) = match split {
+        Split::None => ("", ""),
+        Split::Chain => (structure.chain.get(i), BLANK_CHAIN),
+        Split::Entity => {
+            let entity = structure.entities.get(structure.label_chain.id(i) as usize);
+            (entity.map_or("", String::as_str), UNKNOWN_ENTITY)
+        }
+        Split::ResidueGroup => (group(structure.kind[i]), ""),
+    };
+    if name.is_empty() { if_empty } else { name }
+}
+
+/// Returns the group of a kind.
+const fn group(kind: Kind) -> &'static str {
+    match kind {
+        Kind::Protein | Kind::Nucleic | Kind::Polymer => "polymer",
+        Kind::Cofactor | Kind::Ligand | Kind::VirtualSite => "ligand",
+        Kind::Glycan => "glycan",
+        Kind::Ion => "ion",
+        Kind::Water => "water",
+    }
+}
+
+/// Returns the name of a part: that in the file, and the number of the copy, from 1, in an assembly.
+fn shown((copy, name): (usize, &str)) -> String {
+    let name: String = name.chars().take(MAX_NAME).collect();
+    if copy == 0 { name } else { format!("{name}-{copy}") }
+}

@@ -1,0 +1,366 @@
+//! Meshes in parts: names, oracles, equality with the meshes of the parts alone, and limits.
+#![allow(clippy::pedantic, clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
+
+use molmesh::formats::{Encoder, Format, FormatError};
+use molmesh::pipeline::params::{self, ParamError};
+use molmesh::pipeline::{Choice, JobError, JobLimits, PartReport, Product, Report, estimate, run};
+use molmesh::structure::{ReadLimits, StructureError, read_with};
+use molmesh::surface::{Control, CpuBackend, MemoryMeter, Mesh, OutOfMemory, SurfaceError, SurfaceLimits, Validation};
+use serde::Deserialize;
+
+use crate::tools;
+use crate::tools::files::Files;
+
+/// Two copies of a protein as chains A and B, which touch, each with a water and an ion.
+fn dimer() -> String {
+    let text = include_str!("../../samples/4pti.pdb");
+    let mut lines = Vec::new();
+    for (chain, shift) in [('A', 0.0), ('B', 14.0)] {
+        for line in text.lines().filter(|line| line.starts_with("ATOM")) {
+            let x: f64 = line[30..38].trim().parse().unwrap();
+            lines.push(format!("{}{chain}{}{:8.3}{}", &line[..21], &line[22..30], x + shift, &line[38..]));
+        }
+        let het = |name: &str, element: &str, residue: &str, x: f64| {
+            format!(
+                "HETATM 9999 {name:<4} {residue:>3} {chain} 900    {x:8.3}{:8.3}{:8.3}  1.00 10.00          {element:>2}",
+                62.0, 62.0
+            )
+        };
+        lines.push(het(" O", "O", "HOH", shift));
+        lines.push(het("ZN", "ZN", "ZN", shift + 30.0));
+    }
+    lines.push("END".to_owned());
+    lines.join("\n") + "\n"
+}
+
+fn meshed_with(text: &str, pairs: &[(&str, &str)], limits: &JobLimits) -> Result<Product, JobError> {
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "" };
+    let job = params::parse(pairs.iter().copied()).unwrap().job;
+    run(text.as_bytes(), &job, limits, &choice, &Control::default(), &(), None)
+}
+
+fn meshed(text: &str, pairs: &[(&str, &str)]) -> Product {
+    meshed_with(text, pairs, &JobLimits::default()).unwrap()
+}
+
+fn names(report: &Report) -> Vec<&str> {
+    report.parts.iter().map(|part| part.name.as_str()).collect()
+}
+
+fn encode(format: Format, product: &Product) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let encoder = Encoder::new(format, product.storage, &product.mesh, &product.meta()).unwrap();
+    encoder.write(&mut bytes).unwrap();
+    assert!(bytes.len() as u64 <= encoder.encoded_len_bound());
+    assert!(encoder.encoded_len().is_none_or(|len| len == bytes.len() as u64));
+    bytes
+}
+
+/// Returns one part of a mesh as a mesh.
+fn part(mesh: &Mesh, n: usize) -> Mesh {
+    let range = &mesh.parts[n];
+    let first = u32::try_from(range.vertices.start).unwrap();
+    Mesh {
+        centre: mesh.centre,
+        positions: range.vertices.clone().map(|v| mesh.position(v)).collect(),
+        normals: mesh.normals[range.vertices.clone()].iter().copied().collect(),
+        triangles: mesh.triangles[range.triangles.clone()].iter().map(|t| t.map(|v| v - first)).collect(),
+        atom_ids: mesh.atom_ids.as_ref().map(|ids| ids[range.vertices.clone()].iter().copied().collect()),
+        ..Mesh::default()
+    }
+}
+
+/// Returns the largest distance between equal vertices of two meshes; infinite if the triangles differ.
+fn distance(a: &Mesh, b: &Mesh) -> f64 {
+    if a.triangles != b.triangles || a.n_vertices() != b.n_vertices() {
+        return f64::INFINITY;
+    }
+    let at = |mesh: &Mesh, v: usize, k: usize| mesh.centre[k] + f64::from(mesh.position(v)[k]);
+    (0..a.n_vertices()).flat_map(|v| [0, 1, 2].map(|k| (at(a, v, k) - at(b, v, k)).abs())).fold(0.0, f64::max)
+}
+
+#[test]
+fn a_part_has_the_mesh_of_its_atoms_alone() {
+    let text = dimer();
+    for surface in ["gaussian", "ses"] {
+        let own = [("surface", surface), ("select", "all"), ("resolution", "0.8"), ("atom_ids", "true")];
+        let both = meshed(&text, &[&own[..], &[("split", "chain")]].concat());
+        let alone = ["A", "B"].map(|chain| meshed(&text, &[&own[..], &[("chains", chain)]].concat()));
+        assert_eq!(names(&both.report), ["A", "B"]);
+        for (n, alone) in alone.iter().enumerate() {
+            let part = part(&both.mesh, n);
+            assert!(distance(&part, &alone.mesh) < 1e-5, "{surface} {n}: {}", distance(&part, &alone.mesh));
+            assert_eq!(part.atom_ids, alone.mesh.atom_ids, "indices of atoms of the file");
+            let PartReport { atoms, vertices, triangles, area, volume, .. } = &both.report.parts[n];
+            let (of, report) = (&alone.report, &both.report);
+            assert_eq!((*atoms, *vertices, *triangles), (of.atoms, of.vertices, of.triangles));
+            assert!((area / of.area - 1.0).abs() < 1e-6 && (volume / of.volume - 1.0).abs() < 1e-6);
+            assert!(report.closed && report.oriented && report.manifold);
+        }
+        // Negative controls: the other chain, and one mesh of both chains.
+        assert!(distance(&part(&both.mesh, 0), &alone[1].mesh).is_infinite());
+        let whole = meshed(&text, &own);
+        assert!(whole.report.parts.is_empty() && whole.mesh.parts.is_empty());
+        assert!(whole.report.area < 0.99 * both.report.area, "the chains touch");
+        let sum = |count: fn(&Report) -> u64| alone.iter().map(|product| count(&product.report)).sum::<u64>();
+        let report = &both.report;
+        assert_eq!((report.triangles, report.vertices), (sum(|r| r.triangles), sum(|r| r.vertices)));
+        assert_eq!((report.samples, report.components), (sum(|r| r.samples), sum(|r| r.components)));
+        assert_eq!(report.euler, alone.iter().map(|product| product.report.euler).sum::<i64>());
+        let voids = |report: &Report| {
+            let mut all: Vec<_> = report.void_list.iter().map(|v| v.center.map(|c| (c * 1e3).round() as i64)).collect();
+            all.sort_unstable();
+            all
+        };
+        let mut expected = [voids(&alone[0].report), voids(&alone[1].report)].concat();
+        expected.sort_unstable();
+        let near = |a: &[i64; 3], b: &[i64; 3]| (0..3).all(|k| (a[k] - b[k]).abs() <= 1);
+        assert!(voids(report).iter().zip(&expected).all(|(a, b)| near(a, b)), "{surface}");
+    }
+}
+
+#[test]
+fn every_rule_names_its_parts() {
+    let text = dimer();
+    let of = |pairs: &[(&str, &str)]| {
+        let report = meshed(&text, &[&[("resolution", "1")], pairs].concat()).report;
+        assert_eq!(report.parts.iter().map(|part| part.atoms).sum::<u64>(), report.atoms);
+        assert_eq!(report.parts.iter().map(|part| part.triangles).sum::<u64>(), report.triangles);
+        let area: f64 = report.parts.iter().map(|part| part.area).sum();
+        assert!((area / report.area - 1.0).abs() < 1e-6);
+        names(&report).join(" ")
+    };
+    assert_eq!(of(&[("split", "chain")]), "A B");
+    assert_eq!(of(&[("split", "residue-group"), ("select", "all")]), "polymer water ion");
+    let cif = include_str!("../../samples/1crn.cif");
+    let crambin = meshed(cif, &[("split", "entity"), ("resolution", "1"), ("select", "all")]).report;
+    assert_eq!(names(&crambin), ["1"]);
+    let copies = meshed(cif, &[("split", "chain"), ("resolution", "1"), ("assembly", "1")]).report;
+    assert_eq!(names(&copies), ["A-1"]);
+    // PDB files have no entities.
+    let error = meshed_with(&text, &[("split", "entity")], &JobLimits::default()).unwrap_err();
+    assert!(error.to_string().contains("expected none, chain or residue-group"), "{error}");
+}
+
+#[test]
+fn bad_values_name_the_valid_ones() {
+    let error = params::parse([("split", "atom")]).unwrap_err();
+    assert!(matches!(error, ParamError::BadValue { name: "split", .. }), "{error}");
+    assert!(error.to_string().contains("none, chain, entity, residue-group"), "{error}");
+    let key = |value| params::canonical(&params::parse([("split", value)]).unwrap().job);
+    let none = params::canonical(&params::parse::<&str, &str>([]).unwrap().job);
+    let keys = ["none", "chain", "entity", "residue-group"].map(key);
+    assert_eq!(keys[0], none);
+    assert!((1..4).all(|n| !keys[..n].contains(&keys[n])), "{keys:?}");
+}
+
+/// Part as trimesh reads it.
+#[derive(Debug, Deserialize)]
+struct Read {
+    name: String,
+    watertight: bool,
+    faces: u64,
+    unused: u64,
+    area: f64,
+    volume: f64,
+}
+
+#[test]
+fn other_readers_see_closed_parts_with_their_names() {
+    let text = dimer();
+    let ways: [(&str, &[(&str, &str)]); 3] = [
+        ("plain", &[("split", "chain")]),
+        ("quantized", &[("split", "chain"), ("compress", "quantize"), ("validation", "exact")]),
+        ("colored", &[("split", "residue-group"), ("color", "element"), ("atom_ids", "true"), ("normals", "none")]),
+    ];
+    let (mut files, mut expected) = (Files::new(), Vec::new());
+    for (name, pairs) in ways {
+        let product = meshed(&text, &[&[("select", "all"), ("resolution", "0.7")], pairs].concat());
+        assert_eq!(product.mesh.quantized.is_some(), name == "quantized");
+        for format in [Format::Glb, Format::Gltf, Format::Obj] {
+            if format != Format::Obj || name != "quantized" {
+                files.add(&format!("{name}.{format}"), &encode(format, &product));
+                expected.push((format, product.report.clone()));
+            }
+        }
+    }
+    // Negative control: a part that lacks a triangle.
+    let mut broken = meshed(&text, &[("split", "chain"), ("resolution", "1")]);
+    let last = broken.mesh.n_triangles() - 1;
+    broken.mesh.triangles = broken.mesh.triangles[..last].iter().copied().collect();
+    broken.mesh.parts[1].triangles.end = last;
+    files.add("broken.glb", &encode(Format::Glb, &broken));
+    let gltf: Vec<_> = files.paths.iter().filter(|path| path.extension().unwrap() != "obj").collect();
+    if let Some(reports) = tools::gltf_validate(&gltf) {
+        for report in &reports {
+            report.assert_clean();
+        }
+    }
+    let Some(read) = tools::python::<Vec<Read>>("check_parts.py", &files.paths) else { return };
+    let (broken, good) = read.split_last().unwrap();
+    assert_eq!(broken.iter().map(|part| part.watertight).collect::<Vec<_>>(), [true, false]);
+    for (read, (format, report)) in good.iter().zip(expected) {
+        let mut parts = report.parts;
+        parts.sort_by(|a, b| a.name.cmp(&b.name));
+        assert_eq!(read.len(), parts.len(), "{format} {read:?}");
+        for (read, part) in read.iter().zip(parts) {
+            assert!(read.watertight, "{format} {read:?}");
+            // trimesh prefixes groups with the name of the object.
+            let name = read.name.strip_prefix("surface_").unwrap_or(&read.name);
+            assert_eq!((name, read.faces, read.unused), (part.name.as_str(), part.triangles, 0), "{format}");
+            assert!((read.area / part.area - 1.0).abs() < 1e-4, "{format} {read:?} {part:?}");
+            assert!((read.volume / part.volume - 1.0).abs() < 1e-4, "{format} {read:?} {part:?}");
+        }
+    }
+}
+
+#[test]
+fn formats_without_parts_hold_all_triangles() {
+    let product = meshed(&dimer(), &[("split", "chain"), ("resolution", "1")]);
+    let n = product.mesh.n_triangles();
+    assert_eq!(encode(Format::Stl, &product).len(), 84 + 50 * n);
+    let mut plain = product.clone();
+    plain.mesh.parts = Vec::new();
+    assert_eq!(encode(Format::Ply, &product), encode(Format::Ply, &plain));
+}
+
+#[test]
+fn parts_that_share_vertices_are_rejected() {
+    let mut product = meshed(&dimer(), &[("split", "chain"), ("resolution", "1")]);
+    let check = |product: &Product| Encoder::new(Format::Glb, product.storage, &product.mesh, &product.meta()).err();
+    assert_eq!(check(&product), None);
+    let part = |name: &str| Some(FormatError::BadPart { part: name.into() });
+    let end = product.mesh.parts[1].triangles.end;
+    product.mesh.parts[1].triangles.end = end - 1;
+    assert_eq!(check(&product), part("B"));
+    product.mesh.parts[1].triangles.end = end + 1;
+    assert_eq!(check(&product), part("B"));
+    product.mesh.parts[1].triangles.end = end;
+    product.mesh.triangles[end - 1][0] = 0;
+    assert_eq!(check(&product), part("B"));
+}
+
+#[test]
+fn parts_without_a_surface_are_reported_and_not_written() {
+    // A coarse grid has no point inside the ion.
+    let pairs = [("split", "residue-group"), ("select", "protein,ion"), ("resolution", "4")];
+    let product = meshed(&dimer(), &pairs);
+    let triangles: Vec<u64> = product.report.parts.iter().map(|part| part.triangles).collect();
+    assert!(triangles[0] > 0 && triangles[1] == 0 && product.report.parts[1].atoms == 2, "{triangles:?}");
+    let bytes = encode(Format::Glb, &product);
+    let json = tools::readers::split_glb(&bytes).json;
+    assert_eq!(json["nodes"].as_array().unwrap().len(), 2);
+    assert_eq!((&json["nodes"][1]["name"], json["meshes"].as_array().unwrap().len()), (&"polymer".into(), 1));
+}
+
+#[test]
+fn a_limit_on_triangles_is_that_of_all_parts() {
+    let product = meshed(&dimer(), &[("split", "chain"), ("max_triangles", "8000")]);
+    assert!((4000..=8000).contains(&product.report.triangles), "{}", product.report.triangles);
+    assert_eq!(names(&product.report), ["A", "B"]);
+    let fixed = meshed(&dimer(), &[("split", "chain"), ("resolution", &product.report.resolution.to_string())]);
+    assert_eq!(fixed.mesh, product.mesh);
+}
+
+#[test]
+fn the_number_of_parts_is_limited() {
+    let limited = |max_parts| {
+        let limits = JobLimits { read: ReadLimits { max_parts, ..ReadLimits::default() }, ..JobLimits::default() };
+        meshed_with(&dimer(), &[("split", "chain"), ("resolution", "2")], &limits)
+    };
+    assert_eq!(limited(2).unwrap().report.parts.len(), 2);
+    let error = limited(1).unwrap_err();
+    assert_eq!(error, JobError::Structure(StructureError::TooManyParts { split: "chain", limit: 1 }));
+}
+
+#[test]
+fn limits_of_meshing_apply_to_all_parts_together() {
+    let text = dimer();
+    let usual = meshed(&text, &[("split", "chain"), ("resolution", "0.8")]);
+    let one = meshed(&text, &[("chains", "B"), ("resolution", "0.8")]);
+    let surface = SurfaceLimits::default();
+    let with = |surface, h: &str| {
+        meshed_with(&text, &[("split", "chain"), ("resolution", h)], &JobLimits { surface, ..JobLimits::default() })
+    };
+    // Each part fits, both together do not.
+    let samples = usual.report.samples;
+    assert!(one.report.samples < samples - 1);
+    assert!(with(SurfaceLimits { max_samples: samples, ..surface }, "0.8").is_ok());
+    let few = SurfaceLimits { max_samples: samples - 1, ..surface };
+    let error = with(few, "0.8").unwrap_err();
+    let JobError::Surface(SurfaceError::GridTooLarge { samples: n, limit, suggested_resolution, .. }) = error else {
+        panic!("{error}")
+    };
+    assert!(n >= samples && limit == samples - 1, "{n} {limit}");
+    assert!(with(few, &suggested_resolution.to_string()).is_ok(), "{suggested_resolution}");
+    let bytes = usual.mesh.bytes();
+    assert!(one.mesh.bytes() < bytes - 1);
+    assert!(with(SurfaceLimits { max_mesh_bytes: bytes, ..surface }, "0.8").is_ok());
+    let few = SurfaceLimits { max_mesh_bytes: bytes - 1, ..surface };
+    let error = with(few, "0.8").unwrap_err();
+    let JobError::Surface(SurfaceError::MeshTooLarge { limit, suggested_resolution, .. }) = error else {
+        panic!("{error}")
+    };
+    assert_eq!(limit, bytes - 1);
+    assert!(with(few, &suggested_resolution.to_string()).is_ok(), "{suggested_resolution}");
+    let error = with(SurfaceLimits { max_candidates: 3000, ..surface }, "0.8").unwrap_err();
+    let JobError::Surface(SurfaceError::TooManyCandidates { candidates, limit: 3000, .. }) = error else {
+        panic!("{error}")
+    };
+    assert!(candidates > 3000);
+}
+
+#[test]
+fn estimates_count_every_part() {
+    let text = dimer();
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "" };
+    let job = params::parse([("split", "chain"), ("resolution", "0.8"), ("compress", "quantize")]).unwrap().job;
+    let (limits, control) = (JobLimits::default(), Control::default());
+    let read = |control: &Control<'_>| read_with(text.as_bytes(), &limits.read, control).map(Box::new);
+    let made = run(text.as_bytes(), &job, &limits, &choice, &control, &(), None).unwrap().report;
+    let expected = estimate(read, &job, &limits, &choice, &control).unwrap();
+    let mesh = expected.mesh.unwrap();
+    assert_eq!((mesh.samples, expected.box_cells), (made.samples, made.box_cells));
+    let ratio = mesh.triangles as f64 / made.triangles as f64;
+    assert!((0.8..1.25).contains(&ratio), "{ratio}");
+    let few = JobLimits { surface: SurfaceLimits { max_samples: made.samples - 1, ..limits.surface }, ..limits };
+    let refused = estimate(read, &job, &few, &choice, &control).unwrap().mesh.unwrap_err();
+    assert!(matches!(refused, SurfaceError::GridTooLarge { .. }), "{refused}");
+}
+
+/// Meter that counts bytes.
+#[derive(Debug, Default)]
+struct Meter(AtomicI64);
+
+impl MemoryMeter for Meter {
+    fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
+        self.0.fetch_add(bytes as i64, Ordering::Relaxed);
+        Ok(())
+    }
+
+    fn shrink(&self, bytes: u64) {
+        self.0.fetch_sub(bytes as i64, Ordering::Relaxed);
+    }
+}
+
+#[test]
+fn memory_of_the_joined_mesh_stays_counted() {
+    let text = dimer();
+    let held = |pairs: &[(&str, &str)]| {
+        let (backend, meter) = (CpuBackend::new(Some(1)).unwrap(), Arc::new(Meter::default()));
+        let choice = Choice { backend: &backend, reason: "" };
+        let job = params::parse(pairs.iter().copied()).unwrap().job;
+        assert_eq!(job.validation, Validation::Checksum);
+        let control = Control { memory: meter.clone(), ..Control::default() };
+        let product = run(text.as_bytes(), &job, &JobLimits::default(), &choice, &control, &(), None).unwrap();
+        (meter.0.load(Ordering::Relaxed), product.mesh.bytes() as i64, product.report.atoms as i64)
+    };
+    let (whole, bytes, _) = held(&[("resolution", "1")]);
+    let (split, parts, atoms) = held(&[("resolution", "1"), ("split", "chain")]);
+    assert_eq!(split - parts, whole - bytes + 16 * atoms);
+}

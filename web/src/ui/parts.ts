@@ -1,0 +1,18 @@
+/** List of the parts of a surface, which shows and hides them. */
+
+import type { Viewer } from "../scene/viewer";
+import { el } from "./dom";
+
+/** Lists the parts in `home`, or hides `home` if the surface is not divided. */
+export function listParts(home: HTMLElement, names: string[], viewer: Viewer): void {
+  home.hidden = names.length < 2;
+  const shown = new Set(viewer.shownParts);
+  const entries = home.hidden ? [] : names.map((name) => entry(name, shown.has(name), viewer));
+  home.replaceChildren(...entries);
+}
+
+function entry(name: string, shown: boolean, viewer: Viewer): HTMLElement {
+  const box = el("input", { type: "checkbox", checked: shown });
+  box.addEventListener("change", () => viewer.showPart(name, box.checked));
+  return el("label", {}, box, name);
+}
