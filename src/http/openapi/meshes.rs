@@ -38,7 +38,7 @@ fn reference<T: ToSchema>() -> Content {
     ContentBuilder::new().schema(Some(Ref::from_schema_name(T::name()))).build()
 }
 
-/// Returns a response with the bytes of a mesh file. `model/*` stands for the types of GLB, glTF, STL and OBJ:
+/// Returns a response with the bytes of a mesh file. `model/*` stands for all types that begin with it:
 /// generators take types that end in `+json` for JSON documents.
 fn mesh(doc: &str) -> ResponseBuilder {
     let etag = "Strong validator of the file. Equal tags mean equal bytes.";
@@ -63,7 +63,7 @@ fn mesh(doc: &str) -> ResponseBuilder {
 /// 200: the whole file.
 fn whole() -> RefOr<Response> {
     let doc = "The mesh. Its media type follows from the format: `model/gltf-binary` (glb), `model/gltf+json` (gltf), \
-               `application/ply`, `model/stl`, `model/obj` or `image/png`; \
+               `application/ply`, `model/x-ply-text`, `model/stl`, `model/obj` or `image/png`; \
                `application/octet-stream` if `Accept` prefers it.";
     RefOr::T(mesh(doc).build())
 }
