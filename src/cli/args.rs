@@ -98,7 +98,7 @@ pub(crate) enum ReportStyle {
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{MESH_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct MeshArgs {
-    /// Structure file: PDB, mmCIF or BinaryCIF, optionally compressed with gzip or zstd; `-` is stdin
+    /// Structure file: PDB, mmCIF, BinaryCIF, PQR or XYZ, optionally compressed with gzip or zstd; `-` is stdin
     pub(crate) input: PathBuf,
     /// Mesh file; `-` is stdout
     #[arg(short, long)]

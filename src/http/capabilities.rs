@@ -260,7 +260,7 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
         version: env!("CARGO_PKG_VERSION"),
         units: Units { length: "Å", area: "Å²", volume: "Å³" },
         inputs: Inputs {
-            formats: &["pdb", "mmcif", "bcif"],
+            formats: &["pdb", "mmcif", "bcif", "pqr", "xyz"],
             encodings: &["identity", "gzip", "zstd"],
             note: "The format is detected from the bytes; Content-Type is a hint.",
         },
