@@ -98,12 +98,12 @@ pub(crate) enum ReportStyle {
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{MESH_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct MeshArgs {
-    /// Structure file: PDB, mmCIF or BinaryCIF, optionally compressed with gzip or zstd; `-` is stdin
+    /// Structure file: PDB, mmCIF, BinaryCIF, PQR or XYZ, optionally compressed with gzip or zstd; `-` is stdin
     pub(crate) input: PathBuf,
     /// Mesh file; `-` is stdout
     #[arg(short, long)]
     pub(crate) output: PathBuf,
-    /// glb, gltf, ply, stl or obj [default: by the extension of the output, glb on stdout]
+    /// glb, gltf, ply, ply-text, stl or obj [default: by the extension of the output, glb on stdout]
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
     /// Vertex compression of glb and gltf: none, or quantize (12 bytes instead of 24: 16-bit positions, 8-bit normals)

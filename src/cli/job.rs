@@ -105,7 +105,7 @@ impl<'a> CommandJob<'a> {
         let start = Instant::now();
         output.finish()?;
         report.add_timing("write", (writing + start.elapsed()).as_secs_f64() * 1e3);
-        let written = Written { name: &name, format: format.extension(), bytes };
+        let written = Written { name: &name, format: format.name(), bytes };
         write_report(self.args, &report, self.findings.as_deref(), &written, to_stdout)
     }
 }

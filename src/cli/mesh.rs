@@ -49,7 +49,7 @@ fn named(name: &str) -> Result<Format, CliError> {
         }),
         Ok(format) => Ok(format),
         Err(_unknown) => {
-            let expected = Format::MESHES.map(Format::extension).join(", ");
+            let expected = Format::MESHES.map(Format::name).join(", ");
             Err(CliError::usage(format!("parameter `format`: `{name}` is not allowed; expected one of {expected}")))
         }
     }
@@ -59,7 +59,7 @@ fn named(name: &str) -> Result<Format, CliError> {
 fn format_of(output: &Path) -> Result<Format, CliError> {
     let unknown = |why: &str| CliError::Usage {
         message: format!("cannot tell the format of `{}`: {why}", output.display()),
-        hint: Some(format!("name the format with --format: {}", Format::MESHES.map(Format::extension).join(", "))),
+        hint: Some(format!("name the format with --format: {}", Format::MESHES.map(Format::name).join(", "))),
     };
     match output.extension().map(|extension| extension.to_string_lossy()) {
         Some(extension) if extension.parse::<Format>().is_ok() => named(&extension),

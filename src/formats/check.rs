@@ -20,7 +20,7 @@ fn needs_indices(format: Format, n_vertices: usize) -> bool {
     match format {
         Format::Stl => true,
         Format::Glb | Format::Gltf => u16::try_from(n_vertices).is_ok(),
-        Format::Ply | Format::Obj | Format::Png => false,
+        Format::Ply | Format::PlyText | Format::Obj | Format::Png => false,
     }
 }
 
@@ -58,7 +58,7 @@ pub(super) fn check(mesh: &Mesh, format: Format) -> Result<Summary, FormatError>
         Some(_) => mesh.bounds().map(|row| row.map(|v| v + 0.0)),
         None => extent("position", &mesh.positions[..])?.unwrap_or_default(),
     };
-    if format == Format::Obj {
+    if matches!(format, Format::PlyText | Format::Obj) {
         // The writer relies on a bounded length of lines.
         check_normals(&mesh.normals[..])?;
     }

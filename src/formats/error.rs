@@ -77,8 +77,8 @@ pub enum FormatError {
         /// Largest index that is exact.
         limit: u32,
     },
-    /// A coordinate has too many digits for an OBJ line.
-    #[error("a coordinate of {value} cannot be written to OBJ, the limit is ±{limit}")]
+    /// A coordinate has too many digits for a line of OBJ or text PLY.
+    #[error("a coordinate of {value} cannot be written as text, the limit is ±{limit}")]
     CoordinateTooLarge {
         /// The coordinate, in the file's units.
         value: f64,

@@ -15,6 +15,8 @@ pub enum Format {
     Gltf,
     /// PLY, binary little-endian.
     Ply,
+    /// PLY, text.
+    PlyText,
     /// STL, binary.
     Stl,
     /// Wavefront OBJ.
@@ -25,23 +27,33 @@ pub enum Format {
 
 /// Error: no format has this name.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("unknown format `{0}`; expected one of glb, gltf, ply, stl, obj, png")]
+#[error("unknown format `{0}`; expected one of glb, gltf, ply, ply-text, stl, obj, png")]
 pub struct UnknownFormat(pub String);
 
 impl Format {
     /// Every format.
-    pub const ALL: [Self; 6] = [Self::Glb, Self::Gltf, Self::Ply, Self::Stl, Self::Obj, Self::Png];
+    pub const ALL: [Self; 7] = [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj, Self::Png];
 
     /// Formats that hold a mesh.
-    pub const MESHES: [Self; 5] = [Self::Glb, Self::Gltf, Self::Ply, Self::Stl, Self::Obj];
+    pub const MESHES: [Self; 6] = [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj];
 
-    /// File extension and name, without a dot.
+    /// Extension of file names, without a dot.
     #[must_use]
     pub const fn extension(self) -> &'static str {
+        match self {
+            Self::PlyText => "ply",
+            _ => self.name(),
+        }
+    }
+
+    /// Name as a parameter and in addresses.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
         match self {
             Self::Glb => "glb",
             Self::Gltf => "gltf",
             Self::Ply => "ply",
+            Self::PlyText => "ply-text",
             Self::Stl => "stl",
             Self::Obj => "obj",
             Self::Png => "png",
@@ -57,7 +69,7 @@ impl Format {
     /// Returns true if files of the format are text.
     #[must_use]
     pub const fn is_text(self) -> bool {
-        matches!(self, Self::Gltf | Self::Obj)
+        matches!(self, Self::Gltf | Self::PlyText | Self::Obj)
     }
 
     /// Returns true if the format can hold quantized vertices.
@@ -66,13 +78,14 @@ impl Format {
         matches!(self, Self::Glb | Self::Gltf)
     }
 
-    /// Media type, registered with IANA except that of PLY, for which `application/ply` is common.
+    /// Media type, registered with IANA except those of PLY: `application/ply` is common, the other names its variant.
     #[must_use]
     pub const fn media_type(self) -> &'static str {
         match self {
             Self::Glb => "model/gltf-binary",
             Self::Gltf => "model/gltf+json",
             Self::Ply => "application/ply",
+            Self::PlyText => "model/x-ply-text",
             Self::Stl => "model/stl",
             Self::Obj => "model/obj",
             Self::Png => "image/png",
@@ -82,7 +95,7 @@ impl Format {
 
 impl fmt::Display for Format {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.extension())
+        f.write_str(self.name())
     }
 }
 
@@ -91,7 +104,7 @@ impl FromStr for Format {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let lower = text.to_ascii_lowercase();
-        Self::ALL.into_iter().find(|f| f.extension() == lower).ok_or_else(|| UnknownFormat(text.to_owned()))
+        Self::ALL.into_iter().find(|f| f.name() == lower).ok_or_else(|| UnknownFormat(text.to_owned()))
     }
 }
 

@@ -13,8 +13,10 @@ mod check;
 mod error;
 mod format;
 mod gltf;
+mod lines;
 mod obj;
 mod ply;
+mod ply_text;
 pub mod quantize;
 mod stl;
 mod storage;
@@ -55,6 +57,7 @@ enum Plan {
     Glb(gltf::GlbPlan),
     Gltf(gltf::GltfPlan),
     Ply(ply::PlyPlan),
+    PlyText(ply_text::PlyTextPlan),
     Stl(stl::StlPlan),
     Obj(obj::ObjPlan),
 }
@@ -69,10 +72,10 @@ impl<'a> Encoder<'a> {
     pub fn new(format: Format, storage: impl Into<Storage>, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
         let storage = storage.into();
         if storage.packing != Packing::Full && !format.holds_quantized() {
-            return Err(FormatError::QuantizationNotSupported { format: format.extension() });
+            return Err(FormatError::QuantizationNotSupported { format: format.name() });
         }
         if !format.holds_units(storage.units) {
-            return Err(FormatError::UnitsNotSupported { format: format.extension(), units: storage.units.name() });
+            return Err(FormatError::UnitsNotSupported { format: format.name(), units: storage.units.name() });
         }
         if let Packing::Quantized(step) = Packing::of(mesh)
             && storage.packing != Packing::Quantized(step)
@@ -84,14 +87,15 @@ impl<'a> Encoder<'a> {
             Format::Glb => Plan::Glb(gltf::GlbPlan::new(mesh, storage, &summary, meta)?),
             Format::Gltf => Plan::Gltf(gltf::GltfPlan::new(mesh, storage, &summary, meta)?),
             Format::Ply => Plan::Ply(ply::PlyPlan::new(mesh, storage, meta)),
+            Format::PlyText => Plan::PlyText(ply_text::PlyTextPlan::new(mesh, storage, &summary, meta)?),
             Format::Stl => Plan::Stl(stl::StlPlan::new(mesh, storage.units, meta)?),
             Format::Obj => Plan::Obj(obj::ObjPlan::new(mesh, storage, &summary, meta)?),
-            Format::Png => return Err(FormatError::NotAMeshFormat { format: format.extension() }),
+            Format::Png => return Err(FormatError::NotAMeshFormat { format: format.name() }),
         };
         Ok(Self { mesh, plan })
     }
 
-    /// Returns the exact length of the file, bytes; `None` for OBJ.
+    /// Returns the exact length of the file, bytes; `None` for OBJ and text PLY.
     #[must_use]
     pub fn encoded_len(&self) -> Option<u64> {
         match &self.plan {
@@ -99,7 +103,7 @@ impl<'a> Encoder<'a> {
             Plan::Gltf(plan) => Some(plan.len()),
             Plan::Ply(plan) => Some(plan.len()),
             Plan::Stl(plan) => Some(plan.len()),
-            Plan::Obj(_) => None,
+            Plan::PlyText(_) | Plan::Obj(_) => None,
         }
     }
 
@@ -107,6 +111,7 @@ impl<'a> Encoder<'a> {
     #[must_use]
     pub fn encoded_len_bound(&self) -> u64 {
         match &self.plan {
+            Plan::PlyText(plan) => plan.len_bound(),
             Plan::Obj(plan) => plan.len_bound(),
             _ => self.encoded_len().unwrap_or(u64::MAX),
         }
@@ -123,6 +128,7 @@ impl<'a> Encoder<'a> {
             Plan::Glb(plan) => plan.write(self.mesh, out),
             Plan::Gltf(plan) => plan.write(self.mesh, out),
             Plan::Ply(plan) => plan.write(self.mesh, out),
+            Plan::PlyText(plan) => plan.write(self.mesh, out),
             Plan::Stl(plan) => plan.write(self.mesh, out),
             Plan::Obj(plan) => plan.write(self.mesh, out),
         }?;

@@ -1,4 +1,5 @@
-//! PLY, binary little-endian: a text header, then packed vertex records, then packed faces.
+//! PLY, binary little-endian: a text header, then packed vertex records, then packed faces. [`super::ply_text`] writes
+//! the variant whose records are text.
 
 use std::io::{self, Write};
 
@@ -19,7 +20,7 @@ pub(super) struct PlyPlan {
 
 impl PlyPlan {
     pub(super) fn new(mesh: &Mesh, storage: Storage, meta: &Meta) -> Self {
-        let header = header(mesh, storage, meta);
+        let header = header(mesh, storage, meta, "binary_little_endian", None);
         let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
         let vertex = vertex_bytes(mesh, storage.normals) as u64;
         let len = header.len() as u64 + vertex * n_vertices + FACE_BYTES as u64 * n_triangles;
@@ -84,9 +85,10 @@ fn vertices<const N: usize>(mesh: &Mesh, storage: Storage, out: &mut dyn Write) 
     })
 }
 
-fn header(mesh: &Mesh, storage: Storage, meta: &Meta) -> String {
-    let mut lines = vec!["ply".to_owned(), "format binary_little_endian 1.0".to_owned()];
-    lines.extend(text::facts(mesh, meta, storage.units, None).into_iter().map(|fact| format!("comment {fact}")));
+/// Returns the header of a file with records in this encoding. `precision` describes the rounding of its numbers.
+pub(super) fn header(mesh: &Mesh, storage: Storage, meta: &Meta, encoding: &str, precision: Option<&str>) -> String {
+    let mut lines = vec!["ply".to_owned(), format!("format {encoding} 1.0")];
+    lines.extend(text::facts(mesh, meta, storage.units, precision).into_iter().map(|fact| format!("comment {fact}")));
     lines.push(format!("element vertex {}", mesh.positions.len()));
     let floats: &[&str] = match storage.normals {
         Normals::Smooth => &["x", "y", "z", "nx", "ny", "nz"],

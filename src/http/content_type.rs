@@ -34,6 +34,8 @@ impl DeclaredType {
         match (kind, subtype) {
             ("chemical", "x-pdb" | "pdb") => Self::Structure(SourceFormat::Pdb, essence),
             ("chemical", "x-mmcif" | "mmcif" | "x-cif" | "cif") => Self::Structure(SourceFormat::Mmcif, essence),
+            ("chemical", "x-pqr" | "pqr") => Self::Structure(SourceFormat::Pqr, essence),
+            ("chemical", "x-xyz" | "xyz") => Self::Structure(SourceFormat::Xyz, essence),
             // BinaryCIF has no registered type; that of its container is.
             ("chemical", "x-bcif" | "bcif" | "x-binarycif")
             | ("application", "vnd.binarycif" | "x-bcif" | "vnd.msgpack" | "msgpack" | "x-msgpack") => {
@@ -115,6 +117,8 @@ mod tests {
             assert!(DeclaredType::new(binary).check_format("mmcif").is_err(), "{binary}");
         }
         assert!(DeclaredType::new("chemical/x-mmcif").check_format("bcif").is_err());
+        assert!(DeclaredType::new("chemical/x-xyz").check_format("xyz").is_ok());
+        assert!(DeclaredType::new("chemical/x-pqr").check_format("pdb").is_err());
         assert!(DeclaredType::new("application/gzip").check_bytes(b"ATOM").is_err());
         assert!(DeclaredType::new("application/gzip").check_bytes(&[0x1f, 0x8b, 8]).is_ok());
     }

@@ -150,7 +150,7 @@ pub(super) async fn create(
         resolution: estimate.resolution,
         resolution_from: job.spacing.parameter(),
         surface: job.params.surface.name(),
-        format: format.extension(),
+        format: format.name(),
         box_cells: estimate.box_cells,
         bricks: mesh.map(|m| m.bricks),
         samples: mesh.map(|m| m.samples),

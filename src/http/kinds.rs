@@ -152,7 +152,7 @@ pub(super) const KINDS: &[Row] = &[
     row(Kind::WrongHost, "wrong-host", S::MISDIRECTED_REQUEST, true, "The service has another host name",
         "The service listens on this machine only and does not answer to the host of the request. Use `localhost`, or ask the operator to add the name to server.hosts."),
     row(Kind::UnreadableStructure, "unreadable-structure", S::UNPROCESSABLE_ENTITY, false, "The structure cannot be read",
-        "The body is not a valid PDB, mmCIF or BinaryCIF file. `line` and `column` (text) or `place` (binary) locate the error, `found` and `expected` describe it, and `diagnostics` lists the findings of the strict validator."),
+        "The body is not a valid PDB, mmCIF, BinaryCIF, PQR or XYZ file. `line` and `column` (text) or `place` (binary) locate the error, `found` and `expected` describe it, and `diagnostics` lists the findings of the strict validator."),
     row(Kind::NoAtoms, "no-atoms", S::UNPROCESSABLE_ENTITY, false, "The structure has no atoms",
         "The file has no atoms with coordinates. `found` describes its content."),
     row(Kind::EmptySelection, "empty-selection", S::UNPROCESSABLE_ENTITY, false, "The selection is empty",

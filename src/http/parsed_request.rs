@@ -41,8 +41,8 @@ impl ParsedRequest {
         let format = file.map(format_of).transpose()?;
         let (pairs, mut request) = parse(query)?;
         if let (Some(format), Some(other)) = (format, request.format) {
-            let value = other.extension();
-            let detail = format!("parameter `format`: the address already says {}", format.extension());
+            let value = other.name();
+            let detail = format!("parameter `format`: the address already says {}", format.name());
             return Err(Problem::new(Kind::BadParameter, detail)
                 .with("parameter", "format")
                 .with("value", value)
@@ -100,9 +100,9 @@ fn finish(app: &App, request: &mut Request, headers: &HeaderMap) -> Result<Forma
 
 /// Returns the format that `surface.{ext}` names.
 fn format_of(file: &str) -> Result<Format, Problem> {
-    let format = |ext| Format::ALL.into_iter().find(|format| format.extension() == ext);
+    let format = |ext| Format::ALL.into_iter().find(|format| format.name() == ext);
     file.strip_prefix("surface.").and_then(format).ok_or_else(|| {
-        let available: Vec<String> = Format::ALL.iter().map(|f| format!("surface.{}", f.extension())).collect();
+        let available: Vec<String> = Format::ALL.iter().map(|f| format!("surface.{}", f.name())).collect();
         let detail = format!("a structure has no `{file}`; it has {}", available.join(", "));
         Problem::new(Kind::NotFound, detail).with("available", available)
     })

@@ -120,7 +120,7 @@ fn no_such_result(what: &str) -> Problem {
 
 fn parse(file: &str, namespace: Namespace) -> Option<(ContentKey, Format)> {
     let (key, extension) = file.split_once('.')?;
-    let format = Format::ALL.into_iter().find(|format| format.extension() == extension)?;
+    let format = Format::ALL.into_iter().find(|format| format.name() == extension)?;
     Some((ContentKey::parse(key, namespace).ok()?, format))
 }
 
@@ -133,7 +133,7 @@ pub(super) async fn stored(
     method: &Method,
     headers: &HeaderMap,
 ) -> Result<Option<Response>, Problem> {
-    let name = key.name(format.extension())?;
+    let name = key.name(format.name())?;
     app.pool.settings().budget.check()?;
     let Some((meta, mut body)) = app.store.read(&name, None).await? else { return Ok(None) };
     let Some(headers_of_result) = result_headers(app, key, format).await? else { return Ok(None) };
@@ -185,7 +185,7 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
     headers.insert(header::ETAG, delivery::etag(key));
     headers.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
     headers.insert(header::CACHE_CONTROL, IMMUTABLE);
-    headers.insert(header::CONTENT_LOCATION, delivery::text(&path(key, format.extension())));
+    headers.insert(header::CONTENT_LOCATION, delivery::text(&path(key, format.name())));
     headers.insert(SERVER_TIMING, HeaderValue::from_static("cache;desc=hit"));
     let headers = Arc::new(headers);
     app.result_headers.insert(*key, Arc::clone(&headers));

@@ -47,10 +47,10 @@ fn check_file(row: &Row, path: &str) -> Result<(), String> {
         return Ok(());
     }
     let (stem, extension) = path.rsplit('/').next().and_then(|file| file.split_once('.')).unwrap_or_default();
-    let is_mesh = Format::ALL.into_iter().any(|format| format.extension() == extension);
+    let is_mesh = Format::ALL.into_iter().any(|format| format.name() == extension);
     let is_named = if is_result(row) { stem.len() == 64 } else { stem == "surface" };
     let expected = if is_result(row) { "a result has a name of 64 digits" } else { "a structure has `surface`" };
-    let of = || format!("{expected} and one of the extensions {}", Format::ALL.map(Format::extension).join(", "));
+    let of = || format!("{expected} and one of the extensions {}", Format::ALL.map(Format::name).join(", "));
     if is_mesh && is_named { Ok(()) } else { Err(of()) }
 }
 

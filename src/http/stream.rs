@@ -90,7 +90,7 @@ fn write(
         Ok(()) => {}
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => tracing::debug!("the client left"),
         // The body fails without `Piece::End`, which aborts the connection: a truncated mesh must not look complete.
-        Err(error) => tracing::error!(%error, format = format.extension(), "writing a mesh failed"),
+        Err(error) => tracing::error!(%error, format = format.name(), "writing a mesh failed"),
     }
 }
 

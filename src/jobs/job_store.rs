@@ -145,7 +145,7 @@ impl JobStore {
             namespace,
             input: spec.task.digest.to_string(),
             parameters: spec.parameters,
-            format: spec.format.extension().to_owned(),
+            format: spec.format.name().to_owned(),
             client,
             urgency: spec.task.rank.urgency,
             status: Status::Accepted,
@@ -213,7 +213,7 @@ impl JobStore {
         let makers = if task.strict { Vec::new() } else { self.0.pool.makers(&task.job) };
         for maker in makers {
             let key = ContentKey::new(&task.digest, &task.job, format, &maker, task.namespace);
-            let pin = self.0.store.pin(&key.name(format.extension())?);
+            let pin = self.0.store.pin(&key.name(format.name())?);
             if results::is_stored(&self.0.store, format, &key).await? {
                 return Ok(Some((key.to_string(), pin)));
             }

@@ -18,7 +18,7 @@ impl ContentKey {
     /// renderer. The version is part of the key, since a release may change the last bits.
     pub(crate) fn new(input: &Digest, job: &Job, format: Format, maker: &str, namespace: Namespace) -> Self {
         let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));
-        let text = format!("molmesh {version}\n{maker}\n{}\n{canonical}\n{input}\n", format.extension());
+        let text = format!("molmesh {version}\n{maker}\n{}\n{canonical}\n{input}\n", format.name());
         Self { digest: Digest::of(text.as_bytes()), namespace }
     }
 

@@ -44,7 +44,7 @@ impl SaveError {
 
 /// Returns true if a mesh and its report are stored. A mesh without its report counts as absent.
 pub(crate) async fn is_stored(store: &Store, format: Format, key: &ContentKey) -> Result<bool, StoreError> {
-    let (mesh, report) = (key.name(format.extension())?, key.name(REPORT)?);
+    let (mesh, report) = (key.name(format.name())?, key.name(REPORT)?);
     Ok(store.head(&mesh).await?.is_some() && store.head(&report).await?.is_some())
 }
 
@@ -57,7 +57,7 @@ pub(crate) async fn save(
     key: &ContentKey,
     limit: u64,
 ) -> Result<Pin, SaveError> {
-    let (mesh, report) = (key.name(format.extension())?, key.name(REPORT)?);
+    let (mesh, report) = (key.name(format.name())?, key.name(REPORT)?);
     // Writing the mesh must not evict its report.
     let pin = store.pin(&mesh);
     if is_stored(store, format, key).await? {

@@ -138,7 +138,7 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
 /// support.
 pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
-        let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::extension).collect();
+        let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::name).collect();
         Err(ParamError::BadValue {
             name,
             value: format!("`{value}`"),

@@ -8,7 +8,7 @@ use super::left_out::LeftOutReport;
 use super::parts::PartReport;
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
-use crate::structure::{Selected, Structure, radii};
+use crate::structure::{Selected, Structure};
 use crate::surface::{BackendIdentity, Component, GridStats, Measures, SurfaceKind, Validation};
 
 /// Connected component of the mesh.
@@ -132,7 +132,7 @@ pub struct Report {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "server", schema(required = false))]
     pub warnings: Vec<String>,
-    /// Table of van der Waals radii.
+    /// Table of van der Waals radii, or the file that gives them.
     pub radii: &'static str,
     /// Type of the surface.
     pub surface: &'static str,
@@ -276,7 +276,7 @@ impl Report {
                 .map(|id| AssemblyReport { id, copies: selected.copies.len() as u64 }),
             left_out: LeftOutReport::new(&selected.left_out),
             warnings: structure.warnings.clone(),
-            radii: radii::TABLE,
+            radii: structure.radii_name(),
             surface: params.surface.name(),
             probe: params.surface.has_probe().then_some(params.probe),
             preset: params.preset.name(),

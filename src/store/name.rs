@@ -107,14 +107,16 @@ impl Name {
     /// Returns the name of a result, by content key (64 lower-case hexadecimal digits) and extension.
     ///
     /// # Errors
-    /// Returns [`BadName`] unless the extension has 1 to 16 lower-case letters and digits, with single dots between
-    /// them.
+    /// Returns [`BadName`] unless the extension has 1 to 16 lower-case letters and digits, with single dots or
+    /// hyphens between them.
     pub fn result(key: &str, extension: &str) -> Result<Self, BadName> {
         let _digest: Digest = key.parse().map_err(|_bad| BadName("a key has 64 hexadecimal digits in lower case"))?;
         let good =
             |part: &str| !part.is_empty() && part.bytes().all(|c: u8| c.is_ascii_digit() || c.is_ascii_lowercase());
-        if extension.len() > 16 || !extension.split('.').all(good) {
-            return Err(BadName("an extension has 1 to 16 lower-case letters and digits, with single dots between"));
+        if extension.len() > 16 || !extension.split(['.', '-']).all(good) {
+            return Err(BadName(
+                "an extension has 1 to 16 lower-case letters and digits, with single dots or hyphens between",
+            ));
         }
         Ok(Self { folder: Folder::Results, file: format!("{key}.{extension}").into() })
     }

@@ -20,22 +20,28 @@ pub enum SourceFormat {
     Mmcif,
     /// BinaryCIF: PDBx/mmCIF in MessagePack.
     BinaryCif,
+    /// PQR: atoms with charges and radii.
+    Pqr,
+    /// XYZ: frames of elements and coordinates.
+    Xyz,
 }
 
 impl SourceFormat {
-    /// Returns `pdb`, `mmcif` or `bcif`.
+    /// Returns `pdb`, `mmcif`, `bcif`, `pqr` or `xyz`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Pdb => "pdb",
             Self::Mmcif => "mmcif",
             Self::BinaryCif => "bcif",
+            Self::Pqr => "pqr",
+            Self::Xyz => "xyz",
         }
     }
 }
 
-/// Atoms of all models of a file, in file order. All columns have the same length, except that `label_chain` may be
-/// empty. An atom takes 61 bytes.
+/// Atoms of all models of a file, in file order. All columns have the same length, except that `label_chain` and
+/// `radius` may be empty. An atom takes 61 bytes, and 4 more with a radius.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
     /// Format of the source file.
@@ -72,6 +78,8 @@ pub struct Structure {
     pub occupancy: Vec<f32>,
     /// Isotropic displacement parameters (B-factors), Å²; 0 if the file has none.
     pub b_factor: Vec<f32>,
+    /// Radii in the file, Å; empty if it has none. Atoms of radius 0 are virtual sites.
+    pub radius: Vec<f32>,
     /// Model numbers.
     pub model: Vec<i32>,
     /// True for HETATM records.
@@ -95,6 +103,18 @@ impl Structure {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.element.is_empty()
+    }
+
+    /// Returns the van der Waals radius of atom `i`, Å: that of the file, or that of the element.
+    #[must_use]
+    pub fn vdw_radius(&self, i: usize) -> f32 {
+        self.radius.get(i).copied().unwrap_or_else(|| radii::vdw_radius(self.element[i]))
+    }
+
+    /// Returns the name of the radii, for reports.
+    #[must_use]
+    pub fn radii_name(&self) -> &'static str {
+        if self.radius.is_empty() { radii::TABLE } else { radii::OF_FILE }
     }
 
     /// Returns true if atom `i` is hydrogen or deuterium.
@@ -132,6 +152,8 @@ pub(super) struct Source {
     pub(super) title: Option<String>,
     pub(super) sequence: Sequence,
     pub(super) assemblies: Assemblies,
+    /// Radius of each atom, Å; empty if the file has none. Their memory belongs to the structure.
+    pub(super) radii: Vec<f32>,
     pub(super) warnings: Vec<String>,
 }
 
@@ -294,8 +316,11 @@ impl Columns {
         (self.model[row], [self.x[row], self.y[row], self.z[row]])
     }
 
-    /// Returns a warning about the atoms of unknown elements, if there are any.
-    fn unknown_elements(&self, tables: &Tables) -> Option<String> {
+    /// Returns a warning about the atoms of unknown elements, if there are any and their radii depend on it.
+    fn unknown_elements(&self, tables: &Tables, radii_of_file: &[f32]) -> Option<String> {
+        if !radii_of_file.is_empty() {
+            return None;
+        }
         let mut unknown = (0..self.len()).filter(|&i| self.element[i] == 0 && self.kind[i] != Kind::VirtualSite);
         let first = unknown.next()?;
         let (name, residue) = (tables.name.text(self.name[first]), tables.residue.text(self.residue[first]));
@@ -315,6 +340,9 @@ impl Columns {
     ) -> Result<Structure, StructureError> {
         duplicates::check(self.len(), |row| self.place(row), reading)?;
         kinds::assign(&mut self, &tables, &source.sequence, reading)?;
+        for (kind, _) in self.kind.iter_mut().zip(&source.radii).filter(|(_, radius)| **radius == 0.0) {
+            *kind = Kind::VirtualSite;
+        }
         if tables.label_chain.is_empty() {
             self.label_chain = Vec::new();
         }
@@ -322,7 +350,8 @@ impl Columns {
         let entities = tables.label_chain.texts().map(entity).collect();
         self.shrink();
         reading.keep(source.assemblies.bytes())?;
-        let warnings = source.warnings.into_iter().chain(self.unknown_elements(&tables)).collect();
+        let unknown = self.unknown_elements(&tables, &source.radii);
+        let warnings = source.warnings.into_iter().chain(unknown).collect();
         reading.check()?;
         Ok(Structure {
             format: source.format,
@@ -342,6 +371,7 @@ impl Columns {
             altloc: self.altloc,
             occupancy: self.occupancy,
             b_factor: self.b_factor,
+            radius: source.radii,
             model: self.model,
             hetero: self.hetero,
             kind: self.kind,

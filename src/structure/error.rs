@@ -9,7 +9,7 @@ use crate::surface::OutOfMemory;
 pub enum StructureError {
     /// The bytes are not in a supported format.
     #[error(
-        "unknown structure format: {found}; expected PDB, mmCIF or BinaryCIF, plain or compressed with gzip or zstd"
+        "unknown structure format: {found}; expected PDB, mmCIF, BinaryCIF, PQR or XYZ, plain or compressed with gzip or zstd"
     )]
     UnknownFormat {
         /// Description of the first bytes.

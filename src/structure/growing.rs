@@ -1,6 +1,6 @@
 //! Columns that grow while a file is read: limits, memory and cancellation are checked once per chunk of rows.
 
-use super::atoms::{Atom, Columns, Tables};
+use super::atoms::{Atom, Columns, Source, Structure, Tables};
 use super::error::StructureError;
 use super::read::Reading;
 
@@ -29,6 +29,20 @@ impl GrowingColumns {
 
     pub(super) fn into_columns(self) -> Columns {
         self.columns
+    }
+
+    /// Returns the finished structure.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Columns::finish`].
+    pub(super) fn finish(
+        self,
+        tables: Tables,
+        source: Source,
+        reading: &Reading<'_>,
+    ) -> Result<Structure, StructureError> {
+        reading.keep_texts(tables.n_texts() - self.n_texts)?;
+        self.columns.finish(tables, source, reading)
     }
 
     /// Returns the number of rows that [`Self::push`] may add before [`Self::reserve_chunk`] must be called.

@@ -1,4 +1,4 @@
-//! Reads structure files: PDB, mmCIF and BinaryCIF bytes in, [`crate::surface::Spheres`] out. Positions are in Å.
+//! Reads structure files: PDB, mmCIF, BinaryCIF, PQR and XYZ bytes in, [`crate::surface::Spheres`] out. Positions are in Å.
 //!
 //! The module does not depend on grids, meshes or HTTP. Only [`archive`] reads files from disk.
 //!
@@ -20,6 +20,7 @@ mod copies;
 mod duplicates;
 pub mod element;
 pub mod error;
+mod fields;
 mod growing;
 mod inflate;
 mod kind_set;
@@ -28,6 +29,7 @@ mod mmcif;
 mod number;
 mod pdb;
 mod pieces;
+mod pqr;
 pub mod radii;
 pub mod read;
 mod residue;
@@ -44,6 +46,7 @@ mod survey;
 mod text;
 mod texts;
 mod warnings;
+mod xyz;
 
 pub use archive::{Archive, ArchiveError, EntryId, Stamp};
 pub use assembly::{Assemblies, Operator};

@@ -2,7 +2,7 @@
 
 use super::atoms::{SourceFormat, Structure};
 use super::error::StructureError;
-use super::{bcif, inflate, mmcif, pdb, pieces, sniff};
+use super::{bcif, inflate, mmcif, pdb, pieces, pqr, sniff, xyz};
 use crate::surface::{Control, MemoryMeter as _, Reservation};
 
 /// Limits of reading, checked before memory is allocated.
@@ -134,6 +134,8 @@ fn of_bytes(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureE
         SourceFormat::Pdb => pdb::read(text, reading),
         SourceFormat::Mmcif => mmcif::read(text, reading),
         SourceFormat::BinaryCif => bcif::read(text, reading),
+        SourceFormat::Pqr => pqr::read(text, reading),
+        SourceFormat::Xyz => xyz::read(text, reading),
     }
 }
 

@@ -3,6 +3,7 @@
 use super::atoms::SourceFormat;
 use super::error::StructureError;
 use super::text::quote;
+use super::{pqr, xyz};
 
 /// Record names that identify a PDB file. `END` and `TER` are common words and do not count.
 const PDB_RECORDS: [&[u8]; 33] = [
@@ -31,8 +32,12 @@ pub(super) fn sniff(text: &[u8]) -> Result<SourceFormat, StructureError> {
     if is_cif(head) {
         return Ok(SourceFormat::Mmcif);
     }
+    // The comment of an XYZ file may begin with the name of a PDB record.
+    if xyz::is_xyz(head) {
+        return Ok(SourceFormat::Xyz);
+    }
     if head.split(|&b| b == b'\n' || b == b'\r').any(is_pdb_record) {
-        return Ok(SourceFormat::Pdb);
+        return Ok(if pqr::is_pqr(head) { SourceFormat::Pqr } else { SourceFormat::Pdb });
     }
     unknown(words(head))
 }

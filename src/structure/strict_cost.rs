@@ -86,7 +86,7 @@ impl Cost {
                 others + STEPS_PER_INSERTION * names * (n_residues + names)
             }
             SourceFormat::Mmcif => hierarchy + count(text, b"_struct_ncs_oper.").pow(2),
-            SourceFormat::BinaryCif => 0,
+            SourceFormat::BinaryCif | SourceFormat::Pqr | SourceFormat::Xyz => 0,
         };
         // A residue of n atoms has at most n / 2 alternatives of n / 2 atoms.
         let copies: u64 = residues.values().map(|r| r.n_atoms * r.n_atoms / 4).sum();

@@ -110,13 +110,15 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
         plain => plain?,
     };
     let text = without_mark(&plain);
-    // pdbtbx does not read BinaryCIF.
+    // pdbtbx reads PDB and mmCIF only.
+    let unread =
+        |format: &str| Ok(vec![Diagnostic::note(format!("not checked: the strict validator does not read {format}"))]);
     let format = match sniff::sniff(text)? {
         SourceFormat::Pdb => Format::Pdb,
         SourceFormat::Mmcif => Format::Mmcif,
-        SourceFormat::BinaryCif => {
-            return Ok(vec![Diagnostic::note("not checked: the strict validator does not read BinaryCIF".to_owned())]);
-        }
+        SourceFormat::BinaryCif => return unread("BinaryCIF"),
+        SourceFormat::Pqr => return unread("PQR"),
+        SourceFormat::Xyz => return unread("XYZ"),
     };
     let _memory = reading.reserve(MEMORY_PER_BYTE * text.len() as u64)?;
     let of_structure = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };

@@ -14,6 +14,7 @@ fn magic(format: &str) -> &'static [u8] {
         "glb" => b"glTF",
         "gltf" => b"{",
         "ply" => b"ply\nformat binary_little_endian 1.0\n",
+        "ply-text" => b"ply\nformat ascii 1.0\n",
         "stl" => b"molmesh",
         "obj" => b"#",
         other => panic!("no format {other}"),
@@ -40,6 +41,9 @@ fn format_flag_overrides_the_extension() {
     let output = folder.path("rod.bin");
     assert_code(&mesh(&input, &output, &["--format", "ply"]), 0);
     assert!(fs::read(&output).unwrap().starts_with(magic("ply")));
+    let output = folder.path("rod.ply");
+    assert_code(&mesh(&input, &output, &["--format", "ply-text"]), 0);
+    assert!(fs::read(&output).unwrap().starts_with(magic("ply-text")));
 }
 
 #[test]

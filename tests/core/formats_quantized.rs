@@ -169,7 +169,7 @@ fn integer_vertices_are_neither_rounded_nor_widened() {
         }
     }
     for format in [Format::Ply, Format::Stl, Format::Obj] {
-        let refusal = FormatError::QuantizationNotSupported { format: format.extension() };
+        let refusal = FormatError::QuantizationNotSupported { format: format.name() };
         assert_eq!(Encoder::new(format, Packing::of(&small), &small, &meta()).unwrap_err(), refusal);
         assert_eq!(Encoder::new(format, Packing::Full, &small, &meta()).unwrap_err(), own);
     }
@@ -229,7 +229,7 @@ fn vertices_out_of_range_and_other_formats_are_rejected() {
     }
     for format in [Format::Ply, Format::Stl, Format::Obj] {
         let refusal = Encoder::new(format, Packing::Quantized(step(&mesh)), &mesh, &meta()).unwrap_err();
-        assert_eq!(refusal, FormatError::QuantizationNotSupported { format: format.extension() });
+        assert_eq!(refusal, FormatError::QuantizationNotSupported { format: format.name() });
         assert!(Encoder::new(format, Packing::Full, &mesh, &meta()).is_ok());
     }
     assert!(matches!(placed(small, &mesh, 2), Err(GlbSinkError::Format(FormatError::OutOfQuantizationRange { .. }))));

@@ -13,7 +13,8 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 use tools::files::{MemoryFile, encoded, write_parts};
 use tools::readers::{
-    Contents, accessor_of, gltf_contents, ply_header, read_obj, read_ply, read_stl, split_glb, split_gltf, u32_at,
+    Contents, accessor_of, gltf_contents, ply_header, read_obj, read_ply, read_ply_text, read_stl, split_glb,
+    split_gltf, u32_at,
 };
 use tools::shapes::{FAR, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres};
 
@@ -175,7 +176,7 @@ fn stl_contains_corners_and_normals_of_all_triangles() {
 }
 
 #[test]
-fn obj_round_trips_coordinates_to_its_decimals() {
+fn text_formats_round_trip_coordinates_to_their_decimals() {
     for (name, mesh) in cases() {
         let found = read_obj(&encode(Format::Obj, &mesh, &meta()));
         assert_eq!(found.triangles[..], mesh.triangles[..], "{name}");
@@ -188,6 +189,12 @@ fn obj_round_trips_coordinates_to_its_decimals() {
         };
         close(&found.positions, &absolute(&mesh));
         close(&found.normals, &mesh.normals);
+        let ply = read_ply_text(&encode(Format::PlyText, &mesh, &meta()));
+        let binary = read_ply(&encode(Format::Ply, &mesh, &meta()));
+        close(&ply.positions, &binary.positions);
+        close(&ply.normals, &binary.normals);
+        assert_eq!((&ply.triangles, &ply.colors), (&binary.triangles, &binary.colors), "{name}");
+        assert_eq!(ply.atoms, binary.atoms, "{name}");
         let opaque = |[r, g, b, _]: &[u8; 4]| [*r, *g, *b, 255].map(u16::from);
         let colors = mesh.colors.as_deref().filter(|colors| !colors.is_empty());
         assert_eq!(found.colors, colors.map(|colors| colors.iter().map(opaque).collect::<Vec<_>>()), "{name}");
@@ -201,7 +208,7 @@ fn lengths_are_known_before_writing() {
             let len = encode(format, &mesh, &meta()).len() as u64;
             let encoder = encoder(format, &mesh).unwrap();
             let (exact, bound) = (encoder.encoded_len(), encoder.encoded_len_bound());
-            if format == Format::Obj {
+            if matches!(format, Format::PlyText | Format::Obj) {
                 assert_eq!(exact, None);
                 assert!(len <= bound && bound <= len + len / 2, "{name}: {len} bytes, bound {bound}");
             } else {
@@ -346,7 +353,7 @@ fn invalid_meshes_are_rejected_by_the_formats_that_rely_on_their_values() {
         ("triangle 7 refers to vertex 20, but the mesh has 20", &indexed, broken(|m| m.triangles[7][1] = 20)),
         ("refers to vertex 4294967295", &indexed, broken(|m| m.triangles[0][0] = u32::MAX)),
         ("position 3 holds NaN", &all, broken(|m| m.positions[3][2] = f32::NAN)),
-        ("normal 4 holds inf", &[Format::Obj], broken(|m| m.normals[4][0] = f32::INFINITY)),
+        ("normal 4 holds inf", &[Format::PlyText, Format::Obj], broken(|m| m.normals[4][0] = f32::INFINITY)),
         ("centre 1 holds inf", &all, broken(|m| m.centre[1] = f64::INFINITY)),
     ];
     for format in Format::MESHES {
@@ -427,7 +434,7 @@ fn invalid_meshes_never_panic() {
             };
             let narrow = matches!(format, Format::Glb | Format::Gltf) && n == 4;
             assert_eq!(refused(&far_index), narrow || format == Format::Stl, "{format}");
-            assert_eq!(refused(&long_normal), format == Format::Obj, "{format}");
+            assert_eq!(refused(&long_normal), matches!(format, Format::PlyText | Format::Obj), "{format}");
             assert!(refused(&not_finite) && refused(&short), "{format}");
         }
     }

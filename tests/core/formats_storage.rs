@@ -7,7 +7,7 @@ use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Meta, Normals, Pac
 use molmesh::surface::Mesh;
 use serde_json::{Value, json};
 use tools::files::{Files, MemoryFile, write_parts};
-use tools::readers::{Contents, gltf_contents, read_obj, read_ply, read_stl, split_glb, split_gltf};
+use tools::readers::{Contents, gltf_contents, read_obj, read_ply, read_ply_text, read_stl, split_glb, split_gltf};
 use tools::shapes::{FAR, area_and_volume, dressed, icosphere, torus, triangle, two_spheres};
 
 fn meta() -> Meta {
@@ -49,6 +49,7 @@ fn contents(format: Format, bytes: &[u8]) -> Contents {
             gltf_contents(&json, &bin)
         }
         Format::Ply => read_ply(bytes),
+        Format::PlyText => read_ply_text(bytes),
         Format::Obj => read_obj(bytes),
         Format::Stl => {
             let corners = read_stl(bytes).into_iter().flat_map(|[_, a, b, c]| [a, b, c]).collect();
@@ -102,10 +103,10 @@ fn without_normals_all_other_columns_are_unchanged() {
 #[test]
 fn units_scale_coordinates_and_nothing_else() {
     for (name, mesh) in cases() {
-        for format in [Format::Ply, Format::Obj, Format::Stl] {
+        for format in [Format::Ply, Format::PlyText, Format::Obj, Format::Stl] {
             let [plain, nano] = [Units::Angstrom, Units::Nanometer]
                 .map(|units| contents(format, &encode(format, Storage { units, ..Storage::default() }, &mesh)));
-            // The last decimal of OBJ is 1e-4 Å; floats far from the origin have 6e-5 Å.
+            // The last decimal of text is 1e-4 Å; floats far from the origin have 6e-5 Å.
             let worst = |scale: f64| {
                 let pairs = plain.positions.as_flattened().iter().zip(nano.positions.as_flattened());
                 pairs.map(|(a, b)| (f64::from(*a) - scale * f64::from(*b)).abs()).fold(0.0, f64::max)
@@ -143,7 +144,7 @@ fn units_scale_coordinates_and_nothing_else() {
 fn files_declare_their_units() {
     let mesh = icosphere(1, 3.0, [0.0; 3], false);
     for units in [Units::Angstrom, Units::Nanometer] {
-        for format in [Format::Ply, Format::Stl, Format::Obj] {
+        for format in [Format::Ply, Format::PlyText, Format::Stl, Format::Obj] {
             let bytes = encode(format, Storage { units, ..Storage::default() }, &mesh);
             let head = String::from_utf8_lossy(&bytes[..bytes.len().min(400)]).into_owned();
             let declaration = if format == Format::Stl { "units=" } else { "units " };
@@ -158,7 +159,7 @@ fn metres_require_a_format_with_a_node() {
     let meters = Storage { units: Units::Meter, ..Storage::default() };
     for format in Format::MESHES {
         let refusal = Encoder::new(format, meters, &mesh, &meta()).err();
-        let expected = FormatError::UnitsNotSupported { format: format.extension(), units: "meter" };
+        let expected = FormatError::UnitsNotSupported { format: format.name(), units: "meter" };
         let node = matches!(format, Format::Glb | Format::Gltf);
         assert_eq!(refusal, (!node).then_some(expected), "{format}");
     }
@@ -224,7 +225,7 @@ fn trimesh_reads_scaled_surfaces_with_and_without_normals() {
         for format in Format::MESHES {
             // Trimesh drops triangles of 1e-20 m², so only the validator and the document check metres.
             for (n, storage) in ways(format).into_iter().enumerate().filter(|(_, w)| w.units != Units::Meter) {
-                files.add(&format!("{name}-{n}.{format}"), &encode(format, storage, &mesh));
+                files.add(&format!("{name}-{n}-{format}.{}", format.extension()), &encode(format, storage, &mesh));
                 expected.push((format, storage, mesh.clone()));
             }
         }

@@ -175,7 +175,7 @@ fn every_structure_gives_valid_gltf() {
     for case in cases() {
         for format in [Format::Glb, Format::Gltf] {
             let mesh = mesh(&case.spheres, SurfaceKind::Gaussian, 1.0, 2);
-            let path = dir.path().join(format!("{}.{}", case.name, format.extension()));
+            let path = dir.path().join(format!("{}.{}", case.name, format.name()));
             std::fs::write(&path, encoded(format, &mesh, &Meta::default())).unwrap();
             paths.push(path);
         }

@@ -108,6 +108,7 @@ fn formats_are_negotiated() {
         ("", "text/html,application/xhtml+xml,*/*;q=0.8", 200, "model/gltf-binary"),
         ("?format=obj", "model/stl", 200, "model/obj"),
         ("?format=stl", "text/html", 200, "model/stl"),
+        ("", "model/x-ply-text, */*;q=0.5", 200, "model/x-ply-text"),
         ("", "image/png", 200, "image/png"),
         ("?format=png", "model/stl", 200, "image/png"),
         ("", "image/webp", 406, "application/problem+json"),
@@ -120,7 +121,7 @@ fn formats_are_negotiated() {
         assert_eq!((reply.status, reply.header("content-type")), (status, Some(media_type)), "{query} {accept}");
         assert!(reply.complete);
         if status == 406 {
-            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 6);
+            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 7);
         } else {
             assert!(reply.body.len() > 1000);
         }
@@ -466,9 +467,13 @@ fn archive_entries_are_cacheable_by_url() {
     let head = send(SERVER.addr, "HEAD", path, &[], b"");
     assert_eq!((head.status, head.body.len(), head.header("etag")), (200, 0, Some(etag)));
     assert_eq!(head.header("content-type"), Some("model/gltf-binary"));
-    for (ext, media_type) in
-        [("gltf", "model/gltf+json"), ("ply", "application/ply"), ("stl", "model/stl"), ("obj", "model/obj")]
-    {
+    for (ext, media_type) in [
+        ("gltf", "model/gltf+json"),
+        ("ply", "application/ply"),
+        ("ply-text", "model/x-ply-text"),
+        ("stl", "model/stl"),
+        ("obj", "model/obj"),
+    ] {
         let other = SERVER.get(&format!("/v1/pdb/4pti/surface.{ext}?resolution=1"));
         assert_eq!((other.status, other.header("content-type")), (200, Some(media_type)));
         assert_ne!(other.header("etag"), Some(etag));

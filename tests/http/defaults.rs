@@ -68,7 +68,7 @@ fn sending_all_defaults_changes_nothing() {
     let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
     let json = [("content-type", "application/json")];
     let form = [("content-type", "multipart/form-data; boundary=b")];
-    for format in Format::ALL.map(Format::extension) {
+    for format in Format::ALL.map(Format::name) {
         let plain = server.post(&format!("/v1/meshes?format={format}"), &[], SAMPLE);
         let defaults = query(&description, "post", "/v1/meshes", Some(format));
         assert!(defaults.len() > 10 && defaults.iter().any(|(name, _)| name == "azimuth"), "{defaults:?}");

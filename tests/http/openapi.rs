@@ -70,7 +70,7 @@ fn the_parameters_are_those_of_the_table() {
     let parameter = |name: &str| &DESCRIPTION["components"]["parameters"][name];
     let schema = |name: &str| resolved(&DESCRIPTION, &parameter(name)["schema"]);
     assert_eq!((&schema("resolution")["type"], &schema("resolution")["default"]), (&json!("number"), &json!(0.5)));
-    assert_eq!(schema("format")["enum"].as_array().unwrap().len(), 6);
+    assert_eq!(schema("format")["enum"].as_array().unwrap().len(), 7);
     // Units and ranges are in the text as well.
     for p in TABLE {
         let Domain::Number { min, max, unit } = p.domain else { continue };

@@ -14,6 +14,19 @@ fn real(change: impl FnOnce(&mut molmesh::config::Config)) -> Running {
 }
 
 #[test]
+fn text_ply_has_its_own_address_and_the_usual_file_name() {
+    let server = start(Fake::new(Mode::Octahedra) as _, |_| {});
+    let binary = server.post("/v1/meshes?format=ply", &[], SAMPLE);
+    let made = server.post("/v1/meshes?format=ply-text", &[], SAMPLE);
+    assert!(made.body.starts_with(b"ply\nformat ascii 1.0\n"));
+    assert!(made.header("content-disposition").unwrap().ends_with(".ply\""));
+    let location = made.header("content-location").unwrap();
+    assert!(location.ends_with(".ply-text"), "{location}");
+    assert_ne!(made.header("content-location"), binary.header("content-location"));
+    assert!(server.get(location).body == made.body);
+}
+
+#[test]
 fn a_synchronous_result_is_stored_at_its_content_location() {
     let backend = Fake::new(Mode::Octahedra);
     let server = start(Arc::clone(&backend) as _, |_| {});

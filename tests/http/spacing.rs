@@ -7,6 +7,7 @@ use crate::tools;
 use std::sync::Arc;
 
 use http_support::{Reply, Running, SAMPLE, start};
+use molmesh::formats::Format;
 use molmesh::surface::CpuBackend;
 use serde_json::{Value, json};
 use tools::files::Files;
@@ -191,10 +192,11 @@ fn external_readers_accept_served_files() {
     let server = server();
     let (mut all, mut gltf) = (Files::new(), Files::new());
     let mut expected = Vec::new();
-    for format in ["glb", "gltf", "ply", "stl", "obj"] {
+    for format in ["glb", "gltf", "ply", "ply-text", "stl", "obj"] {
+        let extension = format.parse::<Format>().unwrap().extension();
         for (n, more) in ["", "&normals=none", "&units=nanometer", "&normals=none&units=nanometer"].iter().enumerate() {
             let body = mesh(&server, &format!("detail=2&format={format}{more}")).body;
-            all.add(&format!("{n}.{format}"), &body);
+            all.add(&format!("{n}-{format}.{extension}"), &body);
             if format.starts_with("gl") {
                 gltf.add(&format!("{n}.{format}"), &body);
             }
@@ -211,7 +213,7 @@ fn external_readers_accept_served_files() {
     let plain = reports[0].bounds;
     for (found, (format, bare, scale)) in reports.iter().zip(expected) {
         assert_eq!(found.error, None);
-        // Four decimals of OBJ may make corners of a triangle coincide, which is not a fault of the surface.
+        // Four decimals of text may make corners of a triangle coincide, which is not a fault of the surface.
         assert!(found.watertight && found.winding_consistent && found.bad_edges == 0, "{found:#?}");
         assert!((found.area / (area * scale * scale) - 1.0).abs() < 1e-3, "{found:#?}");
         assert!((found.volume / (volume * scale * scale * scale) - 1.0).abs() < 1e-3, "{found:#?}");

@@ -1,4 +1,4 @@
-//! Strict readers of the five formats, written from their specifications. They panic on anything that the product does
+//! Strict readers of the mesh formats, written from their specifications. They panic on anything that the product does
 //! not write.
 
 #![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "indices are integers")]
@@ -166,9 +166,18 @@ pub fn ply_header(bytes: &[u8]) -> (Vec<String>, usize) {
     (String::from_utf8(bytes[..at].to_vec()).unwrap().lines().map(str::to_owned).collect(), at)
 }
 
-pub fn read_ply(bytes: &[u8]) -> Contents {
-    let (header, mut at) = ply_header(bytes);
-    assert_eq!(header[..2], ["ply", "format binary_little_endian 1.0"]);
+/// Numbers of vertices and faces and the optional columns of a PLY.
+struct PlyLayout {
+    n: usize,
+    m: usize,
+    normals: bool,
+    colors: bool,
+    atoms: bool,
+}
+
+/// Reads the header of a PLY with this encoding.
+fn ply_layout(header: &[String], encoding: &str) -> PlyLayout {
+    assert_eq!(header[..2], ["ply".to_owned(), format!("format {encoding} 1.0")]);
     let count = |what: &str| -> usize {
         let prefix = format!("element {what} ");
         header.iter().find_map(|l| l.strip_prefix(&prefix)).unwrap().parse().unwrap()
@@ -189,6 +198,42 @@ pub fn read_ply(bytes: &[u8]) -> Contents {
         "end_header".into(),
     ]);
     assert_eq!(lines, expected);
+    PlyLayout { n, m, normals, colors, atoms }
+}
+
+pub fn read_ply_text(bytes: &[u8]) -> Contents {
+    let (header, at) = ply_header(bytes);
+    let PlyLayout { n, m, normals, colors, atoms } = ply_layout(&header, "ascii");
+    let mut contents = Contents { colors: colors.then(Vec::new), atoms: atoms.then(Vec::new), ..Contents::default() };
+    let mut lines = std::str::from_utf8(&bytes[at..]).unwrap().lines();
+    for _ in 0..n {
+        let mut words = lines.next().unwrap().split(' ');
+        let mut three = || -> [f32; 3] { std::array::from_fn(|_| words.next().unwrap().parse().unwrap()) };
+        contents.positions.push(three());
+        if normals {
+            contents.normals.push(three());
+        }
+        let mut integer = || -> u32 { words.next().unwrap().parse().unwrap() };
+        if let Some(colors) = &mut contents.colors {
+            colors.push(std::array::from_fn(|_| u16::from(u8::try_from(integer()).unwrap())));
+        }
+        if let Some(atoms) = &mut contents.atoms {
+            atoms.push(integer());
+        }
+        assert_eq!(words.next(), None);
+    }
+    for _ in 0..m {
+        let indices: Vec<u32> = lines.next().unwrap().split(' ').map(|word| word.parse().unwrap()).collect();
+        assert_eq!((indices.len(), indices[0]), (4, 3));
+        contents.triangles.push([indices[1], indices[2], indices[3]]);
+    }
+    assert_eq!(lines.next(), None);
+    contents
+}
+
+pub fn read_ply(bytes: &[u8]) -> Contents {
+    let (header, mut at) = ply_header(bytes);
+    let PlyLayout { n, m, normals, colors, atoms } = ply_layout(&header, "binary_little_endian");
     let mut contents = Contents { colors: colors.then(Vec::new), atoms: atoms.then(Vec::new), ..Contents::default() };
     let mut take = |n: usize| {
         at += n;

@@ -79,6 +79,8 @@ fn keep(folder: &Path, id: &str, bytes: &[u8], config: &Config) -> Result<PathBu
         SourceFormat::Pdb => "pdb",
         SourceFormat::Mmcif => "cif",
         SourceFormat::BinaryCif => "bcif",
+        SourceFormat::Pqr => "pqr",
+        SourceFormat::Xyz => "xyz",
     };
     let compressed = if bytes.starts_with(&[0x1f, 0x8b]) { ".gz" } else { "" };
     let path = folder.join(format!("{}.{extension}{compressed}", id.to_lowercase()));

@@ -56,6 +56,7 @@ pub(super) const PARAMETERS: &[&str] = &[
     "soft-object",
     "png",
     "obj",
+    "ply-text",
     "polymer",
     "ligand,water",
     "hydrogens",

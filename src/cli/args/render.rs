@@ -16,7 +16,7 @@ Examples:
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{RENDER_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct RenderArgs {
-    /// Structure file: PDB, mmCIF or BinaryCIF, optionally compressed with gzip or zstd; `-` is stdin
+    /// Structure file: PDB, mmCIF, BinaryCIF, PQR or XYZ, optionally compressed with gzip or zstd; `-` is stdin
     pub(crate) input: PathBuf,
     /// PNG file; `-` is stdout
     #[arg(short, long)]

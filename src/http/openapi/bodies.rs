@@ -32,6 +32,8 @@ impl ToSchema for StructureFile {}
 
 impl PartialSchema for StructureFile {
     fn schema() -> RefOr<Schema> {
-        RefOr::T(binary("A PDB, mmCIF or BinaryCIF file, uncompressed or compressed with gzip or zstd.").into())
+        RefOr::T(
+            binary("A PDB, mmCIF, BinaryCIF, PQR or XYZ file, uncompressed or compressed with gzip or zstd.").into(),
+        )
     }
 }

@@ -38,11 +38,11 @@ fn reference<T: ToSchema>() -> Content {
     ContentBuilder::new().schema(Some(Ref::from_schema_name(T::name()))).build()
 }
 
-/// 200: the whole file. `model/*` stands for the types of GLB, glTF, STL and OBJ:
+/// 200: the whole file. `model/*` stands for all types that begin with it:
 /// generators take types that end in `+json` for JSON documents.
 fn whole() -> RefOr<Response> {
     let doc = "The mesh. Its media type follows from the format: `model/gltf-binary` (glb), `model/gltf+json` (gltf), \
-               `application/ply`, `model/stl`, `model/obj` or `image/png`; \
+               `application/ply`, `model/x-ply-text`, `model/stl`, `model/obj` or `image/png`; \
                `application/octet-stream` if `Accept` prefers it.";
     let etag = "Strong validator of the file. Equal tags mean equal bytes.";
     let response = ResponseBuilder::new()

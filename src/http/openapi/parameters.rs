@@ -23,7 +23,7 @@ pub(in crate::http) struct ChoiceSchemas;
 impl Modify for ChoiceSchemas {
     fn modify(&self, api: &mut OpenApi) {
         let schemas = &mut api.components.get_or_insert_default().schemas;
-        let files = Format::ALL.map(|format| format!("surface.{}", format.extension()));
+        let files = Format::ALL.map(|format| format!("surface.{}", format.name()));
         let files = ObjectBuilder::new()
             .schema_type(Type::String)
             .description(Some("File name of a mesh: `surface.` and the extension of the format."))
@@ -34,7 +34,7 @@ impl Modify for ChoiceSchemas {
             let default = values.contains(&parameter.default).then(|| Value::from(parameter.default));
             let object = ObjectBuilder::new()
                 .schema_type(Type::String)
-                .description(Some(parameter.doc))
+                .description(Some(format!("Value of `{}`.", parameter.name)))
                 .enum_values(Some(values.iter().map(|value| Value::from(*value))))
                 .default(default);
             schemas.insert(pascal_case(parameter.name), RefOr::T(object.into()));
@@ -94,7 +94,7 @@ fn hints(parameter: &params::Parameter) -> Option<Extensions> {
         control.insert("usual".to_owned(), usual.to_vec().into());
     }
     if params::PICTURES.contains(&parameter.name) {
-        control.insert("format".to_owned(), Format::Png.extension().into());
+        control.insert("format".to_owned(), Format::Png.name().into());
     }
     if params::SPACINGS.contains(&parameter.name) {
         let others: Vec<&str> = params::SPACINGS.into_iter().filter(|name| *name != parameter.name).collect();
@@ -207,7 +207,7 @@ parameters!(
 parameters!(
     /// `{file}` of a result.
     ResultFile: {
-        let pattern = format!("^[0-9a-f]{{64}}\\.({})$", Format::ALL.map(Format::extension).join("|"));
+        let pattern = format!("^[0-9a-f]{{64}}\\.({})$", Format::ALL.map(Format::name).join("|"));
         let example = format!("{}.glb", "0".repeat(64));
         segment("file", "Key of the result, followed by the extension of its format.", &pattern, &example)
     }

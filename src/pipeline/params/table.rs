@@ -136,7 +136,7 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
 }
 
 const SPLITS: &[&str] = &[Split::None.name(), Split::Chain.name(), Split::Entity.name(), Split::ResidueGroup.name()];
-const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj", "png"];
+const FORMATS: &[&str] = &["glb", "gltf", "ply", "ply-text", "stl", "obj", "png"];
 const VIEWS: &[&str] = &view_names(View::ALL);
 const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];

@@ -199,6 +199,7 @@ impl<'a> Block<'a> {
             title,
             sequence: Sequence::of(&categories),
             assemblies: categories.assemblies(),
+            radii: Vec::new(),
             warnings: warnings.messages(|fault| fault.within(&place).into()).into_iter().chain(unread).collect(),
         };
         columns.finish(tables, source, reading).map(Some)

@@ -283,6 +283,7 @@ impl<'a> Reader<'a> {
             title: self.block.title,
             sequence: Sequence::of(&categories),
             assemblies: categories.assemblies(),
+            radii: Vec::new(),
             warnings: warnings.into_iter().chain(too_many).collect(),
         };
         columns.finish(tables, source, self.reading)

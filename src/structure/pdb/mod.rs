@@ -87,6 +87,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         title: normalize(&title, MAX_TITLE),
         sequence: Sequence { listed, ..Sequence::default() },
         assemblies: assemblies.finish(reading)?,
+        radii: Vec::new(),
         warnings: warnings.messages(|fault| fault.locate(text)),
     };
     columns.finish(tables, source, reading)

@@ -21,7 +21,6 @@ use super::contents::{Contents, Kind};
 use super::copies::{Assembly, PlacedCopy};
 use super::duplicates;
 use super::error::StructureError;
-use super::radii;
 use super::read::{ReadLimits, Reading, check};
 use super::text::list;
 use crate::surface::{Control, Spheres, SurfaceError};
@@ -234,7 +233,7 @@ impl Selected {
     /// Returns [`SurfaceError::BadSphere`] if a coordinate is out of range.
     pub fn spheres(&self, structure: &Structure) -> Result<Spheres, SurfaceError> {
         let column = |c: &[f64]| self.atoms.iter().map(|&i| c[i as usize]).collect::<Vec<_>>();
-        let r = self.atoms.iter().map(|&i| radii::vdw_radius(structure.element[i as usize])).collect();
+        let r = self.atoms.iter().map(|&i| structure.vdw_radius(i as usize)).collect();
         let (mut x, mut y, mut z) = (column(&structure.x), column(&structure.y), column(&structure.z));
         for PlacedCopy { rows, operator } in &self.copies {
             let rows = || rows.clone();

@@ -436,9 +436,17 @@ fn parameters() -> Vec<Row> {
 }
 
 /// Media types of meshes and pictures.
-const MEDIA_TYPES: [&str; 6] =
-    ["model/gltf-binary", "model/gltf+json", "application/ply", "model/stl", "model/obj", "image/png"];
-const FILES: [&str; 6] = ["surface.glb", "surface.gltf", "surface.ply", "surface.stl", "surface.obj", "surface.png"];
+const MEDIA_TYPES: [&str; 7] = [
+    "model/gltf-binary",
+    "model/gltf+json",
+    "application/ply",
+    "model/x-ply-text",
+    "model/stl",
+    "model/obj",
+    "image/png",
+];
+const FILES: [&str; 7] =
+    ["surface.glb", "surface.gltf", "surface.ply", "surface.ply-text", "surface.stl", "surface.obj", "surface.png"];
 
 fn http() -> Vec<Row> {
     let with = |row: Row, named: Vec<(&'static str, Is)>| Row { named, ..row };
