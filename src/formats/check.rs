@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::error::FormatError;
 use super::format::Format;
-use crate::surface::{Mesh, PartRange};
+use crate::surface::Mesh;
 
 /// Rows per task; smaller meshes are checked on the calling thread.
 const CHUNK_ROWS: usize = 1 << 16;
@@ -76,13 +76,14 @@ pub(super) fn check(mesh: &Mesh, format: Format) -> Result<Summary, FormatError>
 /// Rejects parts that do not cover the mesh in order, or whose triangles refer to vertices of other parts.
 fn check_parts(mesh: &Mesh, n_vertices: usize) -> Result<(), FormatError> {
     let mut end = [0, 0];
-    for PartRange { name, vertices, triangles } in &mesh.parts {
+    for part in &mesh.parts {
+        let (vertices, triangles) = (&part.vertices, &part.triangles);
         let follows = [vertices.start, triangles.start] == end;
         end = [vertices.end, triangles.end];
         let own = |index: &u32| vertices.contains(&(*index as usize));
         let is_own = |rows: &[[u32; 3]]| rows.par_iter().with_min_len(CHUNK_ROWS).all(|row| row.iter().all(own));
         if !follows || !mesh.triangles.get(triangles.clone()).is_some_and(is_own) {
-            return Err(FormatError::BadPart { part: name.clone() });
+            return Err(FormatError::BadPart { part: part.name.clone() });
         }
     }
     if mesh.parts.is_empty() || end == [n_vertices, mesh.triangles.len()] {

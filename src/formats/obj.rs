@@ -72,12 +72,10 @@ impl ObjPlan {
         for &normal in mesh.normals.iter().filter(|_| smooth) {
             lines.push(|line| vector(line, b"vn", normal, NORMAL_DECIMALS))?;
         }
-        let whole = (None, 0..mesh.triangles.len());
-        let parts = self.groups.iter().map(Some).zip(mesh.parts.iter().map(|part| part.triangles.clone()));
-        for (group, triangles) in
-            parts.chain(mesh.parts.is_empty().then_some(whole)).filter(|(_, rows)| !rows.is_empty())
-        {
-            if let Some(group) = group {
+        let whole = mesh.parts.is_empty().then_some((None, 0..mesh.triangles.len()));
+        let ranges = mesh.parts.iter().map(|part| part.triangles.clone());
+        for (group, triangles) in self.groups.iter().map(Some).zip(ranges).chain(whole) {
+            if let Some(group) = group.filter(|_| !triangles.is_empty()) {
                 lines.text(group)?;
             }
             for &triangle in &mesh.triangles[triangles] {

@@ -213,7 +213,8 @@ impl Columns {
         for (semantic, column) in &self.attributes {
             let mut accessor = column.accessor(part.vertices.start, count(&part.vertices));
             if *semantic == Semantic::Positions {
-                // These are exactly values of the buffer: rounding preserves the order, and doubles hold floats exactly.
+                // These are exactly values of the buffer: rounding preserves the order, and doubles hold floats
+                // exactly.
                 let [low, high] = part.bounds.map(|row| match layout.storage.packing {
                     Packing::Full => Value::from(row.map(f64::from).to_vec()),
                     Packing::Quantized(step) => Value::from(step.position(row).to_vec()),
