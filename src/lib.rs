@@ -59,8 +59,8 @@ pub use surface::Mesh;
 
 /// Meshes a structure file on the CPU.
 ///
-/// `bytes` is a PDB, mmCIF, BinaryCIF, PQR or XYZ file, plain or compressed with gzip or zstd. Positions of the mesh are
-/// in Å and relative to [`Mesh::centre`].
+/// `bytes` is a PDB, mmCIF, BinaryCIF, PQR or XYZ file, plain or compressed with gzip or zstd. Positions of the mesh
+/// are in Å and relative to [`Mesh::centre`].
 ///
 /// # Errors
 /// Returns an [`Error`] if the file cannot be read, the selection is empty, a limit is exceeded, or the density never

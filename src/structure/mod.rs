@@ -1,4 +1,5 @@
-//! Reads structure files: PDB, mmCIF, BinaryCIF, PQR and XYZ bytes in, [`crate::surface::Spheres`] out. Positions are in Å.
+//! Reads structure files: PDB, mmCIF, BinaryCIF, PQR and XYZ bytes in, [`crate::surface::Spheres`] out. Positions are
+//! in Å.
 //!
 //! The module does not depend on grids, meshes or HTTP. Only [`archive`] reads files from disk.
 //!

@@ -2,7 +2,8 @@
 //!
 //! A line is `recordName serial atomName residueName [chainID] residueNumber X Y Z charge radius`. Supported
 //! deviations, which PDB2PQR writes: a serial number that touches the record name (`HETATM10000`), and a chain that
-//! touches the residue number (`A1000`). Serial numbers are ignored. Radii replace those of the table. Charges are only checked.
+//! touches the residue number (`A1000`). Serial numbers are ignored. Radii replace those of the table. Charges are only
+//! checked.
 
 use std::collections::HashMap;
 
@@ -45,9 +46,13 @@ pub(super) fn is_pqr(head: &[u8]) -> bool {
         if let Some((_, first)) = record(&fields) {
             let n = fields.len().saturating_sub(first);
             let last = first + n;
-            return FIELDS.contains(&n)
-                && (last - 5..last).all(|i| fields.real(i).is_some())
-                && !(has_pdb_columns(&head[line]) && (last - 2..last).all(|i| decimals(fields.get(i)) <= 2));
+            if !FIELDS.contains(&n) || !(last - 5..last).all(|i| fields.real(i).is_some()) {
+                return false;
+            }
+            // A PDB line without a B-factor has as many fields, but its coordinates end where a charge would begin.
+            let after_coordinates = fields.range(last - 2).0 >= line.start + 54;
+            let precise = (last - 2..last).any(|i| decimals(fields.get(i)) > 2);
+            return !has_pdb_columns(&head[line]) || (after_coordinates && precise);
         }
     }
     false
@@ -225,6 +230,8 @@ mod tests {
         for pdb in [
             "ATOM      1  N   ARG A   1      32.231  15.281 -13.143",
             "ATOM      1  N   ARG A   1      32.231  15.281 -13.143  1.00 28.28",
+            "ATOM      1  N   ARG A   1      32.231  15.281 -13.143  1.00",
+            "ATOM      1  N   ARG 2   1      32.231  15.281 -13.143  1.00",
             "ATOM      1  N   ARG     1      32.231  15.281 -13.143  1.00 28.28",
             "ATOM      1  N   ARG     1      32.231  15.281 -13.143  1.00 28.28   5",
             "ATOM      1  N   ARG A   1      32.231  15.281 -13.143  1.00 28.28           N",
