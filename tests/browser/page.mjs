@@ -155,7 +155,7 @@ await run({
     assert.deepEqual(formats, can.formats.map((f) => f.name));
     for (const format of formats) {
       const [download] = await Promise.all([page.waitForEvent("download"), page.locator(`#formats button[data-format="${format}"]`).click()]);
-      assert.equal(download.suggestedFilename(), `4PTI.${format}`);
+      assert.equal(download.suggestedFilename(), format === "ply-text" ? "4PTI.ply" : `4PTI.${format}`);
       const direct = await fetched(`${structure}/surface.${format}?resolution=0.8`);
       assert.equal(direct.status, 200);
       assert.ok(readFileSync(await download.path()).equals(direct.bytes), format);

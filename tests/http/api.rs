@@ -532,7 +532,7 @@ fn health_version_and_capabilities() {
     assert_eq!(SERVER.get("/readyz").json()["status"], "ready");
     assert_eq!(SERVER.get("/version").json()["version"], env!("CARGO_PKG_VERSION"));
     let can = SERVER.get("/v1/capabilities").json();
-    assert_eq!(can["formats"].as_array().unwrap().len(), 6);
+    assert_eq!(can["formats"].as_array().unwrap().len(), 7);
     assert_eq!(can["surfaces"].as_array().unwrap().len(), 6);
     assert_eq!(can["presets"]["ses-like"]["isovalue"], 1.9);
     assert_eq!(can["backends"][0]["reason"], "set by a test");
