@@ -268,7 +268,7 @@ pub(crate) struct SelectionArgs {
     /// Id of the biological assembly to build [default: asymmetric-unit, the atoms as they are in the file]
     #[arg(long, value_name = "ID")]
     pub(crate) assembly: Option<String>,
-    /// Divide the mesh into parts that are closed on their own: chain (in an assembly per copy), entity, residue-group
+    /// Divide the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, residue-group
     /// (polymer, ligand, glycan, ion, water) or none [default: none]
     #[arg(long, value_name = "RULE")]
     pub(crate) split: Option<String>,

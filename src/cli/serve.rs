@@ -82,9 +82,9 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
 }
 
-/// Returns the number of threads of the async runtime, which serve sockets and hash uploads: a quarter of the cores.
-/// Meshing has other threads. Two threads are the bound of a service with several GPUs: an upload of 5 MB and its mesh
-/// keep one of them busy for 25 ms.
+/// Returns the number of threads of the async runtime: a quarter of the cores, at least two. They serve sockets and
+/// hash uploads; meshing has other threads. Two threads would limit a service with several GPUs: an upload of 5 MB and
+/// the download of its mesh keep a thread busy for 25 ms.
 fn runtime_threads() -> usize {
     let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
     (cores / 4).max(2)

@@ -73,7 +73,7 @@ pub(super) fn check(mesh: &Mesh, format: Format) -> Result<Summary, FormatError>
     })
 }
 
-/// Rejects parts that do not cover the mesh in order, or whose triangles refer to vertices of other parts.
+/// Rejects parts that do not cover the mesh in order and parts whose triangles refer to vertices of other parts.
 fn check_parts(mesh: &Mesh, n_vertices: usize) -> Result<(), FormatError> {
     let mut end = [0, 0];
     for part in &mesh.parts {

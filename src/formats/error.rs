@@ -25,9 +25,10 @@ pub enum FormatError {
         /// Number of vertices.
         vertices: u64,
     },
-    /// The rows of a part do not follow those of the part before, or its triangles refer to other rows.
+    /// The rows of a part do not follow those of the previous part, or its triangles refer to vertices of other parts.
     #[error(
-        "part `{part}` is not a mesh of its own: its rows must follow the part before and refer to each other only"
+        "part `{part}` is not a mesh of its own: its rows must follow those of the previous part, and its triangles \
+         must refer to its own vertices only"
     )]
     BadPart {
         /// Name of the part.

@@ -78,7 +78,8 @@ impl Format {
         matches!(self, Self::Glb | Self::Gltf)
     }
 
-    /// Media type, registered with IANA except those of PLY: `application/ply` is common, the other names its variant.
+    /// Media type, registered with IANA except those of PLY: `application/ply` is common, `model/x-ply-text` is
+    /// specific to molmesh.
     #[must_use]
     pub const fn media_type(self) -> &'static str {
         match self {

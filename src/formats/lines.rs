@@ -1,4 +1,4 @@
-//! Lines of text formats: numbers with fixed decimals, collected into blocks.
+//! Lines of text formats: numbers with fixed decimals, written in blocks.
 
 use std::io::{self, Write};
 
@@ -8,7 +8,7 @@ use super::check::Summary;
 use super::error::FormatError;
 use crate::surface::Mesh;
 
-/// Decimals of a normal's component.
+/// Decimals of a component of a normal.
 pub(super) const NORMAL_DECIMALS: Decimals = Decimals::Four;
 
 /// Largest coordinate, in the file's units.
@@ -18,7 +18,7 @@ const MAX_COORDINATE: f64 = 1e9;
 /// of 7, four levels of a colour of 3 and an atom index of 10, with blanks and a line feed.
 const LINE_BYTES: usize = 112;
 
-/// Decimals of a number.
+/// Number of decimals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Decimals {
     Four,

@@ -85,7 +85,7 @@ fn vertices<const N: usize>(mesh: &Mesh, storage: Storage, out: &mut dyn Write) 
     })
 }
 
-/// Returns the header of a file with records in this encoding. `precision` describes the rounding of its numbers.
+/// Returns the header of a file whose records have this encoding. `precision` is the unit of the last decimal.
 pub(super) fn header(mesh: &Mesh, storage: Storage, meta: &Meta, encoding: &str, precision: Option<&str>) -> String {
     let mut lines = vec!["ply".to_owned(), format!("format {encoding} 1.0")];
     lines.extend(text::facts(mesh, meta, storage.units, precision).into_iter().map(|fact| format!("comment {fact}")));

@@ -1,6 +1,6 @@
 //! PLY as text: the header of the binary format, then one line per vertex and triangle.
 //!
-//! Numbers are rounded as in OBJ. Vertices with equal coordinates stay separate, and the surface stays closed.
+//! Numbers are rounded as in OBJ. Vertices with equal coordinates stay separate, so the surface stays closed.
 
 use std::io::{self, Write};
 

@@ -106,7 +106,7 @@ async fn collect(body: Body, announced: u64, limit: Limit, lease: &Lease) -> Res
             continue;
         }
         if all.is_empty() {
-            // At most the limit. Memory that no byte is written to is not allocated.
+            // At most the limit. The operating system allocates memory when it is written, not when it is reserved.
             all.reserve(usize::try_from(announced.max(length)).unwrap_or(0));
             all.extend_from_slice(&std::mem::take(&mut first));
         }

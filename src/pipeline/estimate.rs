@@ -126,7 +126,7 @@ fn of_mesh(
     }
     let (samples, limit) = (512 * bricks, limits.max_samples);
     if samples > limit {
-        // Each part fits.
+        // Each part fits the limit, but not all parts together.
         let suggested_resolution = slightly_coarser(h * (samples as f64 / limit as f64).cbrt());
         return Err(SurfaceError::GridTooLarge { samples, limit, resolution: h, suggested_resolution });
     }
@@ -142,7 +142,7 @@ fn of_mesh(
     let vertices = (1.5 * area / (h * h)).round() as u64;
     let triangles = 2 * vertices;
     let bytes = params.mesh_bytes(vertices, triangles);
-    // Parts are quantized after they are joined.
+    // Parts are quantized after joining, so each vertex first takes its full size.
     let in_memory = if lattices.len() > 1 { single.mesh_bytes(vertices, triangles) } else { bytes };
     let estimate = MeshEstimate { bricks, samples, area, vertices, triangles, bytes };
     if in_memory > limits.max_mesh_bytes {
@@ -153,7 +153,7 @@ fn of_mesh(
 
 /// Maximum number of grids that [`with_finest_fit`] plans.
 const MAX_PLANS: u32 = 6;
-/// Factor from a spacing that does not fit all parts to the next one.
+/// Factor by which the spacing grows if it does not fit all parts.
 const COARSER: f64 = 1.5;
 
 /// Replaces the suggested spacing of [`SurfaceError::GridTooLarge`], which is an upper bound, with the finest hundredth
@@ -190,7 +190,7 @@ pub(super) fn with_finest_fit(
                 next = finer;
             }
             Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)) => return error,
-            // The bound of one part need not fit all parts.
+            // The bound comes from one part and may be too fine for all parts.
             _too_large if parts.is_some() && fits.is_none() && next < MAX_RESOLUTION => {
                 next = (COARSER * next).min(MAX_RESOLUTION);
             }

@@ -275,8 +275,8 @@ fn no_fit(params: &SurfaceParams, limit: u64, resolution: f64, triangles: u64) -
     }
 }
 
-/// Observer that times stages but hides their progress: a first, coarse mesh does not advance the job, and a part only
-/// as a whole.
+/// Observer that times stages but hides their progress: a first, coarse mesh does not advance the job, and a part
+/// advances it only when it is complete.
 pub(super) struct WithoutProgress<'a>(pub(super) &'a dyn Observer);
 
 impl Observer for WithoutProgress<'_> {

@@ -1,4 +1,4 @@
-//! Meshes each part of the atoms on its own, and joins the meshes into one with the ranges of the parts.
+//! Meshes each part of the atoms on its own and joins the meshes into one, which records the rows of each part.
 //!
 //! Grids are aligned with the origin, so a part has the mesh that its atoms would have alone.
 
@@ -20,7 +20,7 @@ use crate::surface::{
     PartRange, Reservation, Spheres, Stage, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams,
 };
 
-/// Rows per task.
+/// Rows per parallel task.
 const ROWS: usize = 1 << 16;
 /// Bytes of a quantized vertex.
 const QUANTIZED_BYTES: u64 = 12;
@@ -29,7 +29,7 @@ const QUANTIZED_BYTES: u64 = 12;
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct PartReport {
-    /// Name: the chain with the number of its copy in an assembly, the entity, or the group of residues.
+    /// Name: chain (with the number of its copy in an assembly), entity, or group of residues.
     pub name: String,
     /// Number of atoms.
     pub atoms: u64,
@@ -59,7 +59,7 @@ impl PartReport {
     }
 }
 
-/// Returns the spheres of each part, or all spheres if they are not divided.
+/// Returns the spheres of each part, or all spheres if `parts` is `None`.
 pub(super) fn spheres_of<'s>(
     spheres: &'s Spheres,
     parts: Option<&'s [AtomPart]>,
@@ -68,13 +68,13 @@ pub(super) fn spheres_of<'s>(
     whole.into_iter().chain(parts.unwrap_or_default().iter().map(|part| Cow::Owned(spheres.subset(&part.rows))))
 }
 
-/// Backend that meshes parts on another backend.
+/// Backend that meshes each part on another backend and joins the meshes.
 pub(super) struct PartsBackend<'a> {
     inner: Inner<'a>,
     parts: &'a [AtomPart],
 }
 
-/// Backend that meshes the parts.
+/// Backend that meshes the parts: the chosen one, or the one that it assigned to the job.
 enum Inner<'a> {
     Chosen(&'a dyn Backend),
     Assigned(Box<dyn Backend + 'a>),
@@ -97,7 +97,7 @@ impl<'a> PartsBackend<'a> {
         Self { inner: Inner::Chosen(inner), parts }
     }
 
-    /// Meshes all parts on `backend`; `None` if different backends made them.
+    /// Meshes all parts on `backend`. Returns `None` if a fallback meshed some of them.
     fn join(
         &self,
         backend: &dyn Backend,
@@ -164,7 +164,8 @@ impl Backend for PartsBackend<'_> {
         Some(Box::new(PartsBackend { inner, parts: self.parts }))
     }
 
-    /// Limits apply to all parts together. A mesh is quantized after the parts are joined, as they share one step.
+    /// Limits apply to all parts together. The mesh is quantized after joining, because all parts have the same centre
+    /// and step.
     fn write(
         &self,
         spheres: &Spheres,
@@ -177,7 +178,7 @@ impl Backend for PartsBackend<'_> {
         let assigned = self.inner.for_job(params.surface, work);
         let backend = assigned.as_deref().unwrap_or(&*self.inner);
         let run = Run { params: &SurfaceParams { quantize: None, ..params.clone() }, limits };
-        // The content key names one backend. If it fails between two parts, its fallback repeats all of them.
+        // The content key names one backend. If it fails after some parts, the fallback meshes all parts again.
         for _attempt in 0..2 {
             let memory = Arc::new(Reservation::new(&control.memory));
             let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
@@ -198,14 +199,14 @@ struct Run<'a> {
     limits: &'a SurfaceLimits,
 }
 
-/// Returns the centre of the mesh of all spheres: the grid point nearest to the middle.
+/// Returns the centre of the joined mesh: the grid point nearest to the middle of the bounding box of all spheres.
 fn centre(spheres: &Spheres, params: &SurfaceParams) -> [f64; 3] {
     let [low, high] = spheres.bounds().unwrap_or_default();
     let h = params.resolution;
     std::array::from_fn(|k| (0.5 * (low[k] + high[k]) / h).round() * h)
 }
 
-/// Parts that are meshed.
+/// Joined mesh of the parts so far.
 struct Joined {
     mesh: Mesh,
     grid: GridStats,
@@ -221,7 +222,7 @@ impl Joined {
         Self { mesh, grid: GridStats::default(), measures: Some(Vec::new()), made_by: None, backend: None }
     }
 
-    /// Records the backend of a part. Returns false if another one made the parts before.
+    /// Records the backend of a part. Returns false if it differs from that of the previous parts.
     fn made_by(&mut self, identity: Option<&BackendIdentity>, backend: &dyn Backend) -> bool {
         let name = identity.map_or_else(|| backend.name(), |identity| identity.backend);
         self.made_by = self.made_by.take().or_else(|| identity.cloned());
@@ -236,12 +237,12 @@ impl Joined {
             *position = std::array::from_fn(|k| to_f32(f64::from(position[k]) + shift[k]));
         });
         let [first, n] = [self.mesh.n_vertices(), own.n_vertices()];
-        // `check_size` has checked that indices fit 32 bits; those of this part are checked next.
+        // `check_size` has ensured that the indices so far fit 32 bits; the caller checks those of this part next.
         let offset = u32::try_from(first).unwrap_or(u32::MAX);
         let shifted = |v: u32| v.wrapping_add(offset);
         own.triangles.par_chunks_mut(ROWS).flatten_iter().for_each(|triangle| *triangle = triangle.map(shifted));
         if let Some(ids) = &mut own.atom_ids {
-            // Indices of spheres of the part become indices of all spheres.
+            // Converts indices among the spheres of the part to indices among all spheres.
             ids.par_chunks_mut(ROWS).flatten_iter().for_each(|id| *id = part.rows[*id as usize]);
         }
         let triangles = self.mesh.n_triangles();
@@ -274,29 +275,30 @@ impl Joined {
         self.mesh.parts.push(PartRange { name, vertices: vertices..vertices, triangles: triangles..triangles });
     }
 
-    /// Returns the part of the limits that the next part may use.
+    /// Returns the remaining limits for the next part.
     fn left_of(&self, limits: &SurfaceLimits) -> SurfaceLimits {
         SurfaceLimits {
             max_samples: limits.max_samples.saturating_sub(self.grid.samples),
             max_mesh_bytes: limits.max_mesh_bytes.saturating_sub(self.mesh.bytes()),
-            // One limit applies to both.
+            // One limit applies to both counts.
             max_candidates: limits.max_candidates.saturating_sub(self.grid.candidates.max(self.grid.overlaps)),
         }
     }
 
-    /// Returns the error of a part as that of all parts. `fraction` of the atoms are meshed, including this part.
+    /// Converts the error of a part to an error of all parts. `fraction` of the atoms are in this part and the previous
+    /// ones.
     fn error(&self, error: SurfaceError, run: &Run<'_>, fraction: f64) -> SurfaceError {
         use SurfaceError as E;
         let limit = run.limits.max_candidates;
         match error {
             E::GridTooLarge { samples, resolution, suggested_resolution, .. } => E::GridTooLarge {
-                // The number of a part is an estimate.
+                // The number of grid points of a part that fails is an estimate.
                 samples: self.grid.samples.saturating_add(samples).max(run.limits.max_samples.saturating_add(1)),
                 limit: run.limits.max_samples,
                 resolution,
                 suggested_resolution,
             },
-            // The spacing that fits one part need not fit all.
+            // A spacing that fits one part need not fit all parts.
             E::TooManyCandidates { candidates, resolution, .. } => E::TooManyCandidates {
                 candidates: self.grid.candidates + candidates,
                 limit,

@@ -111,7 +111,7 @@ impl Structure {
         self.radius.get(i).copied().unwrap_or_else(|| radii::vdw_radius(self.element[i]))
     }
 
-    /// Returns the name of the radii, for reports.
+    /// Returns the source of the radii, for reports.
     #[must_use]
     pub fn radii_name(&self) -> &'static str {
         if self.radius.is_empty() { radii::TABLE } else { radii::OF_FILE }
@@ -152,7 +152,7 @@ pub(super) struct Source {
     pub(super) title: Option<String>,
     pub(super) sequence: Sequence,
     pub(super) assemblies: Assemblies,
-    /// Radius of each atom, Å; empty if the file has none. Their memory belongs to the structure.
+    /// Radius of each atom, Å; empty if the file has none. The reader counts their memory for the structure.
     pub(super) radii: Vec<f32>,
     pub(super) warnings: Vec<String>,
 }
@@ -316,7 +316,7 @@ impl Columns {
         (self.model[row], [self.x[row], self.y[row], self.z[row]])
     }
 
-    /// Returns a warning about the atoms of unknown elements, if there are any and their radii depend on it.
+    /// Returns a warning about the atoms of unknown elements; `None` if there are none or the file gives all radii.
     fn unknown_elements(&self, tables: &Tables, radii_of_file: &[f32]) -> Option<String> {
         if !radii_of_file.is_empty() {
             return None;

@@ -9,7 +9,8 @@ use crate::surface::OutOfMemory;
 pub enum StructureError {
     /// The bytes are not in a supported format.
     #[error(
-        "unknown structure format: {found}; expected PDB, mmCIF, BinaryCIF, PQR or XYZ, plain or compressed with gzip or zstd"
+        "unknown structure format: {found}; expected PDB, mmCIF, BinaryCIF, PQR or XYZ, plain or compressed with \
+         gzip or zstd"
     )]
     UnknownFormat {
         /// Description of the first bytes.
@@ -97,7 +98,7 @@ pub enum StructureError {
         /// Limit, number of atoms.
         limit: u64,
     },
-    /// The selected atoms have more parts than allowed.
+    /// The selected atoms would be divided into more parts than allowed.
     #[error("split={split} divides the selected atoms into more than {limit} parts")]
     TooManyParts {
         /// Name of the rule by which atoms are divided.

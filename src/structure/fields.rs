@@ -10,7 +10,7 @@ use super::number;
 use super::read::{MAX_COORDINATE, Reading};
 use super::text::Fault;
 
-/// Number of fields of a line that can be read. Lines of PQR have at most 11.
+/// Maximum number of readable fields of a line. Lines of PQR have at most 11.
 const MAX_FIELDS: usize = 16;
 
 /// Lines between two checks of the cancellation flag: a few milliseconds.
@@ -47,7 +47,7 @@ impl Iterator for Lines<'_> {
 pub(super) struct Fields<'a> {
     text: &'a [u8],
     line: Range<usize>,
-    /// The first fields as byte ranges; empty ranges at the end of the line for missing ones.
+    /// Byte ranges of the first fields; empty and at the end of the line for missing fields.
     ranges: [(usize, usize); MAX_FIELDS],
     len: usize,
 }
@@ -75,7 +75,7 @@ impl<'a> Fields<'a> {
         }
     }
 
-    /// Returns the number of fields, including those that cannot be read.
+    /// Returns the number of fields, including those beyond [`MAX_FIELDS`].
     pub(super) fn len(&self) -> usize {
         self.len
     }
@@ -130,7 +130,7 @@ pub(super) struct Rows<'a> {
 }
 
 impl<'a> Rows<'a> {
-    /// Creates rows, probably as many as `expected`.
+    /// Creates an empty list for about `expected` atoms.
     pub(super) fn new(reading: &'a Reading<'a>, expected: usize) -> Self {
         Self { reading, columns: GrowingColumns::default(), tables: Tables::default(), expected, n_lines: 0 }
     }
@@ -146,7 +146,7 @@ impl<'a> Rows<'a> {
         if self.n_lines.is_multiple_of(LINES_PER_CHECK) { self.reading.check() } else { Ok(()) }
     }
 
-    /// Returns an atom without residue and chain, whose values are those of an ATOM record without them.
+    /// Returns an atom of a polymer without residue and chain, with occupancy 1 and B-factor 0.
     pub(super) fn atom(&mut self, position: [f64; 3], element: u8, name: u32, model: i32) -> Atom {
         Atom {
             position,

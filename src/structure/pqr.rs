@@ -19,7 +19,7 @@ use super::read::Reading;
 use super::text::Fault;
 use crate::surface::OutOfMemory;
 
-/// Largest radius, Å. Larger ones are probably another column.
+/// Largest valid radius, Å. Larger numbers are probably from another column.
 const MAX_RADIUS: f64 = 100.0;
 
 /// Typical length of a line, bytes.
@@ -28,7 +28,7 @@ const BYTES_PER_LINE: usize = 64;
 /// Fields from the atom name to the radius, without and with a chain.
 const FIELDS: [usize; 2] = [8, 9];
 
-/// Returns true for HETATM and false for ATOM, and the number of fields before the atom name. `None` for other records.
+/// Returns true for HETATM or false for ATOM, and the number of fields before the atom name; `None` for other records.
 fn record(fields: &Fields<'_>) -> Option<(bool, usize)> {
     let word = fields.get(0);
     let (hetero, serial) = match word.strip_prefix(b"HETATM") {
@@ -39,7 +39,8 @@ fn record(fields: &Fields<'_>) -> Option<(bool, usize)> {
     serial.iter().all(u8::is_ascii_digit).then_some((hetero, if touches { 1 } else { 2 }))
 }
 
-/// Returns true if the first atom of a PDB or PQR file has the fields of PQR and not the columns of PDB.
+/// Returns true if the first atom of a PDB or PQR file indicates PQR: it has the fields of PQR and either lacks the
+/// columns of PDB or has more decimals than PDB.
 pub(super) fn is_pqr(head: &[u8]) -> bool {
     for line in Lines::new(head) {
         let fields = Fields::split(head, line.clone());
@@ -49,7 +50,7 @@ pub(super) fn is_pqr(head: &[u8]) -> bool {
             if !FIELDS.contains(&n) || !(last - 5..last).all(|i| fields.real(i).is_some()) {
                 return false;
             }
-            // A PDB line without a B-factor has as many fields, but its coordinates end where a charge would begin.
+            // A PDB line without a B-factor has as many fields, with the z coordinate in place of the charge.
             let after_coordinates = fields.range(last - 2).0 >= line.start + 54;
             let precise = (last - 2..last).any(|i| decimals(fields.get(i)) > 2);
             return !has_pdb_columns(&head[line]) || (after_coordinates && precise);
@@ -68,8 +69,8 @@ fn has_pdb_columns(line: &[u8]) -> bool {
         && [54, 60].into_iter().all(|from| matches!(number(from, from + 6), (true, _) | (_, true)))
 }
 
-/// Returns the number of digits after the point. PDB writes occupancies and B-factors with two, PQR charges and radii
-/// with three or four.
+/// Returns the number of decimals. In PDB, occupancies and B-factors have two; in PQR, charges and radii have three or
+/// four.
 fn decimals(field: &[u8]) -> usize {
     memchr::memchr(b'.', field).map_or(0, |point| field.len() - point - 1)
 }
@@ -115,7 +116,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
 /// State of reading.
 struct Pqr<'a> {
     rows: Rows<'a>,
-    /// Guessed elements by atom and residue name.
+    /// Elements guessed from the names of atom and residue.
     guesses: HashMap<(u32, u32), u8>,
     model: i32,
 }

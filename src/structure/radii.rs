@@ -12,7 +12,7 @@ use super::element::SYMBOLS;
 /// Name of the table, for reports.
 pub const TABLE: &str = "Bondi 1964, completed by Mantina et al. 2009; 2.0 Å elsewhere";
 
-/// Name of radii that a file gives, for reports.
+/// Name of radii from the file, for reports.
 pub const OF_FILE: &str = "radii of the file";
 
 /// Radius of elements without a value in either source, and of unknown elements, Å.

@@ -17,7 +17,7 @@ pub struct ReadLimits {
     pub max_duplicates: u64,
     /// Copies of chains in an assembly.
     pub max_copies: u64,
-    /// Parts into which the selected atoms are divided.
+    /// Parts into which `split` divides the selected atoms.
     pub max_parts: u64,
 }
 

@@ -10,7 +10,7 @@ use super::read::{ReadLimits, check};
 use super::select::Selected;
 use crate::surface::Control;
 
-/// Rule by which atoms are divided into parts.
+/// Rule that divides atoms into parts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Split {
     /// One mesh of all atoms.
@@ -43,7 +43,7 @@ impl Split {
 /// Atoms of one part.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AtomPart {
-    /// Name, at most [`MAX_NAME`] characters and the number of a copy.
+    /// Name: at most 40 characters, and the number of the copy in an assembly.
     pub name: String,
     /// Rows of [`Selected::atoms`], ascending.
     pub rows: Vec<u32>,
@@ -52,7 +52,7 @@ pub struct AtomPart {
 /// Maximum length of a name from the file, characters. Chains of the PDB have at most four.
 const MAX_NAME: usize = 40;
 
-/// Name of a blank chain, as in `chains`.
+/// Name of the blank chain, as in the parameter `chains`.
 const BLANK_CHAIN: &str = "_";
 /// Name of atoms whose entity is unknown.
 const UNKNOWN_ENTITY: &str = "unknown";
@@ -65,8 +65,8 @@ impl Selected {
     /// memory to the meter of `control`.
     ///
     /// # Errors
-    /// Returns [`StructureError::TooManyParts`], [`StructureError::NoEntities`] for entities of a file that has none,
-    /// and the errors of memory and cancellation.
+    /// Returns [`StructureError::TooManyParts`], [`StructureError::NoEntities`] for [`Split::Entity`] if the file has
+    /// no entities, and the errors of memory and cancellation.
     pub fn parts(
         &self,
         structure: &Structure,
@@ -136,7 +136,7 @@ const fn group(kind: Kind) -> &'static str {
     }
 }
 
-/// Returns the name of a part: that in the file, and the number of the copy, from 1, in an assembly.
+/// Returns the name of a part: the name in the file and, in an assembly, the number of the copy, from 1.
 fn shown((copy, name): (usize, &str)) -> String {
     let name: String = name.chars().take(MAX_NAME).collect();
     if copy == 0 { name } else { format!("{name}-{copy}") }

@@ -110,7 +110,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
         plain => plain?,
     };
     let text = without_mark(&plain);
-    // pdbtbx reads PDB and mmCIF only.
+    // pdbtbx reads only PDB and mmCIF.
     let unread =
         |format: &str| Ok(vec![Diagnostic::note(format!("not checked: the strict validator does not read {format}"))]);
     let format = match sniff::sniff(text)? {

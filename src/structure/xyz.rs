@@ -14,16 +14,16 @@ use super::pdb::MAX_TITLE;
 use super::read::Reading;
 use super::text::{Fault, normalize};
 
-/// Length of the shortest line of an atom, bytes.
+/// Length of the shortest atom line, bytes.
 const MIN_LINE: usize = "C 0 0 0\n".len();
 
 /// Key of extended XYZ in the comment line.
 const PROPERTIES: &[u8] = b"Properties=";
 
-/// Beginning of its value.
+/// Required beginning of its value.
 const SPECIES_AND_POSITION: &[u8] = b"species:S:1:pos:R:3";
 
-/// Returns true if the text begins with a number, a second line and the line of an atom.
+/// Returns true if the text begins with a line with one integer, any second line and an atom line.
 pub(super) fn is_xyz(head: &[u8]) -> bool {
     let mut lines = Lines::new(head).map(|line| Fields::split(head, line));
     let (Some(count), Some(_comment), Some(atom)) = (lines.next(), lines.next(), lines.next()) else { return false };

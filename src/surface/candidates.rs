@@ -59,7 +59,7 @@ impl OverlapCount {
         Self { so_far: AtomicU64::new(0), limit: limit(limits) }
     }
 
-    /// Number of pairs so far.
+    /// Returns the number of pairs so far.
     pub(super) fn total(&self) -> u64 {
         self.so_far.load(Ordering::Relaxed)
     }

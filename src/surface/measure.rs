@@ -117,8 +117,8 @@ impl Measures {
         Ok(Self::new(self.components, size, topology::check(triangles, control)?, validation))
     }
 
-    /// Returns the measures of several meshes that share no vertex, with their components relative to one centre;
-    /// `None` without meshes.
+    /// Joins the measures of meshes that share no vertex. All components must be relative to the same centre. Returns
+    /// `None` if there are no meshes.
     #[must_use]
     pub fn joined(meshes: Vec<Self>) -> Option<Self> {
         let mut all = meshes.into_iter().reduce(|mut all, next| {

@@ -35,7 +35,7 @@ pub struct Mesh {
     pub atom_ids: Option<Column<u32>>,
     /// Per vertex an sRGB colour with alpha, if the caller set one. Backends leave it empty.
     pub colors: Option<Column<[u8; 4]>>,
-    /// Parts that are closed on their own, in order: they cover all rows. Empty for a mesh that is not divided.
+    /// Parts that are closed on their own. They cover all rows in order. Empty if the mesh is not divided.
     pub parts: Vec<PartRange>,
 }
 
@@ -150,10 +150,10 @@ impl Mesh {
         }
     }
 
-    /// Lowest and highest relative position per axis of some vertices; zeros without vertices.
+    /// Lowest and highest relative position per axis of a range of vertices; zeros for an empty range.
     ///
     /// # Panics
-    /// Panics if there are no such vertices.
+    /// Panics if the range exceeds the vertices.
     #[must_use]
     pub fn bounds_of(&self, vertices: Range<usize>) -> [[f32; 3]; 2] {
         let bounds = match self.vertices() {

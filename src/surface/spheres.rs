@@ -44,7 +44,7 @@ impl Spheres {
     /// Returns the spheres with these indices, in this order.
     ///
     /// # Panics
-    /// Panics if there is no such sphere.
+    /// Panics if an index is out of range.
     #[must_use]
     pub fn subset(&self, rows: &[u32]) -> Self {
         let column = |column: &[f64]| rows.iter().map(|&i| column[i as usize]).collect();

@@ -1,4 +1,4 @@
-//! Meshes in parts: names, oracles, equality with the meshes of the parts alone, and limits.
+//! Parts of a mesh: names, other readers, equality with the meshes of the parts alone, and limits.
 #![allow(clippy::pedantic, clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 use std::sync::Arc;
@@ -74,7 +74,7 @@ fn part(mesh: &Mesh, n: usize) -> Mesh {
     }
 }
 
-/// Returns the largest distance between equal vertices of two meshes; infinite if the triangles differ.
+/// Returns the largest distance between corresponding vertices of two meshes; infinite if the triangles differ.
 fn distance(a: &Mesh, b: &Mesh) -> f64 {
     if a.triangles != b.triangles || a.n_vertices() != b.n_vertices() {
         return f64::INFINITY;
@@ -158,7 +158,7 @@ fn bad_values_name_the_valid_ones() {
     assert!((1..4).all(|n| !keys[..n].contains(&keys[n])), "{keys:?}");
 }
 
-/// Part as trimesh reads it.
+/// Part as read by trimesh.
 #[derive(Debug, Deserialize)]
 struct Read {
     name: String,

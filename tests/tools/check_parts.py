@@ -1,7 +1,7 @@
-"""Reads the nodes of glTF files and the groups of OBJ files with trimesh, as an independent check of parts.
+"""Checks the parts of meshes independently: reads nodes of glTF files and groups of OBJ files with trimesh.
 
-Reads file names from the arguments, or one per line from standard input, and answers each with one line of JSON:
-name, watertight, faces, unused vertices, area and volume of every part, in the order of names.
+Reads file names from the arguments, or one per line from standard input. Prints one line of JSON for each file: name,
+watertight, faces, unused vertices, area and volume of every part, ordered by name.
 """
 
 import json

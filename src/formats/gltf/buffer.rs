@@ -23,7 +23,7 @@ pub(super) enum Rows<'a> {
     Colors(&'a [[u8; 4]]),
     /// Atom indices.
     Atoms(&'a [u32]),
-    /// Vertex indices, and the vertex from which the file counts them.
+    /// Vertex indices, and the vertex that has index 0 in the file.
     Triangles(&'a [[u32; 3]], u32),
 }
 
@@ -60,7 +60,7 @@ impl<'a> Rows<'a> {
             append(&mut all, mesh.triangles.pieces(), |rows| Self::Triangles(rows, 0));
         }
         for part in &mesh.parts {
-            // The layout has checked that indices fit 32 bits.
+            // The layout ensures that indices fit 32 bits.
             let first = u32::try_from(part.vertices.start).unwrap_or(u32::MAX);
             let rows = Self::Triangles(&mesh.triangles[part.triangles.clone()], first);
             all.push((part.triangles.start as u64, rows));
@@ -132,7 +132,7 @@ pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) ->
 
 /// Writes indices, counted from `first`, in the type of the layout.
 fn write_indices(out: &mut dyn Write, index_type: IndexType, indices: &[u32], first: u32) -> io::Result<()> {
-    // No index of a part is lower, as the check before writing found.
+    // The check before writing ensures that no index is lower than `first`.
     let bytes = |index: u32| index.wrapping_sub(first).to_le_bytes();
     match index_type {
         IndexType::U8 => convert_words(out, indices, |index| [bytes(index)[0]]),

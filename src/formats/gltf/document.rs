@@ -1,5 +1,5 @@
-//! JSON document of a glTF: one scene, one node translated to the mesh's centre, with one mesh of one primitive or a
-//! node and a mesh for each part.
+//! JSON document of a glTF: one scene and one node translated to the mesh's centre. The node has one mesh of one
+//! primitive, or a child node with a mesh for each part.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -98,7 +98,7 @@ fn extras(centre: [f64; 3], units: Units, step: Option<Step>, meta: &Meta) -> Ma
     extras
 }
 
-/// Adds buffer, views, accessors, material and a mesh for each of `drawn`, and returns the meshes.
+/// Adds buffer, views, accessors, material and a mesh for each element of `drawn`. Returns the meshes.
 fn meshes(
     root: &mut Root,
     layout: &Layout,
@@ -152,7 +152,7 @@ impl Column {
     }
 }
 
-/// Columns of the buffer, each with its view, and the material. All primitives share them.
+/// Columns of the buffer, and the material. All primitives share them.
 struct Columns {
     attributes: Vec<(Semantic, Column)>,
     indices: Column,
@@ -160,7 +160,7 @@ struct Columns {
 }
 
 impl Columns {
-    /// Adds buffer, views and material. If the accessors of several parts share a view, it must have a stride.
+    /// Adds buffer, views and material. `shared` views, which accessors of several parts use, must have a stride.
     fn new(root: &mut Root, layout: &Layout, shared: bool, summary: &Summary) -> Self {
         let byte_length = USize64(layout.len);
         let buffer = root.push(Buffer { byte_length, name: None, uri: None, extensions: None, extras: None });
@@ -206,14 +206,14 @@ impl Columns {
         Self { attributes, indices, material }
     }
 
-    /// Adds the accessors of a part, and returns its primitive.
+    /// Adds the accessors of a part. Returns its primitive.
     fn primitive(&self, root: &mut Root, layout: &Layout, part: &Drawn<'_>) -> Primitive {
         let count = |rows: &Range<u64>| rows.end - rows.start;
         let mut attributes = BTreeMap::new();
         for (semantic, column) in &self.attributes {
             let mut accessor = column.accessor(part.vertices.start, count(&part.vertices));
             if *semantic == Semantic::Positions {
-                // These are exactly values of the buffer: rounding preserves the order, and doubles hold floats
+                // These are exact values of the buffer: rounding preserves the order, and doubles represent floats
                 // exactly.
                 let [low, high] = part.bounds.map(|row| match layout.storage.packing {
                     Packing::Full => Value::from(row.map(f64::from).to_vec()),

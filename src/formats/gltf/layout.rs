@@ -77,18 +77,18 @@ pub(super) struct Span {
 /// Rows of the mesh that one primitive draws.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Drawn<'a> {
-    /// Name of its node; that of the mesh if it is not divided.
+    /// Name of its node; `None` if the mesh is not divided.
     pub(super) name: Option<&'a str>,
     /// Rows of its vertices.
     pub(super) vertices: Range<u64>,
-    /// Rows of its triangles, whose indices count from the first of its vertices.
+    /// Rows of its triangles. In the file, their indices count from the first of its vertices.
     pub(super) triangles: Range<u64>,
     /// Lowest and highest relative position per axis, Å.
     pub(super) bounds: [[f32; 3]; 2],
 }
 
 impl<'a> Drawn<'a> {
-    /// Returns the parts of a mesh that have triangles, or the whole mesh if it is not divided.
+    /// Returns the parts that have triangles, or the whole mesh if it is not divided.
     pub(super) fn of(mesh: &'a Mesh, summary: &Summary) -> Vec<Self> {
         if mesh.parts.is_empty() {
             return vec![Self::whole([mesh.n_vertices(), mesh.n_triangles()].map(|n| n as u64), summary)];
@@ -104,7 +104,7 @@ impl<'a> Drawn<'a> {
         parts.collect()
     }
 
-    /// Returns the whole of a mesh with these numbers of vertices and triangles.
+    /// Returns a whole mesh with these numbers of vertices and triangles.
     pub(super) fn whole([n_vertices, n_triangles]: [u64; 2], summary: &Summary) -> Self {
         Self { name: None, vertices: 0..n_vertices, triangles: 0..n_triangles, bounds: summary.bounds }
     }

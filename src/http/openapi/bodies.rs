@@ -15,7 +15,7 @@ Two other bodies are accepted. `application/json` names a structure on the serve
 `\"pdb_id\"` for an uploaded structure. `multipart/form-data` has the file in the field `file` and the parameters in \
 the other fields.";
 
-/// Description of the same body, for further operations.
+/// Description of the same body for other operations.
 pub(in crate::http) const AS_FOR_MESHES: &str =
     "A structure file, or another of the bodies that `POST /v1/meshes` accepts.";
 

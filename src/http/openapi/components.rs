@@ -2,7 +2,8 @@
 
 use serde_json::{Map, Value, json};
 
-/// Extension of an error response: the names of its problem types, which name the component. [`share`] removes it.
+/// Temporary extension of an error response with its problem types, from which [`share`] derives the name of the
+/// component.
 pub(super) const PROBLEM_TYPES: &str = "x-problem-types";
 
 /// Replaces inline parameters, headers, error responses and mesh responses by references into `components`.
@@ -41,7 +42,7 @@ pub(in crate::http) fn share(document: &mut Value) {
     }
 }
 
-/// Removes `minimum: 0` from a schema and those in it: that no count is negative needs no line for each.
+/// Removes `minimum: 0` from a schema and its members. Counts are never negative, and the document becomes shorter.
 fn remove_least_counts(schema: &mut Value) {
     match schema {
         Value::Object(members) => {

@@ -38,8 +38,8 @@ fn reference<T: ToSchema>() -> Content {
     ContentBuilder::new().schema(Some(Ref::from_schema_name(T::name()))).build()
 }
 
-/// 200: the whole file. `model/*` stands for all types that begin with it:
-/// generators take types that end in `+json` for JSON documents.
+/// 200: the whole file. `model/*` stands for all types that begin with `model/`: client generators treat types that end
+/// in `+json` as JSON documents.
 fn whole() -> RefOr<Response> {
     let doc = "The mesh. Its media type follows from the format: `model/gltf-binary` (glb), `model/gltf+json` (gltf), \
                `application/ply`, `model/x-ply-text`, `model/stl`, `model/obj` or `image/png`; \
@@ -82,7 +82,7 @@ fn accepted() -> RefOr<Response> {
     RefOr::T(response.build())
 }
 
-/// Returns the response with a part of the content of status 200.
+/// Returns the response for a part of the content: that of status 200, with other headers.
 fn part_of(whole: RefOr<Response>) -> RefOr<Response> {
     let RefOr::T(mut response) = whole else { return whole };
     "The requested part of the file, with the headers of status 200.".clone_into(&mut response.description);

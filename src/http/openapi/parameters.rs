@@ -26,7 +26,7 @@ impl Modify for ChoiceSchemas {
         let files = Format::ALL.map(|format| format!("surface.{}", format.name()));
         let files = ObjectBuilder::new()
             .schema_type(Type::String)
-            .description(Some("File name of a mesh: `surface.` and the extension of the format."))
+            .description(Some("File name of a mesh: `surface.` and the name of the format."))
             .enum_values(Some(files));
         schemas.insert(SURFACE_FILE.to_owned(), RefOr::T(files.into()));
         for parameter in TABLE {
@@ -209,7 +209,7 @@ parameters!(
     ResultFile: {
         let pattern = format!("^[0-9a-f]{{64}}\\.({})$", Format::ALL.map(Format::name).join("|"));
         let example = format!("{}.glb", "0".repeat(64));
-        segment("file", "Key of the result, followed by the extension of its format.", &pattern, &example)
+        segment("file", "Key of the result, followed by the name of its format.", &pattern, &example)
     }
 );
 parameters!(

@@ -284,7 +284,7 @@ pub const TABLE: &[Parameter] = &[
         name: "split",
         domain: Domain::Choice(SPLITS),
         default: "none",
-        doc: "Divides the mesh into parts that are closed on their own: chain (in an assembly per copy), entity, or residue-group (polymer, ligand, glycan, ion, water).",
+        doc: "Divides the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, or residue-group (polymer, ligand, glycan, ion, water).",
     },
     Parameter {
         name: "validation",

@@ -245,7 +245,7 @@ impl<'a> Scanner<'a> {
             let mut done = at;
             let mut plain = true;
             for offsets in edges.offsets().chunks_exact(per_row) {
-                // Checked first: a row that is read twice would also warn twice.
+                // Checked before the row is read: a row that is read twice warns twice.
                 if space == 0 {
                     plain = false;
                     break;

@@ -68,7 +68,7 @@ impl DistanceField {
         Ok(Self { boundary: Some(Boundary { union, bounds, tiles }), level: to_f32(level), tolerance, atom_ids })
     }
 
-    /// Number of ordered pairs of overlapping spheres; 0 unless the boundary of their union is needed.
+    /// Returns the number of ordered pairs of overlapping spheres; 0 if the surface needs no boundary of their union.
     pub(super) fn overlaps(&self) -> u64 {
         self.boundary.as_ref().map_or(0, |boundary| boundary.union.n_overlaps)
     }

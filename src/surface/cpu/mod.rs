@@ -140,7 +140,7 @@ impl Field {
         })
     }
 
-    /// Returns the number of pairs of overlapping spheres, if they were counted.
+    /// Returns the number of ordered pairs of overlapping spheres; 0 if they are not counted.
     fn overlaps(&self) -> u64 {
         match self {
             Self::Density(_) => 0,

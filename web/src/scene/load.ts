@@ -3,7 +3,7 @@
 import { Box3, type BufferAttribute, type BufferGeometry, type Group, type Matrix4, type Mesh, Sphere, Vector3 } from "three";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 
-/** Part of a surface, or the whole of a surface that is not divided. */
+/** Part of a surface, or a whole surface that is not divided. */
 export interface Part {
   name: string;
   geometry: BufferGeometry;
@@ -44,7 +44,7 @@ export async function load(bytes: ArrayBuffer): Promise<Loaded> {
   return { parts, sphere, extras };
 }
 
-/** Returns all meshes with the names in the file: three.js changes those of objects. */
+/** Returns all meshes with their names in the file, because three.js changes the names of objects. */
 function partsOf(group: Group): Part[] {
   const parts: Part[] = [];
   group.traverse((object) => {

@@ -93,12 +93,12 @@ export class Viewer {
     return this.drawn();
   }
 
-  /** Returns the names of the parts that are shown. */
+  /** Returns the names of the visible parts. */
   get shownParts(): string[] {
     return (this.loaded?.parts ?? []).map(({ name }) => name).filter((name) => !this.hidden.has(name));
   }
 
-  /** Shows or hides the parts with a name. They stay so until a surface of another structure is shown. */
+  /** Shows or hides the parts with this name, until a surface of another structure is shown. */
   showPart(name: string, visible: boolean): void {
     if (visible) this.hidden.delete(name);
     else this.hidden.add(name);
