@@ -17,6 +17,10 @@ use super::state::App;
 use crate::jobs::Lease;
 use crate::store::{Digest, Hasher};
 
+/// Limit of memory that is reserved because of a `Content-Length` header alone. The first byte that is written to a
+/// large block can make 2 MiB of it resident, as a huge page.
+const MAX_RESERVED_BYTES: u64 = 1 << 20;
+
 /// Returns true if the body is declared as a form.
 pub(super) fn is_multipart(headers: &HeaderMap) -> bool {
     text(headers, &CONTENT_TYPE).is_some_and(|t| t.trim_start().to_ascii_lowercase().starts_with("multipart/form-data"))
@@ -106,8 +110,7 @@ async fn collect(body: Body, announced: u64, limit: Limit, lease: &Lease) -> Res
             continue;
         }
         if all.is_empty() {
-            // At most the limit. The operating system allocates memory when it is written, not when it is reserved.
-            all.reserve(usize::try_from(announced.max(length)).unwrap_or(0));
+            all.reserve(usize::try_from(announced.clamp(length, MAX_RESERVED_BYTES.max(length))).unwrap_or(0));
             all.extend_from_slice(&std::mem::take(&mut first));
         }
         all.extend_from_slice(&data);
