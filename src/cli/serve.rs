@@ -83,8 +83,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
 }
 
 /// Returns the number of threads of the async runtime: a quarter of the cores, at least two. They serve sockets and
-/// hash uploads; meshing has other threads. Two threads would limit a service with several GPUs: an upload of 5 MB and
-/// the download of its mesh keep a thread busy for 25 ms.
+/// hash uploads; meshing has other threads. With two threads, a service with 32 cores and two GPUs sends half as many
+/// meshes per second.
 fn runtime_threads() -> usize {
     let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
     (cores / 4).max(2)

@@ -11,7 +11,7 @@ use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::parts::{self, PartsBackend};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
 use crate::structure::{AtomPart, Structure, StructureError};
-use crate::surface::cpu::scan;
+use crate::surface::cpu::{LATTICE_BYTES, scan};
 use crate::surface::lattice::{Lattice, slightly_coarser};
 use crate::surface::occupancy::Occupancy;
 use crate::surface::params::MAX_RESOLUTION;
@@ -85,6 +85,9 @@ pub fn estimate<S: Deref<Target = Structure>>(
         }
     }
     let _storage = super::storage(job, &mut params, &spheres);
+    // All lattices, and the spheres of one part at a time.
+    let copies = (LATTICE_BYTES + super::SPHERE_BYTES) * spheres.len() as u64;
+    control.memory.grow(copies).map_err(SurfaceError::from)?;
     let lattices = parts::spheres_of(&spheres, parts.as_deref()).map(|own| Lattice::new(&own, &params));
     let lattices: Vec<Lattice> = lattices.collect::<Result<_, SurfaceError>>()?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));

@@ -132,8 +132,12 @@ impl Pqr<'_> {
     ) -> Result<(Atom, f32), Box<Fault>> {
         let n = fields.len().saturating_sub(first);
         if !FIELDS.contains(&n) {
-            let expected = "10 or 11 fields: record, serial, atom, residue, chain (optional), residue number, x, y, z, \
-                            charge and radius";
+            // A serial number that touches the record name is no field of its own.
+            let [fewest, most] = FIELDS.map(|n| n + first);
+            let expected = format!(
+                "{fewest} or {most} fields: record, serial, atom, residue, chain (optional), residue number, x, y, z, \
+                 charge and radius"
+            );
             return Err(Fault::words(fields.range(0).0, format!("{} fields", fields.len()), expected));
         }
         let number = first + n - 6;
@@ -257,6 +261,7 @@ mod tests {
         for (row, said) in [
             ("ATOM 2 N ARG 1 1 2 3 0", "line 2, column 1: found 9 fields, expected 10 or 11 fields"),
             ("ATOM 2 N ARG A 1 1 2 3 0 1 9", "line 2, column 1: found 12 fields, expected 10 or 11 fields"),
+            ("HETATM10000 N ARG 1 1 2 3 0", "line 2, column 1: found 8 fields, expected 9 or 10 fields"),
             ("ATOM 2 N ARG A x1 1 2 3 0 1", "line 2, column 16: found `x1`, expected a residue number"),
             ("ATOM 2 N ARG 1 1 2 nan 0 1", "line 2, column 20: found `nan`, expected the z coordinate in Å"),
             ("ATOM 2 N ARG 1 1 2 3 zero 1", "line 2, column 22: found `zero`, expected the charge in e"),
