@@ -9,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test interleavings fuzz chaos soak nightly nightly-data nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
+.PHONY: help run test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -17,12 +17,17 @@ help: ## List the targets
 run: web-if-possible ## Build (the first time takes minutes) and serve on http://127.0.0.1:8080
 	$(CARGO) run --profile fast-build --bin molmesh -- serve $(ARGS)
 
-# The steps add a line to this file for each check that they skip; the last step prints it.
-test: export SKIPPED := $(CURDIR)/target/skipped
-test: nothing-skipped tools web fmt-check lint deny-if-installed matrix static-if-possible interleavings tests ## All checks and tests; installs what they need
+STEPS := tools web fmt-check lint deny-if-installed matrix static-if-possible interleavings tests
 
-nothing-skipped:
-	@mkdir -p target && : >"$$SKIPPED"
+# The steps add a line to the file SKIPPED for each check that they skip. The step `tests` prints this file; after the
+# failure of another step, it is printed here.
+test: export SKIPPED := $(CURDIR)/target/skipped
+test: ## All checks and tests; installs what they need
+	@mkdir -p target && : >"$$SKIPPED"; k=0; for step in $(STEPS); do \
+		k=$$((k + 1)); echo "make test: step $$k of $(words $(STEPS)): $$step" >&2; \
+		$(MAKE) --no-print-directory "$$step" && continue; \
+		if [ "$$step" != tests ]; then sort -u "$$SKIPPED"; echo "make test: step $$step failed" >&2; fi; exit 1; \
+	done
 
 tools: ## Install what the tests need (a Python environment, Node packages, software Vulkan, Chromium)
 	@if [ -f tests/tools/setup.sh ]; then bash tests/tools/setup.sh; fi
@@ -91,9 +96,14 @@ chaos: $(if $(BINARY),,release) ## Kill the service at random points, KILLS=200 
 	python3 benches/load/chaos.py $(or $(BINARY),target/release/molmesh) samples/4pti.pdb --kills $(KILLS)
 
 soak: override HOURS := $(or $(HOURS),1)
-soak: $(if $(BINARY),,release) ## Mixed load for HOURS=1, and check that nothing grows
+soak: $(if $(BINARY),,release) ## Mixed load for HOURS=1, and check that memory does not grow and is freed at the end
 	python3 benches/load/soak.py $(or $(BINARY),target/release/molmesh) samples/4pti.pdb samples/1crn.cif \
 		--minutes $$(python3 -c 'print(60 * $(HOURS))')
+
+# CLIENTS=10 sends fewer uploads at once.
+attack: override CLIENTS := $(or $(CLIENTS),100)
+attack: $(if $(BINARY),,release) ## Attack services whose memory is limited, and print a table of figures; needs root for control groups
+	python3 benches/load/attack.py $(or $(BINARY),target/release/molmesh) samples/4pti.pdb --clients $(CLIENTS)
 
 # BINARY=FILE uses an existing binary; NAMES="1aon 7cgo" selects structures.
 nightly: nightly-data tools $(if $(BINARY),,release) ## Check meshes of the large structures in DATA=FOLDER with trimesh
@@ -118,10 +128,10 @@ release: web-if-possible ## Build the optimized binary, target/release/molmesh
 static: ## Build the command line as a static file for any Linux, CPU only: dist/molmesh; installs what it needs
 	deploy/static.sh
 
-# Without Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A failed build
-# is an error.
+# For the tests, without link-time optimization. Without Linux or network access, the tests of the static executable are
+# skipped, or fail if CI is set. A failed build is an error.
 static-if-possible:
-	@deploy/static.sh || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
+	@deploy/static.sh fast-build || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
 
 clean: ## Remove all build output
 	$(CARGO) clean

@@ -113,7 +113,7 @@ mod shaders {
             generated.push_str("];\n\n");
             if !layouts.is_empty() {
                 generated.push_str("/// Name, size, and (field, offset, size) of every struct in a buffer.\n");
-                writeln!(generated, "#[cfg(test)]\npub(super) static {layouts_table}: &[Layout] = &[")
+                writeln!(generated, "#[cfg(test)]\npub(super) static {layouts_table}: &[StructLayout] = &[")
                     .expect("writing to a string cannot fail");
                 generated.extend(layouts);
                 generated.push_str("];\n\n");
@@ -200,7 +200,7 @@ mod shaders {
                     format!("({:?}, {}, {size})", member.name.as_deref().unwrap_or_default(), member.offset)
                 })
                 .collect();
-            found.push(format!("Layout {{ name: {name:?}, size: {span}, fields: &[{}] }},\n", fields.join(", ")));
+            found.push(format!("StructLayout {{ name: {name:?}, size: {span}, fields: &[{}] }},\n", fields.join(", ")));
         }
         found
     }

@@ -1,4 +1,5 @@
-//! Time against atoms, and time of the field stage per pair of a grid point and an atom. Prints a table of medians.
+//! Time as a function of the number of atoms, and time of the field stage per pair of a grid point and an atom. Prints
+//! a table of medians.
 //!
 //! `cargo bench --bench growth -- --max 300000` stops earlier. `RAYON_NUM_THREADS=1` sets the number of threads.
 

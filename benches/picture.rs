@@ -1,4 +1,4 @@
-//! Time to draw a picture of a mesh, with a lower bound.
+//! Time to draw a picture of a mesh, and a lower bound of it.
 //!
 //! `MOLMESH_STRUCTURES=FOLDER cargo bench --bench picture` also draws 2HHB from `FOLDER`; the default is only the
 //! bundled 4PTI. The lower bound reads the corners of all triangles once and writes all pixels once.

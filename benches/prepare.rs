@@ -1,4 +1,4 @@
-//! Time to prepare a GPU job on the host, on one thread and on all: lattice of atoms, and plan of bricks.
+//! Time to prepare a GPU job on the host, on one thread and on all threads: lattice of atoms, and plan of bricks.
 //!
 //! Run it with `cargo bench --bench prepare`. The atoms are generated at the density of proteins, domain by domain, so
 //! that consecutive atoms are near each other, as in files.
@@ -35,7 +35,7 @@ fn atoms(n: usize) -> Spheres {
 fn benches(c: &mut Criterion) {
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
     let (params, limits) =
-        (SurfaceParams::default(), SurfaceLimits { max_samples: 1 << 40, ..SurfaceLimits::default() });
+        (SurfaceParams::default(), SurfaceLimits { max_grid_points: 1 << 40, ..SurfaceLimits::default() });
     let lattice = |spheres: &Spheres| Lattice::new(spheres, &params).expect("a lattice");
     let plan = |lattice: &Lattice| Plan::new(lattice, &limits, &Control::default()).expect("a plan");
     for n in [10_000, 100_000, 335_722, 1_000_000, 3_000_000] {

@@ -1,5 +1,6 @@
-"""Checks bills of materials against the CycloneDX schema and against cargo's list of linked crates. Invalid copies of each
-document must be rejected. Usage: python deploy/check_sbom.py FILE.cdx.json ... (in the Python environment of the tests)
+"""Checks bills of materials against the CycloneDX schema and against cargo's list of linked crates. Invalid copies of
+each document must be rejected. Usage: python deploy/check_sbom.py FILE.cdx.json ... (in the Python environment of the
+tests)
 """
 
 import json

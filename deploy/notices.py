@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 """Writes the licences of everything in the binary to standard output.
 
-Covers the crates that cargo links into `molmesh` (normal dependencies for the target and features) with all their licence
-and notice files, the standard library, musl if the target uses it, and, with the service, third-party parts of the web
-pages. For a crate without a licence file, the text of a licence that it names is used: Apache-2.0, or MIT with its
-authors. If the crate permits neither, the command fails and names it.
+Covers the crates that cargo links into `molmesh` (normal dependencies for the target and features) with all their
+licence and notice files, the standard library, musl if the target uses it, and, with the service, third-party parts of
+the web pages. For a crate without a licence file, the text of a licence that it names is used: Apache-2.0, or MIT with
+its authors. If the crate permits neither, the command fails and names it.
 
 Usage: deploy/notices.py [--target TRIPLE] [--features cli,server,gpu]
 """

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Writes a bill of materials (CycloneDX 1.5, JSON) from cargo-cyclonedx's list of crates.
 
-Without --root, it describes the binary: crates and third-party parts of the web pages. With --root, a file from
-`docker export`, it describes an image: also Debian packages, installed or copied in part. The output depends only on the
-input: references contain no local paths, and the serial number is a digest.
+Without --root, it describes the binary: crates and third-party parts of the web pages. With --root, a file from `docker
+export`, it describes an image: also Debian packages, installed or copied in part. The output depends only on the input:
+references contain no local paths, and the serial number is a digest.
 
 Usage: deploy/sbom.py CRATES.json [--root ROOT.tar --name molmesh:cpu] >OUT.cdx.json
 """

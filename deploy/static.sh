@@ -1,7 +1,10 @@
 #!/usr/bin/env bash
-# Builds the command line (`mesh` and `render` on the CPU, without service and GPU) as the static file dist/molmesh, which
-# runs on any Linux with the same processor architecture. Installs the standard library for musl and Debian's musl-tools
-# if they are missing. Exits with 3 if these are not available, and with the build's status if the build fails.
+# Builds the command line (`mesh` and `render` on the CPU, without service and GPU) as the static file dist/molmesh,
+# which runs on any Linux with the same processor architecture. Installs the standard library for musl and Debian's
+# musl-tools if they are missing. Exits with 3 if these are not available, and with the build's status if the build
+# fails.
+#
+# `static.sh PROFILE` builds with another Cargo profile than release, for tests: only target/TARGET/PROFILE/molmesh.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # shellcheck source=deploy/container/engine.sh
@@ -19,7 +22,13 @@ if [ ! -d "$(rustc --print sysroot)/lib/rustlib/$target/lib" ]; then
 fi
 # The allocator is written in C.
 command -v musl-gcc >/dev/null || (install_packages musl-tools) || impossible "musl-gcc is not installed"
-cargo build --release --locked --bin molmesh --no-default-features --features cli --target "$target"
+profile=${1:-release}
+cargo build --profile "$profile" --locked --bin molmesh --no-default-features --features cli --target "$target"
+if [ "$profile" != release ]; then
+    # A build without changes counts as new.
+    touch "target/$target/$profile/molmesh"
+    exit
+fi
 mkdir -p dist
 # Symbols stay for backtraces. The rename replaces the file without disturbing running processes.
 strip --strip-debug -o dist/molmesh.new "target/$target/release/molmesh"

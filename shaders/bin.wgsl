@@ -24,11 +24,12 @@ const LANES: u32 = 64u;
 // Maximum length of a list in workgroup memory. Longer lists, of fine grids, take a second pass.
 const STAGED: u32 = 256u;
 
-// First atom of each range, and inclusive sums of their lengths; the second pair of arrays alternates during the scan.
+// First atom of each range, and inclusive sums of their lengths. The scan alternates between two arrays of sums.
 var<workgroup> range_start: array<u32, 64>;
 var<workgroup> range_end: array<u32, 64>;
 var<workgroup> range_sum: array<u32, 64>;
-// Bits of the lanes whose atom reaches a sample (0, 1) or only the gap behind the samples (2, 3), for three steps.
+// For each of three steps, the bits of the 64 lanes whose atom reaches a grid point (words 0 and 1), or only the gap
+// behind the grid points (words 2 and 3).
 var<workgroup> hits: array<atomic<u32>, 12>;
 var<workgroup> staged: array<u32, 256>;
 var<workgroup> list_start: u32;
@@ -75,7 +76,7 @@ fn brick_gap(step: i32) -> f32 {
     return max(max(f32(8 * step) - 8.5, f32(-8 * step) - 7.5), 0.0);
 }
 
-// Range `index` of those that may hold candidates of `brick`: first atom and number of atoms. Ranges are in the order
+// First atom and number of atoms of range `index` of those that may hold candidates of `brick`. Ranges are in the order
 // of the atoms: by tile, and by row within a tile.
 fn range_at(tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
     let lo = brick - vec3<i32>(i32(params.back));
@@ -123,8 +124,8 @@ fn range_at(tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
     return vec2<u32>(start, end - start);
 }
 
-// Returns 1 if the atom reaches a sample of the brick, 2 if it reaches only the gap up to the first samples of the
-// neighbours, else 0.
+// Returns 1 if the atom reaches a grid point of the brick, 2 if it reaches only the gap up to the first grid points of
+// the neighbours, else 0.
 fn reach_of(atom: u32, tile_origin: vec3<i32>, lo: vec3<f32>) -> u32 {
     let local = vec3<f32>(atoms[atom].cell - tile_origin) + atoms[atom].frac;
     let reach = reaches[atom];
@@ -135,8 +136,8 @@ fn reach_of(atom: u32, tile_origin: vec3<i32>, lo: vec3<f32>) -> u32 {
     if (any(closed_gap > vec3<f32>(reach)) || (closed.y + closed.z) + closed.x > reach2) {
         return 0u;
     }
-    let samples = square(gap);
-    return select(2u, 1u, (samples.y + samples.z) + samples.x <= reach2);
+    let points = square(gap);
+    return select(2u, 1u, (points.y + points.z) + points.x <= reach2);
 }
 
 @compute @workgroup_size(64)
@@ -161,7 +162,7 @@ fn main(
     if (lane < 12u) {
         atomicStore(&hits[lane], 0u);
     }
-    // Number of atoms that reach a sample, and number of those that reach the gap only.
+    // Number of atoms that reach a grid point, and number of those that reach the gap only.
     var n = vec2<u32>(0u);
     var start = 0u;
     // Index of the current hits; the second pass continues with the index at which the first ended.
@@ -231,11 +232,11 @@ fn main(
                 let low = countOneBits(select(mine.x & earlier, mine.x, half == 1u));
                 let ahead = low + countOneBits(select(0u, mine.y & earlier, half == 1u));
                 if (reaches_it != 0u) {
-                    let place = ahead + select(kept.y, kept.x, reaches_it == 1u);
+                    let rank = ahead + select(kept.y, kept.x, reaches_it == 1u);
                     if (pass_number == 1u) {
-                        lists[start + place + select(n.x, 0u, reaches_it == 1u)] = atom;
-                    } else if (place < STAGED) {
-                        staged[select(STAGED - 1u - place, place, reaches_it == 1u)] = atom;
+                        lists[start + rank + select(n.x, 0u, reaches_it == 1u)] = atom;
+                    } else if (rank < STAGED) {
+                        staged[select(STAGED - 1u - rank, rank, reaches_it == 1u)] = atom;
                     }
                 }
                 kept += vec2<u32>(

@@ -1,5 +1,5 @@
 // Stage `classify`: crossing edges, and the numbers of vertices and triangles of every brick. A workgroup has four
-// bricks and sixteen lanes per brick, one for each half layer of 32 samples.
+// bricks and sixteen lanes per brick, one for each half layer of 32 grid points.
 #include shared/params.wgsl
 #include shared/bits.wgsl
 #include shared/tiles.wgsl
@@ -11,14 +11,14 @@
 @group(0) @binding(2) var<storage, read> bricks: array<u32>;
 @group(0) @binding(3) var<storage, read> inside: array<u32>;
 @group(0) @binding(4) var<storage, read> cases: array<u32>;
-@group(0) @binding(5) var<storage, read_write> records: array<Record>;
+@group(0) @binding(5) var<storage, read_write> records: array<BrickRecord>;
 // Number of vertices, and number of triangles shifted by 16.
 @group(0) @binding(6) var<storage, read_write> counts: array<u32>;
 // Per group of 1024 bricks: number of vertices, triangles and bricks with triangles; the fourth word is unused.
 @group(0) @binding(7) var<storage, read_write> groups: array<atomic<u32>>;
 
 var<workgroup> neighbours: array<u32, 32>;
-// Per half layer: number of crossing edges by axis, ten bits each, and number of triangles.
+// Per half layer, its number of crossing edges by axis (ten bits each), and its number of triangles.
 var<workgroup> edges: array<u32, 64>;
 var<workgroup> triangles: array<u32, 64>;
 var<workgroup> totals: array<vec2<u32>, 4>;

@@ -12,7 +12,7 @@
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> inside: array<u32>;
 @group(0) @binding(2) var<storage, read> cases: array<vec2<u32>>;
-@group(0) @binding(3) var<storage, read> records: array<Record>;
+@group(0) @binding(3) var<storage, read> records: array<BrickRecord>;
 @group(0) @binding(4) var<storage, read> counts: array<u32>;
 @group(0) @binding(5) var<storage, read> offsets: array<vec2<u32>>;
 @group(0) @binding(6) var<storage, read_write> triangles: array<u32>;
@@ -52,7 +52,7 @@ fn main(
             let y_high = records[brick].crossing[6u * layer + 3u];
             let z_low = records[brick].crossing[6u * layer + 4u];
             let z_high = records[brick].crossing[6u * layer + 5u];
-            // Of a neighbour along y, only the lowest rows are needed, and there is space for no others.
+            // Of a neighbour along y, only the lowest rows are needed, and the array has space for these only.
             let whole = (which & 2u) == 0u;
             edges[at] = vec2<u32>(x_low, before);
             before += countOneBits(x_low);

@@ -1,9 +1,9 @@
-// Stage `field`: density at the 8 × 8 × 8 samples of every brick, and the bits of the samples inside the surface. One
-// workgroup per brick, one lane per column of samples along z.
+// Stage `field`: density at the 8 × 8 × 8 grid points of every brick, and the bits of the grid points inside the
+// surface. One workgroup per brick, one lane per column of grid points along z.
 //
-// Each sample has one owner. A halo brick is computed by the same instructions from the same list, so neighbours always
-// agree on a sign. Candidates are staged in workgroup memory in pieces; terms that depend on z are computed once for
-// all 64 columns.
+// Each grid point has one owner. A halo brick is computed by the same instructions from the same list, so neighbours
+// always agree on a sign. Candidates are staged in workgroup memory in pieces; terms that depend on z are computed once
+// for all 64 columns.
 #include shared/params.wgsl
 #include shared/atom.wgsl
 #include shared/bits.wgsl
@@ -24,7 +24,7 @@
 const PIECE: u32 = 24u;
 
 struct Staged {
-    // Whole cells from the atom to the first sample of the brick, and fraction of the atom: x, y.
+    // Whole cells from the atom to the first grid point of the brick, and fraction of the atom: x, y.
     whole: vec2<f32>,
     frac: vec2<f32>,
     inv_length2: f32,

@@ -22,7 +22,7 @@ override NEAREST: bool = false;
 @group(0) @binding(5) var<storage, read> lists: array<u32>;
 @group(0) @binding(6) var<storage, read> heads: array<vec4<u32>>;
 @group(0) @binding(7) var<storage, read> field: array<f32>;
-@group(0) @binding(8) var<storage, read> records: array<Record>;
+@group(0) @binding(8) var<storage, read> records: array<BrickRecord>;
 @group(0) @binding(9) var<storage, read> counts: array<u32>;
 @group(0) @binding(10) var<storage, read> offsets: array<vec2<u32>>;
 // Words of the requested vertex layout: three per position and normal, or two per position and one per normal.
@@ -39,7 +39,7 @@ var<workgroup> crossing: array<u32, 48>;
 var<workgroup> layers: array<u32, 8>;
 // Slots of the brick and of its neighbours towards +x, +y and +z.
 var<workgroup> slots: array<u32, 4>;
-// Centre relative to the first sample of the brick, and 1/ρ².
+// Centre relative to the first grid point of the brick, and 1/ρ².
 var<workgroup> staged: array<vec4<f32>, 128>;
 
 // Keys of the highest position per axis so far, and of the highest negative position.
@@ -68,7 +68,7 @@ fn raise_bounds(p: vec3<f32>) {
     raise_bound(5u, -p.z);
 }
 
-// Contribution of an atom to the gradient at p, which is relative to the first sample of the brick.
+// Contribution of an atom to the gradient at p, which is relative to the first grid point of the brick.
 fn gradient_of(p: vec3<f32>, atom: vec4<f32>) -> vec3<f32> {
     let d = p - atom.xyz;
     let u = dot(d, d) * atom.w;
@@ -104,7 +104,7 @@ fn edge_of(vertex: u32) -> Edge {
     return Edge(32u + select_bit(crossing[word + 1u], rank - n_low), z, axis);
 }
 
-// Density at the second sample of an edge.
+// Density at the second grid point of an edge.
 fn density_beyond(edge: Edge) -> f32 {
     let at = vec3<u32>(edge.bit & 7u, edge.bit >> 3u, edge.z);
     let along = vec3<u32>(vec3<u32>(0u, 1u, 2u) == vec3<u32>(edge.axis));
@@ -115,8 +115,8 @@ fn density_beyond(edge: Edge) -> f32 {
         // A brick out of reach of all atoms.
         return 0.0;
     }
-    let sample = next & vec3<u32>(7u);
-    return field[slot * 512u + sample.z * 64u + sample.y * 8u + sample.x];
+    let point = next & vec3<u32>(7u);
+    return field[slot * 512u + point.z * 64u + point.y * 8u + point.x];
 }
 
 // Stages the candidates from `start` on, padded to a multiple of four by distant atoms.

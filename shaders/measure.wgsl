@@ -1,10 +1,12 @@
 // Stage `measure`: sums over the sheets of a brick, which are the connected parts of its triangles. One workgroup per
 // brick. The vertices that the brick's cells use are numbered and joined along the triangles.
 //
-// A brick writes one block of words: brick, number of sheets and of shared vertices (16 bits each), origin; for each
-// sheet its numbers of triangles and vertices (16 bits each), the neighbours above and below that share vertices
-// (8 bits each), and ten sums; and with several sheets, for each shared vertex its owner (3 bits), key (11 bits) and
-// sheet.
+// The output begins with a table of offsets: for each brick of the piece the offset of its block of words, or NONE if
+// it has no triangles. A block has:
+// - the number of the brick, the numbers of its sheets and of its shared vertices (16 bits each), and the origin;
+// - for each sheet, its numbers of triangles and vertices (16 bits each), the neighbours above and below that share
+//   vertices (8 bits each), and ten sums;
+// - if there are several sheets, for each shared vertex its owner (3 bits), key (11 bits) and sheet.
 #include shared/params.wgsl
 #include shared/bits.wgsl
 #include shared/tiles.wgsl
@@ -15,7 +17,7 @@
 #include shared/triangles.wgsl
 #include shared/block.wgsl
 #include shared/sheets.wgsl
-#include shared/places.wgsl
+#include shared/edge_offsets.wgsl
 #include shared/sums.wgsl
 
 @group(0) @binding(0) var<uniform> params: Params;
@@ -25,7 +27,7 @@
 @group(0) @binding(4) var<storage, read> field: array<f32>;
 @group(0) @binding(5) var<storage, read> inside: array<u32>;
 @group(0) @binding(6) var<storage, read> cases: array<vec2<u32>>;
-@group(0) @binding(7) var<storage, read> records: array<Record>;
+@group(0) @binding(7) var<storage, read> records: array<BrickRecord>;
 @group(0) @binding(8) var<storage, read> counts: array<u32>;
 @group(0) @binding(9) var<storage, read_write> sheets: array<u32>;
 @group(0) @binding(10) var<storage, read_write> counters: Counters;
@@ -36,12 +38,14 @@ const SHEET: u32 = 12u;
 
 // Value that one lane passes to all others.
 var<workgroup> passed: u32;
-// Block of the brick, or NONE if it does not fit.
+// Offset of the block of the brick, or NONE if it does not fit.
 var<workgroup> block: u32;
-// Number of vertices that the brick shares with others.
+// Number of vertices that the brick shares with other bricks.
 var<workgroup> all_shared: atomic<u32>;
-// Triangles, vertices and neighbours of a sheet.
-var<workgroup> counted: array<atomic<u32>, 3>;
+// Number of the brick's own vertices, shifted by 16, and the neighbours that use any, as in `users`.
+var<workgroup> all_counts: atomic<u32>;
+// Number of triangles of a sheet.
+var<workgroup> counted: atomic<u32>;
 
 // Triangles of a brick: their number, and the lane's row with the number of triangles before it.
 struct Triangles {
@@ -51,7 +55,7 @@ struct Triangles {
 }
 
 // First triangle of the window that a pass visits as number `k`. Passes alternate between ascending and descending
-// order, so the first window of each pass but the first is still listed.
+// order, so each pass but the first begins with the window that is still listed.
 fn window_at(pass_: u32, k: u32, n: u32) -> u32 {
     return WINDOW * select(k, (n - 1u) / WINDOW - k, (pass_ & 1u) == 1u);
 }
@@ -117,42 +121,63 @@ fn sum_triangles(lane: u32, t: Triangles, sheet: u32, first: vec3<f32>, origin: 
             }
         }
     }
-    atomicAdd(&counted[0], n_own);
+    atomicAdd(&counted, n_own);
     return sums;
 }
 
-// Writes the sums of all lanes and the counts of a sheet at `at`, unless it is NONE. Clears the counts.
+// Adds the sums of all lanes and the number of triangles to a sheet at `at`, which has its counts, unless it is NONE.
+// Clears the number.
 fn write_sheet(lane: u32, at: u32) {
     if (lane < N_SUMS && at != NONE) {
         sheets[at + 2u + lane] = bitcast<u32>(sum_at(lane));
     }
     if (lane == N_SUMS) {
-        let n = atomicExchange(&counted[0], 0u) | atomicExchange(&counted[1], 0u) << 16u;
-        let near = atomicExchange(&counted[2], 0u);
+        let n = atomicExchange(&counted, 0u);
         if (at != NONE) {
-            sheets[at] = n;
-            sheets[at + 1u] = near;
+            sheets[at] |= n;
         }
     }
 }
 
-// Vertices of a word that are on `sheet`. The word's first vertex is `first`.
-fn edges_on(crossing: u32, first: u32, sheet: u32) -> u32 {
-    var on = 0u;
-    var vertex = first;
-    for (var rest = crossing; rest != 0u; rest &= rest - 1u) {
-        on |= select(0u, rest & ~(rest - 1u), sheet_of(vertex) == sheet);
-        vertex += 1u;
+// Writes the numbers of own vertices and the neighbours of all sheets, whose first word is at `at` unless it is NONE.
+// The vertices still have their edges. Contains barriers.
+fn write_counts(lane: u32, at: u32, n_found: u32, n_vertices: u32) {
+    if (n_found == 1u) {
+        if (lane == 0u && at != NONE) {
+            let counts = atomicLoad(&all_counts);
+            sheets[at] = counts & 0xffff0000u;
+            sheets[at + 1u] = counts & 0xffffu;
+        }
+        return;
     }
-    return on;
+    // The names are not needed any more. Almost all bricks have fewer sheets than one pass counts.
+    for (var first = 0u; first < n_found; first += N_NAMES) {
+        if (lane < N_NAMES) {
+            atomicStore(&names[lane], 0u);
+        }
+        workgroupBarrier();
+        for (var v = lane; v < n_vertices; v += LANES) {
+            let word = atomicLoad(&vertices[v]);
+            let sheet = number_of(word) - first;
+            let edge = (word & ~NUMBERED) >> EDGE_BIT;
+            let counts = counts_of(first_point(edge), axis_of(edge));
+            if (sheet < N_NAMES && counts != 0u) {
+                atomicAdd(&names[sheet], counts & 0xffff0000u);
+                atomicOr(&names[sheet], counts & 0xffffu);
+            }
+        }
+        workgroupBarrier();
+        if (lane < min(N_NAMES, n_found - first) && at != NONE) {
+            let counts = atomicLoad(&names[lane]);
+            sheets[at + SHEET * (first + lane)] = counts & 0xffff0000u;
+            sheets[at + SHEET * (first + lane) + 1u] = counts & 0xffffu;
+        }
+    }
 }
 
-// Counts the brick's own vertices on some edges of a word, and notes the neighbours that use any.
-fn count_vertices(word: Word, on: u32) {
-    if (on != 0u) {
-        atomicAdd(&counted[1], select(0u, countOneBits(on), word.owner == 0u));
-        atomicOr(&counted[2], users(word, on));
-    }
+// Own vertices and neighbours that use any, of some edges of a word.
+fn counts_on(word: Word, on: u32) -> u32 {
+    return select(0u, countOneBits(on) << 16u, word.owner == 0u) | users(word, on);
 }
 
 // Writes the owner, key and sheet of each shared vertex of a word from `at` on. The word's first vertex is `first`. A
@@ -160,12 +185,12 @@ fn count_vertices(word: Word, on: u32) {
 // the brick's vertices.
 fn write_vertices(at: u32, word: Word, crossing: u32, first: u32) {
     let layer = (word.z & 7u) << 8u | word.axis << 6u | (word.quarter & 1u) << 5u;
-    var place = at;
+    var next = at;
     for (var rest = shared_edges(word, crossing); rest != 0u; rest &= rest - 1u) {
         let bit = firstTrailingBit(rest);
         let vertex = first + countOneBits(crossing & below(bit));
-        sheets[place] = word.owner | (layer | bit) << 3u | sheet_of(vertex) << 14u;
-        place += 1u;
+        sheets[next] = word.owner | (layer | bit) << 3u | sheet_of(vertex) << 14u;
+        next += 1u;
     }
 }
 
@@ -182,6 +207,9 @@ fn main(
     let id = params.piece_brick + number;
     let n = counts[id] >> 16u;
     if (n == 0u) {
+        if (lane == 0u) {
+            sheets[number] = NONE;
+        }
         return;
     }
     let first = vec3<f32>(
@@ -192,17 +220,17 @@ fn main(
         origin = steps_at(first, vec3<f32>(4.0));
     }
     load_rows(id, lane);
-    if (lane < 61u) {
+    if (lane < N_NAMES) {
         atomicStore(&names[lane], 0u);
-    } else {
-        atomicStore(&counted[lane - 61u], 0u);
     }
     if (lane < 8u) {
         slots[lane] = slot_of(records[id].neighbours[lane]);
     } else if (lane == 8u) {
         atomicStore(&n_sheets, 0u);
+        atomicStore(&counted, 0u);
     } else if (lane == 9u) {
         atomicStore(&all_shared, 0u);
+        atomicStore(&all_counts, 0u);
     }
     workgroupBarrier();
     let row = row_of(lane);
@@ -219,7 +247,13 @@ fn main(
         );
     }
     let own_shared = n_shared.x + n_shared.y + n_shared.z;
-    atomicAdd(&all_shared, own_shared);
+    if ((used.x | used.y | used.z) != 0u) {
+        let counts = vec3<u32>(counts_on(w0, used.x), counts_on(w1, used.y), counts_on(w2, used.z));
+        let n_own = counts >> vec3<u32>(16u);
+        atomicAdd(&all_shared, own_shared);
+        atomicAdd(&all_counts, (n_own.x + n_own.y + n_own.z) << 16u);
+        atomicOr(&all_counts, (counts.x | counts.y | counts.z) & 0xffffu);
+    }
     let n_used = countOneBits(used);
     // Number of triangles, and number of vertices shifted by 16.
     let own = row.n | (n_used.x + n_used.y + n_used.z) << 16u;
@@ -227,11 +261,11 @@ fn main(
     let n_vertices = listed[LANES - 1u] >> 16u;
     let start = (sum - own) & 0xffffu;
     // Number of vertices before each word.
-    let place = vec3<u32>((sum - own) >> 16u) + vec3<u32>(0u, n_used.x, n_used.x + n_used.y);
+    let before = vec3<u32>((sum - own) >> 16u) + vec3<u32>(0u, n_used.x, n_used.x + n_used.y);
     if (lane < 54u) {
-        edges[3u * lane] = vec2<u32>(used.x, place.x);
-        edges[3u * lane + 1u] = vec2<u32>(used.y, place.y);
-        edges[3u * lane + 2u] = vec2<u32>(used.z, place.z);
+        edges[3u * lane] = vec2<u32>(used.x, before.x);
+        edges[3u * lane + 1u] = vec2<u32>(used.y, before.y);
+        edges[3u * lane + 2u] = vec2<u32>(used.z, before.z);
     }
     for (var v = lane; v < n_vertices; v += LANES) {
         atomicStore(&vertices[v], ~LABEL | v);
@@ -239,25 +273,13 @@ fn main(
     let triangles = Triangles(n, row, start);
     let n_found = join_vertices(lane, triangles, n_vertices);
     let n_written = select(0u, atomicLoad(&all_shared), n_found > 1u);
-    var reserved = 0u;
     if (lane == 0u) {
-        reserved = atomicAdd(&counters.sheet_words, HEADER + SHEET * n_found + n_written);
-    }
-    sheet_bits = 32u - countLeadingZeros(n_found - 1u);
-    place_unit = ldexp(1.0, i32(sheet_bits) - 32);
-    if (n_found > 1u) {
-        number_names(lane, n_vertices);
-        workgroupBarrier();
-    }
-    for (var v = lane; v < n_vertices; v += LANES) {
-        let word = atomicLoad(&vertices[v]);
-        let at = place_on((word & ~NUMBERED) >> EDGE_BIT, first, origin);
-        atomicStore(&vertices[v], at << sheet_bits | number_of(word));
-    }
-    if (lane == 0u) {
+        let n_words = HEADER + SHEET * n_found + n_written;
+        let reserved = params.piece_bricks + atomicAdd(&counters.sheet_words, n_words);
         // A block beyond the capacity is not written. The host detects it by the counter.
-        let fits = reserved + HEADER + SHEET * n_found + n_written <= params.sheet_capacity;
+        let fits = reserved + n_words <= params.sheet_capacity;
         block = select(NONE, reserved, fits);
+        sheets[number] = block;
         if (fits) {
             sheets[reserved] = id;
             sheets[reserved + 1u] = n_found | n_written << 16u;
@@ -267,30 +289,32 @@ fn main(
             sheets[reserved + 4u] = words.z;
         }
     }
+    sheet_bits = 32u - countLeadingZeros(n_found - 1u);
+    offset_unit = ldexp(1.0, i32(sheet_bits) - 32);
+    if (n_found > 1u) {
+        number_names(lane, n_vertices);
+    }
+    let first_sheet = workgroupUniformLoad(&block) + HEADER;
+    write_counts(lane, select(first_sheet, NONE, first_sheet < HEADER), n_found, n_vertices);
+    for (var v = lane; v < n_vertices; v += LANES) {
+        let word = atomicLoad(&vertices[v]);
+        let offset = offset_on((word & ~NUMBERED) >> EDGE_BIT, first, origin);
+        atomicStore(&vertices[v], offset << sheet_bits | number_of(word));
+    }
+    storageBarrier();
     for (var sheet = 0u; sheet < n_found; sheet++) {
         workgroupBarrier();
         let sums = sum_triangles(lane, triangles, sheet, first, origin);
-        var on = used;
-        if (n_found > 1u) {
-            on = vec3<u32>(
-                edges_on(used.x, place.x, sheet),
-                edges_on(used.y, place.y, sheet),
-                edges_on(used.z, place.z, sheet),
-            );
-        }
-        count_vertices(w0, on.x);
-        count_vertices(w1, on.y);
-        count_vertices(w2, on.z);
         sum_lanes(lane, sums);
         write_sheet(lane, select(block + HEADER + SHEET * sheet, NONE, block == NONE));
     }
     if (n_found > 1u) {
-        let before = scan_lanes(lane, own_shared) - own_shared;
+        let start = scan_lanes(lane, own_shared) - own_shared;
         if (block != NONE) {
-            let at = block + HEADER + SHEET * n_found + before;
-            write_vertices(at, w0, used.x, place.x);
-            write_vertices(at + n_shared.x, w1, used.y, place.y);
-            write_vertices(at + n_shared.x + n_shared.y, w2, used.z, place.z);
+            let at = block + HEADER + SHEET * n_found + start;
+            write_vertices(at, w0, used.x, before.x);
+            write_vertices(at + n_shared.x, w1, used.y, before.y);
+            write_vertices(at + n_shared.x + n_shared.y, w2, used.z, before.z);
         }
     }
 }

@@ -1,4 +1,4 @@
-// Stage `scan`: exclusive scan over bricks, which gives the first vertex and the first triangle of each. One workgroup
+// Stage `scan`: exclusive scan over bricks, which yields the first vertex and the first triangle of each. One workgroup
 // per group of 1024 bricks. `classify` has added up the groups, so workgroups do not depend on each other.
 #include shared/params.wgsl
 #include shared/counters.wgsl

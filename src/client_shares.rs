@@ -1,4 +1,4 @@
-//! Shares of bounded pools: the places that one client may hold at once, so that others find some free.
+//! Shares of limits: the number of slots that one client may hold at once, so that some stay free for others.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,11 +9,11 @@ use tokio::time::Instant;
 /// Error of a client that holds its share.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct ShareExceeded {
-    /// Number of places in a share.
+    /// Number of slots in a share.
     pub(crate) limit: usize,
 }
 
-/// Shares of one pool. Stores only clients that hold places or wait for one, so the callers bound the memory.
+/// Shares of one limit. Stores only clients that hold slots or wait for one, so the callers bound the memory.
 #[derive(Debug)]
 pub(crate) struct ClientShares {
     limit: usize,
@@ -21,11 +21,11 @@ pub(crate) struct ClientShares {
 }
 
 impl ClientShares {
-    /// Creates shares of a pool of `places`: the fraction `share` of it, but at least one place.
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a number of places")]
-    #[expect(clippy::cast_precision_loss, reason = "exact up to 2^53 places")]
-    pub(crate) fn new(places: usize, share: f64) -> Arc<Self> {
-        let limit = ((places as f64 * share).ceil() as usize).max(1);
+    /// Creates shares of a limit of `slots`: the fraction `share` of it, but at least one slot.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a number of slots")]
+    #[expect(clippy::cast_precision_loss, reason = "exact up to 2^53 slots")]
+    pub(crate) fn new(slots: usize, share: f64) -> Arc<Self> {
+        let limit = ((slots as f64 * share).ceil() as usize).max(1);
         Arc::new(Self { limit, clients: Mutex::default() })
     }
 
@@ -33,44 +33,44 @@ impl ClientShares {
         self.clients.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns the share of a client, and a place in it that is not taken yet.
-    fn share(self: &Arc<Self>, client: u64) -> (Arc<Semaphore>, Place) {
+    /// Returns the share of a client, and an empty permit for a slot in it.
+    fn share(self: &Arc<Self>, client: u64) -> (Arc<Semaphore>, SharePermit) {
         let mut clients = self.clients();
         let share = clients.entry(client).or_insert_with(|| Arc::new(Semaphore::new(self.limit)));
-        (Arc::clone(share), Place { shares: Arc::clone(self), client, permit: None })
+        (Arc::clone(share), SharePermit { shares: Arc::clone(self), client, permit: None })
     }
 
-    /// Takes a place for a client, until the returned value is dropped.
-    pub(crate) fn take(self: &Arc<Self>, client: u64) -> Result<Place, ShareExceeded> {
-        let (share, mut place) = self.share(client);
-        place.permit = share.try_acquire_owned().ok();
-        if place.permit.is_some() { Ok(place) } else { Err(ShareExceeded { limit: self.limit }) }
+    /// Takes a slot for a client until the permit is dropped.
+    pub(crate) fn take(self: &Arc<Self>, client: u64) -> Result<SharePermit, ShareExceeded> {
+        let (share, mut slot) = self.share(client);
+        slot.permit = share.try_acquire_owned().ok();
+        if slot.permit.is_some() { Ok(slot) } else { Err(ShareExceeded { limit: self.limit }) }
     }
 
-    /// Takes a place for a client and waits for it until `end`. Requests of a client wait in line.
-    pub(crate) async fn wait(self: &Arc<Self>, client: u64, end: Instant) -> Result<Place, ShareExceeded> {
-        let (share, mut place) = self.share(client);
+    /// Waits for a slot for a client, at most until `end`. Requests of one client get their slots in order of arrival.
+    pub(crate) async fn wait(self: &Arc<Self>, client: u64, end: Instant) -> Result<SharePermit, ShareExceeded> {
+        let (share, mut slot) = self.share(client);
         let permit = tokio::time::timeout_at(end, share.acquire_owned()).await;
         // The semaphore is never closed.
-        place.permit = permit.ok().and_then(Result::ok);
-        if place.permit.is_some() { Ok(place) } else { Err(ShareExceeded { limit: self.limit }) }
+        slot.permit = permit.ok().and_then(Result::ok);
+        if slot.permit.is_some() { Ok(slot) } else { Err(ShareExceeded { limit: self.limit }) }
     }
 }
 
-/// Place of a client in a pool.
+/// Slot that a client holds or waits for.
 #[derive(Debug)]
-pub(crate) struct Place {
+pub(crate) struct SharePermit {
     shares: Arc<ClientShares>,
     client: u64,
-    /// `None` before the place is taken.
+    /// `None` before the slot is taken.
     permit: Option<OwnedSemaphorePermit>,
 }
 
-impl Drop for Place {
+impl Drop for SharePermit {
     fn drop(&mut self) {
         let mut clients = self.shares.clients();
         self.permit = None;
-        // Each request that holds a place or waits for one refers to the share.
+        // Each request that holds a slot or waits for one refers to the share.
         if clients.get(&self.client).is_some_and(|share| Arc::strong_count(share) == 1) {
             clients.remove(&self.client);
         }
@@ -93,13 +93,13 @@ mod tests {
         let third = shares.take(1).unwrap();
         assert!(shares.take(1).is_err());
         drop((second, third, other));
-        assert!(shares.clients().is_empty(), "clients without places are forgotten");
+        assert!(shares.clients().is_empty(), "clients without slots are forgotten");
     }
 
     #[test]
     fn a_share_has_at_least_one_place_and_at_most_all() {
-        for (places, share, limit) in [(1, 0.25, 1), (8, 0.0, 1), (1024, 0.25, 256), (256, 1.0, 256), (7, 0.5, 4)] {
-            assert_eq!(ClientShares::new(places, share).limit, limit, "{places} {share}");
+        for (slots, share, limit) in [(1, 0.25, 1), (8, 0.0, 1), (1024, 0.25, 256), (256, 1.0, 256), (7, 0.5, 4)] {
+            assert_eq!(ClientShares::new(slots, share).limit, limit, "{slots} {share}");
         }
     }
 
@@ -121,7 +121,7 @@ mod tests {
             .collect();
         tokio::task::yield_now().await;
         shares.wait(2, soon()).await.expect("another client has its own share");
-        // A request that leaves keeps no place.
+        // A request that leaves keeps no slot.
         waiting[1].abort();
         drop(held);
         assert!(shares.take(1).is_err(), "new requests do not overtake waiting ones");
@@ -129,6 +129,6 @@ mod tests {
             drop(task.await);
         }
         assert_eq!(*order.lock().unwrap(), [0, 2]);
-        assert!(shares.clients().is_empty(), "clients without places are forgotten");
+        assert!(shares.clients().is_empty(), "clients without slots are forgotten");
     }
 }

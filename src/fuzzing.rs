@@ -1,9 +1,12 @@
 //! Private parsers for the targets of `molmesh-fuzz`. Not part of the library's interface.
 
+use std::net::IpAddr;
+use std::sync::LazyLock;
 use std::time::UNIX_EPOCH;
 
 use crate::access::{self, KeyFileError, SignatureCheck, SigningKeys};
-use crate::jobs::Record;
+use crate::config::{ForwardedHeader, Proxies};
+use crate::jobs::JobRecord;
 use crate::structure::{ReadLimits, Structure, StructureError};
 
 /// Parses a key file.
@@ -21,6 +24,21 @@ pub fn has_valid_signature(keys: &SigningKeys, target: &str) -> bool {
     matches!(keys.check(path, query, UNIX_EPOCH), SignatureCheck::Valid(_))
 }
 
+/// Returns the client of a request from the trusted proxy 10.0.0.1 with these values of `header`. All addresses in
+/// 10.0.0.0/8 are trusted.
+#[must_use]
+pub fn forwarded(header: ForwardedHeader, values: &[&str]) -> IpAddr {
+    access::forwarded_client(IpAddr::from([10, 0, 0, 1]), header, values.iter().copied(), PROXIES.as_ref())
+}
+
+/// Returns true if [`forwarded`] trusts this address.
+#[must_use]
+pub fn is_trusted_proxy(address: IpAddr) -> bool {
+    PROXIES.as_ref().is_some_and(|proxies| proxies.contains(address))
+}
+
+static PROXIES: LazyLock<Option<Proxies>> = LazyLock::new(|| "10.0.0.0/8".parse().ok());
+
 /// Reads a structure in at most `n` pieces.
 ///
 /// # Errors
@@ -34,7 +52,7 @@ pub fn structure(bytes: &[u8], limits: &ReadLimits, n: usize) -> Result<Structur
 /// # Errors
 /// Returns the reason as text.
 pub fn record(bytes: &[u8]) -> Result<Vec<u8>, String> {
-    let record: Record = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
+    let record: JobRecord = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
     record.request()?;
     serde_json::to_vec(&record).map_err(|error| error.to_string())
 }

@@ -1,6 +1,6 @@
-//! Watertight molecular-surface meshes from PDB, mmCIF and BinaryCIF files.
+//! Watertight molecular-surface meshes from PDB, mmCIF, BinaryCIF, PQR and XYZ files.
 //!
-//! [`mesh()`] turns the bytes of a structure file into a triangle mesh:
+//! [`mesh()`] converts the bytes of a structure file to a triangle mesh:
 //!
 //! ```
 //! let bytes = std::fs::read("samples/4pti.pdb")?;
@@ -11,7 +11,8 @@
 //! ```
 //!
 //! [`Options`] selects atoms and the surface; [`formats::Encoder`] writes the mesh as GLB, glTF, PLY, STL or OBJ, and
-//! [`pipeline::run`] also returns a report with area, volume and components.
+//! [`pipeline::run`] also returns a report with area, volume and components. The folder `examples` has programs for
+//! these tasks: `select.rs`, `mesh.rs` and `report.rs`.
 //!
 //! [`surface`] is the meshing core, which converts spheres to a mesh. [`structure`] reads files, [`formats`] encodes
 //! meshes, [`picture`] renders them, and [`pipeline`] runs one job from bytes to report. The `gpu` feature adds the GPU

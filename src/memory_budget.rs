@@ -5,13 +5,13 @@ use std::fmt::Debug;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
 
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
 use metrics::gauge;
 
 use crate::surface::{MemoryMeter, OutOfMemory};
-use crate::telemetry::MEMORY_HELD;
+use crate::telemetry::{MEMORY_HELD, MEMORY_USED};
 
-/// Owner of memory that it gives back when the budget is short.
+/// Owner of memory that it can free when the budget is exceeded.
 pub(crate) trait Reclaim: Debug + Send + Sync {
     /// Frees at least `bytes` if possible. Returns true if it freed some.
     fn reclaim(&self, bytes: u64) -> bool;
@@ -22,7 +22,7 @@ pub(crate) trait Reclaim: Debug + Send + Sync {
 pub struct Budget {
     limit: u64,
     held: Arc<AtomicU64>,
-    /// Budget that this one is a part of.
+    /// Budget of which this one is a part.
     whole: Option<Arc<Self>>,
     reclaim: Arc<OnceLock<Weak<dyn Reclaim>>>,
 }
@@ -34,7 +34,7 @@ impl Budget {
         Self { limit, held: Arc::default(), reclaim: Arc::default(), whole: None }
     }
 
-    /// Creates a budget of at most `limit` bytes of this one: its leases count in both.
+    /// Creates a budget of `limit` bytes that is a part of this one: its reservations count in both.
     #[must_use]
     pub fn part(&self, limit: u64) -> Self {
         Self { whole: Some(Arc::new(self.clone())), ..Self::new(limit) }
@@ -43,12 +43,24 @@ impl Budget {
     /// Adds `bytes` regardless of the limit.
     fn add(&self, bytes: u64) {
         self.held.fetch_add(bytes, Ordering::Relaxed);
-        self.whole.iter().for_each(|whole| whole.add(bytes));
+        match &self.whole {
+            Some(whole) => whole.add(bytes),
+            None => publish(MEMORY_USED, bytes, 1.0),
+        }
+    }
+
+    /// Returns the used part, bytes.
+    #[cfg(test)]
+    pub(crate) fn used(&self) -> u64 {
+        self.held.load(Ordering::Relaxed)
     }
 
     fn subtract(&self, bytes: u64) {
         self.held.fetch_sub(bytes, Ordering::Relaxed);
-        self.whole.iter().for_each(|whole| whole.subtract(bytes));
+        match &self.whole {
+            Some(whole) => whole.subtract(bytes),
+            None => publish(MEMORY_USED, bytes, -1.0),
+        }
     }
 
     /// Creates a budget without a limit.
@@ -57,7 +69,8 @@ impl Budget {
         Self::new(u64::MAX)
     }
 
-    /// Sets the owner that is asked for memory before anything is rejected. Only the first call has an effect.
+    /// Sets the owner that is requested to free memory before a reservation is rejected. Only the first call has an
+    /// effect.
     pub(crate) fn reclaim_from(&self, owner: Weak<dyn Reclaim>) {
         self.reclaim.get_or_init(|| owner);
     }
@@ -83,25 +96,29 @@ impl Budget {
             let missing = held.saturating_add(bytes).saturating_sub(limit);
             reclaimed = self.reclaim.get().and_then(Weak::upgrade).is_some_and(|owner| owner.reclaim(missing));
         }
-        if let Some(Err(error)) = self.whole.as_ref().map(|whole| whole.take(bytes)) {
+        let Some(whole) = &self.whole else {
+            publish(MEMORY_USED, bytes, 1.0);
+            return Ok(());
+        };
+        let taken = whole.take(bytes);
+        if taken.is_err() {
             self.held.fetch_sub(bytes, Ordering::Relaxed);
-            return Err(error);
         }
-        Ok(())
+        taken
     }
 
-    /// Takes `bytes` regardless of the limit until the result is dropped, for buffers that are bounded elsewhere. The
-    /// metric of the budget does not count them.
+    /// Takes `bytes` regardless of the limit until the result is dropped, for buffers that are bounded elsewhere.
+    /// [`MEMORY_USED`] counts them, [`MEMORY_HELD`] does not.
     #[must_use]
     pub fn buffers(&self, bytes: u64) -> Buffers {
         self.add(bytes);
         Buffers { budget: self.clone(), bytes }
     }
 
-    /// Creates a lease of 0 bytes.
+    /// Creates a reservation of 0 bytes.
     #[must_use]
-    pub fn lease(&self) -> Lease {
-        Lease { budget: self.clone(), bytes: AtomicU64::new(0) }
+    pub fn reservation(&self) -> MemoryReservation {
+        MemoryReservation { budget: self.clone(), bytes: AtomicU64::new(0), elsewhere: AtomicU64::new(0) }
     }
 }
 
@@ -118,26 +135,49 @@ impl Drop for Buffers {
     }
 }
 
-/// Bytes taken from a budget. Dropping the lease returns them.
+/// Bytes taken from a budget. Dropping the reservation returns them.
 #[derive(Debug)]
-pub struct Lease {
+pub struct MemoryReservation {
     budget: Budget,
     bytes: AtomicU64,
+    /// Bytes of the same work in other reservations.
+    elsewhere: AtomicU64,
 }
 
-impl Lease {
-    /// Adds `bytes` to the lease. A failure changes nothing.
+impl MemoryReservation {
+    /// Adds `bytes` to the reservation. A failure changes nothing.
     ///
     /// # Errors
-    /// [`OutOfMemory::Budget`].
+    /// [`OutOfMemory::Limit`] if the work alone exceeds the budget, else [`OutOfMemory::Budget`].
     pub fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
-        self.budget.take(bytes)?;
+        self.budget.take(bytes).map_err(|error| self.check(bytes).err().unwrap_or(error))?;
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
-        publish(bytes, 1.0);
+        publish(MEMORY_HELD, bytes, 1.0);
         Ok(())
     }
 
-    /// Returns the size of the lease, bytes.
+    /// Appends `data` to `buffer`, whose capacity this reservation contains. A full buffer grows to the `expected`
+    /// length, or to twice its length if that is unknown (0) or too small. It grows to at most 8 times the received
+    /// data, because a client may announce more than it sends. Both buffers count while the data is copied.
+    ///
+    /// # Errors
+    /// [`OutOfMemory::Budget`].
+    pub(crate) fn extend(&self, buffer: &mut BytesMut, data: &[u8], expected: u64) -> Result<(), OutOfMemory> {
+        let (old, length) = (buffer.capacity(), buffer.len() + data.len());
+        if length > old {
+            let expected = usize::try_from(expected).unwrap_or(usize::MAX);
+            let new = if expected < length { 2 * length } else { expected.min(8 * length) };
+            self.grow(new as u64)?;
+            let mut grown = BytesMut::with_capacity(new);
+            grown.extend_from_slice(buffer);
+            *buffer = grown;
+            self.shrink(old as u64);
+        }
+        buffer.extend_from_slice(data);
+        Ok(())
+    }
+
+    /// Returns the size of the reservation, bytes.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.bytes.load(Ordering::Relaxed)
@@ -147,49 +187,49 @@ impl Lease {
     pub fn force(&self, bytes: u64) {
         self.budget.add(bytes);
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
-        publish(bytes, 1.0);
+        publish(MEMORY_HELD, bytes, 1.0);
     }
 
     /// Subtracts `bytes` of freed memory.
     pub fn shrink(&self, bytes: u64) {
         self.budget.subtract(bytes);
         self.bytes.fetch_sub(bytes, Ordering::Relaxed);
-        publish(bytes, -1.0);
+        publish(MEMORY_HELD, bytes, -1.0);
     }
 
-    /// Sets the lease to `bytes` regardless of the limit, for memory that remains of a finished job.
+    /// Sets the reservation to `bytes` regardless of the limit, for memory that remains of a finished job.
     pub fn set(&self, bytes: u64) {
         let before = self.bytes();
         self.force(bytes.saturating_sub(before));
         self.shrink(before.saturating_sub(bytes));
     }
 
-    /// Converts the lease, for memory that no request uses. The lease then has 0 bytes.
+    /// Converts the reservation, for memory that no request uses. The reservation then has 0 bytes.
     pub(crate) fn to_buffers(&self) -> Buffers {
         let bytes = self.bytes.swap(0, Ordering::Relaxed);
-        publish(bytes, -1.0);
+        publish(MEMORY_HELD, bytes, -1.0);
         Buffers { budget: self.budget.clone(), bytes }
     }
 
-    /// Returns `memory` as bytes that hold this lease until the last reference to them is dropped.
+    /// Returns `memory` as bytes that hold this reservation until the last reference to them is dropped.
     pub fn attach(self, memory: impl AsRef<[u8]> + Send + 'static) -> Bytes {
-        Bytes::from_owner(Leased { memory, _lease: self })
+        Bytes::from_owner(Reserved { memory, _reservation: self })
     }
 }
 
-/// Memory together with its lease.
-struct Leased<T> {
+/// Memory together with its reservation.
+struct Reserved<T> {
     memory: T,
-    _lease: Lease,
+    _reservation: MemoryReservation,
 }
 
-impl<T: AsRef<[u8]>> AsRef<[u8]> for Leased<T> {
+impl<T: AsRef<[u8]>> AsRef<[u8]> for Reserved<T> {
     fn as_ref(&self) -> &[u8] {
         self.memory.as_ref()
     }
 }
 
-impl MemoryMeter for Lease {
+impl MemoryMeter for MemoryReservation {
     fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
         self.grow(bytes)
     }
@@ -197,9 +237,17 @@ impl MemoryMeter for Lease {
     fn shrink(&self, bytes: u64) {
         self.shrink(bytes);
     }
+
+    fn budget(&self) -> Option<[u64; 2]> {
+        Some([self.budget.limit, self.bytes().saturating_add(self.elsewhere.load(Ordering::Relaxed))])
+    }
+
+    fn also_held(&self, bytes: u64) {
+        self.elsewhere.fetch_add(bytes, Ordering::Relaxed);
+    }
 }
 
-impl Drop for Lease {
+impl Drop for MemoryReservation {
     fn drop(&mut self) {
         self.shrink(self.bytes());
     }
@@ -207,13 +255,13 @@ impl Drop for Lease {
 
 /// Changes the gauge by a difference, so that several budgets in one process add up.
 #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
-fn publish(bytes: u64, sign: f64) {
-    gauge!(MEMORY_HELD).increment(sign * bytes as f64);
+fn publish(gauge: &'static str, bytes: u64, sign: f64) {
+    gauge!(gauge).increment(sign * bytes as f64);
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{Budget, OutOfMemory};
+    use super::{Budget, BytesMut, MemoryMeter as _, OutOfMemory};
 
     fn held(error: OutOfMemory) -> u64 {
         let OutOfMemory::Budget { held, .. } = error else { return 0 };
@@ -221,9 +269,9 @@ mod tests {
     }
 
     #[test]
-    fn leases_add_up_and_come_back() {
+    fn reservations_add_up_and_are_released() {
         let budget = Budget::new(100);
-        let (a, b) = (budget.lease(), budget.lease());
+        let (a, b) = (budget.reservation(), budget.reservation());
         a.grow(60).unwrap();
         assert_eq!(held(b.grow(41).unwrap_err()), 60);
         b.grow(40).unwrap();
@@ -235,16 +283,18 @@ mod tests {
         drop(b);
         budget.check().unwrap();
         drop(a);
-        budget.lease().grow(100).unwrap();
+        budget.reservation().grow(100).unwrap();
     }
 
     #[test]
     fn a_part_is_limited_and_counts_in_the_whole() {
         let budget = Budget::new(100);
         let part = budget.part(50);
-        let (of_part, of_whole) = (part.lease(), budget.lease());
+        let (of_part, of_whole) = (part.reservation(), budget.reservation());
         of_part.grow(50).unwrap();
-        assert_eq!(held(of_part.grow(1).unwrap_err()), 50);
+        assert_eq!(held(part.reservation().grow(1).unwrap_err()), 50);
+        // Alone, the reservation of all of the part cannot grow at any time.
+        assert_eq!(of_part.grow(1), Err(OutOfMemory::Limit { needed: 51, limit: 50 }));
         assert_eq!(held(of_whole.grow(51).unwrap_err()), 50);
         of_part.shrink(20);
         of_whole.grow(60).unwrap();
@@ -252,16 +302,55 @@ mod tests {
         assert_eq!(held(of_part.grow(20).unwrap_err()), 90);
         of_part.grow(10).unwrap();
         drop((of_part, of_whole));
-        part.lease().grow(50).unwrap();
-        budget.lease().grow(100).unwrap();
+        part.reservation().grow(50).unwrap();
+        budget.reservation().grow(100).unwrap();
     }
 
     #[test]
-    fn attached_bytes_hold_their_lease_to_the_last_reference() {
+    fn growing_buffers_are_charged_by_capacity() {
+        let budget = Budget::new(1000);
+        let (reservation, mut buffer) = (budget.reservation(), BytesMut::new());
+        // An announced length is trusted for eight times what arrived.
+        for (sent, expected, capacity) in [(10, 900, 80), (70, 900, 80), (1, 900, 648), (600, 900, 900)] {
+            if buffer.len() + sent <= 600 {
+                reservation.extend(&mut buffer, &vec![7; sent], expected).unwrap();
+                assert_eq!((buffer.capacity() as u64, reservation.bytes()), (capacity, capacity));
+            } else {
+                // Both buffers do not fit while one moves, and nothing changes.
+                let refused = reservation.extend(&mut buffer, &vec![7; sent], expected);
+                assert_eq!(refused, Err(OutOfMemory::Limit { needed: 1548, limit: 1000 }));
+            }
+        }
+        assert_eq!((buffer.len(), reservation.bytes()), (81, 648));
+        let (reservation, mut buffer) = (Budget::new(100).reservation(), BytesMut::new());
+        reservation.extend(&mut buffer, &[7; 5], 0).unwrap();
+        assert_eq!((buffer.capacity(), reservation.bytes()), (10, 10));
+        reservation.extend(&mut buffer, &[7; 6], 3).unwrap();
+        assert_eq!((buffer.capacity(), &buffer[..], reservation.bytes()), (22, &[7; 11][..], 22));
+    }
+
+    #[test]
+    fn work_that_exceeds_the_budget_alone_is_told_from_work_that_has_to_wait() {
+        let budget = Budget::new(100);
+        let (other, own) = (budget.reservation(), budget.reservation());
+        other.grow(50).unwrap();
+        own.grow(20).unwrap();
+        assert_eq!(held(own.grow(80).unwrap_err()), 70);
+        assert_eq!(own.grow(81), Err(OutOfMemory::Limit { needed: 101, limit: 100 }));
+        // Its input is in another reservation.
+        own.also_held(30);
+        assert_eq!((own.available(), held(own.grow(50).unwrap_err())), (50, 70));
+        assert_eq!(own.check(51), Err(OutOfMemory::Limit { needed: 101, limit: 100 }));
+        drop(other);
+        own.grow(50).unwrap();
+    }
+
+    #[test]
+    fn attached_bytes_hold_their_reservation_until_the_last_reference_is_dropped() {
         let budget = Budget::new(10);
-        let lease = budget.lease();
-        lease.force(11);
-        let mut bytes = lease.attach(vec![7; 11]);
+        let reservation = budget.reservation();
+        reservation.force(11);
+        let mut bytes = reservation.attach(vec![7; 11]);
         let tail = bytes.split_off(10);
         drop(bytes);
         assert_eq!((&tail[..], held(budget.check().unwrap_err())), (&[7][..], 11));

@@ -37,7 +37,7 @@ impl<T: Clone> ResultReceiver<T> {
 
 type Running<K, T> = Mutex<HashMap<K, ResultReceiver<T>>>;
 
-/// Tasks in progress by key, at most one for each key. A task runs on its own, so it ends even if every caller leaves.
+/// Tasks in progress by key, at most one for each key. A task runs to its end even if no caller waits for it any more.
 #[derive(Debug)]
 pub(crate) struct SingleFlight<K, T>(Arc<Running<K, T>>);
 
@@ -68,9 +68,10 @@ where
         }
         let (sender, receiver) = channel();
         running.insert(key.clone(), receiver.clone());
-        // Spawn without the lock: a runtime that shuts down drops the task, and with it the entry, at once.
+        // Spawned without the lock: a runtime that shuts down drops the task at once, and the task's entry takes the
+        // lock.
         drop(running);
-        let entry = Entry { running: Arc::clone(&self.0), key: key.clone() };
+        let entry = RunningTask { running: Arc::clone(&self.0), key: key.clone() };
         let work = start();
         Handle::current().spawn(async move {
             let result = work.await;
@@ -86,12 +87,12 @@ fn lock<K, T>(running: &Running<K, T>) -> MutexGuard<'_, HashMap<K, ResultReceiv
 }
 
 /// Removes a task from the map when it ends, also by a panic.
-struct Entry<K: Eq + Hash, T> {
+struct RunningTask<K: Eq + Hash, T> {
     running: Arc<Running<K, T>>,
     key: K,
 }
 
-impl<K: Eq + Hash, T> Drop for Entry<K, T> {
+impl<K: Eq + Hash, T> Drop for RunningTask<K, T> {
     fn drop(&mut self) {
         lock(&self.running).remove(&self.key);
     }

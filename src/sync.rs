@@ -2,11 +2,9 @@
 //! `shuttle`, those of Shuttle, whose scheduler explores their interleavings in the tests named `interleavings`.
 
 #[cfg(not(feature = "shuttle"))]
-pub(crate) use std::sync::mpsc;
-#[cfg(not(feature = "shuttle"))]
 pub(crate) use std::sync::{Condvar, Mutex, MutexGuard};
 #[cfg(all(feature = "gpu", not(feature = "shuttle")))]
-pub(crate) use std::thread;
+pub(crate) use std::{sync::mpsc, thread};
 #[cfg(all(feature = "server", not(feature = "shuttle")))]
 pub(crate) use tokio::{
     runtime::Handle,

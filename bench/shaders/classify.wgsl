@@ -13,15 +13,15 @@
 fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(num_workgroups) workgroups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
     let i = workgroup_number(workgroup, workgroups) * 256u + lane;
-    if (i >= grid.n_samples) {
+    if (i >= grid.n_points) {
         return;
     }
-    let cell = place_of(i, grid.n);
+    let cell = grid_point(i, grid.n);
     var flag = 0u;
     if (all(cell + vec3<u32>(1u) < grid.n)) {
         for (var c = 0u; c < 8u; c++) {
             let corner = cell + vec3<u32>(c & 1u, c >> 1u & 1u, c >> 2u);
-            flag |= select(0u, 1u << c, field[sample_at(corner, grid.n)] >= ISO);
+            flag |= select(0u, 1u << c, field[point_ix(corner, grid.n)] >= ISO);
         }
     }
     if (field[i] >= 0x80000000u) {

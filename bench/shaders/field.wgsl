@@ -1,6 +1,6 @@
 // The 2010 program, step 1 of 6: one thread per atom adds the atom's density to the grid points around it. WGSL has no
-// atomic addition of floats, so densities are fixed-point numbers: devices add them natively, and the sum does not depend
-// on the order.
+// atomic addition of floats, so densities are fixed-point numbers: devices add them natively, and the sum does not
+// depend on the order.
 
 override KERNEL: u32 = 0u;
 
@@ -11,9 +11,9 @@ const SOFT_OBJECT: u32 = 1u;
 @group(0) @binding(1) var<storage, read> atoms: array<Atom>;
 @group(0) @binding(2) var<storage, read_write> field: array<atomic<u32>>;
 
-// The most that one atom adds, in isovalues: 64 atoms at one place still fit in 32 bits. Only grid points deep inside
-// the molecule reach it.
-const MOST: f32 = 32.0;
+// Maximum density of one atom, in isovalues: 64 atoms at one position still fit in 32 bits. Only grid points deep
+// inside the molecule reach it.
+const MAX_DENSITY: f32 = 32.0;
 
 fn value(u: f32, u_min: f32) -> f32 {
     if (KERNEL == GAUSSIAN) {
@@ -46,12 +46,12 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(num_workgroups) wo
         let dz = f32(z) - atom.frac.z;
         for (var y = first.y; y <= last.y; y++) {
             let dy = f32(y) - atom.frac.y;
-            let row = sample_at(vec3<u32>(centre + vec3<i32>(0, y, z)), grid.n);
+            let row = point_ix(vec3<u32>(centre + vec3<i32>(0, y, z)), grid.n);
             for (var x = first.x; x <= last.x; x++) {
                 let dx = f32(x) - atom.frac.x;
                 let u = (dx * dx + dy * dy + dz * dz) * atom.inv_length2;
                 if (u < grid.support) {
-                    let density = clamp(value(u, u_min) * grid.scale, 0.0, MOST * f32(ISO));
+                    let density = clamp(value(u, u_min) * grid.scale, 0.0, MAX_DENSITY * f32(ISO));
                     atomicAdd(&field[row + u32(x)], u32(density + 0.5));
                 }
             }

@@ -15,7 +15,7 @@ struct Grid {
     n_atoms: u32,
     // Grid points along each axis; the last of each begins no cell.
     n: vec3<u32>,
-    n_samples: u32,
+    n_points: u32,
     // The grid point that positions are relative to.
     centre: vec3<i32>,
     // Å.
@@ -47,11 +47,12 @@ fn workgroup_number(workgroup: vec3<u32>, workgroups: vec3<u32>) -> u32 {
     return workgroup.y * workgroups.x + workgroup.x;
 }
 
-fn place_of(i: u32, n: vec3<u32>) -> vec3<u32> {
+// Grid point with the index `i` in a grid of `n` points.
+fn grid_point(i: u32, n: vec3<u32>) -> vec3<u32> {
     return vec3<u32>(i % n.x, i / n.x % n.y, i / (n.x * n.y));
 }
 
-fn sample_at(p: vec3<u32>, n: vec3<u32>) -> u32 {
+fn point_ix(p: vec3<u32>, n: vec3<u32>) -> u32 {
     return (p.z * n.y + p.y) * n.x + p.x;
 }
 

@@ -10,7 +10,7 @@
 fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(num_workgroups) workgroups: vec3<u32>,
         @builtin(local_invocation_index) lane: u32) {
     let i = workgroup_number(workgroup, workgroups) * 256u + lane;
-    if (i < grid.n_samples && cases[flags[i]] > 0u) {
+    if (i < grid.n_points && cases[flags[i]] > 0u) {
         active_cubes[counts[i].x] = i;
     }
 }

@@ -14,8 +14,8 @@ fn difference(p: vec3<u32>) -> vec3<f32> {
     let x = vec3<u32>(1u, 0u, 0u);
     let y = vec3<u32>(0u, 1u, 0u);
     let z = vec3<u32>(0u, 0u, 1u);
-    let more = vec3<u32>(field[sample_at(p + x, grid.n)], field[sample_at(p + y, grid.n)], field[sample_at(p + z, grid.n)]);
-    let less = vec3<u32>(field[sample_at(p - x, grid.n)], field[sample_at(p - y, grid.n)], field[sample_at(p - z, grid.n)]);
+    let more = vec3<u32>(field[point_ix(p + x, grid.n)], field[point_ix(p + y, grid.n)], field[point_ix(p + z, grid.n)]);
+    let less = vec3<u32>(field[point_ix(p - x, grid.n)], field[point_ix(p - y, grid.n)], field[point_ix(p - z, grid.n)]);
     return vec3<f32>(bitcast<vec3<i32>>(more) - bitcast<vec3<i32>>(less));
 }
 
@@ -27,7 +27,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(num_workgroups) wo
         return;
     }
     let i = active_cubes[number];
-    let cell = place_of(i, grid.n);
+    let cell = grid_point(i, grid.n);
     let flag = flags[i];
     for (var t = 0u; t < cases[flag]; t++) {
         for (var v = 0u; v < 3u; v++) {

@@ -2,7 +2,7 @@
 
 @group(0) @binding(0) var<uniform> grid: Grid;
 @group(0) @binding(1) var<storage, read> field: array<u32>;
-// Triangles of each case; from word 304 on the triangles of each case, four bits a corner.
+// Number of triangles of each case; from word 304 on, the edges of its triangles, four bits per corner.
 @group(0) @binding(2) var<storage, read> cases: array<u32>;
 @group(0) @binding(3) var<storage, read> flags: array<u32>;
 @group(0) @binding(4) var<storage, read> counts: array<vec2<u32>>;
@@ -19,7 +19,7 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(num_workgroups) wo
         return;
     }
     let i = active_cubes[number];
-    let cell = place_of(i, grid.n);
+    let cell = grid_point(i, grid.n);
     let flag = flags[i];
     for (var t = 0u; t < cases[flag]; t++) {
         for (var v = 0u; v < 3u; v++) {
@@ -28,8 +28,8 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(num_workgroups) wo
             let start = edge_start(cell, e);
             let axis = edge_axis(e);
             // Differences of whole numbers are exact.
-            let inner = i32(field[sample_at(start, grid.n)]);
-            let outer = i32(field[sample_at(start + axis, grid.n)]);
+            let inner = i32(field[point_ix(start, grid.n)]);
+            let outer = i32(field[point_ix(start + axis, grid.n)]);
             let s = clamp(f32(inner - i32(ISO)) / f32(inner - outer), EDGE_MARGIN, 1.0 - EDGE_MARGIN);
             let p = vec3<f32>(vec3<i32>(start) + grid.origin - grid.centre) + vec3<f32>(axis) * s;
             let at = 3u * (3u * (counts[i].y + t) + v);

@@ -1,6 +1,7 @@
 //! `molmesh-bench`: benchmarks of molmesh on GPUs and of its service, and the tables and figures of the 2010 paper on
 //! current hardware.
 
+mod commands;
 mod device;
 mod error;
 mod floor;
@@ -16,6 +17,7 @@ mod stats;
 mod structures;
 
 use std::io::Write as _;
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -35,6 +37,8 @@ enum Command {
     Gpu(Box<gpu::GpuArgs>),
     /// Time whole requests to a service, one client and many, on several backends
     Service(Box<service::ServiceArgs>),
+    /// Time whole commands on several backends
+    Commands(commands::CommandsArgs),
     /// Measure the tables of Dias, Bora and Gomes (HPDC 2010) on this machine
     Paper(Box<paper::PaperArgs>),
     /// Download the structures of the 2010 paper
@@ -47,6 +51,7 @@ fn main() -> ExitCode {
     let done = match Args::parse().command {
         Command::Gpu(args) => gpu::run(&args),
         Command::Service(args) => service::run(&args),
+        Command::Commands(args) => commands::run(&args),
         Command::Paper(args) => paper::run(&args),
         Command::Fetch(args) => paper::fetch::run(&args),
         Command::Figures(args) => paper::redraw::run(&args),
@@ -64,6 +69,11 @@ fn main() -> ExitCode {
 fn print(text: &str) -> Result<()> {
     let mut out = std::io::stdout().lock();
     out.write_all(text.as_bytes()).and_then(|()| out.flush()).map_err(Error::file("standard output"))
+}
+
+/// Writes results to a file, if one is given.
+fn write_json(path: Option<&Path>, results: &serde_json::Value) -> Result<()> {
+    path.map_or(Ok(()), |path| std::fs::write(path, format!("{results:#}\n")).map_err(Error::file(path)))
 }
 
 /// Writes a line of progress or an error to standard error. Ignores failures, which cannot be reported.

@@ -49,11 +49,11 @@ const BLOCK: u64 = 512;
 /// Uniform buffer of the grid, in the layout of the shaders.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-struct Grid {
+struct GridUniform {
     origin: [i32; 3],
     n_atoms: u32,
     n: [u32; 3],
-    n_samples: u32,
+    n_points: u32,
     centre: [i32; 3],
     spacing: f32,
     scale: f32,
@@ -95,17 +95,17 @@ const fn single(v: f64) -> f32 {
     v as f32
 }
 
-impl Grid {
+impl GridUniform {
     /// Creates the grid of a job, with at most `limit` points.
     fn new(job: &Prepared, limit: u64) -> Result<Self> {
         let (lattice, params) = (&job.lattice, job.plan.params(&job.lattice, &job.profile, &job.params));
         let bounds = [0, 1, 2].map(|k| bounds(lattice, k));
         let sides = bounds.map(|(lo, hi)| hi - lo + 1.0);
-        let samples = sides.iter().product::<f64>();
-        if samples > limit as f64 {
-            let spacing = lattice.spacing * 1.05 * (samples / limit as f64).cbrt();
+        let n_points = sides.iter().product::<f64>();
+        if n_points > limit as f64 {
+            let spacing = lattice.spacing * 1.05 * (n_points / limit as f64).cbrt();
             let why = format!(
-                "the grid has {samples:.0} points, the device supports {limit}; a spacing of {spacing:.2} Å fits"
+                "the grid has {n_points:.0} grid points, the device supports {limit}; a spacing of {spacing:.2} Å fits"
             );
             return Err(Error::Failed(why));
         }
@@ -120,7 +120,7 @@ impl Grid {
             origin,
             n_atoms: u32::try_from(lattice.atoms.len()).unwrap_or(u32::MAX),
             n,
-            n_samples: n.iter().product(),
+            n_points: n.iter().product(),
             centre: params.centre,
             spacing: params.spacing,
             scale: single(ISO / job.params.isovalue),
@@ -187,7 +187,7 @@ impl Program2010 {
     /// Returns [`Error::Failed`] if the grid or the mesh does not fit, or if the device fails.
     pub(crate) fn run(&mut self, job: &Prepared) -> Result<Soup<'_>> {
         // A binding holds two words per grid point.
-        let mut grid = Grid::new(job, self.gpu.max_binding() / 8)?;
+        let mut grid = GridUniform::new(job, self.gpu.max_binding() / 8)?;
         let [n_active, n_triangles] = self.count(job, &grid)?;
         if n_triangles == 0 {
             return Err(Error::Failed("the surface is empty".to_owned()));
@@ -236,10 +236,10 @@ impl Program2010 {
     }
 
     /// Runs the first three steps. Returns the numbers of active cubes and triangles.
-    fn count(&mut self, job: &Prepared, grid: &Grid) -> Result<[u32; 2]> {
-        let (n, table) = (u64::from(grid.n_samples), case_table());
+    fn count(&mut self, job: &Prepared, grid: &GridUniform) -> Result<[u32; 2]> {
+        let (n, table) = (u64::from(grid.n_points), case_table());
         let atoms_bytes: &[u8] = bytemuck::cast_slice(&job.lattice.atoms);
-        let grid_buffer = self.bound("grid", size_of::<Grid>() as u64);
+        let grid_buffer = self.bound("grid", size_of::<GridUniform>() as u64);
         let atoms = self.bound("atoms", atoms_bytes.len() as u64);
         let cases = self.bound("cases", 4 * table.len() as u64);
         let [field, flags] = ["field", "flags"].map(|name| self.bound(name, 4 * n));
@@ -294,9 +294,9 @@ impl Program2010 {
     }
 
     /// Runs the last three steps. Maps positions and normals, `column` bytes each, in `soup`.
-    fn output(&mut self, grid: &Grid, column: u64) -> Result<()> {
-        let (n, active) = (u64::from(grid.n_samples), u64::from(grid.n_active));
-        let grid_buffer = self.bound("grid", size_of::<Grid>() as u64);
+    fn output(&mut self, grid: &GridUniform, column: u64) -> Result<()> {
+        let (n, active) = (u64::from(grid.n_points), u64::from(grid.n_active));
+        let grid_buffer = self.bound("grid", size_of::<GridUniform>() as u64);
         self.gpu.queue.write_buffer(&grid_buffer.0, 0, bytemuck::bytes_of(grid));
         let cases = self.bound("cases", 4 * case_table().len() as u64);
         let [field, flags] = ["field", "flags"].map(|name| self.bound(name, 4 * n));

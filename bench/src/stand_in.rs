@@ -50,24 +50,24 @@ fn sides(cubes: u64) -> Option<[f64; 3]> {
 /// Generates `n` atoms in a box. The first two are in opposite corners.
 fn spheres(n: usize, sides: [f64; 3]) -> Result<Spheres> {
     let rows = sides.map(|side| (0_u32..).map(|i| f64::from(i) * ATOM_DISTANCE).take_while(move |x| *x <= side));
-    let mut places: Vec<(f64, [f64; 3])> = Vec::new();
+    let mut points: Vec<(f64, [f64; 3])> = Vec::new();
     for z in rows[2].clone() {
         for y in rows[1].clone() {
-            places.extend(rows[0].clone().map(|x| (from_diagonal([x, y, z], sides), [x, y, z])));
+            points.extend(rows[0].clone().map(|x| (from_diagonal([x, y, z], sides), [x, y, z])));
         }
     }
-    if places.len() + 2 < n {
+    if points.len() + 2 < n {
         return Err(Error::Failed(format!("a box of {sides:.1?} Å is too small for {n} atoms")));
     }
-    // The sort is stable: places at the same distance keep their order.
-    places.sort_by(|a, b| a.0.total_cmp(&b.0));
+    // The sort is stable: points at the same distance keep their order.
+    points.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut random = Random::new(n as u64);
     let corners = [[0.0; 3], sides].into_iter();
-    let places = corners.chain(places.into_iter().map(|(_, place)| place)).take(n).enumerate();
-    structures::spheres(places.map(|(i, place)| {
+    let points = corners.chain(points.into_iter().map(|(_, point)| point)).take(n).enumerate();
+    structures::spheres(points.map(|(i, point)| {
         let centre = std::array::from_fn(|k| {
             let offset = 0.5 * ATOM_DISTANCE * random.next();
-            ORIGIN[k] + if i < 2 { place[k] } else { (place[k] + offset).clamp(0.0, sides[k]) }
+            ORIGIN[k] + if i < 2 { point[k] } else { (point[k] + offset).clamp(0.0, sides[k]) }
         });
         (centre, random.radius())
     }))

@@ -113,11 +113,11 @@ pub(crate) fn tiled_sample(n: usize) -> Result<Spheres> {
 pub(crate) fn ball(n: usize, seed: u64) -> Result<Spheres> {
     let mut random = Random::new(seed);
     let half = (1_i32..2000).find(|h| 4.0 * f64::from(*h).powi(3) > n as f64).unwrap_or(1) + 1;
-    let mut places: Vec<[i32; 3]> =
+    let mut points: Vec<[i32; 3]> =
         (-half..=half).flat_map(|z| (-half..=half).flat_map(move |y| (-half..=half).map(move |x| [x, y, z]))).collect();
-    places.sort_by_key(|p| (p.iter().map(|c| c * c).sum::<i32>(), *p));
-    spheres(places.into_iter().take(n).map(|place| {
-        let centre = place.map(|c| ATOM_DISTANCE * (f64::from(c) + 0.5 * random.next()));
+    points.sort_by_key(|p| (p.iter().map(|c| c * c).sum::<i32>(), *p));
+    spheres(points.into_iter().take(n).map(|point| {
+        let centre = point.map(|c| ATOM_DISTANCE * (f64::from(c) + 0.5 * random.next()));
         (centre, random.radius())
     }))
 }

@@ -5,9 +5,9 @@
 
 Clients submit asynchronous jobs without a pause. The service is killed (`kill -9`) while it serves, while it recovers
 the jobs of the process before, and while it drains after SIGTERM. All limits have their defaults, so a job that is
-started three times and killed each time fails; any other end without a result is an error. At last all jobs end, and
-every result is compared with the output of `molmesh mesh`. The exit code is 1 if a job is lost, a result is wrong, or
-no job was open at most of the kills, as the test would then prove nothing.
+started three times and killed each time fails; any other end without a result is an error. Finally the script waits for
+all jobs and compares every result with the output of `molmesh mesh`. The exit code is 1 if a job is lost, a result is
+wrong, or no job was open at most of the kills, because such a run tests nothing.
 """
 
 import argparse
@@ -19,10 +19,10 @@ import sys
 import threading
 import time
 
-from mixed import AWAY, Expected, Server, fetch, folder
+from mixed import UNAVAILABLE, Expected, Server, fetch, folder
 
 OPEN = ("accepted", "running")
-# Time for all jobs to end at last, s.
+# Time for all remaining jobs to end, s.
 FINISH_TIMEOUT = 300
 
 
@@ -43,7 +43,7 @@ class Clients:
                 status, headers, _ = fetch(self.port, "POST", f"/v1/meshes?{query}", structure, {"prefer": "respond-async"}, 10)
                 if status == 202:
                     self.jobs[headers["location"]] = mesh
-            except AWAY:
+            except UNAVAILABLE:
                 pass
             time.sleep(0.02)
 
@@ -80,11 +80,11 @@ def kill(server, phase, dice):
 
 
 def outcome(port, job, mesh, deadline):
-    """Waits for a job. Returns `successful`, `abandoned`, or what is wrong."""
+    """Waits for a job. Returns `successful`, `abandoned`, or an error that begins with `bad`."""
     status, document = None, {"status": "accepted"}
     while document["status"] in OPEN:
         if time.monotonic() > deadline:
-            return "bad: never ends"
+            return "bad: does not end"
         status, _, body = fetch(port, "GET", f"{job}?wait=20")
         if status != 200:
             return f"bad: status {status}"

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Measures memory per listener and lag of events with thousands of listeners to the events of one job.
 
-    molmesh serve --listen 127.0.0.1:8080 --backend reference --set archive.url=none --set server.connections=4000 --set jobs.workers=1 &
+    molmesh serve --listen 127.0.0.1:8080 --backend reference \\
+        --set archive.url=none --set server.connections=4000 --set jobs.workers=1 &
     python3 benches/load/listeners.py http://127.0.0.1:8080 samples/4pti.pdb --pid $!
 
 Long jobs of the slow reference backend keep the only worker busy. The listeners watch a job that is queued behind them.
@@ -59,7 +60,7 @@ def crowd(structure, times):
     return atoms * times
 
 
-async def settled(pid):
+async def steady_memory(pid):
     """Returns the resident memory after it has stayed within 64 KiB for two seconds, bytes."""
     seen = [memory(pid)]
     for _ in range(60):
@@ -82,16 +83,16 @@ async def main():
     crowded = crowd(structure, 200)
     long = [start_job(args.url, crowded + b"REMARK 900 %d\n" % n, "?resolution=0.7") for n in range(24)]
     watched = start_job(args.url, structure, "?resolution=2")
-    alone = await settled(args.pid)
+    alone = await steady_memory(args.pid)
     await asyncio.sleep(3)
-    before = await settled(args.pid)
+    before = await steady_memory(args.pid)
     ready, lags, tasks, taken = asyncio.Semaphore(0), [], [], []
     for _ in range(2):
         for _ in range(args.listeners // 2):
             tasks.append(asyncio.create_task(listen(parts.hostname, parts.port, watched, ready, lags)))
         for _ in range(args.listeners // 2):
             await ready.acquire()
-        taken.append(await settled(args.pid))
+        taken.append(await steady_memory(args.pid))
     each = (taken[1] - taken[0]) / (args.listeners // 2)
     if lags:
         raise SystemExit("the long jobs were too short")

@@ -15,7 +15,7 @@ import time
 from collections import Counter
 
 # Errors of a server that is stopped before or during a request. The client retries.
-AWAY = (OSError, http.client.HTTPException)
+UNAVAILABLE = (OSError, http.client.HTTPException)
 RESOLUTIONS = ("0.6", "0.8", "1", "1.5", "2")
 KERNELS = ("gaussian", "soft-object", "inverse-square")
 
@@ -36,7 +36,7 @@ class Server:
             try:
                 if fetch(self.port, "GET", "/readyz")[0] == 200:
                     return time.perf_counter() - begin
-            except AWAY:
+            except UNAVAILABLE:
                 pass
             if self.process.poll() is not None:
                 raise SystemExit(f"the server ended with {self.process.returncode}: see {self.log}")
@@ -71,7 +71,7 @@ def fetch(port, method, path, body=None, headers=None, timeout=60):
 
 
 class Expected:
-    """Expected responses, computed beforehand with `molmesh mesh`."""
+    """Expected responses, computed before the load with `molmesh mesh`."""
 
     def __init__(self, binary, structures):
         self.inputs, self.files = [], {}
@@ -99,7 +99,7 @@ class Load:
 
     def __init__(self, port, expected, clients, seed=1, every=0.0, later=float("inf")):
         self.port, self.expected = port, expected
-        # Seconds after which deferred jobs are followed; infinite: only by `settle`.
+        # Seconds after which deferred jobs are followed; infinite: only by `follow_deferred`.
         self.later = later
         # Seconds between the starts of two requests of all clients; 0: without pauses.
         self.every, self.turn = every, time.monotonic()
@@ -130,110 +130,110 @@ class Load:
             if not self.over.wait(turn - time.monotonic() if self.every else 0):
                 dice.choice(kinds)(dice)
                 self.count("requests")
-                self.settle(time.monotonic() - self.later)
+                self.follow_deferred(time.monotonic() - self.later)
 
-    def ask(self, method, path, body=None, headers=None, good=(200,), patience=60.0):
+    def send(self, method, path, body=None, headers=None, good=(200,), timeout=60.0):
         """Sends a request until it succeeds. Returns None if it does not succeed in time."""
-        end = time.monotonic() + patience
+        end = time.monotonic() + timeout
         while time.monotonic() < end:
             try:
-                status, heads, answer = fetch(self.port, method, path, body, headers)
+                status, heads, response = fetch(self.port, method, path, body, headers)
             except http.client.IncompleteRead:
                 # A response that has started must be complete.
-                self.count("bad: answers cut off")
+                self.count("bad: responses cut off")
                 continue
             except (ConnectionRefusedError, ConnectionResetError, http.client.RemoteDisconnected, BrokenPipeError) as why:
-                self.count("away" if isinstance(why, ConnectionRefusedError) else "cut before an answer")
+                self.count("connection refused" if isinstance(why, ConnectionRefusedError) else "cut before a response")
                 time.sleep(0.02)
                 continue
             if status in good:
-                return status, heads, answer
+                return status, heads, response
             if status in (429, 503):
-                self.count(f"told to wait ({status})")
+                self.count(f"rejected ({status})")
                 time.sleep(min(float(heads.get("retry-after", "1")), 2.0))
                 continue
             self.count(f"bad: status {status} for {method} {path.split('?')[0][:24]}")
             return None
-        self.count("bad: no answer in a minute")
+        self.count("bad: no response in a minute")
         return None
 
-    def compare(self, what, got, want):
+    def compare(self, what, got, expected):
         self.count(what)
-        if got != want:
+        if got != expected:
             self.count("bad: wrong bytes")
 
     def mesh(self, dice):
         """Requests a mesh with a wait. Follows the job if it takes longer."""
-        fresh, query, want = self.expected.next_request(dice)
-        answer = self.ask("POST", f"/v1/meshes?{query}", fresh, {"prefer": "wait=10"}, good=(200, 202))
-        if answer is None:
+        fresh, query, expected = self.expected.next_request(dice)
+        response = self.send("POST", f"/v1/meshes?{query}", fresh, {"prefer": "wait=10"}, good=(200, 202))
+        if response is None:
             return
-        if answer[0] == 202:
-            self.follow(answer[1]["location"], want)
+        if response[0] == 202:
+            self.follow(response[1]["location"], expected)
         else:
-            self.compare("meshes", answer[2], want)
+            self.compare("meshes", response[2], expected)
 
     def start_job(self, dice):
         """Starts a job. Follows half of the jobs later."""
-        fresh, query, want = self.expected.next_request(dice)
-        answer = self.ask("POST", f"/v1/meshes?{query}", fresh, {"prefer": "respond-async"}, good=(202,))
-        if answer is None:
+        fresh, query, expected = self.expected.next_request(dice)
+        response = self.send("POST", f"/v1/meshes?{query}", fresh, {"prefer": "respond-async"}, good=(202,))
+        if response is None:
             return
         self.count("jobs accepted")
         if dice.random() < 0.5:
             with self.lock:
-                self.deferred.append((time.monotonic(), answer[1]["location"], want))
+                self.deferred.append((time.monotonic(), response[1]["location"], expected))
         else:
-            self.follow(answer[1]["location"], want)
+            self.follow(response[1]["location"], expected)
 
-    def follow(self, location, want):
+    def follow(self, location, expected):
         """Waits for a job and compares its result, which is read in two ranges."""
         end = time.monotonic() + 60
         while time.monotonic() < end:
-            answer = self.ask("GET", f"{location}?wait=5")
-            if answer is None:
+            response = self.send("GET", f"{location}?wait=5")
+            if response is None:
                 return
-            if b'"successful"' in answer[2]:
+            if b'"successful"' in response[2]:
                 break
-            if b'"failed"' in answer[2] or b'"dismissed"' in answer[2]:
+            if b'"failed"' in response[2] or b'"dismissed"' in response[2]:
                 return self.count("bad: accepted jobs lost")
         else:
             return self.count("bad: accepted jobs lost")
-        moved = self.ask("GET", f"{location}/result", good=(303,))
+        moved = self.send("GET", f"{location}/result", good=(303,))
         if moved is None:
             return
-        half = len(want) // 2
-        first = self.ask("GET", moved[1]["location"], headers={"range": f"bytes=0-{half - 1}"}, good=(206,))
-        rest = self.ask("GET", moved[1]["location"], headers={"range": f"bytes={half}-"}, good=(206,))
+        half = len(expected) // 2
+        first = self.send("GET", moved[1]["location"], headers={"range": f"bytes=0-{half - 1}"}, good=(206,))
+        rest = self.send("GET", moved[1]["location"], headers={"range": f"bytes={half}-"}, good=(206,))
         if first and rest:
-            self.compare("jobs done", first[2] + rest[2], want)
+            self.compare("jobs done", first[2] + rest[2], expected)
 
     def upload(self, dice):
         """Uploads a structure and requests a mesh of it twice, the second time from the cache."""
-        fresh, query, want = self.expected.next_request(dice)
-        made = self.ask("POST", "/v1/structures", fresh, good=(200, 201))
+        fresh, query, expected = self.expected.next_request(dice)
+        made = self.send("POST", "/v1/structures", fresh, good=(200, 201))
         if made is None:
             return
         for _ in range(2):
-            answer = self.ask("GET", f"{made[1]['location']}/surface.glb?{query}", good=(200,))
-            if answer:
-                self.compare("meshes of uploads", answer[2], want)
+            response = self.send("GET", f"{made[1]['location']}/surface.glb?{query}", good=(200,))
+            if response:
+                self.compare("meshes of uploads", response[2], expected)
 
     def dismiss(self, dice):
         """Starts a job and cancels it."""
         fresh, query, _ = self.expected.next_request(dice)
-        answer = self.ask("POST", f"/v1/meshes?{query}", fresh, {"prefer": "respond-async"}, good=(202,))
-        if answer and self.ask("DELETE", answer[1]["location"], good=(200, 204, 404, 409, 410)):
+        response = self.send("POST", f"/v1/meshes?{query}", fresh, {"prefer": "respond-async"}, good=(202,))
+        if response and self.send("DELETE", response[1]["location"], good=(200, 204, 404, 409, 410)):
             self.count("jobs dismissed")
 
-    def settle(self, until=float("inf")):
+    def follow_deferred(self, until=float("inf")):
         """Follows the jobs deferred before `until`."""
         while True:
             with self.lock:
                 if not self.deferred or self.deferred[0][0] > until:
                     return
-                _, location, want = self.deferred.pop(0)
-            self.follow(location, want)
+                _, location, expected = self.deferred.pop(0)
+            self.follow(location, expected)
 
     def bad(self):
         return sum(n for what, n in self.counts.items() if what.startswith("bad"))

@@ -48,7 +48,7 @@ class Load:
         self.host, self.port = parts.hostname, parts.port or 80
         self.path = f"/v1/meshes?resolution={resolution}"
         self.structure, self.n = structure, 0
-        self.done, self.refusals, self.ratios, self.told, self.errors = 0, [], [], [], 0
+        self.done, self.refusals, self.ratios, self.retry_after, self.errors = 0, [], [], [], 0
 
     def body(self):
         """Returns the structure with a unique remark: the same work, but different content."""
@@ -57,7 +57,7 @@ class Load:
 
     async def client(self, end):
         while time.perf_counter() < end:
-            body, refused, said = self.body(), None, None
+            body, refused, wait = self.body(), None, None
             while time.perf_counter() < end:
                 try:
                     status, retry, took = await post(self.host, self.port, self.path, body)
@@ -69,8 +69,8 @@ class Load:
                 if status == 503 and retry is not None:
                     self.refusals.append(took)
                     if refused is None:
-                        refused, said = now, retry
-                    self.told.append(retry)
+                        refused, wait = now, retry
+                    self.retry_after.append(retry)
                     await asyncio.sleep(min(retry, max(0, end - now)))
                     continue
                 if status != 200:
@@ -79,7 +79,7 @@ class Load:
                     self.done += 1
                 if refused is not None:
                     # The job was accepted at most `took` before the response.
-                    self.ratios.append((now - took - refused) / said)
+                    self.ratios.append((now - took - refused) / wait)
                 break
 
 
@@ -136,7 +136,7 @@ async def main():
         share = lambda bound: 100 * max((n for b, n in refused if b <= bound), default=0) / max(1, refused[-1][1] if refused else 1)
         print(f"  by the service's clock, body included: {share(0.01):.1f} % within 10 ms, {share(0.05):.1f} % within 50 ms")
     print(f"Retry-After     {100 * right:8.1f} % right within a factor of 2; ratio p50 {percent(load.ratios, 50):.2f}, p90 {percent(load.ratios, 90):.2f}, p99 {percent(load.ratios, 99):.2f}")
-    print(f"told            p50 {percent(load.told, 50):.0f} s, p99 {percent(load.told, 99):.0f} s, longest {max(load.told, default=0)} s")
+    print(f"wait            p50 {percent(load.retry_after, 50):.0f} s, p99 {percent(load.retry_after, 99):.0f} s, longest {max(load.retry_after, default=0)} s")
     print(f"errors          {load.errors:8d}")
     if samples:
         third = len(samples) // 3

@@ -37,7 +37,7 @@ def main():
         stops.append(took)
         starts.append(server.start())
     load.finish()
-    load.settle()
+    load.follow_deferred()
     code, took = server.stop()
     codes.append(code)
     stops.append(took)

@@ -202,8 +202,8 @@ def surface(xp, field, shape, origin, spacing, lookup):
     ends = xp.to(xp.cumsum(number), xp.int64)
     of = xp.repeat(xp.arange(len(cells)), number)
     edges = table.reshape(-1, 5, 3)[case[of], xp.arange(len(of)) - (ends - number)[of]]
-    sample = (cells // ((ny - 1) * (nz - 1)) * ny + cells // (nz - 1) % (ny - 1)) * nz + cells % (nz - 1)
+    point = (cells // ((ny - 1) * (nz - 1)) * ny + cells // (nz - 1) % (ny - 1)) * nz + cells % (nz - 1)
     axis, low, high = edges // 4, edges % 2, edges // 2 % 2
     offsets = xp.put(np.array([[nz, 1], [ny * nz, 1], [ny * nz, nz]]))
-    owner = sample[of][:, None] + low * offsets[axis, 0] + high * offsets[axis, 1]
+    owner = point[of][:, None] + low * offsets[axis, 0] + high * offsets[axis, 1]
     return points, normals, base[owner] + lower[xp.to(mask[owner], xp.int64), axis]

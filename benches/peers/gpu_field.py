@@ -7,8 +7,8 @@ triangles are ours except for rounding. `molmesh-bench gpu` times the same work.
 
 * `torch`: array operations (gpu_arrays.py); pairs of an atom and a grid point are added by index;
 * `torch.compile`: the same with that step compiled into one kernel;
-* `cupy`: CUDA kernels (gpu_kernels.cu): atoms sorted into bins, one block per brick of grid points, then a count, a prefix sum
-  and two kernels that write shared vertices with normals, and triangles;
+* `cupy`: CUDA kernels (gpu_kernels.cu): sort atoms into bins, one block per brick of grid points, then count, prefix
+  sum and two kernels that write shared vertices with normals, and triangles;
 * `scikit-image (host)`: the field of the last baseline, contoured once on the host; only for small grids;
 * `numpy (host)`, `torch (host)`: the array program without a device, on request, for tests.
 
@@ -29,7 +29,7 @@ import numpy as np
 import gpu_arrays
 
 # Beyond this number of grid points, scikit-image would take minutes.
-HOST_SAMPLES = 60_000_000
+HOST_GRID_POINTS = 60_000_000
 
 
 class Case:
@@ -46,9 +46,9 @@ class Case:
         self.origin = low * spacing
         local = positions / spacing - low
         self.atoms = np.column_stack([local, (spacing / radii) ** 2]).astype(np.float32)
-        self.samples = math.prod(self.shape)
-        if self.samples >= 1 << 31:
-            raise ValueError(f"{self.samples} samples do not fit 31 bits")
+        self.n_grid_points = math.prod(self.shape)
+        if self.n_grid_points >= 1 << 31:
+            raise ValueError(f"{self.n_grid_points} grid points do not fit 31 bits")
 
     def reference(self, index):
         """Computes the density at grid points (flat indices) in double precision, atom by atom."""
@@ -148,7 +148,7 @@ class CompiledBaseline(TorchBaseline):
         self.add = self.torch.compile(add, dynamic=False)
 
     def field(self, case, atoms, chunk=16384):
-        grid = self.xp.zeros(case.samples, self.xp.float32)
+        grid = self.xp.zeros(case.n_grid_points, self.xp.float32)
         offsets = self.xp.arange(math.floor(2 * case.widest) + 2)
         # All chunks have the same length, to compile once. Atoms too small to reach a grid point pad the last one.
         for begin in range(0, len(atoms), chunk):
@@ -240,7 +240,7 @@ def measure(baseline, case, warm, runs):
     points, normals, faces = map(baseline.host, mesh)
     values = baseline.host(field)
     random = np.random.default_rng(1)
-    index = np.concatenate([random.choice(np.flatnonzero(values), 300), random.integers(0, case.samples, 50)])
+    index = np.concatenate([random.choice(np.flatnonzero(values), 300), random.integers(0, case.n_grid_points, 50)])
     error = float(np.abs(values[index] - case.reference(index)).max())
     area, volume = area_and_volume(points, faces)
     return {
@@ -253,8 +253,8 @@ def measure(baseline, case, warm, runs):
 
 def on_host(case, values):
     """Times the marching cubes of scikit-image on a field, once."""
-    if case.samples > HOST_SAMPLES:
-        return {"skipped": f"{case.samples} samples; above {HOST_SAMPLES} it would take minutes"}
+    if case.n_grid_points > HOST_GRID_POINTS:
+        return {"skipped": f"{case.n_grid_points} grid points; above {HOST_GRID_POINTS} it would take minutes"}
     from skimage.measure import marching_cubes
 
     begin = time.perf_counter()
@@ -296,7 +296,7 @@ def main():
             baselines[name] = f"{type(error).__name__}: {error}"[:500]
     for file, spacing in ((file, spacing) for file in given.files for spacing in given.spacing):
         case, values = Case(file, spacing), None
-        rows = {"atoms": len(case.atoms), "samples": case.samples, "grid": list(case.shape)}
+        rows = {"atoms": len(case.atoms), "grid_points": case.n_grid_points, "grid": list(case.shape)}
         for name, baseline in baselines.items():
             try:
                 if isinstance(baseline, str):

@@ -37,7 +37,7 @@ def call(command, **options):
     return done.stdout
 
 
-def said(command, environment=None):
+def output_of(command, environment=None):
     """Returns the output of a command without surrounding white space."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **(environment or {})})
@@ -85,7 +85,7 @@ def packages(*names):
         if not has(python(), wanted):
             pip(wanted)
         code = "import importlib.metadata as m, sys; print(', '.join(n + ' ' + m.version(n) for n in sys.argv[1:]))"
-        return said([python(), "-c", code, *names, "numpy"])
+        return output_of([python(), "-c", code, *names, "numpy"])
 
     return ready
 
@@ -98,7 +98,7 @@ def splashsurf():
 def splashsurf_version():
     if not splashsurf():
         call(["cargo", "install", "splashsurf", "--version", SPLASHSURF, "--locked", "--root", FOLDER / "cargo"])
-    return said([splashsurf(), "--version"])
+    return output_of([splashsurf(), "--version"])
 
 
 def molstar_version():
@@ -106,8 +106,8 @@ def molstar_version():
     if not package.exists():
         NODE.mkdir(parents=True, exist_ok=True)
         call(["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", f"molstar@{MOLSTAR}"], cwd=NODE)
-    version = said(["node", "-p", f"require({str(package)!r}).version"])
-    return f"molstar {version}, node {said(['node', '--version'])}"
+    version = output_of(["node", "-p", f"require({str(package)!r}).version"])
+    return f"molstar {version}, node {output_of(['node', '--version'])}"
 
 
 def edtsurf():
@@ -140,7 +140,7 @@ def debian(name):
             wanted = [line.split()[1] for line in plan.splitlines() if line.startswith("Inst ")]
             DEBIAN.mkdir(parents=True, exist_ok=True)
             if name not in wanted:  # the system has it
-                stamp.write_text(said(["dpkg", "--status", name]))
+                stamp.write_text(output_of(["dpkg", "--status", name]))
                 return version(name, stamp)
             archives = FOLDER / "debs" / name
             archives.mkdir(parents=True, exist_ok=True)
@@ -148,7 +148,7 @@ def debian(name):
             for archive in sorted(archives.glob("*.deb")):
                 call(["dpkg", "-x", archive, DEBIAN])
             shutil.rmtree(archives)
-            stamp.write_text(said(["apt-cache", "show", "--no-all-versions", name]))
+            stamp.write_text(output_of(["apt-cache", "show", "--no-all-versions", name]))
         return version(name, stamp)
 
     return ready
@@ -161,4 +161,4 @@ def version(name, stamp):
 
 
 def molmesh_version(binary):
-    return said([str(binary), "--version"])
+    return output_of([str(binary), "--version"])

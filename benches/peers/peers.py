@@ -1,7 +1,8 @@
 """Compares molmesh with other programs on the same structure files, in turn, on a RAM disk.
 
-    python3 benches/peers/peers.py                                       # the samples
-    python3 benches/peers/peers.py --data FOLDER --publish               # 1UBQ, 1A0Q, 7CTH, 6ZU5 of a folder; writes the page
+    # The samples; then 1UBQ, 1A0Q, 7CTH and 6ZU5 of a folder, with an update of the page; then some files and programs.
+    python3 benches/peers/peers.py
+    python3 benches/peers/peers.py --data FOLDER --publish
     python3 benches/peers/peers.py --files A.pdb B.cif --only molmesh,splashsurf --rounds 9
 
 Requires `cargo build --release`, Python 3.11, and the package managers of the programs (cargo, npm, apt-get). Missing
@@ -90,14 +91,14 @@ def launch(peer, job, limit):
     if done.returncode != 0:
         words = done.stderr.strip().splitlines()
         return {"failed": words[-1] if words else f"launch.py ended with {done.returncode}"}
-    said = json.loads(done.stdout)
+    run = json.loads(done.stdout)
     mesh = Path(job.mesh(peer.extension))
-    if said["late"]:
+    if run["late"]:
         return {"limit": limit}
-    if said["status"] != 0 or not mesh.exists() or mesh.stat().st_size == 0:
+    if run["status"] != 0 or not mesh.exists() or mesh.stat().st_size == 0:
         words = errors.read_text(errors="replace").strip().splitlines()
-        return {"failed": f"status {said['status']}" + (f", {words[-1][:160]}" if words else "")}
-    return {"wall": said["wall"], "kb": said["kb"]}
+        return {"failed": f"status {run['status']}" + (f", {words[-1][:160]}" if words else "")}
+    return {"wall": run["wall"], "kb": run["kb"]}
 
 
 def first(peer, job, limit):

@@ -6,9 +6,9 @@
 #   deploy/container/build.sh --base-from-debootstrap  creates the Debian base here, without an image registry
 #   deploy/container/build.sh --target cpu             builds one image
 #
-# A binary from this machine contains the web page if `make web` ran before its build, as `make release` does. It must not
-# need a newer libc than the base; otherwise the image build fails. Environment variables: SUITE (trixie), BASE_IMAGE,
-# RUST_IMAGE, NODE_IMAGE, and SOURCE (address of the sources for the image label).
+# A binary from this machine contains the web page if `make web` ran before its build, as `make release` does. It must
+# not need a newer libc than the base; otherwise the image build fails. Environment variables: SUITE (trixie),
+# BASE_IMAGE, RUST_IMAGE, NODE_IMAGE, and SOURCE (address of the sources for the image label).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
 # shellcheck source=deploy/container/engine.sh

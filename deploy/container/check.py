@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Checks the content and the operation of the images molmesh:cpu and molmesh:gpu.
 
-Each check has a negative control: a broken image (`molmesh:broken`, made here) or an event that it must report. Needs root
-and docker or podman on this machine: requests enter through the container's own network, which has no outside access.
-Usage: deploy/container/check.py [cpu|gpu ...]
+Each check has a negative control: a broken image (`molmesh:broken`, made here) or an event that it must report. Needs
+root and docker or podman on this machine: requests enter through the container's own network, which has no outside
+access. Usage: deploy/container/check.py [cpu|gpu ...]
 """
 
 import io
@@ -20,7 +20,7 @@ import time
 ROOT = pathlib.Path(__file__).resolve().parent.parent.parent
 USER = 65532
 # Bytes of all layers, as the engine counts them.
-MOST_BYTES = {"cpu": 120_000_000, "gpu": 130_000_000}
+MAX_BYTES = {"cpu": 120_000_000, "gpu": 130_000_000}
 READY_SECONDS = 120
 STOP_SECONDS = 60
 VOLUME = "molmesh-check"
@@ -32,7 +32,7 @@ def docker_answers():
     return shutil.which("docker") and subprocess.run(["docker", "info"], capture_output=True, check=False).returncode == 0
 
 
-# As engine.sh chooses, which build.sh asks.
+# Same choice as in engine.sh, which build.sh uses.
 ENGINE, RUN = [os.environ.get("ENGINE") or ("docker" if docker_answers() else "podman")], []
 if ENGINE == ["podman"]:
     if runc := shutil.which("runc"):
@@ -46,8 +46,8 @@ def engine(*arguments, code=0, text=True, stdin=None):
     """Runs the engine and fails unless it exits with `code`; None accepts any exit status."""
     done = subprocess.run([*ENGINE, *arguments], capture_output=True, text=text, input=stdin, check=False)
     if code is not None and done.returncode != code:
-        said = done.stderr if text else done.stderr.decode(errors="replace")
-        raise Failed(f"{' '.join(arguments)} ended with {done.returncode}, not {code}: {said.strip()[-2000:]}")
+        output = done.stderr if text else done.stderr.decode(errors="replace")
+        raise Failed(f"{' '.join(arguments)} ended with {done.returncode}, not {code}: {output.strip()[-2000:]}")
     return done
 
 
@@ -60,7 +60,7 @@ def need(holds, why):
         raise Failed(why)
 
 
-# ------------------------------------------------------------------------------------------- what an image says and holds
+# ------------------------------------------------------------------------------------------------ content of an image
 
 
 class Image:
@@ -92,8 +92,8 @@ def runs_as_nobody(image):
 
 
 def is_small(image):
-    most = MOST_BYTES[image.kind]
-    need(image.size <= most, f"{image.size:,} bytes, {most:,} are allowed")
+    limit = MAX_BYTES[image.kind]
+    need(image.size <= limit, f"{image.size:,} bytes, {limit:,} are allowed")
 
 
 def is_labelled(image):
@@ -132,22 +132,22 @@ def belongs_to_root(image):
     need(not loose, f"writable for all users: {loose}")
 
 
-def brings_licences(image):
+def has_licences(image):
     doc = "/usr/share/doc/molmesh/"
     for name in ("LICENSE-MIT", "LICENSE-APACHE"):
         need(image.read(doc + name) == (ROOT / name).read_bytes(), f"{name} is not ours")
     notices = image.read(doc + "THIRD-PARTY.txt").decode()
-    for held in ("  tokio ", "  ring ", "Swagger UI", "the Rust standard library", "Permission is hereby granted"):
-        need(held in notices, f"the notices lack `{held}`")
+    for part in ("  tokio ", "  ring ", "Swagger UI", "the Rust standard library", "Permission is hereby granted"):
+        need(part in notices, f"the notices lack `{part}`")
 
 
-def brings_certificates(image):
-    need("/var/lib/dpkg/status.d/ca-certificates" in image.files, "nothing says whose certificates these are")
+def has_certificates(image):
+    need("/var/lib/dpkg/status.d/ca-certificates" in image.files, "no package of certificates is recorded")
     n = image.read("/etc/ssl/certs/ca-certificates.crt").count(b"BEGIN CERTIFICATE")
     need(n >= 50, f"{n} certificates")
 
 
-def brings_nothing_of_the_build(image):
+def has_no_build_tools(image):
     tools = ("/usr/bin/gcc", "/usr/bin/python3", "/usr/local/cargo", "/root/.cargo", "/build", "/stage")
     rest = [p for p in image.files if p in tools or p.startswith("/var/lib/apt/lists/") and image.files[p].isfile()]
     need(not rest, f"left over: {rest[:9]}")
@@ -167,11 +167,11 @@ def has_what_its_kind_needs(image):
     for path in wanted[4:]:
         need(json.loads(image.read(path))["ICD"]["library_path"].startswith("lib"), path)
     for path in wanted[:4]:
-        said = engine("run", "--rm", *RUN, *SAFE, "--entrypoint", "ldd", image.name, path).stdout
-        need("=>" in said and "not found" not in said, f"{path} lacks libraries: {said}")
+        output = engine("run", "--rm", *RUN, *SAFE, "--entrypoint", "ldd", image.name, path).stdout
+        need("=>" in output and "not found" not in output, f"{path} lacks libraries: {output}")
 
 
-LOOKS = [
+CONTENT_CHECKS = [
     runs_as_nobody,
     is_small,
     is_labelled,
@@ -180,9 +180,9 @@ LOOKS = [
     checks_its_health,
     has_no_setuid,
     belongs_to_root,
-    brings_licences,
-    brings_certificates,
-    brings_nothing_of_the_build,
+    has_licences,
+    has_certificates,
+    has_no_build_tools,
     has_what_its_kind_needs,
 ]
 
@@ -204,7 +204,7 @@ HEALTHCHECK NONE
     return Image(BROKEN, target)
 
 
-# ------------------------------------------------------------------------------------------------------- running it
+# ---------------------------------------------------------------------------------------------- a running container
 
 
 class Container:
@@ -270,7 +270,7 @@ def serves(image):
     test = image.health[1:]
     container = Container(image.name, "--read-only")
     container.wait_until_healthy(test)
-    need(container.run(*test, "--url", "http://127.0.0.1:1/", code=1).returncode == 1, "control: health of nothing")
+    need(container.run(*test, "--url", "http://127.0.0.1:1/", code=1).returncode == 1, "control: a health check of no service succeeded")
     uid, capabilities, no_new = privileges(container)
     need((uid, int(capabilities, 16), no_new) == (str(USER), 0, "1"), f"uid {uid}, {capabilities}, {no_new}")
     status, glb = container.curl("/v1/meshes", "--data-binary", f"@{ROOT}/samples/4pti.pdb")
@@ -294,31 +294,31 @@ def serves(image):
     container.wait_until_healthy(test)
     status, again = container.curl(f"/v1/jobs/{address}/result", "-L")
     need((status, again) == (200, first), f"after a restart: {status}")
-    need(container.curl("/v1/jobs/0123456789abcdef0123456789abcdef")[0] == 404, "control: a job that never was")
+    need(container.curl("/v1/jobs/0123456789abcdef0123456789abcdef")[0] == 404, "control: an unknown job")
     status, _ = container.curl("/v1/meshes", "--data-binary", f"@{ROOT}/samples/1crn.cif")
     need(status == 200, f"a mesh: {status}")
     need(not container.written(), f"written outside of /data: {container.written()}")
     need(container.stop() == 0, "SIGTERM after a restart")
 
 
-def examines_itself(image):
+def runs_doctor(image):
     done = engine("run", "--rm", *RUN, *SAFE, "--read-only", image.name, "doctor")
-    said = done.stdout
-    need("  cpu        yes" in said and "  gpu        no" in said, f"doctor: {said}")
+    output = done.stdout
+    need("  cpu        yes" in output and "  gpu        no" in output, f"doctor: {output}")
     if image.kind == "gpu":
         driver = "/usr/share/vulkan/icd.d/nvidia_icd.json names libGLX_nvidia.so.0"
-        need(driver in said, f"doctor names no driver: {said}")
-        need("no driver offers an adapter" in said and "no device node" in said, f"doctor gives no reason: {said}")
+        need(driver in output, f"doctor names no driver: {output}")
+        need("no driver offers an adapter" in output and "no device node" in output, f"doctor gives no reason: {output}")
     else:
-        need("no manifest of a Vulkan driver" in said, f"doctor sees a driver: {said}")
+        need("no manifest of a Vulkan driver" in output, f"doctor sees a driver: {output}")
 
 
-def notices_what_goes_wrong(image):
+def reports_faults(image):
     """Negative controls of the checks above."""
     container = Container(image.name, "--user", "0:0", "--entrypoint", "sh", command=["-c", "echo x >/var/tmp/x; exit 3"])
     end = time.monotonic() + READY_SECONDS
     while container.state()["Running"]:
-        need(time.monotonic() < end, "a command that ends at once does not end")
+        need(time.monotonic() < end, "a short command does not end")
         time.sleep(0.1)
     need("/var/tmp/x" in container.written(), f"a file that was written is not seen: {container.written()}")
     need(container.state()["ExitCode"] == 3, "an exit status is not seen")
@@ -328,7 +328,7 @@ def notices_what_goes_wrong(image):
     while container.state()["Running"]:
         need(time.monotonic() < end, f"it runs without its volume: {container.logs()[-2000:]}")
         time.sleep(0.1)
-    need(container.state()["ExitCode"] != 0, "it ends well without its volume")
+    need(container.state()["ExitCode"] != 0, "exit code 0 without the volume")
     container.remove()
 
 
@@ -338,29 +338,29 @@ def main():
 
     def report(target, check, *arguments, fails=False):
         nonlocal failures
-        begun = time.monotonic()
+        started = time.monotonic()
         name = check.__name__.replace("_", " ")
         try:
             check(*arguments)
-            good, why = not fails, "control: the broken image was accepted" if fails else ""
+            passed, why = not fails, "control: the broken image was accepted" if fails else ""
         except Failed as failed:
-            good, why = fails, f"{failed}"
+            passed, why = fails, f"{failed}"
         except (LookupError, ValueError, OSError) as error:
-            good, why = False, repr(error)
-        failures += not good
-        mark = ("objects" if fails else "ok") if good else "FAILED"
-        print(f"{target:4} {mark:8} {name} ({time.monotonic() - begun:.1f} s){'' if good and not fails else ': ' + why[:1500]}", flush=True)
+            passed, why = False, repr(error)
+        failures += not passed
+        mark = ("objects" if fails else "ok") if passed else "FAILED"
+        print(f"{target:4} {mark:8} {name} ({time.monotonic() - started:.1f} s){'' if passed and not fails else ': ' + why[:1500]}", flush=True)
 
     for target in targets:
         image = Image(f"molmesh:{target}", target)
         print(f"{target:4} {image.size:,} bytes, {len(image.files):,} files", flush=True)
-        for look in LOOKS:
-            report(target, look, image)
+        for check in CONTENT_CHECKS:
+            report(target, check, image)
         bad = broken(target)
-        for look in LOOKS:
-            report(target, look, bad, fails=True)
+        for check in CONTENT_CHECKS:
+            report(target, check, bad, fails=True)
         engine("rmi", "--force", BROKEN)
-        for check in (examines_itself, serves, notices_what_goes_wrong):
+        for check in (runs_doctor, serves, reports_faults):
             report(target, check, image)
     engine("rm", "--force", NAME, code=None)
     engine("volume", "rm", "--force", VOLUME, code=None)

@@ -1,5 +1,5 @@
-# Selects the container engine for the scripts that source this file. `pick_engine` sets the array `engine`, the start of
-# a command. Uses docker if its daemon answers, else podman, and installs podman as root on Debian. ENGINE=docker or
+# Selects the container engine for the scripts that source this file. `pick_engine` sets the array `engine`, the start
+# of a command. Uses docker if its daemon answers, else podman, and installs podman as root on Debian. ENGINE=docker or
 # ENGINE=podman overrides the choice.
 
 pick_engine() {

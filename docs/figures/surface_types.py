@@ -4,8 +4,8 @@
     pip install matplotlib
     docs/figures/surface_types.py
 
-Both panels show the plane through the two centres. The surfaces are symmetric about the axis between the centres, so the
-cross-section is exact and not a two-dimensional approximation.
+Both panels show the plane through the two centres. The surfaces are symmetric about the axis between the centres, so
+the cross-section is exact and not a two-dimensional approximation.
 """
 
 import pathlib

@@ -3,9 +3,9 @@
 
     docs/gallery/make.py --data FOLDER [--binary target/release/molmesh] [--only 4PTI]
 
-FOLDER holds structures under their PDB ids, in any format and compression that molmesh reads; what is not there is
-said and left as it is. `--more` also draws, into build/gallery, the entries of the 2010 paper that are not in the
-gallery. Everything is drawn by the CPU, so that no graphics driver has a part in it.
+FOLDER contains structures named by their PDB ids, in any format and compression that molmesh reads. The script names
+missing structures and keeps their pictures. `--more` also draws, into build/gallery, the entries of the 2010 paper that
+are not in the gallery. The CPU draws all pictures, so they do not depend on a graphics driver.
 """
 
 import argparse
@@ -20,7 +20,7 @@ PAGE = HERE.parent / "research" / "gallery.md"
 BEGIN, END = "<!-- pictures: docs/gallery/make.py writes from here -->\n", "<!-- to here -->\n"
 KERNELS = ["gaussian", "soft-object", "inverse-square"]
 VIEW = ["--width", "320", "--height", "240", "--background", "white"]
-# PDB id, what it is, what its mesh needs to be asked for besides its kernel.
+# PDB id, description, and further flags of its mesh.
 SHOWN = [
     ("4PTI", "trypsin inhibitor; an entry of the paper", []),
     ("2HHB", "deoxyhaemoglobin; replaces the paper's 1BIJ, another haemoglobin", []),
@@ -32,7 +32,7 @@ MORE = [("110D", "", []), ("1BK2", "", []), ("1QL2", "", []), ("1AON", "", ["--d
 
 
 def structure(folder, pdb_id):
-    """The file of an entry: the bundled one, or one of the folder."""
+    """Returns the file of an entry: the bundled one, or one of the folder; None if there is none."""
     bundled = ROOT / "samples" / f"{pdb_id.lower()}.pdb"
     if bundled.exists():
         return bundled
@@ -43,7 +43,7 @@ def structure(folder, pdb_id):
 
 
 def draw(binary, path, flags, out):
-    """Draws one picture and gives its report."""
+    """Draws one picture and returns its report."""
     command = [binary, "render", path, "-o", out, *flags, "--backend", "cpu", "--report", "json", "--quiet"]
     done = subprocess.run([str(part) for part in command], capture_output=True, text=True)
     if done.returncode != 0:
@@ -52,12 +52,12 @@ def draw(binary, path, flags, out):
 
 
 def rows(binary, folder, entries, out, only):
-    """Draws the entries that are there. A list of (id, what it is, flags, reports by kernel)."""
+    """Draws the entries whose structures exist. Yields id, description and the pictures with flags and report."""
     out.mkdir(parents=True, exist_ok=True)
     for pdb_id, about, more in entries:
         path = structure(folder, pdb_id)
         if path is None or (only and pdb_id != only.upper()):
-            print(f"{pdb_id}: " + ("left as it is" if path else "not there"))
+            print(f"{pdb_id}: " + ("skipped" if path else "no structure"))
             continue
         reports = []
         for kernel in KERNELS:
@@ -69,7 +69,7 @@ def rows(binary, folder, entries, out, only):
 
 
 def section(pdb_id, about, reports):
-    """An entry of the page."""
+    """Returns an entry of the page as Markdown."""
     atoms = reports[0][3]["atoms"]
     lines = [f"### {pdb_id}", "", f"{about[0].upper()}{about[1:]}. {atoms:,} atoms.", ""]
     lines += ["| " + " | ".join(kernel for kernel, *_ in reports) + " |", "|" + "---|" * len(reports)]
@@ -93,14 +93,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=pathlib.Path, help="folder of structures, named by their PDB ids")
     parser.add_argument("--binary", default=ROOT / "target" / "release" / "molmesh")
-    parser.add_argument("--only", metavar="ID", help="one entry; the page is left as it is")
+    parser.add_argument("--only", metavar="ID", help="one entry; the page is not changed")
     parser.add_argument("--more", action="store_true", help="the paper's other entries, into build/gallery")
     args = parser.parse_args()
     drawn = list(rows(args.binary, args.data, SHOWN, HERE, args.only))
     if args.more:
         list(rows(args.binary, args.data, MORE, ROOT / "build" / "gallery", args.only))
     if len(drawn) < len(SHOWN):
-        print("docs/research/gallery.md is left as it is: not every entry was drawn")
+        print("docs/research/gallery.md was not changed: not every entry was drawn")
         return
     before, rest = PAGE.read_text().split(BEGIN)
     after = rest.split(END)[1]

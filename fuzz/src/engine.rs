@@ -33,8 +33,8 @@ pub(crate) struct Target {
     pub(crate) run: fn(&[u8]),
     /// Bytes that one input may allocate at most, at the same time.
     pub(crate) max_memory: usize,
-    /// Words of the format, for mutations.
-    pub(crate) words: &'static [&'static str],
+    /// Returns the words of the format, for mutations.
+    pub(crate) words: fn() -> Vec<String>,
 }
 
 /// Violation of a limit or a property.
@@ -201,12 +201,12 @@ pub(crate) fn fuzz(
         measure(&bytes, Some(&path), coverage)?;
         inputs.push(bytes);
     }
-    let mut rng = Rng::with_seed(seed);
+    let (mut rng, words) = (Rng::with_seed(seed), (target.words)());
     while start.elapsed() < time {
         // Recent inputs reach the least explored code.
         let first = if rng.bool() { 0 } else { inputs.len() * 3 / 4 };
         let mut input = inputs.get(rng.usize(first..inputs.len().max(first + 1))).cloned().unwrap_or_default();
-        mutate(&mut rng, &mut input, &inputs, target.words, max_len);
+        mutate(&mut rng, &mut input, &inputs, &words, max_len);
         if measure(&input, None, coverage)? {
             inputs.push(input);
         }
@@ -221,7 +221,7 @@ mod tests {
     use crate::targets::TARGETS;
 
     fn target(run: fn(&[u8])) -> Target {
-        Target { name: "test", run, max_memory: 1 << 20, words: &[] }
+        Target { name: "test", run, max_memory: 1 << 20, words: Vec::new }
     }
 
     /// The hook and the counters belong to the process, so one test uses them.
@@ -250,7 +250,7 @@ mod tests {
     fn mutations_follow_their_seed() {
         let mutated = |seed| {
             let (mut rng, mut input) = (Rng::with_seed(seed), b"loop_ 12.5 'a'\n".repeat(9));
-            mutate(&mut rng, &mut input, &[b"other".to_vec()], &["word"], 200);
+            mutate(&mut rng, &mut input, &[b"other".to_vec()], &["word".to_owned()], 200);
             input
         };
         assert_eq!(mutated(1), mutated(1));

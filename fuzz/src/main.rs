@@ -7,6 +7,8 @@
 mod coverage;
 mod engine;
 mod memory;
+#[cfg(test)]
+mod metered;
 mod mutate;
 mod targets;
 

@@ -26,16 +26,16 @@ const NUMBERS: [&str; 16] = [
 /// Bytes that separate parts of text formats.
 const SEPARATORS: &[u8] = b" \t\r\n\0\"';,=&?#/%{}[]<>:-_.\x1b\x7f\xff";
 
-/// Changes `input` in one to eight places. `others` are the inputs that it may take parts from. The result has at most
+/// Applies one to eight changes to `input`. `others` are the inputs that it may take parts from. The result has at most
 /// `max_len` bytes.
-pub(crate) fn mutate(rng: &mut Rng, input: &mut Vec<u8>, others: &[Vec<u8>], words: &[&str], max_len: usize) {
+pub(crate) fn mutate(rng: &mut Rng, input: &mut Vec<u8>, others: &[Vec<u8>], words: &[String], max_len: usize) {
     for _ in 0..1_usize << rng.usize(0..4) {
         once(rng, input, others, words);
     }
     input.truncate(max_len);
 }
 
-fn once(rng: &mut Rng, input: &mut Vec<u8>, others: &[Vec<u8>], words: &[&str]) {
+fn once(rng: &mut Rng, input: &mut Vec<u8>, others: &[Vec<u8>], words: &[String]) {
     let at = rng.usize(0..=input.len());
     match rng.u8(0..14) {
         0 if at < input.len() => input[at] ^= 1 << rng.u8(0..8),
@@ -67,7 +67,7 @@ fn once(rng: &mut Rng, input: &mut Vec<u8>, others: &[Vec<u8>], words: &[&str]) 
             input.splice(at..end, word.iter().copied());
         }
         10 | 11 => {
-            // A line, or what lies between two separators, is removed or doubled.
+            // Removes or doubles a line, or the text between two separators.
             let separator = if rng.bool() { b'\n' } else { SEPARATORS[rng.usize(0..SEPARATORS.len())] };
             let start = input[..at].iter().rposition(|b| *b == separator).map_or(0, |i| i + 1);
             let end = input[at..].iter().position(|b| *b == separator).map_or(input.len(), |i| at + i + 1);

@@ -4,7 +4,7 @@ const STEPS: f32 = 8192.0;
 
 #include shared/picture.wgsl
 
-struct Tap {
+struct TapUniform {
     pixels: vec2<i32>,
     length: vec2<f32>,
 }
@@ -12,7 +12,7 @@ struct Tap {
 @group(0) @binding(0) var<uniform> params: FinishParams;
 @group(0) @binding(1) var<storage, read> seen: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> normals: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read> taps: array<Tap>;
+@group(0) @binding(3) var<storage, read> taps: array<TapUniform>;
 // sRGB levels of linear light, by steps.
 @group(0) @binding(4) var<storage, read> levels: array<u32>;
 @group(0) @binding(5) var<storage, read_write> pixels: array<u32>;

@@ -1,6 +1,6 @@
 // Transforms a vertex: screen position, depth, normal in view space, and light.
 
-struct View {
+struct ViewUniform {
     // Axes of the view: right, up, towards the viewer. The fourth component is the offset of the projection.
     right: vec4<f32>,
     up: vec4<f32>,
@@ -26,7 +26,7 @@ struct Corner {
     @location(2) @interpolate(linear) tint: vec4<f32>,
 }
 
-@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(0) var<uniform> view: ViewUniform;
 
 // Converts sRGB to linear light, like `light::linear`.
 fn linear(level: vec3<f32>) -> vec3<f32> {

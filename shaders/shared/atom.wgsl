@@ -1,6 +1,6 @@
 // Sphere on the lattice.
 struct Atom {
-    // Sample nearest to the centre.
+    // Grid point nearest to the centre.
     cell: vec3<i32>,
     inv_length2: f32,
     // Offset of the centre from `cell`.

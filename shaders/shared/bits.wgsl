@@ -8,8 +8,8 @@ fn below(bit: u32) -> u32 {
     return (1u << bit) - 1u;
 }
 
-// Position of the set bit that has `rank` set bits below it. Unrolled by hand, because
-// shader compilers do not unroll the loop.
+// Position of the set bit that has `rank` set bits below it. Unrolled by hand, because shader compilers do not unroll
+// the loop.
 fn select_bit(word: u32, rank: u32) -> u32 {
     var rest = word;
     var left = rank;

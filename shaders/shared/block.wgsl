@@ -1,11 +1,11 @@
 // Crossing edges of the block of a brick, by words of `edges`. Requires shared/triangles.
 
-// A word of `edges`: the neighbour that owns it, and its place in the block.
+// A word of `edges`: the neighbour that owns it, and its position in the block.
 struct Word {
     owner: u32,
     axis: u32,
     z: u32,
-    // Every fourth y.
+    // y divided by 4.
     quarter: u32,
 }
 
@@ -66,4 +66,15 @@ fn users(word: Word, on: u32) -> u32 {
     let both = vec3<u32>(f.x & f.y, f.x & f.z, f.y & f.z);
     let two = select(vec3<u32>(0u), vec3<u32>(1u << 11u, 1u << 13u, 1u << 14u), both != vec3<u32>(0u));
     return one.x | one.y | one.z | two.x | two.y | two.z;
+}
+
+// Own vertex, shifted by 16, and neighbours that use it as in `users`, of an edge with its first point and its axis.
+fn counts_of(point: vec3<u32>, axis: vec3<bool>) -> u32 {
+    let owner = point.x >> 3u | point.y >> 3u << 1u | point.z >> 3u << 2u;
+    if (owner > 0u) {
+        return 1u << owner;
+    }
+    let f = select(vec3<u32>(0u), vec3<u32>(1u), (point == vec3<u32>(0u)) & !axis);
+    return 1u << 16u | f.x << 9u | f.y << 10u | f.z << 12u
+        | (f.x & f.y) << 11u | (f.x & f.z) << 13u | (f.y & f.z) << 14u;
 }

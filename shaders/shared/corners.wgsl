@@ -9,14 +9,14 @@ struct Corners {
 const FIRST_COLUMN: u32 = 0x01010101u;
 
 fn half_word(brick: u32, at: u32) -> u32 {
-    // NONE is a brick out of reach of all atoms, so no sample of it is inside.
+    // NONE is a brick out of reach of all atoms, so no grid point of it is inside.
     if (brick == 0xffffffffu) {
         return 0u;
     }
     return inside[brick * 16u + at];
 }
 
-// Words shifted by one sample along x, along y and along both.
+// Words shifted by one grid point along x, along y and along both.
 fn plane_corners(own: u32, next: u32, x_own: u32, x_next: u32) -> vec4<u32> {
     let up = own >> 8u | next << 24u;
     let x_up = x_own >> 8u | x_next << 24u;

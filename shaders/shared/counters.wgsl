@@ -10,7 +10,7 @@ struct Counters {
     checksum: array<atomic<u32>, 2>,
     // Number of triangles with a corner twice.
     degenerate: atomic<u32>,
-    // Number of words of sheets, including those beyond the capacity.
+    // Number of words of the blocks of sheets without the table of offsets, including those beyond the capacity.
     sheet_words: atomic<u32>,
     // Keys of the highest position per axis, and of the highest negative position.
     bounds: array<atomic<u32>, 6>,

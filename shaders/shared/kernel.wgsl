@@ -19,7 +19,7 @@ fn z_axis(u: vec4<f32>) -> Axis {
     return Axis(vec4<f32>(0.0), u);
 }
 
-// Terms of the density of a column of samples.
+// Terms of the density of a column of grid points.
 struct Column {
     e: f32,
     w: f32,
@@ -32,7 +32,8 @@ fn column(u: f32) -> Column {
     return Column(0.0, u);
 }
 
-// Density at four samples of a column. Exactly 0 beyond the support, so additional candidates do not change the sum.
+// Density at four grid points of a column. Exactly 0 beyond the support, so additional candidates do not change the
+// sum.
 fn density(c: Column, z: Axis, u_min: f32) -> vec4<f32> {
     if (KERNEL == GAUSSIAN) {
         let tail = c.w + z.w;

@@ -1,6 +1,6 @@
 // Parameters of a dispatch. Lengths are in spacings unless said otherwise.
 struct Params {
-    // Sample that positions are relative to.
+    // Grid point that positions are relative to.
     centre: vec3<i32>,
     // Spacing, Å.
     spacing: f32,
@@ -28,7 +28,7 @@ struct Params {
     ahead: u32,
     // Number of tiles of the job.
     n_tiles: u32,
-    // Capacity of the sheets, in words.
+    // Capacity of the blocks of sheets and the table of their offsets, in words.
     sheet_capacity: u32,
     // Own bricks of the chunk, halo bricks, and entries of the table of halo slots.
     first_brick: u32,
@@ -49,7 +49,7 @@ struct Params {
     triangle_capacity: u32,
     // Always 0, but unknown to the compiler; see `rounded` in `bin.wgsl`.
     zero: u32,
-    // Number of vertices in earlier partitions, which other devices make.
+    // Number of vertices in earlier partitions, which other devices compute.
     base_vertex: u32,
     // Factor of positions before rounding to integers, 1/Å; 0 for vertices in single precision.
     steps_per_angstrom: f32,

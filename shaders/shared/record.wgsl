@@ -1,5 +1,5 @@
 // Result of `classify` for a brick. Requires shared/bits.
-struct Record {
+struct BrickRecord {
     // Crossing edges: half-word 2·(3·z + axis) + half. Vertices are numbered in this order.
     crossing: array<u32, 48>,
     // Per layer: number of vertices before it (16 bits), on its x edges (8 bits) and on its y edges (8 bits).

@@ -1,23 +1,27 @@
 // Sheets of a brick: sets of vertices, joined along triangles and numbered by 64 lanes. Requires shared/bits and
 // shared/triangles.
 //
-// A vertex has one word. While sheets are joined, it holds the vertex's edge and, as label, another vertex of the same
-// sheet, at most as high. After that, it holds the vertex's place (see shared/places) and the number of its sheet.
+// Each vertex has one word. While sheets are joined, the word holds the vertex's edge and a label: the number of a
+// vertex of the same sheet that is not higher than its own. After that, the word holds the vertex's offset (see
+// shared/edge_offsets) and the number of its sheet.
 
-// Mask of a label, and place of the first bit of an edge.
+// Mask of a label, and index of the first bit of an edge.
 const LABEL: u32 = 2047u;
 const EDGE_BIT: u32 = 11u;
-// Marks a vertex that named its set and has the number of its sheet instead of a label.
+// Marks a vertex whose label was replaced by the number of its sheet: the lowest vertex of the sheet.
 const NUMBERED: u32 = 0x80000000u;
 
-// Number of low bits of a word that hold the number of the sheet. A sheet separates samples: it has three vertices if
-// it cuts off one of the 8 corners of the block, four for one of the 84 other samples on the edges of the block, and
-// otherwise at least five. So there are at most 8 + 84 + (1944 - 24 - 336) / 5 = 408 sheets, and at most 9 bits.
+// Number of low bits of a word that hold the number of the sheet, at most 9. Each sheet separates grid points. It has
+// three vertices if it separates one of the 8 corners of the block, four if it separates one of the 84 other grid
+// points on the edges of the block, and otherwise at least five. So the number of sheets is at most
+// 8 + 84 + (1944 - 24 - 336) / 5 = 408.
 var<private> sheet_bits: u32;
 
 // Words of the vertices. A block has at most 1944.
 var<workgroup> vertices: array<atomic<u32>, 1944>;
-// Bits of the vertices that name a sheet.
+// Words that have a bit for each vertex.
+const N_NAMES: u32 = 61u;
+// Bit set of the vertices that name a sheet, the lowest of each; later the counts of this number of sheets.
 var<workgroup> names: array<atomic<u32>, 61>;
 var<workgroup> n_sheets: atomic<u32>;
 
@@ -63,7 +67,7 @@ fn join(a: u32, b: u32) {
     }
 }
 
-// Replaces each label by the vertex to which the labels lead. Labels must not change meanwhile otherwise.
+// Replaces each label by the last vertex of its chain of labels. No other lane may change labels meanwhile.
 fn follow_labels(lane: u32, n: u32) {
     for (var v = lane; v < n; v += LANES) {
         let word = atomicLoad(&vertices[v]);
@@ -101,8 +105,8 @@ fn number_names(lane: u32, n: u32) {
     }
 }
 
-// Number of the sheet of a vertex by its word, which still has its label. The vertex that names the sheet may have its
-// place already.
+// Number of the sheet of a vertex by its word, which still has its label or is marked. The word of the vertex that
+// names the sheet may hold its offset already.
 fn number_of(word: u32) -> u32 {
     if ((word & NUMBERED) != 0u) {
         return word & below(sheet_bits);
@@ -110,7 +114,7 @@ fn number_of(word: u32) -> u32 {
     return atomicLoad(&vertices[word & LABEL]) & below(sheet_bits);
 }
 
-// Sheet of a vertex that has its place.
+// Number of the sheet of a vertex whose word holds its offset.
 fn sheet_of(vertex: u32) -> u32 {
     return atomicLoad(&vertices[vertex]) & below(sheet_bits);
 }

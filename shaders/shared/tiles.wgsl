@@ -1,7 +1,7 @@
-// Tile: 8 × 8 × 8 bricks, with a bit set for each that exists. Requires `tiles` and shared/bits.
+// Tile: 8 × 8 × 8 bricks, and one bit for each, set if the brick exists. Requires `tiles` and shared/bits.
 struct Tile {
     coord: vec3<i32>,
-    // Number of bricks in all tiles before.
+    // Number of bricks in all earlier tiles.
     base: u32,
     // Word z, bit 8·y + x.
     bricks: array<vec2<u32>, 8>,

@@ -1,9 +1,9 @@
 // Triangles of a brick, listed in workgroup memory by 64 lanes. Requires `params`, `inside`, `cases`, `records`,
 // shared/bits and shared/record.
 //
-// Each edge of a cell is owned by a sample of the brick or of one of its seven neighbours towards +x, +y and +z. The
-// brick and its neighbours are combined into one block of 9 × 9 × 9 samples, so that look-ups need not distinguish
-// owners.
+// Each edge of a cell is owned by a grid point of the brick or of one of its seven neighbours towards +x, +y and +z.
+// The brick and its neighbours are combined into one block of 9 × 9 × 9 grid points, so that look-ups need not
+// distinguish owners.
 
 const LANES: u32 = 64u;
 // Number of triangles listed at once.
@@ -13,14 +13,14 @@ const WINDOW: u32 = 256u;
 const PACKED_COUNTS: u32 = 128u;
 const CORNERS: u32 = 152u;
 
-// Inside bits of the rows of nine samples along x: row 9·z + y.
+// Inside bits of the rows of nine grid points along x: row 9·z + y.
 var<workgroup> rows: array<u32, 81>;
-// Crossing edges of the block as words of 4 rows, each with the index of its first vertex: by axis, z and every fourth
-// y; samples with x < 8 first.
+// Crossing edges of the block as words of 4 rows, each with the index of its first vertex. Words are ordered by axis, z
+// and y; grid points with x < 8 come first.
 var<workgroup> edges: array<vec2<u32>, 162>;
-// Triangle counts of eight cases per word; from 32 on, the edges of a cell as offsets from the cell's sample.
+// Triangle counts of eight cases per word; from 32 on, the edges of a cell as offsets from the cell's grid point.
 var<workgroup> packed_counts: array<u32, 48>;
-// Triangles: cell, and corners from bit 12 on. Before that, holds sums over lanes.
+// Triangles: cell, and corners from bit 12 on. Holds sums over lanes before the triangles are listed.
 var<workgroup> listed: array<u32, 256>;
 
 // Row of eight cells: the cases of four cells per word, the first cell, and the number of triangles.
@@ -39,7 +39,7 @@ fn row_at(id: u32, y: u32, z: u32) -> u32 {
     let at = 2u * (z & 7u) + (y >> 2u & 1u);
     let shift = 8u * (y & 3u);
     var row = 0u;
-    // A brick that does not exist is out of reach of all atoms, so no sample of it is inside.
+    // A brick that does not exist is out of reach of all atoms, so no grid point of it is inside.
     if (brick != NONE) {
         row = inside[brick * 16u + at] >> shift & 255u;
     }
@@ -116,7 +116,7 @@ fn scan_lanes(lane: u32, own: u32) -> u32 {
     return sum;
 }
 
-// Lists the triangles of a cell from `at` on, as far as they lie in the window. Returns the place of the next.
+// Lists the triangles of a cell from `at` on, as far as they lie in the window. Returns the index of the next triangle.
 fn list_cell(at: u32, cell: u32, quad: u32, i: u32) -> u32 {
     let n = triangles_of(quad, i);
     if (n == 0u) {
@@ -146,8 +146,8 @@ fn list_row(row: Row, start: u32) {
     at = list_cell(at, row.cell + 7u, row.high, 3u);
 }
 
-// Edge at corner `k` of a listed triangle: the sum of a cell and an offset is a sample, with x from bit 0 on, y from
-// bit 4 on, and one word per four rows.
+// Edge at corner `k` of a listed triangle: the sum of a cell and an offset is a grid point, with x from bit 0 on, y
+// from bit 4 on, and one word per four rows.
 fn edge_at(triangle: u32, k: u32) -> u32 {
     let code = listed[triangle];
     return (code & 0xfffu) + packed_counts[32u + (code >> (12u + 4u * k) & 15u)];

@@ -9,7 +9,7 @@ use std::time::{Instant, SystemTime};
 use super::account::Quota;
 use super::error::AccessError;
 use super::keys::{Denied, Key, KeyRing};
-use super::meter::Meter;
+use super::meter::QuotaMeter;
 use super::sign::{Signature, SignatureCheck, SigningKeys};
 use super::sites::Sites;
 use super::{file, forwarded};
@@ -22,7 +22,7 @@ pub(crate) struct Access {
     signing: Option<SigningKeys>,
     /// Quota per address of clients without a key; `None` means unlimited.
     address_quota: Option<Arc<Quota>>,
-    meter: Arc<Meter>,
+    meter: Arc<QuotaMeter>,
     sites: Sites,
     config: AccessConfig,
     server: ServerConfig,
@@ -34,13 +34,13 @@ struct Keys {
     path: PathBuf,
     ring: RwLock<Arc<KeyRing>>,
     /// Stamp of the file at the last attempt to read it.
-    seen: Mutex<Option<Stamp>>,
+    seen: Mutex<Option<FileStamp>>,
 }
 
 /// Modification time and length of a file.
-type Stamp = (SystemTime, u64);
+type FileStamp = (SystemTime, u64);
 
-fn stamp(path: &Path) -> Option<Stamp> {
+fn stamp(path: &Path) -> Option<FileStamp> {
     let meta = fs::metadata(path).ok()?;
     Some((meta.modified().ok()?, meta.len()))
 }
@@ -69,7 +69,7 @@ impl Access {
             keys: keys.transpose()?,
             signing: signing.transpose().map_err(AccessError::Signing)?,
             address_quota: (!quota.is_unlimited()).then(|| Arc::new(quota)),
-            meter: Arc::new(Meter::new(config.max_addresses)),
+            meter: Arc::new(QuotaMeter::new(config.max_addresses)),
             sites,
             config,
             server,
@@ -97,7 +97,7 @@ impl Access {
         self.signing.as_ref().map_or(SignatureCheck::Absent, |keys| keys.check(path, query, now))
     }
 
-    /// Signs a target of this service like `signature`. Returns `None` if signatures are off.
+    /// Signs a target of this service with the key and expiry of `signature`. Returns `None` without signing keys.
     pub(crate) fn sign(&self, target: &str, signature: &Signature) -> Option<String> {
         self.signing.as_ref()?.sign(Some(&signature.key_id), target, signature.until).ok()
     }
@@ -108,7 +108,7 @@ impl Access {
     }
 
     /// Returns the usage meter.
-    pub(crate) fn meter(&self) -> &Arc<Meter> {
+    pub(crate) fn meter(&self) -> &Arc<QuotaMeter> {
         &self.meter
     }
 

@@ -8,7 +8,7 @@ use crate::config::{ForwardedHeader, Proxies};
 ///
 /// Every proxy appends the address of its peer, so the list is read from the end while the address is a trusted proxy.
 /// Earlier elements may be forged. If a trusted proxy names no valid address, its own address is the client.
-pub(super) fn client<'a>(
+pub(crate) fn client<'a>(
     peer: IpAddr,
     header: ForwardedHeader,
     values: impl DoubleEndedIterator<Item = &'a str>,

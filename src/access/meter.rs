@@ -68,7 +68,7 @@ enum Counter {
 }
 
 #[derive(Debug, Default)]
-struct State {
+struct QuotaTable {
     keys: HashMap<u64, Window>,
     addresses: HashMap<u64, Window>,
     others: Option<Window>,
@@ -76,7 +76,7 @@ struct State {
     sweep_at: Option<Instant>,
 }
 
-impl State {
+impl QuotaTable {
     /// Returns the current window of an account, a new one if necessary.
     fn of(&mut self, account: &Account, capacity: usize, now: Instant) -> (Counter, &mut Window) {
         let (length, client) = (account.quota.window(), account.client);
@@ -118,19 +118,19 @@ impl State {
 
 /// Meter of the quota usage of clients.
 #[derive(Debug)]
-pub(crate) struct Meter {
-    state: Mutex<State>,
+pub(crate) struct QuotaMeter {
+    state: Mutex<QuotaTable>,
     capacity: usize,
 }
 
-impl Meter {
+impl QuotaMeter {
     /// Creates a meter with separate counters for `capacity` addresses; further addresses share one. Keys always have
     /// their own.
     pub(crate) fn new(capacity: usize) -> Self {
         Self { state: Mutex::default(), capacity }
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, QuotaTable> {
         // No code under the lock panics during a change, so a poisoned state is consistent.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -162,7 +162,7 @@ impl Meter {
     /// Adds `time` of computing to the usage of `client`, or to the shared counter if the client has none.
     pub(crate) fn spent(&self, client: u64, time: Duration, now: Instant) {
         let mut state = self.lock();
-        let State { keys, addresses, others, .. } = &mut *state;
+        let QuotaTable { keys, addresses, others, .. } = &mut *state;
         let window = keys.get_mut(&client).or_else(|| addresses.get_mut(&client)).or(others.as_mut());
         if let Some(window) = window {
             window.roll(now);
@@ -190,7 +190,7 @@ impl Meter {
 /// Guard of a running request.
 #[derive(Debug)]
 pub(crate) struct Running {
-    meter: Arc<Meter>,
+    meter: Arc<QuotaMeter>,
     counter: Counter,
 }
 
@@ -215,7 +215,7 @@ mod tests {
 
     #[test]
     fn the_request_quota_is_restored_in_the_next_window() {
-        let (meter, start) = (Arc::new(Meter::new(10)), Instant::now());
+        let (meter, start) = (Arc::new(QuotaMeter::new(10)), Instant::now());
         let me = account(1, true, &QUOTA);
         for n in 1..=3 {
             drop(meter.admit(&me, start + n * S).unwrap());
@@ -234,7 +234,7 @@ mod tests {
 
     #[test]
     fn concurrent_requests_are_counted_until_they_end() {
-        let (meter, now) = (Arc::new(Meter::new(10)), Instant::now());
+        let (meter, now) = (Arc::new(QuotaMeter::new(10)), Instant::now());
         let me = account(1, false, &QUOTA);
         let [first, second] = [meter.admit(&me, now).unwrap(), meter.admit(&me, now).unwrap()];
         let refused = meter.admit(&me, now).unwrap_err();
@@ -251,7 +251,7 @@ mod tests {
 
     #[test]
     fn computing_time_is_charged_when_a_job_ends() {
-        let (meter, now) = (Arc::new(Meter::new(10)), Instant::now());
+        let (meter, now) = (Arc::new(QuotaMeter::new(10)), Instant::now());
         let me = account(1, true, &QUOTA);
         meter.admit_work(&me, now).unwrap();
         meter.spent(1, Duration::from_millis(1999), now);
@@ -272,7 +272,7 @@ mod tests {
 
     #[test]
     fn memory_is_bounded_and_no_usage_is_forgotten() {
-        let (meter, now) = (Arc::new(Meter::new(3)), Instant::now());
+        let (meter, now) = (Arc::new(QuotaMeter::new(3)), Instant::now());
         let address = |n| account(n, false, &QUOTA);
         let use_up = |n, at| (0..3).for_each(|_| drop(meter.admit(&address(n), at).unwrap()));
         (0..3).for_each(|n| use_up(n, now));
@@ -297,7 +297,7 @@ mod tests {
 
     #[test]
     fn a_changed_quota_keeps_the_usage() {
-        let (meter, now) = (Arc::new(Meter::new(1)), Instant::now());
+        let (meter, now) = (Arc::new(QuotaMeter::new(1)), Instant::now());
         drop(meter.admit(&account(1, true, &QUOTA), now).unwrap());
         let more = Quota { requests: Some(5), window_s: 100, ..QUOTA };
         let usage = meter.usage(&account(1, true, &more), now + 20 * S);

@@ -19,6 +19,7 @@ pub(crate) use account::{Account, Exceeded};
 pub(crate) use authorizer::Access;
 pub(crate) use fields::{rate_limit, rate_limit_policy};
 pub(crate) use file::parse as parse_key_file;
+pub(crate) use forwarded::client as forwarded_client;
 pub(crate) use keys::Denied;
 pub(crate) use sign::{SIGNATURE, Signature, SignatureCheck, remove_signature};
 pub(crate) use sites::authority;

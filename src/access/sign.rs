@@ -114,7 +114,7 @@ impl SigningKeys {
             }
             if secret.len() < MIN_SECRET {
                 return Err(format!(
-                    "the secret of `{id}` has less than {MIN_SECRET} characters; `molmesh key signing` prints a new one"
+                    "the secret of `{id}` has fewer than {MIN_SECRET} characters; `molmesh key signing` prints a new one"
                 ));
             }
             if keys.iter().any(|other| other.id == id) {
@@ -356,7 +356,7 @@ mod tests {
             ("justasecretjustasecretjustasecret", "key 1"),
             ("A:justasecretjustasecretjustasecret", "key 1"),
             ("a@:justasecretjustasecretjustasecret", "key 1"),
-            ("a:short", "less than 32"),
+            ("a:short", "fewer than 32"),
             ("a:justasecretjustasecretjustasecret a:justasecretjustasecretjustasecret", "duplicate key `a`"),
         ] {
             let message = SigningKeys::parse(bad).unwrap_err();

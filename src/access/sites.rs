@@ -45,8 +45,8 @@ impl Sites {
     }
 
     /// Returns true if the service answers requests for `authority`, a host with an optional port. On a loopback
-    /// address it must be a name of this machine: another name that leads here belongs to a page that rebinds its own
-    /// name.
+    /// address it must be a name of this machine: any other name that resolves to it may belong to a page that
+    /// uses DNS rebinding.
     pub(crate) fn answers(&self, authority: &str) -> bool {
         let listed = |hosts: &Hosts| hosts.contains(host(authority));
         let is_restricted = self.on_loopback || self.hosts.is_some();

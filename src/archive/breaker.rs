@@ -1,4 +1,5 @@
-//! Circuit breaker of a host. Repeated failures open it: requests fail at once for a while, then one probe decides.
+//! Circuit breaker of a host. Repeated failures open it: requests fail at once for a while, then one trial request
+//! decides.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -7,11 +8,11 @@ use metrics::gauge;
 
 use crate::telemetry::ARCHIVE_BREAKER;
 
-/// Retry time for other requests during a probe.
+/// Retry time for other requests during a trial.
 const PROBE_WAIT: Duration = Duration::from_secs(1);
 
 #[derive(Debug, Clone, Copy)]
-enum State {
+enum BreakerState {
     Closed {
         failures: u32,
     },
@@ -29,13 +30,17 @@ pub(super) struct Breaker {
     /// Consecutive failures that open the breaker.
     max_failures: u32,
     pause: Duration,
-    state: Mutex<State>,
+    state: Mutex<BreakerState>,
 }
 
 impl Breaker {
     pub(super) fn new(host: &str, max_failures: u32, pause: Duration) -> Self {
-        let breaker =
-            Self { host: host.to_owned(), max_failures, pause, state: Mutex::new(State::Closed { failures: 0 }) };
+        let breaker = Self {
+            host: host.to_owned(),
+            max_failures,
+            pause,
+            state: Mutex::new(BreakerState::Closed { failures: 0 }),
+        };
         breaker.publish(false);
         breaker
     }
@@ -47,9 +52,11 @@ impl Breaker {
     /// Returns the time for which the breaker stays open, or `None` if requests are allowed.
     pub(super) fn open_for(&self) -> Option<Duration> {
         match *self.state() {
-            State::Closed { .. } => None,
-            State::Open { until } => Some(until.saturating_duration_since(Instant::now())).filter(|d| !d.is_zero()),
-            State::Probing => Some(PROBE_WAIT),
+            BreakerState::Closed { .. } => None,
+            BreakerState::Open { until } => {
+                Some(until.saturating_duration_since(Instant::now())).filter(|d| !d.is_zero())
+            }
+            BreakerState::Probing => Some(PROBE_WAIT),
         }
     }
 
@@ -60,17 +67,17 @@ impl Breaker {
         }
         let mut state = self.state();
         match *state {
-            State::Closed { .. } => Ok(Permit { breaker: self, probe: false, reported: false }),
-            State::Open { .. } => {
-                *state = State::Probing;
-                Ok(Permit { breaker: self, probe: true, reported: false })
+            BreakerState::Closed { .. } => Ok(Permit { breaker: self, trial: false, reported: false }),
+            BreakerState::Open { .. } => {
+                *state = BreakerState::Probing;
+                Ok(Permit { breaker: self, trial: true, reported: false })
             }
-            // Another request became the probe since the check above.
-            State::Probing => Err(PROBE_WAIT),
+            // Another request became the trial since the check above.
+            BreakerState::Probing => Err(PROBE_WAIT),
         }
     }
 
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, BreakerState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -78,9 +85,9 @@ impl Breaker {
         gauge!(ARCHIVE_BREAKER, "host" => self.host.clone()).set(if open { 1.0 } else { 0.0 });
     }
 
-    fn open(&self, state: &mut State, pause: Duration) {
+    fn open(&self, state: &mut BreakerState, pause: Duration) {
         tracing::warn!(host = self.host, ms = pause.as_millis(), "requests to the archive are paused");
-        *state = State::Open { until: Instant::now() + pause };
+        *state = BreakerState::Open { until: Instant::now() + pause };
         self.publish(true);
     }
 }
@@ -89,21 +96,21 @@ impl Breaker {
 #[derive(Debug)]
 pub(super) struct Permit<'a> {
     breaker: &'a Breaker,
-    probe: bool,
+    trial: bool,
     reported: bool,
 }
 
 impl Permit<'_> {
-    /// Reports a success and closes the breaker after a probe.
+    /// Reports a success and closes the breaker after a trial.
     pub(super) fn succeeded(mut self) {
         self.reported = true;
         let mut state = self.breaker.state();
-        if self.probe {
+        if self.trial {
             tracing::info!(host = self.breaker.host, "the archive is available again");
             self.breaker.publish(false);
         }
-        if self.probe || matches!(*state, State::Closed { .. }) {
-            *state = State::Closed { failures: 0 };
+        if self.trial || matches!(*state, BreakerState::Closed { .. }) {
+            *state = BreakerState::Closed { failures: 0 };
         }
     }
 
@@ -112,12 +119,12 @@ impl Permit<'_> {
         self.reported = true;
         let mut state = self.breaker.state();
         match *state {
-            State::Closed { failures } if failures + 1 < self.breaker.max_failures => {
-                *state = State::Closed { failures: failures + 1 };
+            BreakerState::Closed { failures } if failures + 1 < self.breaker.max_failures => {
+                *state = BreakerState::Closed { failures: failures + 1 };
             }
-            State::Closed { .. } => self.breaker.open(&mut state, self.breaker.pause),
-            _ if self.probe => self.breaker.open(&mut state, self.breaker.pause),
-            State::Open { .. } | State::Probing => {}
+            BreakerState::Closed { .. } => self.breaker.open(&mut state, self.breaker.pause),
+            _ if self.trial => self.breaker.open(&mut state, self.breaker.pause),
+            BreakerState::Open { .. } | BreakerState::Probing => {}
         }
     }
 
@@ -131,9 +138,9 @@ impl Permit<'_> {
 
 impl Drop for Permit<'_> {
     fn drop(&mut self) {
-        if self.probe && !self.reported {
-            // The next request becomes the probe.
-            *self.breaker.state() = State::Open { until: Instant::now() };
+        if self.trial && !self.reported {
+            // The next request becomes the trial.
+            *self.breaker.state() = BreakerState::Open { until: Instant::now() };
         }
     }
 }
@@ -156,9 +163,9 @@ mod tests {
         late.succeeded();
         assert!(breaker.open_for().is_some());
         std::thread::sleep(Duration::from_millis(40));
-        let probe = breaker.acquire().unwrap();
+        let trial = breaker.acquire().unwrap();
         assert_eq!(breaker.acquire().unwrap_err(), PROBE_WAIT);
-        probe.failed();
+        trial.failed();
         assert!(breaker.acquire().is_err());
         std::thread::sleep(Duration::from_millis(40));
         drop(breaker.acquire().unwrap());

@@ -2,6 +2,7 @@
 
 use std::error::Error;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use bytes::{Bytes, BytesMut};
@@ -9,20 +10,19 @@ use reqwest::header::{ETAG, HeaderMap, HeaderName, IF_MODIFIED_SINCE, IF_NONE_MA
 use reqwest::redirect::{Attempt, Policy};
 use reqwest::{Client, Proxy, Response, StatusCode, Url};
 use serde::{Deserialize, Serialize};
+use tokio::sync::Semaphore;
 
 use super::address::{PublicResolver, Refused};
 use super::error::UnavailableReason;
-use super::gzip;
+use super::gzip::{self, StopOnDrop};
 use crate::config::{ArchiveConfig, Templates};
-use crate::memory_budget::Lease;
+use crate::memory_budget::MemoryReservation;
 use crate::store::Digest;
 use crate::surface::OutOfMemory;
 use crate::telemetry::{SpanContext, traceparent};
 
 /// Maximum number of redirects.
 const MAX_REDIRECTS: usize = 3;
-/// Maximum memory that is allocated because of a `Content-Length`, bytes.
-const MAX_PREALLOCATION: u64 = 1 << 20;
 /// Longest accepted `Retry-After`.
 const MAX_RETRY_AFTER: Duration = Duration::from_hours(24);
 const USER_AGENT: &str = concat!("molmesh/", env!("CARGO_PKG_VERSION"), " (molecular surface service)");
@@ -40,12 +40,21 @@ pub(super) struct Origin {
 /// Answer of an archive.
 #[derive(Debug)]
 pub(super) enum Answer {
-    /// The entry.
-    Body { bytes: Bytes, digest: Digest, origin: Origin, lease: Lease },
+    /// The entry. Its bytes hold their reservation.
+    Body { bytes: Bytes, digest: Digest, origin: Origin },
     /// The copy is still current.
     Unchanged,
     /// The archive does not have the entry.
     Absent,
+}
+
+/// Resources for checking bodies.
+#[derive(Debug)]
+pub(super) struct Checks {
+    /// Inflated bytes after which the check of a gzip file stops.
+    pub(super) inflated_bytes: u64,
+    /// Permits to read structures outside of jobs.
+    pub(super) readers: Arc<Semaphore>,
 }
 
 /// Failure of a request.
@@ -108,19 +117,19 @@ fn may_follow(from: &Url, to: &Url) -> bool {
 
 /// Sends a HEAD request and returns the status of the response.
 pub(super) async fn head(client: &Client, url: Url) -> Result<u16, Failed> {
-    client.head(url).send().await.map(|answer| answer.status().as_u16()).map_err(|error| of_client(&error))
+    client.head(url).send().await.map(|answer| answer.status().as_u16()).map_err(|error| from_client(&error))
 }
 
-/// Sends one GET request, a conditional one if a copy is `known`. `lease` is charged with the body while it arrives and
-/// until the answer is dropped. Nothing of the client's request is passed on except the id of a `trace` that is
-/// exported. The check of a gzip file stops after `inflated_bytes`.
+/// Sends one GET request, a conditional one if a copy is `known`. `reservation` is charged with the body while it
+/// arrives and until the response is dropped. Nothing of the client's request is passed on except the id of a `trace`
+/// that is exported.
 pub(super) async fn get(
     client: &Client,
     url: Url,
     known: Option<&Origin>,
     config: &ArchiveConfig,
-    inflated_bytes: u64,
-    lease: Lease,
+    checks: &Checks,
+    reservation: MemoryReservation,
     trace: Option<&SpanContext>,
 ) -> Result<Answer, Failed> {
     let compressed = Path::new(url.path()).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gz"));
@@ -138,7 +147,7 @@ pub(super) async fn get(
     let response = tokio::time::timeout(head_timeout, request.send())
         .await
         .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the response did not begin in time"))?
-        .map_err(|error| of_client(&error))?;
+        .map_err(|error| from_client(&error))?;
     match response.status() {
         StatusCode::OK => {}
         StatusCode::NOT_MODIFIED if known.is_some() => return Ok(Answer::Unchanged),
@@ -158,37 +167,45 @@ pub(super) async fn get(
     }
     let text = |name: HeaderName| Some(response.headers().get(name)?.to_str().ok()?.to_owned());
     let origin = Origin { url: name, etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
-    let bytes = body(response, config, &lease).await?;
-    let (bytes, digest) = tokio::task::spawn_blocking(move || {
-        if compressed && !gzip::is_complete_gzip(&bytes, inflated_bytes) {
-            return Err(Failed::other(UnavailableReason::Damaged, "the file is incomplete"));
-        }
-        let digest = Digest::of(&bytes);
-        Ok((bytes, digest))
-    })
-    .await
-    .map_err(|error| Failed::other(UnavailableReason::Client, &error))??;
-    Ok(Answer::Body { bytes, digest, origin, lease })
+    let bytes = body(response, config, &reservation).await?;
+    let permit = Arc::clone(&checks.readers).acquire_owned().await;
+    let permit = permit.map_err(|closed| Failed::other(UnavailableReason::Client, &closed))?;
+    // The deadline drops this future, which ends the check.
+    let request = StopOnDrop::default();
+    let (stop, inflated_bytes) = (Arc::clone(&request.0), checks.inflated_bytes);
+    let checked = tokio::task::spawn_blocking(move || {
+        let is_damaged = compressed && !gzip::is_complete_gzip(&bytes, inflated_bytes, &stop);
+        let digest = if is_damaged { None } else { Some(Digest::of(&bytes)) };
+        let bytes = reservation.attach(bytes);
+        drop(permit);
+        Some((bytes, digest?))
+    });
+    let checked = checked.await.map_err(|error| Failed::other(UnavailableReason::Client, &error))?;
+    let damaged = || Failed::other(UnavailableReason::Damaged, "the file is incomplete");
+    let (bytes, digest) = checked.ok_or_else(damaged)?;
+    Ok(Answer::Body { bytes, digest, origin })
 }
 
 /// Receives the body up to the limit.
-async fn body(mut response: Response, config: &ArchiveConfig, lease: &Lease) -> Result<Bytes, Failed> {
+async fn body(
+    mut response: Response,
+    config: &ArchiveConfig,
+    reservation: &MemoryReservation,
+) -> Result<Bytes, Failed> {
     let announced = response.content_length();
     if announced.is_some_and(|bytes| bytes > config.max_bytes) {
         return Err(Failed::TooLarge(announced));
     }
-    let capacity = usize::try_from(announced.unwrap_or(0).min(MAX_PREALLOCATION)).unwrap_or(0);
-    let mut body = BytesMut::with_capacity(capacity);
+    let mut body = BytesMut::new();
     loop {
         let chunk = tokio::time::timeout(Duration::from_millis(config.first_byte_timeout_ms), response.chunk())
             .await
             .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the body stalled"))?;
-        let Some(chunk) = chunk.map_err(|error| of_client(&error))? else { break };
+        let Some(chunk) = chunk.map_err(|error| from_client(&error))? else { break };
         if body.len() as u64 + chunk.len() as u64 > config.max_bytes {
             return Err(Failed::TooLarge(None));
         }
-        lease.grow(chunk.len() as u64).map_err(Failed::Memory)?;
-        body.extend_from_slice(&chunk);
+        reservation.extend(&mut body, &chunk, announced.unwrap_or(0)).map_err(Failed::Memory)?;
     }
     match announced {
         Some(bytes) if bytes != body.len() as u64 => Err(Failed::other(
@@ -200,7 +217,7 @@ async fn body(mut response: Response, config: &ArchiveConfig, lease: &Lease) -> 
 }
 
 /// Converts an error of the HTTP client.
-fn of_client(error: &reqwest::Error) -> Failed {
+fn from_client(error: &reqwest::Error) -> Failed {
     let (mut causes, mut next): (Vec<&dyn Error>, Option<&dyn Error>) = (Vec::new(), Some(error));
     while let Some(cause) = next {
         causes.push(cause);

@@ -14,8 +14,10 @@ use metrics::gauge;
 use serde::{Deserialize, Serialize};
 
 use super::client::Origin;
+use crate::memory_budget::MemoryReservation;
 use crate::store::Digest;
 use crate::structure::EntryId;
+use crate::surface::OutOfMemory;
 use crate::telemetry::ARCHIVE_KEPT;
 
 /// Maximum size of the metadata, bytes; validators are short.
@@ -51,6 +53,8 @@ pub(super) enum Found {
     /// The files did not match and were removed.
     Corrupt,
     Copy(Stored),
+    /// No memory is available for the copy now.
+    Refused(OutOfMemory),
 }
 
 /// Size and last use of a copy.
@@ -62,12 +66,12 @@ struct IndexEntry {
 
 /// Index of the copies on disk, read once and then updated.
 #[derive(Debug, Default)]
-struct Index {
+struct CopyIndex {
     entries: HashMap<EntryId, IndexEntry>,
     total: u64,
 }
 
-impl Index {
+impl CopyIndex {
     fn put(&mut self, id: &EntryId, bytes: u64, used: SystemTime) {
         self.remove(id);
         self.entries.insert(id.clone(), IndexEntry { bytes, used });
@@ -101,7 +105,7 @@ impl Index {
 pub(super) struct Disk {
     dir: PathBuf,
     cap: u64,
-    index: Mutex<Option<Index>>,
+    index: Mutex<Option<CopyIndex>>,
     n_temporary: AtomicU64,
 }
 
@@ -115,13 +119,17 @@ impl Disk {
         self.dir.join(id.middle()).join(format!("{id}.{extension}"))
     }
 
-    /// Loads and verifies the copy of an entry.
-    pub(super) fn load(&self, id: &EntryId) -> io::Result<Found> {
+    /// Loads and verifies the copy of an entry. Its bytes hold `reservation`, which is charged first.
+    pub(super) fn load(&self, id: &EntryId, reservation: MemoryReservation) -> io::Result<Found> {
         let metadata = match read(&self.path(id, "json"), METADATA_BYTES) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Found::Nothing),
             metadata => metadata?,
         };
-        let Some(stored) = self.stored(id, &metadata)? else {
+        let metadata = serde_json::from_slice::<Metadata>(&metadata).ok();
+        if let Some(Err(error)) = metadata.as_ref().map(|metadata| reservation.grow(metadata.bytes.min(self.cap))) {
+            return Ok(Found::Refused(error));
+        }
+        let Some(stored) = self.stored(id, metadata, reservation)? else {
             self.remove(id)?;
             return Ok(Found::Corrupt);
         };
@@ -134,8 +142,13 @@ impl Disk {
         Ok(Found::Copy(stored))
     }
 
-    fn stored(&self, id: &EntryId, metadata: &[u8]) -> io::Result<Option<Stored>> {
-        let Ok(metadata) = serde_json::from_slice::<Metadata>(metadata) else { return Ok(None) };
+    fn stored(
+        &self,
+        id: &EntryId,
+        metadata: Option<Metadata>,
+        reservation: MemoryReservation,
+    ) -> io::Result<Option<Stored>> {
+        let Some(metadata) = metadata else { return Ok(None) };
         let Ok(digest) = metadata.sha256.parse::<Digest>() else { return Ok(None) };
         let body = match read(&self.path(id, "body"), metadata.bytes.min(self.cap)) {
             Err(e) if [io::ErrorKind::NotFound, io::ErrorKind::FileTooLarge].contains(&e.kind()) => return Ok(None),
@@ -146,7 +159,7 @@ impl Disk {
         }
         let checked = SystemTime::UNIX_EPOCH + Duration::from_millis(metadata.checked_ms);
         let age = SystemTime::now().duration_since(checked).ok();
-        Ok(Some(Stored { bytes: Bytes::from(body), digest, origin: metadata.origin, age }))
+        Ok(Some(Stored { bytes: reservation.attach(body), digest, origin: metadata.origin, age }))
     }
 
     /// Stores an entry and evicts others if necessary. An entry larger than the capacity is not stored.
@@ -204,7 +217,7 @@ impl Disk {
         renamed
     }
 
-    fn with_index<T>(&self, act: impl FnOnce(&mut Index) -> T) -> T {
+    fn with_index<T>(&self, act: impl FnOnce(&mut CopyIndex) -> T) -> T {
         let mut index = self.index.lock().unwrap_or_else(PoisonError::into_inner);
         let index = index.get_or_insert_with(|| scan(&self.dir));
         let result = act(index);
@@ -223,8 +236,8 @@ fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
 }
 
 /// Indexes the copies of earlier processes and removes their temporary files. Skips unreadable files.
-fn scan(dir: &Path) -> Index {
-    let mut index = Index::default();
+fn scan(dir: &Path) -> CopyIndex {
+    let mut index = CopyIndex::default();
     let folders = fs::read_dir(dir).into_iter().flatten().flatten();
     for file in folders.filter_map(|folder| fs::read_dir(folder.path()).ok()).flatten().flatten() {
         let (path, Ok(data)) = (file.path(), file.metadata()) else { continue };

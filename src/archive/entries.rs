@@ -6,22 +6,26 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use metrics::{counter, histogram};
 use quick_cache::sync::Cache;
+use tokio::sync::Semaphore;
 use tracing::Instrument as _;
 
 use super::client::Answer;
 use super::disk::{Disk, Found, Stored};
 use super::error::FetchError;
+use super::files::Files;
 use super::remote::Remote;
-use crate::client_shares::{ClientShares, Place, ShareExceeded};
+use crate::client_shares::{ClientShares, ShareExceeded, SharePermit};
 use crate::config::Config;
 use crate::memory_budget::Budget;
 use crate::single_flight::SingleFlight;
 use crate::store::Digest;
-use crate::structure::{Archive as Folder, EntryId, Stamp};
+use crate::structure::{EntryId, Stamp};
 use crate::telemetry::{ARCHIVE_FETCH, ARCHIVE_REQUESTS, TraceSpan};
 
 /// Number of entries whose digests are cached, in a few megabytes.
 const CACHED_DIGESTS: usize = 16_384;
+
+const NO_RESULT: FetchError = FetchError::Internal("its fetch ended without a result");
 
 /// Source of an entry's bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,7 +41,7 @@ pub enum Source {
 /// File of an entry, compressed or not.
 #[derive(Debug, Clone)]
 pub struct Entry {
-    /// Bytes as stored or received.
+    /// Bytes as stored or received. They hold their part of the memory budget.
     pub bytes: Bytes,
     /// Digest of the bytes.
     pub digest: Digest,
@@ -60,19 +64,20 @@ struct Known {
 /// Entries by id. Clones share their state.
 #[derive(Debug, Clone)]
 pub struct Archive {
-    shared: Arc<Shared>,
-    /// Client whose share of `archive.concurrent` its fetches take; `None`: no share.
+    shared: Arc<ArchiveState>,
+    /// Client whose share of `archive.concurrent` limits the fetches; `None`: no share.
     client: Option<u64>,
 }
 
 #[derive(Debug)]
-struct Shared {
-    folder: Folder,
-    disk: Disk,
+struct ArchiveState {
+    files: Arc<Files>,
     remote: Option<Remote>,
     shares: Arc<ClientShares>,
     timeout: Duration,
     fetches: SingleFlight<EntryId, Result<Entry, FetchError>>,
+    /// Digests that are being computed; `None` if the folder does not have the entry.
+    digests: SingleFlight<EntryId, Result<Option<Digest>, FetchError>>,
     known: Cache<EntryId, Known>,
     /// Entries that no remote archive has, each with the time until which it is not requested again.
     absent: Cache<EntryId, Instant>,
@@ -82,18 +87,19 @@ struct Shared {
 }
 
 impl Archive {
-    /// Creates the archive of a configuration. Running fetches are charged to `memory`. The first request starts all
-    /// I/O.
+    /// Creates the archive of a configuration. Entries are charged to `memory` from before they are read until they are
+    /// dropped. The first request starts all I/O.
     #[must_use]
     pub fn new(config: &Config, memory: Budget) -> Self {
-        let (archive, inflated) = (&config.archive, config.limits.inflated_bytes);
-        let shared = Shared {
-            folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
-            disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
-            remote: Remote::new(config, memory),
+        let archive = &config.archive;
+        let files = Files::new(config, memory.clone());
+        let shared = ArchiveState {
+            remote: Remote::new(config, memory, Arc::clone(&files.readers)),
+            files: Arc::new(files),
             shares: ClientShares::new(archive.concurrent, config.server.client_share),
             timeout: Duration::from_millis(archive.timeout_ms),
             fetches: SingleFlight::default(),
+            digests: SingleFlight::default(),
             known: Cache::new(CACHED_DIGESTS),
             absent: Cache::new(CACHED_DIGESTS),
             check_interval: Duration::from_millis(archive.local_check_interval_ms),
@@ -103,6 +109,12 @@ impl Archive {
         Self { shared: Arc::new(shared), client: None }
     }
 
+    /// Returns the permits to read structures outside of jobs, one per worker. Reading an entry takes one.
+    #[must_use]
+    pub fn readers(&self) -> Arc<Semaphore> {
+        Arc::clone(&self.shared.files.readers)
+    }
+
     /// Returns the archive for a client, which may fetch its share of `archive.concurrent` entries at once.
     #[must_use]
     pub fn for_client(&self, client: u64) -> Self {
@@ -110,42 +122,42 @@ impl Archive {
     }
 
     /// Returns the bytes of an entry from the first source that has it. Waits at most `archive.timeout_ms`, half
-    /// of it for a place in the share of the client. Must run on a tokio runtime with timers.
+    /// of it for a slot in the share of the client. Must run on a tokio runtime with timers.
     ///
     /// # Errors
     /// Returns any [`FetchError`].
     pub async fn fetch(&self, id: &EntryId) -> Result<Entry, FetchError> {
         let start = tokio::time::Instant::now();
         let deadline = start + self.shared.timeout;
-        let mut place = None;
+        let mut slot = None;
         loop {
-            match (self.run(id, &mut place, deadline).await, self.client) {
+            match (self.run(id, &mut slot, deadline).await, self.client) {
                 // The share of this client, or of the first caller, is exceeded. Each caller waits for its own share,
                 // so that no client waits for the requests of another one.
-                (Err(FetchError::Share { .. }), Some(client)) if place.is_none() => {
+                (Err(FetchError::Share { .. }), Some(client)) if slot.is_none() => {
                     // The other half of the time is for the fetch.
                     let taken = self.shared.shares.wait(client, start + self.shared.timeout / 2).await;
-                    place = Some(taken.map_err(|ShareExceeded { limit }| FetchError::Share { id: id.clone(), limit })?);
+                    slot = Some(taken.map_err(|ShareExceeded { limit }| FetchError::Share { id: id.clone(), limit })?);
                 }
-                // The fetch that this caller joined had no place either. Tries again.
+                // The fetch that this caller joined had no slot either, so this caller tries again with its own slot.
                 (Err(FetchError::Share { .. }), _) => {}
                 (found, _) => return found,
             }
         }
     }
 
-    /// Runs or joins the fetch of an entry. A new fetch takes `place`, or fails if it needs one and there is none.
+    /// Runs or joins the fetch of an entry. A new fetch takes `slot`, or fails if it needs one and there is none.
     async fn run(
         &self,
         id: &EntryId,
-        place: &mut Option<Place>,
+        slot: &mut Option<SharePermit>,
         deadline: tokio::time::Instant,
     ) -> Result<Entry, FetchError> {
         let (shared, wanted, client) = (Arc::clone(&self.shared), id.clone(), self.client);
         // The fetch outlives its first caller, but is traced under that caller's request.
         let mut fetch = self.shared.fetches.run(id, || {
-            let (span, place) = (TraceSpan::current(), place.take());
-            let find = async move { shared.find(&wanted, client, place, deadline).await };
+            let (span, slot) = (TraceSpan::current(), slot.take());
+            let find = async move { shared.find(&wanted, client, slot, deadline).await };
             let find = async move {
                 match span {
                     Some(span) => span.run(find).await,
@@ -154,7 +166,7 @@ impl Archive {
             };
             find.in_current_span()
         });
-        fetch.recv().await.unwrap_or(Err(FetchError::Internal("its fetch ended without a result")))
+        fetch.recv().await.unwrap_or(Err(NO_RESULT))
     }
 
     /// Sends a HEAD request for one entry to every host of the remote archive, with a timeout of `limit` each. Returns
@@ -166,12 +178,20 @@ impl Archive {
         }
     }
 
-    /// Returns the digest of an entry's bytes, without reading them if the digest is cached and fresh.
+    /// Returns the digest of an entry's bytes, without reading them if the digest is cached and fresh. A file of the
+    /// folder is read part by part.
     ///
     /// # Errors
     /// Returns any [`FetchError`].
     pub async fn digest(&self, id: &EntryId) -> Result<Digest, FetchError> {
-        match self.known(id).await {
+        if let Some(digest) = self.known(id).await {
+            return Ok(digest);
+        }
+        let mut local = self.shared.digests.run(id, || {
+            let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
+            async move { shared.local_digest(&wanted).await }.in_current_span()
+        });
+        match local.recv().await.unwrap_or(Err(NO_RESULT))? {
             Some(digest) => Ok(digest),
             None => Ok(self.fetch(id).await?.digest),
         }
@@ -184,9 +204,8 @@ impl Archive {
             return None;
         }
         if known.checked.elapsed() >= self.shared.check_interval {
-            let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
             let checked = Instant::now();
-            let stamp = blocking(move || shared.folder.stamp(&wanted)).await.ok()?.ok()?;
+            let stamp = self.shared.files.stamp(id).await.ok()?;
             if stamp != known.stamp {
                 return None;
             }
@@ -197,20 +216,20 @@ impl Archive {
     }
 }
 
-impl Shared {
+impl ArchiveState {
     async fn find(
-        self: &Arc<Self>,
+        &self,
         id: &EntryId,
         client: Option<u64>,
-        place: Option<Place>,
+        slot: Option<SharePermit>,
         deadline: tokio::time::Instant,
     ) -> Result<Entry, FetchError> {
         let checked = Instant::now();
-        if let Some((bytes, digest, stamp)) = self.local(id).await? {
+        if let Some((bytes, digest, stamp)) = self.local(id, deadline).await? {
             self.remember(id, Known { digest, stamp: Some(stamp), checked, fresh_until: None });
             return Ok(Entry { bytes, digest, source: Source::Local });
         }
-        let stored = self.stored(id).await?;
+        let stored = self.stored(id, deadline).await?;
         let is_fresh = |stored: &Stored| stored.age.is_some_and(|age| age < self.revalidate_after);
         let (remote, stored) = match (&self.remote, stored) {
             // Without a remote archive a copy does not expire.
@@ -226,8 +245,8 @@ impl Shared {
             count("cache", "absent");
             return Err(FetchError::NotFound { id: id.clone() });
         }
-        let place = place.map_or_else(|| client.map(|client| self.shares.take(client)).transpose(), |p| Ok(Some(p)));
-        let _place = place.map_err(|ShareExceeded { limit }| FetchError::Share { id: id.clone(), limit })?;
+        let slot = slot.map_or_else(|| client.map(|client| self.shares.take(client)).transpose(), |p| Ok(Some(p)));
+        let _slot = slot.map_err(|ShareExceeded { limit }| FetchError::Share { id: id.clone(), limit })?;
         let answer = remote.fetch(id, stored.as_ref().map(|stored| &stored.origin), deadline).await;
         let result = match &answer {
             Ok(Answer::Unchanged) => "unchanged",
@@ -240,7 +259,7 @@ impl Shared {
         count("remote", result);
         histogram!(ARCHIVE_FETCH, "result" => result).record(checked.elapsed().as_secs_f64());
         match (answer, stored) {
-            (Ok(Answer::Body { bytes, digest, origin, lease }), _) => {
+            (Ok(Answer::Body { bytes, digest, origin }), _) => {
                 let ms = checked.elapsed().as_millis();
                 tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms, "fetched an entry");
                 let kept = bytes.clone();
@@ -249,8 +268,6 @@ impl Shared {
                     id,
                     Known { digest, stamp: None, checked, fresh_until: Some(checked + self.revalidate_after) },
                 );
-                // From here on the caller accounts for the memory.
-                drop(lease);
                 Ok(Entry { bytes, digest, source: Source::Remote })
             }
             (Ok(Answer::Unchanged), Some(stored)) => {
@@ -276,29 +293,37 @@ impl Shared {
     }
 
     /// Reads the entry from the folder.
-    async fn local(self: &Arc<Self>, id: &EntryId) -> Result<Option<(Bytes, Digest, Stamp)>, FetchError> {
-        let (shared, wanted) = (Arc::clone(self), id.clone());
-        let found = blocking(move || {
-            let found = shared.folder.fetch(&wanted)?;
-            Ok(found.map(|(bytes, stamp)| {
-                let digest = Digest::of(&bytes);
-                (Bytes::from(bytes), digest, stamp)
-            }))
-        });
-        let found = found.await?;
-        match &found {
-            Ok(Some(_)) => count("local", "found"),
-            Ok(None) => {}
-            Err(_) => count("local", "failed"),
-        }
-        found.map_err(|error| FetchError::Local(Arc::new(error)))
+    async fn local(
+        &self,
+        id: &EntryId,
+        deadline: tokio::time::Instant,
+    ) -> Result<Option<(Bytes, Digest, Stamp)>, FetchError> {
+        // The digest of an unchanged file is not computed again.
+        let known = self.known.get(id).and_then(|known| Some((known.stamp?, known.digest)));
+        let found = self.files.read(id, known, deadline).await;
+        count_local(&found);
+        found
+    }
+
+    /// Computes the digest of the entry in the folder, and remembers it.
+    async fn local_digest(&self, id: &EntryId) -> Result<Option<Digest>, FetchError> {
+        let checked = Instant::now();
+        let found = self.files.digest(id).await;
+        count_local(&found);
+        Ok(found?.map(|(digest, stamp)| {
+            self.remember(id, Known { digest, stamp: Some(stamp), checked, fresh_until: None });
+            digest
+        }))
     }
 
     /// Reads the copy on disk. Treats damaged and unreadable copies as missing.
-    async fn stored(self: &Arc<Self>, id: &EntryId) -> Result<Option<Stored>, FetchError> {
-        let (shared, wanted) = (Arc::clone(self), id.clone());
-        match blocking(move || shared.disk.load(&wanted)).await? {
+    async fn stored(&self, id: &EntryId, deadline: tokio::time::Instant) -> Result<Option<Stored>, FetchError> {
+        match self.files.copy(id, deadline).await? {
             Ok(Found::Copy(stored)) => return Ok(Some(stored)),
+            Ok(Found::Refused(error)) => {
+                count("cache", "no-memory");
+                return Err(FetchError::Memory { id: id.clone(), error });
+            }
             Ok(Found::Nothing) => {}
             Ok(Found::Corrupt) => {
                 tracing::warn!(%id, "a damaged copy on disk was removed");
@@ -327,23 +352,26 @@ impl Shared {
 
     /// Changes a copy on disk. A failure is only logged, since the entry itself is still usable.
     async fn on_disk(
-        self: &Arc<Self>,
+        &self,
         id: &EntryId,
         what: &'static str,
         act: impl FnOnce(&Disk, &EntryId) -> std::io::Result<()> + Send + 'static,
     ) {
-        let (shared, wanted) = (Arc::clone(self), id.clone());
-        if let Ok(Err(error)) = blocking(move || act(&shared.disk, &wanted)).await {
+        let wanted = id.clone();
+        if let Ok(Err(error)) = self.files.change(move |disk| act(disk, &wanted)).await {
             tracing::warn!(%id, %error, "a copy could not be {what}");
             count("cache", "failed");
         }
     }
 }
 
-/// Runs blocking `work` on its own thread.
-async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, FetchError> {
-    let ended = tokio::task::spawn_blocking(work).await;
-    ended.map_err(|_panicked_or_stopped| FetchError::Internal("reading ended without a result"))
+fn count_local<T>(found: &Result<Option<T>, FetchError>) {
+    match found {
+        Ok(Some(_)) => count("local", "found"),
+        Ok(None) => {}
+        Err(FetchError::Memory { .. }) => count("local", "no-memory"),
+        Err(_) => count("local", "failed"),
+    }
 }
 
 fn count(source: &'static str, result: &'static str) {

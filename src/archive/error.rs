@@ -49,6 +49,14 @@ pub enum FetchError {
         /// Limit and use of the memory.
         error: OutOfMemory,
     },
+    /// Reading could not begin in time, because all readers were busy.
+    #[error("entry {id} could not be read within {} ms, because too many other structures are being read", limit.as_millis())]
+    Busy {
+        /// Requested entry.
+        id: EntryId,
+        /// Time that the request waited.
+        limit: Duration,
+    },
     /// The client was fetching its share of entries for half of `archive.timeout_ms`.
     #[error("entry {id} cannot be fetched now: this client is fetching {limit} entries, which is its share")]
     Share {

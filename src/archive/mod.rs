@@ -10,6 +10,7 @@ mod client;
 mod disk;
 mod entries;
 mod error;
+mod files;
 mod gzip;
 mod remote;
 

@@ -9,7 +9,7 @@ use tokio::sync::{OnceCell, Semaphore};
 use tokio::time::Instant;
 
 use super::breaker::Breaker;
-use super::client::{self, Answer, Failed, Origin};
+use super::client::{self, Answer, Checks, Failed, Origin};
 use super::error::{FetchError, UnavailableReason};
 use crate::config::{ArchiveConfig, Config, Template};
 use crate::memory_budget::Budget;
@@ -27,8 +27,7 @@ pub(super) struct Remote {
     /// URL templates with the circuit breakers of their hosts.
     sources: Vec<(Template, Arc<Breaker>)>,
     config: ArchiveConfig,
-    /// Inflated bytes after which the check of a gzip file stops.
-    inflated_bytes: u64,
+    checks: Checks,
     /// Pass on the trace context, since its spans are exported.
     sends_trace: bool,
     permits: Semaphore,
@@ -38,9 +37,11 @@ pub(super) struct Remote {
 }
 
 impl Remote {
-    /// Creates the remote archive of a configuration, if it names one. Bodies that arrive are charged to `memory`.
-    pub(super) fn new(config: &Config, memory: Budget) -> Option<Self> {
-        let (inflated_bytes, sends_trace) = (config.limits.inflated_bytes, config.telemetry.endpoint.is_some());
+    /// Creates the remote archive of a configuration, if it names one. Bodies that arrive are charged to `memory`, and
+    /// checked with a permit of `readers`.
+    pub(super) fn new(config: &Config, memory: Budget, readers: Arc<Semaphore>) -> Option<Self> {
+        let checks = Checks { inflated_bytes: config.limits.inflated_bytes, readers };
+        let sends_trace = config.telemetry.endpoint.is_some();
         let config = &config.archive;
         let mut sources: Vec<(Template, Arc<Breaker>)> = Vec::new();
         for template in config.url.as_ref()?.as_slice() {
@@ -57,7 +58,7 @@ impl Remote {
         }
         let permits = Semaphore::new(config.concurrent);
         let client = OnceCell::new();
-        Some(Self { sources, config: config.clone(), inflated_bytes, sends_trace, permits, memory, client })
+        Some(Self { sources, config: config.clone(), checks, sends_trace, permits, memory, client })
     }
 
     /// Sends a HEAD request for `id` to every URL. Returns the hosts with the status or the error.
@@ -175,8 +176,8 @@ impl Remote {
         let permit = breaker.acquire().map_err(paused)?;
         let span = TraceSpan::start(&SpanParent::current(), "GET", SpanKind::Client, std::time::Instant::now());
         let trace = self.sends_trace.then(|| span.context());
-        let lease = self.memory.lease();
-        let get = client::get(client, url, known, &self.config, self.inflated_bytes, lease, trace.as_ref());
+        let reservation = self.memory.reservation();
+        let get = client::get(client, url, known, &self.config, &self.checks, reservation, trace.as_ref());
         let answer = tokio::time::timeout_at(deadline, get)
             .await
             .unwrap_or_else(|_elapsed| Err(Failed::other(UnavailableReason::Timeout, "incomplete at the deadline")));
@@ -244,7 +245,7 @@ mod tests {
     fn pauses_double_and_are_random() {
         let mut config = Config::default();
         config.archive.backoff_ms = 1000;
-        let remote = Remote::new(&config, Budget::unlimited()).unwrap();
+        let remote = Remote::new(&config, Budget::unlimited(), Arc::new(Semaphore::new(1))).unwrap();
         let longest = |attempt| (0..200).map(|_| remote.pause(attempt, None)).max().unwrap_or_default().as_millis();
         for (attempt, span) in [(1, 1000), (2, 2000), (3, 4000)] {
             let longest = longest(attempt);

@@ -27,9 +27,9 @@ const MESH_EXAMPLES: &str = "\
 Examples:
   molmesh mesh 4pti.pdb -o 4pti.glb
   molmesh mesh 1gbt.cif.gz -o - --format ply --resolution 0.3 > 1gbt.ply
-  curl -s http://127.0.0.1:8080/sample.pdb | molmesh mesh - -o 4pti.stl --report json";
+  curl -sS --fail-with-body http://127.0.0.1:8080/sample.pdb | molmesh mesh - -o 4pti.stl --report json";
 
-/// Watertight molecular-surface meshes from PDB, mmCIF and BinaryCIF files.
+/// Watertight molecular-surface meshes from PDB, mmCIF, BinaryCIF, PQR and XYZ files.
 #[derive(Debug, Parser)]
 #[command(name = "molmesh", version, arg_required_else_help = true, disable_help_subcommand = true)]
 #[command(max_term_width = 100, after_help = EXIT_CODES)]
@@ -103,7 +103,7 @@ pub(crate) struct MeshArgs {
     /// Mesh file; `-` is stdout
     #[arg(short, long)]
     pub(crate) output: PathBuf,
-    /// glb, gltf, ply, ply-text, stl or obj [default: by the extension of the output, glb on stdout]
+    /// glb, gltf, ply, ply-text, stl, obj or vtp [default: by the extension of the output, glb on stdout]
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
     /// Vertex compression of glb and gltf: none, or quantize (12 bytes instead of 24: 16-bit positions, 8-bit normals)
@@ -116,6 +116,9 @@ pub(crate) struct MeshArgs {
     /// Unit of lengths in the mesh file: angstrom, nanometer, or meter (glb and gltf only) [default: angstrom]
     #[arg(long, value_name = "UNIT")]
     pub(crate) units: Option<String>,
+    /// Write the atoms of the file to a CSV table, one row per index of `--atom-ids`; `-` is stdout
+    #[arg(long, value_name = "FILE")]
+    pub(crate) atoms: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) job: JobArgs,
 }
@@ -226,8 +229,9 @@ pub(crate) struct SurfaceArgs {
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Colours")]
 pub(crate) struct ColorArgs {
-    /// Colour vertices by their nearest atom: uniform:#RRGGBB, element, chain, entity, residue, bfactor, occupancy,
-    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge or none [default: none]
+    /// Colours of vertices: uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, occupancy,
+    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial or none [default:
+    /// none]
     #[arg(long, value_name = "SCHEME")]
     pub(crate) color: Option<String>,
     /// Palette of a numeric scheme: viridis, cividis, blue-white-red or red-white-blue [default: depends on the scheme]
@@ -236,6 +240,9 @@ pub(crate) struct ColorArgs {
     /// Values at the ends of the palette [default: depends on the scheme]
     #[arg(long, value_name = "MIN,MAX", allow_hyphen_values = true)]
     pub(crate) color_range: Option<String>,
+    /// Transition between colours: nearest (sharp borders) or smooth (averaged over about 1 Å) [default: nearest]
+    #[arg(long, value_name = "BLEND")]
+    pub(crate) color_blend: Option<String>,
 }
 
 // Atom selection.

@@ -53,14 +53,14 @@ pub(crate) enum Purpose {
 
 impl<'a> BackendRequest<'a> {
     /// Creates the request of a command with a single job of unknown work.
-    pub(crate) fn of_command(args: &'a JobArgs, purpose: Purpose) -> Self {
+    pub(crate) fn for_command(args: &'a JobArgs, purpose: Purpose) -> Self {
         let (backend, devices, threads) = (args.backend, &args.devices.devices, args.threads);
         Self { backend, devices, threads, work: None, purpose }
     }
 
     /// Creates the request of a service.
     #[cfg(feature = "server")]
-    pub(crate) fn of_service(backend: BackendName, config: &'a DevicesConfig) -> Self {
+    pub(crate) fn for_service(backend: BackendName, config: &'a DevicesConfig) -> Self {
         let purpose = Purpose::Service(config.clone());
         Self { backend, devices: &config.choice, threads: None, work: None, purpose }
     }
@@ -164,7 +164,7 @@ impl CommandEstimate {
 /// Selects a GPU, or the CPU if the request allows any backend.
 fn gpu_or_cpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliError> {
     let mut estimate = CommandEstimate::new(requested);
-    if let Some(estimate) = estimate.as_ref().filter(|of_command| !of_command.estimate.favours_gpu()) {
+    if let Some(estimate) = estimate.as_ref().filter(|estimate| !estimate.estimate.favours_gpu()) {
         let why = format!("a GPU is not expected to be faster ({})", estimate.text());
         return instead_of_gpu(requested, format!("auto: {why}"), NoGpu { why, devices: Vec::new() });
     }

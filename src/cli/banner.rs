@@ -1,10 +1,14 @@
-//! Banner of a service at its start: addresses, an example command, the backend, and the reasons against the others.
+//! Banner of a service at its start: addresses, an example command, the backend, and the reasons for which the others
+//! are not used.
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use super::page::Page;
 use super::style::Style;
 use super::survey::Availability;
+
+/// Start of an example command. It fails with the problem document if the server returns an error.
+const CURL: &str = "curl -sS --fail-with-body";
 
 /// Facts that the banner shows.
 pub(crate) struct Facts {
@@ -39,10 +43,7 @@ pub(crate) fn text(addr: SocketAddr, metrics: Option<SocketAddr>, facts: &Facts,
         }
     }
     let key = if facts.keys { " -H \"X-Api-Key: $MOLMESH_KEY\"" } else { "" };
-    page.row(
-        "try",
-        &format!("curl -sS {base}/sample.pdb | curl -sS{key} --data-binary @- {base}/v1/meshes -o 4pti.glb"),
-    );
+    page.row("try", &format!("{CURL} {base}/sample.pdb | {CURL}{key} --data-binary @- {base}/v1/meshes -o 4pti.glb"));
     page.finish()
 }
 
@@ -79,13 +80,13 @@ mod tests {
             "http://[::1]:82/metrics",
             "cpu: 2 threads (auto)",
             "not gpu: none found",
-            "| curl -sS --data-binary @- http://127.0.0.1:81/v1/meshes",
+            "| curl -sS --fail-with-body --data-binary @- http://127.0.0.1:81/v1/meshes",
         ] {
             assert!(text.contains(part), "no `{part}` in\n{text}");
         }
         let with_keys = Facts { keys: true, ..facts };
         let keyed = super::text("0.0.0.0:81".parse().unwrap(), None, &with_keys, Style::PLAIN);
-        assert!(keyed.contains("curl -sS -H \"X-Api-Key: $MOLMESH_KEY\" --data-binary"), "{keyed}");
+        assert!(keyed.contains("curl -sS --fail-with-body -H \"X-Api-Key: $MOLMESH_KEY\" --data-binary"), "{keyed}");
         let bare = Facts { keys: false, viewer: false, ..with_keys };
         let bare = super::text("0.0.0.0:81".parse().unwrap(), None, &bare, Style::PLAIN);
         assert!(bare.contains("make web") && !text.contains("make web"), "{bare}");

@@ -171,16 +171,17 @@ impl CliError {
         match self {
             Self::Usage { hint, .. } => hint.clone(),
             Self::Strict { first, .. } => Some(format!("the first: {first}")),
-            Self::InputTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
+            Self::InputTooLarge { .. } => Some("raise the limit with --max-input-bytes".to_owned()),
             Self::Job { source: JobError::Surface(error), .. } => surface_hint(error),
             Self::Job { source: JobError::Structure(error), strict_finding, .. } => match error {
                 StructureError::TooManyAtoms { .. } | StructureError::AssemblyTooLarge { .. } => {
-                    Some("raise it with --max-atoms".to_owned())
+                    Some("raise the limit with --max-atoms".to_owned())
                 }
-                StructureError::TooManyCopies { .. } => Some("raise it with --max-copies".to_owned()),
-                StructureError::TooManyParts { .. } => Some("raise it with --max-parts".to_owned()),
-                StructureError::TooManyDuplicates { .. } => Some("raise it with --max-duplicates".to_owned()),
-                StructureError::InflatedTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
+                StructureError::TooManyCopies { .. } => Some("raise the limit with --max-copies".to_owned()),
+                StructureError::TooManyParts { .. } => Some("raise the limit with --max-parts".to_owned()),
+                StructureError::TooManyDistances { .. } => Some("raise the limit with --max-candidates".to_owned()),
+                StructureError::TooManyDuplicates { .. } => Some("raise the limit with --max-duplicates".to_owned()),
+                StructureError::InflatedTooLarge { .. } => Some("raise the limit with --max-input-bytes".to_owned()),
                 _ => strict_finding.as_deref().map(str::to_owned),
             },
             Self::NoBackend { .. } => Some(format!("try --backend auto{DOCTOR}")),
@@ -209,6 +210,7 @@ fn structure_code(error: &StructureError) -> i32 {
         | StructureError::TooManyDuplicates { .. }
         | StructureError::TooManyCopies { .. }
         | StructureError::TooManyParts { .. }
+        | StructureError::TooManyDistances { .. }
         | StructureError::AssemblyTooLarge { .. }
         | StructureError::Memory(_) => code::LIMIT,
         _ => code::STRUCTURE,
@@ -316,7 +318,7 @@ mod tests {
 
     #[test]
     fn grid_limit_suggests_a_resolution() {
-        let error = SurfaceError::GridTooLarge { samples: 9, limit: 1, resolution: 0.1, suggested_resolution: 0.4 };
+        let error = SurfaceError::GridTooLarge { grid_points: 9, limit: 1, resolution: 0.1, suggested_resolution: 0.4 };
         let hint = CliError::Job { name: "x".into(), source: error.into(), strict_finding: None }.hint();
         assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise --max-grid-points"));
     }

@@ -1,6 +1,7 @@
-//! Ctrl-C: cancels the job, removes the partial file and exits with code 130.
+//! Ctrl-C: cancels the job, removes partial files and exits with code 130.
 
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -8,42 +9,54 @@ use molmesh::surface::CancelToken;
 
 use super::error::CliError;
 
-/// Partial file of a running command. The lock is held during the rename to the final name, so that an interrupt either
-/// removes the partial file or comes after the rename.
-static STAGED: Mutex<Option<PathBuf>> = Mutex::new(None);
+/// Partial files of a running command. The lock is held during the renames to the final names, so that an interrupt
+/// either removes all partial files or comes after the renames.
+static STAGED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
 
-fn staged() -> MutexGuard<'static, Option<PathBuf>> {
+fn staged() -> MutexGuard<'static, Vec<PathBuf>> {
     STAGED.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Registers a file that is removed unless [`commit`] renames it.
 pub(crate) fn stage(path: &Path) {
-    *staged() = Some(path.to_owned());
+    staged().push(path.to_owned());
 }
 
-/// Renames the staged file to `target`.
+/// Renames each staged file of `files` to its target, the second path, unless an interrupt has removed it.
 ///
 /// # Errors
-/// Returns the error of the rename. The file stays staged.
-pub(crate) fn commit(target: &Path) -> std::io::Result<()> {
+/// Returns the number of the file whose rename failed, and the error. This file and the later ones stay staged.
+pub(crate) fn commit(files: &[(&Path, &Path)]) -> Result<(), (usize, io::Error)> {
     let mut staged = staged();
-    if let Some(path) = staged.as_ref() {
-        fs::rename(path, target)?;
-        *staged = None;
+    for (number, (path, target)) in files.iter().enumerate() {
+        if let Some(place) = staged.iter().position(|known| known == path) {
+            fs::rename(path, target).map_err(|error| (number, error))?;
+            staged.swap_remove(place);
+        }
     }
     Ok(())
 }
 
-/// Removes the staged file, if there is one.
-pub(crate) fn discard() {
-    if let Some(path) = staged().take() {
-        // The file may be gone already, and an error here must not hide the original one.
-        drop(fs::remove_file(path));
+/// Removes a staged file, if it is still staged.
+pub(crate) fn discard(path: &Path) {
+    let mut staged = staged();
+    if let Some(place) = staged.iter().position(|known| known == path) {
+        remove(&staged.swap_remove(place));
     }
 }
 
+/// Removes all staged files.
+fn discard_all() {
+    staged().drain(..).for_each(|path| remove(&path));
+}
+
+fn remove(path: &Path) {
+    // The file may be gone already, and an error here must not hide the original one.
+    drop(fs::remove_file(path));
+}
+
 /// Cancels `token` on SIGINT and SIGTERM. Half a second later (the job may be waiting for stdin) or on a second signal,
-/// the process exits. The staged file is removed in all cases.
+/// the process exits. The staged files are removed in all cases.
 ///
 /// # Errors
 /// Returns [`CliError::Internal`] if the signals cannot be watched.
@@ -58,7 +71,7 @@ pub(crate) fn watch(token: &CancelToken) -> Result<(), CliError> {
     use super::style::Style;
 
     fn give_up() -> ! {
-        discard();
+        discard_all();
         CliError::Interrupted.print(Style::stderr());
         super::leave(code::INTERRUPTED)
     }
@@ -85,11 +98,11 @@ pub(crate) fn watch(token: &CancelToken) -> Result<(), CliError> {
 
 /// Returns the error for signals that cannot be watched.
 #[cfg(unix)]
-fn unwatched(error: &std::io::Error) -> CliError {
+fn unwatched(error: &io::Error) -> CliError {
     CliError::Internal(format!("cannot watch for signals: {error}"))
 }
 
-/// Does nothing without signals. The system ends the process and may leave the staged file.
+/// Does nothing without signals. The system ends the process and may leave staged files.
 #[cfg(not(unix))]
 pub(crate) fn watch(_token: &CancelToken) -> Result<(), CliError> {
     Ok(())

@@ -1,14 +1,16 @@
 //! Job of the commands `mesh` and `render`: reads one structure, and writes one file and one report.
 
+use std::cell::OnceCell;
 use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::Path;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, Report};
-use molmesh::structure::StructureError;
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
+use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, SurfaceError};
 use serde_json::{Value, json};
 
@@ -18,7 +20,7 @@ use super::error::CliError;
 use super::output::{self, Output, is_stdio};
 use super::progress::Progress;
 use super::style::Style;
-use super::summary::{self, Written};
+use super::summary::{self, Written, WrittenFiles};
 use super::{interrupt, request};
 
 /// Job of a command, with its input and backend.
@@ -33,6 +35,10 @@ pub(super) struct CommandJob<'a> {
     pub(super) progress: Progress,
     /// Findings of the strict validator, if it ran.
     findings: Option<Vec<Diagnostic>>,
+    /// Output of the table of atoms, if it is requested.
+    table: Option<Output>,
+    /// The structure, kept for that table.
+    structure: OnceCell<Arc<Structure>>,
 }
 
 impl<'a> CommandJob<'a> {
@@ -46,7 +52,7 @@ impl<'a> CommandJob<'a> {
     ) -> Result<(Self, Output), CliError> {
         let limits = request::limits(&args.limits);
         let purpose = if format.is_picture() { Purpose::Picture } else { Purpose::Mesh };
-        let mut requested = BackendRequest::of_command(args, purpose);
+        let mut requested = BackendRequest::for_command(args, purpose);
         backend::check(&requested)?;
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
@@ -54,11 +60,21 @@ impl<'a> CommandJob<'a> {
         let output = Output::open(output, &cancel)?;
         output.refuse_terminal(format)?;
         let input = read(path, limits.read.max_inflated_bytes)?;
-        requested.work = Some(pipeline::estimate_work(&input, &job));
+        requested.work = Some(pipeline::estimate_work(pipeline::estimate_atoms(&input), &job));
         let selected = backend::select(&requested)?;
         let progress = Progress::new(!args.quiet);
         let findings = if strict { Some(check(path, &input, &limits)?) } else { None };
-        Ok((Self { path, args, job, limits, cancel, input, selected, progress, findings }, output))
+        let (table, structure) = (None, OnceCell::new());
+        let job = Self { path, args, job, limits, cancel, input, selected, progress, findings, table, structure };
+        Ok((job, output))
+    }
+
+    /// Adds a table of the atoms in the file `path`, beside the mesh in the file `mesh`.
+    pub(super) fn add_table(&mut self, path: &Path, mesh: &Path) -> Result<(), CliError> {
+        output::refuse_input(self.path, path)?;
+        output::refuse_same(path, mesh)?;
+        self.table = Some(Output::open(path, &self.cancel)?);
+        Ok(())
     }
 
     /// Returns the control of a run: cancellation, no deadline and no memory limit.
@@ -69,7 +85,14 @@ impl<'a> CommandJob<'a> {
     /// Computes the mesh. If the job allows it, the mesh is written to `sink` as GLB at the same time.
     pub(super) fn run(&self, sink: Option<&GlbSink<'_>>) -> Result<Product, JobError> {
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
-        pipeline::run(&self.input, &self.job, &self.limits, &choice, &self.control(), &self.progress, sink)
+        let read = |control: &Control<'_>| {
+            let structure = structure::read_with(&self.input, &self.limits.read, control).map(Arc::new)?;
+            if self.table.is_some() {
+                self.structure.get_or_init(|| Arc::clone(&structure));
+            }
+            Ok(structure)
+        };
+        pipeline::run_with(read, &self.job, &self.limits, &choice, &self.control(), &self.progress, sink)
     }
 
     /// Draws the picture of a product.
@@ -91,7 +114,7 @@ impl<'a> CommandJob<'a> {
 
     /// Completes the output and writes the report. `writing` is the time already spent on writing.
     pub(super) fn finish(
-        self,
+        mut self,
         output: Output,
         mut report: Report,
         format: Format,
@@ -101,11 +124,19 @@ impl<'a> CommandJob<'a> {
         if self.cancel.is_cancelled() {
             return Err(CliError::Interrupted);
         }
-        let (to_stdout, name, bytes) = (output.is_stdout(), output.name.clone(), output.bytes);
         let start = Instant::now();
-        output.finish()?;
+        let mut outputs = vec![output];
+        if let (Some(mut table), Some(structure)) = (self.table.take(), self.structure.get()) {
+            table::write_csv(structure, &mut table).map_err(|source| table.failure(source))?;
+            outputs.push(table);
+        }
+        let to_stdout = outputs.iter().any(Output::is_stdout);
+        let names: Vec<(String, u64)> = outputs.iter().map(|output| (output.name.clone(), output.bytes)).collect();
+        Output::finish(outputs)?;
         report.add_timing("write", (writing + start.elapsed()).as_secs_f64() * 1e3);
-        let written = Written { name: &name, format: format.name(), bytes };
+        let of = |(name, bytes): &(String, u64), format| Written { name: name.clone(), format, bytes: *bytes };
+        let table = names.get(1).map(|file| of(file, "csv"));
+        let written = WrittenFiles { mesh: of(&names[0], format.name()), table };
         write_report(self.args, &report, self.findings.as_deref(), &written, to_stdout)
     }
 }
@@ -172,7 +203,7 @@ fn write_report(
     args: &JobArgs,
     report: &Report,
     findings: Option<&[Diagnostic]>,
-    written: &Written<'_>,
+    written: &WrittenFiles,
     file_on_stdout: bool,
 ) -> Result<(), CliError> {
     match args.report {
@@ -194,12 +225,15 @@ fn write_report(
     }
 }
 
-fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Written<'_>) -> Result<String, CliError> {
+fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &WrittenFiles) -> Result<String, CliError> {
     let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialized: {e}"));
     let mut value = serde_json::to_value(report).map_err(failed)?;
     if let Value::Object(map) = &mut value {
-        let output = json!({ "file": written.name, "format": written.format, "bytes": written.bytes });
-        map.insert("output".to_owned(), output);
+        let file = |file: &Written| json!({ "file": file.name, "format": file.format, "bytes": file.bytes });
+        map.insert("output".to_owned(), file(&written.mesh));
+        if let Some(table) = &written.table {
+            map.insert("atom_table".to_owned(), file(table));
+        }
         let finding = |f: &Diagnostic| json!({ "level": f.level.name(), "message": f.message, "line": f.line });
         if let Some(findings) = findings {
             map.insert("findings".to_owned(), findings.iter().map(finding).collect());

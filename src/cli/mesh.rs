@@ -18,10 +18,13 @@ use super::request;
 /// Runs the command.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let format = args.format.as_ref().map_or_else(|| format_of(&args.output), |name| named(name))?;
-    let Request { mut job, strict, .. } = request::of_mesh(args)?;
+    let Request { mut job, strict, .. } = request::parse_mesh(args)?;
     request::set_format(&mut job, format)?;
     let paths = (args.input.as_path(), args.output.as_path());
-    let (job, mut output) = CommandJob::prepare(job, strict, paths, format, &args.job)?;
+    let (mut job, mut output) = CommandJob::prepare(job, strict, paths, format, &args.job)?;
+    if let Some(path) = &args.atoms {
+        job.add_table(path, &args.output)?;
+    }
     let product = if format == Format::Glb && output.has_random_access() {
         run_to_file(&job, &output)?
     } else {
@@ -40,7 +43,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     job.finish(output, report, format, writing)
 }
 
-/// Mesh format by its name.
+/// Parses the name of a mesh format.
 fn named(name: &str) -> Result<Format, CliError> {
     match Format::from_str(name) {
         Ok(format) if format.is_picture() => Err(CliError::Usage {
@@ -55,10 +58,10 @@ fn named(name: &str) -> Result<Format, CliError> {
     }
 }
 
-/// Format of an output by its file extension; GLB on stdout.
+/// Returns the format of an output by its file extension; GLB on stdout.
 fn format_of(output: &Path) -> Result<Format, CliError> {
     let unknown = |why: &str| CliError::Usage {
-        message: format!("cannot tell the format of `{}`: {why}", output.display()),
+        message: format!("cannot determine the format of `{}`: {why}", output.display()),
         hint: Some(format!("name the format with --format: {}", Format::MESHES.map(Format::name).join(", "))),
     };
     match output.extension().map(|extension| extension.to_string_lossy()) {
@@ -78,7 +81,7 @@ fn run_to_file(job: &CommandJob<'_>, output: &Output) -> Result<Product, CliErro
     })
 }
 
-/// Error of the command for that of its sink.
+/// Converts the error of the sink to that of the command.
 fn sink_failure(output: &Output, cause: Option<GlbSinkError>) -> CliError {
     match cause {
         Some(GlbSinkError::Format(error)) => error.into(),
@@ -88,7 +91,7 @@ fn sink_failure(output: &Output, cause: Option<GlbSinkError>) -> CliError {
     }
 }
 
-/// Encodes the mesh into the output. Returns the time that took, without the writes, in ms.
+/// Encodes the mesh into the output. Returns the time that this took, without the writes, ms.
 fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn ProgressSink) -> Result<f64, CliError> {
     sink.progress("encode", 0.0);
     let start = Instant::now();

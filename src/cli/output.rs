@@ -30,9 +30,10 @@ enum To {
     Stdout(io::Stdout),
     /// Output that a rename cannot replace: a pipe, a terminal, `/dev/null`.
     Device(File),
-    /// A file beside `target`, renamed when it is complete.
+    /// The file `path` beside `target`, renamed when it is complete.
     Staged {
         file: File,
+        path: PathBuf,
         target: PathBuf,
     },
 }
@@ -72,13 +73,18 @@ impl Output {
         Err(CliError::Usage { message, hint: Some("name a file with -o, or redirect the output".to_owned()) })
     }
 
-    /// Renames the file to its final name.
-    pub(crate) fn finish(mut self) -> Result<(), CliError> {
-        let done = self.flush().and_then(|()| match &self.to {
-            To::Staged { target, .. } => interrupt::commit(target),
-            To::Stdout(_) | To::Device(_) => Ok(()),
+    /// Completes all outputs of a command: renames the files to their final names.
+    pub(crate) fn finish(mut outputs: Vec<Self>) -> Result<(), CliError> {
+        for output in &mut outputs {
+            output.flush().map_err(|source| output.failure(source))?;
+        }
+        let staged = |output: &Self| matches!(output.to, To::Staged { .. });
+        let staged: Vec<&Self> = outputs.iter().filter(|output| staged(output)).collect();
+        let paths = staged.iter().filter_map(|output| match &output.to {
+            To::Staged { path, target, .. } => Some((path.as_path(), target.as_path())),
+            To::Stdout(_) | To::Device(_) => None,
         });
-        done.map_err(|source| self.failure(source))
+        interrupt::commit(&paths.collect::<Vec<_>>()).map_err(|(number, source)| staged[number].failure(source))
     }
 
     fn check_cancelled(&self) -> io::Result<()> {
@@ -86,7 +92,7 @@ impl Output {
         if self.cancel.is_cancelled() { Err(io::Error::other("interrupted")) } else { Ok(()) }
     }
 
-    /// Error of the command for a failed write: an interrupt, or the error itself.
+    /// Converts the error of a failed write: to an interrupt if the command was cancelled.
     pub(crate) fn failure(&self, source: io::Error) -> CliError {
         if self.cancel.is_cancelled() {
             CliError::Interrupted
@@ -98,8 +104,8 @@ impl Output {
 
 impl Drop for Output {
     fn drop(&mut self) {
-        if matches!(self.to, To::Staged { .. }) {
-            interrupt::discard();
+        if let To::Staged { path, .. } = &self.to {
+            interrupt::discard(path);
         }
     }
 }
@@ -151,6 +157,19 @@ pub(crate) fn refuse_input(input: &Path, output: &Path) -> Result<(), CliError> 
     Err(CliError::Usage { message, hint: Some("name another file with -o".to_owned()) })
 }
 
+/// Rejects two outputs with the same path, or both on stdout.
+pub(crate) fn refuse_same(a: &Path, b: &Path) -> Result<(), CliError> {
+    let place = |path: &Path| {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        Some((folder.canonicalize().ok()?, path.file_name()?.to_owned()))
+    };
+    let same = if is_stdio(a) || is_stdio(b) { a == b } else { place(a).is_some_and(|at| place(b) == Some(at)) };
+    if !same {
+        return Ok(());
+    }
+    Err(CliError::usage(format!("two outputs are written to `{}`; expected different files", a.display())))
+}
+
 /// Returns true if both are the same regular file, also through links or a redirected stdin.
 #[cfg(unix)]
 fn same_file(input: &Path, output: &Path) -> io::Result<bool> {
@@ -195,16 +214,15 @@ fn open_file(path: &Path) -> io::Result<To> {
     interrupt::stage(&staged);
     let created = OpenOptions::new().write(true).create_new(true).open(&staged).and_then(|file| {
         existing.map_or(Ok(()), |meta| file.set_permissions(meta.permissions()))?;
-        Ok(To::Staged { file, target })
+        Ok(To::Staged { file, path: staged.clone(), target })
     });
-    created.inspect_err(|_| interrupt::discard())
+    created.inspect_err(|_| interrupt::discard(&staged))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    // A single test, as a process has only one staged file.
     #[test]
     fn file_appears_only_when_it_is_finished() {
         let dir = tempfile::tempdir().unwrap();
@@ -221,7 +239,7 @@ mod tests {
         let mut output = Output::open(&path, &cancel).unwrap();
         output.write_all(b"whole").unwrap();
         assert_eq!(output.bytes, 5);
-        output.finish().unwrap();
+        Output::finish(vec![output]).unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"whole");
         assert_eq!(entries(), 1);
 

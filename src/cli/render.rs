@@ -14,7 +14,7 @@ use super::request;
 
 /// Runs the command.
 pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
-    let Request { job, strict, .. } = request::of_render(args)?;
+    let Request { job, strict, .. } = request::parse_render(args)?;
     require_png(&args.output)?;
     let paths = (args.input.as_path(), args.output.as_path());
     let (job, mut output) = CommandJob::prepare(job, strict, paths, Format::Png, &args.job)?;

@@ -3,19 +3,20 @@
 use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError, Request};
 use molmesh::pipeline::{Job, JobLimits};
+use molmesh::structure::read::DISTANCES_PER_PAIR;
 
 use super::args::{JobArgs, LimitArgs, MeshArgs, PictureArgs, RenderArgs};
 use super::error::CliError;
 
 /// Parses the flags of `mesh`.
-pub(super) fn of_mesh(args: &MeshArgs) -> Result<Request, CliError> {
+pub(super) fn parse_mesh(args: &MeshArgs) -> Result<Request, CliError> {
     let own =
         [("format", &args.format), ("compress", &args.compress), ("normals", &args.normals), ("units", &args.units)];
     parse(&own, &args.job)
 }
 
 /// Parses the flags of `render`.
-pub(super) fn of_render(args: &RenderArgs) -> Result<Request, CliError> {
+pub(super) fn parse_render(args: &RenderArgs) -> Result<Request, CliError> {
     let PictureArgs { width, height, view, azimuth, elevation, background, style } = &args.picture;
     let own = [
         ("width", width),
@@ -67,8 +68,9 @@ pub(super) fn limits(args: &LimitArgs) -> JobLimits {
     set(&mut limits.read.max_copies, args.max_copies);
     set(&mut limits.read.max_parts, args.max_parts);
     set(&mut limits.read.max_inflated_bytes, args.max_input_bytes);
-    set(&mut limits.surface.max_samples, args.max_grid_points);
+    set(&mut limits.surface.max_grid_points, args.max_grid_points);
     set(&mut limits.surface.max_candidates, args.max_candidates);
+    set(&mut limits.read.max_distances, args.max_candidates.map(|pairs| pairs.saturating_mul(DISTANCES_PER_PAIR)));
     set(&mut limits.surface.max_mesh_bytes, args.max_mesh_bytes);
     limits
 }
@@ -94,6 +96,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("color", &args.color.color),
         ("palette", &args.color.palette),
         ("color_range", &args.color.color_range),
+        ("color_blend", &args.color.color_blend),
         ("chains", &atoms.chains),
         ("model", &atoms.model),
         ("altloc", &atoms.altloc),
@@ -130,13 +133,13 @@ mod tests {
     fn request(flags: &[&str]) -> Result<Request, CliError> {
         let line = ["molmesh", "mesh", "in.pdb", "-o", "out.glb"].iter().chain(flags);
         let Command::Mesh(args) = Args::try_parse_from(line).unwrap().command else { panic!("not mesh") };
-        of_mesh(&args)
+        parse_mesh(&args)
     }
 
     fn drawn(flags: &[&str]) -> Result<Request, CliError> {
         let line = ["molmesh", "render", "in.pdb", "-o", "out.png"].iter().chain(flags);
         let Command::Render(args) = Args::try_parse_from(line).unwrap().command else { panic!("not render") };
-        of_render(&args)
+        parse_render(&args)
     }
 
     #[test]
@@ -178,6 +181,7 @@ mod tests {
                 "style" => vec![&flag, "gouraud"],
                 "color" => vec![&flag, "bfactor"],
                 "palette" => vec![&flag, "cividis", "--color", "bfactor"],
+                "color_blend" => vec![&flag, "smooth", "--color", "chain"],
                 "color_range" => vec![&flag, "0,50", "--color", "bfactor"],
                 _ => vec![&flag, "2"],
             };

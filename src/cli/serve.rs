@@ -35,7 +35,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     }
     let json = config.log.format == LogFormat::Json;
     strict_validator::quiet_panics();
-    let selected = backend::select(&BackendRequest::of_service(args.backend, &config.devices))?;
+    let selected = backend::select(&BackendRequest::for_service(args.backend, &config.devices))?;
     let others = survey::backends(&selected).into_iter().chain(survey::unused_devices(&selected)).collect();
     let SelectedBackend { backend, reason, renderer, devices, .. } = selected;
     let backend: Arc<dyn Backend> = Arc::from(backend);
@@ -82,8 +82,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
 }
 
-/// Returns the number of threads of the async runtime: a quarter of the cores, at least two. They serve sockets and
-/// hash uploads; meshing has other threads. With two threads, a service with 32 cores and two GPUs sends half as many
+/// Returns the number of threads of the async runtime: a quarter of the cores, at least two. They serve sockets;
+/// hashing and meshing have other threads. With two threads, a service with 32 cores and two GPUs sends half as many
 /// meshes per second.
 fn runtime_threads() -> usize {
     let cores = std::thread::available_parallelism().map_or(1, NonZero::get);

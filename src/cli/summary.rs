@@ -10,17 +10,25 @@ use super::style::Style;
 const BAR: f64 = 24.0;
 
 /// Written file.
-pub(crate) struct Written<'a> {
+pub(crate) struct Written {
     /// Path, or `stdout`.
-    pub(crate) name: &'a str,
+    pub(crate) name: String,
     /// Format.
     pub(crate) format: &'static str,
     /// Bytes.
     pub(crate) bytes: u64,
 }
 
+/// Files of a command.
+pub(crate) struct WrittenFiles {
+    /// Mesh or picture.
+    pub(crate) mesh: Written,
+    /// Table of the atoms, if it was requested.
+    pub(crate) table: Option<Written>,
+}
+
 /// Formats the summary. `findings` are those of the strict validator, if it ran.
-pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[String]>, style: Style) -> String {
+pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[String]>, style: Style) -> String {
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
     let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
     page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, model {})", report.source_format, report.model));
@@ -34,11 +42,11 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
         page.row("warning", warning);
     }
     page.row("surface", &surface(report));
-    let [bricks, with_surface, samples, dense] =
-        [report.bricks, report.surface_bricks, report.samples, report.box_cells].map(grouped);
+    let [bricks, with_surface, grid_points, dense] =
+        [report.bricks, report.surface_bricks, report.grid_points, report.box_cells].map(grouped);
     page.row(
         "grid",
-        &format!("{bricks} bricks ({with_surface} with surface), {samples} grid points; box: {dense} cells"),
+        &format!("{bricks} bricks ({with_surface} with surface), {grid_points} grid points; box: {dense} cells"),
     );
     page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
     if let Some(quantization) = report.quantization {
@@ -62,7 +70,9 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     page.row("area", &format!("{} Å²", decimal(report.area)));
     page.row("volume", &format!("{} Å³", decimal(report.volume)));
     page.row("backend", &format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
-    page.row("wrote", &format!("{} ({}, {} bytes)", written.name, written.format, grouped(written.bytes)));
+    for Written { name, format, bytes } in [Some(&written.mesh), written.table.as_ref()].into_iter().flatten() {
+        page.row("wrote", &format!("{name} ({format}, {} bytes)", grouped(*bytes)));
+    }
     if let Some(findings) = findings {
         add_findings(&mut page, findings);
     }
@@ -119,12 +129,12 @@ fn left_out(left_out: &LeftOutReport) -> String {
 
 /// Formats the colours and the first entries of their legend.
 fn colors(color: &ColorReport) -> String {
-    const MOST: usize = 6;
+    const MAX_ENTRIES: usize = 6;
     let palette = color.palette.map(|palette| format!(", {palette}")).unwrap_or_default();
     let range = color.range.map(|[low, high]| format!(" from {low} to {high}")).unwrap_or_default();
-    let entries = color.legend.iter().filter(|_| color.range.is_none()).take(MOST);
+    let entries = color.legend.iter().filter(|_| color.range.is_none()).take(MAX_ENTRIES);
     let entries: Vec<String> = entries.map(|entry| format!("{} {}", entry.label, entry.color)).collect();
-    let more = if color.range.is_none() && color.legend.len() > MOST { ", …" } else { "" };
+    let more = if color.range.is_none() && color.legend.len() > MAX_ENTRIES { ", …" } else { "" };
     let legend = if entries.is_empty() { String::new() } else { format!(": {}{more}", entries.join(", ")) };
     format!("{}{palette}{range}{legend}", color.scheme)
 }
@@ -264,7 +274,7 @@ mod tests {
             smoothness: Some(1.25),
             bricks: 300,
             surface_bricks: 250,
-            samples: 153_600,
+            grid_points: 153_600,
             box_cells: 1_000_000,
             vertices: 20_000,
             triangles: 39_996,
@@ -289,6 +299,8 @@ mod tests {
                 scheme: "chain".into(),
                 palette: None,
                 range: None,
+                blend: None,
+                source: None,
                 legend: vec![LegendEntry { label: "A".into(), color: "#4fa59b".into() }],
             }),
             backend: "cpu",
@@ -317,7 +329,8 @@ mod tests {
 
     #[test]
     fn summary_is_complete_and_fits_one_screen() {
-        let text = text(&report(), &Written { name: "a.glb", format: "glb", bytes: 720_000 }, None, Style::PLAIN);
+        let mesh = Written { name: "a.glb".to_owned(), format: "glb", bytes: 720_000 };
+        let text = text(&report(), &WrittenFiles { mesh, table: None }, None, Style::PLAIN);
         for part in [
             "4PTI TRYPSIN INHIBITOR",
             "454 of 514",

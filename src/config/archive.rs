@@ -24,13 +24,13 @@ pub struct ArchiveConfig {
     #[schemars(schema_with = "Templates::schema")]
     pub url: Option<Templates>,
     /// Proxy for all requests to the remote archive. Default `none`. Environment variables such as `HTTPS_PROXY` are
-    /// ignored, because the check for private addresses does not apply behind a proxy: a proxy is set here deliberately
-    /// or not at all.
+    /// ignored: the check for private addresses does not apply behind a proxy, so a proxy must be set here
+    /// explicitly.
     #[serde(deserialize_with = "proxy")]
     #[schemars(regex(pattern = "^(none|https?://.+)$"))]
     pub proxy: Option<String>,
-    /// Allows host names that resolve to private, loopback and link-local addresses. Default false: DNS records of
-    /// others must not lead to the operator's machines. IP addresses in `url` are always allowed.
+    /// Allows host names that resolve to private, loopback and link-local addresses. Default false: DNS records that
+    /// others control must not give access to the operator's machines. IP addresses in `url` are always allowed.
     pub allow_private: bool,
     /// Time for a connection, name resolution and TLS included, ms. Default 5,000.
     pub connect_timeout_ms: u64,

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use super::Source;
+use super::ConfigSource;
 
 /// Errors of loading a configuration.
 #[derive(Debug, Error)]
@@ -33,15 +33,15 @@ pub enum ConfigError {
         /// Most similar known key, if one is similar.
         nearest: Option<String>,
         /// Layer that set the key.
-        source_layer: Source,
+        source_layer: ConfigSource,
     },
     /// A secret is set directly and by its file.
     #[error("`{}` ({}) and `{}` ({}) exclude each other: set one of them", one.0, one.1, other.0, other.1)]
     Both {
         /// Key and layer of the secret.
-        one: (String, Source),
+        one: (String, ConfigSource),
         /// Key and layer of its file.
-        other: (String, Source),
+        other: (String, ConfigSource),
     },
     /// The file of a secret cannot be read.
     #[error("{source_layer}: `{key}`: cannot read {}: {reason}", path.display())]
@@ -53,7 +53,7 @@ pub enum ConfigError {
         /// Cause.
         reason: String,
         /// Layer that set the key.
-        source_layer: Source,
+        source_layer: ConfigSource,
     },
     /// A value has the wrong type or is out of range.
     #[error("{source_layer}: `{key}` is {value}; expected {expected}")]
@@ -65,6 +65,6 @@ pub enum ConfigError {
         /// Expected form.
         expected: String,
         /// Layer that set the key.
-        source_layer: Source,
+        source_layer: ConfigSource,
     },
 }

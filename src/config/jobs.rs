@@ -13,8 +13,8 @@ pub struct JobsConfig {
     /// Number of queued jobs. Default 64: at a typical 0.1 s per job on two workers the last one waits three seconds; a
     /// longer queue would only delay refusals. Further requests get a 503 with an estimated `Retry-After`.
     pub queue: usize,
-    /// Number of concurrent requests for meshes, from the submission of the job to the last byte of the answer. Default
-    /// 256: each one holds a thread while its mesh is written, and threads for reading files must be left.
+    /// Number of concurrent requests for meshes, from the submission of the job to the last byte of the response.
+    /// Default 256: each one holds a thread while its mesh is written, and some threads must stay free to read files.
     pub deliveries: usize,
     /// Time from acceptance to the finished mesh, ms, time in the queue included; also the longest wait for `Prefer:
     /// wait=`. Default 60,000: proxies commonly cut an exchange after a minute.
@@ -32,7 +32,8 @@ pub struct JobsConfig {
     /// store takes. After that the mesh is computed again, for at most `attempts` attempts.
     pub save_retry_ms: u64,
     /// Number of results of synchronous requests that are stored concurrently. Default 4: more would compete with
-    /// meshing; a result that is not stored is computed again for the next request.
+    /// meshing, as would more than one while jobs wait for a worker; a result that is not stored is computed again for
+    /// the next request.
     pub concurrent_saves: usize,
     /// Number of asynchronous jobs on record, open and ended. Default 100,000: the records take 400 MB of disk in
     /// blocks of 4 KiB, and listing them at the start takes seconds. At the limit, the record of the ended job that was

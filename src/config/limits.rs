@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::picture::PictureLimits;
 use crate::pipeline::JobLimits;
 use crate::structure::ReadLimits;
+use crate::structure::read::DISTANCES_PER_PAIR;
 use crate::surface::SurfaceLimits;
 
 /// Limits of a request and of all requests together.
@@ -41,9 +42,10 @@ pub struct LimitsConfig {
     /// Number of grid points in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; 4 GiB as 32-bit
     /// numbers.
     pub grid_points: u64,
-    /// Number of pairs of an atom and a brick (8³ grid points) that its support reaches. Default 268,435,456: 128 atoms
+    /// Number of pairs of an atom and a brick (8³ grid points) that its support reaches. Default 134,217,728: 64 atoms
     /// per brick of `grid_points`, several times the number in ordinary structures. Limits the computing time to about
-    /// 16 s of one core, and the memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648.
+    /// 25 s of one core, and the memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648. Also limits
+    /// the search for overlapping spheres, and `within` to 64 tested distances for each pair.
     pub candidate_pairs: u64,
     /// Size of a mesh in memory (24 bytes a vertex, 12 a triangle), bytes. Default 2 GiB: 85 million triangles.
     pub mesh_bytes: u64,
@@ -51,8 +53,9 @@ pub struct LimitsConfig {
     /// text formats are larger.
     pub output_bytes: u64,
     /// Memory of all requests together, bytes: uploads, jobs from decompression to the finished mesh, responses, and
-    /// buffers of connections. Default 8 GiB. Memory is counted before it is allocated. A request or job that would
-    /// exceed the limit is rejected and may be repeated later. Responses may exceed it by their next chunk.
+    /// buffers of connections. Default 8 GiB, or half of the memory of the machine or control group if that is less.
+    /// Memory is counted before it is allocated. A request or job that would exceed the limit is rejected and may be
+    /// repeated later. Responses may exceed it by their next chunk.
     pub memory_bytes: u64,
     /// Part of `memory_bytes` for structures that are kept after they were read, bytes. Default 512 MiB: 8 million
     /// atoms. Further requests for the same file do not read it again. The least recently used structures are evicted,
@@ -77,7 +80,7 @@ impl Default for LimitsConfig {
             mesh_parts: 1000,
             labels: 1_000_000,
             grid_points: 1 << 30,
-            candidate_pairs: 1 << 28,
+            candidate_pairs: 1 << 27,
             mesh_bytes: 2 << 30,
             output_bytes: 3 << 30,
             memory_bytes: 8 << 30,
@@ -98,9 +101,10 @@ impl LimitsConfig {
                 max_duplicates: self.duplicate_atoms,
                 max_copies: self.assembly_copies,
                 max_parts: self.mesh_parts,
+                max_distances: self.candidate_pairs.saturating_mul(DISTANCES_PER_PAIR),
             },
             surface: SurfaceLimits {
-                max_samples: self.grid_points,
+                max_grid_points: self.grid_points,
                 max_mesh_bytes: self.mesh_bytes,
                 max_candidates: self.candidate_pairs,
             },

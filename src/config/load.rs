@@ -9,7 +9,7 @@ use serde_json::Value;
 
 use super::secrets;
 use super::store::HIDDEN;
-use super::{Config, ConfigError};
+use super::{AvailableMemory, Config, ConfigError, OwnedMemory};
 use crate::pipeline::integer::{parse_integer, whole_number};
 use crate::pipeline::nearest::nearest;
 
@@ -19,9 +19,16 @@ const PREFIX: &str = "MOLMESH__";
 /// Layer that set a value.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(tag = "source", rename_all = "lowercase")]
-pub enum Source {
+pub enum ConfigSource {
     /// No layer set the value.
     Default,
+    /// No layer set the value, and the default exceeds half of the memory.
+    Memory {
+        /// Memory, bytes.
+        bytes: u64,
+        /// Name of its owner, such as `this machine`.
+        owner: &'static str,
+    },
     /// TOML file.
     File {
         /// Path of the file.
@@ -37,10 +44,11 @@ pub enum Source {
     Flag,
 }
 
-impl fmt::Display for Source {
+impl fmt::Display for ConfigSource {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Default => f.write_str("default"),
+            Self::Memory { bytes, owner } => write!(f, "half of the {} MiB of {owner}", bytes >> 20),
             Self::File { path } => write!(f, "{}", path.display()),
             Self::Environment { variable } => f.write_str(variable),
             Self::Flag => f.write_str("command line"),
@@ -55,29 +63,44 @@ pub struct Loaded {
     pub config: Config,
     /// Warnings for the operator, one sentence each.
     pub warnings: Vec<String>,
-    sources: BTreeMap<String, Source>,
+    sources: BTreeMap<String, ConfigSource>,
 }
 
 impl Loaded {
     /// Returns the source of the value of `section.key`.
     #[must_use]
-    pub fn source(&self, key: &str) -> Source {
-        self.sources.get(key).cloned().unwrap_or(Source::Default)
+    pub fn source(&self, key: &str) -> ConfigSource {
+        self.sources.get(key).cloned().unwrap_or(ConfigSource::Default)
     }
 
-    /// Returns all keys that a layer set, with their sources.
-    pub fn sources(&self) -> impl Iterator<Item = (&str, &Source)> {
+    /// Returns all keys that do not have their defaults, with their sources.
+    pub fn sources(&self) -> impl Iterator<Item = (&str, &ConfigSource)> {
         self.sources.iter().map(|(key, source)| (key.as_str(), source))
+    }
+
+    /// Reduces `limits.memory_bytes` to half of `memory` if no layer sets it. The other half is for the caches of the
+    /// store, the files that the system keeps in memory, threads, and memory that the allocator has not returned yet.
+    fn fit_memory(&mut self, memory: AvailableMemory) {
+        const KEY: &str = "limits.memory_bytes";
+        let Some(OwnedMemory { bytes, owner }) = memory.least() else { return };
+        let half = (bytes / 2) >> 20 << 20;
+        if self.source(KEY) == ConfigSource::Default && (1..self.config.limits.memory_bytes).contains(&half) {
+            self.config.limits.memory_bytes = half;
+            self.sources.insert(KEY.to_owned(), ConfigSource::Memory { bytes, owner });
+        }
     }
 }
 
-/// Loads the configuration of this process: `file`, then the environment, then `flags`.
+/// Loads the configuration of this process: `file`, then the environment, then `flags`. Reduces `limits.memory_bytes`
+/// to half of the memory of the machine or control group if the default is larger.
 ///
 /// # Errors
 /// Returns the errors of [`load`].
 pub fn load_process(file: Option<&Path>, flags: &[(String, String)]) -> Result<Loaded, ConfigError> {
     let env = std::env::vars_os().filter_map(|(k, v)| Some((k.into_string().ok()?, v.to_string_lossy().into_owned())));
-    load(file, env, flags)
+    let mut loaded = load(file, env, flags)?;
+    loaded.fit_memory(AvailableMemory::detect());
+    Ok(loaded)
 }
 
 /// Loads a configuration: defaults, then `file`, then the variables of `env` that begin with `MOLMESH__`, then
@@ -98,7 +121,7 @@ pub fn load(
         let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Read { path: path.to_owned(), error })?;
         let table: Value = toml::from_str(&text)
             .map_err(|e| ConfigError::Syntax { path: path.to_owned(), reason: tree.syntax(&text, &e) })?;
-        let source = Source::File { path: path.to_owned() };
+        let source = ConfigSource::File { path: path.to_owned() };
         for (section, entries) in table.as_object().into_iter().flatten() {
             let Some(entries) = entries.as_object() else {
                 return Err(tree.unknown(section, source));
@@ -112,10 +135,10 @@ pub fn load(
     env.sort();
     for (name, value) in env {
         let key = name[PREFIX.len()..].to_ascii_lowercase().replace("__", ".");
-        tree.set(&key, &Value::String(value), &Source::Environment { variable: name })?;
+        tree.set(&key, &Value::String(value), &ConfigSource::Environment { variable: name })?;
     }
     for (key, value) in flags {
-        tree.set(key, &Value::String(value.clone()), &Source::Flag)?;
+        tree.set(key, &Value::String(value.clone()), &ConfigSource::Flag)?;
     }
     let mut warnings = tree.read_secrets()?;
     warnings.extend(others.iter().filter_map(|(name, _)| tree.misspelt(name)));
@@ -127,7 +150,7 @@ struct Tree {
     defaults: Value,
     values: Value,
     config: Config,
-    sources: BTreeMap<String, Source>,
+    sources: BTreeMap<String, ConfigSource>,
 }
 
 impl Tree {
@@ -166,7 +189,7 @@ impl Tree {
         keys
     }
 
-    fn unknown(&self, key: &str, source_layer: Source) -> ConfigError {
+    fn unknown(&self, key: &str, source_layer: ConfigSource) -> ConfigError {
         let known = self.keys();
         // A key in the wrong section or in none: suggest the key of the same name.
         let last = key.rsplit('.').next().unwrap_or(key);
@@ -176,7 +199,7 @@ impl Tree {
     }
 
     /// Sets one key and validates the whole configuration, so that an error names the layer that set the value.
-    fn set(&mut self, key: &str, value: &Value, source: &Source) -> Result<(), ConfigError> {
+    fn set(&mut self, key: &str, value: &Value, source: &ConfigSource) -> Result<(), ConfigError> {
         let pointer = format!("/{}", key.replace('.', "/"));
         let default = self.defaults.pointer(&pointer).filter(|d| !d.is_object());
         let Some(default) = default else { return Err(self.unknown(key, source.clone())) };
@@ -231,7 +254,7 @@ impl Tree {
             let at = |key: &str| format!("/{}", key.replace('.', "/"));
             let path = self.values.pointer(&at(&file_key)).and_then(Value::as_str);
             let Some(path) = path.map(PathBuf::from) else { continue };
-            let source = |key: &str| self.sources.get(key).cloned().unwrap_or(Source::Default);
+            let source = |key: &str| self.sources.get(key).cloned().unwrap_or(ConfigSource::Default);
             if self.values.pointer(&at(key)).is_some_and(|value| !value.is_null()) {
                 let [one, other] = [key, &file_key].map(|key| (key.to_owned(), source(key)));
                 return Err(ConfigError::Both { one, other });
@@ -251,7 +274,7 @@ impl Tree {
                 key: key.to_owned(),
                 value: HIDDEN.to_owned(),
                 expected: e.to_string(),
-                source_layer: Source::File { path },
+                source_layer: ConfigSource::File { path },
             })?;
         }
         Ok(warnings)
@@ -266,5 +289,29 @@ pub(super) fn minimum(key: &str) -> u64 {
         // Keeps no structures, or no readback buffers.
         "limits.structure_cache_bytes" | "devices.readback_bytes" => 0,
         _ => 1,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn requests_use_half_of_a_small_memory_unless_configured() {
+        let fitted = |limit: Option<u64>, flags: &[(String, String)]| {
+            let mut loaded = load(None, [], flags).unwrap();
+            loaded.fit_memory(AvailableMemory { machine: Some(64 << 30), limit });
+            (loaded.config.limits.memory_bytes, loaded.source("limits.memory_bytes"))
+        };
+        let owner = "this control group";
+        let small = ConfigSource::Memory { bytes: 2 << 30, owner };
+        assert_eq!(fitted(Some(2 << 30), &[]), (1 << 30, small.clone()));
+        assert_eq!(small.to_string(), "half of the 2048 MiB of this control group");
+        assert_eq!(fitted(Some((3 << 20) + 5), &[]).0, 1 << 20, "whole MiB");
+        for large in [None, Some(16 << 30), Some(1)] {
+            assert_eq!(fitted(large, &[]), (8 << 30, ConfigSource::Default), "{large:?}");
+        }
+        let flags = [("limits.memory_bytes".to_owned(), "8GiB".to_owned())];
+        assert_eq!(fitted(Some(2 << 30), &flags), (8 << 30, ConfigSource::Flag));
     }
 }

@@ -2,23 +2,23 @@
 
 use serde_json::{Map, Value, json};
 
-use super::load::{Loaded, Source};
+use super::load::{ConfigSource, Loaded};
 use super::secrets::{SECRETS, file_key, is_hidden};
 
 /// Printed key.
-struct Row {
+struct ConfigLine {
     key: String,
     /// Value; `None` for a secret.
     value: Option<Value>,
     /// Source of the value. For a secret from a file, source of the key that names the file.
-    source: Source,
+    source: ConfigSource,
     /// True if the value is a secret from the file that the `_file` key names.
     is_from_file: bool,
 }
 
 impl Loaded {
     /// Returns the sections with their rows.
-    fn rows(&self) -> Vec<(String, Vec<Row>)> {
+    fn rows(&self) -> Vec<(String, Vec<ConfigLine>)> {
         let tree = serde_json::to_value(&self.config).unwrap_or_default();
         let section = |(section, keys): (&String, &Value)| {
             let row = |(key, value): (&String, &Value)| self.row(section, key, value);
@@ -27,29 +27,29 @@ impl Loaded {
         tree.as_object().into_iter().flatten().filter_map(section).collect()
     }
 
-    fn row(&self, section: &str, key: &str, value: &Value) -> Row {
+    fn row(&self, section: &str, key: &str, value: &Value) -> ConfigLine {
         let path = format!("{section}.{key}");
         let file_source = self.source(&file_key(&path));
-        let is_from_file = SECRETS.contains(&path.as_str()) && !value.is_null() && file_source != Source::Default;
+        let is_from_file = SECRETS.contains(&path.as_str()) && !value.is_null() && file_source != ConfigSource::Default;
         let source = if is_from_file { file_source } else { self.source(&path) };
         let value = match value {
             Value::Null => Some("none".into()),
             Value::String(text) if is_hidden(&path, text) => None,
             other => Some(other.clone()),
         };
-        Row { key: key.to_owned(), value, source, is_from_file }
+        ConfigLine { key: key.to_owned(), value, source, is_from_file }
     }
 
     /// Returns the effective configuration as a TOML file that loads to the same configuration, except for secrets. A
     /// comment after each value names its source.
     #[must_use]
     pub fn to_toml(&self) -> String {
-        let row = |Row { key, value, source, is_from_file }: &Row| match value {
+        let row = |ConfigLine { key, value, source, is_from_file }: &ConfigLine| match value {
             Some(value) => format!("{key} = {} # {}\n", toml(value), one_line(source)),
             None if *is_from_file => format!("# {key} is set and not shown # the file that {} names\n", file_key(key)),
             None => format!("# {key} is set and not shown # {}\n", one_line(source)),
         };
-        let section = |(section, rows): (String, Vec<Row>)| {
+        let section = |(section, rows): (String, Vec<ConfigLine>)| {
             let rows: String = rows.iter().map(row).collect();
             format!("[{section}]\n{rows}")
         };
@@ -63,7 +63,7 @@ impl Loaded {
         let (mut config, mut sources) = (Map::new(), Map::new());
         for (section, rows) in self.rows() {
             let (mut values, mut from) = (Map::new(), Map::new());
-            for Row { key, value, source, is_from_file } in rows {
+            for ConfigLine { key, value, source, is_from_file } in rows {
                 let mut of = serde_json::to_value(source).unwrap_or_default();
                 if value.is_none() {
                     of["hidden"] = true.into();
@@ -82,7 +82,7 @@ impl Loaded {
 }
 
 /// Formats a source for a comment, without control characters, which would end it.
-fn one_line(source: &Source) -> String {
+fn one_line(source: &ConfigSource) -> String {
     source.to_string().replace(|c: char| c.is_control(), " ")
 }
 

@@ -16,13 +16,13 @@ pub struct ServerConfig {
     /// free port.
     pub listen: SocketAddr,
     /// Host names by which clients reach the service, without ports, besides the names of the loopback addresses.
-    /// Default `none`: a service that listens on a loopback address answers no other name with anything but a 421, so
-    /// that a web page cannot reach it through a name of its own. With a list, this applies to every address.
+    /// Default `none`: a service that listens on a loopback address answers requests for any other name with a 421, so
+    /// that a web page cannot reach it through its own host name. With a list, this applies to every address.
     #[serde(with = "list")]
     #[schemars(schema_with = "Hosts::schema")]
     pub hosts: Option<Hosts>,
-    /// Address of `/metrics`. Default `none`: no port is free on every machine. A separate address, so that a proxy
-    /// cannot expose the metrics by accident.
+    /// Address of `/metrics`. Default `none`: no port is free on every machine. The address is separate, so that a
+    /// proxy cannot expose the metrics by accident.
     pub metrics_listen: Option<SocketAddr>,
     /// Folder of all stored data, and by default of the archive. Default `molmesh-data` in the working folder, which is
     /// usually writable.
@@ -30,11 +30,12 @@ pub struct ServerConfig {
     /// Number of open connections. Default 1,024. Further ones get a 503 and are closed. The hard limit of open files
     /// should be a few hundred higher; `molmesh doctor` compares them.
     pub connections: usize,
-    /// Fraction of a pool that one client may hold, from 0 to 1, at least one place: of `server.connections` by the
-    /// address of the peer, except for `trusted_proxies`; of `jobs.deliveries` and `archive.concurrent` by key, or by
-    /// address without a key. Default 0.25: one client cannot occupy the service, and three others find places. With 1
-    /// a client may hold all places. Connections and deliveries beyond the share get a 503, fetches wait for
-    /// half of `archive.timeout_ms` first.
+    /// Share of one client in each of four limits, as a fraction from 0 to 1. A share has at least one slot. In
+    /// `server.connections`, clients are told apart by the address of the peer; `trusted_proxies` have no share. In
+    /// `jobs.deliveries`, `archive.concurrent` and the threads that read structures outside of jobs (`jobs.workers`),
+    /// they are told apart by key, or by address without a key. Default 0.25: one client cannot occupy the service, and
+    /// three others find free slots. With 1 a client may use all slots. Connections and deliveries beyond the share get
+    /// a 503. Fetches wait for half of `archive.timeout_ms` first, and readers for `jobs.deadline_ms`.
     #[serde(deserialize_with = "telemetry::ratio")]
     #[schemars(range(min = 0, max = 1))]
     pub client_share: f64,
@@ -51,7 +52,7 @@ pub struct ServerConfig {
     /// per second, so that a connection of 8 KiB/s carries a dozen concurrent bodies.
     pub write_bytes: u64,
     /// Size of the head of a request, that is its request line and headers, bytes, at least 8 KiB. Default 64 KiB:
-    /// browsers and proxies send a few. Larger heads get a 431.
+    /// browsers and proxies send a few KiB. Larger heads get a 431.
     pub head_bytes: u32,
     /// Number of concurrent requests on one HTTP/2 connection. Default 64: a page sends a dozen; clients can open
     /// further connections, which are counted.

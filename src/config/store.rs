@@ -37,10 +37,10 @@ pub struct StoreConfig {
     pub timeout_ms: u64,
     /// Minimum time between health checks of the store, ms; `/readyz` writes, reads and removes a small object. Default
     /// 5,000: orchestrators send a request every few seconds.
-    pub probe_ms: u64,
+    pub check_interval_ms: u64,
     /// Time after which a health check of the store fails, ms. Default 10,000: a busy disk takes seconds, and load must
     /// not make the service unready.
-    pub probe_timeout_ms: u64,
+    pub check_timeout_ms: u64,
     /// Time between removals of expired objects, ms. Default 60,000: times to live are hours.
     pub sweep_ms: u64,
     /// Capacity for results and inputs together, bytes. Default 10 GiB: thousands of meshes. The least recently used
@@ -72,8 +72,8 @@ impl Default for StoreConfig {
             secret_access_key: None,
             secret_access_key_file: None,
             timeout_ms: 30_000,
-            probe_ms: 5000,
-            probe_timeout_ms: 10_000,
+            check_interval_ms: 5000,
+            check_timeout_ms: 10_000,
             sweep_ms: 60_000,
             max_bytes: 10 << 30,
             result_ttl_ms: 86_400_000,

@@ -19,8 +19,8 @@ pub struct TelemetryConfig {
     #[serde(deserialize_with = "endpoint")]
     #[schemars(regex(pattern = "^(none|https?://[^?#@]+)$"))]
     pub endpoint: Option<String>,
-    /// Fraction of new traces that are sampled, from 0 to 1. Default 1. A request with `traceparent` is sampled as its
-    /// sampled flag says.
+    /// Fraction of new traces that are sampled, from 0 to 1. Default 1. The sampled flag of
+    /// `traceparent` decides for requests that have one.
     #[serde(deserialize_with = "ratio")]
     #[schemars(range(min = 0, max = 1))]
     pub sample_ratio: f64,

@@ -4,6 +4,9 @@
 use std::io::{self, Write};
 use std::ops::Range;
 
+use super::Units;
+use crate::surface::Mesh;
+
 /// Bytes converted per write call: fits the second-level cache and makes the cost of a call negligible.
 pub(super) const BLOCK_BYTES: usize = 512 << 10;
 
@@ -47,14 +50,19 @@ pub(super) fn convert_words<const N: usize, T: Copy>(
 
 /// Transformation of a vertex into the coordinates of the structure file.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct Placement {
     /// Centre of the mesh, Å.
-    pub(super) centre: [f64; 3],
+    centre: [f64; 3],
     /// Scale factor: file units per Å.
-    pub(super) scale: f64,
+    scale: f64,
 }
 
-impl Place {
+impl Placement {
+    /// Returns the transformation of vertices of `mesh` to coordinates in `units`.
+    pub(super) fn new(mesh: &Mesh, units: Units) -> Self {
+        Self { centre: mesh.centre, scale: units.scale() }
+    }
+
     /// Returns a vertex in the structure file's coordinates and the file's units: computed in double precision and
     /// rounded once.
     #[inline]

@@ -1,7 +1,7 @@
-//! Checks a mesh before it is written: rejects meshes that no format can hold, and computes the bounds.
+//! Check of a mesh before it is written: rejects meshes that the format cannot hold, and computes the bounds.
 //!
-//! The columns are read once, in chunks on rayon's pool: the mesh of a large structure has hundreds of megabytes, and a
-//! file cannot be withdrawn halfway.
+//! The whole mesh is checked first, because a file that is partly sent cannot be withdrawn. The columns are read once,
+//! in parallel: the mesh of a large structure has hundreds of megabytes.
 
 use rayon::prelude::*;
 
@@ -20,15 +20,18 @@ fn needs_indices(format: Format, n_vertices: usize) -> bool {
     match format {
         Format::Stl => true,
         Format::Glb | Format::Gltf => u16::try_from(n_vertices).is_ok(),
-        Format::Ply | Format::PlyText | Format::Obj | Format::Png => false,
+        Format::Ply | Format::PlyText | Format::Obj | Format::Vtp | Format::Png => false,
     }
 }
+
+/// Lowest and highest position relative to the mesh's centre, per axis, Å.
+pub(super) type Bounds = [[f32; 3]; 2];
 
 /// Properties of a valid mesh that the formats need.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Summary {
-    /// Lowest and highest relative position per axis, Å; zeros without vertices.
-    pub(super) bounds: [[f32; 3]; 2],
+    /// Bounds; zeros without vertices.
+    pub(super) bounds: Bounds,
     /// Largest atom index, if the mesh has atom indices.
     pub(super) max_atom: Option<u32>,
     /// True if a colour is not opaque.
@@ -36,8 +39,8 @@ pub(super) struct Summary {
 }
 
 /// Checks that all columns have the same length, and that the values that the writer of `format` relies on are finite
-/// and in range. Columns that are copied unchanged are not read.
-pub(super) fn check(mesh: &Mesh, format: Format) -> Result<Summary, FormatError> {
+/// and in range. Columns that are copied unchanged are not read, nor are positions whose `bounds` are known.
+pub(super) fn check(mesh: &Mesh, format: Format, bounds: Option<Bounds>) -> Result<Summary, FormatError> {
     let n = mesh.n_vertices();
     let n_normals = mesh.quantized.as_ref().map_or(mesh.normals.len(), |quantized| quantized.normals.len());
     let lengths = [
@@ -53,13 +56,14 @@ pub(super) fn check(mesh: &Mesh, format: Format) -> Result<Summary, FormatError>
     if let Some((axis, &value)) = mesh.centre.iter().enumerate().find(|(_, v)| !v.is_finite()) {
         return Err(FormatError::NotFinite { column: "centre", row: axis as u64, value });
     }
-    let bounds = match &mesh.quantized {
-        // A coordinate out of range or not finite lies beyond the step, which the encoder rejects.
-        Some(_) => mesh.bounds().map(|row| row.map(|v| v + 0.0)),
-        None => extent("position", &mesh.positions[..])?.unwrap_or_default(),
-    };
+    if bounds.is_none() {
+        // A quantized coordinate out of range or not finite lies beyond the step, which the encoder rejects.
+        check_finite("position", &mesh.positions[..])?;
+    }
+    // Adding zero turns −0 into 0. JSON distinguishes them.
+    let bounds = bounds.unwrap_or_else(|| mesh.bounds()).map(|row| row.map(|v| v + 0.0));
     if matches!(format, Format::PlyText | Format::Obj) {
-        // The writer relies on a bounded length of lines.
+        // The writer relies on a maximum length of lines.
         check_normals(&mesh.normals[..])?;
     }
     if needs_indices(format, n) {
@@ -94,73 +98,21 @@ fn check_parts(mesh: &Mesh, n_vertices: usize) -> Result<(), FormatError> {
 
 /// Rejects normals that are longer than unit vectors.
 fn check_normals(normals: &[[f32; 3]]) -> Result<(), FormatError> {
-    let longest = extent("normal", normals)?.unwrap_or_default();
-    let beyond = longest.as_flattened().iter().find(|v| v.abs() > MAX_NORMAL);
+    check_finite("normal", normals)?;
+    let beyond = normals.iter().flatten().find(|v| v.abs() > MAX_NORMAL);
     beyond.map_or(Ok(()), |&value| Err(FormatError::NotUnit { value }))
 }
 
-/// Returns the lowest and highest value per axis; `None` without rows. Rejects numbers that are not finite.
-fn extent(column: &'static str, rows: &[[f32; 3]]) -> Result<Option<[[f32; 3]; 2]>, FormatError> {
-    let join = |a: Extent, b: Extent| a.join(&b);
-    let all = if rows.len() <= CHUNK_ROWS {
-        Extent::of(rows)
-    } else {
-        rows.par_chunks(CHUNK_ROWS).map(Extent::of).reduce(Extent::default, join)
+/// Rejects numbers that are not finite.
+fn check_finite(column: &'static str, rows: &[[f32; 3]]) -> Result<(), FormatError> {
+    let bad = |row: &[f32; 3]| row.iter().any(|v| !v.is_finite());
+    let found = match rows.len() {
+        0..=CHUNK_ROWS => rows.iter().position(bad),
+        _ => rows.par_iter().with_min_len(CHUNK_ROWS).position_first(bad),
     };
-    if all.poison.iter().any(|p| p.is_nan()) {
-        let found = rows.iter().enumerate().find_map(|(i, r)| r.iter().find(|v| !v.is_finite()).map(|&v| (i, v)));
-        let (row, value) = found.unwrap_or((0, f32::NAN));
-        return Err(FormatError::NotFinite { column, row: row as u64, value: f64::from(value) });
-    }
-    // Adding zero turns −0 into 0; JSON would distinguish them.
-    Ok((!rows.is_empty()).then(|| [all.low.map(|v| v + 0.0), all.high.map(|v| v + 0.0)]))
-}
-
-/// Running extremes of three axes. `poison` is NaN as soon as one value is not finite, because 0 · ∞ and 0 · NaN are
-/// NaN.
-#[derive(Debug, Clone, Copy)]
-struct Extent {
-    low: [f32; 3],
-    high: [f32; 3],
-    poison: [f32; 3],
-}
-
-impl Default for Extent {
-    fn default() -> Self {
-        Self { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], poison: [0.0; 3] }
-    }
-}
-
-impl Extent {
-    /// Reads four rows at a time: twelve lanes are three vectors, with each axis always in the same lanes.
-    fn of(rows: &[[f32; 3]]) -> Self {
-        let (quads, rest) = rows.as_chunks::<4>();
-        let (mut low, mut high, mut poison) = ([f32::INFINITY; 12], [f32::NEG_INFINITY; 12], [0.0_f32; 12]);
-        for quad in quads {
-            let quad: &[f32; 12] = bytemuck::must_cast_ref(quad);
-            for k in 0..12 {
-                let v = quad[k];
-                low[k] = if v < low[k] { v } else { low[k] };
-                high[k] = if v > high[k] { v } else { high[k] };
-                poison[k] += v * 0.0;
-            }
-        }
-        let lanes = (0..4).map(|q| Self {
-            low: std::array::from_fn(|k| low[3 * q + k]),
-            high: std::array::from_fn(|k| high[3 * q + k]),
-            poison: std::array::from_fn(|k| poison[3 * q + k]),
-        });
-        let rest = rest.iter().map(|&r| Self { low: r, high: r, poison: r.map(|v| v * 0.0) });
-        lanes.chain(rest).fold(Self::default(), |a, b| a.join(&b))
-    }
-
-    fn join(&self, other: &Self) -> Self {
-        Self {
-            low: std::array::from_fn(|k| if other.low[k] < self.low[k] { other.low[k] } else { self.low[k] }),
-            high: std::array::from_fn(|k| if other.high[k] > self.high[k] { other.high[k] } else { self.high[k] }),
-            poison: std::array::from_fn(|k| self.poison[k] + other.poison[k]),
-        }
-    }
+    let Some(row) = found else { return Ok(()) };
+    let value = rows[row].iter().find(|v| !v.is_finite()).map_or(f64::NAN, |&v| f64::from(v));
+    Err(FormatError::NotFinite { column, row: row as u64, value })
 }
 
 /// Largest value; `None` without values.
@@ -181,27 +133,9 @@ fn in_range(triangles: &[[u32; 3]], n_vertices: usize) -> Result<(), FormatError
 }
 
 #[cfg(test)]
-#[expect(clippy::cast_precision_loss, reason = "small integers are exact")]
 mod tests {
     use super::*;
     use crate::formats::Step;
-
-    /// Rows with known extremes: a ramp with one low and one high outlier.
-    fn rows(n: usize) -> Vec<[f32; 3]> {
-        let mut rows: Vec<[f32; 3]> = (0..n).map(|i| [i as f32, -(i as f32), 0.5]).collect();
-        rows[n / 3][2] = -7.0;
-        rows[2 * n / 3][2] = 9.0;
-        rows
-    }
-
-    #[test]
-    fn extent_is_exact_for_every_remainder_and_beyond_one_chunk() {
-        for n in [3, 4, 5, 6, 7, 8, 101, CHUNK_ROWS, CHUNK_ROWS + 1, 3 * CHUNK_ROWS + 2] {
-            let high = (n - 1) as f32;
-            assert_eq!(extent("position", &rows(n)), Ok(Some([[0.0, -high, -7.0], [high, 0.0, 9.0]])), "{n}");
-        }
-        assert_eq!(extent("position", &[]), Ok(None));
-    }
 
     #[test]
     fn non_finite_numbers_are_found_in_any_row() {
@@ -210,7 +144,7 @@ mod tests {
                 for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
                     let mut rows = vec![[1.0; 3]; n];
                     rows[row][row % 3] = value;
-                    match extent("normal", &rows) {
+                    match check_finite("normal", &rows) {
                         Err(FormatError::NotFinite { column: "normal", row: found, .. }) => {
                             assert_eq!(found, row as u64);
                         }
@@ -223,8 +157,26 @@ mod tests {
 
     #[test]
     fn bounds_have_no_negative_zero() {
-        let found = extent("position", &[[-0.0; 3]]).unwrap().unwrap();
-        assert!(found.as_flattened().iter().all(|v| v.is_sign_positive()));
+        let mesh = Mesh { positions: vec![[-0.0; 3]].into(), normals: vec![[0.0, 0.0, 1.0]].into(), ..Mesh::default() };
+        for known in [None, Some([[-0.0; 3]; 2])] {
+            let found = check(&mesh, Format::Glb, known).unwrap().bounds;
+            assert!(found.as_flattened().iter().all(|v| v.is_sign_positive()));
+        }
+    }
+
+    #[test]
+    fn positions_with_known_bounds_are_not_read() {
+        let mesh = Mesh {
+            positions: vec![[1.0, f32::NAN, 3.0]].into(),
+            normals: vec![[0.0, 0.0, 1.0]].into(),
+            ..Mesh::default()
+        };
+        let bounds = [[-1.0; 3], [2.0; 3]];
+        for format in [Format::Glb, Format::Obj] {
+            assert_eq!(check(&mesh, format, Some(bounds)).map(|summary| summary.bounds), Ok(bounds));
+            // Control: without bounds, the number is found.
+            assert!(matches!(check(&mesh, format, None), Err(FormatError::NotFinite { column: "position", .. })));
+        }
     }
 
     #[test]
@@ -241,7 +193,7 @@ mod tests {
     fn columns_of_different_lengths_are_rejected() {
         let whole =
             Mesh { positions: vec![[0.0; 3]; 2].into(), normals: vec![[0.0, 0.0, 1.0]; 2].into(), ..Mesh::default() };
-        assert!(check(&whole, Format::Glb).is_ok());
+        assert!(check(&whole, Format::Glb, None).is_ok());
         let broken = [
             ("normals", Mesh { normals: vec![[0.0; 3]].into(), ..whole.clone() }),
             ("atom_ids", Mesh { atom_ids: Some(vec![1].into()), ..whole.clone() }),
@@ -250,23 +202,29 @@ mod tests {
         for (name, mesh) in broken {
             assert!(
                 matches!(
-                    check(&mesh, Format::Glb),
+                    check(&mesh, Format::Glb, None),
                     Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name
                 ),
                 "{name}"
             );
         }
         let long = Mesh { normals: vec![[0.0, 0.0, 1.5]; 2].into(), ..whole.clone() };
-        assert_eq!(check(&long, Format::Obj), Err(FormatError::NotUnit { value: 1.5 }));
-        assert!(check(&long, Format::Glb).is_ok());
+        assert_eq!(check(&long, Format::Obj, None), Err(FormatError::NotUnit { value: 1.5 }));
+        assert!(check(&long, Format::Glb, None).is_ok());
         let mut rounded = whole.clone();
         rounded.quantize(Step::covering(1.0));
-        assert!(check(&rounded, Format::Glb).is_ok());
+        assert!(check(&rounded, Format::Glb, None).is_ok());
         if let Some(quantized) = &mut rounded.quantized {
             quantized.normals.edit().pop();
-            assert!(matches!(check(&rounded, Format::Glb), Err(FormatError::ColumnLength { column: "normals", .. })));
+            assert!(matches!(
+                check(&rounded, Format::Glb, None),
+                Err(FormatError::ColumnLength { column: "normals", .. })
+            ));
         }
         let adrift = Mesh { centre: [0.0, f64::NAN, 0.0], ..whole };
-        assert!(matches!(check(&adrift, Format::Ply), Err(FormatError::NotFinite { column: "centre", row: 1, .. })));
+        assert!(matches!(
+            check(&adrift, Format::Ply, None),
+            Err(FormatError::NotFinite { column: "centre", row: 1, .. })
+        ));
     }
 }

@@ -5,7 +5,7 @@ use thiserror::Error;
 /// Error of a mesh that is invalid or that the format cannot hold.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum FormatError {
-    /// A column of the mesh has another length than its positions.
+    /// A column of the mesh and its positions differ in length.
     #[error("the mesh has {vertices} positions but {len} {column}")]
     ColumnLength {
         /// `normals`, `atom_ids` or `colors`.
@@ -25,7 +25,8 @@ pub enum FormatError {
         /// Number of vertices.
         vertices: u64,
     },
-    /// The rows of a part do not follow those of the previous part, or its triangles refer to vertices of other parts.
+    /// The rows of a part are not next to those of the previous part, or its triangles refer to vertices of other
+    /// parts.
     #[error(
         "part `{part}` is not a mesh of its own: its rows must follow those of the previous part, and its triangles \
          must refer to its own vertices only"
@@ -51,7 +52,7 @@ pub enum FormatError {
         value: f32,
     },
     /// The mesh has more vertices or triangles than the format can hold.
-    #[error("{format} counts {limit} {what} at most, the mesh has {count}")]
+    #[error("{format} holds at most {limit} {what}, and the mesh has {count}")]
     TooMany {
         /// The format's name.
         format: &'static str,

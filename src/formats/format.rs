@@ -1,4 +1,4 @@
-//! The formats by name, file extension and media type.
+//! Output formats with their names, file extensions and media types.
 
 use std::fmt;
 use std::str::FromStr;
@@ -21,21 +21,24 @@ pub enum Format {
     Stl,
     /// Wavefront OBJ.
     Obj,
+    /// VTK XML `PolyData`, appended raw data.
+    Vtp,
     /// A picture, PNG.
     Png,
 }
 
 /// Error: no format has this name.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("unknown format `{0}`; expected one of glb, gltf, ply, ply-text, stl, obj, png")]
+#[error("unknown format `{0}`; expected one of glb, gltf, ply, ply-text, stl, obj, vtp, png")]
 pub struct UnknownFormat(pub String);
 
 impl Format {
     /// Every format.
-    pub const ALL: [Self; 7] = [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj, Self::Png];
+    pub const ALL: [Self; 8] =
+        [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj, Self::Vtp, Self::Png];
 
     /// Formats that hold a mesh.
-    pub const MESHES: [Self; 6] = [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj];
+    pub const MESHES: [Self; 7] = [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj, Self::Vtp];
 
     /// Extension of file names, without a dot.
     #[must_use]
@@ -56,6 +59,7 @@ impl Format {
             Self::PlyText => "ply-text",
             Self::Stl => "stl",
             Self::Obj => "obj",
+            Self::Vtp => "vtp",
             Self::Png => "png",
         }
     }
@@ -78,8 +82,8 @@ impl Format {
         matches!(self, Self::Glb | Self::Gltf)
     }
 
-    /// Media type, registered with IANA except those of PLY: `application/ply` is common, `model/x-ply-text` is
-    /// specific to molmesh.
+    /// Media type, registered with IANA except those of PLY and VTP: `application/ply` is common,
+    /// `model/x-ply-text` and `model/x-vtp` are specific to molmesh.
     #[must_use]
     pub const fn media_type(self) -> &'static str {
         match self {
@@ -89,6 +93,7 @@ impl Format {
             Self::PlyText => "model/x-ply-text",
             Self::Stl => "model/stl",
             Self::Obj => "model/obj",
+            Self::Vtp => "model/x-vtp",
             Self::Png => "image/png",
         }
     }

@@ -80,13 +80,13 @@ pub(super) fn largest_coordinate(mesh: &Mesh, units: Units, summary: &Summary) -
 }
 
 /// Lines collected into blocks; each block is written with one call.
-pub(super) struct Lines<'a> {
+pub(super) struct LineWriter<'a> {
     out: &'a mut dyn Write,
     block: Vec<u8>,
     used: usize,
 }
 
-impl<'a> Lines<'a> {
+impl<'a> LineWriter<'a> {
     pub(super) fn new(out: &'a mut dyn Write, len_bound: u64) -> Self {
         // A small mesh needs a small block; the current line always fits.
         let small = usize::try_from(len_bound).unwrap_or(usize::MAX).saturating_add(LINE_BYTES);
@@ -116,7 +116,7 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// A line under construction.
+/// Line to which fields are appended.
 pub(super) struct Line<'a> {
     bytes: &'a mut [u8],
     used: usize,
@@ -144,7 +144,7 @@ impl Line<'_> {
         }
     }
 
-    /// Appends a number with fixed decimals, rounded half away from zero, without a negative zero.
+    /// Appends a number with fixed decimals. Rounds ties away from zero and writes no negative zero.
     #[expect(
         clippy::cast_possible_truncation,
         reason = "at most 1e14 by MAX_COORDINATE; the fraction is truncated on purpose"

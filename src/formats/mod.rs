@@ -1,11 +1,11 @@
-//! Mesh encoders. Pure: they take a mesh and an `io::Write`, without paths or HTTP.
+//! Mesh encoders, which write a mesh to an `io::Write`. They do not depend on paths or HTTP.
 //!
 //! Encoding has two steps, so that the length is known before sending: [`Encoder::new`] checks the mesh and computes
 //! the layout, [`Encoder::write`] streams the file. The mesh is never copied as a whole: columns in the format's own
-//! layout are written from memory, all others pass through one block of `BLOCK_BYTES`.
+//! layout are written from memory, all others are converted in one block of `BLOCK_BYTES`.
 //!
-//! One unit is one ångström in every format, unless [`Units`] says otherwise. glTF holds positions relative to
-//! [`Mesh::centre`], in Å, under a node that translates and scales them. PLY, STL and OBJ have no nodes and hold the
+//! One unit is one ångström in every format, unless [`Units`] selects another unit. glTF contains positions relative to
+//! [`Mesh::centre`], in Å, and a node that translates and scales them. The other formats have no nodes and contain the
 //! scaled coordinates of the structure file.
 
 mod block;
@@ -21,12 +21,13 @@ pub mod quantize;
 mod stl;
 mod storage;
 mod text;
+mod vtp;
 
 use std::io::{self, Write};
 
 pub use error::FormatError;
 pub use format::{Format, UnknownFormat};
-pub use gltf::{GlbSink, GlbSinkError, RandomAccess};
+pub use gltf::{GlbSink, GlbSinkError, RandomAccess, linear_of_srgb};
 pub use quantize::{Compress, Packing, Step};
 pub use storage::{Normals, Storage, Units};
 
@@ -60,16 +61,32 @@ enum Plan {
     PlyText(ply_text::PlyTextPlan),
     Stl(stl::StlPlan),
     Obj(obj::ObjPlan),
+    Vtp(vtp::VtpPlan),
 }
 
 impl<'a> Encoder<'a> {
-    /// Checks `mesh` and computes the layout. Reads only the columns whose values the format relies on: the others are
-    /// copied unchanged, so that the file of an invalid mesh may be invalid. [`Packing::of`] is the storage of a mesh
-    /// as it is in memory.
+    /// Checks `mesh` and computes the layout. Reads only the columns whose values the format relies on. The others are
+    /// copied unchanged, so the file of an invalid mesh may be invalid. With [`Packing::of`], vertices are stored as
+    /// they are in memory.
     ///
     /// # Errors
     /// Returns any [`FormatError`].
     pub fn new(format: Format, storage: impl Into<Storage>, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
+        Self::with_bounds(format, storage, mesh, None, meta)
+    }
+
+    /// Acts as [`Self::new`], but does not read the positions if their `bounds` are known: lowest and highest position
+    /// relative to the mesh's centre, per axis, Å.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Self::new`].
+    pub fn with_bounds(
+        format: Format,
+        storage: impl Into<Storage>,
+        mesh: &'a Mesh,
+        bounds: Option<[[f32; 3]; 2]>,
+        meta: &Meta,
+    ) -> Result<Self, FormatError> {
         let storage = storage.into();
         if storage.packing != Packing::Full && !format.holds_quantized() {
             return Err(FormatError::QuantizationNotSupported { format: format.name() });
@@ -82,7 +99,7 @@ impl<'a> Encoder<'a> {
         {
             return Err(FormatError::AlreadyQuantized { step: step.length() });
         }
-        let summary = check::check(mesh, format)?;
+        let summary = check::check(mesh, format, bounds)?;
         let plan = match format {
             Format::Glb => Plan::Glb(gltf::GlbPlan::new(mesh, storage, &summary, meta)?),
             Format::Gltf => Plan::Gltf(gltf::GltfPlan::new(mesh, storage, &summary, meta)?),
@@ -90,6 +107,7 @@ impl<'a> Encoder<'a> {
             Format::PlyText => Plan::PlyText(ply_text::PlyTextPlan::new(mesh, storage, &summary, meta)?),
             Format::Stl => Plan::Stl(stl::StlPlan::new(mesh, storage.units, meta)?),
             Format::Obj => Plan::Obj(obj::ObjPlan::new(mesh, storage, &summary, meta)?),
+            Format::Vtp => Plan::Vtp(vtp::VtpPlan::new(mesh, storage, meta)),
             Format::Png => return Err(FormatError::NotAMeshFormat { format: format.name() }),
         };
         Ok(Self { mesh, plan })
@@ -103,6 +121,7 @@ impl<'a> Encoder<'a> {
             Plan::Gltf(plan) => Some(plan.len()),
             Plan::Ply(plan) => Some(plan.len()),
             Plan::Stl(plan) => Some(plan.len()),
+            Plan::Vtp(plan) => Some(plan.len()),
             Plan::PlyText(_) | Plan::Obj(_) => None,
         }
     }
@@ -119,7 +138,7 @@ impl<'a> Encoder<'a> {
 
     /// Writes the file and flushes `out`. The same mesh and meta give the same bytes.
     ///
-    /// Writes large blocks: `out` needs no buffer.
+    /// Writes large blocks, so `out` needs no buffer.
     ///
     /// # Errors
     /// Returns the errors of `out`.
@@ -131,6 +150,7 @@ impl<'a> Encoder<'a> {
             Plan::PlyText(plan) => plan.write(self.mesh, out),
             Plan::Stl(plan) => plan.write(self.mesh, out),
             Plan::Obj(plan) => plan.write(self.mesh, out),
+            Plan::Vtp(plan) => plan.write(self.mesh, out),
         }?;
         out.flush()
     }

@@ -6,10 +6,10 @@
 
 use std::io::{self, Write};
 
-use super::block::Place;
+use super::block::Placement;
 use super::check::Summary;
 use super::error::FormatError;
-use super::lines::{Decimals, Line, Lines, NORMAL_DECIMALS, largest_coordinate};
+use super::lines::{Decimals, Line, LineWriter, NORMAL_DECIMALS, largest_coordinate};
 use super::{Meta, Normals, Storage, Units, text};
 use crate::surface::Mesh;
 
@@ -53,18 +53,18 @@ impl ObjPlan {
     /// Writes the file.
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(self.header.as_bytes())?;
-        let mut lines = Lines::new(out, self.len_bound);
+        let mut lines = LineWriter::new(out, self.len_bound);
         let Storage { normals, units, .. } = self.storage;
-        let (place, decimals) = (Place { centre: mesh.centre, scale: units.scale() }, Decimals::of(units));
+        let (placement, decimals) = (Placement::new(mesh, units), Decimals::of(units));
         match mesh.colors.as_deref() {
             None => {
                 for &position in &mesh.positions[..] {
-                    lines.push(|line| vector(line, b"v", place.absolute(position), decimals))?;
+                    lines.push(|line| vector(line, b"v", placement.absolute(position), decimals))?;
                 }
             }
             Some(colors) => {
                 for (&position, &color) in mesh.positions.iter().zip(colors) {
-                    lines.push(|line| colored(line, place.absolute(position), decimals, color))?;
+                    lines.push(|line| colored(line, placement.absolute(position), decimals, color))?;
                 }
             }
         }

@@ -3,7 +3,7 @@
 
 use std::io::{self, Write};
 
-use super::block::{Place, put_floats, write_records};
+use super::block::{Placement, put_floats, write_records};
 use super::{Meta, Normals, Storage, text};
 use crate::surface::Mesh;
 
@@ -61,14 +61,14 @@ fn vertex_bytes(mesh: &Mesh, normals: Normals) -> usize {
 
 /// Writes vertex records of `N` bytes.
 fn vertices<const N: usize>(mesh: &Mesh, storage: Storage, out: &mut dyn Write) -> io::Result<()> {
-    let place = Place { centre: mesh.centre, scale: storage.units.scale() };
+    let placement = Placement::new(mesh, storage.units);
     let positions = &mesh.positions[..];
     let normals = (storage.normals == Normals::Smooth).then_some(&mesh.normals[..]);
     let (colors, ids) = (mesh.colors.as_deref(), mesh.atom_ids.as_deref());
     write_records::<N>(out, positions.len(), |range, records| {
         for (record, i) in records.iter_mut().zip(range) {
             let (floats, _) = record.as_chunks_mut::<12>();
-            put_floats(&mut floats[0], place.absolute(positions[i]));
+            put_floats(&mut floats[0], placement.absolute(positions[i]));
             let mut at = 12;
             if let Some(normals) = normals {
                 put_floats(&mut floats[1], normals[i]);

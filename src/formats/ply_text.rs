@@ -4,10 +4,10 @@
 
 use std::io::{self, Write};
 
-use super::block::Place;
+use super::block::Placement;
 use super::check::Summary;
 use super::error::FormatError;
-use super::lines::{Decimals, Line, Lines, NORMAL_DECIMALS, largest_coordinate};
+use super::lines::{Decimals, Line, LineWriter, NORMAL_DECIMALS, largest_coordinate};
 use super::ply::header;
 use super::{Meta, Normals, Storage};
 use crate::surface::Mesh;
@@ -45,14 +45,14 @@ impl PlyTextPlan {
     /// Writes the file.
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(self.header.as_bytes())?;
-        let mut lines = Lines::new(out, self.len_bound);
+        let mut lines = LineWriter::new(out, self.len_bound);
         let Storage { normals, units, .. } = self.storage;
-        let (place, decimals) = (Place { centre: mesh.centre, scale: units.scale() }, Decimals::of(units));
+        let (placement, decimals) = (Placement::new(mesh, units), Decimals::of(units));
         let normals = (normals == Normals::Smooth).then_some(&mesh.normals[..]);
         let (colors, atoms) = (mesh.colors.as_deref(), mesh.atom_ids.as_deref());
         for (i, &position) in mesh.positions.iter().enumerate() {
             lines.push(|line| {
-                line.numbers(place.absolute(position), decimals);
+                line.numbers(placement.absolute(position), decimals);
                 if let Some(normals) = normals {
                     line.numbers(normals[i], NORMAL_DECIMALS);
                 }

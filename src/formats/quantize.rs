@@ -1,5 +1,4 @@
-//! Vertices in 12 bytes instead of 24, as glTF stores them. [`surface::quantize`](crate::surface::quantize) does the
-//! arithmetic.
+//! Storage of glTF vertices in 12 bytes instead of 24. [`surface::quantize`](crate::surface::quantize) rounds them.
 
 use crate::surface::Mesh;
 pub use crate::surface::quantize::{Step, normal};
@@ -18,7 +17,7 @@ impl Compress {
     /// All values.
     pub const ALL: [Self; 2] = [Self::None, Self::Quantize];
 
-    /// Its name as a parameter.
+    /// Returns the value of the parameter.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -45,7 +44,7 @@ impl Packing {
         mesh.quantized.as_ref().map_or(Self::Full, |quantized| Self::Quantized(quantized.step))
     }
 
-    /// The step, if there is one.
+    /// Returns the step of quantized vertices; `None` for floats.
     #[must_use]
     pub const fn step(self) -> Option<Step> {
         match self {

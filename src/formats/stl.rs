@@ -1,9 +1,9 @@
 //! STL, binary: an 80-byte header, a count, then 50 bytes per triangle. It has no shared vertices, colours or
-//! vertex normals; the normals in it are those of the flat triangles.
+//! vertex normals, only the normals of the flat triangles.
 
 use std::io::{self, Write};
 
-use super::block::{Place, put_floats, write_records};
+use super::block::{Placement, put_floats, write_records};
 use super::error::FormatError;
 use super::{GENERATOR, Meta, Units, text};
 use crate::surface::Mesh;
@@ -46,7 +46,7 @@ impl StlPlan {
 
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(&self.head)?;
-        let place = Place { centre: mesh.centre, scale: self.units.scale() };
+        let placement = Placement::new(mesh, self.units);
         let (positions, triangles) = (&mesh.positions[..], &mesh.triangles[..]);
         write_records::<TRIANGLE_BYTES>(out, triangles.len(), |range, records| {
             for (record, triangle) in records.iter_mut().zip(&triangles[range]) {
@@ -54,7 +54,7 @@ impl StlPlan {
                 let (floats, attribute) = record.as_chunks_mut::<12>();
                 put_floats(&mut floats[0], face_normal(corners));
                 for (bytes, corner) in floats[1..].iter_mut().zip(corners) {
-                    put_floats(bytes, place.absolute(corner));
+                    put_floats(bytes, placement.absolute(corner));
                 }
                 attribute.fill(0);
             }

@@ -16,7 +16,7 @@ impl Normals {
     /// All values.
     pub const ALL: [Self; 2] = [Self::Smooth, Self::None];
 
-    /// Its name as a parameter.
+    /// Returns the value of the parameter.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -42,7 +42,7 @@ impl Units {
     /// All units.
     pub const ALL: [Self; 3] = [Self::Angstrom, Self::Nanometer, Self::Meter];
 
-    /// Its name as a parameter, and in files.
+    /// Returns the value of the parameter, which is also the name in files.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -74,9 +74,9 @@ impl Units {
 }
 
 impl Format {
-    /// Returns true if the format can hold coordinates in `units`. In metres a molecule is so small that programs which
-    /// weld vertices within a fixed distance would merge all of them: only formats with a node that scales support
-    /// metres.
+    /// Returns true if the format can hold coordinates in `units`. In metres a molecule is very small, and programs
+    /// that merge vertices within a fixed distance would merge all of them. Therefore only formats with a node that
+    /// scales the mesh support metres.
     #[must_use]
     pub const fn holds_units(self, units: Units) -> bool {
         match (self, units) {

@@ -1,4 +1,4 @@
-//! Text headers of PLY, STL and OBJ: one short ASCII line per fact.
+//! Text headers of PLY, STL and OBJ: one short ASCII line per property of the mesh.
 
 use std::fmt::Write;
 
@@ -7,10 +7,10 @@ use serde_json::Value;
 use super::{GENERATOR, Meta, Units};
 use crate::surface::Mesh;
 
-/// Maximum length of a fact, characters: PLY readers have line buffers of 256 or more.
+/// Maximum length of a line, characters: PLY readers have line buffers of 256 or more.
 const MAX_CHARS: usize = 200;
 
-/// Name of a mesh that has none.
+/// Name in the header of a mesh without a name.
 const NAMELESS: &str = "surface";
 
 /// Returns `text` as one line of printable ASCII: control characters become spaces, other characters JSON's `\u`
@@ -40,7 +40,7 @@ pub(super) fn word(name: Option<&str>) -> String {
     if name.is_empty() { NAMELESS.to_owned() } else { name }
 }
 
-/// Returns the facts: generator, name, units, centre in these units, and every scalar of `meta.extras`. `precision`
+/// Returns the lines: generator, name, units, centre in these units, and every scalar of `meta.extras`. `precision`
 /// describes the rounding of the numbers in the file, if any.
 pub(super) fn facts(mesh: &Mesh, meta: &Meta, units: Units, precision: Option<&str>) -> Vec<String> {
     let [x, y, z] = mesh.centre.map(|v| v * units.scale());

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::device_queue::single_line;
 use super::discover::{self, Discovery, arithmetic, describe};
-use super::engine::{Budget, Engine};
+use super::engine::{DeviceLimits, Engine};
 use super::error::GpuError;
 use super::executor::Executor;
 use super::job::{GpuJob, Prepared};
@@ -33,7 +33,7 @@ impl GpuBackend {
             let (adapter, readback_bytes) = (adapter.clone(), settings.readback_bytes);
             let build = Box::new(move || {
                 let (device, queue) = discover::open(&adapter)?;
-                let mut budget = Budget::of(&device.limits());
+                let mut budget = DeviceLimits::of(&device.limits());
                 if let Some(bytes) = readback_bytes {
                     budget.idle_bytes = [budget.idle_bytes[0].max(bytes), bytes];
                 }
@@ -42,7 +42,7 @@ impl GpuBackend {
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
         let devices: Vec<_> = devices.collect();
-        // On devices of different models or drivers, the bytes of a mesh would depend on which of them were idle.
+        // On devices of different models or drivers, the bytes of a mesh would depend on which devices are idle.
         let identical = devices.windows(2).all(|pair| pair[0].name == pair[1].name);
         let min_partition_bricks = settings.min_partition_bricks.filter(|_| identical);
         let pool = DevicePool::start(devices, &PoolSettings { min_partition_bricks, ..*settings })?;
@@ -71,7 +71,7 @@ impl GpuBackend {
         Ok(GpuJob { prepared: Arc::new(prepared), cancel: control.cancel.clone(), deadline: control.deadline })
     }
 
-    /// Meshes one atom on device `n`, which is given up if that fails.
+    /// Meshes one atom on device `n`. Gives up the device if that fails.
     fn warm_device(&self, n: usize) -> Result<(), SurfaceError> {
         let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
         let job = Self::job(&one_atom()?, &params, &limits, &Control::default())?;
@@ -113,7 +113,7 @@ impl Backend for GpuBackend {
         pool::describe(&up)
     }
 
-    fn makes(&self, surface: SurfaceKind) -> bool {
+    fn supports(&self, surface: SurfaceKind) -> bool {
         surface.kernel().is_some()
     }
 

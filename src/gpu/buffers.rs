@@ -20,11 +20,11 @@ pub enum BufferId {
     Halo,
     /// Candidate lists.
     Lists,
-    /// Header of each candidate list: start, number of atoms that reach a sample, number of all, brick.
+    /// Header of each candidate list: start, number of atoms that reach a grid point, number of all candidates, brick.
     Heads,
     /// Densities.
     Field,
-    /// Bits of the samples inside the surface.
+    /// Bits of the grid points inside the surface.
     Inside,
     /// Result of `classify` for each brick: crossing edges, vertices per layer, neighbours.
     Records,
@@ -44,14 +44,14 @@ pub enum BufferId {
     Sources,
     /// Triangle indices.
     Triangles,
-    /// Blocks of `measure`, one per brick that the surface intersects.
+    /// Table of the offsets of the blocks of `measure`, and the blocks: one per brick that the surface intersects.
     Sheets,
     /// Case table, shared by all jobs.
     Cases,
 }
 
 impl BufferId {
-    /// Buffers that each job has for itself: all but [`Self::Cases`], in the order of the variants.
+    /// Buffers of which each job has its own: all except [`Self::Cases`], in the order of the variants.
     pub(super) const OF_JOB: [Self; 21] = [
         Self::Params,
         Self::Atoms,
@@ -76,7 +76,7 @@ impl BufferId {
         Self::Sheets,
     ];
 
-    /// Returns the index of the buffer in [`Self::OF_JOB`]; [`Self::Cases`] comes after them.
+    /// Returns the index of the buffer in [`Self::OF_JOB`], or the length of that array for [`Self::Cases`].
     pub(super) const fn index(self) -> usize {
         self as usize
     }

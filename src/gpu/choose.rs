@@ -1,4 +1,4 @@
-//! Selection of devices, with a reason for each. Pure functions of the devices' facts and the user's choice.
+//! Selection of devices, with a reason for each. Pure functions of the devices' properties and the user's choice.
 
 use crate::surface::{DeviceChoice, DeviceFacts, DeviceKind, DeviceName, FoundDevice};
 

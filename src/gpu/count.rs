@@ -1,4 +1,4 @@
-//! First half of a job: the stages that sample a chunk and count its vertices and triangles.
+//! First half of a job: the stages that evaluate a chunk and count its vertices and triangles.
 
 use super::buffers::BufferId;
 use super::engine::Engine;

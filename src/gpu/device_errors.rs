@@ -37,7 +37,7 @@ impl DeviceErrors {
         }
     }
 
-    /// Returns and clears the most severe error since the last check; a lost device stays lost. `out_of_memory` makes
+    /// Returns and clears the most severe error since the last check; a lost device stays lost. `out_of_memory` creates
     /// the error for a failed allocation.
     ///
     /// # Errors

@@ -20,11 +20,11 @@ pub(super) struct DeviceThread {
 pub(super) struct RunOutcome {
     /// Duration.
     pub(super) time: Duration,
-    /// Bytes of device memory that are held now.
+    /// Bytes of device memory that the executor holds after the run.
     pub(super) held_bytes: u64,
     /// True if the device failed, so that its executor is discarded.
     pub(super) failed: bool,
-    /// Reason for which the device is given up.
+    /// Reason why the device is given up; `None` if it stays up.
     pub(super) down: Option<String>,
 }
 
@@ -118,7 +118,7 @@ impl DeviceQueue {
         Some((running, left, error))
     }
 
-    /// Marks the device as down, unless it is, and returns the waiting jobs.
+    /// Marks the device as down, unless it is down already, and returns the waiting jobs.
     pub(super) fn mark_down(&mut self, why: &str) -> VecDeque<QueuedJob> {
         if !matches!(self.state, DeviceState::Down(_)) {
             self.state = DeviceState::Down(single_line(why));
@@ -144,7 +144,7 @@ pub(super) fn single_line(text: &str) -> String {
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Replies to jobs that their device will not run.
+/// Sends an error to the callers of jobs that their device will not run.
 pub(super) fn reject(jobs: VecDeque<QueuedJob>, why: &str) {
     for job in jobs {
         job.reply(Err(GpuError::NoDevice(why.to_owned())));

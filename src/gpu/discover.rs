@@ -18,7 +18,7 @@ const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 /// Effort of a discovery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DiscoveryMode {
-    /// Load no driver if there is no sign of hardware, unless devices were requested by name.
+    /// Load no driver if no device node of a GPU exists, unless devices were requested by name.
     Quick,
     /// Load every driver, to list all devices.
     Thorough,
@@ -62,7 +62,7 @@ impl Discovery {
         }
     }
 
-    /// Reason for which no device is selected, on one line; `None` if one is.
+    /// Reason why no device is selected, on one line; `None` if one is.
     #[must_use]
     pub fn no_device_reason(&self) -> Option<String> {
         if self.selected().next().is_some() {
@@ -98,7 +98,7 @@ pub fn discover(choice: &DeviceChoice, mode: DiscoveryMode) -> Discovery {
     let Ok(mut adapters) = catch_unwind(adapters) else {
         return Discovery::nothing("a driver panicked during discovery".to_owned());
     };
-    // The order of the drivers' answers varies with their versions; kind, bus address and name do not.
+    // The order in which drivers list adapters varies with their versions; kind, bus address and name do not.
     adapters.sort_by_cached_key(|adapter| {
         let facts = facts(adapter);
         (facts.kind, facts.bus, facts.name, facts.api)
@@ -165,7 +165,7 @@ pub(super) fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
         .map_err(|error| GpuError::Failed(format!("the device cannot be opened: {error}")))
 }
 
-/// Returns the arithmetic of a device: model, driver, and the processor, which prepares jobs and measures meshes.
+/// Identifies the arithmetic of a device: model, driver, and the processor, which prepares jobs and measures meshes.
 pub(super) fn arithmetic(name: &str, device: &str) -> String {
     format!("{name} {device} {}", crate::surface::arithmetic())
 }

@@ -1,8 +1,8 @@
 //! Engine of one device: its budget, pipelines and buffers, and the upload of jobs.
 //!
-//! Small jobs take one submission, several of them together, with output buffers sized by an estimate. Larger jobs are
-//! counted first and their output is made in buffers of exact size. Jobs that do not fit at once are cut into chunks of
-//! tiles.
+//! Several small jobs share a submission, with output buffers whose size is estimated. A larger job takes two: the
+//! first counts its vertices and triangles, the second writes them to buffers of exact size. A job that exceeds the
+//! budget is cut into chunks of tiles.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -25,12 +25,12 @@ use crate::surface::lattice::{LatticeAtom, slightly_coarser, to_u32};
 
 /// Resources that the engine may use of its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Budget {
+pub struct DeviceLimits {
     /// Bytes of all buffers on the device.
     pub memory: u64,
-    /// Maximum number of bricks whose samples are held at once.
+    /// Maximum number of bricks whose densities are held at once.
     pub chunk_bricks: u64,
-    /// Bytes of the largest output column that is made at once.
+    /// Bytes of the largest output column of a piece.
     pub piece_bytes: u64,
     /// Bytes of the largest readback buffer.
     pub readback_bytes: u64,
@@ -42,19 +42,19 @@ pub struct Budget {
     /// Number of vertices and triangles per brick that the buffers of a small job hold. A surface crosses a brick of
     /// 8 × 8 × 8 cells with about 90 vertices and 180 triangles.
     pub rows_per_brick: [u64; 2],
-    /// Number of words per brick that the surface intersects which the buffers of sheets hold at first. A brick of one
-    /// sheet takes 17; one of several takes 12 more per sheet, and one per shared vertex.
+    /// Initial capacity of the buffers of sheets: number of words per brick that the surface intersects. A brick of one
+    /// sheet takes 17. A brick of several sheets takes 12 more per additional sheet, and one per shared vertex.
     pub sheet_words_per_brick: u64,
 }
 
-impl Budget {
+impl DeviceLimits {
     /// Budget for a device with these limits. WebGPU does not report the memory size; 64 GiB are assumed.
     #[must_use]
     pub fn of(limits: &wgpu::Limits) -> Self {
         let binding = max_binding(limits);
         Self {
             memory: 64 << 30,
-            chunk_bricks: binding / (4 * layout::SAMPLES),
+            chunk_bricks: binding / (4 * layout::BRICK_POINTS),
             piece_bytes: binding,
             readback_bytes: limits.max_buffer_size.min(8 << 30),
             idle_bytes: [8 << 30, 2 << 30],
@@ -69,7 +69,7 @@ impl Budget {
 pub struct Engine {
     pub(super) device: Device,
     pub(super) queue: Queue,
-    pub(super) budget: Budget,
+    pub(super) budget: DeviceLimits,
     /// Bytes of the largest binding.
     max_binding: u64,
     pub(super) pipelines: Pipelines,
@@ -80,7 +80,7 @@ pub struct Engine {
     pub(super) readback: ReadbackPool,
     /// Source of the job that follows the running one.
     pub(super) next_job: Option<NextJob>,
-    /// Next job with the submission that counts its first chunk.
+    /// Next job, if it has been started, with the submission that counts its first chunk.
     pub(super) begun: Option<(LoadedJob, PendingSubmission)>,
     errors: Arc<DeviceErrors>,
     /// Number of submissions so far.
@@ -114,7 +114,7 @@ impl Engine {
     /// # Errors
     /// [`GpuError::Failed`] if the limits of the device are too low or a shader does not compile; [`GpuError::Lost`].
     pub fn new(device: Device, queue: Queue) -> Result<Self, GpuError> {
-        let budget = Budget::of(&device.limits());
+        let budget = DeviceLimits::of(&device.limits());
         Self::with_budget(device, queue, budget)
     }
 
@@ -122,7 +122,7 @@ impl Engine {
     ///
     /// # Errors
     /// Those of [`Self::new`].
-    pub fn with_budget(device: Device, queue: Queue, budget: Budget) -> Result<Self, GpuError> {
+    pub fn with_budget(device: Device, queue: Queue, budget: DeviceLimits) -> Result<Self, GpuError> {
         let limits = device.limits();
         let errors = DeviceErrors::listen(&device);
         let pipelines = Pipelines::new(&device);
@@ -187,8 +187,8 @@ impl Engine {
         let limits = ChunkLimits { bricks: self.budget.chunk_bricks, candidates: self.max_binding / 4 };
         let tiles = partition.map_or(0..plan.tiles.len(), |partition| partition.tiles.clone());
         plan.chunks(tiles, limits).ok_or_else(|| {
-            let tile = plan.candidates.iter().max().map_or(0, |n| 4 * n) + 512 * 4 * layout::SAMPLES;
-            out_of_memory(job, tile, self.budget.chunk_bricks * 4 * layout::SAMPLES)
+            let tile = plan.candidates.iter().max().map_or(0, |n| 4 * n) + 512 * 4 * layout::BRICK_POINTS;
+            out_of_memory(job, tile, self.budget.chunk_bricks * 4 * layout::BRICK_POINTS)
         })
     }
 
@@ -208,7 +208,7 @@ impl Engine {
         let workspace = self.workspace(&sizes);
         let allocated = self.check_allocation(job, sizes.total());
         if let Err(error) = allocated {
-            // Idle workspaces may hold the memory that is missing.
+            // Idle workspaces may hold the missing memory.
             self.workspaces.clear();
             return Err(error);
         }
@@ -258,7 +258,7 @@ impl Engine {
     /// Rejects buffers that exceed the budget or the largest binding.
     fn check_sizes(&self, job: &GpuJob, sizes: &BufferSizes) -> Result<(), GpuError> {
         if sizes.max() > self.max_binding {
-            return Err(out_of_memory(job, sizes.total().max(sizes.max()), self.max_binding));
+            return Err(out_of_memory(job, sizes.total(), self.max_binding));
         }
         if sizes.total() > self.budget.memory {
             return Err(out_of_memory(job, sizes.total(), self.budget.memory));
@@ -294,7 +294,7 @@ fn max_binding(limits: &wgpu::Limits) -> u64 {
     limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) & !(ROW - 1)
 }
 
-/// Error of a job that needs `needed` bytes at once. The memory grows with the inverse cube of the spacing.
+/// Returns the error of a job that needs `needed` bytes at once. The memory grows with the inverse cube of the spacing.
 fn out_of_memory(job: &GpuJob, needed: u64, available: u64) -> GpuError {
     let excess = (needed as f64 / available.max(1) as f64).max(1.0);
     let fitting = job.prepared.lattice.spacing * excess.cbrt();

@@ -1,5 +1,4 @@
-//! Interface between the device pool and the code that runs jobs on one device. Tests implement it with executors that
-//! fail on purpose.
+//! Interface between the device pool and the code that runs jobs on one device.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
@@ -24,7 +23,7 @@ pub trait Executor: Send {
     /// Those of [`Self::run`]; [`GpuError::Failed`] if the executor supports whole jobs only.
     fn run_partition(&mut self, job: &GpuJob, partition: &PartitionHandle) -> JobResult {
         let _ = (job, partition);
-        Err(GpuError::Failed("this program does not support partitions".to_owned()))
+        Err(GpuError::Failed("the executor does not support partitions".to_owned()))
     }
 
     /// Counter of submissions so far. A device on which it does not change for too long is considered hung.

@@ -31,7 +31,7 @@ const SETTINGS: PoolSettings = PoolSettings {
     min_partition_bricks: None,
 };
 
-/// Executor that fails while failures are left and otherwise returns empty meshes.
+/// Executor that fails until no failures are left. Then it returns empty meshes.
 struct Flaky {
     failures: Arc<AtomicUsize>,
 }
@@ -77,7 +77,7 @@ fn job() -> GpuJob {
     GpuJob { prepared: Arc::new(prepared), cancel: CancelToken::default(), deadline: None }
 }
 
-/// Runs `callers` jobs on two devices, of which the first one fails `failures` times, and `disturb` beside them.
+/// Runs `callers` jobs on two devices, of which the first fails `failures` times, and `disturb` at the same time.
 /// Checks that every caller gets a mesh. Returns the status of the devices afterwards.
 fn run(
     job: &GpuJob,

@@ -33,7 +33,7 @@ pub struct Prepared {
     pub limits: SurfaceLimits,
     /// Meter of the mesh's memory.
     memory: Arc<dyn MemoryMeter>,
-    /// True once the mesh is added to the meter: another device may repeat a job.
+    /// True once the mesh is added to the meter. Prevents a second addition if another device repeats the job.
     is_counted: AtomicBool,
 }
 
@@ -100,7 +100,7 @@ pub struct GpuJob {
     pub prepared: Arc<Prepared>,
     /// Cancellation token, checked between dispatches and between chunks.
     pub cancel: CancelToken,
-    /// Deadline, checked at the same places.
+    /// Deadline, checked together with the token.
     pub deadline: Option<Instant>,
 }
 
@@ -138,7 +138,7 @@ impl Finished {
         let Prepared { plan, lattice, params, .. } = prepared;
         let unit = params.quantize.map_or(lattice.spacing, |step| f64::from(step.length()));
         self.meshed.measures = self.sheets.measures(plan, unit, self.meshed.size())?;
-        // Frees the readback buffers that hold nothing else.
+        // Frees the readback buffers that hold only sheets.
         self.sheets = SheetBlocks::default();
         Ok(())
     }

@@ -1,5 +1,5 @@
-//! State of a job between its submissions, and the mesh that results. The columns of the mesh stay in the readback
-//! buffers; nothing is copied.
+//! State of a job between its submissions, and the resulting mesh. The columns of the mesh stay in the readback buffers
+//! and are not copied.
 
 use bytemuck::Pod;
 
@@ -13,7 +13,7 @@ use super::pipelines::{N_STAGES, STAGES};
 use super::plan::layout::{self, Counters};
 use super::readback::ReadbackBuffer;
 use super::recording::PendingSubmission;
-use super::sheets::SheetBlocks;
+use super::sheets::{SheetBlocks, SheetPiece};
 use super::submit::StageTimes;
 use crate::surface::mesh::joined_bounds;
 use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage, Step};
@@ -21,7 +21,7 @@ use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage, Step
 /// Counts of a chunk.
 #[derive(Debug, Default)]
 pub(super) struct ChunkCounts {
-    /// Number of vertices, triangles and bricks with any of them, per group of bricks.
+    /// Per group of bricks: number of vertices, of triangles, and of bricks with triangles; the fourth word is unused.
     pub(super) groups: Vec<[u32; 4]>,
     /// Number of vertices and triangles before the chunk.
     pub(super) first: [u64; 2],
@@ -33,7 +33,7 @@ pub(super) struct PendingOutput {
     pub(super) layout: ReadbackLayout,
     /// Rows that the readback buffer holds.
     pub(super) rows: OutputRows,
-    /// Stage that makes the piece: `interpolate`, `emit` or `measure`.
+    /// Stage that computes the piece: `interpolate`, `emit` or `measure`.
     pub(super) stage: Stage,
     pub(super) chunk: usize,
     pub(super) piece: OutputPiece,
@@ -42,14 +42,15 @@ pub(super) struct PendingOutput {
 /// State of a job.
 pub(super) struct JobState {
     pub(super) loaded: LoadedJob,
-    /// Submission that counts the first chunk, if it was made before the job's turn.
+    /// Submission that counts the first chunk, if it was made while the previous job ran.
     pub(super) counting: Option<PendingSubmission>,
     pub(super) times: StageTimes,
     /// True if some vertex has no gradient.
     pub(super) has_flat_vertices: bool,
     pub(super) vertices: Vec<ReadbackRows>,
     pub(super) triangles: Vec<ReadbackRows>,
-    pub(super) sheets: Vec<ReadbackRows>,
+    /// Blocks of sheets in pieces, each with its number of bricks.
+    pub(super) sheets: Vec<(u32, ReadbackRows)>,
     checksum: u64,
     degenerate: bool,
     /// Bounds of the positions, in Å or steps.
@@ -93,7 +94,7 @@ impl JobState {
         let chunk = &self.loaded.chunks[chunk];
         let counters = counters(readback)?;
         if u64::from(counters.list_end) > chunk.candidates {
-            let why = format!("{} candidates where {} were planned", counters.list_end, chunk.candidates);
+            let why = format!("found {} candidates, expected at most {}", counters.list_end, chunk.candidates);
             return Err(GpuError::Failed(why));
         }
         let groups: Vec<[u32; 4]> = values(readback.as_ref(), offset, chunk.n_groups())?.to_vec();
@@ -105,7 +106,10 @@ impl JobState {
         }
         let end = [counters.vertices, counters.triangles].map(u64::from);
         if end != self.total.map(|n| n & u64::from(u32::MAX)) {
-            return Err(GpuError::Failed(format!("the scan ends at {end:?}, the groups at {:?}", self.total)));
+            return Err(GpuError::Failed(format!(
+                "the scan counts {end:?} vertices and triangles, the groups {:?}",
+                self.total
+            )));
         }
         Ok(ChunkCounts { groups, first })
     }
@@ -141,19 +145,24 @@ impl JobState {
         Ok(finished)
     }
 
-    /// Assembles the mesh, or its partition, as the device made it: normals are zero where the gradient vanishes.
+    /// Assembles the mesh, or its partition. Keeps the normals of the device, which are zero where the gradient
+    /// vanishes.
     ///
     /// # Errors
     /// Those of [`Self::finish`].
     pub(super) fn assemble(&mut self) -> JobResult {
         let mesh = self.mesh()?;
-        let words = column(&self.sheets, |r| (r.layout.sheets, r.rows.sheet_words))?;
-        let sheets = SheetBlocks { words, checksum: self.checksum, degenerate: self.degenerate };
+        let piece = |(n_bricks, rows): &(u32, ReadbackRows)| {
+            let words = column(std::slice::from_ref(rows), |r| (r.layout.sheets, r.rows.sheet_words))?;
+            Ok(SheetPiece { n_bricks: *n_bricks, words })
+        };
+        let pieces = self.sheets.iter().map(piece).collect::<Result<_, GpuError>>()?;
+        let sheets = SheetBlocks { pieces, checksum: self.checksum, degenerate: self.degenerate };
         let (plan, lattice) = (&self.loaded.job.prepared.plan, &self.loaded.job.prepared.lattice);
         let grid = GridStats {
             bricks: plan.n_reached,
             surface_bricks: self.surface_bricks,
-            samples: plan.n_reached * layout::SAMPLES,
+            grid_points: plan.n_reached * layout::BRICK_POINTS,
             box_cells: lattice.box_cells,
             candidates: plan.pairs,
             overlaps: 0,
@@ -189,10 +198,10 @@ impl JobState {
     }
 }
 
-/// Column of `pieces`; `place` returns the offset and the number of rows of a piece.
-fn column<T: Pod>(pieces: &[ReadbackRows], place: impl Fn(&ReadbackRows) -> (u64, u64)) -> Result<Column<T>, GpuError> {
+/// Column of `pieces`; `range` returns the byte offset and the number of rows of a piece.
+fn column<T: Pod>(pieces: &[ReadbackRows], range: impl Fn(&ReadbackRows) -> (u64, u64)) -> Result<Column<T>, GpuError> {
     let piece = |rows: &ReadbackRows| {
-        let (offset, n) = place(rows);
+        let (offset, n) = range(rows);
         let bytes = byte_range::<T>(offset, n)?;
         Column::shared(rows.readback.clone(), bytes.clone())
             .ok_or_else(|| GpuError::Failed(format!("bytes {bytes:?} are not a column")))

@@ -26,7 +26,7 @@ impl Scheduler {
         }
     }
 
-    /// Notes that a thread ends.
+    /// Records that a thread ends.
     pub(super) fn end_thread(&self, thread: DeviceThread) {
         if let Some(queue) = self.lock().queue_of(thread) {
             queue.has_thread = false;
@@ -72,7 +72,7 @@ impl Scheduler {
         self.mark_down(DeviceThread { device: n, generation }, why);
     }
 
-    /// Takes those of `devices` down whose batches have hung, and fails their jobs. Returns the indices of the devices.
+    /// Marks those of `devices` as down whose batches have hung, and fails their jobs. Returns their indices.
     pub(super) fn take_hung(&self, devices: Range<usize>, hang_timeout: Duration) -> Vec<usize> {
         let mut hung = Vec::new();
         {
@@ -158,7 +158,8 @@ impl Scheduler {
     }
 }
 
-/// Returns the time until `end`, which may be beyond every clock; `None` once it has passed.
+/// Returns the time until `end`, or `None` once it has passed. An `end` of `None` never passes: the clock cannot
+/// represent it.
 fn time_left(end: Option<Instant>) -> Option<Duration> {
     match end {
         Some(end) => end.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()),

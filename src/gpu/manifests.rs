@@ -1,5 +1,5 @@
 //! Manifests of Vulkan drivers that the loader would read. If no device is found, they distinguish a machine without a
-//! driver from one whose driver does not start. Nothing is loaded.
+//! driver from one whose driver does not start. This module loads no driver.
 
 use std::env;
 use std::fmt;
@@ -12,7 +12,7 @@ use serde_json::Value;
 pub struct Manifest {
     /// Path of the manifest.
     pub path: PathBuf,
-    /// Library that it names, or the reason for which there is none.
+    /// Library that the manifest names, or the reason why it names none.
     pub library: Result<String, String>,
 }
 
@@ -51,20 +51,20 @@ fn under(root: &Path, variable: impl Fn(&str) -> Option<String>) -> Vec<Manifest
     let listed = |value: String| value.split(':').map(|path| inside(root, path)).collect::<Vec<_>>();
     let replacing = REPLACING.into_iter().find_map(set);
     let of_the_system = || {
-        let mut places = set(ADDITIONAL).map(listed).unwrap_or_default();
+        let mut paths = set(ADDITIONAL).map(listed).unwrap_or_default();
         let home = set("HOME").unwrap_or_default();
         for (name, default) in FOLDERS {
             let value = set(name).unwrap_or_else(|| default.replace("$HOME", &home));
             // The loader searches /etc regardless of the variable.
             let own = if name == "XDG_CONFIG_DIRS" { "/etc" } else { "" };
             let folders = value.split(':').chain([own]).filter(|folder| !folder.is_empty());
-            places.extend(folders.map(|folder| inside(root, folder).join(SUBFOLDER)));
+            paths.extend(folders.map(|folder| inside(root, folder).join(SUBFOLDER)));
         }
-        places
+        paths
     };
-    let places = replacing.map_or_else(of_the_system, listed);
+    let paths = replacing.map_or_else(of_the_system, listed);
     let mut found: Vec<Manifest> = Vec::new();
-    for path in places.iter().flat_map(|place| files(place)) {
+    for path in paths.iter().flat_map(|path| files(path)) {
         if !found.iter().any(|other| other.path == path) {
             let library = library(&path);
             found.push(Manifest { path, library });
@@ -78,10 +78,10 @@ fn inside(root: &Path, path: &str) -> PathBuf {
     root.join(path.trim_start_matches('/'))
 }
 
-/// Returns the file, or the manifests of the folder, sorted by name.
-fn files(place: &Path) -> Vec<PathBuf> {
-    let Ok(entries) = place.read_dir() else {
-        return if place.is_file() { vec![place.to_owned()] } else { Vec::new() };
+/// Returns `path` if it is a file, or the manifests in it, sorted by name, if it is a folder.
+fn files(path: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = path.read_dir() else {
+        return if path.is_file() { vec![path.to_owned()] } else { Vec::new() };
     };
     let json = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "json");
     let mut files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(json).collect();

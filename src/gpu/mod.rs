@@ -20,7 +20,7 @@
 //! pool
 //! engine
 //! submit
-//! job_state, probe, backend, picture
+//! job_state, single_stages, backend, picture
 //! count
 //! output
 //! run_partition
@@ -56,8 +56,6 @@ mod picture_targets;
 mod pipelines;
 pub mod plan;
 pub mod pool;
-#[doc(hidden)]
-pub mod probe;
 mod queued_job;
 mod readback;
 mod recording;
@@ -67,13 +65,15 @@ mod running_batch;
 mod scheduler;
 mod shaders;
 mod sheets;
+#[doc(hidden)]
+pub mod single_stages;
 mod submit;
 mod worker;
 mod workspace;
 
 pub use backend::GpuBackend;
 pub use discover::{Discovery, DiscoveryMode, discover};
-pub use engine::{Budget, Engine};
+pub use engine::{DeviceLimits, Engine};
 pub use error::GpuError;
 pub use executor::{Executor, NextJob};
 pub use job::{Finished, GpuJob, JobResult, Prepared};

@@ -1,7 +1,8 @@
 //! Multi-device jobs: the number of partitions of a large job, and the mesh of its partitions.
 //!
-//! Each device makes one partition: it counts, publishes its counts and makes its vertices; when all have published, it
-//! makes its triangles with the final vertex numbers. The mesh has the same bytes as that of one device.
+//! Each device computes one partition: it counts, publishes its counts and computes its vertices. Once all partitions
+//! have published their counts, it computes its triangles with the final vertex numbers. The mesh has the same bytes as
+//! that of one device.
 
 use super::job::Finished;
 use super::sheets::SheetBlocks;
@@ -15,8 +16,8 @@ pub(super) fn n_partitions(n_bricks: u64, idle: usize, min_bricks: Option<u64>) 
     idle.min(usize::try_from(by_size).unwrap_or(usize::MAX)).max(1)
 }
 
-/// Joins the meshes of partitions, given in order. A stage's time is the longest of all devices. `has_flat_vertices`:
-/// computes the normals of vertices without a gradient.
+/// Joins the meshes of partitions, given in order. A stage's time is the longest of all devices. With
+/// `has_flat_vertices`, computes the normals of vertices without a gradient.
 pub(super) fn join(partitions: Vec<Finished>, has_flat_vertices: bool) -> Finished {
     let stages = max_times(&partitions);
     let mut mesh = Mesh::default();

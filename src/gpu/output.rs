@@ -14,9 +14,9 @@ use super::workspace::BufferSizes;
 use crate::surface::Stage;
 
 impl Engine {
-    /// Counts every chunk and submits its vertices and sheets, because its samples are overwritten by the next chunk;
-    /// triangles need the vertex numbers of all chunks. `accept` is called with the index of each counted chunk and
-    /// returns whether to make its output.
+    /// Counts every chunk and submits its vertices and sheets, because the next chunk overwrites its densities.
+    /// Triangles need the vertex numbers of all chunks. Calls `accept` with the index of each counted chunk; its output
+    /// is computed if `accept` returns true.
     pub(super) fn count_chunks(
         &mut self,
         state: &mut JobState,
@@ -26,7 +26,7 @@ impl Engine {
         let mut all = Vec::with_capacity(n_chunks);
         for chunk in 0..n_chunks {
             state.loaded.job.check()?;
-            // The vertices of the previous chunk are read back meanwhile.
+            // The device transfers the vertices of the previous chunk while it counts this one.
             let submission = match state.counting.take() {
                 Some(submission) => submission,
                 None => self.submit_count(state, chunk)?,
@@ -34,7 +34,8 @@ impl Engine {
             self.collect_output(state)?;
             let counts = self.wait_for_counts(state, chunk, submission)?;
             if accept(self, state, chunk)? {
-                // First, so that sheets that do not fit are made again before the next chunk replaces the samples.
+                // Measures first, so that sheets that do not fit are computed again before the next chunk overwrites
+                // the densities.
                 self.make_output(state, &[(chunk, &counts)], Stage::Measure)?;
                 self.make_output(state, &[(chunk, &counts)], Stage::Interpolate)?;
             }
@@ -43,14 +44,14 @@ impl Engine {
         Ok(all)
     }
 
-    /// Makes the triangles of all chunks. The caller collects the last piece with [`Self::collect_output`].
+    /// Computes the triangles of all chunks. The caller collects the last piece with [`Self::collect_output`].
     pub(super) fn make_triangles(&mut self, state: &mut JobState, counts: &[ChunkCounts]) -> Result<(), GpuError> {
         let all: Vec<_> = counts.iter().enumerate().collect();
         self.make_output(state, &all, Stage::Emit)
     }
 
     /// Submits the output of `stage` for chunks, given with their indices, and collects all pieces but the last. The
-    /// samples of the first chunk must be present for vertices and sheets.
+    /// densities of the first chunk must be present for vertices and sheets.
     pub(super) fn make_output(
         &mut self,
         state: &mut JobState,
@@ -138,13 +139,14 @@ impl Engine {
         Ok(PendingOutput { submission, layout, rows, stage, chunk, piece: *piece })
     }
 
-    /// Waits for the pending output, if any, and adds it to the job. Makes sheets again if they did not fit.
+    /// Waits for the pending output, if any, and adds it to the job. Computes sheets again if they did not fit.
     pub(super) fn collect_output(&mut self, state: &mut JobState) -> Result<(), GpuError> {
         while let Some(PendingOutput { submission, layout, mut rows, stage, chunk, piece }) = state.pending.take() {
             let readback = self.wait_one(submission)?;
             let counters = counters(&readback)?;
             self.add_times(&mut state.times, &readback, stage_index(stage)..stage_index(stage) + 1)?;
-            let made = u64::from(counters.sheet_words);
+            let made =
+                if stage == Stage::Measure { u64::from(piece.n_bricks) + u64::from(counters.sheet_words) } else { 0 };
             if made > rows.sheet_words {
                 let piece = OutputPiece { sheet_words: made, ..piece };
                 self.ensure_capacity(state, &[piece])?;
@@ -153,12 +155,12 @@ impl Engine {
             }
             rows.sheet_words = made;
             state.add_counters(&counters);
-            let columns = match stage {
-                Stage::Emit => &mut state.triangles,
-                Stage::Measure => &mut state.sheets,
-                _ => &mut state.vertices,
-            };
-            columns.push(ReadbackRows { readback, layout, rows });
+            let made = ReadbackRows { readback, layout, rows };
+            match stage {
+                Stage::Emit => state.triangles.push(made),
+                Stage::Measure => state.sheets.push((piece.n_bricks, made)),
+                _ => state.vertices.push(made),
+            }
         }
         Ok(())
     }

@@ -29,12 +29,12 @@ pub(super) struct OutputPiece {
     /// Number of triangles before the piece.
     pub(super) triangle: u64,
     pub(super) n_triangles: u64,
-    /// Capacity of the sheets, in words.
+    /// Capacity of the blocks of sheets and the table of their offsets, in words.
     pub(super) sheet_words: u64,
 }
 
-/// Cuts a chunk into pieces of at most `max_vertices` and `max_triangles`, by the counts of its groups of bricks. A
-/// single group never exceeds the capacity of a device.
+/// Cuts a chunk into pieces of at most `max_vertices` and `max_triangles`, according to the counts of its groups of
+/// bricks. A single group never exceeds the capacity of a device.
 pub(super) fn pieces(
     [first_brick, n_bricks]: [u32; 2],
     groups: &[[u32; 4]],
@@ -59,7 +59,7 @@ pub(super) fn pieces(
         at.n_bricks += n;
         at.n_vertices += v;
         at.n_triangles += t;
-        at.sheet_words += u64::from(b) * sheet_words_per_brick;
+        at.sheet_words += u64::from(n) + u64::from(b) * sheet_words_per_brick;
         left -= n;
     }
     pieces.extend(Some(at).filter(|p| p.n_bricks > 0));
@@ -118,7 +118,7 @@ impl ReadbackLayout {
 pub(super) struct OutputRows {
     pub(super) vertices: u64,
     pub(super) triangles: u64,
-    /// Words of sheets.
+    /// Number of words of the blocks of sheets and the table of their offsets.
     pub(super) sheet_words: u64,
 }
 
@@ -186,7 +186,7 @@ mod tests {
             }
             let sums = groups.iter().fold((0, 0), |s, g| (s.0 + u64::from(g[0]), s.1 + u64::from(g[1])));
             assert_eq!(at, (7 + n_bricks, 11 + sums.0, 13 + sums.1));
-            assert_eq!(cut.iter().map(|p| p.sheet_words).sum::<u64>(), 2 * 9 * 37);
+            assert_eq!(cut.iter().map(|p| p.sheet_words).sum::<u64>(), u64::from(n_bricks) + 2 * 9 * 37);
         }
         assert_eq!(pieces([0, n_bricks], &groups, [0, 0], [1 << 20, 1 << 20], 2).len(), 1);
         assert!(pieces([0, n_bricks], &groups, [0, 0], [168, 386], 2).len() > 18);

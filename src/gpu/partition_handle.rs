@@ -19,18 +19,18 @@ const POLL_INTERVAL: Duration = Duration::from_millis(5);
 /// Handle of one partition of a multi-device job.
 #[derive(Clone)]
 pub struct PartitionHandle {
-    shared: Arc<Shared>,
+    shared: Arc<PartitionedJob>,
     /// Index of the partition.
     pub index: usize,
 }
 
-struct Shared {
+struct PartitionedJob {
     partitions: Vec<Partition>,
-    state: Mutex<State>,
+    state: Mutex<PublishedCounts>,
     changed: Condvar,
 }
 
-struct State {
+struct PublishedCounts {
     counts: Vec<Option<PartitionCounts>>,
     aborted: bool,
     has_flat_vertices: bool,
@@ -74,8 +74,8 @@ impl PartitionHandle {
     #[must_use]
     pub fn for_partitions(partitions: Vec<Partition>) -> Vec<Self> {
         let n = partitions.len();
-        let state = State { counts: vec![None; n], aborted: false, has_flat_vertices: false };
-        let shared = Arc::new(Shared { partitions, state: Mutex::new(state), changed: Condvar::new() });
+        let state = PublishedCounts { counts: vec![None; n], aborted: false, has_flat_vertices: false };
+        let shared = Arc::new(PartitionedJob { partitions, state: Mutex::new(state), changed: Condvar::new() });
         (0..n).map(|index| Self { shared: Arc::clone(&shared), index }).collect()
     }
 
@@ -85,14 +85,9 @@ impl PartitionHandle {
         &self.shared.partitions[self.index]
     }
 
-    /// Number of partitions that have published their counts.
-    #[must_use]
-    pub fn n_published(&self) -> usize {
-        self.lock().counts.iter().flatten().count()
-    }
-
     /// Returns true while this partition waits for the counts of others.
-    pub(super) fn is_waiting(&self) -> bool {
+    #[must_use]
+    pub fn is_waiting(&self) -> bool {
         let state = self.lock();
         state.counts[self.index].is_some() && state.counts.iter().any(Option::is_none)
     }
@@ -111,7 +106,7 @@ impl PartitionHandle {
         if self.lock().aborted { Err(SurfaceError::Cancelled.into()) } else { Ok(()) }
     }
 
-    /// Runs of this partition's bricks that earlier partitions import.
+    /// Runs of bricks of this partition that earlier partitions import.
     pub(super) fn exports(&self) -> Vec<Range<u32>> {
         self.exported_by(self.index).map(|(_, run)| run).collect()
     }
@@ -181,7 +176,7 @@ impl PartitionHandle {
         self.lock().has_flat_vertices
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, PublishedCounts> {
         // No code panics between two changes under the lock, so a poisoned state is consistent.
         self.shared.state.lock().unwrap_or_else(PoisonError::into_inner)
     }

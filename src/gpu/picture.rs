@@ -14,11 +14,11 @@ use super::discover::{self, Discovery, arithmetic, describe};
 use super::error::GpuError;
 use super::hang_limit;
 use super::lifecycle::MAX_COOL_DOWN;
-use super::picture_passes::{Columns, PicturePasses};
+use super::picture_passes::PicturePasses;
 use super::picture_targets::Requirements;
 use super::scheduler::PoolSettings;
 use crate::picture::camera::Camera;
-use crate::picture::{CpuRenderer, Image, PictureError, PictureParams, Rendered, Renderer};
+use crate::picture::{CpuRenderer, Image, MeshColumns, PictureError, PictureParams, Rendered, Renderer};
 use crate::surface::{BackendIdentity, CancelToken, Control, Mesh, Vertices};
 
 /// Interval between attempts to lock the device. Each attempt is followed by a check for cancellation.
@@ -51,11 +51,8 @@ pub trait PictureExecutor: Send {
 impl PictureExecutor for PicturePasses {
     fn draw(&mut self, job: &PictureJob) -> Result<Vec<[u8; 4]>, GpuError> {
         let PictureJob { mesh, params, camera, cancel } = job;
-        let Vertices::Single { positions, normals } = mesh.vertices() else {
-            return Err(GpuError::Failed("the vertices are quantized".to_owned()));
-        };
+        let columns = MeshColumns::of(mesh).map_err(|error| GpuError::Failed(error.to_string()))?;
         Requirements::new(mesh, params).check(&self.limits()).map_err(GpuError::Failed)?;
-        let columns = Columns { positions, normals, triangles: &mesh.triangles, colors: mesh.colors.as_deref() };
         self.draw_mesh(columns, params, camera, cancel)
     }
 }
@@ -68,16 +65,16 @@ pub struct GpuRenderer {
     /// Description of the device.
     device: String,
     build: PictureBuild,
-    state: Mutex<State>,
+    state: Mutex<RendererState>,
     settings: PoolSettings,
     fallback: Option<CpuRenderer>,
 }
 
 /// State of the device.
-struct State {
+struct RendererState {
     /// Open device; `None` after it was lost or hung. The next picture opens it again.
     executor: Option<Box<dyn PictureExecutor>>,
-    /// Reason for not using the device, and the end of its cool-down; `None` as the end means never.
+    /// Reason why the device is down, and the end of its cool-down; an end of `None` means that it stays down.
     down: Option<(GpuError, Option<Instant>)>,
     /// Pause after the next hang.
     cool_down: Duration,
@@ -122,7 +119,7 @@ impl GpuRenderer {
         fallback: Option<CpuRenderer>,
     ) -> Result<Self, GpuError> {
         let executor = Some(open(&build, settings.hang_timeout)?);
-        let state = State { executor, down: None, cool_down: settings.cool_down, fastest: None };
+        let state = RendererState { executor, down: None, cool_down: settings.cool_down, fastest: None };
         Ok(Self { device, build, state: Mutex::new(state), settings: *settings, fallback })
     }
 
@@ -151,7 +148,7 @@ impl GpuRenderer {
     }
 
     /// Draws a picture, unless the device is cooling down.
-    fn draw_unless_down(&self, state: &mut State, job: PictureJob) -> Result<Vec<[u8; 4]>, GpuError> {
+    fn draw_unless_down(&self, state: &mut RendererState, job: PictureJob) -> Result<Vec<[u8; 4]>, GpuError> {
         if let Some((why, end)) = &state.down
             && end.is_none_or(|end| Instant::now() < end)
         {
@@ -167,7 +164,7 @@ impl GpuRenderer {
         drawn
     }
 
-    fn draw_now(&self, state: &mut State, job: PictureJob) -> Result<Vec<[u8; 4]>, GpuError> {
+    fn draw_now(&self, state: &mut RendererState, job: PictureJob) -> Result<Vec<[u8; 4]>, GpuError> {
         let mut executor = match state.executor.take() {
             Some(executor) => executor,
             None => open(&self.build, self.settings.hang_timeout)?,
@@ -214,7 +211,7 @@ fn on_thread<T: Send + 'static>(limit: Duration, work: impl FnOnce() -> T + Send
     done.map_err(|_logged| GpuError::Failed("it panicked".to_owned()))
 }
 
-/// Reason for which the device did not draw a picture.
+/// Reason why the device did not draw a picture.
 enum DrawError {
     /// No renderer could draw it.
     Picture(PictureError),

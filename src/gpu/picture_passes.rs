@@ -13,29 +13,20 @@ use wgpu::{
 use super::device_errors::DeviceErrors;
 use super::error::GpuError;
 use super::picture_targets::{
-    DEPTH, DEPTH_BUFFER, FinishParams, NO_SURFACE_DEPTH, PATTERN, SHADE, View, buffer, layer, layered, taps_of, texture,
+    DEPTH, DEPTH_BUFFER, FinishParams, NO_SURFACE_DEPTH, PATTERN, SHADE, ViewUniform, buffer, layer, layered, taps_of,
+    texture,
 };
 use super::shaders::{PICTURE, Shader};
-use crate::picture::PictureParams;
 use crate::picture::camera::Camera;
 use crate::picture::finish::Finish;
 use crate::picture::light::Levels;
+use crate::picture::{MeshColumns, PictureParams};
 use crate::surface::CancelToken;
 
 /// Interval of checks for cancellation while the device works.
 const CANCEL_INTERVAL: Duration = Duration::from_millis(20);
 /// Width and height of a workgroup in pixels, as in the shaders.
 const GROUP: u32 = 8;
-
-/// Columns of a mesh.
-#[derive(Clone, Copy)]
-pub(super) struct Columns<'a> {
-    pub(super) positions: &'a [[f32; 3]],
-    pub(super) normals: &'a [[f32; 3]],
-    pub(super) triangles: &'a [[u32; 3]],
-    /// sRGB colours, if the mesh has colours of its own.
-    pub(super) colors: Option<&'a [[u8; 4]]>,
-}
 
 /// Open device with the compiled passes. The bind group layouts follow from the shaders.
 pub(super) struct PicturePasses {
@@ -83,13 +74,13 @@ impl PicturePasses {
     /// [`GpuError::Failed`] or [`GpuError::Lost`] as reported by the device.
     pub(super) fn draw_mesh(
         &self,
-        columns: Columns<'_>,
+        columns: MeshColumns<'_>,
         params: &PictureParams,
         camera: &Camera,
         cancel: &CancelToken,
     ) -> Result<Vec<[u8; 4]>, GpuError> {
         let (device, queue) = (&self.device, &self.queue);
-        let Columns { positions, normals, triangles, colors } = columns;
+        let MeshColumns { positions, normals, triangles, colors } = columns;
         let n_pixels = u64::from(params.width) * u64::from(params.height);
         let column = |label: &str, bytes: &[u8], usage| filled(device, queue, label, bytes, usage);
         let position_buffer = column("positions", bytemuck::cast_slice(positions), BufferUsages::VERTEX);
@@ -110,7 +101,7 @@ impl PicturePasses {
         let mut encoder =
             device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("molmesh.picture") });
         for (sample, offset) in (0_u32..).zip(PATTERN) {
-            let view = View::new(camera, offset);
+            let view = ViewUniform::new(camera, offset);
             let view = column("view", bytemuck::bytes_of(&view), BufferUsages::UNIFORM);
             let group = bind(device, &self.draw.get_bind_group_layout(0), &[view.as_entire_binding()]);
             let views = [layer(&shades, sample), layer(&depths, sample), layer(&tints, sample)];

@@ -26,7 +26,7 @@ pub(super) const NO_SURFACE_DEPTH: f64 = 3.0e38;
 /// Uniform of the draw passes, as `shaders/picture/vertex.wgsl` reads it.
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-pub(super) struct View {
+pub(super) struct ViewUniform {
     pub(super) right: [f32; 4],
     pub(super) up: [f32; 4],
     pub(super) toward: [f32; 4],
@@ -39,7 +39,7 @@ pub(super) struct View {
     pub(super) pad: f32,
 }
 
-impl View {
+impl ViewUniform {
     pub(super) fn new(camera: &Camera, offset: [f32; 2]) -> Self {
         let row = |k: usize| {
             let [x, y, z] = camera.axes[k];
@@ -106,17 +106,17 @@ impl FinishParams {
 /// Neighbour of a pixel, as `shaders/picture/finish.wgsl` reads it.
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-pub(super) struct Tap {
+pub(super) struct TapUniform {
     pub(super) pixels: [i32; 2],
     pub(super) length: [f32; 2],
 }
 
 /// Neighbours of `finish`; one unused entry if there are none, because buffers must not be empty.
-pub(super) fn taps_of(finish: &Finish) -> Vec<Tap> {
-    let mut all: Vec<Tap> =
-        finish.taps.iter().map(|tap| Tap { pixels: [tap.dx, tap.dy], length: [tap.right, tap.up] }).collect();
+pub(super) fn taps_of(finish: &Finish) -> Vec<TapUniform> {
+    let mut all: Vec<TapUniform> =
+        finish.taps.iter().map(|tap| TapUniform { pixels: [tap.dx, tap.dy], length: [tap.right, tap.up] }).collect();
     if all.is_empty() {
-        all.push(Tap::zeroed());
+        all.push(TapUniform::zeroed());
     }
     all
 }

@@ -1,4 +1,4 @@
-//! Compute pipelines of the stages, compiled once: one per kernel for the stages that depend on it.
+//! Compute pipelines of the stages, compiled once. Stages that depend on the kernel have one pipeline per kernel.
 
 use wgpu::{BindGroupLayout, ComputePipeline, Device};
 
@@ -19,7 +19,7 @@ pub(super) const TIMESTAMP_BYTES: u64 = 16 * N_STAGES as u64;
 #[derive(Debug)]
 pub(super) struct Pipelines {
     layouts: Vec<BindGroupLayout>,
-    /// Variants per stage: by kernel, and for `interpolate` also by whether the nearest atoms are requested.
+    /// Variants per stage: one per kernel, and for `interpolate` a second one that computes the nearest atoms.
     variants: Vec<Vec<ComputePipeline>>,
 }
 

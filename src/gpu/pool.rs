@@ -1,10 +1,10 @@
 //! Device pool: one thread and one bounded queue per device.
 //!
-//! A job goes to the least loaded device. If the device fails, the job is retried once there, alone and on the rebuilt
-//! device, then on the others; a device that fails too often in a row cools down before it is used again. So does a
-//! device that hangs, which callers notice while they wait; its thread is abandoned and replaced. A large job runs on
-//! several idle devices, and if that fails, on one. Cancellation and deadline are checked here while a job waits, and
-//! by the executor while it runs.
+//! A job goes to the least loaded device. If the device fails, the job is retried once on the rebuilt device, alone,
+//! and then on the other devices. A device that fails too often in a row cools down before it is used again. A device
+//! that hangs cools down as well; waiting callers detect the hang, and its thread is abandoned and replaced. A large
+//! job runs on several idle devices, and if that fails, on one. The pool checks cancellation and deadline while a job
+//! waits; the executor checks them while it runs.
 
 use std::io;
 use std::ops::Range;
@@ -16,7 +16,7 @@ use super::error::GpuError;
 use super::job::{Finished, GpuJob, JobResult};
 use super::multi_device::{join, n_partitions};
 use super::partition_handle::PartitionHandle;
-use super::scheduler::{EnqueueError, PoolSettings, Scheduler, Ticket};
+use super::scheduler::{DeviceTicket, EnqueueError, PoolSettings, Scheduler};
 use super::worker::{self, Build};
 use crate::surface::{DeviceStatus, Stage, SurfaceError};
 use crate::sync::Mutex;
@@ -50,7 +50,7 @@ pub struct DevicePool {
 /// Device that successive threads share.
 type SharedDevice = Arc<PoolDevice>;
 
-/// Finished job with the devices that made it.
+/// Finished job with the devices that ran it.
 #[derive(Debug, Clone)]
 pub struct CompletedJob {
     /// Mesh and stage times. In a multi-device job a stage's time is the longest of all devices.
@@ -164,8 +164,8 @@ impl DevicePool {
         self.run_on_one(job, failures, None).map(|completed| completed.finished)
     }
 
-    /// Runs a job on one device. `failures` counts earlier attempts per device, of which `last_error` is the last
-    /// error.
+    /// Runs a job on one device. `failures` counts the failed attempts so far per device; `last_error` is the error of
+    /// the last one.
     fn run_on_one(
         &self,
         job: &GpuJob,
@@ -251,10 +251,10 @@ impl DevicePool {
         MultiDeviceOutcome::Done(Box::new(CompletedJob { finished, devices }))
     }
 
-    /// Waits for the results of all tickets of a job, in order. The failure of a partition aborts the others, which are
-    /// waited for nevertheless, because their devices are busy until then. If the job is cancelled or late, the waiting
-    /// entries are removed and nothing is waited for.
-    fn wait_for_all(&self, job: &GpuJob, tickets: &[Ticket]) -> Vec<JobResult> {
+    /// Waits for the results of all tickets of a job, in order. The failure of a partition aborts the others; their
+    /// results are awaited nevertheless, because their devices are busy until then. If the job is cancelled or late,
+    /// removes its entries from the queues and does not wait.
+    fn wait_for_all(&self, job: &GpuJob, tickets: &[DeviceTicket]) -> Vec<JobResult> {
         let mut results = Vec::with_capacity(tickets.len());
         while let Some(ticket) = tickets.get(results.len()) {
             match ticket.result.recv_timeout(POLL_INTERVAL) {

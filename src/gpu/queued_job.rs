@@ -4,7 +4,7 @@ use super::job::{GpuJob, JobResult};
 use super::partition_handle::PartitionHandle;
 use crate::sync::mpsc::SyncSender;
 
-/// Load of a large job or of a partition, in small jobs.
+/// Load of a large job or of a partition, in units of a small job.
 pub(super) const LARGE_LOAD: u64 = 16;
 
 /// Job in a device's queue.
@@ -37,7 +37,7 @@ impl QueuedJob {
         }
     }
 
-    /// Load that the job adds to its device, in small jobs.
+    /// Load that the job adds to its device, in units of a small job.
     pub(super) fn load(&self) -> u64 {
         if self.partition.is_none() && self.job.prepared.is_small() { 1 } else { LARGE_LOAD }
     }

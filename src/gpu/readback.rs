@@ -1,7 +1,7 @@
-//! Readback buffers: a submission copies results into them and the host reads them in place.
+//! Readback buffers: a submission copies results into them, and the host reads them there.
 //!
-//! The columns of a mesh stay in the buffer for as long as the mesh lives; then the buffer returns to the pool. Copying
-//! them into other memory would take many times as long as the transfer.
+//! The columns of a mesh stay in the buffer until the mesh is dropped; then the buffer returns to the pool. Copying
+//! them to other memory would take many times as long as the transfer.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -142,7 +142,7 @@ pub(super) fn reserved_sizes(bytes: u64) -> impl Iterator<Item = u64> {
 }
 
 impl ReadbackBuffer {
-    /// Requests to map the first `bytes` bytes. They are readable when the submission is finished and the device was
+    /// Requests to map the first `bytes` bytes. They are readable once the submission is finished and the device was
     /// polled; see [`Self::mapped`].
     pub(super) fn map(&self, bytes: u64) {
         // `mapped` reports a failure.

@@ -40,9 +40,9 @@ impl Executor for Engine {
                 Err(error) => *result = Some(Err(error)),
             }
         }
-        let (places, jobs): (Vec<_>, Vec<_>) = small.into_iter().unzip();
-        for (place, result) in places.into_iter().zip(self.run_small(jobs)) {
-            *place = Some(result);
+        let (slots, jobs): (Vec<_>, Vec<_>) = small.into_iter().unzip();
+        for (slot, result) in slots.into_iter().zip(self.run_small(jobs)) {
+            *slot = Some(result);
         }
         let missing = || Err(GpuError::Failed("a job without a result".to_owned()));
         results.into_iter().map(|result| result.unwrap_or_else(missing)).collect()
@@ -84,10 +84,11 @@ impl Engine {
     /// Estimated output of a job. `None` unless the job is small.
     fn small_capacity(&self, job: &GpuJob, chunks: &[Chunk]) -> Option<OutputRows> {
         // The surface of a small structure crosses a larger share of its bricks; 8 bricks more cover that.
-        let n = job.prepared.plan.bricks.len() as u64 + 8;
+        let n_bricks = job.prepared.plan.bricks.len() as u64;
+        let n = n_bricks + 8;
         let [vertices, triangles] = self.budget.rows_per_brick.map(|each| each * n);
         let vertex = VertexBytes::new(&job.prepared.params);
-        let rows = OutputRows { vertices, triangles, sheet_words: self.budget.sheet_words_per_brick * n };
+        let rows = OutputRows { vertices, triangles, sheet_words: n_bricks + self.budget.sheet_words_per_brick * n };
         let bytes = ReadbackLayout::new(rows, vertex).end;
         let largest = (vertex.positions * vertices).max(TRIANGLE_BYTES * triangles);
         let fits = largest <= self.budget.piece_bytes && bytes <= self.budget.readback_bytes;
@@ -151,7 +152,7 @@ impl Engine {
         self.wait(self.submit(recording, readbacks))
     }
 
-    /// Assembles the mesh of a small job. Its output is made again if the estimate was too low.
+    /// Assembles the mesh of a small job. Its output is computed again if the estimate was too low.
     fn finish_small(
         &mut self,
         state: &mut JobState,
@@ -167,12 +168,14 @@ impl Engine {
         state.times = times.map(|ns| portion(ns, share));
         let counters = counters(readback)?;
         let [vertices, triangles] = state.total;
-        let made = OutputRows { vertices, triangles, sheet_words: counters.sheet_words.into() };
+        let n_bricks = state.loaded.n_bricks();
+        let sheet_words = u64::from(n_bricks) + u64::from(counters.sheet_words);
+        let made = OutputRows { vertices, triangles, sheet_words };
         let rows = ReadbackRows { readback: readback.clone(), layout, rows: made };
         if made.sheet_words > capacity.sheet_words {
             self.make_output(state, &[(0, &counts)], Stage::Measure)?;
         } else {
-            state.sheets.push(rows.clone());
+            state.sheets.push((n_bricks, rows.clone()));
         }
         if vertices > capacity.vertices || triangles > capacity.triangles {
             self.make_output(state, &[(0, &counts)], Stage::Interpolate)?;
@@ -217,8 +220,8 @@ impl Engine {
     }
 
     /// Loads and counts the next job of the pool while the device transfers the results of the current one, whose
-    /// workspace takes `in_use` bytes. Does nothing if the next job is small, or if the memory cannot hold both. A next
-    /// job that fails here starts again when its turn comes.
+    /// workspace takes `in_use` bytes. Does nothing if the next job is small, or if the memory cannot hold both. If the
+    /// next job fails here, its regular run starts from the beginning.
     fn begin_next(&mut self, in_use: u64) -> Option<()> {
         let job = self.next_job.as_ref().and_then(|next| next())?;
         let chunks = self.chunks(&job, None).ok()?;

@@ -1,4 +1,4 @@
-//! Run of one partition of a multi-device job. Its bricks are counted and its vertices made independently of the other
+//! Run of one partition of a multi-device job. The counts of its bricks and its vertices do not depend on the other
 //! partitions; its triangles need the vertex numbers of later partitions.
 
 use std::ops::Range;
@@ -10,15 +10,15 @@ use super::job::{GpuJob, JobResult};
 use super::job_state::JobState;
 use super::output_layout::{OutputRows, narrow, values};
 use super::partition_handle::{Import, PartitionCounts, PartitionHandle};
-use super::plan::layout::Record;
+use super::plan::layout::BrickRecord;
 use super::plan::partition::total_len;
 use super::recording::PendingSubmission;
 
 /// Bytes that are exported per brick: its record, and its first vertex and triangle.
-const RECORD: u64 = size_of::<Record>() as u64;
+const RECORD: u64 = size_of::<BrickRecord>() as u64;
 const OFFSET: u64 = 8;
 
-/// Bytes of the exported `runs`; the size of a mapped range is a multiple of 8 bytes and not zero.
+/// Size of the exported `runs`, rounded up for mapping: a mapped range is a multiple of 8 bytes and not empty.
 fn export_bytes(runs: &[Range<u32>]) -> u64 {
     (total_len(runs) * (RECORD + OFFSET)).next_multiple_of(8).max(8)
 }
@@ -52,7 +52,7 @@ impl Engine {
         let exported = self.wait_one(export)?;
         let [vertices, triangles] = state.total;
         handle.publish(PartitionCounts { vertices, triangles, exported });
-        // The vertices are read back meanwhile.
+        // The device transfers the vertices while this partition waits for the counts of the others.
         let numbering = handle.await_counts(&job)?;
         job.prepared.check_mesh(numbering.total)?;
         let base = narrow(numbering.first[0])?;

@@ -16,12 +16,12 @@ pub(super) struct RunningBatch {
     is_build: bool,
     is_retry: bool,
     replies: Vec<SyncSender<JobResult>>,
-    /// Partition that the batch consists of, if it does.
+    /// Partition, if the batch consists of one.
     partition: Option<PartitionHandle>,
     bricks: u64,
     /// Submissions of the executor.
     submissions: Arc<AtomicU64>,
-    /// Number of submissions at the last change that was seen, and its time.
+    /// Number of submissions, and the time at which it was first seen.
     seen: (u64, Instant),
 }
 
@@ -56,8 +56,8 @@ impl RunningBatch {
         self.bricks
     }
 
-    /// Returns the time limit of a submission, or of the build. `minimum` and `fastest` have the meaning that they have
-    /// in [`hang_limit::of_submission`].
+    /// Returns the time limit of a submission, or of the build. For `minimum` and `fastest`, see
+    /// [`hang_limit::of_submission`].
     pub(super) fn limit(&self, minimum: Duration, fastest: Option<f64>) -> Duration {
         if self.is_build {
             hang_limit::of_build(minimum)

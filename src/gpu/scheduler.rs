@@ -59,7 +59,7 @@ impl Default for PoolSettings {
 }
 
 /// State behind the lock.
-pub(super) struct State {
+pub(super) struct SchedulerState {
     pub(super) queues: Vec<DeviceQueue>,
     pub(super) closed: bool,
     next_id: u64,
@@ -67,7 +67,7 @@ pub(super) struct State {
 
 /// Queues of all devices.
 pub(super) struct Scheduler {
-    state: Mutex<State>,
+    state: Mutex<SchedulerState>,
     /// Notified when a queue or the state of a device has changed.
     pub(super) changed: Condvar,
     /// Notified when a job was added, one per device.
@@ -76,7 +76,7 @@ pub(super) struct Scheduler {
 }
 
 /// Ticket of an enqueued job.
-pub(super) struct Ticket {
+pub(super) struct DeviceTicket {
     /// Index of the device.
     pub(super) device: usize,
     id: u64,
@@ -87,23 +87,23 @@ pub(super) struct Ticket {
 pub(super) enum EnqueueError {
     /// The queues of all eligible devices are still full after a wait.
     Full,
-    /// No device is eligible; with the reasons of those that are down.
+    /// No device is eligible. Contains the reasons of the devices that are down.
     NoDevice(String),
 }
 
-impl State {
+impl SchedulerState {
     /// Returns the queue of a thread unless the thread was replaced.
     pub(super) fn queue_of(&mut self, thread: DeviceThread) -> Option<&mut DeviceQueue> {
         self.queues.get_mut(thread.device).filter(|queue| queue.generation == thread.generation)
     }
 
     /// Adds a job to the queue of device `n`.
-    fn push(&mut self, n: usize, job: &GpuJob, partition: Option<PartitionHandle>, retry: bool) -> Ticket {
+    fn push(&mut self, n: usize, job: &GpuJob, partition: Option<PartitionHandle>, retry: bool) -> DeviceTicket {
         let (reply, result) = sync_channel(1);
         let id = self.next_id;
         self.next_id += 1;
         self.queues[n].push(QueuedJob { id, job: job.clone(), partition, retry, reply });
-        Ticket { device: n, id, result }
+        DeviceTicket { device: n, id, result }
     }
 }
 
@@ -115,14 +115,18 @@ impl Scheduler {
             DeviceQueue::new(*number, name.clone(), settings.queue, settings.cool_down)
         };
         Self {
-            state: Mutex::new(State { queues: devices.iter().map(queue).collect(), closed: false, next_id: 0 }),
+            state: Mutex::new(SchedulerState {
+                queues: devices.iter().map(queue).collect(),
+                closed: false,
+                next_id: 0,
+            }),
             changed: Condvar::new(),
             added: devices.iter().map(|_| Condvar::new()).collect(),
             settings,
         }
     }
 
-    pub(super) fn lock(&self) -> MutexGuard<'_, State> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, SchedulerState> {
         // No code panics between two changes under the lock, so a poisoned state is consistent.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -136,7 +140,7 @@ impl Scheduler {
         failures: &[usize],
         max_failures: usize,
         timeout: Duration,
-    ) -> Result<Ticket, EnqueueError> {
+    ) -> Result<DeviceTicket, EnqueueError> {
         let mut state = self.lock();
         let queues = &state.queues;
         let eligible = |n: &usize| failures[*n] < max_failures && matches!(queues[*n].state, DeviceState::Up);
@@ -170,13 +174,13 @@ impl Scheduler {
         &self,
         job: &GpuJob,
         partitions: Vec<(usize, PartitionHandle)>,
-    ) -> Option<Vec<Ticket>> {
+    ) -> Option<Vec<DeviceTicket>> {
         let mut state = self.lock();
         let accepts = |queue: &DeviceQueue| queue.is_idle() && queue.waiting.len() < self.settings.queue;
         if !partitions.iter().all(|(n, _)| accepts(&state.queues[*n])) {
             return None;
         }
-        let tickets: Vec<Ticket> =
+        let tickets: Vec<DeviceTicket> =
             partitions.into_iter().map(|(n, partition)| state.push(n, job, Some(partition), false)).collect();
         drop(state);
         for ticket in &tickets {
@@ -186,7 +190,7 @@ impl Scheduler {
     }
 
     /// Removes a job from its queue. A running job checks its cancellation token by itself.
-    pub(super) fn cancel(&self, ticket: &Ticket) {
+    pub(super) fn cancel(&self, ticket: &DeviceTicket) {
         let mut state = self.lock();
         let queue = &mut state.queues[ticket.device];
         let position = queue.waiting.iter().position(|job| job.id == ticket.id);
@@ -198,9 +202,9 @@ impl Scheduler {
         drop(removed);
     }
 
-    /// Waits for the next batch of a device: one job, or several small ones. The batch is empty if none came for
+    /// Waits for the next batch of a device: one job, or several small ones. The batch is empty if no job came for
     /// [`PoolSettings::idle`]. Returns `None` once the device is down, its thread replaced, or the scheduler closed.
-    /// `submissions` counts those of the executor.
+    /// `submissions` is the counter of the executor.
     pub(super) fn next_batch(&self, thread: DeviceThread, submissions: &Arc<AtomicU64>) -> Option<Vec<QueuedJob>> {
         let mut state = self.lock();
         state.queue_of(thread)?.running = None;
@@ -271,8 +275,8 @@ impl Scheduler {
         }
     }
 
-    /// Records the results of a batch and then sends them. Callers that retry find the state of the device updated. If
-    /// the thread was replaced, its callers have an error already, and the results are dropped.
+    /// Records the results of a batch before it sends them, so that callers that retry find the state of the device
+    /// updated. If the thread was replaced, its callers have an error already, and the results are dropped.
     pub(super) fn finish_batch(
         &self,
         thread: DeviceThread,

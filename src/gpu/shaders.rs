@@ -1,4 +1,4 @@
-//! Shaders as the build assembled, validated and reflected them.
+//! Shaders with their reflection. The build assembles, validates and reflects them.
 
 use wgpu::{BufferBindingType, ShaderStages};
 
@@ -34,7 +34,7 @@ pub(super) struct Shader<B: 'static = &'static str> {
 /// Struct in a buffer as a shader declares it.
 #[cfg(test)]
 #[derive(Debug)]
-pub(super) struct Layout {
+pub(super) struct StructLayout {
     name: &'static str,
     size: usize,
     /// Name, offset and size of each field.
@@ -74,7 +74,7 @@ mod tests {
     use std::mem::offset_of;
 
     use super::*;
-    use crate::gpu::plan::layout::{Counters, Record, Tile};
+    use crate::gpu::plan::layout::{BrickRecord, Counters, Tile};
     use crate::surface::Stage;
     use crate::surface::lattice::LatticeAtom;
 
@@ -128,14 +128,14 @@ mod tests {
                 base_vertex,
                 steps_per_angstrom
             ),
-            host!("Record", Record, crossing, layers, neighbours),
+            host!("BrickRecord", BrickRecord, crossing, layers, neighbours),
             host!("Counters", Counters, list_end, vertices, triangles, flat, checksum, degenerate, sheet_words, bounds),
             host!("Tile", Tile, coord, base, bricks, before, around),
         ]
     }
 
     /// Returns the differences between the layouts of shaders and host.
-    fn differences(shaders: &[Layout], host: &[Host]) -> Vec<String> {
+    fn differences(shaders: &[StructLayout], host: &[Host]) -> Vec<String> {
         let mut wrong = Vec::new();
         for layout in shaders {
             let Some((_, size, fields)) = host.iter().find(|(name, ..)| *name == layout.name) else {
@@ -163,9 +163,9 @@ mod tests {
 
     #[test]
     fn structs_of_pictures_have_the_same_layout_on_both_sides() {
-        use crate::gpu::picture_targets::{FinishParams, Tap, View};
+        use crate::gpu::picture_targets::{FinishParams, TapUniform, ViewUniform};
         let mut all = vec![
-            host!("View", View, right, up, toward, light, size, offset, scale, reach, diffuse, pad),
+            host!("ViewUniform", ViewUniform, right, up, toward, light, size, offset, scale, reach, diffuse, pad),
             host!(
                 "FinishParams",
                 FinishParams,
@@ -183,7 +183,7 @@ mod tests {
                 line_strength,
                 pad
             ),
-            host!("Tap", Tap, pixels, length),
+            host!("TapUniform", TapUniform, pixels, length),
         ];
         assert_eq!(all.len(), PICTURE_LAYOUTS.len());
         assert_eq!(differences(PICTURE_LAYOUTS, &all), Vec::<String>::new());

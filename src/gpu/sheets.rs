@@ -1,6 +1,6 @@
-//! Blocks of the stage `measure`, as devices write them, and the measures of the mesh that they give.
+//! Blocks of sheets that the stage `measure` writes on a device, and the measures of the mesh computed from them.
 
-use rayon::prelude::*;
+use std::ops::Range;
 
 use super::error::GpuError;
 use super::plan::Plan;
@@ -9,36 +9,51 @@ use crate::surface::join::{self, BrickSheets, SharedVertex, Sheet, SheetSums};
 use crate::surface::lattice::to_u32;
 use crate::surface::{Column, Measures};
 
-/// Words of a block before its sheets, and words of a sheet; as in `measure.wgsl`.
+/// Number of words of a block before its sheets, and of a sheet; as in `measure.wgsl`.
 const HEADER: usize = 5;
 const SHEET: usize = 12;
-/// Bricks that are joined with their neighbours at once.
+/// Number of bricks that a task reads.
 const RUN: usize = 1024;
 
 /// Sheets and checksum of a mesh or partition.
 #[derive(Debug, Clone, Default)]
 pub struct SheetBlocks {
-    /// Blocks of the bricks that the surface intersects, in any order.
-    pub(super) words: Column<u32>,
+    /// Blocks of all bricks, in pieces in the order of the bricks.
+    pub(super) pieces: Vec<SheetPiece>,
     /// Sum of the shares of all directed edges.
     pub(super) checksum: u64,
     /// True if a triangle has a corner twice.
     pub(super) degenerate: bool,
 }
 
+/// Blocks of a run of bricks.
+#[derive(Debug, Clone)]
+pub(super) struct SheetPiece {
+    pub(super) n_bricks: u32,
+    /// Table of the offset of each brick's block, [`NONE`] if the surface does not intersect the brick; followed by the
+    /// blocks in any order.
+    pub(super) words: Column<u32>,
+}
+
 /// Block of one brick.
-#[derive(Clone, Copy)]
-struct Block<'a> {
+struct SheetBlock<'a> {
     origin: [i32; 3],
     sheets: &'a [[u32; SHEET]],
-    /// Vertices that it shares with other bricks, if it has several sheets.
+    /// Vertices that the brick shares with other bricks; empty unless it has several sheets.
     vertices: &'a [u32],
 }
 
 impl SheetBlocks {
+    /// Returns the blocks of `n_bricks` bricks that the surface does not intersect: those of an empty mesh.
+    #[must_use]
+    pub fn without_surface(n_bricks: usize) -> Self {
+        let piece = SheetPiece { n_bricks: to_u32(n_bricks), words: vec![NONE; n_bricks].into() };
+        Self { pieces: vec![piece], checksum: 0, degenerate: false }
+    }
+
     /// Adds the blocks of the next partition.
     pub(super) fn append(&mut self, next: Self) {
-        self.words.append(next.words);
+        self.pieces.extend(next.pieces);
         self.checksum = self.checksum.wrapping_add(next.checksum);
         self.degenerate |= next.degenerate;
     }
@@ -49,84 +64,94 @@ impl SheetBlocks {
     /// # Errors
     /// [`GpuError::Failed`] if the blocks contradict each other or the mesh.
     pub(super) fn measures(&self, plan: &Plan, unit: f64, size: [usize; 2]) -> Result<Option<Measures>, GpuError> {
-        let mut blocks = vec![None; plan.bricks.len()];
-        for words in self.words.pieces() {
-            place(words, &mut blocks)?;
+        let n_bricks = plan.bricks.len();
+        let n_listed: usize = self.pieces.iter().map(|piece| piece.n_bricks as usize).sum();
+        if n_listed != n_bricks {
+            return Err(GpuError::Failed(format!("found sheets of {n_listed} bricks, expected {n_bricks}")));
         }
-        // Bricks that the surface intersects, and the index of each brick among them.
-        let (mut bricks, mut index) = (Vec::with_capacity(blocks.len()), vec![NONE; blocks.len()]);
-        for (brick, block) in blocks.into_iter().enumerate() {
-            if let Some(block) = block {
-                index[brick] = to_u32(bricks.len());
-                bricks.push((plan.bricks[brick], block));
-            }
-        }
-        let mut runs: Vec<SheetSums> = bricks.par_chunks(RUN).map(sums).collect::<Result<_, GpuError>>()?;
-        if let Some(first) = runs.first_mut() {
-            (first.checksum, first.degenerate) = (self.checksum, self.degenerate);
-        }
-        let sheets = || runs.iter().flat_map(|run| &run.sheets);
-        let found: [usize; 2] =
-            [sheets().map(|s| s.vertices as usize).sum(), sheets().map(|s| s.triangles as usize).sum()];
+        let run = |n: usize| self.sums(n * RUN..n_bricks.min((n + 1) * RUN));
+        let runs = join::each(n_bricks.div_ceil(RUN), run);
+        let mut runs: Vec<(SheetSums, [usize; 2])> = runs.into_iter().collect::<Result<_, GpuError>>()?;
+        let found = runs.iter().fold([0; 2], |sum, (_, size)| [sum[0] + size[0], sum[1] + size[1]]);
         if found != size {
             return Err(GpuError::Failed(format!(
                 "the sheets have {found:?} vertices and triangles, the mesh {size:?}"
             )));
         }
-        let near = |run: usize| {
-            let (bricks, index) = (&bricks[run * RUN..], &index);
-            move |brick: usize, n: usize| {
-                let other = plan.neighbour(bricks[brick].0, to_u32(n))?;
-                let at = index[other as usize];
-                (at != NONE).then_some((at as usize / RUN, at as usize % RUN))
-            }
-        };
-        Ok(join::measures(&runs.iter().collect::<Vec<_>>(), near, unit, size))
-    }
-}
-
-/// Stores the blocks in `words` at the indices of their bricks.
-fn place<'a>(mut words: &'a [u32], blocks: &mut [Option<Block<'a>>]) -> Result<(), GpuError> {
-    while let Some((&[brick, counts, x, y, z], rest)) = words.split_first_chunk::<HEADER>() {
-        let [n_sheets, n_vertices] = [counts & 0xffff, counts >> 16].map(|n| n as usize);
-        let parts = rest.split_at_checked(SHEET * n_sheets).and_then(|(sheets, rest)| {
-            let (vertices, rest) = rest.split_at_checked(n_vertices)?;
-            Some((sheets.as_chunks().0, vertices, rest))
-        });
-        let (place, (sheets, vertices, rest)) = match (blocks.get_mut(brick as usize), parts) {
-            (Some(place @ None), Some(parts)) if n_sheets > 0 => (place, parts),
-            _ => {
-                return Err(GpuError::Failed(format!("no block of brick {brick} with {n_sheets} sheets was expected")));
-            }
-        };
-        *place = Some(Block { origin: [x, y, z].map(u32::cast_signed), sheets, vertices });
-        words = rest;
-    }
-    if words.is_empty() { Ok(()) } else { Err(GpuError::Failed(format!("{} words after the last block", words.len()))) }
-}
-
-/// Sums of a run of bricks.
-fn sums(bricks: &[(u32, Block<'_>)]) -> Result<SheetSums, GpuError> {
-    let mut sums = SheetSums::default();
-    for (_, Block { origin, sheets, vertices }) in bricks {
-        let n = narrow(to_u32(sheets.len()))?;
-        let start = sums.near.len();
-        let [first, near, far] = [sums.sheets.len(), start, sums.far.len()].map(to_u32);
-        sums.bricks.push(BrickSheets { first, n, near, far });
-        sums.sheets.extend(sheets.iter().map(|words| sheet(*origin, words)));
-        for word in *vertices {
-            let [owner, ..] = (word & 7).to_le_bytes();
-            let (key, sheet) = (narrow(word >> 3 & 0x7ff)?, narrow(word >> 14)?);
-            if sheet >= n {
-                return Err(GpuError::Failed(format!("a vertex on sheet {sheet} of {n}")));
-            }
-            let column = if owner == 0 { &mut sums.near } else { &mut sums.far };
-            column.push(SharedVertex { owner, key, sheet });
+        if let Some((first, _)) = runs.first_mut() {
+            (first.checksum, first.degenerate) = (self.checksum, self.degenerate);
         }
-        // Devices order vertices by axis first. A stable sort merges these three ascending runs.
-        sums.near[start..].sort_by_key(|vertex| vertex.key);
+        let near = |run: usize| {
+            move |brick: usize, n: usize| {
+                let other = plan.neighbour(plan.bricks[run * RUN + brick], to_u32(n))? as usize;
+                Some((other / RUN, other % RUN))
+            }
+        };
+        let runs: Vec<&SheetSums> = runs.iter().map(|(sums, _)| sums).collect();
+        Ok(join::measures(&runs, near, unit, size))
     }
-    Ok(sums)
+
+    /// Sums of a run of bricks, with its numbers of vertices and triangles.
+    fn sums(&self, bricks: Range<usize>) -> Result<(SheetSums, [usize; 2]), GpuError> {
+        let (mut sums, mut size) = (SheetSums::default(), [0; 2]);
+        sums.bricks.reserve_exact(bricks.len());
+        let mut first = 0;
+        for SheetPiece { n_bricks, words } in &self.pieces {
+            let end = first + *n_bricks as usize;
+            for brick in bricks.start.max(first)..bricks.end.min(end) {
+                match words.get(brick - first) {
+                    Some(&NONE) => add(&mut sums, None)?,
+                    Some(&at) => add(&mut sums, Some(SheetBlock::read(words, brick, at)?))?,
+                    None => return Err(GpuError::Failed(format!("the table of sheets lacks brick {brick}"))),
+                }
+            }
+            first = end;
+        }
+        for sheet in &sums.sheets {
+            size[0] += sheet.vertices as usize;
+            size[1] += sheet.triangles as usize;
+        }
+        Ok((sums, size))
+    }
+}
+
+impl<'a> SheetBlock<'a> {
+    /// Reads the block of `brick`, which begins at `at`.
+    fn read(words: &'a [u32], brick: usize, at: u32) -> Result<Self, GpuError> {
+        let block = words.get(at as usize..).and_then(|words| {
+            let (&[found, counts, x, y, z], rest) = words.split_first_chunk::<HEADER>()?;
+            let [n_sheets, n_vertices] = [counts & 0xffff, counts >> 16].map(|n| n as usize);
+            let (sheets, rest) = rest.split_at_checked(SHEET * n_sheets)?;
+            let vertices = rest.get(..n_vertices)?;
+            let sheets = sheets.as_chunks().0;
+            let block = Self { origin: [x, y, z].map(u32::cast_signed), sheets, vertices };
+            (found as usize == brick && n_sheets > 0).then_some(block)
+        });
+        block.ok_or_else(|| GpuError::Failed(format!("no block of brick {brick} at word {at} of {}", words.len())))
+    }
+}
+
+/// Adds the next brick.
+fn add(sums: &mut SheetSums, block: Option<SheetBlock<'_>>) -> Result<(), GpuError> {
+    let SheetBlock { origin, sheets, vertices } =
+        block.unwrap_or(SheetBlock { origin: [0; 3], sheets: &[], vertices: &[] });
+    let n = narrow(to_u32(sheets.len()))?;
+    let start = sums.near.len();
+    let [first, near, far] = [sums.sheets.len(), start, sums.far.len()].map(to_u32);
+    sums.bricks.push(BrickSheets { first, n, near, far });
+    sums.sheets.extend(sheets.iter().map(|words| sheet(origin, words)));
+    for word in vertices {
+        let [owner, ..] = (word & 7).to_le_bytes();
+        let (key, sheet) = (narrow(word >> 3 & 0x7ff)?, narrow(word >> 14)?);
+        if sheet >= n {
+            return Err(GpuError::Failed(format!("a vertex lies on sheet {sheet}, its brick has {n} sheets")));
+        }
+        let column = if owner == 0 { &mut sums.near } else { &mut sums.far };
+        column.push(SharedVertex { owner, key, sheet });
+    }
+    // Devices order vertices by axis first. A stable sort merges these three ascending runs.
+    sums.near[start..].sort_by_key(|vertex| vertex.key);
+    Ok(())
 }
 
 fn narrow(n: u32) -> Result<u16, GpuError> {
@@ -154,31 +179,45 @@ mod tests {
         words
     }
 
-    /// Number of components of a mesh of three bricks and the given numbers of vertices and triangles.
-    fn components(blocks: &[Vec<u32>], checksum: u64, size: [usize; 2]) -> Result<Option<usize>, GpuError> {
+    /// Number of components of a mesh of three bricks in two pieces, with the given numbers of vertices and triangles.
+    /// `offsets` is the table of the bricks' blocks.
+    fn components(
+        offsets: [u32; 3],
+        blocks: &[Vec<u32>],
+        checksum: u64,
+        size: [usize; 2],
+    ) -> Result<Option<usize>, GpuError> {
         let plan = Plan { bricks: vec![0, 1, 2], ..Plan::default() };
-        let sheets = SheetBlocks { words: blocks.concat().into(), checksum, degenerate: false };
+        let piece = |offsets: &[u32]| SheetPiece {
+            n_bricks: to_u32(offsets.len()),
+            words: [offsets, &blocks.concat()].concat().into(),
+        };
+        let pieces = vec![piece(&offsets[..1]), piece(&offsets[1..])];
+        let sheets = SheetBlocks { pieces, checksum, degenerate: false };
         Ok(sheets.measures(&plan, 1.0, size)?.map(|measures| measures.components.len()))
     }
 
     #[test]
     fn blocks_that_contradict_each_other_or_the_mesh_are_rejected() {
-        assert_eq!(components(&[block(2), block(0)], 0, [8, 8]), Ok(Some(2)));
-        assert_eq!(components(&[block(2)], 7, [4, 4]), Ok(None), "not closed");
+        let block_2 = 2 + to_u32(HEADER + SHEET);
+        assert_eq!(components([1, NONE, block_2], &[block(0), block(2)], 0, [8, 8]), Ok(Some(2)));
+        assert_eq!(components([NONE, NONE, 2], &[block(2)], 7, [4, 4]), Ok(None), "not closed");
         let mut on_another_sheet = block(1);
         on_another_sheet[1] |= 1 << 16;
         on_another_sheet.push(1 << 14);
-        for (what, blocks, size) in [
-            ("two blocks of a brick", vec![block(2), block(2)], [8, 8]),
-            ("no such brick", vec![block(3)], [4, 4]),
-            ("a short block", vec![block(1)[..HEADER + SHEET - 1].to_vec()], [4, 4]),
-            ("a block without sheets", vec![vec![1, 0, 0, 0, 0]], [0, 0]),
-            ("a word too many", vec![block(1), vec![5]], [4, 4]),
-            ("another number of triangles", vec![block(1)], [4, 5]),
-            ("a vertex on another sheet", vec![on_another_sheet], [4, 4]),
+        for (what, offset, block, size) in [
+            ("the block of another brick", 2, block(2), [4, 4]),
+            ("a block beyond the end", 40, block(1), [4, 4]),
+            ("a short block", 2, block(1)[..HEADER + SHEET - 1].to_vec(), [4, 4]),
+            ("a block without sheets", 2, vec![1, 0, 0, 0, 0], [0, 0]),
+            ("another number of triangles", 2, block(1), [4, 5]),
+            ("a vertex on another sheet", 2, on_another_sheet, [4, 4]),
         ] {
-            let found = components(&blocks, 0, size);
+            let found = components([NONE, offset, NONE], &[block], 0, size);
             assert!(matches!(found, Err(GpuError::Failed(_))), "{what}: {found:?}");
         }
+        let plan = Plan { bricks: vec![0], ..Plan::default() };
+        let found = SheetBlocks::default().measures(&plan, 1.0, [0, 0]);
+        assert!(matches!(found, Err(GpuError::Failed(_))), "no entries: {found:?}");
     }
 }

@@ -1,5 +1,5 @@
-//! Submissions to the device queue. A submission may follow another before that is finished: the device runs them in
-//! order without waiting for the host.
+//! Submissions to the device queue. The host may submit before the previous submission is finished; the device runs
+//! them in order.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ impl Engine {
         PendingSubmission { index, readbacks }
     }
 
-    /// Waits for a submission and all before it. Returns the mapped readback buffers.
+    /// Waits for a submission and all earlier ones. Returns the mapped readback buffers.
     pub(super) fn wait(&self, submission: PendingSubmission) -> Result<Vec<Arc<ReadbackBuffer>>, GpuError> {
         let PendingSubmission { index, readbacks } = submission;
         let waited = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None });

@@ -123,7 +123,8 @@ fn run_batch(executor: &mut dyn Executor, batch: &[QueuedJob]) -> Vec<JobResult>
     }
 }
 
-/// Reason to discard the executor. A lack of memory is none: the next job may be smaller.
+/// Returns the reason to discard the executor, if there is one. After a lack of memory the executor stays, because the
+/// next job may be smaller.
 fn device_failure(result: &JobResult) -> Option<String> {
     match result {
         Err(GpuError::OutOfMemory { .. }) | Ok(_) => None,

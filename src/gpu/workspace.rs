@@ -5,7 +5,7 @@ use wgpu::{BindGroup, Buffer, BufferUsages, Device};
 use super::buffers::BufferId;
 use super::output_layout::{OutputRows, TRIANGLE_BYTES, VertexBytes};
 use super::pipelines::{Pipelines, STAGES, stage_index};
-use super::plan::layout::{Counters, Params, Record, SAMPLES, Tile};
+use super::plan::layout::{BRICK_POINTS, BrickRecord, Counters, Params, Tile};
 use super::plan::{Chunk, Plan};
 use super::readback::size_class;
 use super::shaders::SHADERS;
@@ -39,9 +39,9 @@ impl BufferSizes {
             BufferId::Halo => max(&|c| 4 * c.halo_table_len()),
             BufferId::Lists => max(&|c| 4 * c.candidates),
             BufferId::Heads => 16 * slots,
-            BufferId::Field => 4 * SAMPLES * slots,
+            BufferId::Field => 4 * BRICK_POINTS * slots,
             BufferId::Inside => bytes(n_bricks, 64),
-            BufferId::Records => bytes(n_bricks, size_of::<Record>()),
+            BufferId::Records => bytes(n_bricks, size_of::<BrickRecord>()),
             BufferId::Offsets => bytes(n_bricks, 8),
             BufferId::Groups => max(&|c| 16 * c.n_groups()),
             BufferId::Counters => size_of::<Counters>() as u64,

@@ -27,21 +27,21 @@ use tower::ServiceExt as _;
 
 use super::guard::Peer;
 use super::kinds::Kind;
-use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, Pace, Rate, STREAM_BUFFER, Streams};
+use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, MinimumRate, Pace, STREAM_BUFFER, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::socket::Guarded;
 use super::stop::{self, Stop};
-use crate::client_shares::{ClientShares, Place};
+use crate::client_shares::{ClientShares, SharePermit};
 use crate::config::ServerConfig;
 use crate::memory_budget::{Budget, Buffers};
 use crate::telemetry::{CONNECTIONS, REJECTED};
 
 /// Time for the first request of a connection after the service begins to stop.
-const UNDER_WAY: Duration = Duration::from_millis(500);
+const FIRST_REQUEST: Duration = Duration::from_millis(500);
 /// Pause after a failed accept, most likely because no file descriptor is left.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Number of connections beyond the limit that are answered with 503 at the same time; further ones are closed without
-/// an answer. It bounds the file descriptors that refusals take.
+/// a response. The limit bounds the file descriptors of refused connections.
 const MAX_REFUSALS: usize = 64;
 /// HTTP/2 flow control windows per request and per connection, bytes: large enough for long distances.
 const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
@@ -50,19 +50,15 @@ const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
 const SOCKET_BUFFER: usize = 256 << 10;
 /// Receive buffer of a connection, bytes, as charged to the memory budget.
 const RECEIVE_BUFFER: usize = 64 << 10;
-/// Unsent bytes that the system buffers per connection: few enough to see the progress of a slow client every few
-/// seconds.
-#[cfg(target_os = "linux")]
-const UNSENT: u32 = 256 << 10;
 /// Interval of HTTP/2 pings.
 const PING: Duration = Duration::from_secs(20);
 
 /// Time for the last responses, such as those of cancelled jobs.
 const LAST_RESPONSES: Duration = Duration::from_secs(1);
 
-/// Serves `router` on `listener` until the drain; then lets requests finish until [`Stop::Now`], and those that end at
-/// once then for [`LAST_RESPONSES`]. Returns true if all of them finished before [`Stop::Now`].
-/// The buffers of connections are charged to `budget`.
+/// Serves `router` on `listener` until the drain. Then open requests may finish until [`Stop::Now`], and the responses
+/// of cancelled ones for [`LAST_RESPONSES`] after it. Returns true if all requests finished before [`Stop::Now`].
+/// Charges the buffers of connections to `budget`.
 pub(super) async fn serve(
     listener: TcpListener,
     router: Router,
@@ -70,7 +66,7 @@ pub(super) async fn serve(
     budget: Budget,
     mut stop: watch::Receiver<Stop>,
 ) -> bool {
-    let places = Arc::new(Semaphore::new(config.connections));
+    let slots = Arc::new(Semaphore::new(config.connections));
     let shares = ClientShares::new(config.connections, config.client_share);
     let refusals = Arc::new(Semaphore::new(MAX_REFUSALS));
     let mut connections = JoinSet::new();
@@ -102,12 +98,12 @@ pub(super) async fn serve(
             }
         };
         let peer = Peer(peer.ip());
-        let place = match place(&places, &shares, &config, peer) {
-            Ok(place) => place,
+        let slot = match take_slot(&slots, &shares, &config, peer) {
+            Ok(slot) => slot,
             Err(problem) => {
                 counter!(REJECTED, "reason" => problem.slug()).increment(1);
                 if let Ok(hold) = Arc::clone(&refusals).try_acquire_owned() {
-                    refuse(stream, &problem, hold);
+                    refuse(stream, &problem, hold, Pace::new(MinimumRate::new(&config)));
                 }
                 continue;
             }
@@ -116,12 +112,15 @@ pub(super) async fn serve(
             tracing::debug!(%error, "the client disconnected at once");
             continue;
         }
+        let pace = Pace::new(MinimumRate::new(&config));
         let stream = Guarded::new(
             stream,
-            (place, GaugeGuard::new(gauge!(CONNECTIONS)), budget.buffers((SOCKET_BUFFER + RECEIVE_BUFFER) as u64)),
+            (slot, GaugeGuard::new(gauge!(CONNECTIONS)), budget.buffers((SOCKET_BUFFER + RECEIVE_BUFFER) as u64)),
             MAX_TIME_FACTOR * Duration::from_millis(config.write_timeout_ms),
+            Arc::clone(&pace),
         );
-        connections.spawn(connection(stream, peer, router.clone(), Arc::clone(&config), budget.clone(), stop.clone()));
+        let run = connection(stream, (peer, pace), router.clone(), Arc::clone(&config), budget.clone(), stop.clone());
+        connections.spawn(run);
     }
     drop(listener);
     let mut all = std::pin::pin!(async { while connections.join_next().await.is_some() {} });
@@ -139,24 +138,22 @@ pub(super) async fn serve(
 fn set_up(stream: &TcpStream) -> io::Result<()> {
     let socket = socket2::SockRef::from(stream);
     socket.set_send_buffer_size(SOCKET_BUFFER)?;
-    #[cfg(target_os = "linux")]
-    socket.set_tcp_notsent_lowat(UNSENT)?;
     // Responses are written in large pieces, which Nagle's algorithm would only delay.
     stream.set_nodelay(true)
 }
 
-/// Place of a connection in the limits of all clients and of its client. A trusted proxy has many clients, so it has no
-/// share.
-type ConnectionPlace = (OwnedSemaphorePermit, Option<Place>);
+/// Slot of a connection in `server.connections`, and in the share of its client. A trusted proxy serves many clients,
+/// so it has no share.
+type ConnectionSlot = (OwnedSemaphorePermit, Option<SharePermit>);
 
-/// Takes the place of a connection.
-fn place(
-    places: &Arc<Semaphore>,
+/// Takes a slot for a connection. Fails if there is none.
+fn take_slot(
+    slots: &Arc<Semaphore>,
     shares: &Arc<ClientShares>,
     config: &ServerConfig,
     peer: Peer,
-) -> Result<ConnectionPlace, Problem> {
-    let permit = Arc::clone(places)
+) -> Result<ConnectionSlot, Problem> {
+    let permit = Arc::clone(slots)
         .try_acquire_owned()
         .map_err(|_full| Problem::new(Kind::TooManyConnections, "the server has reached its limit of connections"))?;
     let is_proxy = config.trusted_proxies.as_ref().is_some_and(|proxies| proxies.contains(peer.0));
@@ -165,15 +162,16 @@ fn place(
 }
 
 /// Answers a connection beyond a limit with 503, without reading its request.
-fn refuse(stream: TcpStream, problem: &Problem, hold: OwnedSemaphorePermit) {
+fn refuse(stream: TcpStream, problem: &Problem, hold: OwnedSemaphorePermit, pace: Arc<Pace>) {
     let body = problem.document("unknown");
     let head = format!(
         "HTTP/1.1 503 Service Unavailable\r\ncontent-type: {MEDIA_TYPE}\r\ncontent-length: {}\r\n\
          retry-after: 1\r\nconnection: close\r\n\r\n",
         body.len()
     );
-    // The buffer of a new socket holds these few bytes. Dropping the stream closes it gently.
-    let mut stream = Guarded::new(stream, hold, Duration::from_secs(1));
+    // The send buffer of a new socket holds these few bytes, so this does not wait. Dropping the stream sends them
+    // first.
+    let mut stream = Guarded::new(stream, hold, Duration::from_secs(1), pace);
     tokio::spawn(async move {
         if let Err(error) = stream.write_all(&[head.as_bytes(), &body].concat()).await {
             tracing::debug!(%error, "a refused client disconnected");
@@ -210,8 +208,8 @@ impl Drop for Working {
 
 /// Serves one connection.
 async fn connection(
-    stream: Guarded<(ConnectionPlace, GaugeGuard, Buffers)>,
-    peer: Peer,
+    stream: Guarded<(ConnectionSlot, GaugeGuard, Buffers)>,
+    (peer, pace): (Peer, Arc<Pace>),
     router: Router,
     config: Arc<ServerConfig>,
     budget: Budget,
@@ -219,8 +217,7 @@ async fn connection(
 ) {
     let activity = Arc::new(Activity::default());
     let phase = stop.clone();
-    let rate = Rate::new(&config);
-    let (pace, broken) = (Pace::new(rate), Arc::new(Notify::new()));
+    let (rate, broken) = (MinimumRate::new(&config), Arc::new(Notify::new()));
     let service = service_fn(|request: Request<Incoming>| {
         let working = Working::on(&activity);
         let (phase, pace, version) = (phase.clone(), Arc::clone(&pace), request.version());
@@ -230,7 +227,7 @@ async fn connection(
         async move {
             let Ok(mut answer): Result<Response<Body>, Infallible> = answer.await;
             drop(working);
-            // Clients open their next connection elsewhere, before this one is closed.
+            // A client that sees this header opens its next connection to another instance.
             if *phase.borrow() >= Stop::Notice && version < Version::HTTP_2 {
                 answer.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
             }
@@ -260,7 +257,7 @@ async fn connection(
                 if activity.begun.load(Ordering::Relaxed) {
                     connection.as_mut().graceful_shutdown();
                 } else {
-                    (next_check, in_grace) = (Instant::now() + UNDER_WAY, true);
+                    (next_check, in_grace) = (Instant::now() + FIRST_REQUEST, true);
                 }
             }
             () = tokio::time::sleep_until(next_check), if in_grace => {
@@ -271,7 +268,7 @@ async fn connection(
             () = tokio::time::sleep_until(next_check), if !in_grace => {
                 // hyper starts its own timer only when the protocol version is known.
                 if !activity.begun.load(Ordering::Relaxed) {
-                    late();
+                    report_timeout();
                     return;
                 }
                 let busy = activity.busy.swap(false, Ordering::Relaxed) || activity.requests.load(Ordering::Relaxed) > 0;
@@ -309,7 +306,7 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
 fn report(error: &(dyn Error + Send + Sync + 'static)) {
     let hyper = error.downcast_ref::<hyper::Error>();
     if hyper.is_some_and(hyper::Error::is_timeout) {
-        late();
+        report_timeout();
         return;
     }
     if hyper.is_some_and(hyper::Error::is_parse_too_large) {
@@ -325,7 +322,8 @@ fn report(error: &(dyn Error + Send + Sync + 'static)) {
     tracing::debug!(error, "a connection ended early");
 }
 
-fn late() {
+/// Counts and logs a connection that sent no request in time.
+fn report_timeout() {
     counter!(REJECTED, "reason" => "header-timeout").increment(1);
     tracing::debug!("a connection sent no request in time");
 }

@@ -10,10 +10,10 @@ use utoipa::OpenApi;
 
 use super::openapi::access::SecurityRequirements;
 use super::openapi::parameters::ChoiceSchemas;
-use super::openapi::{components, problems};
+use super::openapi::{bodies, components, problems};
 use super::problem::Problem;
 
-const ABOUT: &str = "Watertight molecular-surface meshes from PDB, mmCIF and BinaryCIF files.
+const ABOUT: &str = "Watertight molecular-surface meshes from PDB, mmCIF, BinaryCIF, PQR and XYZ files.
 
 Send a structure file to `POST /v1/meshes`; the response is a mesh (GLB by default). For a long job, send \
 `Prefer: respond-async`: the response is 202 with a job, `GET /v1/jobs/{id}?wait=20` waits for its end, and \
@@ -23,7 +23,7 @@ Every error is a problem document (RFC 9457). Its `type` is the path of an expla
 types. Any operation may also return 403 (`cross-site`), 405 (`method-not-allowed`), 421 (`wrong-host`), 500 \
 (`internal`), 503 (`too-many-connections`) and 504 (`deadline`).
 
-`HEAD` is available wherever `GET` is. If the server has quotas, responses carry `RateLimit-Policy` and `RateLimit` \
+Every operation with `GET` also has `HEAD`. If the server has quotas, responses carry `RateLimit-Policy` and `RateLimit` \
 (draft-ietf-httpapi-ratelimit-headers-11). API keys are optional: a server without keys ignores them and never returns \
 401. Every response has an `X-Request-Id`: that of the request, if it has at most 64 letters, digits, `-`, `_` \
 and `.`, or a new one.";
@@ -49,7 +49,9 @@ and `.`, or a new one.";
         super::capabilities::show, super::problems::list, super::problems::one,
         super::health::live, super::health::ready, super::health::version,
     ),
-    components(schemas(problems::ProblemDocument, super::delivery::ReportDocument)),
+    components(schemas(
+        problems::ProblemDocument, super::delivery::ReportDocument, bodies::NamedStructure, bodies::StructureForm,
+    )),
     modifiers(&SecurityRequirements, &ChoiceSchemas),
 )]
 struct Description;

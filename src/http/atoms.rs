@@ -4,7 +4,6 @@ use axum::body::Body;
 use axum::extract::State;
 use axum::http::header::{self, HeaderMap};
 use axum::response::{IntoResponse, Response};
-use bytes::Bytes;
 use serde::Serialize;
 use utoipa::ToSchema;
 
@@ -15,8 +14,8 @@ use super::openapi::parameters::{ConditionHeaders, EntryPath, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
 use super::problem::Problem;
-use super::source::{Input, StructureSource};
-use super::state::Shared;
+use super::source::{Loaded, StructureSource};
+use super::state::{Delivery, Shared};
 use crate::structure::{Structure, element};
 
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
@@ -69,13 +68,15 @@ struct ResidueColumns {
 problem_responses!(StructureProblems: [
     READING,
     [
-        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull,
-        Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
+        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed,
+        Kind::TooMuchMemory, Kind::MemoryFull,
+        Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
     ],
 ]);
 problem_responses!(EntryProblems: [READING, [
     Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
-    Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::ShareExceeded,
+    Kind::PreconditionFailed, Kind::TooMuchMemory, Kind::MemoryFull, Kind::QueueFull,
+    Kind::TooManyDeliveries, Kind::ShareExceeded,
 ]]);
 
 /// List the atoms of a structure
@@ -86,7 +87,7 @@ problem_responses!(EntryProblems: [READING, [
     params(StructurePath, ConditionHeaders),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
-            ("ETag" = String, description = "Strong validator of the document."),
+            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
         NotModified, StructureProblems,
@@ -97,7 +98,9 @@ pub(super) async fn of_structure(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source.document(&app, &caller, &headers, "", async |input| list(&app, &caller, input).await).await
+    source
+        .document(&app, &caller, &headers, "", async |loaded, delivery| list(&app, &caller, loaded, delivery).await)
+        .await
 }
 
 /// List the atoms of an archive entry
@@ -108,7 +111,7 @@ pub(super) async fn of_structure(
     params(EntryPath, ConditionHeaders),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
-            ("ETag" = String, description = "Strong validator of the document."),
+            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
         NotModified, EntryProblems,
@@ -119,23 +122,16 @@ pub(super) async fn of_entry(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source.document(&app, &caller, &headers, "", async |input| list(&app, &caller, input).await).await
+    source
+        .document(&app, &caller, &headers, "", async |loaded, delivery| list(&app, &caller, loaded, delivery).await)
+        .await
 }
 
-/// Parses a structure and lists its atoms, on a blocking thread. The list is charged to the memory budget until it is
-/// sent.
-async fn list(app: &Shared, caller: &Caller, input: Input) -> Result<Response, Problem> {
-    let mut limits = app.config.limits.job().read;
-    limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
-    let lease = app.pool.settings().budget.lease();
-    let (structures, namespace) = (app.structures(), caller.namespace);
-    let listing = app.read(move |control| {
-        let structure = structures.get(namespace, input.digest, &input.bytes, &limits, control)?;
-        lease.grow(BYTES_PER_ATOM * structure.len() as u64)?;
-        let text = serde_json::to_vec(&document(&structure)).map_err(Problem::internal)?;
-        Ok::<Bytes, Problem>(lease.attach(text))
-    });
-    let text = listing.await??;
+async fn list(app: &Shared, caller: &Caller, loaded: Loaded, delivery: Delivery) -> Result<Response, Problem> {
+    let text = |structure: &Structure| serde_json::to_vec(&document(structure)).map_err(Problem::internal);
+    let listing =
+        loaded.list_atoms(app, caller, delivery, BYTES_PER_ATOM, move |structure, _, _| Ok((text(structure)?, ())));
+    let (text, ()) = listing.await?;
     Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response())
 }
 

@@ -27,7 +27,7 @@ pub(super) struct Capabilities {
     /// Version of the program.
     version: &'static str,
     /// Units of all lengths, areas and volumes.
-    units: Units,
+    units: QuantityUnits,
     /// Accepted uploads.
     inputs: Inputs,
     /// Output formats. `png` is a picture of the mesh.
@@ -59,8 +59,7 @@ pub(super) struct Capabilities {
 
 /// Units of all lengths, areas and volumes.
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = QuantityUnits)]
-struct Units {
+struct QuantityUnits {
     /// Unit of lengths.
     length: &'static str,
     /// Unit of areas.
@@ -139,47 +138,47 @@ struct Limits {
     json_bytes: u64,
     /// Largest head of a form part, in bytes.
     part_head_bytes: u64,
-    /// Most parts of a form.
+    /// Maximum number of parts of a form.
     parts: usize,
     /// Largest structure after decompression, in bytes.
     inflated_bytes: u64,
-    /// Most atoms of a structure.
+    /// Maximum number of atoms in all models of a structure.
     atoms: u64,
-    /// Most atoms of an atom list.
+    /// Maximum number of atoms in a list of atoms or colours.
     labels: u64,
-    /// Most grid points of a mesh.
-    grid_samples: u64,
-    /// Most pairs of atoms and grid bricks of a mesh.
+    /// Maximum number of grid points of a mesh.
+    grid_points: u64,
+    /// Maximum number of pairs of an atom and a grid brick of a mesh.
     candidate_pairs: u64,
     /// Largest mesh in memory, in bytes.
     mesh_bytes: u64,
     /// Largest mesh file, in bytes.
     output_bytes: u64,
-    /// Memory for uploads and meshes, in bytes.
+    /// Memory for all uploads, jobs and meshes together, in bytes.
     memory_bytes: u64,
     /// Largest width and height of a picture, in pixels.
     picture_side: u32,
-    /// Jobs computed at the same time.
+    /// Maximum number of jobs that run at the same time.
     workers: usize,
-    /// Most jobs in the queue.
+    /// Maximum number of jobs in the queue.
     queue: usize,
-    /// Most mesh responses at the same time.
+    /// Maximum number of concurrent mesh requests.
     deliveries: usize,
     /// Time limit of a synchronous request, in ms.
     deadline_ms: u64,
-    /// Time limit of a job, in ms.
+    /// Time limit of an asynchronous job, in ms.
     batch_deadline_ms: u64,
-    /// Most starts of a job.
+    /// Maximum number of starts of an asynchronous job.
     attempts: u32,
     /// Time limit for a request body, in ms.
     body_timeout_ms: u64,
-    /// Time limit for request headers, in ms.
+    /// Time limit for the head of a request, in ms.
     header_timeout_ms: u64,
     /// Period in which a client must read `write_bytes`, in ms.
     write_timeout_ms: u64,
     /// Bytes that a client must read in each `write_timeout_ms`.
     write_bytes: u64,
-    /// Most connections.
+    /// Maximum number of connections.
     connections: usize,
 }
 
@@ -258,7 +257,7 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
     let document = Capabilities {
         name: "molmesh",
         version: env!("CARGO_PKG_VERSION"),
-        units: Units { length: "Å", area: "Å²", volume: "Å³" },
+        units: QuantityUnits { length: "Å", area: "Å²", volume: "Å³" },
         inputs: Inputs {
             formats: &["pdb", "mmcif", "bcif", "pqr", "xyz"],
             encodings: &["identity", "gzip", "zstd"],
@@ -347,7 +346,7 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         inflated_bytes: limits.inflated_bytes,
         atoms: limits.atoms,
         labels: limits.labels,
-        grid_samples: limits.grid_points,
+        grid_points: limits.grid_points,
         candidate_pairs: limits.candidate_pairs,
         mesh_bytes: limits.mesh_bytes,
         output_bytes: limits.output_bytes,

@@ -1,5 +1,6 @@
 //! Parameters of `…/colors`: those of a mesh that affect the colours, with `scheme` instead of `color`.
 
+use crate::pipeline::color::Scheme;
 use crate::pipeline::nearest::nearest;
 use crate::pipeline::params::{self, ParamError};
 use crate::pipeline::{Coloring, Job, color};
@@ -10,21 +11,25 @@ pub(super) const NAMES: [&str; 7] = ["scheme", "palette", "color_range", "model"
 /// Parses the parameters.
 ///
 /// # Errors
-/// Returns a [`ParamError`], also if there is no scheme or a parameter applies to meshes only.
+/// Returns a [`ParamError`], including if there is no scheme or a parameter applies to meshes only.
 pub(super) fn parse(pairs: &[(String, String)]) -> Result<(Job, Coloring), ParamError> {
     if let Some((name, _)) = pairs.iter().find(|(name, _)| !NAMES.contains(&name.as_str())) {
         let name = name.chars().take(64).collect::<String>();
         return Err(ParamError::Unknown { nearest: nearest(&name, NAMES), name });
     }
     let renamed = pairs.iter().map(|(name, value)| (if name == "scheme" { "color" } else { name }, value));
-    let job = params::parse(renamed).map_err(of_scheme)?.job;
-    let missing = || bad_scheme("none".to_owned());
+    let job = params::parse(renamed).map_err(rename_color)?.job;
+    let is_named = pairs.iter().any(|(name, _)| name == "scheme");
+    let missing = || bad_scheme(if is_named { "none" } else { "no value" }.to_owned());
     let coloring = job.color.ok_or_else(missing)?;
+    if matches!(coloring.scheme, Scheme::Vertex(_)) {
+        return Err(bad_scheme(format!("`{}`", coloring.scheme)));
+    }
     Ok((job, coloring))
 }
 
 /// Replaces `color` by `scheme` in an error.
-fn of_scheme(error: ParamError) -> ParamError {
+fn rename_color(error: ParamError) -> ParamError {
     match error {
         ParamError::BadValue { name: "color", value, .. } => bad_scheme(value),
         ParamError::Repeated { name: "color" } => ParamError::Repeated { name: "scheme" },
@@ -38,7 +43,8 @@ fn bad_scheme(value: String) -> ParamError {
 
 /// Returns the description of the valid values of `scheme`.
 pub(super) fn expected() -> String {
-    color::EXPECTED.replace("none, ", "")
+    let of_atoms = |name: &&str| !matches!(name.parse(), Ok(Scheme::Vertex(_))) && *name != "none";
+    color::EXPECTED.split(", ").filter(of_atoms).collect::<Vec<_>>().join(", ")
 }
 
 #[cfg(test)]
@@ -57,6 +63,7 @@ mod tests {
             (&[][..], "scheme"),
             (&[("scheme", "none")], "scheme"),
             (&[("scheme", "chains")], "scheme"),
+            (&[("scheme", "curvature")], "scheme"),
             (&[("scheme", "chain"), ("palette", "viridis")], "palette"),
         ] {
             let Err(ParamError::BadValue { name: found, expected, .. }) = parsed(pairs) else { panic!("{pairs:?}") };

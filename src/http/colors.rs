@@ -20,10 +20,11 @@ use super::openapi::problems::READING;
 use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::range::{self, Wanted};
-use super::source::{self, Input, StructureSource};
-use super::state::Shared;
+use super::source::{self, Loaded, StructureSource};
+use super::state::{Delivery, Shared};
 use crate::pipeline::{AtomColors, ColorError, Coloring, Job, params};
-use crate::structure;
+use crate::structure::{self, ReadLimits, Structure};
+use crate::surface::Control;
 
 /// Header with scheme, palette, range and legend.
 pub(super) const LEGEND: HeaderName = HeaderName::from_static("molmesh-colors");
@@ -36,14 +37,14 @@ problem_responses!(StructureProblems: [
     READING,
     [
         Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed,
-        Kind::RangeNotSatisfiable, Kind::EmptySelection, Kind::MemoryFull, Kind::TooManyDeliveries,
-        Kind::ShareExceeded, Kind::StoreFailed,
+        Kind::RangeNotSatisfiable, Kind::EmptySelection, Kind::TooManyCandidates, Kind::TooMuchMemory, Kind::MemoryFull,
+        Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
     ],
 ]);
 problem_responses!(EntryProblems: [READING, [
     Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
-    Kind::PreconditionFailed, Kind::RangeNotSatisfiable, Kind::EmptySelection, Kind::MemoryFull,
-    Kind::TooManyDeliveries, Kind::ShareExceeded,
+    Kind::PreconditionFailed, Kind::RangeNotSatisfiable, Kind::EmptySelection, Kind::TooManyCandidates,
+    Kind::TooMuchMemory, Kind::MemoryFull, Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded,
 ]]);
 
 /// Get the colours of the atoms of a structure
@@ -102,9 +103,9 @@ async fn answer(
     let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let (job, coloring) = color_parameters::parse(&pairs)?;
     let variant = params::canonical(&job);
-    let write = async |input: Input| {
-        let etag = source::etag(&input.digest, &variant)?;
-        let (colors, legend) = list(app, caller, input, job, coloring).await?;
+    let write = async |loaded: Loaded, delivery| {
+        let etag = source::etag(&loaded.digest, &variant)?;
+        let (colors, legend) = list(app, caller, (loaded, delivery), job, coloring).await?;
         let described =
             [(header::CONTENT_TYPE, HeaderValue::from_static("application/octet-stream")), (LEGEND, legend)];
         Ok((described, part_of(&colors, headers, &etag)?).into_response())
@@ -112,31 +113,24 @@ async fn answer(
     source.document(app, caller, headers, &variant, write).await
 }
 
-/// Parses a structure and lists the colours of its atoms, on a blocking thread. The list counts towards the memory
-/// budget until it is sent.
+/// Lists the colours of the atoms, with their legend.
 async fn list(
     app: &Shared,
     caller: &Caller,
-    input: Input,
+    (loaded, delivery): (Loaded, Delivery),
     job: Job,
     coloring: Coloring,
 ) -> Result<(Bytes, HeaderValue), Problem> {
-    let mut limits = app.config.limits.job().read;
-    limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
-    let lease = app.pool.settings().budget.lease();
-    let (structures, namespace) = (app.structures(), caller.namespace);
-    let listing = app.read(move |control| {
-        let structure = structures.get(namespace, input.digest, &input.bytes, &limits, control)?;
-        let selected = structure::select_with(&structure, &job.selection, &limits, control)?.atoms;
-        let colors = AtomColors::new(&structure, &selected, &coloring).map_err(not_colorable)?;
-        lease.grow(COLOR_BYTES * structure.len() as u64)?;
+    let list = move |structure: &Structure, limits: &ReadLimits, control: &Control<'_>| {
+        let selected = structure::select_with(structure, &job.selection, limits, control)?.atoms;
+        let colors = AtomColors::new(structure, &selected, &coloring).map_err(not_colorable)?;
         let list: Vec<u8> = (0..structure.len()).flat_map(|i| colors.of(i)).collect();
         let mut report = colors.report(&selected);
         report.legend.truncate(MAX_ENTRIES);
         let legend = serde_json::to_string(&report).map_err(Problem::internal)?;
-        Ok::<_, Problem>((lease.attach(list), HeaderValue::from_str(&ascii(&legend)).map_err(Problem::internal)?))
-    });
-    listing.await?
+        Ok((list, HeaderValue::from_str(&ascii(&legend)).map_err(Problem::internal)?))
+    };
+    loaded.list_atoms(app, caller, delivery, COLOR_BYTES, list).await
 }
 
 fn not_colorable(error: ColorError) -> Problem {
@@ -170,10 +164,15 @@ fn part_of(list: &Bytes, headers: &HeaderMap, etag: &HeaderValue) -> Result<Http
         Wanted::Nothing => return Err(delivery::range_outside(length)),
     };
     let accepted = [(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"))];
-    let place = (status == StatusCode::PARTIAL_CONTENT)
+    let content_range = (status == StatusCode::PARTIAL_CONTENT)
         .then(|| [(header::CONTENT_RANGE, delivery::content_range(&range, length))]);
     let [from, to] = [range.start, range.end].map(|at| usize::try_from(at).unwrap_or(list.len()));
-    Ok((status, accepted, place.map_or_else(HeaderMap::new, HeaderMap::from_iter), Body::from(list.slice(from..to)))
+    Ok((
+        status,
+        accepted,
+        content_range.map_or_else(HeaderMap::new, HeaderMap::from_iter),
+        Body::from(list.slice(from..to)),
+    )
         .into_response())
 }
 

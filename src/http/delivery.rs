@@ -1,4 +1,4 @@
-//! Answer of a finished job: the mesh, with a summary in headers, or the report.
+//! Response with a finished job: the mesh, with a summary in headers, or the report.
 
 use std::ops::Range;
 use std::sync::Arc;

@@ -48,26 +48,28 @@ fn diagnosed(problem: Problem, diagnostics: &[Diagnostic]) -> Problem {
     }
 }
 
-/// Returns the problem of a mesh file that exceeds `limit` bytes. File sizes grow with the inverse square of the
-/// spacing.
-#[expect(clippy::cast_precision_loss, reason = "an estimate: 52 bits suffice")]
+/// Returns the problem of a mesh file that exceeds `limit` bytes.
 pub(super) fn file_too_large(bytes: u64, limit: u64, resolution: f64) -> Problem {
-    let fits = resolution * (bytes as f64 / limit as f64).sqrt();
+    oversized(&format!("the file would have {bytes} bytes and the limit is {limit}"), bytes, limit, resolution)
+}
+
+/// Returns the problem of a mesh with `actual` bytes, vertices or triangles, more than `limit`; `what` begins the
+/// explanation. These numbers grow with the inverse square of the spacing.
+#[expect(clippy::cast_precision_loss, reason = "an estimate: 52 bits suffice")]
+fn oversized(what: &str, actual: u64, limit: u64, resolution: f64) -> Problem {
+    let fits = resolution * (actual as f64 / limit as f64).sqrt();
     let fits = (fits * 105.0).ceil() / 100.0;
-    Problem::new(
-        Kind::MeshTooLarge,
-        format!("the file would have {bytes} bytes and the limit is {limit}; a resolution of {fits} Å would fit"),
-    )
-    .with("limit", limit)
-    .with("actual", bytes)
-    .with("suggested_resolution", fits)
+    Problem::new(Kind::MeshTooLarge, format!("{what}; a resolution of {fits} Å would fit"))
+        .with("limit", limit)
+        .with("actual", actual)
+        .with("suggested_resolution", fits)
 }
 
 /// Returns the problem of a mesh that cannot be written.
 pub(super) fn format_problem(error: &FormatError, resolution: f64) -> Problem {
     match *error {
         FormatError::GlbTooLarge { bytes, limit } => file_too_large(bytes, limit, resolution),
-        FormatError::TooMany { count, limit, .. } => file_too_large(count, limit, resolution),
+        FormatError::TooMany { count, limit, .. } => oversized(&error.to_string(), count, limit, resolution),
         FormatError::AtomIndexTooLarge { limit, .. } => {
             Problem::new(Kind::MeshTooLarge, error.to_string()).with("limit", limit).with("parameter", "atom_ids")
         }
@@ -96,17 +98,21 @@ impl From<ParamError> for Problem {
 
 impl From<OutOfMemory> for Problem {
     fn from(error: OutOfMemory) -> Self {
-        let problem = Self::new(Kind::MemoryFull, error.to_string()).retry_after(Duration::from_secs(1));
+        let full = || Self::new(Kind::MemoryFull, error.to_string()).retry_after(Duration::from_secs(1));
         match error {
-            OutOfMemory::Budget { held, limit, .. } => problem.with("limit", limit).with("actual", held),
-            OutOfMemory::System { .. } => problem,
+            OutOfMemory::Budget { held, limit, .. } => full().with("limit", limit).with("actual", held),
+            OutOfMemory::Limit { needed, limit } => {
+                Self::new(Kind::TooMuchMemory, error.to_string()).with("limit", limit).with("actual", needed)
+            }
+            OutOfMemory::System { .. } => full(),
         }
     }
 }
 
 impl From<ShareExceeded> for Problem {
     fn from(ShareExceeded { limit }: ShareExceeded) -> Self {
-        let detail = format!("this client holds {limit} places, which is its share; the others are for other clients");
+        let detail =
+            format!("this client already uses {limit} slots, its share; the other slots are for other clients");
         Self::new(Kind::ShareExceeded, detail).with("limit", limit).retry_after(Duration::from_secs(1))
     }
 }
@@ -141,6 +147,10 @@ impl From<Failure> for Problem {
             }
             Failure::Deadline { limit } => Self::new(Kind::Deadline, error.to_string())
                 .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX)),
+            Failure::Waited { limit, wait } => Self::new(Kind::QueueFull, error.to_string())
+                .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX))
+                .with("estimated_wait_s", wait.as_secs_f64())
+                .retry_after(wait),
             Failure::Memory(error) => error.into(),
             Failure::Stopped => Self::new(Kind::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1)),
             Failure::Panicked { .. } => Self::internal(error),
@@ -178,7 +188,7 @@ impl From<AcceptError> for Problem {
 }
 
 impl From<StoreError> for Problem {
-    /// Logs the details, which may name places that clients need not know.
+    /// Logs the details. Clients do not get them, because they may contain paths and addresses of the operator.
     fn from(error: StoreError) -> Self {
         let wait = Duration::from_secs(5);
         match error {
@@ -200,6 +210,10 @@ impl From<StoreError> for Problem {
             StoreError::Quarantined { .. } => {
                 Self::new(Kind::RecordUnreadable, "the record of the job cannot be read and is in quarantine")
             }
+            StoreError::Damaged { digest } => Self::new(
+                Kind::NoSuchStructure,
+                format!("the stored structure `{digest}` was damaged and has been removed: upload it again"),
+            ),
             other => {
                 tracing::error!(error = %other, "the store failed");
                 Self::new(Kind::StoreFailed, "the store cannot be reached").retry_after(wait)
@@ -230,6 +244,9 @@ impl From<StructureError> for Problem {
                 .with("found", found)
                 .with("expected", expected),
             E::TooManyCopies { limit, .. } => Self::new(Kind::TooManyCopies, detail).with("limit", limit),
+            E::TooManyDistances { limit } => {
+                Self::new(Kind::TooManyCandidates, detail).with("parameter", "select").with("limit", limit)
+            }
             E::TooManyParts { limit, .. } => {
                 Self::new(Kind::TooManyParts, detail).with("parameter", "split").with("limit", limit)
             }
@@ -248,15 +265,16 @@ impl From<StructureError> for Problem {
             E::Cancelled => Self::from(Failure::Stopped),
             E::NoAtoms { found } => Self::new(Kind::NoAtoms, detail).with("found", found),
             E::EmptySelection { holds } => Self::new(Kind::EmptySelection, detail).with("found", holds),
-            E::NotFound { what, asked, available } => {
+            E::NotFound { what, requested, available } => {
                 let parameter = match what {
                     "chain" => "chains",
                     "selected chain" => "select",
+                    "alternative location" => "altloc",
                     other => other,
                 };
                 Self::new(Kind::EmptySelection, detail)
                     .with("parameter", parameter)
-                    .with("value", asked.trim_matches('`'))
+                    .with("value", requested.trim_matches('`'))
                     .with("expected", available)
             }
         }
@@ -299,10 +317,10 @@ impl From<SurfaceError> for Problem {
                 Self::new(Kind::UnreadableStructure, detail).with("atom", index).with("expected", expected)
             }
             E::BadParameter { .. } => ParamError::from(error).into(),
-            E::GridTooLarge { samples, limit, resolution, .. } => fitting(
+            E::GridTooLarge { grid_points, limit, resolution, .. } => fitting(
                 Self::new(Kind::GridTooLarge, detail)
                     .with("limit", limit)
-                    .with("actual", samples)
+                    .with("actual", grid_points)
                     .with("resolution", resolution),
             ),
             E::TooManyCandidates { candidates, limit, resolution, .. } => fitting(
@@ -341,5 +359,23 @@ impl From<SurfaceError> for Problem {
             // Responses are not written to a sink.
             E::Sink => Self::internal(detail),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_format_that_cannot_count_the_triangles_is_explained_by_their_number() {
+        let error = FormatError::TooMany { format: "STL", what: "triangles", count: 400, limit: 100 };
+        let problem = format_problem(&error, 0.5).record("");
+        assert_eq!(problem["detail"], format!("{error}; a resolution of 1.05 Å would fit"));
+        assert_eq!((&problem["limit"], &problem["suggested_resolution"]), (&100.into(), &1.05.into()));
+        let file = format_problem(&FormatError::GlbTooLarge { bytes: 400, limit: 100 }, 0.5).record("");
+        assert_eq!(
+            file["detail"],
+            "the file would have 400 bytes and the limit is 100; a resolution of 1.05 Å would fit"
+        );
     }
 }

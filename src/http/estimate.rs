@@ -24,18 +24,18 @@ use super::openapi::problems::{BODY, NAMED_STRUCTURE, PARAMETERS, ProblemDocumen
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::problem::Problem;
 use super::request_id::RequestId;
-use super::source::Input;
+use super::source::Loaded;
 use super::state::Shared;
 use crate::pipeline::{self, Choice, Estimate};
 use crate::surface::Control;
 
-/// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and samples are exact; the size of the mesh and
-/// the times are estimates.
+/// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and grid points are exact; the size of the mesh
+/// and the times are estimates.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(example = json!({
     "accepted": true, "problem": null, "atoms": 454, "atoms_in_file": 514, "resolution": 0.5,
     "resolution_from": "resolution", "surface": "gaussian", "format": "glb", "box_cells": 464_940, "bricks": 391,
-    "samples": 200_192, "area": 3475.0, "vertices": 20_850, "triangles": 41_700, "mesh_bytes": 1_000_800,
+    "grid_points": 200_192, "area": 3475.0, "vertices": 20_850, "triangles": 41_700, "mesh_bytes": 1_000_800,
     "structure": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "seconds": 0.01,
     "wait_seconds": 0.0, "backend": "cpu",
 }))]
@@ -65,7 +65,7 @@ pub(super) struct EstimateDocument {
     bricks: Option<u64>,
     /// Grid points to evaluate; null like `bricks`.
     #[schema(required)]
-    samples: Option<u64>,
+    grid_points: Option<u64>,
     /// Surface area in Å²; null like `bricks`.
     #[schema(required)]
     area: Option<f64>,
@@ -89,13 +89,13 @@ pub(super) struct EstimateDocument {
 }
 
 problem_responses!(EstimateProblems: [BODY, NAMED_STRUCTURE, PARAMETERS, READING, [
-    Kind::EmptySelection, Kind::TooManyCopies, Kind::TooManyParts, Kind::PictureTooLarge, Kind::Internal,
-    Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::Deadline,
+    Kind::EmptySelection, Kind::TooManyCopies, Kind::TooManyParts, Kind::TooManyCandidates, Kind::PictureTooLarge,
+    Kind::Internal, Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::Deadline,
 ]]);
 
 /// Estimate a mesh
 ///
-/// Takes what `POST /v1/meshes` takes and returns the expected size, memory and time of the mesh without computing it.
+/// Accepts the same requests as `POST /v1/meshes`. Returns the expected size and time of the mesh without computing it.
 #[utoipa::path(post, path = "/v1/estimate", tag = "meshes", operation_id = "estimateMesh",
     params(MeshParameters, ContentEncodingHeader),
     request_body(content = StructureFile, description = AS_FOR_MESHES, content_type = "application/octet-stream"),
@@ -110,33 +110,34 @@ pub(super) async fn create(
     let caller = Caller::of(&extensions);
     let instance = extensions.get::<RequestId>().cloned().unwrap_or_default();
     app.admit_work(&caller)?;
-    // The answer is no mesh, so `Accept` does not choose a format.
+    // The response is no mesh, so `Accept` does not choose a format.
     headers.remove(ACCEPT);
     let parsed = ParsedRequest::from_body(&app, query, &headers, body).await?;
     let ParsedRequest { source, request, format, declared, .. } = parsed;
     let job = request.job;
-    // An estimate is about half the work of a mesh, so it takes a place as well.
-    let permit = app.delivery(caller.client)?;
-    let Input { bytes, digest, lease } = source.load(&app, &caller).await?;
+    // An estimate is about half the work of a mesh, so it takes a delivery slot as well.
+    let delivery = app.delivery(caller.client)?;
+    let digest = source.digest(&app, &caller).await?;
+    let Loaded { input, digest, reservation } = source.find(&app, &caller, &digest).await?;
     drop(source);
-    let seconds = app.pool.expected(&bytes, &job);
-    let reading = app.read({
+    let seconds = app.pool.expected(&input, &job);
+    let reading = app.read(caller.client, (reservation, delivery), {
         let (app, job) = (Arc::clone(&app), job.clone());
         move |control| {
             let start = Instant::now();
             let choice = Choice { backend: app.pool.backend().as_ref(), reason: app.pool.reason() };
             let limits = app.config.limits.job();
             let read =
-                |control: &Control<'_>| app.structures().get(caller.namespace, digest, &bytes, &limits.read, control);
+                |control: &Control<'_>| app.structures().get(caller.namespace, digest, &input, &limits.read, control);
             let estimate = pipeline::estimate(read, &job, &limits, &choice, control);
             app.charge(&caller, start.elapsed());
-            drop((lease, permit));
             estimate
         }
     });
     let estimate = reading.await?.map_err(|error| declared.explain(error.into()))?;
     // The estimate from the file size does not include the copies in an assembly.
-    let seconds = seconds * estimate.atoms as f64 / estimate.distinct_atoms as f64;
+    let guess = seconds * estimate.atoms as f64 / estimate.distinct_atoms as f64;
+    let seconds = estimate.work(&job).map_or(guess, |units| app.pool.seconds(units));
     let wait = app.pool.estimated_wait().as_secs_f64();
     // The size of a picture does not depend on the mesh.
     let limit = if format.is_picture() { u64::MAX } else { app.config.limits.output_bytes };
@@ -153,7 +154,7 @@ pub(super) async fn create(
         format: format.name(),
         box_cells: estimate.box_cells,
         bricks: mesh.map(|m| m.bricks),
-        samples: mesh.map(|m| m.samples),
+        grid_points: mesh.map(|m| m.grid_points),
         area: mesh.map(|m| m.area),
         vertices: mesh.map(|m| m.vertices),
         triangles: mesh.map(|m| m.triangles),
@@ -166,7 +167,8 @@ pub(super) async fn create(
     Ok(([(CACHE_CONTROL, "no-store")], Json(document)).into_response())
 }
 
-/// Returns why the mesh would be refused; `limit` is the maximum size of its file, bytes.
+/// Returns the problem for which the mesh would be rejected; `None` if there is none. `limit` is the maximum size of
+/// its file, bytes.
 fn refusal(estimate: &Estimate, limit: u64) -> Option<Problem> {
     match &estimate.mesh {
         Ok(mesh) if mesh.bytes > limit => Some(file_too_large(mesh.bytes, limit, estimate.resolution)),

@@ -11,13 +11,14 @@ use futures_util::{Stream, StreamExt as _};
 use multer::{Constraints, Multipart, SizeLimit};
 use thiserror::Error;
 
+use super::body_hasher::BodyHasher;
 use super::content_type::DeclaredType;
 use super::kinds::Kind;
 use super::limit::Limit;
 use super::problem::Problem;
 use crate::config::LimitsConfig;
-use crate::jobs::Lease;
-use crate::store::{Digest, Hasher};
+use crate::jobs::MemoryReservation;
+use crate::store::Digest;
 
 /// Maximum size of a parameter field, bytes.
 const MAX_FIELD_BYTES: usize = 4096;
@@ -76,13 +77,13 @@ impl Stream for Feed<'_> {
 const UNBOUNDED: usize = usize::MAX;
 
 /// Limits of a form.
-struct Bounds {
+struct FormLimits {
     body: Limit,
     head: Limit,
     parts: Limit,
 }
 
-impl Bounds {
+impl FormLimits {
     fn new(limits: &LimitsConfig, body: Limit) -> Self {
         let head = Limit { key: "limits.part_head_bytes", max: limits.part_head_bytes };
         Self { body, head, parts: Limit { key: "limits.parts", max: limits.parts as u64 } }
@@ -106,33 +107,34 @@ impl Bounds {
 }
 
 /// Received structure file.
-pub(super) struct Upload {
+pub(super) struct UploadedFile {
     pub(super) bytes: Bytes,
     /// SHA-256 of `bytes`.
     pub(super) digest: Digest,
-    pub(super) lease: Lease,
+    pub(super) reservation: MemoryReservation,
     /// Parameters from the other fields of a form.
     pub(super) fields: Vec<(String, String)>,
     /// Content type of the file.
     pub(super) declared: DeclaredType,
 }
 
-/// Reads a form: one file in `file` or `structure`, parameters in the other fields.
+/// Reads a form of `announced` bytes, 0 if unknown: one file in `file` or `structure`, parameters in the other fields.
 pub(super) async fn read(
     limits: &LimitsConfig,
     within: Limit,
     content_type: &str,
+    announced: u64,
     body: Body,
-    lease: Lease,
-) -> Result<Upload, Problem> {
-    let bounds = Bounds::new(limits, within);
+    reservation: MemoryReservation,
+) -> Result<UploadedFile, Problem> {
+    let bounds = FormLimits::new(limits, within);
     let boundary = multer::parse_boundary(content_type).map_err(|e| bounds.problem(&e))?;
     if boundary.len() > MAX_BOUNDARY {
         let detail = format!("the form's boundary has more than {MAX_BOUNDARY} characters");
         return Err(Problem::new(Kind::BadRequest, detail).with("limit", MAX_BOUNDARY));
     }
     // Upper limit of the parser's buffer.
-    lease.grow(bounds.head.max.saturating_add(PIECE as u64))?;
+    reservation.grow(bounds.head.max.saturating_add(PIECE as u64))?;
     let allowance = AtomicUsize::new(0);
     let mut feed = Feed { body: body.into_data_stream(), rest: Bytes::new(), allowance: &allowance, paused: false };
     let constraints = Constraints::new().size_limit(SizeLimit::new().whole_stream(bounds.body.max));
@@ -151,25 +153,24 @@ pub(super) async fn read(
             return Err(bounds.parts.exceeded("the form has", "parts"));
         }
         let name = field.name().unwrap_or_default().to_owned();
-        lease.grow(name.len() as u64)?;
+        reservation.grow(name.len() as u64)?;
         let is_file = matches!(name.as_str(), "file" | "structure");
         if is_file && file.is_some() {
             return Err(Problem::new(Kind::BadRequest, "the form has more than one file").with("parameter", name));
         }
         let declared = DeclaredType::new(field.content_type().map_or("", |mime| mime.as_ref()));
-        let (mut content, mut hasher) = (BytesMut::new(), Hasher::default());
+        let (mut content, mut hasher) = (BytesMut::new(), BodyHasher::default());
         while let Some(chunk) = field.chunk().await.map_err(|e| bounds.problem(&e))? {
-            lease.grow(chunk.len() as u64)?;
-            content.extend_from_slice(&chunk);
+            reservation.extend(&mut content, &chunk, if is_file { announced } else { 0 })?;
             if is_file {
-                hasher.update(&chunk);
+                hasher.update(&chunk, &reservation).await?;
             }
             if !is_file && content.len() > MAX_FIELD_BYTES {
                 return Err(field_too_long(&name));
             }
         }
         if is_file {
-            file = Some((content.freeze(), hasher.digest(), declared));
+            file = Some((content.freeze(), hasher.digest(&reservation).await?, declared));
         } else {
             fields.push((name, String::from_utf8_lossy(&content).into_owned()));
         }
@@ -184,7 +185,7 @@ pub(super) async fn read(
         let detail = "the form has no file; it belongs in a field named `file` or `structure`";
         return Err(Problem::new(Kind::BadRequest, detail).with("expected", "file"));
     };
-    Ok(Upload { bytes, digest, lease, fields, declared })
+    Ok(UploadedFile { bytes, digest, reservation, fields, declared })
 }
 
 /// Returns the size of a part's headers, bytes.

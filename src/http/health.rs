@@ -17,7 +17,7 @@ use super::stop::Stop;
 
 const NO_STORE: [(axum::http::HeaderName, &str); 1] = [(CACHE_CONTROL, "no-store")];
 
-/// Answer of the liveness probe.
+/// Response to the liveness probe.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Health {
     /// Always `live`.
@@ -40,19 +40,18 @@ pub(super) async fn live() -> Response {
     (NO_STORE, Json(Health { status: "live" })).into_response()
 }
 
-/// Answer of the readiness probe.
+/// Response to the readiness probe.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReadyDocument {
     /// Always `ready`.
     status: &'static str,
     /// The readiness checks; all are `ok`.
-    checks: Vec<Check>,
+    checks: Vec<ReadinessCheck>,
 }
 
 /// Readiness check.
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = ReadinessCheck)]
-pub(super) struct Check {
+pub(super) struct ReadinessCheck {
     /// Name of the check: `accepting`, `devices`, `store` or `records`.
     name: &'static str,
     /// True if the check passed.
@@ -61,7 +60,7 @@ pub(super) struct Check {
     detail: String,
 }
 
-impl Check {
+impl ReadinessCheck {
     fn new(name: &'static str, found: Result<String, String>) -> Self {
         let (ok, detail) = match found {
             Ok(detail) => (true, detail),
@@ -76,7 +75,7 @@ problem_responses!(ReadyProblems: [[Kind::NotReady]]);
 /// Check that the service is ready for requests
 ///
 /// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts
-/// jobs, can write and read the store, and has no unreadable job record in quarantine. The answer does not depend on
+/// jobs, can write and read the store, and has no unreadable job record in quarantine. The response does not depend on
 /// the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
     responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyProblems))]
@@ -95,13 +94,13 @@ pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem
     }
 }
 
-fn accepting(app: &Shared) -> Check {
+fn accepting(app: &Shared) -> ReadinessCheck {
     let ending = *app.stopping.borrow() != Stop::Serve;
     let found = if ending { Err("the service is shutting down") } else { Ok("requests are accepted") };
-    Check::new("accepting", found.map(str::to_owned).map_err(str::to_owned))
+    ReadinessCheck::new("accepting", found.map(str::to_owned).map_err(str::to_owned))
 }
 
-fn devices(app: &Shared) -> Check {
+fn devices(app: &Shared) -> ReadinessCheck {
     let backend = app.pool.backend();
     let found = match app.first_mesh.get() {
         None => Err("the first mesh is being computed".to_owned()),
@@ -118,24 +117,24 @@ fn devices(app: &Shared) -> Check {
             Ok(detail)
         }
     };
-    Check::new("devices", found)
+    ReadinessCheck::new("devices", found)
 }
 
-async fn store(app: &Shared) -> Check {
-    let found = match app.probe.failure(&app.store, &app.config.store).await {
+async fn store(app: &Shared) -> ReadinessCheck {
+    let found = match app.store_health.failure(&app.store, &app.config.store).await {
         None => Ok("the store can be written and read".to_owned()),
         Some(why) => Err(format!("the store does not work: {why}")),
     };
-    Check::new("store", found)
+    ReadinessCheck::new("store", found)
 }
 
-async fn records(app: &Shared) -> Check {
+async fn records(app: &Shared) -> ReadinessCheck {
     let found = match app.store.quarantined().await {
         Ok(0) => Ok("no job record is in quarantine".to_owned()),
         Ok(count) => Err(format!("{count} job records cannot be read and are in quarantine; see the log")),
         Err(_logged) => Err("the quarantine of job records cannot be read".to_owned()),
     };
-    Check::new("records", found)
+    ReadinessCheck::new("records", found)
 }
 
 /// Get the version of the program

@@ -23,7 +23,7 @@ use super::openapi::problems::{MESHING, ProblemDocument, READING};
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::{ContentKey, JobId, JobView, Record, Status, is_stored, rfc3339};
+use crate::jobs::{ContentKey, JobId, JobRecord, JobView, Status, is_stored, rfc3339};
 
 /// Longest poll, s. Proxies commonly cut an exchange after a minute.
 pub(super) const MAX_WAIT_S: u64 = 55;
@@ -131,7 +131,8 @@ impl Poll {
 problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed]]);
 problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::JobEnded, Kind::RecordUnreadable, Kind::StoreFull, Kind::StoreFailed]]);
 problem_responses!(ResultProblems: [READING, MESHING, [
-    Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed, Kind::ResultGone, Kind::JobAbandoned,
+    Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed,
+    Kind::ResultGone, Kind::JobAbandoned,
     Kind::RecordUnreadable,
     Kind::StoreFull, Kind::StoreFailed,
 ]]);
@@ -154,11 +155,11 @@ pub(super) fn no_such_job(id: &str) -> Problem {
 
 /// Get the status of a job
 ///
-/// With `wait`, the response is delayed until the job has ended or the time is over.
+/// With `wait`, the response is delayed until the job has ended or the time has passed.
 #[utoipa::path(get, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "showJob", params(JobPath, Poll),
     responses(
         (status = 200, description = "Status of the job.", body = JobDocument,
-            headers(("Retry-After" = u64, description = "Seconds to wait before the next request.")),
+            headers(("Retry-After" = u64, description = "Seconds to wait before the next request. Absent if waiting does not help.")),
             links(("result" = (operation_id = "showResult", parameters(("file" = "$response.body#/result")))))),
         ShowProblems,
     ))]
@@ -195,6 +196,9 @@ pub(super) async fn show(
 }
 
 /// Cancel a job
+///
+/// Returns the final status of the job, even if it was cancelled before. A job that succeeded or failed cannot be
+/// cancelled (409 `job-ended`).
 #[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "dismissJob", params(JobPath),
     responses((status = 200, description = "The job is cancelled.", body = JobDocument), DismissProblems))]
 pub(super) async fn dismiss(State(app): State<Shared>, caller: Caller, id: JobId) -> Result<Response, Problem> {
@@ -213,7 +217,7 @@ pub(super) async fn dismiss(State(app): State<Shared>, caller: Caller, id: JobId
 #[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
     responses(
         (status = 303, description = "The job has succeeded.",
-            headers(("Location" = String, description = "Path of the mesh: `/v1/results/{file}`."))),
+            headers(("Location" = String, description = "Path of the result, job or structure."))),
         ResultProblems,
     ))]
 pub(super) async fn result(State(app): State<Shared>, caller: Caller, id: JobId) -> Result<Response, Problem> {
@@ -258,7 +262,7 @@ fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Respons
 }
 
 /// Returns the problem of a failed job. Its instance is the request that created the job.
-fn problem(record: &Record) -> Option<Value> {
+fn problem(record: &JobRecord) -> Option<Value> {
     let mut problem = record.problem.clone()?;
     let request = record.requester.request.as_deref().unwrap_or(record.id.as_str());
     problem.as_object_mut()?.insert("instance".to_owned(), request.into());

@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
-use serde_json::Value;
+use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde_json::Number;
 
 use super::kinds::Kind;
 use super::problem::Problem;
@@ -13,11 +13,12 @@ use super::problem::Problem;
 pub(super) fn members(bytes: &[u8]) -> Result<Vec<(String, String)>, Problem> {
     let Members(members) = serde_json::from_slice(bytes)
         .map_err(|e| bad(&e.to_string()).with("line", e.line()).with("column", e.column()))?;
-    let pair = |(name, value): (String, Value)| match text(&value) {
-        Some(text) => Ok((name, text)),
-        None => Err(bad_member(&name)),
+    let pair = |(name, value): (String, Value)| match value {
+        Value::Scalar(text) | Value::List(text) => Some(Ok((name, text))),
+        Value::Null => None,
+        Value::Other => Some(Err(bad_member(&name))),
     };
-    members.into_iter().filter(|(_, value)| !value.is_null()).map(pair).collect()
+    members.into_iter().filter_map(pair).collect()
 }
 
 /// Returns the problem of a body that is not such a document.
@@ -32,21 +33,70 @@ fn bad_member(name: &str) -> Problem {
     Problem::new(Kind::BadParameter, detail).with("parameter", name)
 }
 
-/// Returns a scalar, or a list of scalars separated by commas, as text. Returns `None` for any other value.
-fn text(value: &Value) -> Option<String> {
-    match value {
-        Value::Array(items) if !items.is_empty() => {
-            items.iter().map(scalar).collect::<Option<Vec<_>>>().map(|items| items.join(","))
-        }
-        other => scalar(other),
-    }
+/// Value of a member as text. Other values are skipped and not stored.
+enum Value {
+    Null,
+    Scalar(String),
+    /// Scalars separated by commas.
+    List(String),
+    Other,
 }
 
-fn scalar(value: &Value) -> Option<String> {
-    match value {
-        Value::String(text) => Some(text.clone()),
-        Value::Bool(_) | Value::Number(_) => Some(value.to_string()),
-        Value::Null | Value::Array(_) | Value::Object(_) => None,
+impl<'de> Deserialize<'de> for Value {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Any;
+        impl<'de> Visitor<'de> for Any {
+            type Value = Value;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a value")
+            }
+
+            fn visit_unit<E>(self) -> Result<Value, E> {
+                Ok(Value::Null)
+            }
+
+            fn visit_bool<E>(self, value: bool) -> Result<Value, E> {
+                Ok(Value::Scalar(value.to_string()))
+            }
+
+            fn visit_i64<E>(self, value: i64) -> Result<Value, E> {
+                Ok(Value::Scalar(value.to_string()))
+            }
+
+            fn visit_u64<E>(self, value: u64) -> Result<Value, E> {
+                Ok(Value::Scalar(value.to_string()))
+            }
+
+            fn visit_f64<E>(self, value: f64) -> Result<Value, E> {
+                Ok(Number::from_f64(value).map_or(Value::Other, |number| Value::Scalar(number.to_string())))
+            }
+
+            fn visit_str<E>(self, value: &str) -> Result<Value, E> {
+                Ok(Value::Scalar(value.to_owned()))
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Value, A::Error> {
+                let mut list: Option<String> = None;
+                while let Some(item) = items.next_element()? {
+                    let Value::Scalar(item) = item else {
+                        while items.next_element::<IgnoredAny>()?.is_some() {}
+                        return Ok(Value::Other);
+                    };
+                    list = Some(match list {
+                        None => item,
+                        Some(list) => list + "," + &item,
+                    });
+                }
+                Ok(list.map_or(Value::Other, Value::List))
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<Value, A::Error> {
+                while members.next_entry::<IgnoredAny, IgnoredAny>()?.is_some() {}
+                Ok(Value::Other)
+            }
+        }
+        deserializer.deserialize_any(Any)
     }
 }
 

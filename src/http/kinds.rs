@@ -45,6 +45,7 @@ pub(super) enum Kind {
     MeshTooLarge,
     PictureTooLarge,
     DeviceMemory,
+    TooMuchMemory,
     NoSurface,
     OtherRequest,
     ArchiveUnavailable,
@@ -67,7 +68,7 @@ pub(super) enum Kind {
 }
 
 /// Row of the table of problem types.
-pub(super) struct Row {
+pub(super) struct ProblemEntry {
     pub(super) kind: Kind,
     /// Last segment of the `type`: `/problems/{slug}`.
     pub(super) slug: &'static str,
@@ -75,28 +76,28 @@ pub(super) struct Row {
     pub(super) title: &'static str,
     /// Meaning and remedy.
     pub(super) about: &'static str,
-    /// Counted as a rejection: a limit was reached, or a right was missing.
-    pub(super) limit: bool,
+    /// True if the metric of rejections counts it: a limit was reached, or a permission was missing.
+    pub(super) is_rejection: bool,
 }
 
 const fn row(
     kind: Kind,
     slug: &'static str,
     status: StatusCode,
-    limit: bool,
+    is_rejection: bool,
     title: &'static str,
     about: &'static str,
-) -> Row {
-    Row { kind, slug, status, title, about, limit }
+) -> ProblemEntry {
+    ProblemEntry { kind, slug, status, title, about, is_rejection }
 }
 
 use StatusCode as S;
 
 /// All problem types, in the order of [`Kind`].
 #[rustfmt::skip]
-pub(super) const KINDS: &[Row] = &[
+pub(super) const KINDS: &[ProblemEntry] = &[
     row(Kind::BadRequest, "bad-request", S::BAD_REQUEST, false, "The request is malformed",
-        "The request is not valid HTTP, JSON or multipart/form-data. `detail` says what is wrong."),
+        "The request is not valid HTTP, JSON or multipart/form-data. `detail` gives the reason."),
     row(Kind::BadParameter, "bad-parameter", S::BAD_REQUEST, false, "A parameter cannot be used",
         "A parameter is unknown, repeated, malformed, out of range, or in conflict with another one. `parameter` names it, `value` is the value sent, `expected` describes the allowed values, and `nearest` is the known name closest to an unknown one. In a selection, `column` is the position of the error in characters and `found` the content there. /v1/capabilities lists all parameters."),
     row(Kind::KeyRequired, "key-required", S::UNAUTHORIZED, true, "An API key is required",
@@ -135,7 +136,7 @@ pub(super) const KINDS: &[Row] = &[
         "The job was cancelled and has no result."),
     row(Kind::ResultGone, "result-gone", S::GONE, false, "The result has been removed",
         "The job succeeded, but its result was removed to free space or because it expired. Request the mesh again."),
-    row(Kind::PreconditionFailed, "precondition-failed", S::PRECONDITION_FAILED, false, "The file is another one",
+    row(Kind::PreconditionFailed, "precondition-failed", S::PRECONDITION_FAILED, false, "The file has another `ETag`",
         "No `ETag` in `If-Match` is that of the current file. Request the file again without `If-Match`."),
     row(Kind::BodyTooLarge, "body-too-large", S::PAYLOAD_TOO_LARGE, true, "The request body is too large",
         "The request body exceeds `limit` bytes, or `detail` names the part of it that is too large. Compress the structure with gzip or zstd, or ask the operator to raise the limit that `detail` names."),
@@ -143,14 +144,14 @@ pub(super) const KINDS: &[Row] = &[
         "The structure exceeds `limit` bytes after decompression."),
     row(Kind::EntryTooLarge, "entry-too-large", S::PAYLOAD_TOO_LARGE, true, "The archive entry is too large",
         "The entry exceeds `limit` bytes as sent by the archive. Ask the operator to raise archive.max_bytes."),
-    row(Kind::UnsupportedMediaType, "unsupported-media-type", S::UNSUPPORTED_MEDIA_TYPE, false, "The content does not match its media type",
-        "`Content-Type` is optional, because the server detects the format from the content; but here the two disagree. `declared` is the header, `found` the detected content."),
+    row(Kind::UnsupportedMediaType, "unsupported-media-type", S::UNSUPPORTED_MEDIA_TYPE, false, "The media type does not fit",
+        "`Content-Type` is optional, because the server detects the format from the content. Here the two disagree (`declared` is the header, `found` the detected content), or the body of `POST /v1/structures` is JSON. Only `POST /v1/meshes`, `/v1/report` and `/v1/estimate` take JSON, which names a structure on the server."),
     row(Kind::UnsupportedEncoding, "unsupported-encoding", S::UNSUPPORTED_MEDIA_TYPE, false, "Unsupported content encoding",
         "`Content-Encoding` must be gzip, zstd or identity, and match the content."),
     row(Kind::RangeNotSatisfiable, "range-not-satisfiable", S::RANGE_NOT_SATISFIABLE, false, "The range is not satisfiable",
         "`Range` starts after the end of the file, which has `actual` bytes."),
     row(Kind::WrongHost, "wrong-host", S::MISDIRECTED_REQUEST, true, "The service has another host name",
-        "The service listens on this machine only and does not answer to the host of the request. Use `localhost`, or ask the operator to add the name to server.hosts."),
+        "The service accepts only the names of a loopback address and those in server.hosts. The request names another host. Use `localhost`, or ask the operator to add the name to server.hosts."),
     row(Kind::UnreadableStructure, "unreadable-structure", S::UNPROCESSABLE_ENTITY, false, "The structure cannot be read",
         "The body is not a valid PDB, mmCIF, BinaryCIF, PQR or XYZ file. `line` and `column` (text) or `place` (binary) locate the error, `found` and `expected` describe it, and `diagnostics` lists the findings of the strict validator."),
     row(Kind::NoAtoms, "no-atoms", S::UNPROCESSABLE_ENTITY, false, "The structure has no atoms",
@@ -161,8 +162,8 @@ pub(super) const KINDS: &[Row] = &[
         "The file, or the assembly (`actual` atoms), has more than `limit` atoms."),
     row(Kind::GridTooLarge, "grid-too-large", S::UNPROCESSABLE_ENTITY, true, "The grid would be too large",
         "At this resolution the surface needs more than `limit` grid points. `suggested_resolution` is a grid spacing in Å that fits, if there is one."),
-    row(Kind::TooManyCandidates, "too-many-candidates", S::UNPROCESSABLE_ENTITY, true, "The atoms overlap too much",
-        "At this resolution and with these radii, the pairs of atoms and grid bricks (8 × 8 × 8 points) exceed `limit`. For a solvent-excluded surface, the same limit applies to pairs of atoms that overlap when enlarged by the probe. `suggested_resolution` is a grid spacing in Å that fits, if there is one; smaller radii or a smaller probe also help."),
+    row(Kind::TooManyCandidates, "too-many-candidates", S::UNPROCESSABLE_ENTITY, true, "Too many pairs of atoms and grid bricks",
+        "At this resolution and with these radii, the pairs of atoms and grid bricks (8 × 8 × 8 points) exceed `limit`. For a solvent-excluded surface, the same limit applies to pairs of atoms that overlap when enlarged by the probe; 64 comparisons of overlaps count as a pair. `within` may test 64 distances for each pair that the operator allows. `suggested_resolution` is a grid spacing in Å that fits, if there is one; smaller radii or a smaller probe also help."),
     row(Kind::TooManyDuplicates, "too-many-duplicates", S::UNPROCESSABLE_ENTITY, true, "Too many atoms have the same position",
         "More than `limit` atoms of one model have exactly the coordinates `position` (Å). Remove the placeholder atoms or split the models, or ask the operator to raise limits.duplicate_atoms."),
     row(Kind::TooManyCopies, "too-many-copies", S::UNPROCESSABLE_ENTITY, true, "The assembly has too many copies",
@@ -175,6 +176,8 @@ pub(super) const KINDS: &[Row] = &[
         "`parameter` (`width` or `height`) is `actual` pixels and the limit is `limit`. Request a smaller picture, or ask the operator to raise limits.picture_side."),
     row(Kind::DeviceMemory, "device-memory", S::UNPROCESSABLE_ENTITY, true, "The device has too little memory",
         "At this resolution the surface needs more memory than the device has (`limit` bytes), even in parts. `suggested_resolution` is a grid spacing in Å that fits, if there is one."),
+    row(Kind::TooMuchMemory, "too-much-memory", S::UNPROCESSABLE_ENTITY, true, "The request needs too much memory",
+        "The request alone needs at least `actual` bytes of memory at once, more than the `limit` bytes that the service may use. Use a coarser resolution, a smaller picture or fewer atoms, or ask the operator to raise limits.memory_bytes. An uploaded body may use half of that memory."),
     row(Kind::NoSurface, "no-surface", S::UNPROCESSABLE_ENTITY, false, "There is no surface",
         "The density does not reach `isovalue` at any grid point, or no grid point lies inside the spheres. Use a lower isovalue or a finer resolution."),
     row(Kind::OtherRequest, "other-request", S::UNPROCESSABLE_ENTITY, false, "The idempotency key belongs to another request",
@@ -186,7 +189,7 @@ pub(super) const KINDS: &[Row] = &[
     row(Kind::Internal, "internal", S::INTERNAL_SERVER_ERROR, false, "Internal server error",
         "An unexpected error occurred. The server log has the details under the request id in `instance`."),
     row(Kind::JobAbandoned, "job-abandoned", S::INTERNAL_SERVER_ERROR, false, "The job was abandoned",
-        "The job was started several times and the service ended before the job each time, or the input of the job is missing. The server log has the details."),
+        "The process ended during each attempt of the job (`actual` attempts), or the input of the job is missing. The server log has the details."),
     row(Kind::RecordUnreadable, "record-unreadable", S::INTERNAL_SERVER_ERROR, false, "The record of the job cannot be read",
         "The stored record of the job is damaged, or a later release wrote it. The service keeps it in quarantine for its operator. Send the request again, with another idempotency key if it has one."),
     row(Kind::NotReady, "not-ready", S::SERVICE_UNAVAILABLE, false, "The service is not ready",
@@ -196,9 +199,9 @@ pub(super) const KINDS: &[Row] = &[
     row(Kind::QueueFull, "queue-full", S::SERVICE_UNAVAILABLE, true, "Too many jobs are waiting",
         "All workers are busy and `limit` jobs are waiting, or the job would miss its deadline in the queue. `Retry-After` is an estimate in seconds."),
     row(Kind::TooManyJobs, "too-many-jobs", S::SERVICE_UNAVAILABLE, true, "Too many asynchronous jobs are open",
-        "The server keeps records of `limit` asynchronous jobs, or of so many of one client, and none of these jobs has ended. Wait for the end of a job, or cancel one. Retry after `Retry-After` seconds."),
+        "The server keeps records of at most `limit` asynchronous jobs, in total or for one client, and none of these jobs has ended. Wait for the end of a job, or cancel one. Retry after `Retry-After` seconds."),
     row(Kind::MemoryFull, "memory-full", S::SERVICE_UNAVAILABLE, true, "The memory limit is reached",
-        "Requests and jobs use all memory reserved for them: `limit` bytes, of which `actual` are in use. A request that needs more than `limit` by itself cannot succeed. Retry after `Retry-After` seconds."),
+        "Requests and jobs use all memory reserved for them: `limit` bytes, of which `actual` are in use. Retry after `Retry-After` seconds."),
     row(Kind::StoreFull, "store-full", S::SERVICE_UNAVAILABLE, true, "The store is full",
         "The store uses all space reserved for it (`limit` bytes), and no object may be removed now; without `limit`, its disk is full. Retry after `Retry-After` seconds."),
     row(Kind::StoreFailed, "store-failed", S::SERVICE_UNAVAILABLE, false, "The store is unavailable",
@@ -217,7 +220,7 @@ pub(super) const KINDS: &[Row] = &[
 
 impl Kind {
     /// Returns the row of the kind.
-    pub(super) fn row(self) -> &'static Row {
+    pub(super) fn row(self) -> &'static ProblemEntry {
         match KINDS.iter().find(|row| row.kind == self) {
             Some(row) => row,
             None => unreachable!("every kind has a row, which a test checks"),
@@ -225,7 +228,7 @@ impl Kind {
     }
 
     /// Returns the kind for the status of an error response that a library made.
-    pub(super) fn of_status(status: StatusCode) -> Self {
+    pub(super) fn from_status(status: StatusCode) -> Self {
         match status {
             S::NOT_FOUND => Self::NotFound,
             S::METHOD_NOT_ALLOWED => Self::MethodNotAllowed,

@@ -1,27 +1,30 @@
-//! Answers to requests for meshes: from the store, from a job that the request waits for, or with a job (202).
+//! Responses to requests for meshes: from the store, from a job that the request waits for, or with a job (202).
 //!
 //! A request gets a 202 only if it has `Prefer: respond-async` or `Prefer: wait=`. Any other request is answered within
 //! `jobs.deadline_ms` or refused; its work is cancelled then, unless another request shares it.
 
+use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
+use axum::body::Body;
 use axum::extract::{FromRequestParts, Query};
 use axum::http::header::{self, HeaderMap};
 use axum::http::request::Parts;
 use axum::http::{HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
 use tracing::Instrument as _;
 
 use super::kinds::Kind;
 use super::parsed_request::ParsedRequest;
 use super::preferences::{PREFERENCE_APPLIED, RequestPreferences};
 use super::problem::Problem;
-use super::source::{self, Input, StructureSource};
+use super::source::{self, Loaded, StructureSource};
 use super::state::Shared;
 use super::timing::Timing;
 use super::{conditional, delivery, jobs, results};
-use crate::jobs::{ContentKey, Failure, JobSpec, Refusal, Task, Ticket};
+use crate::jobs::{ContentKey, Failure, Input, JobSpec, Refusal, Task, Ticket};
 use crate::store::Digest;
 use crate::telemetry::{SpanParent, TraceSpan};
 
@@ -33,7 +36,7 @@ pub(super) struct MeshRequest {
     headers: HeaderMap,
     parsed: ParsedRequest,
     preferences: RequestPreferences,
-    /// `Cache-Control` of the answer; `None` if it belongs to this request alone.
+    /// `Cache-Control` of the response; `None` if it belongs to this request alone.
     cache: Option<HeaderValue>,
     timing: Timing,
 }
@@ -57,7 +60,7 @@ impl FromRequestParts<Shared> for MeshRequest {
 
 impl MeshRequest {
     /// Creates the request of an upload, whose reception began with `timing`.
-    pub(super) fn of_upload(
+    pub(super) fn from_upload(
         app: Shared,
         parsed: ParsedRequest,
         preferences: RequestPreferences,
@@ -74,12 +77,18 @@ impl MeshRequest {
             return Ok(response);
         }
         self.timing.lap("lookup");
-        let input = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
+        let (source, caller) = (&self.parsed.source, &self.preferences.caller);
+        // The strict validator and the record of a job need the file.
+        let loaded = if self.parsed.request.strict || self.is_answered_with_job() {
+            source.load(&self.app, caller).await?
+        } else {
+            source.find(&self.app, caller, &digest).await?
+        };
         self.timing.lap("load");
-        self.compute(input).await
+        self.compute(loaded).await
     }
 
-    /// Returns an answer that needs no job: a stored result, a 304, or the headers for a HEAD request.
+    /// Returns a response that needs no job: a stored result, a 304, or the headers for a HEAD request.
     async fn without_work(&self, digest: &Digest) -> Result<Option<Response>, Problem> {
         let Self { app, method, headers, .. } = self;
         let ParsedRequest { request, format, report, declared, .. } = &self.parsed;
@@ -87,7 +96,7 @@ impl MeshRequest {
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
         let namespace = self.preferences.caller.namespace;
         let key = |maker: String| ContentKey::new(digest, &request.job, *format, &maker, namespace);
-        // The file may be made by any backend, and each gives it another key.
+        // Any backend may compute the file, and the key depends on the backend.
         let mut keys: Vec<ContentKey> = app.pool.makers(&request.job).into_iter().map(key).collect();
         // A report has no validator.
         if !report {
@@ -119,7 +128,7 @@ impl MeshRequest {
                 };
                 if let Some(mut response) = stored {
                     response.headers_mut().remove(header::CACHE_CONTROL);
-                    return Ok(Some(self.cached(response)));
+                    return Ok(Some(self.with_cache_control(response)));
                 }
             }
         }
@@ -128,35 +137,42 @@ impl MeshRequest {
         }
         // The summary headers would need a run, as would the `ETag` if several backends may make the file.
         let media_type = HeaderValue::from_static(format.media_type());
-        let mut response = [(header::CONTENT_TYPE, media_type)].into_response();
+        // The length is unknown as well, and an empty body would declare 0 (RFC 9110, section 8.6).
+        let unknown_length = Body::from_stream(futures_util::stream::empty::<Result<Bytes, Infallible>>());
+        let mut response = ([(header::CONTENT_TYPE, media_type)], unknown_length).into_response();
         if let [key] = &keys[..] {
             response.headers_mut().insert(header::ETAG, delivery::etag(key));
         }
-        Ok(Some(self.cached(response)))
+        Ok(Some(self.with_cache_control(response)))
     }
 
-    fn cached(&self, mut response: Response) -> Response {
+    fn with_cache_control(&self, mut response: Response) -> Response {
         if let Some(cache) = &self.cache {
             response.headers_mut().insert(header::CACHE_CONTROL, cache.clone());
         }
         response
     }
 
+    /// Returns true if the response is a job. A job has no report of its own to return later, so a request for a report
+    /// is never answered with a job.
+    fn is_answered_with_job(&self) -> bool {
+        self.preferences.respond_async && !self.parsed.report
+    }
+
     /// Computes the mesh, or answers with a job.
-    async fn compute(self, input: Input) -> Result<Response, Problem> {
+    async fn compute(self, loaded: Loaded) -> Result<Response, Problem> {
         let app = Arc::clone(&self.app);
         app.admit_work(&self.preferences.caller)?;
-        // A job has no report of its own to return later, so a request for a report is never answered with a job.
-        let report = self.parsed.report;
-        if self.preferences.respond_async && !report {
-            return self.accept(input, None).await;
+        if self.is_answered_with_job() {
+            return self.accept(loaded, None).await;
         }
+        let report = self.parsed.report;
         let permit = app.delivery(self.preferences.caller.client)?;
         let wait = self.preferences.wait.filter(|_| !report);
         let jobs = &app.config.jobs;
         let deadline = Duration::from_millis(jobs.deadline_ms);
         let allowed = if wait.is_some() { Duration::from_millis(jobs.batch_deadline_ms) } else { deadline };
-        let ticket = app.pool.submit(self.task(&input), allowed, None);
+        let ticket = app.pool.submit(self.task(&loaded), allowed, None);
         let mut ticket = ticket.map_err(|refusal| self.refused(refusal))?;
         if ticket.is_shared
             && let Some(span) = TraceSpan::current()
@@ -169,13 +185,13 @@ impl MeshRequest {
                 Ok(outcome) => outcome,
                 Err(_elapsed) => {
                     drop(permit);
-                    return self.accept(input, Some(ticket)).await;
+                    return self.accept(loaded, Some(ticket)).await;
                 }
             },
         };
-        let (digest, joined, namespace) = (input.digest, ticket.is_shared, self.preferences.caller.namespace);
+        let (digest, joined, namespace) = (loaded.digest, ticket.is_shared, self.preferences.caller.namespace);
         // Dropping the last ticket of unfinished work cancels it.
-        drop((ticket, input));
+        drop((ticket, loaded));
         let finished = outcome.map_err(|failure| self.failed(failure))?;
         let Self {
             parsed: ParsedRequest { source, request, format, declared, .. }, headers, cache, mut timing, ..
@@ -194,7 +210,7 @@ impl MeshRequest {
         // Another backend may have computed the mesh, with other bytes.
         let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.maker(), namespace);
         let is_stored = results::save_later(&app, &finished, format, &key);
-        // Only now is it known which of several possible files the current one is.
+        // The current file, one of several possible ones, is known only now.
         conditional::check_match(&headers, &delivery::etag(&key))?;
         let mut response = delivery::mesh(&app, Arc::clone(&finished), format, &key, timing, permit).await?;
         let answered = response.headers_mut();
@@ -207,30 +223,37 @@ impl MeshRequest {
         Ok(response)
     }
 
-    fn task(&self, input: &Input) -> Task {
+    fn task(&self, loaded: &Loaded) -> Task {
         Task {
-            input: input.bytes.clone(),
-            digest: input.digest,
+            input: loaded.input.clone(),
+            digest: loaded.digest,
             namespace: self.preferences.caller.namespace,
             strict: self.parsed.request.strict,
             job: self.parsed.request.job.clone(),
             rank: self.preferences.rank,
-            lease: Some(Arc::clone(&input.lease)),
+            reservation: Some(Arc::clone(&loaded.reservation)),
             parent: SpanParent::current(),
             id: None,
         }
     }
 
     /// Accepts a durable job and answers with its address.
-    async fn accept(self, input: Input, ticket: Option<Ticket>) -> Result<Response, Problem> {
-        let task = self.task(&input);
+    async fn accept(self, mut loaded: Loaded, mut ticket: Option<Ticket>) -> Result<Response, Problem> {
+        if loaded.input.file().is_none() {
+            let digest = loaded.digest;
+            loaded = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
+            // The archive may have another file of the entry now.
+            ticket = ticket.filter(|_| loaded.digest == digest);
+        }
+        let Input::File(file) = loaded.input.clone() else { return Err(Problem::internal("a file was not loaded")) };
+        let task = self.task(&loaded);
         let Self { app, parsed: ParsedRequest { request, pairs, format, .. }, preferences, .. } = self;
-        let spec = JobSpec { task, parameters: pairs, format, idempotency_key: preferences.idempotency_key };
+        let spec = JobSpec { task, file, parameters: pairs, format, idempotency_key: preferences.idempotency_key };
         let job_store = app.job_store.clone();
         // A client that disconnects now does not interrupt the acceptance.
         let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());
         let view = accepted.await.map_err(Problem::internal)??;
-        let duration = Duration::from_secs_f64(app.pool.expected(&input.bytes, &request.job));
+        let duration = Duration::from_secs_f64(app.pool.expected(&loaded.input, &request.job));
         let mut response = jobs::accepted(&view, app.pool.estimated_wait() + duration);
         if preferences.respond_async {
             response.headers_mut().insert(PREFERENCE_APPLIED, HeaderValue::from_static("respond-async"));

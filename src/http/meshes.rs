@@ -50,8 +50,8 @@ problem_responses!(ReportProblems: [
 
 /// Mesh a structure and return the report
 ///
-/// Takes what `POST /v1/meshes` takes, computes the mesh and returns its report instead of the file: atoms, grid, area,
-/// volume, components, voids, validation and times.
+/// Accepts the same requests as `POST /v1/meshes`. Computes the mesh and returns its report instead of the file: atoms,
+/// grid, area, volume, components, voids, validation and times.
 #[utoipa::path(post, path = "/v1/report", tag = "meshes", operation_id = "createReport",
     params(MeshParameters, ContentEncodingHeader),
     request_body(content = StructureFile, description = AS_FOR_MESHES, content_type = "application/octet-stream"),
@@ -80,7 +80,7 @@ async fn answer(
     let timing = Timing::start();
     let preferences = RequestPreferences::of(headers, extensions)?;
     let parsed = ParsedRequest { report, ..ParsedRequest::from_body(app, query, headers, body).await? };
-    let mut response = MeshRequest::of_upload(Arc::clone(app), parsed, preferences, timing).answer().await?;
+    let mut response = MeshRequest::from_upload(Arc::clone(app), parsed, preferences, timing).answer().await?;
     if !report {
         response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
     }

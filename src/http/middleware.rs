@@ -49,7 +49,7 @@ async fn catch_panics(request: Request, next: Next) -> Response {
     match AssertUnwindSafe(next.run(request)).catch_unwind().await {
         Ok(response) => response,
         Err(_payload) => {
-            // The panic hook has logged what and where.
+            // The panic hook has logged the message and the location.
             counter!(PANICS, "place" => "http").increment(1);
             Problem::internal("a handler panicked").into_response()
         }
@@ -61,7 +61,7 @@ async fn backstop(State(limit): State<Duration>, request: Request, next: Next) -
         Ok(response) => response,
         Err(_elapsed) => {
             let limit = u64::try_from(limit.as_millis()).unwrap_or(u64::MAX);
-            Problem::new(Kind::Deadline, format!("no answer within {limit} ms")).with("limit", limit).into_response()
+            Problem::new(Kind::Deadline, format!("no response within {limit} ms")).with("limit", limit).into_response()
         }
     }
 }

@@ -7,12 +7,13 @@
 mod kinds;
 mod observed_body;
 mod pace;
-mod probe;
 mod range;
+mod reader_line;
 mod request_id;
 mod scopes;
 mod signal;
 mod socket;
+mod store_health;
 mod timing;
 
 mod stop;
@@ -33,6 +34,7 @@ mod state;
 mod guard;
 
 // Requests: preferences, bodies, structures, parameters.
+mod body_hasher;
 mod color_parameters;
 mod form;
 mod preferences;

@@ -18,8 +18,8 @@ pub(super) const OCTETS: &str = "application/octet-stream";
 pub(super) async fn relabel(request: Request, next: Next) -> Response {
     let values = request.headers().get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok());
     let accept = values.collect::<Vec<_>>().join(",");
-    let ranges = accept.split(',').enumerate().filter_map(|(place, text)| range(place, text));
-    let preferred = ranges.max_by(|a, b| a.weight.total_cmp(&b.weight).then(b.place.cmp(&a.place)));
+    let ranges = accept.split(',').enumerate().filter_map(|(position, text)| range(position, text));
+    let preferred = ranges.max_by(|a, b| a.weight.total_cmp(&b.weight).then(b.position.cmp(&a.position)));
     let is_octets = preferred.is_some_and(|range| range.is(OCTETS));
     let mut response = next.run(request).await;
     let headers = response.headers_mut();
@@ -43,14 +43,14 @@ pub(super) fn format(headers: &HeaderMap) -> Result<Format, Problem> {
 }
 
 /// Media range with its weight and its position in the header.
-struct Range<'a> {
+struct MediaRange<'a> {
     kind: &'a str,
     subtype: &'a str,
     weight: f64,
-    place: usize,
+    position: usize,
 }
 
-impl Range<'_> {
+impl MediaRange<'_> {
     /// Returns true if the range is this media type, not a wildcard that contains it.
     fn is(&self, media_type: &str) -> bool {
         media_type.split_once('/').is_some_and(|(kind, subtype)| {
@@ -75,30 +75,30 @@ fn choose(accept: &str) -> Option<Format> {
     if accept.trim().is_empty() {
         return Some(Format::default());
     }
-    let ranges = accept.split(',').enumerate().filter_map(|(place, text)| range(place, text));
-    // Errors and jobs are JSON, whatever the mesh is. Some generated clients send no other type.
-    let is_json = |range: &Range<'_>| range.is("application/json") || range.is(problem::MEDIA_TYPE);
+    let ranges = accept.split(',').enumerate().filter_map(|(position, text)| range(position, text));
+    // Errors and jobs are JSON, independent of the mesh format. Some generated clients send no other type.
+    let is_json = |range: &MediaRange<'_>| range.is("application/json") || range.is(problem::MEDIA_TYPE);
     let (json, ranges): (Vec<_>, Vec<_>) = ranges.partition(is_json);
     if ranges.is_empty() && json.iter().any(|range| range.weight > 0.0) {
         return Some(Format::default());
     }
     let best = Format::ALL.into_iter().filter_map(|format| {
         let matching = ranges.iter().filter(|range| range.specificity(format.media_type()) > 0);
-        let range = matching.max_by_key(|r| (r.specificity(format.media_type()), usize::MAX - r.place))?;
-        (range.weight > 0.0).then_some((range.weight, usize::MAX - range.place, format))
+        let range = matching.max_by_key(|r| (r.specificity(format.media_type()), usize::MAX - r.position))?;
+        (range.weight > 0.0).then_some((range.weight, usize::MAX - range.position, format))
     });
     // `max_by` returns the last of equal elements; the first one is wanted.
     best.rev().max_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))).map(|(_, _, format)| format)
 }
 
 /// Parses one member of the list. Malformed ones are ignored.
-fn range(place: usize, text: &str) -> Option<Range<'_>> {
+fn range(position: usize, text: &str) -> Option<MediaRange<'_>> {
     let mut parts = text.split(';').map(str::trim);
     let (kind, subtype) = parts.next()?.split_once('/')?;
     let weight = parts
         .find_map(|parameter| parameter.strip_prefix("q=").or_else(|| parameter.strip_prefix("Q=")))
         .map_or(Some(1.0), |q| q.parse::<f64>().ok().filter(|q| (0.0..=1.0).contains(q)))?;
-    Some(Range { kind, subtype, weight, place })
+    Some(MediaRange { kind, subtype, weight, position })
 }
 
 #[cfg(test)]

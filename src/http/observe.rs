@@ -33,7 +33,7 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
     let route = request.extensions().get::<MatchedPath>().cloned();
     let method = request.method().clone();
     let trace = {
-        // Several values are joined, as HTTP has it: right for `tracestate`, and an invalid `traceparent`.
+        // Joins several values, as HTTP permits: the result is valid for `tracestate` and invalid for `traceparent`.
         let header = |name| {
             let values = request.headers().get_all(name).iter();
             values.map(|value| value.to_str().unwrap_or_default()).collect::<Vec<_>>().join(",")
@@ -44,7 +44,7 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
         let name = route.as_ref().map_or_else(|| method.to_owned(), |route| format!("{method} {}", route.as_str()));
         TraceSpan::start(&parent, name, SpanKind::Server, start)
     };
-    // Without the query, which may hold a signature. The guard adds the id of the key.
+    // The log omits the query, which may contain a signature. The guard adds the id of the key.
     let path = shorten(request.uri().path());
     let span = tracing::info_span!(
         "request",
@@ -72,16 +72,16 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
     };
     let request = request
         .map(|body| observed(body, move |bytes, _is_end| _ = received.fetch_add(bytes as u64, Ordering::Relaxed)));
-    let place = HeaderValue::from_str(&traceparent(&trace.context()));
+    let own_parent = HeaderValue::from_str(&traceparent(&trace.context()));
     let mut response = trace.run(next.run(request)).instrument(span).await;
     timing::write_header(&mut response, start.elapsed());
-    if let Ok(place) = place {
-        response.headers_mut().insert(TRACEPARENT, place);
+    if let Ok(own_parent) = own_parent {
+        response.headers_mut().insert(TRACEPARENT, own_parent);
     }
     log.status = Some(response.status().as_u16());
     let length = response.headers().get(CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
     response.map(|body| {
-        // An empty body and the answer to HEAD are not polled.
+        // An empty body and the response to HEAD are not polled.
         log.complete = body.is_end_stream() || log.method == Method::HEAD;
         log.length = length.or_else(|| body.size_hint().exact());
         observed(body, move |bytes, is_end| log.count(bytes, is_end))

@@ -25,13 +25,19 @@ use crate::config::ServerConfig;
 use crate::memory_budget::Budget;
 use crate::telemetry::{BODIES_OPEN, REJECTED};
 
-/// Size of a slice over HTTP/1.1, bytes: eight seconds at 8 KiB/s.
-const SLICE: usize = 64 << 10;
+/// Size of the pieces in which the progress of a client becomes visible, bytes: 16 seconds at 1 KiB/s.
+const PIECE: usize = 16 << 10;
+/// Maximum size of a piece, bytes. Larger ones are not faster.
+const MAX_PIECE: usize = 256 << 10;
+/// Fraction of what a client has read that may be a piece: at 1 KiB/s, a piece takes half of the time that
+/// [`BYTES_PER_SECOND`] adds.
+const PIECES_READ: u64 = 32;
 /// Size of a slice over HTTP/2, bytes: one frame, so that the progress of many concurrent bodies is visible.
 const STREAM_SLICE: usize = 16 << 10;
 /// Send buffer of an HTTP/2 stream, bytes.
 pub(super) const STREAM_BUFFER: usize = 64 << 10;
-/// Size up to which a body is not watched, bytes.
+/// Size up to which a body is not watched over HTTP/1.1, bytes: the buffers of the system take it at once. Over HTTP/2
+/// the client's window may keep any byte in this process.
 const SMALL: u64 = 1 << 10;
 
 tokio::task_local! {
@@ -41,7 +47,7 @@ tokio::task_local! {
 
 /// Number of bytes that a client must read within a time.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Rate {
+pub(super) struct MinimumRate {
     bytes: u64,
     within: Duration,
 }
@@ -51,7 +57,7 @@ const BYTES_PER_SECOND: u64 = 16 << 10;
 /// Maximum time without progress, as a multiple of the rate's time.
 pub(super) const MAX_TIME_FACTOR: u32 = 4;
 
-impl Rate {
+impl MinimumRate {
     /// Returns the time for the next bytes of a client that has read `total` bytes. A slow client on a fast line fills
     /// the buffers of its system first, then pauses until it has read a part of these megabytes.
     fn allowed_time(&self, total: u64) -> Duration {
@@ -67,12 +73,12 @@ impl Rate {
 /// Pace at which one client reads its bodies.
 #[derive(Debug)]
 pub(super) struct Pace {
-    rate: Rate,
-    state: Mutex<State>,
+    rate: MinimumRate,
+    state: Mutex<PaceState>,
 }
 
 #[derive(Debug)]
-struct State {
+struct PaceState {
     /// Bytes that hyper holds and the client has not read.
     offered: u64,
     /// Bytes read since `since`, fewer than the rate requires.
@@ -85,12 +91,19 @@ struct State {
 }
 
 impl Pace {
-    pub(super) fn new(rate: Rate) -> Arc<Self> {
-        let state = State { offered: 0, taken: 0, since: Instant::now(), total: 0, waker: None };
+    pub(super) fn new(rate: MinimumRate) -> Arc<Self> {
+        let state = PaceState { offered: 0, taken: 0, since: Instant::now(), total: 0, waker: None };
         Arc::new(Self { rate, state: Mutex::new(state) })
     }
 
-    fn state(&self) -> MutexGuard<'_, State> {
+    /// Returns the size of a piece, a power of two that grows while an HTTP/1.1 client reads. Each stream of HTTP/2 has
+    /// its own pace, so the pace of its connection stays at the minimum.
+    pub(super) fn piece(&self) -> usize {
+        let fraction = usize::try_from(self.state().total / PIECES_READ).unwrap_or(usize::MAX);
+        1 << fraction.clamp(PIECE, MAX_PIECE).ilog2()
+    }
+
+    fn state(&self) -> MutexGuard<'_, PaceState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -154,13 +167,15 @@ impl Pace {
     /// Watches the body of a response, with the pace of its HTTP/2 stream or else of `connection`. Event streams are
     /// exempt: they are as slow as their events and hold only one.
     pub(super) fn watch(answer: Response<Body>, connection: &Arc<Self>, version: Version) -> Response<Body> {
-        let is_small = answer.body().size_hint().upper().is_some_and(|bytes| bytes <= SMALL);
+        let is_http2 = version == Version::HTTP_2;
+        let limit = if is_http2 { 0 } else { SMALL };
+        let is_small = answer.body().size_hint().upper().is_some_and(|bytes| bytes <= limit);
         let is_events =
             answer.headers().get(CONTENT_TYPE).is_some_and(|t| t.as_bytes().starts_with(b"text/event-stream"));
         if is_small || is_events {
             return answer;
         }
-        let stream = if version == Version::HTTP_2 { STREAM.try_with(Arc::clone).ok() } else { None };
+        let stream = if is_http2 { STREAM.try_with(Arc::clone).ok() } else { None };
         let stays = stream.is_some();
         let pace = stream.unwrap_or_else(|| Arc::clone(connection));
         answer.map(|body| {
@@ -252,7 +267,7 @@ impl HttpBody for Paced {
             }
             return Poll::Ready(None);
         }
-        let length = self.rest.len().min(if self.stays { STREAM_SLICE } else { SLICE });
+        let length = self.rest.len().min(if self.stays { STREAM_SLICE } else { self.pace.piece() / 2 });
         let slice = self.rest.split_to(length);
         Poll::Ready(Some(Ok(Frame::data(self.pace.offer(slice)))))
     }
@@ -278,13 +293,13 @@ impl HttpBody for Paced {
 /// stream is charged to `budget`.
 #[derive(Clone)]
 pub(super) struct Streams {
-    rate: Rate,
+    rate: MinimumRate,
     broken: Arc<Notify>,
     budget: Budget,
 }
 
 impl Streams {
-    pub(super) fn new(rate: Rate, broken: &Arc<Notify>, budget: Budget) -> Self {
+    pub(super) fn new(rate: MinimumRate, broken: &Arc<Notify>, budget: Budget) -> Self {
         Self { rate, broken: Arc::clone(broken), budget }
     }
 }
@@ -321,7 +336,7 @@ mod tests {
     #[tokio::test]
     async fn streams_are_charged_to_the_memory_budget() {
         let (budget, done) = (Budget::new(STREAM_BUFFER as u64), Arc::new(Notify::new()));
-        let streams = Streams::new(Rate::new(&ServerConfig::default()), &Arc::default(), budget.clone());
+        let streams = Streams::new(MinimumRate::new(&ServerConfig::default()), &Arc::default(), budget.clone());
         for _ in 0..2 {
             let done = Arc::clone(&done);
             streams.execute(async move { done.notified().await });

@@ -34,9 +34,9 @@ include!(concat!(env!("OUT_DIR"), "/page.rs"));
 /// Page of a server without the viewer.
 const NONE: &str = include_str!("../../web/none.html");
 const ICON: &str = include_str!("../../web/public/assets/icon.svg");
-/// Script of a server without the component; explains why nothing is shown.
+/// Script of a server without the component. It logs the reason to the console.
 const NO_COMPONENT: &str =
-    "console.error(\"This server was built without its viewer, and has no <molmesh-viewer> to give.\");\n";
+    "console.error(\"This server was built without the viewer, so <molmesh-viewer> is not available.\");\n";
 
 /// Returns true if the program was built with the viewer.
 #[must_use]
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn only_names_that_say_the_contents_are_kept_for_ever() {
+    fn only_files_with_a_hash_in_their_name_are_immutable() {
         for (path, kept) in [
             ("assets/index-CGvWO8zU.css", true),
             ("assets/viewer-BuD58--0.js", true),

@@ -6,14 +6,17 @@ use axum::extract::rejection::QueryRejection;
 use axum::http::header::HeaderMap;
 
 use super::content_type::DeclaredType;
-use super::form::Upload;
+use super::form::UploadedFile;
 use super::kinds::Kind;
 use super::problem::Problem;
-use super::source::{Input, StructureSource};
+use super::source::{Loaded, StructureSource};
 use super::state::{App, Shared};
 use super::{json_body, negotiate, upload};
 use crate::formats::Format;
 use crate::pipeline::params::{self, Request};
+
+/// Size of a JSON document, bytes, up to which it is parsed on the async runtime: a few microseconds.
+const MAX_INLINE_JSON: usize = 4096;
 
 /// Pairs of a query, in order.
 pub(super) type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
@@ -25,7 +28,7 @@ pub(super) struct ParsedRequest {
     /// Parameters as the client wrote them.
     pub(super) pairs: Vec<(String, String)>,
     pub(super) format: Format,
-    /// Answer with the report instead of the mesh.
+    /// True if the response is the report instead of the mesh.
     pub(super) report: bool,
     pub(super) declared: DeclaredType,
 }
@@ -42,11 +45,11 @@ impl ParsedRequest {
         let (pairs, mut request) = parse(query)?;
         if let (Some(format), Some(other)) = (format, request.format) {
             let value = other.name();
-            let detail = format!("parameter `format`: the address already says {}", format.name());
+            let detail = format!("parameter `format`: the path already names {}", format.name());
             return Err(Problem::new(Kind::BadParameter, detail)
                 .with("parameter", "format")
                 .with("value", value)
-                .with("expected", format!("no value here, or the address surface.{value}")));
+                .with("expected", format!("no value here, or the path surface.{value}")));
         }
         let report = format.is_none();
         let format = format.or(request.format).unwrap_or_default();
@@ -68,12 +71,18 @@ impl ParsedRequest {
         let body_has_parameters = is_json || upload::is_multipart(headers);
         let early = if body_has_parameters { None } else { Some(finish(app, &mut request, headers)?) };
         let (source, fields, declared) = if is_json {
-            let (source, fields) = named(&upload::receive_json(app, headers, body).await?)?;
-            // The type of the document says nothing about the structure.
+            let json = upload::receive_json(app, headers, body).await?;
+            let (source, fields) = if json.len() <= MAX_INLINE_JSON {
+                named(&json)?
+            } else {
+                tokio::task::spawn_blocking(move || named(&json)).await.map_err(Problem::internal)??
+            };
+            // The type is that of the document, not that of the structure.
             (source, fields, DeclaredType::Neutral)
         } else {
-            let Upload { bytes, digest, lease, fields, declared } = upload::receive(app, headers, body).await?;
-            (StructureSource::Uploaded(Input::uploaded(bytes, digest, lease)), fields, declared)
+            let UploadedFile { bytes, digest, reservation, fields, declared } =
+                upload::receive(app, headers, body).await?;
+            (StructureSource::Uploaded(Loaded::file(bytes, digest, reservation)), fields, declared)
         };
         if body_has_parameters {
             pairs.extend(fields);
@@ -108,13 +117,22 @@ fn format_of(file: &str) -> Result<Format, Problem> {
     })
 }
 
+fn bad_digest(text: &str) -> Problem {
+    let shown: String = text.chars().take(80).collect();
+    let expected = "the digest of a stored structure, 64 hexadecimal digits in lower case";
+    Problem::new(Kind::BadParameter, format!("member `structure`: `{shown}` is not allowed; expected {expected}"))
+        .with("parameter", "structure")
+        .with("value", shown)
+        .with("expected", expected)
+}
+
 /// Parses `{"pdb_id": …}` or `{"structure": …}`; the other members are parameters.
 fn named(bytes: &[u8]) -> Result<(StructureSource, Vec<(String, String)>), Problem> {
     let (mut source, mut fields) = (None, Vec::new());
     for (name, text) in json_body::members(bytes)? {
         let found = match name.as_str() {
-            "pdb_id" => StructureSource::from_pdb_id(&text)?,
-            "structure" => StructureSource::from_digest(&text)?,
+            "pdb_id" => StructureSource::from_pdb_id(&text).map_err(|problem| problem.with("parameter", "pdb_id"))?,
+            "structure" => StructureSource::Stored(text.parse().map_err(|_bad| bad_digest(&text))?),
             _ => {
                 fields.push((name, text));
                 continue;

@@ -1,4 +1,4 @@
-//! Preferences of a request: synchronous or asynchronous answer, urgency, idempotency key.
+//! Preferences of a request: synchronous or asynchronous response, urgency, idempotency key.
 
 use std::time::Duration;
 
@@ -68,8 +68,8 @@ fn key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
         return Err(bad("the request has more than one `Idempotency-Key` header".to_owned()));
     }
     let text = value.to_str().unwrap_or_default().trim().trim_matches('"');
-    if text.is_empty() || text.len() > MAX_KEY {
-        let detail = format!("`Idempotency-Key` must have 1 to {MAX_KEY} visible characters");
+    if text.is_empty() || text.len() > MAX_KEY || text.contains('\t') {
+        let detail = format!("`Idempotency-Key` must have 1 to {MAX_KEY} printable ASCII characters");
         return Err(bad(detail).with("limit", MAX_KEY));
     }
     Ok(Some(text.to_owned()))
@@ -114,7 +114,9 @@ mod tests {
         }
         let key = "idempotency-key";
         assert_eq!(preferences(&[(key, "\"abc\"")]).unwrap().idempotency_key.as_deref(), Some("abc"));
+        assert_eq!(preferences(&[(key, "a b\t")]).unwrap().idempotency_key.as_deref(), Some("a b"));
         assert!(preferences(&[(key, "")]).is_err());
+        assert!(preferences(&[(key, "a\tb")]).is_err());
         assert!(preferences(&[(key, "a"), (key, "a")]).unwrap_err().is(Kind::BadRequest));
         let long: &'static str = Box::leak("x".repeat(MAX_KEY + 1).into_boxed_str());
         assert!(preferences(&[(key, long)]).is_err());

@@ -150,9 +150,9 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
         return response;
     }
     let problem = response.extensions_mut().remove::<Problem>();
-    let problem = problem.unwrap_or_else(|| of_library(status, &path));
+    let problem = problem.unwrap_or_else(|| from_library(status, &path));
     let row = problem.kind.row();
-    if row.limit {
+    if row.is_rejection {
         counter!(REJECTED, "reason" => row.slug).increment(1);
     }
     let document = problem.document(id.as_str());
@@ -164,11 +164,11 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
 }
 
 /// Returns the problem for an error response of axum or of a layer.
-fn of_library(status: StatusCode, path: &str) -> Problem {
+fn from_library(status: StatusCode, path: &str) -> Problem {
     let detail = match status {
         StatusCode::NOT_FOUND => format!("There is nothing at {path}."),
         StatusCode::METHOD_NOT_ALLOWED => format!("{path} has other methods; the Allow header lists them."),
         _ => status.canonical_reason().unwrap_or("The request could not be answered").to_owned(),
     };
-    Problem::new(Kind::of_status(status), detail)
+    Problem::new(Kind::from_status(status), detail)
 }

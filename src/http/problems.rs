@@ -7,7 +7,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::kinds::{KINDS, Kind, Row};
+use super::kinds::{KINDS, Kind, ProblemEntry};
 use super::openapi::parameters::ProblemPath;
 use super::openapi::problem_responses;
 use super::problem::Problem;
@@ -26,7 +26,7 @@ pub(super) struct ProblemDescription {
     about: &'static str,
 }
 
-fn describe(row: &Row) -> ProblemDescription {
+fn describe(row: &ProblemEntry) -> ProblemDescription {
     ProblemDescription {
         r#type: format!("/problems/{}", row.slug),
         status: row.status.as_u16(),

@@ -86,7 +86,7 @@ pub(super) async fn show(
     params(ResultPath, ConditionHeaders),
     responses(
         (status = 200, description = "The report of the run that computed the mesh.", body = Report,
-            headers(("ETag" = String, description = "Strong validator of the document."))),
+            headers(("ETag" = String, description = "Strong validator: equal tags mean equal bytes."))),
         NotModified, ReportProblems,
     ))]
 pub(super) async fn report(
@@ -160,14 +160,15 @@ pub(super) async fn stored(
         body = part;
     }
     let share = app.delivery_shares.take(caller.client.0)?;
-    // Pieces of running answers are charged regardless of the limit; new answers are refused while it is exceeded.
+    // Pieces of running responses are charged regardless of the limit. While it is exceeded, new responses are
+    // rejected.
     let budget = app.pool.settings().budget.clone();
     let charged = body.map_ok(move |piece| {
         // The share is held until the body is dropped.
         _ = &share;
-        let lease = budget.lease();
-        lease.force(piece.len() as u64);
-        lease.attach(piece)
+        let reservation = budget.reservation();
+        reservation.force(piece.len() as u64);
+        reservation.attach(piece)
     });
     Ok(Some((status, out, Body::from_stream(charged)).into_response()))
 }
@@ -192,14 +193,17 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
     Ok(Some(headers))
 }
 
-/// Stores the result of a synchronous request in the background. Returns false if too many results are being stored
-/// already; then the next request computes it again.
+/// Stores the result of a synchronous request in the background. Returns false, and stores nothing, if too many results
+/// are being stored already: `jobs.concurrent_saves`, or one while jobs wait for a worker.
 pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format, key: &ContentKey) -> bool {
     let _starting = app.save_start.lock().unwrap_or_else(PoisonError::into_inner);
     if app.saves.running(key).is_some() {
         return true;
     }
-    let Ok(permit) = Arc::clone(&app.save_permits).try_acquire_owned() else {
+    let one_runs = app.save_permits.available_permits() < app.config.jobs.concurrent_saves;
+    let may_start = !one_runs || !app.pool.has_waiting();
+    let permit = may_start.then(|| Arc::clone(&app.save_permits).try_acquire_owned());
+    let Some(Ok(permit)) = permit else {
         counter!(RESULTS_NOT_STORED, "reason" => "busy").increment(1);
         return false;
     };
@@ -225,8 +229,8 @@ async fn wait_for_save(app: &App, key: &ContentKey) {
     }
 }
 
-/// Returns true if a result that is being stored will be found at its address. `headers` are those of its answer. Waits
-/// for the end only if the space may not suffice.
+/// Returns true if a result that is being stored will be found at its address. `headers` are those of its response.
+/// Waits until it is stored only if the space may not suffice.
 pub(super) async fn will_be_stored(
     app: &App,
     key: &ContentKey,

@@ -9,7 +9,7 @@ use super::problem::Problem;
 use crate::access::Scope;
 
 /// Operation with the scope that it needs; `None`: open to everybody.
-pub(super) struct Row {
+pub(super) struct OperationScope {
     pub(super) method: Method,
     pub(super) path: &'static str,
     pub(super) scope: Option<Scope>,
@@ -18,7 +18,7 @@ pub(super) struct Row {
 /// Query parameters of an operation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Parameters {
-    /// Those of a mesh.
+    /// Parameters of a mesh.
     Mesh,
     /// Parameters of the colours of atoms.
     Colors,
@@ -27,7 +27,7 @@ pub(super) enum Parameters {
     None,
 }
 
-impl Row {
+impl OperationScope {
     /// Returns the query parameters of the operation.
     pub(super) fn parameters(&self) -> Parameters {
         let is_result = self.path.starts_with("/v1/results/");
@@ -42,8 +42,8 @@ impl Row {
     }
 }
 
-const fn row(method: Method, path: &'static str, scope: Option<Scope>) -> Row {
-    Row { method, path, scope }
+const fn row(method: Method, path: &'static str, scope: Option<Scope>) -> OperationScope {
+    OperationScope { method, path, scope }
 }
 
 const MESH: Option<Scope> = Some(Scope::Mesh);
@@ -52,7 +52,7 @@ const OPEN: Option<Scope> = None;
 
 /// Every operation of the router.
 #[rustfmt::skip]
-pub(super) const TABLE: &[Row] = &[
+pub(super) const TABLE: &[OperationScope] = &[
     row(Method::POST, "/v1/meshes", MESH),
     row(Method::POST, "/v1/report", MESH),
     row(Method::GET, "/v1/pdb/{id}/{file}", MESH),
@@ -130,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn heads_are_gets_and_what_is_unknown_is_closed() {
+    fn head_needs_the_scope_of_get_and_unknown_operations_need_mesh() {
         assert_eq!(of(&Method::HEAD, "/v1/jobs/{id}"), READ);
         assert_eq!(of(&Method::DELETE, "/v1/jobs/{id}"), MESH);
         assert_eq!(of(&Method::TRACE, "/v1/meshes"), MESH);

@@ -12,10 +12,11 @@ use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
 use tokio::task::{JoinHandle, JoinSet};
 
-use super::probe::Probe;
 use super::problem::Problem;
+use super::reader_line::ReaderLine;
 use super::state::{App, Shared};
 use super::stop::{self, Stop};
+use super::store_health::StoreHealth;
 use super::{accept, capabilities, key_reload, metrics, results, router};
 use crate::access::{Access, AccessError};
 use crate::archive::Archive;
@@ -101,7 +102,7 @@ async fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, Soc
 
 impl Server {
     /// Binds the listeners, locks the data folder, opens the store and starts the workers. Must be called on the
-    /// runtime that [`Self::run`] is.
+    /// runtime that [`Self::run`] runs on.
     ///
     /// # Errors
     /// [`ServeError`].
@@ -148,11 +149,14 @@ impl Server {
         if recovered > 0 {
             tracing::info!(jobs = recovered, "resumed jobs of an earlier process");
         }
+        ::metrics::gauge!(telemetry::MEMORY_LIMIT).set(config.limits.memory_bytes as f64);
         let archive = Archive::new(&config, pool.settings().budget.clone());
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let uploads = pool.settings().budget.part(config.limits.memory_bytes / 2);
-        let readers = Arc::new(Semaphore::new(config.jobs.workers));
+        let readers = archive.readers();
+        let reader_shares = ClientShares::new(config.jobs.workers, config.server.client_share);
+        let reader_line = ReaderLine::new(config.jobs.workers);
         let delivery_shares = ClientShares::new(config.jobs.deliveries, config.server.client_share);
         let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
         let (stop, stopping) = watch::channel(Stop::Serve);
@@ -167,6 +171,8 @@ impl Server {
             result_headers: Cache::new(CACHED_HEADERS),
             uploads,
             readers,
+            reader_line,
+            reader_shares,
             save_permits,
             save_start: Mutex::new(()),
             saves: SingleFlight::default(),
@@ -174,7 +180,7 @@ impl Server {
             deliveries,
             delivery_shares,
             first_mesh: OnceLock::new(),
-            probe: Probe::new(),
+            store_health: StoreHealth::new(),
             tracer: traces.tracer(),
             found,
             capabilities,
@@ -270,9 +276,9 @@ async fn wind_down(
     };
     let requests = requests.unwrap_or(false);
     // Records of ended jobs and results that are being stored.
-    let ends = async { tokio::join!(app.job_store.settled(), results::all_saved(app)) };
-    let settled = tokio::time::timeout(CANCELLING, ends).await.is_ok();
-    tracing::info!(requests, jobs, settled, "stopped");
+    let ends = async { tokio::join!(app.job_store.all_recorded(), results::all_saved(app)) };
+    let complete = tokio::time::timeout(CANCELLING, ends).await.is_ok();
+    tracing::info!(requests, jobs, complete, "stopped");
     requests
 }
 

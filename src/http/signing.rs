@@ -5,7 +5,7 @@ use axum::http::{Method, Uri};
 
 use super::color_parameters;
 use super::jobs::{MAX_WAIT_S, Poll};
-use super::scopes::{Parameters, Row, TABLE};
+use super::scopes::{OperationScope, Parameters, TABLE};
 use crate::formats::Format;
 use crate::pipeline::params;
 
@@ -42,7 +42,7 @@ fn matches(route: &str, path: &str) -> bool {
 }
 
 /// Checks the name of a mesh file.
-fn check_file(row: &Row, path: &str) -> Result<(), String> {
+fn check_file(row: &OperationScope, path: &str) -> Result<(), String> {
     if !row.path.ends_with("/{file}") {
         return Ok(());
     }
@@ -54,11 +54,11 @@ fn check_file(row: &Row, path: &str) -> Result<(), String> {
     if is_mesh && is_named { Ok(()) } else { Err(of()) }
 }
 
-fn is_result(row: &Row) -> bool {
+fn is_result(row: &OperationScope) -> bool {
     row.path.starts_with("/v1/results/")
 }
 
-fn check_parameters(row: &Row, uri: &Uri) -> Result<(), String> {
+fn check_parameters(row: &OperationScope, uri: &Uri) -> Result<(), String> {
     let Query(pairs) = Query::<Vec<(String, String)>>::try_from_uri(uri).map_err(|error| error.body_text())?;
     match row.parameters() {
         Parameters::Mesh => params::parse(pairs).map(drop).map_err(|error| error.to_string()),

@@ -16,11 +16,12 @@ use super::conditional;
 use super::guard::Caller;
 use super::kinds::Kind;
 use super::problem::Problem;
-use super::state::Shared;
+use super::state::{Delivery, Shared};
 use crate::archive::{Entry, FetchError, UnavailableReason};
-use crate::memory_budget::Lease;
+use crate::jobs::{Input, MemoryReservation};
 use crate::store::{Digest, Name};
-use crate::structure::{ArchiveError, EntryId};
+use crate::structure::{ArchiveError, EntryId, ReadLimits, Structure};
+use crate::surface::Control;
 
 /// Caching of everything that follows from a structure and its parameters. Archive entries are revised rarely, so a day
 /// without revalidation is acceptable.
@@ -29,33 +30,50 @@ pub(super) const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=
 /// Structure that a request names.
 pub(super) enum StructureSource {
     /// Uploaded with this request.
-    Uploaded(Input),
+    Uploaded(Loaded),
     /// Uploaded earlier.
     Stored(Digest),
     /// Entry of the archive.
     Entry(EntryId),
 }
 
-/// Bytes of a structure file, with the memory that they are charged to. Clones share both.
+/// Structure with the memory that its file is charged to. Clones share both.
 #[derive(Clone)]
-pub(super) struct Input {
-    pub(super) bytes: Bytes,
-    /// SHA-256 of `bytes`. An archive entry may have changed since its digest was first asked for.
+pub(super) struct Loaded {
+    pub(super) input: Input,
+    /// SHA-256 of the file. An archive entry may have changed since its digest was first computed.
     pub(super) digest: Digest,
-    pub(super) lease: Arc<Lease>,
+    pub(super) reservation: Arc<MemoryReservation>,
 }
 
-impl Input {
-    /// Charges bytes to the service's memory budget.
-    fn new(app: &Shared, bytes: Bytes, digest: Digest) -> Result<Self, Problem> {
-        let lease = app.pool.settings().budget.lease();
-        lease.grow(bytes.len() as u64)?;
-        Ok(Self { bytes, digest, lease: Arc::new(lease) })
+impl Loaded {
+    /// Returns a file that `reservation` is charged with already.
+    pub(super) fn file(bytes: Bytes, digest: Digest, reservation: MemoryReservation) -> Self {
+        Self { input: Input::File(bytes), digest, reservation: Arc::new(reservation) }
     }
 
-    /// Uploaded bytes, which `lease` is charged with already.
-    pub(super) fn uploaded(bytes: Bytes, digest: Digest, lease: Lease) -> Self {
-        Self { bytes, digest, lease: Arc::new(lease) }
+    /// Reads the structure and lists its atoms by `list`, on a blocking thread. The list counts towards the memory
+    /// budget, with `bytes_per_atom`, until it is sent. `delivery` is released when the work has stopped.
+    pub(super) async fn list_atoms<T: Send + 'static>(
+        self,
+        app: &Shared,
+        caller: &Caller,
+        delivery: Delivery,
+        bytes_per_atom: u64,
+        list: impl FnOnce(&Structure, &ReadLimits, &Control<'_>) -> Result<(Vec<u8>, T), Problem> + Send + 'static,
+    ) -> Result<(Bytes, T), Problem> {
+        let mut limits = app.config.limits.job().read;
+        limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
+        let reservation = app.pool.settings().budget.reservation();
+        let (structures, namespace) = (app.structures(), caller.namespace);
+        let Self { input, digest, reservation: file } = self;
+        let listing = app.read(caller.client, (file, delivery), move |control| {
+            let structure = structures.get(namespace, digest, &input, &limits, control)?;
+            reservation.grow(bytes_per_atom * structure.len() as u64)?;
+            let (bytes, rest) = list(&structure, &limits, control)?;
+            Ok((reservation.attach(bytes), rest))
+        });
+        listing.await?
     }
 }
 
@@ -73,7 +91,7 @@ impl StructureSource {
     /// Returns the digest of the file. Fails if there is no such structure.
     pub(super) async fn digest(&self, app: &Shared, caller: &Caller) -> Result<Digest, Problem> {
         match self {
-            Self::Uploaded(input) => Ok(input.digest),
+            Self::Uploaded(loaded) => Ok(loaded.digest),
             Self::Stored(digest) => match app.store.head(&Name::input(digest).within(caller.namespace)).await? {
                 Some(_) => Ok(*digest),
                 None => Err(no_such_structure(&digest.to_string())),
@@ -84,49 +102,69 @@ impl StructureSource {
         }
     }
 
+    /// Returns the structure in memory if there is one, or the file. `digest` is the one that [`Self::digest`] returned
+    /// for this caller, which has checked that the structure exists.
+    pub(super) async fn find(&self, app: &Shared, caller: &Caller, digest: &Digest) -> Result<Loaded, Problem> {
+        let namespace = caller.namespace;
+        match (self, app.structures().find(namespace, *digest)) {
+            (Self::Stored(_) | Self::Entry(_), Some(kept)) => {
+                if let Self::Stored(_) = self {
+                    app.store.touch(&Name::input(digest).within(namespace), app.store.now());
+                }
+                let reservation = Arc::new(app.pool.settings().budget.reservation());
+                Ok(Loaded { input: Input::Kept(kept), digest: *digest, reservation })
+            }
+            _ => self.load(app, caller).await,
+        }
+    }
+
     /// Returns the file.
-    pub(super) async fn load(&self, app: &Shared, caller: &Caller) -> Result<Input, Problem> {
+    pub(super) async fn load(&self, app: &Shared, caller: &Caller) -> Result<Loaded, Problem> {
+        let reservation = || app.pool.settings().budget.reservation();
         match self {
-            Self::Uploaded(input) => Ok(input.clone()),
+            Self::Uploaded(loaded) => Ok(loaded.clone()),
             Self::Stored(digest) => {
                 let (name, absent) =
                     (Name::input(digest).within(caller.namespace), || no_such_structure(&digest.to_string()));
                 let size = app.store.head(&name).await?.ok_or_else(absent)?.size;
-                let lease = app.pool.settings().budget.lease();
-                lease.grow(size)?;
-                let bytes = app.store.get(&name).await?.ok_or_else(absent)?.bytes;
-                Ok(Input { bytes, digest: *digest, lease: Arc::new(lease) })
+                let reservation = reservation();
+                reservation.grow(size)?;
+                let bytes = app.store.input(digest, caller.namespace).await?.ok_or_else(absent)?;
+                Ok(Loaded::file(bytes, *digest, reservation))
             }
             Self::Entry(id) => {
                 let fetched = app.archive.for_client(caller.client.0).fetch(id).await;
                 let Entry { bytes, digest, .. } = fetched.map_err(|error| archive_problem(&error))?;
-                Input::new(app, bytes, digest)
+                // The bytes hold their reservation themselves.
+                Ok(Loaded::file(bytes, digest, reservation()))
             }
         }
     }
 
-    /// Returns a response with the document that `write` makes of the structure, or 304 if the client has it. The
-    /// `ETag` is derived from the digest and from `variant`, the parameters of the document.
+    /// Returns a response with the document that `write` makes of the structure, or 304 if the client has it. `write`
+    /// holds the delivery slot of the request until its work has stopped. The `ETag` is derived from the digest and
+    /// from `variant`, the parameters of the document.
     pub(super) async fn document<F>(
         self,
         app: &Shared,
         caller: &Caller,
         headers: &HeaderMap,
         variant: &str,
-        write: impl FnOnce(Input) -> F,
+        write: impl FnOnce(Loaded, Delivery) -> F,
     ) -> Result<Response, Problem>
     where
         F: Future<Output = Result<Response, Problem>>,
     {
-        let validators = validators(&self.digest(app, caller).await?, variant)?;
+        let digest = self.digest(app, caller).await?;
+        let validators = validators(&digest, variant)?;
         conditional::check_match(headers, &validators[0].1)?;
         if conditional::is_unchanged(headers, &validators[0].1) {
             return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
         }
-        let _permit = app.delivery(caller.client)?;
-        let input = self.load(app, caller).await?;
-        let validators = self::validators(&input.digest, variant)?;
-        Ok((validators, write(input).await?).into_response())
+        let delivery = app.delivery(caller.client)?;
+        let loaded = self.find(app, caller, &digest).await?;
+        let validators = self::validators(&loaded.digest, variant)?;
+        Ok((validators, write(loaded, delivery).await?).into_response())
     }
 }
 
@@ -187,6 +225,9 @@ fn archive_problem(error: &FetchError) -> Problem {
             retry_after.iter().fold(problem, |problem, wait| problem.retry_after(*wait))
         }
         FetchError::Memory { error, .. } => (*error).into(),
+        FetchError::Busy { limit, .. } => {
+            Problem::new(Kind::Deadline, detail).with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX))
+        }
         FetchError::Share { limit, .. } => {
             let wait = Duration::from_secs(1);
             Problem::new(Kind::ShareExceeded, detail).with("limit", *limit).retry_after(wait)
@@ -195,7 +236,7 @@ fn archive_problem(error: &FetchError) -> Problem {
     }
 }
 
-/// Converts an error of the local folder, whose paths clients do not get.
+/// Converts an error of the local folder. Clients do not get its path.
 fn folder_problem(error: &ArchiveError) -> Problem {
     let detail = error.to_string();
     match error {

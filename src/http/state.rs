@@ -7,21 +7,23 @@ use axum::http::HeaderMap;
 use bytes::Bytes;
 use quick_cache::sync::Cache;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout_at};
 
 use super::kinds::Kind;
-use super::probe::Probe;
 use super::problem::Problem;
+use super::reader_line::ReaderLine;
 use super::stop::Stop;
+use super::store_health::StoreHealth;
 use crate::access::Access;
 use crate::archive::Archive;
-use crate::client_shares::{ClientShares, Place};
+use crate::client_shares::{ClientShares, SharePermit};
 use crate::config::Config;
 use crate::jobs::{Budget, Client, ContentKey, Failure, JobStore, Pool, Structures};
 use crate::pipeline::Job;
 use crate::single_flight::SingleFlight;
 use crate::store::{Namespace, Secret, Store};
-use crate::surface::{CancelToken, Control, FoundDevice};
+use crate::surface::{CancelToken, Control, FoundDevice, MemoryMeter as _};
 use crate::telemetry::Tracer;
 
 /// Cancels the work when its request ends.
@@ -49,13 +51,17 @@ pub(super) struct App {
     pub(super) uploads: Budget,
     /// Permits to read structures outside of jobs: one per worker.
     pub(super) readers: Arc<Semaphore>,
+    /// Requests that wait for one of `readers`.
+    pub(super) reader_line: Arc<ReaderLine>,
+    /// Shares of the clients in `readers`.
+    pub(super) reader_shares: Arc<ClientShares>,
     /// Permits of `jobs.concurrent_saves`.
     pub(super) save_permits: Arc<Semaphore>,
     /// Held while a save starts, so that its permit and its entry in `saves` appear together.
     pub(super) save_start: Mutex<()>,
     /// Results that are being stored.
     pub(super) saves: SingleFlight<ContentKey, ()>,
-    /// Phase of the shutdown, which ends long answers.
+    /// Phase of the shutdown, which ends long responses.
     pub(super) stopping: watch::Receiver<Stop>,
     /// Permits of `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
@@ -64,7 +70,7 @@ pub(super) struct App {
     /// True if the first mesh was computed, false if it failed; unset before.
     pub(super) first_mesh: OnceLock<bool>,
     /// Health check of the store.
-    pub(super) probe: Probe,
+    pub(super) store_health: StoreHealth,
     /// Exporter of spans.
     pub(super) tracer: Tracer,
     /// Devices that were found at the start.
@@ -77,12 +83,13 @@ impl App {
     /// Rejects a job that is invalid regardless of its input.
     pub(super) fn accepts(&self, job: &Job) -> Result<(), Problem> {
         let refused = |error| Failure::Job { error, diagnostics: Vec::new() };
-        job.check(&self.config.limits.job()).map_err(|error| refused(error).into())
+        job.check(&self.config.limits.job()).map_err(refused)?;
+        Ok(self.pool.settings().budget.reservation().check(job.picture.map_or(0, |picture| picture.bytes()))?)
     }
 
     /// Returns the namespace of a group of keys. Without keys all clients share the common one.
     pub(super) fn namespace(&self, group: &str) -> Namespace {
-        if self.access.has_keys() { Namespace::of_group(&self.secret, group) } else { Namespace::default() }
+        if self.access.has_keys() { Namespace::from_group(&self.secret, group) } else { Namespace::default() }
     }
 
     /// Returns the structures that are kept in memory.
@@ -90,34 +97,39 @@ impl App {
         Arc::clone(&self.pool.settings().structures)
     }
 
-    /// Runs `work`, which reads a structure, on a blocking thread. Waits for a permit first; `jobs.deadline_ms` limits
-    /// both together. If the request ends earlier, the work is cancelled; permit and memory are released when it has
-    /// stopped.
+    /// Runs `work`, which reads a structure, on a blocking thread. Waits for the share of the client and for a permit
+    /// first, at most for half of `jobs.deadline_ms`, which limits all together. A request that would probably wait
+    /// longer is refused at once. If the request ends earlier, the work is cancelled; permits,
+    /// memory and `held` are released when it has stopped.
     pub(super) async fn read<T: Send + 'static>(
         &self,
+        client: Client,
+        held: impl Send + 'static,
         work: impl FnOnce(&Control<'_>) -> T + Send + 'static,
     ) -> Result<T, Failure> {
         let limit = Duration::from_millis(self.config.jobs.deadline_ms);
         let end = Instant::now() + limit;
         let late = |_elapsed| Failure::Deadline { limit };
         let panicked = |message: String| Failure::Panicked { message };
-        let permit = timeout_at(end, Arc::clone(&self.readers).acquire_owned()).await.map_err(late)?;
-        let permit = permit.map_err(|closed| panicked(closed.to_string()))?;
+        let waited = || Failure::Waited { limit, wait: self.reader_line.estimated_wait() };
+        let waiting = self.reader_line.enter(limit / 2).ok_or_else(waited)?;
+        let begin_by = Instant::now() + limit / 2;
+        // In this order, a client that waits for its share takes no permit of others.
+        let share = self.reader_shares.wait(client.0, begin_by).await.map_err(|_full| waited())?;
+        let permit = timeout_at(begin_by, Arc::clone(&self.readers).acquire_owned()).await;
+        let permit = permit.map_err(|_elapsed| waited())?.map_err(|closed| panicked(closed.to_string()))?;
+        let reading_time = waiting.begin();
         let stop = CancelOnDrop(CancelToken::default());
-        let reading = tokio::task::spawn_blocking({
-            let (cancel, lease) = (stop.0.clone(), self.pool.settings().budget.lease());
-            move || {
-                let control =
-                    Control { cancel, deadline: Some(end.into_std()), memory: Arc::new(lease), ..Control::default() };
-                let value = work(&control);
-                drop((control, permit));
-                value
-            }
+        let (cancel, reservation) = (stop.0.clone(), self.pool.settings().budget.reservation());
+        let reading = spawn_holding((held, permit, share, reading_time), move || {
+            let control =
+                Control { cancel, deadline: Some(end.into_std()), memory: Arc::new(reservation), ..Control::default() };
+            work(&control)
         });
         timeout_at(end, reading).await.map_err(late)?.map_err(|error| panicked(error.to_string()))
     }
 
-    /// Takes a place for one request for a mesh.
+    /// Takes a delivery slot for a request for a mesh.
     pub(super) fn delivery(&self, client: Client) -> Result<Delivery, Problem> {
         let permit = Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {
             let limit = self.config.jobs.deliveries;
@@ -132,11 +144,42 @@ impl App {
     }
 }
 
-/// Place of a request in `jobs.deliveries`, and in the share of its client.
+/// Runs `work` on a blocking thread. The thread drops `held` after the work, even if the caller has stopped waiting.
+fn spawn_holding<T: Send + 'static>(
+    held: impl Send + 'static,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> JoinHandle<T> {
+    tokio::task::spawn_blocking(move || {
+        let value = work();
+        drop(held);
+        value
+    })
+}
+
+/// Delivery slot: slot of a request in `jobs.deliveries`, and in the share of its client.
 pub(super) struct Delivery {
     _permit: OwnedSemaphorePermit,
-    _share: Place,
+    _share: SharePermit,
 }
 
 /// State as handlers extract it.
 pub(super) type Shared = Arc<App>;
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc;
+
+    use super::*;
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+    async fn a_request_that_ends_early_releases_nothing_before_its_work_has_stopped() {
+        let (go, wait) = mpsc::sync_channel::<()>(1);
+        let permits = Arc::new(Semaphore::new(1));
+        let held = Arc::clone(&permits).acquire_owned().await.unwrap();
+        let reading = spawn_holding(held, move || wait.recv().is_ok());
+        assert!(tokio::time::timeout(Duration::from_millis(50), reading).await.is_err(), "the request has left");
+        assert_eq!(permits.available_permits(), 0);
+        go.send(()).unwrap();
+        drop(tokio::time::timeout(Duration::from_mins(1), permits.acquire()).await.unwrap().unwrap());
+    }
+}

@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_signal_goes_a_step_further_and_ctrl_c_gives_no_notice() {
+    fn every_signal_starts_the_next_phase_and_ctrl_c_skips_the_notice() {
         let order = |stop: Stop, signal: Stop| stop.next().max(signal);
         let (terminate, interrupt) = (Stop::Notice, Stop::Drain);
         assert_eq!(order(Stop::Serve, terminate), Stop::Notice);

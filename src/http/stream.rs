@@ -26,7 +26,7 @@ const PIECE: usize = 256 << 10;
 const PIECES: usize = 4;
 
 /// Message of the writer.
-enum Piece {
+enum WriterMessage {
     Data(Bytes),
     /// The file is complete. If the channel closes without it, the writer has failed.
     End,
@@ -89,29 +89,30 @@ fn write(
     match written {
         Ok(()) => {}
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => tracing::debug!("the client left"),
-        // The body fails without `Piece::End`, which aborts the connection: a truncated mesh must not look complete.
+        // The body fails without `WriterMessage::End`, which aborts the connection: a truncated mesh must not look
+        // complete.
         Err(error) => tracing::error!(%error, format = format.name(), "writing a mesh failed"),
     }
 }
 
 /// Writer that collects pieces. Blocks while the client is slow.
 struct Pieces {
-    sender: mpsc::Sender<Piece>,
+    sender: mpsc::Sender<WriterMessage>,
     buffer: BytesMut,
     /// Charged with each piece until it is sent.
     budget: Budget,
 }
 
 impl Pieces {
-    fn send(&self, piece: Piece) -> io::Result<()> {
+    fn send(&self, piece: WriterMessage) -> io::Result<()> {
         self.sender.blocking_send(piece).map_err(|_gone| io::ErrorKind::BrokenPipe.into())
     }
 
     fn send_buffer(&mut self) -> io::Result<()> {
         let data = std::mem::take(&mut self.buffer).freeze();
-        let lease = self.budget.lease();
-        lease.force(data.len() as u64);
-        self.send(Piece::Data(lease.attach(data)))
+        let reservation = self.budget.reservation();
+        reservation.force(data.len() as u64);
+        self.send(WriterMessage::Data(reservation.attach(data)))
     }
 
     fn finish(&mut self) -> io::Result<()> {
@@ -119,7 +120,7 @@ impl Pieces {
             self.send_buffer()?;
         }
         // A receiver that knows the length may hang up after the last byte.
-        self.send(Piece::End).or(Ok(()))
+        self.send(WriterMessage::End).or(Ok(()))
     }
 }
 
@@ -143,7 +144,7 @@ impl Write for Pieces {
 
 /// Body that receives the pieces.
 struct MeshBody {
-    pieces: mpsc::Receiver<Piece>,
+    pieces: mpsc::Receiver<WriterMessage>,
     left: Option<u64>,
     ended: bool,
 }
@@ -157,11 +158,11 @@ impl HttpBody for MeshBody {
             return Poll::Ready(None);
         }
         self.pieces.poll_recv(cx).map(|piece| match piece {
-            Some(Piece::Data(data)) => {
+            Some(WriterMessage::Data(data)) => {
                 self.left = self.left.map(|left| left.saturating_sub(data.len() as u64));
                 Some(Ok(Frame::data(data)))
             }
-            Some(Piece::End) => {
+            Some(WriterMessage::End) => {
                 self.ended = true;
                 None
             }

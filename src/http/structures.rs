@@ -10,7 +10,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::form::Upload;
+use super::form::UploadedFile;
 use super::guard::Caller;
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
@@ -23,12 +23,12 @@ use super::openapi::parameters::{
 use super::openapi::problem_responses;
 use super::openapi::problems::{BODY, MESHING, PARAMETERS, READING, SUBMITTING};
 use super::problem::Problem;
-use super::source::{Input, StructureSource};
-use super::state::Shared;
+use super::source::{Loaded, StructureSource};
+use super::state::{Delivery, Shared};
 use super::{delivery, upload};
 use crate::jobs::Failure;
 use crate::pipeline::JobError;
-use crate::store::{Digest, Name};
+use crate::store::Digest;
 use crate::structure::contents::Counts;
 use crate::structure::{Contents, Structure, StructureError};
 
@@ -60,7 +60,7 @@ pub(super) struct StructureDocument {
     digest: String,
     /// Size of the file as uploaded, in bytes.
     bytes: usize,
-    /// File format: `pdb`, `mmcif` or `bcif`.
+    /// File format: `pdb`, `mmcif`, `bcif`, `pqr` or `xyz`.
     format: &'static str,
     /// PDB id or data block name; null if the file has none.
     #[schema(required)]
@@ -115,13 +115,15 @@ struct AssemblyDocument {
 
 problem_responses!(CreateProblems: [
     BODY, READING,
-    [Kind::BadParameter, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFull, Kind::StoreFailed],
+    [Kind::BadParameter, Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded,
+     Kind::StoreFull, Kind::StoreFailed],
 ]);
 problem_responses!(ShowProblems: [
     READING,
     [
-        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull,
-        Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
+        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed,
+        Kind::TooMuchMemory, Kind::MemoryFull,
+        Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
     ],
 ]);
 problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
@@ -136,15 +138,15 @@ problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
     params(ContentEncodingHeader),
     request_body(
         content = StructureFile,
-        description = "A structure file, or `multipart/form-data` with the file in the field `file`.",
+        description = "A structure file, or a form with nothing but the file.",
         content_type = "application/octet-stream",
     ),
     responses(
         (status = 201, description = "The structure was stored.", body = StructureDocument,
-            headers(("Location" = String, description = "Path of the structure.")),
+            headers(("Location" = String, description = "Path of the result, job or structure.")),
             links(("mesh" = (operation_id = "meshStructure", parameters(("digest" = "$response.body#/digest")))))),
         (status = 200, description = "The structure was already stored.", body = StructureDocument,
-            headers(("Location" = String, description = "Path of the structure."))),
+            headers(("Location" = String, description = "Path of the result, job or structure."))),
         CreateProblems,
     ))]
 pub(super) async fn create(
@@ -158,7 +160,7 @@ pub(super) async fn create(
             "a structure is uploaded as a file, not as JSON; `POST /v1/meshes` takes JSON that names a structure";
         return Err(Problem::new(Kind::UnsupportedMediaType, detail).with("declared", "application/json"));
     }
-    let Upload { bytes, digest, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
+    let UploadedFile { bytes, digest, reservation, fields, declared } = upload::receive(&app, &headers, body).await?;
     if let Some((name, _)) = fields.first() {
         return Err(Problem::new(
             Kind::BadParameter,
@@ -166,13 +168,13 @@ pub(super) async fn create(
         )
         .with("parameter", name.as_str()));
     }
-    let _permit = app.delivery(caller.client)?;
-    let input = Input::uploaded(bytes, digest, lease);
+    let delivery = app.delivery(caller.client)?;
+    let loaded = Loaded::file(bytes.clone(), digest, reservation);
     // Parse before storing, so that only readable structures are stored.
-    let summary = summarize(&app, &caller, input.clone()).await.map_err(|failure| declared.explain(failure))?;
+    let summary =
+        summarize(&app, &caller, loaded.clone(), delivery).await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(summary.format)?;
-    let name = Name::input(&digest).within(caller.namespace);
-    let created = app.store.put_new(&name, input.bytes).await?;
+    let created = app.store.put_input(&digest, caller.namespace, bytes).await?;
     let status = if created { StatusCode::CREATED } else { StatusCode::OK };
     let location = delivery::text(&format!("/v1/structures/{digest}"));
     Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())
@@ -183,7 +185,7 @@ pub(super) async fn create(
     params(StructurePath, ConditionHeaders),
     responses(
         (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(
-            ("ETag" = String, description = "Strong validator of the document."),
+            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
         NotModified, ShowProblems,
@@ -194,7 +196,7 @@ pub(super) async fn show(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let write = async |input| Ok(Json(summarize(&app, &caller, input).await?).into_response());
+    let write = async |loaded, delivery| Ok(Json(summarize(&app, &caller, loaded, delivery).await?).into_response());
     source.document(&app, &caller, &headers, "", write).await
 }
 
@@ -232,12 +234,18 @@ pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
 }
 
 /// Parses a structure and describes its contents, on a blocking thread.
-async fn summarize(app: &Shared, caller: &Caller, input: Input) -> Result<StructureDocument, Failure> {
+async fn summarize(
+    app: &Shared,
+    caller: &Caller,
+    loaded: Loaded,
+    delivery: Delivery,
+) -> Result<StructureDocument, Failure> {
     let limits = app.config.limits.job().read;
     let (structures, namespace) = (app.structures(), caller.namespace);
-    let parsing = app.read(move |control| {
-        let kept = structures.get(namespace, input.digest, &input.bytes, &limits, control)?;
-        Ok(summary(&input.digest, input.bytes.len(), &kept, limits.max_copies))
+    let Loaded { input, digest, reservation } = loaded;
+    let parsing = app.read(caller.client, (reservation, delivery), move |control| {
+        let kept = structures.get(namespace, digest, &input, &limits, control)?;
+        Ok(summary(&digest, input.file_bytes(), &kept, limits.max_copies))
     });
     parsing.await?.map_err(|error: StructureError| JobError::from(error).into())
 }

@@ -1,5 +1,5 @@
 //! `Server-Timing`: consecutive phases of a request, which add up to the time from its arrival to the head of the
-//! answer.
+//! response.
 
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};
@@ -37,7 +37,7 @@ impl Timing {
         self.add(name, ms(time));
     }
 
-    /// Ends the last phase: the head of the answer is ready. Writing the body has a span of its own.
+    /// Ends the last phase: the head of the response is ready. Writing the body has a span of its own.
     pub(super) fn head(&mut self) {
         let (_, time) = self.restart();
         self.add("encode", ms(time));
@@ -95,7 +95,7 @@ fn total_entry(microseconds: f64) -> String {
     format!("total;dur={:.3}", microseconds / 1e3)
 }
 
-/// Writes the header of an answer that has phases or a stored `Server-Timing`; its head took `total`.
+/// Writes the header of a response that has phases or a stored `Server-Timing`; its head took `total`.
 pub(super) fn write_header(response: &mut Response, total: Duration) {
     let value = match response.extensions_mut().remove::<Timing>() {
         Some(timing) => timing.value(total),

@@ -8,18 +8,16 @@ use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE};
 use bytes::{Bytes, BytesMut};
 use futures_util::StreamExt as _;
 
+use super::body_hasher::BodyHasher;
 use super::content_type::{DeclaredType, GZIP_MAGIC, ZSTD_MAGIC};
-use super::form::{self, Upload};
+use super::form::{self, UploadedFile};
 use super::kinds::Kind;
 use super::limit::Limit;
 use super::problem::Problem;
 use super::state::App;
-use crate::jobs::Lease;
-use crate::store::{Digest, Hasher};
-
-/// Limit of memory that is reserved because of a `Content-Length` header alone. The first byte that is written to a
-/// large block can make 2 MiB of it resident, as a huge page.
-const MAX_RESERVED_BYTES: u64 = 1 << 20;
+use crate::jobs::MemoryReservation;
+use crate::store::Digest;
+use crate::surface::MemoryMeter as _;
 
 /// Returns true if the body is declared as a form.
 pub(super) fn is_multipart(headers: &HeaderMap) -> bool {
@@ -33,22 +31,24 @@ pub(super) fn is_json(headers: &HeaderMap) -> bool {
 }
 
 /// Receives a structure: a file, or a form around one.
-pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Result<Upload, Problem> {
+pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Result<UploadedFile, Problem> {
     let limit = Limit { key: "limits.body_bytes", max: app.config.limits.body_bytes };
     let announced = announced(headers, limit)?;
+    // A declared length is rejected before the body arrives.
+    app.uploads.reservation().check(announced)?;
     let coding = content_encoding(headers)?;
     let upload = if is_multipart(headers) {
         if coding.is_some() {
             return Err(bad_encoding("a form cannot be compressed as a whole; compress the file in it"));
         }
         let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
-        let form = form::read(&app.config.limits, limit, content_type, body, app.uploads.lease());
+        let form = form::read(&app.config.limits, limit, content_type, announced, body, app.uploads.reservation());
         in_time(app, form).await?
     } else {
-        let lease = app.uploads.lease();
-        let (bytes, digest) = in_time(app, collect(body, announced, limit, &lease)).await?;
+        let reservation = app.uploads.reservation();
+        let (bytes, digest) = in_time(app, collect(body, announced, limit, &reservation)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
-        Upload { bytes, digest, lease, fields: Vec::new(), declared }
+        UploadedFile { bytes, digest, reservation, fields: Vec::new(), declared }
     };
     if let Some((name, _)) = coding.filter(|(_, magic)| !upload.bytes.starts_with(magic)) {
         return Err(bad_encoding(&format!("the body is declared as {name}, but is not {name} data")));
@@ -64,8 +64,10 @@ pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> 
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
-    let lease = app.uploads.lease();
-    in_time(app, collect(body, announced, limit, &lease)).await.map(|(bytes, _digest)| bytes)
+    let reservation = app.uploads.reservation();
+    let (bytes, _digest) = in_time(app, collect(body, announced, limit, &reservation)).await?;
+    // The document is charged until it has been parsed.
+    Ok(reservation.attach(bytes))
 }
 
 /// Returns the length that the headers announce, 0 if they do not.
@@ -94,28 +96,35 @@ fn broken(error: &dyn std::fmt::Display) -> Problem {
 }
 
 /// Reads a body into one buffer and hashes it while it arrives; a body of one frame is not copied.
-async fn collect(body: Body, announced: u64, limit: Limit, lease: &Lease) -> Result<(Bytes, Digest), Problem> {
+async fn collect(
+    body: Body,
+    announced: u64,
+    limit: Limit,
+    reservation: &MemoryReservation,
+) -> Result<(Bytes, Digest), Problem> {
     let mut stream = body.into_data_stream();
-    let (mut first, mut all, mut length, mut hasher) = (Bytes::new(), BytesMut::new(), 0u64, Hasher::default());
+    let (mut first, mut all, mut length, mut hasher) = (Bytes::new(), BytesMut::new(), 0u64, BodyHasher::default());
     while let Some(data) = stream.next().await {
         let data = data.map_err(|e| broken(&e))?;
         length += data.len() as u64;
         if length > limit.max {
             return Err(limit.exceeded_by_body());
         }
-        lease.grow(data.len() as u64)?;
-        hasher.update(&data);
+        hasher.update(&data, reservation).await?;
         if first.is_empty() && all.is_empty() {
+            reservation.grow(data.len() as u64)?;
             first = data;
             continue;
         }
-        if all.is_empty() {
-            all.reserve(usize::try_from(announced.clamp(length, MAX_RESERVED_BYTES.max(length))).unwrap_or(0));
-            all.extend_from_slice(&std::mem::take(&mut first));
+        if !first.is_empty() {
+            reservation.extend(&mut all, &first, announced)?;
+            reservation.shrink(first.len() as u64);
+            first = Bytes::new();
         }
-        all.extend_from_slice(&data);
+        reservation.extend(&mut all, &data, announced)?;
     }
-    Ok((if all.is_empty() { first } else { all.freeze() }, hasher.digest()))
+    let digest = hasher.digest(reservation).await?;
+    Ok((if all.is_empty() { first } else { all.freeze() }, digest))
 }
 
 /// Content coding that the structure reader supports: its name and the first bytes of a compressed file.

@@ -1,8 +1,10 @@
-//! A queued or running job with everybody who waits for it: identical requests share one job.
+//! Queued or running job that several identical requests share.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
+
+use futures_util::future::{BoxFuture, join_all};
 
 use super::rank::Rank;
 use super::{Outcome, Task};
@@ -10,6 +12,7 @@ use crate::pipeline::{ProgressSink, Tracker, params};
 use crate::single_flight::ResultSender;
 use crate::store::Digest;
 use crate::surface::CancelToken;
+use crate::sync::Handle;
 use crate::telemetry::TraceSpan;
 
 /// Returns the identity of the work of a task: namespace, input, parameters and strictness. Tasks with equal keys share
@@ -54,8 +57,24 @@ impl ProgressSink for Progress {
     }
 }
 
-/// Callback that a worker runs right before it starts a job.
-pub(crate) type OnStart = Box<dyn FnOnce() + Send>;
+/// Work that a worker waits for right before it starts a job.
+pub(crate) struct OnStart {
+    runtime: Handle,
+    work: BoxFuture<'static, ()>,
+}
+
+impl OnStart {
+    /// Creates work that uses the current runtime.
+    pub(super) fn new(work: impl Future<Output = ()> + Send + 'static) -> Self {
+        Self { runtime: Handle::current(), work: Box::pin(work) }
+    }
+
+    /// Runs the work of all requests that share a job concurrently, and waits for its end.
+    pub(super) fn run_all(all: Vec<Self>) {
+        let Some(runtime) = all.first().map(|first| first.runtime.clone()) else { return };
+        runtime.block_on(join_all(all.into_iter().map(|each| each.work)));
+    }
+}
 
 /// A queued or running job.
 pub(super) struct CoalescedJob {
@@ -72,7 +91,7 @@ pub(super) struct CoalescedJob {
     pub(super) progress: Arc<Progress>,
     /// Span of the job, a child of the span of its first request.
     pub(super) span: TraceSpan,
-    /// Sends the outcome to the tickets; `None` once they were told that the service stops.
+    /// Sends the outcome to the tickets; `None` once they have received that the service stops.
     pub(super) outcome: Option<ResultSender<Outcome>>,
     pub(super) on_start: Vec<OnStart>,
     /// `None` once a worker has taken it.
@@ -87,7 +106,7 @@ impl CoalescedJob {
 }
 
 /// A job as a worker takes it from the queue.
-pub(super) struct Entry {
+pub(super) struct QueuedTask {
     pub(super) id: u64,
     pub(super) task: Task,
     pub(super) cancel: CancelToken,

@@ -7,17 +7,17 @@ const NEWEST: f64 = 0.2;
 
 /// Seconds per unit of work, as a moving average.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Rate {
+pub(super) struct WorkRate {
     per_unit: f64,
 }
 
-impl Default for Rate {
+impl Default for WorkRate {
     fn default() -> Self {
         Self { per_unit: FIRST_GUESS }
     }
 }
 
-impl Rate {
+impl WorkRate {
     /// Returns the expected duration of `units` of work, s.
     pub(super) fn seconds(self, units: f64) -> f64 {
         self.per_unit * units
@@ -39,7 +39,7 @@ mod tests {
 
     #[test]
     fn the_rate_follows_the_machine() {
-        let mut rate = Rate::default();
+        let mut rate = WorkRate::default();
         for _ in 0..50 {
             rate.learn(1e5, 2.0);
         }

@@ -10,7 +10,7 @@ use crate::telemetry::{
     DEVICE_WAITING,
 };
 
-/// State of each device at the last call: number of rebuilds, and whether it was up.
+/// State of each device at the last call: number of rebuilds, and true if it was up.
 #[derive(Debug, Default)]
 pub(super) struct DeviceMonitor(Mutex<Vec<(u64, bool)>>);
 

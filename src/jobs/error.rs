@@ -50,6 +50,14 @@ pub(crate) enum Failure {
     /// The deadline passed.
     #[error("the deadline of {} s passed", limit.as_secs_f64())]
     Deadline { limit: Duration },
+    /// No worker or reader was free in time, so the work did not begin.
+    #[error("the work did not begin, because all workers are busy; the work ahead takes about {} s", wait.as_secs_f64().ceil())]
+    Waited {
+        /// Time allowed from acceptance to the result.
+        limit: Duration,
+        /// Estimated time until a new request would begin.
+        wait: Duration,
+    },
     /// Memory is not available now.
     #[error(transparent)]
     Memory(#[from] OutOfMemory),

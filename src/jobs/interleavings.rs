@@ -11,7 +11,7 @@ use shuttle::future::block_on;
 
 use super::queue::Queue;
 use super::rank::{Client, DEFAULT_URGENCY, Rank};
-use super::{Failure, Refusal, Task, Ticket};
+use super::{Failure, Input, Refusal, Task, Ticket};
 use crate::pipeline::params;
 use crate::store::{Digest, Namespace};
 use crate::sync::thread::{self, JoinHandle};
@@ -22,15 +22,15 @@ const SCHEDULES: usize = 10_000;
 
 /// Creates a task; tasks of the same number are identical.
 fn task(number: u8, batch: bool) -> Task {
-    let input = Bytes::from(vec![number]);
+    let file = Bytes::from(vec![number]);
     Task {
-        digest: Digest::of(&input),
-        input,
+        digest: Digest::of(&file),
+        input: Input::File(file),
         namespace: Namespace::default(),
         strict: false,
         job: params::parse(std::iter::empty::<(&str, &str)>()).unwrap().job,
         rank: Rank { client: Client::named("a"), batch, urgency: DEFAULT_URGENCY },
-        lease: None,
+        reservation: None,
         parent: SpanParent::default(),
         id: None,
     }
@@ -134,7 +134,7 @@ fn durable_jobs_run_or_are_left_to_the_next_process() {
             block_on(queue.idle());
             queue.close();
             join(workers);
-            assert_eq!(ran, runs.load(Ordering::SeqCst), "each job that ran has told its request so");
+            assert_eq!(ran, runs.load(Ordering::SeqCst), "each job that ran has reported so");
         },
         SCHEDULES,
     );

@@ -1,4 +1,4 @@
-//! Durable jobs: the record is in the store before the client is told of the job, and unfinished jobs are resumed after
+//! Durable jobs: the record is in the store before the client gets its id, and unfinished jobs are resumed after
 //! a restart.
 //!
 //! A job is accepted in three steps: store the input, store the record, answer. Results are named by their contents, so
@@ -8,32 +8,37 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use bytes::Bytes;
 use metrics::counter;
 use serde_json::Value;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, oneshot, watch};
 use tracing::Instrument as _;
 
 use super::durable_job::{DurableJob, Runner};
-use super::rank::{Client, Rank};
-use super::record::{JobId, Record, Requester, Status, now_ms};
+use super::record::{JobId, JobRecord, Requester, Status, now_ms};
 use super::retry::retry;
-use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket, results};
+use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
-use crate::store::{Digest, Name, Namespace, Pin, Secret, Store, StoreError};
-use crate::sync::{Handle, mpsc, timeout};
+use crate::single_flight::SingleFlight;
+use crate::store::{Digest, Namespace, Pin, Secret, Store, StoreError};
+use crate::sync::{Handle, timeout};
 use crate::telemetry::JOBS_RECOVERED;
 
 /// Number of ended jobs that are held in memory; older ones are read from the store.
 const MAX_ENDED: usize = 10_000;
 /// Maximum time that the acceptance of a job whose result is stored waits for its end to be recorded.
 const STORED_WAIT: Duration = Duration::from_secs(5);
+/// Number of records of begun and ended jobs that are written concurrently, so that others find a free thread.
+const CONCURRENT_WRITES: usize = 64;
 
 /// Request for a durable job.
 #[derive(Debug)]
 pub(crate) struct JobSpec {
     /// The task.
     pub(crate) task: Task,
+    /// Structure file of the task.
+    pub(crate) file: Bytes,
     /// Parameters as the client wrote them.
     pub(crate) parameters: Vec<(String, String)>,
     /// Mesh format.
@@ -46,16 +51,16 @@ pub(crate) struct JobSpec {
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct JobView {
     /// Record of the job.
-    pub(crate) record: Record,
+    pub(crate) record: JobRecord,
     /// Running stage.
     pub(crate) stage: Option<&'static str>,
     /// Finished fraction, from 0 to 1.
     pub(crate) fraction: f64,
-    /// Number of this state: the time of the change, ms since 1970. Grows with every change, also after a restart.
+    /// Number of this state: the time of the change, ms since 1970. Grows with every change, even across restarts.
     pub(crate) version: u64,
     /// Record of an end that was decided but is not written yet. The end is visible once it is on record, or
     /// after the store has rejected the record for `jobs.save_retry_ms`.
-    pub(super) end: Option<Box<Record>>,
+    pub(super) end: Option<Box<JobRecord>>,
 }
 
 /// Converts the error of a failed job into the document that clients get.
@@ -63,9 +68,9 @@ pub(crate) type DescribeError = fn(&EndError) -> Value;
 
 /// Durable jobs. Clones share one state.
 #[derive(Clone)]
-pub(crate) struct JobStore(pub(super) Arc<Inner>);
+pub(crate) struct JobStore(pub(super) Arc<JobStoreState>);
 
-pub(super) struct Inner {
+pub(super) struct JobStoreState {
     pub(super) store: Store,
     pub(super) pool: Arc<Pool>,
     pub(super) config: JobsConfig,
@@ -75,11 +80,17 @@ pub(super) struct Inner {
     /// Secret that derives job ids from idempotency keys.
     secret: Secret,
     jobs: Mutex<HashMap<JobId, Arc<DurableJob>>>,
+    /// Permits to write the record of a begun or ended job.
+    pub(super) writes: Semaphore,
+    /// Permits to load the input of a job and to submit it, one per worker.
+    pub(super) loads: Semaphore,
+    /// Results that are being stored: jobs that shared work store its result once.
+    pub(super) saves: SingleFlight<ContentKey, Result<(), SaveError>>,
     /// Number of jobs with a runner.
     pub(super) open: watch::Sender<usize>,
 }
 
-impl Inner {
+impl JobStoreState {
     /// Returns the maximum time from the acceptance of a job to its result.
     pub(super) fn allowed(&self) -> Duration {
         Duration::from_millis(self.config.batch_deadline_ms)
@@ -119,7 +130,8 @@ impl JobStore {
         secret: Secret,
         describe: DescribeError,
     ) -> Self {
-        Self(Arc::new(Inner {
+        let loads = Semaphore::new(pool.settings().workers);
+        Self(Arc::new(JobStoreState {
             store,
             pool,
             config,
@@ -127,20 +139,23 @@ impl JobStore {
             describe,
             secret,
             jobs: Mutex::default(),
+            writes: Semaphore::new(CONCURRENT_WRITES),
+            loads,
+            saves: SingleFlight::default(),
             open: watch::channel(0).0,
         }))
     }
 
-    /// Accepts a job, which survives the process from then on. `ticket` is that of work that is queued or running
+    /// Accepts a job. From then on the job survives the process. `ticket` belongs to work that is queued or running
     /// already.
     pub(crate) async fn accept(&self, spec: JobSpec, ticket: Option<Ticket>) -> Result<JobView, AcceptError> {
         let inner = &self.0;
         let (client, namespace) = (spec.task.rank.client.0, spec.task.namespace);
         let id = match &spec.idempotency_key {
-            Some(key) => JobId::of_key(&inner.secret, namespace, client, key),
+            Some(key) => JobId::from_key(&inner.secret, namespace, client, key),
             None => JobId::random(&inner.secret, client).map_err(AcceptError::Random)?,
         };
-        let record = Record {
+        let record = JobRecord {
             id: id.clone(),
             namespace,
             input: spec.task.digest.to_string(),
@@ -167,12 +182,12 @@ impl JobStore {
             Some(_) => None,
             None => self.stored_result(&spec.task, spec.format).await?,
         };
-        // The job gets its place in the queue first: a record without one could not be run soon. A job with a stored
+        // The job gets its queue slot before its record: without a slot it could not run soon. A job with a stored
         // result needs none.
         let job = Arc::new(DurableJob::new(record));
-        let (input, digest) = (spec.task.input.clone(), spec.task.digest);
+        let digest = spec.task.digest;
         let pin = inner.pin(&id, &digest, namespace)?;
-        let (recorded, wait_for_record) = mpsc::sync_channel(1);
+        let (recorded, wait_for_record) = oneshot::channel();
         let ticket = if ticket.is_some() || stored.is_some() {
             ticket
         } else {
@@ -184,15 +199,15 @@ impl JobStore {
             }
             Some(ticket)
         };
-        let place = inner.admit(&id).await?;
-        inner.store.put_new(&Name::input(&digest).within(namespace), input).await?;
+        let reservation = inner.admit(&id).await?;
+        inner.store.put_input(&digest, namespace, spec.file).await?;
         if !inner.write_new(&job.record()).await?
             && let Some(view) = self.view(&id, namespace).await?
         {
             // A concurrent request with the same key stored its record first.
             return existing(&job.record(), view);
         }
-        drop(place);
+        drop(reservation);
         // Releases the worker that waits in `on_start`; no worker does if the job was joined while it ran.
         _ = recorded.send(());
         let inserted = inner.insert(&id, &job);
@@ -274,7 +289,7 @@ impl JobStore {
     }
 
     /// Resumes a job from its record, unless it runs already.
-    pub(super) async fn resume(&self, record: Record) -> Result<Arc<DurableJob>, StoreError> {
+    pub(super) async fn resume(&self, record: JobRecord) -> Result<Arc<DurableJob>, StoreError> {
         let (id, input, earlier_attempts) = (record.id.clone(), record.input.parse::<Digest>(), record.attempts);
         let fresh = Arc::new(DurableJob::new(record));
         let known = self.0.lock().get(&id).cloned();
@@ -294,18 +309,19 @@ impl JobStore {
         Ok(job)
     }
 
-    /// Returns the callback that records an attempt before the worker starts it, so that a job that crashes the process
-    /// is detected. It first waits for a message on `recorded`, which says that the job itself is on record.
-    pub(super) fn on_start(&self, job: &Arc<DurableJob>, recorded: Option<mpsc::Receiver<()>>) -> OnStart {
+    /// Returns the work that records an attempt before the worker starts it, so that a job that crashes the process is
+    /// detected. It first waits for a message on `recorded`, sent once the job itself is on record.
+    pub(super) fn on_start(&self, job: &Arc<DurableJob>, recorded: Option<oneshot::Receiver<()>>) -> OnStart {
         let (jobs, job) = (self.clone(), Arc::clone(job));
-        let runtime = Handle::current();
-        Box::new(move || {
+        OnStart::new(async move {
             // The sender is dropped if the job could not be recorded; the work is cancelled then.
-            if recorded.is_some_and(|recorded| recorded.recv().is_err()) {
+            if let Some(recorded) = recorded
+                && recorded.await.is_err()
+            {
                 return;
             }
             if job.begin()
-                && let Err(error) = runtime.block_on(jobs.0.write_job(&job))
+                && let Err(error) = jobs.0.write_job(&job).await
             {
                 tracing::error!(job_id = %job.id(), %error, "cannot record an attempt to run a job");
             }
@@ -340,37 +356,9 @@ impl JobStore {
             job.publish_end();
         }
     }
-
-    /// Returns the task of a record, with its input. The inner error says why the task cannot be run any more.
-    pub(super) async fn load_task(
-        &self,
-        record: &Record,
-        digest: Digest,
-    ) -> Result<Result<(Task, Format), String>, StoreError> {
-        let stored = self.0.store.get(&Name::input(&digest).within(record.namespace)).await?;
-        let Some(input) = stored.map(|stored| stored.bytes) else { return Ok(Err("its input was removed".to_owned())) };
-        let settings = self.0.pool.settings();
-        let lease = settings.budget.lease();
-        lease.force(input.len() as u64);
-        Ok(record.request().map(|(request, format)| {
-            let rank = Rank { client: Client(record.client), batch: true, urgency: record.urgency };
-            let task = Task {
-                input,
-                digest,
-                namespace: record.namespace,
-                strict: request.strict,
-                job: request.job,
-                rank,
-                lease: Some(Arc::new(lease)),
-                parent: record.requester.parent(&settings.tracer),
-                id: Some(record.id.clone()),
-            };
-            (task, format)
-        }))
-    }
 }
 
 /// Returns the job that has the idempotency key of `record`, if both requests are the same.
-fn existing(record: &Record, view: JobView) -> Result<JobView, AcceptError> {
+fn existing(record: &JobRecord, view: JobView) -> Result<JobView, AcceptError> {
     if record.is_same_request(&view.record) { Ok(view) } else { Err(AcceptError::OtherRequest) }
 }

@@ -45,7 +45,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn keys_tell_everything_apart() {
+    fn different_results_have_different_keys() {
         let plain = Job::default();
         let fine = params::parse([("resolution", "0.4")]).unwrap().job;
         let chain = params::parse([("chains", "A")]).unwrap().job;

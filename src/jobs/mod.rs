@@ -30,21 +30,19 @@ mod tests;
 mod ticket;
 mod worker;
 
-pub(crate) use crate::memory_budget::{Budget, Lease};
+pub(crate) use crate::memory_budget::{Budget, MemoryReservation};
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};
 pub(crate) use key::ContentKey;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
-pub(crate) use record::{JobId, Record, Status, rfc3339};
+pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
 pub(crate) use results::{REPORT, SaveError, is_stored, save};
-pub(crate) use structures::Structures;
+pub(crate) use structures::{Input, Structures};
 pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;
-
-use bytes::Bytes;
 
 use crate::pipeline::{Job, Product};
 use crate::store::{Digest, Namespace};
@@ -54,9 +52,9 @@ use crate::telemetry::SpanParent;
 /// Work for the pool.
 #[derive(Debug)]
 pub(crate) struct Task {
-    /// Structure file, compressed or not.
-    pub(crate) input: Bytes,
-    /// SHA-256 of `input`.
+    /// Structure. A strict task needs its file.
+    pub(crate) input: Input,
+    /// SHA-256 of the structure file.
     pub(crate) digest: Digest,
     /// Namespace of input and result. Only tasks of one namespace share work.
     pub(crate) namespace: Namespace,
@@ -67,8 +65,7 @@ pub(crate) struct Task {
     /// Client and priority.
     pub(crate) rank: Rank,
     /// Memory budget that `input` is charged to.
-    #[expect(dead_code, reason = "holds the memory until it is dropped")]
-    pub(crate) lease: Option<Arc<Lease>>,
+    pub(crate) reservation: Option<Arc<MemoryReservation>>,
     /// Parent of the spans of the task.
     pub(crate) parent: SpanParent,
     /// Id of the durable job; `None` for an interactive request.
@@ -86,7 +83,7 @@ pub(crate) struct Finished {
     pub(crate) digest: Digest,
     /// Memory budget that the mesh is charged to, until this is dropped.
     #[expect(dead_code, reason = "holds the memory until it is dropped")]
-    pub(crate) lease: Arc<Lease>,
+    pub(crate) reservation: Arc<MemoryReservation>,
 }
 
 /// Outcome of a job.

@@ -8,7 +8,7 @@ use metrics::counter;
 
 use super::devices::DeviceMonitor;
 use super::queue::Queue;
-use super::{Budget, Client, OnStart, Refusal, Structures, Task, Ticket, worker};
+use super::{Budget, Client, Input, OnStart, Refusal, Structures, Task, Ticket, worker};
 use crate::picture::SelectedRenderer;
 use crate::pipeline::{self, Job, JobLimits, maker};
 use crate::surface::Backend;
@@ -32,17 +32,17 @@ pub(crate) struct Settings {
     /// Renderer of pictures.
     pub(crate) renderer: SelectedRenderer,
     /// Receiver of the time that each job took.
-    pub(crate) meter: Option<Meter>,
+    pub(crate) meter: Option<UsageRecorder>,
     /// Exporter for the spans of resumed jobs.
     pub(crate) tracer: Tracer,
 }
 
 /// Callback with the time that a worker spent on a job of a client, successful or not. A shared job is charged to its
 /// first client. The callback precedes the outcome.
-pub(crate) type Meter = Arc<dyn Fn(Client, Duration) + Send + Sync>;
+pub(crate) type UsageRecorder = Arc<dyn Fn(Client, Duration) + Send + Sync>;
 
 /// State that workers share.
-pub(super) struct Shared {
+pub(super) struct WorkerContext {
     pub(super) queue: Arc<Queue>,
     pub(super) backend: Arc<dyn Backend>,
     pub(super) reason: String,
@@ -50,7 +50,7 @@ pub(super) struct Shared {
     monitor: DeviceMonitor,
 }
 
-impl Shared {
+impl WorkerContext {
     /// Updates metrics and log with the state of the devices.
     pub(super) fn publish_devices(&self) {
         self.monitor.publish(&self.backend.devices());
@@ -59,11 +59,11 @@ impl Shared {
 
 /// A running pool. Dropping it cancels running jobs.
 pub(crate) struct Pool {
-    pub(super) shared: Arc<Shared>,
+    pub(super) shared: Arc<WorkerContext>,
 }
 
 impl Pool {
-    /// Starts the workers. `reason` says why this backend was chosen, for reports.
+    /// Starts the workers. `reason` is the reason for the choice of the backend, for reports.
     pub(crate) fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
         let pool = Self::without_workers(settings, backend, reason);
         for n in 0..pool.shared.settings.workers {
@@ -76,27 +76,51 @@ impl Pool {
     /// Creates a pool whose workers have not started.
     pub(super) fn without_workers(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> Self {
         let queue = Arc::new(Queue::new(settings.queue, settings.workers, settings.batch_max_delay));
-        Self { shared: Arc::new(Shared { queue, backend, reason, settings, monitor: DeviceMonitor::default() }) }
+        Self { shared: Arc::new(WorkerContext { queue, backend, reason, settings, monitor: DeviceMonitor::default() }) }
     }
 
     /// Accepts a task whose mesh must be finished within `allowed`, time in the queue included. `on_start` is called
     /// before the work starts, unless the task joins a running job.
     pub(crate) fn submit(&self, task: Task, allowed: Duration, on_start: Option<OnStart>) -> Result<Ticket, Refusal> {
-        let mode = if task.rank.batch { "async" } else { "sync" };
+        let mode = mode(&task);
         let ticket = self.shared.queue.push(task, allowed, on_start)?;
-        let dedup = if ticket.is_shared { "yes" } else { "no" };
-        counter!(JOBS_SUBMITTED, "mode" => mode, "dedup" => dedup).increment(1);
+        count(mode, &ticket);
+        Ok(ticket)
+    }
+
+    /// Accepts a task, without its input, that joins an identical job. `None` if there is none and the
+    /// queue has a free slot for [`Self::submit`].
+    pub(super) fn join(
+        &self,
+        task: &Task,
+        allowed: Duration,
+        on_start: &mut Option<OnStart>,
+    ) -> Result<Option<Ticket>, Refusal> {
+        let ticket = self.shared.queue.join(task, allowed, on_start)?;
+        if let Some(ticket) = &ticket {
+            count(mode(task), ticket);
+        }
         Ok(ticket)
     }
 
     /// Estimates the duration of a job on this machine, s, without its time in the queue.
-    pub(crate) fn expected(&self, input: &[u8], job: &Job) -> f64 {
-        self.shared.queue.expected(pipeline::estimate_work(input, job))
+    pub(crate) fn expected(&self, input: &Input, job: &Job) -> f64 {
+        self.shared.queue.expected(pipeline::estimate_work(input.atoms(), job))
+    }
+
+    /// Estimates the duration of `units` of work on this machine, s.
+    pub(crate) fn seconds(&self, units: f64) -> f64 {
+        self.shared.queue.expected(units)
     }
 
     /// Estimates the queueing time of a job that is accepted now.
     pub(crate) fn estimated_wait(&self) -> Duration {
         self.shared.queue.estimated_wait()
+    }
+
+    /// Returns true if a job waits for a worker.
+    pub(crate) fn has_waiting(&self) -> bool {
+        self.shared.queue.has_waiting()
     }
 
     /// Returns the settings.
@@ -109,7 +133,7 @@ impl Pool {
         &self.shared.backend
     }
 
-    /// Returns why the backend was chosen.
+    /// Returns the reason for the choice of the backend.
     pub(crate) fn reason(&self) -> &str {
         &self.shared.reason
     }
@@ -145,6 +169,15 @@ impl Pool {
         }
         in_time
     }
+}
+
+fn mode(task: &Task) -> &'static str {
+    if task.rank.batch { "async" } else { "sync" }
+}
+
+fn count(mode: &'static str, ticket: &Ticket) {
+    let dedup = if ticket.is_shared { "yes" } else { "no" };
+    counter!(JOBS_SUBMITTED, "mode" => mode, "dedup" => dedup).increment(1);
 }
 
 impl Drop for Pool {

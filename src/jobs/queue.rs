@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use metrics::gauge;
 use tokio::sync::Notify;
 
-use super::coalesced_job::{CoalescedJob, Entry, OnStart, Progress, work_key};
-use super::cost::Rate;
+use super::coalesced_job::{CoalescedJob, OnStart, Progress, QueuedTask, work_key};
+use super::cost::WorkRate;
 use super::rank::{self, Shares};
 use super::{Outcome, Refusal, Task, Ticket};
 use crate::pipeline;
@@ -16,19 +16,21 @@ use crate::surface::CancelToken;
 use crate::sync::{Condvar, Mutex, MutexGuard};
 use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, SpanKind, TraceSpan};
 
-struct State {
+struct QueueState {
     jobs: Vec<CoalescedJob>,
     shares: Shares,
-    rate: Rate,
+    rate: WorkRate,
+    /// Waiting workers, each with its own condition. The last one began to wait last: its memory and caches are warm.
+    idle_workers: Vec<Arc<Condvar>>,
     closed: bool,
-    /// Queued durable jobs are left for the next process.
+    /// True once queued durable jobs are left to the next process.
     leaving: bool,
     next_id: u64,
-    /// Number of queued jobs that the gauge was last told.
+    /// Number of queued jobs that the gauge shows.
     published: usize,
 }
 
-impl State {
+impl QueueState {
     fn waiting(&self) -> impl Iterator<Item = &CoalescedJob> {
         self.jobs.iter().filter(|job| job.begun.is_none())
     }
@@ -40,8 +42,7 @@ impl State {
 
 /// Bounded queue of jobs.
 pub(super) struct Queue {
-    state: Mutex<State>,
-    filled: Condvar,
+    state: Mutex<QueueState>,
     idle: Notify,
     limit: usize,
     workers: usize,
@@ -49,22 +50,23 @@ pub(super) struct Queue {
 }
 
 impl Queue {
-    /// Creates a queue of `limit` places in front of `workers` workers. Durable jobs yield to interactive ones for
+    /// Creates a queue of `limit` slots in front of `workers` workers. Durable jobs yield to interactive ones for
     /// `batch_max_delay` at most.
     pub(super) fn new(limit: usize, workers: usize, batch_max_delay: Duration) -> Self {
-        let state = State {
+        let state = QueueState {
             jobs: Vec::with_capacity(limit.min(1024) + workers),
             shares: Shares::default(),
-            rate: Rate::default(),
+            rate: WorkRate::default(),
+            idle_workers: Vec::with_capacity(workers),
             closed: false,
             leaving: false,
             next_id: 0,
             published: 0,
         };
-        Self { state: Mutex::new(state), filled: Condvar::new(), idle: Notify::new(), limit, workers, batch_max_delay }
+        Self { state: Mutex::new(state), idle: Notify::new(), limit, workers, batch_max_delay }
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, QueueState> {
         // No code under the lock can panic in the middle of a change, so a poisoned state is consistent.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -74,59 +76,23 @@ impl Queue {
         self: &Arc<Self>,
         task: Task,
         allowed: Duration,
-        on_start: Option<OnStart>,
+        mut on_start: Option<OnStart>,
     ) -> Result<Ticket, Refusal> {
-        let work = work_key(&task);
-        let now = Instant::now();
         let mut state = self.lock();
-        if state.closed {
-            return Err(Refusal::Draining);
-        }
-        let ticket = |job, outcome, progress, span| Ticket {
-            queue: Arc::clone(self),
-            job,
-            outcome,
-            deadline: now + allowed,
-            allowed,
-            progress,
-            span,
-            is_shared: false,
-            joined_running: false,
-        };
-        let same = |job: &&mut CoalescedJob| job.work == work && !job.cancel.is_cancelled();
-        if let Some(job) = state.jobs.iter_mut().find(same) {
-            job.rank.batch &= task.rank.batch;
-            let joined_running = job.begun.is_some();
-            job.on_start.extend(on_start.filter(|_| !joined_running));
-            if let Some(context) = &task.parent.context {
-                job.span.link(context.clone());
-            }
-            let outcome = job.outcome.as_ref().map(ResultReceiver::of);
-            let mut ticket = ticket(job.id, outcome, Arc::clone(&job.progress), job.span.clone());
-            (ticket.is_shared, ticket.joined_running) = (true, joined_running);
+        if let Some(ticket) = self.join_in(&mut state, &task, allowed, &mut on_start)? {
             return Ok(ticket);
         }
         let id = state.next_id;
         state.next_id += 1;
-        if state.leaving && task.rank.batch {
-            // The next process runs the job. Without a sender the ticket ends as stopped.
-            return Ok(ticket(id, None, Arc::default(), job_span(&task, now)));
-        }
-        let units = pipeline::estimate_work(&task.input, &task.job);
-        let wait = self.wait(&state, now);
-        // A job of a free worker counts as running before the worker has woken up.
-        if state.jobs.len() >= self.limit + self.workers {
-            return Err(Refusal::QueueFull { waiting: state.waiting().count(), limit: self.limit, wait });
-        }
-        if wait > allowed {
-            return Err(Refusal::TooLate { wait, allowed });
-        }
+        let units = pipeline::estimate_work(task.input.atoms(), &task.job);
+        let expected = state.rate.seconds(units);
+        let now = Instant::now();
         let (sender, outcome) = single_flight::channel();
         let tag = state.shares.tag(&task.rank, units);
         let (progress, span) = (Arc::new(Progress::default()), job_span(&task, now));
         state.jobs.push(CoalescedJob {
             id,
-            work,
+            work: work_key(&task),
             rank: task.rank,
             units,
             tag,
@@ -140,14 +106,90 @@ impl Queue {
             task: Some(task),
         });
         self.publish(&mut state);
+        let worker = state.idle_workers.pop();
         drop(state);
-        self.filled.notify_one();
-        Ok(ticket(id, Some(outcome), progress, span))
+        if let Some(worker) = worker {
+            worker.notify_one();
+        }
+        Ok(self.ticket(id, Some(outcome), progress, span, (allowed, expected)))
+    }
+
+    /// Accepts a task that needs no input: joins an identical job, which takes `on_start` unless it runs. `None` if
+    /// there is none and the queue has a free slot.
+    pub(super) fn join(
+        self: &Arc<Self>,
+        task: &Task,
+        allowed: Duration,
+        on_start: &mut Option<OnStart>,
+    ) -> Result<Option<Ticket>, Refusal> {
+        self.join_in(&mut self.lock(), task, allowed, on_start)
+    }
+
+    fn join_in(
+        self: &Arc<Self>,
+        state: &mut QueueState,
+        task: &Task,
+        allowed: Duration,
+        on_start: &mut Option<OnStart>,
+    ) -> Result<Option<Ticket>, Refusal> {
+        if state.closed {
+            return Err(Refusal::Draining);
+        }
+        let (work, now) = (work_key(task), Instant::now());
+        let same = |job: &&mut CoalescedJob| job.work == work && !job.cancel.is_cancelled();
+        if let Some(job) = state.jobs.iter_mut().find(same) {
+            job.rank.batch &= task.rank.batch;
+            let joined_running = job.begun.is_some();
+            if !joined_running {
+                job.on_start.extend(on_start.take());
+            }
+            if let Some(context) = &task.parent.context {
+                job.span.link(context.clone());
+            }
+            let outcome = job.outcome.as_ref().map(ResultReceiver::of);
+            let (progress, span) = (Arc::clone(&job.progress), job.span.clone());
+            let mut ticket = self.ticket(job.id, outcome, progress, span, (allowed, state.rate.seconds(job.units)));
+            (ticket.is_shared, ticket.joined_running) = (true, joined_running);
+            return Ok(Some(ticket));
+        }
+        if state.leaving && task.rank.batch {
+            let id = state.next_id;
+            state.next_id += 1;
+            // The next process runs the job. Without a sender the ticket ends as stopped.
+            return Ok(Some(self.ticket(id, None, Arc::default(), job_span(task, now), (allowed, 0.0))));
+        }
+        let wait = self.wait(state, now);
+        // A job of a free worker counts as running before the worker has woken up.
+        if state.jobs.len() >= self.limit + self.workers {
+            return Err(Refusal::QueueFull { waiting: state.waiting().count(), limit: self.limit, wait });
+        }
+        if wait > allowed {
+            return Err(Refusal::TooLate { wait, allowed });
+        }
+        Ok(None)
+    }
+
+    /// Creates the ticket of a job that is allowed a time and expected to take a number of seconds. To be finished in
+    /// time, it must begin by then, but half of the time is never given up.
+    fn ticket(
+        self: &Arc<Self>,
+        job: u64,
+        outcome: Option<ResultReceiver<Outcome>>,
+        progress: Arc<Progress>,
+        span: TraceSpan,
+        (allowed, expected): (Duration, f64),
+    ) -> Ticket {
+        let (queue, now) = (Arc::clone(self), Instant::now());
+        let running = Duration::try_from_secs_f64(expected).unwrap_or(Duration::MAX).min(allowed / 2);
+        let (deadline, start_by) = (now + allowed, now + allowed.saturating_sub(running));
+        let (is_shared, joined_running) = (false, false);
+        Ticket { queue, job, outcome, deadline, start_by, allowed, progress, span, is_shared, joined_running }
     }
 
     /// Takes the next job; blocks until there is one. `None` once the queue is closed and empty.
-    pub(super) fn pop(&self) -> Option<Entry> {
+    pub(super) fn pop(&self) -> Option<QueuedTask> {
         let mut state = self.lock();
+        let filled = Arc::new(Condvar::new());
         loop {
             if let Some(entry) = self.take(&mut state) {
                 self.publish(&mut state);
@@ -156,12 +198,14 @@ impl Queue {
             if state.closed {
                 return None;
             }
-            state = self.filled.wait(state).unwrap_or_else(PoisonError::into_inner);
+            state.idle_workers.push(Arc::clone(&filled));
+            state = filled.wait(state).unwrap_or_else(PoisonError::into_inner);
+            state.idle_workers.retain(|worker| !Arc::ptr_eq(worker, &filled));
         }
     }
 
     /// Takes the most urgent job of the client with the lowest tag.
-    fn take(&self, state: &mut State) -> Option<Entry> {
+    fn take(&self, state: &mut QueueState) -> Option<QueuedTask> {
         let now = Instant::now();
         let waited = |job: &CoalescedJob| now.saturating_duration_since(job.accepted);
         let turn = |job: &CoalescedJob| rank::turn(&job.rank, job.tag, job.id, waited(job), self.batch_max_delay);
@@ -175,7 +219,7 @@ impl Queue {
         let job = &mut state.jobs[at];
         job.begun = Some(now);
         job.progress.begin();
-        Some(Entry {
+        Some(QueuedTask {
             id,
             task: job.task.take()?,
             cancel: job.cancel.clone(),
@@ -220,7 +264,7 @@ impl Queue {
     }
 
     /// Updates the metrics and, if no job is left, the shares and the callers of `idle`.
-    fn after_removal(&self, state: &mut State) {
+    fn after_removal(&self, state: &mut QueueState) {
         if state.jobs.is_empty() {
             state.shares.reset();
             self.idle.notify_waiters();
@@ -230,8 +274,11 @@ impl Queue {
 
     /// Accepts no more jobs. Accepted jobs still run.
     pub(super) fn close(&self) {
-        self.lock().closed = true;
-        self.filled.notify_all();
+        let mut state = self.lock();
+        state.closed = true;
+        for worker in state.idle_workers.drain(..) {
+            worker.notify_one();
+        }
     }
 
     /// Leaves queued durable jobs, now and from now on, for the next process: their tickets end as stopped.
@@ -278,13 +325,18 @@ impl Queue {
         self.wait(&self.lock(), Instant::now())
     }
 
+    /// Returns true if a job waits for a worker.
+    pub(super) fn has_waiting(&self) -> bool {
+        self.lock().waiting().next().is_some()
+    }
+
     /// Estimates the duration of a job of `units` work, s.
     pub(super) fn expected(&self, units: f64) -> f64 {
         self.lock().rate.seconds(units)
     }
 
     /// Estimates the remaining work of all jobs, divided by the number of workers.
-    fn wait(&self, state: &State, now: Instant) -> Duration {
+    fn wait(&self, state: &QueueState, now: Instant) -> Duration {
         if state.jobs.len() < self.workers {
             return Duration::ZERO;
         }
@@ -304,7 +356,7 @@ impl Queue {
     }
 
     #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of jobs are small")]
-    fn publish(&self, state: &mut State) {
+    fn publish(&self, state: &mut QueueState) {
         let now = Instant::now();
         let waiting = state.waiting().count();
         let oldest = state.waiting().map(|job| now.saturating_duration_since(job.accepted)).max().unwrap_or_default();

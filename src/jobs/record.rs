@@ -45,9 +45,9 @@ impl JobId {
         Self(hex(unique, DIGITS - OWNER_DIGITS) + &owner)
     }
 
-    /// Returns the id for an idempotency key: the same for the same key of the same client in a namespace, also after a
+    /// Returns the id for an idempotency key: the same for the same key of the same client in a namespace, even after a
     /// restart. Client and key alone do not reveal it.
-    pub(super) fn of_key(secret: &Secret, namespace: Namespace, client: u64, key: &str) -> Self {
+    pub(super) fn from_key(secret: &Secret, namespace: Namespace, client: u64, key: &str) -> Self {
         // A key has no line break, so the text is unambiguous.
         let space = if namespace.is_common() { String::new() } else { format!("{namespace}\n") };
         Self::new(&derive(secret, &format!("idempotency\n{client:x}\n{space}{key}")), secret, client)
@@ -119,7 +119,7 @@ impl Status {
 
 /// Stored state of a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Record {
+pub(crate) struct JobRecord {
     /// Id of the job.
     pub(crate) id: JobId,
     /// Namespace of the job, its input and its result.
@@ -214,7 +214,7 @@ pub(super) enum BadRecord {
     Version(u64),
 }
 
-impl Record {
+impl JobRecord {
     /// Returns the document to store.
     pub(super) fn to_bytes(&self) -> Bytes {
         Bytes::from(serde_json::to_vec(&Versioned { version: VERSION, content: self }).unwrap_or_default())
@@ -276,7 +276,7 @@ mod tests {
         assert_eq!(a.as_str().parse(), Ok(a.clone()));
         let owner = |id: &JobId| id.as_str()[DIGITS - OWNER_DIGITS..].to_owned();
         assert!(owner(&a) == owner(&b) && owner(&a) != owner(&random(2)));
-        let of = |secret: u8, client, key| JobId::of_key(&[secret; 32], Namespace::default(), client, key);
+        let of = |secret: u8, client, key| JobId::from_key(&[secret; 32], Namespace::default(), client, key);
         assert_eq!(of(0, 1, "x"), of(0, 1, "x"));
         assert_eq!(of(0, 1, "x").as_str().parse(), Ok(of(0, 1, "x")));
         for other in [of(1, 1, "x"), of(0, 2, "x"), of(0, 1, "y")] {
@@ -289,8 +289,8 @@ mod tests {
         }
     }
 
-    fn record(parameters: &[(&str, &str)]) -> Record {
-        Record {
+    fn record(parameters: &[(&str, &str)]) -> JobRecord {
+        JobRecord {
             id: JobId::random(&[0; 32], 1).unwrap(),
             namespace: Namespace::default(),
             input: Digest::of(b"x").to_string(),
@@ -317,7 +317,7 @@ mod tests {
         );
         assert!(a.is_same_request(&b));
         assert!(!a.is_same_request(&record(&[("resolution", "0.71"), ("atom_ids", "true")])));
-        assert!(!a.is_same_request(&Record { format: "stl".to_owned(), ..b.clone() }));
+        assert!(!a.is_same_request(&JobRecord { format: "stl".to_owned(), ..b.clone() }));
         assert!(!record(&[("check", "strict")]).is_same_request(&record(&[])));
         // Parameters that this version cannot parse are compared as text.
         let unknown = record(&[("unknown", "1")]);
@@ -328,20 +328,20 @@ mod tests {
     fn records_survive_a_round_trip() {
         let record = record(&[("resolution", "0.5")]);
         let text = record.to_bytes().to_vec();
-        assert_eq!(Record::from_bytes(&text).unwrap(), record);
+        assert_eq!(JobRecord::from_bytes(&text).unwrap(), record);
         // Records of earlier versions have no requester.
         let mut old = serde_json::to_value(&record).unwrap();
         old.as_object_mut().unwrap().remove("requester").unwrap();
-        assert_eq!(serde_json::from_value::<Record>(old).unwrap().requester, Requester::default());
+        assert_eq!(serde_json::from_value::<JobRecord>(old).unwrap().requester, Requester::default());
         let old = serde_json::to_vec(&record).unwrap();
-        assert_eq!(Record::from_bytes(&old).unwrap(), record, "the first records have no version");
+        assert_eq!(JobRecord::from_bytes(&old).unwrap(), record, "the first records have no version");
         let later = br#"{"version":2,"id":7}"#;
-        assert!(matches!(Record::from_bytes(later), Err(BadRecord::Version(2))));
+        assert!(matches!(JobRecord::from_bytes(later), Err(BadRecord::Version(2))));
         for damaged in [b"".as_slice(), &text[..text.len() / 2], b"[]", br#"{"version":1}"#] {
-            assert!(matches!(Record::from_bytes(damaged), Err(BadRecord::Damaged(_))), "{damaged:?}");
+            assert!(matches!(JobRecord::from_bytes(damaged), Err(BadRecord::Damaged(_))), "{damaged:?}");
         }
         let hostile = String::from_utf8(text).unwrap().replace(record.id.as_str(), "../../x");
-        assert!(serde_json::from_str::<Record>(&hostile).is_err());
+        assert!(serde_json::from_str::<JobRecord>(&hostile).is_err());
     }
 
     #[test]

@@ -4,35 +4,43 @@
 //! removed, so that one of them exists at any time. If both exist, the job has ended. The end of a job is thus known
 //! from the name, and a start reads the records of open jobs only.
 
+use std::sync::Arc;
+
+use bytes::Bytes;
 use futures_util::{StreamExt as _, stream};
+use thiserror::Error;
 
 use super::durable_job::DurableJob;
-use super::job_store::{Inner, JobStore};
-use super::record::{JobId, Record};
-use crate::store::{Digest, Folder, Name, Namespace, Pin, RecordCaps, RecordPlace, StoreError};
+use super::job_store::{JobStore, JobStoreState};
+use super::rank::{Client, Rank};
+use super::record::{JobId, JobRecord};
+use super::{Input, Task};
+use crate::formats::Format;
+use crate::store::{Digest, Folder, Name, Namespace, Pin, RecordCaps, RecordReservation, StoreError};
+use crate::surface::OutOfMemory;
 use crate::telemetry::shorten;
 
 /// Concurrent reads of records at startup.
 const RECOVERY_READS: usize = 64;
 
-impl Inner {
+impl JobStoreState {
     /// Protects input and record of an unfinished job from eviction.
     pub(super) fn pin(&self, id: &JobId, input: &Digest, space: Namespace) -> Result<[Pin; 2], StoreError> {
         Ok([self.store.pin(&Name::input(input).within(space)), self.store.pin(&Name::job(id.as_str())?)])
     }
 
     /// Admits the record of a new job. At a cap, forgets ended jobs.
-    pub(super) async fn admit(&self, id: &JobId) -> Result<RecordPlace, StoreError> {
+    pub(super) async fn admit(&self, id: &JobId) -> Result<RecordReservation, StoreError> {
         let caps = RecordCaps { total: self.config.records, per_client: self.config.records_per_client };
-        let (place, removed) = self.store.admit_record(&Name::job(id.as_str())?, caps).await?;
+        let (reservation, removed) = self.store.admit_record(&Name::job(id.as_str())?, caps).await?;
         for id in removed.iter().filter_map(|name| name.stem().parse().ok()) {
             self.lock().remove(&id);
         }
-        Ok(place)
+        Ok(reservation)
     }
 
     /// Writes a record to the store.
-    pub(super) async fn write(&self, record: &Record) -> Result<(), StoreError> {
+    pub(super) async fn write(&self, record: &JobRecord) -> Result<(), StoreError> {
         let (id, bytes) = (record.id.as_str(), record.to_bytes());
         if !record.status.is_final() {
             return self.store.put(&Name::job(id)?, bytes).await;
@@ -45,6 +53,8 @@ impl Inner {
     /// has the latest state, and a job that was dismissed while it started stays dismissed after a restart.
     pub(super) async fn write_job(&self, job: &DurableJob) -> Result<(), StoreError> {
         let _turn = job.writing.lock().await;
+        // The semaphore is never closed.
+        let _permit = self.writes.acquire().await;
         let record = job.record();
         self.write(&record).await?;
         if record.status.is_final() {
@@ -54,7 +64,7 @@ impl Inner {
     }
 
     /// Writes the record of a new, open job. Returns false if there is a job with its id, open or ended.
-    pub(super) async fn write_new(&self, record: &Record) -> Result<bool, StoreError> {
+    pub(super) async fn write_new(&self, record: &JobRecord) -> Result<bool, StoreError> {
         let (open, ended) = (Name::job(record.id.as_str())?, Name::ended_job(record.id.as_str())?);
         if !self.store.put_new(&open, record.to_bytes()).await? {
             return Ok(false);
@@ -68,7 +78,7 @@ impl Inner {
     }
 
     /// Reads the record of a job.
-    pub(super) async fn read(&self, id: &JobId) -> Result<Option<Record>, StoreError> {
+    pub(super) async fn read(&self, id: &JobId) -> Result<Option<JobRecord>, StoreError> {
         // In this order, a job that ends meanwhile is not missed.
         let open = self.read_document(&Name::job(id.as_str())?).await?;
         let ended = self.read_document(&Name::ended_job(id.as_str())?).await?;
@@ -76,8 +86,8 @@ impl Inner {
     }
 
     /// Reads a document. One that cannot be parsed goes into quarantine.
-    async fn read_document(&self, name: &Name) -> Result<Option<Record>, StoreError> {
-        match self.store.get(name).await?.map(|stored| Record::from_bytes(&stored.bytes)) {
+    async fn read_document(&self, name: &Name) -> Result<Option<JobRecord>, StoreError> {
+        match self.store.get(name).await?.map(|stored| JobRecord::from_bytes(&stored.bytes)) {
             Some(Ok(record)) => return Ok(Some(record)),
             Some(Err(error)) => {
                 let short = shorten(&name.to_string());
@@ -91,7 +101,7 @@ impl Inner {
     }
 
     /// Reads the records of open jobs, in the order of their acceptance. Removes those of jobs that have ended.
-    async fn read_open(&self) -> Result<Vec<Record>, StoreError> {
+    async fn read_open(&self) -> Result<Vec<JobRecord>, StoreError> {
         let (ended, open): (Vec<_>, Vec<_>) = self.store.names(Folder::Jobs).into_iter().partition(Name::is_ended_job);
         let read = |name: Name| {
             let ended = &ended;
@@ -116,7 +126,47 @@ impl Inner {
     }
 }
 
+/// Error of [`JobStore::load_input`].
+#[derive(Debug, Error)]
+pub(super) enum LoadError {
+    /// The store has no such input.
+    #[error("its input was removed")]
+    Removed,
+    #[error(transparent)]
+    Memory(#[from] OutOfMemory),
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
 impl JobStore {
+    /// Returns the task of a record, without its input.
+    pub(super) fn task_of(&self, record: &JobRecord, digest: Digest) -> Result<(Task, Format), String> {
+        let (request, format) = record.request()?;
+        let task = Task {
+            input: Input::File(Bytes::new()),
+            digest,
+            namespace: record.namespace,
+            strict: request.strict,
+            job: request.job,
+            rank: Rank { client: Client(record.client), batch: true, urgency: record.urgency },
+            reservation: None,
+            parent: record.requester.parent(&self.0.pool.settings().tracer),
+            id: Some(record.id.clone()),
+        };
+        Ok((task, format))
+    }
+
+    /// Loads the input of a task, charged to the memory budget before it is read.
+    pub(super) async fn load_input(&self, task: &mut Task) -> Result<(), LoadError> {
+        let (name, reservation) =
+            (Name::input(&task.digest).within(task.namespace), self.0.pool.settings().budget.reservation());
+        reservation.grow(self.0.store.head(&name).await?.ok_or(LoadError::Removed)?.size)?;
+        let file = self.0.store.input(&task.digest, task.namespace).await?;
+        task.input = Input::File(file.ok_or(LoadError::Removed)?);
+        task.reservation = Some(Arc::new(reservation));
+        Ok(())
+    }
+
     /// Resumes the unfinished jobs of earlier processes and returns their number.
     pub(crate) async fn recover(&self) -> Result<usize, StoreError> {
         let before = self.0.lock().len();

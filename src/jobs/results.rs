@@ -74,7 +74,7 @@ pub(crate) async fn save(
         }
         let write = || {
             let mut writer = store.writer(&mesh);
-            file.write(&mut writer).and_then(|()| writer.flush()).map_err(of_io)?;
+            file.write(&mut writer).and_then(|()| writer.flush()).map_err(from_io)?;
             Ok(writer.finish()?)
         };
         match write() {
@@ -87,7 +87,7 @@ pub(crate) async fn save(
 }
 
 /// Converts an I/O error of a store writer back into the store's error.
-fn of_io(error: std::io::Error) -> SaveError {
+fn from_io(error: std::io::Error) -> SaveError {
     match error.downcast::<StoreError>() {
         Ok(error) => error.into(),
         Err(error) => SaveError::Other(error.to_string()),

@@ -1,25 +1,27 @@
 //! Structures that are kept in memory after they were read, for further requests for the same file.
 //!
-//! A structure is found by the digest of a file that the request has loaded already, and within its namespace only. It
-//! is charged to the memory budget, which takes the memory back before it rejects anything.
+//! A structure is found by the digest of its file and within its namespace only. It is charged to the memory budget,
+//! which takes the memory back before it rejects anything.
 
 use std::collections::HashSet;
 use std::ops::Deref;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
+use bytes::Bytes;
 use metrics::{counter, gauge};
 
-use super::Lease;
+use super::MemoryReservation;
 use crate::memory_budget::{Budget, Buffers, Reclaim};
+use crate::pipeline::estimate_atoms;
 use crate::store::{Digest, Namespace};
 use crate::structure::{self, ReadLimits, Structure, StructureError};
-use crate::surface::Control;
+use crate::surface::{Control, MemoryMeter as _};
 use crate::sync::{Condvar, Mutex, MutexGuard};
 use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
 
 /// Namespace and digest of a file. All other input of the reader is the same for the whole service, except limits.
-type Key = (Namespace, Digest);
+type StructureKey = (Namespace, Digest);
 
 /// Time between two checks of a request that waits for another one to read its structure.
 const POLL: Duration = Duration::from_millis(20);
@@ -28,6 +30,10 @@ const POLL: Duration = Duration::from_millis(20);
 #[derive(Debug)]
 struct Charged {
     structure: Structure,
+    /// Size of its file, bytes.
+    file_bytes: usize,
+    /// Number of atoms as estimated from the file, so that estimates of work do not depend on its presence in memory.
+    atoms: f64,
     /// Memory of the structure, bytes.
     bytes: u64,
     _charge: Charge,
@@ -37,7 +43,7 @@ struct Charged {
 #[derive(Debug)]
 enum Charge {
     Kept { _buffers: Buffers },
-    Used { _lease: Arc<Lease> },
+    Used { _reservation: Arc<MemoryReservation> },
 }
 
 /// A structure that other requests may use as well. Clones share it.
@@ -63,15 +69,50 @@ impl Deref for KeptStructure {
     }
 }
 
-#[derive(Debug, Default)]
-struct State {
-    /// Least recently used first.
-    kept: Vec<(Key, KeptStructure)>,
-    /// Structures that a request is reading.
-    reading: HashSet<Key>,
+/// Structure of a task or a request.
+#[derive(Debug, Clone)]
+pub(crate) enum Input {
+    /// Structure file, compressed or not.
+    File(Bytes),
+    /// Structure in memory, whose file need not be loaded.
+    Kept(KeptStructure),
 }
 
-impl State {
+impl Input {
+    /// Returns the file; `None` if it was not loaded.
+    pub(crate) fn file(&self) -> Option<&Bytes> {
+        match self {
+            Self::File(file) => Some(file),
+            Self::Kept(_) => None,
+        }
+    }
+
+    /// Returns the size of the file, bytes.
+    pub(crate) fn file_bytes(&self) -> usize {
+        match self {
+            Self::File(file) => file.len(),
+            Self::Kept(kept) => kept.0.file_bytes,
+        }
+    }
+
+    /// Returns the number of atoms as estimated from the file.
+    pub(crate) fn atoms(&self) -> f64 {
+        match self {
+            Self::File(file) => estimate_atoms(file),
+            Self::Kept(kept) => kept.0.atoms,
+        }
+    }
+}
+
+#[derive(Debug, Default)]
+struct CacheState {
+    /// Least recently used first.
+    kept: Vec<(StructureKey, KeptStructure)>,
+    /// Structures that a request is reading.
+    reading: HashSet<StructureKey>,
+}
+
+impl CacheState {
     fn bytes(&self) -> u64 {
         self.kept.iter().map(|(_, kept)| kept.bytes()).sum()
     }
@@ -83,7 +124,7 @@ impl State {
     }
 
     /// Finds a structure, and makes it the most recently used one.
-    fn find(&mut self, key: &Key) -> Option<KeptStructure> {
+    fn find(&mut self, key: &StructureKey) -> Option<KeptStructure> {
         let found = self.kept.iter().position(|(known, _)| known == key)?;
         self.kept[found..].rotate_left(1);
         self.kept.last().map(|(_, kept)| kept.clone())
@@ -95,7 +136,7 @@ impl State {
 pub(crate) struct Structures {
     limit: u64,
     budget: Budget,
-    state: Mutex<State>,
+    state: Mutex<CacheState>,
     /// Notified when a request has ended reading.
     ended: Condvar,
 }
@@ -110,8 +151,13 @@ impl Structures {
         structures
     }
 
-    /// Returns the structure of the file `bytes` with this digest, reading it if necessary. Concurrent calls read it
-    /// once if it is kept, else one after the other.
+    /// Returns the structure of a file if it is kept.
+    pub(crate) fn find(&self, namespace: Namespace, digest: Digest) -> Option<KeptStructure> {
+        self.lock().find(&(namespace, digest))
+    }
+
+    /// Returns the structure of the file with this digest, reading `input` if necessary. Concurrent calls read it once
+    /// if it is kept, else one after the other.
     ///
     /// Memory is charged to the budget until the last reference is dropped, not to the meter of `control`.
     ///
@@ -121,16 +167,25 @@ impl Structures {
         &self,
         namespace: Namespace,
         digest: Digest,
-        bytes: &[u8],
+        input: &Input,
         limits: &ReadLimits,
         control: &Control<'_>,
     ) -> Result<KeptStructure, StructureError> {
+        let hit = |kept: KeptStructure| {
+            counter!(STRUCTURE_CACHE_REQUESTS, "result" => "hit").increment(1);
+            control.memory.also_held(kept.bytes());
+            limits.check_atoms(kept.len()).map(|()| kept)
+        };
+        let file = match input {
+            Input::File(file) => file,
+            Input::Kept(kept) => return hit(kept.clone()),
+        };
+        control.memory.also_held(file.len() as u64);
         let key = (namespace, digest);
         let mut state = self.lock();
         loop {
             if let Some(kept) = state.find(&key) {
-                counter!(STRUCTURE_CACHE_REQUESTS, "result" => "hit").increment(1);
-                return limits.check_atoms(kept.len()).map(|()| kept);
+                return hit(kept);
             }
             if self.limit == 0 || state.reading.insert(key) {
                 break;
@@ -141,31 +196,37 @@ impl Structures {
             }
         }
         drop(state);
-        let _reading = Reading { structures: self, key };
+        let _reading = ReadingMark { structures: self, key };
         counter!(STRUCTURE_CACHE_REQUESTS, "result" => "miss").increment(1);
-        let lease = Arc::new(self.budget.lease());
-        let charged = Control { memory: Arc::<Lease>::clone(&lease), ..control.clone() };
-        let structure = structure::read_with(bytes, limits, &charged)?;
-        let bytes = lease.bytes();
-        if bytes > self.limit {
-            let charge = Charge::Used { _lease: lease };
-            return Ok(KeptStructure(Arc::new(Charged { structure, bytes, _charge: charge })));
+        let reservation = Arc::new(self.budget.reservation());
+        reservation.also_held(file.len() as u64);
+        let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
+        let structure = structure::read_with(file, limits, &charged)?;
+        let bytes = reservation.bytes();
+        control.memory.also_held(bytes);
+        let is_kept = bytes <= self.limit;
+        let charge = if is_kept {
+            Charge::Kept { _buffers: reservation.to_buffers() }
+        } else {
+            Charge::Used { _reservation: reservation }
+        };
+        let (file_bytes, atoms) = (input.file_bytes(), input.atoms());
+        let read = KeptStructure(Arc::new(Charged { structure, file_bytes, atoms, bytes, _charge: charge }));
+        if is_kept {
+            self.keep(key, &read);
         }
-        let charge = Charge::Kept { _buffers: lease.to_buffers() };
-        let kept = KeptStructure(Arc::new(Charged { structure, bytes, _charge: charge }));
-        self.keep(key, &kept);
-        Ok(kept)
+        Ok(read)
     }
 
     /// Keeps a structure, and evicts others.
-    fn keep(&self, key: Key, kept: &KeptStructure) {
+    fn keep(&self, key: StructureKey, kept: &KeptStructure) {
         let mut state = self.lock();
         state.kept.push((key, kept.clone()));
         while state.bytes() > self.limit && state.evict(|_| true).is_some() {}
         publish(&state);
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, CacheState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -185,13 +246,13 @@ impl Reclaim for Structures {
     }
 }
 
-/// Mark of a structure that a request is reading. Dropping it, also after an error or a panic, lets others read.
-struct Reading<'a> {
+/// Mark of a structure that a request is reading. Dropping it, even after an error or a panic, lets others read.
+struct ReadingMark<'a> {
     structures: &'a Structures,
-    key: Key,
+    key: StructureKey,
 }
 
-impl Drop for Reading<'_> {
+impl Drop for ReadingMark<'_> {
     fn drop(&mut self) {
         self.structures.lock().reading.remove(&self.key);
         self.structures.ended.notify_all();
@@ -199,7 +260,7 @@ impl Drop for Reading<'_> {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
-fn publish(state: &State) {
+fn publish(state: &CacheState) {
     gauge!(STRUCTURE_CACHE_BYTES).set(state.bytes() as f64);
 }
 
@@ -210,39 +271,38 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use super::*;
-    use crate::surface::{CancelToken, OutOfMemory};
+    use crate::surface::CancelToken;
+
+    type File = (Input, Digest);
 
     /// Returns a file of `n` atoms and its digest.
-    fn file(n: usize) -> (String, Digest) {
+    fn file(n: usize) -> File {
         let line = |i: usize| format!("ATOM      1  CA  ALA A{:>4}    {i:>8}   2.000   3.000\n", i % 10_000);
         let text: String = (0..n).map(line).collect();
         let digest = Digest::of(text.as_bytes());
-        (text, digest)
+        (Input::File(text.into()), digest)
     }
 
     type Got = Result<KeptStructure, StructureError>;
 
-    fn get_with(structures: &Structures, (text, digest): &(String, Digest), control: &Control<'_>) -> Got {
-        structures.get(Namespace::default(), *digest, text.as_bytes(), &ReadLimits::default(), control)
+    fn get_with(structures: &Structures, (input, digest): &File, control: &Control<'_>) -> Got {
+        structures.get(Namespace::default(), *digest, input, &ReadLimits::default(), control)
     }
 
-    fn get(structures: &Structures, file: &(String, Digest)) -> KeptStructure {
+    fn get(structures: &Structures, file: &File) -> KeptStructure {
         get_with(structures, file, &Control::default()).unwrap()
     }
 
-    fn is_kept(structures: &Structures, file: &(String, Digest)) -> bool {
+    fn is_kept(structures: &Structures, file: &File) -> bool {
         structures.lock().kept.iter().any(|((_, digest), _)| *digest == file.1)
     }
 
-    fn size(file: &(String, Digest)) -> u64 {
+    fn size(file: &File) -> u64 {
         get(&Structures::new(0, &Budget::unlimited()), file).bytes()
     }
 
     fn held(budget: &Budget) -> u64 {
-        match budget.lease().grow(u64::MAX) {
-            Err(OutOfMemory::Budget { held, .. }) => held,
-            other => unreachable!("{other:?}"),
-        }
+        budget.used()
     }
 
     #[test]
@@ -251,13 +311,12 @@ mod tests {
         let file = file(10);
         let first = get(&structures, &file);
         assert!(Arc::ptr_eq(&first.0, &get(&structures, &file).0));
-        let other = Namespace::of_group(&[1; 32], "other");
-        let elsewhere =
-            structures.get(other, file.1, file.0.as_bytes(), &ReadLimits::default(), &Control::default()).unwrap();
+        let other = Namespace::from_group(&[1; 32], "other");
+        let elsewhere = structures.get(other, file.1, &file.0, &ReadLimits::default(), &Control::default()).unwrap();
         assert!(!Arc::ptr_eq(&first.0, &elsewhere.0));
         assert_eq!(*first, *elsewhere);
         let tight = ReadLimits { max_atoms: 9, ..ReadLimits::default() };
-        let refused = structures.get(Namespace::default(), file.1, file.0.as_bytes(), &tight, &Control::default());
+        let refused = structures.get(Namespace::default(), file.1, &file.0, &tight, &Control::default());
         assert_eq!(refused.unwrap_err(), StructureError::TooManyAtoms { limit: 9 });
     }
 
@@ -283,19 +342,19 @@ mod tests {
         for i in [1, 2] {
             get(&structures, &files[i]);
         }
-        let (held, lease) = (structures.lock().bytes(), budget.lease());
+        let (held, reservation) = (structures.lock().bytes(), budget.reservation());
         // Only the least recently used structure that no request uses is freed.
-        lease.grow((1 << 20) - held + 1).unwrap();
+        reservation.grow((1 << 20) - held + 1).unwrap();
         assert_eq!([0, 1, 2].map(|i| is_kept(&structures, &files[i])), [true, false, true]);
         // A structure in use cannot be freed.
         let most = (1 << 20) - in_use.bytes();
-        assert!(lease.grow(most + 1 - lease.bytes()).is_err());
-        lease.grow(most - lease.bytes()).unwrap();
+        assert!(reservation.grow(most + 1 - reservation.bytes()).is_err());
+        reservation.grow(most - reservation.bytes()).unwrap();
         drop(in_use);
-        lease.grow((1 << 20) - lease.bytes()).unwrap();
+        reservation.grow((1 << 20) - reservation.bytes()).unwrap();
         assert_eq!(structures.lock().bytes(), 0);
         // Memory that is taken regardless of the limit does not make the check fail either.
-        drop(lease);
+        drop(reservation);
         get(&structures, &files[0]);
         let buffers = budget.buffers(1 << 20);
         budget.check().unwrap();

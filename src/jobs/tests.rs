@@ -1,5 +1,6 @@
 //! Durable jobs on a store that fails on command.
 
+mod joined;
 mod records;
 
 use std::fmt::Debug;
@@ -15,9 +16,10 @@ use tokio::sync::watch;
 
 use super::durable_job::DurableJob;
 use super::rank::{Client, DEFAULT_URGENCY, Rank};
-use super::record::{Record, Requester, now_ms};
+use super::record::{JobRecord, Requester, now_ms};
 use super::{
-    AcceptError, Budget, EndError, JobId, JobSpec, JobStore, JobView, Pool, Settings, Status, Structures, Task,
+    AcceptError, Budget, EndError, Input, JobId, JobSpec, JobStore, JobView, OnStart, Pool, Settings, Status,
+    Structures, Task,
 };
 use crate::config::JobsConfig;
 use crate::formats::Format;
@@ -29,7 +31,8 @@ use crate::surface::ReferenceBackend;
 use crate::telemetry::{SpanParent, Tracer};
 
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
-const PATIENT: Duration = Duration::from_mins(2);
+/// Maximum time of a step of a test.
+const MAX_WAIT: Duration = Duration::from_mins(2);
 
 /// Job store on a disk that fails on command.
 struct Fixture {
@@ -47,8 +50,11 @@ impl Fixture {
     }
 
     async fn open(dir: TempDir, config: JobsConfig) -> Self {
+        Self::open_within(dir, config, Budget::new(1 << 30)).await
+    }
+
+    async fn open_within(dir: TempDir, config: JobsConfig, budget: Budget) -> Self {
         let (faults, store) = faulty_in(dir.path(), 1 << 30).await;
-        let budget = Budget::new(1 << 30);
         let settings = Settings {
             workers: 1,
             queue: 8,
@@ -70,31 +76,24 @@ impl Fixture {
     }
 
     async fn accept_from(&self, client: &str) -> Result<JobView, AcceptError> {
-        let pairs = [("resolution", "2")].map(|(name, value)| (name.to_owned(), value.to_owned()));
-        let request = params::parse(pairs.iter().map(|(name, value)| (name, value))).unwrap();
-        let rank = Rank { client: Client::named(client), batch: true, urgency: DEFAULT_URGENCY };
-        let (input, digest) = (Bytes::from_static(SAMPLE), Digest::of(SAMPLE));
-        let task = Task {
-            input,
-            digest,
-            namespace: Namespace::default(),
-            strict: false,
-            job: request.job,
-            rank,
-            lease: None,
-            parent: SpanParent::default(),
-            id: None,
-        };
-        let spec = JobSpec { task, parameters: pairs.to_vec(), format: Format::Stl, idempotency_key: None };
+        let parameters = vec![("resolution".to_owned(), "2".to_owned())];
+        let (task, file) = (task(client, "2"), Bytes::from_static(SAMPLE));
+        let spec = JobSpec { task, file, parameters, format: Format::Stl, idempotency_key: None };
         self.jobs.accept(spec, None).await
     }
 
     /// Stores the record of a job that an earlier process accepted.
-    async fn inherit(&self) -> JobId {
-        let record = Record {
+    async fn store_record(&self) -> JobId {
+        self.store_record_with(Bytes::from_static(SAMPLE)).await
+    }
+
+    /// Stores the record of a job with its own input.
+    async fn store_record_with(&self, input: Bytes) -> JobId {
+        let digest = Digest::of(&input);
+        let record = JobRecord {
             id: new_id(),
             namespace: Namespace::default(),
-            input: Digest::of(SAMPLE).to_string(),
+            input: digest.to_string(),
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),
             client: 1,
@@ -109,12 +108,12 @@ impl Fixture {
             problem: None,
         };
         self.jobs.0.write(&record).await.unwrap();
-        self.store.put(&Name::input(&Digest::of(SAMPLE)), Bytes::from_static(SAMPLE)).await.unwrap();
+        self.store.put_new(&Name::input(&digest), input).await.unwrap();
         record.id
     }
 
     /// Returns the stored record of a job.
-    async fn on_record(&self, id: &JobId) -> Record {
+    async fn on_record(&self, id: &JobId) -> JobRecord {
         self.jobs.0.read(id).await.unwrap().unwrap()
     }
 
@@ -122,9 +121,24 @@ impl Fixture {
         self.jobs.watch(id, Namespace::default()).await.unwrap().unwrap()
     }
 
-    /// Waits until the store has failed `times` times.
-    async fn unanswered(&self, times: usize) {
-        until("questions", || async { self.faults.unanswered.load(Ordering::SeqCst) >= times }).await;
+    /// Waits until `times` operations of the store have timed out.
+    async fn until_timed_out(&self, times: usize) {
+        until("the timeouts of the store", || async { self.faults.timed_out.load(Ordering::SeqCst) >= times }).await;
+    }
+}
+
+/// Returns a task of a client.
+fn task(client: &str, resolution: &str) -> Task {
+    Task {
+        input: Input::File(Bytes::from_static(SAMPLE)),
+        digest: Digest::of(SAMPLE),
+        namespace: Namespace::default(),
+        strict: false,
+        job: params::parse([("resolution", resolution)]).unwrap().job,
+        rank: Rank { client: Client::named(client), batch: true, urgency: DEFAULT_URGENCY },
+        reservation: None,
+        parent: SpanParent::default(),
+        id: None,
     }
 }
 
@@ -135,39 +149,40 @@ fn new_id() -> JobId {
 async fn until<F: Future<Output = bool>>(what: &str, mut holds: impl FnMut() -> F) {
     let begun = Instant::now();
     while !holds().await {
-        assert!(begun.elapsed() < PATIENT, "{what} did not come");
+        assert!(begun.elapsed() < MAX_WAIT, "{what} did not come");
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }
 
 #[track_caller]
-fn is<T: PartialEq + Debug>(seen: &watch::Receiver<JobView>, of: impl Fn(&Record) -> T, expected: &T) {
+fn is<T: PartialEq + Debug>(seen: &watch::Receiver<JobView>, of: impl Fn(&JobRecord) -> T, expected: &T) {
     let record = seen.borrow().record.clone();
     assert_eq!(&of(&record), expected, "{record:?}");
 }
 
 async fn ended(seen: &mut watch::Receiver<JobView>) {
     let end = seen.wait_for(|view| view.record.status.is_final());
-    tokio::time::timeout(PATIENT, end).await.expect("the job ends").unwrap();
+    tokio::time::timeout(MAX_WAIT, end).await.expect("the job ends").unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_failing_store_ends_no_job() {
-    let fixture = Fixture::new(1, PATIENT).await;
-    let id = fixture.inherit().await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let id = fixture.store_record().await;
     fixture.faults.silence(Some(Folder::Inputs));
     assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
     let mut seen = fixture.watch(&id).await;
     // More failures than attempts: a failed read of the input is not an attempt.
-    fixture.unanswered(3).await;
+    fixture.until_timed_out(3).await;
     is(&seen, |record| (record.status, record.attempts), &(Status::Accepted, 0));
     fixture.faults.silence(None);
     ended(&mut seen).await;
     is(&seen, |record| (record.status, record.attempts), &(Status::Successful, 1));
     assert_eq!(fixture.store.usage(Folder::Results).objects, 2);
     // A store that answers that the input does not exist is different.
-    let id = fixture.inherit().await;
-    fixture.store.delete(&Name::input(&Digest::of(SAMPLE))).await.unwrap();
+    let other = Bytes::from_static(b"another input");
+    let id = fixture.store_record_with(other.clone()).await;
+    fixture.store.delete(&Name::input(&Digest::of(&other))).await.unwrap();
     assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
     let mut seen = fixture.watch(&id).await;
     ended(&mut seen).await;
@@ -177,11 +192,11 @@ async fn a_failing_store_ends_no_job() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_result_is_held_until_it_is_stored() {
-    let fixture = Fixture::new(1, PATIENT).await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
     fixture.faults.seal(Folder::Results);
     let id = fixture.accept().await.unwrap().record.id;
     let mut seen = fixture.watch(&id).await;
-    fixture.unanswered(3).await;
+    fixture.until_timed_out(3).await;
     is(&seen, |record| record.status, &Status::Running);
     fixture.faults.silence(None);
     ended(&mut seen).await;
@@ -200,10 +215,10 @@ async fn a_result_that_is_never_stored_is_computed_for_every_attempt() {
     is(&seen, |record| (record.status, record.attempts), &(Status::Failed, 3));
     let problem = seen.borrow().record.problem.clone().unwrap();
     assert!(problem.as_str().unwrap().starts_with("Save"), "the cause, not the number of attempts: {problem}");
-    assert_eq!(fixture.faults.unanswered.load(Ordering::SeqCst), 3, "once for each mesh");
+    assert_eq!(fixture.faults.timed_out.load(Ordering::SeqCst), 3, "once for each mesh");
     until("the record", || async { fixture.on_record(&id).await.status == Status::Failed }).await;
     // A result that is too large is not retried.
-    let mut fixture = Fixture::new(3, PATIENT).await;
+    let mut fixture = Fixture::new(3, MAX_WAIT).await;
     fixture.jobs = JobStore::new(
         fixture.store.clone(),
         Arc::clone(&fixture.jobs.0.pool),
@@ -220,13 +235,13 @@ async fn a_result_that_is_never_stored_is_computed_for_every_attempt() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_end_of_a_job_is_recorded_once_the_store_works_again() {
-    let fixture = Fixture::new(1, PATIENT).await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
     fixture.faults.seal(Folder::Results);
     let id = fixture.accept().await.unwrap().record.id;
     let mut seen = fixture.watch(&id).await;
-    fixture.unanswered(1).await;
+    fixture.until_timed_out(1).await;
     fixture.faults.silence(Some(Folder::Jobs));
-    fixture.unanswered(2).await;
+    fixture.until_timed_out(2).await;
     // The end is not visible before it is on record.
     is(&seen, |record| record.status, &Status::Running);
     // Until then nothing removes the result.
@@ -237,14 +252,14 @@ async fn the_end_of_a_job_is_recorded_once_the_store_works_again() {
     ended(&mut seen).await;
     is(&seen, |record| record.status, &Status::Successful);
     assert_eq!(fixture.on_record(&id).await, seen.borrow().record);
-    fixture.jobs.settled().await;
+    fixture.jobs.all_recorded().await;
     expire().await;
     assert_eq!(fixture.store.usage(Folder::Results).objects, 0, "control: an unused result expires");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn no_job_is_accepted_without_a_record() {
-    let fixture = Fixture::new(1, PATIENT).await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
     for folder in Folder::ALL {
         fixture.faults.silence(Some(folder));
         let refused = fixture.accept().await;
@@ -257,14 +272,14 @@ async fn no_job_is_accepted_without_a_record() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_dismissed_job_does_not_start() {
-    let fixture = Fixture::new(1, PATIENT).await;
-    let id = fixture.inherit().await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let id = fixture.store_record().await;
     let job = Arc::new(DurableJob::new(fixture.on_record(&id).await));
     let on_start = fixture.jobs.on_start(&job, None);
     assert!(job.end(Status::Dismissed, |_| {}));
     fixture.jobs.0.write_job(&job).await.unwrap();
     // The worker has already taken the job.
-    tokio::task::spawn_blocking(on_start).await.unwrap();
+    tokio::task::spawn_blocking(move || OnStart::run_all(vec![on_start])).await.unwrap();
     for record in [job.record(), fixture.on_record(&id).await] {
         assert_eq!((record.status, record.attempts), (Status::Dismissed, 0), "{record:?}");
     }
@@ -272,8 +287,8 @@ async fn a_dismissed_job_does_not_start() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_last_record_has_the_latest_state() {
-    let fixture = Fixture::new(1, PATIENT).await;
-    let id = fixture.inherit().await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let id = fixture.store_record().await;
     let job = Arc::new(DurableJob::new(fixture.on_record(&id).await));
     assert!(job.begin());
     // Another task writes the record when the worker wants to record the start.
@@ -290,8 +305,8 @@ async fn the_last_record_has_the_latest_state() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn records_that_cannot_be_read_go_into_quarantine() {
-    let fixture = Fixture::new(1, PATIENT).await;
-    let good = fixture.inherit().await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let good = fixture.store_record().await;
     let whole = fixture.on_record(&good).await.to_bytes();
     let bad = [Bytes::new(), whole.slice(..whole.len() / 2), Bytes::from_static(br#"{"version":2,"id":[]}"#)];
     let names: Vec<_> = bad.iter().map(|_| Name::job(new_id().as_str()).unwrap()).collect();
@@ -320,8 +335,8 @@ async fn records_that_cannot_be_read_go_into_quarantine() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn recovered_inputs_are_pinned() {
-    let fixture = Fixture::new(1, PATIENT).await;
-    let id = fixture.inherit().await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let id = fixture.store_record().await;
     // The job cannot start, so only the recovery protects its input.
     fixture.faults.silence(Some(Folder::Inputs));
     assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
@@ -334,8 +349,8 @@ async fn recovered_inputs_are_pinned() {
 
 #[tokio::test]
 async fn versions_of_states_continue_after_a_restart() {
-    let fixture = Fixture::new(1, PATIENT).await;
-    let id = fixture.inherit().await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let id = fixture.store_record().await;
     let job = DurableJob::new(fixture.on_record(&id).await);
     let mut versions = vec![job.view().version];
     for _ in 0..5 {

@@ -19,6 +19,8 @@ pub(crate) struct Ticket {
     /// `None` if the job is left for the next process.
     pub(super) outcome: Option<ResultReceiver<Outcome>>,
     pub(super) deadline: Instant,
+    /// Moment at which a job that is still queued gives up, because it would probably miss its deadline.
+    pub(super) start_by: Instant,
     pub(super) allowed: Duration,
     pub(super) progress: Arc<Progress>,
     /// Span of the job.
@@ -30,14 +32,20 @@ pub(crate) struct Ticket {
 }
 
 impl Ticket {
-    /// Waits for the outcome, at most until the deadline. Cancel safe.
+    /// Waits for the outcome, at most until the deadline, or until the job must have begun. Cancel safe.
     pub(crate) async fn wait(&mut self) -> Outcome {
         let Some(outcome) = &mut self.outcome else { return Err(Failure::Stopped) };
-        match timeout(self.deadline.saturating_duration_since(Instant::now()), outcome.recv()).await {
-            Err(_elapsed) => Err(Failure::Deadline { limit: self.allowed }),
-            Ok(Some(outcome)) => outcome,
-            Ok(None) => Err(Failure::Stopped),
+        let limit = self.allowed;
+        for end in [self.start_by, self.deadline] {
+            match timeout(end.saturating_duration_since(Instant::now()), outcome.recv()).await {
+                Ok(outcome) => return outcome.unwrap_or(Err(Failure::Stopped)),
+                Err(_elapsed) if self.progress.now().is_none() => {
+                    return Err(Failure::Waited { limit, wait: self.queue.estimated_wait() });
+                }
+                Err(_elapsed) => {}
+            }
         }
+        Err(Failure::Deadline { limit })
     }
 }
 

@@ -5,11 +5,12 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use metrics::{counter, histogram};
 
-use super::coalesced_job::Entry;
-use super::pool::Shared;
-use super::{Failure, Finished, JobId, Lease, Outcome};
+use super::coalesced_job::QueuedTask;
+use super::pool::WorkerContext;
+use super::{Failure, Finished, JobId, MemoryReservation, OnStart, Outcome};
 use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report};
 use crate::structure::strict_validator::{self, Diagnostic, Level, MAX_UNREAD_BYTES};
 use crate::structure::{ReadLimits, StructureError};
@@ -17,7 +18,7 @@ use crate::surface::{Column, Control, SurfaceError};
 use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan};
 
 /// Runs jobs until the queue is closed and empty.
-pub(super) fn work(shared: &Shared) {
+pub(super) fn work(shared: &WorkerContext) {
     while let Some(entry) = shared.queue.pop() {
         let (id, client) = (entry.id, entry.task.rank.client);
         let start = Instant::now();
@@ -33,8 +34,8 @@ pub(super) fn work(shared: &Shared) {
 }
 
 /// Runs one job. `None` if it was cancelled before its start.
-fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
-    let Entry { task, cancel, progress, on_start, accepted, span, .. } = entry;
+fn run(shared: &WorkerContext, entry: QueuedTask) -> Option<Outcome> {
+    let QueuedTask { task, cancel, progress, on_start, accepted, span, .. } = entry;
     let log = span.as_parent().log_span(task.id.as_ref().map(JobId::as_str));
     let _entered = log.enter();
     let id = task.id.clone();
@@ -46,18 +47,21 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
     let waited = accepted.elapsed();
     span.part("queue", accepted, waited);
     let outcome = shared.settings.budget.check().map_err(Failure::from).and_then(|()| {
-        let lease = Arc::new(shared.settings.budget.lease());
+        let reservation = Arc::new(shared.settings.budget.reservation());
         // The memory for drawing is known in advance: reserved now, jobs do not fail at their end for lack of it.
-        lease.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
-        let control = Control { cancel: cancel.clone(), memory: Arc::<Lease>::clone(&lease), ..Control::default() };
+        reservation.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
+        let control = Control {
+            cancel: cancel.clone(),
+            memory: Arc::<MemoryReservation>::clone(&reservation),
+            ..Control::default()
+        };
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
         let work = || {
-            for callback in on_start {
-                callback();
-            }
+            OnStart::run_all(on_start);
+            let file = task.input.file();
             let (diagnostics, checked) = if task.strict {
                 let begun = Instant::now();
-                let found = check(shared, &task.input, &control);
+                let found = check(shared, file, &control);
                 progress.ended("check", begun, begun.elapsed());
                 (Some(found?), Some(begun.elapsed()))
             } else {
@@ -69,7 +73,7 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
                 structures.get(task.namespace, task.digest, &task.input, &limits.read, control)
             };
             let mut product = pipeline::run_with(read, &task.job, limits, &choice, &control, progress.as_ref(), None)
-                .map_err(|error| explained(shared, &task.input, error, &control))?;
+                .map_err(|error| explained(shared, file, error, &control))?;
             if let Some(picture) = &task.job.picture {
                 pipeline::draw(&mut product, picture, &shared.settings.renderer, &control, progress.as_ref())?;
             }
@@ -92,8 +96,8 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
             counter!(JOBS_FALLBACK).increment(1);
             tracing::warn!(renderer, why, "a picture fell back to another renderer");
         }
-        lease.set(bytes_of(&product));
-        Ok(Finished { product, diagnostics, digest: task.digest, lease })
+        reservation.set(bytes_of(&product));
+        Ok(Finished { product, diagnostics, digest: task.digest, reservation })
     });
     // Frees the input before the outcome is sent, so that the receiver sees the true memory use.
     drop(task);
@@ -117,7 +121,7 @@ fn end_span(span: &TraceSpan, id: Option<JobId>, label: &'static str, outcome: O
             span.set("molmesh.backend", report.backend);
             span.set("molmesh.device", report.device.clone());
             span.set("molmesh.atoms", report.atoms.cast_signed());
-            span.set("molmesh.samples", report.samples.cast_signed());
+            span.set("molmesh.grid_points", report.grid_points.cast_signed());
             span.set("molmesh.triangles", report.triangles.cast_signed());
             if let Some(picture) = &report.picture {
                 span.set("molmesh.renderer", picture.renderer);
@@ -130,8 +134,10 @@ fn end_span(span: &TraceSpan, id: Option<JobId>, label: &'static str, outcome: O
 }
 
 /// Runs the strict validator. Fails if it finds errors.
-fn check(shared: &Shared, input: &[u8], control: &Control<'_>) -> Result<Vec<Diagnostic>, Failure> {
-    let diagnostics = strict_validator::check(input, &shared.settings.limits.read, control).map_err(JobError::from)?;
+fn check(shared: &WorkerContext, file: Option<&Bytes>, control: &Control<'_>) -> Result<Vec<Diagnostic>, Failure> {
+    let missing = || Failure::Panicked { message: "a strict task has no file".to_owned() };
+    let file = file.ok_or_else(missing)?;
+    let diagnostics = strict_validator::check(file, &shared.settings.limits.read, control).map_err(JobError::from)?;
     if diagnostics.iter().any(|d| d.level == Level::Error) {
         return Err(Failure::Check { diagnostics });
     }
@@ -139,15 +145,13 @@ fn check(shared: &Shared, input: &[u8], control: &Control<'_>) -> Result<Vec<Dia
 }
 
 /// Adds the findings of the strict validator to the failure of a small file that cannot be read.
-fn explained(shared: &Shared, input: &[u8], error: JobError, control: &Control<'_>) -> Failure {
+fn explained(shared: &WorkerContext, file: Option<&Bytes>, error: JobError, control: &Control<'_>) -> Failure {
     let unreadable =
         matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
+    let Some(file) = file.filter(|_| unreadable) else { return error.into() };
     let limits = ReadLimits { max_inflated_bytes: MAX_UNREAD_BYTES, ..shared.settings.limits.read };
     // If the strict validator fails as well, there are no findings.
-    if !unreadable {
-        return error.into();
-    }
-    Failure::Job { error, diagnostics: strict_validator::check(input, &limits, control).unwrap_or_default() }
+    Failure::Job { error, diagnostics: strict_validator::check(file, &limits, control).unwrap_or_default() }
 }
 
 /// Counts and logs an outcome. Returns its label.
@@ -174,7 +178,7 @@ fn panicked(payload: &(dyn Any + Send)) -> Failure {
 
 fn count(report: &Report) {
     counter!(TRIANGLES).increment(report.triangles);
-    counter!(GRID_POINTS).increment(report.samples);
+    counter!(GRID_POINTS).increment(report.grid_points);
     for (stage, ms) in &report.timings_ms {
         histogram!(STAGE_DURATION, "stage" => stage.clone()).record(ms.as_f64().unwrap_or_default() / 1e3);
     }

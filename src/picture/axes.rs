@@ -4,9 +4,10 @@ use rayon::prelude::*;
 
 /// Number of triangles per task. Fixed, so that sums do not depend on the number of threads.
 const CHUNK: usize = 1 << 14;
-/// Maximum number of triangles that are used; of larger meshes every second, third and so on.
+/// Maximum number of triangles that are used. Of a larger mesh, only every nth triangle is used.
 const MAX_TRIANGLES: usize = 1 << 16;
-/// Third moment, in cubes of the standard deviation, below which a shape is considered symmetric along an axis.
+/// Skewness (third moment divided by the cube of the standard deviation) below which a shape is considered symmetric
+/// along an axis.
 const SKEWED: f64 = 1e-3;
 /// Number of sweeps of the eigenvalue iteration; five suffice for 3 × 3 matrices.
 const SWEEPS: usize = 32;
@@ -14,9 +15,9 @@ const SWEEPS: usize = 32;
 type Vec3 = [f64; 3];
 type Mat3 = [Vec3; 3];
 
-/// Axes of the view: right, up, towards the viewer. The variance of the area is largest along the first and smallest
-/// along the last. The longer tail of the area points right and up; for symmetric shapes, the largest component of the
-/// axis in file coordinates is positive.
+/// Returns the axes of the view: right, up, towards the viewer. The variance of the area is largest along the first and
+/// smallest along the last. The longer tail of the area points right and up; for symmetric shapes, the largest
+/// component of the axis in file coordinates is positive.
 pub(super) fn principal(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> Mat3 {
     let step = triangles.len().div_ceil(MAX_TRIANGLES).max(1);
     let sample: Vec<[u32; 3]> = if step > 1 { triangles.iter().step_by(step).copied().collect() } else { Vec::new() };

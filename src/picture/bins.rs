@@ -26,16 +26,16 @@ pub(super) fn twice_area([a, b, c]: [Corner; 3]) -> i64 {
     ab[0] * ac[1] - ab[1] * ac[0]
 }
 
-/// Addend that leaves the nearest integer in the last bits of a sum. Several times as fast as `round`, which is a
-/// function call for processors without a rounding instruction.
+/// Addend 1.5·2⁵², which leaves the nearest integer in the last bits of a sum. The addition is several times as fast as
+/// `round`, which is a function call for processors without a rounding instruction.
 const ROUNDING: f64 = 6_755_399_441_055_744.0;
 
 /// Corner at a position in pixels.
 #[inline]
-pub(super) fn corner(place: [f32; 3]) -> Corner {
+pub(super) fn corner(position: [f32; 3]) -> Corner {
     #[expect(clippy::cast_possible_truncation, reason = "the last bits hold the integer")]
     let round = |parts: f64| ((parts + ROUNDING).to_bits() as u32).cast_signed();
-    [place[0], place[1]].map(|c| round(f64::from(c) * f64::from(PARTS)))
+    [position[0], position[1]].map(|c| round(f64::from(c) * f64::from(PARTS)))
 }
 
 /// Tiles of a picture.
@@ -52,14 +52,14 @@ impl Tiles {
 }
 
 /// Triangles of one task, by tile.
-struct Chunk {
+struct TaskTriangles {
     /// Start of the list of each tile; the last entry is the total.
     starts: Vec<u32>,
     triangles: Vec<u32>,
 }
 
 /// Front-facing triangles by tile, ascending.
-pub(super) struct Bins(Vec<Chunk>);
+pub(super) struct Bins(Vec<TaskTriangles>);
 
 impl Bins {
     /// Sorts triangles into tiles.
@@ -90,11 +90,11 @@ impl Bins {
     }
 }
 
-fn bin(positions: &[[f32; 3]], part: &[[u32; 3]], first: usize, camera: &Camera, tiles: Tiles) -> Chunk {
+fn bin(positions: &[[f32; 3]], part: &[[u32; 3]], first: usize, camera: &Camera, tiles: Tiles) -> TaskTriangles {
     let mut pairs: Vec<(u32, u32)> = Vec::with_capacity(part.len());
     let mut starts = vec![0_u32; tiles.across * tiles.down + 1];
     for (n, triangle) in part.iter().enumerate() {
-        let corners = triangle.map(|v| corner(camera.place(positions[v as usize])));
+        let corners = triangle.map(|v| corner(camera.project(positions[v as usize])));
         // Rows count downwards, so counter-clockwise triangles have a negative area on the screen.
         if twice_area(corners) >= 0 {
             continue;
@@ -128,7 +128,7 @@ fn bin(positions: &[[f32; 3]], part: &[[u32; 3]], first: usize, camera: &Camera,
         triangles[*at as usize] = triangle;
         *at += 1;
     }
-    Chunk { starts, triangles }
+    TaskTriangles { starts, triangles }
 }
 
 #[cfg(test)]

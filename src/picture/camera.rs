@@ -27,7 +27,7 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// View of a mesh that fills the picture.
+    /// Creates the view in which the mesh fills the picture.
     #[must_use]
     pub fn new(positions: &[[f32; 3]], triangles: &[[u32; 3]], params: &PictureParams) -> Self {
         let wide = rotated(directions(positions, triangles, params.view), params.azimuth, params.elevation);
@@ -55,7 +55,7 @@ impl Camera {
     /// point.
     #[inline]
     #[must_use]
-    pub fn place(&self, position: [f32; 3]) -> [f32; 3] {
+    pub fn project(&self, position: [f32; 3]) -> [f32; 3] {
         let [right, up, toward] = self.axes.map(|axis| dot(axis, position));
         [
             (right + self.shift[0]) * self.scale + self.middle[0],
@@ -94,7 +94,7 @@ fn directions(positions: &[[f32; 3]], triangles: &[[u32; 3]], view: View) -> [[f
     }
 }
 
-/// Axes rotated by azimuth and elevation, degrees.
+/// Returns the axes rotated by azimuth and elevation, degrees.
 fn rotated([right, up, toward]: [[f64; 3]; 3], azimuth: f64, elevation: f64) -> [[f64; 3]; 3] {
     let mix = |a: [f64; 3], x: f64, b: [f64; 3], y: f64| std::array::from_fn(|k| a[k] * x + b[k] * y);
     let (sin, cos) = azimuth.to_radians().sin_cos();
@@ -152,7 +152,7 @@ mod tests {
         ] {
             let camera = camera(view, 0.0, 0.0);
             assert_eq!((camera.axes[2], camera.axes[0]), (toward, right), "{view:?}");
-            // Right-handed: nothing is seen in a mirror.
+            // The axes are right-handed: the picture is not mirrored.
             let [r, u, t] = camera.axes;
             let crossed = [r[1] * u[2] - r[2] * u[1], r[2] * u[0] - r[0] * u[2], r[0] * u[1] - r[1] * u[0]];
             assert_eq!(crossed, t, "{view:?}");
@@ -164,9 +164,9 @@ mod tests {
         let front = camera(View::Front, 0.0, 0.0);
         // 4 Å of height in 92 % of 200 pixels.
         assert!((front.pixel() - 4.0 / 184.0).abs() < 1e-6, "{front:?}");
-        let near = front.place([1.0, 2.0, 3.0]);
+        let near = front.project([1.0, 2.0, 3.0]);
         assert!((near[0] - (150.0 + 46.0)).abs() < 1e-3 && (near[1] - 8.0).abs() < 1e-3 && near[2] == 0.0, "{near:?}");
-        assert_eq!(front.place([0.0, 0.0, -3.0]), [150.0, 100.0, 6.0]);
+        assert_eq!(front.project([0.0, 0.0, -3.0]), [150.0, 100.0, 6.0]);
         assert_eq!(front.reach, 6.0);
         assert!(Camera::new(&[[1.0; 3]], &[], &PictureParams::default()).scale.is_finite());
     }

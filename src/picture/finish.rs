@@ -19,7 +19,7 @@ const QUARTER: [[f64; 2]; 4] = {
 /// Radii of the rings of neighbours, relative to the radius. Rings use the even and the odd directions in
 /// turn.
 const RINGS: [f64; 6] = [0.06, 0.13, 0.24, 0.4, 0.65, 1.0];
-/// Radius of ambient occlusion: at least that of a pocket in Å, and at least a share of the shorter side.
+/// Radius of ambient occlusion: at least that of a pocket in Å, and at least a fraction of the shorter side.
 const RADIUS: f64 = 6.0;
 const RADIUS_SHARE: f64 = 0.07;
 /// Sine above the tangent plane below which a neighbour does not occlude, so that convex surfaces are not darkened.
@@ -68,7 +68,7 @@ pub struct Finish {
 }
 
 impl Finish {
-    /// Parameters for a picture.
+    /// Returns the parameters for a picture.
     #[must_use]
     #[expect(clippy::cast_possible_truncation, reason = "small numbers; shading uses single precision")]
     pub fn new(params: &PictureParams, camera: &Camera) -> Self {
@@ -125,7 +125,7 @@ pub(super) fn finish(
     let levels = Levels::get();
     let mut pixels = vec![[0; 4]; layers.width * layers.height];
     let rows = pixels.par_chunks_mut(layers.width.max(1)).enumerate();
-    rows.try_for_each_init(Row::default, |row, (y, out)| {
+    rows.try_for_each_init(PixelRow::default, |row, (y, out)| {
         control.check()?;
         row.shade(layers, shading, y);
         for (x, pixel) in out.iter_mut().enumerate() {
@@ -165,15 +165,15 @@ fn color(layers: &Layers, shading: &Finish, levels: &Levels, open: Option<f32>, 
 
 /// Row of pixels in columns, so that several pixels are computed at once.
 #[derive(Default)]
-struct Row {
+struct PixelRow {
     normal: [Vec<f32>; 3],
     /// Share of the light that is not occluded, 0 to 1; empty without ambient occlusion.
     open: Vec<f32>,
 }
 
-impl Row {
-    /// Computes the occlusion of row `y`. Each neighbour above the tangent plane of a pixel occludes it; steeper and
-    /// nearer neighbours occlude more.
+impl PixelRow {
+    /// Computes the occlusion of row `y`. Every neighbour above the tangent plane of a pixel occludes it. Neighbours
+    /// that are nearer, or higher above the plane, occlude more.
     fn shade(&mut self, layers: &Layers, shading: &Finish, y: usize) {
         self.open.clear();
         if shading.taps.is_empty() {

@@ -60,7 +60,7 @@ impl Layers {
             light: vec![0.0; n],
             facing: vec![Facing::default(); n],
             is_colored,
-            // Takes no memory unless written: the system provides zeroed pages on the first write.
+            // Takes memory only when written: the system provides zeroed pages on the first write.
             color: vec![[0; 3]; n],
         }
     }

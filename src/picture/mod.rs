@@ -1,4 +1,4 @@
-//! Pictures of meshes: pixels and PNG from a mesh and a view. Pure: no files, no clock, no graphics API.
+//! Pictures of meshes: pixels and PNG from a mesh and a view. Does not depend on files, clocks or a graphics API.
 //!
 //! The projection is orthographic, so lengths can be measured in a picture: [`Rendered::pixel`] is the width of a pixel
 //! in Å. [`camera`] computes the view, `bins` and `raster` the visible surface at four samples per pixel,
@@ -26,8 +26,9 @@ use thiserror::Error;
 use crate::surface::{BackendIdentity, Control, Mesh, OutOfMemory, SurfaceError, arithmetic};
 pub use cpu::CpuRenderer;
 pub use params::{Background, DEFAULT_SIDE, MAX_SIDE, PictureLimits, PictureParams, Style, View};
+pub(crate) use raster::MeshColumns;
 
-/// Reason for which a picture cannot be made.
+/// Reason why a picture cannot be drawn.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum PictureError {
     /// A side has too many pixels.
@@ -43,7 +44,7 @@ pub enum PictureError {
     /// The run was cancelled.
     #[error("cancelled")]
     Cancelled,
-    /// Memory is not available now.
+    /// Not enough memory is available.
     #[error(transparent)]
     Memory(#[from] OutOfMemory),
     /// The vertices are quantized.

@@ -7,7 +7,7 @@ use super::PictureError;
 
 /// Default width and height, pixels.
 pub const DEFAULT_SIDE: u32 = 512;
-/// Maximum width and height, pixels: the maximum texture size that devices have in common.
+/// Maximum width and height, pixels: a texture size that all devices support.
 pub const MAX_SIDE: u32 = 16_384;
 /// Maximum working memory per pixel, bytes: depth, light, normal and colour, twice on a device.
 const PIXEL_BYTES: u64 = 40;

@@ -25,8 +25,8 @@ pub fn encode(image: &Image, control: &Control<'_>) -> Result<Vec<u8>, PictureEr
     encoder.set_color(if opaque { ColorType::Rgb } else { ColorType::Rgba });
     encoder.set_source_srgb(SrgbRenderingIntent::Perceptual);
     encoder.set_deflate_compression(DeflateCompression::Level(4));
-    // Level 4 takes less than half the time of the default for 4 % more bytes; level 1 makes files two thirds larger.
-    // The filter `Up` compresses as well as any other.
+    // Level 4 takes less than half the time of the default for 4 % more bytes; with level 1, files are two thirds
+    // larger. The filter `Up` compresses as well as any other.
     encoder.set_filter(Filter::Up);
     let mut writer = encoder.write_header().map_err(failed)?;
     let mut stream = writer.stream_writer_with_size(CHUNK_BYTES).map_err(failed)?;

@@ -1,24 +1,40 @@
 //! Rasterizer of one tile: the nearest triangle at four samples of every pixel.
 
+use super::PictureError;
 use super::bins::{Bins, PARTS, TILE_HEIGHT, TILE_WIDTH, Tiles, corner, twice_area};
 use super::camera::{Camera, dot};
 use super::layers::{FULL, Facing, NOTHING, SAMPLES, UNIT};
 use super::light::{lambert, linear_levels};
-use crate::surface::{Control, SurfaceError};
+use crate::surface::{Control, Mesh, SurfaceError, Vertices};
 
 /// Positions of the samples within a pixel, in subpixels: the standard pattern of graphics devices.
 const PATTERN: [[i32; 2]; SAMPLES] = [[96, 32], [224, 96], [32, 160], [160, 224]];
 /// Number of samples of a tile.
 const N: usize = TILE_WIDTH * TILE_HEIGHT * SAMPLES;
 
-/// Columns of a mesh.
+/// Columns of a mesh that are drawn.
 #[derive(Clone, Copy)]
-pub(super) struct Shape<'a> {
-    pub(super) positions: &'a [[f32; 3]],
-    pub(super) normals: &'a [[f32; 3]],
-    pub(super) triangles: &'a [[u32; 3]],
+pub(crate) struct MeshColumns<'a> {
+    pub(crate) positions: &'a [[f32; 3]],
+    pub(crate) normals: &'a [[f32; 3]],
+    pub(crate) triangles: &'a [[u32; 3]],
     /// sRGB colours, if the mesh has colours of its own.
-    pub(super) colors: Option<&'a [[u8; 4]]>,
+    pub(crate) colors: Option<&'a [[u8; 4]]>,
+}
+
+impl<'a> MeshColumns<'a> {
+    /// Returns the columns of `mesh`.
+    ///
+    /// # Errors
+    /// [`PictureError::Quantized`].
+    pub(crate) fn of(mesh: &'a Mesh) -> Result<Self, PictureError> {
+        match mesh.vertices() {
+            Vertices::Single { positions, normals } => {
+                Ok(Self { positions, normals, triangles: &mesh.triangles, colors: mesh.colors.as_deref() })
+            }
+            Vertices::Quantized { .. } => Err(PictureError::Quantized),
+        }
+    }
 }
 
 /// Row of tiles of the layers.
@@ -60,7 +76,7 @@ struct Facet {
 }
 
 /// Edge function: positive inside the triangle, 0 on the edge.
-struct Edge {
+struct EdgeFunction {
     /// Increments per column and per row.
     column: i64,
     row: i64,
@@ -68,7 +84,7 @@ struct Edge {
     at: [i64; SAMPLES],
 }
 
-impl Edge {
+impl EdgeFunction {
     /// Edge from `p` to `q`, at the pixel in column `x` of row `y`.
     fn new(p: [i32; 2], q: [i32; 2], x: i64, y: i64) -> Self {
         let ([px, py], [qx, qy]) = (p.map(i64::from), q.map(i64::from));
@@ -85,21 +101,21 @@ impl Edge {
 }
 
 impl Facet {
-    fn new(shape: Shape<'_>, triangle: u32, camera: &Camera) -> Self {
-        let [a, c, b] = shape.triangles[triangle as usize];
+    fn new(mesh: MeshColumns<'_>, triangle: u32, camera: &Camera) -> Self {
+        let [a, c, b] = mesh.triangles[triangle as usize];
         let vertices = [a, b, c];
-        let placed = vertices.map(|v| camera.place(shape.positions[v as usize]));
-        let corners = placed.map(corner);
+        let projected = vertices.map(|v| camera.project(mesh.positions[v as usize]));
+        let corners = projected.map(corner);
         let share = 1.0 / twice_area(corners) as f32;
-        Self { vertices, corners, depths: placed.map(|place| place[2] * share), share }
+        Self { vertices, corners, depths: projected.map(|place| place[2] * share), share }
     }
 
     /// Light, normal and linear colour of each corner, divided by twice the area.
-    fn shades(&self, shape: Shape<'_>, camera: &Camera) -> [[f32; 7]; 3] {
+    fn shades(&self, mesh: MeshColumns<'_>, camera: &Camera) -> [[f32; 7]; 3] {
         let levels = linear_levels();
         self.vertices.map(|v| {
-            let [x, y, z] = camera.turn(shape.normals[v as usize]);
-            let [r, g, b, _] = shape.colors.map_or([0; 4], |colors| colors[v as usize]);
+            let [x, y, z] = camera.turn(mesh.normals[v as usize]);
+            let [r, g, b, _] = mesh.colors.map_or([0; 4], |colors| colors[v as usize]);
             let [r, g, b] = [r, g, b].map(|level| levels[usize::from(level)]);
             [lambert([x, y, z]), x, y, z, r, g, b].map(|value| value * self.share)
         })
@@ -114,7 +130,7 @@ impl Facet {
     /// Draws the samples that are nearer than the present ones.
     fn draw(
         &self,
-        shape: Shape<'_>,
+        mesh: MeshColumns<'_>,
         camera: &Camera,
         [left, top]: [i64; 2],
         [width, height]: [i64; 2],
@@ -122,7 +138,7 @@ impl Facet {
     ) {
         let (rows, columns) = (self.span(1, top, height), self.span(0, left, width));
         let [a, b, c] = self.corners;
-        let mut edges = [[b, c], [c, a], [a, b]].map(|[p, q]| Edge::new(p, q, columns.start, rows.start));
+        let mut edges = [[b, c], [c, a], [a, b]].map(|[p, q]| EdgeFunction::new(p, q, columns.start, rows.start));
         // Most triangles are small and many are hidden, so normals are loaded with the first visible sample.
         let mut shades = None;
         for y in rows {
@@ -141,12 +157,12 @@ impl Facet {
                     if depth >= samples.depth[i] {
                         continue;
                     }
-                    let [a, b, c] = shades.get_or_insert_with(|| self.shades(shape, camera));
+                    let [a, b, c] = shades.get_or_insert_with(|| self.shades(mesh, camera));
                     let value = |k: usize| u * a[k] + v * b[k] + w * c[k];
                     samples.depth[i] = depth;
                     samples.light[i] = value(0);
                     samples.normal[i] = [value(1), value(2), value(3)];
-                    if shape.colors.is_some() {
+                    if mesh.colors.is_some() {
                         samples.color[i] = [value(4), value(5), value(6)];
                     }
                 }
@@ -162,15 +178,15 @@ impl Facet {
     }
 }
 
-/// Number of triangles that are drawn between two checks of the cancellation flag. Large ones fill their tile.
+/// Number of triangles that are drawn between two checks of the cancellation flag. A large triangle fills its tile.
 const TRIANGLES_PER_CHECK: usize = 1 << 10;
 
-/// Draws `shape` in a row of tiles.
+/// Draws `mesh` in a row of tiles.
 ///
 /// # Errors
 /// [`SurfaceError::Cancelled`].
 pub(super) fn fill(
-    shape: Shape<'_>,
+    mesh: MeshColumns<'_>,
     camera: &Camera,
     bins: &Bins,
     tiles: Tiles,
@@ -193,13 +209,13 @@ pub(super) fn fill(
             if n % TRIANGLES_PER_CHECK == 0 {
                 control.check()?;
             }
-            Facet::new(shape, triangle, camera).draw(shape, camera, corner, size, samples);
+            Facet::new(mesh, triangle, camera).draw(mesh, camera, corner, size, samples);
         }
         for y in 0..height {
             for x in 0..width {
                 let (pixel, at) = (y * TILE_WIDTH + x, y * band.width + left + x);
                 (band.depth[at], band.light[at], band.facing[at]) = resolve(samples, pixel);
-                if shape.colors.is_some() {
+                if mesh.colors.is_some() {
                     band.color[at] = mean_color(samples, pixel);
                 }
             }
@@ -233,7 +249,7 @@ fn resolve(samples: &Samples, pixel: usize) -> (f32, f32, Facing) {
         return (NOTHING, 0.0, Facing::default());
     }
     let length = dot(normal, normal).sqrt();
-    // Opposite normals cancel; the pixel then faces the viewer.
+    // Opposite normals cancel. The normal of the pixel then points to the viewer.
     let unit = if length > 0.0 { normal.map(|c| c / length) } else { [0.0, 0.0, 1.0] };
     #[expect(clippy::cast_possible_truncation, reason = "components of a unit vector")]
     let normal = unit.map(|c| (c * UNIT + 0.5_f32.copysign(c)) as i16);

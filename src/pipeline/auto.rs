@@ -1,5 +1,5 @@
-//! Backend that runs each job on the CPU or on GPUs: where it is predicted to end first. The CPU is the fallback of the
-//! GPUs.
+//! Backend that runs each job on the CPU or on GPUs, on the side that is predicted to finish it first. The CPU is the
+//! fallback of the GPUs.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -53,14 +53,14 @@ impl AutoBackend {
     }
 
     fn assign(&self, surface: SurfaceKind, work: f64) -> AssignedBackend<'_> {
-        if !self.gpu.makes(surface) {
+        if !self.gpu.supports(surface) {
             let assignment = self.model().assign_to(Side::Cpu, self.now(), work, 0);
-            return AssignedBackend { auto: self, work, state: Mutex::new((assignment, None)) };
+            return AssignedBackend::new(self, work, assignment, None);
         }
         let gpus = self.gpus();
         let assignment = self.model().assign(self.now(), work, gpus);
         let down = (gpus == 0).then(|| format!("no device is up: {}", self.down_reasons()));
-        AssignedBackend { auto: self, work, state: Mutex::new((assignment, down)) }
+        AssignedBackend::new(self, work, assignment, down)
     }
 
     fn down_reasons(&self) -> String {
@@ -107,7 +107,7 @@ impl Backend for AutoBackend {
         Some(Box::new(self.assign(surface, work)))
     }
 
-    /// Warms both backends up and measures them. If the GPUs fail, the CPU gets every job.
+    /// Warms up and measures both backends. If the GPUs fail, the CPU gets every job.
     fn warm_up(&self) -> Result<(), SurfaceError> {
         self.cpu.warm_up()?;
         // The status of the devices states the reason of a failure.
@@ -133,45 +133,64 @@ impl Backend for AutoBackend {
 struct AssignedBackend<'a> {
     auto: &'a AutoBackend,
     work: f64,
-    /// Assignment with the reason why no GPU makes the job although one should.
-    state: Mutex<(Assignment, Option<String>)>,
+    state: Mutex<AssignedState>,
 }
 
-impl AssignedBackend<'_> {
-    fn state(&self) -> MutexGuard<'_, (Assignment, Option<String>)> {
+struct AssignedState {
+    assignment: Assignment,
+    /// Reason why no GPU runs the job, if one should.
+    failure: Option<String>,
+    /// End of the last mesh, s; `None` if it failed.
+    ended: Option<f64>,
+}
+
+impl<'a> AssignedBackend<'a> {
+    fn new(auto: &'a AutoBackend, work: f64, assignment: Assignment, failure: Option<String>) -> Self {
+        Self { auto, work, state: Mutex::new(AssignedState { assignment, failure, ended: None }) }
+    }
+
+    fn state(&self) -> MutexGuard<'_, AssignedState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Returns the backend to which the job is assigned.
+    fn backend(&self) -> &'a dyn Backend {
+        let side = self.state().assignment.side;
+        self.auto.side(side)
     }
 
     /// Moves the job to the CPU.
     fn fall_back(&self, why: String) {
         let mut state = self.state();
         let mut model = self.auto.model();
-        model.finish(&state.0);
-        *state = (model.assign_to(Side::Cpu, self.auto.now(), self.work, 0), Some(why));
+        model.remove(&state.assignment);
+        state.assignment = model.assign_to(Side::Cpu, self.auto.now(), self.work, 0);
+        state.failure = Some(why);
     }
 }
 
 impl Drop for AssignedBackend<'_> {
     fn drop(&mut self) {
-        let assignment = self.state().0;
-        self.auto.model().finish(&assignment);
+        let state = self.state();
+        let mut model = self.auto.model();
+        match state.ended {
+            Some(end) => model.finish(end, &state.assignment),
+            None => model.remove(&state.assignment),
+        }
     }
 }
 
 impl Backend for AssignedBackend<'_> {
     fn name(&self) -> &'static str {
-        let side = self.state().0.side;
-        self.auto.side(side).name()
+        self.backend().name()
     }
 
     fn arithmetic(&self) -> String {
-        let side = self.state().0.side;
-        self.auto.side(side).arithmetic()
+        self.backend().arithmetic()
     }
 
     fn describe(&self) -> String {
-        let side = self.state().0.side;
-        self.auto.side(side).describe()
+        self.backend().describe()
     }
 
     fn write(
@@ -182,7 +201,8 @@ impl Backend for AssignedBackend<'_> {
         control: &Control<'_>,
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
-        let side = self.state().0.side;
+        let side = self.state().assignment.side;
+        self.state().ended = None;
         let output = match self.auto.side(side).write(spheres, params, limits, control, sink) {
             Err(SurfaceError::Device { why }) if side == Side::Gpu => {
                 self.fall_back(why);
@@ -190,7 +210,10 @@ impl Backend for AssignedBackend<'_> {
             }
             written => written?,
         };
-        let (assignment, failure) = self.state().clone();
+        let mut state = self.state();
+        state.ended = Some(self.auto.now());
+        let (assignment, failure) = (state.assignment, state.failure.clone());
+        drop(state);
         let backend = self.auto.side(assignment.side);
         let made_by = output.made_by.clone().unwrap_or_else(|| backend.identity());
         let made_by = BackendIdentity {

@@ -25,10 +25,10 @@ impl ProgressSink for () {}
 
 /// Measures the wall time of stages.
 ///
-/// The stages of a backend run interleaved on several threads. They share the wall time of their pass in proportion to
-/// the time of the threads in each stage, so they add up to the wall time. Times that a device reports remain
-/// unchanged. The rest of the pass is `roundtrip`: transfers and waiting for the device. Devices that run in parallel
-/// may report more than the wall time; their stages are then scaled to it.
+/// The stages of a backend run interleaved on several threads. The wall time of their pass is divided among them in
+/// proportion to the time that the threads spend in each stage. Times that a device reports remain unchanged, and the
+/// rest of the pass is `roundtrip`: transfers and waiting for the device. Devices that run in parallel may report more
+/// than the wall time; their stages are then scaled to it.
 pub struct StageClock<'a> {
     sink: &'a dyn ProgressSink,
     busy_ns: [AtomicU64; Stage::ALL.len()],
@@ -43,7 +43,7 @@ impl<'a> StageClock<'a> {
         Self { sink, busy_ns: Default::default(), device_ns: Default::default(), wall_ms: Mutex::default() }
     }
 
-    /// Times `work` under `name`.
+    /// Runs `work` and adds its wall time to the stage `name`.
     pub fn time<T>(&self, name: &'static str, work: impl FnOnce() -> T) -> T {
         self.sink.progress(name, 0.0);
         let start = Instant::now();
@@ -52,7 +52,8 @@ impl<'a> StageClock<'a> {
         value
     }
 
-    /// Times a pass of a backend, whose stages are reported through [`Observer::span`] and [`Observer::elapsed`].
+    /// Runs a pass of a backend and divides its wall time among its stages, which the backend reports through
+    /// [`Observer::span`] and [`Observer::elapsed`].
     pub fn pass<T>(&self, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let value = work();

@@ -1,21 +1,24 @@
 //! Estimate of a job's size without its mesh: exact counts for the grid, estimates from the area for the mesh.
 //!
-//! A surface of area A with random orientation crosses 1.5 A/h² edges of a grid of spacing h, as the mean of
+//! A surface of area A with random orientation crosses 1.5 A/h² edges of a grid of spacing h, because the mean of
 //! |nx| + |ny| + |nz| over all normals is 1.5. Each crossing is a vertex, and a closed mesh has about two triangles per
-//! vertex. A coarser mesh gives the area.
+//! vertex. The area is that of a coarser mesh.
 
 use std::ops::Deref;
+use std::sync::Arc;
 
-use super::color::AtomColors;
+use super::color::{AtomColors, Scheme};
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
-use super::parts::{self, PartsBackend};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
+use super::{parts, work};
 use crate::structure::{AtomPart, Structure, StructureError};
-use crate::surface::cpu::{LATTICE_BYTES, scan};
+use crate::surface::cpu::{LATTICE_BYTES, check_work, scan};
 use crate::surface::lattice::{Lattice, slightly_coarser};
-use crate::surface::occupancy::Occupancy;
+use crate::surface::occupancy::count;
 use crate::surface::params::MAX_RESOLUTION;
-use crate::surface::{Backend, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+use crate::surface::{
+    Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams, candidates,
+};
 
 /// Estimated size of a job.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,7 +29,7 @@ pub struct Estimate {
     pub distinct_atoms: u64,
     /// Atoms in the file, all models.
     pub atoms_in_file: u64,
-    /// Grid spacing, Å. It is an estimate if the job would search for it, else exact.
+    /// Grid spacing, Å. It is an estimate if the job would search for it, and otherwise exact.
     pub resolution: f64,
     /// Cells of a dense grid.
     pub box_cells: u64,
@@ -40,7 +43,9 @@ pub struct MeshEstimate {
     /// Occupied bricks.
     pub bricks: u64,
     /// Grid points that would be evaluated.
-    pub samples: u64,
+    pub grid_points: u64,
+    /// Pairs of an atom and a brick in its reach.
+    pub pairs: u64,
     /// Area, Å².
     pub area: f64,
     /// Number of vertices.
@@ -64,13 +69,12 @@ pub fn estimate<S: Deref<Target = Structure>>(
 ) -> Result<Estimate, JobError> {
     let clock = StageClock::new(&());
     let (structure, selected, spheres) = super::load(read, job, &limits.read, &clock, control)?;
-    if let Some(coloring) = &job.color {
+    if let Some(coloring) = job.color.as_ref().filter(|coloring| !matches!(coloring.scheme, Scheme::Vertex(_))) {
         AtomColors::new(&structure, &selected.atoms, coloring)?;
     }
     let parts = selected.parts(&structure, job.split, &limits.read, control)?;
-    let divided = parts.as_deref().map(|parts| PartsBackend::new(choice.backend, parts));
-    let backend = divided.as_ref().map_or(choice.backend, |divided| divided as &dyn Backend);
-    let choice = &Choice { backend, reason: choice.reason };
+    let backend = parts::divided(choice.backend, parts.as_deref());
+    let choice = &Choice { backend: &*backend, reason: choice.reason };
     let mut params = job.params_for(spheres.len());
     let mut refused = None;
     if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -85,25 +89,37 @@ pub fn estimate<S: Deref<Target = Structure>>(
         }
     }
     let _storage = super::storage(job, &mut params, &spheres);
-    // All lattices, and the spheres of one part at a time.
-    let copies = (LATTICE_BYTES + super::SPHERE_BYTES) * spheres.len() as u64;
-    control.memory.grow(copies).map_err(SurfaceError::from)?;
-    let lattices = parts::spheres_of(&spheres, parts.as_deref()).map(|own| Lattice::new(&own, &params));
-    let lattices: Vec<Lattice> = lattices.collect::<Result<_, SurfaceError>>()?;
+    let plan = MeshPlan { spheres: &spheres, parts: parts.as_deref(), params: &params, limits: &limits.surface };
+    let lattices = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
-    let mesh = refused.map_or_else(|| of_mesh(&lattices, &spheres, &params, &limits.surface, choice, control), Err);
-    let explain = |error| with_finest_fit(error, &spheres, parts.as_deref(), &params, &limits.surface, control);
-    let mesh = mesh.map_err(explain);
+    let mesh = refused.map_or_else(|| plan.mesh(&lattices, choice, control), Err);
+    drop(lattices);
     let mesh = match (mesh, job.spacing) {
-        (Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)), _) => return Err(error.into()),
         (Ok(mesh), Spacing::MaxTriangles(limit)) => Ok(mesh.at_most(limit, &params)),
         (mesh, _) => mesh,
     };
-    let mesh = mesh.map(|mesh| MeshEstimate { bytes: mesh.bytes + job.attribute_bytes() * mesh.vertices, ..mesh });
+    let mesh = mesh.and_then(|mesh| {
+        let bytes = mesh.bytes + job.attribute_bytes() * mesh.vertices;
+        control.memory.check(bytes)?;
+        Ok(MeshEstimate { bytes, ..mesh })
+    });
+    let mesh = match mesh.map_err(|error| with_finest_fit(error, &plan, choice, control)) {
+        Err(error) if ends_work(&error) => return Err(error.into()),
+        mesh => mesh,
+    };
     let (atoms, atoms_in_file) = (selected.atoms.len() as u64, structure.len() as u64);
     let distinct_atoms = selected.n_distinct as u64;
     Ok(Estimate { atoms, distinct_atoms, atoms_in_file, resolution, box_cells, mesh })
+}
+
+impl Estimate {
+    /// Returns the work of the job in atoms at 0.5 Å, if the job would be accepted.
+    #[must_use]
+    pub fn work(&self, job: &Job) -> Option<f64> {
+        let MeshEstimate { grid_points, pairs, vertices, .. } = self.mesh.as_ref().ok()?;
+        Some(work::counted_work(job, self.atoms_in_file, [*pairs, *grid_points, *vertices]))
+    }
 }
 
 impl MeshEstimate {
@@ -115,105 +131,250 @@ impl MeshEstimate {
     }
 }
 
-fn of_mesh(
-    lattices: &[Lattice],
-    spheres: &Spheres,
-    params: &SurfaceParams,
-    limits: &SurfaceLimits,
+/// Rejects a job whose mesh alone needs more memory than the budget has, before the work begins. The size of the mesh
+/// is estimated, by a coarser mesh, only if separate spheres would exceed the budget.
+///
+/// # Errors
+/// Returns the errors of the mesh that can be foreseen, and those of the coarser mesh.
+pub(super) fn check_memory(
+    plan: &MeshPlan<'_>,
+    job: &Job,
     choice: &Choice<'_>,
     control: &Control<'_>,
-) -> Result<MeshEstimate, SurfaceError> {
-    let (mut bricks, h) = (0, params.resolution);
-    for lattice in lattices {
-        bricks += Occupancy::new(lattice, limits, control)?.n_reached();
+) -> Result<(), SurfaceError> {
+    let (memory, params) = (&control.memory, plan.params);
+    let attributes = |vertices: u64| vertices.saturating_mul(job.attribute_bytes());
+    let vertices = n_vertices(plan.spheres.area(params), params.resolution);
+    let most = params.mesh_bytes(vertices, vertices.saturating_mul(2)).saturating_add(attributes(vertices));
+    if memory.check(most).is_ok() {
+        return Ok(());
     }
-    let (samples, limit) = (512 * bricks, limits.max_samples);
-    if samples > limit {
-        // Each part fits the limit, but not all parts together.
-        let suggested_resolution = slightly_coarser(h * (samples as f64 / limit as f64).cbrt());
-        return Err(SurfaceError::GridTooLarge { samples, limit, resolution: h, suggested_resolution });
+    let mesh = plan.mesh(&plan.lattices(control)?, choice, control)?;
+    Ok(memory.check(mesh.bytes + attributes(mesh.vertices))?)
+}
+
+/// Returns true if `error` ends the estimate as well, not only the mesh.
+const fn ends_work(error: &SurfaceError) -> bool {
+    matches!(
+        error,
+        SurfaceError::Cancelled
+            | SurfaceError::Deadline
+            | SurfaceError::Memory(OutOfMemory::Budget { .. } | OutOfMemory::System { .. })
+    )
+}
+
+/// Returns the number of vertices of a mesh of `area` Å².
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate")]
+fn n_vertices(area: f64, spacing: f64) -> u64 {
+    (1.5 * area / (spacing * spacing)).round() as u64
+}
+
+/// Spheres whose grid and mesh are planned.
+#[derive(Clone, Copy)]
+pub(super) struct MeshPlan<'a> {
+    pub(super) spheres: &'a Spheres,
+    pub(super) parts: Option<&'a [AtomPart]>,
+    pub(super) params: &'a SurfaceParams,
+    pub(super) limits: &'a SurfaceLimits,
+}
+
+/// Lattices of all parts, and their memory.
+struct Lattices {
+    of_parts: Vec<Lattice>,
+    _memory: Reservation,
+}
+
+impl Deref for Lattices {
+    type Target = [Lattice];
+
+    fn deref(&self) -> &[Lattice] {
+        &self.of_parts
     }
-    let single = SurfaceParams { atom_ids: false, quantize: None, ..params.clone() };
-    let coarse = SurfaceParams { resolution: (COARSE_FACTOR * h).max(MIN_COARSE_SPACING).max(h), ..single.clone() };
-    let mesh = match choice.backend.run(spheres, &coarse, limits, control) {
-        // A coarse grid can miss single small spheres: use the job's grid then.
-        Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, &single, limits, control)?.mesh,
-        meshed => meshed?.mesh,
-    };
-    let area = area(&mesh);
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate")]
-    let vertices = (1.5 * area / (h * h)).round() as u64;
-    let triangles = 2 * vertices;
-    let bytes = params.mesh_bytes(vertices, triangles);
-    // Parts are quantized after joining, so each vertex first takes its full size.
-    let in_memory = if lattices.len() > 1 { single.mesh_bytes(vertices, triangles) } else { bytes };
-    let estimate = MeshEstimate { bricks, samples, area, vertices, triangles, bytes };
-    if in_memory > limits.max_mesh_bytes {
-        return Err(scan::too_large(in_memory, h, limits.max_mesh_bytes));
+}
+
+impl MeshPlan<'_> {
+    /// Places the spheres of each part on its lattice.
+    fn lattices(&self, control: &Control<'_>) -> Result<Lattices, SurfaceError> {
+        // All lattices, and the spheres of one part at a time.
+        let memory = control.reserve((LATTICE_BYTES + super::SPHERE_BYTES) * self.spheres.len() as u64)?;
+        let lattices = parts::spheres_of(self.spheres, self.parts).map(|own| Lattice::new(&own, self.params));
+        Ok(Lattices { of_parts: lattices.collect::<Result<_, SurfaceError>>()?, _memory: memory })
     }
-    Ok(estimate)
+
+    /// Estimates the mesh.
+    fn mesh(
+        &self,
+        lattices: &[Lattice],
+        choice: &Choice<'_>,
+        control: &Control<'_>,
+    ) -> Result<MeshEstimate, SurfaceError> {
+        let Self { spheres, params, limits, .. } = *self;
+        let (mut bricks, mut pairs, h) = (0, 0, params.resolution);
+        candidates::check(spheres, params, limits)?;
+        for lattice in lattices {
+            let counts = check_work(lattice, params, limits, control)?;
+            bricks += counts.reached;
+            pairs += counts.candidates;
+        }
+        let (grid_points, limit) = (512 * bricks, limits.max_grid_points);
+        if grid_points > limit {
+            // Each part fits the limit, but not all parts together.
+            let suggested_resolution = slightly_coarser(h * (grid_points as f64 / limit as f64).cbrt());
+            return Err(SurfaceError::GridTooLarge { grid_points, limit, resolution: h, suggested_resolution });
+        }
+        let area = self.area(COARSE_FACTOR * h, choice, control)?;
+        let vertices = n_vertices(area, h);
+        let triangles = 2 * vertices;
+        let bytes = params.mesh_bytes(vertices, triangles);
+        // Limits count parts before quantizing.
+        let in_memory = if lattices.len() > 1 { self.unquantized().mesh_bytes(vertices, triangles) } else { bytes };
+        if in_memory > limits.max_mesh_bytes {
+            return Err(scan::too_large(in_memory, h, limits.max_mesh_bytes));
+        }
+        Ok(MeshEstimate { bricks, grid_points, pairs, area, vertices, triangles, bytes })
+    }
+
+    fn unquantized(&self) -> SurfaceParams {
+        SurfaceParams { atom_ids: false, quantize: None, ..self.params.clone() }
+    }
+
+    /// Returns the area of a coarser mesh, Å².
+    fn area(&self, coarse: f64, choice: &Choice<'_>, control: &Control<'_>) -> Result<f64, SurfaceError> {
+        let (spheres, limits, single) = (self.spheres, self.limits, self.unquantized());
+        let resolution = coarse.clamp(MIN_COARSE_SPACING, MAX_RESOLUTION).max(single.resolution);
+        let coarse = SurfaceParams { resolution, ..single.clone() };
+        let control = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+        let mut output = match choice.backend.run(spheres, &coarse, limits, &control) {
+            // A coarse grid can miss single small spheres: use the job's grid then.
+            Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, &single, limits, &control)?,
+            output => output?,
+        };
+        Ok(output.measure(&control)?.area)
+    }
+
+    /// Counts the grid points at another spacing.
+    fn grid_points(&self, resolution: f64, control: &Control<'_>) -> Result<u64, SurfaceError> {
+        let (params, limits) = (SurfaceParams { resolution, ..self.params.clone() }, self.limits);
+        // The limit of candidate pairs applies to each part.
+        let counted = parts::spheres_of(self.spheres, self.parts).map(|own| {
+            candidates::check(&own, &params, limits)?;
+            let _lattice = control.reserve(LATTICE_BYTES * own.len() as u64)?;
+            let lattice = Lattice::new(&own, &params)?;
+            Ok(512 * count(&lattice, limits, control)?.reached)
+        });
+        counted.sum()
+    }
 }
 
 /// Maximum number of grids that [`with_finest_fit`] plans.
-const MAX_PLANS: u32 = 6;
+const MAX_PLANS: u32 = 8;
 /// Factor by which the spacing grows if it does not fit all parts.
 const COARSER: f64 = 1.5;
+/// Spacing of the mesh that gives the area for a suggestion, as a multiple of the suggested spacing.
+const SKETCH_FACTOR: f64 = 4.0;
+/// Margin of the estimated size of a mesh that must fit.
+const SIZE_MARGIN: f64 = 1.3;
 
-/// Replaces the suggested spacing of [`SurfaceError::GridTooLarge`], which is an upper bound, with the finest hundredth
-/// of an Å whose planned grid fits.
+/// Replaces the suggested spacing of an error about the grid or about candidate pairs with the finest hundredth of an Å
+/// whose planned grid fits all limits. A mesh of that spacing fits as well.
 pub(super) fn with_finest_fit(
-    error: SurfaceError,
-    spheres: &Spheres,
-    parts: Option<&[AtomPart]>,
-    params: &SurfaceParams,
-    limits: &SurfaceLimits,
+    mut error: SurfaceError,
+    plan: &MeshPlan<'_>,
+    choice: &Choice<'_>,
     control: &Control<'_>,
 ) -> SurfaceError {
-    let SurfaceError::GridTooLarge { samples, limit, resolution, suggested_resolution: bound } = error else {
-        return error;
+    let bound = match &error {
+        SurfaceError::GridTooLarge { suggested_resolution, .. } => Some(*suggested_resolution),
+        SurfaceError::TooManyCandidates { suggested_resolution, .. } => *suggested_resolution,
+        _ => return error,
     };
-    let samples_at = |spacing: f64| {
-        let params = SurfaceParams { resolution: spacing, ..params.clone() };
-        let counted = parts::spheres_of(spheres, parts).map(|own| {
-            let lattice = Lattice::new(&own, &params)?;
-            Ok(512 * Occupancy::new(&lattice, limits, control)?.n_reached())
-        });
-        counted.sum::<Result<u64, SurfaceError>>()
+    let found = bound.map(|bound| finest_fit(bound, plan, choice, control)).transpose();
+    let fits = match found {
+        Ok(fits) => fits.flatten(),
+        Err(ends) => return ends,
     };
-    let (mut fits, mut next) = (None, bound);
+    match &mut error {
+        // A backend may need more than the plan. Its own suggestion is then the coarser one.
+        SurfaceError::GridTooLarge { suggested_resolution, resolution, .. } => {
+            *suggested_resolution = match fits {
+                Some(fits) if fits <= *resolution => *suggested_resolution,
+                fits => fits.unwrap_or(f64::INFINITY),
+            };
+        }
+        SurfaceError::TooManyCandidates { suggested_resolution, .. } => *suggested_resolution = fits,
+        _ => {}
+    }
+    error
+}
+
+/// Returns the finest spacing that fits, beginning at `bound`, if one is found.
+fn finest_fit(
+    bound: f64,
+    plan: &MeshPlan<'_>,
+    choice: &Choice<'_>,
+    control: &Control<'_>,
+) -> Result<Option<f64>, SurfaceError> {
+    // The spheres of one part at a time.
+    let part_bytes = plan.parts.map_or(0, |_| super::SPHERE_BYTES * plan.spheres.len() as u64);
+    let _spheres = control.reserve(part_bytes)?;
+    let limit = plan.limits.max_grid_points;
+    let (mut fits, mut next) = (None, bound.min(MAX_RESOLUTION));
     for _ in 0..MAX_PLANS {
-        match samples_at(next) {
+        let coarser = match plan.grid_points(next, control) {
             Ok(needed) if needed <= limit => {
                 fits = Some(next);
+                // The arcs of a solvent-excluded surface are not counted here.
+                if plan.params.surface == SurfaceKind::Ses {
+                    break;
+                }
                 // The bricks of a finer grid cover less volume, so the grid at this spacing fits as well.
                 let finer = (next * (needed as f64 / limit as f64).cbrt() * 100.0).ceil() / 100.0;
                 if finer >= next {
                     break;
                 }
                 next = finer;
+                continue;
             }
-            Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)) => return error,
-            // The bound comes from one part and may be too fine for all parts.
-            _too_large if parts.is_some() && fits.is_none() && next < MAX_RESOLUTION => {
-                next = (COARSER * next).min(MAX_RESOLUTION);
-            }
-            _too_large => break,
+            Err(error) if ends_work(&error) => return Err(error),
+            _too_large if fits.is_some() => break,
+            // This bound comes from the grid, that one from the pairs: both limits apply.
+            Err(error) => error.suggested_resolution().filter(|coarser| *coarser > next),
+            Ok(_) => None,
+        };
+        // The bounds come from one part and may be too fine for all parts.
+        let coarser = coarser.or_else(|| plan.parts.map(|_| COARSER * next));
+        match coarser.map(|coarser| coarser.min(MAX_RESOLUTION)) {
+            Some(coarser) if coarser > next => next = coarser,
+            _ => break,
         }
     }
-    // The bound ends at the coarsest spacing, which need not fit.
-    let unknown = parts.is_some() || bound >= MAX_RESOLUTION;
-    let suggested_resolution = fits.unwrap_or(if unknown { f64::INFINITY } else { bound });
-    SurfaceError::GridTooLarge { samples, limit, resolution, suggested_resolution }
+    fits.map(|fits| with_fitting_mesh(fits, plan, choice, control)).transpose()
 }
 
-/// Returns the area of a mesh, Å².
-fn area(mesh: &Mesh) -> f64 {
-    let corner = |i: u32| glam::Vec3::from(mesh.positions[i as usize]);
-    let doubled = |t: &[u32; 3]| {
-        let [a, b, c] = t.map(corner);
-        f64::from((b - a).cross(c - a).length())
+/// Returns `spacing`, or a coarser one at which the mesh fits its limit as well.
+fn with_fitting_mesh(
+    spacing: f64,
+    plan: &MeshPlan<'_>,
+    choice: &Choice<'_>,
+    control: &Control<'_>,
+) -> Result<f64, SurfaceError> {
+    let (params, limit) = (plan.params, plan.limits.max_mesh_bytes);
+    let exceeds = |area: f64| {
+        let vertices = n_vertices(area, spacing);
+        let bytes = params.mesh_bytes(vertices, vertices.saturating_mul(2));
+        (bytes > limit || control.memory.check(bytes).is_err()).then_some(bytes)
     };
-    0.5 * mesh.triangles.iter().map(doubled).sum::<f64>()
+    if exceeds(plan.spheres.area(params)).is_none() {
+        return Ok(spacing);
+    }
+    let coarse = MeshPlan { params: &SurfaceParams { resolution: spacing, ..params.clone() }, ..*plan };
+    let area = match coarse.area(SKETCH_FACTOR * spacing, choice, control) {
+        Err(error) if ends_work(&error) => return Err(error),
+        area => area.unwrap_or(0.0),
+    };
+    let Some(bytes) = exceeds(SIZE_MARGIN * area) else { return Ok(spacing) };
+    let limit = limit.min(control.memory.available());
+    Ok(slightly_coarser(spacing * (bytes as f64 / limit as f64).sqrt()).min(MAX_RESOLUTION))
 }
 
 #[cfg(test)]
@@ -239,7 +400,7 @@ mod tests {
             let estimate = estimate(read, &job, &limits, &choice, &control).unwrap();
             let report = run(SAMPLE, &job, &limits, &choice, &control, &(), None).unwrap().report;
             let mesh = estimate.mesh.unwrap();
-            assert_eq!((mesh.samples, estimate.atoms), (report.samples, report.atoms));
+            assert_eq!((mesh.grid_points, estimate.atoms), (report.grid_points, report.atoms));
             let ratio = mesh.triangles as f64 / report.triangles as f64;
             assert!((0.8..1.25).contains(&ratio), "{resolution}: {ratio}");
         }
@@ -284,10 +445,10 @@ mod tests {
     fn the_finest_spacing_that_fits_is_suggested() {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
-        let suggested = |resolution: f64, max_samples: u64| {
+        let suggested = |resolution: f64, max_grid_points: u64| {
             let text = resolution.to_string();
             let job = params::parse([("resolution", text.as_str())]).unwrap().job;
-            let surface = SurfaceLimits { max_samples, ..SurfaceLimits::default() };
+            let surface = SurfaceLimits { max_grid_points, ..SurfaceLimits::default() };
             let limits = JobLimits { surface, ..JobLimits::default() };
             let refused = run(SAMPLE, &job, &limits, &choice, &Control::default(), &(), None).map(drop);
             let planned = estimate(read, &job, &limits, &choice, &Control::default()).unwrap().mesh.map(drop);

@@ -22,7 +22,10 @@ impl Product {
     pub fn file(&self, format: Format) -> Result<File<'_>, FormatError> {
         match &self.picture {
             Some(picture) if format.is_picture() => Ok(File::Picture(picture)),
-            _ => Ok(File::Mesh(Encoder::new(format, self.storage, &self.mesh, &self.meta())?)),
+            _ => {
+                let (mesh, meta) = (&self.mesh, self.meta());
+                Ok(File::Mesh(Encoder::with_bounds(format, self.storage, mesh, self.bounds, &meta)?))
+            }
         }
     }
 }
@@ -54,6 +57,54 @@ impl File<'_> {
         match self {
             Self::Mesh(encoder) => encoder.write(out),
             Self::Picture(bytes) => out.write_all(bytes).and_then(|()| out.flush()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::{Choice, JobLimits, params, run};
+    use crate::surface::mesh::joined_bounds;
+    use crate::surface::{Control, CpuBackend};
+
+    fn written(product: &Product, format: Format) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        product.file(format).unwrap().write(&mut bytes).unwrap();
+        bytes
+    }
+
+    #[test]
+    fn delivered_bounds_are_exact_and_used() {
+        let backend = CpuBackend::new(Some(2)).unwrap();
+        let choice = Choice { backend: &backend, reason: "" };
+        let cases: [&[(&str, &str)]; 6] = [
+            &[],
+            &[("compress", "quantize")],
+            &[("surface", "ses"), ("atom_ids", "true")],
+            &[("max_triangles", "5000")],
+            &[("split", "residue-group"), ("select", "all")],
+            &[("split", "residue-group"), ("select", "all"), ("compress", "quantize")],
+        ];
+        for pairs in cases {
+            let job = params::parse(pairs.iter().copied()).unwrap().job;
+            let sample = include_bytes!("../../samples/4pti.pdb");
+            let product = run(sample, &job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
+            let [low, high] = product.bounds.unwrap();
+            assert_eq!([low, high], product.mesh.bounds(), "{pairs:?}");
+            for part in &product.mesh.parts {
+                let positions = part.vertices.clone().map(|v| [product.mesh.position(v); 2]);
+                assert_eq!(Some(part.bounds), positions.reduce(joined_bounds), "{pairs:?}: {}", part.name);
+            }
+            let scanned = Product { bounds: None, ..product.clone() };
+            let mut other = Product { bounds: Some([low, high.map(|v| 0.5 * v)]), ..product.clone() };
+            other.mesh.parts.iter_mut().for_each(|part| part.bounds[0] = [0.0; 3]);
+            for format in [Format::Glb, Format::Gltf] {
+                let expected = written(&scanned, format);
+                assert!(written(&product, format) == expected, "{pairs:?}");
+                // Negative control: other bounds would be in the file.
+                assert!(written(&other, format) != expected, "{pairs:?}");
+            }
         }
     }
 }

@@ -1,8 +1,8 @@
 //! Search for the finest spacing whose mesh does not exceed a number of triangles.
 //!
-//! The number of triangles is approximately proportional to the inverse square of the spacing: finer grids find more
-//! surface, and narrow necks close or open. The search therefore computes meshes and counts their triangles. The number
-//! of meshes is bounded, and the first one is coarse, so it is cheap.
+//! The number of triangles is only approximately proportional to the inverse square of the spacing: finer grids resolve
+//! more of the surface, and narrow necks close or open. The search therefore computes meshes and counts their
+//! triangles. The number of meshes is bounded, and the first one is coarse, so its time is short.
 
 use std::sync::Arc;
 
@@ -20,7 +20,7 @@ const MAX_TRIES: u32 = 8;
 const TRIES_BEFORE_COARSEST: u32 = 4;
 /// Fraction of the limit from which a mesh is fine enough.
 const FULL: f64 = 0.95;
-/// Fraction of the limit that the search aims at. It is below 1, as the power law is not exact.
+/// Target of the search as a fraction of the limit. It is below 1 because the power law is not exact.
 const AIM: f64 = 0.98;
 /// Spacing of a first, coarse mesh as a multiple of the expected spacing.
 pub(super) const COARSE_FACTOR: f64 = 2.0;
@@ -207,8 +207,8 @@ pub(super) fn mesh(
         let made = unless_empty(clock.pass(|| backend.run(spheres, &params, limits, &control)))?;
         let by = made.as_ref().map(|m| m.made_by.as_ref().map_or(backend.name(), |s| s.backend));
         if by.is_some() && made_by.is_some() && by != made_by {
-            // Counts of different backends may differ slightly, and with them the spacing. The content key names one
-            // backend, so all counts must come from it.
+            // The counts of different backends, and therefore the spacing, may differ slightly. The content key names
+            // one backend, so all counts must come from it.
             if std::mem::replace(&mut restarted, true) {
                 return Err(SurfaceError::Device {
                     why: "different backends ran during the search for the grid spacing".into(),

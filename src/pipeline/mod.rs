@@ -1,4 +1,4 @@
-//! Complete run of one job: structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
+//! Complete run of one job, from a structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
 mod auto;
 mod clock;
@@ -35,7 +35,7 @@ pub use parts::PartReport;
 pub use progress::Tracker;
 pub use report::{AssemblyReport, ComponentReport, PictureReport, Quantization, Report, VoidReport, maker};
 pub use spacing::Spacing;
-pub use work::{estimate_work, mesh_work};
+pub use work::{estimate_atoms, estimate_work, mesh_work};
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureLimits, PictureParams};
@@ -44,10 +44,14 @@ use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, Validation, lattice,
 };
-use parts::PartsBackend;
+use color::{MeshColors, Scheme};
+use estimate::MeshPlan;
 use report::Counts;
 
-/// Parameters of a job: the surface, and how the mesh is stored.
+/// Number of atom indices that are converted between two checks for cancellation.
+const IDS_PER_CHECK: usize = 1 << 20;
+
+/// Parameters of a job: selection, surface, and storage of the mesh.
 #[derive(Debug, Clone, Default)]
 pub struct Job {
     /// Selection of atoms.
@@ -83,13 +87,14 @@ impl Job {
 
     /// Returns true if the nearest atom of every vertex must be found, for its index or its colour.
     fn needs_atoms(&self) -> bool {
-        self.params.atom_ids || self.color.is_some()
+        self.params.atom_ids || self.color.is_some_and(|color| !matches!(color.scheme, Scheme::Vertex(_)))
     }
 
     /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
     /// on triangles, parts and pictures need the whole mesh in memory.
     fn can_stream(&self) -> bool {
-        !self.needs_atoms()
+        !self.params.atom_ids
+            && self.color.is_none()
             && self.validation == Validation::Checksum
             && self.spacing.max_triangles().is_none()
             && self.split == Split::None
@@ -135,6 +140,8 @@ pub struct Choice<'a> {
 pub struct Product {
     /// Mesh.
     pub mesh: Mesh,
+    /// Lowest and highest position of `mesh` relative to its centre, per axis, if the backend delivered them, Å.
+    pub bounds: Option<[[f32; 3]; 2]>,
     /// Encoding in a file.
     pub storage: Storage,
     /// Report of the job.
@@ -192,8 +199,8 @@ impl From<PictureError> for JobError {
     }
 }
 
-/// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh. The observer of
-/// `control` is not used; `progress` is. Memory of the product stays added to the meter of `control`.
+/// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh. Reports to
+/// `progress`, not to the observer of `control`. The memory of the product stays added to the meter of `control`.
 ///
 /// With a `sink`, the mesh is streamed into it as GLB unless the job needs the whole mesh in memory.
 /// [`Product::streamed_bytes`] is set then.
@@ -230,11 +237,11 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let clock = StageClock::new(progress);
     let control = Control { observer: &clock, ..control.clone() };
     let (structure, selected, spheres) = load(read, job, &limits.read, &clock, &control)?;
-    let colors = Colors::new(&structure, &selected, job, &control)?;
+    let colors =
+        job.color.map(|coloring| MeshColors::new(&structure, &selected.atoms, coloring, &control)).transpose()?;
     let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
-    let divided = parts.as_deref().map(|parts| PartsBackend::new(choice.backend, parts));
-    let backend = divided.as_ref().map_or(choice.backend, |divided| divided as &dyn Backend);
-    let choice = &Choice { backend, reason: choice.reason };
+    let backend = parts::divided(choice.backend, parts.as_deref());
+    let choice = &Choice { backend: &*backend, reason: choice.reason };
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -248,19 +255,27 @@ pub fn run_with<S: Deref<Target = Structure>>(
             sink.set_storage(storage);
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
-        let written = clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink));
-        let explain =
-            |error| estimate::with_finest_fit(error, &spheres, parts.as_deref(), &params, &limits.surface, &control);
-        (written.map_err(explain)?, None, storage)
+        let plan = MeshPlan { spheres: &spheres, parts: parts.as_deref(), params: &params, limits: &limits.surface };
+        let checked = if sink.is_none() { estimate::check_memory(&plan, job, choice, &control) } else { Ok(()) };
+        let write = |()| clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink));
+        let written = checked.and_then(write);
+        (written.map_err(|error| estimate::with_finest_fit(error, &plan, choice, &control))?, None, storage)
     };
     let [n_vertices, n_triangles] = output.size();
-    let MeshOutput { mut mesh, streamed, grid, measures, made_by, .. } = output;
-    if let Some(Colors { of_spheres, .. }) = &colors {
-        clock.time("color", || color(&mut mesh, of_spheres, job.params.atom_ids, &control))?;
+    let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
+    let color = |colors: MeshColors| clock.time("color", || colors.apply(&mut mesh, params.resolution, &control));
+    let color = colors.map(color).transpose()?;
+    if !job.params.atom_ids {
+        mesh.atom_ids = None;
     }
     if let Some(ids) = &mut mesh.atom_ids {
         // Convert indices of spheres to indices of atoms in the file.
-        ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
+        for (n, id) in ids.iter_mut().enumerate() {
+            if n.is_multiple_of(IDS_PER_CHECK) {
+                control.check()?;
+            }
+            *id = selected.atoms[*id as usize];
+        }
     }
     let measures = match measures {
         Some(measures) if measures.validation == job.validation => measures,
@@ -275,9 +290,9 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
-    report.color = colors.map(|colors| colors.report);
+    report.color = color;
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
-    let mut product = Product { mesh, storage, report, picture: None, streamed_bytes: None };
+    let mut product = Product { mesh, bounds, storage, report, picture: None, streamed_bytes: None };
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
         let clock = StageClock::new(progress);
         let finish = || sink.finish(&product.meta(), centre, streamed.bounds);
@@ -298,42 +313,6 @@ fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage 
     Storage { packing, normals: job.normals, units: job.units }
 }
 
-/// Colours of a job.
-struct Colors {
-    /// Colour of each sphere.
-    of_spheres: Vec<[u8; 4]>,
-    report: ColorReport,
-}
-
-impl Colors {
-    /// Returns the colours of the selected atoms; `None` if the job has none.
-    fn new(
-        structure: &Structure,
-        selected: &Selected,
-        job: &Job,
-        control: &Control<'_>,
-    ) -> Result<Option<Self>, JobError> {
-        let Some(coloring) = &job.color else { return Ok(None) };
-        control.memory.grow(COLOR_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
-        let colors = AtomColors::new(structure, &selected.atoms, coloring)?;
-        let of_spheres = selected.atoms.iter().map(|&i| colors.of(i as usize)).collect();
-        Ok(Some(Self { of_spheres, report: colors.report(&selected.atoms) }))
-    }
-}
-
-/// Sets the colours of the vertices from their nearest spheres, which are kept only if `keep_atoms`.
-fn color(mesh: &mut Mesh, of_spheres: &[[u8; 4]], keep_atoms: bool, control: &Control<'_>) -> Result<(), SurfaceError> {
-    control.check()?;
-    control.memory.grow(COLOR_BYTES * mesh.n_vertices() as u64)?;
-    mesh.colors = mesh.atom_ids.as_deref().map(|ids| color::of_vertices(of_spheres, ids));
-    if !keep_atoms {
-        mesh.atom_ids = None;
-    }
-    Ok(())
-}
-
-/// Memory of a colour, bytes.
-const COLOR_BYTES: u64 = 4;
 /// Memory of selecting, bytes per atom of the structure.
 const INDEX_BYTES: u64 = 8;
 /// Memory of a sphere, bytes.

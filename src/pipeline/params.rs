@@ -1,7 +1,7 @@
-//! Parser of job parameters. One table of names, descriptions and ranges serves the query of the HTTP service,
-//! `/v1/capabilities` and the command line.
+//! Parser of job parameters: converts pairs of names and values to a validated [`Job`].
 //!
-//! Input: pairs of names and values. Output: a validated [`Job`]. The module depends on neither HTTP nor flags.
+//! The query of the HTTP service, `/v1/capabilities` and the command line use one table of names, descriptions and
+//! ranges. The module depends on neither HTTP nor flags.
 
 mod table;
 
@@ -13,7 +13,7 @@ use thiserror::Error;
 use table::flag;
 pub use table::{Domain, Parameter, TABLE, usual_range};
 
-use super::color::{Coloring, Palette, Scheme};
+use super::color::{ColorBlend, Coloring, Palette, Scheme};
 use super::nearest::nearest;
 use super::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use super::{Job, Spacing};
@@ -79,7 +79,7 @@ pub struct Request {
 /// with another one.
 pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V)>) -> Result<Request, ParamError> {
     let mut seen = [false; TABLE.len()];
-    let mut values = Values::default();
+    let mut values = ParsedValues::default();
     let mut spacing = None;
     for (name, value) in pairs {
         let (name, value) = (name.as_ref(), value.as_ref());
@@ -93,8 +93,8 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         if value.len() > MAX_VALUE_BYTES {
             return Err(parameter.bad_value(value, format!("at most {MAX_VALUE_BYTES} bytes")));
         }
-        // A default conflicts with nothing, since clients may send every default. An explicit format still overrides
-        // `Accept`.
+        // A default value conflicts with no other parameter, because clients may send all defaults. An explicit format
+        // still overrides `Accept`.
         if parameter.name != "format" && parameter.is_default(value) {
             continue;
         }
@@ -106,7 +106,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         }
     }
     let color = values.coloring()?;
-    let Values { options, selection, mut request, .. } = values;
+    let ParsedValues { options, selection, mut request, .. } = values;
     request.job = Job { selection, params: SurfaceParams::new(&options)?, color, ..request.job };
     if let Some(format) = request.format {
         set_format(&mut request.job, format)?;
@@ -188,19 +188,20 @@ impl From<SurfaceError> for ParamError {
 
 /// Values of the parameters that are parsed so far.
 #[derive(Default)]
-struct Values {
+struct ParsedValues {
     options: SurfaceOptions,
     selection: Selection,
     scheme: Option<Scheme>,
     palette: Option<Palette>,
     color_range: Option<[f64; 2]>,
+    color_blend: ColorBlend,
     request: Request,
 }
 
-impl Values {
-    /// Combines `color`, `palette` and `color_range`.
+impl ParsedValues {
+    /// Combines `color`, `palette`, `color_range` and `color_blend`.
     fn coloring(&self) -> Result<Option<Coloring>, ParamError> {
-        let Self { scheme, palette, color_range: range, .. } = *self;
+        let Self { scheme, palette, color_range: range, color_blend: blend, .. } = *self;
         let has_numbers = scheme.is_some_and(|scheme| scheme.palette().is_some());
         let unused = match (palette, range) {
             (Some(palette), _) => Some(("palette", palette.name().to_owned())),
@@ -210,10 +211,14 @@ impl Values {
         if let Some((name, value)) = unused.filter(|_| !has_numbers) {
             let shown = scheme.map_or("none".to_owned(), |scheme| scheme.to_string());
             let expected =
-                format!("no value with color={shown}, or color=bfactor, occupancy, hydrophobicity or charge");
+                format!("no value with color={shown}, or a scheme with numbers: color={}", Scheme::with_numbers());
             return Err(ParamError::BadValue { name, value: format!("`{value}`"), expected });
         }
-        Ok(scheme.map(|scheme| Coloring { scheme, palette, range }))
+        if blend == ColorBlend::Smooth && scheme.is_none() {
+            let expected = format!("{} without colours, or a value of color", ColorBlend::Nearest.name());
+            return Err(ParamError::BadValue { name: "color_blend", value: format!("`{}`", blend.name()), expected });
+        }
+        Ok(scheme.map(|scheme| Coloring { scheme, palette, range, blend }))
     }
 
     /// Returns the picture parameters of the job. The first call creates them.
@@ -257,6 +262,7 @@ impl Values {
             "color" if text == "none" => self.scheme = None,
             "color" => self.scheme = Some(text.parse().ok().ok_or_else(bad)?),
             "palette" => self.palette = Some(named(&Palette::ALL, Palette::name, text).ok_or_else(bad)?),
+            "color_blend" => self.color_blend = named(&ColorBlend::ALL, ColorBlend::name, text).ok_or_else(bad)?,
             "color_range" => self.color_range = Some(range(text).ok_or_else(bad)?),
             "model" => self.selection.model = Some(text.trim().parse().ok().ok_or_else(bad)?),
             "chains" => {
@@ -324,7 +330,7 @@ fn one_char(text: &str) -> Option<char> {
 /// key.
 #[must_use]
 pub fn canonical(job: &Job) -> String {
-    // Destructured, so that a new field must be added here.
+    // Destructured, so that the compiler requires every new field here.
     let Job { selection, params, split, spacing, validation, compress, normals, units, color, picture } = job;
     let Selection { model, chains, atoms, altloc, assembly } = selection;
     let SurfaceParams {

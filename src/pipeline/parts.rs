@@ -1,6 +1,7 @@
-//! Meshes each part of the atoms on its own and joins the meshes into one, which records the rows of each part.
+//! Backend that meshes each part of the atoms separately and joins the meshes. The joined mesh records the rows of each
+//! part.
 //!
-//! Grids are aligned with the origin, so a part has the mesh that its atoms would have alone.
+//! Grids are aligned with the origin, so the mesh of a part does not depend on the other parts.
 
 use std::borrow::Cow;
 use std::ops::Deref;
@@ -15,15 +16,14 @@ use super::work::mesh_work;
 use crate::structure::AtomPart;
 use crate::surface::cpu::scan;
 use crate::surface::lattice::to_f32;
+use crate::surface::mesh::joined_bounds;
 use crate::surface::{
-    Backend, BackendIdentity, Component, Control, DeviceStatus, GridStats, Measures, Mesh, MeshOutput, MeshSink,
-    PartRange, Reservation, Spheres, Stage, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams,
+    Backend, BackendIdentity, Control, DeviceStatus, GridStats, Measures, Mesh, MeshOutput, MeshSink, PartRange,
+    Reservation, Spheres, Stage, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams,
 };
 
 /// Rows per parallel task.
 const ROWS: usize = 1 << 16;
-/// Bytes of a quantized vertex.
-const QUANTIZED_BYTES: u64 = 12;
 
 /// Part of the mesh that is closed on its own.
 #[derive(Debug, Clone, Serialize)]
@@ -46,16 +46,12 @@ pub struct PartReport {
 impl PartReport {
     /// Returns the reports of all parts of `mesh`.
     pub(super) fn all(parts: &[AtomPart], mesh: &Mesh) -> Vec<Self> {
-        let measured = parts.par_iter().zip(&mesh.parts).map(|(part, range)| {
-            let mut whole = Component::default();
-            for triangle in &mesh.triangles[range.triangles.clone()] {
-                whole.add(triangle.map(|v| mesh.position(v as usize).map(f64::from)));
-            }
-            let Component { triangles, area, volume, .. } = whole;
-            let (atoms, vertices) = (part.rows.len() as u64, range.vertices.len() as u64);
-            Self { name: part.name.clone(), atoms, vertices, triangles, area, volume }
-        });
-        measured.collect()
+        let report = |(part, range): (&AtomPart, &PartRange)| {
+            let [vertices, triangles] = [&range.vertices, &range.triangles].map(|rows| rows.len() as u64);
+            let (name, atoms) = (part.name.clone(), part.rows.len() as u64);
+            Self { name, atoms, vertices, triangles, area: range.area, volume: range.volume }
+        };
+        parts.iter().zip(&mesh.parts).map(report).collect()
     }
 }
 
@@ -68,35 +64,40 @@ pub(super) fn spheres_of<'s>(
     whole.into_iter().chain(parts.unwrap_or_default().iter().map(|part| Cow::Owned(spheres.subset(&part.rows))))
 }
 
+/// Returns `backend` or, with `parts`, a backend that meshes each part on it.
+pub(super) fn divided<'a>(backend: &'a dyn Backend, parts: Option<&'a [AtomPart]>) -> AnyBackend<'a> {
+    let inner = AnyBackend::Borrowed(backend);
+    match parts {
+        Some(parts) => AnyBackend::Owned(Box::new(PartsBackend { inner, parts })),
+        None => inner,
+    }
+}
+
 /// Backend that meshes each part on another backend and joins the meshes.
-pub(super) struct PartsBackend<'a> {
-    inner: Inner<'a>,
+struct PartsBackend<'a> {
+    /// The chosen backend, or the one that it assigned to the job.
+    inner: AnyBackend<'a>,
     parts: &'a [AtomPart],
 }
 
-/// Backend that meshes the parts: the chosen one, or the one that it assigned to the job.
-enum Inner<'a> {
-    Chosen(&'a dyn Backend),
-    Assigned(Box<dyn Backend + 'a>),
+/// Borrowed or owned backend.
+pub(super) enum AnyBackend<'a> {
+    Borrowed(&'a dyn Backend),
+    Owned(Box<dyn Backend + 'a>),
 }
 
-impl<'a> Deref for Inner<'a> {
+impl<'a> Deref for AnyBackend<'a> {
     type Target = dyn Backend + 'a;
 
     fn deref(&self) -> &Self::Target {
         match self {
-            Self::Chosen(backend) => *backend,
-            Self::Assigned(backend) => backend.as_ref(),
+            Self::Borrowed(backend) => *backend,
+            Self::Owned(backend) => backend.as_ref(),
         }
     }
 }
 
-impl<'a> PartsBackend<'a> {
-    /// Creates a backend that meshes `parts` of the spheres on `inner`.
-    pub(super) fn new(inner: &'a dyn Backend, parts: &'a [AtomPart]) -> Self {
-        Self { inner: Inner::Chosen(inner), parts }
-    }
-
+impl PartsBackend<'_> {
     /// Meshes all parts on `backend`. Returns `None` if a fallback meshed some of them.
     fn join(
         &self,
@@ -105,7 +106,7 @@ impl<'a> PartsBackend<'a> {
         run: &Run<'_>,
         control: &Control<'_>,
     ) -> Result<Option<MeshOutput>, SurfaceError> {
-        let mut joined = Joined::new(centre(spheres, run.params));
+        let mut joined = Joined::new(centre(spheres, run.single));
         let observer = control.observer;
         let quiet = WithoutProgress(observer);
         let control = Control { observer: &quiet, ..control.clone() };
@@ -116,21 +117,21 @@ impl<'a> PartsBackend<'a> {
             let meshed = {
                 let _spheres = control.reserve(SPHERE_BYTES * part.rows.len() as u64)?;
                 let own = spheres.subset(&part.rows);
-                backend.run(&own, run.params, &joined.left_of(run.limits), &control)
+                backend.run(&own, run.single, &joined.left_of(run), &control)
             };
             match meshed {
                 Ok(output) if !joined.made_by(output.made_by.as_ref(), backend) => return Ok(None),
-                Ok(output) => joined.push(part, output),
+                Ok(output) => joined.push(part, output, run, &control)?,
                 Err(SurfaceError::NoSurface { .. }) => joined.skip(part),
                 Err(error) => return Err(joined.error(error, run, n_atoms as f64 / spheres.len() as f64)),
             }
             let [n_vertices, n_triangles] = [joined.mesh.n_vertices(), joined.mesh.n_triangles()];
-            scan::check_size(run.params, run.limits, n_vertices as u64, n_triangles as u64)?;
+            scan::check_size(run.single, run.limits, n_vertices as u64, n_triangles as u64)?;
             for stage in [Stage::Field, Stage::Emit] {
                 observer.progress(stage, n_atoms, spheres.len());
             }
         }
-        joined.finish(run.params).map(Some)
+        joined.finish(run.single).map(Some)
     }
 }
 
@@ -151,8 +152,8 @@ impl Backend for PartsBackend<'_> {
         self.inner.describe()
     }
 
-    fn makes(&self, surface: SurfaceKind) -> bool {
-        self.inner.makes(surface)
+    fn supports(&self, surface: SurfaceKind) -> bool {
+        self.inner.supports(surface)
     }
 
     fn devices(&self) -> Vec<DeviceStatus> {
@@ -160,12 +161,11 @@ impl Backend for PartsBackend<'_> {
     }
 
     fn for_job(&self, surface: SurfaceKind, work: f64) -> Option<Box<dyn Backend + '_>> {
-        let inner = Inner::Assigned(self.inner.for_job(surface, work)?);
+        let inner = AnyBackend::Owned(self.inner.for_job(surface, work)?);
         Some(Box::new(PartsBackend { inner, parts: self.parts }))
     }
 
-    /// Limits apply to all parts together. The mesh is quantized after joining, because all parts have the same centre
-    /// and step.
+    /// Limits apply to all parts together, before quantizing.
     fn write(
         &self,
         spheres: &Spheres,
@@ -177,14 +177,12 @@ impl Backend for PartsBackend<'_> {
         let work = self.parts.iter().map(|part| mesh_work(part.rows.len() as f64, params.resolution)).sum();
         let assigned = self.inner.for_job(params.surface, work);
         let backend = assigned.as_deref().unwrap_or(&*self.inner);
-        let run = Run { params: &SurfaceParams { quantize: None, ..params.clone() }, limits };
+        let run = Run { params, single: &SurfaceParams { quantize: None, ..params.clone() }, limits };
         // The content key names one backend. If it fails after some parts, the fallback meshes all parts again.
         for _attempt in 0..2 {
             let memory = Arc::new(Reservation::new(&control.memory));
             let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
             if let Some(output) = self.join(backend, spheres, &run, &metered)? {
-                let rounded = if params.quantize.is_some() { QUANTIZED_BYTES * output.size()[0] as u64 } else { 0 };
-                let _rounding = control.reserve(rounded)?;
                 memory.keep();
                 return output.deliver(params, control, sink);
             }
@@ -196,6 +194,8 @@ impl Backend for PartsBackend<'_> {
 /// Parameters and limits of all parts.
 struct Run<'a> {
     params: &'a SurfaceParams,
+    /// The parameters without quantizing: all parts are quantized relative to the centre of the joined mesh.
+    single: &'a SurfaceParams,
     limits: &'a SurfaceLimits,
 }
 
@@ -210,8 +210,8 @@ fn centre(spheres: &Spheres, params: &SurfaceParams) -> [f64; 3] {
 struct Joined {
     mesh: Mesh,
     grid: GridStats,
-    /// Measures of the parts; `None` if a part was not measured.
-    measures: Option<Vec<Measures>>,
+    /// Measures of the parts.
+    measures: Vec<Measures>,
     made_by: Option<BackendIdentity>,
     backend: Option<&'static str>,
 }
@@ -219,7 +219,7 @@ struct Joined {
 impl Joined {
     fn new(centre: [f64; 3]) -> Self {
         let mesh = Mesh { centre, ..Mesh::default() };
-        Self { mesh, grid: GridStats::default(), measures: Some(Vec::new()), made_by: None, backend: None }
+        Self { mesh, grid: GridStats::default(), measures: Vec::new(), made_by: None, backend: None }
     }
 
     /// Records the backend of a part. Returns false if it differs from that of the previous parts.
@@ -230,13 +230,29 @@ impl Joined {
     }
 
     /// Adds the mesh of a part.
-    fn push(&mut self, part: &AtomPart, output: MeshOutput) {
-        let MeshOutput { mesh: mut own, grid, measures, .. } = output;
+    fn push(
+        &mut self,
+        part: &AtomPart,
+        mut output: MeshOutput,
+        run: &Run<'_>,
+        control: &Control<'_>,
+    ) -> Result<(), SurfaceError> {
+        let own = &mut output.mesh;
         let shift: [f64; 3] = std::array::from_fn(|k| own.centre[k] - self.mesh.centre[k]);
-        own.positions.par_chunks_mut(ROWS).flatten_iter().for_each(|position| {
-            *position = std::array::from_fn(|k| to_f32(f64::from(position[k]) + shift[k]));
-        });
+        own.centre = self.mesh.centre;
+        let moved = |p: [f32; 3]| std::array::from_fn(|k| to_f32(f64::from(p[k]) + shift[k]));
+        own.positions.par_chunks_mut(ROWS).flatten_iter().for_each(|position| *position = moved(*position));
+        // Moving and rounding keep the order of coordinates.
+        output.bounds = output.bounds.map(|bounds| bounds.map(moved));
+        let components = output.measures.iter_mut().flat_map(|measures| &mut measures.components);
+        components.for_each(|component| component.shift(shift));
         let [first, n] = [self.mesh.n_vertices(), own.n_vertices()];
+        let rounded = run.params.quantize.map_or(0, |_step| run.params.mesh_bytes(n as u64, 0));
+        let _rounding = control.reserve(rounded)?;
+        output = output.deliver(run.params, control, None)?;
+        let measures = output.measure(control)?.clone();
+        let MeshOutput { mesh: mut own, grid, bounds, .. } = output;
+        let bounds = bounds.unwrap_or_else(|| own.bounds());
         // `check_size` has ensured that the indices so far fit 32 bits; the caller checks those of this part next.
         let offset = u32::try_from(first).unwrap_or(u32::MAX);
         let shifted = |v: u32| v.wrapping_add(offset);
@@ -246,40 +262,39 @@ impl Joined {
             ids.par_chunks_mut(ROWS).flatten_iter().for_each(|id| *id = part.rows[*id as usize]);
         }
         let triangles = self.mesh.n_triangles();
-        let range = PartRange {
+        self.mesh.parts.push(PartRange {
             name: part.name.clone(),
             vertices: first..first + n,
             triangles: triangles..triangles + own.n_triangles(),
-        };
-        own.centre = self.mesh.centre;
+            area: measures.area,
+            volume: measures.volume,
+            bounds,
+        });
         self.mesh.append(own);
-        self.mesh.parts.push(range);
+        self.measures.push(measures);
         let all = &mut self.grid;
         all.bricks += grid.bricks;
         all.surface_bricks += grid.surface_bricks;
-        all.samples += grid.samples;
+        all.grid_points += grid.grid_points;
         all.box_cells = all.box_cells.saturating_add(grid.box_cells);
         all.candidates += grid.candidates;
         all.overlaps += grid.overlaps;
-        self.measures = self.measures.take().zip(measures).map(|(mut all, mut measures)| {
-            measures.components.iter_mut().for_each(|component| component.shift(shift));
-            all.push(measures);
-            all
-        });
+        Ok(())
     }
 
     /// Adds a part without a surface.
     fn skip(&mut self, part: &AtomPart) {
         let [vertices, triangles] = [self.mesh.n_vertices(), self.mesh.n_triangles()];
         let name = part.name.clone();
-        self.mesh.parts.push(PartRange { name, vertices: vertices..vertices, triangles: triangles..triangles });
+        let (vertices, triangles) = (vertices..vertices, triangles..triangles);
+        self.mesh.parts.push(PartRange { name, vertices, triangles, ..PartRange::default() });
     }
 
     /// Returns the remaining limits for the next part.
-    fn left_of(&self, limits: &SurfaceLimits) -> SurfaceLimits {
+    fn left_of(&self, Run { single, limits, .. }: &Run<'_>) -> SurfaceLimits {
         SurfaceLimits {
-            max_samples: limits.max_samples.saturating_sub(self.grid.samples),
-            max_mesh_bytes: limits.max_mesh_bytes.saturating_sub(self.mesh.bytes()),
+            max_grid_points: limits.max_grid_points.saturating_sub(self.grid.grid_points),
+            max_mesh_bytes: limits.max_mesh_bytes.saturating_sub(self.bytes(single)),
             // One limit applies to both counts.
             max_candidates: limits.max_candidates.saturating_sub(self.grid.candidates.max(self.grid.overlaps)),
         }
@@ -291,10 +306,14 @@ impl Joined {
         use SurfaceError as E;
         let limit = run.limits.max_candidates;
         match error {
-            E::GridTooLarge { samples, resolution, suggested_resolution, .. } => E::GridTooLarge {
+            E::GridTooLarge { grid_points, resolution, suggested_resolution, .. } => E::GridTooLarge {
                 // The number of grid points of a part that fails is an estimate.
-                samples: self.grid.samples.saturating_add(samples).max(run.limits.max_samples.saturating_add(1)),
-                limit: run.limits.max_samples,
+                grid_points: self
+                    .grid
+                    .grid_points
+                    .saturating_add(grid_points)
+                    .max(run.limits.max_grid_points.saturating_add(1)),
+                limit: run.limits.max_grid_points,
                 resolution,
                 suggested_resolution,
             },
@@ -310,11 +329,16 @@ impl Joined {
             }
             E::MeshTooLarge { bytes, .. } => {
                 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "casts saturate")]
-                let all = (self.mesh.bytes().saturating_add(bytes) as f64 / fraction) as u64;
-                scan::too_large(all, run.params.resolution, run.limits.max_mesh_bytes)
+                let all = (self.bytes(run.single).saturating_add(bytes) as f64 / fraction) as u64;
+                scan::too_large(all, run.single.resolution, run.limits.max_mesh_bytes)
             }
             other => other,
         }
+    }
+
+    /// Returns the size of the mesh so far, as it counts for limits, bytes.
+    fn bytes(&self, params: &SurfaceParams) -> u64 {
+        params.mesh_bytes(self.mesh.n_vertices() as u64, self.mesh.n_triangles() as u64)
     }
 
     /// Returns the mesh of all parts.
@@ -322,7 +346,9 @@ impl Joined {
         if self.mesh.n_triangles() == 0 {
             return Err(SurfaceError::NoSurface { isovalue: params.level() });
         }
-        let measures = self.measures.and_then(Measures::joined);
-        Ok(MeshOutput { measures, made_by: self.made_by, ..MeshOutput::new(self.mesh, self.grid) })
+        let measures = Measures::joined(self.measures);
+        let parts = self.mesh.parts.iter().filter(|part| !part.vertices.is_empty());
+        let bounds = parts.map(|part| part.bounds).reduce(joined_bounds);
+        Ok(MeshOutput { measures, bounds, made_by: self.made_by, ..MeshOutput::new(self.mesh, self.grid) })
     }
 }

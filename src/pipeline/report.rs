@@ -115,7 +115,7 @@ pub struct Report {
     /// Title of the structure; null if the file has none.
     #[cfg_attr(feature = "server", schema(required))]
     pub title: Option<String>,
-    /// Format of the structure file: `pdb`, `mmcif` or `bcif`.
+    /// Format of the structure file: `pdb`, `mmcif`, `bcif`, `pqr` or `xyz`.
     pub source_format: &'static str,
     /// Meshed atoms, including all copies in an assembly.
     pub atoms: u64,
@@ -165,7 +165,7 @@ pub struct Report {
     /// Bricks that contain a part of the surface.
     pub surface_bricks: u64,
     /// Grid points evaluated.
-    pub samples: u64,
+    pub grid_points: u64,
     /// Cells of a dense grid over the bounding box.
     pub box_cells: u64,
     /// Vertices of the mesh.
@@ -289,14 +289,14 @@ impl Report {
             smoothness: gaussian.then_some(params.smoothness),
             bricks: counts.grid.bricks,
             surface_bricks: counts.grid.surface_bricks,
-            samples: counts.grid.samples,
+            grid_points: counts.grid.grid_points,
             box_cells: counts.grid.box_cells,
             vertices: counts.n_vertices as u64,
             triangles: counts.n_triangles as u64,
             closed: measures.closed,
             oriented: measures.oriented,
             manifold: measures.manifold,
-            // A mesh that fails the checksum is not manifold, whatever its vertices.
+            // A mesh that fails the checksum is not manifold, even if its vertices are.
             manifold_from: match measures.validation {
                 Validation::Checksum if measures.manifold => "construction",
                 _ => "check",
@@ -340,8 +340,8 @@ impl Report {
         maker(&self.arithmetic, self.picture.as_ref().map(|picture| picture.arithmetic.as_str()))
     }
 
-    /// Returns the report as the extras of a mesh file, without fields that differ between runs (the same input gives
-    /// the same bytes) or describe the input rather than the mesh.
+    /// Returns the report as the extras of a mesh file. Leaves out fields that differ between runs, because the same
+    /// input gives the same bytes, and fields that describe the input rather than the mesh.
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };

@@ -2,8 +2,8 @@
 
 use crate::surface::SurfaceParams;
 
-/// Finest automatic spacing, Å. Finer grids show the blending of spheres, not more of the molecule. A given spacing may
-/// be finer.
+/// Finest automatic spacing, Å. Finer grids resolve the blending of spheres, but no more details of the molecule. A
+/// given spacing may be finer.
 pub const FINEST: f64 = 0.25;
 /// Coarsest automatic spacing, Å. Coarser grids miss whole atoms.
 pub const COARSEST: f64 = 4.0;
@@ -11,9 +11,9 @@ pub const COARSEST: f64 = 4.0;
 pub const DETAILS: [f64; 7] = [2.0, 1.4, 1.0, 0.7, 0.5, 0.35, FINEST];
 /// Number of atoms up to which [`DETAILS`] applies unchanged.
 pub const DETAIL_ATOMS: f64 = 10_000.0;
-/// Smallest limit on triangles: no closed mesh on a grid has fewer.
+/// Minimum limit on triangles: no closed mesh on a grid has fewer.
 pub const MIN_TRIANGLE_LIMIT: u32 = 8;
-/// Largest limit on triangles.
+/// Maximum limit on triangles.
 pub const MAX_TRIANGLE_LIMIT: u32 = u32::MAX;
 
 /// Approximate surface area per atom, Å²: heavy atoms of a protein with the default parameters.

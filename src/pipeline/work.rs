@@ -7,8 +7,8 @@ use crate::surface::SurfaceKind;
 const BYTES_PER_ATOM: f64 = 90.0;
 /// Approximate compression ratio of structure files.
 const COMPRESSION: f64 = 4.0;
-/// Approximate size ratio of atoms in text and in BinaryCIF. Does not apply to compressed input, whose format is
-/// unknown and where the two differ less.
+/// Approximate ratio of the sizes of atoms in text and in BinaryCIF. It does not apply to compressed input, whose
+/// format is unknown and whose sizes differ less.
 const BINARY: f64 = 5.0;
 /// Approximate bytes of an archive's BinaryCIF that describe columns. The number does not depend on the size of the
 /// entry.
@@ -18,7 +18,7 @@ const MIN_WORK: f64 = 2_000.0;
 /// Time of the search for a spacing, relative to the final mesh. A coarse mesh precedes it, and sometimes a third is
 /// needed.
 const TRIES: f64 = 1.5;
-/// Work of a pixel of a picture, in atoms: 100 ns on one core, where an atom takes 4 µs on two cores.
+/// Work of a pixel of a picture, in atoms: 100 ns on one core. An atom takes 4 µs on two cores.
 const PIXEL: f64 = 0.0125;
 
 /// Estimates the work of meshing, without reading, in atoms at 0.5 Å.
@@ -43,9 +43,9 @@ const fn relative_time(surface: SurfaceKind) -> f64 {
     }
 }
 
-/// Estimates the work of a job, in atoms at 0.5 Å.
+/// Estimates the number of atoms in a structure file from its size.
 #[must_use]
-pub fn estimate_work(input: &[u8], job: &Job) -> f64 {
+pub fn estimate_atoms(input: &[u8]) -> f64 {
     let compressed = input.starts_with(&[0x1f, 0x8b]) || input.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]);
     // First byte of a MessagePack map; no text begins with it.
     let binary = matches!(input.first(), Some(0x80..=0x8F | 0xDE | 0xDF));
@@ -55,18 +55,44 @@ pub fn estimate_work(input: &[u8], job: &Job) -> f64 {
         (false, true) => len.max((len - DESCRIPTION) * BINARY),
         (false, false) => len,
     };
-    let atoms = bytes / BYTES_PER_ATOM;
+    bytes / BYTES_PER_ATOM
+}
+
+/// Estimates the work of a job on a file of about `atoms` atoms, in atoms at 0.5 Å.
+#[must_use]
+pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
     let resolution = job.spacing.expected(&job.params, atoms);
     let mesh = if job.spacing.max_triangles().is_some() { search_work } else { mesh_work };
-    let pixels = job.picture.map_or(0.0, |picture| f64::from(picture.width) * f64::from(picture.height));
     // Reading does not depend on the spacing.
-    0.3 * (atoms + MIN_WORK) + 0.7 * relative_time(job.params.surface) * mesh(atoms, resolution) + PIXEL * pixels
+    0.3 * (atoms + MIN_WORK) + 0.7 * relative_time(job.params.surface) * mesh(atoms, resolution) + drawing(job)
+}
+
+/// Work of a job besides its atoms and its grid, in atoms: about 1 ms.
+const OVERHEAD: f64 = 250.0;
+/// Work per pair of an atom and a brick, per grid point and per vertex, in atoms.
+const COUNTED: [f64; 3] = [0.019, 0.00023, 0.0032];
+
+/// Estimates the work of a job on a file of `atoms` atoms whose numbers of pairs, grid points and vertices are known,
+/// in atoms at 0.5 Å.
+pub(super) fn counted_work(job: &Job, atoms: u64, counts: [u64; 3]) -> f64 {
+    let mesh: f64 = counts.iter().zip(COUNTED).map(|(n, work)| *n as f64 * work).sum();
+    let tries = if job.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
+    OVERHEAD + 0.3 * atoms as f64 + tries * relative_time(job.params.surface) * mesh + drawing(job)
+}
+
+/// Estimates the work of drawing, in atoms at 0.5 Å.
+fn drawing(job: &Job) -> f64 {
+    PIXEL * job.picture.map_or(0.0, |picture| f64::from(picture.width) * f64::from(picture.height))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::pipeline::params;
+
+    fn estimate_work(input: &[u8], job: &Job) -> f64 {
+        super::estimate_work(estimate_atoms(input), job)
+    }
 
     #[test]
     fn finer_larger_and_compressed_inputs_cost_more() {
@@ -86,6 +112,18 @@ mod tests {
         let (text, of) = (vec![b'A'; 90_000], |surface: &str| params::parse([("surface", surface)]).unwrap().job);
         let [gaussian, sas, ses] = ["gaussian", "sas", "ses"].map(|surface| estimate_work(&text, &of(surface)));
         assert!(gaussian < sas && sas < ses, "{gaussian} {sas} {ses}");
+    }
+
+    #[test]
+    fn counted_work_agrees_for_proteins_and_not_for_a_sphere_on_a_fine_grid() {
+        let at = |resolution: &str| params::parse([("resolution", resolution)]).unwrap().job;
+        // 1AON at 0.5 Å.
+        let protein = counted_work(&at("0.5"), 58_870, [1_300_000, 20_000_000, 2_100_000]);
+        assert!((0.5..2.0).contains(&(protein / super::estimate_work(58_870.0, &at("0.5")))), "{protein}");
+        // An atom at 0.02 Å takes tens of milliseconds, 4 µs for each unit.
+        let sphere = counted_work(&at("0.02"), 1, [70_000, 36_000_000, 140_000]);
+        assert!((2e3..2e4).contains(&sphere), "{sphere}");
+        assert!(super::estimate_work(1.0, &at("0.02")) > 100.0 * sphere, "the control");
     }
 
     #[test]

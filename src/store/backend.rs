@@ -30,10 +30,21 @@ use crate::telemetry::STORE_ERRORS;
 const S3_PART: usize = 8 << 20;
 /// Size of a write to a file, bytes: large enough to make waking a thread worthwhile.
 const FILE_PART: usize = 1 << 20;
-/// Folder of the objects of [`Backend::probe`].
-const PROBE: &str = "probe";
+/// Folder of the objects of [`Backend::check`].
+const CHECK: &str = "check";
 
-enum Kind {
+/// Returns the folder of a store in `data_dir`.
+fn folder_of(data_dir: &FilePath) -> PathBuf {
+    data_dir.join("store")
+}
+
+/// Returns the target of the folder of a store in `data_dir`, if the folder is a symbolic link.
+#[must_use]
+pub fn link_of(data_dir: &FilePath) -> Option<PathBuf> {
+    std::fs::read_link(folder_of(data_dir)).ok()
+}
+
+enum StorageKind {
     Local(PathBuf),
     S3(Bucket),
 }
@@ -41,9 +52,9 @@ enum Kind {
 /// Folder or bucket that holds the objects.
 pub(super) struct Backend {
     objects: Arc<dyn ObjectStore>,
-    kind: Kind,
+    kind: StorageKind,
     /// Folder, or URL without credentials, for messages.
-    place: String,
+    location: String,
     /// Time limit of an operation of a folder. The client of S3 has time limits of its own.
     limit: Duration,
 }
@@ -53,16 +64,20 @@ impl Backend {
     pub(super) async fn open(config: &StoreConfig, data_dir: &FilePath) -> Result<Self, StoreError> {
         let limit = Duration::from_millis(config.timeout_ms);
         if let Some(url) = &config.url {
-            let failed = |reason| StoreError::Open { key: "store.url", place: url.clone(), reason };
+            let failed = |reason| StoreError::Open { key: "store.url", location: url.clone(), reason };
             let (objects, bucket) = s3::connect(config, url).map_err(failed)?;
-            let place = url.trim_end_matches('/').to_owned();
-            return Ok(Self { objects, kind: Kind::S3(bucket), place, limit });
+            let location = url.trim_end_matches('/').to_owned();
+            return Ok(Self { objects, kind: StorageKind::S3(bucket), location, limit });
         }
-        let root = data_dir.join("store");
-        let place = root.display().to_string();
+        let root = folder_of(data_dir);
+        if let Some(target) = link_of(data_dir) {
+            let (store, target) = (root.display(), target.display());
+            tracing::warn!(%store, %target, "the folder of the store is a symbolic link; objects are removed at its target");
+        }
+        let location = root.display().to_string();
         let folder = root.clone();
         let opened = spawn_blocking(move || {
-            for name in Folder::ALL.map(Folder::as_str).into_iter().chain([PROBE, QUARANTINE]) {
+            for name in Folder::ALL.map(Folder::as_str).into_iter().chain([CHECK, QUARANTINE]) {
                 create_folder(&folder.join(name)).map_err(|e| e.to_string())?;
             }
             // An earlier process may have died between creating a folder and making it durable.
@@ -72,30 +87,30 @@ impl Backend {
             LocalFileSystem::new_with_prefix(&folder).map(|files| files.with_fsync(true)).map_err(|e| e.to_string())
         });
         let opened = opened.await.unwrap_or_else(|e| Err(e.to_string()));
-        let failed = |reason| StoreError::Open { key: "server.data_dir", place: place.clone(), reason };
-        Ok(Self { objects: Arc::new(opened.map_err(failed)?), kind: Kind::Local(root), place, limit })
+        let failed = |reason| StoreError::Open { key: "server.data_dir", location: location.clone(), reason };
+        Ok(Self { objects: Arc::new(opened.map_err(failed)?), kind: StorageKind::Local(root), location, limit })
     }
 
     /// Creates a backend over a folder with injected behaviour, for tests.
     #[cfg(test)]
     pub(super) fn over(objects: Arc<dyn ObjectStore>, root: PathBuf, config: &StoreConfig) -> Self {
-        let (place, limit) = (root.display().to_string(), Duration::from_millis(config.timeout_ms));
-        Self { objects, kind: Kind::Local(root), place, limit }
+        let (location, limit) = (root.display().to_string(), Duration::from_millis(config.timeout_ms));
+        Self { objects, kind: StorageKind::Local(root), location, limit }
     }
 
     /// Returns the location, for messages.
-    pub(super) fn place(&self) -> &str {
-        &self.place
+    pub(super) fn location(&self) -> &str {
+        &self.location
     }
 
     /// Converts an error to [`StoreError::Open`], with the configuration key of the location.
     pub(super) fn open_error(&self, error: &StoreError) -> StoreError {
         let key = if self.is_local() { "server.data_dir" } else { "store.url" };
-        StoreError::Open { key, place: self.place.clone(), reason: error.to_string() }
+        StoreError::Open { key, location: self.location.clone(), reason: error.to_string() }
     }
 
     pub(super) fn is_local(&self) -> bool {
-        matches!(self.kind, Kind::Local(_))
+        matches!(self.kind, StorageKind::Local(_))
     }
 
     /// Returns the size of a part of a large object, bytes.
@@ -114,7 +129,7 @@ impl Backend {
             return work.await;
         }
         let late = || format!("no answer within {} ms (store.timeout_ms)", self.limit.as_millis());
-        let late = |_elapsed| Err(of_io(io::Error::new(io::ErrorKind::TimedOut, late())));
+        let late = |_elapsed| Err(from_io(io::Error::new(io::ErrorKind::TimedOut, late())));
         timeout(self.limit, work).await.unwrap_or_else(late)
     }
 
@@ -125,14 +140,14 @@ impl Backend {
         at: &str,
         work: impl FnOnce() -> io::Result<T> + Send + 'static,
     ) -> Result<T, StoreError> {
-        let done = async { spawn_blocking(work).await.unwrap_or_else(|e| Err(e.into())).map_err(of_io) };
+        let done = async { spawn_blocking(work).await.unwrap_or_else(|e| Err(e.into())).map_err(from_io) };
         self.timed(done).await.map_err(|error| self.fail(op, at, &error))
     }
 
     /// Classifies and counts an error. `at` is a path relative to the root of the store.
     pub(super) fn fail(&self, op: &'static str, at: &str, error: &(dyn std::error::Error + 'static)) -> StoreError {
         counter!(STORE_ERRORS, "op" => op).increment(1);
-        StoreError::classify(op, &format!("{}/{at}", self.place), error)
+        StoreError::classify(op, &format!("{}/{at}", self.location), error)
     }
 
     /// Returns a function that classifies and counts an error of the object `name`.
@@ -214,12 +229,12 @@ impl Backend {
     }
 
     /// Writes, reads and removes a small object.
-    pub(super) async fn probe(&self) -> Result<(), StoreError> {
+    pub(super) async fn check(&self) -> Result<(), StoreError> {
         static COUNT: AtomicU64 = AtomicU64::new(0);
         // The name is unique per process, because processes may share a store.
         let file = format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
-        let path = Path::from_iter([PROBE, &file]);
-        let fail = |e: object_store::Error| self.fail("probe", path.as_ref(), &e);
+        let path = Path::from_iter([CHECK, &file]);
+        let fail = |e: object_store::Error| self.fail("check", path.as_ref(), &e);
         let written = Bytes::from(file.into_bytes());
         let answered = async {
             self.objects.put(&path, written.clone().into()).await?;
@@ -230,17 +245,17 @@ impl Backend {
         if read == written {
             return Ok(());
         }
-        Err(self.fail("probe", path.as_ref(), &io::Error::other("the bytes read differ from the bytes written")))
+        Err(self.fail("check", path.as_ref(), &io::Error::other("the bytes read differ from the bytes written")))
     }
 
     /// Reads the secret of the store, or creates it.
     pub(super) async fn secret(&self) -> Result<Secret, StoreError> {
         let outcome = match &self.kind {
-            Kind::Local(root) => {
+            StorageKind::Local(root) => {
                 let root = root.clone();
                 self.blocking("secret", "secret", move || secret::in_folder(&root)).await
             }
-            Kind::S3(_) => {
+            StorageKind::S3(_) => {
                 secret::in_bucket(self.objects.as_ref()).await.map_err(|e| self.fail("secret", "secret", &e))
             }
         };
@@ -249,7 +264,7 @@ impl Backend {
 
     /// Returns the free bytes of the disk, 0 if unknown; `None` on S3.
     pub(super) async fn free_bytes(&self) -> Option<u64> {
-        let Kind::Local(root) = &self.kind else { return None };
+        let StorageKind::Local(root) = &self.kind else { return None };
         let root = root.clone();
         Some(self.blocking("free", "", move || Ok(free_bytes(&root))).await.unwrap_or(0))
     }
@@ -257,7 +272,7 @@ impl Backend {
     /// Sets the modification times of objects to their last uses, which the next process reads. S3 has no such
     /// operation.
     pub(super) async fn save_uses(&self, uses: Vec<(Name, SystemTime)>) -> Result<(), StoreError> {
-        let Kind::Local(root) = &self.kind else { return Ok(()) };
+        let StorageKind::Local(root) = &self.kind else { return Ok(()) };
         let root = root.clone();
         let save = move || {
             for (name, used) in uses {
@@ -271,23 +286,23 @@ impl Backend {
         self.blocking("use", "", save).await
     }
 
-    /// Removes leftovers of crashed processes: staged files, unfinished uploads, probes. Returns their number.
+    /// Removes leftovers of crashed processes: staged files, unfinished uploads, checks. Returns their number.
     pub(super) async fn clear_stale(&self, now: SystemTime) -> Result<u64, StoreError> {
-        let fail = |e: object_store::Error| self.fail("clear", PROBE, &e);
-        let listed = self.timed(self.objects.list(Some(&Path::from(PROBE))).try_collect());
-        let probes: Vec<_> = listed.await.map_err(fail)?;
+        let fail = |e: object_store::Error| self.fail("clear", CHECK, &e);
+        let listed = self.timed(self.objects.list(Some(&Path::from(CHECK))).try_collect());
+        let checks: Vec<_> = listed.await.map_err(fail)?;
         let mut removed = 0;
-        for probe in probes.into_iter().filter(|probe| stale::is_stale(probe.last_modified.into(), now)) {
-            found(self.timed(self.objects.delete(&probe.location)).await).map_err(fail)?;
+        for check in checks.into_iter().filter(|check| stale::is_stale(check.last_modified.into(), now)) {
+            found(self.timed(self.objects.delete(&check.location)).await).map_err(fail)?;
             removed += 1;
         }
         let unfinished = match &self.kind {
-            Kind::Local(root) => {
+            StorageKind::Local(root) => {
                 let folders: Vec<_> =
-                    Folder::ALL.map(Folder::as_str).into_iter().chain([PROBE]).map(|name| root.join(name)).collect();
+                    Folder::ALL.map(Folder::as_str).into_iter().chain([CHECK]).map(|name| root.join(name)).collect();
                 self.blocking("clear", "", move || stale::clear_files(&folders, now)).await
             }
-            Kind::S3(bucket) => bucket.clear_uploads(now).await.map_err(|e| self.fail("clear", "", e.as_ref())),
+            StorageKind::S3(bucket) => bucket.clear_uploads(now).await.map_err(|e| self.fail("clear", "", e.as_ref())),
         };
         unfinished.map(|unfinished| removed + unfinished)
     }
@@ -303,7 +318,7 @@ fn free_bytes(_: &FilePath) -> u64 {
     0
 }
 
-fn of_io(error: io::Error) -> object_store::Error {
+fn from_io(error: io::Error) -> object_store::Error {
     object_store::Error::Generic { store: "folder", source: Box::new(error) }
 }
 

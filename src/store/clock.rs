@@ -50,7 +50,7 @@ impl Clock {
     }
 
     /// Converts a time of the system to a time of this clock.
-    pub(super) fn of_system(&self, at: SystemTime) -> SystemTime {
+    pub(super) fn to_clock(&self, at: SystemTime) -> SystemTime {
         shift(at, self.system(), self.now())
     }
 }

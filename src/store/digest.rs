@@ -16,7 +16,8 @@ pub struct BadDigest;
 pub struct Digest([u8; 32]);
 
 impl Digest {
-    /// Computes the digest of `bytes`. Takes about 1 ns per byte, so large inputs must not run on the async runtime.
+    /// Computes the digest of `bytes`. Takes about 0.6 ns per byte with SHA extensions, else several ns, so large
+    /// inputs must not run on the async runtime.
     #[must_use]
     pub fn of(bytes: &[u8]) -> Self {
         Self(Sha256::digest(bytes).into())
@@ -28,7 +29,7 @@ impl Digest {
 pub(crate) struct Hasher(Sha256);
 
 impl Hasher {
-    /// Adds the next bytes. Takes about 1 ns per byte.
+    /// Adds the next bytes. Takes as long as [`Digest::of`].
     pub(crate) fn update(&mut self, bytes: &[u8]) {
         self.0.update(bytes);
     }

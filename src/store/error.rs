@@ -5,18 +5,19 @@ use std::io;
 
 use thiserror::Error;
 
+use super::digest::Digest;
 use super::name::BadName;
 
 /// Errors of the store. Each names the location concerned.
 #[derive(Debug, Clone, Error)]
 pub enum StoreError {
     /// The store cannot be opened.
-    #[error("cannot open the store at {place} ({key}): {reason}")]
+    #[error("cannot open the store at {location} ({key}): {reason}")]
     Open {
         /// Configuration key of the location.
         key: &'static str,
         /// Location.
-        place: String,
+        location: String,
         /// Cause.
         reason: String,
     },
@@ -39,22 +40,22 @@ pub enum StoreError {
         max_bytes: u64,
     },
     /// The disk is full, or a quota is used up.
-    #[error("no space left at {place} ({op}): {reason}")]
+    #[error("no space left at {location} ({op}): {reason}")]
     NoSpace {
         /// Failed operation.
         op: &'static str,
         /// Location.
-        place: String,
+        location: String,
         /// Message of the system or the service.
         reason: String,
     },
     /// The system or the storage service denies access.
-    #[error("not permitted at {place} ({op}): {reason}")]
+    #[error("not permitted at {location} ({op}): {reason}")]
     Denied {
         /// Failed operation.
         op: &'static str,
         /// Location.
-        place: String,
+        location: String,
         /// Message of the system or the service.
         reason: String,
     },
@@ -77,6 +78,12 @@ pub enum StoreError {
         /// Name of the record.
         name: String,
     },
+    /// A structure file is damaged and is in quarantine.
+    #[error("the stored structure {digest} was damaged and is in the folder `quarantine` of the store")]
+    Damaged {
+        /// Digest of the undamaged file.
+        digest: Digest,
+    },
     /// The limit of jobs on record is reached, and all of them are open.
     #[error("{limit} jobs are on record ({key}), and none of them has ended")]
     TooManyRecords {
@@ -89,12 +96,12 @@ pub enum StoreError {
     #[error(transparent)]
     Name(#[from] BadName),
     /// Any other error of the disk or the storage service.
-    #[error("the store at {place} failed ({op}): {reason}")]
+    #[error("the store at {location} failed ({op}): {reason}")]
     Failed {
         /// Failed operation.
         op: &'static str,
         /// Location.
-        place: String,
+        location: String,
         /// Message of the system or the service.
         reason: String,
     },
@@ -107,26 +114,26 @@ impl StoreError {
         matches!(self, Self::Full { .. } | Self::NoSpace { .. } | Self::Denied { .. } | Self::Failed { .. })
     }
 
-    /// Classifies an error of the backend at `place`.
-    pub(super) fn classify(op: &'static str, place: &str, error: &(dyn StdError + 'static)) -> Self {
+    /// Classifies an error of the backend at `location`.
+    pub(super) fn classify(op: &'static str, location: &str, error: &(dyn StdError + 'static)) -> Self {
         use object_store::Error as Os;
-        let (place, reason) = (place.to_owned(), error.to_string());
+        let (location, reason) = (location.to_owned(), error.to_string());
         let denied = |e: &Os| matches!(e, Os::PermissionDenied { .. } | Os::Unauthenticated { .. });
         for cause in std::iter::successors(Some(error), |e| (*e).source()) {
             if cause.downcast_ref::<Os>().is_some_and(denied) {
-                return Self::Denied { op, place, reason };
+                return Self::Denied { op, location, reason };
             }
             match cause.downcast_ref::<io::Error>().map(io::Error::kind) {
                 Some(io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) => {
-                    return Self::NoSpace { op, place, reason };
+                    return Self::NoSpace { op, location, reason };
                 }
                 Some(io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem) => {
-                    return Self::Denied { op, place, reason };
+                    return Self::Denied { op, location, reason };
                 }
                 _ => {}
             }
         }
-        Self::Failed { op, place, reason }
+        Self::Failed { op, location, reason }
     }
 }
 

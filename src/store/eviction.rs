@@ -35,13 +35,13 @@ pub struct Swept {
 
 /// Bytes reserved by a writer, until they are committed or released.
 #[derive(Debug)]
-pub(super) struct Reservation {
+pub(super) struct SpaceReservation {
     store: Store,
     bytes: u64,
     capped: bool,
 }
 
-impl Reservation {
+impl SpaceReservation {
     /// Reserves more bytes, evicting objects if necessary.
     pub(super) async fn grow(&mut self, bytes: u64) -> Result<(), StoreError> {
         if self.capped {
@@ -57,7 +57,7 @@ impl Reservation {
     }
 }
 
-impl Drop for Reservation {
+impl Drop for SpaceReservation {
     fn drop(&mut self) {
         self.store.index().release(self.bytes);
     }
@@ -105,8 +105,8 @@ impl Store {
     }
 
     /// Returns a reservation of 0 bytes for an object.
-    pub(super) fn empty_reservation(&self, name: &Name) -> Reservation {
-        Reservation { store: self.clone(), bytes: 0, capped: name.folder().is_capped() }
+    pub(super) fn empty_reservation(&self, name: &Name) -> SpaceReservation {
+        SpaceReservation { store: self.clone(), bytes: 0, capped: name.folder().is_capped() }
     }
 
     /// Reserves `more` bytes for a writer that has reserved `had`.

@@ -45,8 +45,15 @@ pub(crate) struct Faults {
     pub(crate) truncate: AtomicBool,
     /// Number of reads of job records.
     pub(crate) job_reads: AtomicUsize,
+    /// Number of reads of inputs.
+    pub(crate) input_reads: AtomicUsize,
+    /// Number of writes of results.
+    pub(crate) result_writes: AtomicUsize,
+    /// Number of operations that wait because of `slow_ms`, and the largest one so far.
+    waiting: AtomicUsize,
+    pub(crate) most_waiting: AtomicUsize,
     /// Number of operations that timed out.
-    pub(crate) unanswered: AtomicUsize,
+    pub(crate) timed_out: AtomicUsize,
 }
 
 pub(crate) fn error(kind: io::ErrorKind) -> object_store::Error {
@@ -56,20 +63,20 @@ pub(crate) fn error(kind: io::ErrorKind) -> object_store::Error {
 impl Faults {
     /// Makes all operations on this folder time out, and no others.
     pub(crate) fn silence(&self, folder: Option<Folder>) {
-        self.unanswered.store(0, Ordering::SeqCst);
+        self.timed_out.store(0, Ordering::SeqCst);
         *self.silent.lock().unwrap() = folder.map(|folder| (folder, true));
     }
 
     /// Makes only writes to this folder time out.
     pub(crate) fn seal(&self, folder: Folder) {
-        self.unanswered.store(0, Ordering::SeqCst);
+        self.timed_out.store(0, Ordering::SeqCst);
         *self.silent.lock().unwrap() = Some((folder, false));
     }
 
     fn check_silence(&self, at: &Path, reading: bool) -> Result<()> {
         let silent = *self.silent.lock().unwrap();
         if silent.is_some_and(|(folder, all)| at.as_ref().starts_with(folder.as_str()) && (all || !reading)) {
-            self.unanswered.fetch_add(1, Ordering::SeqCst);
+            self.timed_out.fetch_add(1, Ordering::SeqCst);
             return Err(error(io::ErrorKind::TimedOut));
         }
         Ok(())
@@ -85,7 +92,12 @@ impl Faults {
         if self.hang.load(Ordering::SeqCst) {
             std::future::pending::<()>().await;
         }
-        tokio::time::sleep(Duration::from_millis(self.slow_ms.load(Ordering::SeqCst))).await;
+        let slow = Duration::from_millis(self.slow_ms.load(Ordering::SeqCst));
+        if !slow.is_zero() {
+            self.most_waiting.fetch_max(self.waiting.fetch_add(1, Ordering::SeqCst) + 1, Ordering::SeqCst);
+            tokio::time::sleep(slow).await;
+            self.waiting.fetch_sub(1, Ordering::SeqCst);
+        }
         Ok(())
     }
 
@@ -142,6 +154,9 @@ impl ObjectStore for Faulty {
         self.faults.check_silence(at, false)?;
         self.faults.check_space()?;
         self.faults.delay().await?;
+        if at.as_ref().starts_with(Folder::Results.as_str()) {
+            self.faults.result_writes.fetch_add(1, Ordering::SeqCst);
+        }
         self.files.put_opts(at, payload, options).await
     }
 
@@ -154,6 +169,9 @@ impl ObjectStore for Faulty {
         self.faults.check_silence(at, true)?;
         if !options.head && at.as_ref().starts_with(Folder::Jobs.as_str()) {
             self.faults.job_reads.fetch_add(1, Ordering::SeqCst);
+        }
+        if !options.head && at.as_ref().starts_with(Folder::Inputs.as_str()) {
+            self.faults.input_reads.fetch_add(1, Ordering::SeqCst);
         }
         self.faults.delay().await?;
         let read = self.files.get_opts(at, options).await?;

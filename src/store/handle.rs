@@ -17,7 +17,7 @@ use tokio::sync::Mutex as AsyncMutex;
 use super::backend::Backend;
 use super::clock::Clock;
 use super::error::StoreError;
-use super::eviction::Reservation;
+use super::eviction::SpaceReservation;
 use super::index::{Index, Seen};
 use super::memory::Memory;
 use super::name::{Folder, Name};
@@ -35,9 +35,9 @@ const WRITE_LOCKS: usize = 64;
 ///
 /// Writes and removals are atomic. Futures may be dropped at any time: a started operation is completed or undone.
 #[derive(Clone)]
-pub struct Store(pub(super) Arc<Inner>);
+pub struct Store(pub(super) Arc<StoreState>);
 
-pub(super) struct Inner {
+pub(super) struct StoreState {
     pub(super) backend: Backend,
     pub(super) config: StoreConfig,
     index: Mutex<Index>,
@@ -54,13 +54,13 @@ pub(super) struct Inner {
 
 impl fmt::Debug for Store {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("Store").field(&self.0.backend.place()).finish()
+        f.debug_tuple("Store").field(&self.0.backend.location()).finish()
     }
 }
 
 impl Store {
     /// Opens the configured store, by default the folder `store` in `data_dir`. Tests it, removes leftovers of crashed
-    /// processes, and indexes its objects. Call it on the runtime that is to run the operations of the store.
+    /// processes, and indexes its objects. Must be called on the runtime that runs the operations of the store.
     ///
     /// # Errors
     /// Returns [`StoreError::Open`] if it cannot be written and read.
@@ -71,7 +71,7 @@ impl Store {
 
     /// Opens a store over `backend`; see [`open`](Self::open).
     pub(super) async fn open_backend(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
-        backend.probe().await.map_err(|e| backend.open_error(&e))?;
+        backend.check().await.map_err(|e| backend.open_error(&e))?;
         let clock = Clock::start();
         let now = clock.now();
         // Not fatal: credentials may permit uploads without permitting their listing.
@@ -90,8 +90,8 @@ impl Store {
             index.update_metrics(folder);
         }
         let [inputs, jobs, results] = Folder::ALL.map(|folder| index.usage(folder).objects);
-        tracing::info!(place = backend.place(), inputs, jobs, results, cleared, "store opened");
-        let store = Self(Arc::new(Inner {
+        tracing::info!(location = backend.location(), inputs, jobs, results, cleared, "store opened");
+        let store = Self(Arc::new(StoreState {
             backend,
             index: Mutex::new(index),
             memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
@@ -267,8 +267,8 @@ impl Store {
     ///
     /// # Errors
     /// Returns a [`StoreError`].
-    pub async fn probe(&self) -> Result<(), StoreError> {
-        self.0.backend.probe().await
+    pub async fn check(&self) -> Result<(), StoreError> {
+        self.0.backend.check().await
     }
 
     /// Returns the secret of the store, from which unguessable ids are derived. Creates it on first use.
@@ -293,8 +293,8 @@ impl Store {
 
     /// Returns the location, for messages.
     #[must_use]
-    pub fn place(&self) -> &str {
-        self.0.backend.place()
+    pub fn location(&self) -> &str {
+        self.0.backend.location()
     }
 
     pub(super) fn index(&self) -> MutexGuard<'_, Index> {
@@ -311,7 +311,7 @@ impl Store {
 
     /// Indexes an object that was just written under the lock of its name, and ends its reservation in the same step,
     /// so that it never counts twice. Caches small results in memory.
-    pub(super) fn commit(&self, name: &Name, size: u64, bytes: Option<&Bytes>, reservation: &mut Reservation) {
+    pub(super) fn commit(&self, name: &Name, size: u64, bytes: Option<&Bytes>, reservation: &mut SpaceReservation) {
         let (used, modified) = (self.now(), SystemTime::now());
         let mut index = self.index();
         index.commit(name, size, used);
@@ -376,7 +376,7 @@ impl Store {
     fn reconcile(&self, name: &Name, seen: Seen, meta: Option<Meta>) {
         let mut index = self.index();
         match meta {
-            Some(meta) => index.adopt(name, seen, meta.size, self.0.clock.of_system(meta.modified)),
+            Some(meta) => index.adopt(name, seen, meta.size, self.0.clock.to_clock(meta.modified)),
             None if index.is_current(name, seen) => {
                 index.forget(name);
                 self.0.memory.remove(name);

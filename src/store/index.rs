@@ -7,14 +7,14 @@ use metrics::gauge;
 
 use super::name::{Folder, Name};
 use super::object::Usage;
-use super::records::{Admission, RecordCaps, Records};
+use super::records::{Admission, JobRecords, RecordCaps};
 use crate::telemetry::{STORE_BYTES, STORE_OBJECTS};
 
 /// Order of last use. The counter orders uses within one clock tick.
 pub(super) type Use = (SystemTime, u64);
 
 #[derive(Debug, Clone, Copy)]
-struct Entry {
+struct ObjectEntry {
     bytes: u64,
     used: Use,
     /// Time of last use that the disk has.
@@ -50,9 +50,9 @@ pub(super) enum ReserveError {
 /// Index of all objects.
 #[derive(Debug, Default)]
 pub(super) struct Index {
-    entries: BTreeMap<Name, Entry>,
+    entries: BTreeMap<Name, ObjectEntry>,
     by_use: BTreeMap<Use, Name>,
-    pub(super) records: Records,
+    pub(super) records: JobRecords,
     /// Number of pins by group.
     pins: BTreeMap<Name, usize>,
     /// Objects being removed: no longer readable, but still on disk.
@@ -82,7 +82,7 @@ impl Index {
             self.records.add(name);
         }
         self.reorder(name, None, Some(used));
-        self.entries.insert(name.clone(), Entry { bytes, used, saved, version });
+        self.entries.insert(name.clone(), ObjectEntry { bytes, used, saved, version });
         self.touch(name, at);
         let total = &mut self.totals[name.folder() as usize];
         *total = Usage { bytes: total.bytes + bytes, objects: total.objects + 1 };
@@ -114,7 +114,7 @@ impl Index {
         }
     }
 
-    /// Changes the place of an object in the orders of use.
+    /// Changes the position of an object in the orders of use.
     fn reorder(&mut self, name: &Name, old: Option<Use>, new: Option<Use>) {
         old.and_then(|old| self.by_use.remove(&old));
         new.and_then(|new| self.by_use.insert(new, name.clone()));
@@ -180,7 +180,7 @@ impl Index {
 
     /// Returns the objects whose last use is `interval` later than the disk says, and marks them as saved.
     pub(super) fn unsaved_uses(&mut self, interval: Duration) -> Vec<(Name, SystemTime)> {
-        let late = |entry: &Entry| entry.used.0.duration_since(entry.saved).is_ok_and(|since| since >= interval);
+        let late = |entry: &ObjectEntry| entry.used.0.duration_since(entry.saved).is_ok_and(|since| since >= interval);
         let late = self.entries.iter_mut().filter(|(_, entry)| late(entry));
         late.map(|(name, entry)| {
             entry.saved = entry.used.0;
@@ -348,7 +348,7 @@ mod tests {
         let Err(ReserveError::Remove(candidates)) = index.reserve(20, 30) else {
             panic!("reserved more than the capacity")
         };
-        assert_eq!(candidates.iter().map(|v| v.names.clone()).collect::<Vec<_>>(), [[name("a")], [name("b")]]);
+        assert_eq!(candidates.iter().map(|c| c.names.clone()).collect::<Vec<_>>(), [[name("a")], [name("b")]]);
         index.touch(&name("a"), at(1));
         index.pin(&name("b"));
         assert!(!index.begin_removal(&candidates[0]) && !index.begin_removal(&candidates[1]));

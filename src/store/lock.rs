@@ -95,7 +95,7 @@ impl FolderLock {
     pub fn acquire(folder: &Path, address: SocketAddr) -> Result<Self, LockError> {
         let failed = |error| LockError::Io { folder: folder.to_owned(), error };
         create_folder(folder).map_err(failed)?;
-        let open = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(folder.join(FILE));
+        let open = open(OpenOptions::new().read(true).write(true).create(true).truncate(false), folder);
         let mut file = open.map_err(failed)?;
         lock(&mut file, folder)?;
         let started = humantime::format_rfc3339_seconds(SystemTime::now()).to_string();
@@ -110,13 +110,33 @@ impl FolderLock {
     /// # Errors
     /// Returns [`LockError::Held`] if a service uses the folder.
     pub fn check(folder: &Path) -> Result<(), LockError> {
-        match File::open(folder.join(FILE)) {
+        match open(OpenOptions::new().read(true), folder) {
             Ok(mut file) => lock(&mut file, folder),
             // A folder that cannot be opened is reported when the store in it is opened.
             Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => Ok(()),
             Err(error) => Err(LockError::Io { folder: folder.to_owned(), error }),
         }
     }
+}
+
+/// Opens the lock file of a folder. Refuses a symbolic link, which may lead to a file of another program, a folder and
+/// special files, such as a pipe, whose opening may wait.
+fn open(options: &mut OpenOptions, folder: &Path) -> io::Result<File> {
+    let file = folder.join(FILE);
+    let wrong = |found: &str| Err(io::Error::other(format!("its file `lock` is {found}; remove it")));
+    match file.symlink_metadata() {
+        Ok(found) if found.is_symlink() => return wrong("a symbolic link"),
+        Ok(found) if found.is_dir() => return wrong("a folder"),
+        Ok(found) if !found.is_file() => return wrong("a pipe, socket or device"),
+        Ok(_) | Err(_) => {}
+    }
+    // Such a file may be created between the two calls.
+    #[cfg(target_os = "linux")]
+    {
+        let flags = rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK;
+        std::os::unix::fs::OpenOptionsExt::custom_flags(options, flags.bits().cast_signed());
+    }
+    options.open(file)
 }
 
 /// Locks an open lock file, or returns its holder in the error.
@@ -164,6 +184,57 @@ mod tests {
         drop(lock);
         FolderLock::check(&folder).unwrap();
         drop(FolderLock::acquire(&folder, address).unwrap());
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn a_symbolic_link_is_not_followed() {
+        let dir = tempfile::tempdir().unwrap();
+        let (folder, other) = (dir.path().join("data"), dir.path().join("other"));
+        std::fs::create_dir(&folder).unwrap();
+        let link = folder.join(FILE);
+        for exists in [false, true] {
+            if exists {
+                std::fs::write(&other, "of another program").unwrap();
+            }
+            std::os::unix::fs::symlink(&other, &link).unwrap();
+            let mut results = vec![FolderLock::acquire(&folder, "127.0.0.1:1".parse().unwrap()).map(drop)];
+            if exists {
+                results.push(FolderLock::check(&folder));
+            }
+            for result in results {
+                let message = result.unwrap_err().to_string();
+                assert!(message.contains("`lock` is a symbolic link"), "{message}");
+            }
+            assert_eq!(
+                std::fs::read(&other).unwrap_or_default(),
+                if exists { &b"of another program"[..] } else { b"" }
+            );
+            assert_eq!(other.exists(), exists);
+            std::fs::remove_file(&link).unwrap();
+        }
+        drop(FolderLock::acquire(&folder, "127.0.0.1:1".parse().unwrap()).unwrap());
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn a_folder_or_a_pipe_is_no_lock_file() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join(FILE);
+        let refused = |what: &str| {
+            let address = "127.0.0.1:1".parse().unwrap();
+            for result in [FolderLock::acquire(dir.path(), address).map(drop), FolderLock::check(dir.path())] {
+                let message = result.unwrap_err().to_string();
+                assert!(message.ends_with(&format!("its file `lock` is {what}; remove it")), "{message}");
+            }
+        };
+        std::fs::create_dir(&file).unwrap();
+        refused("a folder");
+        std::fs::remove_dir(&file).unwrap();
+        assert!(std::process::Command::new("mkfifo").arg(&file).status().unwrap().success());
+        refused("a pipe, socket or device");
+        std::fs::remove_file(&file).unwrap();
+        drop(FolderLock::acquire(dir.path(), "127.0.0.1:1".parse().unwrap()).unwrap());
     }
 
     #[test]

@@ -32,7 +32,7 @@ pub struct BadNamespace;
 impl Namespace {
     /// Returns the namespace of a group of keys. `secret` is the secret of the store: the group alone does not reveal
     /// the names of its objects.
-    pub(crate) fn of_group(secret: &Secret, group: &str) -> Self {
+    pub(crate) fn from_group(secret: &Secret, group: &str) -> Self {
         let digest = derive(secret, &format!("namespace\n{group}"));
         Self(Some(digest.iter().take(16).fold(0, |bits, byte| bits << 8 | u128::from(*byte))))
     }
@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn names_differ_between_namespaces_and_stay_valid() {
         let digest = Digest::of(b"a");
-        let of = |secret: u8, group| Namespace::of_group(&[secret; 32], group);
+        let of = |secret: u8, group| Namespace::from_group(&[secret; 32], group);
         let spaces = [Namespace::default(), of(1, "a"), of(1, "b"), of(2, "a")];
         let names = |space: Namespace| {
             [Name::input(&digest), Name::result(&digest.to_string(), "glb").unwrap()].map(|name| name.within(space))

@@ -31,13 +31,13 @@ struct Jobs {
 
 /// Number and order of the job records in every scope.
 #[derive(Debug, Default)]
-pub(super) struct Records(BTreeMap<Scope, Jobs>);
+pub(super) struct JobRecords(BTreeMap<Scope, Jobs>);
 
 fn scopes(name: &Name) -> [Scope; 2] {
     [Some(name.owner()), None]
 }
 
-impl Records {
+impl JobRecords {
     /// Counts the job of a record.
     pub(super) fn add(&mut self, name: &Name) {
         for scope in scopes(name) {
@@ -86,14 +86,14 @@ pub(super) enum Admission {
     Full(Scope, usize),
 }
 
-/// Place of a job below the caps, until its record is written.
+/// Reservation of a job below the caps, until its record is written.
 #[derive(Debug)]
-pub(crate) struct RecordPlace {
+pub(crate) struct RecordReservation {
     store: Store,
     name: Name,
 }
 
-impl Drop for RecordPlace {
+impl Drop for RecordReservation {
     fn drop(&mut self) {
         self.store.index().records.remove(&self.name);
     }
@@ -108,12 +108,14 @@ impl Store {
         &self,
         name: &Name,
         caps: RecordCaps,
-    ) -> Result<(RecordPlace, Vec<Name>), StoreError> {
+    ) -> Result<(RecordReservation, Vec<Name>), StoreError> {
         let mut removed = Vec::new();
         loop {
             let admission = self.index().admit_record(name, caps);
             match admission {
-                Admission::Admitted => return Ok((RecordPlace { store: self.clone(), name: name.clone() }, removed)),
+                Admission::Admitted => {
+                    return Ok((RecordReservation { store: self.clone(), name: name.clone() }, removed));
+                }
                 Admission::Full(scope, limit) => {
                     let key = if scope.is_some() { "jobs.records_per_client" } else { "jobs.records" };
                     return Err(StoreError::TooManyRecords { limit, key });

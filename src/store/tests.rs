@@ -33,11 +33,11 @@ async fn a_full_disk_is_reported_and_stored_objects_remain() {
     let pin = store.pin(&name(1));
     faults.full.store(true, Ordering::Relaxed);
     for refused in [store.put(&name(2), body(1000)).await, store.put_new(&name(2), body(9)).await.map(|_| ())] {
-        let Err(StoreError::NoSpace { op: "put", place, .. }) = refused else { panic!("{refused:?}") };
-        assert!(place.contains(&name(2).to_string()) && place.contains(store.place()), "{place}");
+        let Err(StoreError::NoSpace { op: "put", location, .. }) = refused else { panic!("{refused:?}") };
+        assert!(location.contains(&name(2).to_string()) && location.contains(store.location()), "{location}");
     }
     assert!(matches!(store.put(&name(1), body(1)).await, Err(StoreError::NoSpace { .. })));
-    assert!(matches!(store.probe().await, Err(StoreError::NoSpace { op: "probe", .. })));
+    assert!(matches!(store.check().await, Err(StoreError::NoSpace { op: "check", .. })));
     let mut writer = store.writer(&name(3));
     let write = move || {
         let refused = io::Write::write_all(&mut writer, &body(5 << 20)).unwrap_err();
@@ -141,7 +141,7 @@ async fn operate(store: &Store) -> Vec<StoreError> {
     errors.extend(store.head(&name(1)).await.err());
     errors.extend(store.put(&name(2), body(1000)).await.err());
     errors.extend(store.put_new(&name(3), body(1000)).await.err());
-    errors.extend(store.probe().await.err());
+    errors.extend(store.check().await.err());
     let mut writer = store.writer(&name(4));
     let write = move || match io::Write::write_all(&mut writer, &body(3 << 20)) {
         Ok(()) => writer.finish().err(),

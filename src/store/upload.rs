@@ -4,7 +4,7 @@ use bytes::Bytes;
 use object_store::{ObjectStoreExt as _, WriteMultipart};
 
 use super::error::StoreError;
-use super::eviction::Reservation;
+use super::eviction::SpaceReservation;
 use super::handle::Store;
 use super::name::{Folder, Name};
 
@@ -13,13 +13,13 @@ const PARTS: usize = 3;
 
 /// Multipart upload in progress.
 #[derive(Debug)]
-pub(super) struct Upload {
+pub(super) struct ObjectUpload {
     store: Store,
     name: Name,
     parts: WriteMultipart,
 }
 
-impl Upload {
+impl ObjectUpload {
     /// Starts an upload. The backend of a folder creates the staged file on the calling thread.
     pub(super) async fn begin(store: &Store, name: &Name) -> Result<Self, StoreError> {
         let backend = &store.0.backend;
@@ -79,7 +79,7 @@ impl Store {
         name: &Name,
         bytes: &Bytes,
         new: bool,
-        reservation: &mut Reservation,
+        reservation: &mut SpaceReservation,
     ) -> Result<bool, StoreError> {
         let _lock = self.write_lock(name).lock().await;
         let backend = &self.0.backend;
@@ -102,7 +102,7 @@ impl Store {
 
 /// Uploads an object in parts. S3 requires parts from 5 GiB on; they are also faster for much smaller objects.
 async fn put_in_parts(store: &Store, name: &Name, mut bytes: Bytes) -> Result<(), StoreError> {
-    let mut upload = Upload::begin(store, name).await?;
+    let mut upload = ObjectUpload::begin(store, name).await?;
     while !bytes.is_empty() {
         let next = bytes.split_to(store.0.backend.part_size().min(bytes.len()));
         if let Err(error) = upload.push(next).await {

@@ -5,10 +5,10 @@ use std::io;
 use bytes::{Bytes, BytesMut};
 
 use super::error::StoreError;
-use super::eviction::Reservation;
+use super::eviction::SpaceReservation;
 use super::handle::Store;
 use super::name::Name;
-use super::upload::Upload;
+use super::upload::ObjectUpload;
 
 /// Blocking writer of an object; see [`Store::writer`].
 ///
@@ -18,10 +18,10 @@ use super::upload::Upload;
 pub struct Writer {
     store: Store,
     name: Name,
-    reservation: Reservation,
+    reservation: SpaceReservation,
     filling: BytesMut,
     /// Upload in parts, from the first full part on.
-    upload: Option<Upload>,
+    upload: Option<ObjectUpload>,
     /// Total size of the uploaded parts, bytes.
     uploaded: u64,
     failed: bool,
@@ -94,7 +94,7 @@ impl Writer {
         self.uploaded += part.len() as u64;
         let upload = match &mut self.upload {
             Some(upload) => upload,
-            none => none.insert(Upload::begin(&self.store, &self.name).await?),
+            none => none.insert(ObjectUpload::begin(&self.store, &self.name).await?),
         };
         upload.push(part).await
     }

@@ -14,12 +14,12 @@ use crate::surface::Control;
 /// Atoms between two checks of the cancellation flag: about a millisecond.
 pub(super) const ATOMS_PER_CHECK: usize = 1 << 16;
 
-type Residue = (u32, i32, u8);
+type ResidueKey = (u32, i32, u8);
 
 /// The chosen letter of each residue that has alternatives.
 #[derive(Debug, Default)]
 pub(super) struct Alternatives {
-    chosen: HashMap<Residue, u8>,
+    chosen: HashMap<ResidueKey, u8>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -37,20 +37,20 @@ impl Letter {
     }
 }
 
-fn residue(structure: &Structure, i: usize) -> Residue {
+fn residue(structure: &Structure, i: usize) -> ResidueKey {
     (structure.chain.id(i), structure.residue_number[i], structure.insertion_code[i])
 }
 
 impl Alternatives {
-    /// Chooses an alternative for each residue of `model`: `wanted` if the residue has it, otherwise the one with the
-    /// highest mean occupancy. The lowest letter wins a tie.
+    /// Chooses an alternative for each residue of `model`: `preferred` if the residue has it, otherwise the one with
+    /// the highest mean occupancy. Of equal ones, chooses the lowest letter.
     pub(super) fn choose(
         structure: &Structure,
         model: i32,
-        wanted: Option<u8>,
+        preferred: Option<u8>,
         control: &Control<'_>,
     ) -> Result<Self, StructureError> {
-        let mut letters: HashMap<Residue, Vec<Letter>> = HashMap::new();
+        let mut letters: HashMap<ResidueKey, Vec<Letter>> = HashMap::new();
         for i in 0..structure.len() {
             if i % ATOMS_PER_CHECK == 0 {
                 read::check(control)?;
@@ -69,7 +69,7 @@ impl Alternatives {
             }
         }
         let best = |letters: Vec<Letter>| {
-            let has = letters.iter().find(|l| Some(l.code) == wanted);
+            let has = letters.iter().find(|l| Some(l.code) == preferred);
             let best = letters.iter().max_by_key(|l| (l.rank(), std::cmp::Reverse(l.code)));
             has.or(best).map_or(0, |l| l.code)
         };

@@ -1,4 +1,4 @@
-//! Local folder of structure files: entry id in, bytes out.
+//! Local folder of structure files, read by entry id.
 //!
 //! Supported layouts: flat (`1abc.cif`, `1abc.pdb`, `pdb1abc.ent`, `1abc.bcif`), and that of wwPDB mirrors, divided by
 //! the two middle characters (`ab/1abc.cif.gz`, `ab/pdb1abc.ent.gz`, also under `divided/mmCIF` and `divided/pdb`).
@@ -91,6 +91,8 @@ pub struct Archive {
     max_bytes: u64,
 }
 
+/// Bytes that are read at once.
+const READ_BYTES: usize = 1 << 18;
 /// Default limit of file sizes. The largest entries are below 1 GiB as text.
 pub const MAX_BYTES: u64 = 4 << 30;
 
@@ -101,7 +103,7 @@ impl Archive {
         Self { dir: dir.into(), max_bytes: MAX_BYTES }
     }
 
-    /// Sets the largest accepted file size on disk, bytes.
+    /// Sets the maximum file size on disk, bytes.
     #[must_use]
     pub fn with_max_bytes(self, bytes: u64) -> Self {
         Self { max_bytes: bytes, ..self }
@@ -113,8 +115,9 @@ impl Archive {
     /// # Errors
     /// [`ArchiveError::TooLarge`] and [`ArchiveError::Io`].
     pub fn fetch(&self, id: &EntryId) -> Result<Option<(Vec<u8>, Stamp)>, ArchiveError> {
-        let Some((file, stamp)) = self.open(id)? else { return Ok(None) };
-        Ok(Some((self.read(file, stamp.bytes, id)?, stamp)))
+        let Some(mut opened) = self.open(id)? else { return Ok(None) };
+        let bytes = opened.read_all()?;
+        Ok(Some((bytes, opened.stamp)))
     }
 
     /// Returns the stamp of an entry's file without reading it, or `None` if it does not exist. Blocks.
@@ -122,10 +125,22 @@ impl Archive {
     /// # Errors
     /// [`ArchiveError::Io`].
     pub fn stamp(&self, id: &EntryId) -> Result<Option<Stamp>, ArchiveError> {
-        Ok(self.open(id)?.map(|(_file, stamp)| stamp))
+        Ok(self.find(id)?.map(|opened| opened.stamp))
     }
 
-    fn open(&self, id: &EntryId) -> io::Result<Option<(File, Stamp)>> {
+    /// Opens the file of an entry, or returns `None` if it does not exist. Blocks.
+    ///
+    /// # Errors
+    /// [`ArchiveError::TooLarge`] and [`ArchiveError::Io`].
+    pub fn open(&self, id: &EntryId) -> Result<Option<Opened>, ArchiveError> {
+        let (found, limit) = (self.find(id)?, self.max_bytes);
+        match found.as_ref().map(|opened| opened.stamp.bytes).filter(|bytes| *bytes > limit) {
+            Some(bytes) => Err(ArchiveError::TooLarge { id: id.clone(), bytes, limit }),
+            None => Ok(found),
+        }
+    }
+
+    fn find(&self, id: &EntryId) -> io::Result<Option<Opened>> {
         let root = match self.dir.canonicalize() {
             Err(e) if is_absent(&e) => return Ok(None),
             root => root?,
@@ -134,34 +149,68 @@ impl Archive {
             if let Some(file) = open_inside(&root, &path)? {
                 let data = file.metadata()?;
                 let stamp = Stamp { path, bytes: data.len(), modified: data.modified().ok() };
-                return Ok(Some((file, stamp)));
+                return Ok(Some(Opened { file, stamp }));
             }
         }
         Ok(None)
     }
+}
 
-    fn read(&self, file: File, bytes: u64, id: &EntryId) -> Result<Vec<u8>, ArchiveError> {
-        let too_large = |bytes| ArchiveError::TooLarge { id: id.clone(), bytes, limit: self.max_bytes };
-        if bytes > self.max_bytes {
-            return Err(too_large(bytes));
+/// Open file of an entry.
+#[derive(Debug)]
+pub struct Opened {
+    file: File,
+    /// Stamp when the file was opened.
+    pub stamp: Stamp,
+}
+
+impl Opened {
+    /// Reads the whole file, whose length is that of the stamp. Blocks.
+    ///
+    /// # Errors
+    /// [`ArchiveError::Io`], including if the length has changed.
+    pub fn read_all(&mut self) -> Result<Vec<u8>, ArchiveError> {
+        let mut bytes = Vec::with_capacity(usize::try_from(self.stamp.bytes).unwrap_or(0));
+        self.read_in_parts(|part| bytes.extend_from_slice(part))?;
+        Ok(bytes)
+    }
+
+    /// Reads the file like [`Self::read_all`], but part by part.
+    ///
+    /// # Errors
+    /// Those of [`Self::read_all`].
+    pub fn read_in_parts(&mut self, mut use_part: impl FnMut(&[u8])) -> Result<(), ArchiveError> {
+        let (mut buffer, mut left) = (vec![0; READ_BYTES], self.stamp.bytes);
+        loop {
+            let n = match self.file.read(&mut buffer) {
+                Err(e) if e.kind() == io::ErrorKind::Interrupted => continue,
+                n => n?,
+            };
+            // The file may change while it is read. Memory is reserved for the length in the stamp.
+            left = match left.checked_sub(n as u64) {
+                Some(0) if n == 0 => return Ok(()),
+                Some(left) if n > 0 => left,
+                _ => return Err(io::Error::other("the file changed while it was read").into()),
+            };
+            use_part(&buffer[..n]);
         }
-        let mut out = Vec::with_capacity(usize::try_from(bytes).unwrap_or(0));
-        // The file may grow during the read.
-        file.take(self.max_bytes.saturating_add(1)).read_to_end(&mut out)?;
-        if out.len() as u64 > self.max_bytes {
-            return Err(too_large(out.len() as u64));
-        }
-        Ok(out)
     }
 }
 
-/// Identity of an entry's file: path, length and modification time. The content is assumed to be unchanged while the
-/// stamp is.
+/// Identity of an entry's file: path, length and modification time. Equal stamps are assumed to mean equal content.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Stamp {
     path: PathBuf,
     bytes: u64,
     modified: Option<SystemTime>,
+}
+
+impl Stamp {
+    /// Returns the length of the file, bytes.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        self.bytes
+    }
 }
 
 /// Returns candidate paths of an entry's file, relative to the folder, in order of preference.

@@ -7,9 +7,9 @@ use std::collections::HashMap;
 
 use indexmap::IndexMap;
 
-/// Largest number of groups in an expression. Entries of the PDB have at most three.
+/// Maximum number of groups in an expression. Entries of the PDB have at most three.
 const MAX_GROUPS: usize = 8;
-/// Largest deviation of a matrix times its transpose from the identity. Files have six digits.
+/// Maximum deviation of a matrix times its transpose from the identity. Files have six digits.
 const MAX_SKEW: f64 = 0.01;
 
 /// Rotation or reflection, then a translation in Å: rows of a matrix with the translation in the last column.
@@ -53,7 +53,7 @@ impl Operator {
     }
 }
 
-/// Rule of an assembly: the operators to copy some chains by. Texts are those of the file.
+/// Rule of an assembly: chains, and the operators that copy them. Texts are those of the file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Generator {
     /// Id of the assembly.
@@ -99,7 +99,7 @@ impl Assemblies {
         self.generators.push(Generator { assembly, expression, chains });
     }
 
-    /// Adds an operator. Ignores it if its id is known.
+    /// Adds an operator, unless one has the same id.
     pub(super) fn add_operator(&mut self, id: String, operator: Option<Operator>) {
         self.operators.entry(id).or_insert(operator);
     }

@@ -5,14 +5,14 @@ use std::collections::HashMap;
 
 use super::atoms::{self, Atom, Slices, Tables};
 use super::contents::Kind;
-use super::element::{self, Name, atomic_number};
+use super::element::{self, AtomName, atomic_number};
 use super::error::StructureError;
 use super::number::{self, single};
 use super::read::MAX_COORDINATE;
 use super::text;
 use super::warnings::Warnings;
 
-/// Longest name of an atom, residue or chain, bytes. Names in the dictionary have up to five characters.
+/// Maximum length of the name of an atom, residue or chain, bytes. Names in the dictionary have up to five characters.
 const MAX_NAME: usize = 255;
 
 /// Marks a column that does not exist.
@@ -117,7 +117,7 @@ pub(super) fn join<F>(parts: Vec<(Slices<'_>, AtomSite<F>)>) -> (Tables, Warning
     (tables, warnings)
 }
 
-/// A range of a text: `text[start..end]`. Fast number parsing may read beyond it.
+/// A range of a text: `text[start..end]`. The fast number parser may read bytes of the text after the range.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Span<'a> {
     pub(super) text: &'a [u8],
@@ -140,23 +140,23 @@ impl<'a> Span<'a> {
 
     /// Parses a real number.
     #[inline]
-    pub(super) fn real(self) -> Result<f64, Wrong> {
-        number::real(self.text, self.start, self.end).ok_or(Wrong)
+    pub(super) fn real(self) -> Result<f64, BadNumber> {
+        number::real(self.text, self.start, self.end).ok_or(BadNumber)
     }
 
     /// Parses an integer.
     #[inline]
-    pub(super) fn integer(self) -> Result<i32, Wrong> {
-        number::integer(self.bytes()).ok_or(Wrong)
+    pub(super) fn integer(self) -> Result<i32, BadNumber> {
+        number::integer(self.bytes()).ok_or(BadNumber)
     }
 }
 
 /// Error for a value that is not a number or is out of range.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Wrong;
+pub(super) struct BadNumber;
 
 /// A row of text or binary data. Column [`NONE`] never has a value.
-pub(super) trait Row {
+pub(super) trait AtomRow {
     /// Error type for invalid values.
     type Fault;
 
@@ -165,13 +165,13 @@ pub(super) trait Row {
 
     /// Returns the real number in a column.
     #[inline]
-    fn real(&self, column: usize) -> Result<Option<f64>, Wrong> {
+    fn real(&self, column: usize) -> Result<Option<f64>, BadNumber> {
         self.text(column).map(Span::real).transpose()
     }
 
     /// Returns the integer in a column.
     #[inline]
-    fn integer(&self, column: usize) -> Result<Option<i32>, Wrong> {
+    fn integer(&self, column: usize) -> Result<Option<i32>, BadNumber> {
         self.text(column).map(Span::integer).transpose()
     }
 
@@ -196,7 +196,7 @@ impl<F> AtomSite<F> {
 
     /// Converts a row.
     #[inline]
-    pub(super) fn atom<R: Row<Fault = F>>(&mut self, row: &R) -> Result<Atom, F> {
+    pub(super) fn atom<R: AtomRow<Fault = F>>(&mut self, row: &R) -> Result<Atom, F> {
         let layout = self.layout;
         let position = [coordinate(row, &layout, 0)?, coordinate(row, &layout, 1)?, coordinate(row, &layout, 2)?];
         let span = name(row, layout.name)?;
@@ -234,7 +234,13 @@ impl<F> AtomSite<F> {
 
     /// Reads an optional number. An unreadable one is replaced by the default, with a warning.
     #[inline]
-    fn optional<R: Row<Fault = F>>(&mut self, row: &R, column: usize, default: (f32, &'static str), what: &str) -> f32 {
+    fn optional<R: AtomRow<Fault = F>>(
+        &mut self,
+        row: &R,
+        column: usize,
+        default: (f32, &'static str),
+        what: &str,
+    ) -> f32 {
         match row.real(column) {
             Ok(None) => return default.0,
             Ok(Some(value)) if single(value).is_finite() => return single(value),
@@ -246,7 +252,7 @@ impl<F> AtomSite<F> {
 
     /// Returns true for a HETATM record. An unknown record is read as ATOM, with a warning.
     #[inline]
-    fn hetero<R: Row<Fault = F>>(&mut self, row: &R) -> bool {
+    fn hetero<R: AtomRow<Fault = F>>(&mut self, row: &R) -> bool {
         let column = self.layout.group;
         match row.text(column).map(|span| span.bytes()) {
             Some(b"HETATM") => true,
@@ -259,7 +265,7 @@ impl<F> AtomSite<F> {
     }
 
     #[inline]
-    fn element<R: Row>(&mut self, row: &R, name: u32, residue: u32) -> u8 {
+    fn element<R: AtomRow>(&mut self, row: &R, name: u32, residue: u32) -> u8 {
         let symbol = row.text(self.layout.element).map_or(0, |span| atomic_number(span.bytes()));
         if symbol != 0 { symbol } else { self.guess(name, residue) }
     }
@@ -268,14 +274,14 @@ impl<F> AtomSite<F> {
     fn guess(&mut self, name: u32, residue: u32) -> u8 {
         let tables = &self.tables;
         *self.guesses.entry((name, residue)).or_insert_with(|| {
-            let name = Name { text: tables.name.text(name).as_bytes(), columns: None };
+            let name = AtomName { text: tables.name.text(name).as_bytes(), columns: None };
             element::guess(name, tables.residue.text(residue))
         })
     }
 }
 
 #[inline]
-fn coordinate<R: Row>(row: &R, layout: &Layout, axis: usize) -> Result<f64, R::Fault> {
+fn coordinate<R: AtomRow>(row: &R, layout: &Layout, axis: usize) -> Result<f64, R::Fault> {
     let column = layout.position[axis];
     if let Ok(Some(value)) = row.real(column)
         && value.abs() <= MAX_COORDINATE
@@ -287,7 +293,7 @@ fn coordinate<R: Row>(row: &R, layout: &Layout, axis: usize) -> Result<f64, R::F
 
 /// Returns a name, which is empty if there is none.
 #[inline]
-fn name<R: Row>(row: &R, columns: [usize; 2]) -> Result<Span<'_>, R::Fault> {
+fn name<R: AtomRow>(row: &R, columns: [usize; 2]) -> Result<Span<'_>, R::Fault> {
     match row.text(columns[0]).or_else(|| row.text(columns[1])) {
         None => Ok(Span::EMPTY),
         Some(span) if span.len() <= MAX_NAME => Ok(span),
@@ -296,19 +302,19 @@ fn name<R: Row>(row: &R, columns: [usize; 2]) -> Result<Span<'_>, R::Fault> {
 }
 
 #[inline]
-fn whole<R: Row>(row: &R, columns: [usize; 2], default: i32, what: &str) -> Result<i32, R::Fault> {
+fn whole<R: AtomRow>(row: &R, columns: [usize; 2], default: i32, what: &str) -> Result<i32, R::Fault> {
     let value = match row.integer(columns[0]) {
         Ok(None) => row.integer(columns[1]),
         value => value,
     };
     match value {
         Ok(value) => Ok(value.unwrap_or(default)),
-        Err(Wrong) => Err(row.fault(columns[0], format!("{what} (a whole number), ? or ."))),
+        Err(BadNumber) => Err(row.fault(columns[0], format!("{what} (a whole number), ? or ."))),
     }
 }
 
 #[inline]
-fn character<R: Row>(row: &R, column: usize, what: &str) -> Result<u8, R::Fault> {
+fn character<R: AtomRow>(row: &R, column: usize, what: &str) -> Result<u8, R::Fault> {
     match row.text(column) {
         None => Ok(0),
         Some(span) if span.len() == 1 => Ok(span.text[span.start]),
@@ -326,24 +332,24 @@ pub(super) struct Passed {
 }
 
 impl Passed {
-    /// Largest number of categories in the message.
+    /// Maximum number of categories in the message.
     const KEPT: usize = 10;
 
     pub(super) fn block(&mut self) {
         self.blocks += 1;
     }
 
-    /// Returns true if the message has no place for more categories.
+    /// Returns true if the message already lists the maximum number of categories.
     pub(super) fn is_full(&self) -> bool {
         self.categories.len() >= Self::KEPT
     }
 
-    /// Notes an `atom_site` without coordinates, described by [`Layout::missing`]. It is always part of the message.
+    /// Adds an `atom_site` without coordinates, described by [`Layout::missing`]. It is always part of the message.
     pub(super) fn lacking(&mut self, missing: String) {
         self.categories.push(missing);
     }
 
-    /// Notes a category, by its name without underscore.
+    /// Adds a category, by its name without underscore.
     pub(super) fn category(&mut self, name: impl AsRef<str> + Into<String>) {
         if !self.is_full() && !self.categories.iter().any(|c| c == name.as_ref()) {
             self.categories.push(name.into());

@@ -1,5 +1,6 @@
 //! Atoms of a structure file, stored as a structure of arrays.
 
+use super::annotations::Annotations;
 use super::assembly::Assemblies;
 use super::contents::Kind;
 use super::duplicates;
@@ -88,6 +89,8 @@ pub struct Structure {
     pub kind: Vec<Kind>,
     /// Assemblies that the file describes.
     pub assemblies: Assemblies,
+    /// Values of residues that the file has: secondary structure and confidence.
+    pub annotations: Annotations,
     /// Messages about unreadable values that were replaced by a default. Their number is bounded.
     pub warnings: Vec<String>,
 }
@@ -105,7 +108,7 @@ impl Structure {
         self.element.is_empty()
     }
 
-    /// Returns the van der Waals radius of atom `i`, Å: that of the file, or that of the element.
+    /// Returns the van der Waals radius of atom `i`, Å: the radius in the file or, without one, of the element.
     #[must_use]
     pub fn vdw_radius(&self, i: usize) -> f32 {
         self.radius.get(i).copied().unwrap_or_else(|| radii::vdw_radius(self.element[i]))
@@ -140,18 +143,19 @@ pub(super) struct Atom {
     pub(super) b_factor: f32,
     pub(super) model: i32,
     pub(super) hetero: bool,
-    /// Polymer or ligand. [`kinds::assign`] makes the final decision when all atoms have been read.
+    /// Polymer or ligand. [`kinds::assign`] determines the final kind when all atoms have been read.
     pub(super) kind: Kind,
 }
 
 /// Fields of a structure that are not columns.
 #[derive(Debug)]
-pub(super) struct Source {
+pub(super) struct SourceFields {
     pub(super) format: SourceFormat,
     pub(super) id: Option<String>,
     pub(super) title: Option<String>,
     pub(super) sequence: Sequence,
     pub(super) assemblies: Assemblies,
+    pub(super) annotations: Annotations,
     /// Radius of each atom, Å; empty if the file has none. The reader counts their memory for the structure.
     pub(super) radii: Vec<f32>,
     pub(super) warnings: Vec<String>,
@@ -272,6 +276,10 @@ columns! {
 }
 
 impl Slices<'_> {
+    pub(super) fn len(&self) -> usize {
+        self.element.len()
+    }
+
     /// Returns the number of rows that are not filled.
     pub(super) fn space(&self) -> usize {
         self.element.len() - self.next
@@ -312,13 +320,13 @@ impl Columns {
     }
 
     /// Returns model and position of a row.
-    pub(super) fn place(&self, row: usize) -> (i32, [f64; 3]) {
+    pub(super) fn model_and_position(&self, row: usize) -> (i32, [f64; 3]) {
         (self.model[row], [self.x[row], self.y[row], self.z[row]])
     }
 
-    /// Returns a warning about the atoms of unknown elements; `None` if there are none or the file gives all radii.
+    /// Returns a warning about the atoms of unknown elements; `None` if there are none or the file contains all radii.
     fn unknown_elements(&self, tables: &Tables, radii_of_file: &[f32]) -> Option<String> {
-        if !radii_of_file.is_empty() {
+        if !radii_of_file.is_empty() || !self.element.contains(&0) {
             return None;
         }
         let mut unknown = (0..self.len()).filter(|&i| self.element[i] == 0 && self.kind[i] != Kind::VirtualSite);
@@ -335,10 +343,10 @@ impl Columns {
     pub(super) fn finish(
         mut self,
         tables: Tables,
-        source: Source,
+        source: SourceFields,
         reading: &Reading<'_>,
     ) -> Result<Structure, StructureError> {
-        duplicates::check(self.len(), |row| self.place(row), reading)?;
+        duplicates::check(self.len(), |row| self.model_and_position(row), reading)?;
         kinds::assign(&mut self, &tables, &source.sequence, reading)?;
         for (kind, _) in self.kind.iter_mut().zip(&source.radii).filter(|(_, radius)| **radius == 0.0) {
             *kind = Kind::VirtualSite;
@@ -350,6 +358,7 @@ impl Columns {
         let entities = tables.label_chain.texts().map(entity).collect();
         self.shrink();
         reading.keep(source.assemblies.bytes())?;
+        source.annotations.keep(reading)?;
         let unknown = self.unknown_elements(&tables, &source.radii);
         let warnings = source.warnings.into_iter().chain(unknown).collect();
         reading.check()?;
@@ -376,6 +385,7 @@ impl Columns {
             hetero: self.hetero,
             kind: self.kind,
             assemblies: source.assemblies,
+            annotations: source.annotations,
             warnings,
         })
     }

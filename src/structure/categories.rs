@@ -1,11 +1,13 @@
-//! Categories of an mmCIF file other than `atom_site`: entities, which tell which chains (`label_asym_id`) are
-//! polymers, and assemblies.
+//! Categories of an mmCIF file other than `atom_site`: entities, which define which chains (`label_asym_id`) are
+//! polymers, assemblies, secondary structure, and the confidence of predicted models.
 //!
-//! Dictionary: PDBx/mmCIF, categories `entity`, `entity_poly`, `struct_asym`, `pdbx_struct_assembly_gen` and
-//! `pdbx_struct_oper_list`.
+//! Dictionaries: PDBx/mmCIF, categories `entity`, `entity_poly`, `struct_asym`, `pdbx_struct_assembly_gen`,
+//! `pdbx_struct_oper_list`, `struct_conf` and `struct_sheet_range`; `ModelCIF`, categories `ma_qa_metric` and
+//! `ma_qa_metric_local`.
 
 use std::collections::{HashMap, HashSet};
 
+use super::annotations::{Annotations, ResidueConfidence, SecondaryRange};
 use super::assembly::{Assemblies, Operator};
 use super::error::StructureError;
 use super::number;
@@ -17,9 +19,13 @@ const ENTITY: &str = "entity";
 const CHAIN: &str = "struct_asym";
 const GENERATOR: &str = "pdbx_struct_assembly_gen";
 const OPERATOR: &str = "pdbx_struct_oper_list";
+const CONF: &str = "struct_conf";
+const SHEET: &str = "struct_sheet_range";
+const METRIC: &str = "ma_qa_metric";
+const LOCAL: &str = "ma_qa_metric_local";
 
-/// Items to read, by category and name. The first [`N_ENTITY_ITEMS`] describe entities, the others assemblies.
-pub(super) const ITEMS: [(&str, &str); 21] = [
+/// Items to read, by category and name, in the order of [`GROUPS`].
+pub(super) const ITEMS: [(&str, &str); 42] = [
     (ENTITY, "id"),
     (ENTITY, "type"),
     ("entity_poly", "entity_id"),
@@ -41,17 +47,48 @@ pub(super) const ITEMS: [(&str, &str); 21] = [
     (OPERATOR, "matrix[3][2]"),
     (OPERATOR, "matrix[3][3]"),
     (OPERATOR, "vector[3]"),
+    (CONF, "conf_type_id"),
+    (CONF, "beg_auth_asym_id"),
+    (CONF, "beg_auth_seq_id"),
+    (CONF, "pdbx_beg_PDB_ins_code"),
+    (CONF, "end_auth_seq_id"),
+    (CONF, "pdbx_end_PDB_ins_code"),
+    (CONF, "pdbx_PDB_helix_class"),
+    (SHEET, "beg_auth_asym_id"),
+    (SHEET, "beg_auth_seq_id"),
+    (SHEET, "pdbx_beg_PDB_ins_code"),
+    (SHEET, "end_auth_seq_id"),
+    (SHEET, "pdbx_end_PDB_ins_code"),
+    (METRIC, "id"),
+    (METRIC, "mode"),
+    (METRIC, "type"),
+    (LOCAL, "model_id"),
+    (LOCAL, "label_asym_id"),
+    (LOCAL, "label_seq_id"),
+    (LOCAL, "label_comp_id"),
+    (LOCAL, "metric_value"),
+    (LOCAL, "metric_id"),
 ];
 
-/// Number of items that describe entities.
-const N_ENTITY_ITEMS: usize = 5;
+/// Names of the data that groups of items describe, and the end of each group among the [`ITEMS`].
+const GROUPS: [(&str, usize); 4] =
+    [("entities", 5), ("assemblies", 21), ("helices and strands", 33), ("confidences", 42)];
+/// First items of the groups after the entities.
+const ASSEMBLIES: usize = GROUPS[0].1;
+const SECONDARY: usize = GROUPS[1].1;
+const CONFIDENCES: usize = GROUPS[2].1;
 
-/// Largest number of values of an item. The largest entries of the PDB have about ten thousand chains.
+/// Maximum number of values of an item. The largest entries of the PDB have about ten thousand chains.
 pub(super) const MAX_VALUES: usize = 1 << 18;
 
-/// Returns true if both items, given by index, describe entities, or both describe assemblies.
+/// Returns true if both items, given by index, belong to the same group.
 pub(super) fn describe_the_same(a: usize, b: usize) -> bool {
-    (a < N_ENTITY_ITEMS) == (b < N_ENTITY_ITEMS)
+    group(a) == group(b)
+}
+
+/// Returns the number of the group of an item, given by index.
+fn group(place: usize) -> usize {
+    GROUPS.iter().position(|(_, end)| place < *end).unwrap_or(GROUPS.len() - 1)
 }
 
 /// Type of an entity.
@@ -76,12 +113,18 @@ impl Entity {
 }
 
 /// Values of the [`ITEMS`], in file order.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Categories {
     values: [Vec<String>; ITEMS.len()],
     /// Bytes of all values.
     bytes: u64,
     full: bool,
+}
+
+impl Default for Categories {
+    fn default() -> Self {
+        Self { values: std::array::from_fn(|_| Vec::new()), bytes: 0, full: false }
+    }
 }
 
 impl Categories {
@@ -98,13 +141,13 @@ impl Categories {
         ITEMS.iter().any(|(known, _)| known.as_bytes().eq_ignore_ascii_case(category))
     }
 
-    /// Adds a value of the item with index `place`. All values count towards the limit of decompressed data, because a
-    /// BinaryCIF file may repeat one long text.
+    /// Adds a value of the item with index `item_ix`. All values count towards the limit of decompressed data, because
+    /// a BinaryCIF file may repeat one long text.
     ///
     /// # Errors
     /// Returns [`StructureError::InflatedTooLarge`] and [`StructureError::Memory`].
-    pub(super) fn add(&mut self, place: usize, value: &[u8], reading: &Reading<'_>) -> Result<(), StructureError> {
-        let values = &mut self.values[place];
+    pub(super) fn add(&mut self, item_ix: usize, value: &[u8], reading: &Reading<'_>) -> Result<(), StructureError> {
+        let values = &mut self.values[item_ix];
         if values.len() >= MAX_VALUES {
             self.full = true;
             return Ok(());
@@ -122,12 +165,11 @@ impl Categories {
         Ok(())
     }
 
-    /// Removes the entities, or the assemblies, to which the item with index `place` belongs. Returns the name of these
-    /// data.
-    pub(super) fn forget(&mut self, place: usize) -> &'static str {
+    /// Removes the values of the group to which the item with index `item_ix` belongs. Returns the name of these data.
+    pub(super) fn forget(&mut self, item_ix: usize) -> &'static str {
         let values = self.values.iter_mut().enumerate();
-        values.filter(|(other, _)| describe_the_same(*other, place)).for_each(|(_, values)| values.clear());
-        if place < N_ENTITY_ITEMS { "entities" } else { "assemblies" }
+        values.filter(|(other, _)| describe_the_same(*other, item_ix)).for_each(|(_, values)| values.clear());
+        GROUPS[group(item_ix)].0
     }
 
     /// Returns true if the types of entities and the entities of chains are known.
@@ -138,14 +180,25 @@ impl Categories {
 
     /// Returns true if every item that describes assemblies has values.
     pub(super) fn assemblies_are_known(&self) -> bool {
-        self.values[N_ENTITY_ITEMS..].iter().all(|values| !values.is_empty())
+        self.values[ASSEMBLIES..SECONDARY].iter().all(|values| !values.is_empty())
+    }
+
+    /// Returns true if there are helices or strands.
+    pub(super) fn secondary_is_known(&self) -> bool {
+        self.values[SECONDARY..CONFIDENCES].iter().any(|values| !values.is_empty())
+    }
+
+    /// Returns true if there are confidences of residues.
+    pub(super) fn confidences_are_known(&self) -> bool {
+        self.values[CONFIDENCES..].iter().all(|values| !values.is_empty())
     }
 
     /// Returns a warning if there were too many values.
     pub(super) fn warning(&self) -> Option<String> {
         self.full.then(|| {
             format!(
-                "more than {MAX_VALUES} entities, chains or operators of assemblies; the rest are treated as unknown"
+                "more than {MAX_VALUES} entities, chains, operators of assemblies, helices, strands or confidences; \
+                 the rest are treated as unknown"
             )
         })
     }
@@ -166,10 +219,49 @@ impl Categories {
         chains.iter().cloned().zip(of_chains.iter().cloned()).collect()
     }
 
+    /// Returns the values of residues.
+    pub(super) fn annotations(&self) -> Annotations {
+        let row =
+            |first: usize, row: usize| move |item: usize| self.values[first + item].get(row).map_or("", String::as_str);
+        let conf = (0..self.values[SECONDARY].len()).filter_map(|i| {
+            let value = row(SECONDARY, i);
+            SecondaryRange::of_conf(std::array::from_fn(value))
+        });
+        let first_sheet = SECONDARY + 7;
+        let sheets = (0..self.values[first_sheet].len()).filter_map(|i| {
+            let value = row(first_sheet, i);
+            SecondaryRange::of_sheet(std::array::from_fn(value))
+        });
+        Annotations { secondary: conf.chain(sheets).collect(), confidence: self.confidences() }
+    }
+
+    /// Returns the confidences of residues (pLDDT), from the first metric of this type.
+    fn confidences(&self) -> Vec<ResidueConfidence> {
+        let [ids, modes, types, rows @ .., metrics] = &self.values[CONFIDENCES..] else { return Vec::new() };
+        let metric = ids.iter().zip(modes.iter().zip(types)).find(|(_, (mode, kind))| {
+            mode.eq_ignore_ascii_case("local") && kind.to_ascii_lowercase().starts_with("plddt")
+        });
+        let Some((metric, (_, kind))) = metric else { return Vec::new() };
+        let own = metrics.iter().enumerate().filter(|(_, of)| *of == metric);
+        let mut own: Vec<ResidueConfidence> = own
+            .filter_map(|(i, _)| {
+                let value = |item: usize| rows[item].get(i).map_or("", String::as_str);
+                ResidueConfidence::of(std::array::from_fn(value))
+            })
+            .collect();
+        // Programs also use the plain type for values up to 1.
+        if kind.contains("[0,1]") || own.iter().all(|row| row.value <= 1.0) {
+            for row in &mut own {
+                row.value *= 100.0;
+            }
+        }
+        own
+    }
+
     /// Returns the assemblies.
     pub(super) fn assemblies(self) -> Assemblies {
         let mut assemblies = Assemblies::default();
-        let mut values = self.values.into_iter().skip(N_ENTITY_ITEMS);
+        let mut values = self.values.into_iter().take(SECONDARY).skip(ASSEMBLIES);
         let mut column = || values.next().unwrap_or_default();
         let [of, expressions, chains, ids] = [column(), column(), column(), column()];
         let numbers: Vec<Vec<String>> = values.collect();
@@ -252,7 +344,7 @@ mod tests {
     #[test]
     fn assemblies_are_rules_and_operators() {
         let mut values = vec![("pdbx_struct_oper_list.id", "7"), ("PDBX_STRUCT_OPER_LIST.ID", "8")];
-        for (row, (name, item)) in ITEMS.into_iter().skip(9).enumerate() {
+        for (row, (name, item)) in ITEMS.into_iter().take(21).skip(9).enumerate() {
             assert_eq!(name, "pdbx_struct_oper_list");
             let item: &'static str = format!("{name}.{item}").leak();
             // The identity with a translation of 4.5, -1 and 0 Å, and an operator without a number.

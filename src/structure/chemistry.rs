@@ -1,6 +1,6 @@
 //! Refines kinds: polymers become protein or nucleic, ligands become ion, cofactor or glycan.
 
-use super::atoms::{Columns, Tables};
+use super::atoms::{Slices, Tables};
 use super::categories::Entity;
 use super::contents::Kind;
 use super::element;
@@ -42,7 +42,7 @@ impl Backbone {
 }
 
 /// Properties of residue names, atom names and chains, by text id.
-struct Texts<'a> {
+pub(super) struct TextClasses<'a> {
     classes: Vec<Class>,
     ions: Vec<bool>,
     backbone: Vec<Backbone>,
@@ -51,8 +51,8 @@ struct Texts<'a> {
     tables: &'a Tables,
 }
 
-impl<'a> Texts<'a> {
-    fn new(tables: &'a Tables, sequence: &'a Sequence) -> Self {
+impl<'a> TextClasses<'a> {
+    pub(super) fn new(tables: &'a Tables, sequence: &'a Sequence) -> Self {
         Self {
             classes: tables.residue.texts().map(Class::of).collect(),
             ions: tables.residue.texts().map(residue::is_ion).collect(),
@@ -63,12 +63,12 @@ impl<'a> Texts<'a> {
         }
     }
 
-    fn entity(&self, columns: &Columns, i: usize) -> Option<Entity> {
+    fn entity(&self, columns: &Slices<'_>, i: usize) -> Option<Entity> {
         self.entities.get(columns.label_chain[i] as usize).copied().flatten()
     }
 
-    /// Returns true if the file declares that the residue of atom `i` is part of a polymer, or a bond shows it.
-    fn is_declared_polymer(&self, columns: &Columns, i: usize) -> bool {
+    /// Returns true if, according to the file or to a bond, the residue of atom `i` is part of a polymer.
+    fn is_declared_polymer(&self, columns: &Slices<'_>, i: usize) -> bool {
         columns.hetero[i]
             || self.entity(columns, i) == Some(Entity::Polymer)
             || self
@@ -78,45 +78,44 @@ impl<'a> Texts<'a> {
 
     /// Returns true if all atoms of a residue are metals or halogens. Atoms without an element count as such if the
     /// residue has the name of an ion.
-    fn is_ion(&self, columns: &Columns, rows: std::ops::Range<usize>) -> bool {
+    fn is_ion(&self, columns: &Slices<'_>, rows: std::ops::Range<usize>) -> bool {
         let listed = self.ions[columns.residue[rows.start] as usize];
         columns.element[rows].iter().all(|&z| if z == 0 { listed } else { element::forms_ions(z) })
     }
-}
 
-/// Replaces the kinds polymer and ligand by the more specific kinds.
-pub(super) fn refine(columns: &mut Columns, tables: &Tables, sequence: &Sequence) {
-    let texts = Texts::new(tables, sequence);
-    let (mut first, mut before) = (0, None);
-    while first < columns.len() {
-        let end = (first + 1..columns.len()).find(|&i| !kinds::same_residue(columns, i, first));
-        let end = end.unwrap_or(columns.len());
-        let class = texts.classes[columns.residue[first] as usize];
-        let is_ion = !matches!(class, Class::AminoAcid | Class::Nucleotide) && texts.is_ion(columns, first..end);
-        let kind = polymer_kind(columns, &texts, first..end, class, before);
-        let other = match class {
-            Class::Cofactor => Kind::Cofactor,
-            Class::Saccharide => Kind::Glycan,
-            _ if texts.entity(columns, first) == Some(Entity::Branched) => Kind::Glycan,
-            _ => Kind::Ligand,
-        };
-        for i in first..end {
-            columns.kind[i] = match columns.kind[i] {
-                Kind::Water => Kind::Water,
-                _ if is_ion => Kind::Ion,
-                Kind::Polymer => kind,
-                _ => other,
+    /// Replaces the kinds polymer and ligand by the more specific kinds.
+    pub(super) fn refine(&self, columns: &mut Slices<'_>) {
+        let (mut first, mut before) = (0, None);
+        while first < columns.len() {
+            let end = (first + 1..columns.len()).find(|&i| !kinds::same_residue(columns, i, first));
+            let end = end.unwrap_or(columns.len());
+            let class = self.classes[columns.residue[first] as usize];
+            let is_ion = !matches!(class, Class::AminoAcid | Class::Nucleotide) && self.is_ion(columns, first..end);
+            let kind = polymer_kind(columns, self, first..end, class, before);
+            let other = match class {
+                Class::Cofactor => Kind::Cofactor,
+                Class::Saccharide => Kind::Glycan,
+                _ if self.entity(columns, first) == Some(Entity::Branched) => Kind::Glycan,
+                _ => Kind::Ligand,
             };
+            for i in first..end {
+                columns.kind[i] = match columns.kind[i] {
+                    Kind::Water => Kind::Water,
+                    _ if is_ion => Kind::Ion,
+                    Kind::Polymer => kind,
+                    _ => other,
+                };
+            }
+            before = Some((first, columns.kind[first]));
+            first = end;
         }
-        before = Some((first, columns.kind[first]));
-        first = end;
     }
 }
 
 /// Returns the kind of a residue of a polymer. `before` has an atom of the preceding residue, and its kind.
 fn polymer_kind(
-    columns: &Columns,
-    texts: &Texts<'_>,
+    columns: &Slices<'_>,
+    texts: &TextClasses<'_>,
     rows: std::ops::Range<usize>,
     class: Class,
     before: Option<(usize, Kind)>,

@@ -9,7 +9,7 @@ use super::text::Fault;
 
 /// Kind of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum TokenKind {
     /// `data_NAME`.
     Data,
     /// `save_NAME` begins a frame, `save_` ends it.
@@ -29,7 +29,7 @@ pub(super) enum Kind {
 /// A token and its byte range.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Token {
-    pub(super) kind: Kind,
+    pub(super) kind: TokenKind,
     pub(super) start: usize,
     pub(super) end: usize,
 }
@@ -40,7 +40,7 @@ impl Token {
     #[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
     pub(super) fn fault(&self, text: &[u8], expected: impl Into<String>) -> Box<Fault> {
         match self.kind {
-            Kind::End => Fault::words(self.start, "the end of the file", expected),
+            TokenKind::End => Fault::words(self.start, "the end of the file", expected),
             _ => Fault::token(text, self.start, self.end, expected),
         }
     }
@@ -58,13 +58,13 @@ impl<'a> Tokenizer<'a> {
         Self { text, at: 0 }
     }
 
-    /// Returns the next token. At the end, every call returns [`Kind::End`].
+    /// Returns the next token. At the end, every call returns [`TokenKind::End`].
     pub(super) fn next(&mut self) -> Result<Token, Box<Fault>> {
         self.skip_blanks();
         let text = self.text;
         let start = self.at;
         let Some(&first) = text.get(start) else {
-            return Ok(Token { kind: Kind::End, start, end: start });
+            return Ok(Token { kind: TokenKind::End, start, end: start });
         };
         match first {
             b'\'' | b'"' => self.quoted(first),
@@ -80,14 +80,14 @@ impl<'a> Tokenizer<'a> {
     fn skip_blanks(&mut self) {
         let mut comment = false;
         let blanks = self.text[self.at..].iter().position(|&b| {
-            // Both are short in real files, so a vectorized search does not pay.
+            // Both are short in real files, so a vectorized search would not be faster.
             comment = if comment { b != b'\n' && b != b'\r' } else { b == b'#' };
             !comment && b > b' '
         });
         self.at = blanks.map_or(self.text.len(), |n| self.at + n);
     }
 
-    /// Reads a quoted value. A quote ends it only if white space follows, and on the same line.
+    /// Reads a quoted value. It ends at the first quote on the same line that white space follows.
     fn quoted(&mut self, quote: u8) -> Result<Token, Box<Fault>> {
         let start = self.at;
         let mut before = 0;
@@ -100,7 +100,7 @@ impl<'a> Tokenizer<'a> {
         // The opening quote is not a closing one, even if a space follows it directly.
         if end > start + 1 && self.text[end - 1] == quote {
             self.at = end;
-            return Ok(Token { kind: Kind::Value, start, end });
+            return Ok(Token { kind: TokenKind::Value, start, end });
         }
         Err(Fault::token(self.text, start, end, format!("a closing {} on the same line", char::from(quote))))
     }
@@ -111,7 +111,7 @@ impl<'a> Tokenizer<'a> {
         match line_beginning_with_semicolon(self.text, start + 1) {
             Some(i) => {
                 self.at = i + 1;
-                Ok(Token { kind: Kind::Value, start, end: self.at })
+                Ok(Token { kind: TokenKind::Value, start, end: self.at })
             }
             None => Err(Fault::words(start, "a text field without end", "a line that begins with ;")),
         }
@@ -141,24 +141,24 @@ fn at_line_start(text: &[u8], at: usize) -> bool {
 }
 
 /// Returns the kind of an unquoted token.
-pub(super) fn bare_kind(token: &[u8]) -> Kind {
+pub(super) fn bare_kind(token: &[u8]) -> TokenKind {
     if token[0] == b'_' {
-        return Kind::Tag;
+        return TokenKind::Tag;
     }
     if token.get(4) != Some(&b'_') && token.get(6) != Some(&b'_') {
-        return Kind::Value;
+        return TokenKind::Value;
     }
     let starts = |word: &[u8]| token.get(..word.len()).is_some_and(|t| t.eq_ignore_ascii_case(word));
     if starts(b"data_") {
-        Kind::Data
+        TokenKind::Data
     } else if starts(b"save_") {
-        Kind::Save
+        TokenKind::Save
     } else if token.eq_ignore_ascii_case(b"loop_") {
-        Kind::Loop
+        TokenKind::Loop
     } else if token.eq_ignore_ascii_case(b"stop_") || token.eq_ignore_ascii_case(b"global_") {
-        Kind::Reserved
+        TokenKind::Reserved
     } else {
-        Kind::Value
+        TokenKind::Value
     }
 }
 
@@ -192,12 +192,12 @@ fn unquote_slow(text: &[u8], start: usize, end: usize) -> (usize, usize, bool) {
 mod tests {
     use super::*;
 
-    fn tokens(text: &str) -> Vec<(Kind, String)> {
+    fn tokens(text: &str) -> Vec<(TokenKind, String)> {
         let mut tokenizer = Tokenizer::new(text.as_bytes());
         let mut out = Vec::new();
         loop {
             let token = tokenizer.next().unwrap();
-            if token.kind == Kind::End {
+            if token.kind == TokenKind::End {
                 return out;
             }
             let (start, end, _) = unquote(text.as_bytes(), token.start, token.end);
@@ -206,14 +206,14 @@ mod tests {
     }
 
     fn values(text: &str) -> Vec<String> {
-        tokens(text).into_iter().filter(|t| t.0 == Kind::Value).map(|t| t.1).collect()
+        tokens(text).into_iter().filter(|t| t.0 == TokenKind::Value).map(|t| t.1).collect()
     }
 
     #[test]
     fn words_tags_and_values() {
-        let kinds: Vec<Kind> =
+        let kinds: Vec<TokenKind> =
             tokens("data_X\nLOOP_ _a.b save_f _c 1 save_ stop_ global_ datax loop_x").iter().map(|t| t.0).collect();
-        use Kind::*;
+        use TokenKind::*;
         assert_eq!(kinds, [Data, Loop, Tag, Save, Tag, Value, Save, Reserved, Reserved, Value, Value]);
     }
 
@@ -235,7 +235,7 @@ mod tests {
             let mut tokenizer = Tokenizer::new(text.as_bytes());
             let fault = loop {
                 match tokenizer.next() {
-                    Ok(token) => assert_ne!(token.kind, Kind::End, "{text:?}"),
+                    Ok(token) => assert_ne!(token.kind, TokenKind::End, "{text:?}"),
                     Err(fault) => break fault,
                 }
             };
@@ -249,7 +249,7 @@ mod tests {
             let mut tokenizer = Tokenizer::new(text.as_bytes());
             for _ in 0..=text.len() {
                 match tokenizer.next() {
-                    Ok(t) if t.kind != Kind::End => { unquote(text.as_bytes(), t.start, t.end); }
+                    Ok(t) if t.kind != TokenKind::End => { unquote(text.as_bytes(), t.start, t.end); }
                     _ => return Ok(()),
                 }
             }

@@ -193,7 +193,8 @@ fn named(names: impl Iterator<Item = String>, n: usize, what: &str) -> String {
     if n == 1 { format!("{what} {list}") } else { format!("{n} {what}s: {list}") }
 }
 
-fn shown(chain: &str) -> String {
+/// Returns the name of a chain for a message.
+pub(super) fn shown(chain: &str) -> String {
     if chain.is_empty() { "(blank)".to_owned() } else { chain.to_owned() }
 }
 

@@ -1,10 +1,11 @@
-//! Copies of the selected atoms that make up an assembly.
+//! Copies of the selected atoms that form an assembly.
 
 use std::collections::HashMap;
 use std::ops::Range;
 
 use super::assembly::{BadExpression, Generator, Operator};
 use super::atoms::Structure;
+use super::contents::shown;
 use super::error::StructureError;
 use super::read::{ReadLimits, check};
 use super::select::Selected;
@@ -17,12 +18,12 @@ use crate::surface::Control;
 pub struct PlacedCopy {
     /// Rows of [`Selected::atoms`].
     pub rows: Range<usize>,
-    /// Operator that moves the atoms to their place.
+    /// Operator that moves the atoms to their positions in the assembly.
     pub operator: Operator,
 }
 
 /// Rule of an assembly with its chains.
-struct Part<'s> {
+struct RuleChains<'s> {
     generator: &'s Generator,
     /// Ids of the chains in their column, ascending.
     chains: Vec<u32>,
@@ -34,7 +35,7 @@ pub(super) struct Assembly<'s> {
     id: &'s str,
     /// Column of the chain names that the assemblies of this file use.
     column: &'s TextColumn,
-    parts: Vec<Part<'s>>,
+    parts: Vec<RuleChains<'s>>,
     /// True for chains of the assembly, by id.
     covered: Vec<bool>,
 }
@@ -43,7 +44,8 @@ impl<'s> Assembly<'s> {
     /// Finds an assembly of the file.
     ///
     /// # Errors
-    /// Returns [`StructureError::NotFound`] if the file has none with this id.
+    /// Returns [`StructureError::NotFound`] if the file has none with this id, [`StructureError::BadAssembly`] if it
+    /// has no atoms of any of its chains.
     pub(super) fn find(structure: &'s Structure, id: &'s str) -> Result<Self, StructureError> {
         let column = if structure.label_chain.is_empty() { &structure.chain } else { &structure.label_chain };
         let ids: HashMap<&str, u32> = column.texts().zip(0..).collect();
@@ -51,21 +53,30 @@ impl<'s> Assembly<'s> {
             let mut chains: Vec<u32> = generator.chains().filter_map(|name| ids.get(name).copied()).collect();
             chains.sort_unstable();
             chains.dedup();
-            Part { generator, chains }
+            RuleChains { generator, chains }
         };
-        let parts: Vec<Part<'s>> = structure.assemblies.generators(id).map(part).collect();
+        let parts: Vec<RuleChains<'s>> = structure.assemblies.generators(id).map(part).collect();
         if parts.is_empty() {
             let known = structure.assemblies.list(0);
             let n = known.len();
-            let names = list(known.into_iter().map(|(id, _)| id.chars().take(40).collect()), n);
+            let names = list(known.into_iter().map(|(id, _)| id.to_owned()), n);
             return Err(StructureError::NotFound {
                 what: "assembly",
-                asked: format!("`{}`", id.chars().take(40).collect::<String>()),
+                requested: format!("`{}`", id.chars().take(40).collect::<String>()),
                 available: if n == 0 { "no assemblies".to_owned() } else { format!("the assemblies {names}") },
             });
         }
         let mut covered = vec![false; column.texts().len()];
         parts.iter().flat_map(|part| &part.chains).for_each(|&chain| covered[chain as usize] = true);
+        if !covered.contains(&true) {
+            let named: Vec<String> = parts.iter().flat_map(|part| part.generator.chains()).map(shown).collect();
+            let n = named.len();
+            return Err(StructureError::BadAssembly {
+                id: id.chars().take(40).collect(),
+                found: format!("chains without atoms: {}", list(named, n)),
+                expected: format!("chains of the file: {}", list(column.texts().map(shown), column.texts().len())),
+            });
+        }
         Ok(Self { structure, id, column, parts, covered })
     }
 
@@ -96,7 +107,7 @@ impl<'s> Assembly<'s> {
         let rows = self.rows_of_chains(&atoms);
         let (mut n_copies, mut n_atoms) = (0_u64, 0_u64);
         let mut parts: Vec<(&Generator, Vec<Range<usize>>)> = Vec::new();
-        for Part { generator, chains } in &self.parts {
+        for RuleChains { generator, chains } in &self.parts {
             let rows = chains.iter().map(|&chain| rows[chain as usize].clone());
             let rows: Vec<Range<usize>> = rows.filter(|rows| !rows.is_empty()).collect();
             if rows.is_empty() {

@@ -8,18 +8,19 @@ use super::error::StructureError;
 use super::read::Reading;
 
 /// Model and position of an atom, compared bit by bit.
-type Place = (i32, [u64; 3]);
+type AtomPosition = (i32, [u64; 3]);
 
 /// Average number of rows in a bucket.
 const ROWS_PER_BUCKET: usize = 64;
 /// Bytes of an entry of the exact count.
-const BYTES_PER_PLACE: u64 = 64;
+const BYTES_PER_POSITION: u64 = 64;
 /// Rows between two checks of the cancellation flag: about a millisecond.
 const ROWS_PER_CHECK: usize = 1 << 17;
 
 /// Rejects rows of which more than the limit have the same model and position. `row` returns both for a row below `n`.
 ///
-/// Counts buckets of a hash first, which is fast and needs little memory. Only rows of crowded buckets are compared.
+/// Counts the rows of each bucket of a hash first, which is fast and needs little memory. Compares only the rows of
+/// buckets with more rows than the limit.
 ///
 /// # Errors
 /// Returns [`StructureError::TooManyDuplicates`] with the position that exceeds the limit first, in the order of rows,
@@ -34,7 +35,7 @@ pub(super) fn check(
         return Ok(());
     }
     // Adding 0 turns -0 into 0.
-    let place = |i| -> Place {
+    let key = |i| -> AtomPosition {
         let (model, position) = row(i);
         (model, position.map(|c| (c + 0.0).to_bits()))
     };
@@ -42,7 +43,7 @@ pub(super) fn check(
     let _of_counts = reading.reserve(4 * n_buckets as u64)?;
     let mut counts = vec![0_u32; n_buckets];
     // The high bits of the hash depend on all bits of the input.
-    let bucket = |i| (FxBuildHasher.hash_one(place(i)) >> 32) as usize & (n_buckets - 1);
+    let bucket = |i| (FxBuildHasher.hash_one(key(i)) >> 32) as usize & (n_buckets - 1);
     for i in 0..n {
         if i % ROWS_PER_CHECK == 0 {
             reading.check()?;
@@ -54,8 +55,8 @@ pub(super) fn check(
     if crowded == 0 {
         return Ok(());
     }
-    let _of_places = reading.reserve(BYTES_PER_PLACE * crowded)?;
-    let mut places: FxHashMap<Place, u64> = FxHashMap::default();
+    let _of_positions = reading.reserve(BYTES_PER_POSITION * crowded)?;
+    let mut positions: FxHashMap<AtomPosition, u64> = FxHashMap::default();
     for i in 0..n {
         if i % ROWS_PER_CHECK == 0 {
             reading.check()?;
@@ -63,7 +64,7 @@ pub(super) fn check(
         if !is_crowded(counts[bucket(i)]) {
             continue;
         }
-        let count = places.entry(place(i)).or_default();
+        let count = positions.entry(key(i)).or_default();
         *count += 1;
         if *count > limit {
             let (_, [x, y, z]) = row(i);
@@ -85,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn the_limit_is_exact_and_the_first_place_is_named() {
+    fn the_limit_is_exact_and_the_first_position_is_named() {
         let apart = |i: u32| (1, [f64::from(i), 0.5, -0.25]);
         let mut rows: Vec<_> = (0..100_000).map(apart).collect();
         assert_eq!(count(&rows, 1), Ok(()));

@@ -1,4 +1,4 @@
-//! Converts element symbols to atomic numbers, and guesses the element if a file does not give it.
+//! Atomic numbers of element symbols, and guesses of the element if a file does not contain it.
 //!
 //! An atom name such as `CA` is a carbon or a calcium. PDB files right-align the symbol in the first two columns of the
 //! name, so ` CA ` is a carbon and `CA  ` a calcium. The residue takes precedence over the alignment, because files
@@ -69,7 +69,7 @@ const SURE: &[&[u8; 2]] = &[
 
 /// An atom name as the file writes it.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Name<'a> {
+pub(super) struct AtomName<'a> {
     /// Without padding.
     pub(super) text: &'a [u8],
     /// The four name columns of a PDB file, if their alignment can be trusted.
@@ -77,7 +77,7 @@ pub(super) struct Name<'a> {
 }
 
 /// Guesses the atomic number from the names of atom and residue. Returns 0 if they suggest none.
-pub(super) fn guess(name: Name<'_>, residue: &str) -> u8 {
+pub(super) fn guess(name: AtomName<'_>, residue: &str) -> u8 {
     let upper = name.text.to_ascii_uppercase();
     let letters_at = upper.iter().position(u8::is_ascii_alphabetic).unwrap_or(upper.len());
     let rest = &upper[letters_at..];
@@ -96,7 +96,7 @@ pub(super) fn guess(name: Name<'_>, residue: &str) -> u8 {
     match (two, name.columns) {
         // ` CL1`: a symbol of one letter, by its alignment. `1HB `: a leading number.
         (_, Some([b' ', ..])) | (None, _) => single,
-        // `HG11`, `CA12`, `NB1A`: all columns are used, so there is no alignment. Hydrogen and carbon are likelier.
+        // `HG11`, `CA12`, `NB1A`: all columns are used, so there is no alignment. Hydrogen and carbon are more likely.
         (Some(two), Some([_, _, _, last])) if last != b' ' => sure(two, n_letters).unwrap_or(single),
         (Some(two), Some(_)) => aligned_left(two, residue).unwrap_or(single),
         (Some(two), None) => sure(two, n_letters).unwrap_or(single),
@@ -118,8 +118,8 @@ fn sure(two: &[u8], n_letters: usize) -> Option<u8> {
 
 /// Returns the element of a two-letter symbol in the first two columns, where the format puts it.
 fn aligned_left(two: &[u8], residue: &str) -> Option<u8> {
-    // Left-justified hydrogens (`HO1 `, `HE  `) are commoner than helium, holmium, hafnium and hassium, and deuterium
-    // is commoner than dysprosium. These elements are accepted only if the residue names them.
+    // Left-justified hydrogens (`HO1 `, `HE  `) are more common than helium, holmium, hafnium and hassium, and
+    // deuterium is more common than dysprosium. These elements are accepted only if the residue names them.
     let rare = matches!(two, b"HE" | b"HO" | b"HF" | b"HS" | b"DY" | b"DB" | b"DS");
     let named = residue.as_bytes().get(..2).is_some_and(|r| r.eq_ignore_ascii_case(two));
     (!rare || named).then(|| atomic_number(two)).filter(|&z| z != 0)
@@ -131,11 +131,11 @@ mod tests {
     use super::*;
 
     fn pdb(columns: &[u8; 4], residue: &str) -> &'static str {
-        symbol(guess(Name { text: columns.trim_ascii(), columns: Some(*columns) }, residue))
+        symbol(guess(AtomName { text: columns.trim_ascii(), columns: Some(*columns) }, residue))
     }
 
     fn cif(name: &str, residue: &str) -> &'static str {
-        symbol(guess(Name { text: name.as_bytes(), columns: None }, residue))
+        symbol(guess(AtomName { text: name.as_bytes(), columns: None }, residue))
     }
 
     #[test]
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn calcium_is_told_from_carbon_by_place_and_residue() {
+    fn calcium_is_told_from_carbon_by_alignment_and_residue() {
         assert_eq!(pdb(b" CA ", "ALA"), "C");
         assert_eq!(pdb(b"CA  ", "ALA"), "C");
         assert_eq!(pdb(b"CA  ", "CA"), "Ca");

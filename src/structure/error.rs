@@ -98,6 +98,15 @@ pub enum StructureError {
         /// Limit, number of atoms.
         limit: u64,
     },
+    /// `within` would test more distances than allowed.
+    #[error(
+        "`within` tests more than {limit} distances between atoms, which is the limit; select fewer atoms after `of`, \
+         or use a smaller distance"
+    )]
+    TooManyDistances {
+        /// Limit, number of distances.
+        limit: u64,
+    },
     /// The selected atoms would be divided into more parts than allowed.
     #[error("split={split} divides the selected atoms into more than {limit} parts")]
     TooManyParts {
@@ -112,7 +121,7 @@ pub enum StructureError {
          BinaryCIF files can; expected none, chain or residue-group"
     )]
     NoEntities,
-    /// Memory is not available now.
+    /// Not enough memory is available.
     #[error(transparent)]
     Memory(#[from] OutOfMemory),
     /// The caller cancelled.
@@ -131,12 +140,12 @@ pub enum StructureError {
         holds: String,
     },
     /// The requested model, chain, alternative location or assembly does not exist.
-    #[error("{what} {asked} is not in the file; it has {available}")]
+    #[error("{what} {requested} is not in the file; it has {available}")]
     NotFound {
         /// `model`, `chain`, `selected chain` (of an expression), `alternative location` or `assembly`.
         what: &'static str,
         /// The requested value.
-        asked: String,
+        requested: String,
         /// The available values.
         available: String,
     },

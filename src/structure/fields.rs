@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::atoms::{Atom, Source, Structure, Tables};
+use super::atoms::{Atom, SourceFields, Structure, Tables};
 use super::contents::Kind;
 use super::error::StructureError;
 use super::growing::GrowingColumns;
@@ -18,18 +18,18 @@ const LINES_PER_CHECK: usize = 1 << 14;
 
 /// All lines of a text as byte ranges, without line endings (LF, CR LF or CR).
 #[derive(Debug)]
-pub(super) struct Lines<'a> {
+pub(super) struct TextLines<'a> {
     text: &'a [u8],
     at: usize,
 }
 
-impl<'a> Lines<'a> {
+impl<'a> TextLines<'a> {
     pub(super) fn new(text: &'a [u8]) -> Self {
         Self { text, at: 0 }
     }
 }
 
-impl Iterator for Lines<'_> {
+impl Iterator for TextLines<'_> {
     type Item = Range<usize>;
 
     fn next(&mut self) -> Option<Range<usize>> {
@@ -177,7 +177,7 @@ impl<'a> Rows<'a> {
     }
 
     /// Returns the finished structure.
-    pub(super) fn finish(self, source: Source) -> Result<Structure, StructureError> {
+    pub(super) fn finish(self, source: SourceFields) -> Result<Structure, StructureError> {
         self.columns.finish(self.tables, source, self.reading)
     }
 }
@@ -190,9 +190,9 @@ mod tests {
     #[test]
     fn lines_end_in_three_ways_and_blank_ones_count() {
         let text = b"a\n\nb\r\n\r\nc\rd";
-        let lines: Vec<&[u8]> = Lines::new(text).map(|line| &text[line]).collect();
+        let lines: Vec<&[u8]> = TextLines::new(text).map(|line| &text[line]).collect();
         assert_eq!(lines, [&b"a"[..], b"", b"b", b"", b"c", b"d"]);
-        assert_eq!(Lines::new(b"").count(), 0);
+        assert_eq!(TextLines::new(b"").count(), 0);
     }
 
     #[test]

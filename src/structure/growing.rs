@@ -1,6 +1,7 @@
 //! Columns that grow while a file is read: limits, memory and cancellation are checked once per chunk of rows.
 
-use super::atoms::{Atom, Columns, Source, Structure, Tables};
+use super::atoms::{Atom, Columns, SourceFields, Structure, Tables};
+use super::duplicates;
 use super::error::StructureError;
 use super::read::Reading;
 
@@ -13,14 +14,16 @@ pub(super) struct GrowingColumns {
     columns: Columns,
     /// Number of rows at which the next check is due.
     next_check: usize,
+    /// Number of rows at which the next search for atoms at the same position is due.
+    next_search: usize,
     /// Number of texts whose memory is reserved.
     n_texts: usize,
 }
 
 impl GrowingColumns {
-    /// Returns columns that hold rows already, whose memory is reserved.
+    /// Takes columns with rows. The caller has reserved their memory.
     pub(super) fn filled(columns: Columns, tables: &Tables) -> Self {
-        Self { next_check: columns.len(), columns, n_texts: tables.n_texts() }
+        Self { next_check: columns.len(), next_search: 2 * columns.len(), columns, n_texts: tables.n_texts() }
     }
 
     pub(super) fn columns(&self) -> &Columns {
@@ -38,7 +41,7 @@ impl GrowingColumns {
     pub(super) fn finish(
         self,
         tables: Tables,
-        source: Source,
+        source: SourceFields,
         reading: &Reading<'_>,
     ) -> Result<Structure, StructureError> {
         reading.keep_texts(tables.n_texts() - self.n_texts)?;
@@ -59,8 +62,8 @@ impl GrowingColumns {
     /// Reserves memory for more rows, for `expected` rows in an empty column.
     ///
     /// # Errors
-    /// Returns [`StructureError::TooManyAtoms`] at the limit, [`StructureError::Memory`] and
-    /// [`StructureError::Cancelled`].
+    /// Returns [`StructureError::TooManyAtoms`] at the limit, [`StructureError::TooManyDuplicates`],
+    /// [`StructureError::Memory`] and [`StructureError::Cancelled`].
     pub(super) fn reserve_chunk(
         &mut self,
         tables: &Tables,
@@ -74,6 +77,12 @@ impl GrowingColumns {
         reading.check()?;
         if n >= limit {
             return Err(StructureError::TooManyAtoms { limit: reading.limits.max_atoms });
+        }
+        // Searches only when the number of rows has doubled, so that the time of all searches grows linearly with the
+        // number of rows.
+        if n >= self.next_search {
+            duplicates::check(n, |row| self.columns.model_and_position(row), reading)?;
+            self.next_search = (2 * n).max(CHUNK);
         }
         reading.keep_texts(tables.n_texts() - self.n_texts)?;
         self.n_texts = tables.n_texts();

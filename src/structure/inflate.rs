@@ -1,4 +1,4 @@
-//! Decompresses gzip (all members) and zstd (all frames), detected by their magic numbers.
+//! Decompression of gzip (all members) and zstd (all frames), detected by their magic numbers.
 //!
 //! Declared sizes are not trusted. The output buffer at most doubles (or grows by 1 MiB) at a time, and never exceeds
 //! the limit by more than one byte.
@@ -12,7 +12,7 @@ use crate::surface::{MemoryMeter as _, OutOfMemory};
 
 const GZIP: &[u8] = b"\x1f\x8b";
 const ZSTD: &[u8] = b"\x28\xb5\x2f\xfd";
-/// Largest accepted zstd window. The sender chooses the window, so it must be bounded. 32 MiB covers all levels of the
+/// Maximum zstd window, bytes. The sender chooses the window, so it must be bounded. 32 MiB covers all levels of the
 /// usual tools except `--ultra --long`.
 const MAX_ZSTD_WINDOW: u64 = 32 << 20;
 
@@ -27,18 +27,32 @@ pub(super) fn encoding(bytes: &[u8]) -> Option<&'static str> {
     }
 }
 
-/// Returns the decompressed bytes, or the input itself if it is not compressed.
-pub(super) fn inflate<'a>(bytes: &'a [u8], limit: u64, reading: &Reading<'_>) -> Result<Cow<'a, [u8]>, StructureError> {
+/// Check of the bytes that are decompressed so far.
+pub(super) type PrefixCheck<'a> = dyn Fn(&[u8]) -> Result<(), StructureError> + 'a;
+
+/// Returns the decompressed bytes, or the input itself if it is not compressed. Calls `check` with the bytes so far
+/// whenever their number has doubled. An error of `check` ends the decompression.
+pub(super) fn inflate<'a>(
+    bytes: &'a [u8],
+    limit: u64,
+    reading: &Reading<'_>,
+    check: &PrefixCheck<'_>,
+) -> Result<Cow<'a, [u8]>, StructureError> {
     let plain = match encoding(bytes) {
         None if bytes.len() as u64 > limit => return Err(StructureError::InflatedTooLarge { limit }),
         None => return Ok(Cow::Borrowed(bytes)),
-        Some("gzip") => gzip(bytes, limit, reading)?,
-        Some(_) => zstd(bytes, limit, reading)?,
+        Some("gzip") => gzip(bytes, limit, reading, check)?,
+        Some(_) => zstd(bytes, limit, reading, check)?,
     };
     Ok(Cow::Owned(plain))
 }
 
-fn gzip(mut rest: &[u8], limit: u64, reading: &Reading<'_>) -> Result<Vec<u8>, StructureError> {
+fn gzip(
+    mut rest: &[u8],
+    limit: u64,
+    reading: &Reading<'_>,
+    check: &PrefixCheck<'_>,
+) -> Result<Vec<u8>, StructureError> {
     let broken = |e: io::Error| StructureError::Decompress { encoding: "gzip", reason: e.to_string() };
     let mut out = Vec::new();
     while !rest.is_empty() {
@@ -51,13 +65,18 @@ fn gzip(mut rest: &[u8], limit: u64, reading: &Reading<'_>) -> Result<Vec<u8>, S
             return Err(StructureError::Decompress { encoding: "gzip", reason });
         }
         let mut decoder = flate2::bufread::GzDecoder::new(rest);
-        append(&mut decoder, &mut out, limit, reading, broken)?;
+        append(&mut decoder, &mut out, limit, reading, check, broken)?;
         rest = decoder.into_inner();
     }
     Ok(out)
 }
 
-fn zstd(mut rest: &[u8], limit: u64, reading: &Reading<'_>) -> Result<Vec<u8>, StructureError> {
+fn zstd(
+    mut rest: &[u8],
+    limit: u64,
+    reading: &Reading<'_>,
+    check: &PrefixCheck<'_>,
+) -> Result<Vec<u8>, StructureError> {
     let broken = |reason: String| StructureError::Decompress { encoding: "zstd", reason };
     let mut out = Vec::new();
     while !rest.is_empty() {
@@ -68,7 +87,7 @@ fn zstd(mut rest: &[u8], limit: u64, reading: &Reading<'_>) -> Result<Vec<u8>, S
         }
         let mut decoder = ruzstd::decoding::StreamingDecoder::new_with_max_window_size(rest, MAX_ZSTD_WINDOW)
             .map_err(|e| broken(e.to_string()))?;
-        append(&mut decoder, &mut out, limit, reading, |e| broken(e.to_string()))?;
+        append(&mut decoder, &mut out, limit, reading, check, |e| broken(e.to_string()))?;
         // The frame may end with a checksum of the decompressed data.
         let frame = &decoder.decoder;
         if let (Some(said), Some(computed)) = (frame.get_checksum_from_data(), frame.get_calculated_checksum())
@@ -84,21 +103,22 @@ fn zstd(mut rest: &[u8], limit: u64, reading: &Reading<'_>) -> Result<Vec<u8>, S
 /// Bytes decompressed between two checks of the cancellation flag: a few milliseconds.
 const BYTES_PER_CHECK: u64 = 1 << 20;
 
-/// Reads `decoder` to its end into a buffer that doubles. Memory is reserved before the buffer grows; the old buffer
-/// counts until it has been copied.
+/// Reads `decoder` to its end into a buffer that doubles when it is full, so that the time of many members is linear.
+/// Reserves memory before the buffer grows; the old buffer counts until it has been copied.
 fn append(
     decoder: &mut dyn Read,
     out: &mut Vec<u8>,
     limit: u64,
     reading: &Reading<'_>,
+    check: &PrefixCheck<'_>,
     broken: impl Fn(io::Error) -> StructureError,
 ) -> Result<(), StructureError> {
     let limit_len = usize::try_from(limit).unwrap_or(usize::MAX - 1);
     loop {
         let remaining = limit_len.saturating_sub(out.len()).saturating_add(1);
-        let step = out.len().max(1 << 20).min(remaining);
-        let start = out.len();
-        if out.capacity() - start < step {
+        let (start, space) = (out.len(), out.capacity() - out.len());
+        let step = if space > 0 { space } else { start.max(1 << 20) }.min(remaining);
+        if space == 0 {
             let (old, new) = (out.capacity() as u64, (start + step) as u64);
             reading.text.grow(new)?;
             out.try_reserve_exact(step).map_err(|_refused| OutOfMemory::System { needed: new })?;
@@ -117,6 +137,7 @@ fn append(
         if out.len() - start < step {
             return Ok(());
         }
+        check(out)?;
     }
 }
 
@@ -129,12 +150,15 @@ fn skippable_frame(bytes: &[u8]) -> bool {
 #[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use std::io::Write;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
     use super::*;
+    use crate::surface::{Control, MemoryMeter};
 
     fn inflated(bytes: &[u8], limit: u64) -> Result<Cow<'_, [u8]>, StructureError> {
-        let control = crate::surface::Control::default();
-        inflate(bytes, limit, &Reading::new(&super::super::ReadLimits::default(), &control))
+        let control = Control::default();
+        inflate(bytes, limit, &Reading::new(&super::super::ReadLimits::default(), &control), &|_| Ok(()))
     }
 
     fn gz(data: &[u8]) -> Vec<u8> {
@@ -160,6 +184,34 @@ mod tests {
         assert_eq!(inflated(&[gz(b"ab"), vec![0; 512]].concat(), 9).unwrap(), &b"ab"[..]);
     }
 
+    /// Counts how often memory is reserved.
+    #[derive(Debug, Default)]
+    struct Counter(AtomicUsize);
+
+    impl MemoryMeter for Counter {
+        fn grow(&self, _bytes: u64) -> Result<(), OutOfMemory> {
+            self.0.fetch_add(1, Ordering::Relaxed);
+            Ok(())
+        }
+
+        fn shrink(&self, _bytes: u64) {}
+    }
+
+    #[test]
+    fn many_small_members_are_copied_as_rarely_as_one() {
+        let control = |memory: &Arc<Counter>| Control { memory: Arc::clone(memory) as _, ..Control::default() };
+        let plain = vec![b'x'; 5 << 20];
+        let members: Vec<u8> = plain.chunks(1 << 10).flat_map(|piece| [gz(piece), gz(b"")].concat()).collect();
+        for packed in [gz(&plain), members] {
+            let count = Arc::default();
+            let control = control(&count);
+            let limits = super::super::ReadLimits::default();
+            assert!(inflate(&packed, u64::MAX, &Reading::new(&limits, &control), &|_| Ok(())).unwrap() == plain);
+            // 1, 2, 4 and 8 MiB.
+            assert_eq!(count.0.load(Ordering::Relaxed), 4);
+        }
+    }
+
     #[test]
     fn a_bomb_stops_at_the_limit() {
         let zeros = vec![b' '; 64 << 20];
@@ -181,7 +233,7 @@ mod tests {
             }
         }
         assert!(inflated(&[gz(b"ab"), b"junk".to_vec()].concat(), 100).is_err());
-        // A zstd frame header that asks for a window of 2 GiB.
+        // A zstd frame header with a window of 2 GiB.
         let huge = [ZSTD, &[0x00, 0xA8, 0, 0, 0][..]].concat();
         assert!(matches!(inflated(&huge, u64::MAX), Err(StructureError::Decompress { .. })));
     }

@@ -1,18 +1,19 @@
-//! Assigns a kind to every atom: first polymer, ligand, water or virtual site, then a more specific kind.
+//! Assignment of a kind to every atom: first polymer, ligand, water or virtual site, then a more specific kind.
 //!
-//! ATOM records are polymer, except for water and single ions. A HETATM residue is polymer if the file declares it to
-//! be: by the entity of its chain or its `label_seq_id` (mmCIF), or by a SEQRES or MODRES record (PDB). Otherwise it is
+//! ATOM records are polymer, except for water and single ions. A HETATM residue is polymer if the file declares it a
+//! polymer: by the entity of its chain or its `label_seq_id` (mmCIF), or by a SEQRES or MODRES record (PDB). It is also
 //! polymer if a backbone bond joins it to an adjacent polymer residue of the file, directly or through other HETATM
 //! residues.
 
 use std::collections::{HashMap, HashSet};
 
-use super::atoms::{Columns, Tables};
+use super::atoms::{Columns, Slices, Tables};
 use super::categories::{Categories, Entity};
+use super::chemistry::TextClasses;
 use super::contents::Kind;
 use super::error::StructureError;
 use super::read::Reading;
-use super::{chemistry, residue, sites};
+use super::{pieces, residue, sites};
 
 /// Sequence information of a file, by chain.
 #[derive(Debug, Default)]
@@ -49,14 +50,14 @@ pub(super) fn listed(chain: &[u8], residue: &[u8]) -> Option<Listed> {
     Some(columns)
 }
 
-/// Longest bond between carbon and nitrogen of a peptide, Å. The usual length is 1.33 Å; non-bonded contacts are
-/// longer.
+/// Maximum length of a bond between carbon and nitrogen of a peptide, Å. The usual length is 1.33 Å; non-bonded
+/// contacts are longer.
 const PEPTIDE_BOND: f64 = 2.0;
-/// Longest bond between O3' and the next phosphorus, Å. The usual length is 1.6 Å.
+/// Maximum length of a bond between O3' and the next phosphorus, Å. The usual length is 1.6 Å.
 const PHOSPHATE_BOND: f64 = 2.2;
 
-/// Sets the kinds of all atoms. The reader has made ATOM records and rows with a `label_seq_id` polymer, and other
-/// HETATM records ligands. Checks for cancellation between passes.
+/// Sets the kinds of all atoms. The reader has set ATOM records and rows with a `label_seq_id` to polymer, and other
+/// HETATM records to ligand. Checks for cancellation between passes. Chains are independent and assigned in parallel.
 pub(super) fn assign(
     columns: &mut Columns,
     tables: &Tables,
@@ -64,20 +65,44 @@ pub(super) fn assign(
     reading: &Reading<'_>,
 ) -> Result<(), StructureError> {
     let solvent = Solvent::new(tables);
-    if columns.hetero.contains(&true) {
-        let decided = sequenced(columns, tables, sequence, &solvent);
+    let declared = Declared::new(columns, tables, sequence, &solvent);
+    let joints: Vec<Option<Joint>> = tables.name.texts().map(Joint::of).collect();
+    let texts = TextClasses::new(tables, sequence);
+    let bytes = usize::try_from(Columns::bytes(columns.len())).unwrap_or(usize::MAX);
+    let mut parts = whole_chains(columns, reading.n_pieces(bytes));
+    let assigned = pieces::map(&mut parts, |rows| {
         reading.check()?;
-        solvent.mark(columns);
+        let has_hetero = rows.hetero.contains(&true);
+        if has_hetero {
+            declared.mark(rows);
+        }
+        solvent.mark(rows);
+        if has_hetero {
+            reading.check()?;
+            bonded(rows, &joints, &declared);
+        }
         reading.check()?;
-        bonded(columns, tables, &decided);
-    } else {
-        solvent.mark(columns);
-    }
-    reading.check()?;
-    chemistry::refine(columns, tables, sequence);
+        texts.refine(rows);
+        Ok(())
+    });
+    assigned.into_iter().collect::<Result<(), StructureError>>()?;
     reading.check()?;
     sites::mark(columns, tables);
     reading.check()
+}
+
+/// Divides the rows at ends of chains into at most `n` parts of similar size.
+fn whole_chains(columns: &mut Columns, n: usize) -> Vec<Slices<'_>> {
+    let size = columns.len().div_ceil(n).max(1);
+    let mut rest = columns.slices();
+    let mut parts = Vec::with_capacity(n);
+    while rest.len() > 0 {
+        let end = (size..rest.len()).find(|&i| !same_chain(&rest, i - 1, i)).unwrap_or(rest.len());
+        let (part, others) = rest.split(end);
+        parts.push(part);
+        rest = others;
+    }
+    parts
 }
 
 /// Residue names of water and single ions.
@@ -103,11 +128,11 @@ impl Solvent {
         self.kinds[residue as usize].is_some()
     }
 
-    fn mark(&self, columns: &mut Columns) {
+    fn mark(&self, columns: &mut Slices<'_>) {
         if !self.any {
             return;
         }
-        for (kind, &residue) in columns.kind.iter_mut().zip(&columns.residue) {
+        for (kind, &residue) in columns.kind.iter_mut().zip(&*columns.residue) {
             if let Some(solvent) = self.kinds[residue as usize] {
                 *kind = solvent;
             }
@@ -115,24 +140,45 @@ impl Solvent {
     }
 }
 
-/// Sets the kinds of HETATM residues that the file declares. Returns, for each `label_chain` id, true if the entity of
-/// the chain decided.
-fn sequenced(columns: &mut Columns, tables: &Tables, sequence: &Sequence, solvent: &Solvent) -> Vec<bool> {
-    let chains: Vec<Option<bool>> =
-        tables.label_chain.texts().map(|chain| Some(*sequence.entities.get(chain)? == Entity::Polymer)).collect();
-    let numbered = has_sequence_numbers(columns, solvent);
-    let is_listed = |chain: u32, residue: u32| sequence.lists(tables.chain.text(chain), tables.residue.text(residue));
-    for i in 0..columns.len() {
-        if !columns.hetero[i] {
-            continue;
-        }
-        let of_entity = chains.get(columns.label_chain[i] as usize).copied().flatten();
-        let polymer = of_entity.unwrap_or_else(|| {
-            (numbered && columns.kind[i] == Kind::Polymer) || is_listed(columns.chain[i], columns.residue[i])
-        });
-        columns.kind[i] = if polymer { Kind::Polymer } else { Kind::Ligand };
+/// Declarations of a file about its HETATM residues.
+struct Declared<'a> {
+    /// True for polymers, by `label_chain` id; `None` if the entity of the chain is unknown.
+    chains: Vec<Option<bool>>,
+    /// True if `label_seq_id` distinguishes polymers from other residues.
+    numbered: bool,
+    tables: &'a Tables,
+    sequence: &'a Sequence,
+}
+
+impl<'a> Declared<'a> {
+    fn new(columns: &Columns, tables: &'a Tables, sequence: &'a Sequence, solvent: &Solvent) -> Self {
+        let is_polymer = |chain| Some(*sequence.entities.get(chain)? == Entity::Polymer);
+        let chains = tables.label_chain.texts().map(is_polymer).collect();
+        Self { chains, numbered: has_sequence_numbers(columns, solvent), tables, sequence }
     }
-    chains.iter().map(Option::is_some).collect()
+
+    /// Returns true for polymers if the entity of the chain is known.
+    fn of_entity(&self, label_chain: u32) -> Option<bool> {
+        self.chains.get(label_chain as usize).copied().flatten()
+    }
+
+    /// Returns true if a record lists the residue name for the chain.
+    fn lists(&self, chain: u32, residue: u32) -> bool {
+        self.sequence.lists(self.tables.chain.text(chain), self.tables.residue.text(residue))
+    }
+
+    /// Sets the kinds of HETATM residues.
+    fn mark(&self, columns: &mut Slices<'_>) {
+        for i in 0..columns.len() {
+            if !columns.hetero[i] {
+                continue;
+            }
+            let polymer = self.of_entity(columns.label_chain[i]).unwrap_or_else(|| {
+                (self.numbered && columns.kind[i] == Kind::Polymer) || self.lists(columns.chain[i], columns.residue[i])
+            });
+            columns.kind[i] = if polymer { Kind::Polymer } else { Kind::Ligand };
+        }
+    }
 }
 
 /// Returns true if `label_seq_id` distinguishes polymers from other residues. Some programs write it for every atom,
@@ -189,13 +235,11 @@ impl Joints {
     }
 }
 
-/// Turns HETATM residues that backbone bonds join to a polymer residue into polymer. Chains in `decided` do not change.
-fn bonded(columns: &mut Columns, tables: &Tables, decided: &[bool]) {
-    let joints: Vec<Option<Joint>> = tables.name.texts().map(Joint::of).collect();
-    let open = |columns: &Columns, i: usize| {
-        columns.kind[i] == Kind::Ligand
-            && columns.hetero[i]
-            && !decided.get(columns.label_chain[i] as usize).is_some_and(|&decided| decided)
+/// Sets the kind of HETATM residues to polymer if backbone bonds join them to a polymer residue, unless the entity of
+/// their chain is known. `joints` are by name id.
+fn bonded(columns: &mut Slices<'_>, joints: &[Option<Joint>], declared: &Declared<'_>) {
+    let open = |columns: &Slices<'_>, i: usize| {
+        columns.kind[i] == Kind::Ligand && columns.hetero[i] && declared.of_entity(columns.label_chain[i]).is_none()
     };
     if !(0..columns.len()).any(|i| open(columns, i) && joints[columns.name[i] as usize].is_some()) {
         return;
@@ -204,7 +248,7 @@ fn bonded(columns: &mut Columns, tables: &Tables, decided: &[bool]) {
     let (mut group, mut has_polymer, mut has_open) = (0, false, false);
     let (mut before, mut first) = (Joints::default(), 0);
     loop {
-        let (end, here) = residue_from(columns, first, &joints);
+        let (end, here) = residue_from(columns, first, joints);
         let at_end = first == columns.len();
         if at_end || !(first > 0 && same_chain(columns, first - 1, first) && before.lead_to(&here)) {
             if has_polymer && has_open {
@@ -234,16 +278,16 @@ fn bonded(columns: &mut Columns, tables: &Tables, decided: &[bool]) {
     }
 }
 
-pub(super) fn same_chain(columns: &Columns, a: usize, b: usize) -> bool {
+pub(super) fn same_chain(columns: &Slices<'_>, a: usize, b: usize) -> bool {
     columns.chain[a] == columns.chain[b] && columns.model[a] == columns.model[b]
 }
 
 /// Returns the index of the first atom in the residue of atom `i`.
-fn residue_start(columns: &Columns, i: usize) -> usize {
+fn residue_start(columns: &Slices<'_>, i: usize) -> usize {
     (0..i).rev().find(|&before| !same_residue(columns, before, i)).map_or(0, |before| before + 1)
 }
 
-pub(super) fn same_residue(columns: &Columns, a: usize, b: usize) -> bool {
+pub(super) fn same_residue(columns: &Slices<'_>, a: usize, b: usize) -> bool {
     columns.residue_number[a] == columns.residue_number[b]
         && columns.residue[a] == columns.residue[b]
         && columns.insertion_code[a] == columns.insertion_code[b]
@@ -251,7 +295,7 @@ pub(super) fn same_residue(columns: &Columns, a: usize, b: usize) -> bool {
 }
 
 /// Returns the end of the residue that begins with atom `first`, and its joints.
-fn residue_from(columns: &Columns, first: usize, joints: &[Option<Joint>]) -> (usize, Joints) {
+fn residue_from(columns: &Slices<'_>, first: usize, joints: &[Option<Joint>]) -> (usize, Joints) {
     let mut found = Joints::default();
     let mut i = first;
     while i < columns.len() && same_residue(columns, i, first) {

@@ -1,5 +1,5 @@
-//! Reads structure files: PDB, mmCIF, BinaryCIF, PQR and XYZ bytes in, [`crate::surface::Spheres`] out. Positions are
-//! in Å.
+//! Structure files: reads PDB, mmCIF, BinaryCIF, PQR and XYZ, and selects atoms as [`crate::surface::Spheres`].
+//! Positions are in Å.
 //!
 //! The module does not depend on grids, meshes or HTTP. Only [`archive`] reads files from disk.
 //!
@@ -8,6 +8,7 @@
 //! second, strict reader.
 
 mod altloc;
+pub mod annotations;
 pub mod archive;
 mod assembly;
 mod atom_site;
@@ -44,12 +45,13 @@ mod strict_cost;
 #[cfg(feature = "strict")]
 pub mod strict_validator;
 mod survey;
+pub mod table;
 mod text;
 mod texts;
 mod warnings;
 mod xyz;
 
-pub use archive::{Archive, ArchiveError, EntryId, Stamp};
+pub use archive::{Archive, ArchiveError, EntryId, Opened, Stamp};
 pub use assembly::{Assemblies, Operator};
 pub use atoms::{SourceFormat, Structure};
 pub use contents::{Contents, Kind};

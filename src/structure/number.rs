@@ -54,7 +54,7 @@ fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
     let point = (points.wrapping_sub(ONES) & !points & HIGH).trailing_zeros() as usize / 8;
     let integer_digits = point.min(len);
     let digits = len - usize::from(point < len);
-    // The window does not show a point in the ninth position.
+    // The window does not contain a point in the ninth position.
     if digits == 0 || digits > 8 || (point == 8 && len > 8) {
         return None;
     }
@@ -220,8 +220,8 @@ mod tests {
 
     proptest::proptest! {
         #[test]
-        fn every_fixed_point_number_is_the_nearest(value in -99_999_999_i64..=99_999_999, places in 0_usize..=8) {
-            let text = format!("{:.*}", places, value as f64 / 10_f64.powi(places as i32));
+        fn every_fixed_point_number_is_the_nearest(value in -99_999_999_i64..=99_999_999, decimals in 0_usize..=8) {
+            let text = format!("{:.*}", decimals, value as f64 / 10_f64.powi(decimals as i32));
             proptest::prop_assert_eq!(parse(&text), text.parse().ok());
         }
 

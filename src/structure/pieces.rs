@@ -6,17 +6,22 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-/// Smallest piece of a text, bytes. One thread reads it in 0.7 ms (PDB) to 1.5 ms (mmCIF). Smaller pieces gain less
-/// than a busy thread pool may delay them.
+/// Minimum size of a piece of a text, bytes. One thread reads it in 0.7 ms (PDB) to 1.5 ms (mmCIF). Smaller pieces gain
+/// less than a busy thread pool may delay them.
 const MIN_PIECE: usize = 512 << 10;
-/// Largest number of pieces per thread. A thread that is busy with other work then delays the last piece little.
+/// Maximum number of pieces per thread. With several, a thread that is busy with other work delays the end only
+/// slightly.
 const PIECES_PER_THREAD: usize = 4;
 
 /// Returns the number of pieces for a text of this size, 1 if it is small or there is one thread.
 pub(super) fn number(bytes: usize) -> usize {
-    match rayon::current_num_threads() {
-        1 => 1,
-        threads => (bytes / MIN_PIECE).clamp(1, PIECES_PER_THREAD * threads),
+    match bytes / MIN_PIECE {
+        // Requesting the number of threads starts them.
+        0 | 1 => 1,
+        n => match rayon::current_num_threads() {
+            1 => 1,
+            threads => n.min(PIECES_PER_THREAD * threads),
+        },
     }
 }
 
@@ -69,6 +74,14 @@ mod tests {
             ("two-letter chains", {
                 let polymer = |i| atom(" CA ", ["ALAXA", "GLYXA"][usize::from(i % 2 == 0)], i, "");
                 (1..30).map(polymer).collect::<String>() + &many(" CA ", "LIGXA")
+            }),
+            ("bonded residues", {
+                let residue = |name: &str, i: i32| atom(" N  ", name, i, "") + &atom(" C  ", name, i, "");
+                let chain = |first: &str, next: &str| {
+                    let others: String = (1..15).map(|i| residue(next, i)).collect();
+                    residue(first, 0) + &others.replace("ATOM  ", "HETATM")
+                };
+                chain("ALA A", "XYZ A") + &chain("ALA B", "XYZ B") + &chain("XYZ C", "XYZ C")
             }),
             ("listed residues", {
                 let end = plain().replace("ATOM  ", "HETATM").replace("ALA", "XYZ");

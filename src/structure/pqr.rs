@@ -7,19 +7,20 @@
 
 use std::collections::HashMap;
 
+use super::annotations::Annotations;
 use super::assembly::Assemblies;
-use super::atoms::{Atom, Source, SourceFormat, Structure};
+use super::atoms::{Atom, SourceFields, SourceFormat, Structure};
 use super::contents::Kind;
-use super::element::{self, Name};
+use super::element::{self, AtomName};
 use super::error::StructureError;
-use super::fields::{Fields, Lines, Rows};
+use super::fields::{Fields, Rows, TextLines};
 use super::kinds::Sequence;
 use super::number::{self, single};
 use super::read::Reading;
 use super::text::Fault;
 use crate::surface::OutOfMemory;
 
-/// Largest valid radius, Å. Larger numbers are probably from another column.
+/// Maximum valid radius, Å. Larger numbers are probably from another column.
 const MAX_RADIUS: f64 = 100.0;
 
 /// Typical length of a line, bytes.
@@ -42,7 +43,7 @@ fn record(fields: &Fields<'_>) -> Option<(bool, usize)> {
 /// Returns true if the first atom of a PDB or PQR file indicates PQR: it has the fields of PQR and either lacks the
 /// columns of PDB or has more decimals than PDB.
 pub(super) fn is_pqr(head: &[u8]) -> bool {
-    for line in Lines::new(head) {
+    for line in TextLines::new(head) {
         let fields = Fields::split(head, line.clone());
         if let Some((_, first)) = record(&fields) {
             let n = fields.len().saturating_sub(first);
@@ -50,7 +51,7 @@ pub(super) fn is_pqr(head: &[u8]) -> bool {
             if !FIELDS.contains(&n) || !(last - 5..last).all(|i| fields.real(i).is_some()) {
                 return false;
             }
-            // A PDB line without a B-factor has as many fields, with the z coordinate in place of the charge.
+            // A PDB line without a B-factor has the same number of fields, but another column where PQR has the charge.
             let after_coordinates = fields.range(last - 2).0 >= line.start + 54;
             let precise = (last - 2..last).any(|i| decimals(fields.get(i)) > 2);
             return !has_pdb_columns(&head[line]) || (after_coordinates && precise);
@@ -84,7 +85,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
     let expected = text.len() / BYTES_PER_LINE + 1;
     let mut file = Pqr { rows: Rows::new(reading, expected), guesses: HashMap::new(), model: 1 };
     let (mut radii, mut ended) = (Vec::new(), false);
-    for line in Lines::new(text) {
+    for line in TextLines::new(text) {
         file.rows.count_line()?;
         let fields = Fields::split(text, line);
         let Some((hetero, first)) = record(&fields) else {
@@ -102,12 +103,13 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         }
         radii.push(radius);
     }
-    file.rows.finish(Source {
+    file.rows.finish(SourceFields {
         format: SourceFormat::Pqr,
         id: None,
         title: None,
         sequence: Sequence::default(),
         assemblies: Assemblies::default(),
+        annotations: Annotations::default(),
         radii,
         warnings: Vec::new(),
     })
@@ -160,7 +162,7 @@ impl Pqr<'_> {
         let (name, residue) = (tables.name.intern(text, a, b), tables.residue.intern(text, c, d));
         let chain = tables.chain.intern(text, chain.0, chain.1);
         let element = *self.guesses.entry((name, residue)).or_insert_with(|| {
-            element::guess(Name { text: fields.get(first), columns: None }, tables.residue.text(residue))
+            element::guess(AtomName { text: fields.get(first), columns: None }, tables.residue.text(residue))
         });
         let plain = self.rows.atom(position, element, name, self.model);
         let kind = if hetero { Kind::Ligand } else { Kind::Polymer };

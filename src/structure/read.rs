@@ -1,9 +1,11 @@
-//! Entry point of the readers: bytes to atoms.
+//! Entry point of the readers, and their limits.
+
+use std::sync::Arc;
 
 use super::atoms::{SourceFormat, Structure};
 use super::error::StructureError;
 use super::{bcif, inflate, mmcif, pdb, pieces, pqr, sniff, xyz};
-use crate::surface::{Control, MemoryMeter as _, Reservation};
+use crate::surface::{Control, MemoryMeter, Reservation};
 
 /// Limits of reading, checked before memory is allocated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,7 +21,12 @@ pub struct ReadLimits {
     pub max_copies: u64,
     /// Parts into which `split` divides the selected atoms.
     pub max_parts: u64,
+    /// Distances between atoms that an expression with `within` tests.
+    pub max_distances: u64,
 }
+
+/// Tested distances that a selection may have for each candidate pair of the surface.
+pub const DISTANCES_PER_PAIR: u64 = 64;
 
 impl Default for ReadLimits {
     fn default() -> Self {
@@ -29,6 +36,7 @@ impl Default for ReadLimits {
             max_duplicates: 1000,
             max_copies: 10_000,
             max_parts: 1000,
+            max_distances: DISTANCES_PER_PAIR << 30,
         }
     }
 }
@@ -39,7 +47,7 @@ impl ReadLimits {
         if n > self.max_rows() { Err(StructureError::TooManyAtoms { limit: self.max_atoms }) } else { Ok(()) }
     }
 
-    /// Atoms in all models, as a number of rows: rows are counted in 32 bits.
+    /// Maximum number of atoms in all models, limited to 32 bits.
     pub(super) fn max_rows(&self) -> usize {
         usize::try_from(self.max_atoms.min(u64::from(u32::MAX))).unwrap_or(usize::MAX)
     }
@@ -52,7 +60,7 @@ const BYTES_PER_TEXT: u64 = 96;
 pub(super) struct Reading<'a> {
     pub(super) limits: &'a ReadLimits,
     control: &'a Control<'a>,
-    /// Memory that is freed when the file has been read: text, decoded columns, and what pieces hold besides rows.
+    /// Memory that is freed when the file has been read: text, decoded columns, and the data of pieces besides rows.
     pub(super) text: Reservation,
     /// Number of pieces to read; `None` to choose it by size.
     pieces: Option<usize>,
@@ -99,14 +107,14 @@ pub(super) fn check(control: &Control<'_>) -> Result<(), StructureError> {
     if control.cancel.is_cancelled() { Err(StructureError::Cancelled) } else { Ok(()) }
 }
 
-/// Largest accepted coordinate (Å, absolute value per axis). No structure file format has columns for larger values.
+/// Maximum absolute value of a coordinate, Å. No structure file format has columns for larger values.
 pub(super) use crate::surface::spheres::MAX_COORDINATE;
 
 /// Reads a structure. Compression and format are detected from the content, not from a file name. Lines, columns and
 /// byte offsets in errors refer to the decompressed text.
 ///
 /// # Errors
-/// Returns any [`StructureError`] of reading. Never panics, whatever the input.
+/// Returns any [`StructureError`] of reading. Never panics on any input.
 pub fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
     read_with(bytes, limits, &Control::default())
 }
@@ -128,14 +136,45 @@ pub(crate) fn read_in_pieces(bytes: &[u8], limits: &ReadLimits, n: usize) -> Res
 
 fn of_bytes(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     reading.check()?;
-    let plain = inflate::inflate(bytes, reading.limits.max_inflated_bytes, reading)?;
-    let text = without_mark(&plain);
+    let check = |inflated: &[u8]| check_sample(inflated, reading);
+    let plain = inflate::inflate(bytes, reading.limits.max_inflated_bytes, reading, &check)?;
+    of_text(without_mark(&plain), reading)
+}
+
+fn of_text(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     match sniff::sniff(text)? {
         SourceFormat::Pdb => pdb::read(text, reading),
         SourceFormat::Mmcif => mmcif::read(text, reading),
         SourceFormat::BinaryCif => bcif::read(text, reading),
         SourceFormat::Pqr => pqr::read(text, reading),
         SourceFormat::Xyz => xyz::read(text, reading),
+    }
+}
+
+/// Number of inflated bytes from which on a sample is checked whenever the number has doubled.
+const SAMPLED_FROM: usize = 32 << 20;
+/// Size of a sample, bytes: more than ten thousand atoms. It is read in a few milliseconds.
+const SAMPLE_BYTES: usize = 1 << 20;
+
+/// Rejects a file if a sample contains too many atoms at the same position, before the whole file is inflated: such
+/// files compress well. Does not depend on the number of threads. Ignores other errors, which the reader of the whole
+/// file reports.
+fn check_sample(inflated: &[u8], reading: &Reading<'_>) -> Result<(), StructureError> {
+    if inflated.len() < SAMPLED_FROM {
+        return Ok(());
+    }
+    let text = without_mark(inflated);
+    // Any lines of a PDB file can be read separately. Other formats require the beginning of the file.
+    let last = matches!(sniff::sniff(text), Ok(SourceFormat::Pdb));
+    let sample = if last { &text[text.len() - SAMPLE_BYTES..] } else { &text[..SAMPLE_BYTES] };
+    let is_end = |b: &u8| *b == b'\n';
+    let start = if last { sample.iter().position(is_end).map_or(0, |i| i + 1) } else { 0 };
+    let end = sample.iter().rposition(is_end).map_or(start, |i| i + 1).max(start);
+    let memory: Arc<dyn MemoryMeter> = Arc::new(Reservation::new(&reading.control.memory));
+    let control = Control { memory, ..reading.control.clone() };
+    match of_text(&sample[start..end], &Reading { pieces: Some(1), ..Reading::new(reading.limits, &control) }) {
+        Err(error @ (StructureError::TooManyDuplicates { .. } | StructureError::Cancelled)) => Err(error),
+        _ => Ok(()),
     }
 }
 
@@ -149,11 +188,10 @@ pub(super) fn without_mark(text: &[u8]) -> &[u8] {
 mod tests {
     use std::fmt::Write as _;
     use std::io::Write as _;
-    use std::sync::Arc;
     use std::sync::atomic::{AtomicU64, Ordering};
 
     use super::*;
-    use crate::surface::{CancelToken, MemoryMeter, OutOfMemory};
+    use crate::surface::{CancelToken, OutOfMemory};
 
     /// Budget that records its maximum, and cancels once that exceeds a value.
     #[derive(Debug)]
@@ -214,6 +252,43 @@ mod tests {
         let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
         encoder.write_all(text).unwrap();
         encoder.finish().unwrap()
+    }
+
+    /// Returns a compressed file of `head`, lines of atoms at positions 1 to `n_positions`, then `n_equal` equal lines.
+    fn crowded(head: &str, line: impl Fn(u32) -> String, n_positions: u32, n_equal: usize) -> Vec<u8> {
+        let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        encoder.write_all(head.as_bytes()).unwrap();
+        (1..=n_positions).for_each(|i| encoder.write_all(line(i).as_bytes()).unwrap());
+        let block = line(0).repeat(1000);
+        (0..n_equal / 1000).for_each(|_| encoder.write_all(block.as_bytes()).unwrap());
+        encoder.finish().unwrap()
+    }
+
+    #[test]
+    fn atoms_at_one_position_end_the_reading_early() {
+        let pdb = |i: u32| {
+            let [x, y] = [i % 1000, i / 1000].map(f64::from);
+            format!("ATOM      1  CA  ALA A   1    {x:>8.3}{y:>8.3}   0.000  1.00  0.00           C\n")
+        };
+        let head =
+            "data_x\nloop_\n_atom_site.Cartn_x\n_atom_site.Cartn_y\n_atom_site.Cartn_z\n_atom_site.type_symbol\n";
+        let cif = |i: u32| format!("{} {} 0.000 C\n", i % 1000, i / 1000);
+        // The whole files have 128 MiB and more; the first 100,000 atoms of the PDB file have different positions.
+        let files = [crowded("", pdb, 100_000, 1_700_000), crowded(head, cif, 0, 12_000_000)];
+        for file in files {
+            for n_pieces in [1, 2, 7] {
+                let found = read_in_pieces(&file, &ReadLimits::default(), n_pieces).unwrap_err();
+                assert!(matches!(found, StructureError::TooManyDuplicates { x: 0.0, y: 0.0, .. }), "{found}");
+            }
+            let (read, budget) = read_within(&file, u64::MAX, u64::MAX);
+            assert!(matches!(read, Err(StructureError::TooManyDuplicates { .. })));
+            let most = budget.most.load(Ordering::SeqCst);
+            assert!(most < 64 << 20, "{most}");
+            assert_eq!(budget.held.load(Ordering::SeqCst), 0);
+        }
+        // Control: as many atoms at different positions.
+        let apart = crowded("", pdb, 500_000, 0);
+        assert_eq!(read(&apart, &ReadLimits::default()).unwrap().len(), 500_000);
     }
 
     #[test]

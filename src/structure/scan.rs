@@ -1,4 +1,4 @@
-//! Finds the boundaries of tokens separated by white space, 64 bytes at a time.
+//! Boundaries of tokens separated by white space, found in blocks of 64 bytes.
 //!
 //! Vector comparisons yield one bit per byte. Changes between adjacent bits are the starts and ends of tokens. Only
 //! white space (any byte up to the space character) separates tokens here; the caller handles quotes, comments and text

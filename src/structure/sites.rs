@@ -1,4 +1,4 @@
-//! Marks virtual sites of force fields: charge sites of water models, lone pairs, mass centres, Drude particles.
+//! Virtual sites of force fields: charge sites of water models, lone pairs, mass centres, Drude particles.
 
 use std::collections::HashMap;
 
@@ -6,7 +6,7 @@ use super::atoms::{Columns, Tables};
 use super::contents::Kind;
 use super::residue;
 
-/// Largest distance of a Drude particle from its atom, Å. No two atoms are this close.
+/// Maximum distance of a Drude particle from its atom, Å. No two atoms are this close.
 const DRUDE_DISTANCE: f64 = 0.4;
 
 /// Marks virtual sites: by name if the element is unknown, Drude particles by name and distance.

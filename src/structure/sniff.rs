@@ -1,4 +1,4 @@
-//! Detects the file format of decompressed bytes from their content.
+//! Detection of the file format of decompressed bytes from their content.
 
 use super::atoms::SourceFormat;
 use super::error::StructureError;

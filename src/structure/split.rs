@@ -28,7 +28,7 @@ impl Split {
     /// All values.
     pub const ALL: [Self; 4] = [Self::None, Self::Chain, Self::Entity, Self::ResidueGroup];
 
-    /// Its name as a parameter.
+    /// Returns the value of the parameter `split`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {

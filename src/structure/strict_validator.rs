@@ -1,19 +1,26 @@
 //! Strict validation of a structure file by pdbtbx.
 //!
 //! The reader of this crate parses only what it needs and stops at the first error. This module checks the whole file
-//! against the format and lists all findings. They accompany a read error, or answer a strict check. pdbtbx cannot be
-//! stopped, is slow (quadratic in the residues of a chain) and panics on hostile input. Therefore:
+//! against the format and lists all findings, for a read error or a strict check. pdbtbx cannot be stopped, is slow
+//! (quadratic in the residues of a chain) and panics on hostile input. Therefore:
 //!
 //! * It checks at most [`MAX_BYTES`] of text that pdbtbx checks fast enough, or [`MAX_UNREAD_BYTES`] of text that this
 //!   crate cannot read. Call it on a thread that may block for about a second.
+//! * pdbtbx runs on a thread of its own. After a cancellation or the deadline, [`check`] returns at once; the thread
+//!   ends within about a second and keeps its memory reserved until then.
 //! * Panics are caught and become a diagnostic. The panic hook is shared by the whole process, so a library cannot
 //!   replace it without races. Call [`quiet_panics`] from `main` before starting threads: it wraps the hook once and
 //!   silences panics of threads inside [`check`]. Without that call, a caught panic also prints to standard error.
 
+use std::any::Any;
 use std::cell::Cell;
 use std::io::BufReader;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use pdbtbx::{Context, ErrorLevel, Format, PDBError, ReadOptions, StrictnessLevel};
 
@@ -25,20 +32,26 @@ use super::text::decode;
 use super::{inflate, sniff};
 use crate::surface::{Control, Reservation};
 
-/// Largest text that is checked.
+/// Maximum size of a text that is checked, bytes.
 pub const MAX_BYTES: u64 = 8 << 20;
 
-/// Largest text that is checked if this crate cannot read it, so that the cost of checking is unknown. Takes about a
-/// second in the worst case.
+/// Maximum size of a text that is checked although this crate cannot read it, bytes. The cost of the check is then
+/// unknown, about a second at most.
 pub const MAX_UNREAD_BYTES: u64 = 32 << 10;
 
-/// Memory of pdbtbx, bytes per byte of text.
-const MEMORY_PER_BYTE: u64 = 32;
+/// Memory of pdbtbx and of its copy of the text, bytes per byte of text.
+const MEMORY_PER_BYTE: u64 = 33;
 
-/// Largest number of returned diagnostics. A damaged file has one per line.
+/// Maximum number of threads that run pdbtbx. It bounds the number of cancelled checks that still run.
+const MAX_THREADS: usize = 8;
+
+/// Interval at which cancellation and deadline are checked.
+const POLL: Duration = Duration::from_millis(5);
+
+/// Maximum number of returned diagnostics. A damaged file has one per line.
 pub const MAX_DIAGNOSTICS: usize = 100;
 
-/// Longest message in characters.
+/// Maximum length of a message, characters.
 const MAX_MESSAGE: usize = 400;
 
 /// Severity of a finding.
@@ -81,6 +94,30 @@ impl Diagnostic {
     }
 }
 
+/// Number of threads that run pdbtbx.
+static THREADS: AtomicUsize = AtomicUsize::new(0);
+
+/// Slot of a thread among the [`MAX_THREADS`].
+struct ThreadSlot;
+
+impl ThreadSlot {
+    /// Waits for a free slot.
+    fn wait(control: &Control<'_>) -> Result<Self, StructureError> {
+        let take = |n: usize| (n < MAX_THREADS).then_some(n + 1);
+        while THREADS.try_update(Ordering::Relaxed, Ordering::Relaxed, take).is_err() {
+            stop(control)?;
+            thread::sleep(POLL);
+        }
+        Ok(Self)
+    }
+}
+
+impl Drop for ThreadSlot {
+    fn drop(&mut self) {
+        THREADS.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
 thread_local! {
     static INSIDE: Cell<bool> = const { Cell::new(false) };
 }
@@ -96,8 +133,8 @@ pub fn quiet_panics() {
     }));
 }
 
-/// Checks a file, compressed or not. Blocks for about a second at most. Never panics. The only finding about a file
-/// that would take longer is a note that says so.
+/// Checks a file, compressed or not. Blocks for about a second at most. Never panics. If the check would take longer,
+/// the only finding is a note about that.
 ///
 /// # Errors
 /// Returns errors of decompression and format detection, of limits, of memory and of cancellation.
@@ -105,7 +142,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
     let limit = limits.max_inflated_bytes.min(MAX_BYTES);
     let reading = Reading::new(limits, control);
     let too_large = || vec![Diagnostic::note(format!("not checked: the text is larger than {limit} bytes"))];
-    let plain = match inflate::inflate(bytes, limit, &reading) {
+    let plain = match inflate::inflate(bytes, limit, &reading, &|_| Ok(())) {
         Err(StructureError::InflatedTooLarge { .. }) if limit < limits.max_inflated_bytes => return Ok(too_large()),
         plain => plain?,
     };
@@ -120,7 +157,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
         SourceFormat::Pqr => return unread("PQR"),
         SourceFormat::Xyz => return unread("XYZ"),
     };
-    let _memory = reading.reserve(MEMORY_PER_BYTE * text.len() as u64)?;
+    let memory = reading.reserve(MEMORY_PER_BYTE * text.len() as u64)?;
     let of_structure = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
     let cost = match read::read_with(text, limits, &of_structure) {
         Ok(structure) => Cost::of(&structure, text),
@@ -135,21 +172,44 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
         Err(error) => return Err(error),
     };
     drop(of_structure);
-    // The cost is that of one category.
+    // The estimated cost applies to a file with one `atom_site` category.
     if !cost.is_low() || count(text, b"_atom_site.label_asym_id") > 1 {
         let message = "not checked: the strict validator would take too long, because its time grows with the square \
                        of the residues of a chain, the atoms of a residue and the records that refer to atoms";
         return Ok(vec![Diagnostic::note(message.to_owned())]);
     }
-    let _copies = reading.reserve(cost.bytes())?;
-    INSIDE.set(true);
-    let outcome = catch_unwind(AssertUnwindSafe(|| findings(text, format)));
-    INSIDE.set(false);
-    Ok(outcome.unwrap_or_else(|panic| {
-        let words = panic.downcast_ref::<String>().map(String::as_str).or(panic.downcast_ref::<&str>().copied());
-        let message = format!("the strict validator failed on this file: {}", words.unwrap_or("no reason given"));
-        vec![Diagnostic { level: Level::Error, message: short(&message), line: None }]
-    }))
+    let held = (memory, reading.reserve(cost.bytes())?, ThreadSlot::wait(control)?);
+    let (text, (sender, receiver)) = (text.to_vec(), mpsc::sync_channel(1));
+    let run = move || {
+        INSIDE.set(true);
+        let found = catch_unwind(AssertUnwindSafe(|| findings(&text, format))).unwrap_or_else(|panic| failed(&*panic));
+        drop((text, held));
+        // The receiver is gone if the check was cancelled.
+        _ = sender.send(found);
+    };
+    if let Err(error) = thread::Builder::new().name("molmesh-strict".to_owned()).spawn(run) {
+        return Ok(vec![Diagnostic::note(format!("not checked: the strict validator has no thread: {error}"))]);
+    }
+    loop {
+        match receiver.recv_timeout(POLL) {
+            Ok(found) => return Ok(found),
+            Err(RecvTimeoutError::Timeout) => stop(control)?,
+            Err(RecvTimeoutError::Disconnected) => return Ok(failed(&"no result")),
+        }
+    }
+}
+
+/// Returns an error after a cancellation or the deadline.
+fn stop(control: &Control<'_>) -> Result<(), StructureError> {
+    let is_late = control.deadline.is_some_and(|deadline| deadline <= Instant::now());
+    if is_late { Err(StructureError::Cancelled) } else { read::check(control) }
+}
+
+/// Returns the finding about a panic of pdbtbx.
+fn failed(panic: &(dyn Any + Send)) -> Vec<Diagnostic> {
+    let words = panic.downcast_ref::<String>().map(String::as_str).or(panic.downcast_ref::<&str>().copied());
+    let message = format!("the strict validator failed on this file: {}", words.unwrap_or("no reason given"));
+    vec![Diagnostic { level: Level::Error, message: short(&message), line: None }]
 }
 
 fn findings(text: &[u8], format: Format) -> Vec<Diagnostic> {

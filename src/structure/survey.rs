@@ -1,4 +1,4 @@
-//! Counts the entries in a folder of structure files, by file names.
+//! Count of the entries in a folder of structure files, by file names.
 
 use std::collections::BTreeSet;
 use std::io;

@@ -1,4 +1,4 @@
-//! Text helpers: line and column of a byte offset, excerpts for messages, decoding.
+//! Line and column of a byte offset, excerpts of texts for messages, and decoding of texts.
 
 use std::borrow::Cow;
 
@@ -109,10 +109,23 @@ pub(super) fn trimmed(raw: &[u8]) -> (usize, usize) {
     (start, end)
 }
 
-/// Joins `items` with commas, at most twenty of `total`.
+/// Joins `items` with commas: at most twenty of `total`, 48 characters of each and about 400 in all, since a file
+/// determines their number and length.
 pub(super) fn list<I: IntoIterator<Item = String>>(items: I, total: usize) -> String {
-    const SHOWN: usize = 20;
-    let shown: Vec<String> = items.into_iter().take(SHOWN).collect();
+    const MAX_ITEMS: usize = 20;
+    const MAX_ITEM_CHARS: usize = 48;
+    const MAX_CHARS: usize = 400;
+    let mut chars = 0;
+    let shorten = |mut item: String| {
+        if let Some((end, _)) = item.char_indices().nth(MAX_ITEM_CHARS) {
+            item.truncate(end);
+            item.push('…');
+        }
+        let fits = chars < MAX_CHARS;
+        chars += item.chars().count();
+        fits.then_some(item)
+    };
+    let shown: Vec<String> = items.into_iter().take(MAX_ITEMS).map_while(shorten).collect();
     let more = total.saturating_sub(shown.len());
     let joined = shown.join(", ");
     if more > 0 { format!("{joined} and {more} more") } else { joined }
@@ -126,8 +139,17 @@ mod tests {
     #[test]
     fn lines_end_in_three_ways() {
         let text = b"ab\ncd\r\nef\rgh";
-        let places: Vec<_> = [0, 1, 3, 5, 7, 10, 11].iter().map(|&at| line_and_column(text, at)).collect();
-        assert_eq!(places, [(1, 1), (1, 2), (2, 1), (2, 3), (3, 1), (4, 1), (4, 2)]);
+        let positions: Vec<_> = [0, 1, 3, 5, 7, 10, 11].iter().map(|&at| line_and_column(text, at)).collect();
+        assert_eq!(positions, [(1, 1), (1, 2), (2, 1), (2, 3), (3, 1), (4, 1), (4, 2)]);
+    }
+
+    #[test]
+    fn lists_are_short_for_any_items() {
+        let (longest, longer) = ("x".repeat(48), "x".repeat(49));
+        assert_eq!(list(["A".to_owned(), longest.clone()], 3), format!("A, {longest} and 1 more"));
+        assert_eq!(list([longer], 1), format!("{longest}…"));
+        assert_eq!(list(vec!["A".to_owned(); 21], 21), format!("{}A and 1 more", "A, ".repeat(19)));
+        assert!(list(vec!["\u{1f9ec}".repeat(9999); 99], 99).len() < 2000);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Interned strings: columns of names of atoms, residues and chains, which store each distinct text once.
 //!
-//! Real files repeat a few hundred names millions of times. A small cache answers almost every lookup with one
-//! comparison. Misses go to a hash table with a random seed, which resists hostile choices of names.
+//! Real files repeat a few hundred names millions of times. A small cache finds almost every text with one comparison.
+//! Other texts are looked up in a hash table, whose random seed resists hostile choices of names.
 
 use std::hash::RandomState;
 

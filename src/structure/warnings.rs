@@ -2,10 +2,10 @@
 
 use super::error::StructureError;
 
-/// Largest number of warnings with their own message. A damaged file may have one per line.
+/// Maximum number of warnings with their own message. A damaged file may have one per line.
 const KEPT: usize = 10;
 
-/// A fault and the default used in place of the value.
+/// A fault, and the default that replaces the value.
 #[derive(Debug, Clone)]
 pub(super) struct Warning<F> {
     pub(super) fault: F,

@@ -3,11 +3,12 @@
 //! Every frame is a model. Further fields of an atom are ignored. Extended XYZ is read if its `Properties` begin with
 //! the element and the position.
 
+use super::annotations::Annotations;
 use super::assembly::Assemblies;
-use super::atoms::{Source, SourceFormat, Structure};
+use super::atoms::{SourceFields, SourceFormat, Structure};
 use super::element;
 use super::error::StructureError;
-use super::fields::{Fields, Lines, Rows};
+use super::fields::{Fields, Rows, TextLines};
 use super::kinds::Sequence;
 use super::number;
 use super::pdb::MAX_TITLE;
@@ -25,7 +26,7 @@ const SPECIES_AND_POSITION: &[u8] = b"species:S:1:pos:R:3";
 
 /// Returns true if the text begins with a line with one integer, any second line and an atom line.
 pub(super) fn is_xyz(head: &[u8]) -> bool {
-    let mut lines = Lines::new(head).map(|line| Fields::split(head, line));
+    let mut lines = TextLines::new(head).map(|line| Fields::split(head, line));
     let (Some(count), Some(_comment), Some(atom)) = (lines.next(), lines.next(), lines.next()) else { return false };
     let is_element = atom.len() > 1 && (atomic_number(atom.get(0)) != 0);
     count.len() == 1
@@ -48,7 +49,7 @@ fn atomic_number(field: &[u8]) -> u8 {
 /// Returns [`StructureError::Syntax`] for a line that cannot be read, and the errors of limits, memory and
 /// cancellation.
 pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
-    let mut lines = Lines::new(text);
+    let mut lines = TextLines::new(text);
     let mut rows: Option<Rows<'_>> = None;
     let (mut title, mut model) = (None, 0_i32);
     while let Some(line) = lines.next() {
@@ -77,12 +78,13 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
     let Some(rows) = rows else {
         return Err(StructureError::NoAtoms { found: "an XYZ file of blank lines".to_owned() });
     };
-    rows.finish(Source {
+    rows.finish(SourceFields {
         format: SourceFormat::Xyz,
         id: None,
         title,
         sequence: Sequence::default(),
         assemblies: Assemblies::default(),
+        annotations: Annotations::default(),
         radii: Vec::new(),
         warnings: Vec::new(),
     })
@@ -209,7 +211,7 @@ mod tests {
         let limits = ReadLimits { max_atoms: 49, ..ReadLimits::default() };
         assert_eq!(read(text.as_bytes(), &limits), Err(StructureError::TooManyAtoms { limit: 49 }));
         assert_eq!(parse(&text).unwrap().len(), 50);
-        // A count that the file does not hold allocates nothing.
+        // No memory is allocated for more atoms than the file can contain.
         assert!(parse("2000000000\n\nC 0 0 0\n").is_err());
     }
 }

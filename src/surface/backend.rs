@@ -10,7 +10,7 @@ use super::simd;
 use super::sink::{MeshPart, MeshSink, SinkFailed};
 use super::spheres::Spheres;
 
-/// Statistics of the sampling grid of a run.
+/// Statistics of the grid of a run.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct GridStats {
     /// Bricks (8 × 8 × 8 cells) within the support of at least one sphere.
@@ -18,7 +18,7 @@ pub struct GridStats {
     /// Bricks that the surface intersects.
     pub surface_bricks: u64,
     /// Grid points at which the density was evaluated, each counted once.
-    pub samples: u64,
+    pub grid_points: u64,
     /// Cells of the bounding box, as a dense grid would have them.
     pub box_cells: u64,
     /// Sphere–brick pairs; the field stage performs 512 evaluations for each.
@@ -41,7 +41,7 @@ pub struct MeshOutput {
     pub measures: Option<Measures>,
     /// Lowest and highest position of `mesh` relative to its centre, per axis, if the backend knows them, Å.
     pub bounds: Option<[[f32; 3]; 2]>,
-    /// The backend that made the mesh, if that is known only after the run.
+    /// The backend that computed the mesh, if it is known only after the run.
     pub made_by: Option<BackendIdentity>,
 }
 
@@ -72,8 +72,23 @@ impl MeshOutput {
         }
     }
 
-    /// Brings a mesh in memory to its destination: rounds vertices that `params` want quantized, and hands the mesh to
-    /// `sink`, if there is one, measured and in a single part.
+    /// Returns the measures of a mesh in memory. Computes them if the backend has not.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
+    pub fn measure(&mut self, control: &Control<'_>) -> Result<&Measures, SurfaceError> {
+        match &mut self.measures {
+            Some(measures) => Ok(measures),
+            none => {
+                self.mesh.make_geometry_contiguous();
+                let measure = || Measures::of(&self.mesh, Validation::Checksum, control);
+                Ok(none.insert(control.span(Stage::Measure, measure)?))
+            }
+        }
+    }
+
+    /// Delivers a mesh in memory: rounds its vertices if `params` request quantized ones. If there is a `sink`,
+    /// measures the mesh and passes it to the sink in a single part.
     ///
     /// # Errors
     /// [`SurfaceError::Sink`] and [`SurfaceError::Cancelled`].
@@ -83,16 +98,16 @@ impl MeshOutput {
         control: &Control<'_>,
         sink: Option<&dyn MeshSink>,
     ) -> Result<Self, SurfaceError> {
-        if params.quantize.is_some_and(|step| self.mesh.quantize(step)) {
-            // They are those of the vertices before rounding.
-            (self.measures, self.bounds) = (None, None);
+        if let Some(step) = params.quantize
+            && self.mesh.quantize(step)
+        {
+            // These are the measures before rounding.
+            self.measures = None;
+            self.bounds = self.bounds.map(|bounds| bounds.map(|row| step.decoded(step.position(row))));
         }
         let Some(sink) = sink else { return Ok(self) };
         self.mesh.make_contiguous();
-        if self.measures.is_none() {
-            let measure = || Measures::of(&self.mesh, Validation::Checksum, control);
-            self.measures = Some(control.span(Stage::Measure, measure)?);
-        }
+        self.measure(control)?;
         let (mesh, failed) = (std::mem::take(&mut self.mesh), |SinkFailed| SurfaceError::Sink);
         let [n_vertices, n_triangles] = [mesh.n_vertices(), mesh.n_triangles()];
         sink.begin(n_vertices, n_triangles).map_err(failed)?;
@@ -104,7 +119,7 @@ impl MeshOutput {
     }
 }
 
-/// Identity of the backend that made a mesh.
+/// Identity of the backend that computed a mesh.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BackendIdentity {
     /// Its name, as in [`Backend::name`].
@@ -140,13 +155,13 @@ pub trait Backend: Send + Sync {
     /// Short stable name: `cpu`, `reference`, `gpu`.
     fn name(&self) -> &'static str;
 
-    /// Name of the arithmetic: equal names give equal bytes for equal input. With several devices, that of the first
-    /// one that accepts jobs. Part of the keys of cached results.
+    /// Name of the arithmetic: equal names give equal bytes for equal input. With several devices, the name of the
+    /// first device that accepts jobs. Part of the content keys of results.
     fn arithmetic(&self) -> String {
         format!("{} {}", self.name(), simd::arithmetic())
     }
 
-    /// Arithmetics of all backends and devices that may run a job. A result under any of them answers a request.
+    /// Arithmetics of all backends and devices that may run a job. A stored result with any of them answers a request.
     fn arithmetics(&self) -> Vec<String> {
         vec![self.arithmetic()]
     }
@@ -159,13 +174,13 @@ pub trait Backend: Send + Sync {
         BackendIdentity::new(self.name(), self.arithmetic(), self.describe())
     }
 
-    /// Returns true if the backend can make this surface. [`Self::write`] rejects others.
-    fn makes(&self, surface: SurfaceKind) -> bool {
+    /// Returns true if the backend supports this surface. [`Self::write`] rejects others.
+    fn supports(&self, surface: SurfaceKind) -> bool {
         let _ = surface;
         true
     }
 
-    /// Meshes `spheres`, in memory or, if there is a `sink`, into that. Both get the same rows.
+    /// Meshes `spheres`, in memory or, if there is a `sink`, into the sink. Both get the same rows.
     ///
     /// # Errors
     /// Any [`SurfaceError`]; limits are checked before memory is allocated. [`SurfaceError::Sink`] if the sink fails.
@@ -192,14 +207,14 @@ pub trait Backend: Send + Sync {
         self.write(spheres, params, limits, control, None)
     }
 
-    /// Returns a backend for a job of several meshes of `surface`, `work` atoms at 0.5 Å in all, which must come from
-    /// one backend; `None` if this is a single backend.
+    /// Chooses one backend for a job of several meshes of `surface`, which must come from the same backend. `work` is
+    /// the total number of atoms at 0.5 Å. Returns `None` if this backend has no alternatives.
     fn for_job(&self, surface: SurfaceKind, work: f64) -> Option<Box<dyn Backend + '_>> {
         let _ = (surface, work);
         None
     }
 
-    /// Makes a first, tiny mesh on all threads and devices: starts threads, loads code and detects failures.
+    /// Computes a first, tiny mesh on all threads and devices: starts threads, loads code and detects failures.
     ///
     /// # Errors
     /// As [`Self::write`].

@@ -1,12 +1,13 @@
 //! Limit on candidate pairs: pairs of a sphere and a brick that its density can reach.
 //!
 //! Their number bounds the time of a run, since each pair costs up to 512 evaluations of the kernel, and the memory of
-//! the candidate lists. Neither the number of spheres nor the number of grid samples bounds it: overlapping spheres
+//! the candidate lists. Neither the number of spheres nor the number of grid points bounds it: overlapping spheres
 //! share bricks.
 
 use std::f64::consts::PI;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use super::control::Control;
 use super::error::SurfaceError;
 use super::kernel::Shape;
 use super::lattice::{BRICK, Lattice, effective_radius, to_u64};
@@ -17,12 +18,12 @@ use super::spheres::Spheres;
 /// candidates of the bricks around it.
 const MAX_LIMIT: u64 = 1 << 31;
 
-/// The limit that takes effect.
+/// Returns the limit of candidate pairs: that of `limits`, or [`MAX_LIMIT`] if it is lower.
 pub(super) fn limit(limits: &SurfaceLimits) -> u64 {
     limits.max_candidates.min(MAX_LIMIT)
 }
 
-/// Rejects a run that is certain to exceed the limit, by one pass over the radii and before anything is allocated.
+/// Rejects a run that is certain to exceed the limit. Passes over the radii once and allocates nothing.
 ///
 /// # Errors
 /// [`SurfaceError::TooManyCandidates`].
@@ -41,25 +42,35 @@ pub(crate) fn check(spheres: &Spheres, params: &SurfaceParams, limits: &SurfaceL
     if least <= limit { Ok(()) } else { Err(error(least, limit, n, reach(largest), params.resolution)) }
 }
 
-/// Returns the error of a run on `lattice` that has at least `candidates` pairs.
-pub(super) fn exceeded(lattice: &Lattice, candidates: u64, limits: &SurfaceLimits) -> SurfaceError {
-    let longest = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
-    error(candidates, limit(limits), lattice.atoms.len(), longest, lattice.spacing)
+/// Returns the error of a run on `lattices` that has at least `candidates` pairs.
+pub(super) fn exceeded(lattices: &[&Lattice], candidates: u64, limits: &SurfaceLimits) -> SurfaceError {
+    let reach =
+        |lattice: &&Lattice| lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
+    let (n, longest) = (lattices.iter().map(|lattice| lattice.atoms.len()).sum(), lattices.iter().map(reach));
+    let spacing = lattices.first().map_or(MAX_RESOLUTION, |lattice| lattice.spacing);
+    error(candidates, limit(limits), n, longest.fold(0.0, f64::max), spacing)
 }
 
-/// Number of pairs of overlapping spheres, which determines the time for finding their boundary.
+/// Number of comparisons of two caps of a sphere that count as one pair of overlapping spheres. Ordinary structures
+/// have fewer comparisons for each pair.
+const COMPARISONS_PER_PAIR: u64 = 64;
+/// Number of comparisons between two checks of the limit and of cancellation: they take about 0.2 ms.
+const COMPARISONS_PER_CHECK: u64 = 1 << 16;
+
+/// Work of finding the boundary of spheres, shared by its threads: pairs of overlapping spheres, and comparisons of
+/// their caps.
 pub(super) struct OverlapCount {
     so_far: AtomicU64,
     limit: u64,
 }
 
 impl OverlapCount {
-    /// Starts at 0. The limit is the one of candidate pairs.
+    /// Starts a count at 0, limited by the limit on candidate pairs.
     pub(super) fn new(limits: &SurfaceLimits) -> Self {
         Self { so_far: AtomicU64::new(0), limit: limit(limits) }
     }
 
-    /// Returns the number of pairs so far.
+    /// Returns the number of pairs so far, including the pairs that stand for comparisons.
     pub(super) fn total(&self) -> u64 {
         self.so_far.load(Ordering::Relaxed)
     }
@@ -68,9 +79,46 @@ impl OverlapCount {
     ///
     /// # Errors
     /// [`SurfaceError::TooManyOverlaps`].
-    pub(super) fn add(&self, n: usize) -> Result<(), SurfaceError> {
-        let overlaps = self.so_far.fetch_add(n as u64, Ordering::Relaxed) + n as u64;
+    pub(super) fn add(&self, n: u64) -> Result<(), SurfaceError> {
+        let overlaps = self.so_far.fetch_add(n, Ordering::Relaxed) + n;
         if overlaps <= self.limit { Ok(()) } else { Err(SurfaceError::TooManyOverlaps { overlaps, limit: self.limit }) }
+    }
+}
+
+/// Comparisons of the caps of a part of the spheres, by one thread.
+pub(super) struct Comparisons<'a> {
+    overlaps: &'a OverlapCount,
+    control: &'a Control<'a>,
+    /// Number of comparisons that `overlaps` does not count yet.
+    uncounted: u64,
+}
+
+impl<'a> Comparisons<'a> {
+    /// Returns a count of 0, whose comparisons are added to `overlaps`.
+    pub(super) fn new(overlaps: &'a OverlapCount, control: &'a Control<'a>) -> Self {
+        Self { overlaps, control, uncounted: 0 }
+    }
+
+    /// Adds `n` comparisons. Checks limit and cancellation from time to time.
+    ///
+    /// # Errors
+    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Cancelled`].
+    #[inline]
+    pub(super) fn add(&mut self, n: usize) -> Result<(), SurfaceError> {
+        self.uncounted += n as u64;
+        if self.uncounted < COMPARISONS_PER_CHECK { Ok(()) } else { self.count() }
+    }
+
+    /// Adds the comparisons that were not added yet to the shared count. The end of a part calls it, so that the total
+    /// depends on the parts and not on the threads.
+    ///
+    /// # Errors
+    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Cancelled`].
+    pub(super) fn count(&mut self) -> Result<(), SurfaceError> {
+        self.control.check()?;
+        self.overlaps.add(self.uncounted / COMPARISONS_PER_PAIR)?;
+        self.uncounted %= COMPARISONS_PER_PAIR;
+        Ok(())
     }
 }
 
@@ -91,14 +139,16 @@ fn fitting(pairs: f64, reach: f64) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::AtomicBool;
+
     use super::*;
     use crate::surface::backend::Backend;
-    use crate::surface::control::Control;
+    use crate::surface::control::{Observer, Stage};
     use crate::surface::cpu::CpuBackend;
     use crate::surface::occupancy::Occupancy;
     use crate::surface::params::SurfaceOptions;
 
-    fn same_place(n: usize) -> Spheres {
+    fn at_one_point(n: usize) -> Spheres {
         Spheres::new(vec![0.3; n], vec![0.2; n], vec![0.1; n], vec![1.7; n]).unwrap()
     }
 
@@ -117,9 +167,20 @@ mod tests {
         Occupancy::new(&lattice, &limits, &Control::default()).unwrap().n_candidates()
     }
 
+    /// True once the field was evaluated.
+    #[derive(Default)]
+    struct Evaluated(AtomicBool);
+
+    impl Observer for Evaluated {
+        fn span(&self, stage: Stage, work: &mut dyn FnMut()) {
+            self.0.fetch_or(stage == Stage::Field, Ordering::Relaxed);
+            work();
+        }
+    }
+
     #[test]
     fn identical_spheres_are_rejected_at_the_exact_limit_and_the_suggestion_fits() {
-        let (spheres, params) = (same_place(100), params(0.4, 3.0));
+        let (spheres, params) = (at_one_point(100), params(0.4, 3.0));
         let exact = pairs(&spheres, &params);
         let backend = CpuBackend::new(Some(2)).unwrap();
         let run = |max_candidates, params: &SurfaceParams| {
@@ -127,6 +188,13 @@ mod tests {
             backend.run(&spheres, params, &limits, &Control::default())
         };
         assert!(run(exact, &params).is_ok());
+        // The pairs are counted before the field is evaluated.
+        let (stages, limits) =
+            (Evaluated::default(), SurfaceLimits { max_candidates: exact - 1, ..SurfaceLimits::default() });
+        let control = Control { observer: &stages, ..Control::default() };
+        assert!(backend.run(&spheres, &params, &limits, &control).is_err() && !stages.0.load(Ordering::Relaxed));
+        backend.run(&spheres, &params, &SurfaceLimits::default(), &control).unwrap();
+        assert!(stages.0.load(Ordering::Relaxed), "the control");
         let error = run(exact - 1, &params).unwrap_err();
         let SurfaceError::TooManyCandidates { candidates, limit, suggested_resolution, .. } = error else {
             panic!("{error}")
@@ -145,13 +213,13 @@ mod tests {
     #[test]
     fn the_lower_bound_holds_and_rejects_an_excessive_run_early() {
         for (resolution, scale) in [(0.2, 1.0), (0.5, 1.0), (0.5, 8.0), (4.0, 0.5)] {
-            let (spheres, params) = (same_place(20), params(resolution, scale));
+            let (spheres, params) = (at_one_point(20), params(resolution, scale));
             let exact = pairs(&spheres, &params);
             let limits = SurfaceLimits { max_candidates: exact, ..SurfaceLimits::default() };
             assert!(check(&spheres, &params, &limits).is_ok(), "{resolution} {scale}");
         }
         let limits = SurfaceLimits { max_candidates: 1 << 28, ..SurfaceLimits::default() };
-        let huge = check(&same_place(300_000), &params(0.5, 10.0), &limits);
+        let huge = check(&at_one_point(300_000), &params(0.5, 10.0), &limits);
         assert!(matches!(huge, Err(SurfaceError::TooManyCandidates { candidates, .. }) if candidates > 1 << 29));
     }
 

@@ -4,10 +4,10 @@
 //! inside. Edge `e = 4·axis + k` runs along `axis` (0 x, 1 y, 2 z) from the corner whose two other coordinates
 //! are the bits of `k`, lower axis first.
 //!
-//! On each face the surface's outline is traced with the inside on its right (seen from outside the cell). If diagonal
-//! corners of a face are inside, each is cut off by itself. This rule depends only on the face's four signs, so two
-//! cells that share a face always agree. The outlines close into loops. Each loop is triangulated without a diagonal
-//! within a face, so no edge of the mesh gets a third triangle.
+//! On each face the outline of the surface is traced with the inside on its right (seen from outside the cell). If
+//! diagonal corners of a face are inside, the outline separates each of them. This rule depends only on the face's four
+//! signs, so two cells that share a face always agree. The outlines close into loops. Each loop is triangulated without
+//! a diagonal within a face, so no edge of the mesh gets a third triangle.
 //!
 //! The tests verify these properties for every case and for every pair of cases that can share a face. They also verify
 //! that the table below follows from the rule.
@@ -15,7 +15,7 @@
 /// Maximum number of triangles of a case.
 pub const MAX_TRIANGLES: usize = 5;
 
-/// The table of all cases.
+/// Table of all cases, parsed at compile time.
 pub static CASES: Cases = Cases::parse(ROWS);
 
 /// The triangles of cases 0 to 255: each digit is a cell edge (hexadecimal), three make a triangle, `.` is none.
@@ -52,7 +52,7 @@ const ROWS: &str = "
 /// One edge of a cell: the corner that owns it, as an offset from the cell's corner 0, and its axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CellEdge {
-    /// Offset of the owning sample, 0 or 1 per axis.
+    /// Offset of the owning grid point, 0 or 1 per axis.
     pub offset: [u8; 3],
     /// 0 x, 1 y, 2 z.
     pub axis: u8,
@@ -131,7 +131,7 @@ mod tests {
     use super::*;
     use std::collections::BTreeMap;
 
-    /// Edge between two adjacent corners.
+    /// Returns the edge between two adjacent corners.
     fn edge_between(a: u8, b: u8) -> u8 {
         let (low, axis) = (a & b, (a ^ b).trailing_zeros());
         let bit = |axis: u8| low >> axis & 1;

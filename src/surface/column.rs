@@ -1,6 +1,6 @@
 //! Column of a mesh: a slice of plain rows.
 //!
-//! Large columns are mapped with huge pages if the system has them: page faults of 4 KiB for 350 MB took half as long
+//! Large columns are mapped with huge pages if the system has them: for 350 MB, page faults of 4 KiB took half as long
 //! as meshing.
 
 use std::fmt;
@@ -24,10 +24,10 @@ const COPIED: usize = 4 << 20;
 pub type SharedBytes = Arc<dyn AsRef<[u8]> + Send + Sync>;
 
 /// Rows of a mesh; dereferences to a slice. A column in several chunks is copied into one when it is first used as a
-/// slice; [`Self::pieces`] gives the chunks without a copy.
-pub struct Column<T: Pod>(Storage<T>);
+/// slice; [`Self::pieces`] returns the chunks without a copy.
+pub struct Column<T: Pod>(ColumnStorage<T>);
 
-enum Storage<T: Pod> {
+enum ColumnStorage<T: Pod> {
     Owned(Vec<T>),
     Mapped {
         map: MmapMut,
@@ -50,13 +50,13 @@ impl<T: Pod> Column<T> {
     pub fn zeroed(n: usize) -> Self {
         let bytes = n * size_of::<T>();
         match mapped(bytes) {
-            Some(map) => Self(Storage::Mapped { map, bytes }),
-            None => Self(Storage::Owned(vec![T::zeroed(); n])),
+            Some(map) => Self(ColumnStorage::Mapped { map, bytes }),
+            None => Self(ColumnStorage::Owned(vec![T::zeroed(); n])),
         }
     }
 }
 
-/// Maps zeroed memory; `None` if the column is small or the system fails to.
+/// Maps zeroed memory. Returns `None` if the column is small or the system cannot map it.
 fn mapped(bytes: usize) -> Option<MmapMut> {
     let map = MmapMut::map_anon(bytes).ok().filter(|_| bytes >= MAP_FROM)?;
     // Advice only: kernels without huge pages ignore it.
@@ -73,7 +73,7 @@ impl<T: Pod> Column<T> {
     pub fn shared(owner: SharedBytes, bytes: Range<usize>) -> Option<Self> {
         let rows = (*owner).as_ref().get(bytes.clone())?;
         bytemuck::try_cast_slice::<u8, T>(rows).ok()?;
-        Some(Self(Storage::Shared { owner, bytes }))
+        Some(Self(ColumnStorage::Shared { owner, bytes }))
     }
 
     /// Concatenates columns without a copy.
@@ -82,7 +82,7 @@ impl<T: Pod> Column<T> {
         let mut chunks = Vec::with_capacity(columns.len());
         for column in columns {
             match column.0 {
-                Storage::Chunks { chunks: own, .. } => chunks.extend(own),
+                ColumnStorage::Chunks { chunks: own, .. } => chunks.extend(own),
                 _ if column.is_empty() => {}
                 _ => chunks.push(column),
             }
@@ -90,7 +90,7 @@ impl<T: Pod> Column<T> {
         match chunks.len() {
             0 => Self::default(),
             1 => chunks.swap_remove(0),
-            _ => Self(Storage::Chunks { chunks, joined: OnceLock::new() }),
+            _ => Self(ColumnStorage::Chunks { chunks, joined: OnceLock::new() }),
         }
     }
 
@@ -102,7 +102,7 @@ impl<T: Pod> Column<T> {
     /// Contiguous runs of rows, in order: one unless the column is in chunks.
     pub fn pieces(&self) -> impl Iterator<Item = &[T]> {
         let (whole, chunks): (Option<&[T]>, &[Self]) = match &self.0 {
-            Storage::Chunks { chunks, joined } if joined.get().is_none() => (None, chunks),
+            ColumnStorage::Chunks { chunks, joined } if joined.get().is_none() => (None, chunks),
             _ => (Some(self), &[]),
         };
         whole.into_iter().chain(chunks.iter().map(|chunk| &**chunk))
@@ -110,7 +110,7 @@ impl<T: Pod> Column<T> {
 
     /// Copies the chunks into one and drops them, so that the rows are not held twice.
     pub fn make_contiguous(&mut self) {
-        if let Storage::Chunks { chunks, joined } = &mut self.0 {
+        if let ColumnStorage::Chunks { chunks, joined } = &mut self.0 {
             let joined = joined.take().map(|column| *column);
             *self = joined.unwrap_or_else(|| {
                 let n = chunks.iter().map(Self::len).sum();
@@ -129,20 +129,20 @@ impl<T: Pod> Column<T> {
     #[must_use]
     pub fn len(&self) -> usize {
         match &self.0 {
-            Storage::Owned(rows) => rows.len(),
-            Storage::Mapped { bytes, .. } => bytes / size_of::<T>(),
-            Storage::Shared { bytes, .. } => bytes.len() / size_of::<T>(),
-            Storage::Chunks { chunks, .. } => chunks.iter().map(Self::len).sum(),
+            ColumnStorage::Owned(rows) => rows.len(),
+            ColumnStorage::Mapped { bytes, .. } => bytes / size_of::<T>(),
+            ColumnStorage::Shared { bytes, .. } => bytes.len() / size_of::<T>(),
+            ColumnStorage::Chunks { chunks, .. } => chunks.iter().map(Self::len).sum(),
         }
     }
 
     /// Rows as a vector, for adding and removing. Copies the column if it is not one yet.
     pub fn edit(&mut self) -> &mut Vec<T> {
-        if !matches!(self.0, Storage::Owned(_)) {
-            self.0 = Storage::Owned(self.to_vec());
+        if !matches!(self.0, ColumnStorage::Owned(_)) {
+            self.0 = ColumnStorage::Owned(self.to_vec());
         }
         match &mut self.0 {
-            Storage::Owned(rows) => rows,
+            ColumnStorage::Owned(rows) => rows,
             _ => unreachable!("owned by now"),
         }
     }
@@ -171,12 +171,12 @@ impl<T: Pod> Deref for Column<T> {
 
     fn deref(&self) -> &[T] {
         match &self.0 {
-            Storage::Owned(rows) => rows,
+            ColumnStorage::Owned(rows) => rows,
             // Mappings begin at a page boundary, which aligns every plain row type.
-            Storage::Mapped { map, bytes } => bytemuck::cast_slice(&map[..*bytes]),
-            // Checked when the column was made.
-            Storage::Shared { owner, bytes } => bytemuck::cast_slice(&(**owner).as_ref()[bytes.clone()]),
-            Storage::Chunks { chunks, joined } => {
+            ColumnStorage::Mapped { map, bytes } => bytemuck::cast_slice(&map[..*bytes]),
+            // Checked when the column was created.
+            ColumnStorage::Shared { owner, bytes } => bytemuck::cast_slice(&(**owner).as_ref()[bytes.clone()]),
+            ColumnStorage::Chunks { chunks, joined } => {
                 let rows = || chunks.iter().map(|chunk| &**chunk);
                 joined.get_or_init(|| Box::new(Self::copied(self.len(), rows())))
             }
@@ -186,21 +186,21 @@ impl<T: Pod> Deref for Column<T> {
 
 impl<T: Pod> DerefMut for Column<T> {
     fn deref_mut(&mut self) -> &mut [T] {
-        if matches!(self.0, Storage::Shared { .. } | Storage::Chunks { .. }) {
+        if matches!(self.0, ColumnStorage::Shared { .. } | ColumnStorage::Chunks { .. }) {
             // Shared memory is read-only: the first write makes a copy.
             *self = self.clone();
         }
         match &mut self.0 {
-            Storage::Owned(rows) => rows,
-            Storage::Mapped { map, bytes } => bytemuck::cast_slice_mut(&mut map[..*bytes]),
-            Storage::Shared { .. } | Storage::Chunks { .. } => unreachable!("copied by now"),
+            ColumnStorage::Owned(rows) => rows,
+            ColumnStorage::Mapped { map, bytes } => bytemuck::cast_slice_mut(&mut map[..*bytes]),
+            ColumnStorage::Shared { .. } | ColumnStorage::Chunks { .. } => unreachable!("copied by now"),
         }
     }
 }
 
 impl<T: Pod> From<Vec<T>> for Column<T> {
     fn from(rows: Vec<T>) -> Self {
-        Self(Storage::Owned(rows))
+        Self(ColumnStorage::Owned(rows))
     }
 }
 
@@ -212,7 +212,7 @@ impl<T: Pod> FromIterator<T> for Column<T> {
 
 impl<T: Pod> Default for Column<T> {
     fn default() -> Self {
-        Self(Storage::Owned(Vec::new()))
+        Self(ColumnStorage::Owned(Vec::new()))
     }
 }
 
@@ -282,7 +282,7 @@ mod tests {
         let mut contiguous = chunked();
         contiguous.make_contiguous();
         assert_eq!(contiguous.pieces().collect::<Vec<_>>(), [[1, 2, 3, 4, 5]]);
-        assert!(matches!(contiguous.0, Storage::Owned(_)));
+        assert!(matches!(contiguous.0, ColumnStorage::Owned(_)));
         let mut longer = chunked();
         longer.edit().push(6);
         assert_eq!(longer.len(), 6);

@@ -10,9 +10,9 @@ use super::memory::{MemoryMeter, OutOfMemory, Reservation};
 /// Stages of a meshing run, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Stage {
-    /// Atoms to occupied bricks and their candidate lists.
+    /// Occupied bricks and their candidate lists.
     Bin,
-    /// Density at every sample of every occupied brick.
+    /// Density at every grid point of every occupied brick.
     Field,
     /// Inside bits, crossing edges and cell cases.
     Classify,
@@ -57,7 +57,7 @@ pub trait Observer: Sync {
         work();
     }
 
-    /// Reports that (a part of) `stage` took `ns` nanoseconds by a device's clock.
+    /// Reports that (a part of) `stage` took `ns` nanoseconds, measured by a device's clock.
     fn elapsed(&self, stage: Stage, ns: u64) {
         let _ = (stage, ns);
     }

@@ -1,5 +1,5 @@
-//! Devices as data: the user's choice, the devices that were found, and the status of those in use. The GPU backend
-//! opens and drives them.
+//! Descriptions of devices: the user's choice, the devices that were found, and the status of those in use. The GPU
+//! backend opens and uses them.
 
 use std::fmt;
 use std::str::FromStr;
@@ -158,7 +158,7 @@ pub struct DeviceStatus {
     pub number: usize,
     /// Name.
     pub name: String,
-    /// Reason for which it accepts no jobs; `None` while it is up.
+    /// Reason why it accepts no jobs; `None` while it is up.
     pub down: Option<String>,
     /// Number of jobs that wait or run.
     pub waiting: usize,

@@ -35,15 +35,15 @@ pub enum SurfaceError {
     },
     /// More grid points than allowed would be needed.
     #[error(
-        "the grid would need about {samples} points at {resolution} Å, the limit is {limit}{}",
+        "the grid would need about {grid_points} grid points at {resolution} Å, the limit is {limit}{}",
         fitting(*suggested_resolution)
     )]
     GridTooLarge {
         /// Estimated number of grid points.
-        samples: u64,
+        grid_points: u64,
         /// Grid points allowed.
         limit: u64,
-        /// The spacing asked for, in Å.
+        /// Requested spacing, Å.
         resolution: f64,
         /// A spacing that would fit, in Å.
         suggested_resolution: f64,
@@ -59,18 +59,19 @@ pub enum SurfaceError {
         candidates: u64,
         /// Pairs allowed.
         limit: u64,
-        /// The spacing asked for, in Å.
+        /// Requested spacing, Å.
         resolution: f64,
         /// A spacing that is certain to fit, in Å, if there is one.
         suggested_resolution: Option<f64>,
     },
     /// Too many pairs of spheres enlarged by the probe overlap.
     #[error(
-        "at least {overlaps} pairs of spheres overlap when enlarged by the probe, the limit is {limit}; use a smaller \
-         probe or smaller radii"
+        "at least {overlaps} pairs of spheres overlap when enlarged by the probe (64 comparisons of overlaps count as \
+         a pair), the limit is {limit}; use a smaller probe or smaller radii"
     )]
     TooManyOverlaps {
-        /// Ordered pairs of overlapping spheres. A lower bound, because counting stops soon after the limit.
+        /// Ordered pairs of overlapping spheres; 64 comparisons of caps count as a pair. A lower bound, because
+        /// counting stops soon after the limit.
         overlaps: u64,
         /// Pairs allowed.
         limit: u64,
@@ -126,7 +127,7 @@ pub enum SurfaceError {
     /// The deadline passed.
     #[error("the deadline passed")]
     Deadline,
-    /// Memory is not available now.
+    /// Not enough memory is available.
     #[error(transparent)]
     Memory(#[from] OutOfMemory),
     /// The run was cancelled by its caller.

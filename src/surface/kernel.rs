@@ -40,8 +40,8 @@ impl Profile {
         let inverse_at_radius = (1.0 - s).powi(2) / s;
         match (kernel, params.paper) {
             (_, Some(PaperParams::Gaussian { a, b })) => {
-                // b·exp(−a d²) is A·exp(−s(u − 1)) with u = a d²/s and A = b·exp(−s). Where a lone atom has a
-                // surface at all, s makes A the threshold, so that the cut-off is relative to it.
+                // b·exp(−a d²) is A·exp(−s(u − 1)) with u = a d²/s and A = b·exp(−s). If an isolated atom has a
+                // surface, s is chosen such that A is the isovalue: the cut-off is then relative to the isovalue.
                 let decay = if b > params.isovalue { (b / params.isovalue).ln() } else { 1.0 };
                 let fixed = Some((decay / a).sqrt());
                 Self { fixed, amplitude: b * (-decay).exp(), decay, tolerance: params.cutoff_tolerance, ..plain }
@@ -54,7 +54,7 @@ impl Profile {
         }
     }
 
-    /// The length scale ρ of an atom of `radius` (after scale and offset), Å.
+    /// Returns the length scale ρ of an atom of `radius` (after scale and offset), Å.
     #[must_use]
     pub fn length(&self, radius: f64) -> f64 {
         self.fixed.unwrap_or(self.scale * radius)
@@ -143,7 +143,7 @@ impl Shape {
         params.surface.kernel().map_or(Self::Sphere { enlarged }, |kernel| Self::Density(Profile::new(kernel, params)))
     }
 
-    /// Returns the length scale ρ of an atom of `radius` (after scale and offset), Å. That of a sphere is its enlarged
+    /// Returns the length scale ρ of an atom of `radius` (after scale and offset), Å. For a sphere it is the enlarged
     /// radius.
     #[must_use]
     pub fn length(&self, radius: f64) -> f64 {

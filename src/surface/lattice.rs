@@ -1,8 +1,8 @@
-//! The sampling lattice: spheres in units of the grid spacing, in one canonical order.
+//! The lattice: spheres in units of the grid spacing, in one canonical order.
 //!
-//! Samples lie at multiples of the spacing, so the lattice does not depend on the tiling of a structure. A sphere's
-//! centre is a lattice cell plus a fraction: the offset of a sample from a centre then depends on these two alone, bit
-//! for bit, in every brick and tile, without 64-bit arithmetic.
+//! Grid points lie at multiples of the spacing, so they do not depend on the structure. The centre of a sphere is
+//! stored as the nearest grid point and a fraction. The offset of a grid point from a centre then has the same bits in
+//! every brick and tile, without 64-bit arithmetic.
 
 use std::ops::Range;
 
@@ -16,11 +16,11 @@ use super::params::SurfaceParams;
 use super::simd::dispatched;
 use super::spheres::Spheres;
 
-/// Samples along a brick's edge.
+/// Grid points along a brick's edge.
 pub const BRICK: i32 = 8;
-/// Samples in a brick.
-pub const BRICK_SAMPLES: usize = 512;
-/// Samples along a tile's edge: 8 bricks.
+/// Grid points in a brick.
+pub const BRICK_POINTS: usize = 512;
+/// Grid points along a tile's edge: 8 bricks.
 pub const TILE: i32 = 64;
 
 /// Maximum number of atoms: candidate lists store indices of 31 bits.
@@ -34,7 +34,7 @@ pub(super) const EDGE_MARGIN: f32 = 1.0 / 1024.0;
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct LatticeAtom {
-    /// The sample nearest to the centre.
+    /// The grid point nearest to the centre.
     pub cell: [i32; 3],
     /// 1/ρ² in units of the spacing: u = d² × this.
     pub inv_length2: f32,
@@ -57,7 +57,7 @@ impl LatticeAtom {
 pub struct Lattice {
     /// Spacing, Å.
     pub spacing: f64,
-    /// The sample that mesh positions are relative to.
+    /// The grid point that mesh positions are relative to.
     pub centre: [i32; 3],
     /// The spheres.
     pub atoms: Column<LatticeAtom>,
@@ -113,8 +113,8 @@ impl Lattice {
     }
 }
 
-/// Returns an upper bound of a vertex's distance from the mesh's centre along any axis, Å, from spheres and parameters
-/// alone, before any density is computed. 0 without spheres.
+/// Returns an upper bound of a vertex's distance from the mesh's centre along any axis, Å; 0 without spheres. Computes
+/// no density.
 #[must_use]
 pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
@@ -122,8 +122,8 @@ pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     let (_, largest) = spheres.radius_range();
     let reach = shape.reach(shape.length(effective_radius(largest, params)));
     let half = (0..3).map(|k| 0.5 * (hi[k] - lo[k])).fold(0.0, f64::max);
-    // The centre is a sample, half a spacing from the middle at most; a vertex lies on an edge that begins within
-    // reach. Half a spacing more is far above every rounding.
+    // The centre is a grid point, at most half a spacing from the middle. A vertex lies on an edge that begins within
+    // reach. The further half spacing is much more than the rounding errors.
     half + reach + 2.0 * params.resolution
 }
 
@@ -132,7 +132,7 @@ pub(super) fn effective_radius(r: f32, params: &SurfaceParams) -> f64 {
     f64::from(r) * params.radius_scale + params.radius_offset
 }
 
-/// Spheres that are being placed on the lattice.
+/// Spheres whose atoms on the lattice are computed.
 struct Placing<'a> {
     spheres: &'a Spheres,
     params: &'a SurfaceParams,
@@ -159,8 +159,8 @@ impl Placing<'_> {
         c.map(|c| to_i32((c / self.params.resolution).round()))
     }
 
-    /// The atoms by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order
-    /// last. `bounds`: lowest and highest coordinates.
+    /// Returns the atoms by tile, brick within the tile, and cell within the brick; ties by offset, by size, and last
+    /// by the order of the input. `bounds` are the lowest and highest coordinates.
     fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
         let n = self.spheres.len();
         // Rounding is monotone, so the outermost tiles are those of the outermost coordinates.
@@ -180,10 +180,10 @@ impl Placing<'_> {
             buckets.push(own);
             rest = others;
         }
-        let place = |scratch: &mut Vec<_>, (bucket, atoms): (usize, &mut [LatticeAtom])| {
-            place(self, &keys, &parts, bucket, scratch, atoms);
+        let write = |scratch: &mut Vec<_>, (bucket, atoms): (usize, &mut [LatticeAtom])| {
+            write_bucket(self, &keys, &parts, bucket, scratch, atoms);
         };
-        buckets.into_par_iter().enumerate().for_each_init(Vec::new, place);
+        buckets.into_par_iter().enumerate().for_each_init(Vec::new, write);
         atoms
     }
 }
@@ -192,16 +192,17 @@ impl Placing<'_> {
 const PART: usize = 1 << 13;
 /// Maximum number of such tasks.
 const MAX_PARTS: usize = 64;
-/// Mean number of atoms of a bucket: those fit the L1 cache.
+/// Mean number of atoms of a bucket: they fit the L1 cache.
 const BUCKET: usize = 512;
-/// Bits of an atom's brick and cell within its tile.
-const PLACE_BITS: u32 = 18;
+/// Number of bits of an atom's brick and cell within its tile.
+const CELL_BITS: u32 = 18;
 
-/// Sort keys of atoms: tile, brick and cell. Their highest bits number buckets, which are sorted independently.
+/// Sort keys of atoms: tile, brick and cell. The highest bits of a key are the number of a bucket. Buckets are sorted
+/// independently.
 struct SortKeys {
     rank: TileRanks,
     n_buckets: usize,
-    /// Number of bits below those that number buckets: at most 32, because [`TileRanks`] are bounded.
+    /// Number of bits below the number of the bucket: at most 32, because [`TileRanks`] are bounded.
     shift: u32,
 }
 
@@ -209,7 +210,7 @@ impl SortKeys {
     /// Keys of `n` atoms.
     fn new(rank: TileRanks, n: usize) -> Self {
         let n_buckets = n.div_ceil(BUCKET).next_power_of_two();
-        let bits = PLACE_BITS + rank.count().next_power_of_two().trailing_zeros();
+        let bits = CELL_BITS + rank.count().next_power_of_two().trailing_zeros();
         Self { rank, n_buckets, shift: bits.saturating_sub(n_buckets.trailing_zeros()) }
     }
 
@@ -220,7 +221,7 @@ impl SortKeys {
         let brick = local.map(|c| c / BRICK.unsigned_abs());
         let cell_in_brick = local.map(|c| c % BRICK.unsigned_abs());
         let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
-        self.rank.of(tile_of(cell)) << PLACE_BITS | pack(brick) << 9 | pack(cell_in_brick)
+        self.rank.of(tile_of(cell)) << CELL_BITS | pack(brick) << 9 | pack(cell_in_brick)
     }
 }
 
@@ -249,7 +250,7 @@ fn by_bucket(placing: &Placing<'_>, keys: &SortKeys, spheres: Range<usize>) -> S
     for &bucket in &buckets {
         starts[bucket as usize] += 1;
     }
-    // Ends of buckets, which the loop below turns into starts.
+    // Computes the ends of the buckets. The next loop decrements them to the starts.
     let mut end = 0;
     for start in &mut starts {
         end += *start;
@@ -267,7 +268,7 @@ fn by_bucket(placing: &Placing<'_>, keys: &SortKeys, spheres: Range<usize>) -> S
 
 dispatched! {
 /// Writes the atoms of a bucket in canonical order.
-fn place(
+fn write_bucket(
     placing: &Placing<'_>,
     keys: &SortKeys,
     parts: &[SortedPart],
@@ -298,7 +299,7 @@ fn place(
 }
 }
 
-/// Numbers that order tiles: at most 16 per atom, and 4,096 more.
+/// Ranks that order tiles. Their number is at most 4,096 plus 16 per atom.
 enum TileRanks {
     /// Ranks within the box with these sides from the lowest tile on.
     Box { lo: [i32; 3], side: [u64; 3] },
@@ -307,7 +308,7 @@ enum TileRanks {
 }
 
 impl TileRanks {
-    /// For `n` atoms in the tiles `of_atom`, between the tiles `lo` and `hi`.
+    /// Ranks the tiles of `n` atoms, given by `of_atom`. They lie between the tiles `lo` and `hi`.
     fn new([lo, hi]: [[i32; 3]; 2], n: usize, of_atom: impl Fn(usize) -> [i32; 3] + Sync) -> Self {
         let side: [u64; 3] = std::array::from_fn(|k| u64::from(lo[k].abs_diff(hi[k])) + 1);
         // Each side is below 2²⁰, as coordinates are bounded.
@@ -340,15 +341,15 @@ impl TileRanks {
     }
 }
 
-/// The tile that a sample belongs to.
-// Written out, here and below: `map` may not be inlined, and these run for every atom.
+/// The tile that a grid point belongs to.
+// Written without `map`, here and below: `map` may not be inlined, and these functions run for every atom.
 #[inline(always)]
 #[must_use]
 pub fn tile_of([x, y, z]: [i32; 3]) -> [i32; 3] {
     [x.div_euclid(TILE), y.div_euclid(TILE), z.div_euclid(TILE)]
 }
 
-/// Tiles are ordered by z, then y, then x.
+/// Returns the sort key of a tile. Tiles are ordered by z, then y, then x.
 #[inline(always)]
 #[must_use]
 pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
@@ -366,7 +367,7 @@ pub(crate) fn to_f32(v: f64) -> f32 {
     v as f32
 }
 
-/// `v`, an integer value, as i32. Coordinates are at most 1e5 Å and the spacing at least 0.01 Å: 1e7 fits.
+/// Converts `v`, an integer value, to i32. Coordinates are at most 1e5 Å and the spacing at least 0.01 Å: 1e7 fits.
 #[expect(clippy::cast_possible_truncation, reason = "validated spheres and spacings keep it within ±1e7")]
 pub(crate) fn to_i32(v: f64) -> i32 {
     debug_assert!(v.abs() < 1e9);
@@ -380,7 +381,7 @@ pub(crate) fn to_u32(n: usize) -> u32 {
     u32::try_from(n).unwrap_or(u32::MAX)
 }
 
-/// `v` as u64, saturating at both ends.
+/// Converts `v` to u64, saturating at both ends.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
 pub(crate) fn to_u64(v: f64) -> u64 {
     v as u64
@@ -395,20 +396,20 @@ mod tests {
 
     /// Independent implementation of the canonical order.
     fn order(a: &LatticeAtom, b: &LatticeAtom) -> Ordering {
-        let place = |atom: &LatticeAtom| {
+        let cell = |atom: &LatticeAtom| {
             let brick = atom.cell.map(|c| c.div_euclid(BRICK));
             let reversed = |[x, y, z]: [i32; 3]| [z, y, x];
             [reversed(tile_of(atom.cell)), reversed(brick), reversed(atom.cell)]
         };
         let rest = |atom: &LatticeAtom| [atom.frac[2], atom.frac[1], atom.frac[0], atom.inv_length2];
         let rest = rest(a).iter().zip(rest(b)).map(|(a, b)| a.total_cmp(&b)).find(|order| order.is_ne());
-        place(a).cmp(&place(b)).then(rest.unwrap_or(Ordering::Equal)).then(a.source.cmp(&b.source))
+        cell(a).cmp(&cell(b)).then(rest.unwrap_or(Ordering::Equal)).then(a.source.cmp(&b.source))
     }
 
     #[test]
     fn atoms_are_in_canonical_order_in_any_box() {
         let at = |i: u32, k: f64, half: f64| half * (f64::from(i) * k).sin();
-        // Many atoms a cell, few, tiles without atoms, and a box of too many tiles to be numbered by place.
+        // Many atoms per cell, few atoms per cell, tiles without atoms, and a box of too many tiles for their ranks.
         for (resolution, half) in [(20.0, 60.0), (4.0, 60.0), (0.5, 60.0), (0.1, 60.0), (0.05, 99_999.0)] {
             // Every seventh sphere lies where another one does, every third of these as large.
             let of = |i: u32| if i.is_multiple_of(7) { i / 2 } else { i };

@@ -14,13 +14,13 @@ use super::union_find::UnionFind;
 /// Method of validating closedness and manifoldness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Validation {
-    /// A 64-bit checksum over the directed edges of the index buffer: opposite directions cancel, so a mesh that is not
-    /// closed and consistently wound leaves a remainder, with a probability of error of 2⁻⁶⁴. That no edge is used more
-    /// than twice then follows from the case table, which the tests verify: for meshes that a backend made.
+    /// A 64-bit checksum over the directed edges of the index buffer. Opposite directions cancel, so a mesh that is not
+    /// closed and consistently wound leaves a remainder, with a probability of error of 2⁻⁶⁴. For meshes of a backend,
+    /// the case table, which the tests verify, then ensures that no edge is used more than twice.
     #[default]
     Checksum,
-    /// Every edge and the fan of triangles around every vertex, for any mesh. Takes about three times as long as
-    /// meshing.
+    /// A check of every edge, and of the fan of triangles around every vertex, for any mesh. Takes about three times as
+    /// long as meshing.
     Exact,
 }
 
@@ -58,11 +58,11 @@ pub struct Measures {
     pub volume: f64,
     /// V − E + F.
     pub euler: i64,
-    /// Every edge is used as often in one direction as in the other.
+    /// True if every edge is used as often in one direction as in the other.
     pub closed: bool,
-    /// Neighbouring triangles wind the same way: no directed edge is used twice.
+    /// True if neighbouring triangles wind the same way: no directed edge is used twice.
     pub oriented: bool,
-    /// Every edge has exactly two triangles and the triangles around every vertex form one closed fan.
+    /// True if every edge has exactly two triangles and the triangles around every vertex form one closed fan.
     pub manifold: bool,
     /// Validation method of the last three fields.
     pub validation: Validation,
@@ -71,8 +71,8 @@ pub struct Measures {
 }
 
 impl Measures {
-    /// Measures `mesh` with its vertices as stored, including rounding, on one thread. Backends measure most meshes
-    /// themselves; this is for the others.
+    /// Measures `mesh` with its vertices as stored, including rounding, on one thread. Used if the backend has not
+    /// measured the mesh.
     ///
     /// # Errors
     /// [`SurfaceError::Cancelled`].
@@ -135,10 +135,9 @@ impl Measures {
         Some(all)
     }
 
-    /// Measures from components whose checksum of directed edges is zero, and the numbers of vertices and triangles;
-    /// every vertex is used.
-    pub(super) fn balanced(mut components: Vec<Component>, size: [u64; 2]) -> Self {
-        components.retain(|c| c.triangles > 0);
+    /// Returns the measures of a mesh of these components and numbers of vertices and triangles. The checksum of its
+    /// directed edges is zero, and triangles use every vertex.
+    pub(super) fn balanced(components: Vec<Component>, size: [u64; 2]) -> Self {
         Self::new(components, size, Topology::of_closed(size[1]), Validation::Checksum)
     }
 
@@ -198,8 +197,8 @@ impl Component {
         (0..3).for_each(|k| self.moment[k] += self.volume * shift[k]);
     }
 
-    /// Adds a triangle. By the divergence theorem, its part of the volume's moment along an axis is the integral of
-    /// half the squared coordinate times the normal.
+    /// Adds a triangle. By the divergence theorem, its contribution to the volume's moment along an axis is the
+    /// integral of half the squared coordinate times the normal.
     pub(crate) fn add(&mut self, [a, b, c]: [[f64; 3]; 3]) {
         let [u, v] = [b, c].map(|p| [p[0] - a[0], p[1] - a[1], p[2] - a[2]]);
         let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];

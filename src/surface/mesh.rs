@@ -1,4 +1,4 @@
-//! The output of the core: an indexed triangle mesh with normals.
+//! Output of the core: an indexed triangle mesh with normals.
 
 use std::ops::Range;
 
@@ -15,7 +15,7 @@ const ROWS: usize = 1 << 16;
 
 /// An indexed triangle mesh. Vertex `i` lies at `centre + position(i)`, in Å.
 ///
-/// Its vertices lie in `positions` and `normals`, or in `quantized`: then those two are empty.
+/// Vertices are stored either in `positions` and `normals`, or in `quantized`; the others are empty.
 ///
 /// Invariants of every mesh that a backend returns: each index is in range, normals have length 1 and point
 /// outwards, triangles wind counter-clockwise seen from outside, and the surface is closed.
@@ -27,7 +27,7 @@ pub struct Mesh {
     pub positions: Column<[f32; 3]>,
     /// Unit normals, one per vertex, pointing out of the molecule.
     pub normals: Column<[f32; 3]>,
-    /// The vertices as small integers, instead of the two columns above.
+    /// Vertices as small integers. If present, `positions` and `normals` are empty.
     pub quantized: Option<Quantized>,
     /// Vertex indices, counter-clockwise seen from outside.
     pub triangles: Column<[u32; 3]>,
@@ -39,8 +39,8 @@ pub struct Mesh {
     pub parts: Vec<PartRange>,
 }
 
-/// Rows of a part of a mesh. Its triangles refer to its own vertices only.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+/// Rows of a part of a mesh, and its measures. Its triangles refer to its own vertices only.
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct PartRange {
     /// Name.
     pub name: String,
@@ -48,6 +48,12 @@ pub struct PartRange {
     pub vertices: Range<usize>,
     /// Rows of its triangles; empty if no grid point lies inside its surface.
     pub triangles: Range<usize>,
+    /// Area, Å².
+    pub area: f64,
+    /// Enclosed volume, Å³.
+    pub volume: f64,
+    /// Lowest and highest position relative to the mesh's centre, per axis, Å; zeros without vertices.
+    pub bounds: [[f32; 3]; 2],
 }
 
 /// Vertices in 12 bytes. The fourth number of a row is 0.
@@ -78,17 +84,31 @@ impl Quantized {
 
 /// Returns the minimum and maximum of the first three columns; `None` without rows.
 pub(super) fn bounds_of<T: Copy + PartialOrd + Send + Sync, const N: usize>(rows: &[[T; N]]) -> Option<[[T; 3]; 2]> {
-    let of = |rows: &[[T; N]]| rows.iter().map(|row| [[row[0], row[1], row[2]]; 2]).reduce(joined_bounds);
+    let of = |rows: &[[T; N]]| {
+        // Four rows at a time fill whole vectors, with each axis always in the same lanes.
+        let (fours, rest) = rows.as_chunks::<4>();
+        let [mut low, mut high] = [[*rows.first()?; 4]; 2];
+        for four in fours {
+            for (row, (low, high)) in four.iter().zip(low.iter_mut().zip(&mut high)) {
+                for k in 0..N {
+                    low[k] = if row[k] < low[k] { row[k] } else { low[k] };
+                    high[k] = if row[k] > high[k] { row[k] } else { high[k] };
+                }
+            }
+        }
+        let lanes = low.into_iter().zip(high).chain(rest.iter().map(|&row| (row, row)));
+        lanes.map(|rows| <[_; 2]>::from(rows).map(|row| [row[0], row[1], row[2]])).reduce(joined_bounds)
+    };
     if rows.len() <= ROWS { of(rows) } else { rows.par_chunks(ROWS).filter_map(of).reduce_with(joined_bounds) }
 }
 
-/// The bounds of both.
+/// Returns the bounds of both.
 pub(crate) fn joined_bounds<T: Copy + PartialOrd>([a, b]: [[T; 3]; 2], [c, d]: [[T; 3]; 2]) -> [[T; 3]; 2] {
     let choose = |take: bool, new, old| if take { new } else { old };
     [std::array::from_fn(|k| choose(c[k] < a[k], c[k], a[k])), std::array::from_fn(|k| choose(d[k] > b[k], d[k], b[k]))]
 }
 
-/// A position as a row.
+/// Converts a position to a row.
 #[inline]
 #[must_use]
 pub(crate) fn position_row(step: Step, position: [f32; 3]) -> [i16; 4] {
@@ -96,7 +116,7 @@ pub(crate) fn position_row(step: Step, position: [f32; 3]) -> [i16; 4] {
     [x, y, z, 0]
 }
 
-/// A unit normal as a row, or a zero one.
+/// Converts a unit normal or zero to a row.
 #[inline]
 #[must_use]
 pub(crate) fn normal_row(normal: [f32; 3]) -> [i8; 4] {
@@ -148,21 +168,6 @@ impl Mesh {
             Some(quantized) => quantized.bounds().unwrap_or_default().map(|row| quantized.step.decoded(row)),
             None => self.positions.pieces().filter_map(bounds_of).reduce(joined_bounds).unwrap_or_default(),
         }
-    }
-
-    /// Lowest and highest relative position per axis of a range of vertices; zeros for an empty range.
-    ///
-    /// # Panics
-    /// Panics if the range exceeds the vertices.
-    #[must_use]
-    pub fn bounds_of(&self, vertices: Range<usize>) -> [[f32; 3]; 2] {
-        let bounds = match self.vertices() {
-            Vertices::Single { positions, .. } => bounds_of(&positions[vertices]),
-            Vertices::Quantized { step, positions, .. } => {
-                bounds_of(&positions[vertices]).map(|bounds| bounds.map(|row| step.decoded(row)))
-            }
-        };
-        bounds.unwrap_or_default()
     }
 
     /// Rounds the vertices to integers. A mesh that already has this step is unchanged. Returns true if the mesh
@@ -233,8 +238,8 @@ impl Mesh {
     fn flat_vertices(&self) -> Vec<u32> {
         // Half a unit of a component is far below every unit vector's longest one.
         match &self.quantized {
-            None => numbers_of(&self.normals, |n: &[f32; 3]| n.iter().all(|c| c.abs() < 0.5)),
-            Some(quantized) => numbers_of(&quantized.normals, |n: &[i8; 4]| *n == [0; 4]),
+            None => indices_of(&self.normals, |n: &[f32; 3]| n.iter().all(|c| c.abs() < 0.5)),
+            Some(quantized) => indices_of(&quantized.normals, |n: &[i8; 4]| *n == [0; 4]),
         }
     }
 
@@ -275,20 +280,20 @@ impl Mesh {
     /// Bytes of positions, normals and indices.
     #[must_use]
     pub fn bytes(&self) -> u64 {
-        let each = if self.quantized.is_some() { 12 } else { 24 };
-        each * self.n_vertices() as u64 + 12 * self.n_triangles() as u64
+        Self::bytes_for(self.n_vertices() as u64, self.n_triangles() as u64, self.quantized.is_some())
     }
 
-    /// Bytes of positions and normals in single precision, and of indices, for so many vertices and triangles.
+    /// Bytes of positions, normals and indices of a mesh with these numbers of vertices and triangles.
     #[must_use]
-    pub fn bytes_for(n_vertices: u64, n_triangles: u64) -> u64 {
-        24 * n_vertices + 12 * n_triangles
+    pub(crate) fn bytes_for(n_vertices: u64, n_triangles: u64, quantized: bool) -> u64 {
+        let of_vertex = if quantized { 12 } else { 24 };
+        of_vertex * n_vertices + 12 * n_triangles
     }
 }
 
-/// Returns the indices of the rows that satisfy `such`.
-fn numbers_of<T>(rows: &[T], such: impl Fn(&T) -> bool) -> Vec<u32> {
-    (0_u32..).zip(rows).filter(|(_, row)| such(row)).map(|(v, _)| v).collect()
+/// Returns the indices of the rows for which `holds` is true.
+fn indices_of<T>(rows: &[T], holds: impl Fn(&T) -> bool) -> Vec<u32> {
+    (0_u32..).zip(rows).filter(|(_, row)| holds(row)).map(|(v, _)| v).collect()
 }
 
 #[cfg(test)]
@@ -331,10 +336,10 @@ mod tests {
     }
 
     #[test]
-    fn integer_bounds_include_every_row_of_every_chunk() {
+    fn bounds_include_every_row_of_every_chunk() {
         let step = Step::covering(1.0);
-        for n in [1, 5, ROWS, 2 * ROWS + 3] {
-            for row in [0, n / 2, n - 1] {
+        for n in [1, 4, 5, 6, 7, 8, ROWS, 2 * ROWS + 3] {
+            for row in [0, n / 2, n.saturating_sub(2), n - 1] {
                 let mut rows = vec![[1, 2, 3, 0]; n];
                 rows[row] = [-7, 9, quantize::BEYOND, 0];
                 let cut = n / 3;
@@ -343,6 +348,8 @@ mod tests {
                 let [low, high] = [[-7, 2, quantize::BEYOND], [1, 9, 3]];
                 let expected = if n == 1 { [[-7, 9, quantize::BEYOND]; 2] } else { [low, high] };
                 assert_eq!(quantized.bounds(), Some(expected), "{row} of {n}");
+                let single: Vec<[f32; 3]> = rows.iter().map(|&[x, y, z, _]| [x, y, z].map(f32::from)).collect();
+                assert_eq!(bounds_of(&single), Some(expected.map(|row| row.map(f32::from))), "{row} of {n}");
             }
         }
     }

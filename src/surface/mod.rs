@@ -1,8 +1,8 @@
-//! The meshing core: spheres and parameters in, a closed triangle mesh out.
+//! Meshing core: computes a closed triangle mesh from spheres and parameters.
 //!
 //! The core does not depend on files, clocks, async, serialization, GPUs or molecules. Lengths are ångström (Å), areas
-//! Å², volumes Å³. Density grows inwards; a sample is inside if its density is at least the isovalue; triangles wind
-//! counter-clockwise seen from outside and normals point outwards.
+//! Å², volumes Å³. Density grows inwards; a grid point is inside if its density is at least the isovalue; triangles
+//! wind counter-clockwise seen from outside and normals point outwards.
 
 pub mod backend;
 pub(crate) mod candidates;
@@ -12,6 +12,7 @@ pub mod control;
 pub mod cpu;
 pub mod devices;
 pub mod error;
+pub(crate) mod grid_limit;
 pub(crate) mod join;
 pub mod kernel;
 pub mod kind;

@@ -1,30 +1,34 @@
 //! Occupied bricks of a lattice: counted for estimates, and listed for the plan of a device's job.
 //!
-//! A brick is occupied if an atom reaches one of its samples or the gap up to the first samples of its neighbours:
-//! cells lie there too. Runs of atoms of a tile count, in parallel, how many of them reach each brick around the tile.
-//! The counts become masks, which are merged by tile. The result equals what the CPU's stage `bin` finds.
+//! A brick is occupied if an atom reaches one of its grid points or the gap up to the first grid points of its
+//! neighbours, which contains cells of the brick. A run is a part of the atoms of one tile. For each run, a thread
+//! counts the atoms that reach each brick in and around the tile, and converts the counts to masks. The masks of a
+//! block of runs are then merged by tile, before the next block is counted. The result equals that of the CPU's stage
+//! `bin`.
+
+mod marks;
 
 use std::collections::hash_map::Entry;
+use std::f64::consts::PI;
 use std::ops::Range;
 
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::candidates;
+use self::marks::{CountedBricks, Marks, RUN, longest, mark_run, runs};
 use super::control::Control;
-use super::cpu;
 use super::error::SurfaceError;
-use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_i32};
+use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_u32, to_u64};
+use super::memory::{MemoryMeter as _, OutOfMemory, Reservation};
 use super::params::SurfaceLimits;
-use super::simd::dispatched;
+use super::{candidates, grid_limit};
 
-/// Maximum number of atoms of a run, which one thread marks: counts of them fit 16 bits.
-const RUN: usize = 4096;
-/// Number of tiles in reach of all runs above which a lower bound of the grid is checked before tiles are allocated. A
-/// tile takes 2 KiB while a run is marked, and 160 bytes from then on.
-const MAX_UNCHECKED_TILES: f64 = 1e5;
-/// Number of atoms that are tested at once.
-const LANES: usize = 8;
+/// Number of tiles in reach of the runs of a block: their marks take at most 40 MB.
+const BLOCK_TILES: f64 = 262_144.0;
+/// Maximum number of runs of a block.
+const BLOCK_RUNS: f64 = 4096.0;
+/// Number of open tiles below which they are not searched for complete ones.
+const MIN_OPEN: usize = 1 << 15;
 
 /// Bricks of a tile as bits: word z, bit `8·y + x`.
 pub type BrickBits = [u64; 8];
@@ -36,17 +40,17 @@ pub struct TileOccupancy {
     pub tile: [i32; 3],
     /// Occupied bricks.
     pub occupied: BrickBits,
-    /// Bricks with a sample in reach of an atom.
+    /// Bricks with a grid point in reach of an atom.
     pub reached: BrickBits,
     /// Pairs of an occupied brick and an atom that reaches it.
     pub candidates: u64,
-    /// Pairs of a brick and an atom that reaches one of its samples.
+    /// Pairs of a brick and an atom that reaches one of its grid points.
     pub pairs: u64,
 }
 
-/// Consecutive atoms of one brick.
+/// Brick that holds consecutive atoms.
 #[derive(Debug, Clone, Copy)]
-pub struct Home {
+pub struct AtomBrick {
     /// Tile coordinates.
     pub tile: [i32; 3],
     /// Index of the brick within its tile.
@@ -56,7 +60,7 @@ pub struct Home {
 }
 
 /// Occupied bricks of a lattice.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Occupancy {
     /// Tiles with occupied bricks, in tile order.
     pub tiles: Vec<TileOccupancy>,
@@ -65,7 +69,66 @@ pub struct Occupancy {
     /// Maximum of `reaches`.
     pub max_reach: f32,
     /// Bricks that hold atoms, in the order of the atoms. A brick with many atoms has several entries.
-    pub homes: Vec<Home>,
+    pub atom_bricks: Vec<AtomBrick>,
+    /// Memory of these lists.
+    _memory: Reservation,
+}
+
+/// Work on a lattice.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct WorkCounts {
+    /// Bricks with a grid point in reach of an atom.
+    pub reached: u64,
+    /// Pairs of an occupied brick and an atom that reaches it.
+    pub candidates: u64,
+}
+
+/// Counts the bricks and pairs of `lattice` without listing them.
+///
+/// # Errors
+/// Those of [`Occupancy::new`].
+pub fn count(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<WorkCounts, SurfaceError> {
+    let memory = Reservation::new(&control.memory);
+    let reaches = Reaches::new(lattice, &memory)?;
+    let mut found = FoundBricks::new(false, &memory);
+    found.search(lattice, &reaches, limits, control)?;
+    Ok(WorkCounts { reached: found.n_reached, candidates: found.n_candidates })
+}
+
+/// Rejects a run before any of it is computed if the atoms of all `lattices` together have too many pairs. Counts the
+/// pairs exactly, but only if an upper bound exceeds the limit.
+///
+/// # Errors
+/// [`SurfaceError::TooManyCandidates`], and the other errors of counting.
+pub(super) fn check_pairs(
+    lattices: &[&Lattice],
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<(), SurfaceError> {
+    let most: f64 = lattices.iter().map(|lattice| most_pairs(lattice)).sum();
+    if most <= candidates::limit(limits) as f64 {
+        return Ok(());
+    }
+    let mut left = candidates::limit(limits);
+    for lattice in lattices {
+        let rest = SurfaceLimits { max_candidates: left, ..*limits };
+        match count(lattice, &rest, control) {
+            Ok(counts) => left -= counts.candidates.min(left),
+            Err(SurfaceError::TooManyCandidates { candidates, .. }) => {
+                let so_far = candidates::limit(limits) - left + candidates;
+                return Err(candidates::exceeded(lattices, so_far, limits));
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(())
+}
+
+/// Upper bound of the candidate pairs of a lattice.
+fn most_pairs(lattice: &Lattice) -> f64 {
+    // A sphere touches at most 2·reach/brick + 2 bricks along each axis.
+    let touched = |atom| 2.0 * lattice.reach(atom) / f64::from(BRICK) + 2.0;
+    lattice.atoms.iter().map(|atom| touched(atom).powi(3)).sum()
 }
 
 impl Occupancy {
@@ -75,31 +138,16 @@ impl Occupancy {
     /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond the
     /// limits, [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
-        let atoms = &lattice.atoms;
-        let runs = runs(atoms);
-        let reaches: Vec<f32> = atoms.par_iter().with_min_len(RUN).map(|atom| reach(lattice, atom)).collect();
-        let max_reach = reaches.par_chunks(RUN).map(longest).reduce(|| 0.0, f32::max);
-        check_lower_bound(lattice, runs.len(), max_reach, limits)?;
-        let mark = |run: &Range<usize>| {
-            control.check()?;
-            Ok(mark_run(&atoms[run.clone()], &reaches[run.clone()]))
-        };
-        let marks = runs.par_iter().map(mark).collect::<Result<Vec<_>, SurfaceError>>()?;
-        let (marks, homes): (Vec<_>, Vec<_>) = marks.into_iter().unzip();
-        let occupancy = Self { tiles: merge(&marks), reaches, max_reach, homes: homes.concat() };
-        control.check()?;
-        let n_reached = occupancy.n_reached();
-        if n_reached.saturating_mul(512) > limits.max_samples {
-            return Err(cpu::grid_too_large(lattice, n_reached * 512, limits));
-        }
-        let candidates = occupancy.n_candidates();
-        if candidates > candidates::limit(limits) {
-            return Err(candidates::exceeded(lattice, candidates, limits));
-        }
-        Ok(occupancy)
+        let memory = Reservation::new(&control.memory);
+        let reaches = Reaches::new(lattice, &memory)?;
+        let mut found = FoundBricks::new(true, &memory);
+        found.search(lattice, &reaches, limits, control)?;
+        let FoundBricks { tiles, atom_bricks, .. } = found;
+        let Reaches { of_atoms, longest } = reaches;
+        Ok(Self { tiles, reaches: of_atoms, max_reach: longest, atom_bricks, _memory: memory })
     }
 
-    /// Number of bricks with a sample in reach of an atom.
+    /// Number of bricks with a grid point in reach of an atom.
     #[must_use]
     pub fn n_reached(&self) -> u64 {
         self.tiles.iter().map(|tile| count_ones(&tile.reached)).sum()
@@ -111,7 +159,7 @@ impl Occupancy {
         self.tiles.iter().map(|tile| tile.candidates).sum()
     }
 
-    /// Number of pairs of a brick and an atom that reaches one of its samples.
+    /// Number of pairs of a brick and an atom that reaches one of its grid points.
     #[must_use]
     pub fn n_pairs(&self) -> u64 {
         self.tiles.iter().map(|tile| tile.pairs).sum()
@@ -124,31 +172,147 @@ pub fn count_ones(bits: &BrickBits) -> u64 {
     bits.iter().map(|word| u64::from(word.count_ones())).sum()
 }
 
-/// Reach of an atom in spacings, a little more than its support: rounding must not lose a pair, and an additional pair
-/// adds zero to the density.
+/// Returns the reach of an atom in spacings, which is slightly more than its support. Rounding must not lose a pair,
+/// and an additional pair adds zero to the density.
 fn reach(lattice: &Lattice, atom: &LatticeAtom) -> f32 {
     to_f32(lattice.reach(atom) * (1.0 + 1e-5)) + 1e-3
 }
 
-/// Returns the maximum of `reaches`.
-fn longest(reaches: &[f32]) -> f32 {
-    reaches.iter().copied().fold(0.0, f32::max)
+/// Reaches of all atoms.
+struct Reaches {
+    of_atoms: Vec<f32>,
+    longest: f32,
 }
 
-/// Rejects a grid whose lower bound exceeds the limit before its tiles are allocated.
-fn check_lower_bound(
-    lattice: &Lattice,
-    n_runs: usize,
-    max_reach: f32,
-    limits: &SurfaceLimits,
-) -> Result<(), SurfaceError> {
-    // Upper bound of the tiles that a run reaches along each axis: small unless spheres are huge compared with the
-    // spacing.
-    let along = 2.0 * (f64::from(max_reach) + 2.0) / f64::from(TILE) + 3.0;
-    if along.powi(3) * n_runs as f64 <= MAX_UNCHECKED_TILES || along < 6.0 {
-        return Ok(());
+impl Reaches {
+    fn new(lattice: &Lattice, memory: &Reservation) -> Result<Self, OutOfMemory> {
+        memory.grow((size_of::<f32>() * lattice.atoms.len()) as u64)?;
+        let of_atoms: Vec<f32> = lattice.atoms.par_iter().with_min_len(RUN).map(|atom| reach(lattice, atom)).collect();
+        let longest = of_atoms.par_chunks(RUN).map(longest).reduce(|| 0.0, f32::max);
+        Ok(Self { of_atoms, longest })
     }
-    cpu::check_lower_bound(lattice, limits)
+
+    /// Rejects a grid that the largest sphere alone exceeds, before its bricks are allocated.
+    fn check(&self, lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<(), SurfaceError> {
+        // A grid point lies within one spacing of every point, so the reached bricks cover a sphere whose radius is
+        // smaller by one spacing.
+        let least = to_u64(4.0 / 3.0 * PI * (f64::from(self.longest) - 1.0).max(0.0).powi(3));
+        if least > limits.max_grid_points { Err(grid_limit::exceeded(lattice, least, limits, control)) } else { Ok(()) }
+    }
+
+    /// Number of runs of a block. It does not depend on the number of threads, and therefore errors do not either.
+    fn runs_per_block(&self) -> usize {
+        // Upper bound of the tiles that a run reaches along each axis.
+        let along = 2.0 * (f64::from(self.longest) + 2.0) / f64::from(TILE) + 3.0;
+        let n = to_u64((BLOCK_TILES / along.powi(3)).clamp(1.0, BLOCK_RUNS));
+        usize::try_from(n).unwrap_or(1)
+    }
+}
+
+/// Bricks that the runs so far reach.
+struct FoundBricks<'a> {
+    /// True if tiles and bricks with atoms are listed, not only counted.
+    lists: bool,
+    /// Tiles that further runs may reach.
+    open: Vec<TileOccupancy>,
+    /// Index in `open` of each tile.
+    index: FxHashMap<[i32; 3], u32>,
+    /// Number of open tiles at which they are next searched for complete ones.
+    max_open: usize,
+    /// Complete tiles, in tile order.
+    tiles: Vec<TileOccupancy>,
+    atom_bricks: Vec<AtomBrick>,
+    n_reached: u64,
+    n_candidates: u64,
+    memory: &'a Reservation,
+}
+
+impl<'a> FoundBricks<'a> {
+    fn new(lists: bool, memory: &'a Reservation) -> Self {
+        let (open, tiles, atom_bricks, index) = (Vec::new(), Vec::new(), Vec::new(), FxHashMap::default());
+        Self { lists, open, index, max_open: MIN_OPEN, tiles, atom_bricks, n_reached: 0, n_candidates: 0, memory }
+    }
+
+    /// Finds the bricks of all atoms.
+    fn search(
+        &mut self,
+        lattice: &Lattice,
+        reaches: &Reaches,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<(), SurfaceError> {
+        let atoms = &lattice.atoms[..];
+        reaches.check(lattice, limits, control)?;
+        let mut runs = runs(atoms);
+        let first_step = *CountedBricks::new(reaches.longest).steps().start();
+        let mark = |run: &Range<usize>| mark_run(&atoms[run.clone()], &reaches.of_atoms[run.clone()], control);
+        loop {
+            let block: Vec<Range<usize>> = runs.by_ref().take(reaches.runs_per_block()).collect();
+            let Some(seen) = block.last().map(|run| run.end) else { break };
+            let marks = block.par_iter().map(mark).collect::<Result<Vec<_>, SurfaceError>>()?;
+            marks.into_iter().try_for_each(|marks| self.add(&marks))?;
+            let grid_points = 512 * self.n_reached;
+            if grid_points > limits.max_grid_points {
+                let all = to_u64(grid_points as f64 * (atoms.len() as f64 / seen as f64));
+                return Err(grid_limit::exceeded(lattice, all, limits, control));
+            }
+            if self.n_candidates > candidates::limit(limits) {
+                return Err(candidates::exceeded(&[lattice], self.n_candidates, limits));
+            }
+            // Atoms are in tile order.
+            self.complete(atoms.get(seen).map(|next| tile_of(next.cell)[2] + first_step))?;
+        }
+        Ok(())
+    }
+
+    /// Adds the marks of a run.
+    fn add(&mut self, marks: &Marks) -> Result<(), OutOfMemory> {
+        self.memory.reserve_rows(&mut self.open, marks.tiles.len())?;
+        self.memory.reserve_entries(&mut self.index, marks.tiles.len())?;
+        for mark in &marks.tiles {
+            self.n_candidates += mark.candidates;
+            match self.index.entry(mark.tile) {
+                Entry::Vacant(entry) => {
+                    entry.insert(to_u32(self.open.len()));
+                    self.n_reached += count_ones(&mark.reached);
+                    self.open.push(*mark);
+                }
+                Entry::Occupied(entry) => {
+                    let tile = &mut self.open[*entry.get() as usize];
+                    let before = count_ones(&tile.reached);
+                    tile.add(mark);
+                    self.n_reached += count_ones(&tile.reached) - before;
+                }
+            }
+        }
+        if self.lists {
+            self.memory.reserve_rows(&mut self.atom_bricks, marks.atom_bricks.len())?;
+            self.atom_bricks.extend_from_slice(&marks.atom_bricks);
+        }
+        Ok(())
+    }
+
+    /// Moves complete tiles from the open ones to `tiles` if they are listed. Complete are the tiles below layer
+    /// `from`, because no further run reaches them, and all tiles if there is no further run.
+    fn complete(&mut self, from: Option<i32>) -> Result<(), OutOfMemory> {
+        if from.is_some() && self.open.len() < self.max_open {
+            return Ok(());
+        }
+        self.open.par_sort_unstable_by_key(|mark| tile_order(mark.tile));
+        let n = from.map_or(self.open.len(), |from| self.open.partition_point(|mark| mark.tile[2] < from));
+        if self.lists && self.tiles.is_empty() && n == self.open.len() {
+            std::mem::swap(&mut self.tiles, &mut self.open);
+        } else if self.lists {
+            self.memory.reserve_rows(&mut self.tiles, n)?;
+            self.tiles.extend(self.open.drain(..n));
+        } else {
+            self.open.drain(..n);
+        }
+        self.index.clear();
+        self.index.extend(self.open.iter().map(|mark| mark.tile).zip(0..));
+        self.max_open = MIN_OPEN.max(2 * self.open.len());
+        Ok(())
+    }
 }
 
 impl TileOccupancy {
@@ -161,247 +325,17 @@ impl TileOccupancy {
     }
 }
 
-/// Squared gaps along one axis between the atoms of a batch and one brick for each.
-#[derive(Clone, Copy, Default)]
-struct Gaps {
-    /// Gaps to the samples of the brick.
-    samples: [f32; LANES],
-    /// Gaps to the closed box that also holds the next brick's first sample; infinite beyond the reach.
-    closed: [f32; LANES],
-}
-
-/// Atoms of a tile, one per lane of a vector.
-struct Batch {
-    /// Cells relative to the tile.
-    cells: [[i32; LANES]; 3],
-    fracs: [[f32; LANES]; 3],
-    /// Reach of each atom; negative in unused lanes.
-    reach: [f32; LANES],
-    /// First brick per axis that may be in reach, relative to the tile.
-    first: [[i32; LANES]; 3],
-}
-
-impl Batch {
-    /// Loads at most [`LANES`] atoms of the tile with first sample `origin`.
-    #[inline(always)]
-    fn new(atoms: &[LatticeAtom], reaches: &[f32], origin: [i32; 3]) -> Self {
-        let (cells, fracs) = ([[0; LANES]; 3], [[0.0; LANES]; 3]);
-        let mut batch = Self { cells, fracs, reach: [-1.0; LANES], first: [[0; LANES]; 3] };
-        for (lane, (atom, &reach)) in atoms.iter().zip(reaches).enumerate().take(LANES) {
-            for (k, origin) in origin.into_iter().enumerate() {
-                batch.cells[k][lane] = atom.cell[k] - origin;
-                batch.fracs[k][lane] = atom.frac[k];
-            }
-            batch.reach[lane] = reach;
-        }
-        for k in 0..3 {
-            for lane in 0..LANES {
-                let local = batch.cells[k][lane] as f32 + batch.fracs[k][lane];
-                // The slack of 0.01 covers rounding, which must not lose a brick.
-                batch.first[k][lane] = floor((local - batch.reach[lane] - 0.01) * (1.0 / BRICK as f32));
-            }
-        }
-        batch
-    }
-
-    /// Returns the gaps along axis `k` to the `i`th brick from the first on. The arithmetic is that of the CPU's stage
-    /// `bin`, operation by operation: coordinates are relative to the tile of the brick.
-    #[inline(always)]
-    fn gaps(&self, k: usize, i: i32) -> Gaps {
-        let mut gaps = Gaps::default();
-        for lane in 0..LANES {
-            let brick = self.first[k][lane] + i;
-            let local = (self.cells[k][lane] - (brick >> 3) * TILE) as f32 + self.fracs[k][lane];
-            let lo = ((brick & 7) * BRICK) as f32;
-            let before = lo - local;
-            let before = if before > 0.0 { before } else { 0.0 };
-            let gap = |behind: f32| if before > behind { before } else { behind };
-            let (samples, closed) = (gap(local - (lo + 7.0)), gap(local - (lo + 8.0)));
-            gaps.samples[lane] = samples * samples;
-            gaps.closed[lane] = if closed <= self.reach[lane] { closed * closed } else { f32::INFINITY };
-        }
-        gaps
-    }
-}
-
-/// Bricks of a tile and around it, counted by the atoms of the tile that reach them.
-struct CountedBricks {
-    /// Number of bricks before the tile, per axis.
-    before: i32,
-    /// Number of bricks per axis.
-    side: i32,
-    /// Number of bricks per axis that an atom may reach. It is the same for all atoms, because mispredicting the end of
-    /// a range costs more than testing bricks out of reach.
-    n: i32,
-    /// Per brick the number of atoms that reach it, and that of those that reach a sample, shifted by 16.
-    counts: Vec<u32>,
-}
-
-impl CountedBricks {
-    /// Bricks around a tile whose atoms reach at most `longest`.
-    fn new(longest: f32) -> Self {
-        let bricks = |length: f32| to_i32(f64::from(length * (1.0 / BRICK as f32)).floor());
-        // An atom lies at most half a spacing outside the samples of its tile. The rest is slack for rounding.
-        let (before, n) = (bricks(longest + 0.52) + 1, bricks(2.0 * longest + 0.1) + 2);
-        let side = before + 7 + n;
-        Self { before, side, n, counts: vec![0; (side.unsigned_abs() as usize).pow(3)] }
-    }
-
-    /// Index of a brick by its place.
-    #[inline(always)]
-    fn index(&self, place: [i32; 3]) -> usize {
-        let [x, y, z] = place.map(|c| c.unsigned_abs() as usize);
-        let side = self.side.unsigned_abs() as usize;
-        (z * side + y) * side + x
-    }
-
-    /// Counts the bricks that a batch reaches. `gaps` and `row` are scratch.
-    #[inline(always)]
-    fn add(&mut self, batch: &Batch, gaps: &mut [Vec<Gaps>; 3], row: &mut Vec<[u32; LANES]>) {
-        for (k, gaps) in gaps.iter_mut().enumerate() {
-            gaps.clear();
-            gaps.extend((0..self.n).map(|i| batch.gaps(k, i)));
-        }
-        row.resize(gaps[0].len(), [0; LANES]);
-        let starts: [usize; LANES] =
-            std::array::from_fn(|lane| self.index(batch.first.map(|first| first[lane] + self.before)));
-        for (z, iz) in gaps[2].iter().zip(0..) {
-            for (y, iy) in gaps[1].iter().zip(0..) {
-                for (row, x) in row.iter_mut().zip(&gaps[0]) {
-                    // In a local array, as the compiler cannot know that `row` is none of the gaps.
-                    let mut reached = [0; LANES];
-                    for (lane, reached) in reached.iter_mut().enumerate() {
-                        let reach2 = batch.reach[lane] * batch.reach[lane];
-                        let near = (y.closed[lane] + z.closed[lane]) + x.closed[lane] <= reach2;
-                        let hit = (y.samples[lane] + z.samples[lane]) + x.samples[lane] <= reach2;
-                        *reached = u32::from(near) + (u32::from(near & hit) << 16);
-                    }
-                    *row = reached;
-                }
-                let offset = self.index([0, iy, iz]);
-                for (lane, start) in starts.iter().enumerate() {
-                    let counts = &mut self.counts[start + offset..][..row.len()];
-                    counts.iter_mut().zip(row.iter()).for_each(|(count, row)| *count += row[lane]);
-                }
-            }
-        }
-    }
-
-    /// Returns the occupied bricks of `tile`, which is `step` tiles away from that of the atoms.
-    #[inline(always)]
-    fn occupancy(&self, tile: [i32; 3], step: [i32; 3]) -> TileOccupancy {
-        let mut occupancy = TileOccupancy { tile, occupied: [0; 8], reached: [0; 8], candidates: 0, pairs: 0 };
-        let starts = step.map(|step| 8 * step + self.before);
-        let [x, y, z] = starts.map(|start| start.max(0)..self.side.min(start + 8));
-        for z in z {
-            let layer = (z - starts[2]).unsigned_abs() as usize & 7;
-            for y in y.clone() {
-                for x in x.clone() {
-                    let (count, bit) = (self.counts[self.index([x, y, z])], 8 * (y - starts[1]) + x - starts[0]);
-                    occupancy.occupied[layer] |= u64::from(count > 0) << bit;
-                    occupancy.reached[layer] |= u64::from(count >> 16 > 0) << bit;
-                    occupancy.candidates += u64::from(count & 0xffff);
-                    occupancy.pairs += u64::from(count >> 16);
-                }
-            }
-        }
-        occupancy
-    }
-}
-
-dispatched! {
-without AVX-512:
-/// Marks the bricks that `atoms`, all in one tile, reach. Returns them with the bricks that hold the atoms.
-fn mark_run(atoms: &[LatticeAtom], reaches: &[f32]) -> (Vec<TileOccupancy>, Vec<Home>) {
-    let Some(first) = atoms.first() else { return (Vec::new(), Vec::new()) };
-    let own = tile_of(first.cell);
-    let mut bricks = CountedBricks::new(longest(reaches));
-    let (mut gaps, mut row) = ([const { Vec::new() }; 3], Vec::new());
-    for (atoms, reaches) in atoms.chunks(LANES).zip(reaches.chunks(LANES)) {
-        bricks.add(&Batch::new(atoms, reaches, own.map(|t| t * TILE)), &mut gaps, &mut row);
-    }
-    let mut homes: Vec<Home> = Vec::new();
-    for atom in atoms {
-        let local = local_brick(atom);
-        match homes.last_mut() {
-            Some(home) if home.local == local => home.n_atoms += 1,
-            _ => homes.push(Home { tile: own, local, n_atoms: 1 }),
-        }
-    }
-    let steps = (-bricks.before >> 3)..=((bricks.side - bricks.before - 1) >> 3);
-    let mut tiles = Vec::new();
-    for z in steps.clone() {
-        for y in steps.clone() {
-            for x in steps.clone() {
-                let mut tile = bricks.occupancy([own[0] + x, own[1] + y, own[2] + z], [x, y, z]);
-                if tile.tile == own {
-                    // A tiny sphere may reach no sample of its own brick, but the plan lists atoms by brick.
-                    for home in &homes {
-                        tile.occupied[home.local as usize >> 6] |= 1 << (home.local & 63);
-                    }
-                }
-                if tile.occupied != [0; 8] {
-                    tiles.push(tile);
-                }
-            }
-        }
-    }
-    (tiles, homes)
-}
-}
-
-/// Rounds `v` down; a whole number may become one less. Casts would check for values out of range.
-#[inline(always)]
-fn floor(v: f32) -> i32 {
-    // Adding 1.5·2²³ leaves the rounded integer in the low bits of the sum.
-    const MAGIC: f32 = 12_582_912.0;
-    (v - 0.5 + MAGIC).to_bits().cast_signed() - MAGIC.to_bits().cast_signed()
-}
-
-/// Cuts the atoms, which are sorted by tile, into runs of at most [`RUN`] atoms of one tile.
-fn runs(atoms: &[LatticeAtom]) -> Vec<Range<usize>> {
-    let mut runs = Vec::new();
-    let mut at = 0;
-    while let Some(first) = atoms.get(at) {
-        let tile = tile_of(first.cell);
-        let rest = &atoms[at..atoms.len().min(at + RUN)];
-        let end = at + rest.partition_point(|atom| tile_of(atom.cell) == tile);
-        runs.push(at..end);
-        at = end;
-    }
-    runs
-}
-
-/// Merges the marks of all runs into one entry per tile, in tile order.
-fn merge(marks: &[Vec<TileOccupancy>]) -> Vec<TileOccupancy> {
-    let mut all: Vec<TileOccupancy> = Vec::new();
-    let mut index: FxHashMap<[i32; 3], usize> = FxHashMap::default();
-    for mark in marks.iter().flatten() {
-        match index.entry(mark.tile) {
-            Entry::Vacant(entry) => {
-                entry.insert(all.len());
-                all.push(*mark);
-            }
-            Entry::Occupied(entry) => all[*entry.get()].add(mark),
-        }
-    }
-    all.par_sort_unstable_by_key(|mark| tile_order(mark.tile));
-    all
-}
-
-/// Index of an atom's brick within its tile.
-#[inline(always)]
-fn local_brick(atom: &LatticeAtom) -> u32 {
-    let [x, y, z] = atom.cell;
-    let brick = |c: i32| c.rem_euclid(TILE).unsigned_abs() / BRICK.unsigned_abs();
-    brick(z) << 6 | brick(y) << 3 | brick(x)
-}
-
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU64, Ordering};
+
     use proptest::prelude::*;
 
+    use super::marks::local_brick;
     use super::*;
+    use crate::surface::lattice::to_i32;
+    use crate::surface::memory::MemoryMeter;
     use crate::surface::{Spheres, SurfaceOptions, SurfaceParams};
 
     /// Occupied bricks of `atoms`, tested one by one with the arithmetic of stage `bin`.
@@ -454,6 +388,78 @@ mod tests {
         }
     }
 
+    /// Memory with a limit.
+    #[derive(Debug)]
+    struct Meter {
+        limit: u64,
+        held: AtomicU64,
+        most: AtomicU64,
+    }
+
+    impl MemoryMeter for Meter {
+        fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
+            let held = self.held.fetch_add(bytes, Ordering::Relaxed) + bytes;
+            if held > self.limit {
+                self.shrink(bytes);
+                return Err(OutOfMemory::Budget { needed: bytes, held: held - bytes, limit: self.limit });
+            }
+            self.most.fetch_max(held, Ordering::Relaxed);
+            Ok(())
+        }
+
+        fn shrink(&self, bytes: u64) {
+            self.held.fetch_sub(bytes, Ordering::Relaxed);
+        }
+    }
+
+    fn meter(limit: u64) -> (Arc<Meter>, Control<'static>) {
+        let meter = Arc::new(Meter { limit, held: AtomicU64::new(0), most: AtomicU64::new(0) });
+        let memory: Arc<dyn MemoryMeter> = Arc::<Meter>::clone(&meter);
+        (meter, Control { memory, ..Control::default() })
+    }
+
+    /// Lattice of 12,167 atoms, each at the corner of eight tiles that no other atom reaches.
+    fn sparse() -> Lattice {
+        let column = |step: i32| (0..23 * 23 * 23).map(|i| f64::from(256 * (i / step % 23))).collect();
+        let spheres = Spheres::new(column(1), column(23), column(529), vec![1.7; 23 * 23 * 23]).unwrap();
+        let options = SurfaceOptions { resolution: Some(1.0), ..SurfaceOptions::default() };
+        Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn sparse_atoms_are_marked_in_blocks_within_the_memory_of_the_meter() {
+        let (lattice, limits) = (sparse(), SurfaceLimits::default());
+        let (listing, control) = meter(u64::MAX);
+        let occupancy = Occupancy::new(&lattice, &limits, &control).unwrap();
+        assert_eq!(occupancy.tiles.len(), 8 * 23 * 23 * 23);
+        assert_eq!(format!("{:?}", occupancy.tiles), format!("{:?}", brute_force(&lattice, &lattice.atoms)));
+        let rows = (size_of_val(&*occupancy.tiles) + size_of_val(&*occupancy.atom_bricks)) as u64;
+        assert!(listing.held.load(Ordering::Relaxed) >= rows);
+        let n_reached = occupancy.n_reached();
+        drop(occupancy);
+        assert_eq!(listing.held.load(Ordering::Relaxed), 0);
+
+        let (counting, control) = meter(u64::MAX);
+        assert_eq!(count(&lattice, &limits, &control).unwrap().reached, n_reached);
+        assert_eq!(counting.held.load(Ordering::Relaxed), 0);
+        let most = |meter: &Meter| meter.most.load(Ordering::Relaxed);
+        assert!(most(&counting) < most(&listing), "{} {}", most(&counting), most(&listing));
+        let (_, control) = meter(most(&counting) / 2);
+        assert!(matches!(count(&lattice, &limits, &control), Err(SurfaceError::Memory(_))));
+
+        // The limit of grid points ends the search early, with an estimate for all atoms.
+        let (stopped, control) = meter(u64::MAX);
+        let few = SurfaceLimits { max_grid_points: 512 * n_reached / 10, ..limits };
+        match count(&lattice, &few, &control) {
+            Err(SurfaceError::GridTooLarge { grid_points, suggested_resolution, .. }) => {
+                assert!(grid_points.abs_diff(512 * n_reached) < 26 * n_reached, "{grid_points} {n_reached}");
+                assert!(suggested_resolution > 1.0);
+            }
+            other => panic!("{other:?}"),
+        }
+        assert!(most(&stopped) <= most(&counting));
+    }
+
     proptest! {
         #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
         #[test]
@@ -463,8 +469,8 @@ mod tests {
             resolution in prop::sample::select(vec![4.0, 1.0, 0.7, 0.5, 0.23, 0.15, 0.06]),
             (largest, on_grid) in (1.0_f32..2.5, any::<bool>()),
         ) {
-            let place = |c: f64| if on_grid { (c / resolution).round() * resolution } else { c };
-            let column = |k: usize| atoms.iter().map(|(centre, _)| place(centre[k])).collect();
+            let rounded = |c: f64| if on_grid { (c / resolution).round() * resolution } else { c };
+            let column = |k: usize| atoms.iter().map(|(centre, _)| rounded(centre[k])).collect();
             let mut radii: Vec<f32> = atoms.iter().map(|(_, radius)| *radius).collect();
             radii[0] = largest;
             let spheres = Spheres::new(column(0), column(1), column(2), radii).unwrap();
@@ -482,8 +488,8 @@ mod tests {
 
             let max_reach = occupancy.reaches.iter().copied().fold(0.0, f32::max);
             prop_assert_eq!(occupancy.max_reach.to_bits(), max_reach.to_bits());
-            let bricks = |home: &Home| vec![(home.tile, home.local); home.n_atoms as usize];
-            let held = occupancy.homes.iter().flat_map(bricks);
+            let bricks = |brick: &AtomBrick| vec![(brick.tile, brick.local); brick.n_atoms as usize];
+            let held = occupancy.atom_bricks.iter().flat_map(bricks);
             prop_assert!(held.eq(lattice.atoms.iter().map(|atom| (tile_of(atom.cell), local_brick(atom)))));
         }
     }

@@ -11,7 +11,7 @@ use super::quantize::Step;
 pub const MIN_RESOLUTION: f64 = 0.01;
 /// Coarsest grid spacing that is accepted, Å.
 pub const MAX_RESOLUTION: f64 = 20.0;
-/// Least radius after scale and offset, Å.
+/// Minimum radius after scale and offset, Å.
 pub const MIN_RADIUS: f64 = 0.05;
 /// Radius of support of the soft-object and inverse-square kernels, in radii.
 pub const SUPPORT_RADII: f64 = 2.0;
@@ -74,7 +74,7 @@ pub struct SurfaceOptions {
     pub paper_b: Option<f64>,
     /// The paper's `c` (inverse square: strength in Å²).
     pub paper_c: Option<f64>,
-    /// Find the atom whose sphere is nearest to every vertex.
+    /// True if the atom whose sphere is nearest to each vertex is requested.
     pub atom_ids: bool,
 }
 
@@ -101,11 +101,10 @@ pub struct SurfaceParams {
     pub preset: Preset,
     /// The paper's raw parameters, which replace radii and smoothness.
     pub paper: Option<PaperParams>,
-    /// Find the atom whose sphere is nearest to every vertex.
+    /// True if the atom whose sphere is nearest to each vertex is requested.
     pub atom_ids: bool,
-    /// Deliver vertices as [`Quantized`](super::mesh::Quantized) ones with this step, which reaches as far as the
-    /// surface does; else in single precision. A backend that cannot delivers single precision, which the caller may
-    /// round.
+    /// Step of [`Quantized`](super::mesh::Quantized) vertices, which covers the extent of the surface; `None` requests
+    /// single precision. A backend without quantized vertices delivers single precision, which the caller may round.
     pub quantize: Option<Step>,
 }
 
@@ -113,8 +112,8 @@ pub struct SurfaceParams {
 #[expect(clippy::struct_field_names, reason = "each is the highest value that is allowed")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SurfaceLimits {
-    /// Grid samples in occupied bricks.
-    pub max_samples: u64,
+    /// Grid points in occupied bricks.
+    pub max_grid_points: u64,
     /// Bytes of vertices and triangles.
     pub max_mesh_bytes: u64,
     /// Candidate pairs: pairs of a sphere and a brick of the grid that its density can reach. Values above 2³¹ count as
@@ -124,7 +123,7 @@ pub struct SurfaceLimits {
 
 impl Default for SurfaceLimits {
     fn default() -> Self {
-        Self { max_samples: 4 << 30, max_mesh_bytes: 8 << 30, max_candidates: 1 << 30 }
+        Self { max_grid_points: 4 << 30, max_mesh_bytes: 8 << 30, max_candidates: 1 << 30 }
     }
 }
 
@@ -150,7 +149,7 @@ fn quoted(preset: Preset) -> String {
     format!("`{preset}`")
 }
 
-/// Rejects values other than the default of the parameters that shape densities.
+/// Rejects values of the parameters that affect only densities.
 fn reject_density_parameters(surface: SurfaceKind, options: &SurfaceOptions) -> Result<(), SurfaceError> {
     let why = format!("no value with surface {surface}: it shapes densities, and this surface has none");
     reject("preset", options.preset.filter(|&preset| preset != Preset::Default).map(quoted), &why)?;
@@ -167,7 +166,7 @@ fn reject_density_parameters(surface: SurfaceKind, options: &SurfaceOptions) -> 
     Ok(())
 }
 
-/// `value` if it is finite and within `[lo, hi]`.
+/// Returns `value` if it is within `[lo, hi]`.
 fn within(name: &'static str, value: f64, lo: f64, hi: f64) -> Result<f64, SurfaceError> {
     if (lo..=hi).contains(&value) { Ok(value) } else { Err(bad(name, value, format!("a number from {lo} to {hi}"))) }
 }
@@ -230,7 +229,7 @@ impl SurfaceParams {
         })
     }
 
-    /// Returns the kernel of the surface for a backend that makes isosurfaces only.
+    /// Returns the kernel of the surface for a backend that supports isosurfaces only.
     ///
     /// # Errors
     /// [`SurfaceError::BadParameter`] names `surface` if that is a surface of spheres.
@@ -246,10 +245,10 @@ impl SurfaceParams {
         self.surface.kernel().map(|_| self.isovalue)
     }
 
-    /// Bytes of the vertices and triangles of such a mesh, nearest atoms aside.
+    /// Bytes of vertices and triangles of a mesh with these numbers of both, without nearest atoms.
     #[must_use]
     pub fn mesh_bytes(&self, n_vertices: u64, n_triangles: u64) -> u64 {
-        if self.quantize.is_some() { 12 * (n_vertices + n_triangles) } else { Mesh::bytes_for(n_vertices, n_triangles) }
+        Mesh::bytes_for(n_vertices, n_triangles, self.quantize.is_some())
     }
 
     /// Returns true if scale and offset leave the smallest radius usable.
@@ -273,7 +272,7 @@ fn paper_params(kernel: Kernel, options: &SurfaceOptions) -> Result<Option<Paper
     let Some((given, given_value)) = all.into_iter().find_map(|(name, value)| Some((name, value?))) else {
         return Ok(None);
     };
-    // An error names a parameter that was given, not the one that is missing.
+    // An error names a parameter that was given, not the missing one.
     let need = |name: &'static str, value: Option<f64>, lo: f64, hi: f64| {
         let missing = || format!("`{name}` beside it: the paper's {kernel} kernel needs both");
         value.map_or_else(|| Err(bad(given, given_value, missing())), |value| within(name, value, lo, hi))

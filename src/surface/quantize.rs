@@ -1,14 +1,15 @@
 //! Vertices in 12 bytes instead of 24: positions as 16-bit integers times a step, normals as 8-bit ones.
 //!
-//! The step is a power of two, so multiplying by it and dividing by it are exact in single precision: a position is
+//! The step is a power of two, so multiplying by it and dividing by it are exact in single precision. A position is
 //! rounded once, and every implementation that rounds to nearest, ties to even, gets the same integers, including
-//! WGSL's `round`. A step that used all 16 bits would be up to half as large, and its division would differ between
-//! devices.
+//! WGSL's `round`. A step that used all 16 bits would be as little as half as large, but its division would differ
+//! between devices.
 
-/// Largest integer of a position. Symmetric, as the structure's middle is 0.
+/// Largest absolute value of an integer of a position. The range is symmetric because positions are relative to the
+/// centre.
 const POSITION_MAX: f32 = 32_767.0;
-/// Marker of a coordinate that is out of range or not finite: one more than the largest integer wraps around to it, as
-/// does one less than the lowest.
+/// Marker of a coordinate that is out of range or not finite. Both the largest integer plus one and the lowest minus
+/// one wrap around to it.
 pub const BEYOND: i16 = i16::MIN;
 /// Largest integer of a normal.
 const NORMAL_MAX: f32 = 127.0;
@@ -39,7 +40,7 @@ impl Step {
         2.0_f32.powi(self.exponent)
     }
 
-    /// Factor from a coordinate to steps, 1/Å: also a power of two.
+    /// Number of steps per Å: also a power of two.
     #[must_use]
     pub fn per_angstrom(self) -> f32 {
         2.0_f32.powi(-self.exponent)
@@ -58,9 +59,9 @@ impl Step {
         bounds.as_flattened().iter().all(|v| v.abs() < self.reach() + half)
     }
 
-    /// A position relative to the mesh's centre, Å, as multiples of the step: the nearest, ties to even. The position
-    /// is the single-precision number that `interpolate` writes (spacings from the centre times the spacing, rounded
-    /// once). A coordinate that [`Self::holds`] rejects becomes [`BEYOND`].
+    /// Rounds a position relative to the mesh's centre, Å, to the nearest multiples of the step, ties to even. The
+    /// position is the single-precision number that `interpolate` writes (spacings from the centre times the spacing,
+    /// rounded once). A coordinate that [`Self::holds`] rejects becomes [`BEYOND`].
     #[inline]
     #[must_use]
     pub fn position(self, position: [f32; 3]) -> [i16; 3] {
@@ -77,7 +78,7 @@ impl Step {
     }
 }
 
-/// A unit normal as multiples of 1/127: 127 times each component, the nearest, ties to even.
+/// Rounds a unit normal to the nearest multiples of 1/127, ties to even.
 ///
 /// Near one direction, (66.5, 75.5, 77.5) and its mirror images, all three components are rounded up by half a unit,
 /// and the vector slightly exceeds the accepted length. Its largest component is rounded down there.
@@ -104,11 +105,11 @@ fn shorten(normal: &mut [i16; 3]) {
     normal[largest] -= normal[largest].signum();
 }
 
-/// The low 16 bits of the integer nearest to `v`, ties to even, within ±`max`, which is 2¹⁵ at most; NaN becomes
-/// `max`.
+/// Returns the low 16 bits of the integer nearest to `v`, ties to even, within ±`max`, which is 2¹⁵ at most; NaN
+/// becomes `max`.
 ///
-/// Adding 1.5 · 2²³ leaves no bits for a fraction, and the integer in the low ones; unlike a rounding instruction every
-/// processor has that for whole vectors.
+/// Adding 1.5 · 2²³ rounds to an integer, which is then in the low bits. Every processor has this addition for whole
+/// vectors, but not every one has a rounding instruction.
 #[inline]
 fn nearest(v: f32, max: f32) -> i16 {
     const INTEGERS: f32 = 12_582_912.0;
@@ -178,7 +179,7 @@ mod tests {
         assert_eq!(normal([f32::NAN, 0.0, f32::NEG_INFINITY]), [126, 0, -127], "not a normal");
     }
 
-    /// Looks at every integer vector that some unit vector is rounded to.
+    /// Checks every integer vector to which some unit vector is rounded.
     #[test]
     fn every_quantized_normal_is_a_unit_vector_to_the_validator() {
         const TOLERANCE: f64 = 0.006_74;

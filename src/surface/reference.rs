@@ -1,7 +1,7 @@
-//! The sequential reference: marching cubes over a dense box, every atom at every sample, in double precision.
+//! Sequential reference: marching cubes over a dense box, every atom at every grid point, in double precision.
 //!
-//! This is the program that the parallel backends are compared with, as in Dias, Bora and Gomes (HPDC 2010): time
-//! grows with atoms times samples. It shares the formulas and the case table with the others and nothing else.
+//! The parallel backends are compared with it, as in Dias, Bora and Gomes (HPDC 2010). Its time grows with the number
+//! of atoms times the number of grid points. It shares only the formulas and the case table with the other backends.
 
 use super::backend::{Backend, GridStats, MeshOutput};
 use super::cases::{CASES, cell_edge};
@@ -19,7 +19,7 @@ use super::spheres::Spheres;
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ReferenceBackend;
 
-/// No vertex on this edge.
+/// Marks an edge without a vertex.
 const NONE: u32 = u32::MAX;
 
 /// The density as a sum over all spheres, in double precision.
@@ -41,7 +41,7 @@ impl Density {
         Ok(Self { profile, spheres: (0..spheres.len()).map(|i| (spheres.centre(i), length(i))).collect() })
     }
 
-    /// F at `x` (Å).
+    /// Returns the density F at `x` (Å).
     #[must_use]
     pub fn value(&self, x: [f64; 3]) -> f64 {
         let term = |(c, length): &([f64; 3], f64)| {
@@ -52,7 +52,7 @@ impl Density {
         self.spheres.iter().map(term).sum()
     }
 
-    /// ∇F at `x`, per Å.
+    /// Returns the gradient ∇F at `x` (Å), per Å.
     #[must_use]
     pub fn gradient(&self, x: [f64; 3]) -> [f64; 3] {
         let mut sum = [0.0; 3];
@@ -82,25 +82,25 @@ impl Density {
     }
 }
 
-/// A dense box of samples.
-struct Grid {
+/// A dense box of grid points.
+struct DenseGrid {
     origin: [i32; 3],
     n: [usize; 3],
 }
 
-impl Grid {
+impl DenseGrid {
     fn new(spheres: &Spheres, density: &Density, h: f64, limits: &SurfaceLimits) -> Result<Self, SurfaceError> {
         let Some([lo, hi]) = spheres.bounds() else { return Err(SurfaceError::NoSpheres) };
         let reach = density.reach();
         let first: [f64; 3] = std::array::from_fn(|k| ((lo[k] - reach) / h).floor() - 1.0);
         let last: [f64; 3] = std::array::from_fn(|k| ((hi[k] + reach) / h).ceil() + 1.0);
         let n: [f64; 3] = std::array::from_fn(|k| last[k] - first[k] + 1.0);
-        let samples = to_u64(n.iter().product());
-        if samples > limits.max_samples {
-            let excess = samples as f64 / limits.max_samples.max(1) as f64;
+        let grid_points = to_u64(n.iter().product());
+        if grid_points > limits.max_grid_points {
+            let excess = grid_points as f64 / limits.max_grid_points.max(1) as f64;
             let suggested_resolution = slightly_coarser(h * excess.cbrt());
-            let limit = limits.max_samples;
-            return Err(SurfaceError::GridTooLarge { samples, limit, resolution: h, suggested_resolution });
+            let limit = limits.max_grid_points;
+            return Err(SurfaceError::GridTooLarge { grid_points, limit, resolution: h, suggested_resolution });
         }
         Ok(Self { origin: first.map(to_i32), n: n.map(|n| usize::try_from(to_u64(n)).unwrap_or(usize::MAX)) })
     }
@@ -118,18 +118,18 @@ impl Grid {
         (0..nz - 1).flat_map(move |z| (0..ny - 1).flat_map(move |y| (0..nx - 1).map(move |x| [x, y, z])))
     }
 
-    fn sample(&self, at: [usize; 3]) -> [i32; 3] {
+    fn point(&self, at: [usize; 3]) -> [i32; 3] {
         std::array::from_fn(|k| self.origin[k] + i32::try_from(at[k]).unwrap_or(i32::MAX))
     }
 }
 
-/// Cells along each axis of the box that the reference samples. Nothing is allocated.
+/// Returns the number of cells along each axis of the box that the reference evaluates. Allocates nothing.
 ///
 /// # Errors
 /// [`SurfaceError::NoSpheres`], and [`SurfaceError::BadParameter`] if the surface has no density.
 pub fn cells(spheres: &Spheres, params: &SurfaceParams) -> Result<[u64; 3], SurfaceError> {
-    let unlimited = SurfaceLimits { max_samples: u64::MAX, max_mesh_bytes: u64::MAX, max_candidates: u64::MAX };
-    let grid = Grid::new(spheres, &Density::new(spheres, params)?, params.resolution, &unlimited)?;
+    let unlimited = SurfaceLimits { max_grid_points: u64::MAX, max_mesh_bytes: u64::MAX, max_candidates: u64::MAX };
+    let grid = DenseGrid::new(spheres, &Density::new(spheres, params)?, params.resolution, &unlimited)?;
     Ok(grid.n.map(|n| n as u64 - 1))
 }
 
@@ -142,7 +142,7 @@ impl Backend for ReferenceBackend {
         "sequential reference, 1 thread, double precision".to_owned()
     }
 
-    fn makes(&self, surface: SurfaceKind) -> bool {
+    fn supports(&self, surface: SurfaceKind) -> bool {
         surface.kernel().is_some()
     }
 
@@ -156,7 +156,7 @@ impl Backend for ReferenceBackend {
     ) -> Result<MeshOutput, SurfaceError> {
         params.check_radius(spheres.radius_range().0)?;
         let density = Density::new(spheres, params)?;
-        let grid = Grid::new(spheres, &density, params.resolution, limits)?;
+        let grid = DenseGrid::new(spheres, &density, params.resolution, limits)?;
         let h = params.resolution;
         let mut field = vec![0.0_f64; grid.len()];
         let layer = grid.n[0] * grid.n[1];
@@ -165,7 +165,7 @@ impl Backend for ReferenceBackend {
             control.span(Stage::Field, || {
                 for (i, value) in layer.iter_mut().enumerate() {
                     let at = [i % grid.n[0], i / grid.n[0], z];
-                    *value = density.value(grid.sample(at).map(|s| f64::from(s) * h));
+                    *value = density.value(grid.point(at).map(|s| f64::from(s) * h));
                 }
             });
             control.observer.progress(Stage::Field, z + 1, grid.n[2]);
@@ -184,14 +184,14 @@ impl Backend for ReferenceBackend {
         }
         scan::check_size(params, limits, mesh.n_vertices() as u64, mesh.n_triangles() as u64)?;
         let n = grid.len() as u64;
-        let stats = GridStats { samples: n, box_cells: cases.len() as u64, ..GridStats::default() };
+        let stats = GridStats { grid_points: n, box_cells: cases.len() as u64, ..GridStats::default() };
         MeshOutput::new(mesh, stats).deliver(params, control, sink)
     }
 }
 
-/// A vertex on every crossing edge, and its id by sample and axis.
+/// Returns the vertices of all crossing edges, and their ids by grid point and axis.
 fn vertices(
-    grid: &Grid,
+    grid: &DenseGrid,
     field: &[f64],
     density: &Density,
     params: &SurfaceParams,
@@ -212,7 +212,7 @@ fn vertices(
                 continue;
             }
             let t = ((value - iso) / (value - other)).clamp(margin, 1.0 - margin);
-            let mut x = grid.sample(cell).map(f64::from);
+            let mut x = grid.point(cell).map(f64::from);
             x[axis] += t;
             let x = x.map(|c| c * h);
             ids[i][axis] = u32::try_from(positions.len()).unwrap_or(NONE);
@@ -230,8 +230,8 @@ fn vertices(
     (mesh, ids)
 }
 
-/// The triangles of every cell.
-fn triangles(grid: &Grid, cases: &[u8], ids: &[[u32; 3]]) -> Vec<[u32; 3]> {
+/// Returns the triangles of every cell.
+fn triangles(grid: &DenseGrid, cases: &[u8], ids: &[[u32; 3]]) -> Vec<[u32; 3]> {
     let mut triangles = Vec::new();
     for (cell, &case) in grid.cells().zip(cases) {
         triangles.extend(CASES.of(case).iter().map(|t| {

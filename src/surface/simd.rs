@@ -1,4 +1,4 @@
-//! SIMD-friendly primitives, inlined into `multiversion` functions, which compile them per instruction set.
+//! Primitives that the compiler vectorizes. They are inlined into functions that are compiled once per instruction set.
 
 /// Compiles a function once per instruction set and picks the best one at run time, so that a portable build runs
 /// at native speed. `without AVX-512:` before the function leaves that set out.
@@ -50,7 +50,7 @@ macro_rules! versions {
 }
 pub(super) use versions;
 
-/// Points that are evaluated together: one AVX-512 vector, two AVX ones.
+/// Number of points that are evaluated together: one AVX-512 vector, or two AVX vectors.
 pub(super) const LANES: usize = 16;
 
 /// Returns the lowest and highest of a vector's lanes.
@@ -74,8 +74,8 @@ pub(super) fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// 2ˣ for x in [−126, 126], relative error below 3e-7: round to nearest, then a minimax polynomial of degree 5 on
-/// [−½, ½] (coefficients by weighted least squares).
+/// Returns 2ˣ for x in [−126, 126], with a relative error below 3e-7. Rounds to the nearest integer, then evaluates a
+/// minimax polynomial of degree 5 on [−½, ½] (coefficients by weighted least squares).
 #[inline(always)]
 pub(super) fn exp2<const FMA: bool>(x: f32) -> f32 {
     // Adding 1.5·2²³ leaves the rounded integer in the low bits of the sum.
@@ -97,8 +97,8 @@ dispatched! {
     }
 }
 
-/// Returns the name of the arithmetic that decides the last bits of results on this processor: fused or not, and the
-/// system and architecture, whose mathematical functions differ. The width of vectors does not matter.
+/// Names the arithmetic that determines the last bits of results on this processor: fused or not, and the system and
+/// architecture, whose mathematical functions differ. The width of vectors does not matter.
 #[must_use]
 pub fn arithmetic() -> String {
     let fused = if is_fused() { "fma" } else { "no-fma" };
@@ -147,7 +147,7 @@ pub(super) mod tests {
         Best,
         /// AVX2 on x86-64 with AVX2, else [`Self::Baseline`].
         Avx2,
-        /// The least that the architecture has.
+        /// Instructions that every processor of the architecture has.
         Baseline,
     }
 
@@ -173,7 +173,7 @@ pub(super) mod tests {
 
     #[test]
     fn instruction_sets_of_one_arithmetic_give_the_same_bytes() {
-        // Overlapping spheres at irregular places, and some at grid points.
+        // Overlapping spheres at irregular positions, and some at grid points.
         let column = |factor: f64| (0..400).map(|i| f64::from(i) * factor % 23.0).collect();
         let radii = (0..400_u16).map(|i| 1.0 + f32::from(i % 7) / 8.0).collect();
         let spheres = Spheres::new(column(7.13), column(3.71), column(1.4), radii).unwrap();

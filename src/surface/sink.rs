@@ -3,7 +3,7 @@
 use super::mesh::{Mesh, bounds_of};
 use super::quantize::Step;
 
-/// Vertex rows as they lie in memory; all columns have the same length.
+/// Rows of vertices, in one of two representations. All columns have the same length.
 #[derive(Debug, Clone, Copy)]
 pub enum Vertices<'a> {
     /// Single precision.
@@ -63,7 +63,7 @@ pub struct MeshPart<'a> {
 }
 
 impl<'a> MeshPart<'a> {
-    /// The whole of `mesh`, whose columns are contiguous or become so.
+    /// Returns the whole of `mesh` as one part. Columns in several chunks are joined.
     #[must_use]
     pub fn whole(mesh: &'a Mesh) -> Self {
         Self { first_vertex: 0, vertices: mesh.vertices(), first_triangle: 0, triangles: &mesh.triangles }

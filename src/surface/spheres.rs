@@ -1,11 +1,16 @@
-//! The input of the core: spheres as a structure of arrays.
+//! Input of the core: spheres as a structure of arrays.
+
+use std::f64::consts::PI;
 
 use rayon::prelude::*;
 
 use super::error::SurfaceError;
+use super::kind::SurfaceKind;
+use super::lattice::effective_radius;
+use super::params::SurfaceParams;
 
-/// Centres beyond this distance from the origin (Å, per axis) are rejected: 32-bit vertex coordinates would
-/// lose more than a hundredth of an ångström there, and no structure file's columns reach that far.
+/// Maximum absolute coordinate of a centre, Å. Beyond it, 32-bit vertex coordinates would lose more than a hundredth of
+/// an ångström. The columns of structure files do not hold such coordinates.
 pub const MAX_COORDINATE: f64 = 100_000.0;
 
 /// Spheres (atom centres with radii), Å. All columns have the same length.
@@ -29,12 +34,12 @@ impl Spheres {
     pub fn new(x: Vec<f64>, y: Vec<f64>, z: Vec<f64>, r: Vec<f32>) -> Result<Self, SurfaceError> {
         assert!(x.len() == y.len() && y.len() == z.len() && z.len() == r.len(), "columns of unequal length");
         for (what, column) in [("x", &x), ("y", &y), ("z", &z)] {
-            if let Some(index) = column.iter().position(|v| !v.is_finite() || v.abs() > MAX_COORDINATE) {
+            if let Some(index) = first_not(column, |v| v.abs() <= MAX_COORDINATE) {
                 let expected = "a finite number within ±100000 Å";
                 return Err(SurfaceError::BadSphere { index, what, value: column[index], expected });
             }
         }
-        if let Some(index) = r.iter().position(|v| !v.is_finite() || *v <= 0.0) {
+        if let Some(index) = first_not(&r, |v| v > 0.0 && v < f32::INFINITY) {
             let expected = "a finite number above 0 Å";
             return Err(SurfaceError::BadSphere { index, what: "radius", value: f64::from(r[index]), expected });
         }
@@ -82,13 +87,21 @@ impl Spheres {
         &self.r
     }
 
+    /// Area of the spheres, Å²: an upper bound of that of their surface at an isovalue of 1 or more.
+    #[must_use]
+    pub fn area(&self, params: &SurfaceParams) -> f64 {
+        let probe = if params.surface == SurfaceKind::Sas { params.probe } else { 0.0 };
+        let radius = |r: &f32| effective_radius(*r, params) + probe;
+        self.r.par_chunks(PART).map(|part| part.iter().map(|r| 4.0 * PI * radius(r).powi(2)).sum::<f64>()).sum()
+    }
+
     /// The smallest and the largest radius, Å.
     pub(super) fn radius_range(&self) -> (f32, f32) {
         let parts = self.r.par_chunks(PART).map(|part| range(part, (f32::MAX, 0.0)));
         parts.reduce(|| (f32::MAX, 0.0), |a, b| (a.0.min(b.0), a.1.max(b.1)))
     }
 
-    /// Lowest and highest centre coordinate per axis, Å; `None` when there are no spheres.
+    /// Lowest and highest centre coordinate per axis, Å; `None` without spheres.
     #[must_use]
     pub fn bounds(&self) -> Option<[[f64; 3]; 2]> {
         let bounds = [&self.x, &self.y, &self.z].map(|column| {
@@ -99,9 +112,18 @@ impl Spheres {
     }
 }
 
-/// Lowest and highest of `values` and those of `none`.
+/// Returns the index of the first value that is not `valid`.
+fn first_not<T: Copy>(values: &[T], valid: impl Fn(T) -> bool) -> Option<usize> {
+    /// Values that are checked without a branch.
+    const BATCH: usize = 256;
+    let is_valid = |batch: &[T]| batch.iter().fold(true, |all, &v| all & valid(v));
+    let first = BATCH * values.chunks(BATCH).position(|batch| !is_valid(batch))?;
+    values[first..].iter().position(|&v| !valid(v)).map(|i| first + i)
+}
+
+/// Returns the lowest and highest of `values` and `none`.
 fn range<T: Copy + PartialOrd>(values: &[T], none: (T, T)) -> (T, T) {
-    // Independent lanes: a single chain of comparisons would wait for each result.
+    // Several lanes: in a single chain, each comparison would wait for the previous one.
     let mut lanes = [none; 8];
     for values in values.chunks(8) {
         for ((lo, hi), &v) in lanes.iter_mut().zip(values) {

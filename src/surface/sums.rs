@@ -1,17 +1,17 @@
-//! Sums over lanes, and the checksum of directed edges. Work is vectorized over batches of triangles.
+//! Sums over lanes, and the checksum of directed edges, vectorized over batches of triangles.
 
-/// A directed edge's share of the checksum: the two directions of an edge have opposite shares.
+/// Returns the share of a directed edge in the checksum. The two directions of an edge have opposite shares.
 #[inline(always)]
 fn edge_share(from: u32, to: u32) -> u64 {
     let (low, high) = if from < to { (from, to) } else { (to, from) };
-    // Two rounds of multiply and shift, as in splitmix64: neighbouring keys must not cancel by arithmetic.
+    // Two rounds of multiply and shift, as in splitmix64: the shares of neighbouring keys must not cancel.
     let mut key = (u64::from(low) << 32 | u64::from(high)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     key = (key ^ key >> 32).wrapping_mul(0xd6e8_feb8_6659_fd93);
     key ^= key >> 32;
     if from < to { key } else { key.wrapping_neg() }
 }
 
-/// Sums in double precision with eight accumulators, as a single one would wait for every addition.
+/// Sums in double precision with eight accumulators: with a single one, each addition would wait for the previous one.
 #[inline(always)]
 pub(super) fn sum_lanes<const N: usize>(lanes: &[f32; N]) -> f64 {
     let mut strands = [0.0_f64; 8];
@@ -26,7 +26,7 @@ pub(super) fn sum_lanes<const N: usize>(lanes: &[f32; N]) -> f64 {
 /// Triangles whose checksum is computed together.
 const SHARES: usize = 16;
 
-/// The checksum of triangles, and whether one of them has a corner twice.
+/// Returns the checksum of triangles, and true if one of them has a corner twice.
 #[inline(always)]
 pub(super) fn edge_shares(triangles: &[[u32; 3]]) -> (u64, bool) {
     let (mut sum, mut twice) = ([0_u64; SHARES], [false; SHARES]);

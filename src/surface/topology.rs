@@ -1,4 +1,4 @@
-//! The exact check of a triangle mesh's topology: every edge, and the fan of triangles around every vertex.
+//! Exact check of the topology of a triangle mesh: every edge, and the fan of triangles around every vertex.
 
 use rayon::prelude::*;
 
@@ -36,18 +36,18 @@ impl Topology {
 }
 
 /// A corner of a triangle: its vertex, then the triangle's other vertices in order.
-type Corner = [u32; 3];
+type TriangleCorner = [u32; 3];
 
 /// Memory of `n` corners, bytes.
 fn memory(n: usize) -> u64 {
-    (n * size_of::<Corner>()) as u64
+    (n * size_of::<TriangleCorner>()) as u64
 }
 
 /// Triangles per part. Sorting their corners takes a few milliseconds.
 const PART: usize = 1 << 15;
 
-/// Checks `triangles`. Sorts the corners of each part of the triangles by vertex, then examines the vertices in as many
-/// ranges.
+/// Checks `triangles`. Sorts the corners of each part of the triangles by vertex, then checks the vertices in as many
+/// ranges as there are parts.
 ///
 /// # Errors
 /// [`SurfaceError::Cancelled`], [`SurfaceError::Memory`].
@@ -55,11 +55,13 @@ pub fn check(triangles: &[[u32; 3]], control: &Control<'_>) -> Result<Topology, 
     let _parts = control.reserve(memory(3 * triangles.len()))?;
     let corners = |part: &[[u32; 3]]| {
         control.check()?;
-        let mut corners: Vec<Corner> = part.iter().flat_map(|&[a, b, c]| [[a, b, c], [b, c, a], [c, a, b]]).collect();
+        let mut corners: Vec<TriangleCorner> =
+            part.iter().flat_map(|&[a, b, c]| [[a, b, c], [b, c, a], [c, a, b]]).collect();
         corners.sort_unstable_by_key(|corner| corner[0]);
         Ok(corners)
     };
-    let parts: Vec<Vec<Corner>> = triangles.par_chunks(PART).map(corners).collect::<Result<_, SurfaceError>>()?;
+    let parts: Vec<Vec<TriangleCorner>> =
+        triangles.par_chunks(PART).map(corners).collect::<Result<_, SurfaceError>>()?;
     let last = parts.iter().filter_map(|part| part.last()).map(|corner| corner[0] as usize).max();
     let width = last.map_or(0, |last| last / parts.len() + 1);
     let examined = (0..parts.len()).into_par_iter().map(|range| {
@@ -68,7 +70,7 @@ pub fn check(triangles: &[[u32; 3]], control: &Control<'_>) -> Result<Topology, 
             let start = |range| part.partition_point(|corner| (corner[0] as usize) < range * width);
             &part[start(range)..start(range + 1)]
         });
-        let pieces: Vec<&[Corner]> = pieces.collect();
+        let pieces: Vec<&[TriangleCorner]> = pieces.collect();
         // The sort needs as much again.
         let _corners = control.reserve(2 * memory(pieces.iter().map(|piece| piece.len()).sum()))?;
         let mut corners = pieces.concat();
@@ -80,8 +82,9 @@ pub fn check(triangles: &[[u32; 3]], control: &Control<'_>) -> Result<Topology, 
     examined.try_reduce(|| Topology::of_closed(0), |a, b| Ok(a.and(b)))
 }
 
-/// Returns the topology of the edges at one vertex, each counted at its lower end. `fan`: all corners there.
-fn of_fan(fan: &mut [Corner]) -> Topology {
+/// Returns the topology of the edges at one vertex. Each edge is counted at its lower end. `fan` contains all corners
+/// at the vertex.
+fn of_fan(fan: &mut [TriangleCorner]) -> Topology {
     fan.sort_unstable();
     let [vertex, ..] = fan[0];
     let mut ends: Vec<u32> = fan.iter().map(|corner| corner[2]).collect();
@@ -98,8 +101,8 @@ fn of_fan(fan: &mut [Corner]) -> Topology {
     Topology { edges, closed, oriented, manifold: closed && oriented && is_cycle(fan) }
 }
 
-/// Returns true if the triangles around one vertex form one cycle. `fan`: its corners, in order.
-fn is_cycle(fan: &[Corner]) -> bool {
+/// Returns true if the triangles around one vertex form one cycle. `fan` contains the corners at the vertex, in order.
+fn is_cycle(fan: &[TriangleCorner]) -> bool {
     let [_, first, mut at] = fan[0];
     let mut n = 1;
     while at != first {

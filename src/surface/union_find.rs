@@ -6,12 +6,12 @@ use super::lattice::to_u32;
 /// the order of the unions.
 #[derive(Debug, Default, Clone)]
 pub(super) struct UnionFind {
-    /// Another member of the same set, at most as high; the representative's is itself.
+    /// For each integer, a member of the same set that is not higher; for a representative, itself.
     parent: Vec<u32>,
 }
 
 impl UnionFind {
-    /// `n` sets of one integer each.
+    /// Creates `n` sets of one integer each.
     pub(super) fn new(n: usize) -> Self {
         Self { parent: (0..to_u32(n)).collect() }
     }
@@ -36,7 +36,7 @@ impl UnionFind {
         self.parent[a.max(b) as usize] = a.min(b);
     }
 
-    /// The representative of `x`. Halves the path to it.
+    /// Returns the representative of `x`. Halves the path to it.
     fn find(&mut self, mut x: u32) -> u32 {
         while self.parent[x as usize] != x {
             let above = self.parent[self.parent[x as usize] as usize];
@@ -44,15 +44,6 @@ impl UnionFind {
             x = above;
         }
         x
-    }
-
-    /// Representatives of all integers.
-    pub(super) fn into_representatives(mut self) -> Vec<u32> {
-        for x in 0..self.parent.len() {
-            // In ascending order: the parent, being lower, has its final representative.
-            self.parent[x] = self.parent[self.parent[x] as usize];
-        }
-        self.parent
     }
 
     /// Writes the number of each integer's set to `numbers`, from 0 in the order of the representatives. Returns the
@@ -82,7 +73,7 @@ mod tests {
             let mut numbers = vec![5];
             assert_eq!(sets.number_sets(&mut numbers), 5);
             assert_eq!(numbers, [0, 0, 0, 1, 2, 3, 4, 1, 1, 1]);
-            sets.into_representatives()
+            (0..10).map(|x| sets.find(x)).collect::<Vec<_>>()
         };
         let expected = [0, 0, 0, 3, 4, 5, 6, 3, 3, 3];
         assert_eq!(joined(&mut pairs.iter()), expected);

@@ -2,7 +2,7 @@
 
 /// Kind of a metric.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum MetricKind {
     /// Counter of integers.
     Counter,
     /// Counter of seconds, with fractions.
@@ -13,7 +13,7 @@ pub enum Kind {
     Histogram,
 }
 
-impl Kind {
+impl MetricKind {
     /// Returns the name of the kind in the exposition format.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -49,7 +49,7 @@ pub struct Metric {
     /// standard.
     pub name: &'static str,
     /// Kind.
-    pub kind: Kind,
+    pub kind: MetricKind,
     /// Labels. Ids are never labels.
     pub labels: &'static [Label],
     /// Help text.

@@ -13,7 +13,7 @@ mod traces;
 
 pub use error::TelemetryError;
 pub use logs::{check_logs, init_logs};
-pub use metrics::{Kind, Label, Metric};
+pub use metrics::{Label, Metric, MetricKind};
 pub use names::*;
 pub(crate) use opentelemetry::trace::{SpanContext, SpanKind};
 pub use recorder::{Recorder, recorder};

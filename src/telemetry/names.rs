@@ -3,7 +3,7 @@
 //! Names follow the conventions of Prometheus: prefix `molmesh_`, base units, `_total` for counters, no ids as labels.
 //! HTTP metrics have the names of OpenTelemetry, process metrics those of the Prometheus client libraries.
 
-use super::metrics::{Kind, Label, Metric};
+use super::metrics::{Label, Metric, MetricKind};
 
 macro_rules! metrics {
     ($($(#[doc = $help:literal])+ $constant:ident = $name:literal, $kind:ident $(, $label:ident: $values:literal)*;)+) => {
@@ -13,7 +13,7 @@ macro_rules! metrics {
         pub const METRICS: &[Metric] = &[$(
             Metric {
                 name: $name,
-                kind: Kind::$kind,
+                kind: MetricKind::$kind,
                 labels: &[$(Label { name: stringify!($label), values: $values }),*],
                 // Every line of a doc comment begins with a space.
                 help: concat!($($help),+).trim_ascii(),
@@ -40,13 +40,14 @@ metrics! {
         status: "HTTP statuses, or `none` where the client left first";
     /// Open connections.
     CONNECTIONS = "molmesh_connections", Gauge;
-    /// Requests rejected by a limit, by the slug of the problem type, or by the timeout.
-    REJECTED = "molmesh_requests_rejected_total", Counter, reason: "slugs of problem types, `header-timeout`, `write-timeout`";
+    /// Requests rejected by a limit, by the slug of the problem type where there is one.
+    REJECTED = "molmesh_requests_rejected_total", Counter,
+        reason: "slugs of problem types, `head-too-large`, `header-timeout`, `write-timeout`";
     /// Response bodies that are being sent.
     BODIES_OPEN = "molmesh_response_bodies_open", Gauge;
     /// Clients with a quota of their own.
     QUOTA_CLIENTS = "molmesh_quota_clients", Gauge;
-    /// Accepted jobs, by mode and by whether they joined an identical running job.
+    /// Accepted jobs, by mode. `dedup` is `yes` for jobs that joined an identical queued or running job.
     JOBS_SUBMITTED = "molmesh_jobs_submitted_total", Counter, mode: "sync|async", dedup: "yes|no";
     /// Completed jobs, by outcome.
     JOBS_FINISHED = "molmesh_jobs_finished_total", Counter, outcome: "successful|failed|dismissed|panicked";
@@ -67,8 +68,12 @@ metrics! {
     QUEUE_AGE = "molmesh_queue_oldest_age_seconds", Gauge;
     /// Estimated time that a new job would wait in the queue.
     QUEUE_WAIT = "molmesh_queue_estimated_wait_seconds", Gauge;
-    /// Bytes of uploads and meshes held in memory.
+    /// Bytes of uploads, jobs and meshes held in memory.
     MEMORY_HELD = "molmesh_memory_held_bytes", Gauge;
+    /// Bytes of the memory budget in use: those held, buffers of connections, and structures that are kept.
+    MEMORY_USED = "molmesh_memory_used_bytes", Gauge;
+    /// Bytes of the memory budget, `limits.memory_bytes`.
+    MEMORY_LIMIT = "molmesh_memory_limit_bytes", Gauge;
     /// Grid points at which the density was evaluated.
     GRID_POINTS = "molmesh_grid_points_evaluated_total", Counter;
     /// Triangles of finished meshes.
@@ -91,7 +96,7 @@ metrics! {
     DEVICE_SHARED = "molmesh_device_shared_submissions_total", Counter, device: "numbers of devices in use";
     /// Partitions of multi-device jobs that a device finished.
     DEVICE_PARTITIONS = "molmesh_device_partitions_total", Counter, device: "numbers of devices in use";
-    /// Lookups of results. The store is asked if the memory cache misses.
+    /// Lookups of results. A miss in memory is followed by a lookup in the store.
     CACHE_REQUESTS = "molmesh_cache_requests_total", Counter, tier: "memory|store", result: "hit|miss";
     /// Lookups of structures in memory. A miss reads the file.
     STRUCTURE_CACHE_REQUESTS = "molmesh_structure_cache_requests_total", Counter, result: "hit|miss";
@@ -149,9 +154,9 @@ mod tests {
         let mut names: Vec<&str> = METRICS.iter().map(|metric| metric.name).collect();
         for metric in METRICS {
             let name = metric.name;
-            let counts = matches!(metric.kind, Kind::Counter | Kind::Seconds);
+            let counts = matches!(metric.kind, MetricKind::Counter | MetricKind::Seconds);
             assert_eq!(name.ends_with("_total"), counts, "{name}");
-            assert_eq!(metric.kind == Kind::Seconds, name.ends_with("_seconds_total"), "{name}");
+            assert_eq!(metric.kind == MetricKind::Seconds, name.ends_with("_seconds_total"), "{name}");
             let known = ["molmesh_", "http_server_", "process_"].iter().any(|prefix| name.starts_with(prefix));
             assert!(known, "{name}");
             assert!(metric.help.ends_with('.') && metric.help.len() > 12, "{name}: {}", metric.help);

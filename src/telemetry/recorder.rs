@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use metrics::Unit;
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
 
-use super::metrics::{Kind, Metric};
+use super::metrics::{Metric, MetricKind};
 use super::names::{
     ARCHIVE_FETCH, BUILD_INFO, HTTP_DURATION, HTTP_REQUEST_SIZE, HTTP_RESPONSE_SIZE, METRICS, STAGE_DURATION,
 };
@@ -41,7 +41,7 @@ impl Recorder {
         process::publish();
         let text = self.0.render();
         // The recorder's counters are integers, so counters of seconds are recorded as gauges. Correct their type.
-        METRICS.iter().filter(|metric| metric.kind == Kind::Seconds).fold(text, |text, metric| {
+        METRICS.iter().filter(|metric| metric.kind == MetricKind::Seconds).fold(text, |text, metric| {
             let line = |kind: &str| format!("# TYPE {} {kind}\n", metric.name);
             text.replace(&line("gauge"), &line(metric.kind.name()))
         })
@@ -89,9 +89,9 @@ fn describe(metric: &Metric) {
         Unit::Count
     };
     match metric.kind {
-        Kind::Counter => metrics::describe_counter!(name, unit, help),
-        Kind::Gauge | Kind::Seconds => metrics::describe_gauge!(name, unit, help),
-        Kind::Histogram => metrics::describe_histogram!(name, unit, help),
+        MetricKind::Counter => metrics::describe_counter!(name, unit, help),
+        MetricKind::Gauge | MetricKind::Seconds => metrics::describe_gauge!(name, unit, help),
+        MetricKind::Histogram => metrics::describe_histogram!(name, unit, help),
     }
     let mut series: Vec<Vec<metrics::Label>> = vec![Vec::new()];
     for label in metric.labels {
@@ -110,10 +110,10 @@ fn describe(metric: &Metric) {
     }
     for labels in series {
         match metric.kind {
-            Kind::Counter => metrics::counter!(name, labels).increment(0),
-            Kind::Gauge => metrics::gauge!(name, labels).set(0.0),
+            MetricKind::Counter => metrics::counter!(name, labels).increment(0),
+            MetricKind::Gauge => metrics::gauge!(name, labels).set(0.0),
             // Empty histograms are not useful, and counters of seconds belong to existing devices and processes.
-            Kind::Histogram | Kind::Seconds => {}
+            MetricKind::Histogram | MetricKind::Seconds => {}
         }
     }
 }

@@ -58,10 +58,10 @@ impl SpanParent {
 
 /// Open span. Clones refer to the same span, which ends with [`TraceSpan::end`] or when the last clone is dropped.
 #[derive(Debug, Clone)]
-pub(crate) struct TraceSpan(Arc<Inner>);
+pub(crate) struct TraceSpan(Arc<SpanState>);
 
 #[derive(Debug)]
-struct Inner {
+struct SpanState {
     request: Option<Arc<str>>,
     tracer: Tracer,
     /// Holds the SDK's span.
@@ -88,7 +88,7 @@ impl TraceSpan {
         let start_time = SystemTime::now().checked_sub(start.elapsed()).unwrap_or(SystemTime::UNIX_EPOCH);
         let context = Context::new().with_span(parent.start(name.into(), kind, start_time));
         let SpanParent { request, tracer, .. } = parent.clone();
-        Self(Arc::new(Inner { request, tracer, context, start, start_time }))
+        Self(Arc::new(SpanState { request, tracer, context, start, start_time }))
     }
 
     /// Returns the span that the current task runs in.
@@ -103,7 +103,7 @@ impl TraceSpan {
 
     /// Returns this span as the parent of others.
     pub(crate) fn as_parent(&self) -> SpanParent {
-        let Inner { request, tracer, .. } = &*self.0;
+        let SpanState { request, tracer, .. } = &*self.0;
         SpanParent { request: request.clone(), context: Some(self.context()), tracer: tracer.clone() }
     }
 
@@ -142,7 +142,7 @@ impl TraceSpan {
         self.span().set_status(Status::error(message));
     }
 
-    /// Records a finished part of this span as a child of it, also after this span has ended.
+    /// Records a finished part of this span as a child of it, even after this span has ended.
     pub(crate) fn part(&self, name: &'static str, start: Instant, duration: Duration) {
         if self.span().span_context().is_sampled() {
             let start = self.wall_clock(start);
@@ -161,7 +161,7 @@ impl TraceSpan {
 
     /// Converts `time`, which may lie before the start of the span: a request can join a job that already runs.
     fn wall_clock(&self, time: Instant) -> SystemTime {
-        let Inner { start, start_time, .. } = &*self.0;
+        let SpanState { start, start_time, .. } = &*self.0;
         match time.checked_duration_since(*start) {
             Some(after) => *start_time + after,
             None => start_time.checked_sub(start.saturating_duration_since(time)).unwrap_or(*start_time),

@@ -1,10 +1,9 @@
-//! Key files for tests, and waiting for a condition.
+//! Key files for tests.
 #![allow(dead_code, reason = "each test binary uses a part")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::time::{Duration, Instant};
 
 use molmesh::access::{Hash, new_key};
 
@@ -40,15 +39,5 @@ impl Keys {
     /// Returns the text of a key.
     pub(crate) fn text(&self, id: &str) -> &str {
         &self.texts[id]
-    }
-}
-
-/// Waits at most a minute until a condition holds.
-#[track_caller]
-pub(crate) fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
-    let end = Instant::now() + Duration::from_mins(1);
-    while !holds() {
-        assert!(Instant::now() < end, "waited too long for: {what}");
-        std::thread::sleep(Duration::from_millis(20));
     }
 }

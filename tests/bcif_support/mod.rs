@@ -20,6 +20,7 @@ pub enum Pack {
 }
 
 use Pack::{Array, Bool, Bytes, Int, Map, Nil, Real, Text};
+use molmesh::structure::{SourceFormat, Structure};
 
 fn length(out: &mut Vec<u8>, head: u8, n: usize) {
     out.push(head);
@@ -204,4 +205,9 @@ pub fn atoms(n: usize, columns: Vec<Pack>) -> Vec<u8> {
     }
     all.extend(columns);
     file(vec![block("TEST", vec![category("_atom_site", i64::try_from(n).unwrap(), all)])])
+}
+
+/// Returns the structure without the fields that depend on the source format.
+pub fn anonymous(structure: &Structure) -> Structure {
+    Structure { format: SourceFormat::Pdb, ..structure.clone() }
 }

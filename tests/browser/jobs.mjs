@@ -1,11 +1,11 @@
-// Meshes that exceed the wait of their request: progress is shown, and a superseded job is cancelled.
+// Meshes that take longer than the wait of their request become jobs, with progress and cancellation.
 import http from "node:http";
-import { assert, browser, clean, fetched, open, reported, run, shown, PATIENCE, URL_OF_SERVICE } from "./lib.mjs";
+import { assert, assertClean, browser, fetchBytes, meshesShown, open, reportValue, run, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
 
 const chromium = await browser();
 const page = await open(chromium);
-/** Shortens the wait that a page asks for, so that every mesh becomes a job. A request without `Prefer` is left as it is. */
 const preferences = [];
+/** Replaces the page's `Prefer: wait` by a wait of 0 s, so that every mesh becomes a job. */
 const shorten = (page) =>
   page.route(/\/surface\.glb/, (route) => {
     const headers = route.request().headers();
@@ -13,22 +13,22 @@ const shorten = (page) =>
     return route.continue({ headers: headers.prefer ? { ...headers, prefer: "wait=0" } : headers });
   });
 await shorten(page);
-const jobs = () => page.asked.filter((line) => line.includes("/v1/jobs/"));
+const jobs = () => page.requests.filter((line) => line.includes("/v1/jobs/"));
 
 await run({
   "a job is followed by its events and its mesh is shown": async () => {
-    await page.waitForFunction(() => window.seen.length > 0, null, { timeout: PATIENCE });
+    await page.waitForFunction(() => window.measures.length > 0, null, { timeout: TIMEOUT_MS });
     await page.locator("#p-resolution").fill("0.2");
-    const before = await shown(page);
+    const before = await meshesShown(page);
     await page.locator("#p-resolution").press("Enter");
-    await page.waitForFunction((n) => window.seen.length > n, before, { timeout: PATIENCE });
-    assert.equal(await reported(page, "resolution"), 0.2);
+    await page.waitForFunction((n) => window.measures.length > n, before, { timeout: TIMEOUT_MS });
+    assert.equal(await reportValue(page, "resolution"), 0.2);
     assert.match(preferences.at(-1), /^wait=[1-9]/);
     for (const part of ["/events", "/result"]) assert.ok(jobs().some((line) => line.endsWith(part)), `${jobs()}`);
   },
 
   "progress is shown, and a superseded job is dismissed": async () => {
-    // Its events and its state are held back: to the page it goes on and on.
+    // The first job appears to run forever: its events and its status are replaced.
     const document = { status: "running", fraction: 0.4, stage: "field", problem: null };
     let first;
     await page.route("**/events", (route) => {
@@ -44,20 +44,20 @@ await run({
     await page.locator("#p-resolution").fill("0.22");
     await page.locator("#p-resolution").press("Enter");
     await page.locator("#busy").waitFor();
-    await page.waitForFunction(() => /field, 40 %/.test(document.querySelector("#busy-text").textContent), null, { timeout: PATIENCE });
+    await page.waitForFunction(() => /field, 40 %/.test(document.querySelector("#busy-text").textContent), null, { timeout: TIMEOUT_MS });
     assert.equal(await page.locator("#progress").getAttribute("value"), "0.4");
-    const before = await shown(page);
+    const before = await meshesShown(page);
     await page.locator("#p-resolution").fill("0.6");
     await page.locator("#p-resolution").press("Enter");
-    await page.waitForFunction((n) => window.seen.length > n, before, { timeout: PATIENCE });
-    assert.equal(await reported(page, "resolution"), 0.6);
+    await page.waitForFunction((n) => window.measures.length > n, before, { timeout: TIMEOUT_MS });
+    assert.equal(await reportValue(page, "resolution"), 0.6);
     assert.ok(jobs().some((line) => line.startsWith("DELETE") && line.includes(first)), `${jobs()}`);
     assert.ok(await page.locator("#busy").isHidden());
   },
 
-  "the component follows a job of another origin, and cancels it when it leaves": async () => {
+  "the component follows a job of another origin, and removing the element cancels it": async () => {
     const element = '<!doctype html><html lang="en"><title>component</title><molmesh-viewer style="height: 200px"></molmesh-viewer>';
-    const server = http.createServer((_, reply) => reply.writeHead(200, { "content-type": "text/html" }).end(`${element}<script type="module" src="${URL_OF_SERVICE}/molmesh-viewer.js"></script>`));
+    const server = http.createServer((_, reply) => reply.writeHead(200, { "content-type": "text/html" }).end(`${element}<script type="module" src="${SERVICE_URL}/molmesh-viewer.js"></script>`));
     await new Promise((resolve) => server.listen(0, "127.0.0.1", resolve));
     const other = await open(chromium, { url: `http://127.0.0.1:${server.address().port}/` });
     await shorten(other);
@@ -66,21 +66,21 @@ await run({
         const viewer = document.querySelector("molmesh-viewer");
         for (const name of [event, "molmesh-error"]) viewer.addEventListener(name, ({ detail }) => resolve(detail), { once: true });
         viewer.src = src;
-      }), [`${URL_OF_SERVICE}/v1/pdb/1crn/surface.glb?resolution=${resolution}`, event]);
+      }), [`${SERVICE_URL}/v1/pdb/1crn/surface.glb?resolution=${resolution}`, event]);
     assert.equal((await load("0.17", "molmesh-load")).report?.resolution, 0.17);
-    assert.ok(other.asked.some((line) => line.includes("/v1/jobs/") && line.endsWith("/result")), `${other.asked}`);
+    assert.ok(other.requests.some((line) => line.includes("/v1/jobs/") && line.endsWith("/result")), `${other.requests}`);
     assert.equal((await load("0.1", "molmesh-progress")).message, undefined);
     await other.evaluate(() => document.querySelector("molmesh-viewer").remove());
-    const id = other.asked.map((line) => /jobs\/([0-9a-f]+)/.exec(line)?.[1]).filter(Boolean).at(-1);
-    const state = await fetched(`/v1/jobs/${id}?wait=55`);
+    const id = other.requests.map((line) => /jobs\/([0-9a-f]+)/.exec(line)?.[1]).filter(Boolean).at(-1);
+    const state = await fetchBytes(`/v1/jobs/${id}?wait=55`);
     assert.equal(JSON.parse(state.bytes).status, "dismissed");
-    // The browser notes that reading the events was broken off.
-    assert.deepEqual(other.wrong.filter((line) => !/ERR_ABORTED/.test(line)), []);
+    // The browser logs the aborted event stream.
+    assert.deepEqual(other.errors.filter((line) => !/ERR_ABORTED/.test(line)), []);
     await other.context().close();
   },
 
-  "nothing went wrong": async () => {
-    // The job may have ended before it was dismissed (409), and the page leaves events behind.
-    clean(page, /409 \(Conflict\)/, /ERR_ABORTED/);
+  "the page has no errors": async () => {
+    // The job may have ended before it was cancelled (409), and the page aborts event streams.
+    assertClean(page, /409 \(Conflict\)/, /ERR_ABORTED/);
   },
 });

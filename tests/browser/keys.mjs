@@ -1,11 +1,11 @@
-// A service that asks for a key.
-import { assert, axe, browser, clean, open, run, PATIENCE } from "./lib.mjs";
+// A service that requires an API key.
+import { assert, assertClean, axe, browser, open, run, TIMEOUT_MS } from "./lib.mjs";
 
 const chromium = await browser();
 const page = await open(chromium);
 
 await run({
-  "a key is asked for": async () => {
+  "the page asks for a key": async () => {
     await page.locator("#key-form").waitFor();
     assert.ok(await page.locator("#problem").isHidden());
     assert.deepEqual(await axe(page), []);
@@ -16,19 +16,19 @@ await run({
     await page.locator("#problem strong").waitFor();
     assert.match(await page.locator("#problem").textContent(), /key is unknown/);
   },
-  "with the key everything works, and it is kept nowhere": async () => {
+  "the page works with the key and does not store it": async () => {
     await page.locator("#key").fill(process.env.MOLMESH_KEY);
     await page.locator("#key").press("Enter");
-    await page.waitForFunction(() => window.seen.length > 0, null, { timeout: PATIENCE });
+    await page.waitForFunction(() => window.measures.length > 0, null, { timeout: TIMEOUT_MS });
     assert.ok(await page.locator("#key-form").isHidden());
-    await page.waitForFunction(() => !document.querySelector("#colour").disabled, null, { timeout: PATIENCE });
+    await page.waitForFunction(() => !document.querySelector("#colour").disabled, null, { timeout: TIMEOUT_MS });
     const [download] = await Promise.all([page.waitForEvent("download"), page.locator('#formats button[data-format="stl"]').click()]);
     assert.ok((await download.suggestedFilename()).endsWith(".stl"));
     assert.match(await page.locator("#curl").textContent(), /X-Api-Key: \$MOLMESH_KEY/);
-    const kept = await page.evaluate(() => JSON.stringify([localStorage, sessionStorage, document.cookie, location.href]));
-    assert.ok(!kept.includes(process.env.MOLMESH_KEY));
-    await page.reload({ timeout: PATIENCE });
+    const stored = await page.evaluate(() => JSON.stringify([localStorage, sessionStorage, document.cookie, location.href]));
+    assert.ok(!stored.includes(process.env.MOLMESH_KEY));
+    await page.reload({ timeout: TIMEOUT_MS });
     await page.locator("#key-form").waitFor();
-    clean(page, /401 \(Unauthorized\)/);
+    assertClean(page, /401 \(Unauthorized\)/);
   },
 });

@@ -1,66 +1,66 @@
-// What the browser tests have in common: a browser, pages that are watched, pictures that are looked at.
+// Shared code of the browser tests: a browser, pages that record requests and errors, and analysis of pictures.
 //
-// The environment says where things are: MOLMESH_URL (a running service), MOLMESH_MODULES (node_modules of the tests),
-// MOLMESH_CHROMIUM (the browser), MOLMESH_ROOT (the repository).
+// Environment: MOLMESH_URL (a running service), MOLMESH_MODULES (node_modules of the tests), MOLMESH_CHROMIUM (path of
+// the browser), MOLMESH_ROOT (the repository).
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
 import path from "node:path";
 
 const { MOLMESH_URL, MOLMESH_MODULES, MOLMESH_CHROMIUM, MOLMESH_ROOT } = process.env;
-export const URL_OF_SERVICE = MOLMESH_URL;
+export const SERVICE_URL = MOLMESH_URL;
 export const MODULES = MOLMESH_MODULES;
 export const ROOT = MOLMESH_ROOT;
 export const require = createRequire(path.join(MODULES, "x.js"));
 export const { chromium } = require("playwright-core");
-/** Longer than anything takes on a machine that does ten other things. */
-export const PATIENCE = 180_000;
+/** Maximum time of one step, ms. A machine that runs ten other tests may need minutes. */
+export const TIMEOUT_MS = 180_000;
 
-/** A browser that finds nothing but this machine. Surfaces are drawn by the processor. */
+/** Starts a browser that reaches only this machine and renders WebGL in software. */
 export async function browser(...flags) {
   const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", ...flags];
-  return chromium.launch({ executablePath: MOLMESH_CHROMIUM, args, timeout: PATIENCE });
+  return chromium.launch({ executablePath: MOLMESH_CHROMIUM, args, timeout: TIMEOUT_MS });
 }
 
-/** A page in a context of its own, watched: what it asks for, and what goes wrong in it. */
+/** Opens a page in a new context. It records its requests (`requests`) and its errors and warnings (`errors`). */
 export async function open(browser, options = {}) {
-  const { url = URL_OF_SERVICE + "/", before, ...rest } = options;
+  const { url = SERVICE_URL + "/", before, ...rest } = options;
   const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, reducedMotion: "reduce", acceptDownloads: true, ...rest });
-  context.setDefaultTimeout(PATIENCE);
+  context.setDefaultTimeout(TIMEOUT_MS);
   const page = await context.newPage();
-  page.wrong = [];
-  page.asked = [];
-  page.on("console", (message) => ["error", "warning"].includes(message.type()) && page.wrong.push(`${message.type()}: ${message.text()}`));
-  page.on("pageerror", (error) => page.wrong.push(`exception: ${error.message}`));
-  page.on("request", (request) => page.asked.push(`${request.method()} ${request.url()}`));
+  page.errors = [];
+  page.requests = [];
+  page.on("console", (message) => ["error", "warning"].includes(message.type()) && page.errors.push(`${message.type()}: ${message.text()}`));
+  page.on("pageerror", (error) => page.errors.push(`exception: ${error.message}`));
+  page.on("request", (request) => page.requests.push(`${request.method()} ${request.url()}`));
   await page.addInitScript(() => {
-    window.seen = [];
-    new PerformanceObserver((list) => window.seen.push(...list.getEntries().map((e) => ({ ms: e.duration, ...e.detail })))).observe({ type: "measure", buffered: true });
+    window.measures = [];
+    new PerformanceObserver((list) => window.measures.push(...list.getEntries().map((e) => ({ ms: e.duration, ...e.detail })))).observe({ type: "measure", buffered: true });
     document.addEventListener("securitypolicyviolation", (e) => console.error(`policy: ${e.violatedDirective} ${e.blockedURI}`));
   });
   await before?.(page);
-  await page.goto(url, { timeout: PATIENCE });
+  await page.goto(url, { timeout: TIMEOUT_MS });
   return page;
 }
 
-/** Surfaces that the page has shown so far. */
-export const shown = (page) => page.evaluate(() => window.seen.filter((e) => e.preview === null).length);
+/** Returns the number of surfaces that the page has shown, without previews. */
+export const meshesShown = (page) => page.evaluate(() => window.measures.filter((e) => e.preview === null).length);
 
-/** Does something, and waits for the surface that follows. */
-export async function remeshed(page, act) {
-  const before = await shown(page);
+/** Runs `act` and waits for the next surface. */
+export async function waitForMesh(page, act) {
+  const before = await meshesShown(page);
   await act();
-  await page.waitForFunction((n) => window.seen.filter((e) => e.preview === null).length > n, before, { timeout: PATIENCE });
+  await page.waitForFunction((n) => window.measures.filter((e) => e.preview === null).length > n, before, { timeout: TIMEOUT_MS });
 }
 
 /** Opens the page and waits for its first surface. */
 export async function start(browser, options = {}) {
   const page = await open(browser, options);
-  await page.waitForFunction(() => window.seen.length > 0, null, { timeout: PATIENCE });
+  await page.waitForFunction(() => window.measures.length > 0, null, { timeout: TIMEOUT_MS });
   return page;
 }
 
-/** Puts a slider where its value is `value` of a thousand, as a hand or a key does. */
+/** Moves a slider to `value`, 0 to 1000, with the events of a user's input. */
 export const slide = (page, name, value) =>
   page.evaluate(
     ([name, value]) => {
@@ -82,27 +82,27 @@ export async function drop(page, name, bytes) {
   for (const type of ["dragover", "drop"]) await page.dispatchEvent("body", type, { dataTransfer: data });
 }
 
-/** A number of the report that is shown. */
-export async function reported(page, row) {
+/** Returns a number from the displayed report. */
+export async function reportValue(page, row) {
   const text = await page.locator(`#report tr[data-row="${row}"] td`).textContent();
   return Number(text.replaceAll(",", "").split(" ")[0]);
 }
 
-/** Fails if anything went wrong in a page, or anything but the service was asked. `allowed` are patterns of what may. */
-export function clean(page, ...allowed) {
-  const wrong = page.wrong.filter((line) => !allowed.some((pattern) => pattern.test(line)));
-  assert.deepEqual(wrong, [], "something went wrong in the page");
-  const elsewhere = page.asked.filter((line) => !line.includes(` ${new URL(page.url()).origin}/`) && !line.includes(" blob:"));
-  assert.deepEqual(elsewhere, [], "the page asked elsewhere");
+/** Fails if a page has errors that match no pattern of `allowed`, or sent a request to another server. */
+export function assertClean(page, ...allowed) {
+  const errors = page.errors.filter((line) => !allowed.some((pattern) => pattern.test(line)));
+  assert.deepEqual(errors, [], "the page has errors");
+  const foreign = page.requests.filter((line) => !line.includes(` ${new URL(page.url()).origin}/`) && !line.includes(" blob:"));
+  assert.deepEqual(foreign, [], "the page sent requests to other servers");
 }
 
-/** Runs scenarios one after the other; the first that fails ends the process with its name. */
+/** Runs scenarios in order. The first failure ends the process. */
 export async function run(scenarios) {
   for (const [name, scenario] of Object.entries(scenarios)) {
-    const begun = performance.now();
+    const startedAt = performance.now();
     try {
       await scenario();
-      console.log(`ok ${name} (${((performance.now() - begun) / 1000).toFixed(1)} s)`);
+      console.log(`ok ${name} (${((performance.now() - startedAt) / 1000).toFixed(1)} s)`);
     } catch (error) {
       console.log(`FAILED ${name}`);
       console.log(error.stack);
@@ -112,16 +112,16 @@ export async function run(scenarios) {
   process.exit(0);
 }
 
-/** Takes the words off the surface, and its picture: width, height and RGBA bytes. */
+/** Takes a screenshot of the surface without its captions and controls. Returns width, height and RGBA bytes. */
 export async function picture(page, selector = "#view-home") {
-  const words = (visibility) =>
+  const setCaptions = (visibility) =>
     page.evaluate((visibility) => {
       for (const node of document.querySelectorAll(".caption, .tools, .now, .tip, .badge, .busy, .problem")) node.style.visibility = visibility;
     }, visibility);
-  await words("hidden");
-  await settled(page);
-  const png = await page.locator(selector).screenshot({ timeout: PATIENCE });
-  await words("");
+  await setCaptions("hidden");
+  await waitForFrames(page);
+  const png = await page.locator(selector).screenshot({ timeout: TIMEOUT_MS });
+  await setCaptions("");
   const helper = await page.context().browser().newPage();
   const decoded = await helper.evaluate(async (text) => {
     const bitmap = await createImageBitmap(await (await fetch(`data:image/png;base64,${text}`)).blob());
@@ -137,33 +137,33 @@ export async function picture(page, selector = "#view-home") {
   return { width: decoded.width, height: decoded.height, data: Buffer.from(decoded.data, "base64") };
 }
 
-/** Waits until what was asked for has been drawn, and a sharp picture stands still. */
-export const settled = (page) =>
+/** Waits until pending changes are drawn, including the full-resolution frame that follows a movement. */
+export const waitForFrames = (page) =>
   page.evaluate(async () => {
     await new Promise((resolve) => setTimeout(resolve, 400));
     for (let i = 0; i < 3; i += 1) await new Promise((resolve) => requestAnimationFrame(resolve));
   });
 
-/** Waits until two pictures are the same, and returns them: what was begun before may still have to be drawn. */
-export async function still(page) {
-  const end = performance.now() + PATIENCE;
+/** Returns a picture after two in a row are equal, because earlier changes may still have to be drawn. */
+export async function stablePicture(page) {
+  const end = performance.now() + TIMEOUT_MS;
   for (let last = await picture(page); ; ) {
     const next = await picture(page);
     if (next.data.equals(last.data)) return next;
-    assert.ok(performance.now() < end, "it goes on moving");
+    assert.ok(performance.now() < end, "the picture keeps changing");
     last = next;
   }
 }
 
 const luminance = (data, i) => (0.2126 * data[i] + 0.7152 * data[i + 1] + 0.0722 * data[i + 2]) / 255;
 
-/** The part of a picture that is not its background, and how bright it is. */
+/** Returns size and brightness of the part of a picture that differs from the background. */
 export function silhouette({ width, height, data }) {
   const same = (i, j) => [0, 1, 2].every((c) => Math.abs(data[i + c] - data[j + c]) <= 6);
   let [pixels, sum] = [0, 0];
   const rows = Array.from({ length: height }, () => 0);
   for (let y = 0; y < height; y += 1) {
-    // The background may fade towards the edges: it is that of the same row.
+    // The background may have a vertical gradient, so each row is compared with its own edge.
     const edge = 4 * (y * width + 2);
     for (let x = 2; x < width - 2; x += 1) {
       const i = 4 * (y * width + x);
@@ -176,10 +176,10 @@ export function silhouette({ width, height, data }) {
   return { pixels, share: pixels / (width * height), brightness: pixels ? sum / pixels : 0, background: luminance(data, 4 * 2) };
 }
 
-/** Triangles, bounds and sizes of a GLB, read without any library. */
+/** Reads JSON, bounds and sizes of a GLB without a library. */
 export function glb(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-  assert.equal(view.getUint32(0, true), 0x46546c67, "no GLB");
+  assert.equal(view.getUint32(0, true), 0x46546c67, "not a GLB");
   const length = view.getUint32(12, true);
   const json = JSON.parse(Buffer.from(bytes.buffer, bytes.byteOffset + 20, length).toString());
   const primitive = json.meshes[0].primitives[0];
@@ -187,8 +187,8 @@ export function glb(bytes) {
   return { json, start: 28 + length, primitive, indices: json.accessors[primitive.indices], min: positions.min, max: positions.max, vertices: positions.count };
 }
 
-/** A GLB whose triangles are changed by `change(index array)`. */
-export function doctored(bytes, change) {
+/** Returns a copy of a GLB after `change` has edited its array of indices. */
+export function withIndices(bytes, change) {
   const copy = Buffer.from(bytes);
   const { json, start, indices } = glb(copy);
   const view = json.bufferViews[indices.bufferView];
@@ -200,36 +200,36 @@ export function doctored(bytes, change) {
   return copy;
 }
 
-/** Turns every triangle inside out. */
+/** Reverses the winding of every triangle. */
 export const inverted = (bytes) =>
-  doctored(bytes, (array) => {
+  withIndices(bytes, (array) => {
     for (let i = 0; i < array.length; i += 3) [array[i], array[i + 1]] = [array[i + 1], array[i]];
   });
 
-/** Leaves no triangle an area. */
-export const emptied = (bytes) => doctored(bytes, (array) => array.fill(0));
+/** Makes every triangle degenerate. */
+export const degenerate = (bytes) => withIndices(bytes, (array) => array.fill(0));
 
-/** Whether a picture of the whole shows the surface of the report, seen from outside: why not, or null. */
-export function looksWrong(picture, bytes, plain) {
+/** Compares a picture of the whole surface with the report of its GLB. Returns the fault, or null. */
+export function pictureFault(picture, bytes, plain) {
   const { min, max, json } = glb(bytes);
   const { area, volume } = json.asset.extras;
   const radius = Math.hypot(...max.map((v, i) => v - min[i])) / 2;
-  // As the viewer looks at the whole.
+  // The camera of the viewer in its initial view.
   const aspect = Math.min(1, picture.width / picture.height);
   const distance = (0.8 * radius) / Math.sin((14 * Math.PI) / 180) / aspect;
   const scale = picture.height / (2 * distance * Math.tan((14 * Math.PI) / 180));
   const { pixels, brightness } = silhouette(picture);
-  const seen = pixels / scale ** 2;
-  // Nothing of this volume has a smaller shadow than a ball, and no closed surface a larger one than half its area.
+  const shadow = pixels / scale ** 2;
+  // A ball has the smallest shadow of all bodies of one volume; a closed surface has at most half its area as shadow.
   const ball = Math.PI * ((3 * volume) / (4 * Math.PI)) ** (2 / 3);
-  if (seen < 0.8 * ball) return `its silhouette has ${seen.toFixed(0)} Å², a ball of its volume ${ball.toFixed(0)} Å²`;
-  if (seen > 0.5 * area) return `its silhouette has ${seen.toFixed(0)} Å², its surface ${area.toFixed(0)} Å²`;
-  // Lights go with the eye: what faces it is bright, the inside of what does not is dark.
-  if (brightness < 0.85 * plain) return `it is as dark (${brightness.toFixed(3)}) as from inside; its colour is ${plain.toFixed(3)}`;
+  if (shadow < 0.8 * ball) return `the silhouette has ${shadow.toFixed(0)} Å², a ball of this volume ${ball.toFixed(0)} Å²`;
+  if (shadow > 0.5 * area) return `the silhouette has ${shadow.toFixed(0)} Å², the surface ${area.toFixed(0)} Å²`;
+  // The lights move with the camera: outer sides that face it are bright, inner sides are dark.
+  if (brightness < 0.85 * plain) return `the surface is dark (${brightness.toFixed(3)}), as if seen from inside; its colour has ${plain.toFixed(3)}`;
   return null;
 }
 
-/** How bright the colour of a surface is. */
+/** Returns the luminance of the default surface colour. */
 export const plainColor = (page) =>
   page.evaluate(() => {
     const hex = getComputedStyle(document.documentElement).getPropertyValue("--plain").trim();
@@ -237,21 +237,28 @@ export const plainColor = (page) =>
     return 0.2126 * r + 0.7152 * g + 0.0722 * b;
   });
 
-/** What axe finds that is serious or critical. */
+/** Returns the serious and critical findings of axe. */
 export async function axe(page) {
   const source = readFileSync(require.resolve("axe-core/axe.min.js"), "utf8");
-  // Playwright evaluates in the page whatever its policy says of scripts.
+  // Playwright runs scripts in the page regardless of its content security policy.
   await page.evaluate(source);
   const { violations } = await page.evaluate(() => window.axe.run(document, { resultTypes: ["violations"] }));
-  const grave = violations.filter(({ impact }) => ["serious", "critical"].includes(impact));
-  return grave.map(({ id, nodes }) => `${id}: ${nodes.map((n) => `${n.target} ${n.failureSummary}`).join("; ")}`);
+  const serious = violations.filter(({ impact }) => ["serious", "critical"].includes(impact));
+  return serious.map(({ id, nodes }) => `${id}: ${nodes.map((n) => `${n.target} ${n.failureSummary}`).join("; ")}`);
+}
+
+/** Returns a promise and the function that resolves it. */
+export function deferred() {
+  let resolve;
+  const promise = new Promise((done) => (resolve = done));
+  return { promise, resolve };
 }
 
 export const sample = (name) => path.join(ROOT, "samples", name);
 
-/** Fetches as a program would. */
-export async function fetched(address, options) {
-  const reply = await fetch(URL_OF_SERVICE + address, options);
+/** Fetches an address of the service without the browser. */
+export async function fetchBytes(address, options) {
+  const reply = await fetch(SERVICE_URL + address, options);
   return { status: reply.status, headers: reply.headers, bytes: Buffer.from(await reply.arrayBuffer()) };
 }
 

@@ -5,6 +5,7 @@ import { glb, MODULES } from "./lib.mjs";
 
 const { MeshoptEncoder } = await import(pathToFileURL(path.join(MODULES, "meshoptimizer/meshopt_encoder.js")));
 
+/** Returns a compressed copy of a GLB. */
 export async function packed(bytes) {
   await MeshoptEncoder.ready;
   const { json, start } = glb(bytes);
@@ -22,7 +23,7 @@ export async function packed(bytes) {
     padded.set(encoded);
     parts.push(padded);
     at += padded.length;
-    // Without the extension there is nothing to read.
+    // Buffer 1 has no data; loaders without the extension find nothing to read.
     view.buffer = 1;
   });
   const last = json.bufferViews.reduce((end, view) => Math.max(end, (view.byteOffset ?? 0) + view.byteLength), 0);

@@ -7,7 +7,7 @@ use std::process::Command;
 
 use cli_support::{Folder, Service, assert_code, molmesh, run, stderr, stdout};
 
-/// Creates a key. Returns the key and its entry for the keys file.
+/// Creates a key. Returns the key and its entry for the key file.
 fn key(args: &[&str]) -> (String, String) {
     let created = run(["key", "new"].iter().chain(args));
     assert_code(&created, 0);
@@ -124,7 +124,7 @@ fn invalid_keys_and_urls_are_rejected_with_a_reason() {
     let secret = "access.signing_secret=a:0123456789abcdef0123456789abcdef";
     for (args, why) in [
         (&["/x"][..], "molmesh key signing"),
-        (&["/x", "--set", "access.signing_secret=a:short"], "less than 32"),
+        (&["/x", "--set", "access.signing_secret=a:short"], "fewer than 32"),
         (&["https://host", "--set", secret], "expected http(s)://host/path"),
         (&["/x?a b", "--set", secret], "%XX"),
         (&["/x?signature=1", "--set", secret], "already"),

@@ -63,7 +63,7 @@ fn surfaces_are_coloured_and_recoloured() {
 
 #[test]
 fn failed_request_keeps_the_previous_surface() {
-    drive("former.mjs", &[], &[]);
+    drive("previous.mjs", &[], &[]);
 }
 
 #[test]
@@ -86,12 +86,12 @@ fn page_asks_for_a_required_key() {
 
 #[test]
 fn page_without_webgl_shows_a_message_and_a_picture() {
-    drive("plain.mjs", &[], &[]);
+    drive("no_webgl.mjs", &[], &[]);
 }
 
 #[test]
 fn other_viewers_load_all_glb_variants() {
-    drive("flavours.mjs", &[], &[]);
+    drive("variants.mjs", &[], &[]);
 }
 
 #[test]

@@ -6,7 +6,7 @@ use crate::cli_support;
 use std::path::Path;
 
 use cli_support::{Folder, assert_code, molmesh, run, stderr, stdout};
-use molmesh::config::{ConfigError, Loaded, Source, load};
+use molmesh::config::{ConfigError, ConfigSource, Loaded, load};
 use serde_json::Value;
 
 fn pairs(list: &[(&str, &str)]) -> Vec<(String, String)> {
@@ -208,7 +208,7 @@ fn secret_files_that_all_users_can_read_cause_a_warning() {
         let loaded = load(None, [], &flags).unwrap();
         assert_eq!(loaded.warnings.len(), usize::from(warned), "{mode:o}: {:?}", loaded.warnings);
         assert!(loaded.warnings.iter().all(|w| w.contains(path.to_str().unwrap()) && !w.contains("hush")));
-        assert_eq!(loaded.source("store.secret_access_key_file"), Source::Flag);
+        assert_eq!(loaded.source("store.secret_access_key_file"), ConfigSource::Flag);
     }
     // The service logs the warning before it can fail.
     let set = format!("store.secret_access_key_file={}", path.display());

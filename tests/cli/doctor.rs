@@ -166,7 +166,7 @@ fn unreachable_store_fails_without_showing_its_key() {
 }
 
 #[test]
-fn a_store_that_is_silent_is_given_up() {
+fn a_store_that_does_not_respond_fails_in_bounded_time() {
     let silent = TcpListener::bind("127.0.0.1:0").unwrap();
     let endpoint = format!("store.endpoint=http://{}", silent.local_addr().unwrap());
     let mut args = vec!["--timeout", "120"];
@@ -245,6 +245,18 @@ fn archive_folder_is_checked() {
     warns(&check_archive(&folder), "archive", "1crn");
     let file = folder.file("file", "");
     warns(&doctor(&folder, &["--archive", file.to_str().unwrap()]), "archive", "cannot be listed");
+}
+
+#[test]
+fn a_store_that_is_a_symbolic_link_is_a_warning() {
+    let folder = Folder::new();
+    let (data, target) = (folder.path("data"), folder.path("elsewhere"));
+    std::fs::create_dir_all(&data).unwrap();
+    assert_eq!(check(&doctor(&folder, &[]), "store").0, "ok", "the control");
+    std::fs::remove_dir_all(data.join("store")).ok();
+    std::fs::create_dir_all(&target).unwrap();
+    std::os::unix::fs::symlink(&target, data.join("store")).unwrap();
+    warns(&doctor(&folder, &[]), "store", "symbolic link");
 }
 
 #[test]

@@ -4,6 +4,8 @@ use crate::cli_support;
 
 use std::fs;
 use std::path::Path;
+#[cfg(target_os = "linux")]
+use std::process::Command;
 
 use cli_support::{Folder, assert_code, mesh, molmesh, pdb, piped, rod, run, stderr, stdout};
 
@@ -72,8 +74,11 @@ fn bad_flags_exit_with_2() {
         ),
         (&["render", "a.pdb", "-o", "b.png", "--units", "nanometer"], "'--units' is an option of `molmesh mesh`"),
         (&["mesh", "a.pdb", "-o", "b.glb", "--width", "9"], "'--width' is an option of `molmesh render`"),
-        (&["mesh", "a.pdb", "-o", "b.xyz"], "--format: glb, gltf, ply, ply-text, stl, obj\n"),
-        (&["mesh", "a.pdb", "-o", "b.glb", "--format", "xyz"], "expected one of glb, gltf, ply, ply-text, stl, obj\n"),
+        (&["mesh", "a.pdb", "-o", "b.xyz"], "--format: glb, gltf, ply, ply-text, stl, obj, vtp\n"),
+        (
+            &["mesh", "a.pdb", "-o", "b.glb", "--format", "xyz"],
+            "expected one of glb, gltf, ply, ply-text, stl, obj, vtp\n",
+        ),
         (&["mesh", "a.pdb", "-o", "b.glb", "--format", "png"], "molmesh render writes pictures"),
         (&["serve", "--metrics-listen", "9090"], "expected an address such as 127.0.0.1:8080, or none"),
         (&["serve", "--listen", "none"], "`server.listen` is \"none\"; expected an address such as 127.0.0.1:8080\n"),
@@ -133,7 +138,7 @@ fn invalid_structures_exit_with_4() {
 #[test]
 fn exceeded_limits_exit_with_5_and_are_named() {
     let message = fails(rod(), &["--max-atoms", "9"], 5);
-    assert!(message.contains('9') && message.contains("hint: raise it with --max-atoms"), "{message}");
+    assert!(message.contains('9') && message.contains("hint: raise the limit with --max-atoms"), "{message}");
     let message = fails(rod(), &["--max-grid-points", "20_000", "--resolution", "0.1"], 5);
     assert!(message.contains("limit is 20000") && message.contains("hint: try --resolution "), "{message}");
     let message = fails(rod(), &["--max-grid-points", "100"], 5);
@@ -185,6 +190,48 @@ fn full_disk_exits_with_7() {
     let done = mesh(&input, Path::new("/dev/full"), &["--format", "glb"]);
     assert_code(&done, 7);
     assert!(stderr(&done).contains("no space left"), "{}", stderr(&done));
+}
+
+/// A disk of 16 MB is filled while a file is replaced: the old file stays, and nothing else.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_disk_that_becomes_full_keeps_the_old_file() {
+    let folder = Folder::new();
+    let (disk, input) = (folder.path("disk"), folder.file("in.pdb", cli_support::block(12)));
+    fs::create_dir(&disk).unwrap();
+    let isolated = |script: &str, args: &[&str]| {
+        let mut command = Command::new("unshare");
+        command.args(["-m", "sh", "-c", &format!("mount -t tmpfs -o size=16m tmpfs \"$0\" && {script}")]).arg(&disk);
+        command.args(args).output()
+    };
+    if !isolated("true", &[]).is_ok_and(|output| output.status.success()) {
+        assert!(std::env::var_os("CI").is_none(), "a disk can be mounted only by root");
+        return eprintln!("SKIPPED: a full disk: mounting needs root and unshare");
+    }
+    // Prints the content of the disk after the command.
+    let script = "printf old > \"$0/$1\" && head -c \"$2\" /dev/zero > \"$0/other\" && shift 2 && \"$@\"; code=$?; \
+                  cd \"$0\" && ls -A && head -c 99 out.*; exit $code";
+    for (command, output, filled, resolution, code) in [
+        ("mesh", "out.stl", "0", "0.1", 7),
+        ("mesh", "out.glb", "0", "0.1", 7),
+        ("mesh", "out.obj", "0", "0.1", 7),
+        ("render", "out.png", "16740000", "1", 7),
+        // Control: the disk is large enough.
+        ("mesh", "out.stl", "0", "2", 0),
+        ("render", "out.png", "1000", "1", 0),
+    ] {
+        let path = disk.join(output).into_os_string().into_string().unwrap();
+        let program = [env!("CARGO_BIN_EXE_molmesh"), command, input.to_str().unwrap(), "-o", &path];
+        let args = [&[output, filled][..], &program, &["--backend", "cpu", "--resolution", resolution]].concat();
+        let done = isolated(script, &args).unwrap();
+        assert_eq!(done.status.code(), Some(code), "{output}: {}", stderr(&done));
+        let left = String::from_utf8_lossy(&done.stdout);
+        assert!(left.starts_with(&format!("other\n{output}\n")), "{output}: {left}");
+        if code == 7 {
+            assert_eq!(left, format!("other\n{output}\nold"));
+            assert!(stderr(&done).contains("no space left"), "{output}: {}", stderr(&done));
+        }
+    }
 }
 
 #[cfg(unix)]

@@ -4,6 +4,8 @@
 
 #[path = "../access_support/mod.rs"]
 mod access_support;
+#[path = "../bcif_support/mod.rs"]
+mod bcif_support;
 #[path = "../cli_support/mod.rs"]
 mod cli_support;
 #[path = "../deploy_support/mod.rs"]

@@ -1,26 +1,23 @@
 //! Memory of the whole process: it stays within the configured limit under load, in a process that cannot have more.
 #![cfg(target_os = "linux")]
 
+use crate::bcif_support;
 use crate::cli_support;
 use crate::http_support;
 
 use std::io::Write as _;
 use std::time::{Duration, Instant};
 
-use cli_support::{Folder, Service};
-use http_support::send;
+use bcif_support::{block, byte_array, category, column, file, i32s, run_length};
+use cli_support::{Folder, MemoryLimit, Service};
+use http_support::{connect, gzip, send};
 
 /// Limit of the service, MiB.
 const BUDGET: u64 = 256;
+/// Limit of the process, MiB.
+const LIMIT: u64 = 512;
 /// Memory outside the budget: threads, the runtime, and requests that are refused, MiB.
 const OVERHEAD: u64 = 96;
-
-/// Returns a compressed PDB file of `n`³ atoms: 40 MB of text for n = 80.
-fn upload(n: u32) -> Vec<u8> {
-    let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
-    gzip.write_all(cli_support::block(n).as_bytes()).unwrap();
-    gzip.finish().unwrap()
-}
 
 #[test]
 fn a_burst_of_large_uploads_stays_within_the_memory_limit() {
@@ -28,10 +25,11 @@ fn a_burst_of_large_uploads_stays_within_the_memory_limit() {
     let budget = format!("limits.memory_bytes={BUDGET}MiB");
     let sets = [&budget, "limits.structure_cache_bytes=16MiB", "jobs.workers=4", "server.client_share=1"];
     let settings = [&["--devices", "cpu"][..], &sets.map(|set| ["--set", set]).concat()].concat();
-    // The address space holds 1 GiB that the allocator reserves, and the stacks of all threads.
-    let service = Service::start_limited(&folder, 4 << 30, &settings);
+    let limit = MemoryLimit::new(LIMIT);
+    let service = Service::start_limited(&folder, &limit, &settings);
     let addr = service.addr.parse().unwrap();
-    let (idle, body) = (service.memory("VmRSS"), upload(80));
+    // 40 MB of text.
+    let (idle, body) = (service.memory("VmRSS"), gzip(cli_support::block(80).as_bytes()));
     let targets = [
         "/v1/structures",
         "/v1/estimate?resolution=2",
@@ -60,11 +58,192 @@ fn a_burst_of_large_uploads_stays_within_the_memory_limit() {
     let peak = service.memory("VmHWM");
     assert!(peak <= idle + BUDGET + OVERHEAD, "{peak} MiB at most, {idle} MiB idle: {statuses:?}");
     assert!(peak > idle + BUDGET / 2, "{peak} MiB at most, {idle} MiB idle: the load was too small");
-    // Memory returns to the system.
-    let end = Instant::now() + Duration::from_secs(30);
-    while service.memory("VmRSS") > idle + OVERHEAD {
-        assert!(Instant::now() < end, "{} MiB, {idle} MiB before", service.memory("VmRSS"));
-        std::thread::sleep(Duration::from_millis(100));
-    }
+    service.assert_memory_returns(idle + OVERHEAD);
     assert_eq!(service.stop("TERM").0, Some(0));
+}
+
+/// Attack: a request, the problem type of its response, and the maximum memory above that of an idle service, MiB.
+struct Attack {
+    name: &'static str,
+    target: &'static str,
+    header: (&'static str, &'static str),
+    body: Vec<u8>,
+    status: u16,
+    slug: &'static str,
+    memory: u64,
+}
+
+const NO_HEADER: (&str, &str) = ("accept", "*/*");
+const GZIP: (&str, &str) = ("content-encoding", "gzip");
+const JSON: (&str, &str) = ("content-type", "application/json");
+const FORM: (&str, &str) = ("content-type", "multipart/form-data; boundary=XX");
+
+fn attacks() -> Vec<Attack> {
+    let attack = |name, target, header, body: Vec<u8>, (status, slug): (u16, &'static str), memory| Attack {
+        name,
+        target,
+        header,
+        body,
+        status,
+        slug,
+        memory,
+    };
+    let identical = gzip(cli_support::pdb(&vec![[0.0; 3]; 300_000]).as_bytes());
+    let dense: Vec<[f64; 3]> =
+        (0..5000_u32).map(|i| [i % 20, i / 20 % 20, i / 400].map(|n| f64::from(n) * 0.1)).collect();
+    let dense = cli_support::pdb(&dense).into_bytes();
+    let picture = gzip(cli_support::block(20).as_bytes());
+    vec![
+        attack(
+            "identical atoms",
+            "/v1/meshes?radius_scale=10",
+            GZIP,
+            identical.clone(),
+            (422, "too-many-duplicates"),
+            BUDGET,
+        ),
+        attack(
+            "identical atoms, estimate",
+            "/v1/estimate?radius_scale=10",
+            GZIP,
+            identical,
+            (422, "too-many-duplicates"),
+            BUDGET,
+        ),
+        attack("sparse atoms", "/v1/meshes", NO_HEADER, lattice(), (422, "grid-too-large"), BUDGET),
+        attack("sparse atoms, estimate", "/v1/estimate", NO_HEADER, lattice(), (200, "grid-too-large"), BUDGET),
+        attack("run-length bomb", "/v1/meshes", NO_HEADER, run_length_bomb(), (422, "too-many-atoms"), 16),
+        attack("gzip bomb", "/v1/meshes", GZIP, gzip_bomb(), (422, "too-much-memory"), BUDGET),
+        attack("JSON of 20 MB", "/v1/meshes", JSON, vec![b'0'; 20_000_000], (413, "body-too-large"), 16),
+        attack(
+            "endless head of a part",
+            "/v1/meshes",
+            FORM,
+            [b"--XX\r\na: ".to_vec(), vec![b'x'; 20_000_000]].concat(),
+            (413, "body-too-large"),
+            16,
+        ),
+        attack(
+            "picture",
+            "/v1/meshes?format=png&width=4096&height=4096",
+            GZIP,
+            picture,
+            (422, "too-much-memory"),
+            BUDGET,
+        ),
+        attack("copies of an assembly", "/v1/meshes?assembly=1", NO_HEADER, assembly(), (422, "too-many-copies"), 16),
+        attack(
+            "overlaps of spheres",
+            "/v1/meshes?surface=ses&probe=10",
+            NO_HEADER,
+            dense,
+            (422, "too-many-candidates"),
+            BUDGET,
+        ),
+    ]
+}
+
+/// Returns a compressed file of 1 GiB.
+fn gzip_bomb() -> Vec<u8> {
+    let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    let piece = b"REMARK\n".repeat(1 << 17);
+    for _ in 0..(1 << 30) / piece.len() {
+        gzip.write_all(&piece).unwrap();
+    }
+    gzip.finish().unwrap()
+}
+
+/// Returns an XYZ file of a million atoms, 64 Å apart: each has bricks of the grid of its own.
+fn lattice() -> Vec<u8> {
+    let mut text = b"1000000\n\n".to_vec();
+    for i in 0..1_000_000_u32 {
+        let [x, y, z] = [i % 100, i / 100 % 100, i / 10_000].map(|n| n * 64);
+        writeln!(text, "C {x} {y} {z}").unwrap();
+    }
+    text
+}
+
+/// Returns a BinaryCIF file of a few hundred bytes that declares 2³¹ atoms.
+fn run_length_bomb() -> Vec<u8> {
+    let n = i32::MAX;
+    let runs = |name| column(name, i32s(&[0, n]), vec![run_length(i64::from(n)), byte_array(3)]);
+    let all = ["Cartn_x", "Cartn_y", "Cartn_z", "auth_seq_id"].map(runs).to_vec();
+    file(vec![block("x", vec![category("_atom_site", i64::from(n), all)])])
+}
+
+/// Returns an mmCIF file of one atom and an assembly of a trillion copies.
+fn assembly() -> Vec<u8> {
+    let columns = |category: &str, names: &[&str]| -> String {
+        std::iter::once("loop_\n".to_owned()).chain(names.iter().map(|name| format!("{category}.{name}\n"))).collect()
+    };
+    let site = columns("_atom_site", &["type_symbol", "label_asym_id", "Cartn_x", "Cartn_y", "Cartn_z"]);
+    let rules = columns("_pdbx_struct_assembly_gen", &["assembly_id", "oper_expression", "asym_id_list"]);
+    let matrix = (1..4).flat_map(|i| (1..4).map(move |j| format!("matrix[{i}][{j}]")));
+    let names: Vec<_> = matrix.chain((1..4).map(|i| format!("vector[{i}]"))).collect();
+    let names: Vec<_> = std::iter::once("id").chain(names.iter().map(String::as_str)).collect();
+    let operators = columns("_pdbx_struct_oper_list", &names);
+    format!("data_x\n{site}C A 0 0 0\n{rules}1 '(1-1000000)(1-1000000)' A\n{operators}1 1 0 0 0 1 0 0 0 1 0 0 0\n")
+        .into_bytes()
+}
+
+/// Every attack gets its problem within the budget, from a process that is limited to twice as much memory.
+#[test]
+fn attacks_are_refused_within_the_memory_limit() {
+    let limit = MemoryLimit::new(LIMIT);
+    for attack in attacks() {
+        let folder = Folder::new();
+        let budget = format!("limits.memory_bytes={BUDGET}MiB");
+        let sets = [&budget, "limits.candidate_pairs=4000000"];
+        let settings = [&["--devices", "cpu"][..], &sets.map(|set| ["--set", set]).concat()].concat();
+        let mut service = Service::start_limited(&folder, &limit, &settings);
+        let idle = service.memory("VmRSS");
+        let reply = send(service.addr.parse().unwrap(), "POST", attack.target, &[attack.header], &attack.body);
+        assert!(service.lives(), "{}: the process ended", attack.name);
+        let used = service.memory("VmHWM").saturating_sub(idle);
+        eprintln!("{}: {used} MiB above {idle} MiB", attack.name);
+        if attack.status == 200 {
+            // An estimate contains the problem that a mesh would get.
+            assert_eq!(reply.json()["problem"]["type"], format!("/problems/{}", attack.slug), "{}", attack.name);
+        } else {
+            reply.problem(attack.status, attack.slug);
+        }
+        assert!(used <= attack.memory + OVERHEAD, "{}: {used} MiB above {idle} MiB", attack.name);
+        assert_eq!(service.stop("TERM").0, Some(0), "{}", attack.name);
+    }
+}
+
+/// Negative control: with a budget above the limit of the process, the same attack ends it.
+#[test]
+fn a_budget_above_the_limit_of_the_process_is_fatal() {
+    let (folder, limit) = (Folder::new(), MemoryLimit::new(LIMIT));
+    let mut service =
+        Service::start_limited(&folder, &limit, &["--devices", "cpu", "--set", "limits.memory_bytes=8GiB"]);
+    let mut client = connect(service.addr.parse().unwrap());
+    let body = gzip_bomb();
+    let head = format!(
+        "POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\n{}: {}\r\ncontent-length: {}\r\n\r\n",
+        GZIP.0,
+        GZIP.1,
+        body.len()
+    );
+    client.write_all(head.as_bytes()).unwrap();
+    drop(client.write_all(&body));
+    let end = Instant::now() + Duration::from_mins(1);
+    while service.lives() {
+        assert!(Instant::now() < end, "the process has {} MiB and runs", service.memory("VmRSS"));
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// The default budget is half of the memory of the control group.
+#[test]
+fn the_default_budget_follows_the_control_group() {
+    let limit = MemoryLimit::new(1000);
+    let Some(printed) = limit.run(&["config", "print"]) else {
+        return eprintln!("SKIPPED: no control group can be created");
+    };
+    let line = printed.lines().find(|line| line.starts_with("memory_bytes")).unwrap();
+    assert_eq!(line, "memory_bytes = 524288000 # half of the 1000 MiB of this control group");
+    let doctor = limit.run(&["doctor", "--listen", "127.0.0.1:0", "--devices", "cpu"]).unwrap();
+    assert!(doctor.contains("500MiB limits.memory_bytes, half of the 1000 MiB of this control group"), "{doctor}");
 }

@@ -17,6 +17,7 @@ fn magic(format: &str) -> &'static [u8] {
         "ply-text" => b"ply\nformat ascii 1.0\n",
         "stl" => b"molmesh",
         "obj" => b"#",
+        "vtp" => b"<?xml version=\"1.0\"?>\n",
         other => panic!("no format {other}"),
     }
 }
@@ -25,7 +26,7 @@ fn magic(format: &str) -> &'static [u8] {
 fn extension_selects_the_format() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
-    for format in ["glb", "gltf", "ply", "stl", "obj"] {
+    for format in ["glb", "gltf", "ply", "stl", "obj", "vtp"] {
         let output = folder.path(&format!("rod.{}", format.to_uppercase()));
         assert_code(&mesh(&input, &output, &[]), 0);
         let bytes = fs::read(&output).unwrap();
@@ -203,7 +204,7 @@ fn json_report_has_its_fields() {
     assert_code(&done, 0);
     assert_eq!(stderr(&done), "", "the report is on stdout");
     let report = json(&stdout(&done));
-    for field in ["vertices", "triangles", "bricks", "samples"] {
+    for field in ["vertices", "triangles", "bricks", "grid_points"] {
         assert!(report[field].as_u64().unwrap() > 0, "{field}: {report}");
     }
     assert_eq!(report["atoms"], 10);
@@ -397,4 +398,49 @@ fn hostile_titles_do_not_reach_the_terminal() {
             assert!(!shown.chars().any(|c| c.is_control() && c != '\n'), "{shown:?}");
         }
     }
+}
+
+#[test]
+fn the_table_of_atoms_has_the_row_of_every_index() {
+    let folder = Folder::new();
+    let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
+    let (output, table) = (folder.path("4pti.ply"), folder.path("4pti.csv"));
+    let flags = ["--format", "ply-text", "--atom-ids", "--atoms", table.to_str().unwrap(), "--resolution", "1"];
+    let done = mesh(Path::new(sample), &output, &flags);
+    assert_code(&done, 0);
+    assert!(stderr(&done).contains("4pti.csv (csv, "), "{}", stderr(&done));
+    let rows: Vec<String> = fs::read_to_string(&table).unwrap().lines().map(str::to_owned).collect();
+    assert_eq!(rows[0], "index,name,element,residue_name,residue_number,insertion_code,chain,model,kind");
+    assert_eq!(rows[1], "0,N,N,ARG,1,,A,1,protein");
+    let text = fs::read_to_string(&output).unwrap();
+    let (header, records) = text.split_once("end_header\n").unwrap();
+    assert!(header.contains("property uint atom"));
+    let vertices = records.lines().filter(|line| line.split(' ').count() == 7);
+    let ids: Vec<usize> = vertices.map(|line| line.rsplit(' ').next().unwrap().parse().unwrap()).collect();
+    assert!(ids.len() > 1000 && ids.iter().all(|id| rows[id + 1].starts_with(&format!("{id},"))));
+    assert!(ids.iter().all(|id| rows[id + 1].ends_with(",protein")), "water is not meshed");
+}
+
+#[test]
+fn the_table_of_atoms_and_the_mesh_are_written_together() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let files = || fs::read_dir(input.parent().unwrap()).unwrap().count();
+    let path = |name: &str| folder.path(name).to_str().unwrap().to_owned();
+    let output = folder.path("rod.glb");
+    for (table, code) in [(path("rod.glb"), 2), (path("rod.pdb"), 2), (path("none/rod.csv"), 7)] {
+        let failed = mesh(&input, &output, &["--atoms", &table]);
+        assert_code(&failed, code);
+        assert_eq!(files(), 1, "{table}");
+    }
+    assert_code(&mesh(&input, &output, &["--atoms", &path("rod.csv"), "--max-grid-points", "10"]), 5);
+    assert_eq!(files(), 1, "a failed job leaves no file");
+    assert_code(&run(["mesh", &path("rod.pdb"), "-o", "-", "--atoms", "-"]), 2);
+    let table = run(["mesh", &path("rod.pdb"), "-o", &path("rod.glb"), "--atoms", "-", "--quiet"]);
+    assert_code(&table, 0);
+    assert!(stdout(&table).starts_with("index,name,"));
+    let report =
+        run(["mesh", &path("rod.pdb"), "-o", &path("rod.glb"), "--atoms", &path("rod.csv"), "--report", "json"]);
+    assert_eq!(json(&stdout(&report))["atom_table"]["format"], "csv");
+    assert_eq!(files(), 3);
 }

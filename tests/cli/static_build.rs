@@ -1,4 +1,4 @@
-//! The static executable of `make static`, without the service.
+//! The static executable, without the service. `make test` builds it with the profile `fast-build`.
 #![cfg(target_os = "linux")]
 #![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
@@ -26,14 +26,14 @@ fn changed(path: &Path) -> SystemTime {
 /// Returns the static executable, if it is newer than the sources.
 fn tool() -> Option<PathBuf> {
     let root = Path::new(ROOT);
-    let tool = root.join("dist/molmesh");
+    let tool = root.join(format!("target/{}-unknown-linux-musl/fast-build/molmesh", std::env::consts::ARCH));
     let built = fs::metadata(&tool).and_then(|meta| meta.modified()).ok();
     let sources = ["src", "Cargo.toml", "Cargo.lock"].map(|name| changed(&root.join(name))).into_iter().max();
     if built.is_some() && built >= sources {
         return Some(tool);
     }
     let why = if built.is_some() { "is older than the sources" } else { "does not exist" };
-    tools::skip(&format!("dist/molmesh {why}; make static builds it"))
+    tools::skip(&format!("{} {why}; make static-if-possible builds it", tool.display()))
 }
 
 fn run(tool: &Path, args: &[&str]) -> Output {

@@ -8,20 +8,10 @@ use crate::http_support;
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use cli_support::{Folder, Service};
-use http_support::{SAMPLE, connect, read_reply, sample, send};
-
-/// Waits until a condition holds, for at most a minute, as the machine may be busy.
-#[track_caller]
-fn eventually(what: &str, mut is: impl FnMut() -> bool) {
-    let end = Instant::now() + Duration::from_mins(1);
-    while !is() {
-        assert!(Instant::now() < end, "waited too long for: {what}");
-        std::thread::sleep(Duration::from_millis(10));
-    }
-}
+use http_support::{SAMPLE, connect, read_reply, sample, send, wait_for};
 
 fn addr(service: &Service) -> SocketAddr {
     service.addr.parse().unwrap()
@@ -82,7 +72,7 @@ fn no_request_fails_under_load() {
                 })
             })
             .collect();
-        eventually("the clients have started", || answered.load(Ordering::SeqCst) >= 30);
+        wait_for("the clients have started", || answered.load(Ordering::SeqCst) >= 30);
         // Requests with slow bodies are in progress all the time.
         let mut slow = [0, 1].map(|n| {
             let mut stream = connect(addr);
@@ -93,14 +83,14 @@ fn no_request_fails_under_load() {
             (stream, body)
         });
         service.signal("TERM");
-        eventually("the service is not ready", || send(addr, "GET", "/readyz", &[], b"").status == 503);
+        wait_for("the service is not ready", || send(addr, "GET", "/readyz", &[], b"").status == 503);
         noticed.store(true, Ordering::SeqCst);
         for client in clients {
             client.join().unwrap();
         }
         assert!(behind.load(Ordering::SeqCst) >= 30);
         service.signal("TERM");
-        eventually("the listener is gone", || TcpStream::connect(addr).is_err());
+        wait_for("the listener is gone", || TcpStream::connect(addr).is_err());
         for (stream, body) in &mut slow {
             stream.write_all(&body[1000..]).unwrap();
             let reply = read_reply(stream, false);
@@ -159,10 +149,10 @@ fn second_signal_ends_the_drain() {
         stream.write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\ncontent-length: 5000\r\n\r\n").unwrap();
         stream.write_all(&SAMPLE[..1000]).unwrap();
         // A response to a later connection shows that this one was accepted.
-        eventually("the service responds", || send(addr(&service), "GET", "/livez", &[], b"").status == 200);
+        wait_for("the service responds", || send(addr(&service), "GET", "/livez", &[], b"").status == 200);
         let at = addr(&service);
         service.signal(signals[0]);
-        eventually("the listener is gone", || TcpStream::connect(at).is_err());
+        wait_for("the listener is gone", || TcpStream::connect(at).is_err());
         service.signal(signals[1]);
         let (code, log) = service.wait();
         assert_eq!(code, Some(1), "a request was cut off: {log}");
@@ -189,7 +179,7 @@ fn durable_jobs_survive_a_stop() {
     let service = Service::start(&folder, &args);
     for job in &jobs {
         let status = || send(addr(&service), "GET", &format!("{job}?wait=10"), &[], b"").json()["status"].clone();
-        eventually("the job is done", || status() == "successful");
+        wait_for("the job is done", || status() == "successful");
     }
     assert_eq!(service.stop("INT").0, Some(0));
 }

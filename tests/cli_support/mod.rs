@@ -44,14 +44,6 @@ pub fn molmesh() -> Command {
     prepared(Command::new(env!("CARGO_BIN_EXE_molmesh")))
 }
 
-/// Returns a command of the binary whose address space is limited to `bytes`.
-pub fn limited(bytes: u64) -> Command {
-    let mut shell = Command::new("sh");
-    let kib = (bytes >> 10).to_string();
-    shell.args(["-c", "ulimit -v \"$0\" && exec \"$@\"", &kib, env!("CARGO_BIN_EXE_molmesh")]);
-    prepared(shell)
-}
-
 fn prepared(mut command: Command) -> Command {
     for name in ["RUST_BACKTRACE", "RUST_LOG", "MOLMESH__DEVICES__USE", "COLUMNS", "CLICOLOR_FORCE"] {
         command.env_remove(name);
@@ -135,6 +127,73 @@ pub fn block(n: u32) -> String {
     pdb(&positions)
 }
 
+/// Limit of the memory of processes: a control group, or the size of the data segment if none can be created.
+#[cfg(target_os = "linux")]
+pub struct MemoryLimit {
+    mib: u64,
+    group: Option<PathBuf>,
+}
+
+#[cfg(target_os = "linux")]
+impl MemoryLimit {
+    pub fn new(mib: u64) -> Self {
+        static COUNT: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
+        let count = COUNT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        let name = format!("molmesh-test-{}-{count}", std::process::id());
+        // Version 1, then version 2.
+        let mounts = [("/sys/fs/cgroup/memory", "memory.limit_in_bytes"), ("/sys/fs/cgroup", "memory.max")];
+        let group = mounts.into_iter().find_map(|(mount, file)| {
+            let group = Path::new(mount).join(&name);
+            std::fs::create_dir(&group).ok()?;
+            let file = group.join(file);
+            if file.exists() && std::fs::write(file, (mib << 20).to_string()).is_ok() {
+                return Some(group);
+            }
+            drop(std::fs::remove_dir(group));
+            None
+        });
+        Self { mib, group }
+    }
+
+    /// Returns a command of the binary that enters the group first.
+    fn command(&self) -> Command {
+        let Some(group) = &self.group else { return molmesh() };
+        let mut shell = Command::new("sh");
+        shell.args(["-c", "echo $$ > \"$0\" && exec \"$@\""]).arg(group.join("cgroup.procs"));
+        shell.arg(env!("CARGO_BIN_EXE_molmesh"));
+        prepared(shell)
+    }
+
+    /// Runs the binary in the group. Returns its output; `None` without a group.
+    pub fn run(&self, args: &[&str]) -> Option<String> {
+        self.group.as_ref()?;
+        Some(stdout(&self.command().args(args).output().unwrap()))
+    }
+
+    /// Limits the data segment of a service outside a group: its size when idle, and as much again as the limit.
+    fn apply(&self, service: &Service) {
+        if self.group.is_none() {
+            let bytes = (service.memory("VmData") + self.mib) << 20;
+            let args = [format!("--pid={}", service.pid()), format!("--data={bytes}")];
+            assert!(Command::new("prlimit").args(args).status().unwrap().success());
+        }
+    }
+}
+
+#[cfg(target_os = "linux")]
+impl Drop for MemoryLimit {
+    fn drop(&mut self) {
+        // A group can be removed when its last process has ended.
+        let removed = |group: &PathBuf| std::fs::remove_dir(group).is_ok();
+        for _ in 0..100 {
+            if self.group.as_ref().is_none_or(removed) {
+                break;
+            }
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
+    }
+}
+
 /// Running `molmesh serve`. Dropping it kills the process, unless it was stopped.
 pub struct Service {
     child: std::process::Child,
@@ -151,9 +210,12 @@ impl Service {
         Self::start_as(molmesh(), folder, more)
     }
 
-    /// Starts a service as [`Self::start`] does, with an address space of `bytes`.
-    pub fn start_limited(folder: &Folder, bytes: u64, more: &[&str]) -> Self {
-        Self::start_as(limited(bytes), folder, more)
+    /// Starts a service as [`Self::start`] does, which cannot use more memory than `limit`.
+    #[cfg(target_os = "linux")]
+    pub fn start_limited(folder: &Folder, limit: &MemoryLimit, more: &[&str]) -> Self {
+        let service = Self::start_as(limit.command(), folder, more);
+        limit.apply(&service);
+        service
     }
 
     fn start_as(mut command: Command, folder: &Folder, more: &[&str]) -> Self {
@@ -205,6 +267,22 @@ impl Service {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
         let line = status.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':')).unwrap();
         line.split_whitespace().next().unwrap().parse::<u64>().unwrap() >> 10
+    }
+
+    /// Returns true if the process runs.
+    pub fn lives(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_none()
+    }
+
+    /// Waits until the resident memory is at most `mib`, at most the ten seconds after which memory must be returned.
+    #[cfg(target_os = "linux")]
+    #[track_caller]
+    pub fn assert_memory_returns(&self, mib: u64) {
+        let end = std::time::Instant::now() + std::time::Duration::from_secs(10);
+        while self.memory("VmRSS") > mib {
+            assert!(std::time::Instant::now() < end, "{} MiB, more than {mib}", self.memory("VmRSS"));
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
     }
 
     /// Returns the process id.

@@ -16,6 +16,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use bcif_support::anonymous;
 use molmesh::formats::{Format, Meta};
 use molmesh::structure::{ReadLimits, Selection, SourceFormat, Structure, read, select};
 use molmesh::surface::{Backend, Control, CpuBackend, SurfaceLimits, SurfaceOptions, SurfaceParams};
@@ -29,19 +30,10 @@ fn structure(path: &Path) -> Structure {
     read(&bytes, &ReadLimits::default()).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// Returns the structure without the fields that depend on the source format.
-fn anonymous(structure: &Structure) -> Structure {
-    Structure { format: SourceFormat::Pdb, ..structure.clone() }
-}
-
-/// Returns a file of the folder beside the repository.
-fn beside(name: &str) -> Option<PathBuf> {
-    tools::structures().map(|folder| folder.join(name))
-}
-
 /// mmCIF files: crambin; four more with alternative locations, several models, ligands, insertion codes.
 fn sources() -> Vec<PathBuf> {
-    let more = ["1gbt.cif.gz", "1pfe.cif.gz", "4cup.cif.gz", "1lcd.cif.gz"].into_iter().filter_map(beside);
+    let more =
+        ["1gbt.cif.gz", "1pfe.cif.gz", "4cup.cif.gz", "1lcd.cif.gz"].into_iter().filter_map(tools::some_structure);
     [PathBuf::from("samples/1crn.cif")].into_iter().chain(more).collect()
 }
 
@@ -165,7 +157,9 @@ fn gemmi_counts_the_same_atoms() {
     let crambin = gemmi_counts(&python, Path::new("samples/1crn.cif"));
     assert_eq!(counts(&committed), crambin);
     assert_eq!(crambin.values().sum::<usize>(), 327);
-    let Some((text, binary)) = beside("1gbt.cif.gz").zip(beside("1gbt.bcif.gz")) else { return };
+    let Some((text, binary)) = tools::some_structure("1gbt.cif.gz").zip(tools::some_structure("1gbt.bcif.gz")) else {
+        return;
+    };
     assert_eq!(counts(&structure(&binary)), gemmi_counts(&python, &text));
     // Control: another entry has other atoms.
     assert_ne!(counts(&structure(&binary)), crambin);
@@ -183,7 +177,9 @@ fn the_committed_file_is_the_sample() {
 /// `1gbt` as distributed by the archive, written by the reference implementation.
 #[test]
 fn an_entry_of_the_archive_is_the_same_in_both_formats() {
-    let Some((text, binary)) = beside("1gbt.cif.gz").zip(beside("1gbt.bcif.gz")) else { return };
+    let Some((text, binary)) = tools::some_structure("1gbt.cif.gz").zip(tools::some_structure("1gbt.bcif.gz")) else {
+        return;
+    };
     let (text, binary) = (structure(&text), structure(&binary));
     assert_eq!((binary.len(), binary.id.as_deref()), (1761, Some("1GBT")));
     assert!(anonymous(&text) == anonymous(&binary), "{} Å", farthest(&text, &binary));

@@ -8,15 +8,15 @@ use crate::tools;
 use std::io::{self, ErrorKind, Write};
 
 use molmesh::formats::{Encoder, Format, FormatError, GlbSink, GlbSinkError, Meta, Packing, RandomAccess};
-use molmesh::surface::{Mesh, MeshPart, MeshSink};
+use molmesh::surface::{Mesh, MeshPart, MeshSink, PartRange};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 use tools::files::{MemoryFile, encoded, write_parts};
 use tools::readers::{
-    Contents, accessor_of, gltf_contents, ply_header, read_obj, read_ply, read_ply_text, read_stl, split_glb,
+    Contents, accessor_of, gltf_contents, ply_header, read_obj, read_ply, read_ply_text, read_stl, read_vtp, split_glb,
     split_gltf, u32_at,
 };
-use tools::shapes::{FAR, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres};
+use tools::shapes::{FAR, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres, union};
 
 fn meta() -> Meta {
     let Value::Object(extras) = json!({
@@ -199,6 +199,25 @@ fn text_formats_round_trip_coordinates_to_their_decimals() {
         let colors = mesh.colors.as_deref().filter(|colors| !colors.is_empty());
         assert_eq!(found.colors, colors.map(|colors| colors.iter().map(opaque).collect::<Vec<_>>()), "{name}");
     }
+}
+
+#[test]
+fn vtp_has_the_columns_of_ply_and_the_part_of_each_triangle() {
+    for (name, mesh) in cases() {
+        let (vtp, parts) = read_vtp(&encode(Format::Vtp, &mesh, &meta()));
+        let ply = read_ply(&encode(Format::Ply, &mesh, &meta()));
+        assert!(vtp == ply && parts.is_none(), "{name}");
+    }
+    let (first, second) = (icosphere(1, 3.0, [0.0; 3], false), icosphere(0, 1.0, [9.0, 0.0, 0.0], false));
+    let mut mesh = union(&first, &second);
+    let ranges = [
+        (0..first.n_vertices(), 0..first.n_triangles()),
+        (first.n_vertices()..mesh.n_vertices(), first.n_triangles()..mesh.n_triangles()),
+    ];
+    mesh.parts = ranges.map(|(vertices, triangles)| PartRange { vertices, triangles, ..PartRange::default() }).into();
+    let (_, parts) = read_vtp(&encode(Format::Vtp, &mesh, &meta()));
+    let expected = [vec![0; first.n_triangles()], vec![1; second.n_triangles()]].concat();
+    assert_eq!(parts, Some(expected));
 }
 
 #[test]

@@ -126,7 +126,7 @@ fn the_same_limit_gives_the_same_mesh_and_report() {
 
 #[test]
 fn the_other_limits_apply_too() {
-    let narrow = SurfaceLimits { max_samples: 40_000, ..SurfaceLimits::default() };
+    let narrow = SurfaceLimits { max_grid_points: 40_000, ..SurfaceLimits::default() };
     let refused = with(PTI, &[("max_triangles", "1000000")], narrow).unwrap_err();
     assert!(matches!(refused, JobError::Surface(SurfaceError::GridTooLarge { .. })), "{refused}");
     assert!(with(PTI, &[("max_triangles", "2000")], narrow).is_ok());
@@ -172,5 +172,8 @@ fn estimates_use_the_chosen_spacing() {
     let made = product(PTI, &[("max_triangles", "20")]).unwrap_err();
     assert_eq!(JobError::Surface(refused.mesh.unwrap_err()), made);
     let (guess, made) = (expected(PTI, &[("detail", "2")]), report(PTI, &[("detail", "2")]));
-    assert_eq!((guess.resolution.to_bits(), guess.mesh.unwrap().samples), (made.resolution.to_bits(), made.samples));
+    assert_eq!(
+        (guess.resolution.to_bits(), guess.mesh.unwrap().grid_points),
+        (made.resolution.to_bits(), made.grid_points)
+    );
 }

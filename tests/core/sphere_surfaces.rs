@@ -283,6 +283,30 @@ fn overlaps_and_candidates_are_limited_and_the_search_can_be_cancelled() {
         "{error:?}"
     );
     assert!(run(1 << 20, &large, &Control::default()).is_ok());
+    // Many caps of one sphere: the comparisons count as well.
+    let n = 2000;
+    let on_sphere = |i: i32| {
+        let (height, turn) = (1.0 - f64::from(2 * i + 1) / f64::from(n), 2.399_963 * f64::from(i));
+        let across = (1.0 - height * height).sqrt();
+        ([across * turn.cos(), across * turn.sin(), height].map(|c| 2.9 * c), 0.3)
+    };
+    let crowd: Vec<Ball> = std::iter::once(([0.0; 3], 0.3)).chain((0..n).map(on_sphere)).collect();
+    let distance2 = |a: &Ball, b: &Ball| (0..3).map(|k| (a.0[k] - b.0[k]).powi(2)).sum::<f64>();
+    let of = |a: &Ball| crowd.iter().filter(|b| distance2(a, b).sqrt() < a.1 + b.1 + 2.8).count() as u64;
+    let pairs: u64 = crowd.iter().map(of).sum();
+    let probed = params(SurfaceKind::Ses, Some(1.4), 2.0);
+    let run_crowd = |max_candidates| {
+        let limits = SurfaceLimits { max_candidates, ..SurfaceLimits::default() };
+        backend.run(&spheres(&crowd), &probed, &limits, &Control::default()).map(|output| output.grid.overlaps)
+    };
+    let overlaps = run_crowd(1 << 31).unwrap();
+    assert!(overlaps > pairs + pairs / 100, "{overlaps} with comparisons, {pairs} pairs");
+    assert_eq!(run_crowd(overlaps), Ok(overlaps));
+    let refused = run_crowd(overlaps - 1);
+    assert!(
+        matches!(refused, Err(SurfaceError::TooManyOverlaps { limit, .. }) if limit == overlaps - 1),
+        "{refused:?}"
+    );
     // Arcs near bricks count as atoms near bricks do.
     let pairs = backend.run(&atoms, &ses, &SurfaceLimits::default(), &Control::default()).unwrap().grid.candidates;
     let error = run(pairs + 1000, &ses, &Control::default()).unwrap_err();
@@ -312,7 +336,7 @@ fn a_grid_without_a_point_inside_has_no_surface_and_other_backends_reject_the_re
     for surface in [SurfaceKind::Vdw, SurfaceKind::Sas, SurfaceKind::Ses] {
         let error = run(&ReferenceBackend, surface);
         assert!(matches!(error, SurfaceError::BadParameter { name: "surface", .. }), "{error:?}");
-        assert!(!ReferenceBackend.makes(surface));
+        assert!(!ReferenceBackend.supports(surface));
     }
 }
 

@@ -109,7 +109,7 @@ fn a_part_has_the_mesh_of_its_atoms_alone() {
         let sum = |count: fn(&Report) -> u64| alone.iter().map(|product| count(&product.report)).sum::<u64>();
         let report = &both.report;
         assert_eq!((report.triangles, report.vertices), (sum(|r| r.triangles), sum(|r| r.vertices)));
-        assert_eq!((report.samples, report.components), (sum(|r| r.samples), sum(|r| r.components)));
+        assert_eq!((report.grid_points, report.components), (sum(|r| r.grid_points), sum(|r| r.components)));
         assert_eq!(report.euler, alone.iter().map(|product| product.report.euler).sum::<i64>());
         let voids = |report: &Report| {
             let mut all: Vec<_> = report.void_list.iter().map(|v| v.center.map(|c| (c * 1e3).round() as i64)).collect();
@@ -289,15 +289,16 @@ fn limits_of_meshing_apply_to_all_parts_together() {
         meshed_with(&text, &[("split", "chain"), ("resolution", h)], &JobLimits { surface, ..JobLimits::default() })
     };
     // Each part fits, both together do not.
-    let samples = usual.report.samples;
-    assert!(one.report.samples < samples - 1);
-    assert!(with(SurfaceLimits { max_samples: samples, ..surface }, "0.8").is_ok());
-    let few = SurfaceLimits { max_samples: samples - 1, ..surface };
+    let grid_points = usual.report.grid_points;
+    assert!(one.report.grid_points < grid_points - 1);
+    assert!(with(SurfaceLimits { max_grid_points: grid_points, ..surface }, "0.8").is_ok());
+    let few = SurfaceLimits { max_grid_points: grid_points - 1, ..surface };
     let error = with(few, "0.8").unwrap_err();
-    let JobError::Surface(SurfaceError::GridTooLarge { samples: n, limit, suggested_resolution, .. }) = error else {
+    let JobError::Surface(SurfaceError::GridTooLarge { grid_points: n, limit, suggested_resolution, .. }) = error
+    else {
         panic!("{error}")
     };
-    assert!(n >= samples && limit == samples - 1, "{n} {limit}");
+    assert!(n >= grid_points && limit == grid_points - 1, "{n} {limit}");
     assert!(with(few, &suggested_resolution.to_string()).is_ok(), "{suggested_resolution}");
     let bytes = usual.mesh.bytes();
     assert!(one.mesh.bytes() < bytes - 1);
@@ -327,10 +328,11 @@ fn estimates_count_every_part() {
     let made = run(text.as_bytes(), &job, &limits, &choice, &control, &(), None).unwrap().report;
     let expected = estimate(read, &job, &limits, &choice, &control).unwrap();
     let mesh = expected.mesh.unwrap();
-    assert_eq!((mesh.samples, expected.box_cells), (made.samples, made.box_cells));
+    assert_eq!((mesh.grid_points, expected.box_cells), (made.grid_points, made.box_cells));
     let ratio = mesh.triangles as f64 / made.triangles as f64;
     assert!((0.8..1.25).contains(&ratio), "{ratio}");
-    let few = JobLimits { surface: SurfaceLimits { max_samples: made.samples - 1, ..limits.surface }, ..limits };
+    let few =
+        JobLimits { surface: SurfaceLimits { max_grid_points: made.grid_points - 1, ..limits.surface }, ..limits };
     let refused = estimate(read, &job, &few, &choice, &control).unwrap().mesh.unwrap_err();
     assert!(matches!(refused, SurfaceError::GridTooLarge { .. }), "{refused}");
 }

@@ -8,11 +8,13 @@
 )]
 
 use std::io::Write;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use molmesh::memory_budget::Budget;
 use molmesh::structure::strict_validator::{self, Level};
 use molmesh::structure::{Contents, ReadLimits, Selection, StructureError, read, select};
-use molmesh::surface::Control;
+use molmesh::surface::{CancelToken, Control, OutOfMemory};
 
 const ATOM: &str = "ATOM      2  CA  ALA A  12      11.104  -6.134   0.500  1.00 20.25           C  \n";
 
@@ -32,6 +34,7 @@ fn limits() -> ReadLimits {
         max_duplicates: u64::MAX,
         max_copies: 1000,
         max_parts: 100,
+        max_distances: u64::MAX,
     }
 }
 
@@ -357,6 +360,49 @@ fn strict_validator_does_not_check_files_that_would_take_long() {
     for text in [residues(20_000), named(2000), atoms(75_000)] {
         let message = found(text);
         assert!(!message.starts_with("not checked"), "{message}");
+    }
+}
+
+#[test]
+fn strict_validator_stops_at_cancellation_and_deadline_and_keeps_its_memory_until_its_end() {
+    strict_validator::quiet_panics();
+    // Takes about a second: see above.
+    let text = strict_cif((1..2000).map(|i| format!("ATOM {i} C CA R{} A 1 {i} 2 3\n", i.min(1000))));
+    let size = 1 << 40;
+    let budget = Budget::new(size);
+    // The whole budget is free only if nothing is held.
+    let held = || match budget.reservation().grow(size) {
+        Ok(_) => 0,
+        Err(OutOfMemory::Budget { held, .. }) => held,
+        other => panic!("{other:?}"),
+    };
+    for is_late in [false, true] {
+        let (cancel, start) = (CancelToken::default(), Instant::now());
+        let delay = Duration::from_millis(100);
+        let control = Control {
+            cancel: cancel.clone(),
+            deadline: is_late.then(|| start + delay),
+            memory: Arc::new(budget.reservation()),
+            ..Control::default()
+        };
+        let check = || (strict_validator::check(text.as_bytes(), &limits(), &control), Instant::now());
+        let (stopped, time) = std::thread::scope(|scope| {
+            let checking = scope.spawn(check);
+            std::thread::sleep(delay.saturating_sub(start.elapsed()));
+            if !is_late {
+                cancel.cancel();
+            }
+            let cancelled = Instant::now();
+            let (stopped, ended) = checking.join().unwrap();
+            (stopped, ended.saturating_duration_since(cancelled))
+        });
+        assert_eq!(stopped, Err(StructureError::Cancelled));
+        assert!(time < Duration::from_millis(500), "the rest takes a second or more: {time:?}");
+        assert!(held() > text.len() as u64, "the thread still uses its memory");
+        while held() > 0 {
+            assert!(start.elapsed() < Duration::from_mins(1), "the thread ends");
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 }
 

@@ -322,7 +322,7 @@ fn with_item(text: &str, item: &str, value: impl Fn(&str, bool) -> String) -> St
 }
 
 #[test]
-fn entities_decide_wherever_they_are_in_the_file() {
+fn entities_decide_at_any_place_in_the_file() {
     let sample = structure(CIF);
     let text = modified_cif("LIG");
     let s = structure(&text);

@@ -16,6 +16,7 @@ const REPEATED: ReadLimits = ReadLimits {
     max_duplicates: u64::MAX,
     max_copies: 1000,
     max_parts: 100,
+    max_distances: u64::MAX,
 };
 
 fn cif(text: impl AsRef<[u8]>) -> Structure {

@@ -13,17 +13,14 @@ use crate::tools;
 
 use std::collections::BTreeMap;
 use std::io::{BufReader, Read};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::Command;
 
 use molmesh::structure::{Contents, ReadLimits, Selection, Structure, StructureError, read, select};
 
-const FOLDER: &str = "../shared/data/structures";
-
 /// Rows of SOURCES.tsv: file, atoms, models.
 fn sources() -> Vec<(String, Option<usize>, Option<usize>)> {
-    let Some(folder) = tools::structures() else { return Vec::new() };
-    let list = std::fs::read_to_string(folder.join("SOURCES.tsv")).expect("the folder has a list");
+    let list = std::fs::read_to_string(tools::some_structures().join("SOURCES.tsv")).expect("the folder has a list");
     let rows = list.lines().skip(1).map(|line| line.split('\t').collect::<Vec<_>>());
     rows.map(|row| (row[0].to_owned(), row[3].parse().ok(), row[4].parse().ok())).collect()
 }
@@ -32,7 +29,7 @@ fn sources() -> Vec<(String, Option<usize>, Option<usize>)> {
 const SAMPLES: [&str; 2] = ["samples/4pti.pdb", "samples/1crn.cif"];
 
 fn path(file: &str) -> PathBuf {
-    if SAMPLES.contains(&file) { file.into() } else { Path::new(FOLDER).join(file) }
+    if SAMPLES.contains(&file) { file.into() } else { tools::some_structures().join(file) }
 }
 
 fn bytes(file: &str) -> Vec<u8> {
@@ -70,7 +67,7 @@ fn every_file_matches_the_list() {
 
 #[test]
 fn errors_name_files_without_atoms() {
-    if sources().is_empty() {
+    if tools::structures().is_none() {
         return;
     }
     let limits = ReadLimits::default();
@@ -84,7 +81,7 @@ fn errors_name_files_without_atoms() {
 
 #[test]
 fn the_default_selection_has_the_atoms_of_the_paper() {
-    if sources().is_empty() {
+    if tools::structures().is_none() {
         return;
     }
     let counts = [
@@ -102,7 +99,7 @@ fn the_default_selection_has_the_atoms_of_the_paper() {
 
 #[test]
 fn ids_and_titles() {
-    if sources().is_empty() {
+    if tools::structures().is_none() {
         return;
     }
     let cases = [
@@ -123,7 +120,7 @@ fn ids_and_titles() {
 
 #[test]
 fn old_and_new_files_of_one_entry_agree() {
-    if sources().is_empty() {
+    if tools::structures().is_none() {
         return;
     }
     let (new, old) = (structure("4pti.pdb.gz"), structure("4pti_1996.ent.gz"));
@@ -152,7 +149,7 @@ fn results_do_not_depend_on_the_number_of_threads() {
 
 #[test]
 fn an_atom_takes_61_bytes() {
-    if sources().is_empty() {
+    if tools::structures().is_none() {
         return;
     }
     for file in ["6zu5.cif.gz", "1aon.pdb.gz", "3v2u.pdb.gz"] {
@@ -379,8 +376,51 @@ fn agrees_with_pdbtbx_except_for_listed_files() {
         };
         wrong.push(format!("{file}: {verdict}"));
     }
-    let expected: Vec<String> = PDBTBX_FAILS.iter().map(|(file, verdict)| format!("{file}: {verdict}")).collect();
-    if !sources().is_empty() {
-        assert_eq!(wrong, expected);
+    let listed: Vec<String> = sources().into_iter().map(|(file, ..)| file).collect();
+    let known = PDBTBX_FAILS.iter().filter(|(file, _)| listed.iter().any(|other| other == file));
+    let expected: Vec<String> = known.map(|(file, verdict)| format!("{file}: {verdict}")).collect();
+    assert_eq!(wrong, expected);
+}
+
+#[test]
+fn gemmi_reads_the_same_helices_and_strands() {
+    use molmesh::structure::Kind;
+    use molmesh::structure::annotations::{SecondaryRanges, SecondaryStructure};
+
+    let files: Vec<String> = sources().into_iter().map(|(file, ..)| file).chain(SAMPLES.map(str::to_owned)).collect();
+    let texts = files.iter().filter(|file| !REFUSED.contains(&file.as_str()) && !OURS_ALONE.contains(&file.as_str()));
+    let texts: Vec<&String> = texts.collect();
+    let paths: Vec<PathBuf> = texts.iter().map(|file| path(file)).collect();
+    type Residues = Vec<(String, String, String)>;
+    let Some(reports) = tools::python::<Option<Residues>>("gemmi_secondary.py", &paths) else { return };
+    let (mut with_ranges, mut rejected) = (0, 0);
+    for (file, residues) in texts.into_iter().zip(reports) {
+        let Some(residues) = residues else {
+            rejected += 1;
+            continue;
+        };
+        let s = structure(file);
+        let Some(ranges) = SecondaryRanges::of(&s) else {
+            assert!(residues.iter().all(|(.., kind)| kind == "-"), "{file}");
+            continue;
+        };
+        let expected: BTreeMap<(String, String), String> =
+            residues.into_iter().map(|(chain, number, kind)| ((chain, number), kind)).collect();
+        let (mut n, mut assigned) = (0, 0);
+        for i in (0..s.len()).filter(|&i| s.model[i] == s.model[0] && s.kind[i] == Kind::Protein) {
+            let code = Some(s.insertion_code[i]).filter(|code| *code != 0).map(|code| char::from(code).to_string());
+            let number = format!("{}{}", s.residue_number[i], code.unwrap_or_default());
+            let Some(kind) = expected.get(&(s.chain.get(i).to_owned(), number.clone())) else { continue };
+            let found = match ranges.get(&s, i) {
+                Some(SecondaryStructure::Strand) => "E",
+                Some(SecondaryStructure::Turn) | None => "-",
+                Some(_) => "H",
+            };
+            assert_eq!(found, kind, "{file} {} {number}", s.chain.get(i));
+            (n, assigned) = (n + 1, assigned + usize::from(found != "-"));
+        }
+        assert!(n > 100 && assigned > 0, "{file}: {n} {assigned}");
+        with_ranges += 1;
     }
+    assert!(with_ranges >= 3 && rejected <= 3, "{with_ranges} {rejected}");
 }

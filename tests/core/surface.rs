@@ -9,6 +9,7 @@
 )]
 
 use crate::measure_support::agree;
+use crate::tools::shapes::Random;
 
 use molmesh::surface::reference::Density;
 use molmesh::surface::{
@@ -75,20 +76,6 @@ fn measures_during_meshing_are_those_of_the_mesh() {
     let measured = exact(&all);
     assert!(!agree(&measured, &fewer.measures.unwrap(), &all.mesh));
     assert!(agree(&measured, all.measures.as_ref().unwrap(), &all.mesh));
-}
-
-/// Small deterministic random number generator.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 11) as f64 / (1_u64 << 53) as f64
-    }
-
-    fn cloud(&mut self, n: usize, side: f64) -> Vec<[f64; 4]> {
-        (0..n).map(|_| [self.next() * side, self.next() * side, self.next() * side, 1.2 + 0.7 * self.next()]).collect()
-    }
 }
 
 /// Returns the slope of log(error) over log(spacing) between the coarsest and the finest spacing.
@@ -434,7 +421,7 @@ fn limits_are_checked_and_suggested_spacings_fit() {
     let at = spheres(&Random(1).cloud(500, 40.0));
     let backend = CpuBackend::new(Some(2)).unwrap();
     for limits in [
-        SurfaceLimits { max_samples: 100_000, ..SurfaceLimits::default() },
+        SurfaceLimits { max_grid_points: 100_000, ..SurfaceLimits::default() },
         SurfaceLimits { max_mesh_bytes: 300_000, ..SurfaceLimits::default() },
         SurfaceLimits { max_candidates: 6_000, ..SurfaceLimits::default() },
     ] {
@@ -462,13 +449,15 @@ fn limits_are_checked_and_suggested_spacings_fit() {
 fn far_too_large_grids_are_rejected_before_evaluation() {
     // 10⁴ times the allowed grid points: even the field of the allowed ones would take seconds here.
     let at = spheres(&Random(1).cloud(3000, 40.0));
-    let limits = SurfaceLimits { max_samples: 1 << 28, ..SurfaceLimits::default() };
+    let limits = SurfaceLimits { max_grid_points: 1 << 28, ..SurfaceLimits::default() };
     let seen = Stages::default();
     let control = Control { observer: &seen, ..Control::default() };
     let backend = CpuBackend::new(Some(2)).unwrap();
     let error = backend.run(&at, &params(Kernel::Gaussian, 0.01), &limits, &control);
-    let SurfaceError::GridTooLarge { samples, limit, suggested_resolution, .. } = error.unwrap_err() else { panic!() };
-    assert!(samples > limit && (0.05..1.0).contains(&suggested_resolution), "{samples} {suggested_resolution}");
+    let SurfaceError::GridTooLarge { grid_points, limit, suggested_resolution, .. } = error.unwrap_err() else {
+        panic!()
+    };
+    assert!(grid_points > limit && (0.05..1.0).contains(&suggested_resolution), "{grid_points} {suggested_resolution}");
     assert_eq!(seen.all(), [Stage::Bin], "nothing was evaluated");
     // Control: a grid within the limit reaches later stages.
     backend.run(&at, &params(Kernel::Gaussian, 1.0), &limits, &control).unwrap();
@@ -717,7 +706,7 @@ fn distant_atoms_cost_only_their_own_bricks() {
     let meshed = run(&spheres(&rows), &params(Kernel::Gaussian, 0.5));
     let m = assert_sound(&meshed, "far apart");
     assert_eq!(m.components.len(), 8);
-    assert!(meshed.grid.box_cells > 1 << 52 && meshed.grid.samples < 1 << 18, "{:?}", meshed.grid);
+    assert!(meshed.grid.box_cells > 1 << 52 && meshed.grid.grid_points < 1 << 18, "{:?}", meshed.grid);
 }
 
 #[test]

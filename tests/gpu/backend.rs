@@ -158,19 +158,19 @@ fn warm_runs_every_device_and_gives_up_those_that_fail() {
 fn many_callers_share_one_device() {
     let fake = FakeDevice::new(&[]);
     let backend = gpu(std::slice::from_ref(&fake));
-    let (done, samples) = (AtomicUsize::new(0), AtomicU64::new(0));
+    let (done, grid_points) = (AtomicUsize::new(0), AtomicU64::new(0));
     std::thread::scope(|scope| {
         for _ in 0..16 {
             scope.spawn(|| {
                 for _ in 0..20 {
                     let meshed = run(&backend, &Control::default()).unwrap();
-                    samples.fetch_add(meshed.grid.samples, Ordering::Relaxed);
+                    grid_points.fetch_add(meshed.grid.grid_points, Ordering::Relaxed);
                     done.fetch_add(1, Ordering::Relaxed);
                 }
             });
         }
     });
-    assert_eq!((done.into_inner(), samples.into_inner()), (320, 320 * 7));
+    assert_eq!((done.into_inner(), grid_points.into_inner()), (320, 320 * 7));
     assert_eq!(fake.calls().iter().sum::<usize>(), 320);
     assert_eq!(backend.devices()[0].finished, 320);
 }

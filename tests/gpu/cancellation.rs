@@ -8,8 +8,10 @@ use molmesh::surface::{Backend as _, CancelToken, Control, Kernel, Observer, Sta
 
 use crate::gpu_support::{engine_with, params, spheres};
 
-/// Maximum time from the cancellation to the end of a job. Tests without optimization run beside others.
-const LIMIT: Duration = Duration::from_millis(if cfg!(debug_assertions) { 500 } else { 50 });
+/// Maximum time from the cancellation to the end of a job.
+const LIMIT: Duration = Duration::from_millis(50);
+/// Number of attempts. Other programs may delay one of them; work that does not check is late in each.
+const ATTEMPTS: usize = 5;
 
 /// Records the start of the first stage.
 #[derive(Default)]
@@ -31,8 +33,7 @@ fn jobs_end_soon_after_cancellation_at_any_time() {
     let at = |i: usize| [i % 30, i / 30 % 30, i / 900].map(|k| 4.0 * k as f64);
     let rows: Vec<[f64; 4]> = (0..27_000).map(at).map(|[x, y, z]| [x, y, z, 1.7]).collect();
     let (spheres, params) = (spheres(&rows), params(Kernel::Gaussian, 0.4));
-    // In stage bin, and while the device works.
-    for delay in [0, 5, 100, 400].map(Duration::from_millis) {
+    let attempt = |delay: Duration| {
         let (start, cancel) = (Start::default(), CancelToken::default());
         let control = Control { cancel: cancel.clone(), observer: &start, ..Control::default() };
         let stopped = std::thread::scope(|scope| {
@@ -45,6 +46,11 @@ fn jobs_end_soon_after_cancellation_at_any_time() {
         });
         let time = start.0.get().unwrap().elapsed();
         assert_eq!(stopped.map(|_| ()).unwrap_err(), SurfaceError::Cancelled, "{delay:?}");
-        assert!(time < delay + LIMIT, "{delay:?}: {time:?}");
+        time.saturating_sub(delay)
+    };
+    // In stage bin, and while the device works.
+    for delay in [0, 5, 100, 400, 2000].map(Duration::from_millis) {
+        let mut times = (0..ATTEMPTS).map(|_| attempt(delay));
+        assert!(times.any(|time| time < LIMIT), "{delay:?}");
     }
 }

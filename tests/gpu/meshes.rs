@@ -7,10 +7,11 @@ use crate::measure_support::agree;
 use std::sync::Arc;
 
 use gpu_support::{
-    KERNELS, Random, engine, engine_with, job, measures, mesh_of, params, quantized, run, sample, spheres,
+    KERNELS, POSITION_BOUND, Random, engine, engine_with, job, measures, mesh_of, params, quantized, run, sample,
+    spheres,
 };
 use molmesh::gpu::plan::ChunkLimits;
-use molmesh::gpu::{Budget, Engine, Executor, GpuError, GpuJob, Prepared};
+use molmesh::gpu::{DeviceLimits, Engine, Executor, GpuError, GpuJob, Prepared};
 use molmesh::surface::quantize::BEYOND;
 use molmesh::surface::{
     Backend, Control, CpuBackend, Mesh, MeshOutput, Quantized, Spheres, SurfaceError, SurfaceKind, SurfaceLimits,
@@ -36,7 +37,7 @@ fn difference(mesh: &Mesh, expected: &Mesh) -> Option<String> {
     };
     let (n, apart) = (mesh.n_vertices(), furthest(&mesh.positions, &expected.positions));
     let turned = furthest(&mesh.normals, &expected.normals);
-    (n != expected.n_vertices() || mesh.normals.len() != n || apart > 1e-4 || turned > 2e-2)
+    (n != expected.n_vertices() || mesh.normals.len() != n || apart > POSITION_BOUND || turned > 2e-2)
         .then(|| format!("{n} vertices of {}, {apart} Å apart, normals {turned}", expected.n_vertices()))
 }
 
@@ -311,7 +312,7 @@ fn control_the_comparison_finds_differences() {
     };
     assert!(changed(&|m| m.triangles[7].swap(0, 1)).is_some());
     assert!(changed(&|m| _ = m.triangles.edit().pop()).is_some());
-    assert!(changed(&|m| m.positions[3][1] += 2e-4).is_some());
+    assert!(changed(&|m| m.positions[3][1] += 2.0 * POSITION_BOUND).is_some());
     assert!(changed(&|m| m.normals[5] = m.normals[5].map(|c| -c)).is_some());
     assert!(changed(&|m| _ = m.positions.edit().pop()).is_some());
     assert!(changed(&|m| m.centre[0] += 0.5).is_some());
@@ -409,7 +410,7 @@ fn bytes(mesh: &Mesh) -> (Vec<u8>, Vec<u8>, Vec<u8>) {
 }
 
 /// Makes a budget smaller.
-type Change = fn(&mut Budget);
+type Change = fn(&mut DeviceLimits);
 
 #[test]
 fn chunks_pieces_and_readback_buffers_change_no_byte() {
@@ -621,7 +622,7 @@ fn a_lost_device_is_an_error_without_panic() {
     let (spheres, params) = (sample("1crn.cif"), params(KERNELS[0], 0.7));
     for small in [0, 16 << 20] {
         let (device, queue) = gpu_support::device();
-        let mut budget = Budget::of(&device.limits());
+        let mut budget = DeviceLimits::of(&device.limits());
         budget.small_bytes = small;
         let mut engine = molmesh::gpu::Engine::with_budget(device.clone(), queue, budget).unwrap();
         let before = mesh_of(&mut engine, &spheres, &params);

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use gpu_support::{KERNELS, Random, engine, job, params, quantized, run, sample, spheres};
 use molmesh::gpu::{
-    Budget, CompletedJob, DevicePool, Engine, Executor, Finished, GpuBackend, GpuError, GpuJob, PartitionHandle,
+    CompletedJob, DeviceLimits, DevicePool, Engine, Executor, Finished, GpuBackend, GpuError, GpuJob, PartitionHandle,
     PoolDevice, PoolSettings,
 };
 use molmesh::surface::{
@@ -31,7 +31,7 @@ const SETTINGS: PoolSettings = PoolSettings {
 };
 
 /// Starts a pool of `n` software devices, each with the budget as modified by `change`.
-fn pool(n: usize, change: fn(&mut Budget), settings: PoolSettings) -> DevicePool {
+fn pool(n: usize, change: fn(&mut DeviceLimits), settings: PoolSettings) -> DevicePool {
     let device = |number| {
         let build = move || Ok(Box::new(gpu_support::engine_with(change)) as Box<dyn Executor>);
         PoolDevice { number, name: format!("device {number}"), build: Box::new(build) }
@@ -96,8 +96,8 @@ fn n_across(mesh: &Mesh, job: &GpuJob, n: usize) -> usize {
     };
     let of_brick: HashMap<[i32; 3], usize> =
         plan.bricks.iter().zip(0..).map(|(brick, id)| (coord(*brick), partition(id))).collect();
-    // A vertex belongs to the brick of the last sample before it.
-    #[expect(clippy::cast_possible_truncation, reason = "a few samples")]
+    // A vertex belongs to the brick of the last grid point before it.
+    #[expect(clippy::cast_possible_truncation, reason = "a few grid points")]
     let of_vertex = |v: u32| {
         let p = mesh.positions[v as usize].map(|c| (f64::from(c) / lattice.spacing + 1e-4).floor() as i32);
         of_brick[&std::array::from_fn(|k| (p[k] + lattice.centre[k]).div_euclid(8))]
@@ -189,7 +189,7 @@ fn a_partition_may_have_no_surface() {
 }
 
 /// Change of a budget.
-type Change = fn(&mut Budget);
+type Change = fn(&mut DeviceLimits);
 
 #[test]
 fn partitions_in_chunks_pieces_and_readback_buffers_have_the_same_bytes() {
@@ -245,7 +245,7 @@ fn errors_are_those_of_one_device() {
     let error = refused(&job(&crowd, &SurfaceParams::new(&none).unwrap()));
     assert!(matches!(error, GpuError::Surface(SurfaceError::NoSurface { .. })), "{error}");
     let whole = run(&mut engine(), &job(&crowd, &params(KERNELS[0], 0.8))).unwrap().meshed.mesh;
-    let bytes = Mesh::bytes_for(whole.n_vertices() as u64, whole.n_triangles() as u64);
+    let bytes = whole.bytes();
     // Limits above and below the size of a partition.
     for max_mesh_bytes in [bytes - 1, bytes / 10] {
         let limits = SurfaceLimits { max_mesh_bytes, ..SurfaceLimits::default() };
@@ -342,7 +342,7 @@ impl Executor for FaultyEngine {
             Some(Fault::LostHalfWay) => {
                 let (device, partition, gate) = (self.device.clone(), partition.clone(), Arc::clone(&self.gate));
                 std::thread::spawn(move || {
-                    while partition.n_published() == 0 {
+                    while !partition.is_waiting() {
                         std::thread::sleep(Duration::from_millis(1));
                     }
                     // It waits for the other partition now, which waits for the gate.

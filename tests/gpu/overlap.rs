@@ -10,7 +10,7 @@ use std::sync::Mutex;
 use gpu_fakes::Step::{Block, Finish, Lose};
 use gpu_fakes::{FakeDevice, SETTINGS, pool, start, wait_for, wait_for_load};
 use gpu_support::{KERNELS, Random, engine_with, params, run, sample, spheres};
-use molmesh::gpu::{Budget, Engine, Executor, GpuError, GpuJob, NextJob};
+use molmesh::gpu::{DeviceLimits, Engine, Executor, GpuError, GpuJob, NextJob};
 use molmesh::surface::CancelToken;
 
 /// Returns `job` at the first call.
@@ -52,7 +52,7 @@ fn the_next_job_is_submitted_before_the_results_of_the_first_are_collected() {
     }
     // The results of the first job have not been collected when the second one is requested: it fails with the device.
     let (device, queue) = gpu_support::device();
-    let budget = Budget { small_bytes: SMALL_BYTES, ..Budget::of(&device.limits()) };
+    let budget = DeviceLimits { small_bytes: SMALL_BYTES, ..DeviceLimits::of(&device.limits()) };
     let mut lost = Engine::with_budget(device.clone(), queue, budget).unwrap();
     lost.set_next_job(Box::new(move || {
         device.destroy();

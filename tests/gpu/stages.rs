@@ -7,19 +7,19 @@ use crate::gpu_support;
 use std::collections::HashMap;
 
 use bytemuck::{Pod, pod_collect_to_vec};
-use gpu_support::{KERNELS, Random, engine_with, job, params, sample, spheres};
+use gpu_support::{FIELD_BOUND, KERNELS, Random, engine_with, job, params, sample, spheres};
 use molmesh::gpu::GpuJob;
 use molmesh::gpu::plan::Plan;
-use molmesh::gpu::plan::layout::{Counters, GROUP, NONE, Record};
-use molmesh::gpu::probe::{BufferId, StageProbe};
-use molmesh::surface::cpu::probe::{Probe, ProbedBrick, ProbedSheet, ProbedSurface, checksum, probe};
+use molmesh::gpu::plan::layout::{BrickRecord, Counters, GROUP, NONE};
+use molmesh::gpu::single_stages::{BufferId, SingleStages};
+use molmesh::surface::cpu::stage_results::{
+    BrickResults, SheetResults, StageResults, SurfaceResults, checksum, run_stages,
+};
 use molmesh::surface::lattice::LatticeAtom;
 use molmesh::surface::quantize::{BEYOND, normal};
 use molmesh::surface::{Kernel, Spheres, Stage, Step, SurfaceLimits};
 
-/// Maximum relative difference of densities; of densities below 0.1, relative to 0.1.
-const FIELD_BOUND: f32 = 1e-5;
-/// Maximum distance of vertices, Å.
+/// Maximum distance of vertices that are made from the same densities, Å.
 const POSITION_BOUND: f32 = 1e-4;
 /// Maximum difference of normals, per component.
 const NORMAL_BOUND: f32 = 1e-3;
@@ -27,11 +27,11 @@ const NORMAL_BOUND: f32 = 1e-3;
 /// Job with the results of the CPU and its buffers on the device.
 struct Setup {
     job: GpuJob,
-    probe: Probe,
-    stages: StageProbe,
+    cpu: StageResults,
+    stages: SingleStages,
     /// Bricks of the CPU in the order of the plan; `None` for a brick of the plan that the CPU does not have.
-    bricks: Vec<Option<ProbedBrick>>,
-    surface: Vec<Option<ProbedSurface>>,
+    bricks: Vec<Option<BrickResults>>,
+    surface: Vec<Option<SurfaceResults>>,
 }
 
 fn halves(word: u64) -> [u32; 2] {
@@ -56,19 +56,19 @@ impl Setup {
     fn new(spheres: &Spheres, kernel: Kernel, resolution: f64) -> Self {
         let params = params(kernel, resolution);
         let job = job(spheres, &params);
-        let probe = probe(&job.prepared.lattice, &params, &SurfaceLimits::default()).unwrap();
-        let rows = [probe.mesh.n_vertices(), probe.mesh.n_triangles()].map(u32_of);
-        let stages = StageProbe::new(engine_with(|_| ()), &job, rows[0], rows[1]).unwrap();
+        let cpu = run_stages(&job.prepared.lattice, &params, &SurfaceLimits::default()).unwrap();
+        let rows = [cpu.mesh.n_vertices(), cpu.mesh.n_triangles()].map(u32_of);
+        let stages = SingleStages::new(engine_with(|_| ()), &job, rows[0], rows[1]).unwrap();
         let plan = &job.prepared.plan;
         let coords = coords(plan);
-        let mut bricks: HashMap<Vec<i32>, ProbedBrick> =
-            probe.bricks.iter().map(|b| (b.coord.to_vec(), b.clone())).collect();
-        let mut surface: HashMap<Vec<i32>, ProbedSurface> =
-            probe.surface.iter().map(|b| (b.coord.to_vec(), b.clone())).collect();
+        let mut bricks: HashMap<Vec<i32>, BrickResults> =
+            cpu.bricks.iter().map(|b| (b.coord.to_vec(), b.clone())).collect();
+        let mut surface: HashMap<Vec<i32>, SurfaceResults> =
+            cpu.surface.iter().map(|b| (b.coord.to_vec(), b.clone())).collect();
         let bricks_in_order = coords.iter().map(|c| bricks.remove(c)).collect();
         let surface_in_order = coords.iter().map(|c| surface.remove(c)).collect();
         assert!(bricks.is_empty() && surface.is_empty(), "the plan has every brick of the CPU");
-        Self { job, probe, stages, bricks: bricks_in_order, surface: surface_in_order }
+        Self { job, cpu, stages, bricks: bricks_in_order, surface: surface_in_order }
     }
 
     /// Runs `stage` on `inputs` with every output poisoned, and reads the outputs.
@@ -98,8 +98,8 @@ impl Setup {
         (entries, heads)
     }
 
-    fn samples(&self) -> Vec<f32> {
-        self.bricks.iter().flat_map(|b| b.as_ref().map_or([0.0; 512], |b| b.samples)).collect()
+    fn fields(&self) -> Vec<f32> {
+        self.bricks.iter().flat_map(|b| b.as_ref().map_or([0.0; 512], |b| b.field)).collect()
     }
 
     fn inside(&self) -> Vec<u32> {
@@ -117,9 +117,9 @@ impl Setup {
         coords.iter().map(|at| std::array::from_fn(|n| neighbour(at, n))).collect()
     }
 
-    fn records(&self) -> Vec<Record> {
-        let record = |(b, neighbours): (&Option<ProbedSurface>, [u32; 8])| {
-            let mut record = Record { crossing: [0; 48], layers: [0; 8], neighbours };
+    fn records(&self) -> Vec<BrickRecord> {
+        let record = |(b, neighbours): (&Option<SurfaceResults>, [u32; 8])| {
+            let mut record = BrickRecord { crossing: [0; 48], layers: [0; 8], neighbours };
             let Some(b) = b else { return record };
             let words: Vec<u32> = b.crossing.iter().flat_map(|w| halves(*w)).collect();
             record.crossing.copy_from_slice(&words);
@@ -137,7 +137,7 @@ impl Setup {
     }
 
     fn groups(&self) -> Vec<[u32; 4]> {
-        let sum = |group: &[Option<ProbedSurface>]| {
+        let sum = |group: &[Option<SurfaceResults>]| {
             let there = group.iter().flatten();
             there.fold([0; 4], |s, b| [s[0] + b.count[0], s[1] + b.count[1], s[2] + 1, 0])
         };
@@ -147,7 +147,7 @@ impl Setup {
     /// First vertex and first triangle of each brick.
     fn offsets(&self) -> Vec<[u32; 2]> {
         let mut at = [0; 2];
-        let mut next = |b: &Option<ProbedSurface>| {
+        let mut next = |b: &Option<SurfaceResults>| {
             let first = at;
             if let Some(b) = b {
                 assert_eq!(b.first, at, "the CPU numbers bricks in the order of the plan");
@@ -252,7 +252,7 @@ fn bin_counts_lists_that_do_not_fit_and_writes_nothing_beyond_the_capacity() {
 }
 
 #[test]
-fn field_is_within_its_bound_and_marks_inside_samples() {
+fn field_is_within_its_bound_and_marks_inside_grid_points() {
     for (name, setup) in setups() {
         let (entries, heads) = setup.lists();
         setup.poison(&[BufferId::Field, BufferId::Inside]);
@@ -261,7 +261,7 @@ fn field_is_within_its_bound_and_marks_inside_samples() {
             &[(BufferId::Lists, raw(&entries)), (BufferId::Heads, raw(&heads))],
             &[BufferId::Field, BufferId::Inside],
         );
-        let (got, expected) = (cast::<f32>(&out[0]), setup.samples());
+        let (got, expected) = (cast::<f32>(&out[0]), setup.fields());
         assert_eq!(differs_by(&got, &expected, FIELD_BOUND, 0.1), None, "{name}");
         let iso = setup.stages.params.isovalue;
         let bits = |half: &[f32]| (0..).zip(half).fold(0, |word, (i, f)| word | u32::from(*f >= iso) << i);
@@ -286,7 +286,7 @@ fn classify_finds_the_same_edges_and_counts() {
             (BufferId::Groups, raw(&vec![[0_u32; 4]; setup.groups().len()])),
         ];
         let out = setup.run(Stage::Classify, &inputs, &[BufferId::Records, BufferId::Counts, BufferId::Groups]);
-        let (records, counts): (Vec<Record>, Vec<u32>) = (cast(&out[0]), cast(&out[1]));
+        let (records, counts): (Vec<BrickRecord>, Vec<u32>) = (cast(&out[0]), cast(&out[1]));
         assert_eq!(unequal(&records, &setup.records()), None, "{name}");
         assert_eq!(unequal(&counts, &setup.counts()), None, "{name}");
         assert_eq!(unequal(&cast::<[u32; 4]>(&out[2]), &setup.groups()), None, "{name}");
@@ -296,7 +296,7 @@ fn classify_finds_the_same_edges_and_counts() {
         wrong[some] ^= 1 << wrong[some].trailing_zeros();
         let out =
             setup.run(Stage::Classify, &[(BufferId::Inside, raw(&wrong))], &[BufferId::Records, BufferId::Counts]);
-        assert!(unequal(&cast::<Record>(&out[0]), &setup.records()).is_some());
+        assert!(unequal(&cast::<BrickRecord>(&out[0]), &setup.records()).is_some());
     }
 }
 
@@ -315,7 +315,7 @@ fn scan_numbers_bricks_in_order() {
         let want = setup.offsets();
         assert_eq!(unequal(&cast::<[u32; 2]>(&out[0]), &want), None, "{name}");
         let tally = cast::<Counters>(&out[1])[0];
-        let mesh = &setup.probe.mesh;
+        let mesh = &setup.cpu.mesh;
         assert_eq!((tally.vertices as usize, tally.triangles as usize), (mesh.n_vertices(), mesh.n_triangles()));
         // Totals of earlier chunks are added. This is also the negative control.
         (setup.stages.params.first_vertex, setup.stages.params.first_triangle) = (1000, 7);
@@ -332,7 +332,7 @@ fn interpolate_is_within_its_bounds() {
         setup.poison(&[BufferId::Positions, BufferId::Normals]);
         let inputs = interpolate_inputs(&setup);
         let out = setup.run(Stage::Interpolate, &inputs, &[BufferId::Positions, BufferId::Normals, BufferId::Counters]);
-        let mesh = &setup.probe.mesh;
+        let mesh = &setup.cpu.mesh;
         let (positions, normals): (Vec<f32>, Vec<f32>) = (cast(&out[0]), cast(&out[1]));
         let flat = |rows: &[[f32; 3]]| rows.as_flattened().to_vec();
         let (want, want_normals) = (flat(&mesh.positions), flat(&mesh.normals));
@@ -358,7 +358,7 @@ fn interpolate_inputs(setup: &Setup) -> Vec<(BufferId, Vec<u8>)> {
     vec![
         (BufferId::Lists, raw(&entries)),
         (BufferId::Heads, raw(&heads)),
-        (BufferId::Field, raw(&setup.samples())),
+        (BufferId::Field, raw(&setup.fields())),
         (BufferId::Records, raw(&setup.records())),
         (BufferId::Counts, raw(&setup.counts())),
         (BufferId::Offsets, raw(&setup.offsets())),
@@ -438,7 +438,7 @@ fn interpolate_marks_coordinates_that_are_not_numbers() {
     for (bad, marked) in [(f32::NAN, true), (f32::INFINITY, true), (spacing, false)] {
         setup.stages.params.spacing = bad;
         let [positions, _] = in_steps(&mut setup, Step::covering(4.0));
-        let n = setup.probe.mesh.n_vertices();
+        let n = setup.cpu.mesh.n_vertices();
         let rows: Vec<[i16; 4]> = cast(&positions[..8 * n]);
         // Infinity times 0 is not a number.
         let all = |row: &[i16; 4]| row[..3].iter().all(|&v| (v == BEYOND) == marked) && row[3] == 0;
@@ -495,12 +495,12 @@ fn emit_makes_the_same_triangles() {
         let mut counts = setup.counts();
         let out = setup.run(Stage::Emit, &inputs(&counts), &[BufferId::Triangles, BufferId::Counters]);
         let got: Vec<[u32; 3]> = cast(&out[0]);
-        assert_eq!(unequal(&got, &setup.probe.mesh.triangles), None, "{name}");
+        assert_eq!(unequal(&got, &setup.cpu.mesh.triangles), None, "{name}");
         let counters = cast::<Counters>(&out[1])[0];
         assert_eq!((counters.checksum, counters.degenerate), ([0, 0], 0), "{name}: a closed mesh");
         let mut wrong = got.clone();
         wrong[got.len() - 1].rotate_left(1);
-        assert!(unequal(&wrong, &setup.probe.mesh.triangles).is_some());
+        assert!(unequal(&wrong, &setup.cpu.mesh.triangles).is_some());
         // Without the last triangle the mesh has a hole, and the checksum is that of the host.
         let last = counts.iter().rposition(|count| count >> 16 > 0).unwrap();
         counts[last] -= 1 << 16;
@@ -538,19 +538,22 @@ const WINDOW: u32 = 256;
 /// Block that `measure` writes for a brick.
 #[derive(Debug, Clone, PartialEq)]
 struct Block {
-    sheets: Vec<ProbedSheet>,
+    sheets: Vec<SheetResults>,
     /// Owner, key and sheet of each shared vertex, if there are several sheets.
     vertices: Vec<[u32; 3]>,
 }
 
-/// Blocks by brick.
-fn blocks(mut words: &[u32]) -> HashMap<u32, Block> {
+/// Blocks by brick. They follow the table of their offsets.
+fn blocks(words: &[u32], n_bricks: usize) -> HashMap<u32, Block> {
+    let all = words;
+    let (table, mut words) = words.split_at(n_bricks);
     let mut blocks = HashMap::new();
     while let Some((&[brick, counts, x, y, z], rest)) = words.split_first_chunk() {
+        assert_eq!(table[brick as usize] as usize, all.len() - words.len(), "the offset of brick {brick}");
         let (sheets, rest) = rest.split_at(12 * (counts & 0xffff) as usize);
         let (vertices, rest) = rest.split_at((counts >> 16) as usize);
         words = rest;
-        let sheet = |words: &[u32; 12]| ProbedSheet {
+        let sheet = |words: &[u32; 12]| SheetResults {
             origin: [x, y, z].map(u32::cast_signed),
             count: [words[0] & 0xffff, words[0] >> 16],
             near: std::array::from_fn(|k| words[1].to_le_bytes()[k]),
@@ -562,6 +565,7 @@ fn blocks(mut words: &[u32]) -> HashMap<u32, Block> {
         };
         assert!(blocks.insert(brick, block).is_none(), "brick {brick} has two blocks");
     }
+    assert_eq!(table.iter().filter(|offset| **offset != NONE).count(), blocks.len());
     blocks
 }
 
@@ -571,7 +575,7 @@ fn twice_the_area(blocks: &HashMap<u32, Block>) -> f64 {
 }
 
 /// Returns true if two sheets have the same sums, up to rounding in single precision.
-fn same_sheet(a: &ProbedSheet, b: &ProbedSheet, several: bool) -> bool {
+fn same_sheet(a: &SheetResults, b: &SheetResults, several: bool) -> bool {
     // Positions are at most 8: products are up to 24 times the area, moments up to 384 times.
     let bound = |k: usize| b.sums[0].max(0.01) * [2e-6, 4e-5, 6e-4][k.saturating_sub(1) / 3];
     let close = (0..10).all(|k| (a.sums[k] - b.sums[k]).abs() <= bound(k));
@@ -581,7 +585,7 @@ fn same_sheet(a: &ProbedSheet, b: &ProbedSheet, several: bool) -> bool {
 
 /// Returns the first difference of a block from the CPU's sheets of a brick. Backends number sheets in different
 /// orders.
-fn block_difference(block: &Block, brick: &ProbedSurface) -> Option<String> {
+fn block_difference(block: &Block, brick: &SurfaceResults) -> Option<String> {
     let several = brick.sheets.len() > 1;
     if block.sheets.len() != brick.sheets.len() || !several && !block.vertices.is_empty() {
         return Some(format!("{} sheets of {}", block.sheets.len(), brick.sheets.len()));
@@ -615,7 +619,7 @@ fn block_difference(block: &Block, brick: &ProbedSurface) -> Option<String> {
 /// Inputs of `measure`.
 fn measure_inputs(setup: &Setup) -> Vec<(BufferId, Vec<u8>)> {
     vec![
-        (BufferId::Field, raw(&setup.samples())),
+        (BufferId::Field, raw(&setup.fields())),
         (BufferId::Inside, raw(&setup.inside())),
         (BufferId::Records, raw(&setup.records())),
         (BufferId::Counts, raw(&setup.counts())),
@@ -643,10 +647,11 @@ fn measure_finds_the_same_sheets_and_sums() {
     for (name, setup) in setups().into_iter().chain(many_sheets()) {
         setup.poison(&[BufferId::Sheets]);
         let out = setup.run(Stage::Measure, &measure_inputs(&setup), &[BufferId::Sheets, BufferId::Counters]);
-        let (words, made) = (cast::<u32>(&out[0]), cast::<Counters>(&out[1])[0].sheet_words as usize);
+        let n_bricks = setup.surface.len();
+        let (words, made) = (cast::<u32>(&out[0]), n_bricks + cast::<Counters>(&out[1])[0].sheet_words as usize);
         assert!(words[made..].iter().all(|&word| word == 0xa5a5_a5a5), "{name}: beyond the last block");
-        let blocks = blocks(&words[..made]);
-        assert_eq!(blocks.len(), setup.probe.surface.len(), "{name}");
+        let blocks = blocks(&words[..made], n_bricks);
+        assert_eq!(blocks.len(), setup.cpu.surface.len(), "{name}");
         for (id, brick) in (0..).zip(&setup.surface) {
             // An empty brick has no block.
             assert_eq!(blocks.contains_key(&id), brick.is_some(), "{name}");
@@ -682,13 +687,14 @@ fn measure_sums_the_positions_that_interpolate_rounds() {
     let mut setup = Setup::new(&sample("4pti.pdb"), Kernel::Gaussian, 0.7);
     let [positions, _] = single(&mut setup);
     let inputs = measure_inputs(&setup);
-    let triangles = setup.probe.mesh.triangles.clone();
+    let triangles = setup.cpu.mesh.triangles.clone();
     let mut area_in_steps = |step: Step| {
         setup.stages.params.steps_per_angstrom = step.per_angstrom();
         let out = setup.run(Stage::Measure, &inputs, &[BufferId::Sheets, BufferId::Counters]);
         setup.stages.params.steps_per_angstrom = 0.0;
-        let made = cast::<Counters>(&out[1])[0].sheet_words as usize;
-        twice_the_area(&blocks(&cast::<u32>(&out[0])[..made]))
+        let n_bricks = setup.surface.len();
+        let made = n_bricks + cast::<Counters>(&out[1])[0].sheet_words as usize;
+        twice_the_area(&blocks(&cast::<u32>(&out[0])[..made], n_bricks))
     };
     for reach in [100.0, 5_000.0] {
         let step = Step::covering(reach);
@@ -722,12 +728,13 @@ fn measure_counts_blocks_that_do_not_fit_and_writes_nothing_beyond_the_capacity(
         (cast::<Counters>(&out[0])[0].sheet_words, cast::<u32>(&out[1]))
     };
     let (all, _) = run(&setup);
-    let size = setup.stages.params.sheet_capacity as usize;
-    setup.stages.params.sheet_capacity = all / 2;
+    let (size, n_bricks) = (setup.stages.params.sheet_capacity as usize, setup.surface.len());
+    setup.stages.params.sheet_capacity = u32_of(n_bricks) + all / 2;
     let (counted, words) = run(&setup);
     setup.stages.params.sheet_capacity = u32_of(size);
-    assert_eq!((counted, words.len()), (all, all as usize / 2));
-    assert!(words.iter().any(|&word| word != 0xa5a5_a5a5));
-    let beyond = setup.stages.read(BufferId::Sheets, 4 * u64::from(all)).unwrap();
+    assert_eq!((counted, words.len()), (all, n_bricks + all as usize / 2));
+    assert!(words[n_bricks..].iter().any(|&word| word != 0xa5a5_a5a5));
+    assert!(words[..n_bricks].iter().all(|&place| place == NONE || (place as usize) < words.len()));
+    let beyond = setup.stages.read(BufferId::Sheets, 4 * (n_bricks as u64 + u64::from(all))).unwrap();
     assert!(cast::<u32>(&beyond)[words.len()..].iter().all(|&word| word == 0xa5a5_a5a5));
 }

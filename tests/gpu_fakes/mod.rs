@@ -24,7 +24,7 @@ pub enum Step {
     Finish,
     /// Blocks until released, or until every job of the call is cancelled or late, and then finishes.
     Block,
-    /// Blocks until released, whatever happens to the jobs.
+    /// Blocks until released, even if the jobs end.
     Hang,
     Lose,
     Fail,
@@ -43,11 +43,11 @@ pub struct FakeDevice {
     calls: Mutex<Vec<Vec<usize>>>,
     released: Mutex<bool>,
     changed: Condvar,
-    /// Number of submissions, for the watch over hangs.
+    /// Number of submissions, from which hangs are detected.
     pub submissions: Arc<AtomicU64>,
     pub builds: AtomicUsize,
     pub drops: AtomicUsize,
-    /// Bytes that were reserved, and number of calls before.
+    /// Bytes that were reserved, and number of calls before the reservation.
     pub reserved: Mutex<Option<(u64, usize)>>,
     next_job: Mutex<Option<NextJob>>,
     /// Number of calls to release idle memory.
@@ -147,9 +147,9 @@ impl Executor for FakeExecutor {
                 Err(GpuError::Surface(SurfaceError::Deadline))
             }
             Step::Finish | Step::Block | Step::Hang | Step::OmitResult => Ok(Finished {
-                meshed: MeshOutput::new(Mesh::default(), GridStats { samples: 7, ..GridStats::default() }),
+                meshed: MeshOutput::new(Mesh::default(), GridStats { grid_points: 7, ..GridStats::default() }),
                 stages: vec![(Stage::Field, 2_000), (Stage::Emit, 1_000)],
-                sheets: SheetBlocks::default(),
+                sheets: SheetBlocks::without_surface(job.prepared.plan.bricks.len()),
             }),
             Step::Lose => Err(GpuError::Lost(LOST.to_owned())),
             Step::Fail => Err(GpuError::Failed("scripted failure".to_owned())),

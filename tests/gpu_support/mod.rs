@@ -4,11 +4,21 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
-use molmesh::gpu::{Budget, Engine, Executor, Finished, GpuError, GpuJob, Prepared};
+pub(crate) use crate::tools::shapes::Random;
+
+use molmesh::gpu::{DeviceLimits, Engine, Executor, Finished, GpuError, GpuJob, Prepared};
 use molmesh::surface::{
     CancelToken, Control, Kernel, Measures, MeshOutput, Spheres, Step, SurfaceLimits, SurfaceOptions, SurfaceParams,
     Validation,
 };
+
+/// Maximum relative difference of densities of two backends; of densities below 0.1, relative to 0.1.
+pub(crate) const FIELD_BOUND: f32 = 1e-5;
+/// Maximum distance of vertices of two backends along an axis, Å. Densities that differ by [`FIELD_BOUND`] move a
+/// vertex by up to spacing · 2 · `FIELD_BOUND` / s, if the densities at the ends of its edge differ by s isovalues: for
+/// a spacing of 0.5 Å and flat edges (s = 0.04), 2.5e-4 Å. Six roundings of coordinates below 64 Å (3.8e-6 Å each) add
+/// a tenth of that.
+pub(crate) const POSITION_BOUND: f32 = 0.5 * 2.0 * FIELD_BOUND / 0.04 + 6.0 * 3.8e-6;
 
 pub(crate) const KERNELS: [Kernel; 3] = [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare];
 
@@ -40,9 +50,9 @@ pub(crate) fn engine() -> MutexGuard<'static, Engine> {
 }
 
 /// Creates an engine with the budget of the device as modified by `change`.
-pub(crate) fn engine_with(change: impl FnOnce(&mut Budget)) -> Engine {
+pub(crate) fn engine_with(change: impl FnOnce(&mut DeviceLimits)) -> Engine {
     let (device, queue) = device();
-    let mut budget = Budget::of(&device.limits());
+    let mut budget = DeviceLimits::of(&device.limits());
     change(&mut budget);
     Engine::with_budget(device, queue, budget).expect("the stages compile")
 }
@@ -103,18 +113,4 @@ pub(crate) fn sample(name: &str) -> Spheres {
         .expect("atoms")
         .spheres(&structure)
         .expect("spheres")
-}
-
-/// Deterministic random generator.
-pub(crate) struct Random(pub(crate) u64);
-
-impl Random {
-    pub(crate) fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 11) as f64 / (1_u64 << 53) as f64
-    }
-
-    pub(crate) fn cloud(&mut self, n: usize, side: f64) -> Vec<[f64; 4]> {
-        (0..n).map(|_| [self.next() * side, self.next() * side, self.next() * side, 1.2 + 0.7 * self.next()]).collect()
-    }
 }

@@ -7,8 +7,8 @@ use std::io::{Read as _, Write as _};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use access_support::{Keys, eventually};
-use http_support::{Fake, Mode, Reply, Running, SAMPLE, connect, sample, send, start};
+use access_support::Keys;
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, connect, sample, send, start, wait_for};
 use molmesh::access::SigningKeys;
 use molmesh::config::{Config, Secret};
 
@@ -191,7 +191,7 @@ fn requests_are_counted_per_key_and_reported_in_header_fields() {
     }
     assert_eq!(with(&server, keys.text("b"), "/v1/capabilities").status, 200);
     assert!(server.metric("molmesh_requests_rejected_total", &["reason=\"quota-exceeded\""]) >= 3.0);
-    eventually("the gauge", || server.metric("molmesh_quota_clients", &[]) >= 2.0);
+    wait_for("the gauge", || server.metric("molmesh_quota_clients", &[]) >= 2.0);
 }
 
 #[test]
@@ -200,8 +200,8 @@ fn a_used_up_quota_is_restored() {
     let server = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
     let status = || with(&server, keys.text("a"), "/v1/capabilities").status;
     for _ in 0..2 {
-        eventually("the quota is used up", || status() == 429);
-        eventually("the quota is restored", || status() == 200);
+        wait_for("the quota is used up", || status() == 429);
+        wait_for("the quota is restored", || status() == 200);
     }
 }
 
@@ -225,7 +225,7 @@ fn computing_time_is_limited_but_other_requests_are_served() {
         assert_eq!(problem["violated-policies"], serde_json::json!(["work"]), "{path}");
     }
     assert_eq!(with(&server, keys.text("a"), "/v1/capabilities").status, 200);
-    eventually("stored results cost no computing time", || post("a", "/v1/meshes", 1, &[]).status == 200);
+    wait_for("stored results cost no computing time", || post("a", "/v1/meshes", 1, &[]).status == 200);
     assert_eq!(post("b", "/v1/meshes", 3, &[]).status, 200, "each key has its own quota");
     // Asynchronous jobs are charged when they end.
     let keys = Keys::new(&[("c", "mesh,read", "work_s = 1\nwindow_s = 86400")]);
@@ -235,7 +235,7 @@ fn computing_time_is_limited_but_other_requests_are_served() {
     };
     let accepted = ask(4, &[("prefer", "respond-async")]);
     let job = accepted.header("location").unwrap();
-    eventually("the job ends", || with(&server, keys.text("c"), job).json()["status"] == "successful");
+    wait_for("the job ends", || with(&server, keys.text("c"), job).json()["status"] == "successful");
     assert_eq!(ask(5, &[]).status, 429);
 }
 
@@ -255,7 +255,7 @@ fn concurrent_requests_are_counted_to_the_last_byte() {
     let mut listening = connect(server.addr);
     let head = format!("GET {job}/events HTTP/1.1\r\nhost: localhost\r\nx-api-key: {}\r\n\r\n", keys.text("a"));
     let mut begun = [0; 12];
-    eventually("the POST request has ended", || {
+    wait_for("the POST request has ended", || {
         listening = connect(server.addr);
         listening.write_all(head.as_bytes()).unwrap();
         listening.read_exact(&mut begun).unwrap();
@@ -268,7 +268,7 @@ fn concurrent_requests_are_counted_to_the_last_byte() {
         (&serde_json::json!(["concurrency"]), Some("1"))
     );
     drop(listening);
-    eventually("the event stream has ended", || with(&server, keys.text("a"), "/v1/capabilities").status == 200);
+    wait_for("the event stream has ended", || with(&server, keys.text("a"), "/v1/capabilities").status == 200);
 }
 
 #[test]
@@ -319,7 +319,7 @@ fn addresses_have_quotas_of_time_and_concurrency() {
     // Two seconds of computing exceed the quota of one. Other requests are served.
     let again = server.post("/v1/meshes?resolution=1.5", &[], SAMPLE);
     assert_eq!(again.problem(429, "quota-exceeded")["violated-policies"], serde_json::json!(["work"]));
-    eventually("no request is running", || get(&server, "/v1/capabilities", &[]).status == 200);
+    wait_for("no request is running", || get(&server, "/v1/capabilities", &[]).status == 200);
     // A request with an incomplete body is running.
     let upload = || {
         let mut stream = connect(server.addr);
@@ -330,7 +330,7 @@ fn addresses_have_quotas_of_time_and_concurrency() {
         stream
     };
     let mut sending = upload();
-    eventually("the concurrent request is rejected", || {
+    wait_for("the concurrent request is rejected", || {
         // A request is counted until shortly after its response was read, so the upload may be rejected. Sends it
         // again.
         if sending.peek(&mut [0]).is_ok() {
@@ -339,7 +339,7 @@ fn addresses_have_quotas_of_time_and_concurrency() {
         get(&server, "/v1/capabilities", &[]).status == 429
     });
     drop(sending);
-    eventually("the upload has ended", || get(&server, "/v1/capabilities", &[]).status == 200);
+    wait_for("the upload has ended", || get(&server, "/v1/capabilities", &[]).status == 200);
 }
 
 #[test]
@@ -406,7 +406,7 @@ fn a_signed_url_replaces_a_key_and_changes_nothing_else() {
     let fresh = get(&server, &sign(&format!("{ENTRY}?resolution=0.9"), None), &[]);
     let location = fresh.header("content-location").unwrap();
     assert!(location.starts_with("/v1/results/") && !location.contains('?'), "{location}");
-    eventually("the result is stored", || get(&server, &sign(location, None), &[]).body == fresh.body);
+    wait_for("the result is stored", || get(&server, &sign(location, None), &[]).body == fresh.body);
     // A signature allows GET and HEAD only.
     send(server.addr, "POST", &sign("/v1/meshes", None), &[], SAMPLE).problem(401, "key-required");
     send(server.addr, "DELETE", &sign("/v1/jobs/x", None), &[], b"").problem(401, "key-required");
@@ -424,7 +424,7 @@ fn a_signature_opens_a_job_with_its_events_and_bytes() {
     let key = ("x-api-key", keys.text("a"));
     let accepted = server.post("/v1/meshes", &[key, ("prefer", "respond-async")], SAMPLE);
     let job = accepted.header("location").unwrap();
-    eventually("the job ends", || with(&server, keys.text("a"), job).json()["status"] == "successful");
+    wait_for("the job ends", || with(&server, keys.text("a"), job).json()["status"] == "successful");
     let signed = sign(job, None);
     let query = signed.split_once('?').unwrap().1;
     assert_eq!(get(&server, &signed, &[]).json()["status"], "successful");
@@ -451,7 +451,7 @@ fn signed_responses_are_not_cached_longer_than_their_signature() {
     let until = |target: &str| SigningKeys::parse(SECRETS).unwrap().sign(None, target, end).unwrap();
     let fresh = get(&server, &until(ENTRY), &[]);
     let stored = fresh.header("content-location").unwrap();
-    eventually("the result is stored", || get(&server, &until(stored), &[]).status == 200);
+    wait_for("the result is stored", || get(&server, &until(stored), &[]).status == 200);
     for target in [ENTRY, stored] {
         let etag = fresh.header("etag").unwrap();
         for headers in [&[][..], &[("if-none-match", etag)]] {
@@ -532,10 +532,10 @@ fn changed_key_files_are_reloaded() {
     let status = |key: &str| with(&server, key, "/v1/capabilities").status;
     assert_eq!(status(keys.text("a")), 200);
     keys.write(&[("b", "read", "note = \"replaces a\"")]);
-    eventually("the new key is known", || status(keys.text("b")) == 200);
+    wait_for("the new key is known", || status(keys.text("b")) == 200);
     assert_eq!(status(keys.text("a")), 401);
     std::fs::write(keys.path(), "[[key]]\nnmae = 3").unwrap();
-    eventually("the error is logged", || !http_support::log_lines("line 2: unknown name `nmae`").is_empty());
+    wait_for("the error is logged", || !http_support::log_lines("line 2: unknown name `nmae`").is_empty());
     assert_eq!(status(keys.text("b")), 200);
 }
 

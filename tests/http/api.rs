@@ -7,7 +7,7 @@ use std::io::{Read as _, Write};
 use std::sync::{Arc, LazyLock};
 
 use bcif_support::CRAMBIN;
-use http_support::{Fake, Mode, Running, SAMPLE, log_lines, send, start};
+use http_support::{Fake, Mode, Running, SAMPLE, gzip, log_lines, send, start};
 use molmesh::surface::cpu::CpuBackend;
 
 /// Server with the fake backend that all tests share. It is never stopped.
@@ -19,12 +19,6 @@ static SERVER: LazyLock<Running> = LazyLock::new(|| {
     std::fs::write(server.dir.path().join("archive/1crn.bcif.gz"), gzip(CRAMBIN)).unwrap();
     server
 });
-
-fn gzip(bytes: &[u8]) -> Vec<u8> {
-    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
-    encoder.write_all(bytes).unwrap();
-    encoder.finish().unwrap()
-}
 
 fn zstd(bytes: &[u8]) -> Vec<u8> {
     ruzstd::encoding::compress_to_vec(bytes, ruzstd::encoding::CompressionLevel::Fastest)
@@ -121,7 +115,7 @@ fn formats_are_negotiated() {
         assert_eq!((reply.status, reply.header("content-type")), (status, Some(media_type)), "{query} {accept}");
         assert!(reply.complete);
         if status == 406 {
-            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 7);
+            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 8);
         } else {
             assert!(reply.body.len() > 1000);
         }
@@ -412,7 +406,7 @@ fn a_strict_check_reports_the_findings_of_the_strict_validator() {
 }
 
 #[test]
-fn binarycif_is_accepted_wherever_text_is() {
+fn binarycif_is_accepted_by_every_operation_that_accepts_text() {
     let text = include_bytes!("../../samples/1crn.cif");
     // The same atoms give the same mesh in every format.
     let stl = |body: &[u8], headers: &[(&str, &str)]| {
@@ -467,12 +461,15 @@ fn archive_entries_are_cacheable_by_url() {
     let head = send(SERVER.addr, "HEAD", path, &[], b"");
     assert_eq!((head.status, head.body.len(), head.header("etag")), (200, 0, Some(etag)));
     assert_eq!(head.header("content-type"), Some("model/gltf-binary"));
+    let new = send(SERVER.addr, "HEAD", "/v1/pdb/4pti/surface.glb?resolution=1.0371", &[], b"");
+    assert_eq!((new.status, new.header("content-length")), (200, None), "the length of a mesh that was not computed");
     for (ext, media_type) in [
         ("gltf", "model/gltf+json"),
         ("ply", "application/ply"),
         ("ply-text", "model/x-ply-text"),
         ("stl", "model/stl"),
         ("obj", "model/obj"),
+        ("vtp", "model/x-vtp"),
     ] {
         let other = SERVER.get(&format!("/v1/pdb/4pti/surface.{ext}?resolution=1"));
         assert_eq!((other.status, other.header("content-type")), (200, Some(media_type)));
@@ -532,7 +529,7 @@ fn health_version_and_capabilities() {
     assert_eq!(SERVER.get("/readyz").json()["status"], "ready");
     assert_eq!(SERVER.get("/version").json()["version"], env!("CARGO_PKG_VERSION"));
     let can = SERVER.get("/v1/capabilities").json();
-    assert_eq!(can["formats"].as_array().unwrap().len(), 7);
+    assert_eq!(can["formats"].as_array().unwrap().len(), 8);
     assert_eq!(can["surfaces"].as_array().unwrap().len(), 6);
     assert_eq!(can["presets"]["ses-like"]["isovalue"], 1.9);
     assert_eq!(can["backends"][0]["reason"], "set by a test");

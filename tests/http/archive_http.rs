@@ -3,14 +3,13 @@
 use crate::archive_support;
 use crate::http_support;
 
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use archive_support::{Remote, Response, ok, status, tagged, with};
-use http_support::{Fake, Mode, SAMPLE, send, start};
+use http_support::{Fake, Mode, SAMPLE, gzip, send, start};
 use molmesh::archive::{Archive, Entry, FetchError, Source, UnavailableReason};
 use molmesh::config::Config;
 use molmesh::memory_budget::Budget;
@@ -22,12 +21,6 @@ const GZ: &str = "/d/{id}.cif.gz";
 
 fn id(text: &str) -> EntryId {
     text.parse().unwrap()
-}
-
-fn gzip(data: &[u8]) -> Vec<u8> {
-    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
-    encoder.write_all(data).unwrap();
-    encoder.finish().unwrap()
 }
 
 /// Configuration with short times, and its data folder.
@@ -119,7 +112,7 @@ async fn the_folder_takes_precedence() {
     let archive = place.archive();
     let entry = archive.fetch(&id("4pti")).await.unwrap();
     assert_eq!((&entry.bytes[..], entry.source, remote.count()), (&b"local"[..], Source::Local, 0));
-    // Also if the entry was fetched before.
+    // Even if the entry was fetched before.
     assert_eq!(archive.digest(&id("1abc")).await.unwrap(), Digest::of(b"remote"));
     place.put("1abc.cif", b"mine");
     pause(5).await;
@@ -425,7 +418,7 @@ async fn the_circuit_breaker_opens_and_closes() {
         assert!(retry_after.unwrap() <= Duration::from_millis(1500));
     }
     assert_eq!(remote.count(), 2, "no requests during the pause");
-    // The probe fails.
+    // The trial fails.
     pause(1600).await;
     assert_eq!(why(archive.fetch(&id("4pti")).await).0, UnavailableReason::Status(500));
     assert_eq!(why(archive.fetch(&id("4pti")).await).0, UnavailableReason::Paused);
@@ -657,8 +650,11 @@ fn meshes_an_entry_of_the_remote_archive() {
     assert!(server.metric("molmesh_archive_fetch_seconds_count", &["result=\"found\""]) >= 1.0);
     assert!(server.metric("molmesh_archive_cache_bytes", &[]) > 0.0);
     let cached = counted("cache", "found");
-    // Other parameters, because the same mesh may come from the stored results.
+    // Other parameters, because the same mesh may come from the stored results. A structure in memory needs no copy,
+    // except for the strict validator.
     assert_eq!(server.get(&SURFACE.replace("=2", "=1.9")).status, 200);
+    assert!(counted("cache", "found") <= cached);
+    assert_eq!(server.get(&format!("{SURFACE}&check=strict")).status, 200);
     assert!(counted("cache", "found") > cached);
     assert_eq!(server.get(SURFACE).header("etag"), reply.header("etag"));
     // Conditional requests use the cached digest and need no copy.
@@ -727,9 +723,9 @@ fn running_fetches_count_as_memory() {
         c.archive.breaker_failures = 1;
     });
     // `archive.max_bytes` is much larger.
-    let document = server.get(SURFACE).problem(503, "memory-full");
+    let document = server.get(SURFACE).problem(422, "too-much-memory");
     assert_eq!(
-        (&document["limit"], document["actual"].as_u64().is_some_and(|held| held > 1 << 20)),
+        (&document["limit"], document["actual"].as_u64().is_some_and(|needed| needed > 4 << 20)),
         (&(4 << 20).into(), true)
     );
     http_support::wait_for("the memory", || server.metric("molmesh_memory_held_bytes", &[]) == 0.0);
@@ -744,4 +740,65 @@ fn an_open_circuit_breaker_is_a_metric() {
     let before = open();
     server.get(SURFACE).problem(424, "archive-unavailable");
     assert!((before, open()) == (0.0, 1.0), "{before} {}", open());
+}
+
+#[test]
+fn local_entries_stay_within_the_memory_budget() {
+    /// Number of entries, each of 20 MB.
+    const ENTRIES: usize = 50;
+    const BUDGET: u64 = 64 << 20;
+    let folder = tempfile::tempdir().unwrap();
+    let path = |i: usize| folder.path().join(format!("1a{i:02}.pdb"));
+    let remark = format!("REMARK 999 {:<69}\n", "");
+    let lines = 20_000_000 / remark.len();
+    std::fs::write(path(0), [SAMPLE, remark.repeat(lines).as_bytes()].concat()).unwrap();
+    (1..ENTRIES).for_each(|i| std::fs::hard_link(path(0), path(i)).unwrap());
+    let server = start(Fake::new(Mode::Octahedra), |c| {
+        c.archive.dir = Some(folder.path().to_owned());
+        c.archive.url = None;
+        c.limits.memory_bytes = BUDGET;
+        c.server.client_share = 1.0;
+    });
+    let held = || server.metric("molmesh_memory_held_bytes", &[]);
+    let before = http_support::peak_memory();
+    let (ended, mut most) = (AtomicUsize::new(0), 0.0_f64);
+    let mut answers = Vec::new();
+    let ask = |i: usize| {
+        let id = path(i).file_stem().unwrap().to_str().unwrap().to_owned();
+        let reply = server.get(&format!("/v1/pdb/{id}/surface.glb?resolution=2"));
+        ended.fetch_add(1, Ordering::SeqCst);
+        reply
+    };
+    std::thread::scope(|scope| {
+        let ask = &ask;
+        let asked: Vec<_> = (0..ENTRIES).map(|i| scope.spawn(move || ask(i))).collect();
+        while ended.load(Ordering::SeqCst) < ENTRIES {
+            most = most.max(held());
+        }
+        answers.extend(asked.into_iter().map(|reply| reply.join().unwrap()));
+    });
+    let n_meshes = answers.iter().filter(|reply| reply.status == 200).count();
+    assert!(n_meshes > 0);
+    for reply in answers.iter().filter(|reply| reply.status != 200) {
+        assert_eq!(reply.status, 503, "{}", reply.text());
+    }
+    assert!(most >= 20e6 && most <= BUDGET as f64, "{most}");
+    // All files at once have 1 GB.
+    let grown = http_support::peak_memory().saturating_sub(before);
+    assert!(grown < 256 << 20, "{grown}");
+    http_support::wait_for("the memory", || held() == 0.0);
+}
+
+#[test]
+fn long_json_documents_name_entries() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("4pti.pdb"), SAMPLE).unwrap();
+    let server = start(Fake::new(Mode::Octahedra), |c| c.archive.dir = Some(folder.path().to_owned()));
+    let json = [("content-type", "application/json")];
+    let members = "\"color\": null, ".repeat(2000);
+    let document = |end: &str| format!("{{{members}\"pdb_id\": \"4pti\"{end}");
+    assert!(document("}").len() > 20_000);
+    assert_eq!(server.post("/v1/meshes", &json, document("}").as_bytes()).status, 200);
+    server.post("/v1/meshes", &json, document("").as_bytes()).problem(400, "bad-request");
+    server.post("/v1/meshes", &json, document(", \"x\": [{}]}").as_bytes()).problem(400, "bad-parameter");
 }

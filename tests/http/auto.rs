@@ -26,7 +26,7 @@ impl Backend for Named {
     }
 
     /// The GPU makes isosurfaces only.
-    fn makes(&self, surface: SurfaceKind) -> bool {
+    fn supports(&self, surface: SurfaceKind) -> bool {
         self.0 != "gpu" || surface.kernel().is_some()
     }
 

@@ -16,7 +16,7 @@ use molmesh::surface::cpu::CpuBackend;
 use rows::{ATOMS, BODY_BYTES, INFLATED_BYTES, Is, Row, rows};
 use serde_json::Value;
 
-/// Time limit of an answer. Unoptimized builds are slower.
+/// Time limit of a response. Unoptimized builds are slower.
 const IN_TIME: Duration = Duration::from_millis(if cfg!(debug_assertions) { 3000 } else { 100 });
 /// Number of slowest rows to print.
 const SHOWN: usize = 8;
@@ -42,7 +42,7 @@ fn ask(server: &Running, row: &Row) -> Reply {
     send(server.addr, row.method, &path, &row.headers, &row.body)
 }
 
-/// Returns the differences between an answer and its row.
+/// Returns the differences between a response and its row.
 fn faults(row: &Row, reply: &Reply, time: Duration) -> Vec<String> {
     let mut faults = Vec::new();
     let mut check = |right: bool, what: String| {
@@ -51,14 +51,14 @@ fn faults(row: &Row, reply: &Reply, time: Duration) -> Vec<String> {
         }
     };
     let text = String::from_utf8_lossy(&reply.body[..reply.body.len().min(2000)]).into_owned();
-    check(reply.complete, "the answer is incomplete".to_owned());
+    check(reply.complete, "the response is incomplete".to_owned());
     check(time <= IN_TIME, format!("took {time:?}, {IN_TIME:?} are allowed"));
     check(reply.status == row.status, format!("status {} instead of {}: {text}", reply.status, row.status));
     if row.slug.is_empty() {
-        check(reply.body.starts_with(b"glTF"), "the answer is not a GLB".to_owned());
+        check(reply.body.starts_with(b"glTF"), "the response is not a GLB".to_owned());
     } else {
         let kind = reply.header("content-type");
-        check(kind == Some("application/problem+json"), format!("the answer is {kind:?}"));
+        check(kind == Some("application/problem+json"), format!("the response is {kind:?}"));
     }
     let document: Value = serde_json::from_slice(&reply.body).unwrap_or(Value::Null);
     if !row.slug.is_empty() {
@@ -78,7 +78,7 @@ fn faults(row: &Row, reply: &Reply, time: Duration) -> Vec<String> {
     faults
 }
 
-/// Sends a row and checks the answer. Repeats slow rows up to twice, as other load may cause a delay.
+/// Sends a row and checks the response. Repeats slow rows up to twice, as other load may cause a delay.
 fn drive(server: &Running, row: &Row) -> (Vec<String>, Duration) {
     let mut fastest = Duration::MAX;
     let mut last = Vec::new();
@@ -98,7 +98,7 @@ fn drive(server: &Running, row: &Row) -> (Vec<String>, Duration) {
 }
 
 #[test]
-fn every_row_gets_its_answer_in_time_and_the_server_keeps_running() {
+fn every_row_gets_its_response_in_time_and_the_server_keeps_running() {
     let server = server();
     let good = || {
         let reply = server.post("/v1/meshes?resolution=1", &[], SAMPLE);
@@ -152,7 +152,7 @@ fn mesh(row: &Row) -> Output {
 }
 
 #[test]
-fn exit_codes_match_the_answers_of_the_server() {
+fn exit_codes_match_the_responses_of_the_server() {
     let mut wrong = Vec::new();
     let mut seen = [0; 8];
     for row in rows() {

@@ -16,7 +16,7 @@ use molmesh::surface::CpuBackend;
 
 use crate::jobs_durable::{Process, ask};
 
-/// System calls that change files or answer clients. Not every architecture has those with `?`.
+/// System calls that change files or send responses to clients. Not every architecture has those with `?`.
 const TRACED: &str = "trace=openat,write,pwrite64,lseek,ftruncate,fsync,fdatasync,?mkdir,mkdirat,?rename,renameat,\
                       ?renameat2,?link,linkat,?unlink,unlinkat,sendto,writev";
 
@@ -106,7 +106,7 @@ fn parse(call: &str) -> Option<Step> {
     })
 }
 
-/// Parses a log of strace. A call takes effect when it returns, but an answer counts when it is sent.
+/// Parses a log of strace. A call takes effect when it returns, but a response counts when it is sent.
 fn steps(log: &str) -> Vec<Step> {
     let mut begun = HashMap::new();
     let mut steps = Vec::new();

@@ -181,7 +181,7 @@ fn fallbacks_are_reported_in_response_report_log_and_metrics() {
     assert_eq!((&report["device"], report.get("fallback")), (&"card 1".into(), None));
 
     *backend.fallback_reason.lock().unwrap() = Some("the card is on fire 7431");
-    // The first result is stored and would answer the same request.
+    // The first result is stored and would be sent for the same request.
     let other = http_support::sample(1);
     let fallback = server.post("/v1/meshes", &[], &other);
     assert_eq!(fallback.header("molmesh-backend"), Some("cpu"));

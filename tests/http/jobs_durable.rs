@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use http_support::{Fake, Mode, SAMPLE, sample, start, wait_for};
+use http_support::{Fake, Mode, SAMPLE, sample, send, start, wait_for};
 use molmesh::surface::CpuBackend;
 
 /// Server process on a data folder.
@@ -294,13 +294,14 @@ fn open_jobs_are_limited() {
     assert_eq!(left, [200, 404]);
 }
 
-/// Starts a process whose data folder is a disk of 16 MB of its own. Returns `None` if no disk can be mounted.
+/// Starts a process with a disk of 16 MB of its own at `disk`, which is or lies in its data folder. Returns `None` if
+/// no disk can be mounted.
 #[expect(clippy::print_stdout, reason = "the list of skipped tests contains this line")]
-fn start_on_small_disk(folder: &Path) -> Option<Process> {
+fn start_on_small_disk(folder: &Path, disk: &Path) -> Option<Process> {
     let mount = r#"mount -t tmpfs -o size=16m tmpfs "$0""#;
     let isolated = |script: &str| {
         let mut command = Command::new("unshare");
-        command.args(["-m", "sh", "-c", script]).arg(folder);
+        command.args(["-m", "sh", "-c", script]).arg(disk);
         command
     };
     if !isolated(mount).output().is_ok_and(|output| output.status.success()) {
@@ -316,7 +317,7 @@ fn start_on_small_disk(folder: &Path) -> Option<Process> {
 #[test]
 fn a_full_disk_evicts_objects_and_is_reported_as_a_full_store() {
     let folder = tempfile::tempdir().unwrap();
-    let Some(server) = start_on_small_disk(folder.path()) else { return };
+    let Some(server) = start_on_small_disk(folder.path(), folder.path()) else { return };
     let filled = |n: usize, bytes: usize| {
         let mut text = sample(n);
         while text.len() < bytes {
@@ -363,5 +364,93 @@ fn a_full_disk_evicts_objects_and_is_reported_as_a_full_store() {
         let (code, location, _) = ask(server.addr, "GET", &format!("{job}/result"), "", b"").unwrap();
         assert_eq!((code, ask(server.addr, "GET", &location.unwrap(), "", b"").unwrap().0), (303, 200));
     }
+    server.kill();
+}
+
+/// Copies a folder, as a killed process leaves it.
+fn copy(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap().map(Result::unwrap) {
+        let to = to.join(entry.file_name());
+        if entry.file_type().unwrap().is_dir() {
+            copy(&entry.path(), &to);
+        } else {
+            drop(std::fs::copy(entry.path(), to));
+        }
+    }
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn two_hundred_joined_jobs_are_recovered_in_a_small_process() {
+    const JOBS: usize = 200;
+    const BUDGET: u64 = 48 << 20;
+    let input = [SAMPLE, &b"REMARK 999 PADDING\n".repeat(5_000_000 / 19)].concat();
+    let server = start(Fake::new(Mode::Held), |c| c.jobs.workers = 1);
+    let upload = server.post("/v1/structures", &[], &input).json();
+    let path = format!("/v1/structures/{}/surface.stl?resolution=2", upload["digest"].as_str().unwrap());
+    let jobs: Vec<String> = (0..JOBS)
+        .map(|_| {
+            let reply = send(server.addr, "GET", &path, &[("prefer", "respond-async")], b"");
+            assert_eq!(reply.status, 202);
+            reply.header("location").unwrap().to_owned()
+        })
+        .collect();
+    let folder = tempfile::tempdir().unwrap();
+    copy(&server.dir.path().join("store"), &folder.path().join("store"));
+    let begun = Instant::now();
+    let mut program = Command::new(env!("CARGO_BIN_EXE_molmesh"));
+    program.env("MOLMESH_LIMITS__MEMORY_BYTES", BUDGET.to_string());
+    let process = Process::spawn(program, folder.path());
+    for job in &jobs {
+        let (_, _, body) = ask(process.addr, "GET", &format!("{job}?wait=20"), "", b"").unwrap();
+        let state: serde_json::Value = serde_json::from_slice(&body).unwrap();
+        assert_eq!(state["status"], "successful", "{state}");
+    }
+    // The time of one job, and of two records for each job, 64 at a time.
+    assert!(begun.elapsed() < Duration::from_secs(30), "{:?}", begun.elapsed());
+    let status = std::fs::read_to_string(format!("/proc/{}/status", process.child.id())).unwrap();
+    let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap().trim().trim_end_matches(" kB");
+    // Program, threads and caches take less than the budget again.
+    let peak = 1024 * peak.parse::<u64>().unwrap();
+    assert!(peak < 3 * BUDGET, "the process took {peak} bytes; all inputs take {}", JOBS * input.len());
+    process.kill();
+}
+
+#[test]
+fn a_store_that_becomes_read_only_is_reported_and_used_again_when_it_recovers() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = folder.path().join("store");
+    std::fs::create_dir(&store).unwrap();
+    let Some(server) = start_on_small_disk(folder.path(), &store) else { return };
+    let remount = |options: &str| {
+        let mut command = Command::new("nsenter");
+        command.args([&format!("--target={}", server.child.id()), "--mount", "mount", "-o", options]);
+        command.arg(&store).status().unwrap().success()
+    };
+    let request = |method: &str, path: &str, headers: &str, body: &[u8]| {
+        let (status, _, body) = ask(server.addr, method, path, headers, body).unwrap();
+        let document: serde_json::Value = serde_json::from_slice(&body).unwrap_or_default();
+        (status, document["type"].as_str().unwrap_or_default().to_owned(), document)
+    };
+    let upload = |n: usize| request("POST", "/v1/structures", "", &sample(n)).0;
+    let ready = || request("GET", "/readyz", "", b"");
+    assert_eq!((upload(1), ready().0), (201, 200));
+    // The upload may still be renamed or synced.
+    wait_for("no file is open", || remount("remount,ro"));
+    let later = "prefer: respond-async\r\n";
+    for (path, headers) in [("/v1/structures", ""), ("/v1/meshes?format=stl", later)] {
+        let (status, kind, document) = request("POST", path, headers, &sample(2));
+        assert_eq!((status, &*kind), (503, "/problems/store-failed"), "{path}: {document}");
+    }
+    assert_eq!(request("POST", "/v1/meshes?format=stl", "", &sample(3)).0, 200, "a mesh needs no store");
+    wait_for("the failure is detected", || ready().0 == 503);
+    let checks = ready().2["checks"].as_array().unwrap().clone();
+    let failed: Vec<_> =
+        checks.iter().filter(|check| check["ok"] == false).map(|check| check["name"].clone()).collect();
+    assert_eq!(failed, ["store"]);
+    assert!(remount("remount,rw"));
+    wait_for("the store is used again", || ready().0 == 200);
+    assert_eq!((upload(1), upload(2)), (200, 201), "what was stored is still there");
     server.kill();
 }

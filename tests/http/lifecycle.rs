@@ -14,7 +14,7 @@ fn running(backend: &Arc<Fake>) -> Running {
     start(Arc::clone(backend) as _, |_| {})
 }
 
-/// Sends an upload without waiting for the answer.
+/// Sends an upload without waiting for the response.
 fn begin(server: &Running, body: &[u8]) -> TcpStream {
     let mut stream = connect(server.addr);
     let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", body.len());
@@ -96,7 +96,7 @@ fn a_queued_job_of_a_disconnected_client_never_runs() {
 }
 
 #[test]
-fn disconnecting_during_the_answer_frees_the_mesh() {
+fn disconnecting_during_the_response_frees_the_mesh() {
     let backend = Fake::new(Mode::Octahedra);
     let server = running(&backend);
     let mut stream = begin(&server, &carbons(60_000));
@@ -176,7 +176,7 @@ fn a_drain_has_a_deadline() {
 }
 
 #[test]
-fn a_backend_that_cannot_be_cancelled_does_not_delay_the_answer() {
+fn a_backend_that_cannot_be_cancelled_does_not_delay_the_response() {
     let backend = Fake::new(Mode::Uncancellable(Duration::from_secs(6)));
     let server = start(Arc::clone(&backend) as _, |c| c.jobs.deadline_ms = 200);
     let start = Instant::now();

@@ -1,11 +1,11 @@
 //! Namespaces of keys: for a key of another group, structures, results and jobs do not exist.
 
-use crate::access_support::{Keys, eventually};
+use crate::access_support::Keys;
 use crate::http_support;
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use http_support::{Fake, Mode, Reply, Running, SAMPLE, sample, send, start};
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, sample, send, start, wait_for};
 use molmesh::access::SigningKeys;
 use molmesh::config::Secret;
 
@@ -41,7 +41,7 @@ impl Setup {
         stored.header("location").unwrap().clone_into(&mut setup.structure);
         let accepted = setup.ask("a", "POST", "/v1/meshes", &[ASYNC], SAMPLE);
         accepted.header("location").unwrap().clone_into(&mut setup.job);
-        eventually("the job ends", || setup.get("a", &setup.job).json()["status"] == "successful");
+        wait_for("the job ends", || setup.get("a", &setup.job).json()["status"] == "successful");
         let result = setup.get("a", &format!("{}/result", setup.job));
         result.header("location").unwrap().clone_into(&mut setup.result);
         setup
@@ -88,7 +88,7 @@ fn comparable(reply: &Reply, path: &str) -> (u16, Vec<(String, String)>, String)
 }
 
 #[test]
-fn what_another_group_holds_is_answered_as_if_it_never_existed() {
+fn objects_of_another_group_do_not_exist_for_a_key() {
     let setup = Setup::new();
     let Setup { structure, job, result, .. } = &setup;
     let report = result.replace(".glb", "/report.json");
@@ -147,31 +147,31 @@ fn another_group_uploads_and_computes_the_same_again() {
     let mesh = setup.get("b", &surface);
     assert!(mesh.status == 200 && !mesh.header("server-timing").unwrap().contains("cache"), "{:?}", mesh.headers);
     assert_eq!((mesh.header("content-location"), setup.started()), (Some(setup.result.as_str()), before + 1));
-    eventually("the result is stored", || setup.get("b", &setup.result).status == 200);
+    wait_for("the result is stored", || setup.get("b", &setup.result).status == 200);
     assert!(setup.get("b", &surface).body == setup.get("a", &surface).body);
     assert_eq!(setup.started(), before + 1);
     // Archive entries are common, results of them are not.
     let entry = "/v1/pdb/4pti/surface.glb?resolution=2";
     let stored = setup.get("a", entry).header("content-location").unwrap().to_owned();
-    eventually("the result is stored", || setup.get("a", &stored).status == 200);
+    wait_for("the result is stored", || setup.get("a", &stored).status == 200);
     assert_eq!(setup.get("b", &stored).status, 404);
     assert_eq!((setup.get("b", entry).status, setup.started()), (200, before + 3));
-    // Running work is not shared: the second job is not answered by the first one.
+    // Running work is not shared: the second job does not get the result of the first one.
     setup.backend.set(Mode::Held);
     let submit = |key| setup.ask(key, "POST", "/v1/meshes", &[ASYNC, ("idempotency-key", "x")], &sample(7));
     let [first, second] = ["a", "b"].map(|key| submit(key).header("location").unwrap().to_owned());
-    eventually("both run", || setup.started() == before + 5);
+    wait_for("both run", || setup.started() == before + 5);
     assert_ne!(first, second);
     setup.get("b", &first).problem(404, "no-such-job");
     setup.ask("b", "DELETE", &first, &[], b"").problem(404, "no-such-job");
     setup.backend.set(Mode::Octahedra);
     for (key, job) in [("a", &first), ("b", &second)] {
-        eventually("the job ends", || setup.get(key, job).json()["status"] == "successful");
+        wait_for("the job ends", || setup.get(key, job).json()["status"] == "successful");
     }
 }
 
 #[test]
-fn signed_urls_open_what_the_group_of_their_key_holds() {
+fn signed_urls_open_objects_of_the_group_of_their_key() {
     let setup = Setup::new();
     let until = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs() + 3600;
     let keys = SigningKeys::parse(SECRETS).unwrap();
@@ -207,7 +207,7 @@ fn jobs_of_a_group_survive_a_restart_and_stay_with_it() {
     let job = accepted.header("location").unwrap().to_owned();
     server.join();
     let server = begin(Mode::Octahedra);
-    eventually("the job ends", || get(&server, "a", &job).json()["status"] == "successful");
+    wait_for("the job ends", || get(&server, "a", &job).json()["status"] == "successful");
     assert_eq!(get(&server, "a", &format!("{job}/result")).status, 303);
     get(&server, "b", &job).problem(404, "no-such-job");
     assert!(server.join());

@@ -12,6 +12,7 @@ use std::process::Command;
 use std::sync::LazyLock;
 
 use http_support::{Fake, Mode, Running, send, start};
+use molmesh::formats::Format;
 use molmesh::pipeline::params::{Domain, TABLE};
 use openapi_support::{operations, resolved};
 use serde_json::{Value, json};
@@ -20,7 +21,7 @@ static SERVER: LazyLock<Running> = LazyLock::new(|| start(Fake::new(Mode::Octahe
 static DESCRIPTION: LazyLock<Value> = LazyLock::new(|| SERVER.get("/openapi.json").json());
 
 #[test]
-fn the_committed_description_is_what_the_code_says() {
+fn the_committed_document_matches_the_code() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("openapi.yaml");
     let reply = SERVER.get("/openapi.yaml");
     assert_eq!((reply.status, reply.header("content-type")), (200, Some("application/yaml")));
@@ -38,11 +39,12 @@ fn the_committed_description_is_what_the_code_says() {
     assert!(served.starts_with("openapi: 3.1.0\n"), "{}", &served[..40]);
     assert!(served.len() < 160_000, "{} bytes", served.len());
     assert_eq!(DESCRIPTION["openapi"], "3.1.0");
+    assert_eq!(DESCRIPTION["components"]["schemas"]["Report"]["example"]["euler"], 2);
     assert_eq!(DESCRIPTION["info"]["version"], env!("CARGO_PKG_VERSION"));
 }
 
 #[test]
-fn the_description_has_the_methods_of_the_router() {
+fn the_document_has_the_methods_of_the_router() {
     let paths = DESCRIPTION["paths"].as_object().unwrap();
     assert!(paths.len() > 15, "{}", paths.len());
     for (path, item) in paths {
@@ -70,7 +72,9 @@ fn the_parameters_are_those_of_the_table() {
     let parameter = |name: &str| &DESCRIPTION["components"]["parameters"][name];
     let schema = |name: &str| resolved(&DESCRIPTION, &parameter(name)["schema"]);
     assert_eq!((&schema("resolution")["type"], &schema("resolution")["default"]), (&json!("number"), &json!(0.5)));
-    assert_eq!(schema("format")["enum"].as_array().unwrap().len(), 7);
+    assert_eq!(schema("format")["enum"].as_array().unwrap().len(), Format::ALL.len());
+    // A format that is sent takes precedence over `Accept`.
+    assert_eq!((schema("format").get("default"), &schema("compress")["default"]), (None, &json!("none")));
     // Units and ranges are in the text as well.
     for p in TABLE {
         let Domain::Number { min, max, unit } = p.domain else { continue };
@@ -80,7 +84,7 @@ fn the_parameters_are_those_of_the_table() {
 }
 
 #[test]
-fn every_reference_leads_somewhere_and_every_response_says_what_it_is() {
+fn every_reference_resolves_and_every_response_has_a_description() {
     fn references(value: &Value, found: &mut BTreeSet<String>) {
         match value {
             Value::Object(members) => {
@@ -101,13 +105,46 @@ fn every_reference_leads_somewhere_and_every_response_says_what_it_is() {
     for (operation, responses) in operations(&DESCRIPTION) {
         let (method, path) = operation.split_once(' ').unwrap();
         let id = &DESCRIPTION["paths"][path][method.to_lowercase()]["operationId"];
-        assert!(ids.insert(id.as_str().unwrap()), "{operation}: {id} is another's");
+        assert!(ids.insert(id.as_str().unwrap()), "{operation}: {id} is not unique");
         for (status, response) in responses {
             assert!(response["description"].as_str().is_some_and(|d| !d.is_empty()), "{operation} {status}");
             let content = response["content"].as_object();
             let problem = content.is_some_and(|c| c.contains_key("application/problem+json"));
             assert_eq!(problem, status >= 400, "{operation} {status}");
         }
+    }
+}
+
+/// Returns the components whose name ends in a number, or consists of a status only.
+fn numbered(description: &Value) -> Vec<String> {
+    let kinds = description["components"].as_object().unwrap().iter();
+    let names = kinds.flat_map(|(kind, of_kind)| of_kind.as_object().unwrap().keys().map(move |name| (kind, name)));
+    let is_numbered =
+        |name: &str| name.starts_with("Error") || name.rsplit_once('-').is_some_and(|(_, n)| n.parse::<u32>().is_ok());
+    names.filter(|(_, name)| is_numbered(name)).map(|(kind, name)| format!("{kind}/{name}")).collect()
+}
+
+#[test]
+fn components_are_named_by_meaning() {
+    assert_eq!(numbered(&DESCRIPTION), Vec::<String>::new());
+    let bad = json!({ "components": { "headers": { "ETag-2": {}, "ETag": {} }, "responses": { "Error422": {} } } });
+    assert_eq!(numbered(&bad), ["headers/ETag-2", "responses/Error422"]);
+}
+
+#[test]
+fn the_json_body_is_a_component_with_a_valid_example() {
+    let json = &DESCRIPTION["components"]["requestBodies"]["StructureByName"]["content"]["application/json"];
+    let schema = resolved(&DESCRIPTION, &json["schema"]);
+    let example = schema["examples"][0].to_string();
+    let folder = SERVER.dir.path().join("archive");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("4pti.pdb"), http_support::SAMPLE).unwrap();
+    for path in ["/v1/meshes", "/v1/report", "/v1/estimate"] {
+        let reply = send(SERVER.addr, "POST", path, &[("content-type", "application/json")], example.as_bytes());
+        assert_eq!(reply.status, 200, "{path}: {}", String::from_utf8_lossy(&reply.body));
+        let content = &DESCRIPTION["paths"][path]["post"]["requestBody"]["content"];
+        let declared: Vec<&String> = content.as_object().unwrap().keys().collect();
+        assert_eq!(declared, ["application/octet-stream"], "{path}");
     }
 }
 
@@ -141,7 +178,7 @@ fn validators_accept_the_document_its_examples_and_its_yaml() {
 }
 
 #[test]
-fn the_page_that_shows_it_needs_nothing_from_elsewhere() {
+fn swagger_ui_loads_nothing_from_other_hosts() {
     let page = SERVER.get("/docs");
     assert_eq!(page.header("content-type"), Some("text/html; charset=utf-8"));
     let policy = page.header("content-security-policy").unwrap();
@@ -160,7 +197,7 @@ fn the_page_that_shows_it_needs_nothing_from_elsewhere() {
 }
 
 #[test]
-fn swagger_ui_is_what_its_note_says_packed_or_not() {
+fn swagger_ui_matches_its_note_compressed_and_uncompressed() {
     let note = include_str!("../../web/swagger/README.md");
     for file in ["swagger-ui-bundle.js", "swagger-ui.css"] {
         let path = format!("/{file}");

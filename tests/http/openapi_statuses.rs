@@ -1,5 +1,5 @@
-//! Every status that the description lists is given by the server, and no other: each scenario drives a server into one
-//! corner, and in the end nothing that is described may be left unseen.
+//! The server returns every status that the OpenAPI document lists, and no other. Each scenario provokes some of the
+//! statuses; at the end, every documented one must have been returned.
 
 use crate::access_support;
 use crate::archive_support;
@@ -22,8 +22,9 @@ use openapi_support::Seen;
 
 const LATER: (&str, &str) = ("prefer", "respond-async");
 const JSON: (&str, &str) = ("content-type", "application/json");
-/// Addresses that no service gives.
+/// Path of a job that does not exist.
 const NO_JOB: &str = "/v1/jobs/00000000000000000000000000000000";
+/// Digest and key that do not exist.
 const ZERO: &str = "0000000000000000000000000000000000000000000000000000000000000000";
 
 fn fake(mode: Mode, change: impl FnOnce(&mut Config)) -> Running {
@@ -46,7 +47,7 @@ fn location(reply: &Reply) -> String {
     reply.header("location").unwrap().to_owned()
 }
 
-/// Promises a job, and waits for its end.
+/// Starts a job and waits for its end.
 fn ended(seen: &Seen, server: &Running, body: &[u8]) -> String {
     let job = location(&seen.expect(202, server.addr, ("POST", "/v1/meshes"), &[LATER], body));
     let reply = seen.expect(200, server.addr, ("GET", &format!("{job}?wait=20")), &[], b"");
@@ -69,13 +70,13 @@ fn plain(seen: &Seen, server: &Running) {
     seen.expect(400, server.addr, ("GET", "/v1/capabilities?x=1"), &[], b"");
     seen.expect(200, server.addr, ("GET", "/problems/internal"), &[], b"");
     seen.expect(404, server.addr, ("GET", "/problems/none"), &[], b"");
-    // The web page is not a part of the document.
+    // The web page is not part of the document.
     for (path, status) in [("/assets/icon.svg", 200), ("/assets/none.js", 404), ("/assets/%ff", 400)] {
         assert_eq!(server.get(path).status, status, "{path}");
     }
 }
 
-/// Uploads, good and bad.
+/// Valid and invalid uploads.
 fn uploads(seen: &Seen, server: &Running) {
     let addr = server.addr;
     seen.expect(201, addr, ("POST", "/v1/structures"), &[], SAMPLE);
@@ -91,14 +92,14 @@ fn uploads(seen: &Seen, server: &Running) {
     seen.expect(406, addr, post, &[("accept", "image/webp")], SAMPLE);
     let octets = seen.expect(200, addr, post, &[("accept", "application/octet-stream")], SAMPLE);
     assert_eq!(octets.header("content-type"), Some("application/octet-stream"));
-    // An estimate is no mesh: whatever is asked for, it is JSON.
+    // An estimate is JSON for every `Accept`.
     seen.expect(200, addr, ("POST", "/v1/estimate"), &[("accept", "application/json")], SAMPLE);
     for path in &UPLOADS[..3] {
         seen.expect(404, addr, ("POST", path), &[JSON], br#"{"pdb_id": "9xyz"}"#);
     }
 }
 
-/// Meshes under addresses.
+/// Meshes, reports, atoms and colours of entries and stored structures.
 fn surfaces(seen: &Seen, server: &Running) {
     let structure = location(&seen.ask(server.addr, "POST", "/v1/structures", &[], SAMPLE));
     for base in [structure.as_str(), "/v1/pdb/4pti"] {
@@ -125,11 +126,11 @@ fn surfaces(seen: &Seen, server: &Running) {
         get(&format!("{base}/surface.exe"), &[], 404);
         get(&format!("{path}?x=1"), &[], 400);
         get(&format!("{path}?chains=Z"), &[], 422);
-        // And what was made, under its own address.
+        // The stored result at its own address.
         get(kept, &[("range", "bytes=0-9")], 206);
         get(kept, &[("range", "bytes=99999999-")], 416);
         get(kept, &[("if-none-match", "*")], 304);
-        // An expected file is sent, another one is not.
+        // `If-Match`: only a matching `ETag` is accepted.
         let other = [("if-match", "\"other\""), ("if-none-match", "*")];
         for path in [&path, kept, &format!("{base}/atoms"), &kept.replace(".glb", "/report.json")] {
             get(path, &other, 412).problem(412, "precondition-failed");
@@ -170,7 +171,7 @@ fn surfaces(seen: &Seen, server: &Running) {
     get(&format!("/v1/results/{ZERO}/report.json"), &[], 404);
 }
 
-/// Jobs and their ends.
+/// Jobs that succeed, fail, are cancelled or exceed their deadline.
 fn jobs(seen: &Seen) {
     let backend = Fake::new(Mode::Octahedra);
     let server = start(Arc::clone(&backend) as _, |c| c.limits.inflated_bytes = 100_000);
@@ -188,14 +189,14 @@ fn jobs(seen: &Seen) {
     }
     seen.expect(404, server.addr, ("DELETE", NO_JOB), &[], b"");
     // A damaged record.
-    let torn = "1".repeat(32);
-    std::fs::write(server.dir.path().join(format!("store/jobs/{torn}.json")), "{").unwrap();
+    let damaged = "1".repeat(32);
+    std::fs::write(server.dir.path().join(format!("store/jobs/{damaged}.json")), "{").unwrap();
     for path in ["", "/events", "/result"] {
-        get(&format!("/v1/jobs/{torn}{path}"), 500);
+        get(&format!("/v1/jobs/{damaged}{path}"), 500);
     }
-    seen.expect(500, server.addr, ("DELETE", &format!("/v1/jobs/{torn}")), &[], b"");
+    seen.expect(500, server.addr, ("DELETE", &format!("/v1/jobs/{damaged}")), &[], b"");
     get(&format!("{NO_JOB}?wait=1000"), 400);
-    // Ends without a result are told as a synchronous request would be.
+    // A job without a result ends with the problem of a synchronous request.
     result(&ended(seen, &server, &vec![b' '; 100_001]), 413);
     result(&ended(seen, &server, b"nothing"), 422);
     backend.set(Mode::Panic);
@@ -210,7 +211,7 @@ fn jobs(seen: &Seen) {
     seen.expect(504, late.addr, ("GET", &format!("{job}/result")), &[], b"");
 }
 
-/// Limits of bodies, and of what archives send.
+/// Limits of bodies and atom lists, and an archive that fails.
 fn sizes(seen: &Seen) {
     let small = fake(Mode::Octahedra, |c| {
         c.limits.body_bytes = 100;
@@ -248,7 +249,7 @@ fn sizes(seen: &Seen) {
     }
 }
 
-/// Backends that panic or do not end, queues that are full.
+/// Backends that panic or do not end, a full queue, and exhausted memory.
 fn failures(seen: &Seen) {
     for (mode, status) in [(Mode::Panic, 500), (Mode::Slow(Duration::from_secs(30)), 504)] {
         let server = fake(mode, |c| c.jobs.deadline_ms = 300);
@@ -275,13 +276,19 @@ fn failures(seen: &Seen) {
         seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/surface.glb"), &[], b"");
         seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/report.json"), &[], b"");
     });
-    let crowded = fake(Mode::Octahedra, |c| c.limits.memory_bytes = 1_000);
-    seen.expect(503, crowded.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
-    seen.expect(503, crowded.addr, ("GET", "/v1/pdb/4pti/colors?scheme=chain"), &[], b"");
-    for path in UPLOADS {
-        seen.expect(503, crowded.addr, ("POST", path), &[], SAMPLE);
+    // The request alone exceeds the first limit, and together with its connection the second one.
+    for (memory_bytes, status) in [(1_000, 422), (400_000, 503)] {
+        let crowded = fake(Mode::Octahedra, |c| c.limits.memory_bytes = memory_bytes);
+        seen.expect(status, crowded.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
+        seen.expect(status, crowded.addr, ("GET", "/v1/pdb/4pti/colors?scheme=chain"), &[], b"");
+        for path in UPLOADS {
+            seen.expect(status, crowded.addr, ("POST", path), &[], SAMPLE);
+        }
     }
 }
+
+/// Change of the configuration of a server.
+type Change = fn(&mut Config);
 
 /// Objects stored under other limits, and a failing store.
 fn restarts(seen: &Seen) {
@@ -313,13 +320,19 @@ fn restarts(seen: &Seen) {
     get(&server, &structure, 422);
     get(&server, &format!("{structure}/atoms"), 422);
     assert!(server.join());
-    let server = begin(|c| c.limits.memory_bytes = 1_000);
-    get(&server, &structure, 503);
-    get(&server, &format!("{structure}/atoms"), 503);
-    get(&server, &format!("{structure}/colors?scheme=chain"), 503);
-    get(&server, &format!("{surface}?resolution=2"), 503);
-    get(&server, &format!("{structure}/report.json"), 503);
-    assert!(server.join());
+    let tight: [(Change, u16); 2] =
+        [(|c| c.limits.memory_bytes = 1_000, 422), (|c| c.limits.memory_bytes = 400_000, 503)];
+    for (change, status) in tight {
+        let server = begin(change);
+        get(&server, &structure, status);
+        get(&server, &format!("{structure}/atoms"), status);
+        get(&server, &format!("{structure}/colors?scheme=chain"), status);
+        if status == 503 {
+            get(&server, &format!("{surface}?resolution=2"), status);
+            get(&server, &format!("{structure}/report.json"), status);
+        }
+        assert!(server.join());
+    }
 
     let server = begin(|_| {});
     break_store(folder.path());
@@ -330,7 +343,7 @@ fn restarts(seen: &Seen) {
     seen.expect(503, server.addr, ("DELETE", &job), &[], b"");
 }
 
-/// Keys and quotas: every operation that takes a key, without one, with another one's, and beyond its quota.
+/// Keys and quotas: every operation without a key, with a key that lacks its scope, and beyond the quota.
 fn rights(seen: &Seen) {
     let keys = access_support::Keys::new(&[
         ("reads", "read", ""),
@@ -356,7 +369,7 @@ fn rights(seen: &Seen) {
     }
 }
 
-/// Puts files in the place of the store's folders.
+/// Replaces the folders of the store by files.
 fn break_store(dir: &Path) {
     for folder in ["inputs", "jobs", "results"].map(|name| dir.join("store").join(name)) {
         std::fs::rename(&folder, folder.with_extension("away")).unwrap();
@@ -365,7 +378,7 @@ fn break_store(dir: &Path) {
 }
 
 #[test]
-fn every_described_status_is_given_and_no_other() {
+fn the_server_returns_every_documented_status_and_no_other() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     archive(server.dir.path(), "4pti", SAMPLE);
     let seen = Seen::of(&server.get("/openapi.json").json());
@@ -382,11 +395,11 @@ fn every_described_status_is_given_and_no_other() {
     let cold = start_cold(cold, |_| {});
     wait_for("the listener", || cold.get("/livez").status == 200);
     seen.expect(503, cold.addr, ("GET", "/readyz"), &[], b"");
-    assert_eq!(seen.unseen(), Vec::<String>::new(), "described, and never given");
+    assert_eq!(seen.unseen(), Vec::<String>::new(), "documented but never returned");
 }
 
 #[test]
-fn what_is_not_described_or_never_seen_is_noticed() {
+fn control_undocumented_and_missing_responses_are_reported() {
     let server = fake(Mode::Octahedra, |_| {});
     let mut description = server.get("/openapi.json").json();
     let live = server.get("/livez");
@@ -396,7 +409,7 @@ fn what_is_not_described_or_never_seen_is_noticed() {
         seen.unseen().contains(&"GET /version: 200".to_owned())
             && !seen.unseen().contains(&"GET /livez: 200".to_owned())
     );
-    assert!(seen.note("GET", "/nowhere", &live).unwrap_err().contains("is not described"));
+    assert!(seen.note("GET", "/nowhere", &live).unwrap_err().contains("is not documented"));
     let gone = server.get(NO_JOB);
     assert!(seen.note("GET", NO_JOB, &gone).is_ok());
     let responses = &mut description["paths"]["/v1/jobs/{id}"]["get"]["responses"];
@@ -404,5 +417,5 @@ fn what_is_not_described_or_never_seen_is_noticed() {
     assert!(Seen::of(&description).note("GET", NO_JOB, &gone).unwrap_err().contains("not one of"));
     let responses = &mut description["paths"]["/v1/jobs/{id}"]["get"]["responses"];
     responses.as_object_mut().unwrap().remove("404");
-    assert!(Seen::of(&description).note("GET", NO_JOB, &gone).unwrap_err().contains("404 is not described"));
+    assert!(Seen::of(&description).note("GET", NO_JOB, &gone).unwrap_err().contains("404 is not documented"));
 }

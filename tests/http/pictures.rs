@@ -37,7 +37,7 @@ fn every_route_of_a_mesh_also_returns_a_picture() {
     let named = br#"{"pdb_id": "4pti", "format": "png", "width": 40, "height": 30, "view": "front"}"#;
     let query = "width=40&height=30&view=front";
     let first = server.get(&format!("/v1/pdb/4pti/surface.png?{query}"));
-    // This answer waits until the result is stored.
+    // This response waits until the result is stored.
     assert_eq!(server.get(first.header("content-location").unwrap()).status, 200);
     let replies = [
         first,
@@ -185,7 +185,7 @@ fn drawing_uses_the_memory_budget() {
     let backend = Fake::new(Mode::Octahedra);
     let server = server(&backend, |c| c.limits.memory_bytes = 4 << 20);
     // Drawing takes 40 bytes per pixel: ten million pixels exceed the budget, ten thousand do not.
-    server.get("/v1/pdb/4pti/surface.png?width=500&height=500").problem(503, "memory-full");
+    server.get("/v1/pdb/4pti/surface.png?width=500&height=500").problem(422, "too-much-memory");
     assert_eq!(backend.started.load(Ordering::SeqCst), 0);
     assert_eq!(server.get("/v1/pdb/4pti/surface.png?width=100&height=100").status, 200);
 }

@@ -1,5 +1,5 @@
 //! Malformed and abusive HTTP/1.1 messages and HTTP/2 frames, written byte by byte. After each of them the server
-//! answers other clients.
+//! serves other clients.
 
 use crate::http_support;
 
@@ -7,13 +7,13 @@ use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::time::Duration;
 
-use http_support::{Fake, Mode, Running, connect, start};
+use http_support::{Fake, Mode, Running, connect, frame, start};
 
 fn server() -> Running {
     start(Fake::new(Mode::Octahedra), |_| {})
 }
 
-/// Sends bytes on one connection and reads until the server closes it. Returns the status of each answer.
+/// Sends bytes on one connection and reads until the server closes it. Returns the status of each response.
 #[track_caller]
 fn statuses(server: &Running, bytes: &[u8]) -> Vec<u16> {
     let mut stream = connect(server.addr);
@@ -41,10 +41,10 @@ fn ambiguous_lengths_never_start_a_second_request() {
     let server = server();
     let statuses = |headers: &str, body: &str| statuses(&server, &post(headers, body));
     let chunked = "transfer-encoding: chunked\r\n";
-    // Control: with one length, the second request is answered.
+    // Control: with one length, the second request gets a response.
     assert_eq!(statuses(chunked, "1\r\nx\r\n0\r\n\r\n"), [422, 200]);
     assert_eq!(statuses("content-length: 1\r\n", "x"), [422, 200]);
-    // With both framings, the chunks count, and the connection ends after the answer (RFC 9112, 6.3).
+    // With both framings, the chunks count, and the connection ends after the response (RFC 9112, 6.3).
     for length in ["1", "5", "500", "x"] {
         let before = format!("content-length: {length}\r\n{chunked}");
         let behind = format!("{chunked}content-length: {length}\r\n");
@@ -147,11 +147,6 @@ const ENHANCE_YOUR_CALM: u32 = 11;
 /// `GET /` with HTTPS in HPACK's static table, and the authority `localhost`.
 const GET: &[u8] = b"\x82\x84\x87\x01\x09localhost";
 
-fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
-    let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
-    [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
-}
-
 /// Opens an HTTP/2 connection.
 fn connect2(server: &Running) -> TcpStream {
     let mut stream = connect(server.addr);
@@ -213,7 +208,7 @@ fn requests_that_are_reset_at_once_end_the_connection() {
 #[test]
 fn endless_header_blocks_end_the_connection() {
     let server = server();
-    // An open block keeps the state of one request, so the number of frames is limited, whatever their size.
+    // An open block keeps the state of one request, so the number of frames is limited, for any size.
     for payload in [&b""[..], b"\x00\x01a\x01b", &[0; 16 << 10]] {
         let code = flood(&server, |n| match n {
             0 => frame(HEADERS, END_STREAM, 1, GET),

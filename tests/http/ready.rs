@@ -45,7 +45,7 @@ fn a_ready_service_lists_its_checks() {
 
 #[test]
 fn failure_and_recovery_of_the_store_are_detected() {
-    let server = start(Fake::new(Mode::Octahedra), |c| c.store.probe_ms = 1);
+    let server = start(Fake::new(Mode::Octahedra), |c| c.store.check_interval_ms = 1);
     set_unavailable(&server, true);
     wait_for("the failure is detected", || server.get("/readyz").status == 503);
     let problem = server.get("/readyz").problem(503, "not-ready");
@@ -88,7 +88,7 @@ fn unreadable_job_records_make_the_service_unready_until_they_are_deleted() {
 
 #[test]
 fn the_store_is_not_checked_more_often_than_configured() {
-    let server = start(Fake::new(Mode::Octahedra), |c| c.store.probe_ms = 3_600_000);
+    let server = start(Fake::new(Mode::Octahedra), |c| c.store.check_interval_ms = 3_600_000);
     set_unavailable(&server, true);
     for _ in 0..5 {
         assert_eq!(server.get("/readyz").status, 200, "the cached result is used");
@@ -100,7 +100,7 @@ fn the_store_is_not_checked_more_often_than_configured() {
 fn a_full_queue_does_not_affect_readiness() {
     let backend = Fake::new(Mode::Slow(Duration::from_mins(5)));
     let server = start(Arc::clone(&backend) as _, |c| {
-        (c.jobs.workers, c.jobs.queue, c.store.probe_ms) = (1, 1, 1);
+        (c.jobs.workers, c.jobs.queue, c.store.check_interval_ms) = (1, 1, 1);
         c.jobs.deadline_ms = 600_000;
         c.server.drain_timeout_ms = 1;
     });

@@ -45,11 +45,11 @@ fn a_synchronous_result_is_stored_at_its_content_location() {
     assert_eq!((unchanged.status, unchanged.body.len()), (304, 0));
     let head = send(server.addr, "HEAD", &location, &[], b"");
     assert_eq!(head.header("content-length"), Some(made.body.len().to_string().as_str()));
-    // The same request is answered from the store.
+    // The same request is served from the store.
     let again = server.post("/v1/meshes?format=ply", &[], SAMPLE);
     assert_eq!((again.body == made.body, backend.started.load(Ordering::SeqCst)), (true, 1));
     assert!(again.header("server-timing").unwrap().contains("hit"));
-    assert!(again.header("cache-control").is_none(), "answers to POST are not cached");
+    assert!(again.header("cache-control").is_none(), "responses to POST are not cached");
     let report = location.replace(".ply", "/report.json");
     for path in [&location, &report] {
         let refused = server.get(&format!("{path}?resolution=1")).problem(400, "bad-parameter");
@@ -81,7 +81,7 @@ fn identical_requests_store_one_result() {
             let ask = || scope.spawn(|| server.post("/v1/meshes?format=stl", &[], &input));
             [(); 6].map(|()| ask()).map(|reply| reply.join().unwrap()).into()
         });
-        // One concurrent save suffices for six answers and is released afterwards.
+        // One concurrent save suffices for six responses and is released afterwards.
         for reply in &replies {
             let location = reply.header("content-location");
             assert!(location.is_some() && location == replies[0].header("content-location"), "{location:?}");
@@ -117,7 +117,7 @@ fn ranges_of_a_result_add_up_to_the_whole() {
 }
 
 #[test]
-fn a_mesh_and_its_report_live_and_die_together() {
+fn a_mesh_and_its_report_are_kept_and_removed_together() {
     let folder = tempfile::tempdir().unwrap();
     let backend = Fake::new(Mode::Octahedra);
     let open = |ttl_ms| {
@@ -167,7 +167,7 @@ fn eviction_removes_a_mesh_with_its_report() {
         .map(|n| {
             let made = server.post("/v1/meshes?format=stl", &[], &carbons(200 + n));
             let mesh = made.header("content-location").unwrap().to_owned();
-            // The answer arrives when the mesh is stored.
+            // The response arrives when the mesh is stored.
             assert_eq!(server.get(&mesh).status, 200);
             mesh
         })
@@ -185,7 +185,7 @@ fn a_result_that_exceeds_the_store_is_not_found_later() {
     let server = start(Fake::new(Mode::Octahedra), |c| c.store.max_bytes = 3_000);
     let before = server.metric("molmesh_results_not_stored_total", &["failed"]);
     let made = server.post("/v1/meshes", &[], SAMPLE);
-    assert_eq!((made.status, made.complete), (200, true), "the answer does not depend on the store");
+    assert_eq!((made.status, made.complete), (200, true), "the response does not depend on the store");
     wait_for("the metric", || server.metric("molmesh_results_not_stored_total", &["failed"]) > before);
     assert_eq!(made.header("content-location"), None, "a result that is not kept has no address");
     // Work that requires the store is rejected.
@@ -230,6 +230,48 @@ fn a_structure_is_uploaded_once_and_meshed_many_times() {
 }
 
 #[test]
+fn a_damaged_structure_is_neither_used_nor_kept_by_another_upload() {
+    // Structures in memory would hide the file.
+    let server = start(Fake::new(Mode::Octahedra), |c| c.limits.structure_cache_bytes = 0);
+    let made = server.post("/v1/structures", &[], SAMPLE);
+    let location = made.header("location").unwrap().to_owned();
+    let digest = location.rsplit('/').next().unwrap();
+    let [stored, quarantined] =
+        ["inputs", "quarantine"].map(|at| server.dir.path().join("store").join(at).join(digest));
+    let mut flipped = SAMPLE.to_vec();
+    // A digit of a coordinate.
+    let at = flipped.windows(6).position(|line| line == b"ATOM  ").unwrap() + 35;
+    flipped[at] ^= 1;
+    let json = format!(r#"{{"structure": "{digest}", "resolution": 2.5}}"#);
+    let verified = || server.metric("molmesh_store_errors_total", &["op=\"verify\""]);
+    for (n, damaged) in [&flipped[..], &SAMPLE[..1000], b""].into_iter().enumerate() {
+        std::fs::write(&stored, damaged).unwrap();
+        let refused = match n {
+            0 => server.get(&location),
+            1 => server.post("/v1/meshes", &[("content-type", "application/json")], json.as_bytes()),
+            _ => server.get(&format!("{location}/surface.glb?resolution=3")),
+        };
+        let problem = refused.problem(404, "no-such-structure");
+        assert!(problem["detail"].as_str().unwrap().contains("damaged"), "{problem}");
+        assert_eq!(std::fs::read(&quarantined).unwrap(), damaged);
+        assert!(!stored.exists());
+        assert_eq!(server.post("/v1/structures", &[], SAMPLE).status, 201);
+        assert_eq!(server.get(&location).status, 200);
+        // An upload also replaces a file whose damage nobody has noticed.
+        std::fs::write(&stored, damaged).unwrap();
+        assert_eq!(server.post("/v1/structures", &[], SAMPLE).status, 201);
+        assert_eq!(std::fs::read(&stored).unwrap(), SAMPLE);
+        std::fs::write(&stored, damaged).unwrap();
+        assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE).status, 202);
+        assert_eq!(std::fs::read(&stored).unwrap(), SAMPLE);
+        assert!((verified() - 3.0 * (n as f64 + 1.0)).abs() < 0.5);
+    }
+    // Undamaged, it is not written again, and the service remains ready.
+    assert_eq!(server.post("/v1/structures", &[], SAMPLE).status, 200);
+    assert_eq!((server.get("/readyz").status, verified()), (200, 9.0));
+}
+
+#[test]
 fn json_documents_name_entries_and_structures() {
     let server = real(|_| {});
     let json = [("content-type", "application/json")];
@@ -246,12 +288,12 @@ fn json_documents_name_entries_and_structures() {
         (b"{\"resolution\": 1}", "bad-request"),
         (b"{\"pdb_id\": ", "bad-request"),
         (b"[1]", "bad-request"),
-        (b"{\"pdb_id\": \"4pti\", \"structure\": \"x\"}", "no-such-structure"),
+        (b"{\"pdb_id\": \"4pti\", \"structure\": \"x\"}", "bad-parameter"),
     ] {
-        let reply = server.post("/v1/meshes", &json, bad);
-        let status = if slug == "no-such-structure" { 404 } else { 400 };
-        reply.problem(status, slug);
+        server.post("/v1/meshes", &json, bad).problem(400, slug);
     }
+    let absent = format!("{{\"structure\": \"{}\"}}", "0".repeat(64));
+    server.post("/v1/meshes", &json, absent.as_bytes()).problem(404, "no-such-structure");
 }
 
 #[test]
@@ -264,7 +306,7 @@ fn estimates_report_the_cost_and_a_spacing_that_fits() {
     };
     let fits = estimate("?resolution=1");
     let report = server.post("/v1/report?resolution=1", &[], SAMPLE).json();
-    assert_eq!((&fits["accepted"], &fits["samples"]), (&true.into(), &report["samples"]));
+    assert_eq!((&fits["accepted"], &fits["grid_points"]), (&true.into(), &report["grid_points"]));
     let ratio = fits["triangles"].as_f64().unwrap() / report["triangles"].as_f64().unwrap();
     assert!((0.8..1.25).contains(&ratio), "{ratio}");
     assert!(fits["seconds"].as_f64().unwrap() > 0.0);

@@ -7,31 +7,16 @@ use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
 
-use http_support::{Fake, Mode, Reply, SAMPLE, log_lines, sample, send, start};
+use http_support::{Fake, Mode, Reply, SAMPLE, log_lines, sample, send, start, wait_for};
 use molmesh::store::{Folder, Store};
-use molmesh::surface::{
-    Backend, Control, CpuBackend, MeshOutput, MeshSink, ReferenceBackend, Spheres, SurfaceError, SurfaceLimits,
-    SurfaceParams,
-};
+use molmesh::surface::{Backend, CpuBackend, ReferenceBackend};
 use serde_json::Value;
 use store_support::Service;
 
 const LATER: (&str, &str) = ("prefer", "respond-async");
-const TIMEOUT: Duration = Duration::from_mins(2);
-
-/// Waits until a condition holds.
-#[track_caller]
-fn until(what: &str, mut is: impl FnMut() -> bool) {
-    let begun = Instant::now();
-    while !is() {
-        assert!(begun.elapsed() < TIMEOUT, "timed out waiting for {what}");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-}
 
 #[track_caller]
 fn get(addr: SocketAddr, path: &str) -> Reply {
@@ -50,7 +35,7 @@ fn submit(addr: SocketAddr, path: &str, body: &[u8]) -> String {
 #[track_caller]
 fn successful(addr: SocketAddr, job: &str) -> Value {
     let mut document = Value::Null;
-    until("the job's end", || {
+    wait_for("the job's end", || {
         let reply = get(addr, &format!("{job}?wait=5"));
         assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
         document = reply.json();
@@ -125,7 +110,7 @@ impl Process {
             }
         });
         let mut addr = None;
-        until("the banner", || {
+        wait_for("the banner", || {
             let log = log.lock().unwrap();
             addr = log.lines().find_map(|line| {
                 let (_, rest) = line.trim_start().strip_prefix("viewer")?.split_once("http://")?;
@@ -241,47 +226,11 @@ fn s3_and_a_local_store_have_the_same_objects() {
     assert_eq!(seen.len(), 4, "four different files");
 }
 
-/// Backend that waits until it is opened.
-struct Gated {
-    fake: Arc<Fake>,
-    open: AtomicBool,
-    waiting: AtomicUsize,
-}
-
-impl Backend for Gated {
-    fn name(&self) -> &'static str {
-        "gated"
-    }
-
-    fn describe(&self) -> String {
-        self.fake.describe()
-    }
-
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
-        self.waiting.fetch_add(1, Ordering::SeqCst);
-        while !self.open.load(Ordering::SeqCst) {
-            control.check()?;
-            std::thread::sleep(Duration::from_millis(5));
-        }
-        self.waiting.fetch_sub(1, Ordering::SeqCst);
-        self.fake.write(spheres, params, limits, control, sink)
-    }
-}
-
 #[test]
 fn asynchronous_jobs_survive_an_s3_outage() {
     let mut service = Service::start(&["--guarded"]);
     let fake = Fake::new(Mode::Octahedra);
-    let backend =
-        Arc::new(Gated { fake: Arc::clone(&fake), open: AtomicBool::new(true), waiting: AtomicUsize::new(0) });
-    let server = start(Arc::clone(&backend) as _, |c| {
+    let server = start(Arc::clone(&fake) as _, |c| {
         c.store = service.config("away");
         c.store.memory_bytes = 0;
         c.jobs.workers = 2;
@@ -297,15 +246,16 @@ fn asynchronous_jobs_survive_an_s3_outage() {
     assert_eq!((before.status, get(addr, &kept).status), (200, 200));
 
     // Two jobs run when S3 becomes unavailable: a synchronous and an asynchronous one.
-    backend.open.store(false, Ordering::SeqCst);
+    fake.set(Mode::Held);
+    let started = fake.started.load(Ordering::SeqCst);
     let accepted = submit(addr, "/v1/meshes?format=stl", &sample(1));
     let waiting = std::thread::spawn(move || send(addr, "POST", "/v1/meshes?format=stl", &[], &sample(2)));
-    until("both jobs", || backend.waiting.load(Ordering::SeqCst) == 2);
+    wait_for("both jobs", || fake.started.load(Ordering::SeqCst) == started + 2);
     service.away();
-    backend.open.store(true, Ordering::SeqCst);
+    fake.set(Mode::Octahedra);
     let reply = waiting.join().unwrap();
     assert_eq!((reply.status, reply.complete, reply.body == before.body), (200, true, true));
-    until("an attempt to keep the result", || !log_lines("the store rejected a write; retrying").is_empty());
+    wait_for("an attempt to keep the result", || !log_lines("the store rejected a write; retrying").is_empty());
     assert_eq!(get(addr, &accepted).json()["status"], "running");
 
     // Requests that need the store are rejected with a message for clients; others succeed.

@@ -1,5 +1,5 @@
-//! Shares of clients in connections, deliveries and archive fetches: a client that holds its share is refused, another
-//! one is answered. The second client has another loopback address.
+//! Shares of clients in connections, deliveries and archive fetches: the requests of a client that holds its share are
+//! rejected, those of another one are served. The second client has another loopback address.
 #![cfg(target_os = "linux")]
 
 use crate::access_support::Keys;
@@ -8,6 +8,7 @@ use crate::http_support;
 
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use http_support::{Fake, Mode, Reply, Running, SAMPLE, carbons, read_reply, start, wait_for};
@@ -22,7 +23,7 @@ fn serve(change: impl FnOnce(&mut Config)) -> Running {
     start(Fake::new(Mode::Octahedra), change)
 }
 
-/// Connects from an address and sends a request. Small buffers, so that an unread answer stays with the server.
+/// Connects from an address and sends a request. Small buffers, so that an unread response stays with the server.
 fn begin(from: &str, server: &Running, method: &str, path: &str, headers: &str, body: &[u8]) -> TcpStream {
     let socket = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
     socket.set_recv_buffer_size(16 << 10).unwrap();
@@ -41,7 +42,7 @@ fn ask(from: &str, server: &Running, method: &str, path: &str, body: &[u8]) -> R
     read_reply(&mut begin(from, server, method, path, "", body), method == "HEAD")
 }
 
-/// Sends a request and reads the first bytes of its answer; the rest stays with the server.
+/// Sends a request and reads the first bytes of its response; the rest stays with the server.
 fn hold(from: &str, server: &Running, method: &str, path: &str, headers: &str, body: &[u8]) -> TcpStream {
     let mut stream = begin(from, server, method, path, headers, body);
     let mut start = [0; 12];
@@ -114,6 +115,35 @@ fn a_client_cannot_take_all_deliveries() {
     assert_eq!(ask(SECOND, &server, "GET", stored, b"").status, 200);
     drop(results);
     wait_for("the results were sent", || ask(FIRST, &server, "GET", stored, b"").status == 200);
+}
+
+#[test]
+fn a_client_cannot_take_all_readers() {
+    const READS: usize = 16;
+    let server = serve(|c| {
+        (c.jobs.workers, c.server.client_share) = (2, 0.25);
+        c.limits.structure_cache_bytes = 0;
+    });
+    let upload = |body: &[u8]| {
+        let document = ask(FIRST, &server, "POST", "/v1/structures", body).json();
+        format!("/v1/structures/{}", document["digest"].as_str().unwrap())
+    };
+    let large = |n: usize| [format!("REMARK 900 {n}\n").as_bytes(), &carbons(100_000)].concat();
+    let (paths, small): (Vec<_>, _) = ((0..READS).map(|n| upload(&large(n))).collect(), upload(SAMPLE));
+    let ended = AtomicUsize::new(0);
+    std::thread::scope(|scope| {
+        for path in &paths {
+            let (ended, server) = (&ended, &server);
+            scope.spawn(move || {
+                assert_eq!(ask(FIRST, server, "GET", path, b"").status, 200);
+                ended.fetch_add(1, Ordering::SeqCst);
+            });
+        }
+        std::thread::sleep(Duration::from_millis(100));
+        assert_eq!(ask(SECOND, &server, "GET", &small, b"").status, 200);
+        let before = ended.load(Ordering::SeqCst);
+        assert!(before < READS * 3 / 4, "{before} reads of the first client had ended");
+    });
 }
 
 #[test]

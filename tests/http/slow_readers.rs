@@ -10,7 +10,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, start, wait_for};
+use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, frame, start, wait_for};
 use molmesh::config::Config;
 use socket2::{Domain, Socket, Type};
 
@@ -52,11 +52,6 @@ fn cut_off(server: &Running) -> f64 {
 
 fn open_files() -> usize {
     std::fs::read_dir("/proc/self/fd").unwrap().count()
-}
-
-fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
-    let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
-    [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
 }
 
 /// State of a stream.
@@ -198,6 +193,28 @@ fn stalled_readers_lose_only_their_streams() {
 }
 
 #[test]
+fn stalled_readers_of_small_responses_lose_their_streams() {
+    let _serial = serialize();
+    let server = serve(|_| {});
+    let before = cut_off(&server);
+    let mut attacker = H2::ask(server.addr, 0, &["/nothing"; STREAMS as usize]);
+    let begun = Instant::now();
+    while !attacker.all(|seen| seen.reset) {
+        assert!(begun.elapsed() < Duration::from_secs(20), "some were not disconnected");
+        attacker.grant(1, false);
+        attacker.read(Duration::from_millis(100));
+    }
+    assert!(attacker.all(|seen| seen.bytes < 300 && !seen.ended));
+    wait_for("they are counted", || cut_off(&server) >= before + f64::from(STREAMS));
+    // Readers of the same responses with a window are served.
+    let mut reader = H2::ask(server.addr, 1 << 16, &["/nothing"; STREAMS as usize]);
+    while !reader.all(|seen| seen.ended) {
+        reader.read(Duration::from_millis(100));
+        assert!(reader.all(|seen| !seen.reset));
+    }
+}
+
+#[test]
 fn readers_above_the_minimum_rate_get_the_whole_body() {
     let _serial = serialize();
     let server = serve(|_| {});
@@ -270,4 +287,32 @@ fn event_streams_have_no_minimum_rate() {
     listener.grant(1 << 20, true);
     listener.read(Duration::from_millis(500));
     assert!(listener.all(|seen| !seen.reset && seen.bytes > 0), "{:?}", listener.seen);
+}
+
+/// Reads the body of a response at `rate` bytes per second with the default buffers of the system. Returns its length.
+fn read_steadily(addr: SocketAddr, path: &str, rate: u32) -> usize {
+    let mut reader = connect(addr);
+    write!(reader, "GET {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n").unwrap();
+    let (start, mut some, mut bytes) = (Instant::now(), [0; 512], 0);
+    loop {
+        match reader.read(&mut some) {
+            Ok(0) => return bytes,
+            Ok(n) => bytes += n,
+            Err(error) => panic!("cut off after {bytes} bytes: {error}"),
+        }
+        let due = start + Duration::from_secs_f64(bytes as f64 / f64::from(rate));
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+    }
+}
+
+#[test]
+fn steady_readers_of_twice_the_minimum_rate_are_served() {
+    let _serial = serialize();
+    let server = serve(|_| {});
+    let path = result(&server, 1600);
+    let (length, before) = (server.get(&path).body.len(), cut_off(&server));
+    // With the former buffers of 256 KiB, the server saw progress every eight seconds.
+    let bytes = read_steadily(server.addr, &path, 32 << 10);
+    assert!(bytes > length, "{bytes} of {length}");
+    assert!(cut_off(&server) < before + 1.0);
 }

@@ -53,7 +53,7 @@ on_both!(
     memory_cache_is_bounded_and_drops_removed_objects,
     a_restart_finds_existing_objects,
     a_cancelled_put_still_finishes,
-    the_probe_leaves_nothing,
+    the_check_leaves_nothing,
 );
 
 fn usage(bytes: usize, objects: u64) -> Usage {
@@ -532,17 +532,17 @@ async fn a_cancelled_put_still_finishes(place: TestStore) {
     assert!(!has(&store, &input(0)).await);
 }
 
-async fn the_probe_leaves_nothing(place: TestStore) {
+async fn the_check_leaves_nothing(place: TestStore) {
     let store = place.open().await;
-    store.probe().await.unwrap();
+    store.check().await.unwrap();
     assert_eq!(Folder::ALL.map(|f| store.usage(f)), [usage(0, 0); 3]);
     assert_eq!(place.unfinished(), Vec::<String>::new());
     if place.is_local() {
-        assert_eq!(std::fs::read_dir(place.root().join("probe")).unwrap().count(), 0);
+        assert_eq!(std::fs::read_dir(place.root().join("check")).unwrap().count(), 0);
         std::fs::remove_dir_all(place.root()).unwrap();
         std::fs::write(place.root(), "in the way").unwrap();
-        let message = store.probe().await.unwrap_err().to_string();
-        assert!(message.contains("probe") && message.contains(store.place()), "{message}");
+        let message = store.check().await.unwrap_err().to_string();
+        assert!(message.contains("check") && message.contains(store.location()), "{message}");
         assert!(store.put(&result(1), Bytes::from_static(b"x")).await.is_err());
         assert_eq!(store.usage(Folder::Results), usage(0, 0));
     }
@@ -603,8 +603,8 @@ async fn uploads_of_crashed_processes_are_removed() {
 
 async fn refusal(config: &StoreConfig, data_dir: &std::path::Path) -> (&'static str, String) {
     let refused = Store::open(config, data_dir).await;
-    let Err(StoreError::Open { key, place, reason }) = refused else { panic!("{refused:?}") };
-    let message = StoreError::Open { key, place, reason }.to_string();
+    let Err(StoreError::Open { key, location, reason }) = refused else { panic!("{refused:?}") };
+    let message = StoreError::Open { key, location, reason }.to_string();
     assert!(message.contains(key), "{message}");
     (key, message)
 }
@@ -629,10 +629,10 @@ async fn errors_name_an_unusable_folder() {
     Store::open(&config, &closed).await.unwrap();
     let mut mode = std::fs::metadata(&closed).unwrap().permissions();
     mode.set_readonly(true);
-    for folder in ["", "store", "store/probe"] {
+    for folder in ["", "store", "store/check"] {
         std::fs::set_permissions(closed.join(folder), mode.clone()).unwrap();
     }
-    let superuser = std::fs::write(closed.join("store/probe/x"), "").is_ok();
+    let superuser = std::fs::write(closed.join("store/check/x"), "").is_ok();
     let closed = if superuser { std::path::PathBuf::from("/sys") } else { closed };
     let (_, message) = refusal(&config, &closed).await;
     assert!(message.contains(&closed.display().to_string()), "{message}");
@@ -670,7 +670,7 @@ async fn errors_name_an_unusable_bucket_but_no_secret() {
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
     // If the service stops, operations fail and the usage is unchanged.
     drop(service);
-    assert!(store.probe().await.is_err());
+    assert!(store.check().await.is_err());
     assert!(store.put(&input(2), Bytes::from_static(b"x")).await.is_err());
     assert_eq!(store.usage(Folder::Inputs), usage(9 * MIB, 1));
 }
@@ -713,11 +713,11 @@ fn metrics_report_stored_and_removed_objects() {
             store.sweep(SystemTime::now() + 10_000 * HOUR).await;
             assert_eq!(value("molmesh_store_removed_total{reason=\"ttl\"}"), 2);
             assert_eq!(value("molmesh_store_objects{folder=\"results\"}"), 0);
-            assert_eq!(value("molmesh_store_errors_total{op=\"probe\"}"), 0);
+            assert_eq!(value("molmesh_store_errors_total{op=\"check\"}"), 0);
             std::fs::remove_dir_all(place.root()).unwrap();
             std::fs::write(place.root(), "in the way").unwrap();
-            assert!(store.probe().await.is_err());
-            assert_eq!(value("molmesh_store_errors_total{op=\"probe\"}"), 1);
+            assert!(store.check().await.is_err());
+            assert_eq!(value("molmesh_store_errors_total{op=\"check\"}"), 1);
         });
     });
 }

@@ -119,7 +119,7 @@ impl Backend for Fake {
             Mode::Panic => panic!("panic of a test"),
             Mode::GridTooLarge => {
                 return Err(SurfaceError::GridTooLarge {
-                    samples: 1000,
+                    grid_points: 1000,
                     limit: 100,
                     resolution: params.resolution,
                     suggested_resolution: 1.1,
@@ -134,7 +134,7 @@ impl Backend for Fake {
         if !warm_up {
             self.finished.fetch_add(1, Ordering::SeqCst);
         }
-        let output = MeshOutput::new(mesh, GridStats { samples: 7, ..GridStats::default() });
+        let output = MeshOutput::new(mesh, GridStats { grid_points: 7, ..GridStats::default() });
         output.deliver(params, control, sink)
     }
 }
@@ -402,10 +402,17 @@ fn unchunk(mut raw: &[u8]) -> (Vec<u8>, bool) {
     }
 }
 
-/// Waits at most half a minute until a condition holds.
+/// Returns the maximum of this process's resident memory, bytes; 0 if the system does not tell.
+pub(crate) fn peak_memory() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let kib = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    kib.and_then(|kib| kib.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()).unwrap_or_default() << 10
+}
+
+/// Waits until a condition holds, for at most two minutes, as the machine may be busy.
 #[track_caller]
 pub(crate) fn wait_for(what: &str, mut is: impl FnMut() -> bool) {
-    let end = Instant::now() + Duration::from_secs(30);
+    let end = Instant::now() + Duration::from_mins(2);
     while !is() {
         assert!(Instant::now() < end, "waited too long for: {what}");
         std::thread::sleep(Duration::from_millis(5));
@@ -430,4 +437,17 @@ pub(crate) fn carbons(n: usize) -> Vec<u8> {
         );
     }
     text.into_bytes()
+}
+
+/// Compresses bytes.
+pub(crate) fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(bytes).unwrap();
+    encoder.finish().unwrap()
+}
+
+/// Returns a frame of HTTP/2.
+pub(crate) fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
+    let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
+    [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
 }

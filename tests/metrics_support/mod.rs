@@ -1,19 +1,18 @@
-//! Parser of the Prometheus format; backends that change metrics.
+//! Parser of the Prometheus format; a backend that changes the metrics of devices.
 #![allow(dead_code, reason = "each test binary uses a part")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 pub(crate) mod queries;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Condvar, Mutex};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
+use std::time::Duration;
 
 use molmesh::surface::{
     Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits,
     SurfaceParams,
 };
-use molmesh::telemetry::{Kind, Metric};
+use molmesh::telemetry::{Metric, MetricKind};
 
 use crate::http_support::{Fake, Mode};
 
@@ -93,9 +92,10 @@ pub(crate) fn check(scrape: &Scrape, metrics: &[Metric]) -> Vec<String> {
     for Sample { name, labels, .. } in &scrape.samples {
         let base = ["_bucket", "_sum", "_count"].iter().find_map(|suffix| {
             let base = name.strip_suffix(suffix)?;
-            metrics.iter().find(|m| m.name == base && m.kind == Kind::Histogram)
+            metrics.iter().find(|m| m.name == base && m.kind == MetricKind::Histogram)
         });
-        let Some(metric) = base.or_else(|| metrics.iter().find(|m| m.name == name && m.kind != Kind::Histogram)) else {
+        let Some(metric) = base.or_else(|| metrics.iter().find(|m| m.name == name && m.kind != MetricKind::Histogram))
+        else {
             faults.push(format!("{name} is not described"));
             continue;
         };
@@ -122,71 +122,6 @@ pub(crate) fn check(scrape: &Scrape, metrics: &[Metric]) -> Vec<String> {
         }
     }
     faults
-}
-
-/// Waits with a long timeout until a condition holds.
-#[track_caller]
-pub(crate) fn until(what: &str, mut is: impl FnMut() -> bool) {
-    let end = Instant::now() + Duration::from_mins(1);
-    while !is() {
-        assert!(Instant::now() < end, "waited too long for: {what}");
-        std::thread::sleep(Duration::from_millis(10));
-    }
-}
-
-/// Backend that holds its jobs until they are released.
-pub(crate) struct Held {
-    fake: Arc<Fake>,
-    open: Mutex<bool>,
-    changed: Condvar,
-    /// True while a job is held.
-    pub(crate) holds: AtomicBool,
-}
-
-impl Held {
-    pub(crate) fn new() -> Arc<Self> {
-        Arc::new(Self {
-            fake: Fake::new(Mode::Octahedra),
-            open: Mutex::new(false),
-            changed: Condvar::new(),
-            holds: AtomicBool::new(false),
-        })
-    }
-
-    pub(crate) fn release(&self) {
-        *self.open.lock().unwrap() = true;
-        self.changed.notify_all();
-    }
-}
-
-impl Backend for Held {
-    fn name(&self) -> &'static str {
-        "held"
-    }
-
-    fn describe(&self) -> String {
-        "nothing".to_owned()
-    }
-
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
-        // The warm-up has one sphere.
-        if spheres.len() > 1 {
-            self.holds.store(true, Ordering::SeqCst);
-            let mut open = self.open.lock().unwrap();
-            while !*open {
-                control.check()?;
-                open = self.changed.wait_timeout(open, Duration::from_millis(5)).unwrap().0;
-            }
-        }
-        self.fake.write(spheres, params, limits, control, sink)
-    }
 }
 
 /// Backend with a device whose metrics are all nonzero and that uses a fallback.

@@ -1,4 +1,4 @@
-// Meshes a file and follows a job with a client that @hey-api/openapi-ts generated, for tests/openapi_clients.rs.
+// Meshes a file and follows a job with a client that @hey-api/openapi-ts generated, for tests/http/openapi_clients.rs.
 // Usage: URL FILE. The generated code parses types that it does not know, such as model/gltf-binary, as JSON: hence
 // `parseAs`.
 import { readFileSync } from "node:fs";

@@ -1,4 +1,4 @@
-"""Meshes a file and follows a job with a Python client that openapi-generator made, for tests/openapi_clients.rs.
+"""Meshes a file and follows a job with a Python client that openapi-generator made, for tests/http/openapi_clients.rs.
 
 Usage: openapi_generator.py URL FOLDER FILE. FOLDER holds the generated package `client`.
 """

@@ -1,4 +1,5 @@
-"""Meshes a file and follows a job with a client that openapi-python-client generated, for tests/openapi_clients.rs.
+"""Meshes a file and follows a job with a client that openapi-python-client generated. Used by
+tests/http/openapi_clients.rs.
 
 Usage: openapi_python_client.py URL FOLDER FILE. FOLDER holds the generated package `client`.
 """

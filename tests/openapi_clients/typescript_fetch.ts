@@ -1,5 +1,5 @@
 // Meshes a file and follows a job with a client that openapi-generator made for TypeScript (typescript-fetch), for
-// tests/openapi_clients.rs. Usage: URL FILE.
+// tests/http/openapi_clients.rs. Usage: URL FILE.
 import { readFileSync } from "node:fs";
 import { Configuration, JobStatus, JobsApi, MeshesApi, ResponseError, ResultsApi } from "./client";
 

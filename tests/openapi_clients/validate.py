@@ -1,4 +1,4 @@
-"""Validates an OpenAPI document, for tests/openapi.rs.
+"""Validates an OpenAPI document, for tests/http/openapi.rs.
 
 Usage: validate.py DOCUMENT.json DOCUMENT.yaml. Checks the document against the specification, every example of a schema
 against that schema, and that a YAML 1.1 parser reads the same document from both files. Exits with 1 and a message on

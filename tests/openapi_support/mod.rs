@@ -70,11 +70,11 @@ impl Seen {
 
     /// Records a response. Fails if a part of it is not documented.
     pub(crate) fn note(&self, method: &str, path: &str, reply: &Reply) -> Result<(), String> {
-        let operation = self.operation(method, path).ok_or_else(|| format!("{method} {path} is not described"))?;
+        let operation = self.operation(method, path).ok_or_else(|| format!("{method} {path} is not documented"))?;
         let status = reply.status;
         let described = self.described[&operation].get(&status);
         let described =
-            described.ok_or_else(|| format!("{operation}: {status} is not described: {:?}", reply.body()))?;
+            described.ok_or_else(|| format!("{operation}: {status} is not documented: {:?}", reply.body()))?;
         self.seen.lock().unwrap().insert((operation.clone(), status));
         let Some(content) = described["content"].as_object() else {
             return if reply.body.is_empty() { Ok(()) } else { Err(format!("{operation}: {status} has a body")) };
@@ -82,7 +82,7 @@ impl Seen {
         let media_type = reply.header("content-type").unwrap_or_default();
         let range = format!("{}/*", media_type.split('/').next().unwrap());
         if !content.contains_key(media_type) && !content.contains_key(&range) {
-            return Err(format!("{operation}: {status} is no {media_type}"));
+            return Err(format!("{operation}: {status} must not have the media type {media_type}"));
         }
         if media_type == "application/problem+json" {
             let (types, found) = (described["description"].as_str().unwrap(), reply.json()["type"].clone());
@@ -92,10 +92,10 @@ impl Seen {
             }
         }
         for (name, _) in reply.headers.iter().filter(|(name, _)| name.starts_with("molmesh-")) {
-            // A part has the headers of the whole.
+            // The document lists these headers for status 200; a part of a file has them too.
             let whole = if status == 206 { 200 } else { status };
             if status < 300 && self.described[&operation][&whole]["headers"].get(name).is_none() {
-                return Err(format!("{operation}: {status} has a header {name} that is not described"));
+                return Err(format!("{operation}: {status} has a header {name} that is not documented"));
             }
         }
         Ok(())

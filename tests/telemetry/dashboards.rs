@@ -1,5 +1,5 @@
-//! Dashboard and alerts of `deploy/`: errors in queries and layout are detected. tests/metrics.rs checks that the
-//! queried metrics exist.
+//! Dashboard and alerts of `deploy/`: errors in queries and layout are detected. tests/telemetry/metrics.rs checks
+//! that the queried metrics exist.
 
 use crate::metrics_support;
 use crate::tools;
@@ -52,7 +52,7 @@ fn wrong_queries_are_detected() {
         ("molmesh_queue_depth / on (device) molmesh_queue_depth", "", Some("no label device")),
         ("molmesh_queue_depth", "{{ $labels.device }}", Some("no label device")),
         ("molmesh_cache_requests_total{result=\"hot\"}", "", Some("never hot")),
-        ("molmesh_queue_depth{job=\"$other\"}", "", Some("not known")),
+        ("molmesh_queue_depth{job=\"$other\"}", "", Some("unknown variable")),
     ];
     let paths: Vec<_> = cases.iter().enumerate().map(|(n, (text, says, _))| rule(n, text, says)).collect();
     let Some(files) = tools::queries(&paths) else { return };

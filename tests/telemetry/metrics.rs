@@ -14,10 +14,10 @@ use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, sample, start, start_cold};
-use metrics_support::{Devices, Held, Scrape, check, queries, until};
+use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, sample, start, start_cold, wait_for};
+use metrics_support::{Devices, Scrape, check, queries};
 use molmesh::surface::CpuBackend;
-use molmesh::telemetry::{self as t, Kind, METRICS, Metric, recorder};
+use molmesh::telemetry::{self as t, METRICS, Metric, MetricKind, recorder};
 
 /// Action that changes metrics. It calls `look` to wait until they have changed.
 type Mover = fn(look: &dyn Fn());
@@ -46,6 +46,8 @@ const ROWS: &[Row] = &[
     (t::QUEUE_AGE, &[], held),
     (t::QUEUE_WAIT, &[], held),
     (t::MEMORY_HELD, &[], held),
+    (t::MEMORY_USED, &[], held),
+    (t::MEMORY_LIMIT, &[], held),
     (t::GRID_POINTS, &[], meshes),
     (t::TRIANGLES, &[], meshes),
     (t::DEVICE_UP, &["device=\"0\""], devices),
@@ -85,25 +87,27 @@ fn meshes(look: &dyn Fn()) {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let ask = || server.post("/v1/meshes", &[], SAMPLE);
     assert_eq!(ask().status, 200);
-    until("the result is cached", || ask().header("server-timing").unwrap().contains("hit"));
+    wait_for("the result is cached", || ask().header("server-timing").unwrap().contains("hit"));
     look();
 }
 
 /// One running and two queued jobs, one of them asynchronous.
 fn held(look: &dyn Fn()) {
-    let backend = Held::new();
+    let backend = Fake::new(Mode::Held);
     let server = start(Arc::clone(&backend) as _, |config| {
         config.jobs.workers = 1;
         config.jobs.deadline_ms = 600_000;
+        // Another limit than that of the servers before.
+        config.limits.memory_bytes = 1 << 30;
     });
     std::thread::scope(|scope| {
         let running = scope.spawn(|| server.post("/v1/meshes", &[], &sample(1)));
-        until("the job runs", || backend.holds.load(Ordering::SeqCst));
+        wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
         let later = [("prefer", "respond-async")];
         assert_eq!(server.post("/v1/meshes", &later, &sample(2)).status, 202);
         assert_eq!(server.post("/v1/meshes", &later, &sample(3)).status, 202);
         look();
-        backend.release();
+        backend.set(Mode::Octahedra);
         assert_eq!(running.join().unwrap().status, 200);
     });
 }
@@ -137,10 +141,10 @@ fn restart(look: &dyn Fn()) {
         folder.path().clone_into(&mut config.server.data_dir);
         config.server.drain_timeout_ms = 1;
     };
-    let backend = Held::new();
+    let backend = Fake::new(Mode::Held);
     let server = start(Arc::clone(&backend) as _, keep);
     assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE).status, 202);
-    until("the job runs", || backend.holds.load(Ordering::SeqCst));
+    wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
     let _drained = server.join();
     let _server = start(Fake::new(Mode::Octahedra), keep);
     look();
@@ -274,7 +278,7 @@ fn every_metric_has_a_row_and_changes() {
                 let now = scrape();
                 rows.iter().filter(|row| !moved(&now, row)).map(|row| row.0).collect::<Vec<_>>()
             };
-            until(&format!("{:?}", rows.iter().map(|row| row.0).collect::<Vec<_>>()), || missing().is_empty());
+            wait_for(&format!("{:?}", rows.iter().map(|row| row.0).collect::<Vec<_>>()), || missing().is_empty());
         });
         let faults = check(&scrape(), METRICS);
         assert_eq!(faults, Vec::<String>::new());
@@ -332,7 +336,7 @@ fn unknown_names_of_clients_are_not_labels() {
     let before = series();
     (0..40).for_each(walk);
     // A response is counted after its last byte.
-    until("the last request is counted", || {
+    wait_for("the last request is counted", || {
         let scrape = scrape();
         scrape.moves(t::HTTP_DURATION, &["route=\"unmatched\""]) >= 40.0
     });
@@ -344,7 +348,7 @@ fn unknown_names_of_clients_are_not_labels() {
 
 /// Returns the table of metrics as in the documentation.
 fn table() -> String {
-    let mut text = "| metric | kind | labels | what |\n| --- | --- | --- | --- |\n".to_owned();
+    let mut text = "| metric | kind | labels | meaning |\n| --- | --- | --- | --- |\n".to_owned();
     for metric in METRICS {
         let label = |label: &t::Label| match label.closed() {
             Some(values) => format!("`{}`: {}", label.name, values.collect::<Vec<_>>().join(", ")),
@@ -375,6 +379,6 @@ fn the_documentation_lists_every_metric() {
 fn counters_of_seconds_have_the_type_counter() {
     let text = recorder().unwrap().render();
     assert!(text.contains("# TYPE process_cpu_seconds_total counter\n"), "{text}");
-    let kinds: BTreeMap<&str, Kind> = METRICS.iter().map(|metric| (metric.name, metric.kind)).collect();
-    assert_eq!(kinds[t::DEVICE_BUSY], Kind::Seconds);
+    let kinds: BTreeMap<&str, MetricKind> = METRICS.iter().map(|metric| (metric.name, metric.kind)).collect();
+    assert_eq!(kinds[t::DEVICE_BUSY], MetricKind::Seconds);
 }

@@ -2,15 +2,13 @@
 
 use crate::archive_support;
 use crate::http_support;
-use crate::metrics_support;
 use crate::trace_support;
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use http_support::{Fake, Mode, Reply, Running, SAMPLE, log_lines, sample, send, start, start_on};
-use metrics_support::{Held, until};
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, log_lines, sample, send, start, start_on, wait_for};
 use molmesh::config::Config;
 use molmesh::surface::{Backend, CpuBackend};
 use opentelemetry_proto::tonic::trace::v1::Span;
@@ -190,7 +188,7 @@ fn an_asynchronous_job_stays_in_the_trace_of_its_request() {
     let failing = [("prefer", "respond-async"), ("x-request-id", "later-2")];
     let failed = server.post("/v1/meshes", &failing, b"nothing to read");
     for location in [reply.header("location").unwrap(), failed.header("location").unwrap()] {
-        until("the job ends", || !server.get(&format!("{location}?wait=20")).json()["finished"].is_null());
+        wait_for("the job ends", || !server.get(&format!("{location}?wait=20")).json()["finished"].is_null());
     }
     assert!(server.join());
     let spans = collector.trace(TRACE);
@@ -208,7 +206,7 @@ fn an_asynchronous_job_stays_in_the_trace_of_its_request() {
 
 #[test]
 fn a_trace_continues_after_a_restart() {
-    let held = Held::new();
+    let held = Fake::new(Mode::Held);
     let (before, after) = (Collector::start(CollectorMode::Accept), Collector::start(CollectorMode::Accept));
     let folder = tempfile::tempdir().unwrap();
     let keep = |config: &mut Config| folder.path().clone_into(&mut config.server.data_dir);
@@ -220,12 +218,12 @@ fn a_trace_continues_after_a_restart() {
     let reply = server.post("/v1/meshes", &headers, SAMPLE);
     assert_eq!(reply.status, 202);
     let location = reply.header("location").unwrap().to_owned();
-    until("the job runs", || held.holds.load(Ordering::SeqCst));
+    wait_for("the job runs", || held.started.load(Ordering::SeqCst) == 1);
     // The job is left to the next start. The result of `join` is ignored, because the last response may miss the drain.
     let _drained = server.join();
 
     let server = traced(Fake::new(Mode::Octahedra), &after, keep);
-    until("the job ends", || server.get(&format!("{location}?wait=20")).json()["status"] == "successful");
+    wait_for("the job ends", || server.get(&format!("{location}?wait=20")).json()["status"] == "successful");
     assert!(server.join());
     let (_, request) = place(&reply);
     let spans = after.trace(TRACE);
@@ -236,16 +234,16 @@ fn a_trace_continues_after_a_restart() {
 
 #[test]
 fn requests_are_linked_to_a_coalesced_job() {
-    let (held, collector) = (Held::new(), Collector::start(CollectorMode::Accept));
+    let (held, collector) = (Fake::new(Mode::Held), Collector::start(CollectorMode::Accept));
     let server = traced(Arc::clone(&held) as _, &collector, |config| config.jobs.deadline_ms = 600_000);
     let other = PARENT.replace(TRACE, "33333333333333333333333333333333");
     let joined = || server.metric("molmesh_jobs_submitted_total", &["dedup=\"yes\""]);
     let timing = std::thread::scope(|scope| {
         let first = scope.spawn(|| server.post("/v1/meshes", &[("traceparent", PARENT)], SAMPLE));
-        until("the job runs", || held.holds.load(Ordering::SeqCst));
+        wait_for("the job runs", || held.started.load(Ordering::SeqCst) == 1);
         let second = scope.spawn(|| server.post("/v1/meshes", &[("traceparent", &other)], SAMPLE));
-        until("the second request joins the job", || joined() > 0.0);
-        held.release();
+        wait_for("the second request joins the job", || joined() > 0.0);
+        held.set(Mode::Octahedra);
         assert_eq!(first.join().unwrap().status, 200);
         second.join().unwrap().header("server-timing").unwrap().to_owned()
     });
@@ -339,7 +337,7 @@ fn failing_collectors_do_not_affect_requests() {
             config.telemetry.flush_timeout_ms = 100;
         });
         let before = sign(&server);
-        until(&format!("{mode:?}"), || {
+        wait_for(&format!("{mode:?}"), || {
             assert_eq!(server.post("/v1/meshes?format=stl", &[], &sample(1)).status, 200);
             sign(&server) > before
         });

@@ -39,14 +39,14 @@ def against_kubernetes(document):
     return []
 
 
-def look(path):
+def check_file(path):
     try:
         documents = [d for d in yaml.safe_load_all(path.read_text()) if d is not None]
     except yaml.YAMLError as error:
-        return {"documents": [], "errors": [f"no YAML: {error}"]}
+        return {"documents": [], "errors": [f"not YAML: {error}"]}
     check = against_compose if path.name.startswith("compose") else against_kubernetes
     return {"documents": documents, "errors": [error for document in documents for error in check(document)]}
 
 
 for line in sys.stdin:
-    print(json.dumps(look(pathlib.Path(line.strip()))), flush=True)
+    print(json.dumps(check_file(pathlib.Path(line.strip()))), flush=True)

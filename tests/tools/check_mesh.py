@@ -1,9 +1,9 @@
 """Reads mesh files with trimesh as an independent check of the product's output.
 
-Reads file names from the arguments, or one per line from standard input, and answers each with one line of
-JSON, at once: so it serves a batch as well as a test that keeps it running. Nothing is repaired or welded,
-except that STL files, which have no shared vertices, are welded where coordinates are equal to the bit; then
-`welded` is true. A file that cannot be read is answered with `error`. Node transforms of glTF are applied.
+Reads file names from the arguments, or one per line from standard input, and prints one line of JSON for each at
+once, so a test can keep the process running. Nothing is repaired. Only STL files, which have no shared vertices, are
+welded where coordinates are equal; then `welded` is true. A file that cannot be read gives `error`. Node transforms
+of glTF are applied.
 """
 
 import json
@@ -23,7 +23,7 @@ def load(path):
         part = scene.geometry[name].copy(include_cache=True)
         written = part._cache.cache.get("vertex_normals")
         if written is not None:
-            # Row vectors times the inverse equal column vectors times the inverse transpose. A scale must not stretch them.
+            # Row vectors times the inverse equal column vectors times its transpose. A scale does not stretch them.
             linear = transform[:3, :3] / np.cbrt(np.linalg.det(transform[:3, :3]))
             normals.append(np.array(written, dtype=np.float64) / normal_unit(path) @ np.linalg.inv(linear))
         part.apply_transform(transform)
@@ -139,14 +139,14 @@ def finite(value):
 
 
 def main():
-    np.seterr(all="ignore")  # broken meshes are what this is for
+    np.seterr(all="ignore")  # broken meshes give NaN
     paths = sys.argv[1:]
     for path in paths or (line.rstrip("\n") for line in sys.stdin):
         if not path:
             continue
         try:
             answer = report(path)
-        except Exception as error:  # whatever a reader says about a broken file is the answer
+        except Exception as error:  # readers of broken files raise errors of any type
             answer = {"file": path, "error": f"{type(error).__name__}: {error}"}
         print(json.dumps(finite(answer), allow_nan=False), flush=True)
 

@@ -1,7 +1,7 @@
 """Counts the atoms that gemmi selects in the first model. tests/core/structure_select.rs compares the counts.
 
-Usage: gemmi_select.py FILE SELECTION… Prints one count per selection. `NUMBER of SELECTION` counts the atoms within this
-distance (Å) of the selected ones.
+Usage: gemmi_select.py FILE SELECTION… Prints one count per selection. `NUMBER of SELECTION` counts the atoms within
+this distance (Å) of the selected ones.
 """
 
 import sys

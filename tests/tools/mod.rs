@@ -158,6 +158,34 @@ pub fn queries(paths: &[impl AsRef<Path>]) -> Option<Vec<Queries>> {
     python("promql.py", paths)
 }
 
+/// VTP file as read by VTK.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(default)]
+pub struct Vtp {
+    /// True if VTK is not installed. Nothing else is set then.
+    pub missing: bool,
+    /// Read error.
+    pub error: Option<String>,
+    pub points: u64,
+    pub triangles: u64,
+    pub bounds: [[f64; 3]; 2],
+    pub area: f64,
+    pub volume: f64,
+    /// Edges with one triangle or more than two.
+    pub bad_edges: u64,
+    /// Name of the active scalars.
+    pub scalars: Option<String>,
+    pub normals: bool,
+    pub colors: Option<Vec<[u8; 4]>>,
+    pub atoms: Option<Vec<u32>>,
+}
+
+/// Reads VTP files.
+pub fn vtp(paths: &[impl AsRef<Path>]) -> Option<Vec<Vtp>> {
+    let reports: Vec<Vtp> = python("read_vtp.py", paths)?;
+    if reports.iter().any(|report| report.missing) { missing("VTK") } else { Some(reports) }
+}
+
 /// PNG file as read by Pillow.
 #[derive(Debug, Clone, Deserialize)]
 pub struct Png {
@@ -226,19 +254,32 @@ pub fn skip<T>(why: &str) -> Option<T> {
     None
 }
 
-/// Returns the folder of real structures beside the repository. Where it does not exist, `MOLMESH_NO_STRUCTURES` says
-/// that this is intended, and the tests that need it are skipped even if `CI` is set.
+/// Returns the folder of real structures beside the repository, with a list of its files in `SOURCES.tsv`. If it does
+/// not exist, tests that need it are skipped. If `CI` is set, they fail, unless `MOLMESH_NO_STRUCTURES` is set too.
 pub fn structures() -> Option<PathBuf> {
     let folder = root().join("../shared/data/structures");
     if folder.is_dir() {
         return Some(folder);
     }
-    let why = "no folder ../shared/data/structures; the samples run alone";
+    let why = "no folder ../shared/data/structures; only those of tests/structures are used";
     if is_set("MOLMESH_NO_STRUCTURES") {
         print_skipped(why);
         return None;
     }
     skip(why)
+}
+
+/// Returns the folder of [`structures`], or the folder of the committed ones, which are entries of the PDB.
+pub fn some_structures() -> PathBuf {
+    structures().unwrap_or_else(|| root().join("tests/structures"))
+}
+
+/// Returns a file of [`some_structures`]; `None` if it is not among the committed ones.
+pub fn some_structure(name: &str) -> Option<PathBuf> {
+    match structures() {
+        Some(folder) => Some(folder.join(name)),
+        None => Some(some_structures().join(name)).filter(|path| path.is_file()),
+    }
 }
 
 fn is_set(variable: &str) -> bool {

@@ -24,8 +24,8 @@ SURFACE = ["--detail", "4", "--validation", "exact"]
 REJECTED = 4
 
 
-def faults(measured, told):
-    """Returns how the measures of trimesh differ from a closed mesh with the reported measures."""
+def faults(measured, reported):
+    """Returns the differences between the measures of trimesh and those of a closed mesh in the report."""
     found = []
     if measured.get("error") or measured["empty"]:
         return [measured.get("error", "the mesh is empty")]
@@ -33,11 +33,11 @@ def faults(measured, told):
         if not measured[name]:
             found.append(f"not {name}")
     for own, name in [("faces", "triangles"), ("vertices", "vertices"), ("euler", "euler"), ("bodies", "components")]:
-        if measured[own] != told[name]:
-            found.append(f"{name}: {measured[own]} instead of {told[name]}")
+        if measured[own] != reported[name]:
+            found.append(f"{name}: {measured[own]} instead of {reported[name]}")
     for name in ["area", "volume"]:
-        if not abs(measured[name] - told[name]) <= TOLERANCE * abs(told[name]):
-            found.append(f"{name}: {measured[name]!r} instead of {told[name]!r}")
+        if not abs(measured[name] - reported[name]) <= TOLERANCE * abs(reported[name]):
+            found.append(f"{name}: {measured[name]!r} instead of {reported[name]!r}")
     return found
 
 
@@ -45,7 +45,7 @@ def control(folder):
     """Checks that faults are found, with an octahedron of area 4·√3 and volume 4/3."""
     corners = ["1 0 0", "-1 0 0", "0 1 0", "0 -1 0", "0 0 1", "0 0 -1"]
     faces = ["0 2 4", "2 1 4", "1 3 4", "3 0 4", "2 0 5", "1 2 5", "3 1 5", "0 3 5"]
-    told = {"triangles": 8, "vertices": 6, "euler": 2, "components": 1, "area": 4 * 3**0.5, "volume": 4 / 3}
+    reported = {"triangles": 8, "vertices": 6, "euler": 2, "components": 1, "area": 4 * 3**0.5, "volume": 4 / 3}
 
     def measured(faces):
         head = f"ply\nformat ascii 1.0\nelement vertex {len(corners)}\nproperty float x\nproperty float y\n"
@@ -57,7 +57,7 @@ def control(folder):
     whole = measured(faces)
     wrong = [measured(faces[1:]), measured(["4 2 0"] + faces[1:]), whole | {"euler": 0}]
     wrong += [whole | {name: whole[name] * (1 + 1e-5)} for name in ["area", "volume"]]
-    if faults(whole, told) or not all(faults(mesh, told) for mesh in wrong):
+    if faults(whole, reported) or not all(faults(mesh, reported) for mesh in wrong):
         sys.exit("nightly.py: the check does not distinguish right from wrong meshes")
 
 
@@ -80,11 +80,11 @@ def main():
                 print(f"{file.name}: FAILED, exit code {done.returncode}: {done.stderr.strip()}", flush=True)
                 failed += 1
                 continue
-            told = json.loads(done.stdout)
-            if told["atoms"] < SMALL:
+            reported = json.loads(done.stdout)
+            if reported["atoms"] < SMALL:
                 continue
-            found = faults(report(str(mesh)), told)
-            size = f"{told['atoms']} atoms, {told['triangles']} triangles, Euler number {told['euler']}"
+            found = faults(report(str(mesh)), reported)
+            size = f"{reported['atoms']} atoms, {reported['triangles']} triangles, Euler number {reported['euler']}"
             print(f"{file.name}: {size}: {'FAILED, ' + '; '.join(found) if found else 'ok'}", flush=True)
             checked += 1
             failed += bool(found)

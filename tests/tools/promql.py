@@ -1,7 +1,7 @@
 """Extracts and parses the PromQL of dashboards and rules.
 
-Reads paths from standard input, one a line; writes one line of JSON per path. A `.json` file is a dashboard of Grafana, a
-`.yaml` file rules of Prometheus.
+Reads paths from standard input, one per line; writes one line of JSON per path. A `.json` file is a dashboard of
+Grafana, a `.yaml` file rules of Prometheus.
 """
 
 import json
@@ -73,7 +73,7 @@ def expression(place, text, words):
     for name, value in VARIABLES.items():
         text = text.replace(name, value)
     if "$" in text:
-        return {"place": place, "error": f"a variable that is not known: {text}", "selectors": []}
+        return {"place": place, "error": f"unknown variable: {text}", "selectors": []}
     try:
         found = list(selectors(promql.parse(text)))
         for selector in found:
@@ -83,7 +83,7 @@ def expression(place, text, words):
         return {"place": place, "error": f"{error}: {text}", "selectors": []}
 
 
-def answer(path):
+def report(path):
     try:
         with open(path, encoding="utf-8") as file:
             found = of_dashboard(json.load(file)) if path.endswith(".json") else of_rules(yaml.safe_load(file))
@@ -93,4 +93,4 @@ def answer(path):
 
 
 for line in sys.stdin:
-    print(json.dumps(answer(line.rstrip("\n"))), flush=True)
+    print(json.dumps(report(line.rstrip("\n"))), flush=True)

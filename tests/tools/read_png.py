@@ -10,11 +10,11 @@ for path in sys.stdin.read().splitlines():
         image.load()
         flat = image.convert("RGBA").tobytes()
         pixels = [list(flat[at : at + 4]) for at in range(0, len(flat), 4)]
-        said = {
+        report = {
             "width": image.size[0],
             "height": image.size[1],
             "mode": image.mode,
             "srgb": "srgb" in image.info,
             "pixels": pixels,
         }
-    print(json.dumps(said))
+    print(json.dumps(report))

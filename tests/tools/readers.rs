@@ -275,6 +275,50 @@ pub fn read_stl(bytes: &[u8]) -> Vec<[[f32; 3]; 4]> {
         .collect()
 }
 
+/// Reads a VTP: arrays of the XML header by name, then their blocks in file order, each after its length.
+pub fn read_vtp(bytes: &[u8]) -> (Contents, Option<Vec<u32>>) {
+    let mark = b"<AppendedData encoding=\"raw\">\n_";
+    let at = bytes.windows(mark.len()).position(|w| w == mark).unwrap() + mark.len();
+    let header = std::str::from_utf8(&bytes[..at]).unwrap();
+    assert!(
+        header
+            .contains("<VTKFile type=\"PolyData\" version=\"1.0\" byte_order=\"LittleEndian\" header_type=\"UInt64\">")
+    );
+    let attribute = |text: &str, name: &str| -> String {
+        let (_, rest) = text.split_once(&format!(" {name}=\"")).unwrap();
+        rest.split_once('"').unwrap().0.to_owned()
+    };
+    let piece = header.lines().find(|line| line.contains("<Piece ")).unwrap();
+    let count = |name: &str| -> usize { attribute(piece, name).parse().unwrap() };
+    let (n, m) = (count("NumberOfPoints"), count("NumberOfPolys"));
+    let mut end = at;
+    let mut block = |name: &str, kind: &str, components: usize, bytes_each: usize, rows: usize| -> Option<&[u8]> {
+        let line = header.lines().find(|line| line.contains(&format!("Name=\"{name}\"")))?;
+        assert_eq!(
+            (attribute(line, "type").as_str(), attribute(line, "NumberOfComponents")),
+            (kind, components.to_string())
+        );
+        let start = at + attribute(line, "offset").parse::<usize>().unwrap();
+        let len = u64::from_le_bytes(bytes[start..start + 8].try_into().unwrap());
+        assert_eq!((start, len as usize), (end, components * bytes_each * rows), "{name}");
+        end = start + 8 + len as usize;
+        Some(&bytes[start + 8..end])
+    };
+    let vectors = |block: &[u8]| block.chunks(12).map(f32x3).collect::<Vec<_>>();
+    let words = |block: &[u8]| block.chunks(4).map(|word| u32_at(word, 0)).collect::<Vec<_>>();
+    let normals = block("Normals", "Float32", 3, 4, n).map(vectors).unwrap_or_default();
+    let color = |row: &[u8]| std::array::from_fn(|k| u16::from(row[k]));
+    let colors = block("RGBA", "UInt8", 4, 1, n).map(|block| block.chunks(4).map(color).collect());
+    let atoms = block("atom", "UInt32", 1, 4, n).map(words);
+    let parts = block("part", "UInt32", 1, 4, m).map(words);
+    let positions = vectors(block("Points", "Float32", 3, 4, n).unwrap());
+    let triangles = words(block("connectivity", "Int32", 1, 4, 3 * m).unwrap()).as_chunks::<3>().0.to_vec();
+    let ends: Vec<u32> = (1..=m as u32).map(|i| 3 * i).collect();
+    assert_eq!(words(block("offsets", "Int32", 1, 4, m).unwrap()), ends);
+    assert_eq!(&bytes[end..], b"\n  </AppendedData>\n</VTKFile>\n");
+    (Contents { positions, normals, triangles, atoms, colors, ..Contents::default() }, parts)
+}
+
 pub fn read_obj(bytes: &[u8]) -> Contents {
     let mut contents = Contents::default();
     for line in std::str::from_utf8(bytes).unwrap().lines() {

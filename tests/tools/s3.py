@@ -1,8 +1,8 @@
 """Runs an in-memory S3 service for the tests of the store.
 
-Prints one line of JSON when it is ready and ends at the end of standard input. The bucket is `meshes`. With `--guarded`, it
-accepts only the printed credentials. After the line `away` it drops every connection, after `back` it answers again. Each
-line is echoed.
+Prints one line of JSON when it is ready and ends at the end of standard input. The bucket is `meshes`. With
+`--guarded`, it accepts only the printed credentials. After the line `away` it drops every connection; after `back` it
+serves again. It echoes each line.
 """
 
 import json
@@ -39,7 +39,7 @@ if "--guarded" in sys.argv:
     everything = {"Version": "2012-10-17", "Statement": [{"Effect": "Allow", "Action": "*", "Resource": "*"}]}
     iam.put_user_policy(UserName="molmesh", PolicyName="all", PolicyDocument=json.dumps(everything))
     key = iam.create_access_key(UserName="molmesh")["AccessKey"]
-    settings.INITIAL_NO_AUTH_ACTION_COUNT = 0  # from now on, every request needs credentials
+    settings.INITIAL_NO_AUTH_ACTION_COUNT = 0  # all requests from here on need credentials
 
 
 class Gate:

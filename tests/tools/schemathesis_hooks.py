@@ -34,6 +34,6 @@ schemathesis.openapi.format("binary", any_structure)
 
 @schemathesis.hook
 def filter_query(context, query):
-    """Drops queries that do not fit into a request line: the HTTP library answers them with 414 or 431 and without a
+    """Drops queries that do not fit into a request line: the HTTP library rejects them with 414 or 431 and without a
     problem document, before the API sees them."""
     return query is None or len(urllib.parse.urlencode(query, doseq=True)) < 32_768

@@ -9,6 +9,7 @@ here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
 root=$(CDPATH='' cd -- "$here/../.." && pwd)
 tools=$root/target/test-tools
 python=${PYTHON:-python3}
+versions="Python 3.11 or later and Node 20.19 or later"
 steps=6
 step=0
 skipped=
@@ -28,8 +29,11 @@ skip() {
 
 for command in "$python" node npm; do
     command -v "$command" >/dev/null 2>&1 ||
-        fail "\`$command\` is not installed; the tests need Python 3.11 or later and Node 20 or later"
+        fail "\`$command\` is not installed; the tests need $versions"
 done
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || fail "$("$python" -V) is too old; the tests need $versions"
+node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 20 || (a === 20 && b >= 19) ? 0 : 1)' ||
+    fail "Node $(node --version) is too old; the tests need $versions"
 
 mkdir -p "$tools"
 # Of two runs at once, the second waits for the first.
@@ -42,7 +46,7 @@ log=$tools/apt.log
 as_root=
 if [ "$(id -u)" -ne 0 ]; then as_root="sudo -n"; fi
 
-# Runs apt-get behind the prefix $1 and waits up to five minutes for each lock. `apt-get update` has no timeout of its own.
+# Runs apt-get behind the prefix $1 and waits up to five minutes for each lock. `apt-get update` itself has no timeout.
 apt_get() {
     prefix=$1
     shift

@@ -1,4 +1,4 @@
-//! Meshes of known area, volume and topology for tests of writers and checkers.
+//! Meshes of known area, volume and topology for tests of writers and checkers, and random spheres.
 
 #![allow(clippy::cast_possible_truncation, reason = "meshes are single precision")]
 
@@ -135,4 +135,20 @@ fn cross(u: [f64; 3], v: [f64; 3]) -> [f64; 3] {
 fn triple(a: [f64; 3], b: [f64; 3], c: [f64; 3]) -> f64 {
     let n = cross(b, c);
     a[0] * n[0] + a[1] * n[1] + a[2] * n[2]
+}
+
+/// Deterministic random number generator with its state.
+pub struct Random(pub u64);
+
+impl Random {
+    /// Returns a number from 0 to 1.
+    pub fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    /// Returns `n` spheres with radii from 1.2 to 1.9 Å in a cube, as centre and radius.
+    pub fn cloud(&mut self, n: usize, side: f64) -> Vec<[f64; 4]> {
+        (0..n).map(|_| [self.next() * side, self.next() * side, self.next() * side, 1.2 + 0.7 * self.next()]).collect()
+    }
 }

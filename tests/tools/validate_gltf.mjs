@@ -1,8 +1,8 @@
 // Validates .glb and .gltf files with the Khronos validator as an independent check of the product's output.
 //
-// Reads file names from the arguments, or one per line from standard input, and answers each with one line of
-// JSON: how many errors, warnings, infos and hints, their codes with a count each, and the first messages.
-// For a file that the validator does not recognize as glTF, the line contains `error`.
+// Reads file names from the arguments, or one per line from standard input. Prints one line of JSON for each: the
+// numbers of errors, warnings, infos and hints, the count of each code, and the first messages. A file that the
+// validator does not recognize as glTF gives `error`.
 import { readFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
 import { createInterface } from 'node:readline';
@@ -13,7 +13,7 @@ const tools = fileURLToPath(new URL('../../target/test-tools/node/', import.meta
 const validator = createRequire(tools)('gltf-validator');
 
 async function report(file) {
-  // 0 means unlimited: a limit could hide errors behind warnings.
+  // 0 means unlimited. A limit could hide errors behind warnings.
   const result = await validator.validateBytes(new Uint8Array(readFileSync(file)), { uri: file, maxIssues: 0 });
   const { numErrors, numWarnings, numInfos, numHints, messages } = result.issues;
   const codes = {};

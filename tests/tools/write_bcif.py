@@ -30,6 +30,8 @@ CATEGORIES = (
     "struct_asym",
     "pdbx_struct_assembly_gen",
     "pdbx_struct_oper_list",
+    "struct_conf",
+    "struct_sheet_range",
     "atom_site",
 )
 BYTE_ARRAY = pdbx.ByteArrayEncoding

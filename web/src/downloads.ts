@@ -24,24 +24,24 @@ export class Downloads {
   private async save(format: string, button: HTMLButtonElement): Promise<void> {
     const wanted = this.wanted(format);
     if (!wanted) return;
-    const said = $("saved");
+    const status = $("saved");
     button.disabled = true;
-    said.textContent = `Making the ${format.toUpperCase()}…`;
+    status.textContent = `Making the ${format.toUpperCase()}…`;
     try {
       const path = surface(wanted.source, format, wanted.choices);
       const reply = await fetchFile(this.client, path, new AbortController().signal, ({ fraction }) => {
-        said.textContent = `Making the ${format.toUpperCase()}: ${Math.round(100 * fraction)} %`;
+        status.textContent = `Making the ${format.toUpperCase()}: ${Math.round(100 * fraction)} %`;
       });
       const blob = await reply.blob();
       const name = /filename="([^"]+)"/.exec(reply.headers.get("content-disposition") ?? "")?.[1] ?? `${stem(wanted.source)}.${format}`;
       const url = URL.createObjectURL(blob);
       const link = el("a", { href: url, download: name });
       link.click();
-      // The browser has copied it by then.
+      // The browser has saved the file by then.
       setTimeout(() => URL.revokeObjectURL(url), 60_000);
-      said.textContent = `${name}, ${bytes(blob.size)}`;
+      status.textContent = `${name}, ${bytes(blob.size)}`;
     } catch (error) {
-      said.textContent = "";
+      status.textContent = "";
       this.failed(error, wanted.source);
     } finally {
       button.disabled = false;

@@ -32,11 +32,11 @@ export class MolmeshViewer extends HTMLElement {
   private readonly menu = document.createElement("select");
   private readonly legend = document.createElement("div");
   private colors: Colors | null = null;
-  /** The content between the tags, shown instead of a surface. */
+  /** The content between the tags, shown if there is no surface. */
   private readonly fallback = document.createElement("slot");
   /** The reason why there is no surface, shown if there is no content between the tags. */
   private readonly reason = document.createElement("p");
-  /** Why the surface of `src` is not shown; null: it is, or will be when it has been loaded. */
+  /** Reason why the surface of `src` is not shown; null if it is shown or loading. */
   private failure: string | null = null;
   private isLost = false;
 
@@ -69,7 +69,7 @@ export class MolmeshViewer extends HTMLElement {
       return this.fail(error);
     }
     this.colors ??= new Colors(this.client, this.viewer, this.legend);
-    this.dress();
+    this.applyAttributes();
     void this.load(this.src);
   }
 
@@ -84,7 +84,7 @@ export class MolmeshViewer extends HTMLElement {
     if (!this.viewer || before === after) return;
     if (name === "src") void this.load(after ?? "");
     else if (name === "scheme") this.paint();
-    else this.dress();
+    else this.applyAttributes();
   }
 
   get src(): string {
@@ -95,7 +95,7 @@ export class MolmeshViewer extends HTMLElement {
     this.setAttribute("src", value);
   }
 
-  /** Loads another file, through a job if the service makes it one. Cancels the former request: the latest one wins. */
+  /** Loads another file, through a job if the service makes it one. Cancels the previous request. */
   private async load(src: string): Promise<void> {
     this.abort?.abort();
     const { signal } = (this.abort = new AbortController());
@@ -168,7 +168,7 @@ export class MolmeshViewer extends HTMLElement {
     });
   }
 
-  private dress(): void {
+  private applyAttributes(): void {
     this.paint();
     this.canvas.setAttribute("aria-label", this.getAttribute("alt") ?? "A molecular surface; arrow keys turn it");
     this.style.background = this.getAttribute("background") ?? "";

@@ -26,7 +26,7 @@ async function begin(): Promise<void> {
     const asksForKey = error instanceof Problem && [401, 403].includes(problem.document.status);
     show($("key-form"), asksForKey);
     if (asksForKey && !client.key) {
-      page.greet("API key required", "The operator of this server provides keys.");
+      page.setCaption("API key required", "The operator of this server provides keys.");
       $("key").focus();
     } else page.problem(problem, () => void begin());
   }

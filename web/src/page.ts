@@ -1,19 +1,19 @@
 /** Controller of the page: structures, parameters and meshes. */
 
 import type { Client } from "./api/client";
-import type { Job } from "./api/jobs";
 import { asProblem, Problem } from "./api/problem";
 import type { Parameter } from "./api/schema";
 import { entry, type Labels, labels, type Source, type Summary, upload } from "./api/structures";
 import { Colors } from "./colors";
+import { connect } from "./controls";
 import { Downloads } from "./downloads";
-import { drops } from "./drop";
 import { keyboard } from "./keyboard";
 import { Picker } from "./picker";
 import { type Delivery, Remesher, type MeshRequest } from "./remesh";
 import { addressOf, type Choices, coarser, curl, currentAddress, drawn, readAddress, SAMPLE, surface, writeAddress } from "./request";
 import { Stage } from "./stage";
-import { $, copy, el, number, show } from "./ui/dom";
+import { Busy } from "./ui/busy";
+import { $, el, number, show } from "./ui/dom";
 import { Form } from "./ui/form";
 import { chooseScheme, fillSchemes } from "./ui/legend";
 import { problem as showProblem } from "./ui/problem";
@@ -41,12 +41,12 @@ export class Page {
   private readonly visited = new Map<string, Source>();
   private labelling: AbortController | null = null;
   private facts = 0;
-  private busy = 0;
+  private readonly busy = new Busy();
 
   constructor(private readonly client: Client) {
     this.stage = new Stage(client, (turning) => $("turn").setAttribute("aria-pressed", String(turning)));
     const { viewer } = this.stage;
-    this.picker = viewer && new Picker(viewer, (words) => this.say(words));
+    this.picker = viewer && new Picker(viewer, (text) => this.announce(text));
     this.colors = viewer && new Colors(client, viewer, $("legend"));
     fillSchemes(this.menu);
     if (viewer && this.picker) keyboard($("view-home"), viewer, this.picker);
@@ -55,7 +55,7 @@ export class Page {
     $("home").addEventListener("click", () => viewer?.reset());
     this.remesher = new Remesher(client, {
       begin: (request) => this.begin(request),
-      progress: (job) => this.progress(job),
+      progress: (job) => this.busy.follow(job),
       show: (delivery) => this.show(delivery),
       failed: (error, request) => this.failed(error, request),
       idle: () => this.idle(),
@@ -65,7 +65,7 @@ export class Page {
 
   /** Builds the form from the OpenAPI document and opens the structure that the address names. */
   async start(parameters: Parameter[], formats: string[]): Promise<void> {
-    const form = new Form($("parameters"), $("picture-fields"), parameters, (mesh, live) => (mesh ? this.changed(live) : this.pictured()));
+    const form = new Form($("parameters"), $("picture-fields"), parameters, (mesh, live) => (mesh ? this.changed(live) : this.displayChanged()));
     this.form = form;
     const wanted = (format: string) => this.shown && { source: this.shown.source, choices: form.of(format, this.shown.choices) };
     new Downloads(this.client, formats, wanted, (error, source) => this.problem(error, () => undefined, source.name));
@@ -82,8 +82,8 @@ export class Page {
     await this.sample(choices);
   }
 
-  /** Sets the caption. */
-  greet(name: string, title: string): void {
+  /** Sets the caption over the surface. */
+  setCaption(name: string, title: string): void {
     $("structure-name").textContent = name;
     $("structure-title").textContent = title;
   }
@@ -107,7 +107,7 @@ export class Page {
       reset: (parameter) => set(parameter, undefined),
       again,
     });
-    this.say(`${name ? `${name}: ` : ""}${found.document.title}. ${found.document.detail ?? ""} ${kept}`.trim());
+    this.announce(`${name ? `${name}: ` : ""}${found.document.title}. ${found.document.detail ?? ""} ${kept}`.trim());
   }
 
   /** Hides the error message. */
@@ -116,44 +116,37 @@ export class Page {
   }
 
   private listen(): void {
-    const file = $<HTMLInputElement>("file");
-    const take = (chosen: File) => void this.open(chosen.name, (signal) => upload(this.client, chosen, chosen.name, signal));
-    file.addEventListener("change", () => {
-      const chosen = file.files?.[0];
-      if (chosen) take(chosen);
-      file.value = "";
+    connect({
+      openFile: (file) => void this.open(file.name, (signal) => upload(this.client, file, file.name, signal)),
+      openEntry: (id) => void this.open(id.toUpperCase(), () => Promise.resolve(entry(id))),
+      openSample: () => void this.sample(),
+      cancel: () => this.cancel(),
+      reset: () => {
+        this.form?.fill(new Map());
+        this.changed(false);
+      },
+      formatChanged: () => this.updateAddress(),
+      recolour: (scheme) => this.recolour(scheme),
+      address: () => {
+        const format = $<HTMLSelectElement>("format").value;
+        return this.shown && this.form ? location.origin + surface(this.shown.source, format, this.form.of(format, this.shown.choices)) : "";
+      },
+      copied: () => this.announce("Copied"),
+      copyFailed: (error) => this.problem(error, () => undefined),
     });
-    drops(take);
-    $("pdb-form").addEventListener("submit", (event) => {
-      event.preventDefault();
-      const id = $<HTMLInputElement>("pdb").value.trim();
-      if (id) void this.open(id.toUpperCase(), () => Promise.resolve(entry(id)));
-    });
-    $("sample").addEventListener("click", () => void this.sample());
-    $("cancel").addEventListener("click", () => {
-      this.opening?.abort();
-      this.opening = null;
-      this.remesher.cancel();
-      this.restore();
-      this.say(this.shown ? `Cancelled. The surface shown is that of ${this.shown.source.name}.` : "Cancelled");
-    });
-    $("reset-all").addEventListener("click", () => {
-      this.form?.fill(new Map());
-      this.changed(false);
-    });
-    $("format").addEventListener("change", () => this.commands());
-    this.menu.addEventListener("change", () => this.recolour(this.menu.value));
     window.addEventListener("popstate", () => {
       // A step to another fragment of the same address opens nothing.
       if (this.shown && addressOf(this.shown.source, this.shown.choices) === currentAddress()) return;
       void this.visit();
     });
-    const copied = (id: string, text: () => string) => $(id).addEventListener("click", () => void copy(text()).then(() => this.say("Copied"), (error: unknown) => this.problem(error, () => undefined)));
-    copied("copy-curl", () => $("curl").textContent ?? "");
-    copied("copy-url", () => {
-      const format = $<HTMLSelectElement>("format").value;
-      return this.shown && this.form ? location.origin + surface(this.shown.source, format, this.form.of(format, this.shown.choices)) : "";
-    });
+  }
+
+  private cancel(): void {
+    this.opening?.abort();
+    this.opening = null;
+    this.remesher.cancel();
+    this.restore();
+    this.announce(this.shown ? `Cancelled. The surface shown is that of ${this.shown.source.name}.` : "Cancelled");
   }
 
   private sample(choices: Choices | null = null): Promise<void> {
@@ -173,14 +166,14 @@ export class Page {
 
   /**
    * Opens another structure, which `find` resolves with, and sets `choices` for it. Without them the parameters stay,
-   * except those that name parts of the former structure. The page describes the former one until the mesh has arrived.
+   * except those that name parts of the previous structure. The page describes the previous one until the mesh arrives.
    */
   private async open(name: string, find: (signal: AbortSignal) => Promise<Source>, choices: Choices | null = null): Promise<void> {
     this.opening?.abort();
     this.remesher.cancel();
     this.clear();
     const abort = (this.opening = new AbortController());
-    this.wait(`Reading ${name}…`, null);
+    this.busy.show(`Reading ${name}…`, null);
     try {
       const source = await find(abort.signal);
       if (abort.signal.aborted) return;
@@ -201,7 +194,7 @@ export class Page {
   private changed(live: boolean, since = performance.now()): void {
     const { form, target: source } = this;
     if (!form) return;
-    this.resettable();
+    this.updateReset();
     if (!source || this.opening) return;
     const choices = form.all;
     const known = this.shown?.source.path === source.path ? this.shown : null;
@@ -229,13 +222,13 @@ export class Page {
   }
 
   /** Updates colours, downloads and command line after a change of a parameter that does not affect the mesh. */
-  private pictured(): void {
+  private displayChanged(): void {
     const { form, shown } = this;
-    this.resettable();
+    this.updateReset();
     if (!form || !shown) return;
     shown.choices = new Map([...form.mesh(shown.choices), ...form.apart(form.all)]);
     this.paint();
-    this.commands();
+    this.updateAddress();
   }
 
   /** Sets structure and parameters of `request` as the next ones to mesh. */
@@ -251,21 +244,21 @@ export class Page {
   private restore(): void {
     this.idle();
     const { shown } = this;
-    if (!shown) return this.greet("No surface", "");
+    if (!shown) return this.setCaption("No surface", "");
     this.target = shown.source;
     this.form?.fill(shown.choices);
-    this.resettable();
+    this.updateReset();
     this.stage.restore();
     show($("preview"), false);
-    this.commands();
+    this.updateAddress();
   }
 
-  private resettable(): void {
+  private updateReset(): void {
     show($("reset-all"), (this.form?.all.size ?? 0) > 0);
   }
 
   /** Updates the address and the command line; `push` adds the address to the history. */
-  private commands(push = false): void {
+  private updateAddress(push = false): void {
     const { shown, form } = this;
     if (!shown || !form) return;
     writeAddress(addressOf(shown.source, shown.choices), push);
@@ -276,30 +269,11 @@ export class Page {
 
   private begin(request: MeshRequest): void {
     this.clear();
-    this.wait("Meshing…", null, request.live ? 600 : 250);
-  }
-
-  /** Shows the progress indicator after a delay of `after` ms, so that short work does not show it. */
-  private wait(words: string, fraction: number | null, after = 250): void {
-    clearTimeout(this.busy);
-    const bar = $<HTMLProgressElement>("progress");
-    if (fraction === null) bar.removeAttribute("value");
-    else bar.value = fraction;
-    $("busy-text").textContent = words;
-    $("stage").setAttribute("aria-busy", "true");
-    if ($("busy").hidden) this.busy = window.setTimeout(() => show($("busy"), true), after);
-  }
-
-  private progress({ status, stage, fraction }: Job): void {
-    const words = status === "accepted" ? "Waiting in the queue…" : `${stage ?? "meshing"}, ${Math.round(100 * fraction)} %`;
-    this.wait(words, status === "accepted" ? null : fraction, 0);
+    this.busy.show("Meshing…", null, request.live ? 600 : undefined);
   }
 
   private idle(): void {
-    if (this.opening) return;
-    clearTimeout(this.busy);
-    show($("busy"), false);
-    $("stage").removeAttribute("aria-busy");
+    if (!this.opening) this.busy.hide();
   }
 
   /** Shows a received mesh. The page changes in one step, once everything is ready. */
@@ -327,16 +301,16 @@ export class Page {
 
   /** Updates the page to describe the mesh of the request, which is now shown. */
   private commit({ source, choices }: MeshRequest, extras: Record<string, unknown>, headers: Headers): void {
-    const { form, shown: former } = this;
+    const { form, shown: previous } = this;
     if (!form) return;
-    const isOther = former?.source.path !== source.path;
+    const isOther = previous?.source.path !== source.path;
     // After a step through the history, the address is already set.
-    const push = isOther && former !== null && addressOf(former.source, former.choices) === currentAddress();
+    const push = isOther && previous !== null && addressOf(previous.source, previous.choices) === currentAddress();
     const all = new Map([...form.mesh(choices), ...form.apart(form.all)]);
-    this.shown = { source, choices: all, resolution: Number(extras["resolution"] ?? 0.5), took: former?.took ?? 0 };
+    this.shown = { source, choices: all, resolution: Number(extras["resolution"] ?? 0.5), took: previous?.took ?? 0 };
     source.resent = false;
     this.visited.set(source.path, source);
-    this.greet(source.name, source.summary?.title ?? String(extras["title"] ?? ""));
+    this.setCaption(source.name, source.summary?.title ?? String(extras["title"] ?? ""));
     document.title = `${source.name} · molmesh`;
     if (isOther) {
       const chains = source.summary?.chains.map((c) => c.name || "_").slice(0, 12).join(",");
@@ -345,11 +319,11 @@ export class Page {
       this.label(source);
     }
     this.paint();
-    form.tell(extras);
+    form.showValues(extras);
     report($("report"), extras, timingsOf(headers));
     $("now").textContent = `${Number(extras["triangles"]).toLocaleString("en")} triangles`;
-    this.commands(push);
-    if (!former) this.stage.viewer?.turn(true);
+    this.updateAddress(push);
+    if (!previous) this.stage.viewer?.turn(true);
     this.later(() => this.complete(source, extras, headers));
   }
 
@@ -361,7 +335,7 @@ export class Page {
 
   private complete(source: Source, extras: Record<string, unknown>, headers: Headers): void {
     const closed = extras["closed"] === true ? "closed" : "not closed";
-    this.say(`Surface of ${source.name}: ${Number(extras["triangles"]).toLocaleString("en")} triangles, area ${number(Number(extras["area"]), 4)} Å², ${closed}.`);
+    this.announce(`Surface of ${source.name}: ${Number(extras["triangles"]).toLocaleString("en")} triangles, area ${number(Number(extras["area"]), 4)} Å², ${closed}.`);
     const key = /\/v1\/results\/([0-9a-f]{64})\./.exec(headers.get("content-location") ?? "")?.[1];
     if (!key) return;
     const shown = this.shown;
@@ -377,9 +351,9 @@ export class Page {
   private label(source: Source): void {
     this.labelling?.abort();
     const abort = (this.labelling = new AbortController());
-    this.picker?.know(null);
+    this.picker?.setLabels(null);
     labels(this.client, source, abort.signal).then(
-      (found: Labels) => abort.signal.aborted || this.picker?.know(found),
+      (found: Labels) => abort.signal.aborted || this.picker?.setLabels(found),
       // Without labels, atoms are shown by number.
       () => undefined,
     );
@@ -401,7 +375,7 @@ export class Page {
     this.problem(error, again, source.name, request);
   }
 
-  private say(words: string): void {
-    $("live").textContent = words;
+  private announce(text: string): void {
+    $("live").textContent = text;
   }
 }

@@ -5,7 +5,7 @@ import type { Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
 
 /** Triangle count above which only clicks search the mesh, since a search per pointer move would be too slow. */
-const MOST_HOVERED = 1_500_000;
+const MAX_HOVER_TRIANGLES = 1_500_000;
 
 export class Picker {
   private labels: Labels | null = null;
@@ -14,7 +14,7 @@ export class Picker {
   private readonly colour = $<HTMLSelectElement>("colour");
   private pending: { x: number; y: number } | null = null;
 
-  constructor(private readonly viewer: Viewer, private readonly say: (words: string) => void) {
+  constructor(private readonly viewer: Viewer, private readonly announce: (text: string) => void) {
     const canvas = viewer.canvas;
     let down = { x: 0, y: 0, moved: true };
     canvas.addEventListener("pointerdown", ({ offsetX: x, offsetY: y }) => {
@@ -37,7 +37,7 @@ export class Picker {
   }
 
   /** Sets the labels of the shown structure; null while they are not available. */
-  know(labels: Labels | null): void {
+  setLabels(labels: Labels | null): void {
     this.labels = labels;
     this.pin(null, false);
     this.hover(null);
@@ -62,7 +62,7 @@ export class Picker {
 
   /** Hovers in the next frame, since pointers move more often than frames are drawn. */
   private soon(place: { x: number; y: number }): void {
-    if (this.viewer.triangles > MOST_HOVERED || this.viewer.isTurning) return;
+    if (this.viewer.triangles > MAX_HOVER_TRIANGLES || this.viewer.isTurning) return;
     const waiting = this.pending !== null;
     this.pending = place;
     if (waiting) return;
@@ -106,7 +106,7 @@ export class Picker {
     const atom = this.labels?.of(row) ?? null;
     this.viewer.mark("pinned", atom ? [atom.first, atom.last] : [row, row]);
     this.tell(atom ? described(atom) : [el("strong", {}, `Atom ${row + 1} of the file`)]);
-    if (aloud) this.say(atom ? `Pinned ${nameOf(atom)}` : `Pinned atom ${row + 1}`);
+    if (aloud) this.announce(atom ? `Pinned ${nameOf(atom)}` : `Pinned atom ${row + 1}`);
   }
 
   private tell(nodes: Node[]): void {

@@ -1,4 +1,4 @@
-/** Queue of mesh requests. The latest request wins; earlier ones are cancelled, here and in the service. */
+/** Queue of mesh requests. A new request cancels the running one, here and in the service. */
 
 import { bytesOf } from "./api/bytes";
 import type { Client } from "./api/client";

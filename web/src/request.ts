@@ -29,14 +29,17 @@ export function coarser(choices: Choices, resolution: number): Choices {
 
 const quoted = (text: string) => (/^[\w./:=-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
+/** Start of a shell command. It fails with the problem document if the server returns an error. */
+const CURL = "curl -sS --fail-with-body";
+
 /** Returns a shell command for the same file that does not depend on earlier requests of the page. */
 export function curl(source: Source, format: string, choices: Choices, origin: string, key: boolean): string {
   const header = key ? ' -H "X-Api-Key: $MOLMESH_KEY"' : "";
   const out = `-o ${quoted(`${stem(source)}.${format}`)}`;
-  if (source.path.startsWith("/v1/pdb/")) return `curl -sS${header} ${quoted(origin + surface(source, format, choices))} ${out}`;
+  if (source.path.startsWith("/v1/pdb/")) return `${CURL}${header} ${quoted(origin + surface(source, format, choices))} ${out}`;
   const address = quoted(`${origin}/v1/meshes${query(choices, format === "glb" ? {} : { format })}`);
-  const sample = source.isSample ? `curl -sS ${origin}/${SAMPLE} -o ${SAMPLE}\n` : "";
-  return `${sample}curl -sS${header} --data-binary @${quoted(source.file || "structure.cif")} ${address} ${out}`;
+  const sample = source.isSample ? `${CURL} ${origin}/${SAMPLE} -o ${SAMPLE}\n` : "";
+  return `${sample}${CURL}${header} --data-binary @${quoted(source.file || "structure.cif")} ${address} ${out}`;
 }
 
 /** The bundled structure. */

@@ -147,7 +147,7 @@ export class Stage {
       const { document } = asProblem(error);
       const none = document.status === 404 || document.status === 406;
       return none
-        ? "This server draws no pictures. Report and downloads work as usual."
+        ? "This server does not render pictures. Report and downloads work as usual."
         : `The picture could not be loaded: ${document.detail ?? document.title}`;
     }
   }

@@ -41,8 +41,9 @@ pub(super) struct Case {
 /// Case with gigabytes of mesh.
 const HUGE: &str = "7cgo-x9-0.5";
 
-/// Returns the cases whose names contain `only`; [`HUGE`] must be named in full. The generated case has `atoms` atoms.
-pub(super) fn selected(atoms: usize, only: &str) -> Vec<Case> {
+/// Returns the cases whose names contain one of `only`, or all if it is empty; [`HUGE`] must be named in full. The
+/// generated case has `atoms` atoms.
+pub(super) fn selected(atoms: usize, only: &[String]) -> Vec<Case> {
     let file = |name, id, kinds, copies, spacing| Case { name, source: Source::File { id, kinds, copies }, spacing };
     let all = [
         Case { name: "ball-0.5", source: Source::Ball(atoms), spacing: Spacing::Is(0.5) },
@@ -53,7 +54,10 @@ pub(super) fn selected(atoms: usize, only: &str) -> Vec<Case> {
         file("7cgo-x9-1.0", "7cgo", "polymer", 3, Spacing::Is(1.0)),
         file(HUGE, "7cgo", "polymer", 3, Spacing::Is(0.5)),
     ];
-    let wanted = |case: &Case| if case.name == HUGE { only == HUGE } else { case.name.contains(only) };
+    let wanted = |case: &Case| match case.name {
+        HUGE => only.iter().any(|name| name == HUGE),
+        name => only.is_empty() || only.iter().any(|part| name.contains(part.as_str())),
+    };
     all.into_iter().filter(wanted).collect()
 }
 
@@ -94,16 +98,20 @@ mod tests {
 
     #[test]
     fn the_huge_case_is_measured_only_by_name() {
-        let names = |only| selected(1, only).iter().map(|case| case.name).collect::<Vec<_>>();
-        assert_eq!(names("x9"), ["7cgo-x9-1.0"]);
-        assert_eq!(names(HUGE), [HUGE]);
-        assert_eq!(names("").len(), 6);
+        let names = |only: &[&str]| {
+            let only: Vec<String> = only.iter().copied().map(str::to_owned).collect();
+            selected(1, &only).iter().map(|case| case.name).collect::<Vec<_>>()
+        };
+        assert_eq!(names(&["x9"]), ["7cgo-x9-1.0"]);
+        assert_eq!(names(&[HUGE]), [HUGE]);
+        assert_eq!(names(&["2hhb", "1aon"]), ["2hhb-7.27M", "1aon-0.5"]);
+        assert_eq!(names(&[]).len(), 6);
     }
 
     #[test]
     fn missing_files_are_reported() {
         let folder = tempfile::tempdir().unwrap();
-        let [case] = selected(1, "2hhb")[..] else { panic!("one case") };
+        let [case] = selected(1, &["2hhb".to_owned()])[..] else { panic!("one case") };
         assert!(case.load(Some(folder.path())).unwrap_err().to_string().contains("no file 2hhb"));
         assert!(case.load(None).unwrap_err().to_string().contains("--data"));
     }

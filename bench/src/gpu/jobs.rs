@@ -20,7 +20,7 @@ const BATCHES: [usize; 4] = [1, 8, 32, 128];
 
 /// Throughput at one batch size.
 #[derive(Debug, Serialize)]
-struct Rate {
+struct BatchRate {
     batch: usize,
     jobs: usize,
     seconds: f64,
@@ -51,7 +51,7 @@ pub(super) fn run(engine: &mut Engine, n: usize) -> Result<Value> {
         let seconds = start.elapsed().as_secs_f64();
         let jobs_per_second = n as f64 / seconds;
         print(&format!("{batch:>10}{n:>8}{seconds:>10.3}{jobs_per_second:>12.0}{:>16}\n", triangles / n))?;
-        rates.push(Rate { batch, jobs: n, seconds, jobs_per_second, triangles });
+        rates.push(BatchRate { batch, jobs: n, seconds, jobs_per_second, triangles });
     }
     Ok(json!({ "prepare_ms": prepare_ms, "jobs": rates }))
 }

@@ -1,16 +1,18 @@
 //! Times of one case on one device: all stages, and the complete request.
 
 use std::fmt::Write as _;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use molmesh::gpu::{Engine, Executor as _};
+use molmesh::gpu::{Engine, Executor as _, Finished, GpuJob};
 use molmesh::surface::{
     Backend, Control, CpuBackend, Measures, Mesh, Spheres, Stage, Step, SurfaceError, SurfaceParams, Validation,
 };
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::{LIMITS, WARM_UP, prepare};
+use super::{GpuArgs, LIMITS, WARM_UP, prepare};
 use crate::error::{Error, Result};
 use crate::floor::Work;
 use crate::rates::Rates;
@@ -32,7 +34,7 @@ struct StageRow {
 
 /// Measurements of a case. Times are in ms.
 #[derive(Debug, Serialize)]
-pub(super) struct Row {
+pub(super) struct CaseTimes {
     resolution: f64,
     atoms: usize,
     box_cells: u64,
@@ -58,7 +60,18 @@ pub(super) struct Row {
     read_ms: Summary,
     /// Lower bound of the time to transfer the mesh.
     transfer_floor_ms: Option<f64>,
+    /// Time per job of jobs that follow each other, each prepared in advance.
+    following: Option<Following>,
     check: Option<Check>,
+}
+
+/// Time per job of jobs that follow each other, ms.
+#[derive(Debug, Clone, Copy, Serialize)]
+struct Following {
+    /// Each job begins after the end of the one before.
+    apart_ms: Summary,
+    /// Each job is begun during the transfer of the one before.
+    overlapped_ms: Summary,
 }
 
 /// Differences from the mesh of the CPU.
@@ -78,22 +91,20 @@ pub(super) fn measure(
     engine: &mut Engine,
     spheres: &Spheres,
     params: &SurfaceParams,
-    runs: usize,
+    args: &GpuArgs,
     rates: Option<&Rates>,
-    check: bool,
-) -> Result<Row> {
+) -> Result<CaseTimes> {
     let [mut prepare_ms, mut ready_ms, mut read_ms, mut stages_ms] = [const { Vec::new() }; 4];
     let mut stages: Vec<(Stage, Vec<f64>)> = Vec::new();
     let mut last = None;
-    for run in 0..WARM_UP + runs {
+    for run in 0..WARM_UP + args.runs {
         // Drop the previous mesh first, so that its memory is reused.
         drop(last.take());
         let start = Instant::now();
         let elapsed = || start.elapsed().as_secs_f64() * 1e3;
         let job = prepare(spheres, params)?;
         let prepared_at = elapsed();
-        let finished = engine.run(std::slice::from_ref(&job)).pop();
-        let finished = finished.ok_or_else(|| Error::failed("no result"))?.map_err(Error::failed)?;
+        let finished = run_job(engine, &job)?;
         let ready_at = elapsed();
         std::hint::black_box(sum_of_bytes(&finished.meshed.mesh));
         let read_at = elapsed();
@@ -120,15 +131,19 @@ pub(super) fn measure(
     };
     let stages: Vec<_> = stages.into_iter().map(stage_row).collect();
     let bytes = meshed.mesh.bytes();
-    Ok(Row {
+    let check = if args.check { Some(compare(&meshed.mesh, spheres, params)?) } else { None };
+    let n = (meshed.mesh.n_vertices(), meshed.mesh.n_triangles());
+    let surface_bricks = meshed.grid.surface_bricks;
+    drop(meshed);
+    Ok(CaseTimes {
         resolution: params.resolution,
         atoms: spheres.len(),
         box_cells: prepared.lattice.box_cells,
         bricks: prepared.plan.bricks.len(),
-        surface_bricks: meshed.grid.surface_bricks,
+        surface_bricks,
         pairs: prepared.plan.pairs,
-        vertices: meshed.mesh.n_vertices(),
-        triangles: meshed.mesh.n_triangles(),
+        vertices: n.0,
+        triangles: n.1,
         step: params.quantize.map(Step::length),
         bytes,
         stages_ms: Summary::of(stages_ms),
@@ -138,8 +153,35 @@ pub(super) fn measure(
         ready_ms: Summary::of(ready_ms),
         read_ms: Summary::of(read_ms),
         transfer_floor_ms: rates.map(|rates| bytes as f64 / rates.to_host * 1e3),
-        check: if check { Some(compare(&meshed.mesh, spheres, params)?) } else { None },
+        following: if args.overlap { Some(following(engine, spheres, params, args.runs)?) } else { None },
+        check,
     })
+}
+
+/// Runs one job.
+fn run_job(engine: &mut Engine, job: &GpuJob) -> Result<Finished> {
+    engine.run(std::slice::from_ref(job)).pop().ok_or_else(|| Error::failed("no result"))?.map_err(Error::failed)
+}
+
+/// Measures `runs` jobs that follow each other, first each after the one before, then each begun early.
+fn following(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams, runs: usize) -> Result<Following> {
+    let job = prepare(spheres, params)?;
+    let early = Arc::new(AtomicBool::new(false));
+    let next = (Arc::clone(&early), job.clone());
+    engine.set_next_job(Box::new(move || next.0.load(Ordering::Relaxed).then(|| next.1.clone())));
+    let mut times = [const { Vec::new() }; 2];
+    for (n, times) in times.iter_mut().enumerate() {
+        early.store(n == 1, Ordering::Relaxed);
+        for run in 0..WARM_UP + runs {
+            let start = Instant::now();
+            drop(run_job(engine, &job)?);
+            if run >= WARM_UP {
+                times.push(start.elapsed().as_secs_f64() * 1e3);
+            }
+        }
+    }
+    let [apart_ms, overlapped_ms] = times.map(Summary::of);
+    Ok(Following { apart_ms, overlapped_ms })
 }
 
 /// Sums all bytes of a mesh, as 64-bit words.
@@ -179,7 +221,7 @@ fn compare(here: &Mesh, spheres: &Spheres, params: &SurfaceParams) -> Result<Che
 }
 
 /// Formats the measurements of a case.
-pub(super) fn table(name: &str, row: &Row) -> String {
+pub(super) fn table(name: &str, row: &CaseTimes) -> String {
     let mut text = format!(
         "{name}: {} atoms at {:.4} Å, {} cells in the box, {} bricks ({} with surface), {} pairs, {} vertices{}, {} triangles, {:.1} MB\n",
         row.atoms,
@@ -209,6 +251,10 @@ pub(super) fn table(name: &str, row: &Row) -> String {
     line("prepare (host)", row.prepare_ms, None, None);
     line("request to ready", row.ready_ms, row.transfer_floor_ms, None);
     line("request to read", row.read_ms, None, None);
+    if let Some(Following { apart_ms, overlapped_ms }) = row.following {
+        line("jobs in a row", apart_ms, None, None);
+        line("overlapped", overlapped_ms, None, None);
+    }
     if let Some(Check { triangles, area, volume, closed }) = &row.check {
         let differences = format!("{triangles:+} triangles, area {area:+.2e}, volume {volume:+.2e}, closed: {closed}");
         _ = writeln!(text, "  difference from the CPU: {differences}");

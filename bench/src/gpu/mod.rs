@@ -18,12 +18,12 @@ use serde_json::{Value, json};
 
 use crate::device::Selected;
 use crate::error::{Error, Result};
-use crate::{print, rates};
+use crate::{print, rates, write_json};
 use cases::Case;
 
 /// Limits of the benchmarks.
 pub(crate) const LIMITS: SurfaceLimits =
-    SurfaceLimits { max_samples: 1 << 40, max_mesh_bytes: 64 << 30, max_candidates: 1 << 31 };
+    SurfaceLimits { max_grid_points: 1 << 40, max_mesh_bytes: 64 << 30, max_candidates: 1 << 31 };
 /// Number of unmeasured runs.
 const WARM_UP: usize = 3;
 
@@ -39,9 +39,9 @@ pub(crate) struct GpuArgs {
     /// Folder with 2hhb, 1aon and 7cgo, as PDB or mmCIF, plain or compressed
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Measure only cases whose name contains this text; 7cgo-x9-0.5 (gigabytes of mesh) only by its full name
-    #[arg(long, value_name = "NAME")]
-    only: Option<String>,
+    /// Measure only cases whose name contains one of these texts; 7cgo-x9-0.5 (gigabytes of mesh) only by its full name
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    only: Vec<String>,
     /// Number of atoms of the generated case, which needs no file
     #[arg(long, value_name = "N", default_value_t = 60_000)]
     atoms: usize,
@@ -52,6 +52,9 @@ pub(crate) struct GpuArgs {
     /// Compare each mesh with that of the CPU
     #[arg(long)]
     check: bool,
+    /// Also measure jobs that follow each other, begun during the transfer of the job before and not
+    #[arg(long, conflicts_with_all = ["jobs", "pool", "spread"])]
+    overlap: bool,
     /// Measure this number of jobs of 600 atoms instead, one by one and in batches
     #[arg(long, value_name = "N")]
     jobs: Option<usize>,
@@ -90,14 +93,13 @@ pub(crate) fn run(args: &GpuArgs) -> Result<()> {
             None => stages(args, &selected)?,
         }
     };
-    let Some(path) = &args.json else { return Ok(()) };
-    std::fs::write(path, format!("{results:#}\n")).map_err(Error::file(path))
+    write_json(args.json.as_deref(), &results)
 }
 
 /// Loads the selected cases. Prints the ones that cannot be measured.
 fn loaded(args: &GpuArgs) -> Result<Vec<(Case, Spheres, SurfaceParams)>> {
     let mut loaded = Vec::new();
-    for case in cases::selected(args.atoms, args.only.as_deref().unwrap_or_default()) {
+    for case in cases::selected(args.atoms, &args.only) {
         match case.load(args.data.as_deref()) {
             Ok((spheres, params)) => {
                 let quantized = args.compress == Compress::Quantize.name();
@@ -124,8 +126,12 @@ fn stages(args: &GpuArgs, selected: &Selected) -> Result<Value> {
         None => "this device does not support timestamps: stages are not timed\n\n".to_owned(),
     })?;
     let mut rows = Vec::new();
+    let results = |rows: &[Value]| {
+        let Selected { name, driver, .. } = selected;
+        json!({ "device": name, "driver": driver, "rates": rates, "runs": args.runs, "cases": rows })
+    };
     for (case, spheres, params) in loaded(args)? {
-        let row = measure::measure(&mut selected.engine()?, &spheres, &params, args.runs, rates.as_ref(), args.check);
+        let row = measure::measure(&mut selected.engine()?, &spheres, &params, args, rates.as_ref());
         rows.push(match row {
             Ok(row) => {
                 print(&measure::table(case.name, &row))?;
@@ -136,9 +142,10 @@ fn stages(args: &GpuArgs, selected: &Selected) -> Result<Value> {
                 json!({ "case": case.name, "not_measured": why.to_string() })
             }
         });
+        // After each case, so that a run that is stopped leaves results.
+        write_json(args.json.as_deref(), &results(&rows))?;
     }
-    let Selected { name, driver, .. } = selected;
-    Ok(json!({ "device": name, "driver": driver, "rates": rates, "runs": args.runs, "cases": rows }))
+    Ok(results(&rows))
 }
 
 /// Prepares a job.

@@ -18,7 +18,7 @@ const SIZES: [(usize, usize); 3] = [(600, 100), (6000, 50), (60_000, 20)];
 
 /// Throughput of jobs of one size.
 #[derive(Debug, Serialize)]
-struct Rate {
+struct PoolRate {
     devices: usize,
     atoms: usize,
     jobs: usize,
@@ -45,7 +45,7 @@ pub(super) fn run(choice: &DeviceChoice, n: usize, callers: usize) -> Result<Val
             let (before, cpu, start) = (shared(), processor_seconds(), Instant::now());
             run_jobs(backend, atoms, jobs, callers)?;
             let seconds = start.elapsed().as_secs_f64();
-            let rate = Rate {
+            let rate = PoolRate {
                 devices,
                 atoms,
                 jobs,

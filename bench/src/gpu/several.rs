@@ -18,7 +18,7 @@ use crate::stats::Summary;
 
 /// Measurements of a case on several devices. Times are in ms.
 #[derive(Debug, Serialize)]
-struct Row {
+struct CaseOnDevices {
     case: &'static str,
     devices: usize,
     atoms: usize,
@@ -61,7 +61,7 @@ pub(super) fn run(
         for ((case, spheres, params), first) in cases.iter().zip(&mut digests) {
             let (row, digest) = measure(backend, spheres, params, runs)?;
             let same = *first.get_or_insert_with(|| digest.clone()) == digest;
-            let row = Row { case: case.name, devices, same, ..row };
+            let row = CaseOnDevices { case: case.name, devices, same, ..row };
             print(&text(&row))?;
             rows.push(row);
         }
@@ -71,7 +71,12 @@ pub(super) fn run(
 }
 
 /// Measures a case on the devices of `backend`. Also returns the SHA-256 digest of its mesh.
-fn measure(backend: &GpuBackend, spheres: &Spheres, params: &SurfaceParams, runs: usize) -> Result<(Row, Vec<u8>)> {
+fn measure(
+    backend: &GpuBackend,
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    runs: usize,
+) -> Result<(CaseOnDevices, Vec<u8>)> {
     let [mut prepare_ms, mut ready_ms] = [const { Vec::new() }; 2];
     let mut all: Vec<CompletedJob> = Vec::with_capacity(runs);
     let mut last = None;
@@ -92,7 +97,7 @@ fn measure(backend: &GpuBackend, spheres: &Spheres, params: &SurfaceParams, runs
         last = Some((job, mesh));
     }
     let (job, mesh) = last.ok_or_else(|| Error::failed("no run"))?;
-    let row = Row {
+    let row = CaseOnDevices {
         case: "",
         devices: 0,
         atoms: spheres.len(),
@@ -126,7 +131,7 @@ fn parts(all: &[CompletedJob]) -> Vec<Part> {
     (0..n).map(part).collect()
 }
 
-fn text(r: &Row) -> String {
+fn text(r: &CaseOnDevices) -> String {
     let mut text = format!(
         "{} on {}: {} atoms, {} bricks, {} triangles, {:.1} MB: prepare {:.1}, ready {:.1} ({:.1}); {}\n",
         r.case,

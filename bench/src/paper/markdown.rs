@@ -216,7 +216,7 @@ fn growth(growth: &Growth) -> String {
             _ = writeln!(text, "| {} | not run: {why} | | | | | | |", series.program);
         }
     }
-    text.push_str("\n| program | what | exponent | fitted from | to | sizes |\n|---|---|---|---|---|---|\n");
+    text.push_str("\n| program | quantity | exponent | fitted from | to | sizes |\n|---|---|---|---|---|---|\n");
     for series in &growth.series {
         for (what, fit) in fits(series) {
             _ = writeln!(

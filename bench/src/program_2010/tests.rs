@@ -200,14 +200,14 @@ fn the_grid_is_laid_out_as_in_the_shaders() {
     let module = naga::front::wgsl::parse_str(SHADERS[0].1).unwrap();
     let (_, ty) = module.types.iter().find(|(_, ty)| ty.name.as_deref() == Some("Grid")).unwrap();
     let naga::TypeInner::Struct { members, span } = &ty.inner else { panic!("Grid is a struct") };
-    assert_eq!(*span as usize, size_of::<Grid>());
+    assert_eq!(*span as usize, size_of::<GridUniform>());
     let declared: Vec<(&str, usize)> =
         members.iter().map(|member| (member.name.as_deref().unwrap(), member.offset as usize)).collect();
     macro_rules! offsets {
-        ($($field:ident),+) => { vec![$((stringify!($field), offset_of!(Grid, $field))),+] };
+        ($($field:ident),+) => { vec![$((stringify!($field), offset_of!(GridUniform, $field))),+] };
     }
     let host = offsets!(
-        origin, n_atoms, n, n_samples, centre, spacing, scale, n_active, support, share, rate, tail_share, tail_rate,
+        origin, n_atoms, n, n_points, centre, spacing, scale, n_active, support, share, rate, tail_share, tail_rate,
         amplitude, u_min
     );
     assert_eq!(declared[..host.len()], host);

@@ -1,6 +1,6 @@
 //! `molmesh-bench service`: time of whole requests, as a client waits for them, on several backends in one run.
 //!
-//! Every upload has other bytes, so that no result is stored already. The backends take turns.
+//! Each upload has different bytes, so that no result is stored already. The backends take turns.
 
 mod client;
 mod process;
@@ -11,12 +11,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use crate::error::{Error, Result};
-use crate::print;
 use crate::stats::{Summary, digits};
 use crate::structures::{self, SAMPLE, file_name};
+use crate::{print, write_json};
 use client::Client;
 use process::Service;
 
@@ -50,6 +50,9 @@ pub(crate) struct ServiceArgs {
     /// Duration of a throughput measurement, s
     #[arg(long, value_name = "S", default_value_t = 5)]
     seconds: u64,
+    /// Measure the first request of this number of new services instead
+    #[arg(long, value_name = "N")]
+    cold: Option<usize>,
     /// Further arguments of `molmesh serve`, such as `--set devices.jobs=4`
     #[arg(last = true, value_name = "ARGS")]
     serve: Vec<String>,
@@ -80,12 +83,12 @@ impl Structure {
         if is_text { Ok(Self { name: id.to_owned(), bytes }) } else { Err(text_only()) }
     }
 
-    /// Returns an upload that no earlier call has returned.
-    fn upload(&self) -> Vec<u8> {
+    /// Returns the first line of an upload of the structure that no earlier upload has.
+    fn mark(&self) -> String {
         static UPLOADS: AtomicU64 = AtomicU64::new(0);
         let n = UPLOADS.fetch_add(1, Ordering::Relaxed);
         let mark = if self.bytes.starts_with(b"data_") || self.bytes.starts_with(b"#") { "#" } else { "REMARK 999" };
-        [format!("{mark} {n}\n").as_bytes(), &self.bytes].concat()
+        format!("{mark} {n}\n")
     }
 }
 
@@ -99,6 +102,9 @@ pub(crate) fn run(args: &ServiceArgs) -> Result<()> {
         None => vec![Structure { name: "4pti".to_owned(), bytes: SAMPLE.to_vec() }],
     };
     let start = |backend: &String| Service::start(&args.binary, backend, &args.serve);
+    if let Some(n) = args.cold {
+        return cold(args, &structures, n, start);
+    }
     let services = args.backends.iter().map(start).collect::<Result<Vec<_>>>()?;
     let mut results = Vec::new();
     for structure in &structures {
@@ -110,10 +116,42 @@ pub(crate) fn run(args: &ServiceArgs) -> Result<()> {
             "structure": structure.name, "bytes": structure.bytes.len(), "milliseconds": latency,
             "known_structure_milliseconds": known, "meshes_per_second": rates,
         }));
+        // After each structure, so that a run that is stopped leaves results.
+        write_results(args, &results)?;
     }
-    let Some(path) = &args.json else { return Ok(()) };
-    let results = json!({ "backends": args.backends, "query": args.query, "clients": args.clients, "rows": results });
-    std::fs::write(path, format!("{results:#}\n")).map_err(Error::file(path))
+    Ok(())
+}
+
+fn write_results(args: &ServiceArgs, rows: &[Value]) -> Result<()> {
+    let results = json!({
+        "backends": args.backends, "query": args.query, "clients": args.clients, "serve": args.serve, "rows": rows,
+    });
+    write_json(args.json.as_deref(), &results)
+}
+
+/// Measures the first request of `n` new services for each structure and backend.
+fn cold(
+    args: &ServiceArgs,
+    structures: &[Structure],
+    n: usize,
+    start: impl Fn(&String) -> Result<Service>,
+) -> Result<()> {
+    let mut results = Vec::new();
+    for structure in structures {
+        let mut times = vec![Vec::new(); args.backends.len()];
+        for _ in 0..n {
+            for (backend, times) in args.backends.iter().zip(&mut times) {
+                let service = start(backend)?;
+                let mut client = Client::connect(service.addr)?;
+                times.push(timed(|| upload(args, structure, &mut client))?);
+            }
+        }
+        let times: Vec<Parts> = times.into_iter().map(parts).collect();
+        print(&table(&structure.name, &args.backends, &times, &[], &[]))?;
+        results.push(json!({ "structure": structure.name, "first_request_milliseconds": times }));
+        write_results(args, &results)?;
+    }
+    Ok(())
 }
 
 /// Times of a request by part, ms: the entries of its `Server-Timing`, and `request` as the client measured it.
@@ -123,44 +161,55 @@ type Parts = BTreeMap<String, Summary>;
 fn in_turn(
     args: &ServiceArgs,
     services: &[Service],
-    ask: impl Fn(usize, &mut Client) -> Result<Value>,
+    ask: impl Fn(usize, &mut Client) -> Result<Map<String, Value>>,
 ) -> Result<Vec<Parts>> {
     let mut clients = services.iter().map(|service| Client::connect(service.addr)).collect::<Result<Vec<_>>>()?;
-    let mut times: Vec<BTreeMap<String, Vec<f64>>> = vec![BTreeMap::new(); services.len()];
+    let mut times = vec![Vec::new(); services.len()];
     for round in 0..WARM_UP + args.requests {
         for (n, client) in clients.iter_mut().enumerate() {
-            let begin = Instant::now();
-            let timing = ask(n, client)?;
-            let waited = begin.elapsed().as_secs_f64() * 1e3;
-            if round < WARM_UP {
-                continue;
-            }
-            times[n].entry("request".to_owned()).or_default().push(waited);
-            for (part, ms) in timing.as_object().into_iter().flatten() {
-                times[n].entry(part.clone()).or_default().push(ms.as_f64().unwrap_or_default());
+            let timing = timed(|| ask(n, client))?;
+            if round >= WARM_UP {
+                times[n].push(timing);
             }
         }
     }
-    let summary = |parts: BTreeMap<String, Vec<f64>>| {
-        parts.into_iter().map(|(part, ms)| (part, Summary::of(ms).rounded())).collect()
-    };
-    Ok(times.into_iter().map(summary).collect())
+    Ok(times.into_iter().map(parts).collect())
+}
+
+/// Sends a request. Returns its `Server-Timing` with the time that the client waited, ms.
+fn timed(ask: impl FnOnce() -> Result<Map<String, Value>>) -> Result<Map<String, Value>> {
+    let begin = Instant::now();
+    let mut timing = ask()?;
+    timing.insert("request".to_owned(), (begin.elapsed().as_secs_f64() * 1e3).into());
+    Ok(timing)
+}
+
+/// Summarizes the times of several requests.
+fn parts(requests: Vec<Map<String, Value>>) -> Parts {
+    let mut times = BTreeMap::<String, Vec<f64>>::new();
+    for (part, ms) in requests.into_iter().flatten() {
+        times.entry(part).or_default().push(ms.as_f64().unwrap_or_default());
+    }
+    times.into_iter().map(|(part, ms)| (part, Summary::of(ms).rounded())).collect()
+}
+
+/// Uploads the structure and receives its mesh.
+fn upload(args: &ServiceArgs, structure: &Structure, client: &mut Client) -> Result<Map<String, Value>> {
+    let target = format!("/v1/meshes?{}", args.query);
+    client.timing("POST", &target, &[structure.mark().as_bytes(), &structure.bytes])
 }
 
 /// Measures requests that upload the structure.
 fn latency(args: &ServiceArgs, structure: &Structure, services: &[Service]) -> Result<Vec<Parts>> {
-    let target = format!("/v1/meshes?{}", args.query);
-    in_turn(args, services, |_, client| {
-        let upload = structure.upload();
-        client.timing("POST", &target, &upload)
-    })
+    in_turn(args, services, |_, client| upload(args, structure, client))
 }
 
 /// Measures requests for a structure that the service has, each with another isovalue.
 fn known_structure(args: &ServiceArgs, structure: &Structure, services: &[Service]) -> Result<Vec<Parts>> {
     let mut digests = Vec::new();
     for service in services {
-        digests.push(Client::connect(service.addr)?.upload(&structure.upload())?);
+        let mark = structure.mark();
+        digests.push(Client::connect(service.addr)?.upload(&[mark.as_bytes(), &structure.bytes])?);
     }
     let count = AtomicU64::new(0);
     in_turn(args, services, |n, client| {
@@ -172,7 +221,6 @@ fn known_structure(args: &ServiceArgs, structure: &Structure, services: &[Servic
 
 /// Measures the meshes per second of many clients that upload different content, on each service alone, twice in turn.
 fn throughput(args: &ServiceArgs, structure: &Structure, services: &[Service]) -> Result<Vec<f64>> {
-    let target = format!("/v1/meshes?{}", args.query);
     let mut rates = vec![0.0_f64; services.len()];
     for _ in 0..2 {
         for (service, best) in services.iter().zip(&mut rates) {
@@ -180,7 +228,7 @@ fn throughput(args: &ServiceArgs, structure: &Structure, services: &[Service]) -
             let client = || -> Result<u64> {
                 let (mut client, mut n) = (Client::connect(service.addr)?, 0);
                 while Instant::now() < end {
-                    client.timing("POST", &target, &structure.upload())?;
+                    upload(args, structure, &mut client)?;
                     n += 1;
                 }
                 Ok(n)
@@ -206,11 +254,13 @@ fn table(name: &str, backends: &[String], latency: &[Parts], known: &[Parts], ra
     text.extend(parts.iter().map(|part| format!(" {part} |")));
     text += " known: request | total | read | meshes/s |\n|---|";
     text += &"---|".repeat(parts.len() + 4);
+    let none = Parts::new();
     let of = |parts: &Parts, part: &str| parts.get(part).map_or_else(|| "–".to_owned(), |s| format!("{:.2}", s.median));
     for (n, backend) in backends.iter().enumerate() {
         text.extend([format!("\n| {backend} |")]);
         text.extend(parts.iter().map(|part| format!(" {} |", of(&latency[n], part))));
-        text.extend(["request", "total", "read"].map(|part| format!(" {} |", of(&known[n], part))));
+        let known = known.get(n).unwrap_or(&none);
+        text.extend(["request", "total", "read"].map(|part| format!(" {} |", of(known, part))));
         text += &rates.get(n).map_or_else(|| " – |".to_owned(), |rate| format!(" {rate:.1} |"));
     }
     text + "\n"

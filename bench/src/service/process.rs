@@ -4,8 +4,13 @@ use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
 
+use super::client::Client;
 use crate::error::{Error, Result};
+
+/// Maximum time until a service is ready.
+const MAX_START: Duration = Duration::from_mins(1);
 
 /// Service in its own process, with its own folder. Dropping it ends the process and removes the folder.
 pub(super) struct Service {
@@ -16,7 +21,8 @@ pub(super) struct Service {
 }
 
 impl Service {
-    /// Starts a service on a free port and waits until it listens.
+    /// Starts a service on a free port and waits until it is ready: it has meshed once and, with several backends,
+    /// measured them.
     ///
     /// # Errors
     /// [`Error::File`] if the binary cannot be started, [`Error::Failed`] with its messages if it ends.
@@ -53,9 +59,26 @@ impl Service {
         // A full pipe would block the service.
         std::thread::spawn(move || lines.map_while(std::result::Result::ok).for_each(drop));
         match addr {
-            Some(addr) => Ok(Self { child, folder, addr }),
+            Some(addr) => {
+                let service = Self { child, folder, addr };
+                service.wait_until_ready()?;
+                Ok(service)
+            }
             None => Err(Error::failed(format!("the service with --backend {backend} did not start:\n{said}"))),
         }
+    }
+}
+
+impl Service {
+    fn wait_until_ready(&self) -> Result<()> {
+        let end = Instant::now() + MAX_START;
+        while Client::connect(self.addr)?.status("/readyz")? != 200 {
+            if Instant::now() > end {
+                return Err(Error::failed(format!("the service was not ready within {MAX_START:?}")));
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        Ok(())
     }
 }
 

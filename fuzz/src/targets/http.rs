@@ -32,6 +32,8 @@ pub(super) const WORDS: &[&str] = &[
     "/surface.png",
     "/report.json",
     "/atoms",
+    "/colors",
+    "/estimate",
     "/events",
     "/result",
     "/problems/",
@@ -42,13 +44,8 @@ pub(super) const WORDS: &[&str] = &[
     "%2f",
     "%",
     "..",
-    "format=",
-    "resolution=2",
-    "chains=",
-    "select=",
     "check=strict",
     "max_triangles=1000",
-    "detail=0",
     "Range: bytes=",
     "If-Range: ",
     "If-None-Match: ",
@@ -88,7 +85,7 @@ pub(super) const WORDS: &[&str] = &[
     "signature=",
 ];
 
-/// Time without a byte of an answer after which the request counts as unanswered.
+/// Maximum pause while a response arrives.
 const SILENCE: Duration = Duration::from_secs(5);
 
 struct Service {
@@ -97,14 +94,14 @@ struct Service {
     known: [(&'static str, String); 3],
 }
 
-/// Sends one request and checks the answer: a status, and none that means a defect.
+/// Sends one request. Checks that the response has a status, and none that indicates a defect.
 pub(super) fn request(bytes: &[u8]) {
     static SERVICE: LazyLock<Service> = LazyLock::new(start);
     let Some((head, body)) = message(bytes, &SERVICE.known) else { return };
-    let answer = exchange(SERVICE.addr, &head, &body);
-    let status = answer.get(9..12).and_then(|digits| std::str::from_utf8(digits).ok()?.parse::<u16>().ok());
-    let shown = || String::from_utf8_lossy(&answer[..answer.len().min(2000)]).into_owned();
-    assert!(answer.starts_with(b"HTTP/1.1 ") && status.is_some(), "not an answer: {:?}", shown());
+    let response = exchange(SERVICE.addr, &head, &body);
+    let status = response.get(9..12).and_then(|digits| std::str::from_utf8(digits).ok()?.parse::<u16>().ok());
+    let shown = || String::from_utf8_lossy(&response[..response.len().min(2000)]).into_owned();
+    assert!(response.starts_with(b"HTTP/1.1 ") && status.is_some(), "not a response: {:?}", shown());
     // No request needs more time than the deadline, and nothing is unavailable for a single client.
     assert!(status.is_some_and(|status| status < 500), "{}", shown());
 }
@@ -138,16 +135,16 @@ fn message(bytes: &[u8], known: &[(&'static str, String)]) -> Option<(Vec<u8>, V
     Some((request, body))
 }
 
-/// Sends a request and reads the answer until the connection ends, or the first MiB of it.
+/// Sends a request and reads the response until the connection ends, or the first MiB of it.
 fn exchange(addr: SocketAddr, head: &[u8], body: &[u8]) -> Vec<u8> {
     let mut stream = TcpStream::connect(addr).expect("the server accepts connections");
     stream.set_read_timeout(Some(SILENCE)).expect("a valid timeout");
-    let mut answer = Vec::new();
-    // The server may answer and close before it has read everything.
+    let mut response = Vec::new();
+    // The server may respond and close before it has read everything.
     let sent = stream.write_all(head).and_then(|()| stream.write_all(body));
-    let read = (&mut stream).take(1 << 20).read_to_end(&mut answer);
-    assert!(!answer.is_empty(), "no answer: {sent:?}, {read:?}");
-    answer
+    let read = (&mut stream).take(1 << 20).read_to_end(&mut response);
+    assert!(!response.is_empty(), "no response: {sent:?}, {read:?}");
+    response
 }
 
 fn start() -> Service {
@@ -191,11 +188,11 @@ fn start() -> Service {
             format!("POST {head}\r\nHost: localhost\r\nConnection: close\r\nContent-Length: {}\r\n\r\n", entry.len());
         String::from_utf8_lossy(&exchange(addr, head.as_bytes(), &entry)).into_owned()
     };
-    // Hexadecimal digits behind a text in an answer.
-    let after = |answer: &str, text: &str| {
-        let rest = answer.split_once(text).map(|(_, rest)| rest);
+    // Returns the hexadecimal digits behind a text in a response.
+    let after = |response: &str, text: &str| {
+        let rest = response.split_once(text).map(|(_, rest)| rest);
         let digits: String = rest.into_iter().flat_map(str::chars).take_while(char::is_ascii_hexdigit).collect();
-        assert!(digits.len() >= 32, "no {text} in {answer:.2000}");
+        assert!(digits.len() >= 32, "no {text} in {response:.2000}");
         digits
     };
     let digest = after(&ask("/v1/structures HTTP/1.1"), "/v1/structures/");

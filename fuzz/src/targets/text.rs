@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 
 use molmesh::access::SigningKeys;
 use molmesh::archive::Archive;
-use molmesh::config::{self, Config};
+use molmesh::config::{self, Config, ForwardedHeader};
 use molmesh::fuzzing;
 use molmesh::memory_budget::Budget;
 use molmesh::pipeline::params;
@@ -14,49 +14,12 @@ use tokio::runtime::Runtime;
 
 use super::assert_short;
 
-/// Words of queries.
+/// Words of queries, besides the names and values of parameters.
 pub(super) const PARAMETERS: &[&str] = &[
     "&",
     "=",
     ",",
-    "preset=",
-    "kernel=",
-    "resolution=",
-    "detail=",
-    "max_triangles=",
-    "isovalue=",
-    "smoothness=",
-    "radius_scale=",
-    "radius_offset=",
-    "cutoff_tolerance=",
-    "paper_a=",
-    "paper_b=",
-    "paper_c=",
-    "atom_ids=",
-    "model=",
-    "chains=",
-    "select=",
-    "altloc=",
-    "assembly=",
-    "validation=",
-    "check=",
-    "format=",
-    "compress=",
-    "normals=",
-    "units=",
-    "width=",
-    "height=",
-    "view=",
-    "azimuth=",
-    "elevation=",
-    "background=",
-    "style=",
     "true",
-    "gaussian",
-    "soft-object",
-    "png",
-    "obj",
-    "ply-text",
     "polymer",
     "ligand,water",
     "hydrogens",
@@ -71,50 +34,63 @@ pub(super) const PARAMETERS: &[&str] = &[
     " and ",
     " or ",
     "not ",
-    "exact",
-    "meter",
     "none",
     "transparent",
     "#fff",
+    "uniform:#ff8800",
+    "element",
+    "bfactor",
+    "plddt",
+    "-4.5,4.5",
+    "asymmetric-unit",
 ];
-/// Words of the configuration.
-pub(super) const CONFIG: &[&str] = &[
-    "[server]\n",
-    "[limits]\n",
-    "[jobs]\n",
-    "[devices]\n",
-    "[archive]\n",
-    "[store]\n",
-    "[access]\n",
-    "[log]\n",
-    "[telemetry]\n",
-    "\n---\n",
-    "MOLMESH__",
-    "__",
-    " = ",
-    "\"none\"",
-    "GiB",
-    "listen",
-    "url",
-    "filter",
-    "format",
-    "sample_ratio",
-    "endpoint",
-    "trusted_proxies",
-    "cors_origins",
-    "secret_headers",
-    "signing_secret",
-    "head_bytes",
-    "{id}",
-    "{middle}",
-    "https://",
-    "[::1]:0",
-    "10.0.0.0/8",
-    "true",
-    "'''",
-    "\"\"\"",
-    "1979-05-27T07:32:00Z",
-    "\\u0007",
+/// Returns words of the configuration: all keys, and values.
+pub(super) fn config_words() -> Vec<String> {
+    const VALUES: &[&str] = &[
+        "\n---\n",
+        "MOLMESH__",
+        "__",
+        " = ",
+        "\"none\"",
+        "\"auto\"",
+        "GiB",
+        "{id}",
+        "{middle}",
+        "https://",
+        "[::1]:0",
+        "10.0.0.0/8",
+        "true",
+        "\"\"\"",
+        "'''",
+        "1979-05-27T07:32:00Z",
+        "\\u0007",
+    ];
+    let mut words = super::owned(VALUES);
+    let config = serde_json::to_value(Config::default()).expect("a configuration is JSON");
+    for (section, keys) in config.as_object().into_iter().flatten() {
+        words.push(format!("[{section}]\n"));
+        words.push(format!("MOLMESH__{}__", section.to_ascii_uppercase()));
+        words.extend(keys.as_object().into_iter().flatten().map(|(key, _)| format!("{key} = ")));
+    }
+    words
+}
+
+/// Words of headers that name the client of a proxy.
+pub(super) const FORWARDED: &[&str] = &[
+    "for=",
+    "For=\"",
+    ";proto=https",
+    ";by=",
+    ", ",
+    "\n",
+    "10.0.0.1",
+    "192.0.2.60",
+    "[2001:db8::1]",
+    "::ffff:10.0.0.2",
+    ":4711",
+    "_hidden",
+    "unknown",
+    "\\\"",
 ];
 /// Words of key files.
 pub(super) const KEY_FILE: &[&str] = &[
@@ -207,7 +183,7 @@ pub(super) fn config(bytes: &[u8]) {
     }
 }
 
-/// Parses a key file. Errors do not quote what may be a key or a hash.
+/// Parses a key file. Errors quote no word that may be a key or a hash.
 pub(super) fn key_file(bytes: &[u8]) {
     let text = String::from_utf8_lossy(bytes);
     if let Err(error) = fuzzing::key_file(&text) {
@@ -237,6 +213,22 @@ pub(super) fn signature(bytes: &[u8]) {
             assert!(!is_valid(&format!("{signed}&a")), "{signed:?}");
         }
         Err(error) => assert_short(&error.to_string()),
+    }
+}
+
+/// Finds the client of a request behind proxies. Each line is a value of the header. The client is the last address,
+/// read from the end, that is not a trusted proxy, so that no address before it matters.
+pub(super) fn forwarded(bytes: &[u8]) {
+    let text = String::from_utf8_lossy(bytes);
+    let values: Vec<&str> = text.lines().collect();
+    let forged: Vec<&str> = ["for=203.0.113.77, 203.0.113.77"].into_iter().chain(values.iter().copied()).collect();
+    for header in [ForwardedHeader::XForwardedFor, ForwardedHeader::Forwarded] {
+        let client = fuzzing::forwarded(header, &values);
+        let is_proxy = fuzzing::is_trusted_proxy(client);
+        assert!(is_proxy || !text.is_empty(), "an address that nobody named: {client}");
+        if !is_proxy {
+            assert_eq!(fuzzing::forwarded(header, &forged), client, "an earlier value changes the client");
+        }
     }
 }
 

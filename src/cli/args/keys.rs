@@ -17,7 +17,7 @@ Examples:
 // `molmesh key`.
 #[derive(Debug, Subcommand)]
 pub(crate) enum KeyCommand {
-    /// Create a key: prints its entry for the keys file to stdout, and the key itself, only once, to stderr
+    /// Create a key: prints its entry for the key file to stdout, and the key itself, only once, to stderr
     New(Box<NewKeyArgs>),
     /// Create a key that signs URLs, for `access.signing_secret`
     Signing(SigningKeyArgs),
@@ -39,13 +39,13 @@ pub(crate) struct NewKeyArgs {
     /// Expiry: a time from now such as 90d, or a date [default: never]
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     pub(crate) expires: Option<String>,
-    /// Comment in the keys file
+    /// Comment in the key file
     #[arg(long, value_name = "TEXT")]
     pub(crate) note: Option<String>,
     /// Requests per window [default: unlimited]
     #[arg(long, value_name = "N", help_heading = "Quota", value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) requests: Option<u64>,
-    /// Worker time per window, such as 10m [default: unlimited]
+    /// Computing time per window, such as 10m [default: unlimited]
     #[arg(long, value_name = "TIME", help_heading = "Quota", allow_hyphen_values = true)]
     pub(crate) work: Option<String>,
     /// Concurrent requests [default: unlimited]

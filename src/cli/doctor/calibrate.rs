@@ -7,7 +7,7 @@ use molmesh::pipeline::cost::{Cost, time_mesh};
 use molmesh::surface::cpu::CpuBackend;
 use molmesh::surface::{DeviceChoice, SurfaceError};
 
-use super::checks::{Check, State};
+use super::checks::{Check, CheckResult};
 use crate::cli::args::BackendName;
 use crate::cli::backend::{self, BackendRequest, Purpose};
 use crate::cli::calibration::{Calibration, MeasuredGpu};
@@ -20,7 +20,7 @@ const FIRST_ATOMS: usize = 8_000;
 
 /// Measures the backends and stores the result.
 pub(super) fn run(devices: &DeviceChoice) -> Check {
-    let warning = |detail: String| Check::new("calibration", State::Warning, detail);
+    let warning = |detail: String| Check::new("calibration", CheckResult::Warning, detail);
     let (gpu, no_gpu) = match gpu(devices) {
         Ok(gpu) => (Some(gpu), String::new()),
         Err(why) => (None, format!(", no GPU: {why}")),
@@ -36,7 +36,7 @@ pub(super) fn run(devices: &DeviceChoice) -> Check {
     });
     let found = format!("CPU: {:.2} µs per atom and thread{of_gpu}", calibration.cpu.per_unit * 1e6);
     match calibration.save() {
-        Ok(path) => Check::new("calibration", State::Ok, format!("{found}; stored in {}", path.display())),
+        Ok(path) => Check::new("calibration", CheckResult::Ok, format!("{found}; stored in {}", path.display())),
         Err(error) => warning(format!("{found}; cannot be stored: {error}")),
     }
 }

@@ -18,7 +18,7 @@ use super::backend::{self, BackendRequest, SelectedBackend};
 use super::error::CliError;
 use super::style::Style;
 use super::survey::{self, Availability};
-use checks::{Check, State};
+use checks::{Check, CheckResult};
 use machine::Machine;
 
 /// Results of the command.
@@ -41,7 +41,7 @@ pub(super) fn run(args: &DoctorArgs) -> Result<(), CliError> {
         DoctorStyle::Text => page::text(&findings, Style::stdout()),
         DoctorStyle::Json => super::config::pretty(&findings.document()),
     })?;
-    let failed: Vec<_> = findings.checks.iter().filter(|c| c.state == State::Failed).map(|c| c.name).collect();
+    let failed: Vec<_> = findings.checks.iter().filter(|c| c.state == CheckResult::Failed).map(|c| c.name).collect();
     if failed.is_empty() {
         return Ok(());
     }
@@ -57,19 +57,18 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     checks.extend(args.calibrate.then(|| calibrate::run(&config.devices.choice)));
     // The same steps as in a service: query all drivers, build the pipelines of the selected devices, make a mesh.
     let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);
-    match backend::select(&BackendRequest::of_service(args.serve.backend, &config.devices)) {
+    match backend::select(&BackendRequest::for_service(args.serve.backend, &config.devices)) {
         Ok(selected) => {
             backends = survey::backends(&selected);
             let SelectedBackend { backend, reason, devices: found, .. } = selected;
             checks.push(checks::first_mesh(backend.as_ref()));
             let n_devices = backend.devices().len();
-            let workers = config.jobs.workers.max(config.devices.jobs * n_devices);
-            checks.push(checks::memory(&machine, &config, workers, n_devices));
+            checks.push(checks::memory(&machine, &loaded, n_devices));
             (devices, taken) = (found, Some((backend.name(), reason)));
         }
         Err(error @ CliError::NoBackend { .. }) => {
-            checks.push(Check::new(checks::DEVICES, State::Failed, error.to_string()));
-            checks.push(checks::memory(&machine, &config, config.jobs.workers, 0));
+            checks.push(Check::new(checks::DEVICES, CheckResult::Failed, error.to_string()));
+            checks.push(checks::memory(&machine, &loaded, 0));
         }
         Err(error) => return Err(error),
     }
@@ -109,7 +108,7 @@ impl Findings {
         let check = |check: &Check| json!({ "name": check.name, "state": check.state.name(), "detail": check.detail });
         let configuration = self.loaded.to_json();
         json!({
-            "ok": self.checks.iter().all(|check| check.state != State::Failed),
+            "ok": self.checks.iter().all(|check| check.state != CheckResult::Failed),
             "molmesh": {
                 "version": env!("CARGO_PKG_VERSION"), "features": super::features(),
                 "target": machine::TARGET, "compiler": machine::COMPILER,

@@ -1,11 +1,11 @@
 //! Text form of the findings.
 
-use molmesh::config::Source;
+use molmesh::config::ConfigSource;
 use molmesh::structure::radii;
 use molmesh::surface::DeviceFacts;
 
 use super::Findings;
-use super::checks::State;
+use super::checks::CheckResult;
 use super::machine::{self, COMPILER, TARGET};
 use crate::cli::page::Page;
 use crate::cli::style::Style;
@@ -23,10 +23,9 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
     page.row("cores", &format!("{cores} for this process"));
     let vectors: Vec<&str> = machine::vectors().collect();
     page.row("vectors", &if vectors.is_empty() { "none".to_owned() } else { vectors.join(" ") });
-    let memory = machine.bytes.map_or("unknown".to_owned(), size);
-    let limit = machine
-        .limit
-        .map_or("no control group limit".to_owned(), |(bytes, owner)| format!("{} for {owner}", size(bytes)));
+    let memory = machine.memory.machine.map_or("unknown".to_owned(), size);
+    let limit = machine.memory.limit;
+    let limit = limit.map_or("no control group limit".to_owned(), |n| format!("{} for this control group", size(n)));
     page.row("memory", &format!("{memory}, {limit}"));
     if let Some([now, most]) = machine.files {
         page.row("open files", &format!("{now}, raised to {most} by a service"));
@@ -56,9 +55,9 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
     page.line(String::new());
     for check in &findings.checks {
         let state = match check.state {
-            State::Ok => style.green("ok     "),
-            State::Warning => style.bold("warning"),
-            State::Failed => style.red("failed "),
+            CheckResult::Ok => style.green("ok     "),
+            CheckResult::Warning => style.bold("warning"),
+            CheckResult::Failed => style.red("failed "),
         };
         page.line(format!("  {state} {}: {}", style.bold(check.name), check.detail));
     }
@@ -72,7 +71,7 @@ fn limits(page: &mut Page, findings: &Findings) {
         let mut rows = vec![String::new()];
         for (key, value) in keys.as_object().into_iter().flatten() {
             let Some(number) = value.as_u64() else { continue };
-            let set = findings.loaded.source(&format!("{section}.{key}")) != Source::Default;
+            let set = findings.loaded.source(&format!("{section}.{key}")) != ConfigSource::Default;
             let value = if key.ends_with("_bytes") { size(number) } else { number.to_string() };
             let word = format!("{key} {value}{}", if set { "*" } else { "" });
             match rows.last_mut() {

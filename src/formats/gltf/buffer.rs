@@ -1,16 +1,16 @@
-//! Bytes of the buffer, as rows of its columns. Each row has a fixed offset, so an output with random access receives
-//! rows in any order.
+//! Bytes of the buffer: rows of its columns. Each row has a fixed offset, so rows can be written in any order to an
+//! output with random access.
 
 use std::io::{self, Write};
 
-use super::layout::{ATOM_BYTES, AtomType, COLOR_BYTES, IndexType, Layout};
+use super::layout::{ATOM_BYTES, AtomType, BufferLayout, COLOR_BYTES, IndexType};
 use crate::formats::block::{convert_words, write_rows};
 use crate::formats::{Packing, quantize};
 use crate::surface::{Mesh, MeshPart, Vertices};
 
 /// Consecutive rows of one column of a mesh.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Rows<'a> {
+pub(super) enum ColumnRows<'a> {
     /// Positions relative to the mesh's centre, Å.
     Positions(&'a [[f32; 3]]),
     /// Positions relative to the mesh's centre, in steps.
@@ -27,7 +27,7 @@ pub(super) enum Rows<'a> {
     Triangles(&'a [[u32; 3]], u32),
 }
 
-impl<'a> Rows<'a> {
+impl<'a> ColumnRows<'a> {
     /// Returns the columns of a part, each with the index of its first row in the mesh.
     pub(super) fn of_part(part: &MeshPart<'a>) -> [(u64, Self); 3] {
         let (positions, normals) = match part.vertices {
@@ -70,7 +70,7 @@ impl<'a> Rows<'a> {
 
     /// Returns the byte offset of these rows in the buffer; `None` if the layout lacks the column. `first` is the index
     /// of the first row in the mesh.
-    pub(super) fn offset(self, layout: &Layout, first: u64) -> Option<u64> {
+    pub(super) fn offset(self, layout: &BufferLayout, first: u64) -> Option<u64> {
         let packing = layout.storage.packing;
         let (span, row_bytes) = match self {
             Self::Positions(_) | Self::QuantizedPositions(_) => (layout.positions, packing.position_bytes()),
@@ -83,7 +83,7 @@ impl<'a> Rows<'a> {
     }
 
     /// Writes these rows in the types of the layout.
-    pub(super) fn write(self, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
+    pub(super) fn write(self, layout: &BufferLayout, out: &mut dyn Write) -> io::Result<()> {
         match (self, layout.storage.packing) {
             (Self::QuantizedPositions(rows), _) => write_rows(out, rows),
             (Self::QuantizedNormals(rows), _) => write_rows(out, rows),
@@ -116,7 +116,11 @@ impl<'a> Rows<'a> {
 }
 
 /// Appends the chunks of a column.
-fn append<'a, T>(all: &mut Vec<(u64, Rows<'a>)>, chunks: impl Iterator<Item = &'a [T]>, rows: fn(&'a [T]) -> Rows<'a>) {
+fn append<'a, T>(
+    all: &mut Vec<(u64, ColumnRows<'a>)>,
+    chunks: impl Iterator<Item = &'a [T]>,
+    rows: fn(&'a [T]) -> ColumnRows<'a>,
+) {
     let mut first = 0;
     for chunk in chunks {
         all.push((first, rows(chunk)));
@@ -125,8 +129,8 @@ fn append<'a, T>(all: &mut Vec<(u64, Rows<'a>)>, chunks: impl Iterator<Item = &'
 }
 
 /// Writes the buffer of `mesh` in order: `layout.len` bytes.
-pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
-    let columns = Rows::of_mesh(mesh).into_iter().filter(|(first, rows)| rows.offset(layout, *first).is_some());
+pub(super) fn write_buffer(mesh: &Mesh, layout: &BufferLayout, out: &mut dyn Write) -> io::Result<()> {
+    let columns = ColumnRows::of_mesh(mesh).into_iter().filter(|(first, rows)| rows.offset(layout, *first).is_some());
     columns.map(|(_, rows)| rows).try_for_each(|rows| rows.write(layout, out))
 }
 
@@ -158,7 +162,8 @@ fn exact_f32_bytes(value: u32) -> [u8; 4] {
     clippy::cast_sign_loss,
     reason = "0 to 255, and 0 to 65,535 after rounding"
 )]
-fn linear_of_srgb() -> [u16; 256] {
+#[must_use]
+pub fn linear_of_srgb() -> [u16; 256] {
     std::array::from_fn(|byte| {
         let s = byte as f64 / 255.0;
         let linear = if s <= 0.04045 { s / 12.92 } else { ((s + 0.055) / 1.055).powf(2.4) };

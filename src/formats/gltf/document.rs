@@ -13,18 +13,18 @@ use gltf_json::validation::USize64;
 use gltf_json::{Accessor, Asset, Buffer, Index, Material, Mesh as GltfMesh, Node, Root, Scene};
 use serde_json::{Map, Value, json};
 
-use super::layout::{ATOM_BYTES, AtomType, COLOR_BYTES, Drawn, IndexType, Layout, Span};
+use super::layout::{ATOM_BYTES, AtomType, BufferLayout, BufferSpan, COLOR_BYTES, Drawn, IndexType};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, GENERATOR, Meta, Packing, Step, Storage, Units};
 
-/// Blue, in linear light. Like all constants here it is a short binary fraction, which JSON shows in few digits.
+/// Blue, in linear light. Like all constants here it is a short binary fraction, which has few digits in JSON.
 const BASE_COLOR: [f32; 4] = [0.156_25, 0.390_625, 0.718_75, 1.0];
-/// White: does not change the mesh's own colours.
+/// White, which does not change the mesh's own colours.
 const WHITE: [f32; 4] = [1.0; 4];
 /// Roughness between chalk and plastic: highlights show the shape without hiding it.
 const ROUGHNESS: f32 = 0.625;
 
-/// Extension that allows integer vertices. Required, as a program without it cannot show the file.
+/// Extension that allows integer vertices. Marked as required: a program without it cannot display the file.
 const QUANTIZED: &str = "KHR_mesh_quantization";
 
 /// Returns the document as a JSON object. With a layout it has one buffer without a URI, which the caller adds if
@@ -33,7 +33,7 @@ pub(super) fn document(
     centre: [f64; 3],
     summary: &Summary,
     storage: Storage,
-    layout: Option<&Layout>,
+    layout: Option<&BufferLayout>,
     drawn: &[Drawn<'_>],
     meta: &Meta,
 ) -> Result<Map<String, Value>, FormatError> {
@@ -57,7 +57,7 @@ pub(super) fn document(
     if let [Drawn { name: None, .. }] = drawn {
         root.nodes[0].mesh = meshes.first().copied();
     } else {
-        // Each part has a node below the one that places the mesh.
+        // Each part has a child node of the node that translates the mesh.
         let nodes = meshes.into_iter().zip(drawn).map(|(mesh, part)| {
             root.push(Node { mesh: Some(mesh), name: part.name.map(str::to_owned), ..Node::default() })
         });
@@ -101,12 +101,12 @@ fn extras(centre: [f64; 3], units: Units, step: Option<Step>, meta: &Meta) -> Ma
 /// Adds buffer, views, accessors, material and a mesh for each element of `drawn`. Returns the meshes.
 fn meshes(
     root: &mut Root,
-    layout: &Layout,
+    layout: &BufferLayout,
     drawn: &[Drawn<'_>],
     name: Option<&str>,
     summary: &Summary,
 ) -> Vec<Index<GltfMesh>> {
-    let columns = Columns::new(root, layout, drawn.len() > 1, summary);
+    let columns = BufferColumns::new(root, layout, drawn.len() > 1, summary);
     let mesh = |part: &Drawn<'_>| {
         let primitive = columns.primitive(root, layout, part);
         root.push(GltfMesh {
@@ -121,7 +121,7 @@ fn meshes(
 }
 
 /// Column of the buffer.
-struct Column {
+struct BufferColumn {
     view: Index<View>,
     /// Length of a row, bytes.
     row_bytes: u64,
@@ -129,7 +129,7 @@ struct Column {
     shape: Type,
 }
 
-impl Column {
+impl BufferColumn {
     /// Returns an accessor of `count` values from row `first` on.
     fn accessor(&self, first: u64, count: u64) -> Accessor {
         let normalized =
@@ -153,15 +153,15 @@ impl Column {
 }
 
 /// Columns of the buffer, and the material. All primitives share them.
-struct Columns {
-    attributes: Vec<(Semantic, Column)>,
-    indices: Column,
+struct BufferColumns {
+    attributes: Vec<(Semantic, BufferColumn)>,
+    indices: BufferColumn,
     material: Index<Material>,
 }
 
-impl Columns {
+impl BufferColumns {
     /// Adds buffer, views and material. `shared` views, which accessors of several parts use, must have a stride.
-    fn new(root: &mut Root, layout: &Layout, shared: bool, summary: &Summary) -> Self {
+    fn new(root: &mut Root, layout: &BufferLayout, shared: bool, summary: &Summary) -> Self {
         let byte_length = USize64(layout.len);
         let buffer = root.push(Buffer { byte_length, name: None, uri: None, extensions: None, extras: None });
         let packing = layout.storage.packing;
@@ -177,7 +177,7 @@ impl Columns {
                 _ => shared.then(|| Stride(usize::try_from(row_bytes).unwrap_or(0))),
             };
             let view = view(root, buffer, span, stride, Target::ArrayBuffer);
-            (semantic, Column { view, row_bytes, component, shape })
+            (semantic, BufferColumn { view, row_bytes, component, shape })
         };
         let bytes = packing.position_bytes();
         let mut attributes = vec![attribute(Semantic::Positions, layout.positions, bytes, position, Type::Vec3)];
@@ -201,13 +201,13 @@ impl Columns {
             IndexType::U32 => ComponentType::U32,
         };
         let view = view(root, buffer, span, None, Target::ElementArrayBuffer);
-        let indices = Column { view, row_bytes: index_type.bytes(), component, shape: Type::Scalar };
+        let indices = BufferColumn { view, row_bytes: index_type.bytes(), component, shape: Type::Scalar };
         let material = root.push(material(layout.colors.is_some(), summary.translucent));
         Self { attributes, indices, material }
     }
 
     /// Adds the accessors of a part. Returns its primitive.
-    fn primitive(&self, root: &mut Root, layout: &Layout, part: &Drawn<'_>) -> Primitive {
+    fn primitive(&self, root: &mut Root, layout: &BufferLayout, part: &Drawn<'_>) -> Primitive {
         let count = |rows: &Range<u64>| rows.end - rows.start;
         let mut attributes = BTreeMap::new();
         for (semantic, column) in &self.attributes {
@@ -236,7 +236,13 @@ impl Columns {
     }
 }
 
-fn view(root: &mut Root, buffer: Index<Buffer>, span: Span, stride: Option<Stride>, target: Target) -> Index<View> {
+fn view(
+    root: &mut Root,
+    buffer: Index<Buffer>,
+    span: BufferSpan,
+    stride: Option<Stride>,
+    target: Target,
+) -> Index<View> {
     root.push(View {
         buffer,
         byte_length: USize64(span.len),

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use super::buffer::write_buffer;
 use super::document::document;
-use super::layout::{Drawn, Layout};
+use super::layout::{BufferLayout, Drawn};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::Mesh;
@@ -17,19 +17,24 @@ const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
 const HEADER_BYTES: u64 = 12;
 const CHUNK_HEADER_BYTES: u64 = 8;
 
-/// Buffer size from which the buffer begins at a multiple of [`HEAD_BYTES`]: it can be written, mapped or requested by
-/// range before the JSON is known.
-pub(super) const LARGE_BUFFER_BYTES: u64 = 1 << 20;
-/// The longest report takes 15,500 bytes: a hundred components of 105 bytes, a title of a thousand characters of four
-/// bytes, and a thousand more.
+/// Size from which on a buffer begins at a multiple of [`HEAD_BYTES`], bytes. Such a buffer can be written, mapped or
+/// requested by range before the JSON is known.
+const LARGE_BUFFER_BYTES: u64 = 1 << 20;
+/// Unit of the size of everything before a large buffer, bytes. The longest report takes 15,500 bytes: a hundred
+/// components of 105 bytes, a title of a thousand characters of four bytes, and a thousand more bytes.
 pub(super) const HEAD_BYTES: u64 = 16 << 10;
+
+/// Returns true if the buffer begins at a multiple of [`HEAD_BYTES`].
+pub(super) const fn is_large(layout: BufferLayout) -> bool {
+    layout.len >= LARGE_BUFFER_BYTES
+}
 
 /// Layout of a GLB file.
 #[derive(Debug)]
 pub(in crate::formats) struct GlbPlan {
     /// Everything before the buffer.
     head: Vec<u8>,
-    layout: Option<Layout>,
+    layout: Option<BufferLayout>,
     len: u32,
 }
 
@@ -40,13 +45,13 @@ impl GlbPlan {
         summary: &Summary,
         meta: &Meta,
     ) -> Result<Self, FormatError> {
-        let layout = Layout::of(mesh, storage, summary)?;
+        let layout = BufferLayout::of(mesh, storage, summary)?;
         Self::placed(layout, &Drawn::of(mesh, summary), storage, mesh.centre, summary, meta)
     }
 
     /// Returns the layout of a mesh of which only the summary is known.
     pub(super) fn placed(
-        layout: Option<Layout>,
+        layout: Option<BufferLayout>,
         drawn: &[Drawn<'_>],
         storage: Storage,
         centre: [f64; 3],
@@ -58,9 +63,9 @@ impl GlbPlan {
         Self::wrap(json, layout)
     }
 
-    fn wrap(mut json: Vec<u8>, layout: Option<Layout>) -> Result<Self, FormatError> {
+    fn wrap(mut json: Vec<u8>, layout: Option<BufferLayout>) -> Result<Self, FormatError> {
         json.resize(json.len().next_multiple_of(4), b' ');
-        if layout.is_some_and(|layout| layout.len >= LARGE_BUFFER_BYTES) {
+        if layout.is_some_and(is_large) {
             let around = HEADER_BYTES + 2 * CHUNK_HEADER_BYTES;
             let head = (json.len() as u64 + around).next_multiple_of(HEAD_BYTES);
             json.resize(usize::try_from(head - around).unwrap_or(json.len()), b' ');
@@ -99,9 +104,18 @@ impl GlbPlan {
     }
 
     pub(in crate::formats) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
+        self.write_with(&mut { out }, |out, layout| write_buffer(mesh, layout, out))
+    }
+
+    /// Writes the file; `buffer` writes the `layout.len` bytes of the buffer.
+    pub(super) fn write_with<W: Write>(
+        &self,
+        out: &mut W,
+        buffer: impl FnOnce(&mut W, &BufferLayout) -> io::Result<()>,
+    ) -> io::Result<()> {
         out.write_all(&self.head)?;
         let Some(layout) = &self.layout else { return Ok(()) };
-        write_buffer(mesh, layout, out)?;
+        buffer(out, layout)?;
         let padding = layout.len.next_multiple_of(4) - layout.len;
         out.write_all(&[0; 3][..usize::try_from(padding).unwrap_or(0)])
     }
@@ -115,9 +129,9 @@ mod tests {
     #[test]
     fn rejects_a_glb_of_four_gibibytes() {
         // 24 bytes per vertex and 12 per triangle, two triangles per vertex: 48 bytes a vertex.
-        let fits = Layout::plain([89_000_000, 178_000_000], Packing::Full).unwrap();
+        let fits = BufferLayout::plain([89_000_000, 178_000_000], Packing::Full).unwrap();
         assert_eq!(GlbPlan::wrap(vec![b' '; 1000], fits).unwrap().len(), 48 * 89_000_000 + HEAD_BYTES);
-        let large = Layout::plain([90_000_000, 180_000_000], Packing::Full).unwrap();
+        let large = BufferLayout::plain([90_000_000, 180_000_000], Packing::Full).unwrap();
         let error = GlbPlan::wrap(vec![b' '; 1000], large).unwrap_err();
         assert_eq!(error, FormatError::GlbTooLarge { bytes: 4_320_016_384, limit: 4_294_967_295 });
         assert!(error.to_string().contains("4320016384"));
@@ -133,7 +147,7 @@ mod tests {
     #[test]
     fn a_large_buffer_begins_at_a_fixed_offset() {
         let head = |json: usize, vertices: u64| {
-            let layout = Layout::plain([vertices, 1], Packing::Full).unwrap();
+            let layout = BufferLayout::plain([vertices, 1], Packing::Full).unwrap();
             GlbPlan::wrap(vec![b' '; json], layout).unwrap().head().len() as u64
         };
         // 24 bytes a vertex and 3 indices of four bytes.

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::buffer::write_buffer;
 use super::document::document;
-use super::layout::{Drawn, Layout};
+use super::layout::{BufferLayout, Drawn};
 use crate::formats::block::BLOCK_BYTES;
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
@@ -21,7 +21,7 @@ pub(in crate::formats) struct GltfPlan {
     before: Vec<u8>,
     /// Text after the base64.
     after: &'static [u8],
-    layout: Option<Layout>,
+    layout: Option<BufferLayout>,
 }
 
 impl GltfPlan {
@@ -31,7 +31,7 @@ impl GltfPlan {
         summary: &Summary,
         meta: &Meta,
     ) -> Result<Self, FormatError> {
-        let layout = Layout::of(mesh, storage, summary)?;
+        let layout = BufferLayout::of(mesh, storage, summary)?;
         let mut document = document(mesh.centre, summary, storage, layout.as_ref(), &Drawn::of(mesh, summary), meta)?;
         // The entry of the buffer comes last and is formatted here, so that `write` can insert the base64 into it.
         document.shift_remove("buffers");

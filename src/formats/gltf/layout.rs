@@ -1,4 +1,4 @@
-//! Layout of the buffer of a glTF. Pure arithmetic on counts, so files of any size can be planned.
+//! Layout of the buffer of a glTF, computed from counts alone, so that files of any size can be planned.
 
 use std::ops::Range;
 
@@ -67,7 +67,7 @@ impl AtomType {
 
 /// A range of the buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Span {
+pub(super) struct BufferSpan {
     /// First byte; a multiple of 4.
     pub(super) offset: u64,
     /// Bytes.
@@ -98,8 +98,8 @@ impl<'a> Drawn<'a> {
             name: Some(&part.name),
             vertices: rows(&part.vertices),
             triangles: rows(&part.triangles),
-            // Adding zero turns −0, which JSON would show, into 0.
-            bounds: mesh.bounds_of(part.vertices.clone()).map(|row| row.map(|v| v + 0.0)),
+            // Adding zero turns −0 into 0. JSON distinguishes them.
+            bounds: part.bounds.map(|row| row.map(|v| v + 0.0)),
         });
         parts.collect()
     }
@@ -112,18 +112,18 @@ impl<'a> Drawn<'a> {
 
 /// Layout of the buffer: attributes in multiples of four bytes per vertex, then indices, which may end unaligned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Layout {
+pub(super) struct BufferLayout {
     pub(super) storage: Storage,
-    pub(super) positions: Span,
-    pub(super) normals: Option<Span>,
-    pub(super) colors: Option<Span>,
-    pub(super) atoms: Option<(AtomType, Span)>,
-    pub(super) indices: (IndexType, Span),
+    pub(super) positions: BufferSpan,
+    pub(super) normals: Option<BufferSpan>,
+    pub(super) colors: Option<BufferSpan>,
+    pub(super) atoms: Option<(AtomType, BufferSpan)>,
+    pub(super) indices: (IndexType, BufferSpan),
     /// Length of the whole buffer, bytes.
     pub(super) len: u64,
 }
 
-impl Layout {
+impl BufferLayout {
     /// Returns the layout of `mesh`; `None` if it has no triangles, as glTF has no empty accessors.
     pub(super) fn of(mesh: &Mesh, storage: Storage, summary: &Summary) -> Result<Option<Self>, FormatError> {
         let (n_vertices, n_triangles) = (mesh.n_vertices() as u64, mesh.triangles.len() as u64);
@@ -154,7 +154,7 @@ impl Layout {
         let mut span = |len: u64| {
             let offset = end;
             end += len;
-            Span { offset, len }
+            BufferSpan { offset, len }
         };
         let positions = span(storage.packing.position_bytes() * n_vertices);
         let normals = storage.normal_bytes().map(|bytes| span(bytes * n_vertices));
@@ -193,7 +193,7 @@ mod tests {
             }
         }
         assert!(matches!(
-            Layout::plain([1 << 32, 1], Packing::Full),
+            BufferLayout::plain([1 << 32, 1], Packing::Full),
             Err(FormatError::TooMany { count: 0x1_0000_0000, .. })
         ));
     }
@@ -220,7 +220,7 @@ mod tests {
             (bare(Packing::Full), 60),
             (bare(quantized), 40),
         ] {
-            let layout = Layout::new([5, 3], 5, storage, true, Some(AtomType::U16)).unwrap();
+            let layout = BufferLayout::new([5, 3], 5, storage, true, Some(AtomType::U16)).unwrap();
             let rest = [layout.colors.unwrap(), layout.atoms.unwrap().1, layout.indices.1];
             let mut end = 0;
             for span in [layout.positions].into_iter().chain(layout.normals).chain(rest) {

@@ -11,6 +11,7 @@ mod json;
 mod layout;
 mod sink;
 
+pub use buffer::linear_of_srgb;
 pub(super) use glb::GlbPlan;
 pub(super) use json::GltfPlan;
 pub use sink::{GlbSink, GlbSinkError, RandomAccess};

@@ -1,16 +1,16 @@
 //! GLB sink: writes the rows of a mesh to their final offset as they arrive, and the header last.
 //!
-//! The bytes are those of [`GlbPlan::write`]. A large buffer begins at a fixed offset, so its rows can be written
-//! before the header is known. A small one is collected in memory.
+//! The file has the same bytes as that of [`GlbPlan::write`]. A large buffer begins at a fixed offset, so its rows can
+//! be written before the header is known. A small buffer is collected in memory.
 
-use std::io::{self, Cursor, Write};
+use std::io::{self, Write};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use thiserror::Error;
 
-use super::buffer::Rows;
-use super::glb::{GlbPlan, HEAD_BYTES, LARGE_BUFFER_BYTES};
-use super::layout::{Drawn, Layout};
+use super::buffer::ColumnRows;
+use super::glb::{GlbPlan, HEAD_BYTES, is_large};
+use super::layout::{BufferLayout, Drawn};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::{MeshPart, MeshSink, SinkFailed, Vertices};
@@ -45,7 +45,7 @@ pub enum GlbSinkError {
 pub struct GlbSink<'a> {
     out: &'a dyn RandomAccess,
     storage: OnceLock<Storage>,
-    layout: OnceLock<Option<Layout>>,
+    layout: OnceLock<Option<BufferLayout>>,
     /// Numbers of vertices and triangles.
     size: OnceLock<[u64; 2]>,
     /// Contents of a small buffer.
@@ -72,8 +72,8 @@ impl<'a> GlbSink<'a> {
         lock(&self.failure).take()
     }
 
-    /// Writes the header, which completes the file, and returns the file's length in bytes. `centre` is that of the
-    /// mesh, `bounds` are those of its positions.
+    /// Completes the file with its header. Returns the length of the file, bytes. `centre` is the centre of the mesh,
+    /// and `bounds` are the bounds of its positions.
     ///
     /// # Errors
     /// [`SinkFailed`]; see [`Self::failure`].
@@ -82,25 +82,23 @@ impl<'a> GlbSink<'a> {
     }
 
     fn try_finish(&self, meta: &Meta, centre: [f64; 3], bounds: [[f32; 3]; 2]) -> Result<u64, GlbSinkError> {
-        // Adding zero turns −0, which JSON would show, into 0.
+        // Adding zero turns −0 into 0. JSON distinguishes them.
         let bounds = bounds.map(|row| row.map(|v| v + 0.0));
         let summary = Summary { bounds, max_atom: None, translucent: false };
         let layout = self.layout.get().copied().flatten();
         let size = self.size.get().copied().unwrap_or_default();
         let drawn = [Drawn::whole(size, &summary)];
         let plan = GlbPlan::placed(layout, &drawn, self.storage(), centre, &summary, meta)?;
-        let head = plan.head().len() as u64;
-        let large = layout.is_some_and(|layout| layout.len >= LARGE_BUFFER_BYTES);
-        if large && head != HEAD_BYTES {
-            return Err(GlbSinkError::HeadTooLong { bytes: head });
+        let bytes = plan.head().len() as u64;
+        let large = layout.is_some_and(is_large);
+        if large && bytes != HEAD_BYTES {
+            return Err(GlbSinkError::HeadTooLong { bytes });
         }
-        self.out.write_all_at(plan.head(), 0)?;
-        self.out.write_all_at(&lock(&self.small), head)?;
-        if let Some(layout) = layout {
-            let end = head + layout.len;
-            let padding = usize::try_from(plan.len() - end).unwrap_or(0);
-            self.out.write_all_at(&[0; 3][..padding], end)?;
-        }
+        plan.write_with(&mut WriterAt { out: self.out, offset: 0 }, |out, layout| {
+            // The rows of a large buffer are in the file already.
+            out.offset += if large { layout.len } else { 0 };
+            out.write_all(&lock(&self.small))
+        })?;
         Ok(plan.len())
     }
 
@@ -110,14 +108,12 @@ impl<'a> GlbSink<'a> {
 
     fn try_begin(&self, n_vertices: usize, n_triangles: usize) -> Result<(), GlbSinkError> {
         let size = *self.size.get_or_init(|| [n_vertices as u64, n_triangles as u64]);
-        let layout = Layout::plain(size, self.storage())?;
+        let layout = BufferLayout::plain(size, self.storage())?;
         if let Some(layout) = layout {
             GlbPlan::check_len(HEAD_BYTES + layout.len.next_multiple_of(4))?;
         }
-        if let Some(Layout { len, .. }) = self.layout.get_or_init(|| layout)
-            && *len < LARGE_BUFFER_BYTES
-        {
-            lock(&self.small).resize(usize::try_from(*len).unwrap_or(0), 0);
+        if let Some(layout) = self.layout.get_or_init(|| layout).filter(|&layout| !is_large(layout)) {
+            lock(&self.small).resize(usize::try_from(layout.len).unwrap_or(0), 0);
         }
         Ok(())
     }
@@ -129,23 +125,14 @@ impl<'a> GlbSink<'a> {
         {
             return Err(FormatError::AlreadyQuantized { step: step.length() }.into());
         }
-        for (first, rows) in Rows::of_part(part) {
+        let (out, start): (&dyn RandomAccess, u64) =
+            if is_large(layout) { (self.out, HEAD_BYTES) } else { (&self.small, 0) };
+        for (first, rows) in ColumnRows::of_part(part) {
             if let Some(offset) = rows.offset(&layout, first) {
-                self.write_at(&layout, offset, rows)?;
+                rows.write(&layout, &mut WriterAt { out, offset: start + offset })?;
             }
         }
         Ok(())
-    }
-
-    /// Writes rows from byte `offset` of the buffer on.
-    fn write_at(&self, layout: &Layout, offset: u64, rows: Rows<'_>) -> io::Result<()> {
-        if layout.len >= LARGE_BUFFER_BYTES {
-            return rows.write(layout, &mut WriterAt { out: self.out, offset: HEAD_BYTES + offset });
-        }
-        let mut small = lock(&self.small);
-        let mut cursor = Cursor::new(&mut small[..]);
-        cursor.set_position(offset);
-        rows.write(layout, &mut cursor)
     }
 
     fn note<T>(&self, done: Result<T, GlbSinkError>) -> Result<T, SinkFailed> {
@@ -163,6 +150,15 @@ impl MeshSink for GlbSink<'_> {
 
     fn part(&self, part: &MeshPart<'_>) -> Result<(), SinkFailed> {
         self.note(self.try_part(part))
+    }
+}
+
+/// Buffer of fixed size in memory.
+impl RandomAccess for Mutex<Vec<u8>> {
+    fn write_all_at(&self, bytes: &[u8], offset: u64) -> io::Result<()> {
+        let start = usize::try_from(offset).unwrap_or(usize::MAX);
+        let mut memory = lock(self);
+        (&mut memory.get_mut(start..).unwrap_or_default()[..]).write_all(bytes)
     }
 }
 

@@ -1,5 +1,5 @@
-//! Chunks of a plan: runs of tiles that fit a device, with the bricks behind them whose samples their cells need. The
-//! halo bricks are computed again in the chunk that owns them.
+//! Chunks of a plan: runs of tiles that fit a device, each with its halo: the bricks behind it that hold grid points of
+//! its cells. A halo brick is computed twice: in this chunk, and in the chunk that owns it.
 
 use std::ops::Range;
 
@@ -10,7 +10,7 @@ use crate::surface::lattice::to_u32;
 /// Capacity of a device for one chunk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ChunkLimits {
-    /// Maximum number of bricks with samples.
+    /// Maximum number of bricks with densities.
     pub bricks: u64,
     /// Maximum number of entries in candidate lists.
     pub candidates: u64,
@@ -23,14 +23,14 @@ pub struct Chunk {
     pub first_brick: u32,
     /// Number of own bricks.
     pub n_own: u32,
-    /// Halo: later bricks that hold samples of the chunk's cells, ascending.
+    /// Halo: later bricks that hold grid points of the chunk's cells, ascending.
     pub halo: Vec<u32>,
     /// Upper bound of the entries in the candidate lists.
     pub candidates: u64,
 }
 
 impl Chunk {
-    /// Number of bricks with samples: own bricks and halo.
+    /// Number of bricks with densities: own bricks and halo.
     #[must_use]
     pub fn n_slots(&self) -> u64 {
         u64::from(self.n_own) + self.halo.len() as u64
@@ -86,7 +86,7 @@ impl Plan {
         let mut chunks = Vec::new();
         let mut from = tiles.start;
         while from < tiles.end {
-            // As many tiles as fit without their halo, then fewer until the halo fits too.
+            // Takes as many tiles as fit without their halo, then fewer until the halo fits too.
             let mut to = from;
             let (mut bricks, mut candidates) = (0, 0);
             while to < tiles.end {
@@ -123,7 +123,7 @@ impl Plan {
         Chunk { first_brick: first, n_own: end - first, halo, candidates }
     }
 
-    /// Bricks behind a run of whole tiles' bricks that hold samples of its cells, ascending.
+    /// Bricks behind a run of whole tiles' bricks that hold grid points of its cells, ascending.
     pub(super) fn halo(&self, bricks: Range<u32>) -> Vec<u32> {
         let mut halo = Vec::new();
         if (bricks.end as usize) < self.bricks.len() {
@@ -172,12 +172,12 @@ mod tests {
 
     /// Returns the first defect of `chunks`.
     fn defect(plan: &Plan, chunks: &[Chunk], limits: ChunkLimits) -> Option<String> {
-        let place = |b: usize| {
+        let coords = |b: usize| {
             let local = [0, 3, 6].map(|shift| i32::try_from(plan.bricks[b] >> shift & 7).unwrap());
             let tile = plan.tiles[(plan.bricks[b] >> 9) as usize].coord;
             std::array::from_fn::<i32, 3, _>(|k| 8 * tile[k] + local[k])
         };
-        let index: HashMap<[i32; 3], u32> = (0..plan.bricks.len()).map(|b| (place(b), to_u32(b))).collect();
+        let index: HashMap<[i32; 3], u32> = (0..plan.bricks.len()).map(|b| (coords(b), to_u32(b))).collect();
         let mut next = 0;
         for chunk in chunks {
             if chunk.first_brick != next || chunk.n_own == 0 || chunk.n_slots() > limits.bricks {
@@ -186,7 +186,7 @@ mod tests {
             next += chunk.n_own;
             let mut needed = BTreeSet::new();
             for own in chunk.first_brick..next {
-                let at = place(own as usize);
+                let at = coords(own as usize);
                 for n in 1..8 {
                     let there = std::array::from_fn(|k| at[k] + (n >> k & 1));
                     needed.extend(index.get(&there).copied().filter(|&b| b >= next));

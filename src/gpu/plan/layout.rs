@@ -4,6 +4,7 @@
 use bytemuck::{Pod, Zeroable};
 
 use crate::surface::cases::{CASES, CellEdge, cell_edge};
+use crate::surface::lattice;
 
 /// Marks a tile or brick that does not exist.
 pub const NONE: u32 = u32::MAX;
@@ -12,7 +13,7 @@ pub const NONE: u32 = u32::MAX;
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Params {
-    /// Sample that positions are relative to.
+    /// Grid point that positions are relative to.
     pub centre: [i32; 3],
     /// Spacing, Å.
     pub spacing: f32,
@@ -32,7 +33,7 @@ pub struct Params {
     pub tail_end: f32,
     /// Soft object, inverse square: factor of the density.
     pub amplitude: f32,
-    /// Inverse square: least u, per 1/ρ².
+    /// Inverse square: minimum u, per 1/ρ².
     pub u_min: f32,
     /// Gaussian: the slope is `2^(slope_offset − rate·u) − slope_tail` up to a factor.
     pub slope_offset: f32,
@@ -46,7 +47,7 @@ pub struct Params {
     pub ahead: u32,
     /// Number of tiles of the job.
     pub n_tiles: u32,
-    /// Capacity of the sheets, in words.
+    /// Capacity of the blocks of sheets and the table of their offsets, in words.
     pub sheet_capacity: u32,
     /// First brick of the chunk.
     pub first_brick: u32,
@@ -76,19 +77,19 @@ pub struct Params {
     pub triangle_capacity: u32,
     /// Always 0, but unknown to the shader compiler; see `rounded` in `bin.wgsl`.
     pub zero: u32,
-    /// Number of vertices in earlier partitions, which other devices make.
+    /// Number of vertices in earlier partitions, which other devices compute.
     pub base_vertex: u32,
     /// Factor of positions before rounding to integers, 1/Å; 0 for vertices in single precision.
     pub steps_per_angstrom: f32,
 }
 
-/// Tile: 8 × 8 × 8 bricks, with a bit set for each that exists.
+/// Tile: 8 × 8 × 8 bricks, and one bit for each, set if the brick exists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Tile {
     /// Coordinates, in tiles.
     pub coord: [i32; 3],
-    /// Number of bricks in all tiles before.
+    /// Number of bricks in all earlier tiles.
     pub base: u32,
     /// Word z, lower half first; bit `8·y + x`.
     pub bricks: [[u32; 2]; 8],
@@ -101,9 +102,9 @@ pub struct Tile {
 /// Result of `classify` for a brick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
-pub struct Record {
-    /// Crossing edges: half-word `2·(3·z + axis) + half` of 32 bits; bit `8·y + x` of the owning sample, the upper half
-    /// from y = 4 on. Vertices are numbered in this order.
+pub struct BrickRecord {
+    /// Crossing edges: half-word `2·(3·z + axis) + half` of 32 bits; bit `8·y + x` of the owning grid point, the upper
+    /// half from y = 4 on. Vertices are numbered in this order.
     pub crossing: [u32; 48],
     /// Per layer: number of vertices before it (16 bits), on its x edges (8 bits) and on its y edges (8 bits).
     pub layers: [u32; 8],
@@ -127,7 +128,7 @@ pub struct Counters {
     pub checksum: [u32; 2],
     /// Number of triangles with a corner twice.
     pub degenerate: u32,
-    /// Number of words of sheets, including those beyond the capacity.
+    /// Number of words of the blocks of sheets without the table of offsets, including those beyond the capacity.
     pub sheet_words: u32,
     /// Keys of the highest position per axis, and of the highest negative position: integers with the order of the
     /// numbers, in Å or steps.
@@ -145,15 +146,14 @@ impl Counters {
     }
 }
 
-/// Number of samples of a brick.
-pub const SAMPLES: u64 = 512;
+/// Number of grid points of a brick.
+pub const BRICK_POINTS: u64 = lattice::BRICK_POINTS as u64;
 /// Number of bricks of a group; `classify` adds up the counts of each group for `scan`.
 pub const GROUP: u32 = 1024;
-/// Number of words of the case table: the triangle count of each case; the same with eight cases per word; the twelve
-/// edges of a cell and four unused words; then two words per case with four bits per triangle corner.
-pub const CASE_WORDS: usize = 256 + 32 + 16 + 2 * 256;
 
-/// Returns the case table as the shaders read it.
+/// Returns the case table in the layout of the shaders: the triangle count of each case, one per word; the same counts,
+/// eight per word; the twelve edges of a cell and four unused words; and two words per case, with four bits per
+/// triangle corner.
 #[must_use]
 pub fn case_table() -> Vec<u32> {
     let counts = || CASES.count.iter().map(|&n| u32::from(n));
@@ -167,7 +167,7 @@ pub fn case_table() -> Vec<u32> {
     counts().chain(packed).chain(edges).chain(rows).collect()
 }
 
-/// Offset of a cell's edge from the cell's sample: 1 along x and 16 along y. Each group of four rows is a word of
+/// Offset of a cell's edge from the cell's grid point: 1 along x and 16 along y. Each group of four rows is a word of
 /// edges, with an offset of 64; a layer has 3 words, including the first row of the next brick, and an axis has 9
 /// layers.
 fn edge_code(edge: u8) -> u32 {
@@ -189,7 +189,7 @@ mod tests {
     #[test]
     fn the_case_table_unpacks_to_the_cases() {
         let table = case_table();
-        assert_eq!(table.len(), CASE_WORDS);
+        assert_eq!(table.len(), 256 + 32 + 16 + 2 * 256);
         for (e, &code) in (0..12).zip(&table[288..]) {
             let CellEdge { offset, axis } = cell_edge(e);
             let steps = [code & 15, code >> 4 & 3, (code >> 6) % 27 / 3].map(|step| u8::try_from(step).unwrap());

@@ -13,8 +13,8 @@ use rayon::prelude::*;
 pub use self::chunk::{Chunk, ChunkLimits};
 use self::layout::{NONE, Params, Tile, halves};
 pub use self::partition::Partition;
-use crate::surface::cpu;
 use crate::surface::cpu::field::Constants;
+use crate::surface::grid_limit;
 use crate::surface::kernel::Profile;
 use crate::surface::lattice::{BRICK, Lattice, tile_order, to_f32, to_u32, to_u64};
 use crate::surface::occupancy::{BrickBits, Occupancy, TileOccupancy, count_ones};
@@ -33,9 +33,9 @@ pub struct Plan {
     pub reaches: Vec<f32>,
     /// Per tile: number of entries in the candidate lists of its bricks.
     pub candidates: Vec<u64>,
-    /// Number of bricks with a sample in reach of an atom.
+    /// Number of bricks with a grid point in reach of an atom.
     pub n_reached: u64,
-    /// Number of pairs of such a brick and an atom that reaches one of its samples.
+    /// Number of pairs of such a brick and an atom that reaches one of its grid points.
     pub pairs: u64,
     /// Maximum of `reaches`.
     pub max_reach: f32,
@@ -50,8 +50,11 @@ impl Plan {
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let occupancy = Occupancy::new(lattice, limits, control)?;
         let (bases, n_bricks) = tile_bases(&occupancy.tiles)
-            .ok_or_else(|| cpu::grid_too_large(lattice, u64::from(u32::MAX) * 512, limits))?;
+            .ok_or_else(|| grid_limit::exceeded(lattice, u64::from(u32::MAX) * 512, limits, control))?;
         let occupied = &occupancy.tiles;
+        let per_tile = size_of::<Tile>() + size_of::<u32>() + size_of::<u64>();
+        let rows = per_tile * occupied.len() + 2 * size_of::<u32>() * (n_bricks + 1);
+        control.memory.grow((rows + size_of::<f32>() * occupancy.reaches.len()) as u64)?;
         let tiles: Vec<Tile> = occupied.par_iter().zip(&bases).map(|(own, &base)| tile(occupied, own, base)).collect();
         let (bricks, first_atoms) = list_bricks(&occupancy, n_bricks);
         Ok(Self {
@@ -75,7 +78,7 @@ impl Plan {
     #[must_use]
     pub fn params(&self, lattice: &Lattice, profile: &Profile, params: &SurfaceParams) -> Params {
         let field = Constants::new(profile, lattice.spacing);
-        // An atom lies at most half a spacing outside the samples of its brick.
+        // An atom lies at most half a spacing outside the grid points of its brick.
         let bricks = |reach: f32| u32::try_from(to_u64(f64::from(reach) / f64::from(BRICK))).unwrap_or(u32::MAX);
         Params {
             centre: lattice.centre,
@@ -142,15 +145,15 @@ fn tile(tiles: &[TileOccupancy], own: &TileOccupancy, base: u32) -> Tile {
 /// Columns [`Plan::bricks`] and [`Plan::first_atoms`].
 fn list_bricks(occupancy: &Occupancy, n_bricks: usize) -> (Vec<u32>, Vec<u32>) {
     let (mut bricks, mut first_atoms) = (Vec::with_capacity(n_bricks), Vec::with_capacity(n_bricks + 1));
-    let mut homes = occupancy.homes.iter().peekable();
+    let mut atom_bricks = occupancy.atom_bricks.iter().peekable();
     let mut at = 0;
     for (t, own) in (0..).zip(&occupancy.tiles) {
         for local in set_bits(&own.occupied) {
             bricks.push(t << 9 | local);
             first_atoms.push(at);
-            // Every atom's own brick is occupied, so this passes every atom.
-            while let Some(home) = homes.next_if(|home| home.local == local && home.tile == own.tile) {
-                at += home.n_atoms;
+            // The brick that holds an atom is always occupied, so this loop passes every atom.
+            while let Some(brick) = atom_bricks.next_if(|brick| brick.local == local && brick.tile == own.tile) {
+                at += brick.n_atoms;
             }
         }
     }
@@ -197,17 +200,17 @@ mod tests {
 
     /// Coordinates of each brick, in bricks.
     fn coords(plan: &Plan) -> Vec<[i32; 3]> {
-        let place = |&b: &u32| {
+        let coords = |&b: &u32| {
             let local = [0, 3, 6].map(|shift| i32::try_from(b >> shift & 7).unwrap());
             let tile = plan.tiles[(b >> 9) as usize].coord;
             std::array::from_fn(|k| 8 * tile[k] + local[k])
         };
-        plan.bricks.iter().map(place).collect()
+        plan.bricks.iter().map(coords).collect()
     }
 
     #[test]
     fn bricks_are_in_order_and_hold_their_atoms() {
-        // From bricks much larger than atoms, some of which reach no sample, to much smaller bricks.
+        // From bricks much larger than atoms, some of which reach no grid point, to much smaller bricks.
         for resolution in [20.0, 3.0, 0.5, 0.15, 0.066, 0.0655, 0.05] {
             let lattice = lattice(200, 60.0, resolution);
             let plan = plan(&lattice);
@@ -215,12 +218,12 @@ mod tests {
             assert!(plan.tiles.windows(2).all(|pair| tile_order(pair[0].coord) < tile_order(pair[1].coord)));
             let coords = coords(&plan);
             let mut seen = 0;
-            for (i, place) in coords.iter().enumerate() {
+            for (i, brick) in coords.iter().enumerate() {
                 let [from, to] = [plan.first_atoms[i], plan.first_atoms[i + 1]];
                 assert_eq!(from, seen);
                 seen = to;
                 for atom in &lattice.atoms[from as usize..to as usize] {
-                    assert_eq!(atom.cell.map(|c| c.div_euclid(BRICK)), *place);
+                    assert_eq!(atom.cell.map(|c| c.div_euclid(BRICK)), *brick);
                 }
             }
             assert_eq!(seen, 200);
@@ -263,14 +266,14 @@ mod tests {
     #[test]
     fn a_grid_beyond_the_limit_is_rejected_with_a_spacing_that_fits() {
         let lattice = lattice(300, 80.0, 0.5);
-        let samples = plan(&lattice).n_reached * 512;
-        let with = |max_samples| {
-            Plan::new(&lattice, &SurfaceLimits { max_samples, ..SurfaceLimits::default() }, &Control::default())
+        let grid_points = plan(&lattice).n_reached * 512;
+        let with = |max_grid_points| {
+            Plan::new(&lattice, &SurfaceLimits { max_grid_points, ..SurfaceLimits::default() }, &Control::default())
         };
-        assert!(with(samples).is_ok());
-        match with(samples - 1) {
-            Err(SurfaceError::GridTooLarge { samples: n, limit, suggested_resolution, .. }) => {
-                assert_eq!((n, limit), (samples, samples - 1));
+        assert!(with(grid_points).is_ok());
+        match with(grid_points - 1) {
+            Err(SurfaceError::GridTooLarge { grid_points: n, limit, suggested_resolution, .. }) => {
+                assert_eq!((n, limit), (grid_points, grid_points - 1));
                 assert!(suggested_resolution >= 0.5);
             }
             other => panic!("{:?}", other.map(|p| p.n_reached)),

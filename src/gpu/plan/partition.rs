@@ -1,8 +1,8 @@
 //! Partitions of a plan for several devices, and the bricks and atoms of other partitions that each needs.
 //!
-//! A partition is a run of tiles. Its last cells have corners in bricks of later partitions. It computes the samples of
-//! these halo bricks again, as a chunk does, but only their owner knows which of their edges are crossed and how the
-//! vertices there are numbered.
+//! A partition is a run of tiles. Its last cells have corners in bricks of later partitions. It computes the grid
+//! points of these halo bricks again, as a chunk does, but imports their crossing edges and vertex numbers, which only
+//! their owner can compute.
 
 use std::ops::Range;
 

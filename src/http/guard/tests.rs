@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn a_key_may_stand_in_two_places_but_there_is_one() {
+fn equal_keys_in_two_headers_are_accepted_and_different_ones_rejected() {
     let text = |pairs: &[(&'static str, &'static str)]| {
         let mut headers = HeaderMap::new();
         for (name, value) in pairs {
@@ -57,7 +57,7 @@ fn caching_ends_with_the_signature() {
 }
 
 #[test]
-fn what_was_public_is_private() {
+fn public_responses_become_private() {
     for (value, private) in [
         ("public, max-age=5, immutable", "private, max-age=5, immutable"),
         ("no-store", "no-store"),

@@ -1,23 +1,36 @@
 //! Request bodies in the OpenAPI document.
 //!
-//! The document declares the bytes of a file alone. The server also accepts forms and JSON, but generators choose one
-//! body for an operation, most of them JSON, and the clients could not send files.
+//! An operation declares the bytes of a file alone. Forms and JSON, which the server accepts as well, are components:
+//! generators choose one body for an operation, most of them JSON if it is declared, and their clients could not send
+//! files. With a form beside the file, the code of openapi-generator for TypeScript does not compile.
 
-use utoipa::openapi::schema::Type;
+use serde_json::{Value, json};
+use utoipa::openapi::schema::{AdditionalProperties, Type};
 use utoipa::openapi::{KnownFormat, ObjectBuilder, RefOr, Schema, SchemaFormat};
 use utoipa::{PartialSchema, ToSchema};
 
 /// Description of a body with a structure to mesh.
-pub(in crate::http) const STRUCTURE_TO_MESH: &str = "A structure file. The server detects the format from the content.
-
-Two other bodies are accepted. `application/json` names a structure on the server and holds the parameters: \
-`{\"pdb_id\": \"4pti\", \"resolution\": 0.7}` for an archive entry, `\"structure\"` with a digest instead of \
-`\"pdb_id\"` for an uploaded structure. `multipart/form-data` has the file in the field `file` and the parameters in \
-the other fields.";
+pub(in crate::http) const STRUCTURE_TO_MESH: &str = "A structure file. The server detects the format from the content. \
+Two other bodies are accepted: a form with the file and parameters (component `StructureUpload`), and JSON that names a \
+structure on the server (component `StructureByName`).";
 
 /// Description of the same body for other operations.
-pub(in crate::http) const AS_FOR_MESHES: &str =
-    "A structure file, or another of the bodies that `POST /v1/meshes` accepts.";
+pub(in crate::http) const AS_FOR_MESHES: &str = "The same bodies as for `POST /v1/meshes`.";
+
+/// Returns the components for `requestBodies`: the bodies that no operation declares.
+pub(super) fn request_bodies() -> Value {
+    let schema = |name: &str| json!({ "schema": { "$ref": format!("#/components/schemas/{name}") } });
+    json!({
+        "StructureByName": {
+            "description": "Body of `POST /v1/meshes`, `/v1/report` and `/v1/estimate` for a structure on the server.",
+            "content": { "application/json": schema(&NamedStructure::name()) },
+        },
+        "StructureUpload": {
+            "description": "Form with a structure file, for the same operations and for `POST /v1/structures`.",
+            "content": { "multipart/form-data": schema(&StructureForm::name()) },
+        },
+    })
+}
 
 /// Returns a schema for bytes.
 pub(super) fn binary(doc: &str) -> ObjectBuilder {
@@ -35,5 +48,41 @@ impl PartialSchema for StructureFile {
         RefOr::T(
             binary("A PDB, mmCIF, BinaryCIF, PQR or XYZ file, uncompressed or compressed with gzip or zstd.").into(),
         )
+    }
+}
+
+/// Form with a structure file.
+pub(in crate::http) enum StructureForm {}
+
+impl ToSchema for StructureForm {}
+
+impl PartialSchema for StructureForm {
+    fn schema() -> RefOr<Schema> {
+        let form = ObjectBuilder::new()
+            .description(Some("Form with a structure file. The other fields are parameters, as in the query."))
+            .property("file", binary("The structure file."))
+            .required("file")
+            .additional_properties(Some(AdditionalProperties::FreeForm(true)));
+        RefOr::T(form.build().into())
+    }
+}
+
+/// JSON document that names a structure.
+pub(in crate::http) enum NamedStructure {}
+
+impl ToSchema for NamedStructure {}
+
+impl PartialSchema for NamedStructure {
+    fn schema() -> RefOr<Schema> {
+        let text = |doc: &str| ObjectBuilder::new().schema_type(Type::String).description(Some(doc));
+        let doc = "Structure on the server: `pdb_id` or `structure`. The other members are parameters, as in the query: \
+                   text, numbers, true, false, or lists of them.";
+        let document = ObjectBuilder::new()
+            .description(Some(doc))
+            .property("pdb_id", text("PDB id of an archive entry."))
+            .property("structure", text("Digest of an uploaded structure."))
+            .additional_properties(Some(AdditionalProperties::FreeForm(true)))
+            .examples([json!({ "pdb_id": "4pti", "resolution": 0.7, "select": ["polymer", "ligand"] })]);
+        RefOr::T(document.build().into())
     }
 }

@@ -1,14 +1,42 @@
-//! Post-processing of the OpenAPI document: moves repeated parameters, responses and headers to `components`.
+//! Post-processing of the OpenAPI document: moves repeated parameters, responses and headers to `components`, and adds
+//! the request bodies that no operation declares and the example of a report.
 
 use serde_json::{Map, Value, json};
+
+use super::bodies::request_bodies;
 
 /// Temporary extension of an error response with its problem types, from which [`share`] derives the name of the
 /// component.
 pub(super) const PROBLEM_TYPES: &str = "x-problem-types";
 
-/// Replaces inline parameters, headers, error responses and mesh responses by references into `components`.
+/// Example of a report, as JSON.
+const REPORT_EXAMPLE: &str = include_str!("report_example.json");
+
+/// Names of error responses with more than two problem types: status, problem types that only this response has, name.
+/// The first row that matches applies.
+const ERROR_NAMES: &[(&str, &[&str], &str)] = &[
+    ("401", &[], "Unauthorized"),
+    ("403", &[], "Forbidden"),
+    ("413", &[], "TooLarge"),
+    ("422", &["other-request"], "MeshRequestRejected"),
+    ("422", &["grid-too-large"], "MeshRejected"),
+    ("422", &["picture-too-large"], "EstimateRejected"),
+    ("422", &["empty-selection"], "SelectionRejected"),
+    ("422", &[], "StructureRejected"),
+    ("500", &[], "JobFailed"),
+    ("503", &["too-many-jobs"], "MeshUnavailable"),
+    ("503", &["device-failed", "queue-full", "store-failed"], "ReportUnavailable"),
+    ("503", &["device-failed", "queue-full"], "EntryReportUnavailable"),
+    ("503", &["shutting-down"], "JobResultUnavailable"),
+    ("503", &["store-full"], "UploadUnavailable"),
+    ("503", &["too-many-deliveries", "store-failed"], "StructureUnavailable"),
+    ("503", &["too-many-deliveries"], "EntryUnavailable"),
+    ("503", &[], "ResultUnavailable"),
+];
+
+/// Replaces inline parameters, headers and the responses of several operations by references into `components`.
 pub(in crate::http) fn share(document: &mut Value) {
-    let mut shared = Shared::default();
+    let mut shared = Components::default();
     let operations = members(document, "paths").flat_map(|(path, item)| {
         let operations = item.as_object_mut().into_iter().flat_map(Map::values_mut);
         operations.map(move |operation| (path, operation))
@@ -36,7 +64,12 @@ pub(in crate::http) fn share(document: &mut Value) {
     }
     if let Some(components) = document.get_mut("components") {
         members(components, "schemas").for_each(|(_, schema)| remove_least_counts(schema));
+        if let Some(Value::Object(report)) = components.pointer_mut("/schemas/Report") {
+            // `json!` of the schema's attribute cannot expand an object of this size.
+            report.insert("example".to_owned(), serde_json::from_str(REPORT_EXAMPLE).unwrap_or_default());
+        }
         if let Value::Object(components) = components {
+            components.insert("requestBodies".to_owned(), request_bodies());
             components.append(&mut shared.0);
         }
     }
@@ -61,10 +94,10 @@ fn members<'a>(value: &'a mut Value, name: &str) -> impl Iterator<Item = (&'a St
 
 /// Component objects by kind and name.
 #[derive(Default)]
-struct Shared(Map<String, Value>);
+struct Components(Map<String, Value>);
 
-impl Shared {
-    /// Replaces `value` by a reference to a component. A number tells different values with one name apart.
+impl Components {
+    /// Replaces `value` by a reference to a component. A number distinguishes different values with one name.
     fn replace(&mut self, kind: &str, name: &str, value: &mut Value) {
         let Value::Object(of_kind) = self.0.entry(kind).or_insert_with(|| json!({})) else { return };
         let mut key = name.to_owned();
@@ -89,7 +122,9 @@ fn parameter_name(path: &str, parameter: &Value) -> String {
 /// Returns the component name of a response; `None` if the response stays with its operation.
 fn response_name(status: &str, response: &Value) -> Option<String> {
     let Some(types) = response[PROBLEM_TYPES].as_array() else {
+        let document = &response["content"]["application/json"]["schema"]["$ref"];
         return match status {
+            "200" if *document == "#/components/schemas/ReportDocument" => Some("MeshReport".to_owned()),
             "200" if response["content"].get("model/*").is_some() => Some("Mesh".to_owned()),
             "200" if response["content"].get("application/octet-stream").is_some() => Some("AtomColors".to_owned()),
             "202" => Some("JobAccepted".to_owned()),
@@ -99,8 +134,10 @@ fn response_name(status: &str, response: &Value) -> Option<String> {
             _ => None,
         };
     };
-    let types: Vec<String> = types.iter().filter_map(Value::as_str).map(pascal_case).collect();
-    Some(if types.len() <= 2 { types.join("Or") } else { format!("Error{status}") })
+    let types: Vec<&str> = types.iter().filter_map(Value::as_str).collect();
+    let named = ERROR_NAMES.iter().find(|(of, needed, _)| *of == status && needed.iter().all(|n| types.contains(n)));
+    let joined = || types.iter().map(|name| pascal_case(name)).collect::<Vec<_>>().join("Or");
+    Some(named.filter(|_| types.len() > 2).map_or_else(joined, |(_, _, name)| (*name).to_owned()))
 }
 
 /// Converts `no-such-job` or `max_triangles` to `NoSuchJob` or `MaxTriangles`.

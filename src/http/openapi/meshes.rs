@@ -15,6 +15,10 @@ use crate::http::delivery::{PICTURE, ReportDocument, SUMMARY};
 use crate::http::jobs::JobDocument;
 use crate::http::negotiate::OCTETS;
 
+/// Descriptions of headers that several responses have. Equal descriptions become one component.
+const ETAG: &str = "Strong validator: equal tags mean equal bytes.";
+const RANGES: &str = "`bytes`, if parts of the file can be requested.";
+
 fn header(kind: Type, doc: &str) -> Header {
     HeaderBuilder::new().schema(Some(ObjectBuilder::new().schema_type(kind))).description(Some(doc)).build()
 }
@@ -42,19 +46,18 @@ fn reference<T: ToSchema>() -> Content {
 /// in `+json` as JSON documents.
 fn whole() -> RefOr<Response> {
     let doc = "The mesh. Its media type follows from the format: `model/gltf-binary` (glb), `model/gltf+json` (gltf), \
-               `application/ply`, `model/x-ply-text`, `model/stl`, `model/obj` or `image/png`; \
+               `application/ply`, `model/x-ply-text`, `model/stl`, `model/obj`, `model/x-vtp` or `image/png`; \
                `application/octet-stream` if `Accept` prefers it.";
-    let etag = "Strong validator of the file. Equal tags mean equal bytes.";
     let response = ResponseBuilder::new()
         .description(doc)
-        .header("Accept-Ranges", text("`bytes`, for a stored result."))
-        .header("Cache-Control", text("Caching rules. Absent in responses to uploads."))
+        .header("Accept-Ranges", text(RANGES))
+        .header("Cache-Control", text("Caching rules."))
         .header("Content-Disposition", text("Suggested file name."))
         .header(
             "Content-Location",
             text("Path of the stored result: `/v1/results/{file}`. Absent if it is not stored."),
         )
-        .header("ETag", text(etag))
+        .header("ETag", text(ETAG))
         .header("Vary", text("`accept`, in responses whose media type depends on `Accept`."));
     let file = || ContentBuilder::new().schema(Some(binary("Bytes of the file."))).build();
     let types = Format::ALL.map(Format::media_type).into_iter();
@@ -72,7 +75,7 @@ fn accepted() -> RefOr<Response> {
     let response = ResponseBuilder::new()
         .description("A job was accepted: the request has `Prefer: respond-async`, or `Prefer: wait=` and the mesh takes longer.")
         .content("application/json", reference::<JobDocument>())
-        .header("Location", text("Path of the job."))
+        .header("Location", text("Path of the result, job or structure."))
         .header("Retry-After", super::problems::retry_after())
         .header("Preference-Applied", text("`respond-async`, if the request prefers it."))
         .link("job", link("showJob", "Status of the job."))
@@ -87,7 +90,7 @@ fn part_of(whole: RefOr<Response>) -> RefOr<Response> {
     let RefOr::T(mut response) = whole else { return whole };
     "The requested part of the file, with the headers of status 200.".clone_into(&mut response.description);
     response.headers.clear();
-    response.headers.insert("Content-Range".to_owned(), text("`bytes FIRST-LAST/LENGTH`.").into());
+    response.headers.insert("Content-Range".to_owned(), text(super::problems::CONTENT_RANGE).into());
     RefOr::T(response)
 }
 
@@ -104,9 +107,9 @@ fn colors() -> RefOr<Response> {
     let response = ResponseBuilder::new()
         .description("The colours, four bytes per atom.")
         .content(OCTETS, list)
-        .header("ETag", text("Strong validator of the colours."))
+        .header("ETag", text(ETAG))
         .header("Cache-Control", text("Caching rules."))
-        .header("Accept-Ranges", text("`bytes`."))
+        .header("Accept-Ranges", text(RANGES))
         .header("molmesh-colors", text(legend));
     RefOr::T(response.build())
 }
@@ -119,7 +122,7 @@ fn part_of_colors() -> RefOr<Response> {
 fn unchanged() -> RefOr<Response> {
     let response = ResponseBuilder::new()
         .description("The client already has the current version.")
-        .header("ETag", text("The validator that matched."))
+        .header("ETag", text(ETAG))
         .header("Cache-Control", text("Caching rules."));
     RefOr::T(response.build())
 }

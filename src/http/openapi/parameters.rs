@@ -31,7 +31,9 @@ impl Modify for ChoiceSchemas {
         schemas.insert(SURFACE_FILE.to_owned(), RefOr::T(files.into()));
         for parameter in TABLE {
             let Domain::Choice(values) = parameter.domain else { continue };
-            let default = values.contains(&parameter.default).then(|| Value::from(parameter.default));
+            // A format that is sent takes precedence over `Accept`, so declaring its default would change responses.
+            let declared = parameter.name != "format" && values.contains(&parameter.default);
+            let default = declared.then(|| Value::from(parameter.default));
             let object = ObjectBuilder::new()
                 .schema_type(Type::String)
                 .description(Some(format!("Value of `{}`.", parameter.name)))
@@ -76,6 +78,7 @@ fn describe(parameter: &params::Parameter) -> String {
     };
     let default = match parameter.default {
         "absent" => String::new(),
+        default if parameter.name == "format" => format!(" Default: the format that `Accept` prefers, or {default}."),
         default => format!(" Default: {default}."),
     };
     format!("{}{range}{default}", parameter.doc)
@@ -162,7 +165,7 @@ parameters!(
 parameters!(
     /// Parameters of a mesh whose path names the format.
     SurfaceParameters: {
-        let doc = "`surface.` and the extension of the mesh format; `surface.png` is a picture of the mesh.";
+        let doc = "`surface.` and the name of the mesh format; `surface.png` is a picture of the mesh.";
         let file = path("file", doc).schema(Some(Ref::from_schema_name(SURFACE_FILE))).build();
         std::iter::once(file).chain(TABLE.iter().filter(|p| p.name != "format").map(query)).collect()
     }
@@ -170,12 +173,12 @@ parameters!(
 parameters!(
     /// Query parameters of the colours of atoms.
     ColorParameters: {
-        let of_mesh = |name: &&str| TABLE.iter().find(|p| p.name == *name).map(query);
+        let mesh_parameter = |name: &&str| TABLE.iter().find(|p| p.name == *name).map(query);
         let value = ObjectBuilder::new().schema_type(Type::String).title(Some(color_parameters::expected())).examples(["chain"]);
         let doc = format!("Colour scheme. Value: {}.", color_parameters::expected());
         let scheme = ParameterBuilder::new().name("scheme").parameter_in(ParameterIn::Query);
         let scheme = scheme.required(Required::True).description(Some(doc)).schema(Some(value)).build();
-        std::iter::once(scheme).chain(color_parameters::NAMES.iter().filter_map(of_mesh)).collect()
+        std::iter::once(scheme).chain(color_parameters::NAMES.iter().filter_map(mesh_parameter)).collect()
     }
 );
 parameters!(
@@ -225,7 +228,8 @@ parameters!(
             "Urgency among the requests of one client, from `u=0` (most urgent) to `u=7` (RFC 9218).",
         ),
         (
-            "Idempotency-Key", Some("^[ -~]{1,255}$"), "upload-1",
+            // Tabs are allowed at both ends, where HTTP removes them.
+            "Idempotency-Key", Some("^[\\t ]*[ -~]{1,255}[\\t ]*$"), "upload-1",
             "Key chosen by the client, 1 to 255 characters. A repeated request with the same key returns the same job.",
         ),
     ])

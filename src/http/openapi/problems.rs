@@ -12,8 +12,11 @@ use utoipa::openapi::{
 use utoipa::{PartialSchema, ToSchema};
 
 use super::components::PROBLEM_TYPES;
-use crate::http::kinds::{KINDS, Kind, Row};
+use crate::http::kinds::{KINDS, Kind, ProblemEntry};
 use crate::http::problem::MEDIA_TYPE;
+
+/// Description of the header `Content-Range`.
+pub(super) const CONTENT_RANGE: &str = "`bytes FIRST-LAST/LENGTH`; `bytes */LENGTH` if the range is outside the file.";
 
 /// Problems while a body is received.
 pub(in crate::http) const BODY: &[Kind] = &[
@@ -22,6 +25,7 @@ pub(in crate::http) const BODY: &[Kind] = &[
     Kind::BodyTooLarge,
     Kind::UnsupportedMediaType,
     Kind::UnsupportedEncoding,
+    Kind::TooMuchMemory,
     Kind::MemoryFull,
 ];
 /// Further problems of a JSON body that names a structure.
@@ -45,6 +49,7 @@ pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::NoSurface,
     Kind::Internal,
     Kind::DeviceFailed,
+    Kind::TooMuchMemory,
     Kind::MemoryFull,
     Kind::ShuttingDown,
     Kind::Deadline,
@@ -80,7 +85,7 @@ pub(in crate::http) use problem_responses;
 
 /// Returns the responses for some kinds, one per status.
 pub(in crate::http) fn responses(groups: &[&[Kind]]) -> BTreeMap<String, RefOr<Response>> {
-    let mut by_status: BTreeMap<String, Vec<&Row>> = BTreeMap::new();
+    let mut by_status: BTreeMap<String, Vec<&ProblemEntry>> = BTreeMap::new();
     for row in KINDS.iter().filter(|row| groups.iter().any(|group| group.contains(&row.kind))) {
         by_status.entry(row.status.as_u16().to_string()).or_default().push(row);
     }
@@ -88,7 +93,7 @@ pub(in crate::http) fn responses(groups: &[&[Kind]]) -> BTreeMap<String, RefOr<R
 }
 
 /// Returns the response for the kinds of one status.
-fn response(rows: &[&Row]) -> Response {
+fn response(rows: &[&ProblemEntry]) -> Response {
     let described: Vec<String> = rows.iter().map(|row| format!("`{}`: {}.", row.slug, row.title)).collect();
     let names: Vec<&str> = rows.iter().map(|row| row.slug).collect();
     let problem = Ref::from_schema_name(ProblemDocument::name());
@@ -111,14 +116,15 @@ fn response(rows: &[&Row]) -> Response {
         response = response.header("WWW-Authenticate", header(text(), "`Bearer` and the reason (RFC 6750)."));
     }
     if has(&[Kind::RangeNotSatisfiable]) {
-        response = response.header("Content-Range", header(text(), "`bytes */LENGTH` with the length of the file."));
+        response = response.header("Content-Range", header(text(), CONTENT_RANGE));
     }
     response.build()
 }
 
 /// Returns the header `Retry-After`.
 pub(super) fn retry_after() -> Header {
-    let seconds = ObjectBuilder::new().schema_type(Type::Integer).minimum(Some(1));
+    let int64 = SchemaFormat::KnownFormat(KnownFormat::Int64);
+    let seconds = ObjectBuilder::new().schema_type(Type::Integer).format(Some(int64)).minimum(Some(0));
     header(seconds, "Seconds to wait before the next request. Absent if waiting does not help.")
 }
 
@@ -130,7 +136,7 @@ fn header(schema: ObjectBuilder, doc: &str) -> Header {
     HeaderBuilder::new().schema(Some(schema)).description(Some(doc)).build()
 }
 
-fn address(row: &Row) -> String {
+fn address(row: &ProblemEntry) -> String {
     format!("/problems/{}", row.slug)
 }
 
@@ -153,11 +159,11 @@ const MEMBERS: &[Member] = &[
     ("expected", Some(Type::String), "Allowed values, in words."),
     ("limit", Some(Type::Integer), "The limit that was exceeded."),
     ("actual", Some(Type::Integer), "The value that exceeds the limit."),
-    ("resolution", Some(Type::Number), "Grid spacing in Å."),
+    ("resolution", Some(Type::Number), "Grid spacing of the rejected mesh in Å."),
     ("suggested_resolution", Some(Type::Number), "Grid spacing in Å at which the mesh would fit."),
     ("isovalue", Some(Type::Number), "Isovalue that the density does not reach."),
-    ("estimated_wait_s", Some(Type::Number), "Estimated time in the queue in s."),
-    ("line", Some(Type::Integer), "Line in the file, from 1."),
+    ("estimated_wait_s", Some(Type::Number), "Estimated time in the queue in seconds."),
+    ("line", Some(Type::Integer), "Line in the file or JSON document, from 1."),
     ("column", Some(Type::Integer), "Column in the line, or position in the expression, from 1."),
     (
         "place",
@@ -165,7 +171,7 @@ const MEMBERS: &[Member] = &[
         "Position in a binary file: category, column, encoding, row (from 1) or byte (from 0). For an invalid assembly, its id.",
     ),
     ("atom", Some(Type::Integer), "Index of the atom, from 0."),
-    ("found", None, "Content found instead of the expected one."),
+    ("found", None, "Content found where `expected` was required."),
     ("declared", Some(Type::String), "The `Content-Type` of the request."),
     ("encoding", Some(Type::String), "Compression of the file."),
     ("host", Some(Type::String), "Host name of the archive."),
@@ -203,13 +209,17 @@ impl PartialSchema for ProblemDocument {
             let kind = kind.clone().map_or_else(|| SchemaType::AnyValue, SchemaType::new);
             problem = problem.property(*name, ObjectBuilder::new().schema_type(kind).description(Some(*doc)));
         }
+        let position = ArrayBuilder::new()
+            .items(Object::with_type(Type::Number))
+            .description(Some("Coordinates x, y, z in Å at which too many atoms lie."));
         let list = |name: &str, doc: &str| {
             ArrayBuilder::new().items(Ref::from_schema_name(name)).description(Some(doc.to_owned()))
         };
         let problem = problem
             .property("nearest", nearest)
             .property("violated-policies", strings("Exhausted quotas: `requests`, `work` or `concurrency`."))
-            .property("available", strings("Available alternatives."))
+            .property("position", position)
+            .property("available", strings("Accepted values, such as media types."))
             .property("checks", list("ReadinessCheck", "Results of the readiness checks."))
             .property("diagnostics", list("Finding", "Errors and warnings of the strict validator about the file."))
             .additional_properties(Some(AdditionalProperties::FreeForm(true)))

@@ -14,11 +14,11 @@ use shuttle::future::block_on;
 use shuttle::rand::{Rng as _, thread_rng};
 use shuttle::scheduler::RandomScheduler;
 
-use super::super::coalesced_job::Entry;
+use super::super::coalesced_job::QueuedTask;
 use super::super::queue::Queue;
 use super::super::{
-    Budget, ContentKey, EndError, Failure, JobId, JobSpec, JobStore, JobView, Pool, REPORT, Record, Settings, Status,
-    Structures,
+    Budget, ContentKey, EndError, Failure, JobId, JobRecord, JobSpec, JobStore, JobView, OnStart, Pool, REPORT,
+    Settings, Status, Structures,
 };
 use super::task;
 use crate::config::JobsConfig;
@@ -78,6 +78,7 @@ impl Fixture {
     fn accept(&self) -> Client<'_> {
         let spec = JobSpec {
             task: task(1, true),
+            file: Bytes::from(vec![1]),
             parameters: Vec::new(),
             format: Format::Glb,
             idempotency_key: Some(KEY.to_owned()),
@@ -88,14 +89,14 @@ impl Fixture {
     }
 
     /// Returns the record of the ended job in the store, without a step of the scheduler.
-    fn on_record(&self) -> Option<Record> {
+    fn on_record(&self) -> Option<JobRecord> {
         let path = Path::from(Name::ended_job(id().as_str()).unwrap().to_string());
         let found = self.objects.get(&path).now_or_never().unwrap().ok()?;
-        Some(Record::from_bytes(&found.bytes().now_or_never().unwrap().unwrap()).unwrap())
+        Some(JobRecord::from_bytes(&found.bytes().now_or_never().unwrap().unwrap()).unwrap())
     }
 
     /// Stores a result of the job.
-    fn store_result(&self, entry: &Entry) {
+    fn store_result(&self, entry: &QueuedTask) {
         let maker = self.jobs.0.pool.makers(&entry.task.job).remove(0);
         let key = ContentKey::new(&entry.task.digest, &entry.task.job, Format::Glb, &maker, Namespace::default());
         for extension in [REPORT, "glb"] {
@@ -113,9 +114,7 @@ impl Fixture {
                     fixture.queue.done(id, None, None);
                     continue;
                 }
-                for callback in std::mem::take(&mut entry.on_start) {
-                    callback();
-                }
+                OnStart::run_all(std::mem::take(&mut entry.on_start));
                 let memory = OutOfMemory::Budget { needed: 1, held: 1, limit: 1 };
                 let failure = match thread_rng().gen_range(0..4) {
                     0 => Failure::Panicked { message: "scripted".to_owned() },
@@ -133,7 +132,7 @@ impl Fixture {
 
     /// Waits for the end of all work and checks the final state. Returns its status.
     fn check(&self, workers: Vec<JoinHandle<()>>) -> Status {
-        block_on(self.jobs.settled());
+        block_on(self.jobs.all_recorded());
         self.queue.close();
         for worker in workers {
             worker.join().unwrap();
@@ -206,7 +205,7 @@ impl Client<'_> {
 
 /// Returns the id of the job.
 fn id() -> JobId {
-    JobId::of_key(&[0; 32], Namespace::default(), task(1, true).rank.client.0, KEY)
+    JobId::from_key(&[0; 32], Namespace::default(), task(1, true).rank.client.0, KEY)
 }
 
 /// Explores schedules of clients that create, read and sometimes cancel one job while two workers run it. Returns the

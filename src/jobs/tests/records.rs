@@ -2,9 +2,9 @@
 
 use std::sync::atomic::Ordering;
 
-use super::{Fixture, PATIENT, ended, new_id};
+use super::{Fixture, MAX_WAIT, ended, new_id};
 use crate::config::JobsConfig;
-use crate::jobs::record::{Record, now_ms};
+use crate::jobs::record::{JobRecord, now_ms};
 use crate::jobs::{AcceptError, JobId, Status};
 use crate::store::{Folder, Namespace, StoreError};
 
@@ -28,7 +28,7 @@ async fn records_are_limited_in_total_and_for_each_client() {
         assert_eq!((l, k), (limit, key), "the request would join the work of the others");
     }
     fixture.faults.silence(None);
-    fixture.jobs.settled().await;
+    fixture.jobs.all_recorded().await;
     // In the order of their use.
     for id in &open {
         assert_eq!(fixture.on_record(id).await.status, Status::Successful);
@@ -49,9 +49,9 @@ async fn a_start_reads_the_records_of_open_jobs_only() {
     const ENDED: usize = 20_000;
     let config = JobsConfig { records_per_client: ENDED, ..JobsConfig::default() };
     let fixture = Fixture::open(tempfile::tempdir().unwrap(), config.clone()).await;
-    let open = [fixture.inherit().await, fixture.inherit().await];
+    let open = [fixture.store_record().await, fixture.store_record().await];
     // A process that dies between the two steps of ending a job leaves both documents.
-    let half_ended = fixture.inherit().await;
+    let half_ended = fixture.store_record().await;
     let folder = fixture.dir.path().join("store/jobs");
     let write = |id: &JobId| std::fs::write(folder.join(format!("{}.ended.json", id.as_str())), b"{}").unwrap();
     write(&half_ended);
@@ -63,20 +63,20 @@ async fn a_start_reads_the_records_of_open_jobs_only() {
     for id in &open {
         ended(&mut fixture.watch(id).await).await;
     }
-    fixture.jobs.settled().await;
+    fixture.jobs.all_recorded().await;
     let count = || fixture.store.usage(Folder::Jobs).objects;
     assert_eq!(count(), ENDED as u64 + 2);
-    // The names alone tell the client: its ended records are removed down to the cap.
+    // The names alone identify the client: its ended records are removed down to the cap.
     fixture.accept().await.unwrap();
     assert_eq!(count(), ENDED as u64);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_record_of_an_ended_job_prevents_another_one() {
-    let fixture = Fixture::new(1, PATIENT).await;
-    let id = fixture.inherit().await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let id = fixture.store_record().await;
     let open = fixture.on_record(&id).await;
-    let ended = Record { status: Status::Dismissed, finished_ms: Some(now_ms()), ..open.clone() };
+    let ended = JobRecord { status: Status::Dismissed, finished_ms: Some(now_ms()), ..open.clone() };
     assert!(!fixture.jobs.0.write_new(&open).await.unwrap(), "the job is open");
     fixture.jobs.0.write(&ended).await.unwrap();
     assert!(!fixture.jobs.0.write_new(&open).await.unwrap(), "the job has ended");
@@ -85,7 +85,7 @@ async fn a_record_of_an_ended_job_prevents_another_one() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn occasional_errors_of_the_store_end_no_job() {
-    let fixture = Fixture::new(3, PATIENT).await;
+    let fixture = Fixture::new(3, MAX_WAIT).await;
     fixture.faults.error_every.store(10, Ordering::SeqCst);
     let mut accepted = Vec::new();
     for client in 0..30 {
@@ -95,7 +95,7 @@ async fn occasional_errors_of_the_store_end_no_job() {
             Err(error) => panic!("{error:?}"),
         }
     }
-    fixture.jobs.settled().await;
+    fixture.jobs.all_recorded().await;
     assert!(accepted.len() < 30 && accepted.len() >= 5, "{} jobs are accepted", accepted.len());
     fixture.faults.error_every.store(0, Ordering::SeqCst);
     for id in &accepted {
@@ -105,8 +105,8 @@ async fn occasional_errors_of_the_store_end_no_job() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_truncated_read_of_a_record_is_no_damage() {
-    let fixture = Fixture::new(1, PATIENT).await;
-    let id = fixture.inherit().await;
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let id = fixture.store_record().await;
     fixture.faults.truncate.store(true, Ordering::SeqCst);
     let refused = fixture.jobs.0.read(&id).await;
     assert!(matches!(refused, Err(StoreError::Failed { .. })), "{refused:?}");

@@ -1,9 +1,12 @@
-//! Colours of atoms: the parameters `color`, `palette` and `color_range`, and the colours that they give the atoms of a
-//! structure. A vertex has the colour of the atom whose sphere is nearest to it.
+//! Colours of atoms by the parameters `color`, `palette` and `color_range`. A vertex has the colour of the atom whose
+//! sphere is nearest to it.
 
+mod blend;
+mod of_mesh;
 mod palette;
 mod scheme;
 mod tables;
+mod vertex;
 
 use std::collections::HashSet;
 
@@ -12,9 +15,13 @@ use rayon::prelude::*;
 use serde::Serialize;
 use thiserror::Error;
 
+pub use blend::ColorBlend;
+pub(super) use of_mesh::MeshColors;
 pub use palette::Palette;
 pub use scheme::{EXPECTED, Hydrophobicity, Scheme};
+pub use vertex::VertexProperty;
 
+use crate::structure::annotations::{Confidences, SecondaryRanges};
 use crate::structure::{Structure, element};
 use crate::surface::Column;
 use palette::Rgb;
@@ -22,7 +29,7 @@ use tables::{OTHER, PLDDT};
 
 /// Vertices per task.
 const ROWS: usize = 1 << 16;
-/// Largest number of entries of a legend.
+/// Maximum number of entries of a legend.
 const MAX_ENTRIES: usize = 100;
 /// Number of values in the legend of a palette.
 const STOPS: u32 = 5;
@@ -36,6 +43,8 @@ pub struct Coloring {
     pub palette: Option<Palette>,
     /// Values at the ends of the palette; the default of the scheme if `None`.
     pub range: Option<[f64; 2]>,
+    /// Transition between the colours of neighbouring vertices.
+    pub blend: ColorBlend,
 }
 
 impl Coloring {
@@ -43,7 +52,8 @@ impl Coloring {
     #[must_use]
     pub fn canonical(&self) -> String {
         let palette = self.palette.or(self.scheme.palette()).map_or("", Palette::name);
-        format!("color={}&palette={palette}&color_range={:?}", self.scheme, self.range)
+        let blend = self.blend.name();
+        format!("color={}&palette={palette}&color_range={:?}&color_blend={blend}", self.scheme, self.range)
     }
 }
 
@@ -69,6 +79,13 @@ pub struct ColorReport {
     /// Values at the ends of the palette of a numeric scheme; absent for other schemes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub range: Option<[f64; 2]>,
+    /// `smooth` if the colours are blended; absent otherwise.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub blend: Option<&'static str>,
+    /// Source of the values of `plddt`: `ma_qa_metric_local`, the table of `ModelCIF`, or `b_factor`; absent for other
+    /// schemes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub source: Option<&'static str>,
     /// Colours of five equidistant values, or of the categories that occur, at most 100.
     pub legend: Vec<LegendEntry>,
 }
@@ -93,6 +110,10 @@ pub struct AtomColors<'a> {
     colors: Vec<Rgb>,
     /// Values by residue name.
     values: Vec<Option<f64>>,
+    /// Helices and strands.
+    secondary: Option<SecondaryRanges>,
+    /// Confidences in a table of the file.
+    confidences: Option<Confidences<'a>>,
     /// Factor that converts B-factors to pLDDT from 0 to 100.
     plddt_scale: f64,
 }
@@ -101,10 +122,13 @@ impl<'a> AtomColors<'a> {
     /// Prepares the colours of all atoms. `selected` are the atoms that the default range and the legend describe.
     ///
     /// # Errors
-    /// Returns a [`ColorError`] if the file lacks the values of the scheme.
+    /// Returns a [`ColorError`] if the file lacks the values of the scheme, or the scheme is of vertices.
     pub fn new(structure: &'a Structure, selected: &[u32], coloring: &Coloring) -> Result<Self, ColorError> {
-        let Coloring { scheme, palette, range } = *coloring;
+        let Coloring { scheme, palette, range, blend: _ } = *coloring;
         let fail = |why: String| ColorError { scheme: scheme.to_string(), why };
+        if matches!(scheme, Scheme::Vertex(_)) {
+            return Err(fail("it colours vertices, not atoms".to_owned()));
+        }
         let residues = || structure.residue.texts();
         let values = match scheme {
             Scheme::Hydrophobicity(scale) => {
@@ -120,7 +144,15 @@ impl<'a> AtomColors<'a> {
             })?,
             _ => Vec::new(),
         };
-        let plddt_scale = if scheme == Scheme::Plddt { plddt_scale(structure).map_err(fail)? } else { 1.0 };
+        let secondary = (scheme == Scheme::SecondaryStructure).then(|| SecondaryRanges::of(structure)).flatten();
+        if scheme == Scheme::SecondaryStructure && secondary.is_none() {
+            let why = "the file describes no helices and strands (HELIX and SHEET records of PDB, or struct_conf and \
+                       struct_sheet_range of mmCIF); none are computed";
+            return Err(fail(why.to_owned()));
+        }
+        let confidences = (scheme == Scheme::Plddt).then(|| Confidences::of(structure, selected)).flatten();
+        let of_b_factors = scheme == Scheme::Plddt && confidences.is_none();
+        let plddt_scale = if of_b_factors { plddt_scale(structure).map_err(fail)? } else { 1.0 };
         let column = match scheme {
             Scheme::BFactor => Some(&structure.b_factor),
             Scheme::Occupancy => Some(&structure.occupancy),
@@ -128,7 +160,7 @@ impl<'a> AtomColors<'a> {
         };
         let range = range.or(scheme.range()).or_else(|| Some(range_of(column?, selected))).unwrap_or_default();
         let palette = palette.or(scheme.palette()).unwrap_or(Palette::Viridis);
-        Ok(Self { structure, scheme, palette, range, colors, values, plddt_scale })
+        Ok(Self { structure, scheme, palette, range, colors, values, secondary, confidences, plddt_scale })
     }
 
     /// Returns the colour of atom `i`, sRGB and opaque.
@@ -142,47 +174,55 @@ impl<'a> AtomColors<'a> {
         let structure = self.structure;
         match self.scheme {
             Scheme::Uniform(color) => color,
+            // Rejected by [`Self::new`].
+            Scheme::Vertex(_) => OTHER,
             Scheme::Element => tables::element(structure.element[i]),
             Scheme::Chain => tables::category(structure.chain.id(i)),
             Scheme::Entity => self.colors[structure.label_chain.id(i) as usize],
             Scheme::Residue => self.colors[structure.residue.id(i) as usize],
             Scheme::BFactor => self.scaled(f64::from(structure.b_factor[i])),
             Scheme::Occupancy => self.scaled(f64::from(structure.occupancy[i])),
-            Scheme::Plddt => PLDDT[self.plddt_class(i)].2,
+            Scheme::SecondaryStructure => self.secondary(i).1,
+            Scheme::Plddt => self.plddt(i).map_or(OTHER, |value| PLDDT[plddt_class(value)].2),
             Scheme::Hydrophobicity(_) | Scheme::Charge => {
                 self.values[structure.residue.id(i) as usize].map_or(OTHER, |value| self.scaled(value))
             }
         }
     }
 
-    /// Returns the colour of a value. In an empty range, all values have the colour of the palette's middle.
     fn scaled(&self, value: f64) -> Rgb {
-        let [low, high] = self.range;
-        self.palette.at(if high > low { (value - low) / (high - low) } else { 0.5 })
+        scaled(self.palette, self.range, value)
     }
 
-    fn plddt_class(&self, i: usize) -> usize {
-        let value = f64::from(self.structure.b_factor[i]) * self.plddt_scale;
-        PLDDT.iter().position(|(bound, ..)| value <= *bound).unwrap_or(PLDDT.len() - 1)
+    /// Returns label and colour of the secondary structure of atom `i`.
+    fn secondary(&self, i: usize) -> (&'static str, Rgb) {
+        tables::secondary(self.secondary.as_ref().and_then(|ranges| ranges.get(self.structure, i)))
+    }
+
+    /// Returns the pLDDT of atom `i`, 0 to 100; `None` if the table of the file lacks its residue.
+    fn plddt(&self, i: usize) -> Option<f64> {
+        match &self.confidences {
+            Some(confidences) => confidences.get(self.structure, i),
+            None => Some(f64::from(self.structure.b_factor[i]) * self.plddt_scale),
+        }
     }
 
     /// Returns the scheme, the range and the legend of the `selected` atoms.
     #[must_use]
     pub fn report(&self, selected: &[u32]) -> ColorReport {
-        let entry = |label: String, color: Rgb| LegendEntry { label, color: format!("#{color:06x}") };
-        let [low, high] = self.range;
-        let value = |stop: u32| round(low + (high - low) * f64::from(stop) / f64::from(STOPS - 1));
         let legend = match self.scheme {
             Scheme::Uniform(_) => Vec::new(),
             Scheme::Plddt => PLDDT.iter().map(|(_, label, color)| entry((*label).to_owned(), *color)).collect(),
-            _ if self.scheme.palette().is_some() => {
-                (0..STOPS).map(value).map(|value| entry(value.to_string(), self.scaled(value))).collect()
-            }
+            _ if self.scheme.palette().is_some() => stops(self.palette, self.range),
             _ => self.categories(selected).into_iter().map(|(label, color)| entry(label, color)).collect(),
         };
         let has_numbers = self.scheme.palette().is_some();
+        let source = (self.scheme == Scheme::Plddt)
+            .then(|| if self.confidences.is_some() { "ma_qa_metric_local" } else { "b_factor" });
         ColorReport {
             scheme: self.scheme.to_string(),
+            blend: None,
+            source,
             palette: has_numbers.then(|| self.palette.name()),
             range: has_numbers.then_some(self.range),
             legend,
@@ -199,6 +239,7 @@ impl<'a> AtomColors<'a> {
                 Scheme::Element => u32::from(structure.element[i]),
                 Scheme::Residue => structure.residue.id(i),
                 Scheme::Entity => structure.label_chain.id(i),
+                Scheme::SecondaryStructure => self.secondary(i).1,
                 _ => structure.chain.id(i),
             };
             if found.len() == MAX_ENTRIES || !seen.insert(id) {
@@ -209,6 +250,7 @@ impl<'a> AtomColors<'a> {
                     usize::from(structure.element[i]).checked_sub(1).map_or("?", |z| element::SYMBOLS[z])
                 }
                 Scheme::Residue => structure.residue.get(i),
+                Scheme::SecondaryStructure => self.secondary(i).0,
                 Scheme::Entity => {
                     structure.entities.get(id as usize).filter(|name| !name.is_empty()).map_or("?", String::as_str)
                 }
@@ -223,14 +265,29 @@ impl<'a> AtomColors<'a> {
     }
 }
 
-/// Returns the colour of each vertex. `ids` are indices into `colors`.
-#[must_use]
-pub(super) fn of_vertices(colors: &[[u8; 4]], ids: &[u32]) -> Column<[u8; 4]> {
-    let mut column = Column::zeroed(ids.len());
-    column.par_chunks_mut(ROWS).zip(ids.par_chunks(ROWS)).for_each(|(out, ids)| {
-        out.iter_mut().zip(ids).for_each(|(out, &id)| *out = colors[id as usize]);
+/// Returns the colour of each vertex by its index of an atom or its value.
+fn of_vertices<T: Copy + Sync>(rows: &[T], color: impl Fn(T) -> [u8; 4] + Sync) -> Column<[u8; 4]> {
+    let mut column = Column::zeroed(rows.len());
+    column.par_chunks_mut(ROWS).zip(rows.par_chunks(ROWS)).for_each(|(out, rows)| {
+        out.iter_mut().zip(rows).for_each(|(out, &row)| *out = color(row));
     });
     column
+}
+
+/// Returns the colour of a value. In an empty range, all values have the colour of the palette's middle.
+fn scaled(palette: Palette, [low, high]: [f64; 2], value: f64) -> Rgb {
+    palette.at(if high > low { (value - low) / (high - low) } else { 0.5 })
+}
+
+/// Returns the legend of a numeric scheme: equidistant values.
+fn stops(palette: Palette, range: [f64; 2]) -> Vec<LegendEntry> {
+    let [low, high] = range;
+    let value = |stop: u32| round(low + (high - low) * f64::from(stop) / f64::from(STOPS - 1));
+    (0..STOPS).map(value).map(|value| entry(value.to_string(), scaled(palette, range, value))).collect()
+}
+
+fn entry(label: String, color: Rgb) -> LegendEntry {
+    LegendEntry { label, color: format!("#{color:06x}") }
 }
 
 /// Returns the colour of the entity of each `label_chain`; `None` if none is known.
@@ -243,6 +300,11 @@ fn entities(structure: &Structure) -> Option<Vec<Rgb>> {
     });
     let colors = colors.collect();
     (!names.is_empty()).then_some(colors)
+}
+
+/// Returns the class of a pLDDT from 0 to 100.
+fn plddt_class(value: f64) -> usize {
+    PLDDT.iter().position(|(bound, ..)| value <= *bound).unwrap_or(PLDDT.len() - 1)
 }
 
 /// Returns the factor that converts the B-factors of a predicted structure to pLDDT from 0 to 100. Some programs write
@@ -342,6 +404,62 @@ HETATM Xx X XYZ D W 71.0 1.0 16 0 0
         assert_eq!(colors(&structure, &cividis)[..2], ["00224e", "00224e"]);
     }
 
+    /// Three residues of a predicted model: the first is in a helix, the second in a strand.
+    fn model(metric: &str, values: [&str; 3], numbers: [i32; 3]) -> String {
+        let row = |i: usize| format!("C CA GLY A {} {} 10 {} 0 0", i + 1, numbers[i], 4 * i);
+        let confidence = |i: usize| format!("1 A {} GLY 7 {}", i + 1, values[i]);
+        let tags = |category: &str, items: &str| {
+            let tags: Vec<String> = items.split(' ').map(|item| format!("_{category}.{item}")).collect();
+            format!("loop_\n{}", tags.join("\n"))
+        };
+        let atoms = "type_symbol label_atom_id label_comp_id label_asym_id label_seq_id auth_seq_id B_iso_or_equiv \
+                     Cartn_x Cartn_y Cartn_z";
+        let names = "beg_auth_asym_id beg_auth_seq_id end_auth_seq_id";
+        let lines = [
+            "data_m\nloop_\n_ma_data.id\n1".to_owned(),
+            tags("atom_site", atoms),
+            [0, 1, 2].map(row).join("\n"),
+            format!("_ma_qa_metric.id 7\n_ma_qa_metric.mode local\n_ma_qa_metric.type '{metric}'"),
+            tags("ma_qa_metric_local", "model_id label_asym_id label_seq_id label_comp_id metric_id metric_value"),
+            [0, 1, 2].map(confidence).join("\n"),
+            tags("struct_conf", &format!("conf_type_id {names} pdbx_PDB_helix_class")),
+            "HELX_P A 1 1 5\nSTRN A 2 2 ?\n".to_owned(),
+        ];
+        lines.join("\n")
+    }
+
+    #[test]
+    fn the_table_of_a_predicted_model_precedes_b_factors() {
+        let found = |text: &str| {
+            let structure = structure(text);
+            let colors = AtomColors::new(&structure, &[0, 1, 2], &coloring(&[("color", "plddt")])).unwrap();
+            let all: Vec<String> = (0..3).map(|i| format!("{:06x}", colors.rgb(i))).collect();
+            (all.join(" "), colors.report(&[0, 1, 2]).source.unwrap())
+        };
+        let classes = "ff7d45 ffdb13 0053d6".to_owned();
+        let of_table = (classes.clone(), "ma_qa_metric_local");
+        assert_eq!(found(&model("pLDDT", ["50", "69.9", "99"], [1, 2, 3])), of_table);
+        assert_eq!(found(&model("pLDDT in [0,1]", ["0.5", "0.699", "0.99"], [1, 2, 3])), of_table);
+        // Without a scale in its name, values up to 1 are not on a scale to 100.
+        assert_eq!(found(&model("pLDDT", ["0.5", "0.699", "0.99"], [1, 2, 3])), of_table);
+        let of_b_factors = ("ff7d45 ff7d45 ff7d45".to_owned(), "b_factor");
+        assert_eq!(found(&model("PAE", ["50", "69.9", "99"], [1, 2, 3])), of_b_factors);
+        assert_eq!(found(&model("pLDDT", ["50", "69.9", "99"], [11, 12, 13])), of_b_factors);
+    }
+
+    #[test]
+    fn secondary_structure_is_that_of_the_file() {
+        let helix = structure(&model("pLDDT", ["50"; 3], [1, 2, 3]));
+        let scheme = coloring(&[("color", "secondary-structure")]);
+        let colors = AtomColors::new(&helix, &[0, 1, 2], &scheme).unwrap();
+        let found = [0, 1, 2].map(|i| format!("{:06x}", colors.rgb(i)));
+        assert_eq!(found, ["a00080", "ffc800", "b0b0b0"]);
+        let legend = colors.report(&[0, 1, 2]).legend;
+        assert_eq!(legend.iter().map(|e| e.label.as_str()).collect::<Vec<_>>(), ["3-10 helix", "strand", "other"]);
+        let error = AtomColors::new(&structure(CIF), &ALL, &scheme).err().unwrap();
+        assert!(error.why.contains("no helices and strands"), "{error}");
+    }
+
     #[test]
     fn default_ranges_and_legends_describe_the_selected_atoms() {
         let structure = structure(CIF);
@@ -430,13 +548,16 @@ HETATM Xx X XYZ D W 71.0 1.0 16 0 0
             &[("color_range", "0,1"), ("color", "none")],
         ] {
             let text = refuse(pairs);
-            assert!(text.contains("or color=bfactor, occupancy, hydrophobicity or charge"), "{text}");
+            assert!(text.contains("or a scheme with numbers: color=bfactor, occupancy, hydrophobicity"), "{text}");
         }
         for range in ["1", "1,1", "2,1", "1,2,3", "a,b", "0,inf", "nan,1", ""] {
             let text = refuse(&[("color", "bfactor"), ("color_range", range)]);
             assert!(text.contains("two numbers separated by a comma"), "{text}");
         }
         assert!(refuse(&[("color", "chains")]).contains("expected none, uniform:#RRGGBB, element"));
+        assert!(refuse(&[("color", "chain"), ("color_blend", "sharp")]).contains("one of nearest, smooth"));
+        assert!(refuse(&[("color_blend", "smooth")]).contains("nearest without colours"));
+        assert!(refuse(&[("color", "bfactor"), ("palette", "jet")]).contains("one of viridis, cividis"));
         let key = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
         assert_eq!(key(&[("color", "bfactor")]), key(&[("color", "bfactor"), ("palette", "viridis")]));
         assert_ne!(key(&[("color", "bfactor")]), key(&[("color", "bfactor"), ("palette", "cividis")]));

@@ -45,10 +45,10 @@ impl Palette {
 
 /// Interpolates between equidistant colours. `t` is clamped to 0 to 1.
 fn between(stops: &[Rgb], t: f64) -> Rgb {
-    let place = t.clamp(0.0, 1.0) * (stops.len() - 1) as f64;
+    let position = t.clamp(0.0, 1.0) * (stops.len() - 1) as f64;
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the table")]
-    let lower = (place as usize).min(stops.len() - 2);
-    let (part, low, high) = (place - lower as f64, stops[lower].to_be_bytes(), stops[lower + 1].to_be_bytes());
+    let lower = (position as usize).min(stops.len() - 2);
+    let (part, low, high) = (position - lower as f64, stops[lower].to_be_bytes(), stops[lower + 1].to_be_bytes());
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between two bytes")]
     let mixed = |k: usize| (f64::from(low[k]) + part * (f64::from(high[k]) - f64::from(low[k]))).round() as u8;
     u32::from_be_bytes([0, mixed(1), mixed(2), mixed(3)])

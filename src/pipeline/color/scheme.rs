@@ -4,10 +4,12 @@ use std::fmt;
 use std::str::FromStr;
 
 use super::palette::{Palette, Rgb};
+use super::vertex::VertexProperty;
 
 /// Description of the valid values of the parameter `color`.
-pub const EXPECTED: &str = "none, uniform:#RRGGBB, element, chain, entity, residue, bfactor, occupancy, plddt, \
-                            hydrophobicity, hydrophobicity:wimley-white, charge";
+pub const EXPECTED: &str = "none, uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, \
+                            occupancy, plddt, hydrophobicity, hydrophobicity:wimley-white, charge, curvature, \
+                            radial";
 
 /// Hydrophobicity scale.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -18,7 +20,7 @@ pub enum Hydrophobicity {
     WimleyWhite,
 }
 
-/// Colour scheme: gives every atom a colour.
+/// Colour scheme: assigns a colour to every atom or every vertex.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scheme {
     /// One colour, `0xRRGGBB`.
@@ -31,51 +33,65 @@ pub enum Scheme {
     Entity,
     /// Colour of the residue name.
     Residue,
+    /// Secondary structure of the residue in the file.
+    SecondaryStructure,
     /// B-factor.
     BFactor,
     /// Occupancy.
     Occupancy,
-    /// Confidence of a predicted structure, in the B-factor column.
+    /// Confidence of a predicted structure, from `ma_qa_metric_local` or the B-factor column.
     Plddt,
     /// Hydrophobicity of the residue.
     Hydrophobicity(Hydrophobicity),
     /// Formal charge of the residue at pH 7.
     Charge,
+    /// Property of the vertex.
+    Vertex(VertexProperty),
 }
 
 /// Schemes by name, except [`Scheme::Uniform`].
-const NAMED: [(&str, Scheme); 10] = [
+const NAMED: [(&str, Scheme); 13] = [
     ("element", Scheme::Element),
     ("chain", Scheme::Chain),
     ("entity", Scheme::Entity),
     ("residue", Scheme::Residue),
+    ("secondary-structure", Scheme::SecondaryStructure),
     ("bfactor", Scheme::BFactor),
     ("occupancy", Scheme::Occupancy),
     ("plddt", Scheme::Plddt),
     ("hydrophobicity", Scheme::Hydrophobicity(Hydrophobicity::KyteDoolittle)),
     ("hydrophobicity:wimley-white", Scheme::Hydrophobicity(Hydrophobicity::WimleyWhite)),
     ("charge", Scheme::Charge),
+    ("curvature", Scheme::Vertex(VertexProperty::Curvature)),
+    ("radial", Scheme::Vertex(VertexProperty::Radial)),
 ];
 
 impl Scheme {
+    /// Lists the names of the numeric schemes.
+    pub(in super::super) fn with_numbers() -> String {
+        let named = NAMED.iter().filter(|(_, scheme)| scheme.palette().is_some());
+        named.map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
+    }
+
     /// Returns the default palette of a numeric scheme; `None` for other schemes.
     #[must_use]
     pub const fn palette(self) -> Option<Palette> {
         match self {
-            Self::BFactor | Self::Occupancy => Some(Palette::Viridis),
-            Self::Hydrophobicity(_) => Some(Palette::BlueWhiteRed),
+            Self::BFactor | Self::Occupancy | Self::Vertex(VertexProperty::Radial) => Some(Palette::Viridis),
+            Self::Hydrophobicity(_) | Self::Vertex(VertexProperty::Curvature) => Some(Palette::BlueWhiteRed),
             Self::Charge => Some(Palette::RedWhiteBlue),
             _ => None,
         }
     }
 
-    /// Returns the default range of a numeric scheme; `None` if it is that of the values, and for other schemes.
+    /// Returns the default range of a numeric scheme; `None` if the values determine it, and for other schemes.
     #[must_use]
     pub(super) const fn range(self) -> Option<[f64; 2]> {
         match self {
             Self::Hydrophobicity(Hydrophobicity::KyteDoolittle) => Some([-4.5, 4.5]),
             Self::Hydrophobicity(Hydrophobicity::WimleyWhite) => Some([-2.02, 2.02]),
             Self::Charge => Some([-1.0, 1.0]),
+            Self::Vertex(VertexProperty::Curvature) => Some([-0.5, 0.5]),
             _ => None,
         }
     }

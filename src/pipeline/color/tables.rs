@@ -2,6 +2,7 @@
 #![expect(clippy::unreadable_literal, reason = "colours are written as in style sheets")]
 
 use super::palette::Rgb;
+use crate::structure::annotations::SecondaryStructure;
 
 /// Colour of atoms for which a scheme has no colour or value.
 pub(super) const OTHER: Rgb = 0xb0b0b0;
@@ -163,6 +164,18 @@ fn parent(name: &str) -> &str {
 
 fn find<T: Copy>(table: &[(&str, T)], name: &str) -> Option<T> {
     table.iter().find(|(known, _)| *known == name).map(|(_, value)| *value)
+}
+
+/// Label and colour of a secondary structure, by the colours "structure" of Jmol (jmol.sourceforge.net/jscolors).
+pub(super) fn secondary(structure: Option<SecondaryStructure>) -> (&'static str, Rgb) {
+    match structure {
+        Some(SecondaryStructure::AlphaHelix) => ("alpha helix", 0xff0080),
+        Some(SecondaryStructure::ThreeTenHelix) => ("3-10 helix", 0xa00080),
+        Some(SecondaryStructure::PiHelix) => ("pi helix", 0x600080),
+        Some(SecondaryStructure::Strand) => ("strand", 0xffc800),
+        Some(SecondaryStructure::Turn) => ("turn", 0x6080ff),
+        None => ("other", OTHER),
+    }
 }
 
 /// Classes of the predicted local distance difference test (pLDDT, 0 to 100): upper bound, label and colour, as in the

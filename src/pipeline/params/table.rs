@@ -5,7 +5,7 @@ use std::str::FromStr;
 use super::ParamError;
 use crate::formats::{Compress, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, Style, View};
-use crate::pipeline::color::{self, Palette};
+use crate::pipeline::color::{self, ColorBlend, Palette};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::structure::Split;
 use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
@@ -136,13 +136,14 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
 }
 
 const SPLITS: &[&str] = &[Split::None.name(), Split::Chain.name(), Split::Entity.name(), Split::ResidueGroup.name()];
-const FORMATS: &[&str] = &["glb", "gltf", "ply", "ply-text", "stl", "obj", "png"];
+const FORMATS: &[&str] = &["glb", "gltf", "ply", "ply-text", "stl", "obj", "vtp", "png"];
 const VIEWS: &[&str] = &view_names(View::ALL);
 const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
 const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
 const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
 
+const BLENDS: &[&str] = &[ColorBlend::Nearest.name(), ColorBlend::Smooth.name()];
 const PALETTES: &[&str] =
     &[Palette::Viridis.name(), Palette::Cividis.name(), Palette::BlueWhiteRed.name(), Palette::RedWhiteBlue.name()];
 
@@ -234,19 +235,25 @@ pub const TABLE: &[Parameter] = &[
         name: "color",
         domain: Domain::Text { expected: color::EXPECTED },
         default: "none",
-        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7. STL has no colours.",
+        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, secondary structure in the file (Jmol), B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7; or by the mean curvature of the surface, or the distance from the centroid of the atoms (radial). STL has no colours.",
     },
     Parameter {
         name: "palette",
         domain: Domain::Choice(PALETTES),
-        default: "viridis for bfactor and occupancy, blue-white-red for hydrophobicity, red-white-blue for charge",
-        doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity and charge only.",
+        default: "viridis for bfactor, occupancy and radial, blue-white-red for hydrophobicity and curvature, red-white-blue for charge",
+        doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity, charge, curvature and radial only.",
     },
     Parameter {
         name: "color_range",
         domain: Domain::Text { expected: "two numbers separated by a comma, the lower one first" },
-        default: "the lowest and highest value of the meshed atoms; −4.5,4.5 or −2.02,2.02 for hydrophobicity, −1,1 for charge",
+        default: "the lowest and highest value of the meshed atoms, or of the mesh for radial; −4.5,4.5 or −2.02,2.02 for hydrophobicity, −1,1 for charge, −0.5,0.5 for curvature",
         doc: "Values at the ends of the palette. Values beyond an end have its colour.",
+    },
+    Parameter {
+        name: "color_blend",
+        domain: Domain::Choice(BLENDS),
+        default: "nearest",
+        doc: "Transition between colours: nearest has sharp borders, smooth averages colours along the surface over about 1 Å.",
     },
     Parameter {
         name: "model",

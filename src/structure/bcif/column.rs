@@ -6,7 +6,7 @@ use super::super::text::decode;
 use super::decode::Values;
 use super::encoding::{Chain, Strings};
 use super::fault::Fault;
-use super::msgpack::{Cursor, Token};
+use super::msgpack::{Cursor, PackToken};
 
 /// An undecoded column.
 #[derive(Debug, Clone, Copy)]
@@ -45,13 +45,13 @@ pub(super) enum Cells<'a> {
 
 /// A decoded column.
 #[derive(Debug)]
-pub(super) struct Column<'a> {
+pub(super) struct DecodedColumn<'a> {
     pub(super) cells: Cells<'a>,
     /// By row: true if there is no value.
     mask: Option<Vec<bool>>,
 }
 
-impl Column<'_> {
+impl DecodedColumn<'_> {
     #[inline]
     pub(super) fn is_null(&self, row: usize) -> bool {
         self.mask.as_ref().is_some_and(|mask| mask[row])
@@ -82,10 +82,10 @@ impl Column<'_> {
 
 /// Limits of decoding.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Bounds {
+pub(super) struct DecodeLimits {
     /// Number of rows in the category.
     pub(super) rows: usize,
-    /// Largest number of distinct texts in a column.
+    /// Maximum number of distinct texts in a column.
     pub(super) texts: usize,
 }
 
@@ -97,7 +97,7 @@ impl<'a> Raw<'a> {
             match key {
                 b"name" => name = Some(value.text()?),
                 b"data" => data = Some(*value),
-                b"mask" if head.next()? != Token::Nil => mask = Some(*value),
+                b"mask" if head.next()? != PackToken::Nil => mask = Some(*value),
                 _ => {}
             }
             Ok(())
@@ -108,16 +108,16 @@ impl<'a> Raw<'a> {
     }
 
     /// Decodes the column. If `texts` is true, integers are converted to texts.
-    pub(super) fn load(&self, bounds: Bounds, texts: bool) -> Result<Column<'a>, Box<Fault>> {
+    pub(super) fn load(&self, bounds: DecodeLimits, texts: bool) -> Result<DecodedColumn<'a>, Box<Fault>> {
         self.decode(bounds, texts).map_err(|fault| fault.within(decode(self.name)))
     }
 
-    fn decode(&self, bounds: Bounds, texts: bool) -> Result<Column<'a>, Box<Fault>> {
+    fn decode(&self, bounds: DecodeLimits, texts: bool) -> Result<DecodedColumn<'a>, Box<Fault>> {
         let mask = self.mask.map(|mask| nulls(mask, bounds.rows).map_err(|f| f.within("mask"))).transpose()?.flatten();
         let (data, chain) = encoded(self.data)?;
         if let Some(strings) = chain.strings() {
             let cells = Cells::Text(strings.read(data, bounds).map_err(|f| f.within("StringArray"))?);
-            return Ok(Column { cells, mask });
+            return Ok(DecodedColumn { cells, mask });
         }
         let values = chain.decode(data, max_values(bounds.rows))?;
         whole_column(values.len(), bounds.rows)?;
@@ -127,11 +127,11 @@ impl<'a> Raw<'a> {
             Values::Real(_) if texts => return Err(Fault::new("real numbers", "texts")),
             Values::Real(values) => Cells::Real(values),
         };
-        Ok(Column { cells, mask })
+        Ok(DecodedColumn { cells, mask })
     }
 }
 
-/// Returns the largest number of values in an intermediate step of decoding `n` values. Run-length pairs take two.
+/// Returns the maximum number of values in an intermediate step of decoding `n` values. Run-length pairs take two.
 const fn max_values(n: usize) -> usize {
     n.saturating_add(1).saturating_mul(2)
 }
@@ -160,7 +160,7 @@ fn nulls(mask: Cursor<'_>, rows: usize) -> Result<Option<Vec<bool>>, Box<Fault>>
 }
 
 impl<'a> Strings<'a> {
-    fn read(&self, data: &'a [u8], bounds: Bounds) -> Result<Texts<'a>, Box<Fault>> {
+    fn read(&self, data: &'a [u8], bounds: DecodeLimits) -> Result<Texts<'a>, Box<Fault>> {
         let chain = |at, what| Chain::read(at).map_err(|f: Box<Fault>| f.within(what));
         let offset_chain = chain(self.offset_chain, "offsetEncoding")?;
         let offsets = offset_chain.decode(self.offsets, max_values(bounds.texts)).and_then(Values::ints);

@@ -1,8 +1,8 @@
 //! Decoder of BinaryCIF encodings.
 //!
-//! A file lists a chain of encodings in the order of their application, so decoding starts at the end. Lengths are
-//! known before memory is allocated: every value comes from at least one byte or from a run, and the runs are summed
-//! first.
+//! A file lists a chain of encodings in the order of their application, so decoding starts at the end. The number of
+//! values is known before memory is allocated: every value takes at least one byte or is part of a run, and the lengths
+//! of runs are added up first.
 
 use super::encoding::{Chain, Encoding, Number};
 use super::fault::Fault;
@@ -11,21 +11,21 @@ impl Chain<'_> {
     /// Decodes `data`. No step may produce more than `most` values.
     pub(super) fn decode(&self, data: &[u8], most: usize) -> Result<Values, Box<Fault>> {
         let chain = &self.0[..];
-        let place = |i: usize| format!("{} (encoding {} of {})", chain[i].name(), i + 1, chain.len());
+        let location = |i: usize| format!("{} (encoding {} of {})", chain[i].name(), i + 1, chain.len());
         let Some((last, mut others)) = chain.split_last() else {
             return Err(Fault::new("no encoding", "at least ByteArray"));
         };
-        let number = byte_array(last, data).map_err(|fault| fault.within(place(others.len())))?;
+        let number = byte_array(last, data).map_err(|fault| fault.within(location(others.len())))?;
         let mut values = match others.split_last() {
             Some((&Encoding::IntegerPacking { size, number: packed }, before)) => {
                 others = before;
-                unpack(data, number, packed, size, most).map_err(|fault| fault.within(place(before.len())))?
+                unpack(data, number, packed, size, most).map_err(|fault| fault.within(location(before.len())))?
             }
             _ => numbers(data, number, most)?,
         };
         for (i, encoding) in others.iter().enumerate().rev() {
             let undone = values.ints().and_then(|ints| encoding.undo(ints, most));
-            values = undone.map_err(|fault| fault.within(place(i)))?;
+            values = undone.map_err(|fault| fault.within(location(i)))?;
         }
         Ok(values)
     }
@@ -122,7 +122,7 @@ fn sums<const N: usize>(
     if numbers.last().is_some_and(|bytes| goes_on(number(*bytes))) {
         return Err(Fault::new("the end of the data within a value", "its last number"));
     }
-    said(n, size)?;
+    check_declared(n, size)?;
     within(n, most)?;
     if n == numbers.len() {
         return Ok(numbers.iter().map(|bytes| number(*bytes)).collect());
@@ -141,7 +141,7 @@ fn sums<const N: usize>(
 }
 
 /// Checks a length against the declared one.
-fn said(n: usize, size: Option<usize>) -> Result<(), Box<Fault>> {
+fn check_declared(n: usize, size: Option<usize>) -> Result<(), Box<Fault>> {
     match size {
         Some(size) if size != n => Err(Fault::new(format!("{n} values"), format!("{size}, as srcSize says"))),
         _ => Ok(()),
@@ -199,7 +199,7 @@ fn repeat(pairs: &[i32], size: Option<usize>, most: usize) -> Result<Vec<i32>, B
         let count = usize::try_from(count).ok().ok_or_else(|| Fault::new(format!("a run of {count}"), "a count"))?;
         n = n.saturating_add(count);
     }
-    said(n, size)?;
+    check_declared(n, size)?;
     within(n, most)?;
     let mut values = Vec::with_capacity(n);
     for &[value, count] in pairs {

@@ -6,7 +6,7 @@ use super::super::text::quote;
 use super::fault::Fault;
 use super::msgpack::Cursor;
 
-/// Longest chain of encodings. Useful chains have at most five.
+/// Maximum length of a chain of encodings. Useful chains have at most five.
 const MAX_CHAIN: usize = 8;
 
 /// Little-endian number types.

@@ -13,11 +13,11 @@ mod fault;
 mod msgpack;
 mod rows;
 
-use self::column::{Bounds, Column, Raw};
+use self::column::{DecodeLimits, DecodedColumn, Raw};
 use self::fault::Fault;
 use self::msgpack::Cursor;
 use super::atom_site::{Layout, Passed};
-use super::atoms::{Columns, Source, SourceFormat, Structure};
+use super::atoms::{Columns, SourceFields, SourceFormat, Structure};
 use super::categories::{self, Categories};
 use super::error::StructureError;
 use super::kinds::Sequence;
@@ -26,9 +26,9 @@ use super::read::{ReadLimits, Reading};
 use super::text::{decode, normalize};
 use crate::surface::MemoryMeter as _;
 
-/// Largest number of columns in a category. The dictionary has about a hundred for `atom_site`.
+/// Maximum number of columns in a category. The dictionary has about a hundred for `atom_site`.
 const MAX_COLUMNS: usize = 1000;
-/// Largest number of texts of a column in a category with fewer rows. Programs that select atoms keep all texts.
+/// Maximum number of texts of a column in a category with fewer rows. Programs that select atoms keep all texts.
 const MAX_UNUSED_TEXTS: usize = 1 << 20;
 
 /// Reads the first data block that has atoms with coordinates.
@@ -45,7 +45,7 @@ pub(super) fn read(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, Str
             // Data after the atoms must be well-formed, but is not used.
             if found.is_none() {
                 passed.block();
-                let block = Block::read(at, &mut passed)?;
+                let block = BinaryBlock::read(at, &mut passed)?;
                 found = block.structure(reading, &mut passed).transpose();
                 last = block.name;
             }
@@ -107,14 +107,14 @@ impl<'a> Category<'a> {
     }
 
     /// Decodes an item; integers become texts if `texts` is true. Returns `None` if the category lacks the item.
-    fn column(&self, item: &str, max_rows: usize, texts: bool) -> Result<Option<Column<'a>>, Box<Fault>> {
+    fn column(&self, item: &str, max_rows: usize, texts: bool) -> Result<Option<DecodedColumn<'a>>, Box<Fault>> {
         let columns = self.columns()?;
         let named = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item.as_bytes()));
         let Some(raw) = named else { return Ok(None) };
         let Some(rows) = usize::try_from(self.rows).ok().filter(|&n| n <= max_rows) else {
             return Err(Fault::new(format!("{} rows", self.rows), format!("at most {max_rows}")).within("rowCount"));
         };
-        raw.load(Bounds { rows, texts: max_rows }, texts).map(Some)
+        raw.load(DecodeLimits { rows, texts: max_rows }, texts).map(Some)
     }
 
     /// Returns the first value of an item, normalized, of at most `max` characters.
@@ -124,10 +124,10 @@ impl<'a> Category<'a> {
     }
 
     /// Returns the limits of decoding, or `None` if there are more rows than allowed atoms.
-    fn bounds(&self, limits: &ReadLimits) -> Option<Bounds> {
+    fn bounds(&self, limits: &ReadLimits) -> Option<DecodeLimits> {
         let rows = usize::try_from(self.rows).ok().filter(|&n| n <= limits.max_rows())?;
         // Unused texts are allowed, within a limit.
-        Some(Bounds { rows, texts: rows.max(MAX_UNUSED_TEXTS).min(limits.max_rows()) })
+        Some(DecodeLimits { rows, texts: rows.max(MAX_UNUSED_TEXTS).min(limits.max_rows()) })
     }
 }
 
@@ -136,12 +136,12 @@ const CATEGORIES: [&[u8]; 3] = [b"atom_site", b"entry", b"struct"];
 
 /// A data block with its required categories.
 #[derive(Debug, Default)]
-struct Block<'a> {
+struct BinaryBlock<'a> {
     name: Option<String>,
     categories: Vec<Category<'a>>,
 }
 
-impl<'a> Block<'a> {
+impl<'a> BinaryBlock<'a> {
     fn read(at: &mut Cursor<'a>, passed: &mut Passed) -> Result<Self, Box<Fault>> {
         let mut block = Self::default();
         let mut any = false;
@@ -193,11 +193,12 @@ impl<'a> Block<'a> {
         let entry = value("entry", "id", 80)?;
         let title = value("struct", "title", MAX_TITLE)?;
         let place = self.category("atom_site").map(Category::place).unwrap_or_default();
-        let source = Source {
+        let source = SourceFields {
             format: SourceFormat::BinaryCif,
             id: entry.or_else(|| self.name.clone()),
             title,
             sequence: Sequence::of(&categories),
+            annotations: categories.annotations(),
             assemblies: categories.assemblies(),
             radii: Vec::new(),
             warnings: warnings.messages(|fault| fault.within(&place).into()).into_iter().chain(unread).collect(),
@@ -208,23 +209,23 @@ impl<'a> Block<'a> {
     /// Returns entities and assemblies, and a warning for those that cannot be read.
     fn categories(&self, reading: &Reading<'_>) -> Result<(Categories, Vec<String>), StructureError> {
         let (mut known, mut unread) = (Categories::default(), Vec::new());
-        let mut places = (0..categories::ITEMS.len()).peekable();
-        while let Some(place) = places.next() {
-            let (name, item) = categories::ITEMS[place];
+        let mut items = (0..categories::ITEMS.len()).peekable();
+        while let Some(item_ix) = items.next() {
+            let (name, item) = categories::ITEMS[item_ix];
             let Some(category) = self.category(name) else { continue };
             match category.column(item, categories::MAX_VALUES, false) {
                 Ok(None) => {}
                 Ok(Some(column)) => {
                     for row in 0..usize::try_from(category.rows).unwrap_or(0) {
-                        known.add(place, &column.shown(row), reading)?;
+                        known.add(item_ix, &column.shown(row), reading)?;
                     }
                 }
                 Err(fault) => {
                     let error = StructureError::from(fault.within(category.place()));
-                    let what = known.forget(place);
+                    let what = known.forget(item_ix);
                     unread.push(format!("{error}; {what} are unknown"));
                     // The other items of the same group are useless without this one.
-                    while places.next_if(|&next| categories::describe_the_same(next, place)).is_some() {}
+                    while items.next_if(|&next| categories::describe_the_same(next, item_ix)).is_some() {}
                 }
             }
         }

@@ -1,4 +1,4 @@
-//! In-place MessagePack reader. It neither copies nor builds a tree, so memory does not depend on declared lengths.
+//! MessagePack reader. It neither copies values nor builds a tree, so memory does not depend on declared lengths.
 //! Skipping a value is iterative, so nesting depth is harmless.
 //!
 //! Specification: <https://github.com/msgpack/msgpack/blob/master/spec.md>.
@@ -8,7 +8,7 @@ use super::fault::Fault;
 
 /// A value, or the head of a container.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Token<'a> {
+pub(super) enum PackToken<'a> {
     Nil,
     Bool(bool),
     Integer(i64),
@@ -23,7 +23,7 @@ pub(super) enum Token<'a> {
     Extension,
 }
 
-impl Token<'_> {
+impl PackToken<'_> {
     /// Describes the token for a message.
     pub(super) fn words(&self) -> String {
         match self {
@@ -53,50 +53,50 @@ impl<'a> Cursor<'a> {
     }
 
     /// Returns the next value or container head. The values of a container follow.
-    pub(super) fn next(&mut self) -> Result<Token<'a>, Box<Fault>> {
+    pub(super) fn next(&mut self) -> Result<PackToken<'a>, Box<Fault>> {
         let start = self.at;
         let [first] = self.take()?;
         Ok(match first {
-            0x00..=0x7F => Token::Integer(first.into()),
-            0x80..=0x8F => self.container(Token::Map((first & 15).into()))?,
-            0x90..=0x9F => self.container(Token::Array((first & 15).into()))?,
-            0xA0..=0xBF => Token::Text(self.slice((first & 31).into())?),
-            0xC0 => Token::Nil,
+            0x00..=0x7F => PackToken::Integer(first.into()),
+            0x80..=0x8F => self.container(PackToken::Map((first & 15).into()))?,
+            0x90..=0x9F => self.container(PackToken::Array((first & 15).into()))?,
+            0xA0..=0xBF => PackToken::Text(self.slice((first & 31).into())?),
+            0xC0 => PackToken::Nil,
             0xC1 => {
                 let fault = Fault::new("c1, which no value begins with", "a MessagePack value");
                 return Err(fault.within(format_args!("byte {start}")));
             }
-            0xC2 | 0xC3 => Token::Bool(first == 0xC3),
+            0xC2 | 0xC3 => PackToken::Bool(first == 0xC3),
             0xC4..=0xC6 => {
                 let n = self.length(first - 0xC4)?;
-                Token::Bytes(self.slice(n)?)
+                PackToken::Bytes(self.slice(n)?)
             }
             0xC7..=0xC9 => {
                 let n = self.length(first - 0xC7)?;
                 self.extension(n)?
             }
-            0xCA => Token::Real(f32::from_be_bytes(self.take()?).into()),
-            0xCB => Token::Real(f64::from_be_bytes(self.take()?)),
-            0xCC..=0xCE => Token::Integer(self.length(first - 0xCC)?.into()),
+            0xCA => PackToken::Real(f32::from_be_bytes(self.take()?).into()),
+            0xCB => PackToken::Real(f64::from_be_bytes(self.take()?)),
+            0xCC..=0xCE => PackToken::Integer(self.length(first - 0xCC)?.into()),
             0xCF => unsigned(u64::from_be_bytes(self.take()?)),
-            0xD0 => Token::Integer(i8::from_be_bytes(self.take()?).into()),
-            0xD1 => Token::Integer(i16::from_be_bytes(self.take()?).into()),
-            0xD2 => Token::Integer(i32::from_be_bytes(self.take()?).into()),
-            0xD3 => Token::Integer(i64::from_be_bytes(self.take()?)),
+            0xD0 => PackToken::Integer(i8::from_be_bytes(self.take()?).into()),
+            0xD1 => PackToken::Integer(i16::from_be_bytes(self.take()?).into()),
+            0xD2 => PackToken::Integer(i32::from_be_bytes(self.take()?).into()),
+            0xD3 => PackToken::Integer(i64::from_be_bytes(self.take()?)),
             0xD4..=0xD8 => self.extension(1 << (first - 0xD4))?,
             0xD9..=0xDB => {
                 let n = self.length(first - 0xD9)?;
-                Token::Text(self.slice(n)?)
+                PackToken::Text(self.slice(n)?)
             }
             0xDC | 0xDD => {
                 let n = self.length(first - 0xDC + 1)?;
-                self.container(Token::Array(n))?
+                self.container(PackToken::Array(n))?
             }
             0xDE | 0xDF => {
                 let n = self.length(first - 0xDE + 1)?;
-                self.container(Token::Map(n))?
+                self.container(PackToken::Map(n))?
             }
-            0xE0..=0xFF => Token::Integer(first.cast_signed().into()),
+            0xE0..=0xFF => PackToken::Integer(first.cast_signed().into()),
         })
     }
 
@@ -106,8 +106,8 @@ impl<'a> Cursor<'a> {
         while pending > 0 {
             pending -= 1;
             match self.next()? {
-                Token::Array(n) => pending += u64::from(n),
-                Token::Map(n) => pending += 2 * u64::from(n),
+                PackToken::Array(n) => pending += u64::from(n),
+                PackToken::Map(n) => pending += 2 * u64::from(n),
                 _ => {}
             }
         }
@@ -121,7 +121,7 @@ impl<'a> Cursor<'a> {
         mut entry: impl FnMut(&'a [u8], &mut Self) -> Result<(), Box<Fault>>,
     ) -> Result<(), Box<Fault>> {
         let n = match self.next()? {
-            Token::Map(n) => n,
+            PackToken::Map(n) => n,
             other => return Err(Fault::new(other.words(), "a map")),
         };
         for _ in 0..n {
@@ -141,7 +141,7 @@ impl<'a> Cursor<'a> {
         mut item: impl FnMut(u32, &mut Self) -> Result<(), Box<Fault>>,
     ) -> Result<(), Box<Fault>> {
         let n = match self.next()? {
-            Token::Array(n) => n,
+            PackToken::Array(n) => n,
             other => return Err(Fault::new(other.words(), "an array")),
         };
         for i in 0..n {
@@ -183,14 +183,14 @@ impl<'a> Cursor<'a> {
 
     pub(super) fn text(&mut self) -> Result<&'a [u8], Box<Fault>> {
         match self.next()? {
-            Token::Text(text) => Ok(text),
+            PackToken::Text(text) => Ok(text),
             other => Err(Fault::new(other.words(), "a text")),
         }
     }
 
     pub(super) fn bytes(&mut self) -> Result<&'a [u8], Box<Fault>> {
         match self.next()? {
-            Token::Bytes(bytes) => Ok(bytes),
+            PackToken::Bytes(bytes) => Ok(bytes),
             other => Err(Fault::new(other.words(), "bytes")),
         }
     }
@@ -198,8 +198,8 @@ impl<'a> Cursor<'a> {
     /// Reads a boolean. Languages without booleans write 1 or 0.
     pub(super) fn truth(&mut self) -> Result<bool, Box<Fault>> {
         match self.next()? {
-            Token::Bool(value) => Ok(value),
-            Token::Integer(value @ (0 | 1)) => Ok(value == 1),
+            PackToken::Bool(value) => Ok(value),
+            PackToken::Integer(value @ (0 | 1)) => Ok(value == 1),
             other => Err(Fault::new(other.words(), "true or false")),
         }
     }
@@ -208,8 +208,8 @@ impl<'a> Cursor<'a> {
     pub(super) fn number(&mut self) -> Result<f64, Box<Fault>> {
         match self.next()? {
             #[expect(clippy::cast_precision_loss, reason = "factors and bounds are small or already rounded")]
-            Token::Integer(value) => Ok(value as f64),
-            Token::Real(value) if value.is_finite() => Ok(value),
+            PackToken::Integer(value) => Ok(value as f64),
+            PackToken::Real(value) if value.is_finite() => Ok(value),
             other => Err(Fault::new(other.words(), "a finite number")),
         }
     }
@@ -218,9 +218,9 @@ impl<'a> Cursor<'a> {
     pub(super) fn whole<T: TryFrom<i64>>(&mut self, expected: &str) -> Result<T, Box<Fault>> {
         let token = self.next()?;
         let value = match token {
-            Token::Integer(value) => Some(value),
+            PackToken::Integer(value) => Some(value),
             #[expect(clippy::cast_possible_truncation, reason = "whole and far below 2⁵³")]
-            Token::Real(value) if value.fract() == 0.0 && value.abs() < 1e15 => Some(value as i64),
+            PackToken::Real(value) if value.fract() == 0.0 && value.abs() < 1e15 => Some(value as i64),
             _ => None,
         };
         value.and_then(|v| T::try_from(v).ok()).ok_or_else(|| Fault::new(token.words(), expected))
@@ -250,17 +250,17 @@ impl<'a> Cursor<'a> {
         Ok(found)
     }
 
-    fn extension(&mut self, len: u32) -> Result<Token<'a>, Box<Fault>> {
+    fn extension(&mut self, len: u32) -> Result<PackToken<'a>, Box<Fault>> {
         let [_kind] = self.take()?;
         self.slice(len)?;
-        Ok(Token::Extension)
+        Ok(PackToken::Extension)
     }
 
     /// Rejects container heads that declare more values than there are bytes.
-    fn container(&mut self, head: Token<'a>) -> Result<Token<'a>, Box<Fault>> {
+    fn container(&mut self, head: PackToken<'a>) -> Result<PackToken<'a>, Box<Fault>> {
         let least = match head {
-            Token::Array(n) => n as usize,
-            Token::Map(n) => 2 * n as usize,
+            PackToken::Array(n) => n as usize,
+            PackToken::Map(n) => 2 * n as usize,
             _ => 0,
         };
         if least > self.bytes.len() - self.at { Err(self.end(least)) } else { Ok(head) }
@@ -276,9 +276,9 @@ impl<'a> Cursor<'a> {
 }
 
 /// Converts an unsigned number. Values that do not fit into `i64` are neither lengths nor ids and become real numbers.
-fn unsigned(value: u64) -> Token<'static> {
+fn unsigned(value: u64) -> PackToken<'static> {
     #[expect(clippy::cast_precision_loss, reason = "used only in messages")]
-    i64::try_from(value).map_or(Token::Real(value as f64), Token::Integer)
+    i64::try_from(value).map_or(PackToken::Real(value as f64), PackToken::Integer)
 }
 
 #[cfg(test)]

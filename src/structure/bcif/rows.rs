@@ -1,16 +1,17 @@
 //! Decodes columns and converts their rows to atoms, on several threads if there are many rows.
 
-use super::super::atom_site::{self, AtomSite, Layout, Span, Wrong};
+use super::super::atom_site::{self, AtomSite, BadNumber, Layout, Span};
 use super::super::atoms::{Columns, Tables};
+use super::super::duplicates;
 use super::super::error::StructureError;
 use super::super::pieces;
 use super::super::read::Reading;
 use super::super::text::{decode, quote};
 use super::super::warnings::Warnings;
-use super::column::{Bounds, Cells, Column, Raw};
+use super::column::{Cells, DecodeLimits, DecodedColumn, Raw};
 use super::fault::Fault;
 
-/// Bytes of text that take the time of a row.
+/// Bytes of text that take as long to read as a row.
 const BYTES_PER_ROW: usize = 80;
 /// Rows between two checks of the cancellation flag and charges of memory: a few milliseconds.
 const ROWS_PER_CHECK: usize = 1 << 14;
@@ -18,16 +19,16 @@ const ROWS_PER_CHECK: usize = 1 << 14;
 /// Columns of `atom_site` in file order. Only the required ones are decoded.
 struct Table<'a> {
     raw: &'a [Raw<'a>],
-    columns: Vec<Option<Column<'a>>>,
+    columns: Vec<Option<DecodedColumn<'a>>>,
 }
 
 /// A row of the table.
-struct Row<'t> {
+struct BinaryRow<'t> {
     table: &'t Table<'t>,
     index: usize,
 }
 
-impl Row<'_> {
+impl BinaryRow<'_> {
     /// Returns the cells of a column, or `None` if it has no value in this row.
     #[inline]
     fn cells(&self, column: usize) -> Option<&Cells<'_>> {
@@ -36,7 +37,7 @@ impl Row<'_> {
     }
 }
 
-impl atom_site::Row for Row<'_> {
+impl atom_site::AtomRow for BinaryRow<'_> {
     type Fault = Box<Fault>;
 
     #[inline]
@@ -47,17 +48,17 @@ impl atom_site::Row for Row<'_> {
     }
 
     #[inline]
-    fn real(&self, column: usize) -> Result<Option<f64>, Wrong> {
+    fn real(&self, column: usize) -> Result<Option<f64>, BadNumber> {
         match self.cells(column) {
             None => Ok(None),
             Some(Cells::Int(values)) => Ok(Some(values[self.index].into())),
-            Some(Cells::Real(values)) => Some(values[self.index]).filter(|v| v.is_finite()).map(Some).ok_or(Wrong),
+            Some(Cells::Real(values)) => Some(values[self.index]).filter(|v| v.is_finite()).map(Some).ok_or(BadNumber),
             Some(Cells::Text(_)) => self.text(column).map(Span::real).transpose(),
         }
     }
 
     #[inline]
-    fn integer(&self, column: usize) -> Result<Option<i32>, Wrong> {
+    fn integer(&self, column: usize) -> Result<Option<i32>, BadNumber> {
         match self.cells(column) {
             None => Ok(None),
             Some(Cells::Int(values)) => Ok(Some(values[self.index])),
@@ -83,10 +84,10 @@ impl atom_site::Row for Row<'_> {
 
 /// Converts a real number with an integral value.
 #[cold]
-fn whole(value: f64) -> Result<i32, Wrong> {
+fn whole(value: f64) -> Result<i32, BadNumber> {
     let fits = value.fract() == 0.0 && value.abs() <= f64::from(i32::MAX);
     #[expect(clippy::cast_possible_truncation, reason = "an integral value in range")]
-    if fits { Ok(value as i32) } else { Err(Wrong) }
+    if fits { Ok(value as i32) } else { Err(BadNumber) }
 }
 
 /// Returns an upper bound for the memory (bytes) of the decoded columns of the layout.
@@ -106,7 +107,7 @@ pub(super) type Atoms = (Columns, Tables, Warnings<Box<Fault>>);
 pub(super) fn read(
     raw: &[Raw<'_>],
     layout: Layout,
-    bounds: Bounds,
+    bounds: DecodeLimits,
     reading: &Reading<'_>,
 ) -> Result<Result<Atoms, Box<Fault>>, StructureError> {
     let n_pieces = reading.n_pieces(BYTES_PER_ROW * bounds.rows);
@@ -114,6 +115,7 @@ pub(super) fn read(
         Ok(columns) => Table { raw, columns },
         Err(fault) => return Ok(Err(fault)),
     };
+    check_samples(&table, layout, bounds, reading)?;
     let mut columns = Columns::zeroed(bounds.rows);
     let mut rest = columns.slices();
     let mut parts = Vec::with_capacity(n_pieces);
@@ -132,7 +134,7 @@ pub(super) fn read(
                 reading.hold_texts(site.tables.n_texts() - n_texts)?;
                 n_texts = site.tables.n_texts();
             }
-            match site.atom(&Row { table: &table, index }) {
+            match site.atom(&BinaryRow { table: &table, index }) {
                 Ok(atom) => slices.put(&atom),
                 Err(fault) => return Ok(Err(fault)),
             };
@@ -149,34 +151,68 @@ pub(super) fn read(
     Ok(Ok((columns, tables, warnings)))
 }
 
-/// A column and its fallback, if required.
-type Pair<'a> = [Option<Column<'a>>; 2];
+/// Number of rows from which on samples are checked first.
+const SAMPLED_FROM: usize = 1 << 20;
+/// Number of rows of a sample.
+const SAMPLE: usize = 1 << 14;
+/// Number of samples.
+const N_SAMPLES: usize = 8;
 
-/// Decodes columns, in parallel if asked to. The second of a pair is required only if the first has rows without a
+/// Rejects a file if samples of its rows contain too many atoms at the same position. Does not depend on the number of
+/// threads. Ignores other errors, which the conversion of all rows reports.
+fn check_samples(
+    table: &Table<'_>,
+    layout: Layout,
+    bounds: DecodeLimits,
+    reading: &Reading<'_>,
+) -> Result<(), StructureError> {
+    if bounds.rows < SAMPLED_FROM {
+        return Ok(());
+    }
+    for first in (0..bounds.rows - SAMPLE).step_by(bounds.rows / N_SAMPLES) {
+        reading.check()?;
+        let _memory = reading.reserve(Columns::bytes(SAMPLE))?;
+        let (mut columns, mut site) = (Columns::zeroed(SAMPLE), AtomSite::new(layout));
+        let mut rows = columns.slices();
+        for index in first..first + SAMPLE {
+            match site.atom(&BinaryRow { table, index }) {
+                Ok(atom) => rows.put(&atom),
+                Err(_fault) => return Ok(()),
+            };
+        }
+        duplicates::check(SAMPLE, |row| columns.model_and_position(row), reading)?;
+    }
+    Ok(())
+}
+
+/// A column and its fallback, if required.
+type ColumnPair<'a> = [Option<DecodedColumn<'a>>; 2];
+
+/// Decodes columns, in parallel if requested. The second of a pair is required only if the first has rows without a
 /// value.
 fn load<'a>(
     raw: &[Raw<'a>],
     layout: &Layout,
-    bounds: Bounds,
+    bounds: DecodeLimits,
     parallel: bool,
-) -> Result<Vec<Option<Column<'a>>>, Box<Fault>> {
+) -> Result<Vec<Option<DecodedColumn<'a>>>, Box<Fault>> {
     let texts = layout.texts().map(|pair| (pair, true));
     let numbers = layout.numbers().map(|pair| (pair, false));
     let mut wanted: Vec<_> = texts.into_iter().chain(numbers).collect();
-    let load = |&mut ([first, second], texts): &mut ([usize; 2], bool)| -> Result<Pair<'a>, Box<Fault>> {
+    let load = |&mut ([first, second], texts): &mut ([usize; 2], bool)| -> Result<ColumnPair<'a>, Box<Fault>> {
         let load = |column: usize| raw.get(column).map(|raw| raw.load(bounds, texts)).transpose();
         let (first, mut fallback) = (load(first)?, None);
-        if first.as_ref().is_some_and(Column::has_nulls) {
+        if first.as_ref().is_some_and(DecodedColumn::has_nulls) {
             fallback = load(second)?;
         }
         Ok([first, fallback])
     };
     let loaded = if parallel { pieces::map(&mut wanted, load) } else { wanted.iter_mut().map(load).collect() };
-    let mut columns: Vec<Option<Column<'a>>> = Vec::new();
+    let mut columns: Vec<Option<DecodedColumn<'a>>> = Vec::new();
     columns.resize_with(raw.len(), || None);
-    for ((places, _), pair) in wanted.into_iter().zip(loaded) {
-        for (place, column) in places.into_iter().zip(pair?) {
-            if let (Some(slot), Some(column)) = (columns.get_mut(place), column) {
+    for ((indices, _), pair) in wanted.into_iter().zip(loaded) {
+        for (index, column) in indices.into_iter().zip(pair?) {
+            if let (Some(slot), Some(column)) = (columns.get_mut(index), column) {
                 *slot = Some(column);
             }
         }

@@ -1,5 +1,5 @@
-//! Reader of PDBx/mmCIF: the `atom_site` category of the first data block that has one, entry id, title, entities and
-//! assemblies.
+//! Reader of PDBx/mmCIF: the `atom_site` category of the first data block that has one, entry id, title, entities,
+//! assemblies, secondary structure and confidences.
 //!
 //! Dictionary: PDBx/mmCIF, category `atom_site`. Author names and numbers (`auth_*`) take precedence. The identifiers
 //! of the dictionary (`label_*`) are the fallback.
@@ -7,11 +7,11 @@
 mod row;
 mod rows;
 
-use self::rows::Rows;
+use self::rows::TableRows;
 use super::atom_site::{Layout, Passed};
-use super::atoms::{Source, SourceFormat, Structure};
+use super::atoms::{SourceFields, SourceFormat, Structure};
 use super::categories::Categories;
-use super::cif::{self, Kind, Token, Tokenizer};
+use super::cif::{self, Token, TokenKind, Tokenizer};
 use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
@@ -23,20 +23,20 @@ const VALUES_PER_CHECK: usize = 1 << 16;
 
 /// Reason to stop reading rows.
 #[derive(Debug)]
-enum Stop {
+enum StopReason {
     /// Syntax error.
     Fault(Box<Fault>),
-    /// Error that has no place in the text.
+    /// Error without a position in the text.
     Error(Box<StructureError>),
 }
 
-impl From<StructureError> for Stop {
+impl From<StructureError> for StopReason {
     fn from(error: StructureError) -> Self {
         Self::Error(Box::new(error))
     }
 }
 
-impl From<Box<Fault>> for Stop {
+impl From<Box<Fault>> for StopReason {
     fn from(fault: Box<Fault>) -> Self {
         Self::Fault(fault)
     }
@@ -46,19 +46,21 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
     let mut reader = Reader::new(text, reading);
     match reader.run() {
         Ok(()) => reader.finish(),
-        Err(Stop::Fault(fault)) => Err(fault.locate(text)),
-        Err(Stop::Error(error)) => Err(*error),
+        Err(StopReason::Fault(fault)) => Err(fault.locate(text)),
+        Err(StopReason::Error(error)) => Err(*error),
     }
 }
 
 /// Values of a data block that have been read so far.
 #[derive(Debug, Default)]
-struct Block {
+struct TextBlock {
     name: Option<String>,
     entry: Option<String>,
     title: Option<String>,
     categories: Categories,
     in_frame: bool,
+    /// True if the block has a category of the dictionary of predicted models.
+    predicted: bool,
     /// Tags and values of an `atom_site` without a loop, as in files with one atom: byte ranges.
     tags: Vec<(usize, usize)>,
     values: Vec<(usize, usize)>,
@@ -68,40 +70,40 @@ struct Reader<'a> {
     text: &'a [u8],
     tokens: Tokenizer<'a>,
     reading: &'a Reading<'a>,
-    block: Block,
-    rows: Option<Rows<'a>>,
+    block: TextBlock,
+    rows: Option<TableRows<'a>>,
     passed: Passed,
 }
 
 impl<'a> Reader<'a> {
     fn new(text: &'a [u8], reading: &'a Reading<'a>) -> Self {
-        let (tokens, block, passed) = (Tokenizer::new(text), Block::default(), Passed::default());
+        let (tokens, block, passed) = (Tokenizer::new(text), TextBlock::default(), Passed::default());
         Self { text, tokens, reading, block, rows: None, passed }
     }
 
-    fn run(&mut self) -> Result<(), Stop> {
+    fn run(&mut self) -> Result<(), StopReason> {
         let mut token = self.tokens.next()?;
         loop {
             self.reading.check()?;
             match token.kind {
-                Kind::End | Kind::Data => {
+                TokenKind::End | TokenKind::Data => {
                     self.end_block()?;
-                    if self.rows.is_some() || token.kind == Kind::End {
+                    if self.rows.is_some() || token.kind == TokenKind::End {
                         return Ok(());
                     }
                     self.begin_block(&token);
                 }
-                Kind::Save => self.block.in_frame = token.end - token.start > b"save_".len(),
-                Kind::Reserved => {}
-                Kind::Tag => self.item(&token)?,
-                Kind::Loop => {
+                TokenKind::Save => self.block.in_frame = token.end - token.start > b"save_".len(),
+                TokenKind::Reserved => {}
+                TokenKind::Tag => self.item(&token)?,
+                TokenKind::Loop => {
                     token = self.category()?;
                     if self.rows.is_some() {
                         return self.rest_of_block(token);
                     }
                     continue;
                 }
-                Kind::Value => {
+                TokenKind::Value => {
                     let expected = "a data block, loop_, or a tag that begins with _";
                     return Err(token.fault(self.text, expected).into());
                 }
@@ -112,14 +114,14 @@ impl<'a> Reader<'a> {
 
     fn begin_block(&mut self, token: &Token) {
         let name = &self.text[token.start + b"data_".len()..token.end];
-        self.block = Block { name: normalize(name, 80), ..Block::default() };
+        self.block = TextBlock { name: normalize(name, 80), ..TextBlock::default() };
         self.passed.block();
     }
 
     /// Reads a tag and its value.
-    fn item(&mut self, tag: &Token) -> Result<(), Stop> {
+    fn item(&mut self, tag: &Token) -> Result<(), StopReason> {
         let value = self.tokens.next()?;
-        if value.kind != Kind::Value {
+        if value.kind != TokenKind::Value {
             let expected = format!("a value of {}", decode(&self.text[tag.start..tag.end.min(tag.start + 80)]));
             return Err(value.fault(self.text, expected).into());
         }
@@ -130,8 +132,8 @@ impl<'a> Reader<'a> {
             self.block.values.push((value.start, value.end));
         } else {
             self.note_value(name, &value);
-            if let Some(place) = self.described_item(tag) {
-                self.describe(place, &value)?;
+            if let Some(item_ix) = self.described_item(tag) {
+                self.describe(item_ix, &value)?;
             }
         }
         Ok(())
@@ -146,9 +148,9 @@ impl<'a> Reader<'a> {
     }
 
     /// Stores a value that describes entities or assemblies.
-    fn describe(&mut self, place: usize, value: &Token) -> Result<(), StructureError> {
+    fn describe(&mut self, item_ix: usize, value: &Token) -> Result<(), StructureError> {
         let (start, end, _) = cif::unquote(self.text, value.start, value.end);
-        self.block.categories.add(place, &self.text[start..end], self.reading)
+        self.block.categories.add(item_ix, &self.text[start..end], self.reading)
     }
 
     /// Stores the id or title of the entry.
@@ -162,17 +164,17 @@ impl<'a> Reader<'a> {
         if !quoted && matches!(raw, b"?" | b".") {
             return;
         }
-        let (place, max) = if is_id { (&mut self.block.entry, 80) } else { (&mut self.block.title, MAX_TITLE) };
-        if place.is_none() {
-            *place = normalize(raw, max);
+        let (target, max) = if is_id { (&mut self.block.entry, 80) } else { (&mut self.block.title, MAX_TITLE) };
+        if target.is_none() {
+            *target = normalize(raw, max);
         }
     }
 
     /// Reads a loop: tags, then rows. Returns the token after it.
-    fn category(&mut self) -> Result<Token, Stop> {
+    fn category(&mut self) -> Result<Token, StopReason> {
         let mut tags: Vec<Token> = Vec::new();
         let mut token = self.tokens.next()?;
-        while token.kind == Kind::Tag {
+        while token.kind == TokenKind::Tag {
             tags.push(token);
             token = self.tokens.next()?;
         }
@@ -181,25 +183,25 @@ impl<'a> Reader<'a> {
         };
         self.note_category(first);
         let is_atom_site = !self.block.in_frame && row::has_prefix(&self.text[first.start..first.end]);
-        if is_atom_site && self.rows.is_none() && token.kind == Kind::Value {
+        if is_atom_site && self.rows.is_none() && token.kind == TokenKind::Value {
             let ranges: Vec<_> = tags.iter().map(|t| (t.start, t.end)).collect();
             if let Some(layout) = self.layout(&ranges)? {
-                let mut rows = Rows::new(self.text, layout, self.reading);
+                let mut rows = TableRows::new(self.text, layout, self.reading);
                 self.tokens.at = rows.read(token.start)?;
                 self.rows = Some(rows);
                 return Ok(self.tokens.next()?);
             }
         }
-        let places: Vec<Option<usize>> = tags.iter().map(|tag| self.described_item(tag)).collect();
-        let describes = places.iter().any(Option::is_some);
+        let items: Vec<Option<usize>> = tags.iter().map(|tag| self.described_item(tag)).collect();
+        let describes = items.iter().any(Option::is_some);
         let mut i = 0;
-        while token.kind == Kind::Value {
+        while token.kind == TokenKind::Value {
             // Uses the first row of a loop over entries or titles.
             if let Some(tag) = tags.get(i) {
                 self.note_value(&self.text[tag.start..tag.end], &token);
             }
-            if describes && let Some(place) = places[i % places.len()] {
-                self.describe(place, &token)?;
+            if describes && let Some(item_ix) = items[i % items.len()] {
+                self.describe(item_ix, &token)?;
             }
             i += 1;
             if i % VALUES_PER_CHECK == 0 {
@@ -211,7 +213,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Returns the columns of `atom_site`, or `None` if it has no coordinates.
-    fn layout(&mut self, tags: &[(usize, usize)]) -> Result<Option<Layout>, Stop> {
+    fn layout(&mut self, tags: &[(usize, usize)]) -> Result<Option<Layout>, StopReason> {
         let layout = row::layout(self.text, tags)?;
         if let Some(missing) = layout.missing() {
             self.passed.lacking(missing);
@@ -221,40 +223,44 @@ impl<'a> Reader<'a> {
     }
 
     /// Ends a data block. An `atom_site` without a loop is one row.
-    fn end_block(&mut self) -> Result<(), Stop> {
+    fn end_block(&mut self) -> Result<(), StopReason> {
         let (tags, values) = (std::mem::take(&mut self.block.tags), std::mem::take(&mut self.block.values));
         if self.rows.is_some() || tags.is_empty() {
             return Ok(());
         }
         if let Some(layout) = self.layout(&tags)? {
-            let mut rows = Rows::new(self.text, layout, self.reading);
+            let mut rows = TableRows::new(self.text, layout, self.reading);
             rows.single(&values)?;
             self.rows = Some(rows);
         }
         Ok(())
     }
 
-    /// Reads the title, the assemblies and, if HETATM records need them, the entities after the atoms. Ignores syntax
-    /// errors, because the atoms are complete.
-    fn rest_of_block(&mut self, mut token: Token) -> Result<(), Stop> {
-        let hetero = self.rows.as_ref().is_some_and(Rows::has_hetero);
+    /// Reads the title, the assemblies, the helices and strands, the confidences of a predicted model and, if HETATM
+    /// records need them, the entities after the atoms. Ignores syntax errors, because the atoms are complete.
+    fn rest_of_block(&mut self, mut token: Token) -> Result<(), StopReason> {
+        let hetero = self.rows.as_ref().is_some_and(TableRows::has_hetero);
         let wanted = |reader: &Self| {
             let known = &reader.block.categories;
-            reader.block.title.is_none() || !known.assemblies_are_known() || (hetero && !known.entities_are_known())
+            reader.block.title.is_none()
+                || !known.assemblies_are_known()
+                || !known.secondary_is_known()
+                || (hetero && !known.entities_are_known())
+                || (reader.block.predicted && !known.confidences_are_known())
         };
-        while wanted(self) && !matches!(token.kind, Kind::End | Kind::Data) {
+        while wanted(self) && !matches!(token.kind, TokenKind::End | TokenKind::Data) {
             let next = match token.kind {
-                Kind::Tag => self.item(&token).and_then(|()| Ok(self.tokens.next()?)),
-                Kind::Loop => self.category(),
-                Kind::Save => {
+                TokenKind::Tag => self.item(&token).and_then(|()| Ok(self.tokens.next()?)),
+                TokenKind::Loop => self.category(),
+                TokenKind::Save => {
                     self.block.in_frame = token.end - token.start > b"save_".len();
-                    self.tokens.next().map_err(Stop::from)
+                    self.tokens.next().map_err(StopReason::from)
                 }
-                _ => self.tokens.next().map_err(Stop::from),
+                _ => self.tokens.next().map_err(StopReason::from),
             };
             match next {
                 Ok(next) => token = next,
-                Err(Stop::Fault(_)) => return Ok(()),
+                Err(StopReason::Fault(_)) => return Ok(()),
                 Err(error) => return Err(error),
             }
         }
@@ -262,6 +268,7 @@ impl<'a> Reader<'a> {
     }
 
     fn note_category(&mut self, tag: &Token) {
+        self.block.predicted |= self.text[tag.start..tag.end].starts_with(b"_ma_");
         if self.passed.is_full() {
             return;
         }
@@ -270,18 +277,19 @@ impl<'a> Reader<'a> {
     }
 
     fn finish(self) -> Result<Structure, StructureError> {
-        let (columns, tables, warnings) = self.rows.map(Rows::into_parts).unwrap_or_default();
+        let (columns, tables, warnings) = self.rows.map(TableRows::into_parts).unwrap_or_default();
         if columns.len() == 0 {
             return Err(self.passed.no_atoms("mmCIF", self.block.name));
         }
         let categories = self.block.categories;
         let too_many = categories.warning();
         let warnings = warnings.messages(|fault| fault.locate(self.text));
-        let source = Source {
+        let source = SourceFields {
             format: SourceFormat::Mmcif,
             id: self.block.entry.or(self.block.name),
             title: self.block.title,
             sequence: Sequence::of(&categories),
+            annotations: categories.annotations(),
             assemblies: categories.assemblies(),
             radii: Vec::new(),
             warnings: warnings.into_iter().chain(too_many).collect(),

@@ -26,7 +26,7 @@ pub(super) fn has_prefix(tag: &[u8]) -> bool {
 
 /// A row as byte ranges of its values. `QUOTES` is false for rows without quotes, which need no unquoting.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Row<'a, const QUOTES: bool> {
+pub(super) struct TextRow<'a, const QUOTES: bool> {
     pub(super) text: &'a [u8],
     /// Origin of the offsets.
     pub(super) base: usize,
@@ -34,7 +34,7 @@ pub(super) struct Row<'a, const QUOTES: bool> {
     pub(super) offsets: &'a [u32],
 }
 
-impl<const QUOTES: bool> Row<'_, QUOTES> {
+impl<const QUOTES: bool> TextRow<'_, QUOTES> {
     /// Returns start and end of a value, including quotes.
     #[inline]
     fn raw(&self, column: usize) -> (usize, usize) {
@@ -42,7 +42,7 @@ impl<const QUOTES: bool> Row<'_, QUOTES> {
     }
 }
 
-impl<const QUOTES: bool> atom_site::Row for Row<'_, QUOTES> {
+impl<const QUOTES: bool> atom_site::AtomRow for TextRow<'_, QUOTES> {
     type Fault = Box<Fault>;
 
     /// Returns a value without quotes. `?` and `.` mean that there is no value.

@@ -1,4 +1,4 @@
-//! Reads the rows of the `atom_site` loop: a fast path for plain rows, the full grammar for all others.
+//! Reader of the rows of the `atom_site` loop: a fast path for plain rows, and the full grammar for all others.
 //!
 //! Almost all rows are plain tokens separated by blanks, which [`Edges`] finds. Rows with comments, text fields, quoted
 //! blanks or a possible end of the loop go through the tokenizer one at a time. A loop with one line per row is read in
@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::super::atom_site::{self, AtomSite, Layout};
 use super::super::atoms::{Atom, Columns, Tables};
-use super::super::cif::{Kind, Tokenizer, bare_kind};
+use super::super::cif::{TokenKind, Tokenizer, bare_kind};
 use super::super::error::StructureError;
 use super::super::growing::GrowingColumns;
 use super::super::pieces;
@@ -17,8 +17,8 @@ use super::super::read::Reading;
 use super::super::scan::Edges;
 use super::super::text::Fault;
 use super::super::warnings::Warnings;
-use super::Stop;
-use super::row::Row;
+use super::StopReason;
+use super::row::TextRow;
 
 /// Bytes scanned at a time. The window is short after a special row, because the bytes after it are scanned again.
 const MIN_WINDOW: usize = 1 << 8;
@@ -26,7 +26,8 @@ const MAX_WINDOW: usize = 16 << 10;
 /// Bytes between two charges of the memory of texts.
 const BYTES_PER_CHARGE: usize = 1 << 20;
 
-pub(super) struct Rows<'a> {
+/// Reader of the rows of an `atom_site` loop, with the atoms read so far.
+pub(super) struct TableRows<'a> {
     text: &'a [u8],
     site: AtomSite<Box<Fault>>,
     columns: GrowingColumns,
@@ -35,26 +36,27 @@ pub(super) struct Rows<'a> {
     expected: usize,
 }
 
-impl<'a> Rows<'a> {
+impl<'a> TableRows<'a> {
     pub(super) fn new(text: &'a [u8], layout: Layout, reading: &'a Reading<'a>) -> Self {
         Self { text, site: AtomSite::new(layout), columns: GrowingColumns::default(), reading, expected: 1 }
     }
 
+    /// Returns the columns of the atoms, the tables of texts, and the warnings.
     pub(super) fn into_parts(self) -> (Columns, Tables, Warnings<Box<Fault>>) {
         (self.columns.into_columns(), self.site.tables, self.site.warnings)
     }
 
-    /// Returns true if some row is a HETATM record.
+    /// Returns true if a row read so far is a HETATM record.
     pub(super) fn has_hetero(&self) -> bool {
         self.columns.columns().hetero.contains(&true)
     }
 
-    /// Reads rows from the first value on. Returns the end of the loop.
-    pub(super) fn read(&mut self, first: usize) -> Result<usize, Stop> {
+    /// Reads all rows, from the first value at offset `first` on. Returns the offset of the end of the loop.
+    pub(super) fn read(&mut self, first: usize) -> Result<usize, StopReason> {
         let mut at = if let Some(end) = self.read_plain(first)? {
             end
         } else {
-            // Untouched memory is not allocated.
+            // The system allocates memory only when it is first written to.
             self.expected = memchr::memchr_iter(b'\n', &self.text[first..]).count() + 1;
             first
         };
@@ -72,13 +74,13 @@ impl<'a> Rows<'a> {
     }
 
     /// Reads a row by the full grammar. Returns `None` at the end of the loop.
-    fn special_row(&mut self, at: usize) -> Result<Option<usize>, Stop> {
+    fn special_row(&mut self, at: usize) -> Result<Option<usize>, StopReason> {
         let mut tokens = Tokenizer { text: self.text, at };
         let width = self.site.layout.width;
         let mut values = Vec::new();
         for i in 0..width {
             let token = tokens.next()?;
-            if token.kind != Kind::Value {
+            if token.kind != TokenKind::Value {
                 if i == 0 {
                     return Ok(None);
                 }
@@ -91,8 +93,8 @@ impl<'a> Rows<'a> {
         Ok(Some(tokens.at))
     }
 
-    /// Reads one row, given by the ranges of its values.
-    pub(super) fn single(&mut self, values: &[(usize, usize)]) -> Result<(), Stop> {
+    /// Reads one row, given by the ranges of its values in the text.
+    pub(super) fn single(&mut self, values: &[(usize, usize)]) -> Result<(), StopReason> {
         let Some(&(base, _)) = values.first() else { return Ok(()) };
         let mut offsets = Vec::with_capacity(2 * values.len());
         for &(start, end) in values {
@@ -101,7 +103,7 @@ impl<'a> Rows<'a> {
             };
             offsets.extend([from, to]);
         }
-        let atom = self.site.atom(&Row::<true> { text: self.text, base, offsets: &offsets })?;
+        let atom = self.site.atom(&TextRow::<true> { text: self.text, base, offsets: &offsets })?;
         self.columns.reserve_chunk(&self.site.tables, self.reading, self.expected)?;
         self.columns.push(&atom);
         Ok(())
@@ -233,7 +235,7 @@ impl<'a> Scanner<'a> {
         mut at: usize,
         end: usize,
         stop: &dyn Fn() -> bool,
-    ) -> Result<usize, Stop> {
+    ) -> Result<usize, StopReason> {
         let per_row = 2 * site.layout.width;
         let mut edges = std::mem::take(&mut self.edges);
         let result = loop {
@@ -251,9 +253,9 @@ impl<'a> Scanner<'a> {
                     break;
                 }
                 let atom = match special(window, offsets) {
-                    0 if !words => site.atom(&Row::<false> { text: self.text, base: at, offsets })?,
+                    0 if !words => site.atom(&TextRow::<false> { text: self.text, base: at, offsets })?,
                     special if special < 2 && values_only(window, offsets, words) => {
-                        site.atom(&Row::<true> { text: self.text, base: at, offsets })?
+                        site.atom(&TextRow::<true> { text: self.text, base: at, offsets })?
                     }
                     _ => {
                         plain = false;
@@ -293,7 +295,7 @@ fn values_only(window: &[u8], offsets: &[u32], words: bool) -> bool {
         let token = &window[token[0] as usize..token[1] as usize];
         match token[0] {
             quote @ (b'\'' | b'"') => token.len() > 1 && token[token.len() - 1] == quote,
-            _ => !words || bare_kind(token) == Kind::Value,
+            _ => !words || bare_kind(token) == TokenKind::Value,
         }
     })
 }
@@ -323,13 +325,13 @@ mod tests {
         let limits = ReadLimits { max_duplicates: u64::MAX, ..ReadLimits::default() };
         let control = Control::default();
         let reading = Reading::new(&limits, &control);
-        let mut table = Rows::new(text.as_bytes(), layout(&text), &reading);
+        let mut table = TableRows::new(text.as_bytes(), layout(&text), &reading);
         let stop = table.read_plain(TAGS.len()).unwrap()?;
         Some((table.columns.columns().len(), stop - TAGS.len()))
     }
 
     #[test]
-    fn plain_rows_are_read_by_several_threads_whatever_follows() {
+    fn plain_rows_are_read_by_several_threads_with_any_rest() {
         const N: usize = 200_000;
         let rows = "1.0 2.0 3.0 A\n".repeat(N);
         for end in ["", "#\n", "#\nloop_\n_x.y\n1\n", "\n# comment\n\n_x.y 1\n", "4 5 6 B", "4 5 6 'B", "data_y\n"] {

@@ -1,7 +1,7 @@
 //! Assemblies in REMARK 350 records.
 //!
 //! `BIOMOLECULE` begins an assembly, or several that are described together. `APPLY THE FOLLOWING TO CHAINS` begins a
-//! rule, `AND CHAINS` continues its list of chains. Three `BIOMT` records make an operator of the rule.
+//! rule, `AND CHAINS` continues its list of chains. Three `BIOMT` records define an operator of the rule.
 
 use super::super::assembly::{Assemblies, Operator};
 use super::super::error::StructureError;
@@ -56,8 +56,8 @@ impl Remark350 {
         Ok(())
     }
 
-    /// Reads a row of an operator: `1   2  0.5 0.0 0.0  0.0`. Ignores the number of the operator, because files count
-    /// operators anew in every assembly.
+    /// Reads a row of an operator: `1   2  0.5 0.0 0.0  0.0`. Ignores the number of the operator, because files number
+    /// the operators of each assembly from 1.
     fn operator_row(&mut self, text: &str, reading: &Reading<'_>) -> Result<(), StructureError> {
         let (number, rest) = text.split_at_checked(1).unwrap_or_default();
         match number {

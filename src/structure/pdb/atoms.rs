@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 
 use super::super::atoms::{Atom, Slices, Tables};
 use super::super::contents::Kind;
-use super::super::element::{self, Name, atomic_number};
+use super::super::element::{self, AtomName, atomic_number};
 use super::super::error::StructureError;
 use super::super::number::single;
 use super::super::read::Reading;
@@ -97,11 +97,11 @@ impl<'a> Atoms<'a> {
         let n_warnings = self.warnings.len();
         if self.file.tabs && line.contains(&b'\t') {
             let (expanded, origin) = expand_tabs(line);
-            let place = |at: usize| start + origin.get(at).copied().unwrap_or(line.len());
+            let in_file = |at: usize| start + origin.get(at).copied().unwrap_or(line.len());
             let read = self.columns_of(&expanded);
-            self.warnings.after(n_warnings).iter_mut().for_each(|w| w.fault.at = place(w.fault.at));
+            self.warnings.after(n_warnings).iter_mut().for_each(|w| w.fault.at = in_file(w.fault.at));
             return read.map_err(|mut fault| {
-                fault.at = place(fault.at);
+                fault.at = in_file(fault.at);
                 fault
             });
         }
@@ -202,7 +202,7 @@ impl<'a> Atoms<'a> {
         if let Some(&z) = self.guesses.get(&(u32::from_le_bytes(columns), residue)) {
             return z;
         }
-        let name = Name { text: &columns[from..to], columns: (!self.left_justified).then_some(columns) };
+        let name = AtomName { text: &columns[from..to], columns: (!self.left_justified).then_some(columns) };
         let z = element::guess(name, self.tables.residue.text(residue));
         self.guesses.insert((u32::from_le_bytes(columns), residue), z);
         z

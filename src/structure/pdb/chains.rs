@@ -1,4 +1,4 @@
-//! Resolves column 21 of ATOM records: the fourth letter of a residue name, or the first letter of a chain name.
+//! Meaning of column 21 of ATOM records: the fourth letter of a residue name, or the first letter of a chain name.
 //!
 //! Programs that write many chains put two-letter names into columns 21 and 22. Simulation programs put four-letter
 //! residue names into columns 18 to 21. `HISA` of chain `A` and `HIS` of chain `AA` look the same. A single row is
@@ -12,14 +12,14 @@ use super::card::{Card, card, expand_tabs, residue_number};
 use super::lines::Lines;
 
 /// Columns 21 and 22.
-type Pair = [u8; 2];
+type ChainLetters = [u8; 2];
 
 /// Chains of two letters, in columns 21 and 22.
 #[derive(Debug, Default)]
 pub(super) struct TwoLetterChains {
     /// Pairs for which the file has evidence; true for chain names.
-    verdicts: HashMap<Pair, bool>,
-    /// The verdict on all pairs, if all are equal.
+    is_chain_name: HashMap<ChainLetters, bool>,
+    /// True if all these pairs are chain names, false if none is; `None` otherwise.
     all: Option<bool>,
 }
 
@@ -28,10 +28,10 @@ impl TwoLetterChains {
     pub(super) fn find(text: &[u8]) -> Self {
         let mut evidence = Evidence::default();
         Lines::new(text).for_each(|(start, end)| evidence.line(&text[start..end]));
-        let verdicts = evidence.verdicts();
-        let first = verdicts.values().next().copied();
-        let all = first.filter(|first| verdicts.values().all(|chain| chain == first));
-        Self { verdicts, all }
+        let is_chain_name = evidence.chain_names();
+        let first = is_chain_name.values().next().copied();
+        let all = first.filter(|first| is_chain_name.values().all(|chain| chain == first));
+        Self { is_chain_name, all }
     }
 
     /// Returns true if column 21 of an ATOM record, given by its columns 18 to 22, belongs to the chain name. Column 21
@@ -41,11 +41,12 @@ impl TwoLetterChains {
         if second <= b' ' {
             return false;
         }
-        if let Some(&chain) = self.verdicts.get(&[first, second]) {
+        if let Some(&chain) = self.is_chain_name.get(&[first, second]) {
             return chain;
         }
-        // Without evidence for this pair, the name decides. Short names are right-aligned in columns 18 to 20.
-        let (three, four) = (Name::of(&[a, b, c]), Name::of(&columns[..4]));
+        // Without evidence for this pair, the residue name determines it. Short names are right-aligned in columns 18
+        // to 20.
+        let (three, four) = (NameLists::of(&[a, b, c]), NameLists::of(&columns[..4]));
         if [a, b, c].contains(&b' ') {
             self.all != Some(false)
         } else if four.four_letters {
@@ -58,13 +59,13 @@ impl TwoLetterChains {
 
 /// Lists of residue names that contain a name.
 #[derive(Debug, Clone, Copy, Default)]
-struct Name {
+struct NameLists {
     polymer: bool,
     water: bool,
     four_letters: bool,
 }
 
-impl Name {
+impl NameLists {
     fn of(columns: &[u8]) -> Self {
         let Ok(name) = std::str::from_utf8(columns.trim_ascii()) else { return Self::default() };
         Self { polymer: is_polymer(name), water: is_water(name), four_letters: is_four_letters(name) }
@@ -72,17 +73,17 @@ impl Name {
 }
 
 /// Columns 18-27 of a residue: name, chain and number.
-type Residue = [u8; 10];
+type ResidueText = [u8; 10];
 
 /// Evidence on pairs of letters, from the residues and SEQRES records of a file.
 #[derive(Debug, Default)]
 struct Evidence {
-    /// For each pair, the numbers of consecutive residues in a chain that keep it and that change it.
-    counts: HashMap<Pair, [u64; 2]>,
+    /// For each pair, how often the next residue of a chain has the same pair, and how often another one.
+    counts: HashMap<ChainLetters, [u64; 2]>,
     /// Pairs named by SEQRES records.
-    listed: HashSet<Pair>,
+    listed: HashSet<ChainLetters>,
     /// Residue of the previous ATOM record; `None` where a chain may end.
-    before: Option<Residue>,
+    before: Option<ResidueText>,
 }
 
 impl Evidence {
@@ -112,7 +113,7 @@ impl Evidence {
 
     #[inline]
     fn atom(&mut self, card: &Card) {
-        let mut here = Residue::default();
+        let mut here = ResidueText::default();
         here.copy_from_slice(&card[17..27]);
         if self.before != Some(here) {
             if let Some(before) = self.before {
@@ -123,7 +124,7 @@ impl Evidence {
     }
 
     /// Counts a pair of consecutive residues, if their numbers are consecutive too.
-    fn step(&mut self, before: Residue, here: Residue) {
+    fn step(&mut self, before: ResidueText, here: ResidueText) {
         let letters = [before[3], here[3]].map(|b| if b <= b' ' { b' ' } else { b });
         if before[4] != here[4] || letters == [b' '; 2] || before[..4] == here[..4] {
             return;
@@ -132,13 +133,13 @@ impl Evidence {
         if n != m + 1 {
             return;
         }
-        let names = [before, here].map(|residue| Name::of(&residue[..3]));
+        let names = [before, here].map(|residue| NameLists::of(&residue[..3]));
         if names.iter().any(|name| name.water) {
             return;
         }
         if letters[0] == letters[1] {
             // Four-letter names may follow each other: lipids POPC and DOPC, residues GLUH and LYSH.
-            let four = [before, here].map(|residue| Name::of(&residue[..4]).four_letters);
+            let four = [before, here].map(|residue| NameLists::of(&residue[..4]).four_letters);
             if names.iter().all(|name| name.polymer) && four != [true; 2] {
                 self.counts.entry([letters[0], here[4]]).or_default()[0] += 1;
             }
@@ -149,13 +150,13 @@ impl Evidence {
         }
     }
 
-    fn verdicts(self) -> HashMap<Pair, bool> {
+    fn chain_names(self) -> HashMap<ChainLetters, bool> {
         let counted = self.counts.into_iter().map(|(pair, [stays, changes])| (pair, stays > changes));
         counted.chain(self.listed.into_iter().map(|pair| (pair, true))).collect()
     }
 }
 
-fn number(residue: Residue) -> Option<i64> {
+fn number(residue: ResidueText) -> Option<i64> {
     let mut card = [b' '; 80];
     card[17..27].copy_from_slice(&residue);
     residue_number(&card).ok().map(|(number, _)| number.into())

@@ -1,10 +1,10 @@
 //! Reader of PDB files, including common deviations from the format.
 //!
 //! Code counts columns from 0; comments and messages count from 1, as the format description (wwPDB, version 3.3) does.
-//! The reader uses ATOM, HETATM, MODEL, ENDMDL, END, HEADER, TITLE, SEQRES, MODRES and REMARK 350 records. It ignores
-//! atom serial numbers, so their overflow is harmless. Supported deviations: lines that end after the coordinates,
-//! hybrid-36 and five-digit residue numbers, four-letter residue names, two-letter chain names, missing element
-//! columns, entry id and line number in columns 73-80 (before 1996), tabs, any line ending.
+//! The reader uses ATOM, HETATM, MODEL, ENDMDL, END, HEADER, TITLE, SEQRES, MODRES, HELIX, SHEET and REMARK 350
+//! records. It ignores atom serial numbers, so their overflow is harmless. Supported deviations: lines that end after
+//! the coordinates, hybrid-36 and five-digit residue numbers, four-letter residue names, two-letter chain names,
+//! missing element columns, entry id and line number in columns 73-80 (before 1996), tabs, any line ending.
 //!
 //! A first pass over the pieces of the file finds its [`records`], a second one reads the [`atoms`].
 
@@ -21,8 +21,9 @@ use std::collections::HashSet;
 use self::assemblies::Remark350;
 use self::atoms::{Atoms, File};
 use self::lines::Lines;
-use self::records::{Boundary, Line, Mark, Records};
-use super::atoms::{Columns, Slices, Source, SourceFormat, Structure, join};
+use self::records::{Line, Mark, ModelBoundary, PieceRecords};
+use super::annotations::Annotations;
+use super::atoms::{Columns, Slices, SourceFields, SourceFormat, Structure, join};
 use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pieces;
@@ -30,7 +31,7 @@ use super::read::Reading;
 use super::text::{self, normalize};
 use super::warnings::Warnings;
 
-/// Longest title, characters.
+/// Maximum length of a title, characters.
 pub(super) const MAX_TITLE: usize = 1000;
 
 /// Lines between two checks of the cancellation flag: a few milliseconds.
@@ -39,7 +40,7 @@ const LINES_PER_CHECK: usize = 1 << 14;
 pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     let file = File::new(text);
     let mut ranges = pieces::cut(text, 0, reading.n_pieces(text.len()));
-    let found = pieces::map(&mut ranges, |range| Records::find(&file, range.clone(), reading));
+    let found = pieces::map(&mut ranges, |range| PieceRecords::find(&file, range.clone(), reading));
     let mut found = found.into_iter().collect::<Result<Vec<_>, _>>()?;
     let fault = found.iter().position(|records| records.fault.is_some()).and_then(|last| {
         found.truncate(last + 1);
@@ -72,21 +73,23 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
     memory.keep();
     number_models(&found, &mut columns.model);
     let (mut id, mut title, mut listed) = (None, Vec::new(), HashSet::new());
-    let mut assemblies = Remark350::default();
+    let (mut assemblies, mut annotations) = (Remark350::default(), Annotations::default());
     for records in found {
         id = id.or(records.id);
         title.extend(records.title);
         listed.extend(records.listed);
+        annotations.secondary.extend(records.secondary);
         for (start, end) in records.assemblies {
             assemblies.line(&text[start..end], reading)?;
         }
     }
-    let source = Source {
+    let source = SourceFields {
         format: SourceFormat::Pdb,
         id,
         title: normalize(&title, MAX_TITLE),
         sequence: Sequence { listed, ..Sequence::default() },
         assemblies: assemblies.finish(reading)?,
+        annotations,
         radii: Vec::new(),
         warnings: warnings.messages(|fault| fault.locate(text)),
     };
@@ -94,15 +97,15 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
 }
 
 /// Lines of the atoms of a piece, and their rows.
-type Part<'a> = (&'a [Line], Slices<'a>);
+type PieceAtoms<'a> = (&'a [Line], Slices<'a>);
 
 /// Reads the atoms of all pieces, each into its rows.
 fn read_atoms<'f>(
     file: &'f File<'f>,
-    parts: &mut [Part<'_>],
+    parts: &mut [PieceAtoms<'_>],
     reading: &Reading<'_>,
 ) -> Result<Vec<Atoms<'f>>, StructureError> {
-    let pass = |parts: &mut [Part<'_>], left_justified| {
+    let pass = |parts: &mut [PieceAtoms<'_>], left_justified| {
         let read = pieces::map(parts, |(lines, rows)| Atoms::read(file, left_justified, lines, rows, reading));
         read.into_iter().collect::<Result<Vec<_>, _>>()
     };
@@ -118,7 +121,7 @@ fn read_atoms<'f>(
 }
 
 /// Sets the model numbers of all rows.
-fn number_models(found: &[Records], mut rows: &mut [i32]) {
+fn number_models(found: &[PieceRecords], mut rows: &mut [i32]) {
     let mut models = Models::default();
     for records in found {
         let mut first = 0;
@@ -126,8 +129,8 @@ fn number_models(found: &[Records], mut rows: &mut [i32]) {
             rows = models.fill(rows, row - first);
             first = row;
             match boundary {
-                Boundary::Begins(number) => models.begin(number),
-                Boundary::Ends => models.current = None,
+                ModelBoundary::Begins(number) => models.begin(number),
+                ModelBoundary::Ends => models.current = None,
             }
         }
         rows = models.fill(rows, records.atoms.len() - first);

@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 use std::ops::Range;
 
+use super::super::annotations::SecondaryRange;
 use super::super::error::StructureError;
 use super::super::kinds::Listed;
 use super::super::number;
@@ -35,27 +36,27 @@ impl Line {
 
 /// Record at the beginning or end of a model.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Boundary {
+pub(super) enum ModelBoundary {
     /// MODEL, with its number if it has one.
     Begins(Option<i32>),
     /// ENDMDL or END.
     Ends,
 }
 
-/// Place of a boundary among the atoms.
+/// Boundary of a model, with its position among the atoms.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Mark {
     /// Number of atoms before it in its piece.
     pub(super) row: usize,
-    pub(super) boundary: Boundary,
+    pub(super) boundary: ModelBoundary,
 }
 
-/// Memory of a mark and its model among the known ones, or of a REMARK 350 record, bytes.
+/// Memory of a mark and its model among the known ones, or of a REMARK 350, HELIX or SHEET record, bytes.
 const BYTES_PER_MARK: u64 = 64;
 
 /// Records of a piece.
 #[derive(Debug, Default)]
-pub(super) struct Records {
+pub(super) struct PieceRecords {
     /// ATOM and HETATM records.
     pub(super) atoms: Vec<Line>,
     pub(super) marks: Vec<Mark>,
@@ -63,13 +64,15 @@ pub(super) struct Records {
     pub(super) title: Vec<u8>,
     /// REMARK 350 records, as ranges of the text.
     pub(super) assemblies: Vec<(usize, usize)>,
+    /// HELIX and SHEET records.
+    pub(super) secondary: Vec<SecondaryRange>,
     /// Chains and residue names in SEQRES and MODRES records.
     pub(super) listed: HashSet<Listed>,
     /// The first fault. Records after it are missing.
     pub(super) fault: Option<Box<Fault>>,
 }
 
-impl Records {
+impl PieceRecords {
     /// Finds the records of a piece of a file.
     ///
     /// # Errors
@@ -95,9 +98,9 @@ impl Records {
         Ok(records)
     }
 
-    /// Returns the number of marks and REMARK 350 records.
+    /// Returns the number of marks and of REMARK 350, HELIX and SHEET records.
     fn n_noted(&self) -> usize {
-        self.marks.len() + self.assemblies.len()
+        self.marks.len() + self.assemblies.len() + self.secondary.len()
     }
 
     #[inline]
@@ -123,12 +126,13 @@ impl Records {
         let word = &line[..line.len().min(6)];
         match word.trim_ascii_end() {
             b"MODEL" => {
-                let boundary = Boundary::Begins(model_number(start, line)?);
+                let boundary = ModelBoundary::Begins(model_number(start, line)?);
                 self.marks.push(Mark { row: self.atoms.len(), boundary });
             }
-            b"ENDMDL" | b"END" => self.marks.push(Mark { row: self.atoms.len(), boundary: Boundary::Ends }),
+            b"ENDMDL" | b"END" => self.marks.push(Mark { row: self.atoms.len(), boundary: ModelBoundary::Ends }),
             b"SEQRES" => sequence::of_chain(line, &mut self.listed),
             b"MODRES" => sequence::of_residue(line, &mut self.listed),
+            b"HELIX" | b"SHEET" => self.secondary.extend(SecondaryRange::of_record(line)),
             b"HEADER" if self.id.is_none() => {
                 let id = line.get(62..66).unwrap_or_default();
                 if id.first().is_some_and(u8::is_ascii_digit) && id.iter().all(u8::is_ascii_alphanumeric) {

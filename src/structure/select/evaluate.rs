@@ -19,6 +19,8 @@ pub(super) struct Marks {
 pub(super) struct Evaluation<'a> {
     pub(super) structure: &'a Structure,
     pub(super) control: &'a Control<'a>,
+    /// Number of tested distances.
+    pub(super) distances: near::TestCount,
     /// Atoms that can be meshed; `within` and `byres` ignore the others. `None` if no condition depends on other atoms.
     pub(super) usable: Option<Marks>,
 }
@@ -67,7 +69,7 @@ impl Evaluation<'_> {
             Condition::Within(distance, of) => {
                 let of = self.usable(self.marks(of)?);
                 let mut marks = self.each(|_| false)?;
-                near::mark(s, &of.atoms, distance.angstrom(), &mut marks.atoms, self.control)?;
+                near::mark(s, &of.atoms, distance.angstrom(), &mut marks.atoms, &self.distances, self.control)?;
                 Ok(marks)
             }
             Condition::ByResidue(of) => {

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use crate::structure::{Kind, Structure};
 
-/// Largest number of residue names that are counted separately.
+/// Maximum number of residue names that are counted separately.
 const MAX_NAMES: usize = 10;
 
 /// Atoms of the model that were not selected. Each is counted under the first reason that applies, in field order.
@@ -32,6 +32,14 @@ impl LeftOut {
     pub fn total(&self) -> u64 {
         let of_kinds: u64 = self.kinds.iter().map(|(_, n)| n).sum();
         of_kinds + self.other_chains + self.virtual_sites + self.hydrogens + self.alternatives
+    }
+
+    /// Adds the counts of other atoms, without kinds and residue names.
+    pub(super) fn add(&mut self, other: &Self) {
+        self.other_chains += other.other_chains;
+        self.virtual_sites += other.virtual_sites;
+        self.hydrogens += other.hydrogens;
+        self.alternatives += other.alternatives;
     }
 
     /// Sets the counts of kinds and residue names.
@@ -69,6 +77,12 @@ impl Tally {
             self.latest = (residue, kind);
         }
         self.pending += 1;
+    }
+
+    /// Adds the counts of other atoms.
+    pub(super) fn append(&mut self, other: Self) {
+        self.flush();
+        other.finish().into_iter().for_each(|(key, n)| *self.counts.entry(key).or_default() += n);
     }
 
     fn flush(&mut self) {

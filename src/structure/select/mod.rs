@@ -7,22 +7,23 @@ mod near;
 mod parse;
 
 use std::collections::HashSet;
+use std::ops::Range;
 
-use evaluate::Evaluation;
+use evaluate::{Evaluation, Marks};
 pub use expression::Expression;
 pub use left_out::LeftOut;
 use left_out::Tally;
 pub use parse::{BadExpression, MAX_DEPTH, MAX_DISTANCE, MAX_WITHIN};
 use rayon::prelude::*;
 
-use super::altloc::{ATOMS_PER_CHECK, Alternatives};
+use super::altloc::Alternatives;
 use super::atoms::Structure;
 use super::contents::{Contents, Kind};
 use super::copies::{Assembly, PlacedCopy};
-use super::duplicates;
 use super::error::StructureError;
 use super::read::{ReadLimits, Reading, check};
 use super::text::list;
+use super::{duplicates, pieces};
 use crate::surface::{Control, Spheres, SurfaceError};
 
 /// Selection of atoms. Default: first model, polymer, no hydrogens, alternative locations with the highest occupancy.
@@ -45,7 +46,7 @@ pub struct Selection {
 pub struct Selected {
     /// Indices of the selected atoms in the columns of the structure: ascending, or by copy in an assembly.
     pub atoms: Vec<u32>,
-    /// Copies that make up the assembly; empty for the asymmetric unit.
+    /// Copies that form the assembly; empty for the asymmetric unit.
     pub copies: Vec<PlacedCopy>,
     /// Number of selected atoms before they were copied.
     pub n_distinct: usize,
@@ -55,7 +56,7 @@ pub struct Selected {
     pub left_out: LeftOut,
 }
 
-/// Minimum number of atoms of a copy that a task moves.
+/// Number of atoms that a task selects or copies, and minimum number that a task moves: about 0.1 ms of work.
 const ATOMS_PER_TASK: usize = 1 << 14;
 
 /// Selects atoms.
@@ -73,7 +74,8 @@ pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, 
 /// memory of an assembly to the meter of `control`.
 ///
 /// # Errors
-/// Returns the errors of [`select`], [`StructureError::Memory`] and [`StructureError::Cancelled`].
+/// Returns the errors of [`select`], [`StructureError::TooManyDistances`], [`StructureError::Memory`] and
+/// [`StructureError::Cancelled`].
 pub fn select_with(
     structure: &Structure,
     selection: &Selection,
@@ -93,7 +95,8 @@ pub fn select_with(
     condition.chains(&mut names);
     // Fails for chains that do not exist.
     self::chains(structure, names, SELECTED_CHAIN)?;
-    let mut evaluation = Evaluation { structure, control, usable: None };
+    let distances = near::TestCount::new(limits);
+    let mut evaluation = Evaluation { structure, control, distances, usable: None };
     if condition.depends_on_others() {
         evaluation.usable = Some(evaluation.each(|i| {
             structure.model[i] == model
@@ -103,32 +106,9 @@ pub fn select_with(
         })?);
     }
     let marks = evaluation.marks(condition)?;
-    let (mut left_out, mut residues) = (LeftOut::default(), Tally::default());
-    let mut atoms: Vec<u32> = Vec::new();
-    // The reader limits the number of atoms, so indices have 32 bits.
-    for (i, index) in (0..structure.len()).zip(0_u32..) {
-        if i % ATOMS_PER_CHECK == 0 {
-            check(control)?;
-        }
-        if structure.model[i] != model {
-            continue;
-        }
-        if chains.as_ref().is_some_and(|chains| !chains[structure.chain.id(i) as usize])
-            || assembly.as_ref().is_some_and(|assembly| !assembly.covers(i))
-        {
-            left_out.other_chains += 1;
-        } else if structure.kind[i] == Kind::VirtualSite {
-            left_out.virtual_sites += 1;
-        } else if !marks.atoms[i] {
-            residues.add(structure.residue.id(i), structure.kind[i]);
-        } else if !hydrogens && structure.is_hydrogen(i) {
-            left_out.hydrogens += 1;
-        } else if !alternatives.keeps(structure, i) {
-            left_out.alternatives += 1;
-        } else {
-            atoms.push(index);
-        }
-    }
+    let rules =
+        Rules { structure, model, chains, assembly: assembly.as_ref(), marks, hydrogens: *hydrogens, alternatives };
+    let Found { atoms, mut left_out, residues } = rules.find(control)?;
     if atoms.is_empty() {
         return Err(StructureError::EmptySelection { holds: holds(structure, selection, model) });
     }
@@ -140,13 +120,78 @@ pub fn select_with(
     }
 }
 
+/// Rules by which atoms are selected.
+struct Rules<'a> {
+    structure: &'a Structure,
+    model: i32,
+    /// True for selected chains, by id.
+    chains: Option<Vec<bool>>,
+    assembly: Option<&'a Assembly<'a>>,
+    marks: Marks,
+    hydrogens: bool,
+    alternatives: Alternatives,
+}
+
+/// Selected atoms, and counts of the others.
+#[derive(Default)]
+struct Found {
+    atoms: Vec<u32>,
+    left_out: LeftOut,
+    residues: Tally,
+}
+
+impl Rules<'_> {
+    /// Finds the selected atoms, in parallel.
+    fn find(&self, control: &Control<'_>) -> Result<Found, StructureError> {
+        let n = self.structure.len();
+        let range = |first| first..n.min(first + ATOMS_PER_TASK);
+        let mut ranges: Vec<Range<usize>> = (0..n).step_by(ATOMS_PER_TASK).map(range).collect();
+        let parts = pieces::map(&mut ranges, |range| check(control).map(|()| self.find_in(range.clone())));
+        let mut found = Found::default();
+        for part in parts {
+            let Found { atoms, left_out, residues } = part?;
+            found.atoms.extend_from_slice(&atoms);
+            found.left_out.add(&left_out);
+            found.residues.append(residues);
+        }
+        Ok(found)
+    }
+
+    fn find_in(&self, range: Range<usize>) -> Found {
+        let Self { structure, chains, assembly, .. } = self;
+        let Found { mut atoms, mut left_out, mut residues } = Found::default();
+        for i in range {
+            if structure.model[i] != self.model {
+                continue;
+            }
+            if chains.as_ref().is_some_and(|chains| !chains[structure.chain.id(i) as usize])
+                || assembly.is_some_and(|assembly| !assembly.covers(i))
+            {
+                left_out.other_chains += 1;
+            } else if structure.kind[i] == Kind::VirtualSite {
+                left_out.virtual_sites += 1;
+            } else if !self.marks.atoms[i] {
+                residues.add(structure.residue.id(i), structure.kind[i]);
+            } else if !self.hydrogens && structure.is_hydrogen(i) {
+                left_out.hydrogens += 1;
+            } else if !self.alternatives.keeps(structure, i) {
+                left_out.alternatives += 1;
+            } else {
+                // The reader limits the number of atoms, so indices have 32 bits.
+                atoms.push(u32::try_from(i).unwrap_or(u32::MAX));
+            }
+        }
+        Found { atoms, left_out, residues }
+    }
+}
+
 fn model(structure: &Structure, selection: &Selection) -> Result<i32, StructureError> {
     match selection.model {
         None => Ok(structure.model.first().copied().unwrap_or(1)),
-        Some(asked) if structure.model.contains(&asked) => Ok(asked),
-        Some(asked) => Err(StructureError::NotFound {
+        Some(requested) if structure.model.contains(&requested) => Ok(requested),
+        Some(requested) => Err(StructureError::NotFound {
             what: "model",
-            asked: asked.to_string(),
+            requested: requested.to_string(),
             available: Contents::of(structure, None).model_list(),
         }),
     }
@@ -155,21 +200,21 @@ fn model(structure: &Structure, selection: &Selection) -> Result<i32, StructureE
 /// Name of chains in an expression, in [`StructureError::NotFound`].
 const SELECTED_CHAIN: &str = "selected chain";
 
-/// Returns, for each text of the chain column, true if it is one of `asked`. `_` is the blank chain unless a chain has
-/// this name.
+/// Returns, for each text of the chain column, true if it is one of `requested`. `_` is the blank chain unless a chain
+/// has this name.
 fn chains<'a>(
     structure: &'a Structure,
-    asked: impl IntoIterator<Item = &'a str>,
+    requested: impl IntoIterator<Item = &'a str>,
     what: &'static str,
 ) -> Result<Vec<bool>, StructureError> {
     let known: HashSet<&str> = structure.chain.texts().collect();
     let mut names: HashSet<&str> = HashSet::new();
-    for name in asked {
-        let name = if name == "_" && !known.contains("_") { "" } else { name };
+    for requested in requested {
+        let name = if requested == "_" && !known.contains("_") { "" } else { requested };
         if !known.contains(name) {
             return Err(StructureError::NotFound {
                 what,
-                asked: format!("`{}`", name.chars().take(40).collect::<String>()),
+                requested: format!("`{}`", requested.chars().take(40).collect::<String>()),
                 available: Contents::of(structure, None).chain_list(),
             });
         }
@@ -179,19 +224,23 @@ fn chains<'a>(
 }
 
 fn alternative(structure: &Structure, selection: &Selection, model: i32) -> Result<Option<u8>, StructureError> {
-    let Some(asked) = selection.altloc else { return Ok(None) };
+    let Some(requested) = selection.altloc else { return Ok(None) };
     let mut present = [false; 256];
     for (altloc, _) in structure.altloc.iter().zip(&structure.model).filter(|(_, m)| **m == model) {
         present[usize::from(*altloc)] = true;
     }
-    match u8::try_from(asked) {
+    match u8::try_from(requested) {
         Ok(letter) if letter != 0 && present[usize::from(letter)] => Ok(Some(letter)),
         _ => {
             let letters: Vec<String> =
                 (1..=u8::MAX).filter(|&b| present[usize::from(b)]).map(|b| char::from(b).into()).collect();
             let n = letters.len();
             let available = if n == 0 { "none".to_owned() } else { list(letters, n) };
-            Err(StructureError::NotFound { what: "alternative location", asked: format!("`{asked}`"), available })
+            Err(StructureError::NotFound {
+                what: "alternative location",
+                requested: format!("`{requested}`"),
+                available,
+            })
         }
     }
 }
@@ -212,17 +261,21 @@ fn holds(structure: &Structure, selection: &Selection, model: i32) -> String {
     if !heavy && counts.hydrogens > 0 {
         kinds = vec!["all"];
     }
-    let asked: String = selection.atoms.to_string().chars().take(200).collect();
+    let hint = if kinds.is_empty() {
+        "an atom of radius 0 and a site that is not an atom have no surface".to_owned()
+    } else {
+        format!("`select={}` selects them", kinds.join(","))
+    };
+    let requested: String = selection.atoms.to_string().chars().take(200).collect();
     let chains = match &selection.chains {
         Some(names) => format!(" of chains {}", list(names.iter().cloned(), names.len())),
         None => String::new(),
     };
     let assembly = selection.assembly.as_ref().map(|id| format!(" in assembly {id}")).unwrap_or_default();
     format!(
-        "{asked}{chains}{assembly} was requested; model {model} has {counts} in {}; the file has {}; `select={}` selects them",
+        "{requested}{chains}{assembly} was requested; model {model} has {counts} in {}; the file has {}; {hint}",
         contents.chain_list(),
         contents.model_list(),
-        kinds.join(",")
     )
 }
 
@@ -232,9 +285,16 @@ impl Selected {
     /// # Errors
     /// Returns [`SurfaceError::BadSphere`] if a coordinate is out of range.
     pub fn spheres(&self, structure: &Structure) -> Result<Spheres, SurfaceError> {
-        let column = |c: &[f64]| self.atoms.iter().map(|&i| c[i as usize]).collect::<Vec<_>>();
-        let r = self.atoms.iter().map(|&i| structure.vdw_radius(i as usize)).collect();
-        let (mut x, mut y, mut z) = (column(&structure.x), column(&structure.y), column(&structure.z));
+        let (n, atoms) = (self.atoms.len(), self.atoms.chunks(ATOMS_PER_TASK));
+        let (mut x, mut y, mut z, mut r) = (vec![0.0; n], vec![0.0; n], vec![0.0; n], vec![0.0; n]);
+        let centres = x.chunks_mut(ATOMS_PER_TASK).zip(y.chunks_mut(ATOMS_PER_TASK)).zip(z.chunks_mut(ATOMS_PER_TASK));
+        let mut parts: Vec<_> = atoms.zip(centres).zip(r.chunks_mut(ATOMS_PER_TASK)).collect();
+        pieces::map(&mut parts, |((atoms, ((x, y), z)), r)| {
+            for (row, i) in atoms.iter().map(|&i| i as usize).enumerate() {
+                (x[row], y[row], z[row]) = (structure.x[i], structure.y[i], structure.z[i]);
+                r[row] = structure.vdw_radius(i);
+            }
+        });
         for PlacedCopy { rows, operator } in &self.copies {
             let rows = || rows.clone();
             let moved = (&mut x[rows()], &mut y[rows()], &mut z[rows()]).into_par_iter().with_min_len(ATOMS_PER_TASK);

@@ -1,25 +1,30 @@
 //! Atoms near other atoms, on a uniform grid.
 //!
-//! The result equals that of testing `dx² + dy² + dz² ≤ d²` in double precision for all pairs: the bounds of a cell are
-//! tested with the same operations, which are monotone.
+//! The result equals that of testing `dx² + dy² + dz² ≤ d²` in double precision for all pairs. The bounds of a cell are
+//! tested with the same operations; rounding keeps their order.
+
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use rayon::prelude::*;
 
-use crate::structure::read::check;
+use crate::structure::altloc::ATOMS_PER_CHECK;
+use crate::structure::read::{ReadLimits, check};
 use crate::structure::{Structure, StructureError};
 use crate::surface::{Control, MemoryMeter as _, Reservation};
 
 type Point = [f64; 3];
 
-/// Number of atoms that a thread tests between two checks of the cancellation flag.
+/// Number of atoms that a task tests.
 const ATOMS_PER_TASK: usize = 4096;
+/// Number of tested distances between two checks of limit and cancellation: they take less than 0.1 ms.
+const TESTS_PER_CHECK: usize = 1 << 15;
 /// The grid has at most `MIN_CELLS + CELLS_PER_ATOM · n` cells for `n` atoms.
 const CELLS_PER_ATOM: f64 = 4.0;
 const MIN_CELLS: f64 = 4096.0;
 /// Distance above which cells are half as long as the distance, Å.
 const LONG_DISTANCE: f64 = 8.0;
-/// Number of points up to which testing all points of a cell is faster than testing its bounds.
-const FEW_POINTS: usize = 16;
+/// Number of points of a cell up to which testing all of them is faster than testing its bounds.
+const MAX_TESTED_POINTS: usize = 16;
 /// Margin of the distance when cells are chosen, Å. It exceeds all rounding of coordinates.
 const SLACK: f64 = 1e-6;
 
@@ -30,19 +35,58 @@ pub(super) fn mark(
     of: &[bool],
     distance: f64,
     marks: &mut [bool],
+    tests: &TestCount,
     control: &Control<'_>,
 ) -> Result<(), StructureError> {
     let Some(first) = of.iter().position(|&mark| mark) else { return Ok(()) };
     let model = structure.model[first];
     let memory = Reservation::new(&control.memory);
-    let grid = Grid::new(structure, of, distance, &memory, control)?;
+    let grid = PointGrid::new(structure, of, distance, &memory, control)?;
     marks.par_chunks_mut(ATOMS_PER_TASK).enumerate().try_for_each(|(part, marks)| {
-        check(control)?;
+        let mut tests = Tests { count: tests, control, uncounted: 0 };
         for (i, mark) in (ATOMS_PER_TASK * part..).zip(marks) {
-            *mark = structure.model[i] == model && grid.is_near(position(structure, i));
+            *mark = structure.model[i] == model && grid.is_near(position(structure, i), &mut tests)?;
         }
-        Ok(())
+        tests.count()
     })
+}
+
+/// Number of tested distances, which determines the time of a selection.
+pub(super) struct TestCount {
+    so_far: AtomicU64,
+    limit: u64,
+}
+
+impl TestCount {
+    /// Starts at 0.
+    pub(super) fn new(limits: &ReadLimits) -> Self {
+        Self { so_far: AtomicU64::new(0), limit: limits.max_distances }
+    }
+}
+
+/// Tests of distances by one thread.
+struct Tests<'a> {
+    count: &'a TestCount,
+    control: &'a Control<'a>,
+    /// Number of tests that `count` does not include yet.
+    uncounted: usize,
+}
+
+impl Tests<'_> {
+    /// Adds `n` tests. Checks limit and cancellation from time to time.
+    #[inline]
+    fn add(&mut self, n: usize) -> Result<(), StructureError> {
+        self.uncounted += n;
+        if self.uncounted < TESTS_PER_CHECK { Ok(()) } else { self.count() }
+    }
+
+    /// Counts the tests so far, so that their total does not depend on threads.
+    fn count(&mut self) -> Result<(), StructureError> {
+        check(self.control)?;
+        let (TestCount { so_far, limit }, new) = (self.count, std::mem::take(&mut self.uncounted) as u64);
+        let tests = so_far.fetch_add(new, Ordering::Relaxed) + new;
+        if tests <= *limit { Ok(()) } else { Err(StructureError::TooManyDistances { limit: *limit }) }
+    }
 }
 
 fn position(structure: &Structure, i: usize) -> Point {
@@ -51,12 +95,12 @@ fn position(structure: &Structure, i: usize) -> Point {
 
 /// Lowest and highest coordinates.
 #[derive(Debug, Clone, Copy)]
-struct Bounds {
+struct PointBox {
     low: Point,
     high: Point,
 }
 
-impl Bounds {
+impl PointBox {
     const NONE: Self = Self { low: [f64::INFINITY; 3], high: [f64::NEG_INFINITY; 3] };
 
     fn add(&mut self, point: Point) {
@@ -64,7 +108,7 @@ impl Bounds {
         self.high = std::array::from_fn(|k| self.high[k].max(point[k]));
     }
 
-    /// Returns the least and greatest squared distance between `point` and points in the box.
+    /// Returns the minimum and maximum squared distance between `point` and points in the box.
     fn distances2(&self, point: Point) -> [f64; 2] {
         let ends: [[f64; 2]; 3] = std::array::from_fn(|k| [point[k] - self.low[k], point[k] - self.high[k]]);
         let least = ends.map(|[from_low, from_high]| (-from_low).max(from_high).max(0.0));
@@ -84,7 +128,7 @@ fn square([x, y, z]: Point) -> f64 {
 }
 
 /// Points in the cells of a uniform grid.
-struct Grid {
+struct PointGrid {
     distance: f64,
     distance2: f64,
     low: Point,
@@ -93,14 +137,14 @@ struct Grid {
     /// Number of each cell among the occupied ones, from 1; 0 for empty cells.
     slots: Vec<u32>,
     /// Bounds of the points in each occupied cell.
-    bounds: Vec<Bounds>,
+    bounds: Vec<PointBox>,
     /// Index of the first point of each occupied cell; the last element is the number of points.
     first: Vec<u32>,
     points: Vec<Point>,
 }
 
-impl Grid {
-    /// Sorts the marked atoms, at least one, into cells.
+impl PointGrid {
+    /// Sorts the marked atoms into cells. There is at least one.
     fn new(
         structure: &Structure,
         marked: &[bool],
@@ -109,15 +153,19 @@ impl Grid {
         control: &Control<'_>,
     ) -> Result<Self, StructureError> {
         let atoms = || (0..structure.len()).filter(|&i| marked[i]).map(|i| position(structure, i));
-        let (mut all, mut n_points) = (Bounds::NONE, 0_usize);
-        atoms().for_each(|point| {
+        let (mut all, mut n_points) = (PointBox::NONE, 0_usize);
+        for point in atoms() {
+            if n_points % ATOMS_PER_CHECK == 0 {
+                check(control)?;
+            }
             all.add(point);
             n_points += 1;
-        });
+        }
         let size: Point = std::array::from_fn(|k| all.high[k] - all.low[k]);
         let sides = |cell: f64| size.map(|side| (side / cell).floor() + 1.0);
         let most = MIN_CELLS + CELLS_PER_ATOM * n_points as f64;
-        // Large cells have many points. In cells smaller than the distance, testing the bounds settles most of them.
+        // Large cells have many points. If cells are smaller than the distance, testing the bounds is enough for most
+        // cells.
         let mut cell = if distance > LONG_DISTANCE { 0.5 * distance } else { distance };
         while sides(cell).iter().product::<f64>() > most {
             cell *= 1.25;
@@ -125,7 +173,7 @@ impl Grid {
         let n = sides(cell).map(whole);
         let n_cells = n.iter().product::<usize>();
         // There are at most as many occupied cells as points.
-        memory.grow((4 * n_cells + n_points * (size_of::<Bounds>() + size_of::<Point>() + 8)) as u64)?;
+        memory.grow((4 * n_cells + n_points * (size_of::<PointBox>() + size_of::<Point>() + 8)) as u64)?;
         let mut grid = Self {
             distance,
             distance2: distance * distance,
@@ -137,12 +185,14 @@ impl Grid {
             first: Vec::new(),
             points: vec![[0.0; 3]; n_points],
         };
-        check(control)?;
         let (mut counts, mut n_slots): (Vec<u32>, u32) = (Vec::new(), 0);
-        for point in atoms() {
+        for (n, point) in atoms().enumerate() {
+            if n % ATOMS_PER_CHECK == 0 {
+                check(control)?;
+            }
             let index = grid.index(grid.cell_of(point));
             if grid.slots[index] == 0 {
-                grid.bounds.push(Bounds::NONE);
+                grid.bounds.push(PointBox::NONE);
                 counts.push(0);
                 n_slots += 1;
                 grid.slots[index] = n_slots;
@@ -151,20 +201,21 @@ impl Grid {
             grid.bounds[slot].add(point);
             counts[slot] += 1;
         }
-        check(control)?;
         let mut total = 0;
         for count in &mut counts {
             grid.first.push(total);
             total += std::mem::replace(count, total);
         }
         grid.first.push(total);
-        // Each count is now the index of the next free place.
-        for point in atoms() {
+        // Each count is now the index of the next free entry.
+        for (n, point) in atoms().enumerate() {
+            if n % ATOMS_PER_CHECK == 0 {
+                check(control)?;
+            }
             let slot = grid.slots[grid.index(grid.cell_of(point))] as usize - 1;
             grid.points[counts[slot] as usize] = point;
             counts[slot] += 1;
         }
-        check(control)?;
         Ok(grid)
     }
 
@@ -178,39 +229,56 @@ impl Grid {
     }
 
     /// Returns true if a point of the grid is within the distance.
-    fn is_near(&self, point: Point) -> bool {
+    fn is_near(&self, point: Point, tests: &mut Tests<'_>) -> Result<bool, StructureError> {
         let reach = self.distance + SLACK;
         let outside = (0..3).any(|k| {
             let beyond = self.n[k] as f64 * self.cell + reach;
             !(-reach..=beyond).contains(&(point[k] - self.low[k]))
         });
         if outside {
-            return false;
+            return Ok(false);
         }
         // A point in the same cell is almost always within the distance.
-        if self.holds_near(self.cell_of(point), point) {
-            return true;
+        if self.holds_near(self.cell_of(point), point, tests)? {
+            return Ok(true);
         }
         let from = self.cell_of(point.map(|v| v - reach));
         let to = self.cell_of(point.map(|v| v + reach));
-        (from[2]..=to[2])
-            .any(|z| (from[1]..=to[1]).any(|y| (from[0]..=to[0]).any(|x| self.holds_near([x, y, z], point))))
+        for z in from[2]..=to[2] {
+            for y in from[1]..=to[1] {
+                for x in from[0]..=to[0] {
+                    if self.holds_near([x, y, z], point, tests)? {
+                        return Ok(true);
+                    }
+                }
+            }
+        }
+        Ok(false)
     }
 
     /// Returns true if a point in `cell` is within the distance.
-    fn holds_near(&self, cell: [usize; 3], point: Point) -> bool {
+    fn holds_near(&self, cell: [usize; 3], point: Point, tests: &mut Tests<'_>) -> Result<bool, StructureError> {
         let slot = self.slots[self.index(cell)] as usize;
+        tests.add(1)?;
         if slot == 0 {
-            return false;
+            return Ok(false);
         }
         let points = &self.points[self.first[slot - 1] as usize..self.first[slot] as usize];
-        if points.len() > FEW_POINTS {
+        if points.len() > MAX_TESTED_POINTS {
             let [least, greatest] = self.bounds[slot - 1].distances2(point);
             if least > self.distance2 || greatest <= self.distance2 {
-                return greatest <= self.distance2;
+                return Ok(greatest <= self.distance2);
             }
         }
-        points.iter().any(|other| square(std::array::from_fn(|k| point[k] - other[k])) <= self.distance2)
+        let is_near = |other: &Point| square(std::array::from_fn(|k| point[k] - other[k])) <= self.distance2;
+        for points in points.chunks(TESTS_PER_CHECK) {
+            let found = points.iter().position(is_near);
+            tests.add(found.unwrap_or(points.len()))?;
+            if found.is_some() {
+                return Ok(true);
+            }
+        }
+        Ok(false)
     }
 }
 
@@ -218,14 +286,15 @@ impl Grid {
 #[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
-    use crate::structure::{ReadLimits, read};
+    use crate::structure::read;
+    use crate::surface::CancelToken;
 
     /// Returns atoms at these positions, given in units of 0.001 Å.
-    fn atoms(places: &[[i32; 3]]) -> Structure {
-        let rows: String = places
+    fn atoms(positions: &[[i32; 3]]) -> Structure {
+        let rows: String = positions
             .iter()
-            .map(|place| {
-                let [x, y, z] = place.map(|v| f64::from(v) / 1000.0);
+            .map(|position| {
+                let [x, y, z] = position.map(|v| f64::from(v) / 1000.0);
                 format!("ATOM C {x:.3} {y:.3} {z:.3}\n")
             })
             .collect();
@@ -236,7 +305,8 @@ mod tests {
 
     fn near(s: &Structure, of: &[bool], distance: f64) -> Vec<bool> {
         let mut marks = vec![false; s.len()];
-        mark(s, of, distance, &mut marks, &Control::default()).unwrap();
+        let tests = TestCount::new(&ReadLimits::default());
+        mark(s, of, distance, &mut marks, &tests, &Control::default()).unwrap();
         marks
     }
 
@@ -251,9 +321,9 @@ mod tests {
         let sides = [[9_000; 3], [80_000; 3], [60_000, 60_000, 1], [12; 3], [90_000_000; 3]];
         for (i, [x, y, z]) in sides.into_iter().enumerate() {
             let unit = if i == 3 { 1000 } else { 1 };
-            let mut place = || [unit * next(x), unit * next(y), unit * next(z)];
-            let places: Vec<[i32; 3]> = (0..700).map(|_| place()).collect();
-            let s = atoms(&places);
+            let mut point = || [unit * next(x), unit * next(y), unit * next(z)];
+            let positions: Vec<[i32; 3]> = (0..700).map(|_| point()).collect();
+            let s = atoms(&positions);
             for share in [1, 7, 350] {
                 let of: Vec<bool> = (0..s.len()).map(|i| i % share == 0).collect();
                 for distance in [0.001, 1.0, 2.0, 3.75, 5.0, 20.0, 50.0] {
@@ -277,12 +347,35 @@ mod tests {
         assert_eq!(near(&s, &[false; 2], 50.0), [false; 2]);
     }
 
+    /// Two dense clusters around the distance: every cell has near and distant points.
+    #[test]
+    fn the_tests_of_clusters_are_limited_and_stop_at_cancellation() {
+        let side = 100_000;
+        let point = |i: i32| [(i % 2) * 50_000 + i / 2 % 100, i / 200 % 100, i / 20_000];
+        let s = atoms(&(0..side).map(point).collect::<Vec<_>>());
+        let of: Vec<bool> = (0..s.len()).map(|i| i % 2 == 0).collect();
+        let run = |max_distances: u64, control: &Control<'_>| {
+            let tests = TestCount::new(&ReadLimits { max_distances, ..ReadLimits::default() });
+            let marked = mark(&s, &of, 49.95, &mut vec![false; s.len()], &tests, control);
+            (marked, tests.so_far.into_inner())
+        };
+        let (limited, tests) = run(1_000_000, &Control::default());
+        assert_eq!(limited, Err(StructureError::TooManyDistances { limit: 1_000_000 }));
+        // Each thread stops at its next check.
+        let threads = rayon::current_num_threads() as u64;
+        assert!(tests <= 1_000_000 + threads * (2 * TESTS_PER_CHECK as u64 + 1), "{tests}");
+        let cancel = CancelToken::default();
+        cancel.cancel();
+        let (cancelled, tests) = run(u64::MAX, &Control { cancel, ..Control::default() });
+        assert_eq!((cancelled, tests), (Err(StructureError::Cancelled), 0));
+    }
+
     /// Two dense clusters slightly farther apart than the distance: the worst case for a grid.
     #[test]
-    fn distant_crowds_are_compared_by_their_bounds() {
-        let places: Vec<[i32; 3]> =
+    fn distant_clusters_are_compared_by_their_bounds() {
+        let positions: Vec<[i32; 3]> =
             (0..200_000).map(|i| [i % 100 + if i % 2 == 0 { 0 } else { 50_100 }, i / 100 % 100, i / 10_000]).collect();
-        let s = atoms(&places);
+        let s = atoms(&positions);
         let of: Vec<bool> = (0..s.len()).map(|i| i % 2 == 0).collect();
         let start = std::time::Instant::now();
         assert_eq!(near(&s, &of, 50.0), of);

@@ -8,11 +8,11 @@ use super::expression::{ANY_CODE, Condition, Distance, Expression, ResidueRange}
 use crate::structure::KindSet;
 use crate::structure::element::atomic_number;
 
-/// Largest nesting of parentheses, `not`, `byres` and `within`.
+/// Maximum nesting depth of parentheses, `not`, `byres` and `within`.
 pub const MAX_DEPTH: usize = 16;
-/// Largest number of `within` in an expression.
+/// Maximum number of `within` in an expression.
 pub const MAX_WITHIN: usize = 8;
-/// Largest distance of `within`, Å.
+/// Maximum distance of `within`, Å.
 pub const MAX_DISTANCE: u32 = 50;
 
 /// Syntax error of an expression.
@@ -74,7 +74,7 @@ pub(super) fn is_keyword(word: &str) -> bool {
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Token {
+enum ExpressionToken {
     Open,
     Close,
     Comma,
@@ -85,7 +85,7 @@ enum Token {
     End,
 }
 
-impl Token {
+impl ExpressionToken {
     fn found(&self) -> String {
         match self {
             Self::Open => "`(`".to_owned(),
@@ -98,7 +98,7 @@ impl Token {
 }
 
 /// Splits a text into tokens with their positions, from 0.
-fn tokens(text: &str) -> Result<Vec<(usize, Token)>, BadExpression> {
+fn tokens(text: &str) -> Result<Vec<(usize, ExpressionToken)>, BadExpression> {
     let mut tokens = Vec::new();
     let mut rest = text.chars().enumerate().peekable();
     let fault =
@@ -107,9 +107,9 @@ fn tokens(text: &str) -> Result<Vec<(usize, Token)>, BadExpression> {
         let token = match c {
             c if c.is_whitespace() => continue,
             c if c.is_control() => return Err(fault(at, format!("`{}`", c.escape_default()), "no control characters")),
-            '(' => Token::Open,
-            ')' => Token::Close,
-            ',' => Token::Comma,
+            '(' => ExpressionToken::Open,
+            ')' => ExpressionToken::Close,
+            ',' => ExpressionToken::Comma,
             '"' => {
                 let mut value = String::new();
                 loop {
@@ -123,7 +123,7 @@ fn tokens(text: &str) -> Result<Vec<(usize, Token)>, BadExpression> {
                         None => return Err(fault(text.chars().count(), "the end".to_owned(), "a closing `\"`")),
                     }
                 }
-                Token::Quoted(value)
+                ExpressionToken::Quoted(value)
             }
             c => {
                 let mut word = String::from(c);
@@ -131,12 +131,12 @@ fn tokens(text: &str) -> Result<Vec<(usize, Token)>, BadExpression> {
                 while let Some((_, c)) = rest.next_if(|(_, c)| of_word(*c)) {
                     word.push(c);
                 }
-                Token::Word(word)
+                ExpressionToken::Word(word)
             }
         };
         tokens.push((at, token));
     }
-    tokens.push((text.chars().count(), Token::End));
+    tokens.push((text.chars().count(), ExpressionToken::End));
     Ok(tokens)
 }
 
@@ -146,7 +146,8 @@ pub(super) fn expression(text: &str) -> Result<Expression, BadExpression> {
     let mut parser = Parser { tokens: &tokens, next: 0, depth: 0, n_within: 0, hydrogens: false };
     let (mut items, mut with_hydrogens) = (Vec::new(), false);
     loop {
-        let lone = matches!(parser.tokens.get(parser.next + 1), Some((_, Token::Comma | Token::End)));
+        let lone =
+            matches!(parser.tokens.get(parser.next + 1), Some((_, ExpressionToken::Comma | ExpressionToken::End)));
         if lone && HYDROGEN.iter().any(|word| parser.is_at(word)) {
             parser.next += 1;
             with_hydrogens = true;
@@ -154,8 +155,8 @@ pub(super) fn expression(text: &str) -> Result<Expression, BadExpression> {
             items.push(parser.or()?);
         }
         match parser.token() {
-            Token::Comma => parser.next += 1,
-            Token::End => break,
+            ExpressionToken::Comma => parser.next += 1,
+            ExpressionToken::End => break,
             _ => return Err(parser.fault("`and`, `or`, `,` or the end")),
         }
     }
@@ -166,7 +167,7 @@ pub(super) fn expression(text: &str) -> Result<Expression, BadExpression> {
 }
 
 struct Parser<'a> {
-    tokens: &'a [(usize, Token)],
+    tokens: &'a [(usize, ExpressionToken)],
     next: usize,
     depth: usize,
     n_within: usize,
@@ -174,8 +175,8 @@ struct Parser<'a> {
 }
 
 impl Parser<'_> {
-    fn token(&self) -> &Token {
-        self.tokens.get(self.next).map_or(&Token::End, |(_, token)| token)
+    fn token(&self) -> &ExpressionToken {
+        self.tokens.get(self.next).map_or(&ExpressionToken::End, |(_, token)| token)
     }
 
     fn fault(&self, expected: impl Into<String>) -> BadExpression {
@@ -184,7 +185,7 @@ impl Parser<'_> {
     }
 
     fn is_at(&self, word: &str) -> bool {
-        matches!(self.token(), Token::Word(text) if text == word)
+        matches!(self.token(), ExpressionToken::Word(text) if text == word)
     }
 
     /// Skips a keyword. Returns false if it is not there.
@@ -240,10 +241,10 @@ impl Parser<'_> {
             }
             return Ok(Condition::Within(distance, Box::new(self.nested(Self::operand)?)));
         }
-        if *self.token() == Token::Open {
+        if *self.token() == ExpressionToken::Open {
             self.next += 1;
             let condition = self.nested(Self::or)?;
-            if *self.token() != Token::Close {
+            if *self.token() != ExpressionToken::Close {
                 return Err(self.fault("`and`, `or` or `)`"));
             }
             self.next += 1;
@@ -255,7 +256,7 @@ impl Parser<'_> {
     /// Parses a distance with at most three decimals.
     fn distance(&mut self) -> Result<Distance, BadExpression> {
         let expected = format!("a distance above 0 and up to {MAX_DISTANCE} Å with at most three decimals");
-        let Token::Word(text) = self.token() else { return Err(self.fault(expected)) };
+        let ExpressionToken::Word(text) = self.token() else { return Err(self.fault(expected)) };
         let (whole, decimals) = text.split_once('.').unwrap_or((text, ""));
         let digits = |text: &str| text.bytes().all(|b| b.is_ascii_digit());
         let valid = digits(whole) && digits(decimals) && whole.len() <= 4 && decimals.len() <= 3;
@@ -275,7 +276,7 @@ impl Parser<'_> {
         let expected = format!(
             "a kind ({names}, hydrogen, all), `chain`, `resi`, `resn`, `name`, `elem`, `within`, `byres`, `not` or `(`"
         );
-        let Token::Word(word) = self.token() else { return Err(self.fault(expected)) };
+        let ExpressionToken::Word(word) = self.token() else { return Err(self.fault(expected)) };
         let condition = if let Some(set) = KindSet::named(word) {
             Condition::Kinds(set)
         } else if word == "all" {
@@ -299,12 +300,14 @@ impl Parser<'_> {
         let mut values = Vec::new();
         loop {
             let keyword = match self.token() {
-                Token::Quoted(value) => {
+                ExpressionToken::Quoted(value) => {
                     values.push((self.next, value.clone()));
                     None
                 }
-                Token::Word(word) if is_keyword(word) => Some(format!("; `{word}` is a keyword, write it in quotes")),
-                Token::Word(word) => {
+                ExpressionToken::Word(word) if is_keyword(word) => {
+                    Some(format!("; `{word}` is a keyword, write it in quotes"))
+                }
+                ExpressionToken::Word(word) => {
                     let parts: Vec<&str> = word.split('+').collect();
                     let whole = parts.iter().any(|part| part.is_empty());
                     let parts = if whole { vec![word.as_str()] } else { parts };
@@ -317,12 +320,12 @@ impl Parser<'_> {
                 return Err(self.fault(format!("{}{why}", property.expected())));
             }
             self.next += 1;
-            let is_value = |token: Option<&(usize, Token)>| match token {
-                Some((_, Token::Quoted(_))) => true,
-                Some((_, Token::Word(word))) => !is_keyword(word),
+            let is_value = |token: Option<&(usize, ExpressionToken)>| match token {
+                Some((_, ExpressionToken::Quoted(_))) => true,
+                Some((_, ExpressionToken::Word(word))) => !is_keyword(word),
                 _ => false,
             };
-            if *self.token() == Token::Comma && is_value(self.tokens.get(self.next + 1)) {
+            if *self.token() == ExpressionToken::Comma && is_value(self.tokens.get(self.next + 1)) {
                 self.next += 1;
             } else if !is_value(self.tokens.get(self.next)) {
                 break;

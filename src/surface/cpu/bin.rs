@@ -1,30 +1,33 @@
 //! Stage `bin`: assigns atoms to tiles, and within a tile to bricks.
 //!
-//! A tile is 8 × 8 × 8 bricks, the unit of parallel work. A tile also evaluates the face samples of one layer of bricks
-//! beyond its upper faces (index 8). They belong to the next tile, which computes the same bits.
+//! A tile is 8 × 8 × 8 bricks, the unit of parallel work. A tile also evaluates the grid points on the faces of one
+//! layer of bricks beyond its upper faces (index 8). They belong to the next tile, which computes the same bits.
 
 use std::ops::Range;
 
-use rustc_hash::{FxHashMap, FxHashSet};
+use rustc_hash::FxHashMap;
 
-use crate::surface::candidates;
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32, to_u64};
-use crate::surface::params::{MAX_RESOLUTION, SurfaceLimits};
+use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32};
+use crate::surface::memory::{MemoryMeter as _, Reservation};
+use crate::surface::params::SurfaceLimits;
 use crate::surface::simd::dispatched;
+use crate::surface::{candidates, grid_limit};
 
 /// Bricks along a tile's edge with the layer beyond.
 pub(super) const SIDE: usize = 9;
 /// Bricks of a tile with the layer beyond.
 pub(super) const SLOTS: usize = SIDE * SIDE * SIDE;
-/// Marks a candidate that reaches no sample of the brick, only the gap up to its neighbours' first samples: it affects
-/// normals, not the field.
+/// Marks a candidate that reaches no grid point of the brick, only the gap up to the first grid points of its
+/// neighbours. Such a candidate affects normals, not the field.
 pub(super) const NORMAL_ONLY: u32 = 1 << 31;
 /// Pairs of an atom and a tile between two checks of the cancellation flag.
 const PAIRS_PER_CHECK: u64 = 1 << 16;
-/// Memory of a pair of an atom and a tile, bytes: in a list that doubles, and sorted.
-const PAIR_BYTES: u64 = 20;
+/// Memory of a tile's coordinates and its first index, bytes.
+const TILE_BYTES: u64 = 20;
+/// Memory for sorting a tile, bytes: its coordinates, number, rank and cursor.
+const SORTED_TILE_BYTES: u64 = 32;
 /// Atoms whose candidate pairs are counted and checked against the limit together: 190,000 pairs at most.
 const ATOMS_PER_CHECK: usize = 256;
 /// Maximum capacity of a list that is kept between tiles; longer lists are freed.
@@ -43,7 +46,7 @@ pub(super) struct Tiles {
     atoms: Vec<u32>,
 }
 
-/// First and last tile per axis whose samples, with the layer beyond, the atom reaches.
+/// First and last tile per axis whose grid points, with the layer beyond, the atom reaches.
 fn tile_range(atom: &LatticeAtom, reach: f64) -> [[i32; 2]; 3] {
     let side = f64::from(TILE);
     std::array::from_fn(|k| {
@@ -64,14 +67,17 @@ impl Tiles {
     /// Returns [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond
     /// the limits, and [`SurfaceError::Cancelled`].
     pub(super) fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
+        // Only the result stays added.
+        let (lasting, scratch) = (Reservation::new(&control.memory), Reservation::new(&control.memory));
         let mut index: FxHashMap<[i32; 3], u32> = FxHashMap::default();
         let (mut pairs, mut unchecked) = (0_u64, 0_u64);
-        // Every tile in reach holds at least one occupied brick. A tile in reach of an atom holds at least one of its
-        // candidate pairs, except where the atom reaches a corner alone. Both bound the allocations below.
-        let max_tiles = limits.max_samples / 512 + 1;
+        // Two facts bound the allocations below. Every tile in reach holds at least one occupied brick. A tile in reach
+        // of an atom holds at least one of its candidate pairs, unless the atom reaches only a corner of the tile.
+        let max_tiles = limits.max_grid_points / 512 + 1;
         let max_pairs = candidates::limit(limits).max(8 * lattice.atoms.len() as u64);
         // Tiles in the order of their first atoms, and every pair of an atom and such a tile.
-        let mut hits: Vec<(u32, u32)> = Vec::with_capacity(2 * lattice.atoms.len());
+        let mut hits: Vec<(u32, u32)> = Vec::new();
+        scratch.reserve_rows(&mut hits, 2 * lattice.atoms.len())?;
         // The last tile of each parity: neighbouring atoms look up the same eight tiles repeatedly.
         let mut recent = [([i32::MAX; 3], 0_u32); 8];
         for (i, atom) in (0_u32..).zip(&lattice.atoms) {
@@ -81,25 +87,30 @@ impl Tiles {
             unchecked += n;
             if unchecked > PAIRS_PER_CHECK {
                 control.check()?;
-                control.memory.grow(PAIR_BYTES * unchecked)?;
                 unchecked = 0;
             }
             if n > max_tiles || index.len() as u64 > max_tiles {
-                return Err(too_large(lattice, n.max(index.len() as u64).saturating_mul(512), limits));
+                let grid_points = n.max(index.len() as u64).saturating_mul(512);
+                return Err(grid_limit::exceeded(lattice, grid_points, limits, control));
             }
             if pairs > max_pairs {
-                return Err(candidates::exceeded(lattice, pairs, limits));
+                return Err(candidates::exceeded(&[lattice], pairs, limits));
             }
+            // Both limits have 32 bits.
+            scratch.reserve_rows(&mut hits, usize::try_from(n).unwrap_or(usize::MAX))?;
             for tile in boxed(range) {
                 let parity = tile.iter().fold(0, |p, c| p << 1 | usize::from(c & 1 == 1));
                 let (cached, id) = &mut recent[parity];
                 if *cached != tile {
                     let next = to_u32(index.len());
+                    lasting.reserve_entries(&mut index, 1)?;
                     (*cached, *id) = (tile, *index.entry(tile).or_insert(next));
                 }
                 hits.push((*id, i));
             }
         }
+        lasting.grow(TILE_BYTES * (index.len() + 1) as u64 + (size_of::<u32>() * hits.len()) as u64)?;
+        scratch.grow(SORTED_TILE_BYTES * (index.len() + 1) as u64)?;
         let mut met: Vec<([i32; 3], u32)> = index.iter().map(|(tile, id)| (*tile, *id)).collect();
         met.sort_unstable_by_key(|(tile, _)| tile_order(*tile));
         let mut rank = vec![0_usize; met.len()];
@@ -122,7 +133,8 @@ impl Tiles {
             atoms[*at] = *atom;
             *at += 1;
         }
-        let coords = met.into_iter().map(|(tile, _)| tile).collect();
+        let coords = met.iter().map(|(tile, _)| *tile).collect();
+        lasting.keep();
         Ok(Self { coords, index, starts, atoms })
     }
 
@@ -137,68 +149,12 @@ impl Tiles {
     }
 }
 
-/// Returns the error for a grid of at least `samples` samples.
-pub(crate) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits) -> SurfaceError {
-    let excess = samples as f64 / limits.max_samples.max(1) as f64;
-    let mut fitting = lattice.spacing * excess.max(1.0).cbrt();
-    // Coarsens the spacing until an upper bound of the samples fits; a box of one cell needs 27 blocks at most.
-    while max_samples(lattice, fitting) > limits.max_samples as f64 && fitting < MAX_RESOLUTION {
-        fitting *= 1.08;
-    }
-    SurfaceError::GridTooLarge {
-        samples,
-        limit: limits.max_samples,
-        resolution: lattice.spacing,
-        suggested_resolution: (fitting.min(MAX_RESOLUTION) * 100.0).ceil() / 100.0,
-    }
-}
-
-/// Rejects a grid that is certain to exceed the limit before any of it is computed.
-///
-/// # Errors
-/// Returns [`SurfaceError::GridTooLarge`].
-pub(crate) fn check_lower_bound(lattice: &Lattice, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
-    let least = to_u64(min_samples(lattice));
-    if least > limits.max_samples { Err(too_large(lattice, least, limits)) } else { Ok(()) }
-}
-
-/// A lower bound of the samples: the volume of the blocks that lie wholly within some atom's reach.
-fn min_samples(lattice: &Lattice) -> f64 {
-    let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(f64::MAX, f64::min);
-    // Half the least reach: a sphere then holds a few blocks wherever it lies.
-    let side = 0.5 * reach;
-    let mut blocks: FxHashSet<[i32; 3]> = FxHashSet::default();
-    for atom in &lattice.atoms {
-        let (centre, reach2) = ([0, 1, 2].map(|k| atom.position(k) / side), (lattice.reach(atom) / side).powi(2));
-        let home = centre.map(|c| to_i32(c.floor()));
-        blocks.extend(boxed(home.map(|c| [c - 2, c + 2])).filter(|block| {
-            let furthest =
-                |k: usize| (f64::from(block[k]) - centre[k]).abs().max((f64::from(block[k] + 1) - centre[k]).abs());
-            (0..3).map(|k| furthest(k).powi(2)).sum::<f64>() <= reach2
-        }));
-    }
-    blocks.len() as f64 * side.powi(3)
-}
-
-/// An upper bound of the samples at another `spacing` (Å): blocks as long as the reach and a brick together that
-/// hold an atom, with their neighbours, contain every brick in reach.
-fn max_samples(lattice: &Lattice, spacing: f64) -> f64 {
-    let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
-    let side = reach + spacing * f64::from(BRICK);
-    let scale = lattice.spacing / side;
-    let homes: FxHashSet<[i32; 3]> =
-        lattice.atoms.iter().map(|atom| std::array::from_fn(|k| to_i32((atom.position(k) * scale).floor()))).collect();
-    let near = |c: &[i32; 3]| boxed(c.map(|c| [c - 1, c + 1])).collect::<Vec<_>>();
-    let blocks: FxHashSet<[i32; 3]> = homes.iter().flat_map(near).collect();
-    blocks.len() as f64 * (side / spacing).powi(3)
-}
-
 /// Bricks of a tile and their candidate atoms. Reused from tile to tile.
 #[derive(Debug)]
 pub(super) struct Bricks {
     /// Candidates per slot: atom indices, ascending, some marked [`NORMAL_ONLY`].
     lists: Vec<Vec<u32>>,
-    /// Per slot the number of candidates that reach a sample.
+    /// Per slot the number of candidates that reach a grid point.
     pub(super) reaching: Vec<u32>,
 }
 
@@ -208,25 +164,25 @@ impl Default for Bricks {
     }
 }
 
-/// Squared distances along one axis from an atom to the samples of each of the 9 brick layers, and to the closed
-/// box that also holds the next brick's first sample. The layer beyond the tile has its first sample only.
+/// Squared distances along one axis from an atom to the grid points of each of the 9 brick layers, and to the closed
+/// box that also holds the next brick's first grid point. The layer beyond the tile has its first grid point only.
 struct AxisReach {
     first: usize,
     last: usize,
-    samples: [f32; SIDE],
+    points: [f32; SIDE],
     closed: [f32; SIDE],
 }
 
 impl AxisReach {
     #[inline(always)]
     fn new(local: f32, reach: f32) -> Self {
-        let mut axis = Self { first: SIDE, last: 0, samples: [0.0; SIDE], closed: [0.0; SIDE] };
+        let mut axis = Self { first: SIDE, last: 0, points: [0.0; SIDE], closed: [0.0; SIDE] };
         for b in 0..SIDE {
             let lo = (b * 8) as f32;
             let beyond = b == SIDE - 1;
             let gap = |hi: f32| (lo - local).max(local - hi).max(0.0);
-            let (samples, closed) = if beyond { (gap(lo), gap(lo)) } else { (gap(lo + 7.0), gap(lo + 8.0)) };
-            (axis.samples[b], axis.closed[b]) = (samples * samples, closed * closed);
+            let (points, closed) = if beyond { (gap(lo), gap(lo)) } else { (gap(lo + 7.0), gap(lo + 8.0)) };
+            (axis.points[b], axis.closed[b]) = (points * points, closed * closed);
             if closed <= reach {
                 (axis.first, axis.last) = (axis.first.min(b), b + 1);
             }
@@ -271,8 +227,8 @@ impl Bricks {
 }
 
 dispatched! {
-/// Appends the candidates among `atoms`, which follow those appended before. Returns the number of candidate pairs of
-/// the layers' own bricks.
+/// Appends the candidates among `atoms`, which come after all earlier ones in canonical order. Returns the number of
+/// candidate pairs of the layers' own bricks.
 fn find(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], layers: &Range<usize>, atoms: &[u32]) -> u64 {
     let origin = tile.map(|t| t * TILE);
     let mut own = 0;
@@ -286,16 +242,16 @@ fn find(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], layers: &Range<u
         for bz in z.first.max(layers.start)..z.last.min(layers.end + 1) {
             for by in y.first..y.last {
                 let closed = y.closed[by] + z.closed[bz];
-                let samples = y.samples[by] + z.samples[bz];
+                let points = y.points[by] + z.points[bz];
                 let row = (bz * SIDE + by) * SIDE;
                 for bx in x.first..x.last {
                     if closed + x.closed[bx] > reach2 {
                         continue;
                     }
-                    // A brick in the layer beyond feeds no vertex of these: only its samples matter.
+                    // A brick in the next layer adds no vertices here; only its grid points matter.
                     let beyond = bz == layers.end || by == SIDE - 1 || bx == SIDE - 1;
                     own += u64::from(!beyond);
-                    let reaches = samples + x.samples[bx] <= reach2;
+                    let reaches = points + x.points[bx] <= reach2;
                     if !reaches && beyond {
                         continue;
                     }
@@ -316,7 +272,7 @@ pub(super) fn slot_brick(slot: usize) -> [usize; 3] {
     [slot % SIDE, slot / SIDE % SIDE, slot / (SIDE * SIDE)]
 }
 
-/// First sample of a slot's brick.
+/// First grid point of a slot's brick.
 pub(super) fn slot_origin(tile: [i32; 3], slot: usize) -> [i32; 3] {
     let brick = slot_brick(slot);
     std::array::from_fn(|k| tile[k] * TILE + i32::try_from(brick[k]).unwrap_or_default() * BRICK)

@@ -4,7 +4,7 @@ use super::bin::NORMAL_ONLY;
 use crate::surface::lattice::LatticeAtom;
 use crate::surface::simd::LANES;
 
-/// Factor above the difference by rounding between u of a vertex and of the box around it.
+/// Factor that exceeds the rounding errors of u, for a vertex and for the box around it.
 const MARGIN: f32 = 1.0 + 1e-4;
 
 /// A brick's candidates in its own coordinates.
@@ -56,8 +56,8 @@ impl BrickAtoms {
                 u[i] = (dx * dx + dy * dy + dz * dz) * inv[i];
             }
             for (row, u) in rows.iter().zip(u) {
-                if let Some(place) = near.get_mut(n) {
-                    *place = *row;
+                if let Some(slot) = near.get_mut(n) {
+                    *slot = *row;
                 }
                 n += usize::from(u < limit);
             }

@@ -1,25 +1,25 @@
 //! Stage `classify`: inside bits, crossing edges with their parameters, active cells with their cases.
 //!
-//! A brick's samples are eight 64-bit words, one per z layer, bit `8·y + x`. Every test on them is a shift.
+//! The inside bits of a brick are eight 64-bit words, one per z layer, bit `8·y + x`. Every test on them is a shift.
 
 use std::num::NonZeroU16;
 
 use super::edge::Edge;
-use super::field::Samples;
+use super::field::BrickField;
 use crate::surface::cases::CASES;
-use crate::surface::lattice::{BRICK_SAMPLES, EDGE_MARGIN, to_u32};
+use crate::surface::lattice::{BRICK_POINTS, EDGE_MARGIN, to_u32};
 use crate::surface::simd::dispatched;
 use crate::surface::sphere_union::Feature;
 
 /// Inside bits of a brick: word z, bit `8·y + x`.
 pub(super) type Inside = [u64; 8];
 
-/// Brick that the surface intersects, as the later stages need it.
+/// Brick that the surface intersects, in the form that the later stages need.
 #[derive(Debug, Clone)]
 pub(super) struct SurfaceBrick {
     /// Slot within the tile (0 to 8 per axis; 8 never occurs here).
     pub(super) slot: u16,
-    /// Crossing edges: word `3·z + axis`, bit `8·y + x` of the owning sample. Vertices are numbered in this order.
+    /// Crossing edges: word `3·z + axis`, bit `8·y + x` of the owning grid point. Vertices are numbered in this order.
     pub(super) crossing: [u64; 24],
     /// Vertices of the brick before each word.
     pub(super) before: [u16; 24],
@@ -45,9 +45,9 @@ pub(super) struct SurfaceBrick {
 pub(super) struct ClassifiedBricks {
     /// Bricks with surface, by slot.
     pub(super) bricks: Vec<SurfaceBrick>,
-    /// Parameter of each vertex along its edge, from the owning sample, in vertex order.
+    /// Parameter of each vertex along its edge, from the owning grid point, in vertex order.
     pub(super) t: Vec<f32>,
-    /// Edge of each vertex, likewise.
+    /// Edge of each vertex, in vertex order.
     pub(super) edges: Vec<Edge>,
     /// Case of each active cell, in cell order.
     pub(super) cases: Vec<u8>,
@@ -65,7 +65,8 @@ pub(super) struct ClassifiedBricks {
     pub(super) sheets: Vec<[u64; 8]>,
 }
 
-/// Vertices, and active cells, that a brick in reach of an atom rarely exceeds on average.
+/// Upper bound of the mean numbers of vertices and of active cells per brick in reach of an atom. Structures rarely
+/// exceed it.
 const USUAL: usize = 96;
 
 /// Counts of a tile before a brick.
@@ -76,25 +77,25 @@ pub(super) struct CountsBefore {
     pub(super) cases: usize,
 }
 
-/// Samples of a brick and of its seven neighbours towards +x, +y, +z: index bit 0 is x, 1 y, 2 z.
+/// Fields of a brick and of its seven neighbours towards +x, +y, +z: index bit 0 is x, 1 y, 2 z.
 #[derive(Clone, Copy)]
 pub(super) struct Neighbourhood<'a> {
     /// Inside bits of the brick and its neighbours.
     pub(super) inside: [&'a Inside; 8],
-    /// Densities likewise.
-    pub(super) samples: [&'a Samples; 8],
+    /// Densities of the brick and its neighbours.
+    pub(super) fields: [&'a BrickField; 8],
 }
 
 dispatched! {
 /// Inside bits of a brick.
-pub(super) fn inside_bits(samples: &Samples, iso: f32) -> Inside {
-    // Loops, as a closure does not always compile to the same instructions.
+pub(super) fn inside_bits(field: &BrickField, iso: f32) -> Inside {
+    // Written as loops: a closure does not always compile to the same instructions.
     let mut inside = [0; 8];
     for (z, word) in inside.iter_mut().enumerate() {
         for y in 0..8 {
             let mut row = 0_u64;
             for x in 0..8 {
-                row |= u64::from(samples[z * 64 + y * 8 + x] >= iso) << x;
+                row |= u64::from(field[z * 64 + y * 8 + x] >= iso) << x;
             }
             *word |= row << (8 * y);
         }
@@ -103,7 +104,7 @@ pub(super) fn inside_bits(samples: &Samples, iso: f32) -> Inside {
 }
 }
 
-/// Inside bits shifted by one sample along the axes of `shift` (bit 0 x, 1 y, 2 z), for layer z.
+/// Inside bits shifted by one grid point along the axes of `shift` (bit 0 x, 1 y, 2 z), for layer z.
 #[inline(always)]
 fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
     const FIRST_COLUMN: u64 = 0x0101_0101_0101_0101;
@@ -233,7 +234,7 @@ fn classify(found: &mut ClassifiedBricks, slot: usize, around: &Neighbourhood<'_
         (*crossing, *before) = (layer[0] ^ layer[1 << (w % 3)], n);
         n += ones(*crossing);
     }
-    edge_parameters(&brick.crossing, n, &around.samples, iso, found);
+    edge_parameters(&brick.crossing, n, &around.fields, iso, found);
     let mut torn = false;
     for (layer, &cells) in corners.iter().zip(&active) {
         let mut cells = cells;
@@ -289,11 +290,11 @@ fn sheets(active: &[u64; 8], links: &[[u64; 8]; 3], found: &mut Vec<[u64; 8]>) -
             found.push(sheet);
         }
     }
-    debug_assert!(n == 1 || found.len() == first + usize::from(n), "one mask a sheet, none for a lone one");
+    debug_assert!(n == 1 || found.len() == first + usize::from(n), "one mask per sheet, none for a single sheet");
     NonZeroU16::new(n)
 }
 
-/// Adds to `sheet` every cell that its links reach.
+/// Adds every cell to `sheet` that its links reach.
 #[inline(always)]
 fn flood(sheet: &mut [u64; 8], links: &[[u64; 8]; 3]) {
     let [lx, ly, lz] = links;
@@ -323,26 +324,26 @@ fn ones(word: u64) -> u16 {
     u16::try_from(word.count_ones()).unwrap_or_default()
 }
 
-/// Returns the samples at both ends of an edge.
+/// Returns the values at both ends of an edge.
 #[inline(always)]
-pub(super) fn at_ends(edge: Edge, samples: &[&Samples; 8]) -> [f32; 2] {
+pub(super) fn at_ends(edge: Edge, fields: &[&BrickField; 8]) -> [f32; 2] {
     const STEP: [usize; 3] = [1, 8, 64];
-    let (axis, at) = (usize::from(edge.axis()), edge.sample());
+    let (axis, at) = (usize::from(edge.axis()), edge.grid_point());
     let coordinate = [at & 7, at >> 3 & 7, at >> 6][axis];
     let (far, next) = if coordinate == 7 { (1 << axis, at - 7 * STEP[axis]) } else { (0, at + STEP[axis]) };
-    [samples[0][at & 511], samples[far][next & 511]]
+    [fields[0][at & 511], fields[far][next & 511]]
 }
 
 /// Computes the crossing edges, and the point along each at which the density is `iso`, by linear interpolation.
 #[inline(always)]
-fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, found: &mut ClassifiedBricks) {
+fn edge_parameters(crossing: &[u64; 24], n: u16, fields: &[&BrickField; 8], iso: f32, found: &mut ClassifiedBricks) {
     let ClassifiedBricks { t, edges, .. } = found;
     let first = t.len();
-    // Densities at both ends first, one division per vector afterwards: `t` holds F(owner) − iso meanwhile.
+    // Collects F(owner) − iso in `t` first, so that the divisions below are vectorized.
     t.resize(first + usize::from(n), 0.0);
     edges.resize(first + usize::from(n), Edge::default());
     // F(owner) − F(other end).
-    let mut drop = [0.0; 3 * BRICK_SAMPLES];
+    let mut drop = [0.0; 3 * BRICK_POINTS];
     let mut ends = t[first..].iter_mut().zip(&mut drop).zip(&mut edges[first..]);
     for (w, &word) in crossing.iter().enumerate() {
         let (z, axis) = (w / 3, w % 3);
@@ -351,7 +352,7 @@ fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f
             let bit = left.trailing_zeros() as usize;
             left &= left - 1;
             let own = Edge::new(z, bit, axis);
-            let [f0, f1] = at_ends(own, samples);
+            let [f0, f1] = at_ends(own, fields);
             if let Some(((above, drop), edge)) = ends.next() {
                 (*above, *drop, *edge) = (f0 - iso, f0 - f1, own);
             }

@@ -1,8 +1,8 @@
 //! Van der Waals, solvent-accessible and solvent-excluded surfaces: level sets of the distance to the boundary of a
 //! union of spheres, in the stages `field`, `classify` and `interpolate`.
 //!
-//! Every distance is a function of the point and the boundary alone: spheres and arcs out of reach do not affect its
-//! bits. Signs at the samples decide the topology, as for densities. Vertices are then moved along their edges to the
+//! Every distance depends on the point and the boundary alone: spheres and arcs out of reach do not affect its bits. As
+//! for densities, the signs at the grid points determine the topology. Vertices are then moved along their edges to the
 //! exact surface.
 
 use std::ops::Range;
@@ -11,19 +11,20 @@ use super::RunContext;
 use super::bin::{Bricks, NORMAL_ONLY, Tiles};
 use super::classify::ClassifiedBricks;
 use super::edge::Edge;
-use super::field::{SampleRange, Samples};
+use super::field::{BrickField, GridPointRange};
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{EDGE_MARGIN, Lattice, LatticeAtom, to_f32};
 use crate::surface::params::SurfaceKind;
 use crate::surface::simd::LANES;
 use crate::surface::sphere_union::{BrickUnion, Feature, Lanes, Nearest, SphereUnion};
 
-/// Value of a sample at the surface. Samples more than a spacing outside are 0, those more than a spacing inside 2.
+/// Value at a grid point on the surface. Grid points more than a spacing outside are 0, those more than a spacing
+/// inside 2.
 pub(super) const SURFACE: f32 = 1.0;
 
 /// Maximum distance of vertices from the surface, Å.
 const TOLERANCE: f64 = 1e-4;
-/// Minimum of this tolerance in spacings, because coordinates within a brick are rounded.
+/// Minimum of [`TOLERANCE`] in spacings: coordinates within a brick are rounded.
 const ROUNDING: f32 = 4e-6;
 /// Maximum number of steps of a root search. Every fourth one halves the bracket.
 const MAX_STEPS: usize = 64;
@@ -73,6 +74,11 @@ impl DistanceField {
         self.boundary.as_ref().map_or(0, |boundary| boundary.union.n_overlaps)
     }
 
+    /// Returns the bounding spheres of the arcs.
+    pub(super) fn bounds(&self) -> Option<&Lattice> {
+        self.boundary.as_ref().map(|boundary| &boundary.bounds)
+    }
+
     /// Finds the arcs near every brick in `layers` of a tile, and in the layer beyond, as [`Bricks::fill`] finds atoms.
     ///
     /// # Errors
@@ -112,15 +118,15 @@ impl DistanceField {
         self.boundary.as_ref().map(|boundary| &boundary.union)
     }
 
-    /// Writes the samples of the brick that is loaded.
-    pub(super) fn sample(&self, spheres: &mut BrickUnion, range: SampleRange, out: &mut Samples) {
-        // In a block of 4 × 2 × 2 samples, few spheres can be the nearest one.
+    /// Writes the values at the grid points of the brick that is loaded.
+    pub(super) fn evaluate(&self, spheres: &mut BrickUnion, range: GridPointRange, out: &mut BrickField) {
+        // In a block of 4 × 2 × 2 grid points, few spheres can be the nearest one.
         for (z, y, x) in blocks(range) {
-            let sample = |lane: usize| [x + lane % 4, y + lane / 4 % 2, z + lane / 8];
-            let points: Lanes = std::array::from_fn(|k| std::array::from_fn(|lane| sample(lane)[k] as f32));
+            let point = |lane: usize| [x + lane % 4, y + lane / 4 % 2, z + lane / 8];
+            let points: Lanes = std::array::from_fn(|k| std::array::from_fn(|lane| point(lane)[k] as f32));
             let found = spheres.nearest(self.union(), self.level, &points);
             for (lane, distance) in found.distance.into_iter().enumerate() {
-                let [x, y, z] = sample(lane);
+                let [x, y, z] = point(lane);
                 let value = (SURFACE + (distance - self.level)).clamp(0.0, 2.0 * SURFACE);
                 // Outside all spheres, the distance itself is not needed.
                 out[(z * 8 + y) * 8 + x] = if distance > 0.0 { value } else { 0.0 };
@@ -133,7 +139,7 @@ impl DistanceField {
     pub(super) fn refine(
         &self,
         spheres: &mut BrickUnion,
-        samples: &[&Samples; 8],
+        fields: &[&BrickField; 8],
         first: usize,
         found: &mut ClassifiedBricks,
     ) {
@@ -145,7 +151,7 @@ impl DistanceField {
         }
         // For vertices that are close together, few spheres and arcs can be the nearest ones.
         for order in by_cube(edges).chunks(LANES) {
-            let mut search = RootSearch::new(order, edges, t, samples);
+            let mut search = RootSearch::new(order, edges, t, fields);
             for step in 0..MAX_STEPS {
                 let points = search.points();
                 let at = spheres.nearest(self.union(), self.level, &points);
@@ -190,13 +196,13 @@ impl DistanceField {
     }
 }
 
-/// Returns the first sample (z, y, x) of each block of a brick.
-fn blocks(range: SampleRange) -> impl Iterator<Item = (usize, usize, usize)> {
+/// Returns the first grid point (z, y, x) of each block of a brick.
+fn blocks(range: GridPointRange) -> impl Iterator<Item = (usize, usize, usize)> {
     let layers = (0..range.z_layers).step_by(2);
     layers.flat_map(move |z| (0..range.y_pairs).flat_map(move |pair| [0, 4].map(move |x| (z, 2 * pair, x))))
 }
 
-/// Returns the indices of edges, sorted by cubes of 4 × 4 × 4 samples, then of 2 × 2 × 2.
+/// Returns the indices of edges, sorted by cubes of 4 × 4 × 4 grid points, then of 2 × 2 × 2.
 fn by_cube(edges: &[Edge]) -> Vec<usize> {
     let cube = |edge: &Edge| {
         let bit = |b: u16| (edge.x() >> b & 1) | (edge.y() >> b & 1) << 1 | (edge.z() >> b & 1) << 2;
@@ -236,14 +242,14 @@ struct RootSearch {
 
 impl RootSearch {
     /// Starts the search on the edges `of`. Unused lanes repeat the last edge.
-    fn new(of: &[usize], edges: &[Edge], t: &[f32], samples: &[&Samples; 8]) -> Self {
+    fn new(of: &[usize], edges: &[Edge], t: &[f32], fields: &[&BrickField; 8]) -> Self {
         let index = |lane: usize| of[lane.min(of.len() - 1)];
         let edge = |lane: usize| edges[index(lane)];
         let coordinate = |k: usize, edge: Edge| f32::from([edge.x(), edge.y(), edge.z()][k]);
         Self {
             base: std::array::from_fn(|k| std::array::from_fn(|lane| coordinate(k, edge(lane)))),
             axis: std::array::from_fn(|lane| usize::from(edge(lane).axis())),
-            from_inside: std::array::from_fn(|lane| samples[0][edge(lane).sample()] >= SURFACE),
+            from_inside: std::array::from_fn(|lane| fields[0][edge(lane).grid_point()] >= SURFACE),
             ends: [[0.0; LANES], [1.0; LANES]],
             t: std::array::from_fn(|lane| t[index(lane)]),
             features: [Feature::default(); LANES],

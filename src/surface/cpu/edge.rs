@@ -1,18 +1,18 @@
-//! Grid edges of a brick, which carry its vertices.
+//! Grid edges of a brick, on which its vertices lie.
 
-/// Samples along a brick's side with the neighbours' first layer.
+/// Grid points along a brick's side with the neighbours' first layer.
 const N: u16 = 9;
 const SIDE: usize = N as usize;
-/// Number of grid edges of a brick with those layers, three per sample, `3·((z·9 + y)·9 + x) + axis`, rounded up to a
-/// power of two so that a mask bounds an index.
+/// Number of grid edges of a brick with those layers, three per grid point, `3·((z·9 + y)·9 + x) + axis`, rounded up to
+/// a power of two so that a mask bounds an index.
 pub(super) const EDGES: usize = (3 * SIDE * SIDE * SIDE).next_power_of_two();
 
-/// Edge of a brick: `z << 8 | (8·y + x) << 2 | axis` of its first sample.
+/// Edge of a brick: `z << 8 | (8·y + x) << 2 | axis` of its first grid point.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Edge(u16);
 
 impl Edge {
-    /// The edge along `axis` from the sample at `bit` of layer z.
+    /// The edge along `axis` from the grid point at `bit` of layer z.
     #[inline(always)]
     pub(super) fn new(z: usize, bit: usize, axis: usize) -> Self {
         // Eleven bits.
@@ -25,19 +25,19 @@ impl Edge {
         self.0 & 3
     }
 
-    /// X coordinate of its sample.
+    /// X coordinate of its grid point.
     #[inline(always)]
     pub(super) fn x(self) -> u16 {
         self.0 >> 2 & 7
     }
 
-    /// Y coordinate of its sample.
+    /// Y coordinate of its grid point.
     #[inline(always)]
     pub(super) fn y(self) -> u16 {
         self.0 >> 5 & 7
     }
 
-    /// Z coordinate of its sample.
+    /// Z coordinate of its grid point.
     #[inline(always)]
     pub(super) fn z(self) -> u16 {
         self.0 >> 8 & 7
@@ -50,15 +50,15 @@ impl Edge {
         (first[0] | first[1] << 1 | first[2] << 2) & !(1 << self.axis())
     }
 
-    /// Returns the edge's place in the order of the brick's vertices: layer (3 bits), axis (2 bits) and bit (6 bits).
+    /// Returns a key in the order of the brick's vertices: layer (3 bits), axis (2 bits) and bit (6 bits).
     #[inline(always)]
     pub(super) fn key(self) -> u16 {
         self.0 & 7 << 8 | self.axis() << 6 | self.0 >> 2 & 63
     }
 
-    /// Index among the brick's samples and cells: `(z·8 + y)·8 + x`.
+    /// Index among the brick's grid points and cells: `(z·8 + y)·8 + x`.
     #[inline(always)]
-    pub(super) fn sample(self) -> usize {
+    pub(super) fn grid_point(self) -> usize {
         usize::from(self.0 >> 2 & 511)
     }
 
@@ -72,25 +72,25 @@ impl Edge {
     #[inline(always)]
     pub(super) fn index_from(self, far: [usize; 3]) -> usize {
         let [x, y, z] = [self.x(), self.y(), self.z()].map(usize::from);
-        let sample = ((z + far[2]) * SIDE + y + far[1]) * SIDE + x + far[0];
-        (3 * sample + usize::from(self.axis())) % EDGES
+        let point = ((z + far[2]) * SIDE + y + far[1]) * SIDE + x + far[0];
+        (3 * point + usize::from(self.axis())) % EDGES
     }
 }
 
-/// Cell of each grid edge's first sample; an edge beyond the brick belongs to the brick's last cell before it.
+/// Cell of each grid edge's first grid point; an edge beyond the brick belongs to the brick's last cell before it.
 pub(super) static CELL_OF: [u16; EDGES] = {
     let mut cells = [0; EDGES];
-    let mut sample = 0;
-    while sample < N * N * N {
-        let at = [sample % N, sample / N % N, sample / (N * N)];
+    let mut point = 0;
+    while point < N * N * N {
+        let at = [point % N, point / N % N, point / (N * N)];
         let (mut cell, mut k) = (0, 3);
         while k > 0 {
             k -= 1;
             cell = 8 * cell + if at[k] < 8 { at[k] } else { 7 };
         }
-        let edge = 3 * sample as usize;
+        let edge = 3 * point as usize;
         (cells[edge], cells[edge + 1], cells[edge + 2]) = (cell, cell, cell);
-        sample += 1;
+        point += 1;
     }
     cells
 };
@@ -104,8 +104,8 @@ mod tests {
         for (z, y, x, axis) in (0..8 * 8 * 8 * 3).map(|i| (i / 192, i / 24 % 8, i / 3 % 8, i % 3)) {
             let edge = Edge::new(z, 8 * y + x, axis);
             assert_eq!([edge.x(), edge.y(), edge.z(), edge.axis()].map(usize::from), [x, y, z, axis]);
-            assert_eq!((edge.sample(), edge.index()), ((z * 8 + y) * 8 + x, 3 * ((z * 9 + y) * 9 + x) + axis));
-            assert_eq!(usize::from(CELL_OF[edge.index()]), edge.sample());
+            assert_eq!((edge.grid_point(), edge.index()), ((z * 8 + y) * 8 + x, 3 * ((z * 9 + y) * 9 + x) + axis));
+            assert_eq!(usize::from(CELL_OF[edge.index()]), edge.grid_point());
         }
         assert_eq!(CELL_OF[Edge::new(1, 8 * 3, 1).index_from([8, 0, 0])], (8 + 3) * 8 + 7, "beyond x");
         assert_eq!(CELL_OF[Edge::new(0, 0, 2).index_from([0, 8, 8])], (7 * 8 + 7) * 8, "beyond y and z");

@@ -1,7 +1,7 @@
 //! Stage `emit`: triangle indices, and sheets and sums while their corners are in cache.
 //!
-//! A brick's cells use vertices of the brick itself and of its seven neighbours towards +x, +y, +z. They are first
-//! entered into a small table by grid edge; each corner of a triangle is then a look-up.
+//! A brick's cells use vertices of the brick itself and of its seven neighbours towards +x, +y, +z. All these vertices
+//! are first entered into a small table, by grid edge. Each corner of a triangle is then a look-up in the table.
 
 use std::sync::LazyLock;
 
@@ -43,7 +43,7 @@ impl CaseRow {
         let mut edges: Vec<u8> = Vec::new();
         let mut loop_ends = [0; 4];
         let mut n_loops = 0;
-        // A loop's triangles follow each other, and each but the first has a corner with an earlier one in common.
+        // The triangles of a loop are consecutive, and each but the first shares a corner with an earlier one.
         for triangle in triangles {
             if !triangle.iter().any(|e| edges.contains(e)) {
                 n_loops += 1;
@@ -116,9 +116,9 @@ impl BrickTable {
 }
 
 dispatched! {
-/// Writes the triangles of a brick. `cases` are those of its active cells in order, `own_sheets` the cells of each
-/// sheet if there are several and they are known. Leaves the inputs of the sums in `table` and `sheets`, with vertices
-/// rounded by `rounding`.
+/// Writes the triangles of a brick. `cases` are the cases of its active cells in order. `own_sheets` are the cells of
+/// each sheet, if there are several and they are known. Stores the inputs of the sums in `table` and `sheets`, with
+/// vertices rounded by `rounding`.
 pub(super) fn emit(
     table: &mut BrickTable,
     sheets: &mut Sheets,

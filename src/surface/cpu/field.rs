@@ -1,17 +1,18 @@
-//! Stage `field`: the density at the 8 × 8 × 8 samples of a brick.
+//! Stage `field`: the density at the 8 × 8 × 8 grid points of a brick.
 //!
-//! Each sample's density is a sum over the brick's candidates in ascending order, and each term is a function of the
-//! atom and the sample alone. An atom out of reach adds an exact zero. A sample therefore has the same bits in every
-//! tile, and for every candidate list that contains all atoms in reach. Neighbouring bricks thus agree on every sign.
+//! Each grid point's density is a sum over the brick's candidates in ascending order, and each term is a function of
+//! the atom and the grid point alone. An atom out of reach adds an exact zero. A grid point therefore has the same bits
+//! in every tile, and for every candidate list that contains all atoms in reach. Neighbouring bricks thus agree on
+//! every sign.
 
 use super::bin::NORMAL_ONLY;
 use crate::surface::kernel::{MIN_DISTANCE2, Profile};
-use crate::surface::lattice::{BRICK_SAMPLES, LatticeAtom, to_f32};
+use crate::surface::lattice::{BRICK_POINTS, LatticeAtom, to_f32};
 use crate::surface::params::Kernel;
 use crate::surface::simd::{dispatched, exp2, fma};
 
 /// Densities of a brick, x fastest: index `(z·8 + y)·8 + x`.
-pub(super) type Samples = [f32; BRICK_SAMPLES];
+pub(super) type BrickField = [f32; BRICK_POINTS];
 
 /// Lower bound of exponents: products of two stay normal numbers, as subnormal ones cost hundreds of cycles. Terms that
 /// small lie beyond the cut-off for every valid smoothness.
@@ -69,9 +70,9 @@ impl Constants {
     }
 }
 
-/// Range of the required samples of a brick: all, or only the first layer along y, z or both.
+/// Range of the required grid points of a brick: all, or only the first layer along y, z or both.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct SampleRange {
+pub(super) struct GridPointRange {
     /// Number of row pairs along y: 4, or 1 for the first layer.
     pub(super) y_pairs: usize,
     /// Number of layers along z: 8, or 1.
@@ -126,7 +127,7 @@ struct AtomInBrick {
 }
 
 #[inline(always)]
-fn place_atom(atom: &LatticeAtom, origin: [i32; 3], support: f32, range: SampleRange) -> AtomInBrick {
+fn place_atom(atom: &LatticeAtom, origin: [i32; 3], support: f32, range: GridPointRange) -> AtomInBrick {
     let reach = (support / atom.inv_length2).sqrt() + 1e-3;
     let base: [f32; 3] = std::array::from_fn(|k| (origin[k] - atom.cell[k]) as f32);
     let rows = |k: usize, n: usize| {
@@ -134,7 +135,7 @@ fn place_atom(atom: &LatticeAtom, origin: [i32; 3], support: f32, range: SampleR
         [to_row((c - reach).ceil(), n), to_row((c + reach).floor() + 1.0, n)]
     };
     let [y0, y1] = rows(1, 8);
-    // Whole numbers are exact in f32 here, so this rounds once and depends on sample and atom only.
+    // Whole numbers are exact in f32 here, so this rounds once and depends on grid point and atom only.
     let away = |k: usize, i: usize| (base[k] + i as f32) - atom.frac[k];
     let mut d = Axes { x: [0.0; 16], yz: [0.0; 16] };
     for i in 0..8 {
@@ -159,8 +160,8 @@ fn gaussian<const FMA: bool, const FULL: bool>(
     atoms: &[LatticeAtom],
     candidates: &[u32],
     origin: [i32; 3],
-    range: SampleRange,
-    out: &mut Samples,
+    range: GridPointRange,
+    out: &mut BrickField,
 ) {
     for &candidate in candidates {
         if candidate & NORMAL_ONLY != 0 {
@@ -199,8 +200,8 @@ fn compact<const FMA: bool, const INVERSE: bool>(
     atoms: &[LatticeAtom],
     candidates: &[u32],
     origin: [i32; 3],
-    range: SampleRange,
-    out: &mut Samples,
+    range: GridPointRange,
+    out: &mut BrickField,
 ) {
     for &candidate in candidates {
         if candidate & NORMAL_ONLY != 0 {
@@ -232,15 +233,15 @@ fn compact<const FMA: bool, const INVERSE: bool>(
 }
 
 dispatched! {
-/// Adds the densities of `candidates` to `out`, for the brick whose first sample is `origin`. Skips candidates that
+/// Adds the densities of `candidates` to `out`, for the brick whose first grid point is `origin`. Skips candidates that
 /// have the flag [`NORMAL_ONLY`].
 pub(super) fn evaluate(
     c: &Constants,
     atoms: &[LatticeAtom],
     candidates: &[u32],
     origin: [i32; 3],
-    range: SampleRange,
-    out: &mut Samples,
+    range: GridPointRange,
+    out: &mut BrickField,
 ) {
 
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {

@@ -14,9 +14,10 @@ use crate::surface::mesh::{normal_row, position_row};
 use crate::surface::params::Kernel;
 use crate::surface::quantize::Step;
 use crate::surface::simd::{LANES, dispatched, exp2, extent, fma};
+use crate::surface::sink::Vertices;
 use crate::surface::sphere_union::Feature;
 
-/// Vertices of one brick in its own coordinates, spacings from its first sample, and the atoms around them.
+/// Vertices of one brick, in spacings relative to its first grid point, and the atoms around them.
 #[derive(Debug, Default)]
 pub(super) struct VertexBatch {
     p: [Vec<f32>; 3],
@@ -25,13 +26,13 @@ pub(super) struct VertexBatch {
 }
 
 impl VertexBatch {
-    /// Places a brick's vertices in order; pads the count to whole vectors by repeating the last one.
-    fn place(&mut self, edges: &[Edge], t: &[f32]) {
+    /// Computes the positions of a brick's vertices; pads them to whole vectors by repeating the last one.
+    fn fill(&mut self, edges: &[Edge], t: &[f32]) {
         let padded = t.len().next_multiple_of(LANES);
         for column in self.p.iter_mut().chain(&mut self.n) {
             column.resize(padded, 0.0);
         }
-        places(edges, t, &mut self.p);
+        positions(edges, t, &mut self.p);
         for column in &mut self.p {
             let last = column[t.len() - 1];
             column[t.len()..].fill(last);
@@ -40,8 +41,8 @@ impl VertexBatch {
 }
 
 dispatched! {
-/// Computes the positions of vertices on their edges, in spacings from the brick's first sample.
-fn places(edges: &[Edge], t: &[f32], p: &mut [Vec<f32>; 3]) {
+/// Computes the positions of vertices on their edges, in spacings from the brick's first grid point.
+fn positions(edges: &[Edge], t: &[f32], p: &mut [Vec<f32>; 3]) {
     let [x, y, z] = p;
     for (((x, y), z), (edge, t)) in x.iter_mut().zip(y).zip(z).zip(edges.iter().zip(t)) {
         let along = |axis: u16| if edge.axis() == axis { *t } else { 0.0 };
@@ -54,7 +55,7 @@ fn places(edges: &[Edge], t: &[f32], p: &mut [Vec<f32>; 3]) {
 
 /// Inputs of a brick's vertices.
 pub(super) struct BrickVertices<'a> {
-    /// The brick's first sample.
+    /// The brick's first grid point.
     pub(super) origin: [i32; 3],
     /// The brick's candidate atoms.
     pub(super) candidates: &'a [u32],
@@ -64,7 +65,7 @@ pub(super) struct BrickVertices<'a> {
     pub(super) spheres: &'a [u32],
     /// Parameter of each vertex along its edge.
     pub(super) t: &'a [f32],
-    /// Those edges.
+    /// Edge of each vertex.
     pub(super) edges: &'a [Edge],
 }
 
@@ -72,12 +73,20 @@ pub(super) struct BrickVertices<'a> {
 pub(super) enum VertexRows<'a> {
     /// Positions relative to the mesh's centre, Å, and unit normals.
     Single { positions: &'a mut [[f32; 3]], normals: &'a mut [[f32; 3]] },
-    /// The same in steps, and in units of 1/127.
+    /// Positions in steps, and normals in units of 1/127.
     Quantized { step: Step, positions: &'a mut [[i16; 4]], normals: &'a mut [[i8; 4]] },
 }
 
 impl VertexRows<'_> {
-    /// Some of the rows.
+    /// Returns the rows for reading.
+    pub(super) fn as_vertices(&self) -> Vertices<'_> {
+        match self {
+            Self::Single { positions, normals } => Vertices::Single { positions, normals },
+            Self::Quantized { step, positions, normals } => Vertices::Quantized { step: *step, positions, normals },
+        }
+    }
+
+    /// Returns some of the rows.
     pub(super) fn slice(&mut self, rows: Range<usize>) -> VertexRows<'_> {
         match self {
             Self::Single { positions, normals } => {
@@ -135,7 +144,7 @@ pub(super) fn interpolate(
     control: &Control<'_>,
 ) -> Result<usize, SurfaceError> {
     let BrickVertices { origin, candidates, features, spheres, t, edges } = *source;
-    batch.place(edges, t);
+    batch.fill(edges, t);
     match field {
         Field::Density(constants) => {
             batch.n.iter_mut().for_each(|column| column.fill(0.0));
@@ -165,11 +174,12 @@ pub(super) fn interpolate(
     })
 }
 
-/// Returns a position in Å, from a brick's offset from the mesh's centre and a position within the brick, both in
-/// spacings. Whole lattice steps are exact in f32; the fraction is added before the one multiplication.
+/// Returns a position relative to the mesh's centre, Å. `offset` is the brick's offset from the centre and `in_brick` a
+/// position within the brick, both in spacings. Whole spacings are exact in f32, so the product is the only rounding
+/// besides the sum.
 #[inline(always)]
-pub(super) fn position(offset: [f32; 3], place: [f32; 3], spacing: f32) -> [f32; 3] {
-    std::array::from_fn(|k| (offset[k] + place[k]) * spacing)
+pub(super) fn position(offset: [f32; 3], in_brick: [f32; 3], spacing: f32) -> [f32; 3] {
+    std::array::from_fn(|k| (offset[k] + in_brick[k]) * spacing)
 }
 
 /// Returns a gradient scaled to length 1, and true if it has a direction.
@@ -206,7 +216,7 @@ fn write<P, N>(
 }
 
 dispatched! {
-/// Positions in Å and normals of length 1, row by row.
+/// Writes positions in Å and normals of length 1.
 fn finish(
     spacing: f64,
     offset: [f64; 3],
@@ -219,7 +229,7 @@ fn finish(
 }
 
 dispatched! {
-/// The same numbers, rounded.
+/// Writes quantized positions and normals.
 fn round(
     spacing: f64,
     offset: [f64; 3],
@@ -232,7 +242,7 @@ fn round(
 }
 }
 
-/// Adds −∇F of the candidates to each vertex's sum, up to a common factor.
+/// Adds −∇F of the candidates to the sum of each vertex, up to a common factor.
 #[inline(always)]
 fn sum_gradients<const FMA: bool>(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
     let [px, py, pz] = p;

@@ -7,7 +7,7 @@ use std::num::NonZeroU16;
 
 use glam::Vec3A;
 
-use super::neighbours::{NumberedBrick, Shared, shared_vertices};
+use super::neighbours::{NeighbourVertex, NumberedBrick, shared_vertices};
 use super::sheets::Sheets;
 use super::table::BrickTable;
 use crate::surface::join::{BrickSheets, SharedVertex, Sheet, SheetSums};
@@ -35,7 +35,7 @@ impl SheetSums {
         Self { bricks: Vec::with_capacity(bricks), sheets: Vec::with_capacity(2 * bricks), ..Self::default() }
     }
 
-    /// Adds the brick that `emit` has just written. `origin` is its first sample relative to the mesh's centre.
+    /// Adds the brick that `emit` has just written. `origin` is its first grid point relative to the mesh's centre.
     pub(super) fn add(
         &mut self,
         table: &BrickTable,
@@ -96,7 +96,7 @@ fn note_vertices(
             continue;
         }
         let known = has_one_sheet(near);
-        shared_vertices(near, usize::from(neighbour), |Shared { edge, index, .. }| {
+        shared_vertices(near, usize::from(neighbour), |NeighbourVertex { edge, index, .. }| {
             let sheet = on(index);
             sums[usize::from(sheet)].above |= 1 << neighbour;
             if !known {
@@ -111,7 +111,7 @@ fn note_vertices(
 /// Bit n stands for the brick that has this one as neighbour n.
 const USERS: [u8; 8] = [0, 1 << 1, 1 << 2, 0b1110, 1 << 4, 0b11_0010, 0b101_0100, 0];
 
-/// Returns true if a brick is known to have one sheet before its triangles exist.
+/// Returns true if `classify` has found a single sheet in the brick.
 #[inline(always)]
 fn has_one_sheet(of: &NumberedBrick<'_>) -> bool {
     of.brick.n_sheets == Some(NonZeroU16::MIN)
@@ -126,7 +126,7 @@ fn terms(table: &BrickTable, edges: [u16; 3]) -> [Vec3A; 3] {
     [n, n * sum, n * (a * sum + b * (b + c) + c * c)]
 }
 
-/// Computes the lengths of normals, padded with zeros: a single square root takes as long as a vector of them.
+/// Computes the lengths of normals. Pads with zeros, because one square root takes as long as a vector of them.
 #[inline(always)]
 fn lengths(normals: &[Vec3A]) -> [f32; LANES] {
     let mut lengths = [0.0; LANES];
@@ -156,8 +156,8 @@ fn sum_by_sheet(table: &BrickTable, sheets: &Sheets, sums: &mut [Sheet]) {
 }
 
 dispatched! {
-/// Returns the sums over triangles given by the grid edges of their corners. Single precision within a brick, where
-/// differences of positions are nearly exact; double precision between bricks.
+/// Returns the sums over triangles given by the grid edges of their corners. Uses single precision within a brick,
+/// where differences of positions are nearly exact; sums over bricks use double precision.
 fn sum(table: &BrickTable, corners: &[[u16; 3]]) -> Sheet {
     let mut all = Sheet { triangles: to_u32(corners.len()), ..Sheet::default() };
     let mut normals = [Vec3A::ZERO; LANES];

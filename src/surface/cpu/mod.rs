@@ -1,9 +1,10 @@
 //! Native CPU backend: seven stages over occupied bricks, parallel over tiles, with SIMD.
 //!
-//! First pass (`sample.rs`): `bin` assigns atoms to tiles. Each tile, or a slab of it, finds the candidates of its
-//! bricks, evaluates `field` into a scratch that fits the core's cache, and `classify` keeps crossing bits, edge
-//! parameters and cases. The field is never stored beyond a tile. `scan` numbers the tiles. Second pass (`write.rs`):
-//! `interpolate` and `emit` write vertices and triangles to memory or to a sink; `measure` sums over them.
+//! First pass (`first_pass.rs`): `bin` assigns atoms to tiles. For each tile, or a slab of it, a thread finds the
+//! candidates of the bricks and evaluates `field` in a scratch buffer that fits the core's cache; `classify` keeps
+//! crossing bits, edge parameters and cases. Densities are not kept. `scan` numbers the vertices and triangles of all
+//! tiles. Second pass (`write.rs`): `interpolate` and `emit` write vertices and triangles to memory or to a sink;
+//! `measure` sums over them.
 //!
 //! The same input gives the same bytes on any number of threads.
 
@@ -14,15 +15,15 @@ mod distance;
 mod edge;
 mod emit;
 pub(crate) mod field;
+mod first_pass;
 mod interpolate;
 mod measure;
 mod neighbours;
-#[doc(hidden)]
-pub mod probe;
-mod sample;
 pub(crate) mod scan;
 mod sheets;
 mod slabs;
+#[doc(hidden)]
+pub mod stage_results;
 mod table;
 mod threads;
 mod write;
@@ -30,28 +31,24 @@ mod write;
 use std::ops::Range;
 use std::sync::Arc;
 
-// Limits that the occupancy count shares with this backend.
-pub(crate) use self::bin::{check_lower_bound, too_large as grid_too_large};
-
 use self::bin::{Tiles, slot_brick};
 use self::classify::{ClassifiedBricks, CountsBefore};
 use self::distance::DistanceField;
 use self::field::Constants;
+use self::first_pass::Pass;
 use self::neighbours::NumberedBrick;
-use self::sample::Pass;
 use self::scan::Totals;
 use super::backend::{Backend, GridStats, MeshOutput};
-use super::candidates;
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::kernel::Shape;
 use super::lattice::{Lattice, TILE, to_f32, to_u32};
-use super::memory::Reservation;
+use super::memory::{MemoryMeter, Reservation};
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
-use super::simd;
 use super::sink::MeshSink;
 use super::spheres::Spheres;
+use super::{candidates, occupancy, simd};
 
 /// Native CPU backend.
 #[derive(Debug, Default)]
@@ -148,7 +145,15 @@ impl Field {
         }
     }
 
-    /// Returns the value of the samples at the surface.
+    /// Returns the bounding spheres of the arcs of the boundary, if the surface needs one.
+    fn bounds(&self) -> Option<&Lattice> {
+        match self {
+            Self::Density(_) => None,
+            Self::Distance(field) => field.bounds(),
+        }
+    }
+
+    /// Returns the value at the grid points on the surface.
     fn level(&self, params: &SurfaceParams) -> f32 {
         match self {
             Self::Density(_) => to_f32(params.isovalue),
@@ -157,7 +162,37 @@ impl Field {
     }
 }
 
-/// A tile between the stages.
+/// Returns the field of a run whose pairs do not exceed the limit.
+fn checked_field(lattice: &Lattice, context: RunContext<'_>) -> Result<Field, SurfaceError> {
+    let RunContext { limits, control, .. } = context;
+    occupancy::check_pairs(&[lattice], limits, control)?;
+    let field = Field::new(lattice, context)?;
+    if let Some(bounds) = field.bounds() {
+        occupancy::check_pairs(&[lattice, bounds], limits, control)?;
+    }
+    Ok(field)
+}
+
+/// Rejects a run as it would be rejected before its field is evaluated.
+///
+/// # Errors
+/// Those of the limits on grid points, pairs and overlaps.
+pub(crate) fn check_work(
+    lattice: &Lattice,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<occupancy::WorkCounts, SurfaceError> {
+    let counts = occupancy::count(lattice, limits, control)?;
+    if matches!(lattice.shape, Shape::Sphere { .. }) {
+        let memory: Arc<dyn MemoryMeter> = Arc::new(Reservation::new(&control.memory));
+        let control = Control { memory, ..control.clone() };
+        checked_field(lattice, RunContext { params, limits, control: &control, free_threads: 1 })?;
+    }
+    Ok(counts)
+}
+
+/// Results of the stages for a tile.
 #[derive(Debug)]
 struct Tile {
     coord: [i32; 3],
@@ -184,7 +219,7 @@ struct Scanned {
     quantize: Option<Step>,
 }
 
-/// Surface bricks of a tile whose rows one thread writes at once.
+/// Run of surface bricks of a tile. One thread writes its rows.
 #[derive(Debug, Clone)]
 struct Piece {
     tile: usize,
@@ -209,6 +244,9 @@ fn pieces(done: &mut [Tile]) -> Vec<Piece> {
 /// Memory of placing an atom on the lattice, bytes: the atom, its bucket and its index, and the tables of buckets.
 pub(crate) const LATTICE_BYTES: u64 = 41;
 
+/// Memory of a slab and its result besides the lists that it owns, bytes: while the results are collected and sorted.
+const RESULT_BYTES: u64 = (size_of::<slabs::Slab>() + 3 * size_of::<(usize, Tile)>()) as u64;
+
 fn scan(spheres: &Spheres, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
     let lattice = context.control.span(Stage::Bin, || {
         candidates::check(spheres, context.params, context.limits)?;
@@ -222,16 +260,18 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
     let RunContext { params, limits, control, free_threads } = context;
     let tiles = control.span(Stage::Bin, || -> Result<_, SurfaceError> {
         let tiles = Tiles::new(&lattice, limits, control)?;
-        if tiles.len() as f64 * f64::from(TILE).powi(3) > limits.max_samples as f64 {
-            bin::check_lower_bound(&lattice, limits)?;
+        if tiles.len() as f64 * f64::from(TILE).powi(3) > limits.max_grid_points as f64 {
+            // Rejects a grid that exceeds the limit before any of it is computed.
+            occupancy::count(&lattice, limits, control)?;
         }
         Ok(tiles)
     });
     let tiles = tiles?;
     control.check()?;
-    let field = control.span(Stage::Bin, || Field::new(&lattice, context))?;
+    let field = control.span(Stage::Bin, || checked_field(&lattice, context))?;
     control.check()?;
     let slabs = slabs::cut(&tiles, free_threads);
+    control.memory.grow(RESULT_BYTES * slabs.len() as u64)?;
     let pass = Pass {
         lattice: &lattice,
         tiles: &tiles,
@@ -240,12 +280,12 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
         field: &field,
         iso: field.level(params),
         context,
-        counters: sample::PassCounters::default(),
+        counters: first_pass::PassCounters::default(),
     };
-    let sampled = threads::each(slabs.len(), |i| pass.sample(i))?;
+    let evaluated = threads::each(slabs.len(), |i| pass.evaluate(i))?;
     let counters = pass.counters;
     let mut done: Vec<(usize, Tile)> =
-        slabs.iter().zip(sampled).filter_map(|(slab, tile)| Some((slab.tile, tile?))).collect();
+        slabs.iter().zip(evaluated).filter_map(|(slab, tile)| Some((slab.tile, tile?))).collect();
     done.sort_unstable_by_key(|(t, _)| *t);
     let mut done: Vec<Tile> = done.into_iter().map(|(_, tile)| tile).collect();
     control.check()?;
@@ -257,7 +297,7 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
     let grid = GridStats {
         bricks: counters.bricks.into_inner(),
         surface_bricks,
-        samples: counters.samples.into_inner(),
+        grid_points: counters.grid_points.into_inner(),
         box_cells: lattice.box_cells,
         candidates: counters.candidates.into_inner(),
         overlaps: field.overlaps(),

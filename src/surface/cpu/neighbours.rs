@@ -55,12 +55,12 @@ fn shared_edges(crossing: &[u64; 24], n: usize, mut each: impl FnMut(usize, usiz
         4 => [0, 1].iter().for_each(|&axis| bits(crossing[axis], |b| each(0, b, axis))),
         5 => bits(crossing[1] & X0, |b| each(0, b, 1)),
         6 => bits(crossing[0] & Y0, |b| each(0, b, 0)),
-        // All eight share a single sample and no edge.
+        // All eight share a single grid point and no edge.
         _ => {}
     }
 }
 
-/// Returns the offset of the neighbour `n` (bits: 0 x, 1 y, 2 z), in samples.
+/// Returns the offset of the neighbour `n` (bits: 0 x, 1 y, 2 z), in grid points.
 #[inline(always)]
 pub(super) fn far(n: usize) -> [usize; 3] {
     [8 * (n & 1), 8 * (n >> 1 & 1), 8 * (n >> 2 & 1)]
@@ -68,7 +68,7 @@ pub(super) fn far(n: usize) -> [usize; 3] {
 
 /// A vertex of a neighbour.
 #[derive(Clone, Copy)]
-pub(super) struct Shared {
+pub(super) struct NeighbourVertex {
     /// Rank among the neighbour's vertices.
     pub(super) rank: u32,
     /// Its edge in the neighbour.
@@ -79,7 +79,7 @@ pub(super) struct Shared {
 
 /// Calls `each` for the vertices of the neighbour `n` (bits: 0 x, 1 y, 2 z, but not 0) that a brick's cells use.
 #[inline(always)]
-pub(super) fn shared_vertices(of: &NumberedBrick<'_>, n: usize, mut each: impl FnMut(Shared)) {
+pub(super) fn shared_vertices(of: &NumberedBrick<'_>, n: usize, mut each: impl FnMut(NeighbourVertex)) {
     let SurfaceBrick { crossing, before, .. } = of.brick;
     let far = far(n);
     shared_edges(crossing, n, |z, bit, axis| {
@@ -87,7 +87,7 @@ pub(super) fn shared_vertices(of: &NumberedBrick<'_>, n: usize, mut each: impl F
         let below = crossing[w] & !(u64::MAX << (bit & 63));
         let rank = u32::from(before[w]) + below.count_ones();
         let edge = Edge::new(z, bit, axis);
-        each(Shared { rank, edge, index: edge.index_from(far) });
+        each(NeighbourVertex { rank, edge, index: edge.index_from(far) });
     });
 }
 

@@ -1,4 +1,4 @@
-//! Sheets of a brick: its vertices, connected by its own triangles.
+//! Sheets of a brick: sets of vertices that its triangles connect.
 
 use super::edge::EDGES;
 use crate::surface::union_find::UnionFind;
@@ -57,7 +57,7 @@ impl Sheets {
         }
     }
 
-    /// Numbers the remaining sheets from 0, and returns their number.
+    /// Numbers the remaining sheets from 0. Returns how many there are.
     pub(super) fn resolve(&mut self) -> u16 {
         u16::try_from(self.united.number_sets(&mut self.numbers)).unwrap_or(u16::MAX)
     }

@@ -1,8 +1,8 @@
-//! Work items of the first pass: whole tiles, or slabs of tiles that would keep one thread busy while the others are
-//! idle.
+//! Work items of the first pass: whole tiles, or slabs of large tiles, which would keep one thread busy while the
+//! others are idle.
 //!
-//! The result does not depend on the split: a slab finds what its tile would find in these layers, and slabs are joined
-//! in order.
+//! The result does not depend on the split: the results of a slab are those of the whole tile in these layers, and
+//! slabs are joined in order.
 
 use std::cmp::Reverse;
 use std::ops::Range;
@@ -13,7 +13,7 @@ use rustc_hash::FxHashMap;
 use super::bin::{SIDE, Tiles};
 use super::{NO_BRICK, Tile};
 
-/// Layers of a tile's bricks that one thread samples at once.
+/// Layers of a tile's bricks that one thread evaluates at once.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Slab {
     /// The tile.
@@ -22,7 +22,7 @@ pub(super) struct Slab {
     pub(super) layers: Range<usize>,
 }
 
-/// Maximum number of slabs per tile: each evaluates one extra layer of samples.
+/// Maximum number of slabs per tile: each evaluates one extra layer of grid points.
 const MAX_SLABS: usize = 4;
 
 /// Splits large tiles into slabs for `threads` idle threads. Splitting a small structure for 16 threads costs 20 to 40
@@ -46,7 +46,7 @@ fn pieces(own: usize, all: usize, threads: usize) -> usize {
     if own * threads <= all { 1 } else { (3 * own * threads).div_ceil(2 * all).next_power_of_two().min(MAX_SLABS) }
 }
 
-/// Tiles of which only some slabs have been sampled.
+/// Tiles of which only some slabs have been evaluated.
 #[derive(Default)]
 pub(super) struct PartialTiles(Mutex<FxHashMap<usize, Vec<(usize, Tile)>>>);
 
@@ -124,15 +124,15 @@ mod tests {
 
     #[test]
     fn slabs_find_the_same_as_the_whole_tile() {
-        let told = |scanned: &Scanned| (format!("{:?}", scanned.done), format!("{:?}", scanned.grid));
+        let described = |scanned: &Scanned| (format!("{:?}", scanned.done), format!("{:?}", scanned.grid));
         let whole = scanned(1);
-        let expected = told(&whole);
+        let expected = described(&whole);
         assert!(
             whole.done.iter().any(|tile| !tile.found.sheets.is_empty()),
             "bricks with several sheets are among them"
         );
         for threads in [3, 8, 16] {
-            assert!(told(&scanned(threads)) == expected, "{threads} threads");
+            assert!(described(&scanned(threads)) == expected, "{threads} threads");
         }
     }
 }

@@ -4,15 +4,15 @@ use glam::Vec3A;
 
 use super::edge::{self, EDGES, Edge};
 use super::interpolate::position;
-use super::neighbours::{NumberedBrick, Shared, far, shared_vertices};
+use super::neighbours::{NeighbourVertex, NumberedBrick, far, shared_vertices};
 use super::sheets::NONE;
 use crate::surface::cases::MAX_TRIANGLES;
-use crate::surface::lattice::{BRICK_SAMPLES, to_f32};
+use crate::surface::lattice::{BRICK_POINTS, to_f32};
 use crate::surface::quantize::Step;
 
 /// Capacity for the corners of a brick's triangles: five triangles per cell, and the padding of a cell's row.
 const CORNERS: usize = 512 * 3 * MAX_TRIANGLES + ROW;
-/// Corners that every cell writes, as whole vectors: those beyond its triangles are overwritten by the next cell.
+/// Number of corners that every cell writes: whole vectors. The next cell overwrites those beyond the cell's triangles.
 pub(super) const ROW: usize = 16;
 
 /// Vertices of the current brick by grid edge, `3·((z·9 + y)·9 + x) + axis`, and its triangles. Entries of edges that
@@ -20,12 +20,12 @@ pub(super) const ROW: usize = 16;
 pub(super) struct BrickTable {
     /// Global vertex ids.
     pub(super) ids: Box<[u32; EDGES]>,
-    /// Positions in spacings from the brick's first sample.
+    /// Positions in spacings from the brick's first grid point.
     at: Box<[Vec3A; EDGES]>,
     /// Sheet of a vertex, before sheets that meet are united.
     pub(super) sheet: Box<[u16; EDGES]>,
     /// Sheet of each cell of the brick, if there are several and they are known.
-    cells: Box<[u16; BRICK_SAMPLES]>,
+    cells: Box<[u16; BRICK_POINTS]>,
     /// Corners of the triangles as grid edges.
     pub(super) corners: Box<[u16; CORNERS]>,
     /// Triangles.
@@ -48,7 +48,7 @@ impl Default for BrickTable {
             ids: boxed(0),
             at: boxed(Vec3A::ZERO),
             sheet: boxed(0),
-            cells: Box::new([0; BRICK_SAMPLES]),
+            cells: Box::new([0; BRICK_POINTS]),
             corners: Box::new([0; CORNERS]),
             triangles: 0,
             shared: 0,
@@ -56,7 +56,7 @@ impl Default for BrickTable {
     }
 }
 
-/// Coordinates of samples within a layer, by bit.
+/// Coordinates of grid points within a layer, by bit.
 static LAYER: [Vec3A; 64] = {
     let mut table = [Vec3A::ZERO; 64];
     let mut bit = 0_u8;
@@ -81,15 +81,15 @@ static LAYERS: [Vec3A; 8] = {
 /// Directions by axis; the last one is zero.
 static ALONG: [Vec3A; 4] = [Vec3A::X, Vec3A::Y, Vec3A::Z, Vec3A::ZERO];
 
-/// Returns a vertex's position in its own brick, in spacings from the first sample of that brick.
+/// Returns a vertex's position in its own brick, in spacings from the first grid point of that brick.
 #[inline(always)]
-fn place(edge: Edge, t: f32) -> Vec3A {
+fn in_own_brick(edge: Edge, t: f32) -> Vec3A {
     corner(edge) + along(edge, t)
 }
 
 #[inline(always)]
 fn corner(edge: Edge) -> Vec3A {
-    LAYER[edge.sample() % 64] + LAYERS[edge.sample() / 64]
+    LAYER[edge.grid_point() % 64] + LAYERS[edge.grid_point() / 64]
 }
 
 #[inline(always)]
@@ -112,14 +112,14 @@ impl BrickTable {
     pub(super) fn fill(&mut self, around: &[Option<NumberedBrick<'_>>; 8]) {
         if let Some(own) = &around[0] {
             for ((edge, t), id) in own.edges.iter().zip(own.t).zip(own.first..) {
-                self.put(edge.index(), id, place(*edge, *t));
+                self.put(edge.index(), id, in_own_brick(*edge, *t));
             }
         }
         self.shared = 0;
         for (n, near) in around.iter().enumerate().skip(1) {
             let Some(near) = near else { continue };
             let beyond = Vec3A::from_array(far(n).map(|k| k as f32));
-            shared_vertices(near, n, |Shared { rank, edge, index }| {
+            shared_vertices(near, n, |NeighbourVertex { rank, edge, index }| {
                 let t = near.t.get(rank as usize).copied().unwrap_or_default();
                 self.put(index, near.first + rank, (corner(edge) + beyond) + along(edge, t));
                 self.shared |= 1 << n;
@@ -142,11 +142,11 @@ impl BrickTable {
         for (n, near) in around.iter().enumerate() {
             let Some(near) = near else { continue };
             if n == 0 {
-                near.edges.iter().for_each(|edge| self.sheet[edge.index()] = self.cells[edge.sample()]);
+                near.edges.iter().for_each(|edge| self.sheet[edge.index()] = self.cells[edge.grid_point()]);
                 continue;
             }
-            shared_vertices(near, n, |Shared { index, .. }| {
-                self.sheet[index] = self.cells[usize::from(edge::CELL_OF[index]) % BRICK_SAMPLES];
+            shared_vertices(near, n, |NeighbourVertex { index, .. }| {
+                self.sheet[index] = self.cells[usize::from(edge::CELL_OF[index]) % BRICK_POINTS];
             });
         }
     }
@@ -156,11 +156,11 @@ impl BrickTable {
     pub(super) fn round(&mut self, of: &NumberedBrick<'_>, n: usize, rounding: &Rounding) {
         let Rounding { step, spacing, offset } = *rounding;
         let far = far(n);
-        // Computed as in the vertex's own brick, so that all bricks see the same position.
+        // Computed as in the vertex's own brick, so that all bricks get the same position.
         let own: [f32; 3] = std::array::from_fn(|k| to_f32(offset[k] + far[k] as f64));
         let (h, length) = (to_f32(spacing), f64::from(step.length()));
         let mut put = |index: usize, edge: Edge, t: f32| {
-            let steps = step.position(position(own, place(edge, t).to_array(), h));
+            let steps = step.position(position(own, in_own_brick(edge, t).to_array(), h));
             // Double precision, as a large offset is subtracted.
             let at: [f32; 3] = std::array::from_fn(|k| to_f32(f64::from(steps[k]) * length / spacing - offset[k]));
             self.at[index] = Vec3A::from_array(at);
@@ -169,7 +169,7 @@ impl BrickTable {
             of.edges.iter().zip(of.t).for_each(|(edge, t)| put(edge.index(), *edge, *t));
             return;
         }
-        shared_vertices(of, n, |Shared { rank, edge, index }| {
+        shared_vertices(of, n, |NeighbourVertex { rank, edge, index }| {
             put(index, edge, of.t.get(rank as usize).copied().unwrap_or_default());
         });
     }
@@ -184,7 +184,7 @@ impl BrickTable {
         self.shared
     }
 
-    /// Returns a vertex's position in spacings from the brick's first sample.
+    /// Returns a vertex's position in spacings from the brick's first grid point.
     #[inline(always)]
     pub(super) fn position(&self, edge: u16) -> Vec3A {
         self.at[usize::from(edge) % EDGES]
@@ -203,6 +203,6 @@ pub(super) struct Rounding {
     pub(super) step: Step,
     /// Å.
     pub(super) spacing: f64,
-    /// Offset of the brick's first sample from the mesh's centre, in spacings.
+    /// Offset of the brick's first grid point from the mesh's centre, in spacings.
     pub(super) offset: [f64; 3],
 }

@@ -1,7 +1,7 @@
 //! The second pass: `interpolate` and `emit` write the rows of every piece, in memory or into a sink.
 //!
-//! In memory, a piece is written to its final place. For a sink, it lives in the thread's scratch until the sink has
-//! taken it.
+//! In memory, a piece is written to its final position. For a sink, it is written to a scratch buffer of the thread,
+//! which the sink reads.
 
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -18,21 +18,21 @@ use crate::surface::backend::{MeshOutput, StreamedMesh};
 use crate::surface::column::Column;
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
-use crate::surface::join::{self, SheetSums};
+use crate::surface::join::{self, Sheet, SheetSums};
 use crate::surface::lattice::Lattice;
-use crate::surface::measure::{Measures, Validation};
+use crate::surface::measure::Measures;
 use crate::surface::mesh::{Mesh, Quantized, joined_bounds};
 use crate::surface::quantize::Step;
-use crate::surface::sink::{MeshPart, MeshSink, SinkFailed, Vertices};
+use crate::surface::sink::{MeshPart, MeshSink, SinkFailed};
 
 thread_local! {
-    // As in the first pass: kept per thread, not per piece.
-    static SCRATCH: RefCell<Scratch> = RefCell::default();
+    // Kept per thread, as in the first pass.
+    static SCRATCH: RefCell<PieceScratch> = RefCell::default();
 }
 
 /// Buffers that a thread reuses from piece to piece.
 #[derive(Default)]
-struct Scratch {
+struct PieceScratch {
     stages: Stages,
     rows: ScratchRows,
 }
@@ -45,7 +45,7 @@ struct Stages {
     sheets: Sheets,
 }
 
-/// Rows of a piece on their way to a sink.
+/// Rows of a piece for a sink.
 #[derive(Default)]
 struct ScratchRows {
     positions: Vec<[f32; 3]>,
@@ -63,7 +63,7 @@ pub(super) struct PieceRows<'a> {
 
 /// Destination of the rows.
 pub(super) enum Destination<'a> {
-    /// Rows of each piece. The locks only hand them to the thread that fills them.
+    /// Rows of each piece. A lock gives one thread mutable access to them.
     Memory(Vec<Mutex<PieceRows<'a>>>),
     Sink(&'a dyn MeshSink),
 }
@@ -74,7 +74,7 @@ pub(super) struct PieceSummary {
     flat: usize,
     /// Sums over its triangles.
     pub(super) sums: SheetSums,
-    /// Bounds of its positions, Å; computed for a sink only.
+    /// Bounds of its positions, Å.
     bounds: Option<[[f32; 3]; 2]>,
 }
 
@@ -92,34 +92,30 @@ pub(super) fn write(
     let failed = |SinkFailed| SurfaceError::Sink;
     let [n_vertices, n_triangles] = [scanned.totals.vertices, scanned.totals.triangles];
     sink.begin(n_vertices, n_triangles).map_err(failed)?;
+    let _sums = control.reserve(SHEET_BYTES * scanned.grid.surface_bricks)?;
     let written = write_pieces(scanned, control, &Destination::Sink(sink))?;
     let measures = control.span(Stage::Measure, || measures(scanned, &written));
     let measures = match measures {
         Some(measures) if written.iter().all(|piece| piece.flat == 0) => measures,
-        // A normal without a gradient depends on the triangles around it, and measuring a mesh that is not closed needs
-        // the whole mesh: it is computed again in memory, and its rows replace the first ones.
+        // The normal of a vertex without a gradient depends on the triangles around it, and measuring a mesh that is
+        // not closed requires the whole mesh. In both cases the mesh is computed again in memory and sent again.
         _ => {
-            let MeshOutput { mesh, measures, .. } = in_memory(scanned, false, control)?;
-            sink.part(&MeshPart::whole(&mesh)).map_err(failed)?;
-            measures.map_or_else(|| Measures::of(&mesh, Validation::Checksum, control), Ok)?
+            let mut output = in_memory(scanned, false, control)?;
+            sink.part(&MeshPart::whole(&output.mesh)).map_err(failed)?;
+            output.measure(control)?.clone()
         }
     };
-    let bounds = written.iter().filter_map(|piece| piece.bounds).reduce(joined_bounds).unwrap_or_default();
+    let bounds = bounds_of(&written).unwrap_or_default();
     let mesh = Mesh { centre: scanned.lattice.centre(), ..Mesh::default() };
     let streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds });
     Ok(MeshOutput { streamed, measures: Some(measures), ..MeshOutput::new(mesh, scanned.grid) })
 }
 
-/// Bytes of a vertex with 32-bit floating-point numbers, and of a quantized one.
-const SINGLE_BYTES: usize = 24;
-const QUANTIZED_BYTES: usize = 12;
-
 fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
     let Scanned { lattice, totals, pieces, .. } = scanned;
     let of_ids = if atom_ids { size_of::<u32>() * totals.vertices } else { 0 };
-    let of_vertex = if scanned.quantize.is_some() { QUANTIZED_BYTES } else { SINGLE_BYTES };
-    let bytes = of_vertex * totals.vertices + size_of::<[u32; 3]>() * totals.triangles + of_ids;
-    control.memory.grow(bytes as u64)?;
+    let [n, m] = [totals.vertices, totals.triangles].map(|n| n as u64);
+    control.memory.grow(Mesh::bytes_for(n, m, scanned.quantize.is_some()) + of_ids as u64)?;
     let n_single = if scanned.quantize.is_some() { 0 } else { totals.vertices };
     let mut mesh = Mesh {
         centre: lattice.centre(),
@@ -141,13 +137,23 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
         let atom_ids = ids.as_mut().map(|ids| take(ids, n));
         Mutex::new(PieceRows { rows: rows.take(n), triangles: take(&mut triangles, m), atom_ids })
     });
+    let _sums = control.reserve(SHEET_BYTES * scanned.grid.surface_bricks)?;
     let written = write_pieces(scanned, control, &Destination::Memory(of_piece.collect()))?;
     if written.iter().any(|piece| piece.flat > 0) {
         control.span(Stage::Interpolate, || mesh.fill_flat_normals());
     }
     let measures = control.span(Stage::Measure, || measures(scanned, &written));
-    Ok(MeshOutput { measures, ..MeshOutput::new(mesh, scanned.grid) })
+    Ok(MeshOutput { measures, bounds: bounds_of(&written), ..MeshOutput::new(mesh, scanned.grid) })
 }
+
+/// Returns the bounds of the positions of all pieces, Å.
+fn bounds_of(written: &[PieceSummary]) -> Option<[[f32; 3]; 2]> {
+    written.iter().filter_map(|piece| piece.bounds).reduce(joined_bounds)
+}
+
+/// Memory of the sums of a brick, bytes: its sheet, the copy in a group of bricks, and the component if it is separate.
+/// Few bricks have several sheets.
+const SHEET_BYTES: u64 = 3 * size_of::<Sheet>() as u64;
 
 /// Writes all pieces, in parallel.
 pub(super) fn write_pieces(
@@ -160,7 +166,7 @@ pub(super) fn write_pieces(
     let finished = AtomicUsize::new(0);
     threads::each(pieces.len(), |i| {
         control.check()?;
-        let written = SCRATCH.with_borrow_mut(|Scratch { stages, rows }| match destination {
+        let written = SCRATCH.with_borrow_mut(|PieceScratch { stages, rows }| match destination {
             Destination::Memory(of_piece) => {
                 let mut rows = of_piece[i].lock().unwrap_or_else(PoisonError::into_inner);
                 writer.write(&pieces[i], &mut rows, stages)
@@ -173,7 +179,7 @@ pub(super) fn write_pieces(
     })
 }
 
-/// Measures of the mesh that the pieces make up; `None` if it is not closed.
+/// Returns the measures of the mesh that consists of the pieces; `None` if it is not closed.
 fn measures(scanned: &Scanned, written: &[PieceSummary]) -> Option<Measures> {
     let Scanned { lattice, tiles, done, totals, pieces, .. } = scanned;
     let sums: Vec<&SheetSums> = written.iter().map(|piece| &piece.sums).collect();
@@ -216,17 +222,12 @@ impl Writer<'_> {
             }
         };
         let mut rows = PieceRows { rows, triangles: first(&mut scratch.triangles, m), atom_ids: None };
-        let mut written = self.write(piece, &mut rows, stages)?;
-        let vertices = match rows.rows {
-            VertexRows::Single { positions, normals } => Vertices::Single { positions, normals },
-            VertexRows::Quantized { step, positions, normals } => Vertices::Quantized { step, positions, normals },
-        };
-        written.bounds = vertices.bounds();
+        let written = self.write(piece, &mut rows, stages)?;
         let tile = &self.scanned.done[piece.tile];
         let [start, _] = tile.span(piece);
         let part = MeshPart {
             first_vertex: tile.first_vertex + start.vertices,
-            vertices,
+            vertices: rows.rows.as_vertices(),
             first_triangle: tile.first_triangle + start.triangles,
             triangles: rows.triangles,
         };
@@ -243,7 +244,7 @@ impl Writer<'_> {
     ) -> Result<PieceSummary, SurfaceError> {
         let flat = self.control.span(Stage::Interpolate, || self.interpolate(piece, rows, &mut stages.batch))?;
         let sums = self.control.span(Stage::Emit, || self.emit(piece, rows.triangles, stages));
-        Ok(PieceSummary { flat, sums, bounds: None })
+        Ok(PieceSummary { flat, sums, bounds: rows.rows.as_vertices().bounds() })
     }
 
     /// Writes the vertices. Returns the number of vertices without a gradient.

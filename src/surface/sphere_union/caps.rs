@@ -1,8 +1,15 @@
 //! Caps of a sphere: the parts of its surface that lie within other spheres.
 
-/// Tolerance of all covering tests, Å: a cap covers only what lies this far inside it. Points where caps meet are then
-/// exposed. That moves the surface at most by the tolerance, whereas losing such a point would move it farther.
+use crate::surface::candidates::Comparisons;
+use crate::surface::error::SurfaceError;
+
+/// Tolerance of all covering tests, Å: a cap covers only points that lie farther than this inside it. Points at which
+/// caps meet are then exposed, which moves the surface by the tolerance at most. Without such a point, the surface
+/// would move farther.
 pub(super) const TOLERANCE: f64 = 1e-6;
+
+/// Caps that are sorted without a check of the cancellation flag: a few milliseconds.
+const SORTED_AT_ONCE: usize = 1 << 15;
 
 /// Sphere relative to the centre of another one.
 #[derive(Debug, Clone, Copy)]
@@ -38,7 +45,17 @@ pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
 }
 
 /// Fills `caps` with the caps on the sphere of number `own` that no other cap contains, largest first.
-pub(super) fn caps(own: u32, radius: f64, neighbours: &[Neighbour], tolerance: f64, caps: &mut Vec<Cap>) -> Cover {
+///
+/// # Errors
+/// Returns the errors of [`Comparisons::add`].
+pub(super) fn caps(
+    own: u32,
+    radius: f64,
+    neighbours: &[Neighbour],
+    tolerance: f64,
+    caps: &mut Vec<Cap>,
+    comparisons: &mut Comparisons<'_>,
+) -> Result<Cover, SurfaceError> {
     caps.clear();
     for other in neighbours {
         let distance2 = dot(other.to, other.to);
@@ -47,9 +64,9 @@ pub(super) fn caps(own: u32, radius: f64, neighbours: &[Neighbour], tolerance: f
             continue;
         }
         if distance2 <= difference * difference {
-            // One contains the other. Of equal spheres, the one with the lowest number remains.
+            // One sphere contains the other. Of equal spheres, the one with the lowest number remains.
             if difference < 0.0 || difference == 0.0 && other.index < own {
-                return Cover::Whole;
+                return Ok(Cover::Whole);
             }
             continue;
         }
@@ -57,26 +74,40 @@ pub(super) fn caps(own: u32, radius: f64, neighbours: &[Neighbour], tolerance: f
         let height = (distance2 + sum * difference) / (2.0 * distance * radius);
         caps.push(Cap { axis: other.to.map(|c| c / distance), height, index: other.index });
     }
-    caps.sort_unstable_by(|a, b| a.height.total_cmp(&b.height).then(a.index.cmp(&b.index)));
+    sort(caps, comparisons)?;
     let mut kept = 0;
     for i in 0..caps.len() {
         let cap = caps[i];
+        comparisons.add(kept)?;
         match caps[..kept].iter().find(|larger| larger.covers_edge(&cap, tolerance / radius)) {
             None => {
                 caps[kept] = cap;
                 kept += 1;
             }
             // The smaller cap covers the rest of the sphere.
-            Some(larger) if -dot(larger.axis, cap.axis) > cap.height => return Cover::Whole,
+            Some(larger) if -dot(larger.axis, cap.axis) > cap.height => return Ok(Cover::Whole),
             Some(_) => {}
         }
     }
     caps.truncate(kept);
-    Cover::Caps
+    Ok(Cover::Caps)
+}
+
+/// Sorts caps by height and number. Halves a long list first, with a check of the cancellation flag at each half.
+fn sort(caps: &mut [Cap], comparisons: &mut Comparisons<'_>) -> Result<(), SurfaceError> {
+    let order = |a: &Cap, b: &Cap| a.height.total_cmp(&b.height).then(a.index.cmp(&b.index));
+    if caps.len() <= SORTED_AT_ONCE {
+        caps.sort_unstable_by(order);
+        return Ok(());
+    }
+    comparisons.count()?;
+    let (lower, _, upper) = caps.select_nth_unstable_by(caps.len() / 2, order);
+    sort(lower, comparisons)?;
+    sort(upper, comparisons)
 }
 
 impl Cap {
-    /// Returns true if this cap, reduced by `tolerance`, contains the edge of another one.
+    /// Returns true if this cap, reduced by `tolerance`, contains the edge of another cap.
     fn covers_edge(&self, other: &Self, tolerance: f64) -> bool {
         let cos = dot(self.axis, other.axis);
         // On the edge of the other cap, n·axis is at least height·cos − sin·sin.

@@ -1,6 +1,9 @@
-//! Uniform grid of cells with the spheres whose centres they contain.
+//! Uniform grid of cells, each with the spheres whose centres it contains.
 
-use rustc_hash::FxHashMap;
+use std::cmp::Ordering;
+
+use rayon::prelude::*;
+use rustc_hash::{FxBuildHasher, FxHashMap};
 
 use super::caps::Neighbour;
 use super::radius;
@@ -10,6 +13,9 @@ use crate::surface::lattice::{LatticeAtom, to_i32, to_u32};
 
 /// Maximum memory per sphere, bytes: its cell while sorting, its number and its entry in the index.
 const BYTES: u64 = 64;
+
+/// Spheres or cells between two checks of the cancellation flag: a few milliseconds.
+const PER_CHECK: usize = 1 << 16;
 
 /// Cells with the diameter of the largest sphere as edge length: spheres that overlap lie in neighbouring cells.
 pub(super) struct Cells<'a> {
@@ -38,8 +44,17 @@ impl<'a> Cells<'a> {
         let side = 2.001 * atoms.iter().map(radius).fold(0.0, f64::max) + 1.0;
         let cell =
             |atom: &LatticeAtom| -> [i32; 3] { std::array::from_fn(|k| to_i32((atom.position(k) / side).floor())) };
-        let mut keys: Vec<([i32; 3], u32)> = atoms.iter().zip(0..).map(|(atom, i)| (cell(atom), i)).collect();
-        keys.sort_unstable();
+        let mut keys: Vec<([i32; 3], u32)> = Vec::with_capacity(atoms.len());
+        for some in atoms.chunks(PER_CHECK) {
+            control.check()?;
+            keys.extend(some.iter().zip(to_u32(keys.len())..).map(|(atom, i)| (cell(atom), i)));
+        }
+        // Equal keys need no sorting, so that a cancelled sort ends after one pass over its current parts.
+        let order = |a: &([i32; 3], u32), b: &([i32; 3], u32)| {
+            if control.cancel.is_cancelled() { Ordering::Equal } else { a.cmp(b) }
+        };
+        keys.par_sort_unstable_by(order);
+        control.check()?;
         let (mut coords, mut starts): (Vec<[i32; 3]>, Vec<u32>) = (Vec::new(), Vec::new());
         for (i, (cell, _)) in keys.iter().enumerate() {
             if coords.last() != Some(cell) {
@@ -48,7 +63,11 @@ impl<'a> Cells<'a> {
             }
         }
         starts.push(to_u32(keys.len()));
-        let index = coords.iter().copied().zip(0..).collect();
+        let mut index = FxHashMap::with_capacity_and_hasher(coords.len(), FxBuildHasher);
+        for (some, first) in coords.chunks(PER_CHECK).zip((0..).step_by(PER_CHECK)) {
+            control.check()?;
+            index.extend(some.iter().copied().zip(first..));
+        }
         Ok(Self { atoms, index, coords, starts, order: keys.into_iter().map(|(_, i)| i).collect() })
     }
 
@@ -72,7 +91,7 @@ impl<'a> Cells<'a> {
         let base = self.of(cell).first().map_or([0; 3], |&i| self.atoms[i as usize].cell);
         let mut around = Around { atoms: self.atoms, base, order, columns: Default::default() };
         for (k, column) in around.columns.iter_mut().enumerate().take(3) {
-            column.extend(around.order.iter().map(|&i| place(&self.atoms[i as usize], base, k)));
+            column.extend(around.order.iter().map(|&i| coordinate(&self.atoms[i as usize], base, k)));
         }
         around.columns[3].extend(around.order.iter().map(|&i| radius(&self.atoms[i as usize])));
         around
@@ -80,7 +99,7 @@ impl<'a> Cells<'a> {
 }
 
 /// Returns coordinate `k` of an atom relative to a cell of the lattice.
-fn place(atom: &LatticeAtom, base: [i32; 3], k: usize) -> f64 {
+fn coordinate(atom: &LatticeAtom, base: [i32; 3], k: usize) -> f64 {
     f64::from(atom.cell[k] - base[k]) + f64::from(atom.frac[k])
 }
 
@@ -88,7 +107,7 @@ impl Around<'_> {
     /// Fills `found` with the spheres that overlap sphere `own`, including `own` itself.
     pub(super) fn neighbours(&self, own: u32, found: &mut Vec<Neighbour>) {
         let atom = &self.atoms[own as usize];
-        let [cx, cy, cz]: [f64; 3] = std::array::from_fn(|k| place(atom, self.base, k));
+        let [cx, cy, cz]: [f64; 3] = std::array::from_fn(|k| coordinate(atom, self.base, k));
         let r = radius(atom);
         let [x, y, z, radii] = &self.columns;
         found.clear();

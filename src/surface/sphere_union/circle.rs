@@ -57,6 +57,11 @@ impl Uncovered {
         self.ranges.is_empty()
     }
 
+    /// Returns the number of uncovered parts.
+    pub(super) fn len(&self) -> usize {
+        self.ranges.len()
+    }
+
     /// Subtracts the directions n with n·(p, q) > `bound`.
     pub(super) fn cover(&mut self, [p, q]: [f64; 2], bound: f64) {
         let length = (p * p + q * q).sqrt();

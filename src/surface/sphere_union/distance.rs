@@ -4,14 +4,14 @@ use super::{Arc, SphereUnion};
 use crate::surface::lattice::LatticeAtom;
 use crate::surface::simd::{LANES, dispatched, extent};
 
-/// Coordinates of points, axis by axis, in spacings from the brick's first sample.
+/// Coordinates of points, axis by axis, in spacings from the brick's first grid point.
 pub(in crate::surface) type Lanes = [[f32; LANES]; 3];
 
 /// Marks a point whose nearest boundary point lies in a face.
 const NO_ARC: u32 = u32::MAX;
 
-/// Distance outside the union, spacings, beyond which there are no vertices. It exceeds their tolerance on the finest
-/// grid.
+/// Distance outside the union, spacings, beyond which there are no vertices. It exceeds the tolerance of vertices on
+/// the finest grid.
 const OUTSIDE: f32 = 0.1;
 
 /// Margin for rounding in comparisons of distances, spacings. Coordinates stay below 100 spacings per sphere radius.
@@ -26,7 +26,7 @@ pub(in crate::surface) struct BrickUnion {
     spheres: Vec<u32>,
     /// Spheres in which a point of the batch may lie deepest: centre and radius, index in `columns`.
     near: Vec<([f32; 4], u32)>,
-    /// Depth of the batch's centre in each sphere, or its distance from each arc.
+    /// Depth of the batch's centre in each sphere, or the distance of the centre from each arc.
     depths: Vec<f32>,
     arcs: Arcs,
 }
@@ -49,8 +49,8 @@ impl Feature {
 /// Distances of points to the boundary.
 #[derive(Debug, Clone)]
 pub(in crate::surface) struct Nearest {
-    /// Signed distance, positive inside, spacings. Exact between 0 and the level; elsewhere only its sign and its side
-    /// of the level are exact.
+    /// Signed distance, positive inside, spacings. Exact between 0 and the level; elsewhere only its comparisons with 0
+    /// and the level are exact.
     pub(in crate::surface) distance: [f32; LANES],
     /// Index of the sphere in which the point lies deepest.
     sphere: [u32; LANES],
@@ -65,8 +65,8 @@ impl Default for Nearest {
 }
 
 impl BrickUnion {
-    /// Loads the spheres and arcs around the brick at `origin`. The coordinates of an arc are relative to the cell of
-    /// its bounding sphere, which comes with it.
+    /// Loads the spheres and arcs around the brick at `origin`. Each arc comes with its bounding sphere; its
+    /// coordinates are relative to the cell of that sphere.
     pub(in crate::surface) fn load<'a>(
         &mut self,
         origin: [i32; 3],
@@ -117,9 +117,9 @@ impl BrickUnion {
     /// Returns the outward normal, of any length, of the level set through a point inside.
     pub(in crate::surface) fn outward(&self, found: &Nearest, points: &Lanes, lane: usize) -> [f32; 3] {
         let point: [f32; 3] = std::array::from_fn(|k| points[k][lane]);
-        let place = found.sphere[lane] as usize;
+        let sphere = found.sphere[lane] as usize;
         match found.arc[lane] {
-            NO_ARC => std::array::from_fn(|k| point[k] - self.columns[k].get(place).copied().unwrap_or_default()),
+            NO_ARC => std::array::from_fn(|k| point[k] - self.columns[k].get(sphere).copied().unwrap_or_default()),
             arc => toward(&self.arcs.get(arc as usize), point),
         }
     }
@@ -156,16 +156,16 @@ dispatched! {
 fn nearest(brick: &mut BrickUnion, union: Option<&SphereUnion>, level: f32, points: &Lanes, found: &mut Nearest) {
     deepest(brick, level + 0.05, points, found);
     let Some(union) = union else { return };
-    // Points that are deeper are inside in any case. The margin keeps the distance continuous around the level.
+    // Deeper points are inside in any case. The margin keeps the distance continuous around the level.
     let enough = level + 0.05;
     let mut buried = [false; LANES];
     for lane in 0..LANES {
         let depth = found.distance[lane];
         if depth > 0.0 && depth < enough {
-            let place = found.sphere[lane] as usize;
-            let from: [f32; 3] = std::array::from_fn(|k| points[k][lane] - brick.columns[k][place]);
+            let sphere = found.sphere[lane] as usize;
+            let from: [f32; 3] = std::array::from_fn(|k| points[k][lane] - brick.columns[k][sphere]);
             let scale = (from[0] * from[0] + from[1] * from[1] + from[2] * from[2]).sqrt().recip();
-            buried[lane] = !union.is_exposed(brick.spheres[place], from.map(|c| c * scale));
+            buried[lane] = !union.is_exposed(brick.spheres[sphere], from.map(|c| c * scale));
         }
     }
     if buried != [false; LANES] {
@@ -179,7 +179,7 @@ fn nearest(brick: &mut BrickUnion, union: Option<&SphereUnion>, level: f32, poin
 #[inline(always)]
 fn deepest(brick: &mut BrickUnion, enough: f32, points: &Lanes, found: &mut Nearest) {
     let BrickUnion { columns: [x, y, z, radii], near, depths, .. } = brick;
-    let Bounds { centre, span } = Bounds::new(points);
+    let BoundingSphere { centre, span } = BoundingSphere::new(points);
     let mut best = [f32::MIN; LANES];
     let [cx, cy, cz, cr] = [&*x, y, z, radii].map(|column| column.as_chunks::<LANES>().0);
     for ((((x, y), z), r), depth) in cx.iter().zip(cy).zip(cz).zip(cr).zip(depths.as_chunks_mut::<LANES>().0) {
@@ -200,20 +200,20 @@ fn deepest(brick: &mut BrickUnion, enough: f32, points: &Lanes, found: &mut Near
     for (first, depths) in (0_u32..).step_by(LANES).zip(depths[..radii.len()].as_chunks::<LANES>().0) {
         let mut left = (0..LANES).fold(0_u32, |bits, i| bits | u32::from(depths[i] >= least) << i);
         while left != 0 {
-            let place = first + left.trailing_zeros();
+            let sphere = first + left.trailing_zeros();
             left &= left - 1;
-            let i = place as usize;
-            near.push(([x[i], y[i], z[i], radii[i]], place));
+            let i = sphere as usize;
+            near.push(([x[i], y[i], z[i], radii[i]], sphere));
         }
     }
     let [px, py, pz] = points;
-    for &([x, y, z, r], place) in &*near {
+    for &([x, y, z, r], sphere) in &*near {
         for i in 0..LANES {
             let (dx, dy, dz) = (px[i] - x, py[i] - y, pz[i] - z);
             let depth = r - (dx * dx + dy * dy + dz * dz).sqrt();
             let deeper = depth > found.distance[i];
             found.distance[i] = if deeper { depth } else { found.distance[i] };
-            found.sphere[i] = if deeper { place } else { found.sphere[i] };
+            found.sphere[i] = if deeper { sphere } else { found.sphere[i] };
         }
     }
 }
@@ -222,7 +222,7 @@ fn deepest(brick: &mut BrickUnion, enough: f32, points: &Lanes, found: &mut Near
 #[inline(always)]
 fn nearest_arc(brick: &mut BrickUnion, points: &Lanes, most: f32, buried: &[bool; LANES], found: &mut Nearest) {
     let BrickUnion { arcs, depths, .. } = brick;
-    let Bounds { centre, span } = Bounds::new(points);
+    let BoundingSphere { centre, span } = BoundingSphere::new(points);
     let mut best = [f32::MAX; LANES];
     for (group, distances) in arcs.groups.iter().zip(depths.as_chunks_mut::<LANES>().0) {
         for i in 0..LANES {
@@ -308,13 +308,13 @@ fn distance2(arc: &[f32; ARC_ROWS], x: [f32; 3]) -> f32 {
     z * z + if p >= s * cos { circle } else { end }
 }
 
-/// Bounding box of points: its centre, and half its diagonal.
-struct Bounds {
+/// Sphere around the bounding box of points: centre, and half the diagonal of the box.
+struct BoundingSphere {
     centre: [f32; 3],
     span: f32,
 }
 
-impl Bounds {
+impl BoundingSphere {
     #[inline(always)]
     fn new(points: &Lanes) -> Self {
         let [x, y, z] = [extent(&points[0]), extent(&points[1]), extent(&points[2])];

@@ -1,9 +1,9 @@
 //! Boundary of a union of spheres: its faces, given by the caps that bound them, and its arcs.
 //!
 //! A face is the part of a sphere that lies in no other sphere. An arc is a part of the circle of two spheres that lies
-//! in no third one; its ends are the vertices of the boundary. The boundary point nearest to a point x inside the union
-//! lies in a face, on an arc or is a vertex. If it lies in the face of sphere i, then i is the sphere in which x lies
-//! deepest. Testing one point of that sphere is therefore enough for all faces.
+//! in no third sphere; its ends are vertices of the boundary. Let x be a point inside the union. The boundary point
+//! nearest to x lies in a face or on an arc, or is a vertex. If it lies in the face of sphere i, then i is the sphere
+//! in which x lies deepest. So it is enough to test one point of that sphere for all faces.
 //!
 //! Lengths are in grid spacings. References: M. Connolly, J. Appl. Cryst. 16, 1983; C. Quan, B. Stamm, J. Comput.
 //! Phys. 322, 2016.
@@ -23,7 +23,7 @@ use self::caps::{Cap, Cover, Neighbour, TOLERANCE, dot};
 use self::cells::Cells;
 use self::circle::{Exposed, Uncovered};
 pub(super) use self::distance::{BrickUnion, Feature, Lanes, Nearest};
-use super::candidates;
+use super::candidates::{Comparisons, OverlapCount};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::lattice::{LatticeAtom, to_f32, to_i32, to_u32};
@@ -45,8 +45,10 @@ pub(super) struct Arc {
     half: [f32; 2],
 }
 
-/// Cells between two reports of progress: about 2,000 atoms.
-const CELLS_PER_REPORT: usize = 128;
+/// Cells whose boundary is found by one task. Few lists are freed quickly.
+const CELLS_PER_PART: usize = 32;
+/// Parts between two reports of progress: about 2,000 atoms.
+const PARTS_PER_REPORT: usize = 4;
 
 /// Caps per group: one vector.
 const GROUP: usize = 8;
@@ -61,13 +63,13 @@ pub(super) struct SphereUnion {
     faces: Vec<Option<[u32; 2]>>,
     caps: Vec<CapGroup>,
     arcs: Vec<Arc>,
-    /// Ordered pairs of overlapping spheres.
+    /// Number of ordered pairs of overlapping spheres, including the pairs that stand for comparisons of caps.
     pub(super) n_overlaps: u64,
 }
 
-/// Boundary of the spheres of one cell.
+/// Boundary of the spheres of some cells.
 #[derive(Default)]
-struct Part {
+struct CellsBoundary {
     /// Exposed spheres, each with its number of groups of caps.
     faces: Vec<(u32, u32)>,
     caps: Vec<CapGroup>,
@@ -75,7 +77,7 @@ struct Part {
     bounds: Vec<LatticeAtom>,
 }
 
-impl Part {
+impl CellsBoundary {
     fn bytes(&self) -> usize {
         size_of_val(&*self.caps) + size_of_val(&*self.arcs) + size_of_val(&*self.bounds) + size_of_val(&*self.faces)
     }
@@ -83,7 +85,7 @@ impl Part {
 
 /// Buffers that a thread reuses.
 #[derive(Default)]
-struct Scratch {
+struct CapScratch {
     neighbours: Vec<Neighbour>,
     caps: Vec<Cap>,
     uncovered: Uncovered,
@@ -104,29 +106,36 @@ impl SphereUnion {
         control: &Control<'_>,
     ) -> Result<(Self, Vec<LatticeAtom>), SurfaceError> {
         let cells = Cells::new(atoms, control)?;
-        let overlaps = candidates::OverlapCount::new(limits);
+        let overlaps = OverlapCount::new(limits);
         let done = AtomicUsize::new(0);
         let tolerance = TOLERANCE / spacing;
-        let part = |scratch: &mut Scratch, cell: usize| {
-            let mut part = Part::default();
-            let around = cells.around(cell);
-            for &own in cells.of(cell) {
-                control.check()?;
-                around.neighbours(own, &mut scratch.neighbours);
-                overlaps.add(scratch.neighbours.len())?;
-                let from = Sphere { atom: &atoms[own as usize], index: own, radius: radius(&atoms[own as usize]) };
-                from.boundary(scratch, tolerance, reach, &mut part);
+        let n_parts = cells.len().div_ceil(CELLS_PER_PART);
+        let part = |scratch: &mut CapScratch, number: usize| {
+            let mut part = CellsBoundary::default();
+            let mut comparisons = Comparisons::new(&overlaps, control);
+            for cell in (number * CELLS_PER_PART..cells.len()).take(CELLS_PER_PART) {
+                let around = cells.around(cell);
+                for &own in cells.of(cell) {
+                    control.check()?;
+                    around.neighbours(own, &mut scratch.neighbours);
+                    overlaps.add(scratch.neighbours.len() as u64)?;
+                    let from = Sphere { atom: &atoms[own as usize], index: own, radius: radius(&atoms[own as usize]) };
+                    let before = part.bytes();
+                    from.boundary(scratch, tolerance, reach, &mut part, &mut comparisons)?;
+                    // The capacity of a growing list is up to twice its length. The third part is its copy in the
+                    // result.
+                    control.memory.grow(3 * (part.bytes() - before) as u64)?;
+                }
             }
-            // The part, and its copy in the result.
-            control.memory.grow(2 * part.bytes() as u64)?;
+            comparisons.count()?;
             let n = done.fetch_add(1, Ordering::Relaxed) + 1;
-            if n.is_multiple_of(CELLS_PER_REPORT) {
-                control.observer.progress(Stage::Bin, n, cells.len());
+            if n.is_multiple_of(PARTS_PER_REPORT) {
+                control.observer.progress(Stage::Bin, n, n_parts);
             }
             Ok(part)
         };
-        let parts: Vec<Part> =
-            (0..cells.len()).into_par_iter().map_init(Scratch::default, part).collect::<Result<_, SurfaceError>>()?;
+        let parts: Vec<CellsBoundary> =
+            (0..n_parts).into_par_iter().map_init(CapScratch::default, part).collect::<Result<_, SurfaceError>>()?;
         control.memory.grow((size_of::<Option<[u32; 2]>>() * atoms.len()) as u64)?;
         let mut whole = Self { faces: vec![None; atoms.len()], n_overlaps: overlaps.total(), ..Self::default() };
         let mut bounds = Vec::with_capacity(parts.iter().map(|part| part.arcs.len()).sum());
@@ -134,6 +143,7 @@ impl SphereUnion {
         whole.caps.reserve_exact(parts.iter().map(|part| part.caps.len()).sum());
         let mut first = 0;
         for part in &parts {
+            control.check()?;
             for &(sphere, groups) in &part.faces {
                 whole.faces[sphere as usize] = Some([first, first + groups]);
                 first += groups;
@@ -181,18 +191,25 @@ struct Sphere<'a> {
 
 impl Sphere<'_> {
     /// Adds the face of this sphere, and its arcs with spheres of higher numbers.
-    fn boundary(&self, scratch: &mut Scratch, tolerance: f64, reach: f64, part: &mut Part) {
-        let Scratch { neighbours, caps, uncovered } = scratch;
-        if caps::caps(self.index, self.radius, neighbours, tolerance, caps) == Cover::Whole {
-            return;
+    fn boundary(
+        &self,
+        scratch: &mut CapScratch,
+        tolerance: f64,
+        reach: f64,
+        part: &mut CellsBoundary,
+        comparisons: &mut Comparisons<'_>,
+    ) -> Result<(), SurfaceError> {
+        let CapScratch { neighbours, caps, uncovered } = scratch;
+        if caps::caps(self.index, self.radius, neighbours, tolerance, caps, comparisons)? == Cover::Whole {
+            return Ok(());
         }
         let before = part.arcs.len();
-        // An arc is stored for the sphere with the lower number. Circles with spheres of lower numbers are searched
-        // only until an exposed part proves that this sphere has a face.
+        // An arc is stored for the sphere with the lower number. Circles with spheres of lower numbers are only
+        // searched until an exposed part proves that this sphere has a face.
         let mut exposed = caps.is_empty();
         for cap in caps.iter().filter(|cap| cap.index > self.index) {
             let circle = Circle::new(self.radius, cap);
-            circle.uncover(cap, caps, tolerance / self.radius, uncovered);
+            circle.uncover(cap, caps, tolerance / self.radius, uncovered, comparisons)?;
             uncovered.arcs(|arc| self.add_arc(&circle, &arc, reach, part));
         }
         exposed |= part.arcs.len() > before;
@@ -200,16 +217,17 @@ impl Sphere<'_> {
             if exposed {
                 break;
             }
-            Circle::new(self.radius, cap).uncover(cap, caps, tolerance / self.radius, uncovered);
+            Circle::new(self.radius, cap).uncover(cap, caps, tolerance / self.radius, uncovered, comparisons)?;
             exposed = !uncovered.is_empty();
         }
         if exposed {
             part.faces.push((self.index, to_u32(caps.len().div_ceil(GROUP))));
             part.caps.extend(caps.chunks(GROUP).map(group));
         }
+        Ok(())
     }
 
-    fn add_arc(&self, circle: &Circle, arc: &Exposed, reach: f64, part: &mut Part) {
+    fn add_arc(&self, circle: &Circle, arc: &Exposed, reach: f64, part: &mut CellsBoundary) {
         let along = |[x, y]: [f64; 2]| std::array::from_fn(|k| x * circle.first[k] + y * circle.second[k]);
         let [x, y] = arc.middle;
         let (middle, side): ([f64; 3], [f64; 3]) = (along([x, y]), along([-y, x]));
@@ -266,10 +284,18 @@ impl Circle {
         Self { centre, axis: cap.axis, first, second, radius: radius * sin, sin }
     }
 
-    /// Finds the parts of this circle, the edge of `own`, that no other cap covers.
-    fn uncover(&self, own: &Cap, caps: &[Cap], tolerance: f64, uncovered: &mut Uncovered) {
+    /// Finds the parts of this circle, the edge of cap `own`, that no other cap covers.
+    fn uncover(
+        &self,
+        own: &Cap,
+        caps: &[Cap],
+        tolerance: f64,
+        uncovered: &mut Uncovered,
+        comparisons: &mut Comparisons<'_>,
+    ) -> Result<(), SurfaceError> {
         uncovered.reset();
         for cap in caps.iter().filter(|cap| cap.index != own.index) {
+            comparisons.add(uncovered.len())?;
             let cos = dot(cap.axis, own.axis);
             let bound = cap.height + tolerance - own.height * cos;
             // No point of the circle lies within the cap.
@@ -279,9 +305,10 @@ impl Circle {
             let toward = [dot(cap.axis, self.first), dot(cap.axis, self.second)].map(|c| c * self.sin);
             uncovered.cover(toward, bound);
             if uncovered.is_empty() {
-                return;
+                break;
             }
         }
+        Ok(())
     }
 }
 

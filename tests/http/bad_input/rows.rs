@@ -1,11 +1,9 @@
-//! Table of requests and expected answers. Lines and columns count from 1.
-
-use std::io::Write;
+//! Table of requests and expected responses. Lines and columns count from 1.
 
 use serde_json::{Value, json};
 
 use crate::bcif_support::{CRAMBIN, atoms, block, byte_array, category, column, file, i32s, reals, run_length};
-use crate::http_support::SAMPLE;
+use crate::http_support::{SAMPLE, gzip};
 
 /// Limits of the server, and of the command line if it has them. All other limits have their defaults.
 pub(crate) const BODY_BYTES: u64 = 4 << 20;
@@ -34,7 +32,7 @@ impl Is {
     }
 }
 
-/// Request with its expected answer.
+/// Request with its expected response.
 #[derive(Debug, Clone)]
 pub(crate) struct Row {
     pub(crate) name: &'static str,
@@ -132,12 +130,6 @@ fn empty_selection(name: &'static str, query: &str, parameter: &str, value: &str
         ("expected", Is::Contains(available)),
     ];
     Row { named, query: query.to_owned(), ..upload(name, ATOM, 422, "empty-selection", 4) }
-}
-
-fn gzip(data: &[u8]) -> Vec<u8> {
-    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
-    encoder.write_all(data).unwrap();
-    encoder.finish().unwrap()
 }
 
 /// Returns a zstd frame of `n` blocks, each of which encodes 128 KiB of spaces in four bytes.
@@ -353,20 +345,27 @@ fn chains() -> String {
     many(ATOMS, |i| format!("c{i} . 1 {} 2 {}\n", i % 40, i / 40 % 50))
 }
 
+/// Returns a file whose assembly names chains that it does not have.
+fn absent_chains() -> String {
+    let head = "REMARK 350 BIOMOLECULE: 1\nREMARK 350 APPLY THE FOLLOWING TO CHAINS: X, Y\n";
+    let row = |k: usize| {
+        let m = [1, 2, 3].map(|j| if j == k { "1.000000" } else { "0.000000" }).join("  ");
+        format!("REMARK 350   BIOMT{k}   1  {m}        0.00000\n")
+    };
+    format!("{head}{}{ATOM}", [1, 2, 3].map(row).concat())
+}
+
 /// Parameters with a valid file.
 fn parameters() -> Vec<Row> {
     let mut far_too_fine = Row {
         query: "resolution=0.01".to_owned(),
-        ..beyond("a grid that is far too fine", SAMPLE, 422, "grid-too-large", 1 << 30)
+        ..beyond("a grid that is far too fine", SAMPLE, 422, "too-many-candidates", 1 << 27)
     };
     far_too_fine.named.extend([
-        ("actual", Is::Above(1_073_741_824.0)),
+        ("actual", Is::Above(134_217_728.0)),
         ("resolution", Is::Equal(json!(0.01))),
         ("suggested_resolution", Is::Above(0.01)),
     ]);
-    let misspelt = vec![("parameter", Is::Equal("resolutoin".into())), ("nearest", Is::Equal("resolution".into()))];
-    let twice = vec![("parameter", Is::Equal("resolution".into()))];
-    let no_water = vec![("found", Is::Contains("polymer"))];
     vec![
         far_too_fine,
         parameter("a resolution of zero", "resolution=0", "resolution", "0"),
@@ -390,6 +389,15 @@ fn parameters() -> Vec<Row> {
         parameter("an isovalue of a surface of spheres", "surface=ses&isovalue=2", "isovalue", "2"),
         parameter("a probe that is too large", "surface=ses&probe=11", "probe", "11"),
         parameter("half of the paper's parameters", "paper_a=1", "paper_a", "1"),
+    ]
+}
+
+/// Selections and formats with a valid file.
+fn selections() -> Vec<Row> {
+    let misspelt = vec![("parameter", Is::Equal("resolutoin".into())), ("nearest", Is::Equal("resolution".into()))];
+    let twice = vec![("parameter", Is::Equal("resolution".into()))];
+    let no_water = vec![("found", Is::Contains("polymer"))];
+    vec![
         parameter("a chain without a name", "chains=,", "chains", ","),
         Row {
             named: vec![
@@ -422,6 +430,17 @@ fn parameters() -> Vec<Row> {
         Row { named: twice, ..parameter("a repeated parameter", "resolution=1&resolution=2", "", "") },
         empty_selection("an unknown chain", "chains=Z", "chains", "Z", "A"),
         empty_selection("an unknown model", "model=7", "model", "7", "1"),
+        empty_selection("an unknown alternative location", "altloc=Q", "altloc", "Q", "none"),
+        empty_selection("no chain without a name", "chains=_", "chains", "_", "A"),
+        Row {
+            named: vec![("place", Is::Equal("assembly 1".into())), ("found", Is::Contains("without atoms: X, Y"))],
+            query: "assembly=1".to_owned(),
+            ..upload("an assembly of absent chains", absent_chains(), 422, "unreadable-structure", 4)
+        },
+        Row {
+            named: vec![("found", Is::Contains("an atom of radius 0"))],
+            ..upload("radii of zero", "ATOM 1 C GLY 1 0 0 0 0 0\n", 422, "empty-selection", 4)
+        },
         Row {
             named: no_water,
             query: "select=water".to_owned(),
@@ -436,17 +455,26 @@ fn parameters() -> Vec<Row> {
 }
 
 /// Media types of meshes and pictures.
-const MEDIA_TYPES: [&str; 7] = [
+const MEDIA_TYPES: [&str; 8] = [
     "model/gltf-binary",
     "model/gltf+json",
     "application/ply",
     "model/x-ply-text",
     "model/stl",
     "model/obj",
+    "model/x-vtp",
     "image/png",
 ];
-const FILES: [&str; 7] =
-    ["surface.glb", "surface.gltf", "surface.ply", "surface.ply-text", "surface.stl", "surface.obj", "surface.png"];
+const FILES: [&str; 8] = [
+    "surface.glb",
+    "surface.gltf",
+    "surface.ply",
+    "surface.ply-text",
+    "surface.stl",
+    "surface.obj",
+    "surface.vtp",
+    "surface.png",
+];
 
 fn http() -> Vec<Row> {
     let with = |row: Row, named: Vec<(&'static str, Is)>| Row { named, ..row };
@@ -504,6 +532,24 @@ fn http() -> Vec<Row> {
             request("a problem that is not UTF-8", "GET", "/problems/%ff", 400, "bad-request"),
             says("detail", "UTF-8"),
         ),
+        with(
+            upload("a JSON number as structure", "{\"structure\": 1}", 400, "bad-parameter", 0)
+                .header("content-type", "application/json"),
+            vec![
+                ("parameter", Is::Equal("structure".into())),
+                ("value", Is::Equal("1".into())),
+                ("expected", Is::Contains("digest")),
+            ],
+        ),
+        with(
+            upload("a JSON document with a bad id", "{\"pdb_id\": \"../x\"}", 400, "bad-parameter", 0)
+                .header("content-type", "application/json"),
+            vec![("parameter", Is::Equal("pdb_id".into())), ("value", Is::Equal("../x".into()))],
+        ),
+        with(
+            request("colours without a scheme", "GET", "/v1/pdb/4pti/colors", 400, "bad-parameter"),
+            vec![("parameter", Is::Equal("scheme".into())), ("value", Is::Equal("no value".into()))],
+        ),
         with(surface("a missing entry", "9zzz", 404, "not-in-archive"), says("detail", "9zzz")),
         with(surface("an entry that is noise", "1bad", 422, "unreadable-structure"), says("found", "`noise`")),
         with(
@@ -515,5 +561,5 @@ fn http() -> Vec<Row> {
 
 /// Returns all rows.
 pub(crate) fn rows() -> Vec<Row> {
-    [not_structures(), compressed(), pdb(), mmcif(), binary(), parameters(), http()].concat()
+    [not_structures(), compressed(), pdb(), mmcif(), binary(), parameters(), selections(), http()].concat()
 }

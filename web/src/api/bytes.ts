@@ -3,8 +3,8 @@
  * less time than `arrayBuffer()`, whose time for a few megabytes is as long as meshing.
  */
 export async function bytesOf(reply: Response): Promise<ArrayBuffer> {
-  const told = Number(reply.headers.get("content-length"));
-  if (!reply.body || !(told > 1 << 20)) return reply.arrayBuffer();
+  const length = Number(reply.headers.get("content-length"));
+  if (!reply.body || !(length > 1 << 20)) return reply.arrayBuffer();
   let reader;
   try {
     reader = reply.body.getReader({ mode: "byob" });
@@ -12,7 +12,7 @@ export async function bytesOf(reply: Response): Promise<ArrayBuffer> {
     // Not every browser supports byte streams for responses.
     return reply.arrayBuffer();
   }
-  let buffer = new ArrayBuffer(told);
+  let buffer = new ArrayBuffer(length);
   for (let at = 0; ; ) {
     if (at === buffer.byteLength) {
       // There are more bytes if a proxy compressed the response and stated the compressed length.

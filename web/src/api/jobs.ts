@@ -1,6 +1,6 @@
 /**
- * Requests for files that may take long. The service is asked for a job if the file is not ready after a few seconds; the
- * job is followed to its result, and cancelled on abort. Used by the page and by `<molmesh-viewer>`.
+ * Requests for files that may take long. If a file is not ready after a few seconds, the service returns a job, which
+ * is followed to its result and cancelled on abort. Used by the page and by `<molmesh-viewer>`.
  */
 
 import type { Client } from "./client";
@@ -17,14 +17,14 @@ export interface Job {
 /** Called with the state of a job that is being followed. */
 export type Progress = (job: Job) => void;
 
-/** Time after which the service answers with a job, s. */
+/** Time after which the service responds with a job, s. */
 const WAIT_S = 5;
 /** Longest wait for the end of a job in one poll, s. */
 const POLL_S = 5;
-/** Bounds of the pause between two polls, s, whatever `Retry-After` says. */
-const PAUSE_S = { least: 0.5, most: 30 };
+/** Bounds of the pause between two polls, s. They limit `Retry-After`. */
+const PAUSE_S = { min: 0.5, max: 30 };
 
-/** Meshes are large and made in milliseconds: not worth the browser's disk. */
+/** Keeps meshes out of the browser's cache: they are large and made in milliseconds. */
 const UNCACHED: RequestInit = { cache: "no-store" };
 
 /**
@@ -40,7 +40,10 @@ export async function fetchFile(
   return reply.status === 202 ? follow(client, reply, signal, progress) : complete(reply);
 }
 
-/** Whether `Prefer` may be sent: the header makes browsers send a preflight, which a static file server elsewhere rejects. */
+/**
+ * Returns true if `Prefer` may be sent. The header makes browsers send a preflight request, which a static file server
+ * of another origin rejects.
+ */
 function acceptsPreference(path: string): boolean {
   const { origin, pathname } = new URL(path, location.href);
   return origin === location.origin || pathname.includes("/v1/");
@@ -52,7 +55,7 @@ async function follow(client: Client, reply: Response, signal: AbortSignal, prog
   if (!location) throw new Error("the server accepted a job but sent no Location header for it");
   const address = new URL(location, reply.url).href;
   const cancel = () => void client.ask(address, { method: "DELETE", keepalive: true }).catch(() => undefined);
-  // The signal may have been aborted while the answer arrived.
+  // The signal may have been aborted while the response arrived.
   if (signal.aborted) cancel();
   signal.addEventListener("abort", cancel, { once: true });
   try {
@@ -79,7 +82,7 @@ async function ended(client: Client, address: string, signal: AbortSignal, progr
     const job = (await reply.json()) as Job;
     progress(job);
     if (isOver(job)) return job;
-    const pause = Math.min(PAUSE_S.most, Math.max(PAUSE_S.least, Number(reply.headers.get("retry-after")) || 0));
+    const pause = Math.min(PAUSE_S.max, Math.max(PAUSE_S.min, Number(reply.headers.get("retry-after")) || 0));
     await sleep(1000 * pause, signal);
   }
 }
@@ -101,8 +104,8 @@ function sleep(ms: number, signal: AbortSignal): Promise<void> {
 }
 
 /**
- * Reads a job's events to its end; null if they stop before. The browser's own EventSource sends no key, so the answer
- * is read as text.
+ * Reads a job's events to its end; null if they stop before. `EventSource` sends no API key, so the response is
+ * read as text.
  */
 async function endedInEvents(
   client: Client, address: string, signal: AbortSignal, progress: Progress,
@@ -117,7 +120,7 @@ async function endedInEvents(
       if (isOver(job)) return job;
     }
   } catch {
-    // The poll that follows reports what keeps failing. An abort ends here.
+    // The next poll reports lasting failures. An abort ends here.
     signal.throwIfAborted();
   }
   return null;
@@ -125,7 +128,7 @@ async function endedInEvents(
 
 const isOver = ({ status }: Job) => ["successful", "failed", "dismissed"].includes(status);
 
-/** The data of server-sent events. Each event of a job is its whole state, so a broken stream needs no resumption. */
+/** Yields the data of server-sent events. Each event is the whole state of a job, so a broken stream is not resumed. */
 async function* events(body: ReadableStream<Uint8Array>): AsyncGenerator<string> {
   const reader = body.pipeThrough(new TextDecoderStream() as ReadableWritablePair<string, Uint8Array>).getReader();
   let text = "";

@@ -23,8 +23,8 @@ export interface Hit {
 }
 
 /**
- * Finds the first triangle that faces the origin of `ray`, and the atom of its corner nearest to the intersection. `ray`
- * is in scene coordinates; `matrix` transforms the mesh into them.
+ * Finds the first triangle that faces the origin of `ray`, and the atom of its corner nearest to the intersection.
+ * `ray` is in scene coordinates; `matrix` transforms the mesh into them.
  */
 export function pick(geometry: BufferGeometry, matrix: Matrix4, ray: Ray): Hit | null {
   const positions = column(geometry, "position");

@@ -18,7 +18,7 @@ export interface ViewerOptions {
 /** Duration of the initial rotation, ms: one full turn. */
 const TURN = 14_000;
 /** Maximum device pixels per CSS pixel. More is not visible. */
-const MOST_PIXELS = 2;
+const MAX_PIXEL_RATIO = 2;
 /** Frame time, ms, above which the resolution is reduced during motion. */
 const SLOW = 40;
 
@@ -49,7 +49,7 @@ export class Viewer {
   private turnUntil = 0;
   private settle = 0;
   private readonly size = new ResizeObserver(() => this.resize());
-  private readonly calm = matchMedia("(prefers-reduced-motion: reduce)");
+  private readonly reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
   /** Creates a viewer on `canvas` with the context `gl`. */
   constructor(readonly canvas: HTMLCanvasElement, gl: WebGL2RenderingContext, private readonly options: ViewerOptions = {}) {
@@ -87,7 +87,7 @@ export class Viewer {
     this.loaded = loaded;
     material.set("unit", loaded.sphere.radius / Math.max(radius(loaded), 1e-9));
     this.scene.add(...this.meshes);
-    this.dress();
+    this.applyStyle();
     if (fresh || first) this.reset();
     else this.clip();
     return this.drawn();
@@ -131,11 +131,11 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Starts or stops the rotation. Without a user action it turns once, and not at all if reduced motion is preferred. */
-  turn(on: boolean, asked = false): void {
+  /** Starts or stops the rotation. Unless `byUser`, it turns once, or not at all if reduced motion is preferred. */
+  turn(on: boolean, byUser = false): void {
     const now = performance.now();
     const was = this.isTurning;
-    this.turnUntil = !on || (this.calm.matches && !asked) ? 0 : asked ? Number.POSITIVE_INFINITY : now + TURN;
+    this.turnUntil = !on || (this.reducedMotion.matches && !byUser) ? 0 : byUser ? Number.POSITIVE_INFINITY : now + TURN;
     this.controls.autoRotate = this.isTurning;
     this.controls.autoRotateSpeed = (60_000 / TURN);
     if (was !== this.isTurning) this.options.onTurn?.(this.isTurning);
@@ -198,7 +198,7 @@ export class Viewer {
     const next = rows ?? [-2, -2];
     if (this.marked[which].every((row, i) => row === next[i])) return;
     this.marked[which] = next;
-    this.dress();
+    this.applyStyle();
     this.invalidate();
   }
 
@@ -206,7 +206,7 @@ export class Viewer {
   colour(texture: DataTexture | null, atoms: number): void {
     this.colors?.texture.dispose();
     this.colors = texture ? { texture, atoms } : null;
-    this.dress();
+    this.applyStyle();
     this.invalidate();
   }
 
@@ -215,7 +215,7 @@ export class Viewer {
     this.haze = new Color(background);
     this.plain = new Color(plain);
     this.clear();
-    this.dress();
+    this.applyStyle();
     this.invalidate();
   }
 
@@ -277,13 +277,13 @@ export class Viewer {
     const next = Math.round(coarse * 4) / 4;
     if (next === this.coarse) return;
     this.coarse = next;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MOST_PIXELS) * next);
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MAX_PIXEL_RATIO) * next);
   }
 
   private resize(): void {
     const { clientWidth, clientHeight } = this.canvas;
     if (!clientWidth || !clientHeight) return;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MOST_PIXELS) * this.coarse);
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MAX_PIXEL_RATIO) * this.coarse);
     this.renderer.setSize(clientWidth, clientHeight, false);
     const before = Math.min(1, this.camera.aspect);
     this.camera.aspect = clientWidth / clientHeight;
@@ -311,7 +311,7 @@ export class Viewer {
   }
 
   /** Applies colours and marks to the surface. */
-  private dress(): void {
+  private applyStyle(): void {
     const { material } = this;
     if (!material) return;
     material.set("plain", this.plain);

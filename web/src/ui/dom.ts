@@ -35,7 +35,7 @@ export function bytes(count: number): string {
   return `${count.toFixed(unit ? 1 : 0)} ${units[unit]}`;
 }
 
-/** Copies text to the clipboard, also without TLS. */
+/** Copies text to the clipboard, even without TLS. */
 export async function copy(text: string): Promise<void> {
   try {
     await navigator.clipboard.writeText(text);

@@ -62,7 +62,7 @@ function numeric(parameter: Parameter, changed: Changed): Field {
   if (parameter.unit) exact.setAttribute("aria-description", `in ${parameter.unit}`);
   let [value, shown] = [undefined as string | undefined, parameter.fallback];
   let dragging = false;
-  const say = () => {
+  const update = () => {
     const now = value ?? shown;
     const known = now !== undefined && now !== "" && Number.isFinite(Number(now));
     if (!dragging) slider.value = String(known ? scale.position(Number(now)) : Math.round(scale.steps / 2));
@@ -80,7 +80,7 @@ function numeric(parameter: Parameter, changed: Changed): Field {
     changed(parameter.name, String(scale.value(slider.valueAsNumber)), false);
   });
   exact.addEventListener("change", () => changed(parameter.name, exact.value.trim() === "" ? undefined : exact.value.trim(), false));
-  say();
+  update();
   return {
     parameter,
     element,
@@ -90,11 +90,11 @@ function numeric(parameter: Parameter, changed: Changed): Field {
     set value(next) {
       value = next;
       if (document.activeElement === exact && exact.value !== (next ?? "")) exact.value = next ?? "";
-      say();
+      update();
     },
     effective(next) {
       shown = next === undefined ? parameter.fallback : String(next);
-      say();
+      update();
     },
   };
 }
@@ -108,12 +108,12 @@ function menu(parameter: Parameter, changed: Changed): Field {
   head.append(select);
   select.addEventListener("change", () => changed(parameter.name, select.value === "" || select.value === parameter.fallback ? undefined : select.value, false));
   let value: string | undefined;
-  const say = () => {
+  const update = () => {
     select.value = value ?? (named ? (parameter.fallback ?? "") : "");
     mark(value !== undefined);
   };
-  say();
-  return { parameter, element, get value() { return value; }, set value(next) { value = next; say(); }, effective: () => undefined };
+  update();
+  return { parameter, element, get value() { return value; }, set value(next) { value = next; update(); }, effective: () => undefined };
 }
 
 function toggle(parameter: Parameter, changed: Changed): Field {
@@ -123,12 +123,12 @@ function toggle(parameter: Parameter, changed: Changed): Field {
   const standard = parameter.fallback === "true";
   box.addEventListener("change", () => changed(parameter.name, box.checked === standard ? undefined : String(box.checked), false));
   let value: string | undefined;
-  const say = () => {
+  const update = () => {
     box.checked = value === undefined ? standard : value === "true";
     mark(value !== undefined);
   };
-  say();
-  return { parameter, element, get value() { return value; }, set value(next) { value = next; say(); }, effective: () => undefined };
+  update();
+  return { parameter, element, get value() { return value; }, set value(next) { value = next; update(); }, effective: () => undefined };
 }
 
 function text(parameter: Parameter, changed: Changed): Field {
@@ -139,7 +139,7 @@ function text(parameter: Parameter, changed: Changed): Field {
   head.append(input, list);
   input.addEventListener("change", () => changed(parameter.name, input.value.trim() === "" ? undefined : input.value.trim(), false));
   let value: string | undefined;
-  const say = () => {
+  const update = () => {
     input.value = value ?? "";
     mark(value !== undefined);
   };
@@ -147,7 +147,7 @@ function text(parameter: Parameter, changed: Changed): Field {
     parameter,
     element,
     get value() { return value; },
-    set value(next) { value = next; say(); },
+    set value(next) { value = next; update(); },
     effective(next) {
       input.placeholder = next === undefined ? parameter.fallbackWords : String(next);
     },

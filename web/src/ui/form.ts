@@ -26,8 +26,8 @@ export class Form {
   private readonly fields = new Map<string, Field>();
 
   /**
-   * Fills `home`, and `pictures` with parameters of single formats. Calls `changed` after every change and states whether
-   * it affects the mesh and whether a slider is still being dragged.
+   * Fills `home`, and `pictures` with parameters of single formats. Calls `changed` after every change and
+   * states whether it affects the mesh and whether a slider is still being dragged.
    */
   constructor(private readonly home: HTMLElement, pictures: HTMLElement, parameters: Parameter[], private readonly changed: (mesh: boolean, live: boolean) => void) {
     const first = parameters.filter((p) => FIRST.includes(p.name)).sort((a, b) => FIRST.indexOf(a.name) - FIRST.indexOf(b.name));
@@ -51,7 +51,7 @@ export class Form {
     return this.chosen(choices, isOfMesh);
   }
 
-  /** Returns the values in `choices` that do not change the displayed mesh: colours, and parameters of a single format. */
+  /** Returns the values in `choices` that do not change the displayed mesh: colours and parameters of one format. */
   apart(choices: Choices): Choices {
     return this.chosen(choices, (parameter) => !isOfMesh(parameter));
   }
@@ -90,13 +90,13 @@ export class Form {
     if ([...choices.keys()].some((name) => this.fields.get(name)?.parameter.format === "" && ![...FIRST, ...COLORS].includes(name))) this.home.querySelector("details")?.setAttribute("open", "");
   }
 
-  /** Resets parameters that name parts of the former structure, without an event. */
+  /** Resets parameters that name parts of the previous structure without calling `changed`. */
   forget(): void {
     for (const name of PARTS) this.put(name, undefined);
   }
 
   /** Shows the values from a report that the service used by default. */
-  tell(report: Record<string, unknown>): void {
+  showValues(report: Record<string, unknown>): void {
     for (const [name, { effective, parameter }] of this.fields) {
       const value = report[name];
       const numeric = parameter.kind === "number" || parameter.kind === "integer";

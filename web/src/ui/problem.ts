@@ -32,7 +32,7 @@ export function problem(home: HTMLElement, { document, numbers }: Problem, about
   };
   const actions: HTMLElement[] = [];
   const suggested = document.suggested_resolution;
-  if (typeof suggested === "number") actions.push(act(`Take ${suggested} Å`, () => remedies.takeResolution(suggested), true));
+  if (typeof suggested === "number") actions.push(act(`Use ${suggested} Å`, () => remedies.takeResolution(suggested), true));
   const parameter = document.parameter;
   if (typeof parameter === "string") actions.push(act(`Reset ${parameter.replaceAll("_", " ")}`, () => remedies.reset(parameter)));
   if (document.status === 0 || document.status >= 500 || document.status === 429) actions.push(act("Try again", () => remedies.again()));

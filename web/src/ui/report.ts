@@ -6,12 +6,12 @@ export type Report = Record<string, unknown>;
 
 const UNITS: Record<string, string> = { area: "Å²", volume: "Å³", resolution: "Å" };
 const ROWS = ["atoms", "triangles", "vertices", "area", "volume", "components", "voids", "euler", "resolution", "isovalue", "smoothness", "surface", "probe", "preset"];
-const PROOFS = ["closed", "oriented", "manifold"];
+const CHECKS = ["closed", "oriented", "manifold"];
 
 /** Writes a report; `timings` are pairs of stage and ms. */
 export function report(home: HTMLElement, document: Report, timings: [string, number][]): void {
   const isOpen = home.querySelector("details")?.open ?? false;
-  const proofs = PROOFS.filter((name) => typeof document[name] === "boolean").map((name) => {
+  const checks = CHECKS.filter((name) => typeof document[name] === "boolean").map((name) => {
     const yes = document[name] === true;
     return el("span", { class: yes ? "yes" : "no" }, `${yes ? "✓" : "✗ not"} ${name}`);
   });
@@ -22,13 +22,13 @@ export function report(home: HTMLElement, document: Report, timings: [string, nu
     return el("tr", { "data-row": name }, el("th", { scope: "row" }, name === "euler" ? "Euler number" : name), el("td", {}, `${text} ${UNITS[name] ?? ""}${from}`.trim()));
   });
   const device = document["device"] ?? document["backend"];
-  const parts: Node[] = [el("div", { class: "proof" }, ...proofs), el("table", {}, el("tbody", {}, ...rows))];
+  const parts: Node[] = [el("div", { class: "checks" }, ...checks), el("table", {}, el("tbody", {}, ...rows))];
   if (device) parts.push(el("p", { class: "why" }, el("b", {}, String(document["backend"] ?? "")), ` ${String(document["device"] ?? "")}`, ...(document["backend_reason"] ? [` (${String(document["backend_reason"])})`] : [])));
   if (document["fallback"]) parts.push(el("p", { class: "why" }, `Fallback: ${String(document["fallback"])}`));
   if (timings.length) {
-    const most = Math.max(...timings.map(([, ms]) => ms), 1e-3);
+    const longest = Math.max(...timings.map(([, ms]) => ms), 1e-3);
     const bars = timings.map(([stage, ms]) =>
-      el("tr", {}, el("th", { scope: "row" }, stage), el("td", {}, el("meter", { min: 0, max: most, value: ms, "aria-label": `${stage}: ${ms.toFixed(2)} ms` })), el("td", {}, `${ms.toFixed(2)} ms`)),
+      el("tr", {}, el("th", { scope: "row" }, stage), el("td", {}, el("meter", { min: 0, max: longest, value: ms, "aria-label": `${stage}: ${ms.toFixed(2)} ms` })), el("td", {}, `${ms.toFixed(2)} ms`)),
     );
     const total = timings.reduce((sum, [, ms]) => sum + ms, 0);
     const details = el("details", { class: "times" }, el("summary", {}, `Time per stage: ${total.toFixed(1)} ms`), el("table", {}, el("tbody", {}, ...bars)));
@@ -40,8 +40,8 @@ export function report(home: HTMLElement, document: Report, timings: [string, nu
 
 /** Returns the stage times of a report, or of `Server-Timing`, ms. */
 export function timingsOf(headers: Headers, document?: Report): [string, number][] {
-  const told = document?.["timings_ms"];
-  if (told && typeof told === "object") return Object.entries(told as Record<string, number>);
+  const timings = document?.["timings_ms"];
+  if (timings && typeof timings === "object") return Object.entries(timings as Record<string, number>);
   const entries = (headers.get("server-timing") ?? "").split(", ").map((entry) => entry.split(";dur="));
   return entries.filter((entry) => entry.length === 2 && entry[0] !== "total").map(([name, ms]) => [name ?? "", Number(ms)]);
 }

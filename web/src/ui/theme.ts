@@ -5,17 +5,17 @@ import { $ } from "./dom";
 type Choice = "system" | "light" | "dark";
 const KEY = "molmesh-theme";
 const NEXT: Record<Choice, Choice> = { system: "light", light: "dark", dark: "system" };
-const SAID: Record<Choice, [string, string]> = { system: ["◐", "system setting"], light: ["☀", "light"], dark: ["☾", "dark"] };
+const LABELS: Record<Choice, [string, string]> = { system: ["◐", "system setting"], light: ["☀", "light"], dark: ["☾", "dark"] };
 
 /** Applies the choice. Calls `changed` now and whenever colours change. */
 export function theme(changed: () => void): void {
   const button = $("theme");
   const dark = matchMedia("(prefers-color-scheme: dark)");
-  let choice = kept();
+  let choice = stored();
   const apply = () => {
     const isDark = choice === "dark" || (choice === "system" && dark.matches);
     document.documentElement.dataset["theme"] = isDark ? "dark" : "light";
-    const [sign, words] = SAID[choice];
+    const [sign, words] = LABELS[choice];
     button.textContent = sign;
     button.setAttribute("aria-label", `Colours: ${words}`);
     button.title = `Colours: ${words}`;
@@ -34,7 +34,7 @@ export function theme(changed: () => void): void {
   apply();
 }
 
-function kept(): Choice {
+function stored(): Choice {
   try {
     const found = localStorage.getItem(KEY);
     return found === "light" || found === "dark" ? found : "system";

@@ -2,7 +2,7 @@
 
 use super::*;
 
-fn token(bytes: &[u8]) -> Token<'_> {
+fn token(bytes: &[u8]) -> PackToken<'_> {
     let mut cursor = Cursor::new(bytes);
     let token = cursor.next().unwrap();
     assert_eq!(cursor.at, bytes.len(), "{bytes:x?}");
@@ -17,36 +17,36 @@ fn refusal(bytes: &[u8]) -> String {
 /// Covers every first byte in the table of the specification.
 #[test]
 fn every_form_of_every_value() {
-    let cases: [(&[u8], Token<'_>); 29] = [
-        (b"\xc0", Token::Nil),
-        (b"\xc2", Token::Bool(false)),
-        (b"\xc3", Token::Bool(true)),
-        (b"\x7f", Token::Integer(127)),
-        (b"\xe0", Token::Integer(-32)),
-        (b"\xff", Token::Integer(-1)),
-        (b"\xcc\xff", Token::Integer(255)),
-        (b"\xcd\x01\x00", Token::Integer(256)),
-        (b"\xce\xff\xff\xff\xff", Token::Integer(4_294_967_295)),
-        (b"\xcf\0\0\0\x01\0\0\0\0", Token::Integer(1 << 32)),
-        (b"\xcf\x80\0\0\0\0\0\0\0", Token::Real(9_223_372_036_854_775_808.0)),
-        (b"\xd0\x80", Token::Integer(-128)),
-        (b"\xd1\x80\0", Token::Integer(-32768)),
-        (b"\xd2\x80\0\0\0", Token::Integer(-2_147_483_648)),
-        (b"\xd3\xff\xff\xff\xff\xff\xff\xff\xfe", Token::Integer(-2)),
-        (b"\xca\x3f\xc0\0\0", Token::Real(1.5)),
-        (b"\xcb\xc0\x04\0\0\0\0\0\0", Token::Real(-2.5)),
-        (b"\xa2ab", Token::Text(b"ab")),
-        (b"\xd9\x01a", Token::Text(b"a")),
-        (b"\xda\0\x01a", Token::Text(b"a")),
-        (b"\xdb\0\0\0\x01a", Token::Text(b"a")),
-        (b"\xc4\x02\0\x01", Token::Bytes(&[0, 1])),
-        (b"\xc5\0\x01\x07", Token::Bytes(&[7])),
-        (b"\xc6\0\0\0\x01\x07", Token::Bytes(&[7])),
-        (b"\x90", Token::Array(0)),
-        (b"\x80", Token::Map(0)),
-        (b"\xd5\x01ab", Token::Extension),
-        (b"\xc7\x03\x01abc", Token::Extension),
-        (b"\xc8\0\x01\x01a", Token::Extension),
+    let cases: [(&[u8], PackToken<'_>); 29] = [
+        (b"\xc0", PackToken::Nil),
+        (b"\xc2", PackToken::Bool(false)),
+        (b"\xc3", PackToken::Bool(true)),
+        (b"\x7f", PackToken::Integer(127)),
+        (b"\xe0", PackToken::Integer(-32)),
+        (b"\xff", PackToken::Integer(-1)),
+        (b"\xcc\xff", PackToken::Integer(255)),
+        (b"\xcd\x01\x00", PackToken::Integer(256)),
+        (b"\xce\xff\xff\xff\xff", PackToken::Integer(4_294_967_295)),
+        (b"\xcf\0\0\0\x01\0\0\0\0", PackToken::Integer(1 << 32)),
+        (b"\xcf\x80\0\0\0\0\0\0\0", PackToken::Real(9_223_372_036_854_775_808.0)),
+        (b"\xd0\x80", PackToken::Integer(-128)),
+        (b"\xd1\x80\0", PackToken::Integer(-32768)),
+        (b"\xd2\x80\0\0\0", PackToken::Integer(-2_147_483_648)),
+        (b"\xd3\xff\xff\xff\xff\xff\xff\xff\xfe", PackToken::Integer(-2)),
+        (b"\xca\x3f\xc0\0\0", PackToken::Real(1.5)),
+        (b"\xcb\xc0\x04\0\0\0\0\0\0", PackToken::Real(-2.5)),
+        (b"\xa2ab", PackToken::Text(b"ab")),
+        (b"\xd9\x01a", PackToken::Text(b"a")),
+        (b"\xda\0\x01a", PackToken::Text(b"a")),
+        (b"\xdb\0\0\0\x01a", PackToken::Text(b"a")),
+        (b"\xc4\x02\0\x01", PackToken::Bytes(&[0, 1])),
+        (b"\xc5\0\x01\x07", PackToken::Bytes(&[7])),
+        (b"\xc6\0\0\0\x01\x07", PackToken::Bytes(&[7])),
+        (b"\x90", PackToken::Array(0)),
+        (b"\x80", PackToken::Map(0)),
+        (b"\xd5\x01ab", PackToken::Extension),
+        (b"\xc7\x03\x01abc", PackToken::Extension),
+        (b"\xc8\0\x01\x01a", PackToken::Extension),
     ];
     for (bytes, expected) in cases {
         assert_eq!(token(bytes), expected, "{bytes:x?}");
@@ -80,7 +80,7 @@ fn depth_costs_nothing() {
 }
 
 #[test]
-fn maps_and_arrays_give_places() {
+fn maps_and_arrays_give_positions() {
     let bytes = b"\x82\xa1a\x93\x01\x02\x03\xa1b\x81\xa1c\xc0";
     let mut seen = Vec::new();
     let mut cursor = Cursor::new(bytes);

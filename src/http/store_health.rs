@@ -13,7 +13,7 @@ const MAX_WAIT: Duration = Duration::from_millis(500);
 
 /// Health check of the store. Clones share one state.
 #[derive(Debug, Clone)]
-pub(super) struct Probe(watch::Sender<Verdict>);
+pub(super) struct StoreHealth(watch::Sender<Verdict>);
 
 #[derive(Debug, Clone)]
 struct Verdict {
@@ -26,50 +26,50 @@ struct Verdict {
 }
 
 impl Verdict {
-    /// Returns why the store does not work; a check that takes longer than `limit` has failed.
+    /// Returns the reason of a failure; `None` if the store works. A check that takes longer than `limit` has failed.
     fn failure(&self, limit: Duration) -> Option<&'static str> {
         let silent = self.begun.is_some_and(|begun| begun.elapsed() >= limit);
         if silent { Some("it does not answer") } else { self.failed }
     }
 }
 
-impl Probe {
+impl StoreHealth {
     /// Creates the check of a store that was just opened, and so works.
     pub(super) fn new() -> Self {
         Self(watch::channel(Verdict { at: Instant::now(), failed: None, begun: None }).0)
     }
 
-    /// Returns why the store does not work, or `None` if it does. A slow check counts as failed only after
-    /// `store.probe_timeout_ms`: a busy disk still works.
+    /// Returns the reason of a failure; `None` if the store works. A slow check counts as failed only after
+    /// `store.check_timeout_ms`, because a busy disk still works.
     pub(super) async fn failure(&self, store: &Store, config: &StoreConfig) -> Option<&'static str> {
         let mut verdict = self.0.subscribe();
-        if verdict.borrow_and_update().at.elapsed() >= Duration::from_millis(config.probe_ms) {
+        if verdict.borrow_and_update().at.elapsed() >= Duration::from_millis(config.check_interval_ms) {
             let mine = self
                 .0
                 .send_if_modified(|verdict| verdict.begun.is_none() && verdict.begun.replace(Instant::now()).is_none());
             verdict.mark_unchanged();
             if mine {
-                let (probe, store) = (self.clone(), store.clone());
+                let (health, store) = (self.clone(), store.clone());
                 tokio::spawn(async move {
-                    let outcome = store.probe().await;
-                    probe.conclude(store.place(), &outcome);
+                    let outcome = store.check().await;
+                    health.conclude(store.location(), &outcome);
                 });
             }
             drop(tokio::time::timeout(MAX_WAIT, verdict.wait_for(|verdict| verdict.begun.is_none())).await);
         }
-        verdict.borrow().failure(Duration::from_millis(config.probe_timeout_ms))
+        verdict.borrow().failure(Duration::from_millis(config.check_timeout_ms))
     }
 
-    fn conclude(&self, place: &str, outcome: &Result<(), StoreError>) {
+    fn conclude(&self, location: &str, outcome: &Result<(), StoreError>) {
         let failed = outcome.as_ref().err().map(|error| match error {
             StoreError::NoSpace { .. } => "no space is left",
             StoreError::Denied { .. } => "writing is not permitted",
-            _ => "it cannot be written or read; the log says why",
+            _ => "it cannot be written or read; the log gives the reason",
         });
         self.0.send_modify(|verdict| {
             match (outcome, verdict.failed) {
                 (Err(error), None) => tracing::error!(%error, "the store has failed: not ready"),
-                (Ok(()), Some(_)) => tracing::info!(place, "the store works again"),
+                (Ok(()), Some(_)) => tracing::info!(location, "the store works again"),
                 _ => {}
             }
             *verdict = Verdict { at: Instant::now(), failed, begun: None };

@@ -1,10 +1,10 @@
-// Every GLB flavour that the service has is loaded by three.js and by model-viewer, with the sizes that its report has.
+// three.js and model-viewer load every variant of GLB, with the sizes that the report states.
 import http from "node:http";
 import { readFileSync } from "node:fs";
 import path from "node:path";
-import { assert, browser, fetched, glb, inverted, MODULES, open, run, URL_OF_SERVICE, PATIENCE } from "./lib.mjs";
+import { assert, browser, fetchBytes, glb, inverted, open, run, MODULES, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
 
-const PAGE = `<!doctype html><html lang="en"><meta charset="utf-8"><title>flavours</title>
+const PAGE = `<!doctype html><html lang="en"><meta charset="utf-8"><title>variants</title>
 <script type="importmap">{ "imports": { "three": "/three/build/three.module.js" } }</script>
 <script type="module" src="/@google/model-viewer/dist/model-viewer.min.js"></script>
 <model-viewer id="viewer" style="width: 300px; height: 300px"></model-viewer>
@@ -18,14 +18,14 @@ window.load = async (url) => {
   scene.updateMatrixWorld(true);
   const size = new THREE.Box3().setFromObject(scene, true).getSize(new THREE.Vector3()).toArray();
   const { geometry } = mesh;
-  // The volume by the divergence theorem: its sign says how triangles are wound.
+  // Volume by the divergence theorem; its sign gives the winding of the triangles.
   const [a, b, c] = [0, 1, 2].map(() => new THREE.Vector3());
   let volume = 0;
   for (let i = 0; i < geometry.index.count; i += 3) {
     [a, b, c].forEach((v, k) => v.fromBufferAttribute(geometry.getAttribute("position"), geometry.index.getX(i + k)).applyMatrix4(mesh.matrixWorld));
     volume += a.dot(b.cross(c)) / 6;
   }
-  return { size, volume, triangles: geometry.index.count / 3, attributes: Object.keys(geometry.attributes).sort(), wide: geometry.index.array.BYTES_PER_ELEMENT };
+  return { size, volume, triangles: geometry.index.count / 3, attributes: Object.keys(geometry.attributes).sort(), indexBytes: geometry.index.array.BYTES_PER_ELEMENT };
 };
 window.view = (url) => new Promise((resolve, reject) => {
   const viewer = document.querySelector("#viewer");
@@ -48,46 +48,46 @@ const server = http.createServer((request, reply) => {
 await new Promise((resolve) => server.listen(0, "127.0.0.1", resolve));
 const chromium = await browser();
 const page = await open(chromium, { url: `http://127.0.0.1:${server.address().port}/` });
-await page.waitForFunction(() => window.ready && customElements.get("model-viewer"), null, { timeout: PATIENCE });
+await page.waitForFunction(() => window.ready && customElements.get("model-viewer"), null, { timeout: TIMEOUT_MS });
 
-const can = JSON.parse((await fetched("/v1/capabilities")).bytes);
-const values = (name) => can.parameters.find((p) => p.name === name).values;
-const flavours = [];
-for (const compress of values("compress")) for (const normals of values("normals")) for (const atom_ids of ["false", "true"]) flavours.push({ compress, normals, atom_ids, resolution: "0.9" });
-for (const units of values("units")) for (const compress of values("compress")) flavours.push({ units, compress, resolution: "0.9" });
-// Indices of 32 and of 16 bits.
-for (const compress of values("compress")) flavours.push({ compress, atom_ids: "true", resolution: "0.2" });
+const capabilities = JSON.parse((await fetchBytes("/v1/capabilities")).bytes);
+const values = (name) => capabilities.parameters.find((p) => p.name === name).values;
+const variants = [];
+for (const compress of values("compress")) for (const normals of values("normals")) for (const atom_ids of ["false", "true"]) variants.push({ compress, normals, atom_ids, resolution: "0.9" });
+for (const units of values("units")) for (const compress of values("compress")) variants.push({ units, compress, resolution: "0.9" });
+// Fine meshes have indices of 32 bits.
+for (const compress of values("compress")) variants.push({ compress, atom_ids: "true", resolution: "0.2" });
 const close = (a, b, tolerance) => Math.abs(a - b) <= tolerance * Math.abs(b);
 
 await run({
-  [`three.js and model-viewer load ${flavours.length} flavours`]: async () => {
-    const wide = new Set();
-    for (const flavour of flavours) {
-      const address = `/v1/pdb/1crn/surface.glb?${new URLSearchParams(flavour)}`;
-      const { bytes, headers, status } = await fetched(address);
+  [`three.js and model-viewer load ${variants.length} variants`]: async () => {
+    const indexBytes = new Set();
+    for (const variant of variants) {
+      const address = `/v1/pdb/1crn/surface.glb?${new URLSearchParams(variant)}`;
+      const { bytes, headers, status } = await fetchBytes(address);
       assert.equal(status, 200, address);
       const { json } = glb(bytes);
       const scale = json.asset.extras.unit_scale;
-      const three = await page.evaluate((url) => window.load(url), URL_OF_SERVICE + address);
+      const three = await page.evaluate((url) => window.load(url), SERVICE_URL + address);
       assert.equal(three.triangles, Number(headers.get("molmesh-triangles")), address);
       assert.ok(close(three.volume * scale ** 3, Number(headers.get("molmesh-volume")), 2e-3), `${address}: ${three.volume}`);
-      const attributes = ["position", ...(flavour.normals === "none" ? [] : ["normal"]), ...(flavour.atom_ids === "true" ? ["_atom"] : [])];
+      const attributes = ["position", ...(variant.normals === "none" ? [] : ["normal"]), ...(variant.atom_ids === "true" ? ["_atom"] : [])];
       assert.deepEqual(three.attributes, attributes.sort(), address);
-      wide.add(three.wide);
-      const viewed = await page.evaluate((url) => window.view(url), URL_OF_SERVICE + address);
+      indexBytes.add(three.indexBytes);
+      const viewed = await page.evaluate((url) => window.view(url), SERVICE_URL + address);
       viewed.forEach((side, i) => assert.ok(close(side, three.size[i], 1e-2), `${address}: ${viewed} ${three.size}`));
     }
-    assert.deepEqual([...wide].sort(), [2, 4], "sizes of indices");
+    assert.deepEqual([...indexBytes].sort(), [2, 4], "sizes of indices");
   },
 
-  "an inverted mesh is noticed": async () => {
+  "an inverted mesh has a negative volume": async () => {
     const address = "/v1/pdb/1crn/surface.glb?resolution=0.9";
-    await page.route("**/inverted.glb", async (route) => route.fulfill({ contentType: "model/gltf-binary", body: inverted((await fetched(address)).bytes) }));
+    await page.route("**/inverted.glb", async (route) => route.fulfill({ contentType: "model/gltf-binary", body: inverted((await fetchBytes(address)).bytes) }));
     const three = await page.evaluate((url) => window.load(url), "/inverted.glb");
     assert.ok(three.volume < 0, `${three.volume}`);
   },
 
-  "nothing went wrong": async () => {
-    assert.deepEqual(page.wrong.filter((line) => !line.startsWith("warning")), []);
+  "the page has no errors": async () => {
+    assert.deepEqual(page.errors.filter((line) => !line.startsWith("warning")), []);
   },
 });

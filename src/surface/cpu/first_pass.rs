@@ -1,49 +1,49 @@
-//! First pass over a tile, or a slab of it: candidates of its bricks, `field` in a scratch buffer, and the results of
-//! `classify`.
+//! First pass over a tile, or a slab of it. Finds the candidates of its bricks, evaluates `field` in a scratch buffer,
+//! and keeps the results of `classify`.
 
 use std::cell::RefCell;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
-use super::bin::{self, Bricks, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
+use super::bin::{Bricks, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, ClassifiedBricks, Inside, Neighbourhood};
-use super::field::{self, SampleRange, Samples};
+use super::field::{self, BrickField, GridPointRange};
 use super::slabs::{PartialTiles, Slab};
 use super::{Field, NO_BRICK, RunContext, Tile, scan};
-use crate::surface::candidates;
 use crate::surface::control::Stage;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::{BRICK_SAMPLES, Lattice};
+use crate::surface::lattice::{BRICK_POINTS, Lattice};
 use crate::surface::memory::{MemoryMeter as _, Reservation};
 use crate::surface::sphere_union::BrickUnion;
+use crate::surface::{candidates, grid_limit};
 
 /// Buffers that a thread reuses from tile to tile.
-struct Scratch {
+struct TileScratch {
     bricks: Bricks,
     /// Arcs of the boundary near the bricks, for surfaces of spheres.
     arcs: Bricks,
     spheres: BrickUnion,
-    /// Two layers of bricks, with even and odd z: no more are needed at a time, and untouched memory is never mapped.
+    /// Two layers of bricks, with even and odd z: only two are needed at a time.
     layers: [Layer; 2],
     /// Index into its layer per slot, or `NO_BRICK`.
     slots: Vec<u16>,
 }
 
-/// Densities of a brick, aligned to a cache line, so that no vector crosses one.
+/// Densities of a brick, aligned to cache lines, so that no vector crosses a boundary between two lines.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
-struct AlignedSamples(Samples);
+struct AlignedField(BrickField);
 
 /// Densities and inside bits of the bricks of a layer in reach of an atom.
 #[derive(Default)]
 struct Layer {
-    fields: Vec<AlignedSamples>,
+    fields: Vec<AlignedField>,
     inside: Vec<Inside>,
-    /// The bricks with samples inside: row y, bit x.
+    /// The bricks with grid points inside: row y, bit x.
     rows: [u16; SIDE],
 }
 
-impl Default for Scratch {
+impl Default for TileScratch {
     fn default() -> Self {
         Self {
             bricks: Bricks::default(),
@@ -57,14 +57,13 @@ impl Default for Scratch {
 
 /// Candidates of a brick between two checks of the cancellation flag: a fraction of a millisecond.
 const CANDIDATES_PER_CHECK: usize = 4096;
-
 /// Memory of a tile's table of bricks, bytes.
-const TILE_BYTES: u64 = (size_of::<u16>() * BRICK_SAMPLES) as u64;
+const TILE_BYTES: u64 = (size_of::<u16>() * BRICK_POINTS) as u64;
 
 thread_local! {
-    // Thread-local: rayon splits work and would create a scratch for each part, and fresh memory costs more than
-    // filling it.
-    static SCRATCH: RefCell<Scratch> = RefCell::default();
+    // Thread-local, because rayon would create a scratch for each part of the work. Allocating fresh memory takes
+    // longer than filling it.
+    static SCRATCH: RefCell<TileScratch> = RefCell::default();
 }
 
 impl Layer {
@@ -73,7 +72,7 @@ impl Layer {
         if self.fields.len() < n {
             // Reserves the maximum once: growing would copy, and untouched memory costs nothing.
             self.fields.reserve_exact(SIDE * SIDE - self.fields.len());
-            self.fields.resize(n, AlignedSamples([0.0; BRICK_SAMPLES]));
+            self.fields.resize(n, AlignedField([0.0; BRICK_POINTS]));
         }
     }
 }
@@ -82,7 +81,7 @@ impl Layer {
 #[derive(Default)]
 pub(super) struct PassCounters {
     pub(super) bricks: AtomicU64,
-    pub(super) samples: AtomicU64,
+    pub(super) grid_points: AtomicU64,
     pub(super) candidates: AtomicU64,
     candidate_pairs: AtomicU64,
     mesh_bytes: AtomicU64,
@@ -115,11 +114,11 @@ impl Pass<'_> {
     /// # Errors
     /// Returns [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`] or [`SurfaceError::MeshTooLarge`] as
     /// soon as the slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
-    pub(super) fn sample(&self, i: usize) -> Result<Option<Tile>, SurfaceError> {
+    pub(super) fn evaluate(&self, i: usize) -> Result<Option<Tile>, SurfaceError> {
         self.context.control.check()?;
         let slab = &self.slabs[i];
         let tile = SCRATCH.with_borrow_mut(|scratch| {
-            let tile = self.sample_into(slab, scratch);
+            let tile = self.evaluate_into(slab, scratch);
             scratch.bricks.free_long_lists();
             scratch.arcs.free_long_lists();
             tile
@@ -136,12 +135,12 @@ impl Pass<'_> {
         memory.grow(size_of::<u32>() as u64 * n)?;
         let all = self.counters.candidate_pairs.fetch_add(n, Ordering::Relaxed) + n;
         if all > candidates::limit(self.context.limits) {
-            return Err(candidates::exceeded(self.lattice, all, self.context.limits));
+            return Err(candidates::exceeded(&[self.lattice], all, self.context.limits));
         }
         Ok(())
     }
 
-    fn sample_into(&self, slab: &Slab, scratch: &mut Scratch) -> Result<Tile, SurfaceError> {
+    fn evaluate_into(&self, slab: &Slab, scratch: &mut TileScratch) -> Result<Tile, SurfaceError> {
         let memory = Reservation::new(&self.context.control.memory);
         let (coord, counters, layers) = (self.tiles.coords[slab.tile], &self.counters, &slab.layers);
         let atoms = self.tiles.atoms(slab.tile);
@@ -156,17 +155,14 @@ impl Pass<'_> {
             }
         }
         let reached = count_occupied(&scratch.bricks, layers, counters);
-        let occupied = reached as u64 * BRICK_SAMPLES as u64;
-        let samples = counters.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
-        if samples > self.context.limits.max_samples {
-            return Err(bin::too_large(
-                self.lattice,
-                counters.all_slabs(samples, self.slabs.len()),
-                self.context.limits,
-            ));
+        let occupied = reached as u64 * BRICK_POINTS as u64;
+        let grid_points = counters.grid_points.fetch_add(occupied, Ordering::Relaxed) + occupied;
+        if grid_points > self.context.limits.max_grid_points {
+            let all = counters.all_slabs(grid_points, self.slabs.len());
+            return Err(grid_limit::exceeded(self.lattice, all, self.context.limits, self.context.control));
         }
         memory.grow(TILE_BYTES + ClassifiedBricks::max_bytes(reached))?;
-        let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
+        let mut bricks = vec![NO_BRICK; BRICK_POINTS];
         let mut found = ClassifiedBricks::with_capacity(reached);
         for z in layers.start..=layers.end {
             self.context.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z))?;
@@ -189,9 +185,9 @@ impl Pass<'_> {
     }
 }
 
-impl Scratch {
+impl TileScratch {
     /// Evaluates the densities of every brick of layer z in reach of an atom; z is at most the layer beyond the slab's
-    /// `own`, of which only the first samples are needed.
+    /// `own`, of which only the first grid points are needed.
     ///
     /// # Errors
     /// Returns [`SurfaceError::Cancelled`].
@@ -205,10 +201,10 @@ impl Scratch {
                 continue;
             }
             layer.grow(n + 1);
-            let AlignedSamples(field) = &mut layer.fields[n];
+            let AlignedField(field) = &mut layer.fields[n];
             let [_, y, _] = slot_brick(slot);
             let rows = |beyond: bool, all: usize| if beyond { 1 } else { all };
-            let range = SampleRange { y_pairs: rows(y == SIDE - 1, 4), z_layers: rows(z == own.end, 8) };
+            let range = GridPointRange { y_pairs: rows(y == SIDE - 1, 4), z_layers: rows(z == own.end, 8) };
             field.fill(0.0);
             let (atoms, origin) = (&pass.lattice.atoms, slot_origin(tile, slot));
             match pass.field {
@@ -221,7 +217,7 @@ impl Scratch {
                 Field::Distance(distance) => {
                     pass.context.control.check()?;
                     distance.load(spheres, atoms, bricks.of(slot), arcs.of(slot), origin);
-                    distance.sample(spheres, range, field);
+                    distance.evaluate(spheres, range, field);
                 }
             }
             // A layer has 81 bricks.
@@ -229,9 +225,7 @@ impl Scratch {
             n += 1;
         }
         layer.inside.clear();
-        layer
-            .inside
-            .extend(layer.fields[..n].iter().map(|AlignedSamples(field)| classify::inside_bits(field, pass.iso)));
+        layer.inside.extend(layer.fields[..n].iter().map(|AlignedField(field)| classify::inside_bits(field, pass.iso)));
         for (row, slots) in layer.rows.iter_mut().zip(slots[z * SIDE * SIDE..].chunks(SIDE)) {
             let inside = |slot: &u16| layer.inside.get(usize::from(*slot)).is_some_and(|bits| *bits != NONE_INSIDE);
             *row = slots.iter().rev().fold(0, |row, slot| row << 1 | u16::from(inside(slot)));
@@ -239,8 +233,8 @@ impl Scratch {
         Ok(())
     }
 
-    /// Classifies every brick of layer z that has, or borders on, samples inside; requires the layer above to be the
-    /// last one evaluated. Writes the index of each local brick's record to `local`.
+    /// Classifies every brick of layer z that has, or borders on, grid points inside; requires the layer above to be
+    /// the last one evaluated. Writes the index of each local brick's record to `local`.
     ///
     /// # Errors
     /// Returns [`SurfaceError::Cancelled`].
@@ -252,7 +246,7 @@ impl Scratch {
         found: &mut ClassifiedBricks,
         local: &mut [u16],
     ) -> Result<(), SurfaceError> {
-        const NOTHING: Samples = [0.0; BRICK_SAMPLES];
+        const NOTHING: BrickField = [0.0; BRICK_POINTS];
         let Self { bricks, arcs, spheres, layers, slots } = self;
         for y in 0..SIDE - 1 {
             let rows = layers.iter().fold(0, |rows, layer| rows | layer.rows[y] | layer.rows[y + 1]);
@@ -265,7 +259,7 @@ impl Scratch {
                     std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(z + (n >> 2)) % 2]));
                 let around = Neighbourhood {
                     inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NONE_INSIDE)),
-                    samples: near.map(|(i, layer)| layer.fields.get(i).map_or(&NOTHING, |AlignedSamples(field)| field)),
+                    fields: near.map(|(i, layer)| layer.fields.get(i).map_or(&NOTHING, |AlignedField(field)| field)),
                 };
                 let first = found.t.len();
                 let Some(record) = found.add(slot, &around, pass.iso, bricks.of(slot)) else { continue };
@@ -274,7 +268,7 @@ impl Scratch {
                     pass.context.control.check()?;
                     let origin = slot_origin(tile, slot);
                     distance.load(spheres, &pass.lattice.atoms, bricks.of(slot), arcs.of(slot), origin);
-                    distance.refine(spheres, &around.samples, first, found);
+                    distance.refine(spheres, &around.fields, first, found);
                 }
             }
         }
@@ -282,7 +276,7 @@ impl Scratch {
     }
 }
 
-/// Inside bits of a brick without samples inside.
+/// Inside bits of a brick without grid points inside.
 const NONE_INSIDE: Inside = [0; 8];
 
 /// Distance in slots to the neighbour towards +x (bit 0), +y (bit 1), +z (bit 2).

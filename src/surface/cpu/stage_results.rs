@@ -1,16 +1,16 @@
-//! Intermediate results of the stages of this backend, brick by brick: reference and input for tests of a device's
-//! stages. Meshing does not use it.
+//! Intermediate results of the stages of this backend, brick by brick. Tests of a device's stages use them as input and
+//! as reference.
 
 use super::bin::{Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, SurfaceBrick};
-use super::field::{self, Constants, SampleRange, Samples};
+use super::field::{self, BrickField, Constants, GridPointRange};
 use super::write::{self, Destination};
 use super::{RunContext, Tile};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::join::Sheet;
 use crate::surface::kernel::Profile;
-use crate::surface::lattice::{BRICK, BRICK_SAMPLES, Lattice, to_f32};
+use crate::surface::lattice::{BRICK, BRICK_POINTS, Lattice, to_f32};
 use crate::surface::mesh::Mesh;
 use crate::surface::params::{SurfaceLimits, SurfaceParams};
 use crate::surface::sink::{MeshPart, MeshSink, SinkFailed};
@@ -18,25 +18,25 @@ use crate::surface::sums::edge_shares;
 
 /// A brick with candidates.
 #[derive(Debug, Clone)]
-pub struct ProbedBrick {
+pub struct BrickResults {
     /// Coordinates in bricks from the lattice's origin.
     pub coord: [i32; 3],
-    /// Atoms that reach one of its samples, ascending.
+    /// Atoms that reach one of its grid points, ascending.
     pub reaching: Vec<u32>,
-    /// Atoms that reach only the gap up to its neighbours' first samples, ascending.
+    /// Atoms that reach only the gap up to its neighbours' first grid points, ascending.
     pub gap_only: Vec<u32>,
     /// Densities, x fastest.
-    pub samples: Samples,
-    /// Samples inside: word z, bit `8·y + x`.
+    pub field: BrickField,
+    /// Grid points inside: word z, bit `8·y + x`.
     pub inside: [u64; 8],
 }
 
 /// A brick that the surface intersects.
 #[derive(Debug, Clone)]
-pub struct ProbedSurface {
+pub struct SurfaceResults {
     /// Coordinates in bricks from the lattice's origin.
     pub coord: [i32; 3],
-    /// Crossing edges: word `3·z + axis`, bit `8·y + x` of the owning sample.
+    /// Crossing edges: word `3·z + axis`, bit `8·y + x` of the owning grid point.
     pub crossing: [u64; 24],
     /// Vertices of the brick before each word.
     pub before: [u16; 24],
@@ -45,14 +45,14 @@ pub struct ProbedSurface {
     /// Vertices and triangles.
     pub count: [u32; 2],
     /// Sheets.
-    pub sheets: Vec<ProbedSheet>,
+    pub sheets: Vec<SheetResults>,
     /// Key and sheet of each vertex that other bricks use, if there are several sheets.
     pub shared: Vec<[u16; 2]>,
 }
 
 /// Sums over the triangles of a sheet, in spacings.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ProbedSheet {
+pub struct SheetResults {
     /// Offset of the origin from the mesh's centre.
     pub origin: [i32; 3],
     /// Triangles, and vertices of the brick itself.
@@ -63,7 +63,7 @@ pub struct ProbedSheet {
     pub sums: [f64; 10],
 }
 
-impl ProbedSheet {
+impl SheetResults {
     fn new(sheet: &Sheet) -> Self {
         let Sheet { origin, triangles, vertices, above, below, area, vector, product, moment } = *sheet;
         let [[x, y, z], [px, py, pz], [mx, my, mz]] = [vector, product, moment];
@@ -72,7 +72,7 @@ impl ProbedSheet {
     }
 }
 
-/// Sink of rows that nobody reads.
+/// Sink that discards all rows.
 struct Discard;
 
 impl MeshSink for Discard {
@@ -93,11 +93,11 @@ pub fn checksum(triangles: &[[u32; 3]]) -> u64 {
 
 /// Intermediate results of all stages.
 #[derive(Debug, Clone)]
-pub struct Probe {
+pub struct StageResults {
     /// Bricks with candidates, tile by tile.
-    pub bricks: Vec<ProbedBrick>,
+    pub bricks: Vec<BrickResults>,
     /// Bricks with surface, in the order of the mesh.
-    pub surface: Vec<ProbedSurface>,
+    pub surface: Vec<SurfaceResults>,
     /// The mesh.
     pub mesh: Mesh,
 }
@@ -106,7 +106,11 @@ pub struct Probe {
 ///
 /// # Errors
 /// Any [`SurfaceError`].
-pub fn probe(lattice: &Lattice, params: &SurfaceParams, limits: &SurfaceLimits) -> Result<Probe, SurfaceError> {
+pub fn run_stages(
+    lattice: &Lattice,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+) -> Result<StageResults, SurfaceError> {
     let control = Control::default();
     let tiles = Tiles::new(lattice, limits, &control)?;
     let constants = Constants::new(&Profile::new(params.kernel_for("gpu")?, params), lattice.spacing);
@@ -117,39 +121,39 @@ pub fn probe(lattice: &Lattice, params: &SurfaceParams, limits: &SurfaceLimits) 
         tile.fill(lattice, tiles.coords[t], &(0..SIDE - 1), tiles.atoms(t), |_| Ok(()))?;
         for slot in (0..SLOTS).filter(|&slot| slot_brick(slot).iter().all(|&b| b < 8) && !tile.of(slot).is_empty()) {
             let origin = slot_origin(tiles.coords[t], slot);
-            let mut samples = [0.0; BRICK_SAMPLES];
-            let whole = SampleRange { y_pairs: 4, z_layers: 8 };
-            field::evaluate(&constants, &lattice.atoms, tile.of(slot), origin, whole, &mut samples);
+            let mut field = [0.0; BRICK_POINTS];
+            let whole = GridPointRange { y_pairs: 4, z_layers: 8 };
+            field::evaluate(&constants, &lattice.atoms, tile.of(slot), origin, whole, &mut field);
             let (gap_only, reaching) = tile.of(slot).iter().partition::<Vec<u32>, _>(|&c| c & NORMAL_ONLY != 0);
-            bricks.push(ProbedBrick {
+            bricks.push(BrickResults {
                 coord: origin.map(|c| c.div_euclid(BRICK)),
                 reaching,
                 gap_only: gap_only.iter().map(|c| c & !NORMAL_ONLY).collect(),
-                inside: classify::inside_bits(&samples, iso),
-                samples,
+                inside: classify::inside_bits(&field, iso),
+                field,
             });
         }
     }
     let scanned =
         super::scan_lattice(lattice.clone(), RunContext { params, limits, control: &control, free_threads: 1 })?;
     let mesh = write::write(&scanned, params.atom_ids, &control, None)?.mesh;
-    let mut surface: Vec<ProbedSurface> = scanned.done.iter().flat_map(surface_of).collect();
+    let mut surface: Vec<SurfaceResults> = scanned.done.iter().flat_map(surface_of).collect();
     let written = write::write_pieces(&scanned, &control, &Destination::Sink(&Discard))?;
     let runs = written.iter().flat_map(|piece| (0..piece.sums.bricks.len()).map(|ix| (&piece.sums, ix)));
-    for (probed, (sums, ix)) in surface.iter_mut().zip(runs) {
+    for (result, (sums, ix)) in surface.iter_mut().zip(runs) {
         let brick = &sums.bricks[ix];
         let sheets = &sums.sheets[brick.first as usize..][..usize::from(brick.n)];
-        probed.sheets = sheets.iter().map(ProbedSheet::new).collect();
-        probed.shared = sums.shared_by(ix)[0].iter().map(|vertex| [vertex.key, vertex.sheet]).collect();
+        result.sheets = sheets.iter().map(SheetResults::new).collect();
+        result.shared = sums.shared_by(ix)[0].iter().map(|vertex| [vertex.key, vertex.sheet]).collect();
     }
-    Ok(Probe { bricks, surface, mesh })
+    Ok(StageResults { bricks, surface, mesh })
 }
 
-fn surface_of(tile: &Tile) -> Vec<ProbedSurface> {
+fn surface_of(tile: &Tile) -> Vec<SurfaceResults> {
     let found = &tile.found;
     let ends = found.bricks.iter().skip(1).map(|b| [b.vertex, b.triangle]).chain([[found.vertices, found.triangles]]);
     let first = |v: usize, of_brick: u32| u32::try_from(v).unwrap_or(u32::MAX) + of_brick;
-    let probed = |(brick, end): (&SurfaceBrick, [u32; 2])| ProbedSurface {
+    let result = |(brick, end): (&SurfaceBrick, [u32; 2])| SurfaceResults {
         coord: slot_origin(tile.coord, usize::from(brick.slot)).map(|c| c.div_euclid(BRICK)),
         crossing: brick.crossing,
         before: brick.before,
@@ -158,5 +162,5 @@ fn surface_of(tile: &Tile) -> Vec<ProbedSurface> {
         sheets: Vec::new(),
         shared: Vec::new(),
     };
-    found.bricks.iter().zip(ends).map(probed).collect()
+    found.bricks.iter().zip(ends).map(result).collect()
 }

@@ -12,11 +12,11 @@ use super::recording::{Dispatch, workgroups};
 use super::workspace::{BufferSizes, Workspace};
 use crate::surface::Stage;
 
-/// Capacity of the sheets: no brick needs more words per triangle than one with a single triangle.
+/// Capacity of the blocks of sheets: no brick needs more words per triangle than one with a single triangle.
 const WORDS_PER_TRIANGLE: u32 = 17;
 
 /// Buffers of a job on a device, and its stages.
-pub struct StageProbe {
+pub struct SingleStages {
     engine: Engine,
     workspace: Workspace,
     variant: Variant,
@@ -26,7 +26,7 @@ pub struct StageProbe {
     chunk: Chunk,
 }
 
-impl StageProbe {
+impl SingleStages {
     /// Loads `job` with output buffers for `vertices` and `triangles`.
     ///
     /// # Errors
@@ -35,17 +35,18 @@ impl StageProbe {
         let chunks = engine.chunks(job, None)?;
         let [chunk] = &chunks[..] else { return Err(GpuError::Failed("more than one chunk".to_owned())) };
         let chunk = chunk.clone();
+        let n_bricks = job.prepared.plan.bricks.len() as u64;
         let capacity = OutputRows {
             vertices: vertices.into(),
             triangles: triangles.into(),
-            sheet_words: u64::from(triangles) * u64::from(WORDS_PER_TRIANGLE),
+            sheet_words: n_bricks + u64::from(triangles) * u64::from(WORDS_PER_TRIANGLE),
         };
         let loaded = engine.load(job, None, chunks, capacity)?;
         let params = Params {
             piece_bricks: loaded.n_bricks(),
             vertex_capacity: vertices,
             triangle_capacity: triangles,
-            sheet_capacity: triangles * WORDS_PER_TRIANGLE,
+            sheet_capacity: loaded.n_bricks() + triangles * WORDS_PER_TRIANGLE,
             ..chunk.params(&loaded.params)
         };
         let (workspace, variant, vertex) = (loaded.workspace, loaded.variant, loaded.vertex);

@@ -1,16 +1,16 @@
-// Places of vertices on their edges, as integers of `32 - sheet_bits` bits. Requires `params`, `field`, shared/bits,
-// shared/crossing and shared/sheets.
+// Offsets of vertices along their edges, as integers of `32 - sheet_bits` bits. Requires `params`, `field`,
+// shared/bits, shared/crossing and shared/sheets.
 //
-// The place of a rounded position is its coordinate along the edge in steps, relative to an origin; otherwise it is the
-// parameter of the crossing in units of `place_unit`.
+// For rounded positions, the offset is the coordinate along the edge in steps, relative to an origin. Otherwise it is
+// the parameter of the crossing in units of `offset_unit`.
 
-// 2^-(32 - sheet_bits)
-var<private> place_unit: f32;
+// 2^-(32 - sheet_bits), set by the stage.
+var<private> offset_unit: f32;
 // Slots of the brick and of its neighbours.
 var<workgroup> slots: array<u32, 8>;
 
-// First sample of an edge in the block.
-fn sample_of(edge: u32) -> vec3<u32> {
+// First grid point of an edge in the block.
+fn first_point(edge: u32) -> vec3<u32> {
     let word = edge >> 6u;
     return vec3<u32>(edge & 15u, 4u * (word % 3u) + (edge >> 4u & 3u), word / 3u % 9u);
 }
@@ -20,25 +20,25 @@ fn axis_of(edge: u32) -> vec3<bool> {
     return vec3<u32>(0u, 1u, 2u) == vec3<u32>((edge >> 6u) / 27u);
 }
 
-// Density at a sample of the block. A brick that does not exist is out of reach of all atoms.
+// Density at a grid point of the block. A brick that does not exist is out of reach of all atoms.
 fn density_at(at: vec3<u32>) -> f32 {
     let slot = slots[at.x >> 3u | at.y >> 3u << 1u | at.z >> 3u << 2u];
     if (slot == NONE) {
         return 0.0;
     }
-    let sample = at & vec3<u32>(7u);
-    return field[slot * 512u + sample.z * 64u + sample.y * 8u + sample.x];
+    let point = at & vec3<u32>(7u);
+    return field[slot * 512u + point.z * 64u + point.y * 8u + point.x];
 }
 
-// Rounded position in steps of a point relative to the brick's first sample, which is `first` relative to the centre.
-// Equal to the position that `interpolate` writes.
+// Rounded position of a point, in steps relative to the centre. `p` is relative to the brick's first grid point, and
+// `first` is that grid point relative to the centre, both in spacings. Equal to the position that `interpolate` writes.
 fn steps_at(first: vec3<f32>, p: vec3<f32>) -> vec3<f32> {
     return round((first + p) * params.spacing * params.steps_per_angstrom);
 }
 
-// Computes the place of the vertex on an edge.
-fn place_on(edge: u32, first: vec3<f32>, origin: vec3<f32>) -> u32 {
-    let at = sample_of(edge);
+// Offset of the vertex on an edge.
+fn offset_on(edge: u32, first: vec3<f32>, origin: vec3<f32>) -> u32 {
+    let at = first_point(edge);
     let axis = axis_of(edge);
     let t = crossing_at(density_at(at), density_at(at + vec3<u32>(axis)));
     if (params.steps_per_angstrom > 0.0) {
@@ -50,10 +50,10 @@ fn place_on(edge: u32, first: vec3<f32>, origin: vec3<f32>) -> u32 {
 
 // Position of a vertex relative to `origin`, by its edge and its word.
 fn position_of(edge: u32, word: u32, first: vec3<f32>, origin: vec3<f32>) -> vec3<f32> {
-    let at = vec3<f32>(sample_of(edge));
+    let at = vec3<f32>(first_point(edge));
     if (params.steps_per_angstrom > 0.0) {
         let along = vec3<f32>(f32(bitcast<i32>(word) >> sheet_bits));
         return select(steps_at(first, at) - origin, along, axis_of(edge));
     }
-    return at + vec3<f32>(axis_of(edge)) * f32(word >> sheet_bits) * place_unit;
+    return at + vec3<f32>(axis_of(edge)) * f32(word >> sheet_bits) * offset_unit;
 }

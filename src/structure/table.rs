@@ -1,0 +1,100 @@
+//! Table of the atoms of a file as CSV (RFC 4180, lines end in LF).
+
+use std::io::{self, Write};
+
+use super::atoms::Structure;
+use super::element;
+
+/// Names of the columns.
+const HEADER: &str = "index,name,element,residue_name,residue_number,insertion_code,chain,model,kind\n";
+/// Bytes of text collected for one write.
+const BLOCK_BYTES: usize = 1 << 16;
+
+/// Writes one row for each atom of all models, in file order, after a row with the names of the columns: its index from
+/// 0, its names as in the file, and the name of its kind. Numbers are decimal; an unknown element is `?`.
+///
+/// # Errors
+/// Returns the errors of `out`.
+pub fn write_csv(structure: &Structure, out: &mut dyn Write) -> io::Result<()> {
+    let mut rows = Vec::with_capacity(2 * BLOCK_BYTES);
+    rows.extend_from_slice(HEADER.as_bytes());
+    for i in 0..structure.len() {
+        let symbol = usize::from(structure.element[i]).checked_sub(1).map_or("?", |z| element::SYMBOLS[z]);
+        let code = structure.insertion_code[i];
+        let (mut index, mut number, mut model) = (itoa::Buffer::new(), itoa::Buffer::new(), itoa::Buffer::new());
+        let mut bytes = [0; 4];
+        let fields = [
+            index.format(i),
+            structure.name.get(i),
+            symbol,
+            structure.residue.get(i),
+            number.format(structure.residue_number[i]),
+            if code == 0 { "" } else { char::from(code).encode_utf8(&mut bytes) },
+            structure.chain.get(i),
+            model.format(structure.model[i]),
+            structure.kind[i].name(),
+        ];
+        for (column, text) in fields.into_iter().enumerate() {
+            if column > 0 {
+                rows.push(b',');
+            }
+            put_field(&mut rows, text);
+        }
+        rows.push(b'\n');
+        if rows.len() >= BLOCK_BYTES {
+            out.write_all(&rows)?;
+            rows.clear();
+        }
+    }
+    out.write_all(&rows)
+}
+
+/// Appends a field, in quotes if it contains a separator or a quote.
+fn put_field(rows: &mut Vec<u8>, text: &str) {
+    if !text.contains(['"', ',', '\n', '\r']) {
+        rows.extend_from_slice(text.as_bytes());
+        return;
+    }
+    rows.push(b'"');
+    rows.extend_from_slice(text.replace('"', "\"\"").as_bytes());
+    rows.push(b'"');
+}
+
+#[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
+mod tests {
+    use super::*;
+    use crate::structure::{ReadLimits, read};
+
+    fn csv(text: &[u8]) -> String {
+        let mut bytes = Vec::new();
+        write_csv(&read(text, &ReadLimits::default()).unwrap(), &mut bytes).unwrap();
+        String::from_utf8(bytes).unwrap()
+    }
+
+    #[test]
+    fn rows_are_the_records_of_the_file() {
+        let file = std::str::from_utf8(include_bytes!("../../samples/4pti.pdb")).unwrap();
+        let records: Vec<&str> = file.lines().filter(|l| l.starts_with("ATOM") || l.starts_with("HETATM")).collect();
+        let table = csv(file.as_bytes());
+        let rows: Vec<&str> = table.lines().collect();
+        assert_eq!((rows[0], rows.len()), (HEADER.trim_end(), records.len() + 1));
+        for (i, (row, line)) in rows[1..].iter().zip(&records).enumerate() {
+            let [name, residue, chain, number, code] = [12..16, 17..20, 21..22, 22..26, 26..27].map(|c| line[c].trim());
+            let start = format!("{i},{name},{},{residue},{number},{code},{chain},1,", line[76..78].trim());
+            assert!(row.starts_with(&start), "{row}\n{line}");
+        }
+        assert!(rows[1].ends_with(",protein") && rows[rows.len() - 1].ends_with(",water"));
+    }
+
+    #[test]
+    fn names_with_separators_are_quoted() {
+        let cif = "data_x\nloop_\n_atom_site.type_symbol\n_atom_site.auth_atom_id\n_atom_site.auth_comp_id\n\
+                   _atom_site.auth_asym_id\n_atom_site.pdbx_PDB_ins_code\n_atom_site.auth_seq_id\n\
+                   _atom_site.Cartn_x\n_atom_site.Cartn_y\n_atom_site.Cartn_z\n\
+                   C 'O5\"' 'A,B' A B -7 0 0 0\nXx ? ? ? ? ? 4 0 0\n";
+        let rows: Vec<String> = csv(cif.as_bytes()).lines().skip(1).map(str::to_owned).collect();
+        assert_eq!(rows[0], "0,\"O5\"\"\",C,\"A,B\",-7,B,A,1,polymer");
+        assert_eq!(rows[1], "1,,?,,0,,,1,polymer");
+    }
+}

@@ -1,0 +1,31 @@
+//! `make test` names its steps, stops at the first failure, and then prints the skipped checks.
+#![cfg(unix)]
+
+use std::process::Command;
+
+/// Runs `make test` with other steps. Returns success, standard output and standard error.
+fn make_test(steps: &str) -> (bool, String, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let mut make = Command::new("make");
+    make.current_dir(env!("CARGO_MANIFEST_DIR")).env_remove("MAKEFLAGS").env_remove("MAKELEVEL");
+    // Without cargo-deny, a step is skipped.
+    make.env("PATH", "/usr/bin:/bin").args(["test", &format!("STEPS={steps}")]);
+    let done = make.arg(format!("SKIPPED={}", folder.path().join("skipped").display())).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (done.status.success(), text(done.stdout), text(done.stderr))
+}
+
+#[test]
+fn make_test_names_its_steps_and_reports_skipped_checks_after_a_failure() {
+    if !["/usr/bin/make", "/bin/make"].iter().any(|path| std::path::Path::new(path).is_file()) {
+        return crate::tools::missing("make").unwrap_or(());
+    }
+    let skipped = "SKIPPED: cargo-deny is not installed";
+    let (passes, out, err) = make_test("deny-if-installed help");
+    assert!(passes, "{err}");
+    assert!(err.contains("make test: step 1 of 2: deny-if-installed\nmake test: step 2 of 2: help\n"), "{err}");
+    assert_eq!(out.matches(skipped).count(), 1, "{out}");
+    let (passes, out, err) = make_test("deny-if-installed no-such-step help");
+    assert!(!passes && err.contains("make test: step no-such-step failed") && !err.contains("3 of 3"), "{err}");
+    assert_eq!(out.matches(skipped).count(), 2, "once by the step, once at the end: {out}");
+}
