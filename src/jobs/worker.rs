@@ -86,6 +86,8 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Option<Outcome> {
             catch_unwind(AssertUnwindSafe(work)).map_err(|payload| panicked(&*payload))??;
         product.report.add_timing("queue", ms(waited));
         count(&product.report);
+        let (backend, reason) = (product.report.backend, &product.report.backend_reason);
+        tracing::debug!(backend, reason, timings_ms = ?product.report.timings_ms, "a job succeeded");
         if let Some(why) = &product.report.fallback {
             counter!(JOBS_FALLBACK).increment(1);
             tracing::warn!(backend = product.report.backend, why, "a job fell back to another backend");

@@ -1,10 +1,12 @@
 //! Backend that runs each job on the CPU or on GPUs, on the side that is predicted to finish it first. The CPU is the
 //! fallback of the GPUs.
 
+use std::num::NonZero;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::cost::{Assignment, Cost, Model, Side};
+use super::host_cores::processor_time;
 use super::work::mesh_work;
 use crate::surface::{
     Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceKind,
@@ -26,7 +28,8 @@ impl AutoBackend {
     /// Combines two backends. `gpu` has no fallback of its own.
     #[must_use]
     pub fn new(cpu: Box<dyn Backend>, gpu: Box<dyn Backend>) -> Self {
-        Self { cpu, gpu, model: Mutex::default(), start: Instant::now() }
+        let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
+        Self { cpu, gpu, model: Mutex::new(Model::new(cores)), start: Instant::now() }
     }
 
     fn model(&self) -> MutexGuard<'_, Model> {
@@ -34,8 +37,9 @@ impl AutoBackend {
         self.model.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn now(&self) -> f64 {
-        self.start.elapsed().as_secs_f64()
+    /// Returns the wall time since the start and the processor time of this process, s.
+    fn now(&self) -> [f64; 2] {
+        [self.start.elapsed().as_secs_f64(), processor_time()]
     }
 
     fn side(&self, side: Side) -> &dyn Backend {
@@ -140,8 +144,8 @@ struct AssignedState {
     assignment: Assignment,
     /// Reason why no GPU runs the job, if one should.
     failure: Option<String>,
-    /// End of the last mesh, s; `None` if it failed.
-    ended: Option<f64>,
+    /// Wall time and processor time at the end of the last mesh, s; `None` if it failed.
+    ended: Option<[f64; 2]>,
 }
 
 impl<'a> AssignedBackend<'a> {
@@ -163,8 +167,9 @@ impl<'a> AssignedBackend<'a> {
     fn fall_back(&self, why: String) {
         let mut state = self.state();
         let mut model = self.auto.model();
-        model.remove(&state.assignment);
-        state.assignment = model.assign_to(Side::Cpu, self.auto.now(), self.work, 0);
+        let now = self.auto.now();
+        model.remove(now, &state.assignment);
+        state.assignment = model.assign_to(Side::Cpu, now, self.work, 0);
         state.failure = Some(why);
     }
 }
@@ -175,7 +180,7 @@ impl Drop for AssignedBackend<'_> {
         let mut model = self.auto.model();
         match state.ended {
             Some(end) => model.finish(end, &state.assignment),
-            None => model.remove(&state.assignment),
+            None => model.remove(self.auto.now(), &state.assignment),
         }
     }
 }

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
+use super::host_cores::HostCores;
 use super::work::mesh_work;
 use crate::surface::{Backend, Control, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
 
@@ -100,58 +101,32 @@ fn generated(atoms: usize) -> Result<Spheres, SurfaceError> {
 
 /// Weight of the last job in the averages of a backend.
 const LAST_JOB_WEIGHT: f64 = 0.3;
-/// Half-life of a slowdown, s: the load that caused it may have ended. A backend that was slow under load is tried
-/// again after a few half-lives.
-const SLOWDOWN_HALF_LIFE: f64 = 5.0;
-/// Bounds of the slowdown.
-const SLOWDOWN: [f64; 2] = [1.0, 30.0];
-/// Bounds of the actual waiting time as a fraction of the estimate. A fraction above 1 is caused by other work, and
-/// would move even more jobs to the backend that causes it.
+/// Bounds of the actual waiting time as a fraction of the estimate. A fraction above 1 is caused by jobs of the CPU, and
+/// would move even more jobs there.
 const OVERLAP: [f64; 2] = [0.02, 1.0];
 
-/// Correction of the estimates of a backend by the times of its finished jobs.
-#[derive(Debug, Clone, Copy)]
-struct Correction {
-    /// Time of a job that did not wait, divided by its estimate. It exceeds 1 if other work uses the same cores. Valid
-    /// at `at`, s.
-    slowdown: f64,
-    at: f64,
-    /// Weighted averages of the times that jobs waited and of the estimates of these times, s. Jobs wait for a shorter
-    /// time than estimated if a device overlaps several jobs.
+/// Waiting times of the finished jobs of a backend. Jobs wait for a shorter time than estimated if a device overlaps
+/// several jobs.
+#[derive(Debug, Clone, Copy, Default)]
+struct Overlap {
+    /// Weighted averages of the times that jobs waited and of the estimates of these times, s.
     waited: [f64; 2],
 }
 
-impl Default for Correction {
-    fn default() -> Self {
-        Self { slowdown: 1.0, at: 0.0, waited: [0.0; 2] }
-    }
-}
-
-impl Correction {
-    fn slowdown(&self, now: f64) -> f64 {
-        1.0 + (self.slowdown - 1.0) * (-(now - self.at).max(0.0) / SLOWDOWN_HALF_LIFE).exp2()
-    }
-
-    /// Returns the predicted time until the end of a job whose estimates are a waiting time of `wait` and an own time
-    /// of `cost`, s.
-    fn end(&self, now: f64, [wait, cost]: [f64; 2]) -> f64 {
+impl Overlap {
+    /// Returns the actual waiting time as a fraction of the estimate.
+    fn fraction(self) -> f64 {
         let [actual, estimated] = self.waited;
-        let overlap = if estimated > 0.0 { (actual / estimated).clamp(OVERLAP[0], OVERLAP[1]) } else { 1.0 };
-        overlap * wait + self.slowdown(now) * cost
+        if estimated > 0.0 { (actual / estimated).clamp(OVERLAP[0], OVERLAP[1]) } else { 1.0 }
     }
 
-    /// Updates the averages with a job that ended at `now`, `taken` s after its assignment.
-    fn update(&mut self, now: f64, taken: f64, [wait, cost]: [f64; 2]) {
-        let slowdown = self.slowdown(now);
-        let towards = |old: f64, seen: f64| old + LAST_JOB_WEIGHT * (seen - old);
+    /// Updates the averages with a job that ended `taken` s after its assignment. Its estimates are a waiting time of
+    /// `wait` and an own time of `cost`, s.
+    fn update(&mut self, taken: f64, [wait, cost]: [f64; 2]) {
         if wait > 0.0 {
+            let towards = |old: f64, seen: f64| old + LAST_JOB_WEIGHT * (seen - old);
             let [actual, estimated] = self.waited;
-            self.waited = [towards(actual, (taken - slowdown * cost).max(0.0)), towards(estimated, wait)];
-        } else if cost > 0.0 {
-            // A slow job sets the slowdown immediately, because each such job delays many others.
-            let seen = taken / cost;
-            let slowdown = towards(slowdown, seen).max(seen).clamp(SLOWDOWN[0], SLOWDOWN[1]);
-            (self.slowdown, self.at) = (slowdown, now);
+            self.waited = [towards(actual, (taken - cost).max(0.0)), towards(estimated, wait)];
         }
     }
 }
@@ -217,25 +192,36 @@ pub struct Assignment {
 }
 
 /// Predicts the ends of jobs on both backends.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub struct Model {
     costs: Option<[Cost; 2]>,
     loads: [Load; 2],
-    corrections: [Correction; 2],
+    overlap: Overlap,
+    host: HostCores,
 }
 
 impl Model {
+    /// Creates the model of an idle host of `cores` cores.
+    #[must_use]
+    pub fn new(cores: usize) -> Self {
+        let host = HostCores::new(cores);
+        Self { costs: None, loads: [Load::default(); 2], overlap: Overlap::default(), host }
+    }
+
     /// Sets the costs of the CPU and of one GPU. Until then, GPUs get all jobs.
     pub const fn set_costs(&mut self, cpu: Cost, gpu: Cost) {
         self.costs = Some([cpu, gpu]);
     }
 
-    /// Assigns a job of `work` units at the moment `now`, s, to the backend where it is predicted to end first.
-    /// `gpus` is the number of GPUs that accept jobs; without one, the CPU gets the job.
-    pub fn assign(&mut self, now: f64, work: f64, gpus: usize) -> Assignment {
+    /// Assigns a job of `work` units to the backend where it is predicted to end first. `now` is the present wall time
+    /// and processor time of this process, s, and `gpus` the number of GPUs that accept jobs; without one, the CPU gets
+    /// the job.
+    pub fn assign(&mut self, now: [f64; 2], work: f64, gpus: usize) -> Assignment {
+        let idle_share = self.host.idle_share(self.loads[Side::Gpu as usize].jobs);
         let ends = self.costs.filter(|_| gpus > 0).map(|_| {
-            [Side::Cpu, Side::Gpu]
-                .map(|side| self.corrections[side as usize].end(now, self.estimates(side, now, work, gpus)))
+            let [cpu, gpu] = [Side::Cpu, Side::Gpu].map(|side| self.estimates(side, now[0], work, gpus));
+            // The CPU runs its jobs one after the other, on the cores that the jobs of the GPUs leave idle.
+            [(cpu[0] + cpu[1]) / idle_share, self.overlap.fraction() * gpu[0] + gpu[1]]
         });
         let side = match ends {
             _ if gpus == 0 => Side::Cpu,
@@ -246,11 +232,17 @@ impl Model {
     }
 
     /// Assigns a job to a given backend.
-    pub fn assign_to(&mut self, side: Side, now: f64, work: f64, gpus: usize) -> Assignment {
-        let estimates = self.estimates(side, now, work, gpus);
+    pub fn assign_to(&mut self, side: Side, now: [f64; 2], work: f64, gpus: usize) -> Assignment {
+        let estimates = self.estimates(side, now[0], work, gpus);
         let added = estimates[1] / devices(side, gpus) as f64;
-        self.loads[side as usize].add(now, added);
-        Assignment { side, ends: None, added, at: now, estimates }
+        self.loads[side as usize].add(now[0], added);
+        self.update_host(now);
+        Assignment { side, ends: None, added, at: now[0], estimates }
+    }
+
+    fn update_host(&mut self, now: [f64; 2]) {
+        let [cpu, gpu] = self.loads.map(|load| load.jobs);
+        self.host.update(now, cpu, gpu);
     }
 
     /// Estimates the time before a job, and its own time, s.
@@ -261,17 +253,18 @@ impl Model {
         [wait, self.costs.map_or(0.0, |costs| costs[side as usize].seconds(work))]
     }
 
-    /// Removes the load of a job that was finished at `now`, s, and updates the averages with its time.
-    pub fn finish(&mut self, now: f64, assignment: &Assignment) {
-        self.remove(assignment);
-        if self.costs.is_some() {
-            self.corrections[assignment.side as usize].update(now, now - assignment.at, assignment.estimates);
+    /// Removes the load of a job that was finished at `now`, and learns from its time.
+    pub fn finish(&mut self, now: [f64; 2], assignment: &Assignment) {
+        self.remove(now, assignment);
+        if self.costs.is_some() && assignment.side == Side::Gpu {
+            self.overlap.update(now[0] - assignment.at, assignment.estimates);
         }
     }
 
     /// Removes the load of a job that was not finished.
-    pub fn remove(&mut self, assignment: &Assignment) {
+    pub fn remove(&mut self, now: [f64; 2], assignment: &Assignment) {
         self.loads[assignment.side as usize].remove(assignment.added);
+        self.update_host(now);
     }
 }
 
@@ -311,20 +304,21 @@ mod tests {
     /// end, and the number of jobs per backend. `forced` gives all jobs to one backend.
     fn simulate(gpu: Cost, jobs: &[(f64, f64)], forced: Option<Side>) -> (f64, [usize; 2]) {
         let costs = [CPU, gpu];
-        let mut model = Model::default();
+        // Jobs of the GPU need no cores of this host.
+        let mut model = Model::new(1 << 20);
         model.set_costs(CPU, gpu);
         let (mut free, mut total, mut counts) = ([0.0_f64; 2], 0.0, [0; 2]);
         let mut running: Vec<(f64, Assignment)> = Vec::new();
         for &(now, work) in jobs {
             running.retain(|(end, assignment)| {
                 if *end <= now {
-                    model.finish(*end, assignment);
+                    model.finish([*end, 0.0], assignment);
                 }
                 *end > now
             });
             let assignment = match forced {
-                Some(side) => model.assign_to(side, now, work, 1),
-                None => model.assign(now, work, 1),
+                Some(side) => model.assign_to(side, [now, 0.0], work, 1),
+                None => model.assign([now, 0.0], work, 1),
             };
             let side = assignment.side as usize;
             let end = free[side].max(now) + costs[side].seconds(work);
@@ -364,35 +358,35 @@ mod tests {
         let (alone, _) = simulate(gpu, &jobs(0.0), Some(Side::Gpu));
         assert!(together < 0.9 * alone, "{together} {alone}");
         // Small jobs end first on the CPU, large ones on the GPU.
-        let mut model = Model::default();
+        let mut model = Model::new(16);
         model.set_costs(CPU, gpu);
         for (work, side) in [(1e3, Side::Cpu), (1e6, Side::Gpu)] {
-            let assignment = model.assign(0.0, work, 1);
+            let assignment = model.assign([0.0; 2], work, 1);
             assert_eq!(assignment.side, side, "{work}");
-            model.remove(&assignment);
+            model.remove([0.0; 2], &assignment);
         }
     }
 
     #[test]
     fn a_gpu_that_is_down_gets_nothing() {
-        let mut model = Model::default();
-        assert_eq!(model.assign(0.0, 1e6, 0).side, Side::Cpu);
+        let mut model = Model::new(16);
+        assert_eq!(model.assign([0.0; 2], 1e6, 0).side, Side::Cpu);
         // Without costs, a GPU that is up gets everything.
-        assert_eq!(model.assign(0.0, 1.0, 1).side, Side::Gpu);
+        assert_eq!(model.assign([0.0; 2], 1.0, 1).side, Side::Gpu);
         model.set_costs(CPU, Cost { per_job: 0.0, per_unit: 1e-9 });
         for _ in 0..100 {
-            assert_eq!(model.assign(0.0, 1e6, 0).side, Side::Cpu);
+            assert_eq!(model.assign([0.0; 2], 1e6, 0).side, Side::Cpu);
         }
-        assert_eq!(model.assign(0.0, 1e6, 1).side, Side::Gpu);
+        assert_eq!(model.assign([0.0; 2], 1e6, 1).side, Side::Gpu);
     }
 
     #[test]
     fn more_gpus_end_a_queue_sooner() {
         let gpu = Cost { per_job: 0.0, per_unit: 1e-6 };
         let end = |gpus: usize| {
-            let mut model = Model::default();
+            let mut model = Model::new(16);
             model.set_costs(Cost { per_job: 1e3, per_unit: 1.0 }, gpu);
-            (0..10).map(|_| model.assign(0.0, 1e6, gpus).ends.unwrap()[1]).last().unwrap()
+            (0..10).map(|_| model.assign([0.0; 2], 1e6, gpus).ends.unwrap()[1]).last().unwrap()
         };
         assert!((end(1) - 10.0).abs() < 1e-9, "{}", end(1));
         assert!(end(4) < 4.0 && end(16) < 1.01, "{} {}", end(4), end(16));
@@ -400,18 +394,18 @@ mod tests {
 
     #[test]
     fn late_jobs_and_early_ends_correct_the_load() {
-        let mut model = Model::default();
+        let mut model = Model::new(16);
         model.set_costs(Cost { per_job: 1e3, per_unit: 0.0 }, Cost { per_job: 1.0, per_unit: 0.0 });
-        let first = model.assign(0.0, 0.0, 1);
-        let second = model.assign(0.0, 0.0, 1);
-        let wait = |model: &Model, now: f64| { *model }.assign(now, 0.0, 1).ends.unwrap()[1] - 1.0;
+        let first = model.assign([0.0; 2], 0.0, 1);
+        let second = model.assign([0.0; 2], 0.0, 1);
+        let wait = |model: &Model, now: f64| { *model }.assign([now, 0.0], 0.0, 1).ends.unwrap()[1] - 1.0;
         // Both are late, slightly and by 48 s.
         assert!((wait(&model, 2.1) - 0.2).abs() < 1e-9);
         assert!((wait(&model, 50.0) - 48.0).abs() < 1e-9);
         // One has ended early: at most the estimate of the other remains.
-        model.remove(&first);
+        model.remove([50.0, 0.0], &first);
         assert!((wait(&model, 0.0) - 1.0).abs() < 1e-9);
-        model.remove(&second);
+        model.remove([50.0, 0.0], &second);
         assert!(wait(&model, 0.0).abs() < 1e-9);
     }
 
@@ -421,27 +415,29 @@ mod tests {
         const STEPS: f64 = 80_000.0;
         let seconds = 500.0 * jobs[0].1;
         let step = seconds / STEPS;
-        let mut model = Model::default();
+        let mut model = Model::new(16);
         let [cpu, gpu] = jobs.map(|(_, per_job)| Cost { per_job, per_unit: 0.0 });
         model.set_costs(cpu, gpu);
-        let (mut done, mut now) = ([0.0; 2], 0.0);
+        let (mut done, mut now, mut processor) = ([0.0; 2], 0.0, 0.0);
         let mut running: Vec<Option<(Assignment, f64)>> = vec![None; clients];
         while now < seconds {
             let cores =
                 |job: &Option<(Assignment, f64)>| job.map_or(0.0, |(assigned, _)| jobs[assigned.side as usize].0);
-            let share = (16.0 / running.iter().map(cores).sum::<f64>()).min(1.0);
+            let needed = running.iter().map(cores).sum::<f64>();
+            let share = (16.0 / needed).min(1.0);
             now += step;
+            processor += step * needed.min(16.0);
             for job in &mut running {
                 let (assignment, left) = job.get_or_insert_with(|| {
                     let assignment = match forced {
-                        Some(side) => model.assign_to(side, now, 0.0, 1),
-                        None => model.assign(now, 0.0, 1),
+                        Some(side) => model.assign_to(side, [now, processor], 0.0, 1),
+                        None => model.assign([now, processor], 0.0, 1),
                     };
                     (assignment, jobs[assignment.side as usize].1)
                 });
                 *left -= share * step;
                 if *left <= 0.0 {
-                    model.finish(now, assignment);
+                    model.finish([now, processor], assignment);
                     done[assignment.side as usize] += 1.0 / seconds;
                     *job = None;
                 }
@@ -464,27 +460,33 @@ mod tests {
     }
 
     #[test]
-    fn a_slowdown_is_learnt_and_forgotten() {
-        let mut model = Model::default();
-        model.set_costs(Cost { per_job: 1.0, per_unit: 0.0 }, Cost { per_job: 1.5, per_unit: 0.0 });
-        let mut now = 0.0;
-        for _ in 0..20 {
-            let assignment = model.assign_to(Side::Cpu, now, 0.0, 1);
-            now += 4.0;
-            model.finish(now, &assignment);
-        }
-        let side = |now: f64| { model }.assign(now, 0.0, 1).side;
-        assert_eq!((side(now), side(now + 60.0)), (Side::Gpu, Side::Cpu));
-        // A device that overlaps its jobs.
-        let mut ends = Vec::new();
+    fn a_device_that_overlaps_its_jobs_is_predicted_to_end_them_sooner() {
+        let mut model = Model::new(16);
+        model.set_costs(Cost { per_job: 1e3, per_unit: 0.0 }, Cost { per_job: 1.5, per_unit: 0.0 });
+        let (mut ends, mut now) = (Vec::new(), [0.0; 2]);
         for _ in 0..40 {
             let all: Vec<_> = (0..8).map(|_| model.assign_to(Side::Gpu, now, 0.0, 1)).collect();
             ends.push({ model }.assign(now, 0.0, 1).ends.unwrap()[1]);
-            now += 2.0;
+            now[0] += 2.0;
             for assignment in &all {
                 model.finish(now, assignment);
             }
         }
         assert!(ends[0] > 13.0 && *ends.last().unwrap() < 4.0, "{ends:?}");
+    }
+
+    #[test]
+    fn the_cpu_is_predicted_to_run_on_idle_cores_only() {
+        let mut model = Model::new(4);
+        model.set_costs(Cost { per_job: 1.0, per_unit: 0.0 }, Cost { per_job: 1.5, per_unit: 0.0 });
+        let end = |model: &Model, now: [f64; 2]| { *model }.assign(now, 0.0, 1).ends.unwrap()[0];
+        assert!((end(&model, [0.0; 2]) - 1.0).abs() < 1e-9);
+        // Each job of the GPU uses a core.
+        let job = model.assign_to(Side::Gpu, [0.0; 2], 0.0, 1);
+        let another = model.assign_to(Side::Gpu, [0.0; 2], 0.0, 1);
+        assert!((end(&model, [1.0, 2.0]) - 2.0).abs() < 1e-9);
+        model.finish([1.0, 2.0], &job);
+        model.finish([1.0, 2.0], &another);
+        assert!((end(&model, [2.0, 2.0]) - 1.0).abs() < 1e-9);
     }
 }

@@ -9,6 +9,7 @@ mod draw;
 mod estimate;
 mod file;
 mod fit;
+mod host_cores;
 pub mod integer;
 mod left_out;
 pub mod nearest;

@@ -59,6 +59,9 @@ pub(crate) struct ServiceArgs {
     /// Also write the results to this file, as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
+    /// Folder for the log of each service, BACKEND.log
+    #[arg(long, value_name = "FOLDER")]
+    logs: Option<PathBuf>,
 }
 
 /// Structure whose uploads differ in a comment.
@@ -101,7 +104,7 @@ pub(crate) fn run(args: &ServiceArgs) -> Result<()> {
         Some(folder) => args.ids.iter().map(|id| Structure::load(folder, id)).collect::<Result<Vec<_>>>()?,
         None => vec![Structure { name: "4pti".to_owned(), bytes: SAMPLE.to_vec() }],
     };
-    let start = |backend: &String| Service::start(&args.binary, backend, &args.serve);
+    let start = |backend: &String| Service::start(&args.binary, backend, &args.serve, args.logs.as_deref());
     if let Some(n) = args.cold {
         return cold(args, &structures, n, start);
     }

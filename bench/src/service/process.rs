@@ -1,6 +1,7 @@
 //! A running `molmesh serve`.
 
-use std::io::{BufRead as _, BufReader};
+use std::fs::File;
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -23,10 +24,11 @@ pub(super) struct Service {
 impl Service {
     /// Starts a service on a free port and waits until it is ready: it has meshed once and, with several backends,
     /// measured them.
+    /// Its log goes to the file `BACKEND.log` of `logs`, if that folder is given.
     ///
     /// # Errors
     /// [`Error::File`] if the binary cannot be started, [`Error::Failed`] with its messages if it ends.
-    pub(super) fn start(binary: &Path, backend: &str, more: &[String]) -> Result<Self> {
+    pub(super) fn start(binary: &Path, backend: &str, more: &[String], logs: Option<&Path>) -> Result<Self> {
         let folder = std::env::temp_dir().join(format!("molmesh-bench-{}-{backend}", std::process::id()));
         let mut child = Command::new(binary)
             .args(["serve", "--listen", "127.0.0.1:0", "--backend", backend, "--data-dir"])
@@ -56,8 +58,16 @@ impl Service {
             }
             said.extend([line.as_str(), "\n"]);
         }
+        let log = logs.map(|folder| folder.join(format!("{backend}.log")));
+        let mut log = log.map(|path| File::create(&path).map_err(Error::file(&path))).transpose()?;
         // A full pipe would block the service.
-        std::thread::spawn(move || lines.map_while(std::result::Result::ok).for_each(drop));
+        std::thread::spawn(move || {
+            for line in lines.map_while(std::result::Result::ok) {
+                if let Some(log) = &mut log {
+                    drop(writeln!(log, "{line}"));
+                }
+            }
+        });
         match addr {
             Some(addr) => {
                 let service = Self { child, folder, addr };

@@ -1,0 +1,90 @@
+//! Number of cores of the host that a job of a GPU keeps busy, and the share of cores that it leaves to the CPU backend.
+
+/// Cores that a job keeps busy before any measurement.
+const FIRST_GUESS: f64 = 1.0;
+/// Minimum duration of a measurement, s of GPU jobs.
+const MIN_JOB_TIME: f64 = 0.05;
+/// Weight of the last measurement in the average.
+const LAST_WEIGHT: f64 = 0.3;
+/// Minimum share of idle cores: a loaded host still runs a job of the CPU.
+const MIN_SHARE: f64 = 0.05;
+
+/// Measurement of the processor time of GPU jobs, while the CPU backend has no job. For a job of a GPU, the host reads a
+/// file, sorts atoms and sends a mesh.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct HostCores {
+    cores: f64,
+    per_job: f64,
+    /// Duration and processor time of GPU jobs since the last measurement, s.
+    sums: [f64; 2],
+    /// Last update: wall time and processor time, s, and the number of GPU jobs, 0 if the CPU backend had jobs.
+    last: ([f64; 2], usize),
+}
+
+impl HostCores {
+    /// Creates the measurement of a host of `cores` cores.
+    pub(super) const fn new(cores: usize) -> Self {
+        Self { cores: cores as f64, per_job: FIRST_GUESS, sums: [0.0; 2], last: ([0.0; 2], 0) }
+    }
+
+    /// Notes that the number of jobs changes at `now`, the wall time and processor time of this process, s.
+    pub(super) fn update(&mut self, now: [f64; 2], cpu_jobs: usize, gpu_jobs: usize) {
+        let ([wall, processor], n) = self.last;
+        if n > 0 {
+            self.sums[0] += n as f64 * (now[0] - wall).max(0.0);
+            self.sums[1] += (now[1] - processor).max(0.0);
+        }
+        self.last = (now, if cpu_jobs == 0 { gpu_jobs } else { 0 });
+        let [jobs, processor] = self.sums;
+        if jobs >= MIN_JOB_TIME {
+            self.per_job += LAST_WEIGHT * (processor / jobs - self.per_job);
+            self.sums = [0.0; 2];
+        }
+    }
+
+    /// Returns the share of cores, from 0.05 to 1, that `gpu_jobs` jobs of GPUs leave idle.
+    pub(super) fn idle_share(&self, gpu_jobs: usize) -> f64 {
+        (1.0 - self.per_job * gpu_jobs as f64 / self.cores).clamp(MIN_SHARE, 1.0)
+    }
+}
+
+/// Returns the processor time of this process, s; 0 on systems other than Linux, where GPU jobs count as free.
+pub(super) fn processor_time() -> f64 {
+    #[cfg(target_os = "linux")]
+    {
+        let time = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+        time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
+    }
+    #[cfg(not(target_os = "linux"))]
+    0.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_jobs_of_gpus_alone_are_measured() {
+        let mut host = HostCores::new(8);
+        let mut now = [0.0; 2];
+        for _ in 0..30 {
+            // Two jobs of a GPU use a core together; then a job of the CPU uses all; then the host is idle.
+            for (cpu_jobs, gpu_jobs, cores) in [(0, 2, 1.0), (1, 2, 8.0), (0, 0, 0.0)] {
+                host.update(now, cpu_jobs, gpu_jobs);
+                now = [now[0] + 0.1, now[1] + 0.1 * cores];
+            }
+        }
+        assert!((host.per_job - 0.5).abs() < 1e-3, "{host:?}");
+        assert_eq!([0, 8, 16, 99].map(|jobs| (20.0 * host.idle_share(jobs)).round()), [20.0, 10.0, 1.0, 1.0]);
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn work_takes_processor_time() {
+        let begun = processor_time();
+        let end = std::time::Instant::now() + std::time::Duration::from_millis(30);
+        while std::time::Instant::now() < end {}
+        let busy = processor_time() - begun;
+        assert!(busy > 1e-3, "{busy}");
+    }
+}
