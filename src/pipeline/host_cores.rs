@@ -6,6 +6,9 @@ const FIRST_GUESS: f64 = 1.0;
 const MIN_JOB_TIME: f64 = 0.05;
 /// Weight of the last measurement in the average.
 const LAST_WEIGHT: f64 = 0.3;
+/// Time constant of the average number of GPU jobs, s. Small jobs share a submission and end together: for a moment, the
+/// host seems idle.
+const JOBS_TIME: f64 = 0.05;
 /// Minimum share of idle cores: a loaded host still runs a job of the CPU.
 const MIN_SHARE: f64 = 0.05;
 
@@ -17,24 +20,37 @@ pub(super) struct HostCores {
     per_job: f64,
     /// Duration and processor time of GPU jobs since the last measurement, s.
     sums: [f64; 2],
-    /// Last update: wall time and processor time, s, and the number of GPU jobs, 0 if the CPU backend had jobs.
-    last: ([f64; 2], usize),
+    /// Number of GPU jobs, averaged over the last moments.
+    mean_jobs: f64,
+    last: Update,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Update {
+    /// Wall time and processor time, s.
+    at: [f64; 2],
+    gpu_jobs: usize,
+    /// True if the CPU backend has no job.
+    gpu_alone: bool,
 }
 
 impl HostCores {
     /// Creates the measurement of a host of `cores` cores.
     pub(super) const fn new(cores: usize) -> Self {
-        Self { cores: cores as f64, per_job: FIRST_GUESS, sums: [0.0; 2], last: ([0.0; 2], 0) }
+        let last = Update { at: [0.0; 2], gpu_jobs: 0, gpu_alone: true };
+        Self { cores: cores as f64, per_job: FIRST_GUESS, sums: [0.0; 2], mean_jobs: 0.0, last }
     }
 
     /// Notes that the number of jobs changes at `now`, the wall time and processor time of this process, s.
     pub(super) fn update(&mut self, now: [f64; 2], cpu_jobs: usize, gpu_jobs: usize) {
-        let ([wall, processor], n) = self.last;
-        if n > 0 {
-            self.sums[0] += n as f64 * (now[0] - wall).max(0.0);
-            self.sums[1] += (now[1] - processor).max(0.0);
+        let Update { at, gpu_jobs: before, gpu_alone } = self.last;
+        let [wall, processor] = [0, 1].map(|k| (now[k] - at[k]).max(0.0));
+        self.mean_jobs += (1.0 - (-wall / JOBS_TIME).exp()) * (before as f64 - self.mean_jobs);
+        if gpu_alone && before > 0 {
+            self.sums[0] += before as f64 * wall;
+            self.sums[1] += processor;
         }
-        self.last = (now, if cpu_jobs == 0 { gpu_jobs } else { 0 });
+        self.last = Update { at: now, gpu_jobs, gpu_alone: cpu_jobs == 0 };
         let [jobs, processor] = self.sums;
         if jobs >= MIN_JOB_TIME {
             self.per_job += LAST_WEIGHT * (processor / jobs - self.per_job);
@@ -42,9 +58,13 @@ impl HostCores {
         }
     }
 
-    /// Returns the share of cores, from 0.05 to 1, that `gpu_jobs` jobs of GPUs leave idle.
-    pub(super) fn idle_share(&self, gpu_jobs: usize) -> f64 {
-        (1.0 - self.per_job * gpu_jobs as f64 / self.cores).clamp(MIN_SHARE, 1.0)
+    /// Returns the share of cores, from 0.05 to 1, that the jobs of GPUs leave idle at the moment `now` of [`update`].
+    ///
+    /// [`update`]: Self::update
+    pub(super) fn idle_share(&mut self, now: [f64; 2], cpu_jobs: usize, gpu_jobs: usize) -> f64 {
+        self.update(now, cpu_jobs, gpu_jobs);
+        let jobs = self.mean_jobs.max(gpu_jobs as f64);
+        (1.0 - self.per_job * jobs / self.cores).clamp(MIN_SHARE, 1.0)
     }
 }
 
@@ -75,7 +95,13 @@ mod tests {
             }
         }
         assert!((host.per_job - 0.5).abs() < 1e-3, "{host:?}");
-        assert_eq!([0, 8, 16, 99].map(|jobs| (20.0 * host.idle_share(jobs)).round()), [20.0, 10.0, 1.0, 1.0]);
+        let now = [now[0] + 9.0, now[1]];
+        assert_eq!([0, 8, 16, 99].map(|jobs| (20.0 * host.idle_share(now, 0, jobs)).round()), [20.0, 10.0, 1.0, 1.0]);
+        // Eight jobs end together: half of the cores may be needed again at once.
+        host.update(now, 0, 8);
+        let ended = [now[0] + 0.2, now[1] + 0.8];
+        assert!(host.idle_share(ended, 0, 0) < 0.55, "{host:?}");
+        assert!(host.idle_share([ended[0] + 0.5, ended[1]], 0, 0) > 0.99, "{host:?}");
     }
 
     #[cfg(target_os = "linux")]
