@@ -266,7 +266,7 @@ pub(crate) struct SelectionArgs {
     /// Comma-separated chains, by author name [default: all]
     #[arg(long, value_name = "A,B")]
     pub(crate) chains: Option<String>,
-    /// Model number [default: the first]
+    /// Model number, or all: one part of the mesh per model [default: the first]
     #[arg(long, value_name = "N")]
     pub(crate) model: Option<String>,
     /// Alternative location [default: the one with the highest occupancy in each residue]
@@ -295,7 +295,7 @@ pub(crate) struct LimitArgs {
     /// Copies of chains in the assembly [default: 10000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_copies: Option<u64>,
-    /// Parts of a mesh with `--split` [default: 1000]
+    /// Parts of a mesh with `--split` or `--model all` [default: 1000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_parts: Option<u64>,
     /// Bytes of the input after decompression, such as 64MiB [default: 4GiB]

@@ -31,7 +31,11 @@ pub(crate) struct WrittenFiles {
 pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[String]>, style: Style) -> String {
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
     let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
-    page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, model {})", report.source_format, report.model));
+    let models = match report.models {
+        Some(n) => format!("{} models", grouped(n)),
+        None => format!("model {}", report.model),
+    };
+    page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, {models})", report.source_format));
     if let Some(assembly) = &report.assembly {
         page.row("assembly", &format!("{} of {} copies", assembly.id, grouped(assembly.copies)));
     }
@@ -252,6 +256,7 @@ mod tests {
             atoms: 454,
             atoms_in_file: 514,
             model: 1,
+            models: None,
             assembly: None,
             left_out: LeftOutReport {
                 total: 60,

@@ -33,8 +33,8 @@ pub struct LimitsConfig {
     pub duplicate_atoms: u64,
     /// Number of copies of chains in an assembly. Default 10,000: six times as many as in the largest virus of the PDB.
     pub assembly_copies: u64,
-    /// Number of parts of a mesh with `split`. Default 1,000: most structures have fewer chains. Each part is meshed on
-    /// its own and adds about a kilobyte to the header of a glTF.
+    /// Number of parts of a mesh with `split` or `model=all`. Default 1,000: most structures have fewer chains. Each
+    /// part is meshed on its own and adds about a kilobyte to the header of a glTF.
     pub mesh_parts: u64,
     /// Number of atoms whose names or colours are listed, for web pages that show them. Default 1,000,000: about 10 MB
     /// of JSON, the most that is useful in a browser.

@@ -247,8 +247,9 @@ impl From<StructureError> for Problem {
             E::TooManyDistances { limit } => {
                 Self::new(Kind::TooManyCandidates, detail).with("parameter", "select").with("limit", limit)
             }
-            E::TooManyParts { limit, .. } => {
-                Self::new(Kind::TooManyParts, detail).with("parameter", "split").with("limit", limit)
+            E::TooManyParts { rule, limit } => {
+                let parameter = rule.split('=').next().unwrap_or(rule);
+                Self::new(Kind::TooManyParts, detail).with("parameter", parameter).with("limit", limit)
             }
             E::NoEntities => Self::new(Kind::BadParameter, detail)
                 .with("parameter", "split")

@@ -169,7 +169,7 @@ pub(super) const KINDS: &[ProblemEntry] = &[
     row(Kind::TooManyCopies, "too-many-copies", S::UNPROCESSABLE_ENTITY, true, "The assembly has too many copies",
         "The assembly has more than `limit` copies of chains. Mesh another assembly or the asymmetric unit, or ask the operator to raise limits.assembly_copies."),
     row(Kind::TooManyParts, "too-many-parts", S::UNPROCESSABLE_ENTITY, true, "The mesh would have too many parts",
-        "`split` divides the selected atoms into more than `limit` parts. Select fewer chains or another `split`, or ask the operator to raise limits.mesh_parts."),
+        "`parameter` (`split` or `model`) divides the selected atoms into more than `limit` parts. Select fewer chains or another `split`, or one model, or ask the operator to raise limits.mesh_parts."),
     row(Kind::MeshTooLarge, "mesh-too-large", S::UNPROCESSABLE_ENTITY, true, "The mesh would be too large",
         "The mesh or its file exceeds `limit` bytes; `suggested_resolution` is a grid spacing in Å that fits, if there is one. Or no mesh has as few triangles as `max_triangles` requires: `actual` is the smallest number, at `resolution`."),
     row(Kind::PictureTooLarge, "picture-too-large", S::UNPROCESSABLE_ENTITY, true, "The picture would be too large",

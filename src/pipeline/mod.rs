@@ -292,6 +292,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     report.color = color;
+    report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
     let mut product = Product { mesh, bounds, storage, report, picture: None, streamed_bytes: None };
     if let (Some(sink), Some(streamed)) = (sink, streamed) {

@@ -4,23 +4,21 @@
 //! ranges. The module depends on neither HTTP nor flags.
 
 mod table;
+mod values;
 
 use std::fmt::Write as _;
-use std::str::FromStr;
 
 use thiserror::Error;
 
-use table::flag;
 pub use table::{Domain, Parameter, TABLE, usual_range};
+use values::ParsedValues;
 
-use super::color::{ColorBlend, Coloring, Palette, Scheme};
 use super::nearest::nearest;
-use super::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use super::{Job, Spacing};
 use crate::formats::{Compress, Format, Normals, Units};
-use crate::picture::{Background, MAX_SIDE, PictureParams, Style, View};
+use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Selection, Split};
-use crate::surface::{PaperParams, Preset, SurfaceError, SurfaceKind, SurfaceOptions, SurfaceParams, Validation};
+use crate::surface::{PaperParams, SurfaceError, SurfaceParams};
 
 /// Errors of parsing parameters.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -106,6 +104,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         }
     }
     let color = values.coloring()?;
+    values.divide_models()?;
     let ParsedValues { options, selection, mut request, .. } = values;
     request.job = Job { selection, params: SurfaceParams::new(&options)?, color, ..request.job };
     if let Some(format) = request.format {
@@ -184,146 +183,6 @@ impl From<SurfaceError> for ParamError {
             }
         }
     }
-}
-
-/// Values of the parameters that are parsed so far.
-#[derive(Default)]
-struct ParsedValues {
-    options: SurfaceOptions,
-    selection: Selection,
-    scheme: Option<Scheme>,
-    palette: Option<Palette>,
-    color_range: Option<[f64; 2]>,
-    color_blend: ColorBlend,
-    request: Request,
-}
-
-impl ParsedValues {
-    /// Combines `color`, `palette`, `color_range` and `color_blend`.
-    fn coloring(&self) -> Result<Option<Coloring>, ParamError> {
-        let Self { scheme, palette, color_range: range, color_blend: blend, .. } = *self;
-        let has_numbers = scheme.is_some_and(|scheme| scheme.palette().is_some());
-        let unused = match (palette, range) {
-            (Some(palette), _) => Some(("palette", palette.name().to_owned())),
-            (_, Some([low, high])) => Some(("color_range", format!("{low},{high}"))),
-            _ => None,
-        };
-        if let Some((name, value)) = unused.filter(|_| !has_numbers) {
-            let shown = scheme.map_or("none".to_owned(), |scheme| scheme.to_string());
-            let expected =
-                format!("no value with color={shown}, or a scheme with numbers: color={}", Scheme::with_numbers());
-            return Err(ParamError::BadValue { name, value: format!("`{value}`"), expected });
-        }
-        if blend == ColorBlend::Smooth && scheme.is_none() {
-            let expected = format!("{} without colours, or a value of color", ColorBlend::Nearest.name());
-            return Err(ParamError::BadValue { name: "color_blend", value: format!("`{}`", blend.name()), expected });
-        }
-        Ok(scheme.map(|scheme| Coloring { scheme, palette, range, blend }))
-    }
-
-    /// Returns the picture parameters of the job. The first call creates them.
-    fn picture(&mut self) -> &mut PictureParams {
-        self.request.job.picture.get_or_insert_default()
-    }
-
-    /// Parses the value of one parameter.
-    fn set(&mut self, parameter: &Parameter, text: &str) -> Result<(), ParamError> {
-        let bad = || parameter.invalid(text);
-        // The core checks ranges, because they may depend on the surface.
-        let number = || text.trim().parse::<f64>().ok().filter(|v| v.is_finite()).map(Some).ok_or_else(bad);
-        let side = || whole(text).and_then(|n| u32::try_from(n).ok()).filter(|n| (1..=MAX_SIDE).contains(n));
-        let angle = || {
-            let Domain::Number { min, max, .. } = parameter.domain else { return None };
-            text.trim().parse::<f64>().ok().filter(|angle| (min..=max).contains(angle))
-        };
-        match parameter.name {
-            "preset" => self.options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
-            "surface" => self.options.surface = Some(SurfaceKind::from_str(text).ok().ok_or_else(bad)?),
-            "probe" => self.options.probe = number()?,
-            "resolution" => self.options.resolution = number()?,
-            "detail" => {
-                let level = whole(text).filter(|level| *level < DETAILS.len() as u64);
-                self.request.job.spacing = Spacing::Detail(level.and_then(|l| u8::try_from(l).ok()).ok_or_else(bad)?);
-            }
-            "max_triangles" => {
-                let most = whole(text)
-                    .filter(|most| (u64::from(MIN_TRIANGLE_LIMIT)..=u64::from(MAX_TRIANGLE_LIMIT)).contains(most));
-                self.request.job.spacing = Spacing::MaxTriangles(most.ok_or_else(bad)?);
-            }
-            "isovalue" => self.options.isovalue = number()?,
-            "smoothness" => self.options.smoothness = number()?,
-            "radius_scale" => self.options.radius_scale = number()?,
-            "radius_offset" => self.options.radius_offset = number()?,
-            "cutoff_tolerance" => self.options.cutoff_tolerance = number()?,
-            "paper_a" => self.options.paper_a = number()?,
-            "paper_b" => self.options.paper_b = number()?,
-            "paper_c" => self.options.paper_c = number()?,
-            "atom_ids" => self.options.atom_ids = flag(text).ok_or_else(bad)?,
-            "color" if text == "none" => self.scheme = None,
-            "color" => self.scheme = Some(text.parse().ok().ok_or_else(bad)?),
-            "palette" => self.palette = Some(named(&Palette::ALL, Palette::name, text).ok_or_else(bad)?),
-            "color_blend" => self.color_blend = named(&ColorBlend::ALL, ColorBlend::name, text).ok_or_else(bad)?,
-            "color_range" => self.color_range = Some(range(text).ok_or_else(bad)?),
-            "model" => self.selection.model = Some(text.trim().parse().ok().ok_or_else(bad)?),
-            "chains" => {
-                self.selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect());
-            }
-            "select" => {
-                let bad = |error| ParamError::BadExpression { name: "select", text: text.to_owned(), error };
-                self.selection.atoms = text.parse().map_err(bad)?;
-            }
-            "assembly" => {
-                let id = Some(text.trim()).filter(|id| !id.is_empty() && !id.chars().any(char::is_control));
-                let id = id.ok_or_else(bad)?;
-                self.selection.assembly = (id != parameter.default).then(|| id.to_owned());
-            }
-            "split" => self.request.job.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
-            "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
-            "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
-            "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
-            "format" => self.request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
-            "compress" => self.request.job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
-            "normals" => self.request.job.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
-            "units" => self.request.job.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
-            "width" => self.picture().width = side().ok_or_else(bad)?,
-            "height" => self.picture().height = side().ok_or_else(bad)?,
-            "view" => self.picture().view = named(&View::ALL, View::name, text).ok_or_else(bad)?,
-            "azimuth" => self.picture().azimuth = angle().ok_or_else(bad)?,
-            "elevation" => self.picture().elevation = angle().ok_or_else(bad)?,
-            "background" => self.picture().background = text.parse::<Background>().ok().ok_or_else(bad)?,
-            "style" => self.picture().style = named(&Style::ALL, Style::name, text).ok_or_else(bad)?,
-            _ => return Err(unknown(parameter.name)),
-        }
-        Ok(())
-    }
-}
-
-/// Returns the value with this name.
-fn named<T: Copy>(all: &[T], name: impl Fn(T) -> &'static str, text: &str) -> Option<T> {
-    all.iter().copied().find(|value| name(*value) == text)
-}
-
-fn whole(text: &str) -> Option<u64> {
-    text.trim().parse().ok()
-}
-
-/// Splits a list at commas. Rejects empty items and control characters.
-fn list(text: &str) -> Option<Vec<&str>> {
-    let words: Vec<&str> = text.split(',').map(str::trim).collect();
-    words.iter().all(|w| !w.is_empty() && !w.chars().any(char::is_control)).then_some(words)
-}
-
-/// Parses two numbers, the lower one first.
-fn range(text: &str) -> Option<[f64; 2]> {
-    let (low, high) = text.split_once(',')?;
-    let [low, high] = [low, high].map(|end| end.trim().parse::<f64>().ok().filter(|end| end.is_finite()));
-    // Adding 0 turns −0 into 0, so both have one canonical form.
-    Some([low? + 0.0, high? + 0.0]).filter(|[low, high]| low < high)
-}
-
-fn one_char(text: &str) -> Option<char> {
-    let mut chars = text.chars();
-    chars.next().filter(|c| chars.next().is_none() && !c.is_control())
 }
 
 /// Returns all parameters of a job as one line of text, which is equal for equal jobs only. It is part of the content

@@ -121,12 +121,15 @@ pub struct Report {
     pub atoms: u64,
     /// Atoms in all models of the file.
     pub atoms_in_file: u64,
-    /// Number of the meshed model.
+    /// Number of the meshed model; of the first one with `model=all`.
     pub model: i32,
+    /// Number of meshed models with `model=all`; absent if one model is meshed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub models: Option<u64>,
     /// Assembly; absent for the asymmetric unit.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub assembly: Option<AssemblyReport>,
-    /// Atoms of the model that are not meshed.
+    /// Atoms of the meshed models that are not meshed.
     pub left_out: LeftOutReport,
     /// Unreadable values that do not affect the mesh, at most 12; absent if there are none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -269,6 +272,7 @@ impl Report {
             atoms: selected.atoms.len() as u64,
             atoms_in_file: structure.len() as u64,
             model: selected.model,
+            models: None,
             assembly: job
                 .selection
                 .assembly

@@ -1,6 +1,6 @@
 //! Chooses one alternative location for each residue.
 //!
-//! Chain, number and insertion code identify a residue. Two residue names with the same three values
+//! Model, chain, number and insertion code identify a residue. Two residue names with the same values
 //! (microheterogeneity) are alternatives of one residue. The same letter applies to the whole residue, so that bonded
 //! atoms always come from one alternative.
 
@@ -9,12 +9,13 @@ use std::collections::HashMap;
 use super::atoms::Structure;
 use super::error::StructureError;
 use super::read;
+use super::select::Models;
 use crate::surface::Control;
 
 /// Atoms between two checks of the cancellation flag: about a millisecond.
 pub(super) const ATOMS_PER_CHECK: usize = 1 << 16;
 
-type ResidueKey = (u32, i32, u8);
+type ResidueKey = (i32, u32, i32, u8);
 
 /// The chosen letter of each residue that has alternatives.
 #[derive(Debug, Default)]
@@ -38,15 +39,15 @@ impl Letter {
 }
 
 fn residue(structure: &Structure, i: usize) -> ResidueKey {
-    (structure.chain.id(i), structure.residue_number[i], structure.insertion_code[i])
+    (structure.model[i], structure.chain.id(i), structure.residue_number[i], structure.insertion_code[i])
 }
 
 impl Alternatives {
-    /// Chooses an alternative for each residue of `model`: `preferred` if the residue has it, otherwise the one with
+    /// Chooses an alternative for each residue of `models`: `preferred` if the residue has it, otherwise the one with
     /// the highest mean occupancy. Of equal ones, chooses the lowest letter.
     pub(super) fn choose(
         structure: &Structure,
-        model: i32,
+        models: Models,
         preferred: Option<u8>,
         control: &Control<'_>,
     ) -> Result<Self, StructureError> {
@@ -55,7 +56,7 @@ impl Alternatives {
             if i % ATOMS_PER_CHECK == 0 {
                 read::check(control)?;
             }
-            if structure.altloc[i] == 0 || structure.model[i] != model {
+            if structure.altloc[i] == 0 || !models.contains(structure.model[i]) {
                 continue;
             }
             let of_residue = letters.entry(residue(structure, i)).or_default();

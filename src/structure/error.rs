@@ -108,10 +108,10 @@ pub enum StructureError {
         limit: u64,
     },
     /// The selected atoms would be divided into more parts than allowed.
-    #[error("split={split} divides the selected atoms into more than {limit} parts")]
+    #[error("{rule} divides the selected atoms into more than {limit} parts")]
     TooManyParts {
-        /// Name of the rule by which atoms are divided.
-        split: &'static str,
+        /// Parameter that divides the atoms, such as `split=chain`.
+        rule: &'static str,
         /// Limit, number of parts.
         limit: u64,
     },

@@ -59,7 +59,7 @@ pub use copies::PlacedCopy;
 pub use error::StructureError;
 pub use kind_set::KindSet;
 pub use read::{ReadLimits, read, read_with};
-pub use select::{BadExpression, Expression, LeftOut, Selected, Selection, select, select_with};
+pub use select::{BadExpression, Expression, LeftOut, ModelChoice, Selected, Selection, select, select_with};
 pub use split::{AtomPart, Split};
 pub use survey::{Survey, survey};
 pub use texts::TextColumn;

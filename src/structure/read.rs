@@ -19,7 +19,7 @@ pub struct ReadLimits {
     pub max_duplicates: u64,
     /// Copies of chains in an assembly.
     pub max_copies: u64,
-    /// Parts into which `split` divides the selected atoms.
+    /// Parts into which `split` or `model=all` divides the selected atoms.
     pub max_parts: u64,
     /// Distances between atoms that an expression with `within` tests.
     pub max_distances: u64,

@@ -20,21 +20,24 @@ pub enum Split {
     Chain,
     /// One part per entity.
     Entity,
+    /// One part per model, for `model=all`.
+    Model,
     /// One part per group of kinds: polymer, ligand (with cofactors), glycan, ion, water.
     ResidueGroup,
 }
 
 impl Split {
-    /// All values.
+    /// All values of the parameter `split`.
     pub const ALL: [Self; 4] = [Self::None, Self::Chain, Self::Entity, Self::ResidueGroup];
 
-    /// Returns the value of the parameter `split`.
+    /// Returns the value of the parameter `split`, or the name of the rule.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::None => "none",
             Self::Chain => "chain",
             Self::Entity => "entity",
+            Self::Model => "model",
             Self::ResidueGroup => "residue-group",
         }
     }
@@ -43,7 +46,7 @@ impl Split {
 /// Atoms of one part.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AtomPart {
-    /// Name: at most 40 characters, and the number of the copy in an assembly.
+    /// Name: at most 40 characters and the number of the copy in an assembly, or `model` and its number.
     pub name: String,
     /// Rows of [`Selected::atoms`], ascending.
     pub rows: Vec<u32>,
@@ -82,7 +85,7 @@ impl Selected {
         }
         control.memory.grow(BYTES_PER_ROW * self.atoms.len() as u64)?;
         let mut parts = Vec::new();
-        let mut found: FxHashMap<(usize, &str), usize> = FxHashMap::default();
+        let mut found: FxHashMap<(i64, &str), usize> = FxHashMap::default();
         let mut copies = self.copies.iter().enumerate().peekable();
         for (row, index) in (0_usize..).zip(0_u32..).take(self.atoms.len()) {
             if row % ATOMS_PER_CHECK == 0 {
@@ -92,16 +95,20 @@ impl Selected {
                 copies.next();
             }
             let i = self.atoms[row] as usize;
-            let copy = copies.peek().filter(|_| split == Split::Chain).map_or(0, |(number, _)| number + 1);
-            let key = (copy, name(structure, split, i));
+            let number = match split {
+                Split::Chain => copies.peek().map_or(0, |(copy, _)| i64::try_from(copy + 1).unwrap_or(i64::MAX)),
+                Split::Model => i64::from(structure.model[i]),
+                _ => 0,
+            };
+            let key = (number, name(structure, split, i));
             let part = match found.get(&key) {
                 Some(&part) => part,
                 None if parts.len() as u64 >= limits.max_parts => {
-                    return Err(StructureError::TooManyParts { split: split.name(), limit: limits.max_parts });
+                    return Err(StructureError::TooManyParts { rule: rule(split), limit: limits.max_parts });
                 }
                 None => {
                     found.insert(key, parts.len());
-                    parts.push(AtomPart { name: shown(key), rows: Vec::new() });
+                    parts.push(AtomPart { name: shown(split, key), rows: Vec::new() });
                     parts.len() - 1
                 }
             };
@@ -114,7 +121,7 @@ impl Selected {
 /// Returns the name of the part of atom `i`, without the number of a copy.
 fn name(structure: &Structure, split: Split, i: usize) -> &str {
     let (name, if_empty) = match split {
-        Split::None => ("", ""),
+        Split::None | Split::Model => ("", ""),
         Split::Chain => (structure.chain.get(i), BLANK_CHAIN),
         Split::Entity => {
             let entity = structure.entities.get(structure.label_chain.id(i) as usize);
@@ -136,8 +143,24 @@ const fn group(kind: Kind) -> &'static str {
     }
 }
 
-/// Returns the name of a part: the name in the file and, in an assembly, the number of the copy, from 1.
-fn shown((copy, name): (usize, &str)) -> String {
+/// Returns the name of a part: the number of a model, or the name in the file and, in an assembly, the number of the
+/// copy, from 1.
+fn shown(split: Split, (number, name): (i64, &str)) -> String {
     let name: String = name.chars().take(MAX_NAME).collect();
-    if copy == 0 { name } else { format!("{name}-{copy}") }
+    match split {
+        Split::Model => format!("model {number}"),
+        _ if number == 0 => name,
+        _ => format!("{name}-{number}"),
+    }
+}
+
+/// Returns the parameter that divides atoms by a rule.
+const fn rule(split: Split) -> &'static str {
+    match split {
+        Split::None => "split=none",
+        Split::Chain => "split=chain",
+        Split::Entity => "split=entity",
+        Split::ResidueGroup => "split=residue-group",
+        Split::Model => "model=all",
+    }
 }

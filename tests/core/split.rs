@@ -1,6 +1,7 @@
 //! Parts of a mesh: names, other readers, equality with the meshes of the parts alone, and limits.
 #![allow(clippy::pedantic, clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicI64, Ordering};
 
@@ -276,7 +277,7 @@ fn the_number_of_parts_is_limited() {
     };
     assert_eq!(limited(2).unwrap().report.parts.len(), 2);
     let error = limited(1).unwrap_err();
-    assert_eq!(error, JobError::Structure(StructureError::TooManyParts { split: "chain", limit: 1 }));
+    assert_eq!(error, JobError::Structure(StructureError::TooManyParts { rule: "split=chain", limit: 1 }));
 }
 
 #[test]
@@ -367,4 +368,102 @@ fn memory_of_the_joined_mesh_stays_counted() {
     let (whole, bytes, _) = held(&[("resolution", "1")]);
     let (split, parts, atoms) = held(&[("resolution", "1"), ("split", "chain")]);
     assert_eq!(split - parts, whole - bytes + 16 * atoms);
+}
+
+/// Three models of the first residues of a protein, numbered 1, 2 and 7. The second one is stretched along x, and the
+/// last one lacks the last atoms.
+fn ensemble() -> String {
+    let text = include_str!("../../samples/4pti.pdb");
+    let atoms: Vec<&str> = text.lines().filter(|line| line.starts_with("ATOM")).take(60).collect();
+    let model = |number: usize, stretch: f64, n: usize| {
+        let atom = |line: &&str| {
+            let x: f64 = line[30..38].trim().parse().unwrap();
+            format!("{}{:8.3}{}\n", &line[..30], stretch * x, &line[38..])
+        };
+        format!("MODEL     {number:>4}\n{}ENDMDL\n", atoms[..n].iter().map(atom).collect::<String>())
+    };
+    format!("{}{}{}END\n", model(1, 1.0, 60), model(2, 1.2, 60), model(7, 1.0, 50))
+}
+
+#[test]
+fn all_models_have_the_meshes_of_each_model_alone() {
+    let pdb = ensemble();
+    let xyz = "2\nfirst\nC 0 0 0\nC 1.5 0 0\n1\nsecond\nO 9 0 0\n";
+    let near = "select=byres within 4 of resi 3";
+    for (text, numbers, select) in [
+        (pdb.as_str(), vec!["1", "2", "7"], "select=polymer"),
+        (&pdb, vec!["1", "2", "7"], near),
+        (xyz, vec!["1", "2"], "select=all"),
+    ] {
+        let own = [("resolution", "0.8"), ("atom_ids", "true"), select.split_once('=').unwrap()];
+        let all = meshed(text, &[&own[..], &[("model", "all")]].concat());
+        let expected: Vec<String> = numbers.iter().map(|number| format!("model {number}")).collect();
+        assert_eq!(names(&all.report), expected);
+        assert_eq!((all.report.models, all.mesh.parts.len()), (Some(numbers.len() as u64), numbers.len()));
+        for (n, number) in numbers.iter().enumerate() {
+            let alone = meshed(text, &[&own[..], &[("model", number)]].concat());
+            let part = part(&all.mesh, n);
+            assert!(distance(&part, &alone.mesh) < 1e-5, "{select} {number}: {}", distance(&part, &alone.mesh));
+            assert_eq!(part.atom_ids, alone.mesh.atom_ids, "indices of atoms of the file");
+            assert_eq!((all.report.parts[n].atoms, alone.report.models), (alone.report.atoms, None));
+            // Negative control: the other model.
+            let other = (n + 1) % numbers.len();
+            assert!(distance(&self::part(&all.mesh, other), &alone.mesh) > 0.1);
+        }
+        let left: u64 = numbers
+            .iter()
+            .map(|number| meshed(text, &[&own[..], &[("model", number)]].concat()).report.left_out.total)
+            .sum();
+        assert_eq!(all.report.left_out.total, left);
+        let obj = String::from_utf8(encode(Format::Obj, &all)).unwrap();
+        assert_eq!(obj.lines().filter(|line| line.starts_with("g model_")).count(), numbers.len());
+    }
+}
+
+#[test]
+fn gemmi_counts_the_atoms_of_each_model() {
+    let mut files = Files::new();
+    files.add("ensemble.pdb", ensemble().as_bytes());
+    let Some(python) = tools::python_interpreter().or_else(|| tools::missing("gemmi")) else { return };
+    let output = Command::new(python).arg("tests/tools/gemmi_dump.py").arg(&files.paths[0]).output().unwrap();
+    let output = String::from_utf8(output.stdout).unwrap();
+    let first = output.lines().next().unwrap();
+    let expected: Vec<u64> = first.split(' ').skip(1).map(|n| n.parse().unwrap()).collect();
+    let all = meshed(&ensemble(), &[("model", "all"), ("resolution", "2"), ("select", "all")]);
+    assert_eq!(all.report.parts.iter().map(|part| part.atoms).collect::<Vec<_>>(), expected);
+    assert_eq!(expected, [60, 60, 50], "negative control: the last model is shorter");
+}
+
+#[test]
+fn all_models_exclude_other_parts_and_are_limited() {
+    let refused = |pairs: &[(&str, &str)]| {
+        let ParamError::BadValue { name, expected, .. } = params::parse(pairs.iter().copied()).unwrap_err() else {
+            panic!("{pairs:?}")
+        };
+        (name, expected)
+    };
+    let (name, expected) = refused(&[("model", "all"), ("split", "chain")]);
+    assert_eq!((name, expected.as_str()), ("split", "none with model=all, which makes one part of each model"));
+    let (name, expected) = refused(&[("assembly", "1"), ("model", "all")]);
+    assert_eq!(name, "assembly");
+    assert!(expected.starts_with("asymmetric-unit with model=all"), "{expected}");
+    for bad in ["ALL", "1,2", "1.5", "", "-"] {
+        let (name, expected) = refused(&[("model", bad)]);
+        assert_eq!((name, expected.as_str()), ("model", "the number of a model of the file, or all"), "{bad}");
+    }
+    // Defaults do not conflict, and the keys of one model and of all differ.
+    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+    let all = canonical(&[("model", "all")]);
+    assert_eq!(all, canonical(&[("model", "all"), ("split", "none"), ("assembly", "asymmetric-unit")]));
+    assert_ne!(all, canonical(&[]));
+    let limited = |max_parts| {
+        let limits = JobLimits { read: ReadLimits { max_parts, ..ReadLimits::default() }, ..JobLimits::default() };
+        meshed_with(&ensemble(), &[("model", "all"), ("resolution", "2")], &limits)
+    };
+    assert_eq!(limited(3).unwrap().report.parts.len(), 3);
+    let error = limited(2).unwrap_err();
+    assert_eq!(error, JobError::Structure(StructureError::TooManyParts { rule: "model=all", limit: 2 }));
+    let few = JobLimits { read: ReadLimits { max_atoms: 169, ..ReadLimits::default() }, ..JobLimits::default() };
+    let error = meshed_with(&ensemble(), &[("model", "all")], &few).unwrap_err();
+    assert_eq!(error, JobError::Structure(StructureError::TooManyAtoms { limit: 169 }));
 }

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use molmesh::memory_budget::Budget;
 use molmesh::structure::strict_validator::{self, Level};
-use molmesh::structure::{Contents, ReadLimits, Selection, StructureError, read, select};
+use molmesh::structure::{Contents, ModelChoice, ReadLimits, Selection, StructureError, read, select};
 use molmesh::surface::{CancelToken, Control, OutOfMemory};
 
 const ATOM: &str = "ATOM      2  CA  ALA A  12      11.104  -6.134   0.500  1.00 20.25           C  \n";
@@ -236,7 +236,7 @@ fn reads_a_hundred_thousand_of_everything() {
         );
         let missing =
             select(&s, &Selection { chains: Some(vec!["none".to_owned()]), ..Selection::default() }).unwrap_err();
-        let no_model = select(&s, &Selection { model: Some(-1), ..Selection::default() }).unwrap_err();
+        let no_model = select(&s, &Selection { model: ModelChoice::Number(-1), ..Selection::default() }).unwrap_err();
         let empty = select(&s, &Selection { atoms: "water".parse().unwrap(), ..Selection::default() }).unwrap_err();
         for error in [missing, no_model, empty] {
             assert!(error.to_string().len() < 8000, "{name}: {error}");

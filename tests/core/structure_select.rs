@@ -12,8 +12,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use molmesh::structure::select::{MAX_DEPTH, MAX_DISTANCE, MAX_WITHIN};
 use molmesh::structure::{
-    BadExpression, Contents, Expression, KindSet, ReadLimits, Selection, Structure, StructureError, read, select,
-    select_with,
+    BadExpression, Contents, Expression, KindSet, ModelChoice, ReadLimits, Selection, Structure, StructureError, read,
+    select, select_with,
 };
 use molmesh::surface::{CancelToken, Control, MemoryMeter, OutOfMemory};
 use proptest::prelude::*;
@@ -137,12 +137,12 @@ fn properties_select_atoms() {
         assert_eq!(taken(&kinds(text)), expected, "{text}");
     }
     // A distance is measured in the selected model, and to atoms of other chains.
-    let second = Selection { model: Some(5), ..kinds("within 1 of water") };
+    let second = Selection { model: ModelChoice::Number(5), ..kinds("within 1 of water") };
     assert_eq!(taken(&second), [21, 22]);
     let of_chain = Selection { chains: chains(&["B"]), ..kinds("within 1 of ion") };
     assert_eq!(taken(&of_chain), [11, 13]);
-    assert_eq!(taken(&Selection { model: Some(5), ..kinds("chain _") }), [22]);
-    assert_eq!(taken(&Selection { model: Some(5), ..kinds("chain \"\"") }), [22]);
+    assert_eq!(taken(&Selection { model: ModelChoice::Number(5), ..kinds("chain _") }), [22]);
+    assert_eq!(taken(&Selection { model: ModelChoice::Number(5), ..kinds("chain \"\"") }), [22]);
     let found = refusal(&kinds("polymer or chain Z"));
     assert_eq!(found, "selected chain `Z` is not in the file; it has 3 chains: A, B, W");
     let quoted = FILE.replace(" CB APRO A", " O\"\"APRO A");
@@ -498,7 +498,7 @@ fn evaluation_reserves_memory_and_can_be_cancelled() {
 
 #[test]
 fn models_chains_and_alternatives() {
-    assert_eq!(taken(&Selection { model: Some(5), ..Selection::default() }), [21]);
+    assert_eq!(taken(&Selection { model: ModelChoice::Number(5), ..Selection::default() }), [21]);
     assert_eq!(taken(&Selection { chains: chains(&["B"]), ..Selection::default() }), [9, 11]);
     assert_eq!(taken(&Selection { chains: chains(&["B", "A"]), ..Selection::default() }), [1, 3, 5, 6, 9, 11]);
     assert_eq!(taken(&Selection { altloc: Some('A'), ..Selection::default() }), [1, 2, 5, 6, 8, 10]);
@@ -506,14 +506,17 @@ fn models_chains_and_alternatives() {
     assert_eq!(taken(&Selection { altloc: Some('C'), ..Selection::default() }), [1, 3, 5, 6, 9, 11]);
     assert_eq!(taken(&Selection { altloc: Some('B'), ..Selection::default() }), [1, 3, 7, 9, 11]);
     for blank in ["", "_"] {
-        assert_eq!(taken(&Selection { model: Some(5), chains: chains(&[blank]), ..kinds("water") }), [22]);
+        assert_eq!(
+            taken(&Selection { model: ModelChoice::Number(5), chains: chains(&[blank]), ..kinds("water") }),
+            [22]
+        );
     }
 }
 
 #[test]
 fn errors_list_the_available_values() {
     assert_eq!(
-        refusal(&Selection { model: Some(2), ..Selection::default() }),
+        refusal(&Selection { model: ModelChoice::Number(2), ..Selection::default() }),
         "model 2 is not in the file; it has 2 models: 1, 5"
     );
     assert_eq!(
@@ -525,7 +528,7 @@ fn errors_list_the_available_values() {
         "alternative location `Z` is not in the file; it has A, B, C"
     );
     assert_eq!(
-        refusal(&Selection { altloc: Some('Å'), model: Some(5), ..Selection::default() }),
+        refusal(&Selection { altloc: Some('Å'), model: ModelChoice::Number(5), ..Selection::default() }),
         "alternative location `Å` is not in the file; it has none"
     );
     assert_eq!(

@@ -257,9 +257,9 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "model",
-        domain: Domain::Integer { min: i32::MIN as i64, max: i32::MAX as i64 },
+        domain: Domain::Text { expected: "the number of a model of the file, or all" },
         default: "the first model of the file",
-        doc: "Number of the model to mesh.",
+        doc: "Number of the model to mesh. all meshes every model and makes each one a part that is closed on its own; it needs split=none and assembly=asymmetric-unit.",
     },
     Parameter {
         name: "chains",

@@ -26,11 +26,41 @@ use super::text::list;
 use super::{duplicates, pieces};
 use crate::surface::{Control, Spheres, SurfaceError};
 
+/// Models of a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ModelChoice {
+    /// The first model.
+    #[default]
+    First,
+    /// The model with this number.
+    Number(i32),
+    /// All models.
+    All,
+}
+
+/// Models that a selection takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Models {
+    One(i32),
+    All,
+}
+
+impl Models {
+    /// Returns true if `model` is one of them.
+    #[inline]
+    pub(super) fn contains(self, model: i32) -> bool {
+        match self {
+            Self::One(number) => number == model,
+            Self::All => true,
+        }
+    }
+}
+
 /// Selection of atoms. Default: first model, polymer, no hydrogens, alternative locations with the highest occupancy.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Selection {
-    /// Model number in the file; the first model by default.
-    pub model: Option<i32>,
+    /// Models to select from.
+    pub model: ModelChoice,
     /// Author names of chains; all by default. The empty string and `_` select the blank chain.
     pub chains: Option<Vec<String>>,
     /// Condition on atoms.
@@ -50,9 +80,9 @@ pub struct Selected {
     pub copies: Vec<PlacedCopy>,
     /// Number of selected atoms before they were copied.
     pub n_distinct: usize,
-    /// The selected model.
+    /// The selected model; the first one if all are selected.
     pub model: i32,
-    /// Counts of the other atoms of that model.
+    /// Counts of the other atoms of the selected models.
     pub left_out: LeftOut,
 }
 
@@ -83,13 +113,13 @@ pub fn select_with(
     control: &Control<'_>,
 ) -> Result<Selected, StructureError> {
     let assembly = selection.assembly.as_deref().map(|id| Assembly::find(structure, id)).transpose()?;
-    let model = model(structure, selection)?;
+    let models = models(structure, selection)?;
     let chains = match &selection.chains {
         Some(names) => Some(chains(structure, names.iter().map(String::as_str), "chain")?),
         None => None,
     };
-    let wanted = alternative(structure, selection, model)?;
-    let alternatives = Alternatives::choose(structure, model, wanted, control)?;
+    let wanted = alternative(structure, selection, models)?;
+    let alternatives = Alternatives::choose(structure, models, wanted, control)?;
     let Expression { condition, hydrogens } = &selection.atoms;
     let mut names = Vec::new();
     condition.chains(&mut names);
@@ -99,7 +129,7 @@ pub fn select_with(
     let mut evaluation = Evaluation { structure, control, distances, usable: None };
     if condition.depends_on_others() {
         evaluation.usable = Some(evaluation.each(|i| {
-            structure.model[i] == model
+            models.contains(structure.model[i])
                 && structure.kind[i] != Kind::VirtualSite
                 && (*hydrogens || !structure.is_hydrogen(i))
                 && alternatives.keeps(structure, i)
@@ -107,8 +137,10 @@ pub fn select_with(
     }
     let marks = evaluation.marks(condition)?;
     let rules =
-        Rules { structure, model, chains, assembly: assembly.as_ref(), marks, hydrogens: *hydrogens, alternatives };
+        Rules { structure, models, chains, assembly: assembly.as_ref(), marks, hydrogens: *hydrogens, alternatives };
     let Found { atoms, mut left_out, residues } = rules.find(control)?;
+    let first = structure.model.first().copied().unwrap_or(1);
+    let model = if let Models::One(model) = models { model } else { first };
     if atoms.is_empty() {
         return Err(StructureError::EmptySelection { holds: holds(structure, selection, model) });
     }
@@ -123,7 +155,7 @@ pub fn select_with(
 /// Rules by which atoms are selected.
 struct Rules<'a> {
     structure: &'a Structure,
-    model: i32,
+    models: Models,
     /// True for selected chains, by id.
     chains: Option<Vec<bool>>,
     assembly: Option<&'a Assembly<'a>>,
@@ -161,7 +193,7 @@ impl Rules<'_> {
         let Self { structure, chains, assembly, .. } = self;
         let Found { mut atoms, mut left_out, mut residues } = Found::default();
         for i in range {
-            if structure.model[i] != self.model {
+            if !self.models.contains(structure.model[i]) {
                 continue;
             }
             if chains.as_ref().is_some_and(|chains| !chains[structure.chain.id(i) as usize])
@@ -185,11 +217,12 @@ impl Rules<'_> {
     }
 }
 
-fn model(structure: &Structure, selection: &Selection) -> Result<i32, StructureError> {
+fn models(structure: &Structure, selection: &Selection) -> Result<Models, StructureError> {
     match selection.model {
-        None => Ok(structure.model.first().copied().unwrap_or(1)),
-        Some(requested) if structure.model.contains(&requested) => Ok(requested),
-        Some(requested) => Err(StructureError::NotFound {
+        ModelChoice::First => Ok(Models::One(structure.model.first().copied().unwrap_or(1))),
+        ModelChoice::All => Ok(Models::All),
+        ModelChoice::Number(requested) if structure.model.contains(&requested) => Ok(Models::One(requested)),
+        ModelChoice::Number(requested) => Err(StructureError::NotFound {
             what: "model",
             requested: requested.to_string(),
             available: Contents::of(structure, None).model_list(),
@@ -223,10 +256,10 @@ fn chains<'a>(
     Ok(structure.chain.texts().map(|text| names.contains(text)).collect())
 }
 
-fn alternative(structure: &Structure, selection: &Selection, model: i32) -> Result<Option<u8>, StructureError> {
+fn alternative(structure: &Structure, selection: &Selection, models: Models) -> Result<Option<u8>, StructureError> {
     let Some(requested) = selection.altloc else { return Ok(None) };
     let mut present = [false; 256];
-    for (altloc, _) in structure.altloc.iter().zip(&structure.model).filter(|(_, m)| **m == model) {
+    for (altloc, _) in structure.altloc.iter().zip(&structure.model).filter(|(_, model)| models.contains(**model)) {
         present[usize::from(*altloc)] = true;
     }
     match u8::try_from(requested) {

@@ -3,8 +3,10 @@
 //! The result equals that of testing `dx² + dy² + dz² ≤ d²` in double precision for all pairs. The bounds of a cell are
 //! tested with the same operations; rounding keeps their order.
 
+use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use indexmap::IndexMap;
 use rayon::prelude::*;
 
 use crate::structure::altloc::ATOMS_PER_CHECK;
@@ -28,8 +30,8 @@ const MAX_TESTED_POINTS: usize = 16;
 /// Margin of the distance when cells are chosen, Å. It exceeds all rounding of coordinates.
 const SLACK: f64 = 1e-6;
 
-/// Marks every atom whose distance to an atom of `of` in the same model is at most `distance`. Atoms of `of` belong to
-/// one model.
+/// Marks every atom whose distance to an atom of `of` in the same model is at most `distance`. The time is linear if
+/// the atoms of each model are consecutive, as in files of all usual programs.
 pub(super) fn mark(
     structure: &Structure,
     of: &[bool],
@@ -38,17 +40,32 @@ pub(super) fn mark(
     tests: &TestCount,
     control: &Control<'_>,
 ) -> Result<(), StructureError> {
-    let Some(first) = of.iter().position(|&mark| mark) else { return Ok(()) };
-    let model = structure.model[first];
-    let memory = Reservation::new(&control.memory);
-    let grid = PointGrid::new(structure, of, distance, &memory, control)?;
-    marks.par_chunks_mut(ATOMS_PER_TASK).enumerate().try_for_each(|(part, marks)| {
-        let mut tests = Tests { count: tests, control, uncounted: 0 };
-        for (i, mark) in (ATOMS_PER_TASK * part..).zip(marks) {
-            *mark = structure.model[i] == model && grid.is_near(position(structure, i), &mut tests)?;
+    let mut models: IndexMap<i32, Range<usize>> = IndexMap::new();
+    let mut first = 0;
+    for run in structure.model.chunk_by(|a, b| a == b) {
+        let rows = first..first + run.len();
+        models.entry(run[0]).or_insert_with(|| rows.clone()).end = rows.end;
+        first = rows.end;
+    }
+    for (model, rows) in models {
+        check(control)?;
+        let is_of = |i: usize| of[i] && structure.model[i] == model;
+        if !rows.clone().any(is_of) {
+            continue;
         }
-        tests.count()
-    })
+        let memory = Reservation::new(&control.memory);
+        let grid = PointGrid::new(structure, rows.clone(), is_of, distance, &memory, control)?;
+        marks[rows.clone()].par_chunks_mut(ATOMS_PER_TASK).enumerate().try_for_each(|(part, marks)| {
+            let mut tests = Tests { count: tests, control, uncounted: 0 };
+            for (i, mark) in (rows.start + ATOMS_PER_TASK * part..).zip(marks) {
+                if structure.model[i] == model {
+                    *mark = grid.is_near(position(structure, i), &mut tests)?;
+                }
+            }
+            tests.count()
+        })?;
+    }
+    Ok(())
 }
 
 /// Number of tested distances, which determines the time of a selection.
@@ -144,15 +161,16 @@ struct PointGrid {
 }
 
 impl PointGrid {
-    /// Sorts the marked atoms into cells. There is at least one.
+    /// Sorts the atoms among `rows` for which `is_of` is true into cells. There is at least one.
     fn new(
         structure: &Structure,
-        marked: &[bool],
+        rows: Range<usize>,
+        is_of: impl Fn(usize) -> bool,
         distance: f64,
         memory: &Reservation,
         control: &Control<'_>,
     ) -> Result<Self, StructureError> {
-        let atoms = || (0..structure.len()).filter(|&i| marked[i]).map(|i| position(structure, i));
+        let atoms = || rows.clone().filter(|&i| is_of(i)).map(|i| position(structure, i));
         let (mut all, mut n_points) = (PointBox::NONE, 0_usize);
         for point in atoms() {
             if n_points % ATOMS_PER_CHECK == 0 {
