@@ -36,7 +36,7 @@ fn benches(c: &mut Criterion) {
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
     let (params, limits) =
         (SurfaceParams::default(), SurfaceLimits { max_grid_points: 1 << 40, ..SurfaceLimits::default() });
-    let lattice = |spheres: &Spheres| Lattice::new(spheres, &params).expect("a lattice");
+    let lattice = |spheres: &Spheres| Lattice::new(spheres, &params, &Control::default()).expect("a lattice");
     let plan = |lattice: &Lattice| Plan::new(lattice, &limits, &Control::default()).expect("a plan");
     for n in [10_000, 100_000, 335_722, 1_000_000, 3_000_000] {
         let spheres = atoms(n);

@@ -109,6 +109,7 @@ impl LimitsConfig {
                 max_candidates: self.candidate_pairs,
             },
             picture: PictureLimits { max_side: self.picture_side },
+            max_file_bytes: self.output_bytes,
         }
     }
 }

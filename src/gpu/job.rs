@@ -52,7 +52,7 @@ impl Prepared {
         let profile = Profile::new(params.kernel_for("gpu")?, params);
         candidates::check(spheres, params, limits)?;
         control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
-        let lattice = Lattice::new(spheres, params)?;
+        let lattice = Lattice::new(spheres, params, control)?;
         control.check()?;
         let plan = Plan::new(&lattice, limits, control)?;
         let memory = Arc::clone(&control.memory);

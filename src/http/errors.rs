@@ -17,6 +17,7 @@ use crate::pipeline::params::ParamError;
 use crate::store::StoreError;
 use crate::structure::strict_validator::Diagnostic;
 use crate::structure::{Split, StructureError};
+use crate::surface::params::MAX_RESOLUTION;
 use crate::surface::{OutOfMemory, SurfaceError};
 
 /// Finding of the strict validator.
@@ -59,6 +60,9 @@ pub(super) fn file_too_large(bytes: u64, limit: u64, resolution: f64) -> Problem
 fn oversized(what: &str, actual: u64, limit: u64, resolution: f64) -> Problem {
     let fits = resolution * (actual as f64 / limit as f64).sqrt();
     let fits = (fits * 105.0).ceil() / 100.0;
+    if fits > MAX_RESOLUTION {
+        return Problem::new(Kind::MeshTooLarge, what.to_owned()).with("limit", limit).with("actual", actual);
+    }
     Problem::new(Kind::MeshTooLarge, format!("{what}; a resolution of {fits} Å would fit"))
         .with("limit", limit)
         .with("actual", actual)
@@ -373,6 +377,10 @@ mod tests {
         let problem = format_problem(&error, 0.5).record("");
         assert_eq!(problem["detail"], format!("{error}; a resolution of 1.05 Å would fit"));
         assert_eq!((&problem["limit"], &problem["suggested_resolution"]), (&100.into(), &1.05.into()));
+        // No grid is coarser than 20 Å.
+        let none = file_too_large(200_000, 100, 0.5).record("");
+        assert_eq!(none["detail"], "the file would have 200000 bytes and the limit is 100");
+        assert!(none.get("suggested_resolution").is_none());
         let file = format_problem(&FormatError::GlbTooLarge { bytes: 400, limit: 100 }, 0.5).record("");
         assert_eq!(
             file["detail"],

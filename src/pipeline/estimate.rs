@@ -8,16 +8,16 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use super::color::{AtomColors, Scheme};
+use super::finest_fit::with_finest_fit;
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
 use super::{parts, work};
 use crate::structure::{AtomPart, Structure, StructureError};
 use crate::surface::cpu::{LATTICE_BYTES, check_work, scan};
 use crate::surface::lattice::{Lattice, slightly_coarser};
-use crate::surface::occupancy::count;
 use crate::surface::params::MAX_RESOLUTION;
 use crate::surface::{
-    Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams, candidates,
+    Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
 };
 
 /// Estimated size of a job.
@@ -89,7 +89,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
         }
     }
     let _storage = super::storage(job, &mut params, &spheres);
-    let plan = MeshPlan { spheres: &spheres, parts: parts.as_deref(), params: &params, limits: &limits.surface };
+    let plan = MeshPlan::new(&spheres, parts.as_deref(), &params, job, limits);
     let lattices = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
@@ -154,7 +154,7 @@ pub(super) fn check_memory(
 }
 
 /// Returns true if `error` ends the estimate as well, not only the mesh.
-const fn ends_work(error: &SurfaceError) -> bool {
+pub(super) const fn ends_work(error: &SurfaceError) -> bool {
     matches!(
         error,
         SurfaceError::Cancelled
@@ -165,7 +165,7 @@ const fn ends_work(error: &SurfaceError) -> bool {
 
 /// Returns the number of vertices of a mesh of `area` Å².
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate")]
-fn n_vertices(area: f64, spacing: f64) -> u64 {
+pub(super) fn n_vertices(area: f64, spacing: f64) -> u64 {
     (1.5 * area / (spacing * spacing)).round() as u64
 }
 
@@ -176,6 +176,10 @@ pub(super) struct MeshPlan<'a> {
     pub(super) parts: Option<&'a [AtomPart]>,
     pub(super) params: &'a SurfaceParams,
     pub(super) limits: &'a SurfaceLimits,
+    /// Bytes that colours and atom indices add to a vertex.
+    pub(super) attribute_bytes: u64,
+    /// Maximum size of the mesh's file.
+    pub(super) max_file_bytes: u64,
 }
 
 /// Lattices of all parts, and their memory.
@@ -192,12 +196,26 @@ impl Deref for Lattices {
     }
 }
 
-impl MeshPlan<'_> {
+impl<'a> MeshPlan<'a> {
+    /// Plans the mesh of `spheres` in a job.
+    pub(super) fn new(
+        spheres: &'a Spheres,
+        parts: Option<&'a [AtomPart]>,
+        params: &'a SurfaceParams,
+        job: &Job,
+        limits: &'a JobLimits,
+    ) -> Self {
+        // The size of a picture does not depend on its mesh.
+        let max_file_bytes = if job.picture.is_some() { u64::MAX } else { limits.max_file_bytes };
+        let (limits, attribute_bytes) = (&limits.surface, job.attribute_bytes());
+        Self { spheres, parts, params, limits, attribute_bytes, max_file_bytes }
+    }
+
     /// Places the spheres of each part on its lattice.
     fn lattices(&self, control: &Control<'_>) -> Result<Lattices, SurfaceError> {
         // All lattices, and the spheres of one part at a time.
         let memory = control.reserve((LATTICE_BYTES + super::SPHERE_BYTES) * self.spheres.len() as u64)?;
-        let lattices = parts::spheres_of(self.spheres, self.parts).map(|own| Lattice::new(&own, self.params));
+        let lattices = parts::spheres_of(self.spheres, self.parts).map(|own| Lattice::new(&own, self.params, control));
         Ok(Lattices { of_parts: lattices.collect::<Result<_, SurfaceError>>()?, _memory: memory })
     }
 
@@ -239,7 +257,7 @@ impl MeshPlan<'_> {
     }
 
     /// Returns the area of a coarser mesh, Å².
-    fn area(&self, coarse: f64, choice: &Choice<'_>, control: &Control<'_>) -> Result<f64, SurfaceError> {
+    pub(super) fn area(&self, coarse: f64, choice: &Choice<'_>, control: &Control<'_>) -> Result<f64, SurfaceError> {
         let (spheres, limits, single) = (self.spheres, self.limits, self.unquantized());
         let resolution = coarse.clamp(MIN_COARSE_SPACING, MAX_RESOLUTION).max(single.resolution);
         let coarse = SurfaceParams { resolution, ..single.clone() };
@@ -251,130 +269,6 @@ impl MeshPlan<'_> {
         };
         Ok(output.measure(&control)?.area)
     }
-
-    /// Counts the grid points at another spacing.
-    fn grid_points(&self, resolution: f64, control: &Control<'_>) -> Result<u64, SurfaceError> {
-        let (params, limits) = (SurfaceParams { resolution, ..self.params.clone() }, self.limits);
-        // The limit of candidate pairs applies to each part.
-        let counted = parts::spheres_of(self.spheres, self.parts).map(|own| {
-            candidates::check(&own, &params, limits)?;
-            let _lattice = control.reserve(LATTICE_BYTES * own.len() as u64)?;
-            let lattice = Lattice::new(&own, &params)?;
-            Ok(512 * count(&lattice, limits, control)?.reached)
-        });
-        counted.sum()
-    }
-}
-
-/// Maximum number of grids that [`with_finest_fit`] plans.
-const MAX_PLANS: u32 = 8;
-/// Factor by which the spacing grows if it does not fit all parts.
-const COARSER: f64 = 1.5;
-/// Spacing of the mesh that gives the area for a suggestion, as a multiple of the suggested spacing.
-const SKETCH_FACTOR: f64 = 4.0;
-/// Margin of the estimated size of a mesh that must fit.
-const SIZE_MARGIN: f64 = 1.3;
-
-/// Replaces the suggested spacing of an error about the grid or about candidate pairs with the finest hundredth of an Å
-/// whose planned grid fits all limits. A mesh of that spacing fits as well.
-pub(super) fn with_finest_fit(
-    mut error: SurfaceError,
-    plan: &MeshPlan<'_>,
-    choice: &Choice<'_>,
-    control: &Control<'_>,
-) -> SurfaceError {
-    let bound = match &error {
-        SurfaceError::GridTooLarge { suggested_resolution, .. } => Some(*suggested_resolution),
-        SurfaceError::TooManyCandidates { suggested_resolution, .. } => *suggested_resolution,
-        _ => return error,
-    };
-    let found = bound.map(|bound| finest_fit(bound, plan, choice, control)).transpose();
-    let fits = match found {
-        Ok(fits) => fits.flatten(),
-        Err(ends) => return ends,
-    };
-    match &mut error {
-        // A backend may need more than the plan. Its own suggestion is then the coarser one.
-        SurfaceError::GridTooLarge { suggested_resolution, resolution, .. } => {
-            *suggested_resolution = match fits {
-                Some(fits) if fits <= *resolution => *suggested_resolution,
-                fits => fits.unwrap_or(f64::INFINITY),
-            };
-        }
-        SurfaceError::TooManyCandidates { suggested_resolution, .. } => *suggested_resolution = fits,
-        _ => {}
-    }
-    error
-}
-
-/// Returns the finest spacing that fits, beginning at `bound`, if one is found.
-fn finest_fit(
-    bound: f64,
-    plan: &MeshPlan<'_>,
-    choice: &Choice<'_>,
-    control: &Control<'_>,
-) -> Result<Option<f64>, SurfaceError> {
-    // The spheres of one part at a time.
-    let part_bytes = plan.parts.map_or(0, |_| super::SPHERE_BYTES * plan.spheres.len() as u64);
-    let _spheres = control.reserve(part_bytes)?;
-    let limit = plan.limits.max_grid_points;
-    let (mut fits, mut next) = (None, bound.min(MAX_RESOLUTION));
-    for _ in 0..MAX_PLANS {
-        let coarser = match plan.grid_points(next, control) {
-            Ok(needed) if needed <= limit => {
-                fits = Some(next);
-                // The arcs of a solvent-excluded surface are not counted here.
-                if plan.params.surface == SurfaceKind::Ses {
-                    break;
-                }
-                // The bricks of a finer grid cover less volume, so the grid at this spacing fits as well.
-                let finer = (next * (needed as f64 / limit as f64).cbrt() * 100.0).ceil() / 100.0;
-                if finer >= next {
-                    break;
-                }
-                next = finer;
-                continue;
-            }
-            Err(error) if ends_work(&error) => return Err(error),
-            _too_large if fits.is_some() => break,
-            // This bound comes from the grid, that one from the pairs: both limits apply.
-            Err(error) => error.suggested_resolution().filter(|coarser| *coarser > next),
-            Ok(_) => None,
-        };
-        // The bounds come from one part and may be too fine for all parts.
-        let coarser = coarser.or_else(|| plan.parts.map(|_| COARSER * next));
-        match coarser.map(|coarser| coarser.min(MAX_RESOLUTION)) {
-            Some(coarser) if coarser > next => next = coarser,
-            _ => break,
-        }
-    }
-    fits.map(|fits| with_fitting_mesh(fits, plan, choice, control)).transpose()
-}
-
-/// Returns `spacing`, or a coarser one at which the mesh fits its limit as well.
-fn with_fitting_mesh(
-    spacing: f64,
-    plan: &MeshPlan<'_>,
-    choice: &Choice<'_>,
-    control: &Control<'_>,
-) -> Result<f64, SurfaceError> {
-    let (params, limit) = (plan.params, plan.limits.max_mesh_bytes);
-    let exceeds = |area: f64| {
-        let vertices = n_vertices(area, spacing);
-        let bytes = params.mesh_bytes(vertices, vertices.saturating_mul(2));
-        (bytes > limit || control.memory.check(bytes).is_err()).then_some(bytes)
-    };
-    if exceeds(plan.spheres.area(params)).is_none() {
-        return Ok(spacing);
-    }
-    let coarse = MeshPlan { params: &SurfaceParams { resolution: spacing, ..params.clone() }, ..*plan };
-    let area = match coarse.area(SKETCH_FACTOR * spacing, choice, control) {
-        Err(error) if ends_work(&error) => return Err(error),
-        area => area.unwrap_or(0.0),
-    };
-    let Some(bytes) = exceeds(SIZE_MARGIN * area) else { return Ok(spacing) };
-    let limit = limit.min(control.memory.available());
-    Ok(slightly_coarser(spacing * (bytes as f64 / limit as f64).sqrt()).min(MAX_RESOLUTION))
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ pub mod cost;
 mod draw;
 mod estimate;
 mod file;
+mod finest_fit;
 mod fit;
 mod host_cores;
 pub mod integer;
@@ -118,7 +119,7 @@ impl Job {
 }
 
 /// Limits of one job.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub struct JobLimits {
     /// Limits of reading.
     pub read: ReadLimits,
@@ -126,6 +127,17 @@ pub struct JobLimits {
     pub surface: SurfaceLimits,
     /// Limits of drawing.
     pub picture: PictureLimits,
+    /// Size of a mesh file in bytes that the service sends or stores. A run does not check it, because a mesh can be
+    /// written in several formats. The spacing that an error suggests respects it for binary files of the size of the
+    /// mesh in memory, such as GLB.
+    pub max_file_bytes: u64,
+}
+
+impl Default for JobLimits {
+    fn default() -> Self {
+        let (read, surface, picture) = <(ReadLimits, SurfaceLimits, PictureLimits)>::default();
+        Self { read, surface, picture, max_file_bytes: u64::MAX }
+    }
 }
 
 /// Chosen backend and the reason for the choice, for reports and logs.
@@ -246,7 +258,10 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
-        let fitted = fit::mesh(&spheres, job, limit, &limits.surface, choice, &clock, &control)?;
+        let fitted = fit::mesh(&spheres, job, limit, &limits.surface, choice, &clock, &control).map_err(|error| {
+            let plan = MeshPlan::new(&spheres, parts.as_deref(), &params, job, limits);
+            finest_fit::with_finest_fit(error, &plan, choice, &control)
+        })?;
         params.resolution = fitted.resolution;
         let storage = storage(job, &mut params, &spheres);
         (fitted.output, Some(fitted.tries), storage)
@@ -256,11 +271,11 @@ pub fn run_with<S: Deref<Target = Structure>>(
             sink.set_storage(storage);
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
-        let plan = MeshPlan { spheres: &spheres, parts: parts.as_deref(), params: &params, limits: &limits.surface };
+        let plan = MeshPlan::new(&spheres, parts.as_deref(), &params, job, limits);
         let checked = if sink.is_none() { estimate::check_memory(&plan, job, choice, &control) } else { Ok(()) };
         let write = |()| clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink));
         let written = checked.and_then(write);
-        (written.map_err(|error| estimate::with_finest_fit(error, &plan, choice, &control))?, None, storage)
+        (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, choice, &control))?, None, storage)
     };
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;

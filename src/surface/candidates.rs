@@ -19,7 +19,7 @@ use super::spheres::Spheres;
 const MAX_LIMIT: u64 = 1 << 31;
 
 /// Returns the limit of candidate pairs: that of `limits`, or [`MAX_LIMIT`] if it is lower.
-pub(super) fn limit(limits: &SurfaceLimits) -> u64 {
+pub(crate) fn limit(limits: &SurfaceLimits) -> u64 {
     limits.max_candidates.min(MAX_LIMIT)
 }
 
@@ -163,7 +163,7 @@ mod tests {
 
     /// Exact number of candidate pairs.
     fn pairs(spheres: &Spheres, params: &SurfaceParams) -> u64 {
-        let (lattice, limits) = (Lattice::new(spheres, params).unwrap(), SurfaceLimits::default());
+        let (lattice, limits) = (Lattice::new(spheres, params, &Control::default()).unwrap(), SurfaceLimits::default());
         Occupancy::new(&lattice, &limits, &Control::default()).unwrap().n_candidates()
     }
 
@@ -203,7 +203,7 @@ mod tests {
         let coarser = SurfaceParams { resolution: suggested_resolution.unwrap(), ..params.clone() };
         assert!(coarser.resolution > params.resolution && run(exact - 1, &coarser).is_ok());
         // The occupancy count finds the same pairs.
-        let lattice = Lattice::new(&spheres, &params).unwrap();
+        let lattice = Lattice::new(&spheres, &params, &Control::default()).unwrap();
         for (max_candidates, fits) in [(exact, true), (exact - 1, false)] {
             let limits = SurfaceLimits { max_candidates, ..SurfaceLimits::default() };
             assert_eq!(Occupancy::new(&lattice, &limits, &Control::default()).is_ok(), fits);

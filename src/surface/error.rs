@@ -155,6 +155,6 @@ fn fitting(spacing: f64) -> String {
     if spacing <= MAX_RESOLUTION {
         format!("; {spacing} Å would fit")
     } else {
-        format!("; no grid spacing up to {MAX_RESOLUTION} Å would fit")
+        "; no grid spacing that would fit was found".to_owned()
     }
 }

@@ -4,15 +4,19 @@
 //! stored as the nearest grid point and a fraction. The offset of a grid point from a centre then has the same bits in
 //! every brick and tile, without 64-bit arithmetic.
 
+use std::cmp::Ordering;
 use std::ops::Range;
 
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
+use super::checked_sort;
 use super::column::Column;
+use super::control::Control;
 use super::error::SurfaceError;
-use super::kernel::Shape;
-use super::params::SurfaceParams;
+use super::kernel::{MIN_DISTANCE2, Shape};
+use super::memory::Reservation;
+use super::params::{SurfaceKind, SurfaceParams};
 use super::simd::dispatched;
 use super::spheres::Spheres;
 
@@ -67,15 +71,18 @@ pub struct Lattice {
     pub support: f64,
     /// Cells of the box around all supports.
     pub box_cells: u64,
+    /// Upper bound of the grid points in bricks that an atom reaches, from the box around all supports.
+    pub(super) box_points: u64,
 }
 
 impl Lattice {
-    /// Places `spheres` on the lattice of `params.resolution`.
+    /// Places `spheres` on the lattice of `params.resolution`. The caller has reserved
+    /// [`LATTICE_BYTES`](super::cpu::LATTICE_BYTES) for each of them.
     ///
     /// # Errors
     /// [`SurfaceError::NoSpheres`]; [`SurfaceError::BadParameter`] if scale and offset leave a radius of 0 or less, or
-    /// there are more spheres than 31 bits can number.
-    pub fn new(spheres: &Spheres, params: &SurfaceParams) -> Result<Self, SurfaceError> {
+    /// there are more spheres than 31 bits can number; [`SurfaceError::Cancelled`]; [`SurfaceError::Memory`].
+    pub fn new(spheres: &Spheres, params: &SurfaceParams, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let Some([lo, hi]) = spheres.bounds() else { return Err(SurfaceError::NoSpheres) };
         if spheres.len() > MAX_ATOMS {
             let expected = format!("at most {MAX_ATOMS} spheres");
@@ -86,9 +93,12 @@ impl Lattice {
         let (smallest, largest) = spheres.radius_range();
         params.check_radius(smallest)?;
         let largest = effective_radius(largest, params);
-        let atoms = Placing { spheres, params, shape: &shape }.in_canonical_order([lo, hi]);
+        let atoms = Placing { spheres, params, shape: &shape, control }.in_canonical_order([lo, hi])?;
         let margin = 2.0 * shape.reach(shape.length(largest));
-        let box_cells = (0..3).map(|k| ((hi[k] - lo[k] + margin) / spacing).ceil()).product::<f64>();
+        let side = |k: usize| ((hi[k] - lo[k] + margin) / spacing).ceil();
+        let box_cells = (0..3).map(side).product::<f64>();
+        // The outermost bricks extend by at most their edge beyond the box, at both ends of each axis.
+        let box_points = (0..3).map(|k| side(k) + f64::from(2 * BRICK)).product::<f64>();
         Ok(Self {
             spacing,
             centre: std::array::from_fn(|k| to_i32((0.5 * (lo[k] + hi[k]) / spacing).round())),
@@ -97,6 +107,7 @@ impl Lattice {
             support: shape.support(),
             // Saturates: a sparse assembly's box may hold more cells than any integer type.
             box_cells: to_u64(box_cells),
+            box_points: to_u64(box_points),
         })
     }
 
@@ -127,6 +138,28 @@ pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     half + reach + 2.0 * params.resolution
 }
 
+/// Returns true if a grid point is certain to lie inside the surface: the one nearest to the centre of a sphere, with a
+/// margin for rounding. The densities of several spheres together may have a surface even if this is false.
+#[must_use]
+pub fn is_certain_to_have_surface(spheres: &Spheres, params: &SurfaceParams) -> bool {
+    let (shape, spacing) = (Shape::new(params), params.resolution);
+    (0..spheres.len()).into_par_iter().with_min_len(PART).any(|i| {
+        let radius = effective_radius(spheres.radius(i), params);
+        let distance2 = spheres.centre(i).map(|c| (c - (c / spacing).round() * spacing).powi(2)).iter().sum::<f64>();
+        match &shape {
+            Shape::Density(profile) => {
+                let length2 = profile.length(radius).powi(2);
+                profile.value(distance2 / length2, MIN_DISTANCE2 / length2) > INSIDE_MARGIN * params.isovalue
+            }
+            // The solvent-excluded surface encloses the spheres without the probe.
+            Shape::Sphere { enlarged } => {
+                let inside = if params.surface == SurfaceKind::Sas { radius + enlarged } else { radius };
+                INSIDE_MARGIN * distance2.sqrt() < inside
+            }
+        }
+    })
+}
+
 /// Radius of a sphere after scale and offset, Å.
 pub(super) fn effective_radius(r: f32, params: &SurfaceParams) -> f64 {
     f64::from(r) * params.radius_scale + params.radius_offset
@@ -137,6 +170,7 @@ struct Placing<'a> {
     spheres: &'a Spheres,
     params: &'a SurfaceParams,
     shape: &'a Shape,
+    control: &'a Control<'a>,
 }
 
 impl Placing<'_> {
@@ -161,17 +195,18 @@ impl Placing<'_> {
 
     /// Returns the atoms by tile, brick within the tile, and cell within the brick; ties by offset, by size, and last
     /// by the order of the input. `bounds` are the lowest and highest coordinates.
-    fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
+    fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Result<Column<LatticeAtom>, SurfaceError> {
         let n = self.spheres.len();
         // Rounding is monotone, so the outermost tiles are those of the outermost coordinates.
         let tiles = bounds.map(|c| tile_of(self.cell(c)));
-        let keys = SortKeys::new(TileRanks::new(tiles, n, |i| tile_of(self.cell(self.spheres.centre(i)))), n);
+        let ranks = TileRanks::new(tiles, n, |i| tile_of(self.cell(self.spheres.centre(i))), self.control)?;
+        let keys = SortKeys::new(ranks, n);
         // Independent of the number of threads. The tables of all parts together take at most a byte per atom.
         let part = PART.max(n / MAX_PARTS);
-        let parts: Vec<SortedPart> = (0..n.div_ceil(part))
+        let parts = (0..n.div_ceil(part))
             .into_par_iter()
             .map(|i| by_bucket(self, &keys, i * part..n.min((i + 1) * part)))
-            .collect();
+            .collect::<Result<Vec<SortedPart>, SurfaceError>>()?;
         let mut atoms = Column::zeroed(n);
         let mut rest = &mut atoms[..];
         let mut buckets = Vec::with_capacity(keys.n_buckets);
@@ -181,19 +216,26 @@ impl Placing<'_> {
             rest = others;
         }
         let write = |scratch: &mut Vec<_>, (bucket, atoms): (usize, &mut [LatticeAtom])| {
-            write_bucket(self, &keys, &parts, bucket, scratch, atoms);
+            write_bucket(self, &keys, &parts, bucket, scratch, atoms)
         };
-        buckets.into_par_iter().enumerate().for_each_init(Vec::new, write);
-        atoms
+        buckets.into_par_iter().enumerate().try_for_each_init(Vec::new, write)?;
+        Ok(atoms)
     }
 }
 
+/// Margin of [`is_certain_to_have_surface`].
+const INSIDE_MARGIN: f64 = 1.001;
 /// Minimum number of atoms that one task sorts by bucket.
 const PART: usize = 1 << 13;
 /// Maximum number of such tasks.
 const MAX_PARTS: usize = 64;
 /// Mean number of atoms of a bucket: they fit the L1 cache.
 const BUCKET: usize = 512;
+/// Number of atoms of a bucket from which on its scratch memory is reserved. The scratch of smaller buckets takes less
+/// than a megabyte per thread.
+const LARGE_BUCKET: usize = 1 << 14;
+/// Atoms between two checks of the cancellation flag: at most a few milliseconds.
+const ATOMS_PER_CHECK: usize = 1 << 13;
 /// Number of bits of an atom's brick and cell within its tile.
 const CELL_BITS: u32 = 18;
 
@@ -243,12 +285,17 @@ impl SortedPart {
 
 dispatched! {
 /// Sorts the `spheres` by bucket, with a counting sort.
-fn by_bucket(placing: &Placing<'_>, keys: &SortKeys, spheres: Range<usize>) -> SortedPart {
+fn by_bucket(placing: &Placing<'_>, keys: &SortKeys, spheres: Range<usize>) -> Result<SortedPart, SurfaceError> {
     let mut starts = vec![0; keys.n_buckets + 1];
     let bucket = |i| u32::try_from(keys.of(placing.cell(placing.spheres.centre(i))) >> keys.shift).unwrap_or(u32::MAX);
-    let buckets: Vec<u32> = spheres.clone().map(bucket).collect();
-    for &bucket in &buckets {
-        starts[bucket as usize] += 1;
+    let mut buckets: Vec<u32> = Vec::with_capacity(spheres.len());
+    for first in spheres.clone().step_by(ATOMS_PER_CHECK) {
+        placing.control.check()?;
+        for i in first..spheres.end.min(first + ATOMS_PER_CHECK) {
+            let bucket = bucket(i);
+            starts[bucket as usize] += 1;
+            buckets.push(bucket);
+        }
     }
     // Computes the ends of the buckets. The next loop decrements them to the starts.
     let mut end = 0;
@@ -257,12 +304,17 @@ fn by_bucket(placing: &Placing<'_>, keys: &SortKeys, spheres: Range<usize>) -> S
         *start = end;
     }
     let mut indices = vec![0; buckets.len()];
-    for (i, &bucket) in spheres.zip(&buckets).rev() {
-        let start = &mut starts[bucket as usize];
-        *start -= 1;
-        indices[*start as usize] = to_u32(i);
+    let mut i = spheres.end;
+    for buckets in buckets.rchunks(ATOMS_PER_CHECK) {
+        placing.control.check()?;
+        for &bucket in buckets.iter().rev() {
+            i -= 1;
+            let start = &mut starts[bucket as usize];
+            *start -= 1;
+            indices[*start as usize] = to_u32(i);
+        }
     }
-    SortedPart { indices, starts }
+    Ok(SortedPart { indices, starts })
 }
 }
 
@@ -275,28 +327,46 @@ fn write_bucket(
     bucket: usize,
     scratch: &mut Vec<LatticeAtom>,
     atoms: &mut [LatticeAtom],
-) {
+) -> Result<(), SurfaceError> {
+    let control = placing.control;
+    control.check()?;
+    // All atoms may lie in one bucket.
+    let bytes = (size_of::<LatticeAtom>() + size_of::<u64>()) * atoms.len();
+    let large = if atoms.len() < LARGE_BUCKET { 0 } else { bytes };
+    let _memory = control.reserve(large as u64)?;
     scratch.clear();
+    scratch.reserve(atoms.len());
     for part in parts {
-        scratch.extend(part.bucket(bucket).iter().map(|&i| placing.atom(i as usize)));
+        for indices in part.bucket(bucket).chunks(ATOMS_PER_CHECK) {
+            control.check()?;
+            scratch.extend(indices.iter().map(|&i| placing.atom(i as usize)));
+        }
     }
     let mask = (1 << keys.shift) - 1;
     // Keys are equal above the mask. Spheres with equal keys keep their order.
     let mut order: Vec<u64> =
         scratch.iter().zip(0_u64..).map(|(atom, i)| (keys.of(atom.cell) & mask) << 32 | i).collect();
-    order.sort_unstable();
+    checked_sort::sort(&mut order, Ord::cmp, control)?;
     for (atom, key) in atoms.iter_mut().zip(&order) {
         *atom = scratch[usize::try_from(key & u64::from(u32::MAX)).unwrap_or(usize::MAX)];
     }
+    drop(order);
+    if large > 0 {
+        *scratch = Vec::new();
+    }
     let same = |a: &LatticeAtom, b: &LatticeAtom| a.cell == b.cell;
     for same in atoms.chunk_by_mut(same).filter(|same| same.len() > 1) {
-        same.sort_unstable_by(|a, b| {
-            let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
-            let size = a.inv_length2.total_cmp(&b.inv_length2);
-            axis(2).then(axis(1)).then(axis(0)).then(size).then(a.source.cmp(&b.source))
-        });
+        checked_sort::sort(same, by_offset, control)?;
     }
+    Ok(())
 }
+}
+
+/// Order of the atoms of a cell.
+fn by_offset(a: &LatticeAtom, b: &LatticeAtom) -> Ordering {
+    let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
+    let size = a.inv_length2.total_cmp(&b.inv_length2);
+    axis(2).then(axis(1)).then(axis(0)).then(size).then(a.source.cmp(&b.source))
 }
 
 /// Ranks that order tiles. Their number is at most 4,096 plus 16 per atom.
@@ -304,28 +374,39 @@ enum TileRanks {
     /// Ranks within the box with these sides from the lowest tile on.
     Box { lo: [i32; 3], side: [u64; 3] },
     /// Ranks among the tiles with atoms, if the box has too many.
-    Listed(Vec<[i32; 3]>),
+    Listed {
+        /// Sort keys of the tiles.
+        order: Vec<[i32; 3]>,
+        /// Memory of `order`.
+        _memory: Reservation,
+    },
 }
 
 impl TileRanks {
     /// Ranks the tiles of `n` atoms, given by `of_atom`. They lie between the tiles `lo` and `hi`.
-    fn new([lo, hi]: [[i32; 3]; 2], n: usize, of_atom: impl Fn(usize) -> [i32; 3] + Sync) -> Self {
+    fn new(
+        [lo, hi]: [[i32; 3]; 2],
+        n: usize,
+        of_atom: impl Fn(usize) -> [i32; 3] + Sync,
+        control: &Control<'_>,
+    ) -> Result<Self, SurfaceError> {
         let side: [u64; 3] = std::array::from_fn(|k| u64::from(lo[k].abs_diff(hi[k])) + 1);
         // Each side is below 2²⁰, as coordinates are bounded.
         if side.iter().product::<u64>() <= 16 * n as u64 + 4096 {
-            return Self::Box { lo, side };
+            return Ok(Self::Box { lo, side });
         }
+        let memory = control.reserve((size_of::<[i32; 3]>() * n) as u64)?;
         let mut order: Vec<[i32; 3]> = (0..n).into_par_iter().map(|i| tile_order(of_atom(i))).collect();
-        order.par_sort_unstable();
+        checked_sort::sort(&mut order, Ord::cmp, control)?;
         order.dedup();
-        Self::Listed(order)
+        Ok(Self::Listed { order, _memory: memory })
     }
 
     /// Number of ranks.
     fn count(&self) -> u64 {
         match self {
             Self::Box { side, .. } => side.iter().product(),
-            Self::Listed(order) => order.len() as u64,
+            Self::Listed { order, .. } => order.len() as u64,
         }
     }
 
@@ -336,7 +417,7 @@ impl TileRanks {
                 let [x, y, z]: [u64; 3] = std::array::from_fn(|k| u64::from(tile[k].abs_diff(lo[k])));
                 (z * side[1] + y) * side[0] + x
             }
-            Self::Listed(order) => order.partition_point(|&t| t < tile_order(tile)) as u64,
+            Self::Listed { order, .. } => order.partition_point(|&t| t < tile_order(tile)) as u64,
         }
     }
 }
@@ -389,8 +470,6 @@ pub(crate) fn to_u64(v: f64) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use std::cmp::Ordering;
-
     use super::*;
     use crate::surface::params::SurfaceOptions;
 
@@ -419,8 +498,8 @@ mod tests {
             let options = SurfaceOptions { resolution: Some(resolution), ..SurfaceOptions::default() };
             let params = SurfaceParams::new(&options).unwrap();
             let on = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let [lattice, other] =
-                [1, 3].map(|threads| on(threads).install(|| Lattice::new(&spheres, &params).unwrap()));
+            let [lattice, other] = [1, 3]
+                .map(|threads| on(threads).install(|| Lattice::new(&spheres, &params, &Control::default()).unwrap()));
             assert_eq!(lattice.atoms, other.atoms, "the number of threads matters");
             let sorted = |atoms: &[LatticeAtom]| atoms.windows(2).all(|pair| order(&pair[0], &pair[1]).is_lt());
             assert!(sorted(&lattice.atoms), "{resolution}");

@@ -7,6 +7,7 @@
 pub mod backend;
 pub(crate) mod candidates;
 pub mod cases;
+mod checked_sort;
 pub mod column;
 pub mod control;
 pub mod cpu;

@@ -27,6 +27,8 @@ use super::{candidates, grid_limit};
 const BLOCK_TILES: f64 = 262_144.0;
 /// Maximum number of runs of a block.
 const BLOCK_RUNS: f64 = 4096.0;
+/// Number of runs of a block that the limit of grid points does not lower.
+const MIN_BLOCK_RUNS: f64 = 4.0;
 /// Number of open tiles below which they are not searched for complete ones.
 const MIN_OPEN: usize = 1 << 15;
 
@@ -88,11 +90,47 @@ pub struct WorkCounts {
 /// # Errors
 /// Those of [`Occupancy::new`].
 pub fn count(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<WorkCounts, SurfaceError> {
+    try_count(lattice, limits, control)?.map_err(|excess| excess.error(lattice, limits))
+}
+
+/// Counts the bricks and pairs of `lattice` as [`count`] does. If they exceed a limit, returns an estimate of the
+/// counts.
+///
+/// # Errors
+/// [`SurfaceError::Cancelled`] and [`SurfaceError::Memory`].
+pub(crate) fn try_count(
+    lattice: &Lattice,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<Result<WorkCounts, Excess>, SurfaceError> {
     let memory = Reservation::new(&control.memory);
     let reaches = Reaches::new(lattice, &memory)?;
     let mut found = FoundBricks::new(false, &memory);
-    found.search(lattice, &reaches, limits, control)?;
-    Ok(WorkCounts { reached: found.n_reached, candidates: found.n_candidates })
+    let searched = found.search(lattice, &reaches, limits, control)?;
+    Ok(searched.map(|()| WorkCounts { reached: found.n_reached, candidates: found.n_candidates }))
+}
+
+/// Count that exceeds its limit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Excess {
+    /// Grid points of the whole lattice, an estimate.
+    GridPoints(u64),
+    /// Candidate pairs: those that were counted before the search ended, and an estimate for the whole lattice.
+    Pairs {
+        /// Pairs so far.
+        counted: u64,
+        /// Estimate of all pairs.
+        all: u64,
+    },
+}
+
+impl Excess {
+    fn error(self, lattice: &Lattice, limits: &SurfaceLimits) -> SurfaceError {
+        match self {
+            Self::GridPoints(grid_points) => grid_limit::exceeded(lattice, grid_points, limits),
+            Self::Pairs { counted, .. } => candidates::exceeded(&[lattice], counted, limits),
+        }
+    }
 }
 
 /// Rejects a run before any of it is computed if the atoms of all `lattices` together have too many pairs. Counts the
@@ -141,7 +179,7 @@ impl Occupancy {
         let memory = Reservation::new(&control.memory);
         let reaches = Reaches::new(lattice, &memory)?;
         let mut found = FoundBricks::new(true, &memory);
-        found.search(lattice, &reaches, limits, control)?;
+        found.search(lattice, &reaches, limits, control)?.map_err(|excess| excess.error(lattice, limits))?;
         let FoundBricks { tiles, atom_bricks, .. } = found;
         let Reaches { of_atoms, longest } = reaches;
         Ok(Self { tiles, reaches: of_atoms, max_reach: longest, atom_bricks, _memory: memory })
@@ -192,19 +230,20 @@ impl Reaches {
         Ok(Self { of_atoms, longest })
     }
 
-    /// Rejects a grid that the largest sphere alone exceeds, before its bricks are allocated.
-    fn check(&self, lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<(), SurfaceError> {
+    /// Returns a lower bound of the grid points in bricks that the largest sphere reaches.
+    fn least_grid_points(&self) -> u64 {
         // A grid point lies within one spacing of every point, so the reached bricks cover a sphere whose radius is
         // smaller by one spacing.
-        let least = to_u64(4.0 / 3.0 * PI * (f64::from(self.longest) - 1.0).max(0.0).powi(3));
-        if least > limits.max_grid_points { Err(grid_limit::exceeded(lattice, least, limits, control)) } else { Ok(()) }
+        to_u64(4.0 / 3.0 * PI * (f64::from(self.longest) - 1.0).max(0.0).powi(3))
     }
 
     /// Number of runs of a block. It does not depend on the number of threads, and therefore errors do not either.
-    fn runs_per_block(&self) -> usize {
+    fn runs_per_block(&self, limits: &SurfaceLimits) -> usize {
         // Upper bound of the tiles that a run reaches along each axis.
         let along = 2.0 * (f64::from(self.longest) + 2.0) / f64::from(TILE) + 3.0;
-        let n = to_u64((BLOCK_TILES / along.powi(3)).clamp(1.0, BLOCK_RUNS));
+        // A search that exceeds a limit ends soon, even if each run takes long.
+        let most = limits.max_grid_points as f64 / self.least_grid_points().max(1) as f64;
+        let n = to_u64((BLOCK_TILES / along.powi(3)).min(most.max(MIN_BLOCK_RUNS)).clamp(1.0, BLOCK_RUNS));
         usize::try_from(n).unwrap_or(1)
     }
 }
@@ -233,36 +272,43 @@ impl<'a> FoundBricks<'a> {
         Self { lists, open, index, max_open: MIN_OPEN, tiles, atom_bricks, n_reached: 0, n_candidates: 0, memory }
     }
 
-    /// Finds the bricks of all atoms.
+    /// Finds the bricks of all atoms, unless they exceed a limit.
     fn search(
         &mut self,
         lattice: &Lattice,
         reaches: &Reaches,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<(), SurfaceError> {
+    ) -> Result<Result<(), Excess>, SurfaceError> {
         let atoms = &lattice.atoms[..];
-        reaches.check(lattice, limits, control)?;
+        // Before any brick is allocated.
+        let least = reaches.least_grid_points();
+        if least > limits.max_grid_points {
+            return Ok(Err(Excess::GridPoints(least)));
+        }
+        let n_runs = reaches.runs_per_block(limits);
         let mut runs = runs(atoms);
         let first_step = *CountedBricks::new(reaches.longest).steps().start();
         let mark = |run: &Range<usize>| mark_run(&atoms[run.clone()], &reaches.of_atoms[run.clone()], control);
         loop {
-            let block: Vec<Range<usize>> = runs.by_ref().take(reaches.runs_per_block()).collect();
+            let block: Vec<Range<usize>> = runs.by_ref().take(n_runs).collect();
             let Some(seen) = block.last().map(|run| run.end) else { break };
             let marks = block.par_iter().map(mark).collect::<Result<Vec<_>, SurfaceError>>()?;
             marks.into_iter().try_for_each(|marks| self.add(&marks))?;
             let grid_points = 512 * self.n_reached;
+            let of_all = |so_far: u64| to_u64(so_far as f64 * (atoms.len() as f64 / seen as f64));
             if grid_points > limits.max_grid_points {
-                let all = to_u64(grid_points as f64 * (atoms.len() as f64 / seen as f64));
-                return Err(grid_limit::exceeded(lattice, all, limits, control));
+                let all = of_all(grid_points).min(lattice.box_points.max(grid_points));
+                return Ok(Err(Excess::GridPoints(all)));
             }
             if self.n_candidates > candidates::limit(limits) {
-                return Err(candidates::exceeded(&[lattice], self.n_candidates, limits));
+                let counted = self.n_candidates;
+                return Ok(Err(Excess::Pairs { counted, all: of_all(counted) }));
             }
             // Atoms are in tile order.
             self.complete(atoms.get(seen).map(|next| tile_of(next.cell)[2] + first_step))?;
         }
-        Ok(())
+        Ok(Ok(()))
     }
 
     /// Adds the marks of a run.
@@ -381,7 +427,7 @@ mod tests {
             let column = || vec![-0.52 * resolution];
             let spheres = Spheres::new(column(), column(), column(), vec![1.7]).unwrap();
             let options = SurfaceOptions { resolution: Some(resolution), ..SurfaceOptions::default() };
-            let lattice = Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap()).unwrap();
+            let lattice = Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap(), &Control::default()).unwrap();
             assert_eq!(lattice.atoms[0].cell, [-1; 3]);
             let occupancy = Occupancy::new(&lattice, &SurfaceLimits::default(), &Control::default()).unwrap();
             assert_eq!(format!("{:?}", occupancy.tiles), format!("{:?}", brute_force(&lattice, &lattice.atoms)));
@@ -423,7 +469,7 @@ mod tests {
         let column = |step: i32| (0..23 * 23 * 23).map(|i| f64::from(256 * (i / step % 23))).collect();
         let spheres = Spheres::new(column(1), column(23), column(529), vec![1.7; 23 * 23 * 23]).unwrap();
         let options = SurfaceOptions { resolution: Some(1.0), ..SurfaceOptions::default() };
-        Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap()).unwrap()
+        Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap(), &Control::default()).unwrap()
     }
 
     #[test]
@@ -452,6 +498,8 @@ mod tests {
         let few = SurfaceLimits { max_grid_points: 512 * n_reached / 10, ..limits };
         match count(&lattice, &few, &control) {
             Err(SurfaceError::GridTooLarge { grid_points, suggested_resolution, .. }) => {
+                // The box around the atoms is much larger.
+                assert!(lattice.box_points > 2 * grid_points);
                 assert!(grid_points.abs_diff(512 * n_reached) < 26 * n_reached, "{grid_points} {n_reached}");
                 assert!(suggested_resolution > 1.0);
             }
@@ -475,7 +523,7 @@ mod tests {
             radii[0] = largest;
             let spheres = Spheres::new(column(0), column(1), column(2), radii).unwrap();
             let options = SurfaceOptions { resolution: Some(resolution), ..SurfaceOptions::default() };
-            let lattice = Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap()).unwrap();
+            let lattice = Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap(), &Control::default()).unwrap();
             let found = |threads| {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
                 pool.install(|| Occupancy::new(&lattice, &SurfaceLimits::default(), &Control::default())).unwrap()

@@ -165,7 +165,8 @@ pub(super) mod tests {
             let (params, control) = (SurfaceParams::new(&options).unwrap(), Control::default());
             let output = CpuBackend::default().write(spheres, &params, limits, &control, None).unwrap();
             let measures = Measures::of(&output.mesh, Validation::Checksum, &control).unwrap();
-            let occupancy = Occupancy::new(&Lattice::new(spheres, &params).unwrap(), limits, &control).unwrap();
+            let occupancy =
+                Occupancy::new(&Lattice::new(spheres, &params, &control).unwrap(), limits, &control).unwrap();
             format!("{output:?}\n{measures:?}\n{occupancy:?}")
         };
         pool.build().unwrap().install(|| (arithmetic(), SurfaceKind::ALL.iter().copied().map(run).collect()))

@@ -9,6 +9,7 @@ use molmesh::formats::{Format, GlbSink, RandomAccess};
 use molmesh::picture::{PictureParams, SelectedRenderer};
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, ProgressSink, params};
 use molmesh::structure::{self, ReadLimits, Selection};
+use molmesh::surface::lattice::Lattice;
 use molmesh::surface::{
     Backend as _, CancelToken, Control, CpuBackend, Measures, MeshSink, Observer, Spheres, Stage, SurfaceError,
     SurfaceLimits, SurfaceParams, Validation,
@@ -304,6 +305,33 @@ fn pictures_end_soon_after_cancellation_at_any_time() {
                 let cancelled = matches!(stopped, Err(JobError::Surface(SurfaceError::Cancelled)));
                 assert!(cancelled || (*part > 0.3 && stopped.is_ok()), "{stage} after {part} of {time:?}: {stopped:?}");
                 late
+            });
+        }
+    }
+}
+
+#[test]
+fn placing_on_the_lattice_ends_soon_after_cancellation() {
+    const N: u32 = 1_000_000;
+    // All atoms in one cell, a compact structure, and a box of too many tiles for a table.
+    for (half, resolution) in [(0.2, 20.0), (150.0, 0.5), (99_999.0, 0.05)] {
+        let column = |k: f64| (0..N).map(|i| half * (f64::from(i) * k).sin()).collect();
+        let spheres = Spheres::new(column(0.37), column(1.13), column(2.71), vec![1.7; N as usize]).unwrap();
+        let params = SurfaceParams { resolution, ..SurfaceParams::default() };
+        let place = |control: &Control<'_>| Lattice::new(&spheres, &params, control).map(|lattice| lattice.atoms.len());
+        let whole = Instant::now();
+        assert_eq!(place(&Control::default()), Ok(N as usize), "the control");
+        let whole = whole.elapsed();
+        for part in [0.05, 0.2, 0.4, 0.6, 0.8] {
+            assert_in_time(&format!("{resolution} after {part}"), || {
+                let at = CancelIn { delay: whole.mul_f64(part), ..CancelIn::new("bin") };
+                at.start("bin");
+                let stopped = place(&at.control());
+                let time = at.time();
+                // The work may be over already.
+                let cancelled = stopped == Err(SurfaceError::Cancelled);
+                assert!(cancelled || (part > 0.3 && stopped.is_ok()), "after {part} of {whole:?}: {stopped:?}");
+                time
             });
         }
     }

@@ -81,8 +81,11 @@ impl Case {
             let options = SurfaceOptions { resolution: Some(spacing), ..SurfaceOptions::default() };
             SurfaceParams::new(&options).map_err(Error::failed)
         };
-        let cells =
-            |spacing| Lattice::new(&spheres, &params(spacing)?).map(|lattice| lattice.box_cells).map_err(Error::failed);
+        let cells = |spacing| {
+            Lattice::new(&spheres, &params(spacing)?, &Control::default())
+                .map(|lattice| lattice.box_cells)
+                .map_err(Error::failed)
+        };
         let spacing = match self.spacing {
             Spacing::Is(spacing) => spacing,
             Spacing::Cells(n) => grid::for_cubes(n, &cells)?.spacing,

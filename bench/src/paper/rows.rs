@@ -135,7 +135,7 @@ pub(super) fn grids(entry: &Entry, spheres: &Spheres, kernel: Kernel) -> Result<
         Ok(cells.iter().product())
     };
     let gpu = |spacing| {
-        let lattice = Lattice::new(spheres, &surface(kernel, spacing)?).map_err(Error::failed)?;
+        let lattice = Lattice::new(spheres, &surface(kernel, spacing)?, &Control::default()).map_err(Error::failed)?;
         Ok(program_2010::cubes(&lattice).iter().product())
     };
     Ok([grid::for_cubes(entry.cubes[0], &cpu)?, grid::for_cubes(entry.cubes[1], &gpu)?])

@@ -166,7 +166,7 @@ mod tests {
         let at = |i: u32, k: f64| 55.0 * (f64::from(i) * k).sin();
         let column = |k: f64| (0..900).map(|i| at(i, k)).collect::<Vec<_>>();
         let spheres = Spheres::new(column(0.37), column(1.13), column(2.71), vec![1.6; 900]).unwrap();
-        let lattice = Lattice::new(&spheres, &SurfaceParams::default()).unwrap();
+        let lattice = Lattice::new(&spheres, &SurfaceParams::default(), &Control::default()).unwrap();
         Plan::new(&lattice, &SurfaceLimits::default(), &Control::default()).unwrap()
     }
 

@@ -50,7 +50,7 @@ impl Plan {
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let occupancy = Occupancy::new(lattice, limits, control)?;
         let (bases, n_bricks) = tile_bases(&occupancy.tiles)
-            .ok_or_else(|| grid_limit::exceeded(lattice, u64::from(u32::MAX) * 512, limits, control))?;
+            .ok_or_else(|| grid_limit::exceeded(lattice, u64::from(u32::MAX) * 512, limits))?;
         let occupied = &occupancy.tiles;
         let per_tile = size_of::<Tile>() + size_of::<u32>() + size_of::<u64>();
         let rows = per_tile * occupied.len() + 2 * size_of::<u32>() * (n_bricks + 1);
@@ -191,7 +191,8 @@ mod tests {
         let (x, y, z) = (column(), column(), column());
         let radii = (0..n).map(|i| 1.2 + 0.1 * (i % 7) as f32).collect();
         let options = SurfaceOptions { resolution: Some(resolution), ..SurfaceOptions::default() };
-        Lattice::new(&Spheres::new(x, y, z, radii).unwrap(), &SurfaceParams::new(&options).unwrap()).unwrap()
+        let (spheres, params) = (Spheres::new(x, y, z, radii).unwrap(), SurfaceParams::new(&options).unwrap());
+        Lattice::new(&spheres, &params, &Control::default()).unwrap()
     }
 
     fn plan(lattice: &Lattice) -> Plan {

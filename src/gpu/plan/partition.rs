@@ -126,7 +126,7 @@ mod tests {
         let column = |k: f64| (0..900).map(|i| at(i, k)).collect::<Vec<_>>();
         let spheres = Spheres::new(column(0.37), column(1.13), column(2.71), vec![1.6; 900]).unwrap();
         let options = SurfaceOptions { resolution: Some(resolution), ..SurfaceOptions::default() };
-        let lattice = Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap()).unwrap();
+        let lattice = Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap(), &Control::default()).unwrap();
         let plan = Plan::new(&lattice, &SurfaceLimits::default(), &Control::default()).unwrap();
         (lattice, plan)
     }

@@ -251,7 +251,7 @@ fn scan(spheres: &Spheres, context: RunContext<'_>) -> Result<Scanned, SurfaceEr
     let lattice = context.control.span(Stage::Bin, || {
         candidates::check(spheres, context.params, context.limits)?;
         context.control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
-        Lattice::new(spheres, context.params)
+        Lattice::new(spheres, context.params, context.control)
     });
     scan_lattice(lattice?, context)
 }

@@ -97,6 +97,9 @@ pub(super) struct CountedBricks {
     /// Per brick, the number of atoms that reach it in the low 16 bits, and the number of atoms that reach one of its
     /// grid points in the high 16 bits. Empty before [`Self::allocate`].
     counts: Vec<u32>,
+    /// First brick per axis that was counted, and the first one after all of these: few of `counts` if there are few
+    /// atoms.
+    counted: [[i32; 2]; 3],
 }
 
 impl CountedBricks {
@@ -106,12 +109,18 @@ impl CountedBricks {
         // An atom lies at most half a spacing outside the grid points of its tile. The rest is slack for rounding.
         let (before, n) = (bricks(longest + 0.52) + 1, bricks(2.0 * longest + 0.1) + 2);
         let side = before + 7 + n;
-        Self { before, side, n, counts: Vec::new() }
+        Self { before, side, n, counts: Vec::new(), counted: [[side, 0]; 3] }
     }
 
     /// Tiles that contain the bricks, per axis, relative to the tile of the atoms.
     pub(super) fn steps(&self) -> RangeInclusive<i32> {
         (-self.before >> 3)..=((self.side - self.before - 1) >> 3)
+    }
+
+    /// Tiles that contain counted bricks, and the tile of the atoms, per axis, relative to the tile of the atoms.
+    fn counted_steps(&self, axis: usize) -> RangeInclusive<i32> {
+        let [first, end] = self.counted[axis];
+        ((first - self.before) >> 3).min(0)..=((end - self.before - 1) >> 3).max(0)
     }
 
     /// Allocates the counts.
@@ -139,6 +148,14 @@ impl CountedBricks {
         row.resize(gaps[0].len(), [0; LANES]);
         let starts: [usize; LANES] =
             std::array::from_fn(|lane| self.index(batch.first.map(|first| first[lane] + self.before)));
+        for (counted, first) in self.counted.iter_mut().zip(&batch.first) {
+            for (first, reach) in first.iter().zip(&batch.reach) {
+                let start = first + self.before;
+                if *reach >= 0.0 {
+                    *counted = [counted[0].min(start), counted[1].max(start + self.n)];
+                }
+            }
+        }
         for (z, iz) in gaps[2].iter().zip(0..) {
             for (y, iy) in gaps[1].iter().zip(0..) {
                 for (row, x) in row.iter_mut().zip(&gaps[0]) {
@@ -166,7 +183,8 @@ impl CountedBricks {
     fn occupancy(&self, tile: [i32; 3], step: [i32; 3]) -> TileOccupancy {
         let mut occupancy = TileOccupancy { tile, occupied: [0; 8], reached: [0; 8], candidates: 0, pairs: 0 };
         let starts = step.map(|step| 8 * step + self.before);
-        let [x, y, z] = starts.map(|start| start.max(0)..self.side.min(start + 8));
+        let range = |k: usize| starts[k].max(self.counted[k][0])..self.counted[k][1].min(starts[k] + 8);
+        let [x, y, z] = [0, 1, 2].map(range);
         for z in z {
             let layer = (z - starts[2]).unsigned_abs() as usize & 7;
             for y in y.clone() {
@@ -207,9 +225,9 @@ pub(super) fn mark_run(atoms: &[LatticeAtom], reaches: &[f32], control: &Control
             }
         }
     }
-    for z in bricks.steps() {
-        for y in bricks.steps() {
-            for x in bricks.steps() {
+    for z in bricks.counted_steps(2) {
+        for y in bricks.counted_steps(1) {
+            for x in bricks.counted_steps(0) {
                 let mut tile = bricks.occupancy([own[0] + x, own[1] + y, own[2] + z], [x, y, z]);
                 if tile.tile == own {
                     // A tiny sphere may reach no grid point of its own brick, but the plan lists atoms by brick.
