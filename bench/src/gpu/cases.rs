@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use molmesh::surface::lattice::Lattice;
-use molmesh::surface::{Spheres, SurfaceOptions, SurfaceParams};
+use molmesh::surface::{Control, Spheres, SurfaceOptions, SurfaceParams};
 
 use crate::error::{Error, Result};
 use crate::{grid, structures};

@@ -1,7 +1,7 @@
 //! Rows of the paper's tables: all structures, kernels and programs.
 
 use molmesh::surface::lattice::Lattice;
-use molmesh::surface::{Kernel, Spheres, SurfaceParams, reference};
+use molmesh::surface::{Control, Kernel, Spheres, SurfaceParams, reference};
 
 use super::entries::{Entry, KERNELS, surface};
 use super::programs::{Program, reference_estimate, timed};
