@@ -11,6 +11,7 @@ mod file;
 mod fit;
 pub mod integer;
 mod left_out;
+mod map_file;
 pub mod nearest;
 pub mod params;
 mod parts;
@@ -25,12 +26,13 @@ use thiserror::Error;
 
 pub use auto::AutoBackend;
 pub use clock::{ProgressSink, StageClock};
-pub use color::{AtomColors, ColorError, ColorReport, Coloring};
+pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
 #[cfg(feature = "png")]
 pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::File;
 pub use left_out::{KindCount, LeftOutReport, ResidueCount};
+pub use map_file::MapFile;
 pub use parts::PartReport;
 pub use progress::Tracker;
 pub use report::{AssemblyReport, ComponentReport, PictureReport, Quantization, Report, VoidReport, maker};
@@ -39,6 +41,7 @@ pub use work::{estimate_atoms, estimate_work, mesh_work};
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureLimits, PictureParams};
+use crate::structure::map::{MapError, MapLimits};
 use crate::structure::{self, ReadLimits, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits,
@@ -72,16 +75,25 @@ pub struct Job {
     pub units: Units,
     /// Colours of the vertices; `None` for a mesh without colours.
     pub color: Option<Coloring>,
+    /// Map whose values colour the vertices, for [`Scheme::needs_map`] only.
+    pub map: Option<MapFile>,
     /// Parameters of a picture of the mesh; `None` for a mesh file.
     pub picture: Option<PictureParams>,
 }
 
 impl Job {
-    /// Checks the size of the picture before any other work.
+    /// Checks the size of the picture, and that there is a map if and only if the colours need one, before any other
+    /// work.
     ///
     /// # Errors
-    /// Returns [`JobError::Picture`] if it exceeds the limits.
+    /// Returns [`JobError::Picture`] if the picture exceeds the limits, and [`JobError::Color`].
     pub fn check(&self, limits: &JobLimits) -> Result<(), JobError> {
+        let scheme = self.color.map(|color| color.scheme);
+        match (scheme.filter(|scheme| scheme.needs_map()), &self.map) {
+            (Some(scheme), None) => return Err(ColorError::without_map(scheme).into()),
+            (None, Some(_)) => return Err(ColorError::unused_map(scheme).into()),
+            _ => {}
+        }
         self.picture.map_or(Ok(()), |picture| picture.check(limits.picture)).map_err(JobError::Picture)
     }
 
@@ -125,6 +137,8 @@ pub struct JobLimits {
     pub surface: SurfaceLimits,
     /// Limits of drawing.
     pub picture: PictureLimits,
+    /// Limits of reading a map.
+    pub map: MapLimits,
 }
 
 /// Chosen backend and the reason for the choice, for reports and logs.
@@ -172,9 +186,12 @@ pub enum JobError {
     /// Drawing failed.
     #[error(transparent)]
     Picture(PictureError),
-    /// The structure lacks the values of the colour scheme.
+    /// The structure or the map lacks the values of the colour scheme.
     #[error(transparent)]
     Color(#[from] ColorError),
+    /// Reading the map failed.
+    #[error(transparent)]
+    Map(MapError),
 }
 
 impl From<StructureError> for JobError {
@@ -184,6 +201,16 @@ impl From<StructureError> for JobError {
             StructureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
             StructureError::Memory(error) => Self::Surface(error.into()),
             error => Self::Structure(error),
+        }
+    }
+}
+
+impl From<MapError> for JobError {
+    fn from(error: MapError) -> Self {
+        match error {
+            MapError::Cancelled => Self::Surface(SurfaceError::Cancelled),
+            MapError::Memory(error) => Self::Surface(error.into()),
+            error => Self::Map(error),
         }
     }
 }
@@ -237,8 +264,10 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let clock = StageClock::new(progress);
     let control = Control { observer: &clock, ..control.clone() };
     let (structure, selected, spheres) = load(read, job, &limits.read, &clock, &control)?;
-    let colors =
-        job.color.map(|coloring| MeshColors::new(&structure, &selected.atoms, coloring, &control)).transpose()?;
+    let read_map = |file: &MapFile| clock.time("read", || file.read(&limits.map, &control));
+    let map = job.map.as_ref().map(read_map).transpose()?;
+    let prepare = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, map, &control);
+    let colors = job.color.map(prepare).transpose()?;
     let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
     let backend = parts::divided(choice.backend, parts.as_deref());
     let choice = &Choice { backend: &*backend, reason: choice.reason };
