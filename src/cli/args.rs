@@ -230,8 +230,8 @@ pub(crate) struct SurfaceArgs {
 #[command(next_help_heading = "Colours")]
 pub(crate) struct ColorArgs {
     /// Colours of vertices: uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, occupancy,
-    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial or none [default:
-    /// none]
+    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial, map or none
+    /// [default: none]
     #[arg(long, value_name = "SCHEME")]
     pub(crate) color: Option<String>,
     /// Palette of a numeric scheme: viridis, cividis, blue-white-red or red-white-blue [default: depends on the scheme]
@@ -243,6 +243,12 @@ pub(crate) struct ColorArgs {
     /// Transition between colours: nearest (sharp borders) or smooth (averaged over about 1 Å) [default: nearest]
     #[arg(long, value_name = "BLEND")]
     pub(crate) color_blend: Option<String>,
+    /// Map for `--color map`: CCP4, MRC or OpenDX, optionally compressed with gzip or zstd
+    #[arg(long, value_name = "FILE")]
+    pub(crate) map: Option<PathBuf>,
+    /// Distance from the surface at which the map is sampled, in Å [default: 1.4]
+    #[arg(long, value_name = "Å")]
+    pub(crate) color_offset: Option<String>,
 }
 
 // Atom selection.
@@ -298,7 +304,10 @@ pub(crate) struct LimitArgs {
     /// Parts of a mesh with `--split` or `--model all` [default: 1000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_parts: Option<u64>,
-    /// Bytes of the input after decompression, such as 64MiB [default: 4GiB]
+    /// Grid points of the map [default: 67108864]
+    #[arg(long, value_name = "N", value_parser = count)]
+    pub(crate) max_map_points: Option<u64>,
+    /// Bytes of the input, and of the map, after decompression, such as 64MiB [default: 4GiB]
     #[arg(long, value_name = "BYTES", value_parser = size)]
     pub(crate) max_input_bytes: Option<u64>,
     /// Grid points in occupied bricks [default: 4294967296]

@@ -6,6 +6,7 @@ use molmesh::formats::FormatError;
 use molmesh::picture::PictureError;
 use molmesh::pipeline::JobError;
 use molmesh::structure::StructureError;
+use molmesh::structure::map::MapError;
 use molmesh::surface::SurfaceError;
 use thiserror::Error;
 
@@ -21,7 +22,7 @@ pub(crate) mod code {
     pub(crate) const USAGE: i32 = 2;
     /// The input cannot be read from disk or stdin.
     pub(crate) const INPUT: i32 = 3;
-    /// The structure is rejected: unreadable, no atoms, empty selection.
+    /// The structure or the map is rejected: unreadable, no atoms, empty selection.
     pub(crate) const STRUCTURE: i32 = 4;
     /// A limit is exceeded.
     pub(crate) const LIMIT: i32 = 5;
@@ -43,8 +44,8 @@ Exit codes:
     1  internal error, or the checked service is unhealthy
     2  wrong usage or invalid parameter
     3  the input cannot be read
-    4  the structure is rejected: unreadable, no atoms, empty selection
-    5  a limit is exceeded: input, atoms, grid, mesh
+    4  the structure or the map is rejected: unreadable, no atoms, empty selection
+    5  a limit is exceeded: input, atoms, map, grid, mesh
     6  the backend or device does not exist on this machine
     7  the output cannot be written
     8  another service uses the data folder
@@ -151,6 +152,7 @@ impl CliError {
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
             Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
             Self::Job { source: JobError::Color(_), .. } => code::STRUCTURE,
+            Self::Job { source: JobError::Map(error), .. } => map_code(error),
             Self::Strict { .. } => code::STRUCTURE,
             Self::Format(error) => format_code(error),
             Self::NoBackend { .. } => code::BACKEND,
@@ -184,6 +186,11 @@ impl CliError {
                 StructureError::InflatedTooLarge { .. } => Some("raise the limit with --max-input-bytes".to_owned()),
                 _ => strict_finding.as_deref().map(str::to_owned),
             },
+            Self::Job { source: JobError::Map(error), .. } => match error {
+                MapError::TooManyPoints { .. } => Some("raise the limit with --max-map-points".to_owned()),
+                MapError::InflatedTooLarge { .. } => Some("raise the limit with --max-input-bytes".to_owned()),
+                _ => None,
+            },
             Self::NoBackend { .. } => Some(format!("try --backend auto{DOCTOR}")),
             #[cfg(feature = "server")]
             Self::InUse(_) => Some("stop that service, or choose another folder with --data-dir".to_owned()),
@@ -213,6 +220,13 @@ fn structure_code(error: &StructureError) -> i32 {
         | StructureError::TooManyDistances { .. }
         | StructureError::AssemblyTooLarge { .. }
         | StructureError::Memory(_) => code::LIMIT,
+        _ => code::STRUCTURE,
+    }
+}
+
+fn map_code(error: &MapError) -> i32 {
+    match error {
+        MapError::TooManyPoints { .. } | MapError::InflatedTooLarge { .. } | MapError::Memory(_) => code::LIMIT,
         _ => code::STRUCTURE,
     }
 }

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
-use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, Report};
+use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, SurfaceError};
@@ -44,7 +44,7 @@ pub(super) struct CommandJob<'a> {
 impl<'a> CommandJob<'a> {
     /// Prepares a job and opens its output. Cheap steps come first: flags, output, input, backend.
     pub(super) fn prepare(
-        job: Job,
+        mut job: Job,
         strict: bool,
         (path, output): (&'a Path, &Path),
         format: Format,
@@ -57,9 +57,25 @@ impl<'a> CommandJob<'a> {
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
         output::refuse_input(path, output)?;
+        let map = args.color.map.as_deref();
+        if let Some(map) = map {
+            output::refuse_input(map, output)?;
+            if is_stdio(map) && is_stdio(path) {
+                return Err(CliError::usage("the structure and the map cannot both be read from stdin"));
+            }
+        }
+        let needs_map = job.color.is_some_and(|color| color.scheme.needs_map());
+        if needs_map != map.is_some() {
+            let message = if needs_map { "`--color map` needs `--map FILE`" } else { "`--map` needs `--color map`" };
+            return Err(CliError::usage(message));
+        }
         let output = Output::open(output, &cancel)?;
         output.refuse_terminal(format)?;
         let input = read(path, limits.read.max_inflated_bytes)?;
+        if let Some(map) = map {
+            // The command line makes no content keys.
+            job.map = Some(MapFile::new(String::new(), read(map, limits.map.max_inflated_bytes)?));
+        }
         requested.work = Some(pipeline::estimate_work(pipeline::estimate_atoms(&input), &job));
         let selected = backend::select(&requested)?;
         let progress = Progress::new(!args.quiet);
@@ -107,7 +123,8 @@ impl<'a> CommandJob<'a> {
             JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
             source => {
                 let strict_finding = worst_finding(&source, &self.input, &self.limits).map(String::into_boxed_str);
-                CliError::Job { name: name_of(self.path), strict_finding, source }
+                let map = self.args.color.map.as_deref().filter(|_| matches!(source, JobError::Map(_)));
+                CliError::Job { name: name_of(map.unwrap_or(self.path)), strict_finding, source }
             }
         }
     }

@@ -68,6 +68,8 @@ pub(super) fn limits(args: &LimitArgs) -> JobLimits {
     set(&mut limits.read.max_copies, args.max_copies);
     set(&mut limits.read.max_parts, args.max_parts);
     set(&mut limits.read.max_inflated_bytes, args.max_input_bytes);
+    set(&mut limits.map.max_inflated_bytes, args.max_input_bytes);
+    set(&mut limits.map.max_points, args.max_map_points);
     set(&mut limits.surface.max_grid_points, args.max_grid_points);
     set(&mut limits.surface.max_candidates, args.max_candidates);
     set(&mut limits.read.max_distances, args.max_candidates.map(|pairs| pairs.saturating_mul(DISTANCES_PER_PAIR)));
@@ -97,6 +99,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("palette", &args.color.palette),
         ("color_range", &args.color.color_range),
         ("color_blend", &args.color.color_blend),
+        ("color_offset", &args.color.color_offset),
         ("chains", &atoms.chains),
         ("model", &atoms.model),
         ("altloc", &atoms.altloc),
@@ -182,6 +185,7 @@ mod tests {
                 "color" => vec![&flag, "bfactor"],
                 "palette" => vec![&flag, "cividis", "--color", "bfactor"],
                 "color_blend" => vec![&flag, "smooth", "--color", "chain"],
+                "color_offset" => vec![&flag, "2", "--color", "map"],
                 "color_range" => vec![&flag, "0,50", "--color", "bfactor"],
                 _ => vec![&flag, "2"],
             };

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::picture::PictureLimits;
 use crate::pipeline::JobLimits;
 use crate::structure::ReadLimits;
+use crate::structure::map::MapLimits;
 use crate::structure::read::DISTANCES_PER_PAIR;
 use crate::surface::SurfaceLimits;
 
@@ -22,8 +23,8 @@ pub struct LimitsConfig {
     pub part_head_bytes: u64,
     /// Number of parts of a form. Default 128: one file and all parameters are fewer than half.
     pub parts: usize,
-    /// Size of a structure file after decompression, bytes. Default 2 GiB: the largest entries inflate to about 1 GB.
-    /// Stops compression bombs.
+    /// Size of a structure or map file after decompression, bytes. Default 2 GiB: the largest entries inflate to about
+    /// 1 GB. Stops compression bombs.
     pub inflated_bytes: u64,
     /// Number of atoms in all models of a structure, and of an assembly. Default 10,000,000: four times the largest PDB
     /// entry; at 80 bytes each 800 MB.
@@ -36,6 +37,8 @@ pub struct LimitsConfig {
     /// Number of parts of a mesh with `split` or `model=all`. Default 1,000: most structures have fewer chains. Each
     /// part is meshed on its own and adds about a kilobyte to the header of a glTF.
     pub mesh_parts: u64,
+    /// Number of grid points of a map for `color=map`. Default 67,108,864: 406 along each axis, 256 MiB in memory.
+    pub map_points: u64,
     /// Number of atoms whose names or colours are listed, for web pages that show them. Default 1,000,000: about 10 MB
     /// of JSON, the most that is useful in a browser.
     pub labels: u64,
@@ -78,6 +81,7 @@ impl Default for LimitsConfig {
             duplicate_atoms: 1000,
             assembly_copies: 10_000,
             mesh_parts: 1000,
+            map_points: 64 << 20,
             labels: 1_000_000,
             grid_points: 1 << 30,
             candidate_pairs: 1 << 27,
@@ -110,6 +114,7 @@ impl LimitsConfig {
             },
             picture: PictureLimits { max_side: self.picture_side },
             max_file_bytes: self.output_bytes,
+            map: MapLimits { max_points: self.map_points, max_inflated_bytes: self.inflated_bytes },
         }
     }
 }

@@ -15,6 +15,7 @@ use crate::pipeline::JobError;
 use crate::pipeline::color::{self, ColorError};
 use crate::pipeline::params::ParamError;
 use crate::store::StoreError;
+use crate::structure::map::MapError;
 use crate::structure::strict_validator::Diagnostic;
 use crate::structure::{Split, StructureError};
 use crate::surface::params::MAX_RESOLUTION;
@@ -145,6 +146,7 @@ impl From<Failure> for Problem {
             Failure::Job { error: JobError::Surface(error), .. } => error.into(),
             Failure::Job { error: JobError::Picture(error), .. } => error.into(),
             Failure::Job { error: JobError::Color(error), .. } => error.into(),
+            Failure::Job { error: JobError::Map(error), .. } => error.into(),
             Failure::Check { ref diagnostics } => {
                 let problem = Self::new(Kind::UnreadableStructure, error.to_string()).with("parameter", "check");
                 diagnosed(problem, diagnostics)
@@ -292,6 +294,27 @@ impl From<ColorError> for Problem {
             .with("parameter", "color")
             .with("value", error.scheme)
             .with("expected", color::EXPECTED)
+    }
+}
+
+impl From<MapError> for Problem {
+    fn from(error: MapError) -> Self {
+        use MapError as E;
+        let problem = |kind| Self::new(kind, error.to_string()).with("parameter", "map");
+        match &error {
+            E::UnknownFormat { found } => problem(Kind::UnreadableMap).with("found", found.as_str()),
+            E::Malformed { place, found, expected } => problem(Kind::UnreadableMap)
+                .with("place", place.as_str())
+                .with("found", found.as_str())
+                .with("expected", expected.as_str()),
+            E::Decompress { encoding, .. } => problem(Kind::UnreadableMap).with("encoding", *encoding),
+            E::TooManyPoints { points, limit } => {
+                problem(Kind::MapTooLarge).with("actual", *points).with("limit", *limit)
+            }
+            E::InflatedTooLarge { limit } => problem(Kind::InflatedTooLarge).with("limit", *limit),
+            E::Memory(error) => (*error).into(),
+            E::Cancelled => Self::from(Failure::Stopped),
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! `multipart/form-data` bodies: one file and parameters. Every part is limited before it is buffered.
+//! `multipart/form-data` bodies: a structure file, a map, and parameters. Every part is limited before it is buffered.
 
 use std::pin::Pin;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -112,13 +112,16 @@ pub(super) struct UploadedFile {
     /// SHA-256 of `bytes`.
     pub(super) digest: Digest,
     pub(super) reservation: MemoryReservation,
+    /// Map from the field `map` of a form, with its SHA-256.
+    pub(super) map: Option<(Digest, Bytes)>,
     /// Parameters from the other fields of a form.
     pub(super) fields: Vec<(String, String)>,
     /// Content type of the file.
     pub(super) declared: DeclaredType,
 }
 
-/// Reads a form of `announced` bytes, 0 if unknown: one file in `file` or `structure`, parameters in the other fields.
+/// Reads a form of `announced` bytes, 0 if unknown: one structure file in `file` or `structure`, at most one map in
+/// `map`, parameters in the other fields.
 pub(super) async fn read(
     limits: &LimitsConfig,
     within: Limit,
@@ -139,7 +142,7 @@ pub(super) async fn read(
     let mut feed = Feed { body: body.into_data_stream(), rest: Bytes::new(), allowance: &allowance, paused: false };
     let constraints = Constraints::new().size_limit(SizeLimit::new().whole_stream(bounds.body.max));
     let mut form = Multipart::with_constraints(&mut feed, boundary, constraints);
-    let (mut file, mut fields) = (None, Vec::new());
+    let (mut file, mut map, mut fields) = (None, None, Vec::new());
     let head = usize::try_from(bounds.head.max).unwrap_or(UNBOUNDED);
     loop {
         allowance.store(head, Ordering::Relaxed);
@@ -149,19 +152,24 @@ pub(super) async fn read(
         if head_bytes(field.headers()) > head {
             return Err(bounds.head_too_long());
         }
-        if fields.len() + usize::from(file.is_some()) >= limits.parts {
+        if fields.len() + usize::from(file.is_some()) + usize::from(map.is_some()) >= limits.parts {
             return Err(bounds.parts.exceeded("the form has", "parts"));
         }
         let name = field.name().unwrap_or_default().to_owned();
         reservation.grow(name.len() as u64)?;
-        let is_file = matches!(name.as_str(), "file" | "structure");
-        if is_file && file.is_some() {
+        let (is_structure, is_map) = (matches!(name.as_str(), "file" | "structure"), name == "map");
+        let is_file = is_structure || is_map;
+        if is_structure && file.is_some() {
             return Err(Problem::new(Kind::BadRequest, "the form has more than one file").with("parameter", name));
+        }
+        if is_map && map.is_some() {
+            return Err(Problem::new(Kind::BadRequest, "the form has more than one map").with("parameter", name));
         }
         let declared = DeclaredType::new(field.content_type().map_or("", |mime| mime.as_ref()));
         let (mut content, mut hasher) = (BytesMut::new(), BodyHasher::default());
         while let Some(chunk) = field.chunk().await.map_err(|e| bounds.problem(&e))? {
-            reservation.extend(&mut content, &chunk, if is_file { announced } else { 0 })?;
+            // A map is the second file, so the announced length is not its own.
+            reservation.extend(&mut content, &chunk, if is_structure { announced } else { 0 })?;
             if is_file {
                 hasher.update(&chunk, &reservation).await?;
             }
@@ -169,8 +177,10 @@ pub(super) async fn read(
                 return Err(field_too_long(&name));
             }
         }
-        if is_file {
+        if is_structure {
             file = Some((content.freeze(), hasher.digest(&reservation).await?, declared));
+        } else if is_map {
+            map = Some((hasher.digest(&reservation).await?, content.freeze()));
         } else {
             fields.push((name, String::from_utf8_lossy(&content).into_owned()));
         }
@@ -185,7 +195,7 @@ pub(super) async fn read(
         let detail = "the form has no file; it belongs in a field named `file` or `structure`";
         return Err(Problem::new(Kind::BadRequest, detail).with("expected", "file"));
     };
-    Ok(UploadedFile { bytes, digest, reservation, fields, declared })
+    Ok(UploadedFile { bytes, digest, reservation, map, fields, declared })
 }
 
 /// Returns the size of a part's headers, bytes.

@@ -247,8 +247,8 @@ impl MeshRequest {
         }
         let Input::File(file) = loaded.input.clone() else { return Err(Problem::internal("a file was not loaded")) };
         let task = self.task(&loaded);
-        let Self { app, parsed: ParsedRequest { request, pairs, format, .. }, preferences, .. } = self;
-        let spec = JobSpec { task, file, parameters: pairs, format, idempotency_key: preferences.idempotency_key };
+        let Self { app, parsed: ParsedRequest { request, pairs, map, format, .. }, preferences, .. } = self;
+        let spec = JobSpec { task, file, map, parameters: pairs, format, idempotency_key: preferences.idempotency_key };
         let job_store = app.job_store.clone();
         // A client that disconnects now does not interrupt the acceptance.
         let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());

@@ -4,6 +4,7 @@ use axum::body::Body;
 use axum::extract::Query;
 use axum::extract::rejection::QueryRejection;
 use axum::http::header::HeaderMap;
+use bytes::Bytes;
 
 use super::content_type::DeclaredType;
 use super::form::UploadedFile;
@@ -13,7 +14,9 @@ use super::source::{Loaded, StructureSource};
 use super::state::{App, Shared};
 use super::{json_body, negotiate, upload};
 use crate::formats::Format;
+use crate::pipeline::MapFile;
 use crate::pipeline::params::{self, Request};
+use crate::store::Digest;
 
 /// Size of a JSON document, bytes, up to which it is parsed on the async runtime: a few microseconds.
 const MAX_INLINE_JSON: usize = 4096;
@@ -25,6 +28,8 @@ pub(super) type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
 pub(super) struct ParsedRequest {
     pub(super) source: StructureSource,
     pub(super) request: Request,
+    /// Map of the job, with its digest.
+    pub(super) map: Option<(Digest, Bytes)>,
     /// Parameters as the client wrote them.
     pub(super) pairs: Vec<(String, String)>,
     pub(super) format: Format,
@@ -55,11 +60,11 @@ impl ParsedRequest {
         let format = format.or(request.format).unwrap_or_default();
         params::set_format(&mut request.job, format)?;
         app.accepts(&request.job)?;
-        Ok(Self { source, request, pairs, format, report, declared: DeclaredType::Neutral })
+        Ok(Self { source, request, map: None, pairs, format, report, declared: DeclaredType::Neutral })
     }
 
-    /// Receives a body: a structure file, a form with a file, or a JSON document that names a structure. Invalid
-    /// parameters in the query are rejected before the body is received.
+    /// Receives a body: a structure file, a form with a file and perhaps a map, or a JSON document that names a
+    /// structure. Invalid parameters in the query are rejected before the body is received.
     pub(super) async fn from_body(
         app: &Shared,
         query: Pairs,
@@ -70,7 +75,7 @@ impl ParsedRequest {
         let is_json = upload::is_json(headers);
         let body_has_parameters = is_json || upload::is_multipart(headers);
         let early = if body_has_parameters { None } else { Some(finish(app, &mut request, headers)?) };
-        let (source, fields, declared) = if is_json {
+        let (source, fields, declared, map) = if is_json {
             let json = upload::receive_json(app, headers, body).await?;
             let (source, fields) = if json.len() <= MAX_INLINE_JSON {
                 named(&json)?
@@ -78,18 +83,19 @@ impl ParsedRequest {
                 tokio::task::spawn_blocking(move || named(&json)).await.map_err(Problem::internal)??
             };
             // The type is that of the document, not that of the structure.
-            (source, fields, DeclaredType::Neutral)
+            (source, fields, DeclaredType::Neutral, None)
         } else {
-            let UploadedFile { bytes, digest, reservation, fields, declared } =
+            let UploadedFile { bytes, digest, reservation, map, fields, declared } =
                 upload::receive(app, headers, body).await?;
-            (StructureSource::Uploaded(Loaded::file(bytes, digest, reservation)), fields, declared)
+            (StructureSource::Uploaded(Loaded::file(bytes, digest, reservation)), fields, declared, map)
         };
         if body_has_parameters {
             pairs.extend(fields);
             request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
         }
+        request.job.map = map.as_ref().map(|(digest, bytes)| MapFile::new(digest.to_string(), bytes.clone()));
         let format = early.map_or_else(|| finish(app, &mut request, headers), Ok)?;
-        Ok(Self { source, request, pairs, format, report: false, declared })
+        Ok(Self { source, request, map, pairs, format, report: false, declared })
     }
 }
 

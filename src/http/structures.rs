@@ -160,13 +160,14 @@ pub(super) async fn create(
             "a structure is uploaded as a file, not as JSON; `POST /v1/meshes` takes JSON that names a structure";
         return Err(Problem::new(Kind::UnsupportedMediaType, detail).with("declared", "application/json"));
     }
-    let UploadedFile { bytes, digest, reservation, fields, declared } = upload::receive(&app, &headers, body).await?;
-    if let Some((name, _)) = fields.first() {
+    let UploadedFile { bytes, digest, reservation, map, fields, declared } =
+        upload::receive(&app, &headers, body).await?;
+    if let Some(name) = map.map(|_| "map").or(fields.first().map(|(name, _)| name.as_str())) {
         return Err(Problem::new(
             Kind::BadParameter,
             format!("a structure has no parameter `{name}`; parameters belong to meshes"),
         )
-        .with("parameter", name.as_str()));
+        .with("parameter", name));
     }
     let delivery = app.delivery(caller.client)?;
     let loaded = Loaded::file(bytes.clone(), digest, reservation);

@@ -48,7 +48,7 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
         let reservation = app.uploads.reservation();
         let (bytes, digest) = in_time(app, collect(body, announced, limit, &reservation)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
-        UploadedFile { bytes, digest, reservation, fields: Vec::new(), declared }
+        UploadedFile { bytes, digest, reservation, map: None, fields: Vec::new(), declared }
     };
     if let Some((name, _)) = coding.filter(|(_, magic)| !upload.bytes.starts_with(magic)) {
         return Err(bad_encoding(&format!("the body is declared as {name}, but is not {name} data")));

@@ -165,8 +165,8 @@ pub(super) struct Runner {
     pub(super) job: Arc<DurableJob>,
     /// Ticket of queued or running work; `None` for a job from the records.
     pub(super) ticket: Option<Ticket>,
-    /// Keeps input and record in the store.
-    pub(super) pin: [Pin; 2],
+    /// Keeps input, map and record in the store.
+    pub(super) pin: Vec<Pin>,
     pub(super) digest: Digest,
     /// Number of attempts by earlier processes.
     pub(super) earlier_attempts: u32,

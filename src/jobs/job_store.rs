@@ -1,8 +1,8 @@
 //! Durable jobs: the record is in the store before the client gets its id, and unfinished jobs are resumed after
 //! a restart.
 //!
-//! A job is accepted in three steps: store the input, store the record, answer. Results are named by their contents, so
-//! computing one twice is harmless; a crash costs time and never loses a job.
+//! A job is accepted in three steps: store the input and its map, store the record, answer. Results are named by their
+//! contents, so computing one twice is harmless; a crash costs time and never loses a job.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -39,6 +39,8 @@ pub(crate) struct JobSpec {
     pub(crate) task: Task,
     /// Structure file of the task.
     pub(crate) file: Bytes,
+    /// Map of the task, with its digest.
+    pub(crate) map: Option<(Digest, Bytes)>,
     /// Parameters as the client wrote them.
     pub(crate) parameters: Vec<(String, String)>,
     /// Mesh format.
@@ -159,6 +161,7 @@ impl JobStore {
             id: id.clone(),
             namespace,
             input: spec.task.digest.to_string(),
+            map: spec.map.as_ref().map(|(digest, _)| digest.to_string()),
             parameters: spec.parameters,
             format: spec.format.name().to_owned(),
             client,
@@ -186,7 +189,8 @@ impl JobStore {
         // result needs none.
         let job = Arc::new(DurableJob::new(record));
         let digest = spec.task.digest;
-        let pin = inner.pin(&id, &digest, namespace)?;
+        let map = spec.map.as_ref().map(|(digest, _)| *digest);
+        let pin = inner.pin(&id, [digest].into_iter().chain(map), namespace)?;
         let (recorded, wait_for_record) = oneshot::channel();
         let ticket = if ticket.is_some() || stored.is_some() {
             ticket
@@ -201,6 +205,9 @@ impl JobStore {
         };
         let reservation = inner.admit(&id).await?;
         inner.store.put_input(&digest, namespace, spec.file).await?;
+        if let Some((digest, bytes)) = spec.map {
+            inner.store.put_input(&digest, namespace, bytes).await?;
+        }
         if !inner.write_new(&job.record()).await?
             && let Some(view) = self.view(&id, namespace).await?
         {
@@ -291,16 +298,18 @@ impl JobStore {
     /// Resumes a job from its record, unless it runs already.
     pub(super) async fn resume(&self, record: JobRecord) -> Result<Arc<DurableJob>, StoreError> {
         let (id, input, earlier_attempts) = (record.id.clone(), record.input.parse::<Digest>(), record.attempts);
+        let map = record.map.as_deref().map(str::parse::<Digest>).transpose();
         let fresh = Arc::new(DurableJob::new(record));
         let known = self.0.lock().get(&id).cloned();
         if let Some(known) = known {
             return Ok(known);
         }
-        let Ok(digest) = input else {
-            self.finish(&fresh, Err(EndError::Lost { why: "its input has no valid digest".to_owned() })).await;
+        let (Ok(digest), Ok(map)) = (input, map) else {
+            let why = "its input or its map has no valid digest".to_owned();
+            self.finish(&fresh, Err(EndError::Lost { why })).await;
             return Ok(fresh);
         };
-        let pin = self.0.pin(&id, &digest, fresh.record().namespace)?;
+        let pin = self.0.pin(&id, [digest].into_iter().chain(map), fresh.record().namespace)?;
         let job = self.0.insert(&id, &fresh);
         if Arc::ptr_eq(&job, &fresh) {
             counter!(JOBS_RECOVERED).increment(1);

@@ -10,7 +10,7 @@ use serde_json::{Map, Value};
 use thiserror::Error;
 
 use crate::formats::Format;
-use crate::pipeline::params;
+use crate::pipeline::{MapFile, params};
 use crate::store::{Namespace, OWNER_DIGITS, Secret, derive};
 use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, traceparent, tracestate};
 
@@ -127,6 +127,9 @@ pub(crate) struct JobRecord {
     pub(crate) namespace: Namespace,
     /// SHA-256 of the input.
     pub(crate) input: String,
+    /// SHA-256 of the map that was sent beside the input.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) map: Option<String>,
     /// Names and values of the parameters, as the client wrote them.
     pub(crate) parameters: Vec<(String, String)>,
     /// Mesh format, as a file name extension.
@@ -234,10 +237,11 @@ impl JobRecord {
         let mut request = params::parse(self.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
         let format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
         params::set_format(&mut request.job, format).map_err(|e| e.to_string())?;
+        request.job.map = self.map.clone().map(MapFile::not_loaded);
         Ok((request, format))
     }
 
-    /// Returns true if both records describe the same request: equal input, format and parsed parameters.
+    /// Returns true if both records describe the same request: equal input, map, format and parsed parameters.
     pub(super) fn is_same_request(&self, other: &Self) -> bool {
         let parsed = |record: &Self| {
             let (request, _) = record.request().ok()?;
@@ -245,7 +249,7 @@ impl JobRecord {
         };
         let same_parameters =
             || self.parameters == other.parameters || parsed(self).is_some_and(|own| parsed(other) == Some(own));
-        (&self.input, &self.format) == (&other.input, &other.format) && same_parameters()
+        (&self.input, &self.map, &self.format) == (&other.input, &other.map, &other.format) && same_parameters()
     }
 }
 
@@ -294,6 +298,7 @@ mod tests {
             id: JobId::random(&[0; 32], 1).unwrap(),
             namespace: Namespace::default(),
             input: Digest::of(b"x").to_string(),
+            map: None,
             parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect(),
             format: "glb".to_owned(),
             client: u64::MAX,
@@ -318,6 +323,9 @@ mod tests {
         assert!(a.is_same_request(&b));
         assert!(!a.is_same_request(&record(&[("resolution", "0.71"), ("atom_ids", "true")])));
         assert!(!a.is_same_request(&JobRecord { format: "stl".to_owned(), ..b.clone() }));
+        let mapped = |map: &str| JobRecord { map: Some(map.to_owned()), ..b.clone() };
+        assert!(mapped("1").is_same_request(&mapped("1")));
+        assert!(!mapped("1").is_same_request(&mapped("2")) && !mapped("1").is_same_request(&b));
         assert!(!record(&[("check", "strict")]).is_same_request(&record(&[])));
         // Parameters that this version cannot parse are compared as text.
         let unknown = record(&[("unknown", "1")]);

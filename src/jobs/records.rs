@@ -16,7 +16,8 @@ use super::rank::{Client, Rank};
 use super::record::{JobId, JobRecord};
 use super::{Input, Task};
 use crate::formats::Format;
-use crate::store::{Digest, Folder, Name, Namespace, Pin, RecordCaps, RecordReservation, StoreError};
+use crate::pipeline::MapFile;
+use crate::store::{BadDigest, Digest, Folder, Name, Namespace, Pin, RecordCaps, RecordReservation, StoreError};
 use crate::surface::OutOfMemory;
 use crate::telemetry::shorten;
 
@@ -25,8 +26,15 @@ const RECOVERY_READS: usize = 64;
 
 impl JobStoreState {
     /// Protects input and record of an unfinished job from eviction.
-    pub(super) fn pin(&self, id: &JobId, input: &Digest, space: Namespace) -> Result<[Pin; 2], StoreError> {
-        Ok([self.store.pin(&Name::input(input).within(space)), self.store.pin(&Name::job(id.as_str())?)])
+    pub(super) fn pin(
+        &self,
+        id: &JobId,
+        inputs: impl IntoIterator<Item = Digest>,
+        space: Namespace,
+    ) -> Result<Vec<Pin>, StoreError> {
+        let mut pins = vec![self.store.pin(&Name::job(id.as_str())?)];
+        pins.extend(inputs.into_iter().map(|input| self.store.pin(&Name::input(&input).within(space))));
+        Ok(pins)
     }
 
     /// Admits the record of a new job. At a cap, forgets ended jobs.
@@ -156,13 +164,25 @@ impl JobStore {
         Ok((task, format))
     }
 
-    /// Loads the input of a task, charged to the memory budget before it is read.
+    /// Loads the input of a task and its map, charged to the memory budget before they are read.
     pub(super) async fn load_input(&self, task: &mut Task) -> Result<(), LoadError> {
-        let (name, reservation) =
-            (Name::input(&task.digest).within(task.namespace), self.0.pool.settings().budget.reservation());
-        reservation.grow(self.0.store.head(&name).await?.ok_or(LoadError::Removed)?.size)?;
-        let file = self.0.store.input(&task.digest, task.namespace).await?;
-        task.input = Input::File(file.ok_or(LoadError::Removed)?);
+        let reservation = self.0.pool.settings().budget.reservation();
+        let map: Option<Digest> = match &task.job.map {
+            Some(map) => Some(map.digest().parse().map_err(|_bad: BadDigest| LoadError::Removed)?),
+            None => None,
+        };
+        let load = async |digest: Digest| {
+            let name = Name::input(&digest).within(task.namespace);
+            reservation.grow(self.0.store.head(&name).await?.ok_or(LoadError::Removed)?.size)?;
+            self.0.store.input(&digest, task.namespace).await?.ok_or(LoadError::Removed)
+        };
+        let file = load(task.digest).await?;
+        let loaded = match map {
+            Some(digest) => Some(MapFile::new(digest.to_string(), load(digest).await?)),
+            None => None,
+        };
+        task.job.map = loaded;
+        task.input = Input::File(file);
         task.reservation = Some(Arc::new(reservation));
         Ok(())
     }

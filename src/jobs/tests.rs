@@ -78,7 +78,7 @@ impl Fixture {
     async fn accept_from(&self, client: &str) -> Result<JobView, AcceptError> {
         let parameters = vec![("resolution".to_owned(), "2".to_owned())];
         let (task, file) = (task(client, "2"), Bytes::from_static(SAMPLE));
-        let spec = JobSpec { task, file, parameters, format: Format::Stl, idempotency_key: None };
+        let spec = JobSpec { task, file, map: None, parameters, format: Format::Stl, idempotency_key: None };
         self.jobs.accept(spec, None).await
     }
 
@@ -94,6 +94,7 @@ impl Fixture {
             id: new_id(),
             namespace: Namespace::default(),
             input: digest.to_string(),
+            map: None,
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),
             client: 1,

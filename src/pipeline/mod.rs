@@ -13,6 +13,7 @@ mod fit;
 mod host_cores;
 pub mod integer;
 mod left_out;
+mod map_file;
 pub mod nearest;
 pub mod params;
 mod parts;
@@ -27,12 +28,13 @@ use thiserror::Error;
 
 pub use auto::AutoBackend;
 pub use clock::{ProgressSink, StageClock};
-pub use color::{AtomColors, ColorError, ColorReport, Coloring};
+pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
 #[cfg(feature = "png")]
 pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::File;
 pub use left_out::{KindCount, LeftOutReport, ResidueCount};
+pub use map_file::MapFile;
 pub use parts::PartReport;
 pub use progress::Tracker;
 pub use report::{AssemblyReport, ComponentReport, PictureReport, Quantization, Report, VoidReport, maker};
@@ -41,6 +43,7 @@ pub use work::{estimate_atoms, estimate_work, mesh_work};
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureLimits, PictureParams};
+use crate::structure::map::{MapError, MapLimits};
 use crate::structure::{self, ReadLimits, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits,
@@ -74,16 +77,25 @@ pub struct Job {
     pub units: Units,
     /// Colours of the vertices; `None` for a mesh without colours.
     pub color: Option<Coloring>,
+    /// Map whose values colour the vertices, for [`Scheme::needs_map`] only.
+    pub map: Option<MapFile>,
     /// Parameters of a picture of the mesh; `None` for a mesh file.
     pub picture: Option<PictureParams>,
 }
 
 impl Job {
-    /// Checks the size of the picture before any other work.
+    /// Checks the size of the picture, and that there is a map if and only if the colours need one, before any other
+    /// work.
     ///
     /// # Errors
-    /// Returns [`JobError::Picture`] if it exceeds the limits.
+    /// Returns [`JobError::Picture`] if the picture exceeds the limits, and [`JobError::Color`].
     pub fn check(&self, limits: &JobLimits) -> Result<(), JobError> {
+        let scheme = self.color.map(|color| color.scheme);
+        match (scheme.filter(|scheme| scheme.needs_map()), &self.map) {
+            (Some(scheme), None) => return Err(ColorError::without_map(scheme).into()),
+            (None, Some(_)) => return Err(ColorError::unused_map(scheme).into()),
+            _ => {}
+        }
         self.picture.map_or(Ok(()), |picture| picture.check(limits.picture)).map_err(JobError::Picture)
     }
 
@@ -127,6 +139,8 @@ pub struct JobLimits {
     pub surface: SurfaceLimits,
     /// Limits of drawing.
     pub picture: PictureLimits,
+    /// Limits of reading a map.
+    pub map: MapLimits,
     /// Size of a mesh file in bytes that the service sends or stores. A run does not check it, because a mesh can be
     /// written in several formats. The spacing that an error suggests respects it for binary files of the size of the
     /// mesh in memory, such as GLB.
@@ -136,7 +150,7 @@ pub struct JobLimits {
 impl Default for JobLimits {
     fn default() -> Self {
         let (read, surface, picture) = <(ReadLimits, SurfaceLimits, PictureLimits)>::default();
-        Self { read, surface, picture, max_file_bytes: u64::MAX }
+        Self { read, surface, picture, map: MapLimits::default(), max_file_bytes: u64::MAX }
     }
 }
 
@@ -185,9 +199,12 @@ pub enum JobError {
     /// Drawing failed.
     #[error(transparent)]
     Picture(PictureError),
-    /// The structure lacks the values of the colour scheme.
+    /// The structure or the map lacks the values of the colour scheme.
     #[error(transparent)]
     Color(#[from] ColorError),
+    /// Reading the map failed.
+    #[error(transparent)]
+    Map(MapError),
 }
 
 impl From<StructureError> for JobError {
@@ -197,6 +214,16 @@ impl From<StructureError> for JobError {
             StructureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
             StructureError::Memory(error) => Self::Surface(error.into()),
             error => Self::Structure(error),
+        }
+    }
+}
+
+impl From<MapError> for JobError {
+    fn from(error: MapError) -> Self {
+        match error {
+            MapError::Cancelled => Self::Surface(SurfaceError::Cancelled),
+            MapError::Memory(error) => Self::Surface(error.into()),
+            error => Self::Map(error),
         }
     }
 }
@@ -250,8 +277,10 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let clock = StageClock::new(progress);
     let control = Control { observer: &clock, ..control.clone() };
     let (structure, selected, spheres) = load(read, job, &limits.read, &clock, &control)?;
-    let colors =
-        job.color.map(|coloring| MeshColors::new(&structure, &selected.atoms, coloring, &control)).transpose()?;
+    let read_map = |file: &MapFile| clock.time("read", || file.read(&limits.map, &control));
+    let map = job.map.as_ref().map(read_map).transpose()?;
+    let prepare = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, map, &control);
+    let colors = job.color.map(prepare).transpose()?;
     let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
     let backend = parts::divided(choice.backend, parts.as_deref());
     let choice = &Choice { backend: &*backend, reason: choice.reason };

@@ -190,7 +190,7 @@ impl From<SurfaceError> for ParamError {
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that the compiler requires every new field here.
-    let Job { selection, params, split, spacing, validation, compress, normals, units, color, picture } = job;
+    let Job { selection, params, split, spacing, validation, compress, normals, units, color, map, picture } = job;
     let Selection { model, chains, atoms, altloc, assembly } = selection;
     let SurfaceParams {
         surface,
@@ -238,6 +238,10 @@ pub fn canonical(job: &Job) -> String {
     if let Some(color) = color {
         text.push('&');
         text.push_str(&color.canonical());
+    }
+    if let Some(map) = map {
+        text.push_str("&map=");
+        text.push_str(map.digest());
     }
     if let Some(picture) = picture {
         text.push('&');

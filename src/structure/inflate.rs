@@ -7,8 +7,8 @@ use std::borrow::Cow;
 use std::io::{self, Read};
 
 use super::error::StructureError;
-use super::read::Reading;
-use crate::surface::{MemoryMeter as _, OutOfMemory};
+use super::read::{ReadLimits, Reading};
+use crate::surface::{Control, MemoryMeter as _, OutOfMemory, Reservation};
 
 const GZIP: &[u8] = b"\x1f\x8b";
 const ZSTD: &[u8] = b"\x28\xb5\x2f\xfd";
@@ -45,6 +45,30 @@ pub(super) fn inflate<'a>(
         Some(_) => zstd(bytes, limit, reading, check)?,
     };
     Ok(Cow::Owned(plain))
+}
+
+/// Decompressed bytes with the memory that they are charged to.
+pub(super) struct Inflated<'a> {
+    bytes: Cow<'a, [u8]>,
+    _memory: Reservation,
+}
+
+impl Inflated<'_> {
+    pub(super) fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+/// Decompresses a file as [`inflate`] does, without checks on the way.
+pub(super) fn inflate_once<'a>(
+    bytes: &'a [u8],
+    limit: u64,
+    control: &Control<'_>,
+) -> Result<Inflated<'a>, StructureError> {
+    let limits = ReadLimits::default();
+    let reading = Reading::new(&limits, control);
+    let bytes = inflate(bytes, limit, &reading, &|_| Ok(()))?;
+    Ok(Inflated { bytes, _memory: reading.text })
 }
 
 fn gzip(

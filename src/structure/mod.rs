@@ -27,6 +27,7 @@ mod growing;
 mod inflate;
 mod kind_set;
 mod kinds;
+pub mod map;
 mod mmcif;
 mod number;
 mod pdb;

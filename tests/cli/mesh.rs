@@ -444,3 +444,36 @@ fn the_table_of_atoms_and_the_mesh_are_written_together() {
     assert_eq!(json(&stdout(&report))["atom_table"]["format"], "csv");
     assert_eq!(files(), 3);
 }
+
+#[test]
+fn a_map_colours_the_mesh() {
+    let folder = Folder::new();
+    let sample = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb"));
+    let [map, bad, output] = ["map.dx", "bad.dx", "out.ply"].map(|name| folder.path(name));
+    let mut text = "object 1 class gridpositions counts 2 2 2\norigin -50 -50 -50\n".to_owned();
+    text += "delta 120 0 0\ndelta 0 120 0\ndelta 0 0 120\n";
+    text += "object 3 class array type double rank 0 items 8 data follows\n-1 -1 -1 -1\n1 1 1 1\n";
+    fs::write(&map, &text).unwrap();
+    fs::write(&bad, text.replace("\n1 1 1 1\n", "\n1 1 x 1\n")).unwrap();
+    let [map, bad] = [map.to_str().unwrap(), bad.to_str().unwrap()];
+    let with = |flags: &[&str]| mesh(sample, &output, &[&["--resolution", "1.5", "--report", "json"], flags].concat());
+    let done = with(&["--color", "map", "--map", map, "--color-offset", "0.5"]);
+    assert_code(&done, 0);
+    let color = &json(&stdout(&done))["color"];
+    assert_eq!((&color["map"]["format"], &color["map"]["offset"]), (&"dx".into(), &0.5.into()));
+    assert_eq!((&color["map"]["vertices_outside"], &color["palette"]), (&0.into(), &"red-white-blue".into()));
+    let header = fs::read(&output).unwrap();
+    assert!(String::from_utf8_lossy(&header[..1000]).contains("property uchar red"));
+    for (flags, code, words) in [
+        (&["--color", "map"][..], 2, "`--color map` needs `--map FILE`"),
+        (&["--color", "chain", "--map", map], 2, "`--map` needs `--color map`"),
+        (&["--color", "map", "--map", bad], 4, "bad.dx: the map cannot be read: line 8: found `x`"),
+        (&["--color", "map", "--map", map, "--max-map-points", "7"], 5, "--max-map-points"),
+        (&["--color", "map", "--map", "none.dx"], 3, "cannot read none.dx"),
+        (&["--color-offset", "2"], 2, "no value without color=map"),
+    ] {
+        let done = with(flags);
+        assert_code(&done, code);
+        assert!(stderr(&done).contains(words), "{flags:?}: {}", stderr(&done));
+    }
+}

@@ -19,6 +19,7 @@ mod formats_storage;
 mod language;
 mod links;
 mod make_test;
+mod maps;
 mod peers;
 mod picture;
 mod real_structures;

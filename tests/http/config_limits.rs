@@ -40,6 +40,7 @@ const ROWS: &[Row] = &[
     ("limits.duplicate_atoms", "too-many-duplicates", "http/limits::atoms_at_one_position_are_limited"),
     ("limits.assembly_copies", "too-many-copies", "http/limits::assemblies_are_limited"),
     ("limits.mesh_parts", "too-many-parts", "http/limits::parts_of_meshes_are_limited"),
+    ("limits.map_points", "map-too-large", "http/maps::maps_are_limited"),
     ("limits.labels", "too-many-atoms", "http/limits::listed_atoms_are_limited"),
     ("limits.grid_points", "grid-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
     (

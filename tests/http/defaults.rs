@@ -144,6 +144,7 @@ fn a_default_is_valid_with_every_parameter() {
         &[("color", "chain")],
         &[("color", "bfactor"), ("palette", "blue-white-red"), ("color_range", "0,50")],
         &[("color", "chain"), ("color_blend", "smooth")],
+        &[("color", "map"), ("color_offset", "2")],
         &[("model", "1")],
         &[("chains", "A")],
         &[("select", "ligand")],

@@ -35,6 +35,7 @@ mod jobs;
 mod jobs_durable;
 mod lifecycle;
 mod limits;
+mod maps;
 mod namespaces;
 mod openapi;
 mod openapi_clients;

@@ -1,6 +1,7 @@
 //! Targets: plain functions over bytes that panic if a property is violated.
 
 mod http;
+mod map;
 mod structure;
 mod text;
 
@@ -15,6 +16,7 @@ pub(crate) const TARGETS: &[Target] = &[
     Target { name: "binarycif", run: structure::mesh, max_memory: 64 << 20, words: || owned(structure::BINARYCIF) },
     Target { name: "pqr", run: structure::mesh, max_memory: 64 << 20, words: || owned(structure::PQR) },
     Target { name: "xyz", run: structure::mesh, max_memory: 64 << 20, words: || owned(structure::XYZ) },
+    Target { name: "map", run: map::sample, max_memory: 16 << 20, words: || owned(map::WORDS) },
     Target {
         name: "parameters",
         run: text::parameters,

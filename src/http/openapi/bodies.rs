@@ -11,8 +11,8 @@ use utoipa::{PartialSchema, ToSchema};
 
 /// Description of a body with a structure to mesh.
 pub(in crate::http) const STRUCTURE_TO_MESH: &str = "A structure file. The server detects the format from the content. \
-Two other bodies are accepted: a form with the file and parameters (component `StructureUpload`), and JSON that names a \
-structure on the server (component `StructureByName`).";
+Two other bodies are accepted: a form with the file, parameters and perhaps a map (component `StructureUpload`), and \
+JSON that names a structure on the server (component `StructureByName`).";
 
 /// Description of the same body for other operations.
 pub(in crate::http) const AS_FOR_MESHES: &str = "The same bodies as for `POST /v1/meshes`.";
@@ -58,9 +58,13 @@ impl ToSchema for StructureForm {}
 
 impl PartialSchema for StructureForm {
     fn schema() -> RefOr<Schema> {
+        let doc = "Form with a structure file, and a map for `color=map`. The other fields are parameters, as in the \
+                   query.";
+        let map = "A CCP4, MRC or OpenDX map for `color=map`, uncompressed or compressed with gzip or zstd.";
         let form = ObjectBuilder::new()
-            .description(Some("Form with a structure file. The other fields are parameters, as in the query."))
+            .description(Some(doc))
             .property("file", binary("The structure file."))
+            .property("map", binary(map))
             .required("file")
             .additional_properties(Some(AdditionalProperties::FreeForm(true)));
         RefOr::T(form.build().into())

@@ -54,6 +54,8 @@ pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::ShuttingDown,
     Kind::Deadline,
 ];
+/// Problems of reading a map that is sent beside the structure.
+pub(in crate::http) const MAP: &[Kind] = &[Kind::UnreadableMap, Kind::MapTooLarge];
 /// Problems of submitting a job.
 pub(in crate::http) const SUBMITTING: &[Kind] = &[
     Kind::OtherRequest,

@@ -78,6 +78,7 @@ impl Fixture {
     fn accept(&self) -> Client<'_> {
         let spec = JobSpec {
             task: task(1, true),
+            map: None,
             file: Bytes::from(vec![1]),
             parameters: Vec::new(),
             format: Format::Glb,

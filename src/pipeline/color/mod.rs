@@ -2,6 +2,7 @@
 //! sphere is nearest to it.
 
 mod blend;
+mod of_map;
 mod of_mesh;
 mod palette;
 mod scheme;
@@ -45,6 +46,8 @@ pub struct Coloring {
     pub range: Option<[f64; 2]>,
     /// Transition between the colours of neighbouring vertices.
     pub blend: ColorBlend,
+    /// Distance from the surface, along the normal of a vertex, at which a map is sampled, Å.
+    pub offset: f64,
 }
 
 impl Coloring {
@@ -53,7 +56,8 @@ impl Coloring {
     pub fn canonical(&self) -> String {
         let palette = self.palette.or(self.scheme.palette()).map_or("", Palette::name);
         let blend = self.blend.name();
-        format!("color={}&palette={palette}&color_range={:?}&color_blend={blend}", self.scheme, self.range)
+        let offset = if self.scheme.needs_map() { format!("&color_offset={}", self.offset) } else { String::new() };
+        format!("color={}&palette={palette}&color_range={:?}&color_blend={blend}{offset}", self.scheme, self.range)
     }
 }
 
@@ -86,8 +90,25 @@ pub struct ColorReport {
     /// schemes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub source: Option<&'static str>,
+    /// Map of the scheme `map`; absent for other schemes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub map: Option<MapReport>,
     /// Colours of five equidistant values, or of the categories that occur, at most 100.
     pub legend: Vec<LegendEntry>,
+}
+
+/// Map whose values colour a mesh.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct MapReport {
+    /// File format: `ccp4` (also MRC) or `dx`.
+    pub format: &'static str,
+    /// Number of points along each axis of the file.
+    pub size: [usize; 3],
+    /// Distance from the surface at which the map was sampled in Å.
+    pub offset: f64,
+    /// Vertices that are grey, because the map has no value there.
+    pub vertices_outside: u64,
 }
 
 /// The structure lacks the values of a scheme.
@@ -98,6 +119,20 @@ pub struct ColorError {
     pub scheme: String,
     /// Reason.
     pub why: String,
+}
+
+impl ColorError {
+    /// Returns the error of a request without a map.
+    pub(super) fn without_map(scheme: Scheme) -> Self {
+        let why = "it needs a map: send one as the part `map` of a form, or use --map on the command line";
+        Self { scheme: scheme.to_string(), why: why.to_owned() }
+    }
+
+    /// Returns the error of a map that no colour needs.
+    pub(super) fn unused_map(scheme: Option<Scheme>) -> Self {
+        let scheme = scheme.map_or_else(|| "none".to_owned(), |scheme| scheme.to_string());
+        Self { scheme, why: "it does not use the map that was sent; set color=map".to_owned() }
+    }
 }
 
 /// Colours of the atoms of a structure.
@@ -124,7 +159,7 @@ impl<'a> AtomColors<'a> {
     /// # Errors
     /// Returns a [`ColorError`] if the file lacks the values of the scheme, or the scheme is of vertices.
     pub fn new(structure: &'a Structure, selected: &[u32], coloring: &Coloring) -> Result<Self, ColorError> {
-        let Coloring { scheme, palette, range, blend: _ } = *coloring;
+        let Coloring { scheme, palette, range, .. } = *coloring;
         let fail = |why: String| ColorError { scheme: scheme.to_string(), why };
         if matches!(scheme, Scheme::Vertex(_)) {
             return Err(fail("it colours vertices, not atoms".to_owned()));
@@ -213,7 +248,7 @@ impl<'a> AtomColors<'a> {
         let legend = match self.scheme {
             Scheme::Uniform(_) => Vec::new(),
             Scheme::Plddt => PLDDT.iter().map(|(_, label, color)| entry((*label).to_owned(), *color)).collect(),
-            _ if self.scheme.palette().is_some() => stops(self.palette, self.range),
+            _ if self.scheme.palette().is_some() => stops(self.palette, self.range, round),
             _ => self.categories(selected).into_iter().map(|(label, color)| entry(label, color)).collect(),
         };
         let has_numbers = self.scheme.palette().is_some();
@@ -223,6 +258,7 @@ impl<'a> AtomColors<'a> {
             scheme: self.scheme.to_string(),
             blend: None,
             source,
+            map: None,
             palette: has_numbers.then(|| self.palette.name()),
             range: has_numbers.then_some(self.range),
             legend,
@@ -279,8 +315,8 @@ fn scaled(palette: Palette, [low, high]: [f64; 2], value: f64) -> Rgb {
     palette.at(if high > low { (value - low) / (high - low) } else { 0.5 })
 }
 
-/// Returns the legend of a numeric scheme: equidistant values.
-fn stops(palette: Palette, range: [f64; 2]) -> Vec<LegendEntry> {
+/// Returns the legend of a numeric scheme: equidistant values, rounded by `round`.
+fn stops(palette: Palette, range: [f64; 2], round: impl Fn(f64) -> f64) -> Vec<LegendEntry> {
     let [low, high] = range;
     let value = |stop: u32| round(low + (high - low) * f64::from(stop) / f64::from(STOPS - 1));
     (0..STOPS).map(value).map(|value| entry(value.to_string(), scaled(palette, range, value))).collect()

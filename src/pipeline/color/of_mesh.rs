@@ -1,10 +1,13 @@
 //! Colours of the vertices of a mesh: those of the nearest atoms, or of properties of the vertices.
 
 use super::super::JobError;
-use super::vertex::{self, VertexProperty};
-use super::{AtomColors, ColorBlend, ColorReport, Coloring, Palette, Scheme};
+use super::of_map::{significant, symmetric_range};
+use super::tables::OTHER;
+use super::vertex::{self, ValueSource, VertexProperty};
+use super::{AtomColors, ColorBlend, ColorError, ColorReport, Coloring, MapReport, Palette, Scheme};
 use super::{extremes, of_vertices, round, scaled, stops};
 use crate::structure::Structure;
+use crate::structure::map::Map;
 use crate::surface::{Control, Mesh, SurfaceError};
 
 /// Memory of a colour, bytes.
@@ -19,23 +22,31 @@ pub(in super::super) struct MeshColors {
 enum ColorSource {
     /// Colour of each sphere, and the finished report.
     Atoms { of_spheres: Vec<[u8; 4]>, report: ColorReport },
-    /// Property of a vertex, and the centroid of the atoms.
-    Vertices { property: VertexProperty, centroid: [f64; 3] },
+    /// Values of the vertices.
+    Vertices(ValueSource),
 }
 
 impl MeshColors {
-    /// Prepares the colours of the `selected` atoms.
+    /// Prepares the colours of the `selected` atoms. `map` is that of the scheme `map`.
     ///
     /// # Errors
-    /// Returns [`JobError::Color`] if the file lacks the values of the scheme, and the errors of memory.
+    /// Returns [`JobError::Color`] if the values of the scheme are missing, and the errors of memory.
     pub(in super::super) fn new(
         structure: &Structure,
         selected: &[u32],
         coloring: Coloring,
+        map: Option<Map>,
         control: &Control<'_>,
     ) -> Result<Self, JobError> {
         let source = if let Scheme::Vertex(property) = coloring.scheme {
-            ColorSource::Vertices { property, centroid: centroid(structure, selected) }
+            ColorSource::Vertices(match property {
+                VertexProperty::Curvature => ValueSource::Curvature,
+                VertexProperty::Radial => ValueSource::Radial(centroid(structure, selected)),
+                VertexProperty::Map => {
+                    let map = map.ok_or_else(|| ColorError::without_map(coloring.scheme))?;
+                    ValueSource::Map(Box::new(map), coloring.offset)
+                }
+            })
         } else {
             control.memory.grow(COLOR_BYTES * selected.len() as u64).map_err(SurfaceError::from)?;
             let colors = AtomColors::new(structure, selected, &coloring)?;
@@ -48,16 +59,16 @@ impl MeshColors {
     /// Sets the colours of the vertices. `resolution` is the grid spacing, Å. Returns the report.
     ///
     /// # Errors
-    /// Returns the errors of memory and cancellation.
+    /// Returns [`JobError::Color`] if the map has no value at any vertex, and the errors of memory and cancellation.
     pub(in super::super) fn apply(
         self,
         mesh: &mut Mesh,
         resolution: f64,
         control: &Control<'_>,
-    ) -> Result<ColorReport, SurfaceError> {
+    ) -> Result<ColorReport, JobError> {
         control.check()?;
-        control.memory.grow(COLOR_BYTES * mesh.n_vertices() as u64)?;
-        let Coloring { scheme, palette, range, blend } = self.coloring;
+        control.memory.grow(COLOR_BYTES * mesh.n_vertices() as u64).map_err(SurfaceError::from)?;
+        let Coloring { scheme, palette, range, blend, .. } = self.coloring;
         if matches!(scheme, Scheme::Vertex(_)) || blend == ColorBlend::Smooth {
             mesh.make_geometry_contiguous();
         }
@@ -65,14 +76,26 @@ impl MeshColors {
             ColorSource::Atoms { of_spheres, report } => {
                 (mesh.atom_ids.as_deref().map(|ids| of_vertices(ids, |id| of_spheres[id as usize])), report)
             }
-            ColorSource::Vertices { property, centroid } => {
-                let values = vertex::values(mesh, property, centroid, control)?;
+            ColorSource::Vertices(source) => {
+                let values = vertex::values(mesh, &source, control)?;
                 let palette = palette.or(scheme.palette()).unwrap_or(Palette::Viridis);
-                let of_values = || extremes(values.iter().copied()).map(round);
-                let range = range.or(scheme.range()).unwrap_or_else(of_values);
+                let (of_values, map) = match &source {
+                    ValueSource::Map(map, offset) => {
+                        let of_values = symmetric_range(&values).ok_or_else(|| outside(scheme, map, *offset))?;
+                        (of_values, Some(report_of_map(map, *offset, &values)))
+                    }
+                    _ => (extremes(values.iter().copied()).map(round), None),
+                };
+                let range = range.or(scheme.range()).unwrap_or(of_values);
                 let color = |value: f32| {
-                    let [_, r, g, b] = scaled(palette, range, f64::from(value)).to_be_bytes();
+                    let color = if value.is_nan() { OTHER } else { scaled(palette, range, f64::from(value)) };
+                    let [_, r, g, b] = color.to_be_bytes();
                     [r, g, b, u8::MAX]
+                };
+                // Values of a map may have any scale.
+                let legend = match map {
+                    Some(_) => stops(palette, range, |value| significant(value, 5)),
+                    None => stops(palette, range, round),
                 };
                 let report = ColorReport {
                     scheme: scheme.to_string(),
@@ -80,7 +103,8 @@ impl MeshColors {
                     range: Some(range),
                     blend: None,
                     source: None,
-                    legend: stops(palette, range),
+                    map,
+                    legend,
                 };
                 (Some(of_vertices(&values, color)), report)
             }
@@ -92,6 +116,20 @@ impl MeshColors {
         mesh.colors = colors;
         Ok(report)
     }
+}
+
+/// Describes a map and counts the vertices without a value.
+fn report_of_map(map: &Map, offset: f64, values: &[f32]) -> MapReport {
+    let vertices_outside = values.iter().filter(|value| value.is_nan()).count() as u64;
+    MapReport { format: map.format().name(), size: map.size(), offset, vertices_outside }
+}
+
+/// Returns the error of a mesh that lies outside the map.
+fn outside(scheme: Scheme, map: &Map, offset: f64) -> ColorError {
+    let [low, high] = map.bounds().map(|end| end.map(|v| format!("{v:.1}")).join(", "));
+    let why =
+        format!("the map has no value {offset} Å from the surface anywhere; it extends from ({low}) to ({high}) Å");
+    ColorError { scheme: scheme.to_string(), why }
 }
 
 /// Returns the mean position of the `selected` atoms, Å.

@@ -9,7 +9,7 @@ use super::vertex::VertexProperty;
 /// Description of the valid values of the parameter `color`.
 pub const EXPECTED: &str = "none, uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, \
                             occupancy, plddt, hydrophobicity, hydrophobicity:wimley-white, charge, curvature, \
-                            radial";
+                            radial, map";
 
 /// Hydrophobicity scale.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,7 +50,7 @@ pub enum Scheme {
 }
 
 /// Schemes by name, except [`Scheme::Uniform`].
-const NAMED: [(&str, Scheme); 13] = [
+const NAMED: [(&str, Scheme); 14] = [
     ("element", Scheme::Element),
     ("chain", Scheme::Chain),
     ("entity", Scheme::Entity),
@@ -64,6 +64,7 @@ const NAMED: [(&str, Scheme); 13] = [
     ("charge", Scheme::Charge),
     ("curvature", Scheme::Vertex(VertexProperty::Curvature)),
     ("radial", Scheme::Vertex(VertexProperty::Radial)),
+    ("map", Scheme::Vertex(VertexProperty::Map)),
 ];
 
 impl Scheme {
@@ -73,13 +74,19 @@ impl Scheme {
         named.map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
     }
 
+    /// Returns true if the scheme needs a map beside the structure.
+    #[must_use]
+    pub const fn needs_map(self) -> bool {
+        matches!(self, Self::Vertex(VertexProperty::Map))
+    }
+
     /// Returns the default palette of a numeric scheme; `None` for other schemes.
     #[must_use]
     pub const fn palette(self) -> Option<Palette> {
         match self {
             Self::BFactor | Self::Occupancy | Self::Vertex(VertexProperty::Radial) => Some(Palette::Viridis),
             Self::Hydrophobicity(_) | Self::Vertex(VertexProperty::Curvature) => Some(Palette::BlueWhiteRed),
-            Self::Charge => Some(Palette::RedWhiteBlue),
+            Self::Charge | Self::Vertex(VertexProperty::Map) => Some(Palette::RedWhiteBlue),
             _ => None,
         }
     }

@@ -2,7 +2,9 @@
 //!
 //! Both are computed on the host from the finished mesh, so that every backend gives the same ones.
 
+use super::of_map;
 use crate::formats::linear_of_srgb;
+use crate::structure::map::Map;
 use crate::surface::{Column, Control, Mesh, SurfaceError, Vertices};
 
 /// Memory of a value and its sums while values are computed, bytes per vertex.
@@ -22,40 +24,56 @@ pub enum VertexProperty {
     Curvature,
     /// Distance from the centroid of the meshed atoms, Å.
     Radial,
+    /// Value of the map that is sent beside the structure, near the vertex.
+    Map,
 }
 
-/// Returns the property of each vertex. `centroid` is that of the meshed atoms.
-pub(in super::super) fn values(
-    mesh: &Mesh,
-    property: VertexProperty,
-    centroid: [f64; 3],
-    control: &Control<'_>,
-) -> Result<Vec<f32>, SurfaceError> {
+/// Source of the values of the vertices.
+pub(super) enum ValueSource {
+    Curvature,
+    /// Distance from this centroid of the meshed atoms.
+    Radial([f64; 3]),
+    /// Map, sampled at this distance from the surface, Å.
+    Map(Box<Map>, f64),
+}
+
+/// Returns the value of each vertex; NaN for those without one.
+pub(super) fn values(mesh: &Mesh, source: &ValueSource, control: &Control<'_>) -> Result<Vec<f32>, SurfaceError> {
     control.check()?;
     let _memory = control.reserve(VALUE_BYTES * mesh.n_vertices() as u64)?;
-    Ok(match property {
-        VertexProperty::Curvature => curvatures(mesh),
-        VertexProperty::Radial => {
+    Ok(match source {
+        ValueSource::Curvature => curvatures(mesh),
+        ValueSource::Radial(centroid) => {
             let origin: [f64; 3] = std::array::from_fn(|k| mesh.centre[k] - centroid[k]);
             let distance = |i| length(std::array::from_fn(|k| origin[k] + f64::from(mesh.position(i)[k])));
             (0..mesh.n_vertices()).map(|i| single(distance(i))).collect()
         }
+        ValueSource::Map(map, offset) => of_map::values(mesh, map, *offset, control)?,
     })
+}
+
+/// Returns the normal of a vertex, of length 1 unless it is 0.
+pub(super) fn unit_normal(mesh: &Mesh, i: usize) -> [f64; 3] {
+    let normal = normal(mesh, i);
+    let length = length(normal);
+    if length > 0.0 { normal.map(|v| v / length) } else { normal }
+}
+
+/// Returns the normal of a vertex as it is stored.
+fn normal(mesh: &Mesh, i: usize) -> [f64; 3] {
+    match mesh.vertices() {
+        Vertices::Single { normals, .. } => normals[i].map(f64::from),
+        Vertices::Quantized { normals, .. } => {
+            let [x, y, z, _] = normals[i];
+            [x, y, z].map(|v| f64::from(v) / 127.0)
+        }
+    }
 }
 
 /// Returns the mean curvature of each vertex: half the divergence of the normals, averaged over the area of its
 /// triangles. The normals are those of the exact surface and interpolated linearly in a triangle, so that thin
 /// triangles have little weight.
 fn curvatures(mesh: &Mesh) -> Vec<f32> {
-    let normal = |i: u32| -> [f64; 3] {
-        match mesh.vertices() {
-            Vertices::Single { normals, .. } => normals[i as usize].map(f64::from),
-            Vertices::Quantized { normals, .. } => {
-                let [x, y, z, _] = normals[i as usize];
-                [x, y, z].map(|v| f64::from(v) / 127.0)
-            }
-        }
-    };
     // Sums of area and of divergence times area.
     let mut sums = vec![[0.0; 2]; mesh.n_vertices()];
     for triangle in &mesh.triangles[..] {
@@ -70,7 +88,7 @@ fn curvatures(mesh: &Mesh) -> Vec<f32> {
         // The gradient of the weight of a corner is the cross product of the unit normal and the opposite edge, divided
         // by twice the area.
         let divergence: f64 =
-            (0..3).map(|k| dot(normal(triangle[k]), cross(unit, edge((k + 1) % 3, (k + 2) % 3)))).sum();
+            (0..3).map(|k| dot(normal(mesh, triangle[k] as usize), cross(unit, edge((k + 1) % 3, (k + 2) % 3)))).sum();
         for i in triangle {
             let [area, total] = &mut sums[*i as usize];
             *area += twice_area;
@@ -135,7 +153,7 @@ fn nearest_srgb(linear: &[u16; 256], level: u16) -> u8 {
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "values of vertices are single precision")]
-fn single(value: f64) -> f32 {
+pub(super) fn single(value: f64) -> f32 {
     value as f32
 }
 
@@ -191,7 +209,7 @@ mod tests {
     fn curvatures_are_those_of_a_torus_and_change_sign_with_its_normals() {
         let (mut mesh, expected) = torus(3.0, 1.5);
         let control = Control::default();
-        let of = |mesh: &Mesh| values(mesh, VertexProperty::Curvature, [0.0; 3], &control).unwrap();
+        let of = |mesh: &Mesh| values(mesh, &ValueSource::Curvature, &control).unwrap();
         let worst = |found: &[f32], sign: f64| {
             let off = found.iter().zip(&expected).map(|(found, expected)| (f64::from(*found) - sign * expected).abs());
             off.fold(0.0, f64::max)
@@ -206,7 +224,7 @@ mod tests {
     #[test]
     fn distances_are_from_the_centroid() {
         let (mesh, _) = torus(3.0, 1.0);
-        let found = values(&mesh, VertexProperty::Radial, [5.0, 0.0, 4.0], &Control::default()).unwrap();
+        let found = values(&mesh, &ValueSource::Radial([5.0, 0.0, 4.0]), &Control::default()).unwrap();
         // The vertex on the outer ring lies 4 Å from the axis and 4 Å below the centroid.
         assert!((f64::from(found[0]) - 32.0_f64.sqrt()).abs() < 1e-5, "{}", found[0]);
     }
@@ -217,7 +235,7 @@ mod tests {
         let (mesh, expected) = torus(3.0, 1.5);
         let mut rounded = mesh.clone();
         assert!(rounded.quantize(Step::covering(5.0)));
-        let found = values(&rounded, VertexProperty::Curvature, [0.0; 3], &Control::default()).unwrap();
+        let found = values(&rounded, &ValueSource::Curvature, &Control::default()).unwrap();
         let mean = |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / expected.len() as f64;
         let off = mean(&mut found.iter().zip(&expected).map(|(found, expected)| f64::from(*found) - expected));
         assert!(off.abs() < 5e-3, "{off}");

@@ -235,18 +235,18 @@ pub const TABLE: &[Parameter] = &[
         name: "color",
         domain: Domain::Text { expected: color::EXPECTED },
         default: "none",
-        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, secondary structure in the file (Jmol), B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7; or by the mean curvature of the surface, or the distance from the centroid of the atoms (radial). STL has no colours.",
+        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, secondary structure in the file (Jmol), B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7; or by the mean curvature of the surface, the distance from the centroid of the atoms (radial), or the values of a map sent beside the structure (map). STL has no colours.",
     },
     Parameter {
         name: "palette",
         domain: Domain::Choice(PALETTES),
-        default: "viridis for bfactor, occupancy and radial, blue-white-red for hydrophobicity and curvature, red-white-blue for charge",
-        doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity, charge, curvature and radial only.",
+        default: "viridis for bfactor, occupancy and radial, blue-white-red for hydrophobicity and curvature, red-white-blue for charge and map",
+        doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity, charge, curvature, radial and map only.",
     },
     Parameter {
         name: "color_range",
         domain: Domain::Text { expected: "two numbers separated by a comma, the lower one first" },
-        default: "the lowest and highest value of the meshed atoms, or of the mesh for radial; −4.5,4.5 or −2.02,2.02 for hydrophobicity, −1,1 for charge, −0.5,0.5 for curvature",
+        default: "the lowest and highest value of the meshed atoms, or of the mesh for radial; symmetric around 0 for map, with the largest absolute value at the mesh; −4.5,4.5 or −2.02,2.02 for hydrophobicity, −1,1 for charge, −0.5,0.5 for curvature",
         doc: "Values at the ends of the palette. Values beyond an end have its colour.",
     },
     Parameter {
@@ -255,6 +255,13 @@ pub const TABLE: &[Parameter] = &[
         default: "nearest",
         doc: "Transition between colours: nearest has sharp borders, smooth averages colours along the surface over about 1 Å.",
     },
+    number(
+        "color_offset",
+        [-10.0, 10.0],
+        "Å",
+        "1.4",
+        "Distance from the surface, outward along its normals, at which the map is sampled; color=map only.",
+    ),
     Parameter {
         name: "model",
         domain: Domain::Text { expected: "the number of a model of the file, or all" },

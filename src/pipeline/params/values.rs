@@ -12,6 +12,9 @@ use crate::pipeline::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::structure::{ModelChoice, Selection, Split};
 use crate::surface::{Preset, SurfaceKind, SurfaceOptions, Validation};
 
+/// Default of `color_offset`: the radius of a water molecule, Å.
+const DEFAULT_COLOR_OFFSET: f64 = 1.4;
+
 /// Value of `model` for all models.
 const ALL_MODELS: &str = "all";
 
@@ -24,13 +27,14 @@ pub(super) struct ParsedValues {
     palette: Option<Palette>,
     color_range: Option<[f64; 2]>,
     color_blend: ColorBlend,
+    color_offset: Option<f64>,
     pub(super) request: Request,
 }
 
 impl ParsedValues {
-    /// Combines `color`, `palette`, `color_range` and `color_blend`.
+    /// Combines `color`, `palette`, `color_range`, `color_blend` and `color_offset`.
     pub(super) fn coloring(&self) -> Result<Option<Coloring>, ParamError> {
-        let Self { scheme, palette, color_range: range, color_blend: blend, .. } = *self;
+        let Self { scheme, palette, color_range: range, color_blend: blend, color_offset, .. } = *self;
         let has_numbers = scheme.is_some_and(|scheme| scheme.palette().is_some());
         let unused = match (palette, range) {
             (Some(palette), _) => Some(("palette", palette.name().to_owned())),
@@ -47,7 +51,12 @@ impl ParsedValues {
             let expected = format!("{} without colours, or a value of color", ColorBlend::Nearest.name());
             return Err(ParamError::BadValue { name: "color_blend", value: format!("`{}`", blend.name()), expected });
         }
-        Ok(scheme.map(|scheme| Coloring { scheme, palette, range, blend }))
+        if let Some(offset) = color_offset.filter(|_| !scheme.is_some_and(Scheme::needs_map)) {
+            let expected = "no value without color=map".to_owned();
+            return Err(ParamError::BadValue { name: "color_offset", value: format!("`{offset}`"), expected });
+        }
+        let offset = color_offset.unwrap_or(DEFAULT_COLOR_OFFSET);
+        Ok(scheme.map(|scheme| Coloring { scheme, palette, range, blend, offset }))
     }
 
     /// Divides the mesh by model if all models are meshed.
@@ -81,9 +90,9 @@ impl ParsedValues {
         // The core checks ranges, because they may depend on the surface.
         let number = || text.trim().parse::<f64>().ok().filter(|v| v.is_finite()).map(Some).ok_or_else(bad);
         let side = || whole(text).and_then(|n| u32::try_from(n).ok()).filter(|n| (1..=MAX_SIDE).contains(n));
-        let angle = || {
+        let bounded = || {
             let Domain::Number { min, max, .. } = parameter.domain else { return None };
-            text.trim().parse::<f64>().ok().filter(|angle| (min..=max).contains(angle))
+            text.trim().parse::<f64>().ok().filter(|value| (min..=max).contains(value)).map(|value| value + 0.0)
         };
         match parameter.name {
             "preset" => self.options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
@@ -112,6 +121,7 @@ impl ParsedValues {
             "color" => self.scheme = Some(text.parse().ok().ok_or_else(bad)?),
             "palette" => self.palette = Some(named(&Palette::ALL, Palette::name, text).ok_or_else(bad)?),
             "color_blend" => self.color_blend = named(&ColorBlend::ALL, ColorBlend::name, text).ok_or_else(bad)?,
+            "color_offset" => self.color_offset = Some(bounded().ok_or_else(bad)?),
             "color_range" => self.color_range = Some(range(text).ok_or_else(bad)?),
             "model" => {
                 self.selection.model = match text.trim() {
@@ -142,8 +152,8 @@ impl ParsedValues {
             "width" => self.picture().width = side().ok_or_else(bad)?,
             "height" => self.picture().height = side().ok_or_else(bad)?,
             "view" => self.picture().view = named(&View::ALL, View::name, text).ok_or_else(bad)?,
-            "azimuth" => self.picture().azimuth = angle().ok_or_else(bad)?,
-            "elevation" => self.picture().elevation = angle().ok_or_else(bad)?,
+            "azimuth" => self.picture().azimuth = bounded().ok_or_else(bad)?,
+            "elevation" => self.picture().elevation = bounded().ok_or_else(bad)?,
             "background" => self.picture().background = text.parse::<Background>().ok().ok_or_else(bad)?,
             "style" => self.picture().style = named(&Style::ALL, Style::name, text).ok_or_else(bad)?,
             _ => return Err(unknown(parameter.name)),
