@@ -1,4 +1,7 @@
-//! `…/atoms`: identity of the atoms of a structure, in columns that are indexed by `_ATOM` of a mesh.
+//! `…/atoms`: identity of the atoms of a structure, in columns that are indexed by `_ATOM` of a mesh, or the atoms of a
+//! mesh with their positions.
+
+use std::collections::HashSet;
 
 use axum::body::Body;
 use axum::extract::State;
@@ -7,21 +10,26 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use super::atom_parameters::{self, Positions};
 use super::guard::Caller;
 use super::kinds::Kind;
 use super::openapi::meshes::NotModified;
-use super::openapi::parameters::{ConditionHeaders, EntryPath, StructurePath};
+use super::openapi::parameters::{AtomParameters, ConditionHeaders, EntryPath, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
+use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
-use crate::structure::{Structure, element};
+use crate::structure::{self, Selected, Structure, element};
 
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
 const BYTES_PER_ATOM: u64 = 24;
+/// Memory charged for the index and the position of an atom, bytes, in addition.
+const BYTES_PER_POSITION: u64 = 72;
 
-/// Atoms of all models in file order. Row `i` describes the atom with index `i` in `_ATOM` of a mesh.
+/// Atoms of all models in file order: row `i` describes the atom with index `i` in `_ATOM` of a mesh. With
+/// `positions=true`, the atoms of a mesh in its order.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct AtomsDocument {
     /// Number of atoms, the length of each column of `atoms`.
@@ -43,6 +51,18 @@ struct AtomColumns {
     name: Vec<u32>,
     /// Index into `elements`.
     element: Vec<u8>,
+    /// Index of the atom in the file, as in `_ATOM`; with `positions=true` only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    index: Option<Vec<u32>>,
+    /// First coordinate in Å, rounded to 0.001 Å; with `positions=true` only, like `y` and `z`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    x: Option<Vec<f64>>,
+    /// Second coordinate in Å.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    y: Option<Vec<f64>>,
+    /// Third coordinate in Å.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    z: Option<Vec<f64>>,
 }
 
 /// Columns with one row per residue.
@@ -69,22 +89,23 @@ problem_responses!(StructureProblems: [
     READING,
     [
         Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed,
-        Kind::TooMuchMemory, Kind::MemoryFull,
+        Kind::EmptySelection, Kind::TooManyCopies, Kind::TooManyCandidates, Kind::TooMuchMemory, Kind::MemoryFull,
         Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
     ],
 ]);
 problem_responses!(EntryProblems: [READING, [
     Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
-    Kind::PreconditionFailed, Kind::TooMuchMemory, Kind::MemoryFull, Kind::QueueFull,
+    Kind::PreconditionFailed, Kind::EmptySelection, Kind::TooManyCopies, Kind::TooManyCandidates,
+    Kind::TooMuchMemory, Kind::MemoryFull, Kind::QueueFull,
     Kind::TooManyDeliveries, Kind::ShareExceeded,
 ]]);
 
 /// List the atoms of a structure
 ///
 /// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
-/// list.
+/// list. With `positions=true`, the list has the atoms of a mesh only, and their positions.
 #[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
-    params(StructurePath, ConditionHeaders),
+    params(StructurePath, AtomParameters, ConditionHeaders),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
             ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
@@ -96,19 +117,18 @@ pub(super) async fn of_structure(
     State(app): State<Shared>,
     caller: Caller,
     source: StructureSource,
+    query: Pairs,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source
-        .document(&app, &caller, &headers, "", async |loaded, delivery| list(&app, &caller, loaded, delivery).await)
-        .await
+    answer(&app, &caller, source, query, &headers).await
 }
 
 /// List the atoms of an archive entry
 ///
 /// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
-/// list.
+/// list. With `positions=true`, the list has the atoms of a mesh only, and their positions.
 #[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
-    params(EntryPath, ConditionHeaders),
+    params(EntryPath, AtomParameters, ConditionHeaders),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
             ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
@@ -120,40 +140,73 @@ pub(super) async fn of_entry(
     State(app): State<Shared>,
     caller: Caller,
     source: StructureSource,
+    query: Pairs,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    source
-        .document(&app, &caller, &headers, "", async |loaded, delivery| list(&app, &caller, loaded, delivery).await)
-        .await
+    answer(&app, &caller, source, query, &headers).await
 }
 
-async fn list(app: &Shared, caller: &Caller, loaded: Loaded, delivery: Delivery) -> Result<Response, Problem> {
-    let text = |structure: &Structure| serde_json::to_vec(&document(structure)).map_err(Problem::internal);
+async fn answer(
+    app: &Shared,
+    caller: &Caller,
+    source: StructureSource,
+    query: Pairs,
+    headers: &HeaderMap,
+) -> Result<Response, Problem> {
+    let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let positions = atom_parameters::parse(&pairs)?;
+    let variant = positions.as_ref().map_or_else(String::new, |positions| positions.canonical.clone());
+    let write = async |loaded, delivery| list(app, caller, loaded, delivery, positions).await;
+    source.document(app, caller, headers, &variant, write).await
+}
+
+async fn list(
+    app: &Shared,
+    caller: &Caller,
+    loaded: Loaded,
+    delivery: Delivery,
+    positions: Option<Positions>,
+) -> Result<Response, Problem> {
+    let bytes_per_atom = if positions.is_some() { 0 } else { BYTES_PER_ATOM };
     let listing =
-        loaded.list_atoms(app, caller, delivery, BYTES_PER_ATOM, move |structure, _, _| Ok((text(structure)?, ())));
+        loaded.list_atoms(app, caller, delivery, bytes_per_atom, move |structure, limits, control, memory| {
+            let select =
+                |Positions { selection, .. }: Positions| structure::select_with(structure, &selection, limits, control);
+            let selected = positions.map(select).transpose()?;
+            if let Some(selected) = &selected {
+                memory.grow((BYTES_PER_ATOM + BYTES_PER_POSITION) * selected.atoms.len() as u64)?;
+            }
+            let text = serde_json::to_vec(&document(structure, selected.as_ref())).map_err(Problem::internal)?;
+            Ok((text, ()))
+        });
     let (text, ()) = listing.await?;
     Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response())
 }
 
-/// Builds the columns.
-fn document(structure: &Structure) -> AtomsDocument {
-    let count = structure.len();
+/// Builds the columns, of the selected atoms with their positions or of all atoms.
+fn document(structure: &Structure, selected: Option<&Selected>) -> AtomsDocument {
+    let count = selected.map_or(structure.len(), |selected| selected.atoms.len());
+    let index = |row: usize| selected.map_or(row, |selected| selected.atoms[row] as usize);
+    let copies: HashSet<usize> =
+        selected.iter().flat_map(|selected| &selected.copies).map(|copy| copy.rows.start).collect();
     let mut elements: Vec<&'static str> = Vec::new();
     // Index of each atomic number in `elements`.
     let mut element_at = [u8::MAX; 1 + element::SYMBOLS.len()];
-    let mut atoms = AtomColumns { name: structure.name.ids().to_vec(), element: Vec::with_capacity(count) };
+    let mut atoms = AtomColumns::default();
     let mut residues = ResidueColumns::default();
-    for i in 0..count {
+    for row in 0..count {
+        let i = index(row);
         let number = usize::from(structure.element[i]);
         if element_at[number] == u8::MAX {
             element_at[number] = u8::try_from(elements.len()).unwrap_or(0);
             elements.push(if number == 0 { "?" } else { element::SYMBOLS[number - 1] });
         }
+        atoms.name.push(structure.name.id(i));
         atoms.element.push(element_at[number]);
-        if i > 0 && same_residue(structure, i - 1, i) {
+        if row > 0 && !copies.contains(&row) && same_residue(structure, index(row - 1), i) {
             continue;
         }
-        residues.first.push(i);
+        residues.first.push(row);
         residues.name.push(structure.residue.get(i).to_owned());
         residues.number.push(structure.residue_number[i]);
         let code = structure.insertion_code[i];
@@ -162,7 +215,25 @@ fn document(structure: &Structure) -> AtomsDocument {
         residues.model.push(structure.model[i]);
         residues.kind.push(structure.kind[i].name());
     }
+    if let Some(selected) = selected {
+        let [x, y, z] = positions(structure, selected);
+        atoms.index = Some(selected.atoms.clone());
+        (atoms.x, atoms.y, atoms.z) = (Some(x), Some(y), Some(z));
+    }
     AtomsDocument { count, names: structure.name.texts().map(str::to_owned).collect(), elements, atoms, residues }
+}
+
+/// Returns the coordinates of the selected atoms, with their copies, in Å, rounded to 0.001 Å.
+fn positions(structure: &Structure, selected: &Selected) -> [Vec<f64>; 3] {
+    let of_file = |row: usize| {
+        let i = selected.atoms[row] as usize;
+        [structure.x[i], structure.y[i], structure.z[i]]
+    };
+    let mut all: Vec<[f64; 3]> = (0..selected.atoms.len()).map(of_file).collect();
+    for copy in &selected.copies {
+        all[copy.rows.clone()].iter_mut().for_each(|place| *place = copy.operator.apply(*place));
+    }
+    [0, 1, 2].map(|axis| all.iter().map(|place| (place[axis] * 1000.0).round() / 1000.0).collect())
 }
 
 fn same_residue(structure: &Structure, a: usize, b: usize) -> bool {
@@ -176,13 +247,13 @@ fn same_residue(structure: &Structure, a: usize, b: usize) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::structure::{self, ReadLimits};
+    use crate::structure::{ReadLimits, Selection};
 
     #[test]
     fn rows_are_those_of_the_file() {
         let text = include_bytes!("../../samples/4pti.pdb");
         let structure = structure::read(text, &ReadLimits::default()).unwrap();
-        let listed = document(&structure);
+        let listed = document(&structure, None);
         let text = std::str::from_utf8(text).unwrap();
         let lines: Vec<&str> = text.lines().filter(|l| l.starts_with("ATOM") || l.starts_with("HETATM")).collect();
         assert_eq!(
@@ -207,5 +278,47 @@ mod tests {
         // The charged memory suffices.
         let bytes = serde_json::to_vec(&listed).unwrap().len() as u64;
         assert!(bytes < BYTES_PER_ATOM * listed.count as u64, "{bytes}");
+    }
+    #[test]
+    fn copies_of_an_assembly_are_listed_with_their_positions() {
+        let packed = include_bytes!("../../tests/structures/1pfe.cif.gz");
+        let structure = structure::read(packed, &ReadLimits::default()).unwrap();
+        let mut selection = Selection { atoms: "ligand".parse().unwrap(), ..Selection::default() };
+        let one = document(&structure, Some(&structure::select(&structure, &selection).unwrap()));
+        selection.assembly = Some("1".to_owned());
+        let two = document(&structure, Some(&structure::select(&structure, &selection).unwrap()));
+        // Two quinoxaline-2-carboxylic acids with 12 atoms each; the assembly has two copies.
+        assert_eq!((one.count, two.count), (24, 48));
+        assert_eq!(
+            (&one.residues.name[..], &one.residues.first[..]),
+            (&["QUI".to_owned(), "QUI".to_owned()][..], &[0, 12][..])
+        );
+        assert_eq!(two.residues.first, [0, 12, 24, 36]);
+        let columns = |listed: &AtomsDocument| {
+            let AtomColumns { index, x, y, z, .. } = &listed.atoms;
+            [x, y, z]
+                .map(|axis| axis.clone().unwrap())
+                .map(|axis| index.clone().unwrap().into_iter().zip(axis).collect::<Vec<_>>())
+        };
+        let ([x, y, z], moved) = (columns(&one), columns(&two));
+        // Operator 2 of the file: -x, -x + y, -z of a hexagonal cell.
+        let (c, s) = (0.5, 0.866_025_403_8);
+        for row in 0..24 {
+            let file = |axis: &[(u32, f64)]| {
+                let (i, value) = axis[row];
+                (i as usize, value)
+            };
+            let (i, x0) = file(&x);
+            let (y0, z0) = (y[row].1, z[row].1);
+            assert!((x0 - structure.x[i]).abs() < 6e-4 && structure.residue.get(i) == "QUI", "{row}");
+            assert_eq!([moved[0][row], moved[1][row], moved[2][row]], [x[row], y[row], z[row]]);
+            let expected = [-c * x0 - s * y0, -s * x0 + c * y0, -z0];
+            for axis in 0..3 {
+                assert!((moved[axis][row + 24].1 - expected[axis]).abs() < 2e-3, "{row}: {expected:?}");
+                assert_eq!(moved[axis][row + 24].0, x[row].0);
+            }
+        }
+        let bytes = serde_json::to_vec(&two).unwrap().len() as u64;
+        assert!(bytes < (BYTES_PER_ATOM + BYTES_PER_POSITION) * two.count as u64 + 1000, "{bytes}");
     }
 }

@@ -22,6 +22,7 @@ use super::problem::Problem;
 use super::range::{self, Wanted};
 use super::source::{self, Loaded, StructureSource};
 use super::state::{Delivery, Shared};
+use crate::jobs::MemoryReservation;
 use crate::pipeline::{AtomColors, ColorError, Coloring, Job, params};
 use crate::structure::{self, ReadLimits, Structure};
 use crate::surface::Control;
@@ -121,7 +122,7 @@ async fn list(
     job: Job,
     coloring: Coloring,
 ) -> Result<(Bytes, HeaderValue), Problem> {
-    let list = move |structure: &Structure, limits: &ReadLimits, control: &Control<'_>| {
+    let list = move |structure: &Structure, limits: &ReadLimits, control: &Control<'_>, _: &MemoryReservation| {
         let selected = structure::select_with(structure, &job.selection, limits, control)?.atoms;
         let colors = AtomColors::new(structure, &selected, &coloring).map_err(not_colorable)?;
         let list: Vec<u8> = (0..structure.len()).flat_map(|i| colors.of(i)).collect();

@@ -34,6 +34,7 @@ mod state;
 mod guard;
 
 // Requests: preferences, bodies, structures, parameters.
+mod atom_parameters;
 mod body_hasher;
 mod color_parameters;
 mod form;

@@ -20,6 +20,8 @@ pub(super) struct OperationScope {
 pub(super) enum Parameters {
     /// Parameters of a mesh.
     Mesh,
+    /// Parameters of the list of atoms.
+    Atoms,
     /// Parameters of the colours of atoms.
     Colors,
     /// `wait`.
@@ -35,6 +37,7 @@ impl OperationScope {
         match self.path {
             "/v1/meshes" | "/v1/report" | "/v1/estimate" => Parameters::Mesh,
             "/v1/jobs/{id}" if self.method == Method::GET => Parameters::Wait,
+            path if path.ends_with("/atoms") => Parameters::Atoms,
             path if path.ends_with("/colors") => Parameters::Colors,
             _ if is_file && !is_result => Parameters::Mesh,
             _ => Parameters::None,

@@ -3,9 +3,9 @@
 use axum::extract::Query;
 use axum::http::{Method, Uri};
 
-use super::color_parameters;
 use super::jobs::{MAX_WAIT_S, Poll};
 use super::scopes::{OperationScope, Parameters, TABLE};
+use super::{atom_parameters, color_parameters};
 use crate::formats::Format;
 use crate::pipeline::params;
 
@@ -62,6 +62,7 @@ fn check_parameters(row: &OperationScope, uri: &Uri) -> Result<(), String> {
     let Query(pairs) = Query::<Vec<(String, String)>>::try_from_uri(uri).map_err(|error| error.body_text())?;
     match row.parameters() {
         Parameters::Mesh => params::parse(pairs).map(drop).map_err(|error| error.to_string()),
+        Parameters::Atoms => atom_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Wait => {
             let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;

@@ -53,14 +53,17 @@ impl Loaded {
     }
 
     /// Reads the structure and lists its atoms by `list`, on a blocking thread. The list counts towards the memory
-    /// budget, with `bytes_per_atom`, until it is sent. `delivery` is released when the work has stopped.
+    /// budget until it is sent: with `bytes_per_atom` of the file, and with what `list` adds to the reservation.
+    /// `delivery` is released when the work has stopped.
     pub(super) async fn list_atoms<T: Send + 'static>(
         self,
         app: &Shared,
         caller: &Caller,
         delivery: Delivery,
         bytes_per_atom: u64,
-        list: impl FnOnce(&Structure, &ReadLimits, &Control<'_>) -> Result<(Vec<u8>, T), Problem> + Send + 'static,
+        list: impl FnOnce(&Structure, &ReadLimits, &Control<'_>, &MemoryReservation) -> Result<(Vec<u8>, T), Problem>
+        + Send
+        + 'static,
     ) -> Result<(Bytes, T), Problem> {
         let mut limits = app.config.limits.job().read;
         limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
@@ -70,7 +73,7 @@ impl Loaded {
         let listing = app.read(caller.client, (file, delivery), move |control| {
             let structure = structures.get(namespace, digest, &input, &limits, control)?;
             reservation.grow(bytes_per_atom * structure.len() as u64)?;
-            let (bytes, rest) = list(&structure, &limits, control)?;
+            let (bytes, rest) = list(&structure, &limits, control, &reservation)?;
             Ok((reservation.attach(bytes), rest))
         });
         listing.await?

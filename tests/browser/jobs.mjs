@@ -69,13 +69,23 @@ await run({
       }), [`${SERVICE_URL}/v1/pdb/1crn/surface.glb?resolution=${resolution}`, event]);
     assert.equal((await load("0.17", "molmesh-load")).report?.resolution, 0.17);
     assert.ok(other.requests.some((line) => line.includes("/v1/jobs/") && line.endsWith("/result")), `${other.requests}`);
+    // The job appears to run until it is cancelled, however soon it ends.
+    const running = { status: "running", fraction: 0.4, stage: "field", problem: null };
+    await other.route("**/events", (route) => route.fulfill({ contentType: "text/event-stream", body: `id: 1\nevent: running\ndata: ${JSON.stringify(running)}\n\n` }));
+    await other.route(/\/v1\/jobs\/[0-9a-f]+\?wait=/, (route) => route.fulfill({ json: running }));
     assert.equal((await load("0.1", "molmesh-progress")).message, undefined);
-    await other.evaluate(() => document.querySelector("molmesh-viewer").remove());
     const id = other.requests.map((line) => /jobs\/([0-9a-f]+)/.exec(line)?.[1]).filter(Boolean).at(-1);
-    const state = await fetchBytes(`/v1/jobs/${id}?wait=55`);
-    assert.equal(JSON.parse(state.bytes).status, "dismissed");
-    // The browser logs the aborted event stream.
-    assert.deepEqual(other.errors.filter((line) => !/ERR_ABORTED/.test(line)), []);
+    const isCancellation = (request) => request.method() === "DELETE" && request.url() === `${SERVICE_URL}/v1/jobs/${id}`;
+    // The removal alone cancels the job.
+    assert.ok(!other.requests.includes(`DELETE ${SERVICE_URL}/v1/jobs/${id}`), `${other.requests}`);
+    const answered = other.waitForResponse((reply) => isCancellation(reply.request()));
+    await other.evaluate(() => document.querySelector("molmesh-viewer").remove());
+    const answer = (await answered).status();
+    const state = JSON.parse((await fetchBytes(`/v1/jobs/${id}?wait=55`)).bytes).status;
+    // A job that has ended cannot be cancelled.
+    assert.deepEqual([answer, state], answer === 409 ? [409, "successful"] : [200, "dismissed"]);
+    // The browser logs the aborted event stream and a cancellation that came too late.
+    assert.deepEqual(other.errors.filter((line) => !/ERR_ABORTED|409 \(Conflict\)/.test(line)), []);
     await other.context().close();
   },
 

@@ -2,7 +2,7 @@
 import http from "node:http";
 import { readFileSync } from "node:fs";
 import path from "node:path";
-import { assert, browser, fetchBytes, glb, inverted, open, run, MODULES, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
+import { assert, browser, fetchBytes, glb, inverted, open, run, MODULES, ROOT, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
 
 const PAGE = `<!doctype html><html lang="en"><meta charset="utf-8"><title>variants</title>
 <script type="importmap">{ "imports": { "three": "/three/build/three.module.js" } }</script>
@@ -13,19 +13,30 @@ import * as THREE from "three";
 import { GLTFLoader } from "/three/examples/jsm/loaders/GLTFLoader.js";
 window.load = async (url) => {
   const { scene } = await new GLTFLoader().loadAsync(url);
-  let mesh;
-  scene.traverse((object) => (mesh ??= object.isMesh ? object : undefined));
+  const meshes = [];
+  scene.traverse((object) => object.isMesh && meshes.push(object));
   scene.updateMatrixWorld(true);
   const size = new THREE.Box3().setFromObject(scene, true).getSize(new THREE.Vector3()).toArray();
-  const { geometry } = mesh;
   // Volume by the divergence theorem; its sign gives the winding of the triangles.
   const [a, b, c] = [0, 1, 2].map(() => new THREE.Vector3());
-  let volume = 0;
-  for (let i = 0; i < geometry.index.count; i += 3) {
-    [a, b, c].forEach((v, k) => v.fromBufferAttribute(geometry.getAttribute("position"), geometry.index.getX(i + k)).applyMatrix4(mesh.matrixWorld));
-    volume += a.dot(b.cross(c)) / 6;
+  let [volume, triangles] = [0, 0];
+  const [kinds, colors, shades] = [new Set(), new Set(), new Set()];
+  for (const { geometry, matrixWorld, material } of meshes) {
+    triangles += geometry.index.count / 3;
+    kinds.add(Object.keys(geometry.attributes).sort().join());
+    for (let i = 0; i < geometry.index.count; i += 3) {
+      [a, b, c].forEach((v, k) => v.fromBufferAttribute(geometry.getAttribute("position"), geometry.index.getX(i + k)).applyMatrix4(matrixWorld));
+      volume += a.dot(b.cross(c)) / 6;
+    }
+    const color = geometry.getAttribute("color");
+    if (!color) continue;
+    colors.add([color.array.constructor.name, color.normalized, color.itemSize, material.vertexColors].join());
+    for (let i = 0; i < color.count; i += 1) shades.add(new THREE.Color().fromBufferAttribute(color, i).getHexString());
   }
-  return { size, volume, triangles: geometry.index.count / 3, attributes: Object.keys(geometry.attributes).sort(), indexBytes: geometry.index.array.BYTES_PER_ELEMENT };
+  return {
+    size, volume, triangles, kinds: [...kinds], colors: [...colors], shades: [...shades],
+    parts: meshes.map((mesh) => mesh.userData.name ?? mesh.name), indexBytes: meshes[0].geometry.index.array.BYTES_PER_ELEMENT,
+  };
 };
 window.view = (url) => new Promise((resolve, reject) => {
   const viewer = document.querySelector("#viewer");
@@ -57,13 +68,21 @@ for (const compress of values("compress")) for (const normals of values("normals
 for (const units of values("units")) for (const compress of values("compress")) variants.push({ units, compress, resolution: "0.9" });
 // Fine meshes have indices of 32 bits.
 for (const compress of values("compress")) variants.push({ compress, atom_ids: "true", resolution: "0.2" });
+// Colours, of atoms and of vertices, and parts.
+for (const compress of values("compress")) for (const atom_ids of ["false", "true"]) for (const normals of values("normals")) variants.push({ compress, atom_ids, normals, color: "element", resolution: "0.9" });
+for (const compress of values("compress")) for (const color of ["curvature", "chain"]) for (const split of values("split")) variants.push({ compress, color, split, select: "all", resolution: "0.9", atom_ids: "true" });
+for (const compress of values("compress")) variants.push({ compress, color: "element", color_blend: "smooth", split: "chain", normals: "none", assembly: "1", units: "nanometer", resolution: "0.9" });
+// Two chains, ligands and water.
+const complex = await fetchBytes("/v1/structures", { method: "POST", body: readFileSync(path.join(ROOT, "tests/structures/1pfe.cif.gz")) });
+const { digest } = JSON.parse(complex.bytes);
 const close = (a, b, tolerance) => Math.abs(a - b) <= tolerance * Math.abs(b);
 
 await run({
   [`three.js and model-viewer load ${variants.length} variants`]: async () => {
     const indexBytes = new Set();
     for (const variant of variants) {
-      const address = `/v1/pdb/1crn/surface.glb?${new URLSearchParams(variant)}`;
+      const base = variant.color ? `/v1/structures/${digest}` : "/v1/pdb/1crn";
+      const address = `${base}/surface.glb?${new URLSearchParams(variant)}`;
       const { bytes, headers, status } = await fetchBytes(address);
       assert.equal(status, 200, address);
       const { json } = glb(bytes);
@@ -71,8 +90,18 @@ await run({
       const three = await page.evaluate((url) => window.load(url), SERVICE_URL + address);
       assert.equal(three.triangles, Number(headers.get("molmesh-triangles")), address);
       assert.ok(close(three.volume * scale ** 3, Number(headers.get("molmesh-volume")), 2e-3), `${address}: ${three.volume}`);
-      const attributes = ["position", ...(variant.normals === "none" ? [] : ["normal"]), ...(variant.atom_ids === "true" ? ["_atom"] : [])];
-      assert.deepEqual(three.attributes, attributes.sort(), address);
+      const attributes = ["position", ...(variant.normals === "none" ? [] : ["normal"]), ...(variant.atom_ids === "true" ? ["_atom"] : []), ...(variant.color ? ["color"] : [])];
+      assert.deepEqual(three.kinds, [attributes.sort().join()], address);
+      assert.deepEqual(three.colors, variant.color ? ["Uint16Array,true,4,true"] : [], address);
+      const { parts, color } = json.asset.extras;
+      const isDivided = variant.split !== undefined && variant.split !== "none";
+      assert.equal(three.parts.length > 1, isDivided, address);
+      if (isDivided) assert.deepEqual(three.parts, parts.filter(({ triangles }) => triangles > 0).map(({ name }) => name), address);
+      // The colours are those of the legend, in sRGB.
+      if (color && !color.range && !color.blend) {
+        const legend = color.legend.map((entry) => entry.color.slice(1));
+        assert.ok(three.shades.length > 1 && three.shades.every((shade) => legend.includes(shade)), `${address}: ${three.shades} ${legend}`);
+      }
       indexBytes.add(three.indexBytes);
       const viewed = await page.evaluate((url) => window.view(url), SERVICE_URL + address);
       viewed.forEach((side, i) => assert.ok(close(side, three.size[i], 1e-2), `${address}: ${viewed} ${three.size}`));

@@ -62,6 +62,11 @@ fn surfaces_are_coloured_and_recoloured() {
 }
 
 #[test]
+fn display_follows_its_controls_and_its_address() {
+    drive("display.mjs", &[], &[]);
+}
+
+#[test]
 fn failed_request_keeps_the_previous_surface() {
     drive("previous.mjs", &[], &[]);
 }
@@ -73,7 +78,7 @@ fn component_polls_jobs_and_shows_its_fallback() {
 
 #[test]
 fn page_polls_long_jobs() {
-    // A job that is cancelled must run for a second.
+    // The finest mesh of the script must be within the limit.
     drive("jobs.mjs", &["--set", "limits.grid_points=200000000"], &[]);
 }
 

@@ -628,6 +628,39 @@ fn atoms_are_listed_with_the_indices_of_meshes() {
 }
 
 #[test]
+fn atoms_of_a_mesh_are_listed_with_their_positions() {
+    let structure = SERVER.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    let ask = |query: &str| SERVER.get(&format!("{structure}/atoms{query}"));
+    let list = ask("?positions=true&select=water").json();
+    let text = std::str::from_utf8(SAMPLE).unwrap();
+    let lines: Vec<&str> = text.lines().filter(|l| l.starts_with("ATOM") || l.starts_with("HETATM")).collect();
+    let expected: Vec<(usize, [f64; 3])> = lines
+        .iter()
+        .enumerate()
+        .filter(|(_, line)| line[17..20].trim() == "HOH")
+        .map(|(row, line)| (row, [30..38, 38..46, 46..54].map(|c| line[c].trim().parse().unwrap())))
+        .collect();
+    let column = |name: &str| list["atoms"][name].as_array().unwrap().iter().map(|v| v.as_f64().unwrap());
+    let places = column("x").zip(column("y")).zip(column("z")).map(|((x, y), z)| [x, y, z]);
+    let rows = column("index").map(|index| lines.iter().enumerate().position(|(row, _)| row as f64 == index).unwrap());
+    assert_eq!(rows.zip(places).collect::<Vec<_>>(), expected);
+    assert_eq!((&list["count"], expected.len()), (&60.into(), 60));
+    assert!(list["residues"]["kind"].as_array().unwrap().iter().all(|kind| kind == "water"));
+    // The whole list has no positions, and another validator.
+    let whole = ask("?positions=false&select=polymer");
+    assert_eq!((whole.json(), whole.header("etag")), (ask("").json(), ask("").header("etag")));
+    assert!(whole.json()["atoms"].get("x").is_none());
+    assert_ne!(ask("?positions=true").header("etag"), whole.header("etag"));
+    assert_ne!(ask("?positions=true").header("etag"), ask("?positions=true&chains=A").header("etag"));
+    for (query, parameter) in
+        [("select=water", "positions"), ("positions=yes", "positions"), ("positions=true&resolution=1", "resolution")]
+    {
+        assert_eq!(ask(&format!("?{query}")).problem(400, "bad-parameter")["parameter"], parameter, "{query}");
+    }
+    ask("?positions=true&select=ligand").problem(422, "empty-selection");
+}
+
+#[test]
 fn colours_of_atoms_are_those_of_the_vertices() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();

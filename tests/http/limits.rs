@@ -332,6 +332,13 @@ fn listed_atoms_are_limited() {
     };
     assert_eq!(colored(101).problem(422, "too-many-atoms")["limit"], 100);
     assert_eq!(colored(100).body.len(), 400);
+    // The copies of an assembly count.
+    let structure = server.post("/v1/structures", &[], hexamer().as_bytes()).header("location").unwrap().to_owned();
+    let placed = |server: &Running| server.get(&format!("{structure}/atoms?positions=true&assembly=1"));
+    assert_eq!(placed(&server).json()["count"], 60);
+    let few = fake(|c| c.limits.labels = 59);
+    few.post("/v1/structures", &[], hexamer().as_bytes());
+    assert_eq!(placed(&few).problem(422, "too-many-atoms")["limit"], 59);
     assert!(rejected(&server, "too-many-atoms") >= 1.0);
     // The limit does not apply to meshes.
     assert_eq!(server.post("/v1/meshes", &[], &carbons(101)).status, 200);

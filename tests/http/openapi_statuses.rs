@@ -151,6 +151,8 @@ fn surfaces(seen: &Seen, server: &Running) {
         let atoms = format!("{base}/atoms");
         let tag = get(&atoms, &[], 200).header("etag").unwrap().to_owned();
         get(&atoms, &[("if-none-match", &tag)], 304);
+        get(&format!("{atoms}?x=1"), &[], 400);
+        get(&format!("{atoms}?positions=true&chains=Z"), &[], 422);
         let report = kept.replace(".glb", "/report.json");
         let tag = get(&report, &[], 200).header("etag").unwrap().to_owned();
         get(&report, &[("if-none-match", &tag)], 304);

@@ -1,19 +1,24 @@
-/** Colours of the shown surface: applies the colour scheme of the parameters, and shows its legend. */
+/** Colours of the shown surface: applies a colour scheme, and passes on its legend. */
 
-import { atomColors, colorsPath } from "./api/colors";
+import { atomColors, colorsPath, type Legend } from "./api/colors";
 import type { Client } from "./api/client";
 import type { Choices } from "./request";
 import { palette } from "./scene/material";
 import type { Viewer } from "./scene/viewer";
-import { showLegend } from "./ui/legend";
 
 export class Colors {
   private abort: AbortController | null = null;
-  /** Path of the colours that are shown or being fetched. */
+  /** Path of the colours that are shown or being fetched; empty for those of the file. */
   private path: string | null = null;
   private structure = "";
 
-  constructor(private readonly client: Client, private readonly viewer: Viewer, private readonly legend: HTMLElement) {}
+  /** `keepsFile`: without a scheme, the surface has the colours in its file, if there are any. */
+  constructor(
+    private readonly client: Client,
+    private readonly viewer: Viewer,
+    private readonly explain: (legend: Legend | null) => void,
+    private readonly keepsFile: boolean,
+  ) {}
 
   /** Colours the surface of a structure. Throws if the colours are not available; then the surface has one colour. */
   async apply(structure: string, choices: Choices, since = performance.now()): Promise<void> {
@@ -30,11 +35,14 @@ export class Colors {
       const { rgba, legend } = await atomColors(this.client, path, signal);
       signal.throwIfAborted();
       const received = performance.now();
-      this.viewer.colour(palette(rgba), rgba.length / 4);
-      showLegend(this.legend, legend);
+      this.viewer.colour(palette(rgba), rgba.length / 4, this.keepsFile);
+      this.explain(legend);
+      const applied = performance.now();
       const drawn = await this.viewer.drawn();
       // Read by web/measure.mjs and the browser tests.
-      performance.measure("molmesh:recolor", { start: since, end: drawn, detail: { atoms: rgba.length / 4, received: received - since, drawn: drawn - received } });
+      const times = { received: received - since, applied: applied - received, drawn: drawn - applied };
+      const detail = { atoms: rgba.length / 4, ...times };
+      performance.measure("molmesh:recolor", { start: since, end: drawn, detail });
     } catch (error) {
       if (signal.aborted) return;
       this.clear();
@@ -42,9 +50,18 @@ export class Colors {
     }
   }
 
+  /** Shows the colours in the file of the surface, which `legend` describes. */
+  useFile(structure: string, legend: Legend): void {
+    this.abort?.abort();
+    this.structure = structure;
+    this.path = "";
+    this.viewer.colour(null, 0, true);
+    this.explain(legend);
+  }
+
   private clear(): void {
     this.path = null;
-    this.viewer.colour(null, 0);
-    showLegend(this.legend, null);
+    this.viewer.colour(null, 0, this.keepsFile);
+    this.explain(null);
   }
 }

@@ -15,7 +15,6 @@ export interface Actions {
   reset(): void;
   /** Called when another format is chosen for the command line. */
   formatChanged(): void;
-  recolour(scheme: string): void;
   /** Returns the address of the shown surface in the chosen format; empty if there is none. */
   address(): string;
   copied(): void;
@@ -39,8 +38,6 @@ export function connect(actions: Actions): void {
   $("cancel").addEventListener("click", () => actions.cancel());
   $("reset-all").addEventListener("click", () => actions.reset());
   $("format").addEventListener("change", () => actions.formatChanged());
-  const menu = $<HTMLSelectElement>("colour");
-  menu.addEventListener("change", () => actions.recolour(menu.value));
   const copies = (id: string, text: () => string) =>
     $(id).addEventListener("click", () => void copy(text()).then(() => actions.copied(), (error: unknown) => actions.copyFailed(error)));
   copies("copy-curl", () => $("curl").textContent ?? "");

@@ -68,7 +68,7 @@ export class MolmeshViewer extends HTMLElement {
     } catch (error) {
       return this.fail(error);
     }
-    this.colors ??= new Colors(this.client, this.viewer, this.legend);
+    this.colors ??= new Colors(this.client, this.viewer, (legend) => showLegend(this.legend, legend), true);
     this.applyAttributes();
     void this.load(this.src);
   }

@@ -2,10 +2,12 @@
 
 import type { Client } from "./api/client";
 import { asProblem, Problem } from "./api/problem";
-import type { Parameter } from "./api/schema";
+import type { Legend } from "./api/colors";
+import type { Parameter, Schemes } from "./api/schema";
 import { entry, type Labels, labels, type Source, type Summary, upload } from "./api/structures";
 import { Colors } from "./colors";
 import { connect } from "./controls";
+import { Display, type DisplayState } from "./display";
 import { Downloads } from "./downloads";
 import { keyboard } from "./keyboard";
 import { Picker } from "./picker";
@@ -13,11 +15,17 @@ import { type Delivery, Remesher, type MeshRequest } from "./remesh";
 import { addressOf, type Choices, coarser, curl, currentAddress, drawn, readAddress, SAMPLE, surface, writeAddress } from "./request";
 import { Stage } from "./stage";
 import { Busy } from "./ui/busy";
+import { ColourControls } from "./ui/colours";
 import { $, el, number, show } from "./ui/dom";
 import { Form } from "./ui/form";
-import { chooseScheme, fillSchemes } from "./ui/legend";
 import { problem as showProblem } from "./ui/problem";
 import { report, timingsOf } from "./ui/report";
+
+/** Parameters and display of a surface. */
+interface State {
+  choices: Choices;
+  display: DisplayState;
+}
 
 /** Time from input to frame, ms, above which a dragged slider shows a coarser preview. */
 const PREVIEW_FROM = 200;
@@ -27,15 +35,18 @@ export class Page {
   private readonly remesher: Remesher;
   private readonly picker: Picker | null;
   private readonly colors: Colors | null;
-  private readonly menu = $<HTMLSelectElement>("colour");
+  private readonly display: Display | null;
+  private readonly colourControls = new ColourControls((scheme) => this.recolour(scheme), (palette) => this.form?.set("palette", palette));
   private form: Form | null = null;
   /**
    * The shown surface with its structure and parameters. Caption, address, command line, report and downloads describe
    * only this surface.
    */
-  private shown: { source: Source; choices: Choices; resolution: number; took: number } | null = null;
+  private shown: { source: Source; choices: Choices; legend: Legend | null; resolution: number; took: number } | null = null;
   /** Structure of the next mesh. After a failure, the structure of the shown surface, if there is one. */
   private target: Source | null = null;
+  /** Display of the next mesh; null if it does not change. */
+  private nextDisplay: DisplayState | null = null;
   private opening: AbortController | null = null;
   /** Structures shown so far, by path, so that returning to one needs no second upload. */
   private readonly visited = new Map<string, Source>();
@@ -44,13 +55,17 @@ export class Page {
   private readonly busy = new Busy();
 
   constructor(private readonly client: Client) {
-    this.stage = new Stage(client, (turning) => $("turn").setAttribute("aria-pressed", String(turning)));
+    this.stage = new Stage(client, (turning) => $("turn").setAttribute("aria-pressed", String(turning)), () => this.updateAddress());
     const { viewer } = this.stage;
     this.picker = viewer && new Picker(viewer, (text) => this.announce(text));
-    this.colors = viewer && new Colors(client, viewer, $("legend"));
-    fillSchemes(this.menu);
+    this.colors = viewer && new Colors(client, viewer, (legend) => this.colourControls.explain(legend), false);
+    this.display = viewer && new Display(client, viewer, {
+      changed: () => this.updateAddress(),
+      divide: (byChain) => this.form?.set("split", byChain ? "chain" : undefined),
+      failed: (error) => this.problem(error, () => undefined, this.shown?.source.name),
+    });
     if (viewer && this.picker) keyboard($("view-home"), viewer, this.picker);
-    for (const id of ["turn", "home", "colour"]) show($(id), viewer !== null);
+    for (const id of ["turn", "home", "colour", "display"]) show($(id), viewer !== null);
     $("turn").addEventListener("click", () => viewer?.turn(!viewer.isTurning, true));
     $("home").addEventListener("click", () => viewer?.reset());
     this.remesher = new Remesher(client, {
@@ -64,8 +79,9 @@ export class Page {
   }
 
   /** Builds the form from the OpenAPI document and opens the structure that the address names. */
-  async start(parameters: Parameter[], formats: string[]): Promise<void> {
-    const form = new Form($("parameters"), $("picture-fields"), parameters, (mesh, live) => (mesh ? this.changed(live) : this.displayChanged()));
+  async start(parameters: Parameter[], formats: string[], schemes: Schemes): Promise<void> {
+    this.colourControls.fill(schemes);
+    const form = new Form($("parameters"), $("picture-fields"), parameters, schemes, (mesh, live) => (mesh ? this.changed(live) : this.displayChanged()));
     this.form = form;
     const wanted = (format: string) => this.shown && { source: this.shown.source, choices: form.of(format, this.shown.choices) };
     new Downloads(this.client, formats, wanted, (error, source) => this.problem(error, () => undefined, source.name));
@@ -76,10 +92,10 @@ export class Page {
   /** Opens the structure that the address names, else the sample, with the parameters of the address. */
   private async visit(): Promise<void> {
     if (!this.form) return;
-    const { choices, pdb, structure } = readAddress(this.form.names);
-    if (pdb) return this.open(pdb.toUpperCase(), () => Promise.resolve(entry(pdb)), choices);
-    if (structure) return this.open(`Structure ${structure.slice(0, 8)}`, (signal) => this.known(structure, signal), choices);
-    await this.sample(choices);
+    const { pdb, structure, ...state } = readAddress(this.form.names);
+    if (pdb) return this.open(pdb.toUpperCase(), () => Promise.resolve(entry(pdb)), state);
+    if (structure) return this.open(`Structure ${structure.slice(0, 8)}`, (signal) => this.known(structure, signal), state);
+    await this.sample(state);
   }
 
   /** Sets the caption over the surface. */
@@ -126,7 +142,6 @@ export class Page {
         this.changed(false);
       },
       formatChanged: () => this.updateAddress(),
-      recolour: (scheme) => this.recolour(scheme),
       address: () => {
         const format = $<HTMLSelectElement>("format").value;
         return this.shown && this.form ? location.origin + surface(this.shown.source, format, this.form.of(format, this.shown.choices)) : "";
@@ -136,7 +151,7 @@ export class Page {
     });
     window.addEventListener("popstate", () => {
       // A step to another fragment of the same address opens nothing.
-      if (this.shown && addressOf(this.shown.source, this.shown.choices) === currentAddress()) return;
+      if (this.address === currentAddress()) return;
       void this.visit();
     });
   }
@@ -149,11 +164,11 @@ export class Page {
     this.announce(this.shown ? `Cancelled. The surface shown is that of ${this.shown.source.name}.` : "Cancelled");
   }
 
-  private sample(choices: Choices | null = null): Promise<void> {
+  private sample(state: State | null = null): Promise<void> {
     return this.open("The sample", async (signal) => {
       const blob = await (await this.client.ask(`/${SAMPLE}`, { signal })).blob();
       return { ...(await upload(this.client, blob, SAMPLE, signal)), isSample: true };
-    }, choices);
+    }, state);
   }
 
   /** Returns a structure that was uploaded before. */
@@ -165,10 +180,11 @@ export class Page {
   }
 
   /**
-   * Opens another structure, which `find` resolves with, and sets `choices` for it. Without them the parameters stay,
-   * except those that name parts of the previous structure. The page describes the previous one until the mesh arrives.
+   * Opens another structure, which `find` resolves with, with the parameters and display in `state`. Without it they
+   * stay, except those that name parts of the previous structure. The page describes the previous one until the mesh
+   * arrives.
    */
-  private async open(name: string, find: (signal: AbortSignal) => Promise<Source>, choices: Choices | null = null): Promise<void> {
+  private async open(name: string, find: (signal: AbortSignal) => Promise<Source>, state: State | null = null): Promise<void> {
     this.opening?.abort();
     this.remesher.cancel();
     this.clear();
@@ -178,15 +194,18 @@ export class Page {
       const source = await find(abort.signal);
       if (abort.signal.aborted) return;
       this.opening = null;
-      if (choices) this.form?.fill(choices);
-      else if (source.path !== this.target?.path) this.form?.forget();
+      const isOther = source.path !== this.target?.path;
+      if (state) this.form?.fill(state.choices);
+      else if (isOther) this.form?.forget();
+      if (state) this.nextDisplay = state.display;
+      else if (isOther && this.display) this.nextDisplay = { ...this.display.state, hidden: [] };
       this.target = source;
       this.changed(false);
     } catch (error) {
       if (abort.signal.aborted) return;
       this.opening = null;
       this.restore();
-      this.problem(error, () => void this.open(name, find, choices), name);
+      this.problem(error, () => void this.open(name, find, state), name);
     }
   }
 
@@ -198,13 +217,14 @@ export class Page {
     if (!source || this.opening) return;
     const choices = form.all;
     const known = this.shown?.source.path === source.path ? this.shown : null;
+    const display = this.nextDisplay;
     if (live && known && known.took > PREVIEW_FROM) {
       const set = Number(choices.get("resolution"));
       const preview = Number((2 * (set > 0 ? set : known.resolution)).toPrecision(3));
       const path = drawn(source, form.mesh(coarser(choices, preview)));
-      return this.remesher.want({ source, choices, path, preview, live, since });
+      return this.remesher.want({ source, choices, display, path, preview, live, since });
     }
-    this.remesher.want({ source, choices, path: drawn(source, form.mesh(choices)), live, since });
+    this.remesher.want({ source, choices, display, path: drawn(source, form.mesh(choices)), live, since });
   }
 
   /** Sets a colour scheme. Resets palette and range, which may not apply to the new scheme. */
@@ -217,7 +237,8 @@ export class Page {
   private paint(): void {
     const { shown } = this;
     if (!shown) return;
-    chooseScheme(this.menu, shown.choices.get("color") ?? "none");
+    this.colourControls.choose(shown.choices);
+    if (shown.legend && this.form?.coloursVertices(shown.choices)) return this.colors?.useFile(shown.source.path, shown.legend);
     this.colors?.apply(shown.source.path, shown.choices).catch((error: unknown) => this.problem(error, () => this.paint(), shown.source.name));
   }
 
@@ -226,7 +247,7 @@ export class Page {
     const { form, shown } = this;
     this.updateReset();
     if (!form || !shown) return;
-    shown.choices = new Map([...form.mesh(shown.choices), ...form.apart(form.all)]);
+    shown.choices = form.displayed(shown.choices);
     this.paint();
     this.updateAddress();
   }
@@ -234,6 +255,7 @@ export class Page {
   /** Sets structure and parameters of `request` as the next ones to mesh. */
   private take(request: MeshRequest): void {
     this.target = request.source;
+    this.nextDisplay = request.display;
     this.form?.fill(request.choices);
   }
 
@@ -243,10 +265,12 @@ export class Page {
    */
   private restore(): void {
     this.idle();
+    this.nextDisplay = null;
     const { shown } = this;
     if (!shown) return this.setCaption("No surface", "");
     this.target = shown.source;
     this.form?.fill(shown.choices);
+    this.display?.follow(shown.source, shown.choices);
     this.updateReset();
     this.stage.restore();
     show($("preview"), false);
@@ -257,11 +281,16 @@ export class Page {
     show($("reset-all"), (this.form?.all.size ?? 0) > 0);
   }
 
+  /** Address of the page for the shown surface; empty if there is none. */
+  private get address(): string {
+    return this.shown ? addressOf(this.shown.source, this.shown.choices, this.display?.state ?? null) : "";
+  }
+
   /** Updates the address and the command line; `push` adds the address to the history. */
   private updateAddress(push = false): void {
     const { shown, form } = this;
     if (!shown || !form) return;
-    writeAddress(addressOf(shown.source, shown.choices), push);
+    writeAddress(this.address, push);
     const format = $<HTMLSelectElement>("format").value || "glb";
     const choices = form.of(format, shown.choices);
     $("curl").textContent = curl(shown.source, format, choices, location.origin, this.client.key !== "");
@@ -285,10 +314,15 @@ export class Page {
     const scene = await this.stage.prepare(bytes, source, form.of("png", taken), signal);
     signal.throwIfAborted();
     const { extras } = scene.loaded;
+    const previous = this.address;
+    if (preview === undefined && request.display && this.display) {
+      this.display.state = request.display;
+      this.nextDisplay = null;
+    }
     const drawing = this.stage.show(scene, this.shown?.source.path !== source.path, preview !== undefined);
     show($("preview"), preview !== undefined);
     $("preview").textContent = preview === undefined ? "" : `preview at ${number(preview, 2)} Å`;
-    if (preview === undefined) this.commit(request, extras, headers);
+    if (preview === undefined) this.commit(request, extras, headers, previous);
     const { shown } = this;
     const time = await drawing;
     // Read by web/measure.mjs.
@@ -299,15 +333,15 @@ export class Page {
     $("now").textContent += `, ${number(shown.took, 3)} ms from input to frame`;
   }
 
-  /** Updates the page to describe the mesh of the request, which is now shown. */
-  private commit({ source, choices }: MeshRequest, extras: Record<string, unknown>, headers: Headers): void {
+  /** Updates the page to describe the mesh of the request, which is now shown. `address` is that of the one before. */
+  private commit({ source, choices }: MeshRequest, extras: Record<string, unknown>, headers: Headers, address: string): void {
     const { form, shown: previous } = this;
     if (!form) return;
     const isOther = previous?.source.path !== source.path;
     // After a step through the history, the address is already set.
-    const push = isOther && previous !== null && addressOf(previous.source, previous.choices) === currentAddress();
-    const all = new Map([...form.mesh(choices), ...form.apart(form.all)]);
-    this.shown = { source, choices: all, resolution: Number(extras["resolution"] ?? 0.5), took: previous?.took ?? 0 };
+    const push = isOther && previous !== null && address === currentAddress();
+    const legend = (extras["color"] ?? null) as Legend | null;
+    this.shown = { source, choices: form.displayed(choices), legend, resolution: Number(extras["resolution"] ?? 0.5), took: previous?.took ?? 0 };
     source.resent = false;
     this.visited.set(source.path, source);
     this.setCaption(source.name, source.summary?.title ?? String(extras["title"] ?? ""));
@@ -315,10 +349,11 @@ export class Page {
     if (isOther) {
       const chains = source.summary?.chains.map((c) => c.name || "_").slice(0, 12).join(",");
       form.hint("chains", chains ? `all: ${chains}` : "all");
-      form.offer("assembly", source.summary?.assemblies.map(({ id }) => id) ?? []);
+      form.offer("assembly", source.summary?.assemblies.map(({ id, copies }) => [id, copies === null ? id : `${id} (copies: ${copies})`]) ?? []);
       this.label(source);
     }
     this.paint();
+    this.display?.follow(source, this.shown.choices);
     form.showValues(extras);
     report($("report"), extras, timingsOf(headers));
     $("now").textContent = `${Number(extras["triangles"]).toLocaleString("en")} triangles`;

@@ -4,12 +4,15 @@ import { bytesOf } from "./api/bytes";
 import type { Client } from "./api/client";
 import { fetchFile, type Progress } from "./api/jobs";
 import type { Source } from "./api/structures";
+import type { DisplayState } from "./display";
 import type { Choices } from "./request";
 
 export interface MeshRequest {
   source: Source;
   /** All parameters at the time of the request; a preview replaces the grid spacing. */
   choices: Choices;
+  /** Display of the surface; null if it does not change. */
+  display: DisplayState | null;
   /** Path of the mesh. */
   path: string;
   /** Grid spacing of a preview, Å; undefined for a full mesh. */

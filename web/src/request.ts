@@ -1,6 +1,7 @@
 /** A structure with the parameters that the user has set, as a URL and as a shell command. */
 
 import type { Source } from "./api/structures";
+import { displayPairs, type DisplayState, readDisplay } from "./display";
 
 /** Parameters set by the user, by name; all others have their defaults. */
 export type Choices = ReadonlyMap<string, string>;
@@ -51,18 +52,23 @@ export function stem(source: Source): string {
 }
 
 /** Reads structure and parameters from the page's address, which preserves them for reloading and sharing. */
-export function readAddress(known: ReadonlySet<string>): { choices: Map<string, string>; pdb: string; structure: string } {
+export function readAddress(known: ReadonlySet<string>): {
+  choices: Map<string, string>;
+  display: DisplayState;
+  pdb: string;
+  structure: string;
+} {
   const pairs = new URLSearchParams(location.search);
   const choices = new Map([...pairs].filter(([name, value]) => known.has(name) && value !== ""));
-  return { choices, pdb: pairs.get("pdb") ?? "", structure: pairs.get("structure") ?? "" };
+  return { choices, display: readDisplay(pairs), pdb: pairs.get("pdb") ?? "", structure: pairs.get("structure") ?? "" };
 }
 
-/** Returns the page's address for a structure and parameters. */
-export function addressOf(source: Source, choices: Choices): string {
+/** Returns the page's address for a structure, parameters and display. */
+export function addressOf(source: Source, choices: Choices, display: DisplayState | null): string {
   const name: Record<string, string> = {};
   if (source.path.startsWith("/v1/pdb/")) name["pdb"] = decodeURIComponent(source.path.slice("/v1/pdb/".length));
   else if (!source.isSample) name["structure"] = source.path.slice("/v1/structures/".length);
-  return location.pathname + query(new Map(Object.entries(name)), Object.fromEntries(choices));
+  return location.pathname + query(new Map(Object.entries(name)), Object.fromEntries([...choices, ...(display ? displayPairs(display) : [])]));
 }
 
 /** Returns the current address of the page, in the form of `addressOf`. */

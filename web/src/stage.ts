@@ -38,7 +38,7 @@ export class Stage {
   private kept: Scene | null = null;
   private fetching: AbortController | null = null;
 
-  constructor(private readonly client: Client, onTurn: (turning: boolean) => void) {
+  constructor(private readonly client: Client, onTurn: (turning: boolean) => void, private readonly onParts: () => void) {
     const gl = contextOf(this.canvas, false);
     this.viewer = gl && new Viewer(this.canvas, gl, { onTurn, onLost: (lost) => this.onLost(lost) });
     if (!this.viewer) this.explain(ABSENT);
@@ -55,7 +55,7 @@ export class Stage {
     this.scene = scene;
     this.fetching?.abort();
     const drawn = this.viewer?.show(scene.loaded, fresh) ?? Promise.resolve(performance.now());
-    if (this.viewer) listParts(this.parts, scene.loaded.parts.map(({ name }) => name), this.viewer);
+    if (this.viewer) listParts(this.parts, scene.loaded.parts.map(({ name }) => name), this.viewer, this.onParts);
     if (!preview) this.kept = scene;
     if (!this.draws) this.showPicture(scene);
     return drawn;

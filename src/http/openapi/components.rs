@@ -21,6 +21,7 @@ const ERROR_NAMES: &[(&str, &[&str], &str)] = &[
     ("422", &["other-request"], "MeshRequestRejected"),
     ("422", &["grid-too-large"], "MeshRejected"),
     ("422", &["picture-too-large"], "EstimateRejected"),
+    ("422", &["too-many-copies"], "AtomsRejected"),
     ("422", &["empty-selection"], "SelectionRejected"),
     ("422", &[], "StructureRejected"),
     ("500", &[], "JobFailed"),

@@ -9,7 +9,7 @@ use utoipa::{IntoParams, Modify};
 
 use super::components::pascal_case;
 use crate::formats::Format;
-use crate::http::color_parameters;
+use crate::http::{atom_parameters, color_parameters};
 use crate::pipeline::params::{self, Domain, TABLE};
 
 const DIGEST_PATTERN: &str = "^[0-9a-f]{64}$";
@@ -179,6 +179,18 @@ parameters!(
         let scheme = ParameterBuilder::new().name("scheme").parameter_in(ParameterIn::Query);
         let scheme = scheme.required(Required::True).description(Some(doc)).schema(Some(value)).build();
         std::iter::once(scheme).chain(color_parameters::NAMES.iter().filter_map(mesh_parameter)).collect()
+    }
+);
+parameters!(
+    /// Query parameters of the list of atoms.
+    AtomParameters: {
+        let mesh_parameter = |name: &&str| TABLE.iter().find(|p| p.name == *name).map(query);
+        let value = ObjectBuilder::new().schema_type(Type::Boolean).default(Some(Value::from(false)));
+        let doc = "Lists only the atoms of a mesh with the same parameters, with the copies of an assembly, and adds their \
+                   indices in the file and their positions. The parameters that select atoms need it. Default: false.";
+        let positions = ParameterBuilder::new().name(atom_parameters::POSITIONS).parameter_in(ParameterIn::Query);
+        let positions = positions.required(Required::False).description(Some(doc)).schema(Some(value)).build();
+        std::iter::once(positions).chain(atom_parameters::NAMES.iter().filter_map(mesh_parameter)).collect()
     }
 );
 parameters!(

@@ -18,13 +18,14 @@ export interface AtomColors {
   legend: Legend;
 }
 
-/** Schemes of the menu with their labels. */
+/** Schemes by properties of atoms, with their labels. */
 export const SCHEMES: readonly (readonly [string, string])[] = [
   ["none", "one colour"],
   ["element", "by element"],
   ["chain", "by chain"],
   ["entity", "by entity"],
   ["residue", "by residue"],
+  ["secondary-structure", "secondary structure"],
   ["bfactor", "B-factor"],
   ["occupancy", "occupancy"],
   ["plddt", "pLDDT"],
@@ -32,6 +33,16 @@ export const SCHEMES: readonly (readonly [string, string])[] = [
   ["hydrophobicity:wimley-white", "hydrophobicity (Wimley–White)"],
   ["charge", "charge"],
 ];
+
+const LABELS = new Map<string, string>([
+  ...SCHEMES,
+  ["uniform:", "another colour"],
+  ["curvature", "curvature"],
+  ["radial", "distance from the centre"],
+]);
+
+/** Returns the label of a scheme; its name if it has none. */
+export const labelOf = (scheme: string): string => LABELS.get(scheme) ?? scheme;
 
 /** Parameters of a mesh that affect the colours of its atoms. */
 const SHARED = ["palette", "color_range", "model", "chains", "select", "altloc"];

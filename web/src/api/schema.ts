@@ -58,10 +58,10 @@ function resolved<T extends Reference>(api: OpenApi, value: T): T {
   return kind && name ? (api.components?.[kind]?.[name] as T) : value;
 }
 
-function described(api: OpenApi): Described[] {
+function described(api: OpenApi, id = "createMesh"): Described[] {
   const operations = Object.values(api.paths).flatMap((path) => Object.values(path));
-  const mesh = operations.find((operation) => operation.operationId === "createMesh");
-  return (mesh?.parameters ?? []).map((parameter) => resolved(api, parameter)).filter((parameter) => parameter.in === "query");
+  const operation = operations.find(({ operationId }) => operationId === id);
+  return (operation?.parameters ?? []).map((parameter) => resolved(api, parameter)).filter((parameter) => parameter.in === "query");
 }
 
 /** Returns the parameters in document order. `format` is chosen by the buttons that download files. */
@@ -73,6 +73,25 @@ export function parametersOf(api: OpenApi): Parameter[] {
 export function formatsOf(api: OpenApi): string[] {
   const format = described(api).find((parameter) => parameter.name === "format")?.schema;
   return (format && resolved(api, format).enum) ?? ["glb"];
+}
+
+/** Colour schemes and palettes of the service. */
+export interface Schemes {
+  /** Values of the parameter `color`. */
+  all: string[];
+  /** Schemes by properties of atoms. The others need a mesh with colours. */
+  ofAtoms: ReadonlySet<string>;
+  palettes: string[];
+}
+
+export function schemesOf(api: OpenApi): Schemes {
+  const schema = (name: string, operation?: string): Schema => {
+    const found = described(api, operation).find((parameter) => parameter.name === name)?.schema;
+    return found ? resolved(api, found) : {};
+  };
+  const words = ({ title }: Schema) => title?.split(", ") ?? [];
+  const ofAtoms = new Set(words(schema("scheme", "colorAtoms")));
+  return { all: words(schema("color")), ofAtoms, palettes: schema("palette").enum ?? [] };
 }
 
 function kindOf(schema: Schema): Kind {

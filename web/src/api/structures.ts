@@ -1,5 +1,6 @@
 /** Structures: their paths, summaries and atom labels. */
 
+import { type Choices, query } from "../request";
 import type { Client } from "./client";
 
 /** Source of a mesh: an upload, by the digest of its bytes, or an entry of the archive. */
@@ -49,7 +50,7 @@ interface AtomsDocument {
   count: number;
   names: string[];
   elements: string[];
-  atoms: { name: number[]; element: number[] };
+  atoms: { name: number[]; element: number[]; index?: number[]; x?: number[]; y?: number[]; z?: number[] };
   residues: { first: number[]; name: string[]; number: number[]; insertion_code: string[]; chain: string[]; model: number[]; kind: string[] };
 }
 
@@ -117,6 +118,26 @@ export class Labels {
 /** Fetches the labels of a structure's atoms. */
 export async function labels(client: Client, source: Source, signal: AbortSignal): Promise<Labels> {
   return new Labels(await client.json<AtomsDocument>(`${source.path}/atoms`, { signal }));
+}
+
+/** Atoms with coordinates in Å. */
+export interface Positions {
+  x: number[];
+  y: number[];
+  z: number[];
+  /** Rows of the atoms in the whole list. */
+  index: number[];
+  elements: string[];
+  /** Names of the residues. */
+  residues: string[];
+}
+
+/** Fetches the atoms of a structure that `selection` names, with the copies of an assembly. */
+export async function positions(client: Client, source: Source, selection: Choices, signal: AbortSignal): Promise<Positions> {
+  const path = `${source.path}/atoms${query(selection, { positions: "true" })}`;
+  const { atoms, elements, residues } = await client.json<AtomsDocument>(path, { signal });
+  const { x = [], y = [], z = [], index = [] } = atoms;
+  return { x, y, z, index, elements: atoms.element.map((i) => elements[i] ?? "?"), residues: residues.name };
 }
 
 /** Returns the name of an atom, such as `LYS 15 A · CA`. */

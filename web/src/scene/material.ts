@@ -11,6 +11,7 @@ out vec3 vEye;
 out vec3 vColor;
 out float vGlow;
 uniform vec3 plain;
+uniform bool own;
 uniform vec2 hovered;
 uniform vec2 pinned;
 uniform int atoms;
@@ -25,7 +26,7 @@ void main() {
   vColor = plain;
   // Vertex colours of the file.
   #if defined(USE_COLOR_ALPHA) || defined(USE_COLOR)
-  vColor = color.rgb;
+  if (own) vColor = color.rgb;
   #endif
   vGlow = 0.0;
   #ifdef NORMALS
@@ -50,6 +51,7 @@ uniform vec3 glow;
 uniform vec2 depths;
 uniform float hazy;
 uniform float unit;
+uniform float alpha;
 const vec3 KEY = vec3(0.38, 0.62, 0.69);
 const vec3 FILL = vec3(-0.75, -0.1, 0.65);
 void main() {
@@ -75,7 +77,7 @@ void main() {
   float shine = 0.16 * pow(max(dot(n, half_way), 0.0), 36.0);
   vec3 lit = base * light + shine;
   float far = clamp((-vEye.z - depths.x) / (depths.y - depths.x), 0.0, 1.0);
-  color = linearToOutputTexel(vec4(mix(lit, haze, hazy * far * far), 1.0));
+  color = linearToOutputTexel(vec4(mix(lit, haze, hazy * far * far), alpha));
 }`;
 
 export class SurfaceMaterial extends ShaderMaterial {
@@ -94,6 +96,9 @@ export class SurfaceMaterial extends ShaderMaterial {
         glow: { value: new Color("#ffb020") },
         haze: { value: new Color("#ffffff") },
         hazy: { value: 0.55 },
+        // True if the colours of the file are shown.
+        own: { value: true },
+        alpha: { value: 1 },
         depths: { value: new Vector2(0, 1) },
         // Units of the scene per ångström.
         unit: { value: 1 },

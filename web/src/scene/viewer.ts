@@ -1,6 +1,6 @@
 /** Viewer of a surface on a canvas. Draws only when something has changed. */
 
-import { Color, DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, Vector3, WebGLRenderer } from "three";
+import { type BufferGeometry, Color, DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import type { Loaded } from "./load";
 import { SurfaceMaterial } from "./material";
@@ -36,10 +36,16 @@ export class Viewer {
   /** One mesh per part. They share a material. */
   private meshes: Mesh[] = [];
   private material: SurfaceMaterial | null = null;
+  /** Material that writes only depths. */
+  private depths: SurfaceMaterial | null = null;
+  private sticks: { mesh: Mesh; material: SurfaceMaterial } | null = null;
+  private transparency = 0;
   /** Names of hidden parts. */
   private readonly hidden = new Set<string>();
   private loaded: Loaded | null = null;
   private colors: { texture: DataTexture; atoms: number } | null = null;
+  /** True if the colours of the file are shown without colours per atom. */
+  private usesFile = true;
   private haze = new Color("#ffffff");
   private plain = new Color("#5fb3a1");
   private marked = { hovered: [-2, -2], pinned: [-2, -2] };
@@ -74,20 +80,23 @@ export class Viewer {
     const first = !this.loaded;
     this.scene.remove(...this.meshes);
     this.release();
-    if (fresh) this.hidden.clear();
     const material = (this.material = new SurfaceMaterial(loaded.parts[0]!.geometry));
+    this.depths = new SurfaceMaterial(loaded.parts[0]!.geometry);
+    this.depths.colorWrite = false;
+    this.depths.transparent = true;
     this.meshes = loaded.parts.map(({ name, geometry, matrix }) => {
       const mesh = new Mesh(geometry, material);
       mesh.matrixAutoUpdate = false;
       mesh.matrix.copy(matrix);
       mesh.frustumCulled = false;
+      mesh.renderOrder = 1;
       mesh.visible = !this.hidden.has(name);
       return mesh;
     });
     this.loaded = loaded;
-    material.set("unit", loaded.sphere.radius / Math.max(radius(loaded), 1e-9));
     this.scene.add(...this.meshes);
     this.applyStyle();
+    this.applyTransparency();
     if (fresh || first) this.reset();
     else this.clip();
     return this.drawn();
@@ -98,10 +107,21 @@ export class Viewer {
     return (this.loaded?.parts ?? []).map(({ name }) => name).filter((name) => !this.hidden.has(name));
   }
 
-  /** Shows or hides the parts with this name, until a surface of another structure is shown. */
+  /** Returns the names of the hidden parts. */
+  get hiddenParts(): string[] {
+    return (this.loaded?.parts ?? []).map(({ name }) => name).filter((name) => this.hidden.has(name));
+  }
+
+  /** Shows or hides the parts with this name. */
   showPart(name: string, visible: boolean): void {
-    if (visible) this.hidden.delete(name);
-    else this.hidden.add(name);
+    const others = [...this.hidden].filter((other) => other !== name);
+    this.hideParts(visible ? others : [...others, name]);
+  }
+
+  /** Hides the parts with these names and shows all others, also in the following surfaces. */
+  hideParts(names: Iterable<string>): void {
+    this.hidden.clear();
+    for (const name of names) this.hidden.add(name);
     this.meshes.forEach((mesh, i) => (mesh.visible = !this.hidden.has(this.loaded?.parts[i]?.name ?? "")));
     this.invalidate();
   }
@@ -109,6 +129,53 @@ export class Viewer {
   private release(): void {
     for (const { geometry } of this.meshes) geometry.dispose();
     this.material?.dispose();
+    this.depths?.dispose();
+  }
+
+  /** Sets the transparency of the surface: 0 is opaque, 1 is invisible. */
+  setTransparency(transparency: number): void {
+    this.transparency = transparency;
+    this.applyTransparency();
+    this.invalidate();
+  }
+
+  /** Draws the depths of a transparent surface first, so that only its nearest layer is visible. */
+  private applyTransparency(): void {
+    const { material, depths } = this;
+    if (!material || !depths) return;
+    const isTransparent = this.transparency > 0;
+    material.set("alpha", 1 - this.transparency);
+    if (material.transparent === isTransparent && !isTransparent) return;
+    material.transparent = isTransparent;
+    material.needsUpdate = true;
+    for (const mesh of this.meshes) {
+      mesh.clear();
+      if (!isTransparent) continue;
+      const layer = new Mesh(mesh.geometry, depths);
+      layer.matrixAutoUpdate = false;
+      layer.frustumCulled = false;
+      mesh.add(layer);
+    }
+  }
+
+  /** Shows sticks with coordinates in Å, which stay when another surface is shown; null for none. */
+  showSticks(geometry: BufferGeometry | null): void {
+    if (!geometry && !this.sticks) return;
+    if (this.sticks) {
+      this.scene.remove(this.sticks.mesh);
+      this.sticks.mesh.geometry.dispose();
+      this.sticks.material.dispose();
+      this.sticks = null;
+    }
+    if (geometry) {
+      const material = new SurfaceMaterial(geometry);
+      const mesh = new Mesh(geometry, material);
+      mesh.frustumCulled = false;
+      this.sticks = { mesh, material };
+      this.scene.add(mesh);
+    }
+    this.applyStyle();
+    this.invalidate();
   }
 
   /** Resolves with the time in the frame after the next one that is drawn. */
@@ -202,10 +269,12 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Sets the colours per atom; null for one colour. */
-  colour(texture: DataTexture | null, atoms: number): void {
+  /** Sets the colours per atom; null for the colours of the file if `usesFile`, otherwise for one colour. */
+  colour(texture: DataTexture | null, atoms: number, usesFile: boolean): void {
+    this.usesFile = usesFile;
     this.colors?.texture.dispose();
     this.colors = texture ? { texture, atoms } : null;
+    if (texture) this.renderer.initTexture(texture);
     this.applyStyle();
     this.invalidate();
   }
@@ -239,6 +308,7 @@ export class Viewer {
     this.size.disconnect();
     this.controls.dispose();
     this.release();
+    this.showSticks(null);
     this.colors?.texture.dispose();
     this.renderer.dispose();
   }
@@ -312,10 +382,17 @@ export class Viewer {
 
   /** Applies colours and marks to the surface. */
   private applyStyle(): void {
-    const { material } = this;
-    if (!material) return;
+    const { material, loaded, sticks } = this;
+    if (!material || !loaded) return;
+    const scale = unitScale(loaded);
+    const materials = [material, ...(sticks ? [sticks.material] : [])];
+    for (const each of materials) {
+      each.set("haze", this.haze);
+      each.set("unit", 1 / scale);
+    }
+    sticks?.mesh.scale.setScalar(1 / scale);
     material.set("plain", this.plain);
-    material.set("haze", this.haze);
+    material.set("own", this.usesFile);
     material.set("hovered", new Vector2(...this.marked.hovered));
     material.set("pinned", new Vector2(...this.marked.pinned));
     material.set("atoms", this.colors?.atoms ?? 0);
@@ -323,15 +400,17 @@ export class Viewer {
     const prepare = () => {
       const distance = this.camera.position.distanceTo(this.loaded?.sphere.center ?? this.controls.target);
       const radius = this.loaded?.sphere.radius ?? 1;
-      material.set("depths", new Vector2(distance - 0.5 * radius, distance + radius));
-      material.uniformsNeedUpdate = true;
+      for (const each of materials) {
+        each.set("depths", new Vector2(distance - 0.5 * radius, distance + radius));
+        each.uniformsNeedUpdate = true;
+      }
     };
-    for (const mesh of this.meshes) mesh.onBeforeRender = prepare;
+    for (const mesh of [...this.meshes, ...(sticks ? [sticks.mesh] : [])]) mesh.onBeforeRender = prepare;
   }
 }
 
-/** Returns the radius in Å if the file states its units. */
-function radius(loaded: Loaded): number {
+/** Returns Å per unit of the file; 1 if it does not state its units. */
+function unitScale(loaded: Loaded): number {
   const scale = Number(loaded.extras["unit_scale"] ?? 1);
-  return loaded.sphere.radius * (Number.isFinite(scale) ? scale : 1);
+  return Number.isFinite(scale) && scale > 0 ? scale : 1;
 }

@@ -11,9 +11,12 @@ export interface Field {
   value: string | undefined;
   /** Shows the value that the service used by default. */
   effective(value: string | number | undefined): void;
-  /** Sets the suggested values of a text field. */
-  offer?(values: string[]): void;
+  /** Sets the values that a text field offers. With values, it is a menu. */
+  offer?(values: Offer[]): void;
 }
+
+/** Value with its label. */
+export type Offer = [value: string, label: string];
 
 /** Called when a value is set or reset (undefined); `live` while a slider is dragged. */
 export type Changed = (name: string, value: string | undefined, live: boolean) => void;
@@ -133,14 +136,21 @@ function toggle(parameter: Parameter, changed: Changed): Field {
 
 function text(parameter: Parameter, changed: Changed): Field {
   const { id, element, head, mark } = frame(parameter, changed);
-  const input = el("input", { type: "text", id, class: "wide", autocomplete: "off", spellcheck: "false", placeholder: parameter.fallbackWords, "aria-describedby": `${id}-doc` });
-  const list = el("datalist", { id: `${id}-list` });
-  input.setAttribute("list", list.id);
-  head.append(input, list);
-  input.addEventListener("change", () => changed(parameter.name, input.value.trim() === "" ? undefined : input.value.trim(), false));
+  const attributes = { id, "aria-describedby": `${id}-doc` };
+  const input = el("input", { type: "text", class: "wide", autocomplete: "off", spellcheck: "false", placeholder: parameter.fallbackWords, ...attributes });
+  const select = el("select", attributes);
+  head.append(input);
+  const set = (text: string) => changed(parameter.name, text.trim() === "" ? undefined : text.trim(), false);
+  input.addEventListener("change", () => set(input.value));
+  select.addEventListener("change", () => set(select.value));
   let value: string | undefined;
+  let offers: Offer[] = [];
   const update = () => {
     input.value = value ?? "";
+    const isOther = value !== undefined && !offers.some(([offered]) => offered === value);
+    const all: Offer[] = [["", parameter.fallbackWords], ...offers, ...(isOther ? [[value, value] as Offer] : [])];
+    select.replaceChildren(...all.map(([offered, label]) => el("option", { value: offered }, label)));
+    select.value = value ?? "";
     mark(value !== undefined);
   };
   return {
@@ -152,7 +162,9 @@ function text(parameter: Parameter, changed: Changed): Field {
       input.placeholder = next === undefined ? parameter.fallbackWords : String(next);
     },
     offer(values) {
-      list.replaceChildren(...values.map((value) => el("option", { value })));
+      offers = values;
+      (values.length ? input : select).replaceWith(values.length ? select : input);
+      update();
     },
   };
 }

@@ -1,9 +1,9 @@
 /** Form of all parameters: common ones first, others in a collapsed section, picture settings beside the download. */
 
-import type { Parameter } from "../api/schema";
-import type { Choices } from "../request";
+import type { Parameter, Schemes } from "../api/schema";
+import { type Choices, query } from "../request";
 import { el } from "./dom";
-import { field, type Field } from "./field";
+import { field, type Field, type Offer } from "./field";
 
 /** Storage parameters, which do not apply to pictures. */
 const STORAGE = ["compress", "normals", "units", "atom_ids"];
@@ -11,11 +11,12 @@ const STORAGE = ["compress", "normals", "units", "atom_ids"];
 /** Parameters whose values name parts of one structure. */
 const PARTS = ["model", "chains", "altloc", "assembly"];
 
-/** Parameters of colours, which change the shown surface without a new mesh. */
-const COLORS = ["color", "palette", "color_range"];
+/** Parameters of colours. Colours of atoms change the shown surface without a new mesh. */
+const COLORS = ["color", "palette", "color_range", "color_blend"];
 
-/** Returns true if a parameter changes the displayed mesh. */
-const isOfMesh = ({ name, format }: Parameter) => format === "" && !COLORS.includes(name);
+const isOfColors = ({ name }: Parameter) => COLORS.includes(name);
+/** Returns true if a parameter always changes the mesh. */
+const isOfShape = (parameter: Parameter) => parameter.format === "" && !isOfColors(parameter);
 
 /** Parameters at the top. Others follow below. */
 const FIRST = [
@@ -29,7 +30,7 @@ export class Form {
    * Fills `home`, and `pictures` with parameters of single formats. Calls `changed` after every change and
    * states whether it affects the mesh and whether a slider is still being dragged.
    */
-  constructor(private readonly home: HTMLElement, pictures: HTMLElement, parameters: Parameter[], private readonly changed: (mesh: boolean, live: boolean) => void) {
+  constructor(private readonly home: HTMLElement, pictures: HTMLElement, parameters: Parameter[], private readonly schemes: Schemes, private readonly changed: (mesh: boolean, live: boolean) => void) {
     const first = parameters.filter((p) => FIRST.includes(p.name)).sort((a, b) => FIRST.indexOf(a.name) - FIRST.indexOf(b.name));
     const others = parameters.filter((p) => !FIRST.includes(p.name) && !p.format);
     const apart = parameters.filter((p) => p.format);
@@ -46,14 +47,27 @@ export class Form {
     return new Map([...this.fields].flatMap(([name, { value }]) => (value === undefined ? [] : [[name, value]])));
   }
 
-  /** Returns the values in `choices` that affect the mesh. */
-  mesh(choices: Choices): Choices {
-    return this.chosen(choices, isOfMesh);
+  /** Returns true if the colours belong to vertices, so that they come with the mesh. */
+  coloursVertices(choices: Choices): boolean {
+    const scheme = choices.get("color") ?? "none";
+    if (scheme === "none") return false;
+    const isOfAtoms = scheme.startsWith("uniform:") || this.schemes.ofAtoms.has(scheme);
+    return !isOfAtoms || choices.get("color_blend") === "smooth";
   }
 
-  /** Returns the values in `choices` that do not change the displayed mesh: colours and parameters of one format. */
-  apart(choices: Choices): Choices {
-    return this.chosen(choices, (parameter) => !isOfMesh(parameter));
+  /** Returns the values in `choices` that affect the displayed mesh. */
+  mesh(choices: Choices): Choices {
+    const withColors = this.coloursVertices(choices);
+    return this.chosen(choices, (parameter) => isOfShape(parameter) || (withColors && isOfColors(parameter)));
+  }
+
+  /** Returns the parameters of a surface: the shape in `choices`, with the set colours and parameters of one format. */
+  displayed(choices: Choices): Choices {
+    const all = this.all;
+    // New colours of vertices come with the next mesh.
+    const colors = this.coloursVertices(all) ? choices : all;
+    const apart = this.chosen(all, ({ format }) => format !== "");
+    return new Map([...this.chosen(choices, isOfShape), ...this.chosen(colors, isOfColors), ...apart]);
   }
 
   /** Returns the values in `choices` that apply to a file of `format`. */
@@ -77,11 +91,13 @@ export class Form {
   set(name: string, value: string | undefined, live = false): void {
     const field = this.fields.get(name);
     if (!field) return;
-    const mesh = isOfMesh(field.parameter);
-    if (field.value === value && !live) return this.changed(mesh, live);
+    const { parameter } = field;
+    const before = query(this.mesh(this.all));
     field.value = value;
-    if (value !== undefined) for (const other of field.parameter.insteadOf) this.put(other, undefined);
-    this.changed(mesh, live);
+    if (value !== undefined) for (const other of parameter.insteadOf) this.put(other, undefined);
+    const now = this.all;
+    const needsMesh = isOfColors(parameter) ? this.coloursVertices(now) && query(this.mesh(now)) !== before : isOfShape(parameter);
+    this.changed(needsMesh, live);
   }
 
   /** Sets all values without calling `changed`. */
@@ -109,8 +125,8 @@ export class Form {
     this.fields.get(name)?.effective(words);
   }
 
-  /** Sets the values that a text field suggests for this structure. */
-  offer(name: string, values: string[]): void {
+  /** Sets the values that a text field offers for this structure. */
+  offer(name: string, values: Offer[]): void {
     this.fields.get(name)?.offer?.(values);
   }
 

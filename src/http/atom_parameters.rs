@@ -1,0 +1,87 @@
+//! Parameters of `…/atoms`: `positions`, and those of a mesh that select its atoms.
+
+use crate::pipeline::nearest::nearest;
+use crate::pipeline::params::{self, ParamError};
+use crate::structure::Selection;
+
+/// Name of the parameter that requests positions.
+pub(super) const POSITIONS: &str = "positions";
+/// Names of the parameters.
+pub(super) const NAMES: [&str; 6] = [POSITIONS, "model", "chains", "select", "altloc", "assembly"];
+
+/// Selection of atoms that are listed with their positions.
+pub(super) struct Positions {
+    pub(super) selection: Selection,
+    /// Text that is equal for equal lists.
+    pub(super) canonical: String,
+}
+
+/// Parses the parameters. Returns `None` if no positions are requested.
+///
+/// # Errors
+/// Returns a [`ParamError`], including if atoms are selected without positions.
+pub(super) fn parse(pairs: &[(String, String)]) -> Result<Option<Positions>, ParamError> {
+    if let Some((name, _)) = pairs.iter().find(|(name, _)| !NAMES.contains(&name.as_str())) {
+        let name = name.chars().take(64).collect::<String>();
+        return Err(ParamError::Unknown { nearest: nearest(&name, NAMES), name });
+    }
+    let (own, of_mesh): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == POSITIONS);
+    let job = params::parse(of_mesh.iter().map(|(name, value)| (name, value)))?.job;
+    let bad = |value: &str, expected: &str| ParamError::BadValue {
+        name: POSITIONS,
+        value: format!("`{}`", value.chars().take(64).collect::<String>()),
+        expected: expected.to_owned(),
+    };
+    let positions = match &own[..] {
+        [] => false,
+        [(_, value)] => match value.as_str() {
+            "true" => true,
+            "false" => false,
+            other => return Err(bad(other, "true or false")),
+        },
+        _ => return Err(ParamError::Repeated { name: POSITIONS }),
+    };
+    if positions {
+        let canonical = format!("{POSITIONS}&{}", params::canonical(&job));
+        return Ok(Some(Positions { selection: job.selection, canonical }));
+    }
+    if job.selection != Selection::default() {
+        return Err(bad("false", "true, which the parameters that select atoms need"));
+    }
+    Ok(None)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parsed(pairs: &[(&str, &str)]) -> Result<Option<Positions>, ParamError> {
+        let pairs: Vec<_> = pairs.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect();
+        parse(&pairs)
+    }
+
+    #[test]
+    fn a_selection_needs_positions() {
+        assert!(parsed(&[]).unwrap().is_none());
+        assert!(parsed(&[("positions", "false"), ("assembly", "asymmetric-unit")]).unwrap().is_none());
+        let found = parsed(&[("select", "ligand"), ("positions", "true")]).unwrap().unwrap();
+        let other = parsed(&[("positions", "true")]).unwrap().unwrap();
+        assert_ne!(found.canonical, other.canonical);
+        assert_ne!(found.selection, other.selection);
+        for (pairs, name) in [
+            (&[("select", "ligand")][..], "positions"),
+            (&[("positions", "1")], "positions"),
+            (&[("positions", "true"), ("select", "ligands and")], "select"),
+            (&[("positions", "true"), ("positions", "true")], "positions"),
+            (&[("positions", "true"), ("resolution", "1")], "resolution"),
+        ] {
+            let error = parsed(pairs).err().unwrap();
+            let found = match &error {
+                ParamError::BadValue { name, .. } | ParamError::Repeated { name } => *name,
+                ParamError::BadExpression { name, .. } => *name,
+                ParamError::Unknown { name, .. } => name.as_str(),
+            };
+            assert_eq!(found, name, "{error}");
+        }
+    }
+}
