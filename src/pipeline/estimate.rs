@@ -8,16 +8,18 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use super::color::{AtomColors, Scheme};
+use super::cut::Cut;
+use super::divided::{Division, divided};
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
-use super::{parts, work};
+use super::{parts, suggest, work};
 use crate::structure::{AtomPart, Structure, StructureError};
 use crate::surface::cpu::{LATTICE_BYTES, check_work, scan};
 use crate::surface::lattice::{Lattice, slightly_coarser};
 use crate::surface::occupancy::count;
 use crate::surface::params::MAX_RESOLUTION;
 use crate::surface::{
-    Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams, candidates,
+    Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
 };
 
 /// Estimated size of a job.
@@ -50,6 +52,8 @@ pub struct MeshEstimate {
     pub area: f64,
     /// Number of vertices.
     pub vertices: u64,
+    /// Number of vertices of the surface before it is cut; equal to `vertices` without a cut.
+    pub whole_vertices: u64,
     /// Number of triangles.
     pub triangles: u64,
     /// Bytes of the binary part of a GLB. Without colours and atom indices, the mesh in memory has the same size.
@@ -73,8 +77,10 @@ pub fn estimate<S: Deref<Target = Structure>>(
         AtomColors::new(&structure, &selected.atoms, coloring)?;
     }
     let parts = selected.parts(&structure, job.split, &limits.read, control)?;
-    let backend = parts::divided(choice.backend, parts.as_deref());
-    let choice = &Choice { backend: &*backend, reason: choice.reason };
+    let cut = Cut::of(&selected, parts.as_deref(), job.validation, control)?;
+    let division = Division::of(parts.as_deref(), cut.as_ref());
+    let backend = divided(choice.backend, division);
+    let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
     let mut params = job.params_for(spheres.len());
     let mut refused = None;
     if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -89,7 +95,8 @@ pub fn estimate<S: Deref<Target = Structure>>(
         }
     }
     let _storage = super::storage(job, &mut params, &spheres);
-    let plan = MeshPlan { spheres: &spheres, parts: parts.as_deref(), params: &params, limits: &limits.surface };
+    let plan = MeshPlan::new(&spheres, division, &params, &limits.surface);
+    let choice = plan.choice(undivided, choice);
     let lattices = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
@@ -101,10 +108,10 @@ pub fn estimate<S: Deref<Target = Structure>>(
     };
     let mesh = mesh.and_then(|mesh| {
         let bytes = mesh.bytes + job.attribute_bytes() * mesh.vertices;
-        control.memory.check(bytes)?;
+        control.memory.check(bytes.saturating_add(plan.bytes_before_cut(&mesh)))?;
         Ok(MeshEstimate { bytes, ..mesh })
     });
-    let mesh = match mesh.map_err(|error| with_finest_fit(error, &plan, choice, control)) {
+    let mesh = match mesh.map_err(|error| suggest::with_finest_fit(error, &plan, choice, control)) {
         Err(error) if ends_work(&error) => return Err(error.into()),
         mesh => mesh,
     };
@@ -117,8 +124,8 @@ impl Estimate {
     /// Returns the work of the job in atoms at 0.5 Å, if the job would be accepted.
     #[must_use]
     pub fn work(&self, job: &Job) -> Option<f64> {
-        let MeshEstimate { grid_points, pairs, vertices, .. } = self.mesh.as_ref().ok()?;
-        Some(work::counted_work(job, self.atoms_in_file, [*pairs, *grid_points, *vertices]))
+        let MeshEstimate { grid_points, pairs, whole_vertices, .. } = self.mesh.as_ref().ok()?;
+        Some(work::counted_work(job, self.atoms_in_file, [*pairs, *grid_points, *whole_vertices]))
     }
 }
 
@@ -146,15 +153,21 @@ pub(super) fn check_memory(
     let attributes = |vertices: u64| vertices.saturating_mul(job.attribute_bytes());
     let vertices = n_vertices(plan.spheres.area(params), params.resolution);
     let most = params.mesh_bytes(vertices, vertices.saturating_mul(2)).saturating_add(attributes(vertices));
+    // A surface before its cut has at most the same size, besides its atom indices.
+    let most = if plan.cut.is_some() { most.saturating_mul(2).saturating_add(ID_BYTES * vertices) } else { most };
     if memory.check(most).is_ok() {
         return Ok(());
     }
     let mesh = plan.mesh(&plan.lattices(control)?, choice, control)?;
-    Ok(memory.check(mesh.bytes + attributes(mesh.vertices))?)
+    let bytes = mesh.bytes.saturating_add(attributes(mesh.vertices));
+    Ok(memory.check(bytes.saturating_add(plan.bytes_before_cut(&mesh)))?)
 }
 
+/// Memory of the atom index of a vertex, bytes.
+const ID_BYTES: u64 = 4;
+
 /// Returns true if `error` ends the estimate as well, not only the mesh.
-const fn ends_work(error: &SurfaceError) -> bool {
+pub(super) const fn ends_work(error: &SurfaceError) -> bool {
     matches!(
         error,
         SurfaceError::Cancelled
@@ -165,7 +178,7 @@ const fn ends_work(error: &SurfaceError) -> bool {
 
 /// Returns the number of vertices of a mesh of `area` Å².
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate")]
-fn n_vertices(area: f64, spacing: f64) -> u64 {
+pub(super) fn n_vertices(area: f64, spacing: f64) -> u64 {
     (1.5 * area / (spacing * spacing)).round() as u64
 }
 
@@ -174,6 +187,7 @@ fn n_vertices(area: f64, spacing: f64) -> u64 {
 pub(super) struct MeshPlan<'a> {
     pub(super) spheres: &'a Spheres,
     pub(super) parts: Option<&'a [AtomPart]>,
+    pub(super) cut: Option<&'a Cut>,
     pub(super) params: &'a SurfaceParams,
     pub(super) limits: &'a SurfaceLimits,
 }
@@ -192,7 +206,30 @@ impl Deref for Lattices {
     }
 }
 
-impl MeshPlan<'_> {
+impl<'a> MeshPlan<'a> {
+    pub(super) fn new(
+        spheres: &'a Spheres,
+        division: Option<Division<'a>>,
+        params: &'a SurfaceParams,
+        limits: &'a SurfaceLimits,
+    ) -> Self {
+        let (parts, cut) = (division.and_then(Division::parts), division.and_then(Division::cut));
+        Self { spheres, parts, cut, params, limits }
+    }
+
+    /// Returns the choice of the backend that estimates the mesh: the one that does not divide it if the plan cuts the
+    /// mesh itself.
+    pub(super) fn choice<'c>(&self, undivided: &'c Choice<'c>, divided: &'c Choice<'c>) -> &'c Choice<'c> {
+        if self.cut.is_some() { undivided } else { divided }
+    }
+
+    /// Returns the memory of the surface before it is cut, with its atom indices, bytes; 0 without a cut.
+    fn bytes_before_cut(&self, mesh: &MeshEstimate) -> u64 {
+        let n = mesh.whole_vertices;
+        let bytes = self.params.mesh_bytes(n, n.saturating_mul(2)).saturating_add(ID_BYTES.saturating_mul(n));
+        if self.cut.is_some() { bytes } else { 0 }
+    }
+
     /// Places the spheres of each part on its lattice.
     fn lattices(&self, control: &Control<'_>) -> Result<Lattices, SurfaceError> {
         // All lattices, and the spheres of one part at a time.
@@ -222,38 +259,54 @@ impl MeshPlan<'_> {
             let suggested_resolution = slightly_coarser(h * (grid_points as f64 / limit as f64).cbrt());
             return Err(SurfaceError::GridTooLarge { grid_points, limit, resolution: h, suggested_resolution });
         }
-        let area = self.area(COARSE_FACTOR * h, choice, control)?;
-        let vertices = n_vertices(area, h);
+        let [whole_area, area] = self.areas(COARSE_FACTOR * h, choice, control)?;
+        let [whole_vertices, vertices] = [whole_area, area].map(|area| n_vertices(area, h));
         let triangles = 2 * vertices;
         let bytes = params.mesh_bytes(vertices, triangles);
-        // Limits count parts before quantizing.
-        let in_memory = if lattices.len() > 1 { self.unquantized().mesh_bytes(vertices, triangles) } else { bytes };
+        // Limits count parts before quantizing, and a surface before its cut.
+        let counted = if lattices.len() > 1 { &self.unquantized() } else { params };
+        let in_memory = counted.mesh_bytes(whole_vertices, 2 * whole_vertices);
         if in_memory > limits.max_mesh_bytes {
             return Err(scan::too_large(in_memory, h, limits.max_mesh_bytes));
         }
-        Ok(MeshEstimate { bricks, grid_points, pairs, area, vertices, triangles, bytes })
+        Ok(MeshEstimate { bricks, grid_points, pairs, area, vertices, whole_vertices, triangles, bytes })
     }
 
     fn unquantized(&self) -> SurfaceParams {
         SurfaceParams { atom_ids: false, quantize: None, ..self.params.clone() }
     }
 
-    /// Returns the area of a coarser mesh, Å².
-    fn area(&self, coarse: f64, choice: &Choice<'_>, control: &Control<'_>) -> Result<f64, SurfaceError> {
-        let (spheres, limits, single) = (self.spheres, self.limits, self.unquantized());
+    /// Returns the areas of a coarser mesh before and after the cut, Å². They are equal without a cut.
+    pub(super) fn areas(
+        &self,
+        coarse: f64,
+        choice: &Choice<'_>,
+        control: &Control<'_>,
+    ) -> Result<[f64; 2], SurfaceError> {
+        let (spheres, limits) = (self.spheres, self.limits);
+        let single = SurfaceParams { atom_ids: self.cut.is_some(), ..self.unquantized() };
         let resolution = coarse.clamp(MIN_COARSE_SPACING, MAX_RESOLUTION).max(single.resolution);
         let coarse = SurfaceParams { resolution, ..single.clone() };
         let control = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
-        let mut output = match choice.backend.run(spheres, &coarse, limits, &control) {
-            // A coarse grid can miss single small spheres: use the job's grid then.
-            Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, &single, limits, &control)?,
-            output => output?,
+        let areas = |params: &SurfaceParams| {
+            let mut output = choice.backend.run(spheres, params, limits, &control)?;
+            let whole = output.measure(&control)?.area;
+            let Some(cut) = self.cut else { return Ok([whole; 2]) };
+            output.mesh.make_contiguous();
+            match cut.area(&output.mesh) {
+                0.0 => Err(SurfaceError::NoPatch),
+                area => Ok([whole, area]),
+            }
         };
-        Ok(output.measure(&control)?.area)
+        match areas(&coarse) {
+            // A coarse grid can miss single small spheres: use the job's grid then.
+            Err(SurfaceError::NoSurface { .. } | SurfaceError::NoPatch) => areas(&single),
+            areas => areas,
+        }
     }
 
     /// Counts the grid points at another spacing.
-    fn grid_points(&self, resolution: f64, control: &Control<'_>) -> Result<u64, SurfaceError> {
+    pub(super) fn grid_points(&self, resolution: f64, control: &Control<'_>) -> Result<u64, SurfaceError> {
         let (params, limits) = (SurfaceParams { resolution, ..self.params.clone() }, self.limits);
         // The limit of candidate pairs applies to each part.
         let counted = parts::spheres_of(self.spheres, self.parts).map(|own| {
@@ -264,117 +317,6 @@ impl MeshPlan<'_> {
         });
         counted.sum()
     }
-}
-
-/// Maximum number of grids that [`with_finest_fit`] plans.
-const MAX_PLANS: u32 = 8;
-/// Factor by which the spacing grows if it does not fit all parts.
-const COARSER: f64 = 1.5;
-/// Spacing of the mesh that gives the area for a suggestion, as a multiple of the suggested spacing.
-const SKETCH_FACTOR: f64 = 4.0;
-/// Margin of the estimated size of a mesh that must fit.
-const SIZE_MARGIN: f64 = 1.3;
-
-/// Replaces the suggested spacing of an error about the grid or about candidate pairs with the finest hundredth of an Å
-/// whose planned grid fits all limits. A mesh of that spacing fits as well.
-pub(super) fn with_finest_fit(
-    mut error: SurfaceError,
-    plan: &MeshPlan<'_>,
-    choice: &Choice<'_>,
-    control: &Control<'_>,
-) -> SurfaceError {
-    let bound = match &error {
-        SurfaceError::GridTooLarge { suggested_resolution, .. } => Some(*suggested_resolution),
-        SurfaceError::TooManyCandidates { suggested_resolution, .. } => *suggested_resolution,
-        _ => return error,
-    };
-    let found = bound.map(|bound| finest_fit(bound, plan, choice, control)).transpose();
-    let fits = match found {
-        Ok(fits) => fits.flatten(),
-        Err(ends) => return ends,
-    };
-    match &mut error {
-        // A backend may need more than the plan. Its own suggestion is then the coarser one.
-        SurfaceError::GridTooLarge { suggested_resolution, resolution, .. } => {
-            *suggested_resolution = match fits {
-                Some(fits) if fits <= *resolution => *suggested_resolution,
-                fits => fits.unwrap_or(f64::INFINITY),
-            };
-        }
-        SurfaceError::TooManyCandidates { suggested_resolution, .. } => *suggested_resolution = fits,
-        _ => {}
-    }
-    error
-}
-
-/// Returns the finest spacing that fits, beginning at `bound`, if one is found.
-fn finest_fit(
-    bound: f64,
-    plan: &MeshPlan<'_>,
-    choice: &Choice<'_>,
-    control: &Control<'_>,
-) -> Result<Option<f64>, SurfaceError> {
-    // The spheres of one part at a time.
-    let part_bytes = plan.parts.map_or(0, |_| super::SPHERE_BYTES * plan.spheres.len() as u64);
-    let _spheres = control.reserve(part_bytes)?;
-    let limit = plan.limits.max_grid_points;
-    let (mut fits, mut next) = (None, bound.min(MAX_RESOLUTION));
-    for _ in 0..MAX_PLANS {
-        let coarser = match plan.grid_points(next, control) {
-            Ok(needed) if needed <= limit => {
-                fits = Some(next);
-                // The arcs of a solvent-excluded surface are not counted here.
-                if plan.params.surface == SurfaceKind::Ses {
-                    break;
-                }
-                // The bricks of a finer grid cover less volume, so the grid at this spacing fits as well.
-                let finer = (next * (needed as f64 / limit as f64).cbrt() * 100.0).ceil() / 100.0;
-                if finer >= next {
-                    break;
-                }
-                next = finer;
-                continue;
-            }
-            Err(error) if ends_work(&error) => return Err(error),
-            _too_large if fits.is_some() => break,
-            // This bound comes from the grid, that one from the pairs: both limits apply.
-            Err(error) => error.suggested_resolution().filter(|coarser| *coarser > next),
-            Ok(_) => None,
-        };
-        // The bounds come from one part and may be too fine for all parts.
-        let coarser = coarser.or_else(|| plan.parts.map(|_| COARSER * next));
-        match coarser.map(|coarser| coarser.min(MAX_RESOLUTION)) {
-            Some(coarser) if coarser > next => next = coarser,
-            _ => break,
-        }
-    }
-    fits.map(|fits| with_fitting_mesh(fits, plan, choice, control)).transpose()
-}
-
-/// Returns `spacing`, or a coarser one at which the mesh fits its limit as well.
-fn with_fitting_mesh(
-    spacing: f64,
-    plan: &MeshPlan<'_>,
-    choice: &Choice<'_>,
-    control: &Control<'_>,
-) -> Result<f64, SurfaceError> {
-    let (params, limit) = (plan.params, plan.limits.max_mesh_bytes);
-    let exceeds = |area: f64| {
-        let vertices = n_vertices(area, spacing);
-        let bytes = params.mesh_bytes(vertices, vertices.saturating_mul(2));
-        (bytes > limit || control.memory.check(bytes).is_err()).then_some(bytes)
-    };
-    if exceeds(plan.spheres.area(params)).is_none() {
-        return Ok(spacing);
-    }
-    let coarse = MeshPlan { params: &SurfaceParams { resolution: spacing, ..params.clone() }, ..*plan };
-    let area = match coarse.area(SKETCH_FACTOR * spacing, choice, control) {
-        Err(error) if ends_work(&error) => return Err(error),
-        area => area.unwrap_or(0.0),
-    };
-    let Some(bytes) = exceeds(SIZE_MARGIN * area) else { return Ok(spacing) };
-    let limit = limit.min(control.memory.available());
-    Ok(slightly_coarser(spacing * (bytes as f64 / limit as f64).sqrt()).min(MAX_RESOLUTION))
 }
 
 #[cfg(test)]

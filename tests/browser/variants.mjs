@@ -25,7 +25,7 @@ window.load = async (url) => {
     [a, b, c].forEach((v, k) => v.fromBufferAttribute(geometry.getAttribute("position"), geometry.index.getX(i + k)).applyMatrix4(mesh.matrixWorld));
     volume += a.dot(b.cross(c)) / 6;
   }
-  return { size, volume, triangles: geometry.index.count / 3, attributes: Object.keys(geometry.attributes).sort(), indexBytes: geometry.index.array.BYTES_PER_ELEMENT };
+  return { size, volume, instances: mesh.isInstancedMesh ? mesh.count : null, triangles: geometry.index.count / 3, attributes: Object.keys(geometry.attributes).sort(), indexBytes: geometry.index.array.BYTES_PER_ELEMENT };
 };
 window.view = (url) => new Promise((resolve, reject) => {
   const viewer = document.querySelector("#viewer");
@@ -85,6 +85,14 @@ await run({
     await page.route("**/inverted.glb", async (route) => route.fulfill({ contentType: "model/gltf-binary", body: inverted((await fetchBytes(address)).bytes) }));
     const three = await page.evaluate((url) => window.load(url), "/inverted.glb");
     assert.ok(three.volume < 0, `${three.volume}`);
+  },
+
+  "three.js repeats the mesh of an assembly": async () => {
+    const [plain, repeated] = await Promise.all(
+      ["", "&assembly=1&instances=true"].map((more) => page.evaluate((url) => window.load(url), `${SERVICE_URL}/v1/pdb/1crn/surface.glb?resolution=0.9${more}`)),
+    );
+    assert.deepEqual([plain.instances, repeated.instances], [null, 1]);
+    repeated.size.forEach((side, i) => assert.ok(close(side, plain.size[i], 1e-5), `${repeated.size} ${plain.size}`));
   },
 
   "the page has no errors": async () => {
