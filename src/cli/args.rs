@@ -281,6 +281,14 @@ pub(crate) struct SelectionArgs {
     /// Id of the biological assembly to build [default: asymmetric-unit, the atoms as they are in the file]
     #[arg(long, value_name = "ID")]
     pub(crate) assembly: Option<String>,
+    /// Mesh each distinct set of chains of the assembly once and repeat the mesh (glb and gltf only); surfaces of
+    /// neighbouring instances are not joined
+    #[arg(long)]
+    pub(crate) instances: bool,
+    /// Atoms whose surface is made: selection (the selected atoms alone), or whole (all polymer chains and the selected
+    /// atoms; only the triangles nearest to selected atoms are kept, and the mesh is open) [default: selection]
+    #[arg(long, value_name = "CONTEXT")]
+    pub(crate) context: Option<String>,
     /// Divide the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, residue-group
     /// (polymer, ligand, glycan, ion, water) or none [default: none]
     #[arg(long, value_name = "RULE")]
@@ -298,7 +306,7 @@ pub(crate) struct LimitArgs {
     /// Atoms of one model, or of the assembly, at exactly the same position [default: 1000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_duplicates: Option<u64>,
-    /// Copies of chains in the assembly [default: 10000]
+    /// Copies of chains in the assembly, or instances [default: 10000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_copies: Option<u64>,
     /// Parts of a mesh with `--split` or `--model all` [default: 1000]

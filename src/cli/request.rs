@@ -104,6 +104,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("model", &atoms.model),
         ("altloc", &atoms.altloc),
         ("assembly", &atoms.assembly),
+        ("context", &atoms.context),
         ("split", &atoms.split),
         ("validation", &args.validation),
     ];
@@ -111,6 +112,9 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         own.iter().copied().chain(given).filter_map(|(name, value)| value.clone().map(|value| (name, value))).collect();
     if surface.atom_ids {
         pairs.push(("atom_ids", "true".to_owned()));
+    }
+    if atoms.instances {
+        pairs.push(("instances", "true".to_owned()));
     }
     if args.check {
         pairs.push(("check", "strict".to_owned()));
@@ -167,6 +171,8 @@ mod tests {
                 "compress" => vec![&flag, "quantize"],
                 "normals" => vec![&flag, "none"],
                 "units" => vec![&flag, "nanometer"],
+                "instances" => vec![&flag, "--assembly", "1"],
+                "context" => vec![&flag, "whole"],
                 "split" => vec![&flag, "chain"],
                 "max_triangles" => vec![&flag, "5000"],
                 "surface" => vec![&flag, "soft-object"],
@@ -195,7 +201,7 @@ mod tests {
             let changed = ask(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
             assert_ne!(key(&changed), key(&ask(&[]).unwrap()), "{flag} changes nothing");
             // A parameter that changes the mesh changes the picture.
-            if !["format", "compress", "normals", "units"].contains(&parameter.name) {
+            if !["format", "compress", "normals", "units", "instances"].contains(&parameter.name) {
                 assert_ne!(key(&drawn(&value).unwrap()), key(&drawn(&[]).unwrap()), "{flag} changes no picture");
             }
         }
@@ -208,6 +214,10 @@ mod tests {
         let default = request(&["--detail", "3", "--resolution", "0.5"]).unwrap();
         assert_eq!(params::canonical(&default.job), params::canonical(&request(&["--detail", "3"]).unwrap().job));
         assert!(both.code() == 2 && message.contains("`detail`") && message.contains("`resolution`"), "{message}");
+        for flags in [&["--instances"][..], &["--instances", "--assembly", "1", "--context", "whole"]] {
+            let message = request(flags).unwrap_err().to_string();
+            assert!(message.contains("`instances`") && message.contains("expected false"), "{message}");
+        }
         for flags in [["--detail", "7"], ["--max-triangles", "7"], ["--normals", "flat"], ["--units", "inch"]] {
             assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");
         }
@@ -228,6 +238,7 @@ mod tests {
             ["--surface", "x"],
             ["--chains", ",,"],
             ["--split", "atom"],
+            ["--context", "all"],
         ] {
             assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");
         }

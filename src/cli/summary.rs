@@ -1,6 +1,6 @@
 //! Summary of a report, as text of at most one screen.
 
-use molmesh::pipeline::{ColorReport, LeftOutReport, PictureReport, Report};
+use molmesh::pipeline::{ColorReport, InstancesReport, LeftOutReport, PictureReport, Report};
 use molmesh::surface::Validation;
 
 use super::page::Page;
@@ -36,8 +36,14 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
         None => format!("model {}", report.model),
     };
     page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, {models})", report.source_format));
+    if let Some(selected) = report.selected_atoms {
+        page.row("selected", &format!("{} atoms; the mesh is cut out of the surface of all atoms", grouped(selected)));
+    }
     if let Some(assembly) = &report.assembly {
         page.row("assembly", &format!("{} of {} copies", assembly.id, grouped(assembly.copies)));
+    }
+    if let Some(instances) = &report.instances {
+        page.row("instances", &repeated(report, instances));
     }
     if report.left_out.total > 0 {
         page.row("left out", &left_out(&report.left_out));
@@ -72,7 +78,9 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     page.row("validation", &validation(report, style));
     page.row("parts", &parts(report));
     page.row("area", &format!("{} Å²", decimal(report.area)));
-    page.row("volume", &format!("{} Å³", decimal(report.volume)));
+    if let Some(volume) = report.volume {
+        page.row("volume", &format!("{} Å³", decimal(volume)));
+    }
     page.row("backend", &format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
     for Written { name, format, bytes } in [Some(&written.mesh), written.table.as_ref()].into_iter().flatten() {
         page.row("wrote", &format!("{name} ({format}, {} bytes)", grouped(*bytes)));
@@ -105,6 +113,14 @@ fn surface(report: &Report) -> String {
     let isovalue = report.isovalue.map(|level| format!(", isovalue {level}")).unwrap_or_default();
     let probe = report.probe.map(|radius| format!(", probe {radius} Å")).unwrap_or_default();
     format!("{}, {} Å{from}{isovalue}{smoothness}{probe}{preset}", report.surface, report.resolution)
+}
+
+/// Formats the sums over all instances.
+fn repeated(report: &Report, instances: &InstancesReport) -> String {
+    let InstancesReport { count, atoms_sum, area_sum, volume_sum, .. } = instances;
+    let [count, units, atoms] = [*count, report.parts.len() as u64, *atoms_sum].map(grouped);
+    let [area, volume] = [*area_sum, *volume_sum].map(decimal);
+    format!("{count} of {units} distinct units, not joined; sums: {atoms} atoms, {area} Å², {volume} Å³")
 }
 
 /// Formats the numbers of atoms that were left out, by residue name and reason.
@@ -156,6 +172,10 @@ fn validation(report: &Report, style: Style) -> String {
     let status = |holds: bool, yes: &str, no: &str| if holds { style.green(yes) } else { style.red(no) };
     let method = if report.validation == Validation::Exact.name() { "exact edge matching" } else { "edge checksum" };
     let manifold = if report.manifold_from == "check" { "manifold" } else { "manifold by construction" };
+    if report.open_reason.is_some() {
+        let oriented = status(report.oriented, "oriented", "NOT oriented");
+        return format!("open along the cut (by {method}), {oriented}, Euler number {}", report.euler);
+    }
     format!(
         "{} (by {method}), {}, {}, Euler number {}",
         status(report.closed, "watertight", "NOT watertight"),
@@ -254,10 +274,12 @@ mod tests {
             title: Some("TRYPSIN INHIBITOR".into()),
             source_format: "pdb",
             atoms: 454,
+            selected_atoms: None,
             atoms_in_file: 514,
             model: 1,
             models: None,
             assembly: None,
+            instances: None,
             left_out: LeftOutReport {
                 total: 60,
                 virtual_sites: 2,
@@ -284,6 +306,7 @@ mod tests {
             vertices: 20_000,
             triangles: 39_996,
             closed: true,
+            open_reason: None,
             oriented: true,
             manifold: false,
             manifold_from: "check",
@@ -295,7 +318,7 @@ mod tests {
             component_list: Vec::new(),
             parts: Vec::new(),
             area: 3200.04,
-            volume: 7100.0,
+            volume: Some(7100.0),
             report_units: "angstrom",
             file_units: "nanometer",
             normals: "none",

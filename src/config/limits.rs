@@ -32,7 +32,8 @@ pub struct LimitsConfig {
     /// Number of atoms of one model, or of an assembly, at exactly the same position. Default 1,000: structures have at
     /// most a few, and the work of a mesh grows with the square of their number.
     pub duplicate_atoms: u64,
-    /// Number of copies of chains in an assembly. Default 10,000: six times as many as in the largest virus of the PDB.
+    /// Number of copies of chains in an assembly, or of instances. Default 10,000: six times as many as in the largest
+    /// virus of the PDB.
     pub assembly_copies: u64,
     /// Number of parts of a mesh with `split` or `model=all`. Default 1,000: most structures have fewer chains. Each
     /// part is meshed on its own and adds about a kilobyte to the header of a glTF.

@@ -36,6 +36,8 @@ pub(super) struct Summary {
     pub(super) max_atom: Option<u32>,
     /// True if a colour is not opaque.
     pub(super) translucent: bool,
+    /// True if the mesh is cut open, so that its inside can be seen.
+    pub(super) open: bool,
 }
 
 /// Checks that all columns have the same length, and that the values that the writer of `format` relies on are finite
@@ -74,6 +76,7 @@ pub(super) fn check(mesh: &Mesh, format: Format, bounds: Option<Bounds>) -> Resu
         bounds,
         max_atom: mesh.atom_ids.as_ref().map(|ids| maximum(&ids[..]).unwrap_or(0)),
         translucent: mesh.colors.as_ref().is_some_and(|colors| colors.iter().any(|c| c[3] != u8::MAX)),
+        open: mesh.cut,
     })
 }
 

@@ -101,6 +101,12 @@ pub enum FormatError {
         /// The format's name.
         format: &'static str,
     },
+    /// Only glTF and GLB repeat a mesh.
+    #[error("{format} cannot hold instances, glb and gltf can")]
+    InstancesNotSupported {
+        /// The format's name.
+        format: &'static str,
+    },
     /// Only glTF and GLB hold coordinates in units this large.
     #[error("{format} cannot hold coordinates in {units}, glb and gltf can")]
     UnitsNotSupported {

@@ -82,6 +82,12 @@ impl Format {
         matches!(self, Self::Glb | Self::Gltf)
     }
 
+    /// Returns true if the format can repeat a mesh.
+    #[must_use]
+    pub const fn holds_instances(self) -> bool {
+        matches!(self, Self::Glb | Self::Gltf)
+    }
+
     /// Media type, registered with IANA except those of PLY and VTP: `application/ply` is common,
     /// `model/x-ply-text` and `model/x-vtp` are specific to molmesh.
     #[must_use]

@@ -94,6 +94,9 @@ impl<'a> Encoder<'a> {
         if !format.holds_units(storage.units) {
             return Err(FormatError::UnitsNotSupported { format: format.name(), units: storage.units.name() });
         }
+        if mesh.placements.is_some() && !format.holds_instances() {
+            return Err(FormatError::InstancesNotSupported { format: format.name() });
+        }
         if let Packing::Quantized(step) = Packing::of(mesh)
             && storage.packing != Packing::Quantized(step)
         {

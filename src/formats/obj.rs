@@ -144,7 +144,7 @@ mod tests {
     #[test]
     fn too_large_coordinates_are_rejected() {
         let mesh = Mesh { centre: [0.0, -2e9, 0.0], positions: vec![[0.0; 3]].into(), ..Mesh::default() };
-        let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: None, translucent: false };
+        let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: None, translucent: false, open: false };
         let plan = |storage: Storage| ObjPlan::new(&mesh, storage, &summary, &Meta::default());
         let error = plan(Storage::default()).unwrap_err();
         assert_eq!(error, FormatError::CoordinateTooLarge { value: -2e9, limit: 1e9 });

@@ -108,7 +108,7 @@ mod tests {
             triangles: vec![[u32::MAX; 3]].into(),
             ..Mesh::default()
         };
-        let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: Some(u32::MAX), translucent: false };
+        let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: Some(u32::MAX), translucent: false, open: false };
         let storage = Storage { units: super::super::Units::Angstrom, ..Storage::default() };
         let plan = PlyTextPlan::new(&mesh, storage, &summary, &Meta::default()).unwrap();
         let mut bytes = Vec::new();

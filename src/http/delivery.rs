@@ -42,7 +42,7 @@ pub(super) static SUMMARY: [SummaryHeader; 17] = [
     summary("molmesh-vertices", "vertices", Type::Integer, "Vertices of the mesh."),
     summary("molmesh-triangles", "triangles", Type::Integer, "Triangles of the mesh."),
     summary("molmesh-area", "area", Type::Number, "Surface area in Å², including the walls of voids."),
-    summary("molmesh-volume", "volume", Type::Number, "Enclosed volume in Å³, voids subtracted."),
+    summary("molmesh-volume", "volume", Type::Number, "Enclosed volume in Å³, voids subtracted; absent if the mesh is cut open."),
     summary("molmesh-closed", "closed", Type::Boolean, "`true` if the mesh has no boundary."),
     summary("molmesh-manifold", "manifold", Type::Boolean, "`true` if all edges and vertices are manifold, by a check or by construction: `manifold_from` in the report."),
     summary("molmesh-euler", "euler", Type::Integer, "Euler characteristic: vertices − edges + triangles."),

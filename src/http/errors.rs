@@ -374,6 +374,7 @@ impl From<SurfaceError> for Problem {
                 }
                 None => Self::new(Kind::NoSurface, detail).with("parameter", "resolution"),
             },
+            E::NoPatch => Self::new(Kind::NoSurface, detail).with("parameter", "context"),
             E::DeviceMemory { needed, available, .. } => {
                 fitting(Self::new(Kind::DeviceMemory, detail).with("limit", available).with("actual", needed))
             }

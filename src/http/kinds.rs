@@ -185,7 +185,7 @@ pub(super) const KINDS: &[ProblemEntry] = &[
     row(Kind::TooMuchMemory, "too-much-memory", S::UNPROCESSABLE_ENTITY, true, "The request needs too much memory",
         "The request alone needs at least `actual` bytes of memory at once, more than the `limit` bytes that the service may use. Use a coarser resolution, a smaller picture or fewer atoms, or ask the operator to raise limits.memory_bytes. An uploaded body may use half of that memory."),
     row(Kind::NoSurface, "no-surface", S::UNPROCESSABLE_ENTITY, false, "There is no surface",
-        "The density does not reach `isovalue` at any grid point, or no grid point lies inside the spheres. Use a lower isovalue or a finer resolution."),
+        "The density does not reach `isovalue` at any grid point, or no grid point lies inside the spheres. Use a lower isovalue or a finer resolution. Or no triangle is nearest to a selected atom (`context=whole`)."),
     row(Kind::OtherRequest, "other-request", S::UNPROCESSABLE_ENTITY, false, "The idempotency key belongs to another request",
         "The `Idempotency-Key` was used before with another structure, another map, other parameters or another format."),
     row(Kind::ArchiveUnavailable, "archive-unavailable", S::FAILED_DEPENDENCY, false, "The archive is unavailable",

@@ -8,6 +8,8 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use super::color::{AtomColors, Scheme};
+use super::cut::Cut;
+use super::divided::{Division, divided};
 use super::finest_fit::with_finest_fit;
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
@@ -50,6 +52,8 @@ pub struct MeshEstimate {
     pub area: f64,
     /// Number of vertices.
     pub vertices: u64,
+    /// Number of vertices of the surface before it is cut; equal to `vertices` without a cut.
+    pub whole_vertices: u64,
     /// Number of triangles.
     pub triangles: u64,
     /// Bytes of the binary part of a GLB. Without colours and atom indices, the mesh in memory has the same size.
@@ -73,8 +77,10 @@ pub fn estimate<S: Deref<Target = Structure>>(
         AtomColors::new(&structure, &selected.atoms, coloring)?;
     }
     let parts = selected.parts(&structure, job.split, &limits.read, control)?;
-    let backend = parts::divided(choice.backend, parts.as_deref());
-    let choice = &Choice { backend: &*backend, reason: choice.reason };
+    let cut = Cut::of(&selected, parts.as_deref(), job.validation, control)?;
+    let division = Division::of(parts.as_deref(), cut.as_ref());
+    let backend = divided(choice.backend, division);
+    let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
     let mut params = job.params_for(spheres.len());
     let mut refused = None;
     if let Spacing::MaxTriangles(limit) = job.spacing {
@@ -89,7 +95,8 @@ pub fn estimate<S: Deref<Target = Structure>>(
         }
     }
     let _storage = super::storage(job, &mut params, &spheres);
-    let plan = MeshPlan::new(&spheres, parts.as_deref(), &params, job, limits);
+    let plan = MeshPlan::new(&spheres, division, &params, job, limits);
+    let choice = plan.choice(undivided, choice);
     let lattices = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
@@ -101,7 +108,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
     };
     let mesh = mesh.and_then(|mesh| {
         let bytes = mesh.bytes + job.attribute_bytes() * mesh.vertices;
-        control.memory.check(bytes)?;
+        control.memory.check(bytes.saturating_add(plan.bytes_before_cut(&mesh)))?;
         Ok(MeshEstimate { bytes, ..mesh })
     });
     let mesh = match mesh.map_err(|error| with_finest_fit(error, &plan, choice, control)) {
@@ -117,8 +124,8 @@ impl Estimate {
     /// Returns the work of the job in atoms at 0.5 Å, if the job would be accepted.
     #[must_use]
     pub fn work(&self, job: &Job) -> Option<f64> {
-        let MeshEstimate { grid_points, pairs, vertices, .. } = self.mesh.as_ref().ok()?;
-        Some(work::counted_work(job, self.atoms_in_file, [*pairs, *grid_points, *vertices]))
+        let MeshEstimate { grid_points, pairs, whole_vertices, .. } = self.mesh.as_ref().ok()?;
+        Some(work::counted_work(job, self.atoms_in_file, [*pairs, *grid_points, *whole_vertices]))
     }
 }
 
@@ -146,12 +153,18 @@ pub(super) fn check_memory(
     let attributes = |vertices: u64| vertices.saturating_mul(job.attribute_bytes());
     let vertices = n_vertices(plan.spheres.area(params), params.resolution);
     let most = params.mesh_bytes(vertices, vertices.saturating_mul(2)).saturating_add(attributes(vertices));
+    // A surface before its cut has at most the same size, besides its atom indices.
+    let most = if plan.cut.is_some() { most.saturating_mul(2).saturating_add(ID_BYTES * vertices) } else { most };
     if memory.check(most).is_ok() {
         return Ok(());
     }
     let mesh = plan.mesh(&plan.lattices(control)?, choice, control)?;
-    Ok(memory.check(mesh.bytes + attributes(mesh.vertices))?)
+    let bytes = mesh.bytes.saturating_add(attributes(mesh.vertices));
+    Ok(memory.check(bytes.saturating_add(plan.bytes_before_cut(&mesh)))?)
 }
+
+/// Memory of the atom index of a vertex, bytes.
+const ID_BYTES: u64 = 4;
 
 /// Returns true if `error` ends the estimate as well, not only the mesh.
 pub(super) const fn ends_work(error: &SurfaceError) -> bool {
@@ -174,6 +187,7 @@ pub(super) fn n_vertices(area: f64, spacing: f64) -> u64 {
 pub(super) struct MeshPlan<'a> {
     pub(super) spheres: &'a Spheres,
     pub(super) parts: Option<&'a [AtomPart]>,
+    pub(super) cut: Option<&'a Cut>,
     pub(super) params: &'a SurfaceParams,
     pub(super) limits: &'a SurfaceLimits,
     /// Bytes that colours and atom indices add to a vertex.
@@ -200,7 +214,7 @@ impl<'a> MeshPlan<'a> {
     /// Plans the mesh of `spheres` in a job.
     pub(super) fn new(
         spheres: &'a Spheres,
-        parts: Option<&'a [AtomPart]>,
+        division: Option<Division<'a>>,
         params: &'a SurfaceParams,
         job: &Job,
         limits: &'a JobLimits,
@@ -208,7 +222,21 @@ impl<'a> MeshPlan<'a> {
         // The size of a picture does not depend on its mesh.
         let max_file_bytes = if job.picture.is_some() { u64::MAX } else { limits.max_file_bytes };
         let (limits, attribute_bytes) = (&limits.surface, job.attribute_bytes());
-        Self { spheres, parts, params, limits, attribute_bytes, max_file_bytes }
+        let (parts, cut) = (division.and_then(Division::parts), division.and_then(Division::cut));
+        Self { spheres, parts, cut, params, limits, attribute_bytes, max_file_bytes }
+    }
+
+    /// Returns the choice of the backend that estimates the mesh: the one that does not divide it if the plan cuts the
+    /// mesh itself.
+    pub(super) fn choice<'c>(&self, undivided: &'c Choice<'c>, divided: &'c Choice<'c>) -> &'c Choice<'c> {
+        if self.cut.is_some() { undivided } else { divided }
+    }
+
+    /// Returns the memory of the surface before it is cut, with its atom indices, bytes; 0 without a cut.
+    fn bytes_before_cut(&self, mesh: &MeshEstimate) -> u64 {
+        let n = mesh.whole_vertices;
+        let bytes = self.params.mesh_bytes(n, n.saturating_mul(2)).saturating_add(ID_BYTES.saturating_mul(n));
+        if self.cut.is_some() { bytes } else { 0 }
     }
 
     /// Places the spheres of each part on its lattice.
@@ -240,34 +268,50 @@ impl<'a> MeshPlan<'a> {
             let suggested_resolution = slightly_coarser(h * (grid_points as f64 / limit as f64).cbrt());
             return Err(SurfaceError::GridTooLarge { grid_points, limit, resolution: h, suggested_resolution });
         }
-        let area = self.area(COARSE_FACTOR * h, choice, control)?;
-        let vertices = n_vertices(area, h);
+        let [whole_area, area] = self.areas(COARSE_FACTOR * h, choice, control)?;
+        let [whole_vertices, vertices] = [whole_area, area].map(|area| n_vertices(area, h));
         let triangles = 2 * vertices;
         let bytes = params.mesh_bytes(vertices, triangles);
-        // Limits count parts before quantizing.
-        let in_memory = if lattices.len() > 1 { self.unquantized().mesh_bytes(vertices, triangles) } else { bytes };
+        // Limits count parts before quantizing, and a surface before its cut.
+        let counted = if lattices.len() > 1 { &self.unquantized() } else { params };
+        let in_memory = counted.mesh_bytes(whole_vertices, 2 * whole_vertices);
         if in_memory > limits.max_mesh_bytes {
             return Err(scan::too_large(in_memory, h, limits.max_mesh_bytes));
         }
-        Ok(MeshEstimate { bricks, grid_points, pairs, area, vertices, triangles, bytes })
+        Ok(MeshEstimate { bricks, grid_points, pairs, area, vertices, whole_vertices, triangles, bytes })
     }
 
     fn unquantized(&self) -> SurfaceParams {
         SurfaceParams { atom_ids: false, quantize: None, ..self.params.clone() }
     }
 
-    /// Returns the area of a coarser mesh, Å².
-    pub(super) fn area(&self, coarse: f64, choice: &Choice<'_>, control: &Control<'_>) -> Result<f64, SurfaceError> {
-        let (spheres, limits, single) = (self.spheres, self.limits, self.unquantized());
+    /// Returns the areas of a coarser mesh before and after the cut, Å². They are equal without a cut.
+    pub(super) fn areas(
+        &self,
+        coarse: f64,
+        choice: &Choice<'_>,
+        control: &Control<'_>,
+    ) -> Result<[f64; 2], SurfaceError> {
+        let (spheres, limits) = (self.spheres, self.limits);
+        let single = SurfaceParams { atom_ids: self.cut.is_some(), ..self.unquantized() };
         let resolution = coarse.clamp(MIN_COARSE_SPACING, MAX_RESOLUTION).max(single.resolution);
         let coarse = SurfaceParams { resolution, ..single.clone() };
         let control = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
-        let mut output = match choice.backend.run(spheres, &coarse, limits, &control) {
-            // A coarse grid can miss single small spheres: use the job's grid then.
-            Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, &single, limits, &control)?,
-            output => output?,
+        let areas = |params: &SurfaceParams| {
+            let mut output = choice.backend.run(spheres, params, limits, &control)?;
+            let whole = output.measure(&control)?.area;
+            let Some(cut) = self.cut else { return Ok([whole; 2]) };
+            output.mesh.make_contiguous();
+            match cut.area(&output.mesh) {
+                0.0 => Err(SurfaceError::NoPatch),
+                area => Ok([whole, area]),
+            }
         };
-        Ok(output.measure(&control)?.area)
+        match areas(&coarse) {
+            // A coarse grid can miss single small spheres: use the job's grid then.
+            Err(SurfaceError::NoSurface { .. } | SurfaceError::NoPatch) => areas(&single),
+            areas => areas,
+        }
     }
 }
 

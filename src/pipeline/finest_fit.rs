@@ -283,8 +283,8 @@ fn with_fitting_mesh(
     }
     let area = if plan.spheres.len() <= MAX_SKETCHED {
         let coarse = MeshPlan { params: &SurfaceParams { resolution: spacing, ..params.clone() }, ..*plan };
-        match coarse.area(SKETCH_FACTOR * spacing, choice, control) {
-            Ok(area) => most.min(SIZE_MARGIN * area),
+        match coarse.areas(SKETCH_FACTOR * spacing, choice, control) {
+            Ok([whole, _]) => most.min(SIZE_MARGIN * whole),
             Err(error) if ends_work(&error) => return Err(error),
             Err(_) => most,
         }

@@ -10,6 +10,7 @@ use super::clock::StageClock;
 use super::spacing::{COARSEST, FINEST, Spacing};
 use super::work::search_work;
 use super::{Choice, Job};
+use crate::structure::Context;
 use crate::surface::{
     Control, MeshOutput, Observer, Reservation, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
 };
@@ -194,7 +195,7 @@ pub(super) fn mesh(
                 }
                 None => (spacing, true),
             },
-            Next::Fail { resolution, triangles } => return Err(no_fit(&job.params, limit, resolution, triangles)),
+            Next::Fail { resolution, triangles } => return Err(no_fit(job, limit, resolution, triangles)),
         };
         // Hold only one mesh at a time.
         last = None;
@@ -254,23 +255,24 @@ pub(super) fn expected(
                 search.record(spacing, made.map(|m| m.mesh.n_triangles() as u64));
             }
             Next::Try(spacing) | Next::Use(spacing) => return Ok(spacing),
-            Next::Fail { resolution, triangles } => return Err(no_fit(&job.params, limit, resolution, triangles)),
+            Next::Fail { resolution, triangles } => return Err(no_fit(job, limit, resolution, triangles)),
         }
     }
 }
 
-/// Converts [`SurfaceError::NoSurface`] to `None`.
+/// Converts [`SurfaceError::NoSurface`] and [`SurfaceError::NoPatch`] to `None`.
 fn unless_empty(made: Result<MeshOutput, SurfaceError>) -> Result<Option<MeshOutput>, SurfaceError> {
     match made {
-        Err(SurfaceError::NoSurface { .. }) => Ok(None),
+        Err(SurfaceError::NoSurface { .. } | SurfaceError::NoPatch) => Ok(None),
         made => made.map(Some),
     }
 }
 
 /// Returns the error for a search without a result.
-fn no_fit(params: &SurfaceParams, limit: u64, resolution: f64, triangles: u64) -> SurfaceError {
+fn no_fit(job: &Job, limit: u64, resolution: f64, triangles: u64) -> SurfaceError {
     match triangles {
-        0 => SurfaceError::NoSurface { isovalue: params.level() },
+        0 if job.selection.context == Context::Whole => SurfaceError::NoPatch,
+        0 => SurfaceError::NoSurface { isovalue: job.params.level() },
         _ => SurfaceError::TooManyTriangles { triangles, limit, resolution },
     }
 }

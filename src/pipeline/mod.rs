@@ -4,6 +4,8 @@ mod auto;
 mod clock;
 pub mod color;
 pub mod cost;
+mod cut;
+mod divided;
 #[cfg(feature = "png")]
 mod draw;
 mod estimate;
@@ -11,6 +13,7 @@ mod file;
 mod finest_fit;
 mod fit;
 mod host_cores;
+mod instances;
 pub mod integer;
 mod left_out;
 mod map_file;
@@ -33,6 +36,7 @@ pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
 pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::File;
+pub use instances::InstancesReport;
 pub use left_out::{KindCount, LeftOutReport, ResidueCount};
 pub use map_file::MapFile;
 pub use parts::PartReport;
@@ -44,12 +48,14 @@ pub use work::{estimate_atoms, estimate_work, mesh_work};
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureLimits, PictureParams};
 use crate::structure::map::{MapError, MapLimits};
-use crate::structure::{self, ReadLimits, Selected, Selection, Split, Structure, StructureError};
+use crate::structure::{self, Context, ReadLimits, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, Validation, lattice,
 };
 use color::{MeshColors, Scheme};
+use cut::Cut;
+use divided::{Division, divided};
 use estimate::MeshPlan;
 use report::Counts;
 
@@ -105,13 +111,15 @@ impl Job {
     }
 
     /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
-    /// on triangles, parts and pictures need the whole mesh in memory.
+    /// on triangles, parts, cuts, instances and pictures need the whole mesh in memory.
     fn can_stream(&self) -> bool {
         !self.params.atom_ids
             && self.color.is_none()
             && self.validation == Validation::Checksum
             && self.spacing.max_triangles().is_none()
             && self.split == Split::None
+            && self.selection.context == Context::Selection
+            && !self.selection.instances
             && self.picture.is_none()
     }
 
@@ -282,14 +290,16 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let prepare = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, map, &control);
     let colors = job.color.map(prepare).transpose()?;
     let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
-    let backend = parts::divided(choice.backend, parts.as_deref());
-    let choice = &Choice { backend: &*backend, reason: choice.reason };
+    let cut = Cut::of(&selected, parts.as_deref(), job.validation, &control)?;
+    let division = Division::of(parts.as_deref(), cut.as_ref());
+    let backend = divided(choice.backend, division);
+    let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
         let fitted = fit::mesh(&spheres, job, limit, &limits.surface, choice, &clock, &control).map_err(|error| {
-            let plan = MeshPlan::new(&spheres, parts.as_deref(), &params, job, limits);
-            finest_fit::with_finest_fit(error, &plan, choice, &control)
+            let plan = MeshPlan::new(&spheres, division, &params, job, limits);
+            finest_fit::with_finest_fit(error, &plan, plan.choice(undivided, choice), &control)
         })?;
         params.resolution = fitted.resolution;
         let storage = storage(job, &mut params, &spheres);
@@ -300,9 +310,10 @@ pub fn run_with<S: Deref<Target = Structure>>(
             sink.set_storage(storage);
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
-        let plan = MeshPlan::new(&spheres, parts.as_deref(), &params, job, limits);
+        let plan = MeshPlan::new(&spheres, division, &params, job, limits);
+        let choice = plan.choice(undivided, choice);
         let checked = if sink.is_none() { estimate::check_memory(&plan, job, choice, &control) } else { Ok(()) };
-        let write = |()| clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink));
+        let write = |()| clock.pass(|| backend.write(&spheres, &params, &limits.surface, &control, sink));
         let written = checked.and_then(write);
         (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, choice, &control))?, None, storage)
     };
@@ -322,8 +333,10 @@ pub fn run_with<S: Deref<Target = Structure>>(
             *id = selected.atoms[*id as usize];
         }
     }
+    instances::place(&mut mesh, &selected.units, &control)?;
     let measures = match measures {
-        Some(measures) if measures.validation == job.validation => measures,
+        // The cut has validated the surface before it divided it.
+        Some(measures) if cut.is_some() || measures.validation == job.validation => measures,
         measures => clock.time(Stage::Measure.name(), || {
             mesh.make_geometry_contiguous();
             match measures {
@@ -333,10 +346,11 @@ pub fn run_with<S: Deref<Target = Structure>>(
         })?,
     };
     let (resolution, centre) = (params.resolution, mesh.centre);
-    let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, made_by, storage };
+    let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     report.color = color;
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
+    report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
     let mut product = Product { mesh, bounds, storage, report, picture: None, streamed_bytes: None };
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
@@ -382,6 +396,7 @@ fn load<S: Deref<Target = Structure>>(
         control.check()?;
         control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
         let spheres = selected.spheres(structure)?;
+        selected.check_instances(&spheres, &job.selection)?;
         selected.check_duplicates(&spheres, limits, control)?;
         Ok((selected, spheres))
     })?;

@@ -3,22 +3,22 @@
 //! The query of the HTTP service, `/v1/capabilities` and the command line use one table of names, descriptions and
 //! ranges. The module depends on neither HTTP nor flags.
 
+mod canonical;
 mod table;
 mod values;
 
-use std::fmt::Write as _;
-
 use thiserror::Error;
 
+pub use canonical::canonical;
 pub use table::{Domain, Parameter, TABLE, usual_range};
 use values::ParsedValues;
 
 use super::nearest::nearest;
-use super::{Job, Spacing};
+use super::Job;
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
-use crate::structure::{BadExpression, Selection, Split};
-use crate::surface::{PaperParams, SurfaceError, SurfaceParams};
+use crate::structure::{BadExpression, Context, Selection, Split};
+use crate::surface::{SurfaceError, SurfaceParams};
 
 /// Errors of parsing parameters.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -107,10 +107,26 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     values.divide_models()?;
     let ParsedValues { options, selection, mut request, .. } = values;
     request.job = Job { selection, params: SurfaceParams::new(&options)?, color, ..request.job };
+    check_instances(&request.job)?;
     if let Some(format) = request.format {
         set_format(&mut request.job, format)?;
     }
     Ok(request)
+}
+
+/// Rejects instances without an assembly, and with a surface that is divided or joined otherwise.
+fn check_instances(job: &Job) -> Result<(), ParamError> {
+    let Selection { assembly, context, instances, .. } = &job.selection;
+    let expected = match (assembly, context, job.split) {
+        (None, ..) => "false for the asymmetric unit, or a value of assembly".to_owned(),
+        (_, Context::Whole, _) => format!("false with context={}, which makes one surface", context.name()),
+        (.., split) if split != Split::None => format!("false with split={}", split.name()),
+        _ => return Ok(()),
+    };
+    if !instances {
+        return Ok(());
+    }
+    Err(ParamError::BadValue { name: "instances", value: "`true`".to_owned(), expected })
 }
 
 /// Maximum length of the value of a parameter, bytes: enough for the names of 1,000 chains. Job records contain values.
@@ -133,8 +149,8 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
 /// Sets the format of a job, for a format that was not given as a parameter. A picture format adds picture parameters.
 ///
 /// # Errors
-/// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals` or a picture parameter that the format does not
-/// support.
+/// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals`, `instances` or a picture parameter that the
+/// format does not support.
 pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
         let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::name).collect();
@@ -150,6 +166,9 @@ pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     if !format.holds_units(job.units) {
         let instead: Vec<_> = Units::ALL.into_iter().filter(|u| format.holds_units(*u)).map(Units::name).collect();
         return refuse("units", job.units.name(), &instead.join(", "), &|f| f.holds_units(job.units));
+    }
+    if job.selection.instances && !format.holds_instances() {
+        return refuse("instances", "true", "false", &|f| f.holds_instances());
     }
     if job.normals == Normals::None && format.is_picture() {
         return refuse("normals", job.normals.name(), Normals::Smooth.name(), &|f| !f.is_picture());
@@ -183,70 +202,4 @@ impl From<SurfaceError> for ParamError {
             }
         }
     }
-}
-
-/// Returns all parameters of a job as one line of text, which is equal for equal jobs only. It is part of the content
-/// key.
-#[must_use]
-pub fn canonical(job: &Job) -> String {
-    // Destructured, so that the compiler requires every new field here.
-    let Job { selection, params, split, spacing, validation, compress, normals, units, color, map, picture } = job;
-    let Selection { model, chains, atoms, altloc, assembly } = selection;
-    let SurfaceParams {
-        surface,
-        probe,
-        resolution,
-        isovalue,
-        smoothness,
-        radius_scale,
-        radius_offset,
-        cutoff_tolerance,
-        preset,
-        paper,
-        atom_ids,
-        // Follows from `compress` and the spheres.
-        quantize: _,
-    } = params;
-    // Contains only the parameter that sets the spacing: the other two have their defaults.
-    let spacing = match spacing {
-        Spacing::Given => format!("resolution={resolution}"),
-        Spacing::Detail(level) => format!("detail={level}"),
-        Spacing::MaxTriangles(most) => format!("max_triangles={most}"),
-    };
-    let mut text = format!(
-        "surface={surface}&probe={probe}&{spacing}&isovalue={isovalue}&smoothness={smoothness}\
-         &radius_scale={radius_scale}&radius_offset={radius_offset}&cutoff_tolerance={cutoff_tolerance}\
-         &preset={preset}&atom_ids={atom_ids}&model={model:?}&chains={chains:?}&select={:?}&altloc={altloc:?}\
-         &assembly={assembly:?}&validation={}&compress={}&normals={}&units={}",
-        atoms.to_string(),
-        validation.name(),
-        compress.name(),
-        normals.name(),
-        units.name()
-    );
-    if *split != Split::None {
-        text.push_str("&split=");
-        text.push_str(split.name());
-    }
-    let paper = match paper {
-        None => Ok(()),
-        Some(PaperParams::Gaussian { a, b } | PaperParams::SoftObject { a, b }) => {
-            write!(text, "&paper_a={a}&paper_b={b}")
-        }
-        Some(PaperParams::InverseSquare { c, b }) => write!(text, "&paper_c={c}&paper_b={b}"),
-    };
-    if let Some(color) = color {
-        text.push('&');
-        text.push_str(&color.canonical());
-    }
-    if let Some(map) = map {
-        text.push_str("&map=");
-        text.push_str(map.digest());
-    }
-    if let Some(picture) = picture {
-        text.push('&');
-        text.push_str(&picture.canonical());
-    }
-    debug_assert!(paper.is_ok(), "writing to a string does not fail");
-    text
 }

@@ -1,46 +1,48 @@
-//! Backend that meshes each part of the atoms separately and joins the meshes. The joined mesh records the rows of each
-//! part.
+//! Meshes of the parts of the atoms, made separately and joined. The joined mesh records the rows of each part.
 //!
 //! Grids are aligned with the origin, so the mesh of a part does not depend on the other parts.
 
 use std::borrow::Cow;
-use std::ops::Deref;
-use std::sync::Arc;
 
 use rayon::prelude::*;
 use serde::Serialize;
 
 use super::SPHERE_BYTES;
 use super::fit::WithoutProgress;
-use super::work::mesh_work;
 use crate::structure::AtomPart;
 use crate::surface::cpu::scan;
 use crate::surface::lattice::to_f32;
 use crate::surface::mesh::joined_bounds;
 use crate::surface::{
-    Backend, BackendIdentity, Control, DeviceStatus, GridStats, Measures, Mesh, MeshOutput, MeshSink, PartRange,
-    Reservation, Spheres, Stage, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams,
+    Backend, BackendIdentity, Control, GridStats, Measures, Mesh, MeshOutput, PartRange, Spheres, Stage, SurfaceError,
+    SurfaceLimits, SurfaceParams,
 };
 
 /// Rows per parallel task.
 const ROWS: usize = 1 << 16;
 
-/// Part of the mesh that is closed on its own.
+/// Part of the mesh. It is closed on its own, unless `context=whole` divides one surface.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct PartReport {
-    /// Name: chain (with the number of its copy in an assembly), entity, or group of residues.
+    /// Name: chain (with the number of its copy in an assembly), entity, group of residues, or the chains of a unit
+    /// (`instances`).
     pub name: String,
     /// Number of atoms.
     pub atoms: u64,
     /// Number of vertices.
     pub vertices: u64,
-    /// Number of triangles; 0 if no grid point lies inside the surface of the part.
+    /// Number of triangles; 0 if no grid point lies inside the surface of the part, or if no triangle is nearest to its
+    /// atoms.
     pub triangles: u64,
     /// Surface area in Å².
     pub area: f64,
-    /// Enclosed volume in Å³.
-    pub volume: f64,
+    /// Enclosed volume in Å³; null for a part of one surface (`context=whole`).
+    #[cfg_attr(feature = "server", schema(required))]
+    pub volume: Option<f64>,
+    /// Number of instances in the assembly; absent without `instances`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub instances: Option<u64>,
 }
 
 impl PartReport {
@@ -49,7 +51,8 @@ impl PartReport {
         let report = |(part, range): (&AtomPart, &PartRange)| {
             let [vertices, triangles] = [&range.vertices, &range.triangles].map(|rows| rows.len() as u64);
             let (name, atoms) = (part.name.clone(), part.rows.len() as u64);
-            Self { name, atoms, vertices, triangles, area: range.area, volume: range.volume }
+            let instances = mesh.placements.is_some().then_some(range.placements.len() as u64);
+            Self { name, atoms, vertices, triangles, area: range.area, volume: range.volume, instances }
         };
         parts.iter().zip(&mesh.parts).map(report).collect()
     }
@@ -64,139 +67,49 @@ pub(super) fn spheres_of<'s>(
     whole.into_iter().chain(parts.unwrap_or_default().iter().map(|part| Cow::Owned(spheres.subset(&part.rows))))
 }
 
-/// Returns `backend` or, with `parts`, a backend that meshes each part on it.
-pub(super) fn divided<'a>(backend: &'a dyn Backend, parts: Option<&'a [AtomPart]>) -> AnyBackend<'a> {
-    let inner = AnyBackend::Borrowed(backend);
-    match parts {
-        Some(parts) => AnyBackend::Owned(Box::new(PartsBackend { inner, parts })),
-        None => inner,
-    }
-}
-
-/// Backend that meshes each part on another backend and joins the meshes.
-struct PartsBackend<'a> {
-    /// The chosen backend, or the one that it assigned to the job.
-    inner: AnyBackend<'a>,
-    parts: &'a [AtomPart],
-}
-
-/// Borrowed or owned backend.
-pub(super) enum AnyBackend<'a> {
-    Borrowed(&'a dyn Backend),
-    Owned(Box<dyn Backend + 'a>),
-}
-
-impl<'a> Deref for AnyBackend<'a> {
-    type Target = dyn Backend + 'a;
-
-    fn deref(&self) -> &Self::Target {
-        match self {
-            Self::Borrowed(backend) => *backend,
-            Self::Owned(backend) => backend.as_ref(),
+/// Meshes all parts on `backend`. Returns `None` if a fallback meshed some of them.
+pub(super) fn join(
+    parts: &[AtomPart],
+    backend: &dyn Backend,
+    run: &Run<'_>,
+    control: &Control<'_>,
+) -> Result<Option<MeshOutput>, SurfaceError> {
+    let spheres = run.spheres;
+    let mut joined = Joined::new(centre(spheres, run.single));
+    let observer = control.observer;
+    let quiet = WithoutProgress(observer);
+    let control = Control { observer: &quiet, ..control.clone() };
+    let mut n_atoms = 0;
+    for part in parts {
+        control.check()?;
+        n_atoms += part.rows.len();
+        let meshed = {
+            let _spheres = control.reserve(SPHERE_BYTES * part.rows.len() as u64)?;
+            let own = spheres.subset(&part.rows);
+            backend.run(&own, run.single, &joined.left_of(run), &control)
+        };
+        match meshed {
+            Ok(output) if !joined.made_by(output.made_by.as_ref(), backend) => return Ok(None),
+            Ok(output) => joined.push(part, output, run, &control)?,
+            Err(SurfaceError::NoSurface { .. }) => joined.skip(part),
+            Err(error) => return Err(joined.error(error, run, n_atoms as f64 / spheres.len() as f64)),
+        }
+        let [n_vertices, n_triangles] = [joined.mesh.n_vertices(), joined.mesh.n_triangles()];
+        scan::check_size(run.single, run.limits, n_vertices as u64, n_triangles as u64)?;
+        for stage in [Stage::Field, Stage::Emit] {
+            observer.progress(stage, n_atoms, spheres.len());
         }
     }
+    joined.finish(run.single).map(Some)
 }
 
-impl PartsBackend<'_> {
-    /// Meshes all parts on `backend`. Returns `None` if a fallback meshed some of them.
-    fn join(
-        &self,
-        backend: &dyn Backend,
-        spheres: &Spheres,
-        run: &Run<'_>,
-        control: &Control<'_>,
-    ) -> Result<Option<MeshOutput>, SurfaceError> {
-        let mut joined = Joined::new(centre(spheres, run.single));
-        let observer = control.observer;
-        let quiet = WithoutProgress(observer);
-        let control = Control { observer: &quiet, ..control.clone() };
-        let mut n_atoms = 0;
-        for part in self.parts {
-            control.check()?;
-            n_atoms += part.rows.len();
-            let meshed = {
-                let _spheres = control.reserve(SPHERE_BYTES * part.rows.len() as u64)?;
-                let own = spheres.subset(&part.rows);
-                backend.run(&own, run.single, &joined.left_of(run), &control)
-            };
-            match meshed {
-                Ok(output) if !joined.made_by(output.made_by.as_ref(), backend) => return Ok(None),
-                Ok(output) => joined.push(part, output, run, &control)?,
-                Err(SurfaceError::NoSurface { .. }) => joined.skip(part),
-                Err(error) => return Err(joined.error(error, run, n_atoms as f64 / spheres.len() as f64)),
-            }
-            let [n_vertices, n_triangles] = [joined.mesh.n_vertices(), joined.mesh.n_triangles()];
-            scan::check_size(run.single, run.limits, n_vertices as u64, n_triangles as u64)?;
-            for stage in [Stage::Field, Stage::Emit] {
-                observer.progress(stage, n_atoms, spheres.len());
-            }
-        }
-        joined.finish(run.single).map(Some)
-    }
-}
-
-impl Backend for PartsBackend<'_> {
-    fn name(&self) -> &'static str {
-        self.inner.name()
-    }
-
-    fn arithmetic(&self) -> String {
-        self.inner.arithmetic()
-    }
-
-    fn arithmetics(&self) -> Vec<String> {
-        self.inner.arithmetics()
-    }
-
-    fn describe(&self) -> String {
-        self.inner.describe()
-    }
-
-    fn supports(&self, surface: SurfaceKind) -> bool {
-        self.inner.supports(surface)
-    }
-
-    fn devices(&self) -> Vec<DeviceStatus> {
-        self.inner.devices()
-    }
-
-    fn for_job(&self, surface: SurfaceKind, work: f64) -> Option<Box<dyn Backend + '_>> {
-        let inner = AnyBackend::Owned(self.inner.for_job(surface, work)?);
-        Some(Box::new(PartsBackend { inner, parts: self.parts }))
-    }
-
-    /// Limits apply to all parts together, before quantizing.
-    fn write(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: Option<&dyn MeshSink>,
-    ) -> Result<MeshOutput, SurfaceError> {
-        let work = self.parts.iter().map(|part| mesh_work(part.rows.len() as f64, params.resolution)).sum();
-        let assigned = self.inner.for_job(params.surface, work);
-        let backend = assigned.as_deref().unwrap_or(&*self.inner);
-        let run = Run { params, single: &SurfaceParams { quantize: None, ..params.clone() }, limits };
-        // The content key names one backend. If it fails after some parts, the fallback meshes all parts again.
-        for _attempt in 0..2 {
-            let memory = Arc::new(Reservation::new(&control.memory));
-            let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-            if let Some(output) = self.join(backend, spheres, &run, &metered)? {
-                memory.keep();
-                return output.deliver(params, control, sink);
-            }
-        }
-        Err(SurfaceError::Device { why: "different backends meshed the parts".into() })
-    }
-}
-
-/// Parameters and limits of all parts.
-struct Run<'a> {
-    params: &'a SurfaceParams,
+/// Spheres, parameters and limits of all parts.
+pub(super) struct Run<'a> {
+    pub(super) spheres: &'a Spheres,
+    pub(super) params: &'a SurfaceParams,
     /// The parameters without quantizing: all parts are quantized relative to the centre of the joined mesh.
-    single: &'a SurfaceParams,
-    limits: &'a SurfaceLimits,
+    pub(super) single: &'a SurfaceParams,
+    pub(super) limits: &'a SurfaceLimits,
 }
 
 /// Returns the centre of the joined mesh: the grid point nearest to the middle of the bounding box of all spheres.
@@ -267,8 +180,9 @@ impl Joined {
             vertices: first..first + n,
             triangles: triangles..triangles + own.n_triangles(),
             area: measures.area,
-            volume: measures.volume,
+            volume: Some(measures.volume),
             bounds,
+            placements: 0..0,
         });
         self.mesh.append(own);
         self.measures.push(measures);

@@ -4,6 +4,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::color::ColorReport;
+use super::instances::InstancesReport;
 use super::left_out::LeftOutReport;
 use super::parts::PartReport;
 use super::{Choice, Job};
@@ -21,13 +22,14 @@ pub struct ComponentReport {
     pub vertices: u64,
     /// Area in Å².
     pub area: f64,
-    /// Volume in Å³, negative for a void.
-    pub volume: f64,
+    /// Volume in Å³, negative for a void; null if the mesh is cut open.
+    #[cfg_attr(feature = "server", schema(required))]
+    pub volume: Option<f64>,
 }
 
 impl ComponentReport {
-    fn new(&Component { triangles, vertices, area, volume, .. }: &Component) -> Self {
-        Self { triangles, vertices, area, volume }
+    fn new(&Component { triangles, vertices, area, volume, .. }: &Component, is_open: bool) -> Self {
+        Self { triangles, vertices, area, volume: (!is_open).then_some(volume) }
     }
 }
 
@@ -58,7 +60,7 @@ impl VoidReport {
 pub struct AssemblyReport {
     /// Id in the file.
     pub id: String,
-    /// Number of copies of chains.
+    /// Number of copies of chains, or of instances.
     pub copies: u64,
 }
 
@@ -117,8 +119,12 @@ pub struct Report {
     pub title: Option<String>,
     /// Format of the structure file: `pdb`, `mmcif`, `bcif`, `pqr` or `xyz`.
     pub source_format: &'static str,
-    /// Meshed atoms, including all copies in an assembly.
+    /// Meshed atoms, including all copies in an assembly. With `instances`, the atoms of the units.
     pub atoms: u64,
+    /// Atoms of the selection, including all copies in an assembly, if the mesh is cut out of the surface of the whole
+    /// structure (`context=whole`); absent otherwise.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub selected_atoms: Option<u64>,
     /// Atoms in all models of the file.
     pub atoms_in_file: u64,
     /// Number of the meshed model; of the first one with `model=all`.
@@ -129,6 +135,10 @@ pub struct Report {
     /// Assembly; absent for the asymmetric unit.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub assembly: Option<AssemblyReport>,
+    /// Instances of the units of the assembly, which `parts` lists; absent without `instances`. All other numbers of
+    /// the report describe the units, each once.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub instances: Option<InstancesReport>,
     /// Atoms of the meshed models that are not meshed.
     pub left_out: LeftOutReport,
     /// Unreadable values that do not affect the mesh, at most 12; absent if there are none.
@@ -175,11 +185,15 @@ pub struct Report {
     pub vertices: u64,
     /// Triangles of the mesh.
     pub triangles: u64,
-    /// True if the mesh has no boundary.
+    /// True if the mesh has no boundary. A surface that `split` and `context=whole` divide is checked before that.
     pub closed: bool,
+    /// Reason why the mesh has a boundary: `cut` (`context=whole`). Absent if `closed` is true, or if a check found a
+    /// defect.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub open_reason: Option<&'static str>,
     /// True if all triangles have consistent winding.
     pub oriented: bool,
-    /// True if all edges and vertices are manifold.
+    /// True if all edges and vertices are manifold. False for a mesh with a boundary.
     pub manifold: bool,
     /// `check` if a check of the mesh found `manifold`; `construction` if it follows from the case table, because the
     /// checksum does not see vertices.
@@ -191,20 +205,21 @@ pub struct Report {
     /// Number of connected components.
     pub components: u64,
     /// Number of voids: components with negative volume. Most are gaps between atoms, so the number depends on the grid
-    /// spacing.
+    /// spacing. 0 if the mesh is cut open.
     pub voids: u64,
     /// Voids with the largest volumes, at most 100.
     pub void_list: Vec<VoidReport>,
     /// Components with the largest areas, at most 100.
     pub component_list: Vec<ComponentReport>,
-    /// Parts that are closed on their own; absent if the request does not divide the mesh.
+    /// Parts of the mesh; absent if the request does not divide it.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "server", schema(required = false))]
     pub parts: Vec<PartReport>,
     /// Surface area in Å², including the walls of voids.
     pub area: f64,
-    /// Enclosed volume in Å³, voids subtracted.
-    pub volume: f64,
+    /// Enclosed volume in Å³, voids subtracted; null if the mesh is cut open.
+    #[cfg_attr(feature = "server", schema(required))]
+    pub volume: Option<f64>,
     /// Units of all lengths, areas and volumes in this report: `angstrom`.
     pub report_units: &'static str,
     /// Units of the coordinates in the mesh file: `angstrom`, `nanometer` or `meter`.
@@ -246,6 +261,8 @@ pub(super) struct Counts {
     pub(super) grid: GridStats,
     pub(super) n_vertices: usize,
     pub(super) n_triangles: usize,
+    /// True if the mesh was cut out of a closed one.
+    pub(super) cut: bool,
     pub(super) made_by: Option<BackendIdentity>,
     pub(super) storage: Storage,
 }
@@ -263,21 +280,21 @@ impl Report {
         let params = &job.params;
         let gaussian = params.surface == SurfaceKind::Gaussian && params.paper.is_none();
         let made_by = counts.made_by.clone().unwrap_or_else(|| choice.backend.identity());
-        let mut voids: Vec<&Component> = measures.components.iter().filter(|c| c.volume < 0.0).collect();
+        let is_open = counts.cut && !measures.closed;
+        let components = &measures.components;
+        let mut voids: Vec<&Component> = components.iter().filter(|c| !is_open && c.volume < 0.0).collect();
         voids.sort_by(|a, b| a.volume.total_cmp(&b.volume));
         Self {
             id: structure.id.clone(),
             title: structure.title.clone(),
             source_format: structure.format.name(),
             atoms: selected.atoms.len() as u64,
+            selected_atoms: selected.marks.is_some().then(|| selected.n_selected()),
             atoms_in_file: structure.len() as u64,
             model: selected.model,
             models: None,
-            assembly: job
-                .selection
-                .assembly
-                .clone()
-                .map(|id| AssemblyReport { id, copies: selected.copies.len() as u64 }),
+            assembly: job.selection.assembly.clone().map(|id| AssemblyReport { id, copies: selected.n_copies() }),
+            instances: None,
             left_out: LeftOutReport::new(&selected.left_out),
             warnings: structure.warnings.clone(),
             radii: structure.radii_name(),
@@ -298,6 +315,7 @@ impl Report {
             vertices: counts.n_vertices as u64,
             triangles: counts.n_triangles as u64,
             closed: measures.closed,
+            open_reason: is_open.then_some("cut"),
             oriented: measures.oriented,
             manifold: measures.manifold,
             // A mesh that fails the checksum is not manifold, even if its vertices are.
@@ -307,13 +325,13 @@ impl Report {
             },
             validation: measures.validation.name(),
             euler: measures.euler,
-            components: measures.components.len() as u64,
+            components: components.len() as u64,
             voids: voids.len() as u64,
             void_list: voids.iter().take(100).map(|void| VoidReport::new(void, counts.centre)).collect(),
-            component_list: measures.components.iter().take(100).map(ComponentReport::new).collect(),
+            component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
             parts: Vec::new(),
             area: measures.area,
-            volume: measures.volume,
+            volume: (!is_open).then_some(measures.volume),
             report_units: Units::Angstrom.name(),
             file_units: counts.storage.units.name(),
             normals: counts.storage.normals.name(),

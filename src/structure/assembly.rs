@@ -12,6 +12,9 @@ const MAX_GROUPS: usize = 8;
 /// Maximum deviation of a matrix times its transpose from the identity. Files have six digits.
 const MAX_SKEW: f64 = 0.01;
 
+/// Maximum deviation of the numbers of a matrix from those of a rotation, for instances: 0.1 Å at 1000 Å.
+const MAX_DEVIATION: f64 = 1e-4;
+
 /// Rotation or reflection, then a translation in Å: rows of a matrix with the translation in the last column.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Operator(pub [[f64; 4]; 3]);
@@ -37,6 +40,31 @@ impl Operator {
     #[inline]
     pub fn apply(&self, [x, y, z]: [f64; 3]) -> [f64; 3] {
         self.0.map(|[a, b, c, t]| a * x + b * y + c * z + t)
+    }
+
+    /// Returns the rotation as a unit quaternion (x, y, z, w); `None` if the matrix is not that of a rotation.
+    #[must_use]
+    pub fn rotation(&self) -> Option<[f64; 4]> {
+        let [[a, b, c, _], [d, e, f, _], [g, h, i, _]] = self.0;
+        // Four times each component times x, y, z or w. The row with the largest diagonal is the most precise.
+        let products = [
+            [1.0 + a - e - i, b + d, c + g, h - f],
+            [b + d, 1.0 - a + e - i, f + h, c - g],
+            [c + g, f + h, 1.0 - a - e + i, d - b],
+            [h - f, c - g, d - b, 1.0 + a + e + i],
+        ];
+        let largest = (0..4).max_by(|&j, &k| products[j][j].total_cmp(&products[k][k]))?;
+        let row = products[largest];
+        let length = row.iter().map(|v| v * v).sum::<f64>().sqrt();
+        let [x, y, z, w] = row.map(|v| v / length);
+        let rotated = [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ];
+        let own = self.0.iter().flat_map(|row| &row[..3]);
+        let is_rotation = own.zip(rotated.as_flattened()).all(|(own, rotated)| (own - rotated).abs() <= MAX_DEVIATION);
+        is_rotation.then_some([x, y, z, w])
     }
 
     /// Returns the operator that applies `first`, then this one.
@@ -287,6 +315,33 @@ mod tests {
             all.add_generator(id.to_owned(), expression.to_owned(), "A".to_owned());
         }
         assert_eq!(all.list(1000), [("2", Some(7)), ("PAU", Some(1)), ("3", None), ("4", None)]);
+    }
+
+    #[test]
+    fn rotations_have_quaternions_and_reflections_none() {
+        let of = |m: [[f64; 3]; 3]| Operator(m.map(|[a, b, c]| [a, b, c, 7.0])).rotation();
+        assert_eq!(Operator::IDENTITY.rotation(), Some([0.0, 0.0, 0.0, 1.0]));
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        let near = |found: Option<[f64; 4]>, expected: [f64; 4]| {
+            found.is_some_and(|q| q.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9))
+        };
+        // Quarter turns about z and x, and half turns about each axis.
+        assert!(near(of([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), [0.0, 0.0, half, half]));
+        assert!(near(of([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), [half, 0.0, 0.0, half]));
+        assert!(near(of([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]), [1.0, 0.0, 0.0, 0.0]));
+        assert!(near(of([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]), [0.0, 1.0, 0.0, 0.0]));
+        assert!(near(of([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]), [0.0, 0.0, 1.0, 0.0]));
+        // A cyclic exchange of the axes is a third of a turn.
+        assert!(near(of([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), [0.5, 0.5, 0.5, 0.5]));
+        for reflection in [
+            [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]],
+            [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]],
+            [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+            // Lengths change by half a percent.
+            [[1.005, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        ] {
+            assert_eq!(of(reflection), None, "{reflection:?}");
+        }
     }
 
     #[test]

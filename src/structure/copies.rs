@@ -1,7 +1,9 @@
-//! Copies of the selected atoms that form an assembly.
+//! Copies of the selected atoms that form an assembly, and its distinct units.
 
 use std::collections::HashMap;
 use std::ops::Range;
+
+use indexmap::IndexMap;
 
 use super::assembly::{BadExpression, Generator, Operator};
 use super::atoms::Structure;
@@ -11,7 +13,7 @@ use super::read::{ReadLimits, check};
 use super::select::Selected;
 use super::text::list;
 use super::texts::TextColumn;
-use crate::surface::Control;
+use crate::surface::{Control, Reservation};
 
 /// Copy of atoms, moved by an operator.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,6 +23,25 @@ pub struct PlacedCopy {
     /// Operator that moves the atoms to their positions in the assembly.
     pub operator: Operator,
 }
+
+/// Atoms that an assembly repeats, and their placements.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Unit {
+    /// Author names of the chains, separated by commas; at most 40 characters.
+    pub name: String,
+    /// Rows of [`Selected::atoms`].
+    pub rows: Range<usize>,
+    /// Operators that place the instances.
+    pub operators: Vec<Operator>,
+    /// Rotations of the operators, as unit quaternions (x, y, z, w).
+    pub rotations: Vec<[f64; 4]>,
+}
+
+/// Maximum length of the name of a unit, characters.
+const MAX_NAME: usize = 40;
+
+/// Rule that applies, with the rows of each of its chains.
+type AppliedRule<'s> = (&'s Generator, Vec<Range<usize>>);
 
 /// Rule of an assembly with its chains.
 struct RuleChains<'s> {
@@ -98,39 +119,17 @@ impl<'s> Assembly<'s> {
         limits: &ReadLimits,
         control: &Control<'_>,
     ) -> Result<Selected, StructureError> {
-        let assemblies = &self.structure.assemblies;
-        let bad = |BadExpression { found, expected }| StructureError::BadAssembly { id: self.shown(), found, expected };
         let mut atoms = selected.atoms;
-        let _sorting = control.reserve((size_of::<u32>() * atoms.len()) as u64)?;
-        // Stable, so the atoms of a chain stay in file order.
-        atoms.sort_by_key(|&i| self.column.id(i as usize));
-        let rows = self.rows_of_chains(&atoms);
-        let (mut n_copies, mut n_atoms) = (0_u64, 0_u64);
-        let mut parts: Vec<(&Generator, Vec<Range<usize>>)> = Vec::new();
-        for RuleChains { generator, chains } in &self.parts {
-            let rows = chains.iter().map(|&chain| rows[chain as usize].clone());
-            let rows: Vec<Range<usize>> = rows.filter(|rows| !rows.is_empty()).collect();
-            if rows.is_empty() {
-                continue;
-            }
-            let copies = assemblies.count(&generator.expression, limits.max_copies).map_err(bad)?;
-            n_copies = n_copies.saturating_add(copies);
-            if n_copies > limits.max_copies {
-                return Err(StructureError::TooManyCopies { id: self.shown(), limit: limits.max_copies });
-            }
-            let of_copy: usize = rows.iter().map(ExactSizeIterator::len).sum();
-            n_atoms = n_atoms.saturating_add(copies.saturating_mul(of_copy as u64));
-            parts.push((generator, rows));
-        }
-        if n_atoms > limits.max_rows() as u64 {
-            let id = self.shown();
-            return Err(StructureError::AssemblyTooLarge { id, atoms: n_atoms, limit: limits.max_atoms });
-        }
-        let n_rows = usize::try_from(n_atoms).unwrap_or(usize::MAX);
+        let _sorting = self.sort(&mut atoms, control)?;
+        let (rules, counts) = self.rules(&atoms, limits)?;
+        let n_copies: u64 = counts.iter().sum();
+        let of_rule = |((_, rows), copies): (&AppliedRule<'_>, &u64)| copies.saturating_mul(n_rows(rows));
+        let n_atoms = rules.iter().zip(&counts).map(of_rule).fold(0, u64::saturating_add);
+        let capacity = self.check_atoms(n_atoms, limits)?;
         control.memory.grow(4 * n_atoms + size_of::<PlacedCopy>() as u64 * n_copies)?;
-        let (mut all, mut copies) = (Vec::with_capacity(n_rows), Vec::new());
-        for (generator, rows) in parts {
-            for operator in assemblies.expand(&generator.expression).map_err(bad)? {
+        let (mut all, mut copies) = (Vec::with_capacity(capacity), Vec::new());
+        for (generator, rows) in rules {
+            for operator in self.expand(generator)? {
                 check(control)?;
                 let first = all.len();
                 for rows in &rows {
@@ -140,6 +139,102 @@ impl<'s> Assembly<'s> {
             }
         }
         Ok(Selected { atoms: all, copies, ..selected })
+    }
+
+    /// Replaces the selected atoms by those of the distinct units, whose placements are recorded and not applied. Rules
+    /// for the same chains have one unit.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Self::copy`], and [`StructureError::BadAssembly`] for an operator that is no rotation.
+    pub(super) fn units(
+        self,
+        selected: Selected,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+    ) -> Result<Selected, StructureError> {
+        let mut atoms = selected.atoms;
+        let _sorting = self.sort(&mut atoms, control)?;
+        let (rules, counts) = self.rules(&atoms, limits)?;
+        let mut placed: IndexMap<Vec<Range<usize>>, Vec<&Generator>> = IndexMap::new();
+        rules.into_iter().for_each(|(generator, rows)| placed.entry(rows).or_default().push(generator));
+        let n_atoms = placed.keys().map(|rows| n_rows(rows)).fold(0, u64::saturating_add);
+        let capacity = self.check_atoms(n_atoms, limits)?;
+        let of_instance = (size_of::<Operator>() + size_of::<[f64; 4]>()) as u64;
+        control.memory.grow(4 * n_atoms + of_instance * counts.iter().sum::<u64>())?;
+        let (mut all, mut units) = (Vec::with_capacity(capacity), Vec::new());
+        for (rows, generators) in placed {
+            check(control)?;
+            let first = all.len();
+            rows.iter().for_each(|rows| all.extend_from_slice(&atoms[rows.clone()]));
+            let mut operators = Vec::new();
+            for generator in generators {
+                operators.append(&mut self.expand(generator)?);
+            }
+            let rotations: Option<Vec<[f64; 4]>> = operators.iter().map(Operator::rotation).collect();
+            let rotations = rotations.ok_or_else(|| StructureError::BadAssembly {
+                id: self.shown(),
+                found: "an operator that is not a rotation and a translation".to_owned(),
+                expected: "rotations and translations only, for `instances`".to_owned(),
+            })?;
+            units.push(Unit { name: self.unit_name(&atoms, &rows), rows: first..all.len(), operators, rotations });
+        }
+        Ok(Selected { atoms: all, units, ..selected })
+    }
+
+    /// Returns the author names of the chains of a unit.
+    fn unit_name(&self, atoms: &[u32], rows: &[Range<usize>]) -> String {
+        let chain = &self.structure.chain;
+        let mut names: Vec<String> = rows.iter().map(|rows| chain.get(atoms[rows.start] as usize)).map(shown).collect();
+        names.dedup();
+        names.join(",").chars().take(MAX_NAME).collect()
+    }
+
+    /// Sorts atoms by chain. Returns the reservation of the sort.
+    fn sort(&self, atoms: &mut [u32], control: &Control<'_>) -> Result<Reservation, StructureError> {
+        let sorting = control.reserve(size_of_val(atoms) as u64)?;
+        // Stable, so the atoms of a chain stay in file order.
+        atoms.sort_by_key(|&i| self.column.id(i as usize));
+        Ok(sorting)
+    }
+
+    /// Returns the rules that apply to `atoms`, which are sorted by chain, and their numbers of copies.
+    fn rules(&self, atoms: &[u32], limits: &ReadLimits) -> Result<(Vec<AppliedRule<'s>>, Vec<u64>), StructureError> {
+        let rows = self.rows_of_chains(atoms);
+        let (mut rules, mut counts) = (Vec::new(), Vec::new());
+        let mut n_copies = 0_u64;
+        for RuleChains { generator, chains } in &self.parts {
+            let rows = chains.iter().map(|&chain| rows[chain as usize].clone());
+            let rows: Vec<Range<usize>> = rows.filter(|rows| !rows.is_empty()).collect();
+            if rows.is_empty() {
+                continue;
+            }
+            let count = self.structure.assemblies.count(&generator.expression, limits.max_copies);
+            counts.push(count.map_err(|bad| self.bad(bad))?);
+            n_copies = n_copies.saturating_add(counts.last().copied().unwrap_or_default());
+            if n_copies > limits.max_copies {
+                return Err(StructureError::TooManyCopies { id: self.shown(), limit: limits.max_copies });
+            }
+            rules.push((*generator, rows));
+        }
+        Ok((rules, counts))
+    }
+
+    /// Checks the number of atoms to mesh, and returns it.
+    fn check_atoms(&self, atoms: u64, limits: &ReadLimits) -> Result<usize, StructureError> {
+        let n = usize::try_from(atoms).unwrap_or(usize::MAX);
+        if n <= limits.max_rows() {
+            return Ok(n);
+        }
+        Err(StructureError::AssemblyTooLarge { id: self.shown(), atoms, limit: limits.max_atoms })
+    }
+
+    /// Returns the operators of a rule.
+    fn expand(&self, generator: &Generator) -> Result<Vec<Operator>, StructureError> {
+        self.structure.assemblies.expand(&generator.expression).map_err(|bad| self.bad(bad))
+    }
+
+    fn bad(&self, BadExpression { found, expected }: BadExpression) -> StructureError {
+        StructureError::BadAssembly { id: self.shown(), found, expected }
     }
 
     /// Returns the rows of each chain in `atoms`, which are sorted by chain.
@@ -157,4 +252,9 @@ impl<'s> Assembly<'s> {
     fn shown(&self) -> String {
         self.id.chars().take(40).collect()
     }
+}
+
+/// Returns the number of atoms in these rows.
+fn n_rows(rows: &[Range<usize>]) -> u64 {
+    rows.iter().map(|rows| rows.len() as u64).sum()
 }

@@ -1,10 +1,11 @@
-//! Division of the selected atoms into parts, each of which gets its own closed mesh.
+//! Division of the selected atoms into parts: each gets its own closed mesh, or its triangles of one surface.
 
 use rustc_hash::FxHashMap;
 
 use super::altloc::ATOMS_PER_CHECK;
 use super::atoms::Structure;
 use super::contents::Kind;
+use super::copies::Unit;
 use super::error::StructureError;
 use super::read::{ReadLimits, check};
 use super::select::Selected;
@@ -64,7 +65,8 @@ const UNKNOWN_ENTITY: &str = "unknown";
 const BYTES_PER_ROW: u64 = 16;
 
 impl Selected {
-    /// Divides the selected atoms into parts, in order of first appearance; `None` for [`Split::None`]. Adds their
+    /// Divides the selected atoms into parts, in order of first appearance; `None` for [`Split::None`]. The units of an
+    /// assembly are parts. Adds their
     /// memory to the meter of `control`.
     ///
     /// # Errors
@@ -77,6 +79,13 @@ impl Selected {
         limits: &ReadLimits,
         control: &Control<'_>,
     ) -> Result<Option<Vec<AtomPart>>, StructureError> {
+        if !self.units.is_empty() {
+            control.memory.grow((size_of::<u32>() * self.atoms.len()) as u64)?;
+            // The number of atoms fits 32 bits.
+            let row = |row: usize| u32::try_from(row).unwrap_or(u32::MAX);
+            let part = |unit: &Unit| AtomPart { name: unit.name.clone(), rows: unit.rows.clone().map(row).collect() };
+            return Ok(Some(self.units.iter().map(part).collect()));
+        }
         if split == Split::None {
             return Ok(None);
         }
@@ -93,6 +102,9 @@ impl Selected {
             }
             while copies.peek().is_some_and(|(_, copy)| copy.rows.end <= row) {
                 copies.next();
+            }
+            if !self.has(self.atoms[row]) {
+                continue;
             }
             let i = self.atoms[row] as usize;
             let number = match split {

@@ -87,6 +87,16 @@ impl MeshOutput {
         }
     }
 
+    /// Validates the measures of a mesh in memory. Computes them if the backend has not.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
+    pub(crate) fn validated(mut self, validation: Validation, control: &Control<'_>) -> Result<Self, SurfaceError> {
+        let measures = self.measure(control)?.clone();
+        self.measures = Some(measures.validated(validation, &self.mesh.triangles, control)?);
+        Ok(self)
+    }
+
     /// Delivers a mesh in memory: rounds its vertices if `params` request quantized ones. If there is a `sink`,
     /// measures the mesh and passes it to the sink in a single part.
     ///

@@ -105,6 +105,9 @@ pub enum SurfaceError {
         /// Isovalue of the request, if the surface has one.
         isovalue: Option<f64>,
     },
+    /// No triangle of the surface is nearest to a selected atom.
+    #[error("no triangle of the surface of the whole structure is nearest to the selected atoms; they may be buried")]
+    NoPatch,
     /// The sink of the mesh failed. It keeps the cause.
     #[error("the mesh sink failed")]
     Sink,

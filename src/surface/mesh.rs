@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use bytemuck::Pod;
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
@@ -35,8 +36,23 @@ pub struct Mesh {
     pub atom_ids: Option<Column<u32>>,
     /// Per vertex an sRGB colour with alpha, if the caller set one. Backends leave it empty.
     pub colors: Option<Column<[u8; 4]>>,
-    /// Parts that are closed on their own. They cover all rows in order. Empty if the mesh is not divided.
+    /// Parts with their own vertices. They cover all rows in order. Empty if the mesh is not divided.
     pub parts: Vec<PartRange>,
+    /// True if the mesh, or each of its parts, was cut out of a closed surface and has a boundary. Backends leave it
+    /// false.
+    pub cut: bool,
+    /// Placements of the parts; `None` if each part is placed once, where it is. Backends leave it empty.
+    pub placements: Option<Placements>,
+}
+
+/// Rotations and translations that place instances of parts: a position p relative to the mesh's centre is placed at
+/// the rotated p plus the translation, relative to the same centre.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Placements {
+    /// Translations, Å.
+    pub translations: Column<[f32; 3]>,
+    /// Rotations as unit quaternions (x, y, z, w), one for each translation.
+    pub rotations: Column<[f32; 4]>,
 }
 
 /// Rows of a part of a mesh, and its measures. Its triangles refer to its own vertices only.
@@ -46,14 +62,16 @@ pub struct PartRange {
     pub name: String,
     /// Rows of its vertices.
     pub vertices: Range<usize>,
-    /// Rows of its triangles; empty if no grid point lies inside its surface.
+    /// Rows of its triangles; may be empty.
     pub triangles: Range<usize>,
     /// Area, Å².
     pub area: f64,
-    /// Enclosed volume, Å³.
-    pub volume: f64,
+    /// Enclosed volume, Å³; `None` if the part is not closed on its own.
+    pub volume: Option<f64>,
     /// Lowest and highest position relative to the mesh's centre, per axis, Å; zeros without vertices.
     pub bounds: [[f32; 3]; 2],
+    /// Rows of its placements; empty if the mesh has none.
+    pub placements: Range<usize>,
 }
 
 /// Vertices in 12 bytes. The fourth number of a row is 0.
@@ -234,6 +252,23 @@ impl Mesh {
         }
     }
 
+    /// Replaces the vertices with those of `rows`, in order. The triangles must already refer to the new ones. All
+    /// columns must be contiguous.
+    pub(crate) fn take_vertices(&mut self, rows: &[u32]) {
+        match &mut self.quantized {
+            None => {
+                self.positions = taken(&self.positions, rows);
+                self.normals = taken(&self.normals, rows);
+            }
+            Some(quantized) => {
+                quantized.positions = taken(&quantized.positions, rows);
+                quantized.normals = taken(&quantized.normals, rows);
+            }
+        }
+        self.atom_ids = self.atom_ids.take().map(|column| taken(&column, rows));
+        self.colors = self.colors.take().map(|column| taken(&column, rows));
+    }
+
     /// Vertices whose normal is zero.
     fn flat_vertices(&self) -> Vec<u32> {
         // Half a unit of a component is far below every unit vector's longest one.
@@ -289,6 +324,14 @@ impl Mesh {
         let of_vertex = if quantized { 12 } else { 24 };
         of_vertex * n_vertices + 12 * n_triangles
     }
+}
+
+/// Returns the `rows` of a column.
+fn taken<T: Pod + Send + Sync>(column: &[T], rows: &[u32]) -> Column<T> {
+    let mut taken = Column::zeroed(rows.len());
+    let chunks = taken.par_chunks_mut(ROWS).zip(rows.par_chunks(ROWS));
+    chunks.for_each(|(out, rows)| out.iter_mut().zip(rows).for_each(|(out, &row)| *out = column[row as usize]));
+    taken
 }
 
 /// Returns the indices of the rows for which `holds` is true.

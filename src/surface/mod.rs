@@ -41,7 +41,7 @@ pub use devices::{DeviceChoice, DeviceFacts, DeviceKind, DeviceName, DeviceStatu
 pub use error::SurfaceError;
 pub use measure::{Component, Measures, Validation};
 pub use memory::{MemoryMeter, OutOfMemory, Reservation};
-pub use mesh::{Mesh, PartRange, Quantized};
+pub use mesh::{Mesh, PartRange, Placements, Quantized};
 pub use params::{Kernel, PaperParams, Preset, SurfaceKind, SurfaceLimits, SurfaceOptions, SurfaceParams};
 pub use quantize::Step;
 pub use reference::ReferenceBackend;

@@ -33,8 +33,9 @@ window.load = async (url) => {
     colors.add([color.array.constructor.name, color.normalized, color.itemSize, material.vertexColors].join());
     for (let i = 0; i < color.count; i += 1) shades.add(new THREE.Color().fromBufferAttribute(color, i).getHexString());
   }
+  const instances = meshes[0].isInstancedMesh ? meshes[0].count : null;
   return {
-    size, volume, triangles, kinds: [...kinds], colors: [...colors], shades: [...shades],
+    size, volume, triangles, instances, kinds: [...kinds], colors: [...colors], shades: [...shades],
     parts: meshes.map((mesh) => mesh.userData.name ?? mesh.name), indexBytes: meshes[0].geometry.index.array.BYTES_PER_ELEMENT,
   };
 };
@@ -114,6 +115,14 @@ await run({
     await page.route("**/inverted.glb", async (route) => route.fulfill({ contentType: "model/gltf-binary", body: inverted((await fetchBytes(address)).bytes) }));
     const three = await page.evaluate((url) => window.load(url), "/inverted.glb");
     assert.ok(three.volume < 0, `${three.volume}`);
+  },
+
+  "three.js repeats the mesh of an assembly": async () => {
+    const [plain, repeated] = await Promise.all(
+      ["", "&assembly=1&instances=true"].map((more) => page.evaluate((url) => window.load(url), `${SERVICE_URL}/v1/pdb/1crn/surface.glb?resolution=0.9${more}`)),
+    );
+    assert.deepEqual([plain.instances, repeated.instances], [null, 1]);
+    repeated.size.forEach((side, i) => assert.ok(close(side, plain.size[i], 1e-5), `${repeated.size} ${plain.size}`));
   },
 
   "the page has no errors": async () => {

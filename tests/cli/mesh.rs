@@ -477,3 +477,28 @@ fn a_map_colours_the_mesh() {
         assert!(stderr(&done).contains(words), "{flags:?}: {}", stderr(&done));
     }
 }
+
+#[test]
+fn patches_and_instances_are_described() {
+    let folder = Folder::new();
+    let input = std::path::Path::new("samples/4pti.pdb");
+    let patch = mesh(input, &folder.path("patch.glb"), &["--context", "whole", "--select", "resi 10-20"]);
+    assert_code(&patch, 0);
+    let text = stderr(&patch);
+    for part in ["open along the cut (by exact edge matching), oriented", "atoms; the mesh is cut out of the surface"] {
+        assert!(text.contains(part), "no `{part}` in\n{text}");
+    }
+    assert!(!text.contains("volume") && !text.contains("watertight"), "{text}");
+    let flags = ["--assembly", "1", "--instances", "--resolution", "1"];
+    let repeated = mesh(input, &folder.path("repeated.glb"), &flags);
+    assert_code(&repeated, 0);
+    let text = stderr(&repeated);
+    assert!(text.contains("1 of 1 distinct units, not joined; sums: 454 atoms"), "{text}");
+    // Other formats, and requests without an assembly, are refused before any work.
+    for (name, flags) in [("repeated.ply", &flags[..]), ("alone.glb", &flags[2..])] {
+        let refused = mesh(input, &folder.path(name), flags);
+        assert_code(&refused, 2);
+        assert!(stderr(&refused).contains("parameter `instances`: `true` is not allowed"), "{}", stderr(&refused));
+    }
+    assert_eq!(folder.entries(), ["patch.glb", "repeated.glb"]);
+}

@@ -264,6 +264,7 @@ fn jobs_of_ten_seconds_end_soon_after_cancellation_at_any_time() {
         ("within", &distant_crowds(300_000, 310), job(&[("select", "chain A and within 50 of chain B")])),
         ("split", &copies, fine(&[("split", "chain"), ("assembly", "1")])),
         ("color", &lattice, fine(&[("color", "element"), ("atom_ids", "true")])),
+        ("context", &lattice, fine(&[("context", "whole"), ("select", "elem C")])),
         ("occupancy", &lattice, fine(&[("color", "occupancy")])),
         ("max_triangles", &lattice, job(&[("max_triangles", "10000000")])),
         ("assembly", &copies, fine(&[("assembly", "1")])),

@@ -8,7 +8,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use molmesh::pipeline::{Choice, JobError, JobLimits, Product, params, run};
-use molmesh::structure::{ReadLimits, Selection, Structure, StructureError, read, read_with, select, select_with};
+use molmesh::structure::{
+    Kind, ReadLimits, Selection, Structure, StructureError, read, read_with, select, select_with,
+};
 use molmesh::surface::{Control, CpuBackend, MemoryMeter, OutOfMemory, SurfaceError};
 
 use crate::bcif_support::{block, category, file, ints, reals, texts};
@@ -373,6 +375,15 @@ fn sorted(positions: impl IntoIterator<Item = [f64; 3]>) -> Vec<[i64; 3]> {
     all
 }
 
+/// Returns the structures of the repository.
+fn committed() -> Vec<std::path::PathBuf> {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/structures");
+    let files = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    let mut files: Vec<_> = files.filter(|path| path.extension().is_some_and(|end| end == "gz")).collect();
+    files.sort();
+    files
+}
+
 #[test]
 fn agrees_with_gemmi() {
     let Some(python) = tools::python_interpreter().or_else(|| tools::missing("gemmi")) else { return };
@@ -397,16 +408,38 @@ fn agrees_with_gemmi() {
         ("7cth.cif.gz", "1"),
     ];
     cases.extend(real.into_iter().filter_map(|(file, id)| Some((tools::some_structure(file)?, id))));
-    for (path, id) in cases {
+    let mut cases: Vec<_> = cases.into_iter().map(|(path, id)| (path, id.to_owned())).collect();
+    // Every assembly of the committed structures, with the ids and the numbers of atoms that gemmi finds.
+    let mut n_committed = 0;
+    for path in committed() {
+        let output = Command::new(&python).arg("tests/tools/gemmi_assembly.py").arg(&path).output().unwrap();
+        assert!(output.status.success(), "{}: {}", path.display(), String::from_utf8_lossy(&output.stderr));
+        let theirs = String::from_utf8(output.stdout).unwrap();
+        let structure = parse(&std::fs::read(&path).unwrap());
+        let count = |id: &str| {
+            let selected = select(&structure, &of(id)).unwrap();
+            let copies: usize = selected.copies.len();
+            // gemmi counts alternative locations, in every copy of these chains.
+            let all = structure.len() - structure.kind.iter().filter(|kind| **kind == Kind::VirtualSite).count();
+            (all * copies).to_string()
+        };
+        let ours = structure.assemblies.list(u64::MAX).into_iter().map(|(id, _)| format!("{id} {}\n", count(id)));
+        assert_eq!(ours.collect::<String>(), theirs, "{}", path.display());
+        let ids = structure.assemblies.list(u64::MAX).into_iter().map(|(id, _)| id.to_owned());
+        cases.extend(ids.map(|id| (path.clone(), id)));
+        n_committed += 1;
+    }
+    assert!(n_committed >= 3);
+    for (path, id) in &cases {
         let name = format!("{}, assembly {id}", path.display());
-        let output = Command::new(&python).arg("tests/tools/gemmi_assembly.py").arg(&path).arg(id).output().unwrap();
+        let output = Command::new(&python).arg("tests/tools/gemmi_assembly.py").arg(path).arg(id).output().unwrap();
         assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
         let numbers = |line: &str| {
             let all: Vec<f64> = line.split(' ').map(|v| v.parse().unwrap()).collect();
             [all[0], all[1], all[2]]
         };
         let theirs = sorted(String::from_utf8(output.stdout).unwrap().lines().map(numbers));
-        let ours = sorted(positions(&parse(&std::fs::read(&path).unwrap()), id));
+        let ours = sorted(positions(&parse(&std::fs::read(path).unwrap()), id));
         assert_eq!(ours.len(), theirs.len(), "{name}");
         assert!(!ours.is_empty());
         // Rounding may change the order of atoms, so each is compared with its neighbours too.
@@ -416,6 +449,9 @@ fn agrees_with_gemmi() {
             !theirs[around].iter().any(|other| near(at, other))
         });
         assert_eq!(unmatched.count(), 0, "{name}");
+        // Negative control: an atom that is 0.01 Å away.
+        let moved = ours[0].map(|v| v + 10);
+        assert!(!near(&moved, &ours[0]), "{name}");
     }
 }
 

@@ -15,6 +15,7 @@ mod tools;
 
 mod backend;
 mod cancellation;
+mod divided;
 mod meshes;
 mod multi_device;
 mod overlap;

@@ -804,3 +804,66 @@ fn requests_change_the_metrics() {
         SERVER.metric("http_server_request_duration_seconds_count", &["route=\"unmatched\""]) > 0.0
     });
 }
+
+#[test]
+fn a_patch_of_the_whole_surface_says_that_it_is_open() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let query = "context=whole&select=resi%2010-20&resolution=1";
+    let reply = server.post(&format!("/v1/meshes?{query}"), &[], SAMPLE);
+    assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
+    assert_eq!((reply.header("molmesh-closed"), reply.header("molmesh-volume")), (Some("false"), None));
+    assert!(reply.header("molmesh-area").unwrap().parse::<f64>().unwrap() > 100.0);
+    let report = server.post(&format!("/v1/report?{query}"), &[], SAMPLE).json();
+    assert_eq!((&report["closed"], &report["open_reason"]), (&false.into(), &"cut".into()));
+    assert!(report["volume"].is_null() && report.as_object().unwrap().contains_key("volume"));
+    assert!(report["selected_atoms"].as_u64().unwrap() < report["atoms"].as_u64().unwrap());
+    // Control: without the context, the patch is closed.
+    let alone = server.post("/v1/report?select=resi%2010-20&resolution=1", &[], SAMPLE).json();
+    assert!(alone["closed"] == true && alone["volume"].is_number() && alone.get("open_reason").is_none());
+    let estimate = server.post(&format!("/v1/estimate?{query}"), &[], SAMPLE).json();
+    let [expected, found] = [&estimate, &report].map(|document| document["triangles"].as_f64().unwrap());
+    assert!(estimate["accepted"] == true && (0.6..1.6).contains(&(expected / found)), "{expected} {found}");
+    // An asynchronous job has the same bytes.
+    let job = server.post(&format!("/v1/meshes?{query}"), &[("prefer", "respond-async")], SAMPLE);
+    let location = job.header("location").unwrap().to_owned();
+    assert_eq!(server.get(&format!("{location}?wait=20")).json()["status"], "successful");
+    let result = server.get(server.get(&format!("{location}/result")).header("location").unwrap());
+    assert!(result.body == reply.body);
+    // The key differs from that of the surface of the selection.
+    let other = server.post("/v1/meshes?select=resi%2010-20&resolution=1", &[], SAMPLE);
+    assert_ne!(other.header("etag"), reply.header("etag"));
+    let buried = "context=whole&select=resi%2021%20and%20name%20C&resolution=1";
+    let problem = server.post(&format!("/v1/meshes?{buried}"), &[], SAMPLE).problem(422, "no-surface");
+    assert_eq!(problem["parameter"], "context");
+    let bad = server.post("/v1/meshes?context=all", &[], SAMPLE).problem(400, "bad-parameter");
+    assert!(bad["expected"].as_str().unwrap().contains("selection, whole"), "{bad}");
+    assert!(server.join());
+}
+
+#[test]
+fn instances_need_an_assembly_and_a_format_that_repeats_a_mesh() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let query = "assembly=1&instances=true&resolution=1.5";
+    let reply = server.post(&format!("/v1/meshes?{query}"), &[], SAMPLE);
+    assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
+    let text = String::from_utf8_lossy(&reply.body).into_owned();
+    assert!(text.contains("EXT_mesh_gpu_instancing"));
+    let report = server.post(&format!("/v1/report?{query}"), &[], SAMPLE).json();
+    assert_eq!((&report["instances"]["count"], &report["instances"]["joined"]), (&1.into(), &false.into()));
+    assert_eq!(report["instances"]["area_sum"], report["area"]);
+    for (query, expected) in [
+        ("instances=true", "asymmetric unit"),
+        ("instances=true&assembly=1&format=stl", "glb, gltf"),
+        ("instances=true&assembly=1&format=png", "glb, gltf"),
+        ("instances=true&assembly=1&context=whole", "context=whole"),
+        ("instances=true&assembly=1&split=chain", "split=chain"),
+    ] {
+        let problem = server.post(&format!("/v1/meshes?{query}"), &[], SAMPLE).problem(400, "bad-parameter");
+        assert_eq!(problem["parameter"], "instances", "{query}");
+        assert!(problem["expected"].as_str().unwrap().contains(expected), "{problem}");
+    }
+    // `Accept` chooses the format as well.
+    let accepted = server.post(&format!("/v1/meshes?{query}"), &[("accept", "model/stl")], SAMPLE);
+    assert_eq!(accepted.problem(400, "bad-parameter")["parameter"], "instances");
+    assert!(server.join());
+}

@@ -240,6 +240,8 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         &[("model", "2")],
         &[("altloc", "B")],
         &[("assembly", "1")],
+        &[("context", "whole")],
+        &[("instances", "true"), ("assembly", "1")],
         &[("split", "chain")],
         &[("split", "entity")],
         &[("split", "residue-group")],

@@ -150,6 +150,8 @@ fn a_default_is_valid_with_every_parameter() {
         &[("select", "ligand")],
         &[("altloc", "B")],
         &[("assembly", "1")],
+        &[("context", "whole")],
+        &[("instances", "true"), ("assembly", "1")],
         &[("split", "chain")],
         &[("validation", "exact")],
         &[("check", "strict")],
@@ -207,6 +209,8 @@ fn errors_of_conflicts_name_the_sent_parameters() {
         (&[("width", "512"), ("azimuth", "1")], Format::Stl, &["`azimuth`"]),
         (&[("azimuth", "0"), ("style", "gouraud")], Format::Obj, &["`style`"]),
         (&[("compress", "quantize")], Format::Ply, &["`compress`"]),
+        (&[("instances", "true"), ("assembly", "1")], Format::Stl, &["`instances`"]),
+        (&[("instances", "true")], Format::Glb, &["`instances`"]),
     ] {
         let refused = read(pairs, format).unwrap_err().to_string();
         for name in names {

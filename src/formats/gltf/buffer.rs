@@ -3,9 +3,9 @@
 
 use std::io::{self, Write};
 
-use super::layout::{ATOM_BYTES, AtomType, BufferLayout, COLOR_BYTES, IndexType};
+use super::layout::{ATOM_BYTES, AtomType, BufferLayout, COLOR_BYTES, IndexType, ROTATION_BYTES, TRANSLATION_BYTES};
 use crate::formats::block::{convert_words, write_rows};
-use crate::formats::{Packing, quantize};
+use crate::formats::{Packing, Step, quantize};
 use crate::surface::{Mesh, MeshPart, Vertices};
 
 /// Consecutive rows of one column of a mesh.
@@ -23,6 +23,10 @@ pub(super) enum ColumnRows<'a> {
     Colors(&'a [[u8; 4]]),
     /// Atom indices.
     Atoms(&'a [u32]),
+    /// Translations of instances, Å.
+    Translations(&'a [[f32; 3]]),
+    /// Rotations of instances: unit quaternions.
+    Rotations(&'a [[f32; 4]]),
     /// Vertex indices, and the vertex that has index 0 in the file.
     Triangles(&'a [[u32; 3]], u32),
 }
@@ -56,6 +60,10 @@ impl<'a> ColumnRows<'a> {
         if let Some(atoms) = &mesh.atom_ids {
             append(&mut all, atoms.pieces(), Self::Atoms);
         }
+        if let Some(placements) = &mesh.placements {
+            append(&mut all, placements.translations.pieces(), Self::Translations);
+            append(&mut all, placements.rotations.pieces(), Self::Rotations);
+        }
         if mesh.parts.is_empty() {
             append(&mut all, mesh.triangles.pieces(), |rows| Self::Triangles(rows, 0));
         }
@@ -77,6 +85,8 @@ impl<'a> ColumnRows<'a> {
             Self::Normals(_) | Self::QuantizedNormals(_) => (layout.normals?, packing.normal_bytes()),
             Self::Colors(_) => (layout.colors?, COLOR_BYTES),
             Self::Atoms(_) => (layout.atoms?.1, ATOM_BYTES),
+            Self::Translations(_) => (layout.placements?[0], TRANSLATION_BYTES),
+            Self::Rotations(_) => (layout.placements?[1], ROTATION_BYTES),
             Self::Triangles(..) => (layout.indices.1, 3 * layout.indices.0.bytes()),
         };
         Some(span.offset + row_bytes * first)
@@ -110,6 +120,12 @@ impl<'a> ColumnRows<'a> {
                 // A small 32-bit integer, low byte first, is a 16-bit integer and two zero bytes.
                 _ => write_rows(out, rows),
             },
+            (Self::Translations(rows), packing) => {
+                // The scale of the node applies to translations as well.
+                let scale = packing.step().map_or(1.0, Step::length);
+                convert_words(out, rows, |row| bytemuck::cast::<_, [u8; 12]>(row.map(|v| (v / scale).to_le_bytes())))
+            }
+            (Self::Rotations(rows), _) => write_rows(out, rows),
             (Self::Triangles(rows, first), _) => write_indices(out, layout.indices.0, rows.as_flattened(), first),
         }
     }

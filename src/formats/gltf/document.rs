@@ -13,7 +13,9 @@ use gltf_json::validation::USize64;
 use gltf_json::{Accessor, Asset, Buffer, Index, Material, Mesh as GltfMesh, Node, Root, Scene};
 use serde_json::{Map, Value, json};
 
-use super::layout::{ATOM_BYTES, AtomType, BufferLayout, BufferSpan, COLOR_BYTES, Drawn, IndexType};
+use super::layout::{
+    ATOM_BYTES, AtomType, BufferLayout, BufferSpan, COLOR_BYTES, Drawn, IndexType, ROTATION_BYTES, TRANSLATION_BYTES,
+};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, GENERATOR, Meta, Packing, Step, Storage, Units};
 
@@ -26,6 +28,9 @@ const ROUGHNESS: f32 = 0.625;
 
 /// Extension that allows integer vertices. Marked as required: a program without it cannot display the file.
 const QUANTIZED: &str = "KHR_mesh_quantization";
+
+/// Extension that repeats a mesh. Marked as required: a program without it would show one instance.
+const INSTANCING: &str = "EXT_mesh_gpu_instancing";
 
 /// Returns the document as a JSON object. With a layout it has one buffer without a URI, which the caller adds if
 /// needed.
@@ -52,6 +57,7 @@ pub(super) fn document(
         root.extensions_required.push(QUANTIZED.to_owned());
     }
     let meshes = layout.map_or_else(Vec::new, |layout| meshes(&mut root, layout, drawn, name.as_deref(), summary));
+    let placements = layout.map_or_else(Vec::new, |layout| placements(&mut root, layout, drawn));
     let node = root.push(Node { name, translation: Some([0.0; 3]), ..Node::default() });
     root.push(Scene { nodes: vec![node], name: None, extensions: None, extras: None });
     if let [Drawn { name: None, .. }] = drawn {
@@ -73,6 +79,10 @@ pub(super) fn document(
     let scale = step.map_or(1.0, |step| f64::from(step.length())) * units.scale();
     if step.is_some() || units != Units::Angstrom {
         value["nodes"][0]["scale"] = Value::from(vec![scale; 3]);
+    }
+    // The nodes of parts follow that of the mesh.
+    for (node, attributes) in (1..).zip(placements) {
+        value["nodes"][node]["extensions"] = json!({ INSTANCING: { "attributes": attributes } });
     }
     value["asset"]["extras"] = Value::Object(extras(centre, units, step, meta));
     match value {
@@ -118,6 +128,26 @@ fn meshes(
         })
     };
     drawn.iter().map(mesh).collect()
+}
+
+/// Adds views and accessors of the instances of each element of `drawn`. Returns the attributes of the extension.
+fn placements(root: &mut Root, layout: &BufferLayout, drawn: &[Drawn<'_>]) -> Vec<Value> {
+    let Some([translations, rotations]) = layout.placements else { return Vec::new() };
+    root.extensions_used.push(INSTANCING.to_owned());
+    root.extensions_required.push(INSTANCING.to_owned());
+    let mut column = |span, row_bytes, shape| {
+        let view = view(root, Index::new(0), span, None, None);
+        BufferColumn { view, row_bytes, component: ComponentType::F32, shape }
+    };
+    let translations = column(translations, TRANSLATION_BYTES, Type::Vec3);
+    let rotations = column(rotations, ROTATION_BYTES, Type::Vec4);
+    let mut attributes = |part: &Drawn<'_>| {
+        let (first, count) = (part.placements.start, part.placements.end - part.placements.start);
+        let [translation, rotation] =
+            [&translations, &rotations].map(|column| root.push(column.accessor(first, count)));
+        json!({ "TRANSLATION": translation.value(), "ROTATION": rotation.value() })
+    };
+    drawn.iter().map(&mut attributes).collect()
 }
 
 /// Column of the buffer.
@@ -176,7 +206,7 @@ impl BufferColumns {
                 ComponentType::U16 if shape == Type::Scalar => Some(Stride(4)),
                 _ => shared.then(|| Stride(usize::try_from(row_bytes).unwrap_or(0))),
             };
-            let view = view(root, buffer, span, stride, Target::ArrayBuffer);
+            let view = view(root, buffer, span, stride, Some(Target::ArrayBuffer));
             (semantic, BufferColumn { view, row_bytes, component, shape })
         };
         let bytes = packing.position_bytes();
@@ -200,9 +230,9 @@ impl BufferColumns {
             IndexType::U16 => ComponentType::U16,
             IndexType::U32 => ComponentType::U32,
         };
-        let view = view(root, buffer, span, None, Target::ElementArrayBuffer);
+        let view = view(root, buffer, span, None, Some(Target::ElementArrayBuffer));
         let indices = BufferColumn { view, row_bytes: index_type.bytes(), component, shape: Type::Scalar };
-        let material = root.push(material(layout.colors.is_some(), summary.translucent));
+        let material = root.push(material(layout.colors.is_some(), summary));
         Self { attributes, indices, material }
     }
 
@@ -241,25 +271,25 @@ fn view(
     buffer: Index<Buffer>,
     span: BufferSpan,
     stride: Option<Stride>,
-    target: Target,
+    target: Option<Target>,
 ) -> Index<View> {
     root.push(View {
         buffer,
         byte_length: USize64(span.len),
         byte_offset: (span.offset > 0).then_some(USize64(span.offset)),
         byte_stride: stride,
-        target: Some(Valid(target)),
+        target: target.map(Valid),
         name: None,
         extensions: None,
         extras: None,
     })
 }
 
-fn material(coloured: bool, translucent: bool) -> Material {
+fn material(coloured: bool, summary: &Summary) -> Material {
     Material {
         name: Some("surface".to_owned()),
-        alpha_mode: Valid(if translucent { AlphaMode::Blend } else { AlphaMode::Opaque }),
-        double_sided: false,
+        alpha_mode: Valid(if summary.translucent { AlphaMode::Blend } else { AlphaMode::Opaque }),
+        double_sided: summary.open,
         pbr_metallic_roughness: PbrMetallicRoughness {
             base_color_factor: PbrBaseColorFactor(if coloured { WHITE } else { BASE_COLOR }),
             metallic_factor: StrengthFactor(0.0),

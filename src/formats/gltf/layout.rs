@@ -11,6 +11,9 @@ const MAX_EXACT_F32: u32 = 1 << 24;
 
 /// Length of a colour: four 16-bit integers.
 pub(super) const COLOR_BYTES: u64 = 8;
+/// Lengths of the translation and the rotation of an instance.
+pub(super) const TRANSLATION_BYTES: u64 = 12;
+pub(super) const ROTATION_BYTES: u64 = 16;
 /// Length of an atom index in either type.
 pub(super) const ATOM_BYTES: u64 = 4;
 
@@ -85,6 +88,8 @@ pub(super) struct Drawn<'a> {
     pub(super) triangles: Range<u64>,
     /// Lowest and highest relative position per axis, Å.
     pub(super) bounds: [[f32; 3]; 2],
+    /// Rows of its placements; empty if it is placed once.
+    pub(super) placements: Range<u64>,
 }
 
 impl<'a> Drawn<'a> {
@@ -100,17 +105,20 @@ impl<'a> Drawn<'a> {
             triangles: rows(&part.triangles),
             // Adding zero turns −0 into 0. JSON distinguishes them.
             bounds: part.bounds.map(|row| row.map(|v| v + 0.0)),
+            placements: rows(&part.placements),
         });
         parts.collect()
     }
 
     /// Returns a whole mesh with these numbers of vertices and triangles.
     pub(super) fn whole([n_vertices, n_triangles]: [u64; 2], summary: &Summary) -> Self {
-        Self { name: None, vertices: 0..n_vertices, triangles: 0..n_triangles, bounds: summary.bounds }
+        let (vertices, triangles) = (0..n_vertices, 0..n_triangles);
+        Self { name: None, vertices, triangles, bounds: summary.bounds, placements: 0..0 }
     }
 }
 
-/// Layout of the buffer: attributes in multiples of four bytes per vertex, then indices, which may end unaligned.
+/// Layout of the buffer: attributes in multiples of four bytes per vertex, placements, then indices, which may end
+/// unaligned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct BufferLayout {
     pub(super) storage: Storage,
@@ -118,6 +126,8 @@ pub(super) struct BufferLayout {
     pub(super) normals: Option<BufferSpan>,
     pub(super) colors: Option<BufferSpan>,
     pub(super) atoms: Option<(AtomType, BufferSpan)>,
+    /// Translations and rotations of instances.
+    pub(super) placements: Option<[BufferSpan; 2]>,
     pub(super) indices: (IndexType, BufferSpan),
     /// Length of the whole buffer, bytes.
     pub(super) len: u64,
@@ -134,11 +144,12 @@ impl BufferLayout {
         // Indices count from the first vertex of a part.
         let most = mesh.parts.iter().map(|part| part.vertices.len() as u64).max();
         let most = most.unwrap_or(n_vertices);
-        Self::new([n_vertices, n_triangles], most, storage, mesh.colors.is_some(), atoms).map(Some)
+        let placed = mesh.placements.as_ref().map_or(0, |placements| placements.rotations.len() as u64);
+        Self::new([n_vertices, n_triangles, placed], most, storage, mesh.colors.is_some(), atoms).map(Some)
     }
 
     fn new(
-        [n_vertices, n_triangles]: [u64; 2],
+        [n_vertices, n_triangles, n_placements]: [u64; 3],
         n_indexed: u64,
         storage: Storage,
         colors: bool,
@@ -160,13 +171,17 @@ impl BufferLayout {
         let normals = storage.normal_bytes().map(|bytes| span(bytes * n_vertices));
         let colors = colors.then(|| span(COLOR_BYTES * n_vertices));
         let atoms = atoms.map(|atom_type| (atom_type, span(ATOM_BYTES * n_vertices)));
+        let placements =
+            (n_placements > 0).then(|| [TRANSLATION_BYTES, ROTATION_BYTES].map(|of| span(of * n_placements)));
         let indices = (index_type, span(3 * n_triangles * index_type.bytes()));
-        Ok(Self { storage, positions, normals, colors, atoms, indices, len: end })
+        Ok(Self { storage, positions, normals, colors, atoms, placements, indices, len: end })
     }
 
     /// Returns the layout of a mesh without colours and atoms; `None` if it has no triangles.
     pub(super) fn plain(counts: [u64; 2], storage: impl Into<Storage>) -> Result<Option<Self>, FormatError> {
-        if counts[1] == 0 { Ok(None) } else { Self::new(counts, counts[0], storage.into(), false, None).map(Some) }
+        let [n_vertices, n_triangles] = counts;
+        let layout = || Self::new([n_vertices, n_triangles, 0], n_vertices, storage.into(), false, None);
+        if n_triangles == 0 { Ok(None) } else { layout().map(Some) }
     }
 }
 
@@ -220,14 +235,15 @@ mod tests {
             (bare(Packing::Full), 60),
             (bare(quantized), 40),
         ] {
-            let layout = BufferLayout::new([5, 3], 5, storage, true, Some(AtomType::U16)).unwrap();
-            let rest = [layout.colors.unwrap(), layout.atoms.unwrap().1, layout.indices.1];
+            let layout = BufferLayout::new([5, 3, 2], 5, storage, true, Some(AtomType::U16)).unwrap();
+            let [translations, rotations] = layout.placements.unwrap();
+            let rest = [layout.colors.unwrap(), layout.atoms.unwrap().1, translations, rotations, layout.indices.1];
             let mut end = 0;
             for span in [layout.positions].into_iter().chain(layout.normals).chain(rest) {
                 assert_eq!((span.offset, span.offset % 4), (end, 0));
                 end += span.len;
             }
-            assert_eq!((end, layout.len), (vertices + 40 + 20 + 9, vertices + 69));
+            assert_eq!((end, layout.len), (vertices + 40 + 20 + 24 + 32 + 9, vertices + 125));
         }
     }
 }

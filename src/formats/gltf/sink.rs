@@ -84,7 +84,7 @@ impl<'a> GlbSink<'a> {
     fn try_finish(&self, meta: &Meta, centre: [f64; 3], bounds: [[f32; 3]; 2]) -> Result<u64, GlbSinkError> {
         // Adding zero turns −0 into 0. JSON distinguishes them.
         let bounds = bounds.map(|row| row.map(|v| v + 0.0));
-        let summary = Summary { bounds, max_atom: None, translucent: false };
+        let summary = Summary { bounds, max_atom: None, translucent: false, open: false };
         let layout = self.layout.get().copied().flatten();
         let size = self.size.get().copied().unwrap_or_default();
         let drawn = [Drawn::whole(size, &summary)];

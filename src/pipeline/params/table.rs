@@ -7,7 +7,7 @@ use crate::formats::{Compress, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, Style, View};
 use crate::pipeline::color::{self, ColorBlend, Palette};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
-use crate::structure::Split;
+use crate::structure::{Context, Split};
 use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{Preset, SurfaceKind, Validation};
 
@@ -136,6 +136,7 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
 }
 
 const SPLITS: &[&str] = &[Split::None.name(), Split::Chain.name(), Split::Entity.name(), Split::ResidueGroup.name()];
+const CONTEXTS: &[&str] = &[Context::Selection.name(), Context::Whole.name()];
 const FORMATS: &[&str] = &["glb", "gltf", "ply", "ply-text", "stl", "obj", "vtp", "png"];
 const VIEWS: &[&str] = &view_names(View::ALL);
 const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
@@ -295,10 +296,22 @@ pub const TABLE: &[Parameter] = &[
         doc: "Biological assembly to mesh: the selected atoms, copied by the operators of the file. asymmetric-unit meshes the atoms as they are in the file.",
     },
     Parameter {
+        name: "instances",
+        domain: Domain::Flag,
+        default: "false",
+        doc: "Meshes each distinct set of chains of the assembly once and repeats the mesh by rotations and translations (EXT_mesh_gpu_instancing); glb and gltf only. Surfaces of neighbouring instances are not joined.",
+    },
+    Parameter {
+        name: "context",
+        domain: Domain::Choice(CONTEXTS),
+        default: "selection",
+        doc: "Atoms whose surface is made. selection: the selected atoms alone. whole: the polymer of all chains and the selected atoms; the mesh is then cut, and only the triangles that are nearest to selected atoms remain. It is open along the cut.",
+    },
+    Parameter {
         name: "split",
         domain: Domain::Choice(SPLITS),
         default: "none",
-        doc: "Divides the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, or residue-group (polymer, ligand, glycan, ion, water).",
+        doc: "Divides the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, or residue-group (polymer, ligand, glycan, ion, water). With context=whole, divides the triangles of one surface by their nearest atoms.",
     },
     Parameter {
         name: "validation",

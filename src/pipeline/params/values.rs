@@ -9,7 +9,7 @@ use crate::picture::{Background, MAX_SIDE, PictureParams, Style, View};
 use crate::pipeline::Spacing;
 use crate::pipeline::color::{ColorBlend, Coloring, Palette, Scheme};
 use crate::pipeline::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
-use crate::structure::{ModelChoice, Selection, Split};
+use crate::structure::{Context, ModelChoice, Selection, Split};
 use crate::surface::{Preset, SurfaceKind, SurfaceOptions, Validation};
 
 /// Default of `color_offset`: the radius of a water molecule, Å.
@@ -65,10 +65,11 @@ impl ParsedValues {
             return Ok(());
         }
         let split = &mut self.request.job.split;
-        let other = match (*split, &self.selection.assembly) {
-            (Split::None, None) => None,
-            (Split::None, Some(id)) => Some(("assembly", id.clone(), "asymmetric-unit")),
-            (rule, _) => Some(("split", rule.name().to_owned(), Split::None.name())),
+        let other = match (*split, &self.selection.assembly, self.selection.context) {
+            (Split::None, None, Context::Selection) => None,
+            (Split::None, None, context) => Some(("context", context.name().to_owned(), Context::Selection.name())),
+            (Split::None, Some(id), _) => Some(("assembly", id.clone(), "asymmetric-unit")),
+            (rule, ..) => Some(("split", rule.name().to_owned(), Split::None.name())),
         };
         if let Some((name, value, instead)) = other {
             let value = format!("`{}`", value.chars().take(64).collect::<String>());
@@ -141,6 +142,8 @@ impl ParsedValues {
                 let id = id.ok_or_else(bad)?;
                 self.selection.assembly = (id != parameter.default).then(|| id.to_owned());
             }
+            "instances" => self.selection.instances = flag(text).ok_or_else(bad)?,
+            "context" => self.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
             "split" => self.request.job.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
             "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,

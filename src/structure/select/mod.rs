@@ -1,30 +1,33 @@
 //! Selection of the atoms to mesh: an expression, chains, a model and alternative locations.
 
+mod context;
 mod evaluate;
 mod expression;
 mod left_out;
 mod near;
 mod parse;
+mod selected;
 
 use std::collections::HashSet;
 use std::ops::Range;
 
+pub use context::Context;
 use evaluate::{Evaluation, Marks};
 pub use expression::Expression;
 pub use left_out::LeftOut;
 use left_out::Tally;
 pub use parse::{BadExpression, MAX_DEPTH, MAX_DISTANCE, MAX_WITHIN};
-use rayon::prelude::*;
+pub use selected::Selected;
 
 use super::altloc::Alternatives;
 use super::atoms::Structure;
 use super::contents::{Contents, Kind};
-use super::copies::{Assembly, PlacedCopy};
+use super::copies::Assembly;
 use super::error::StructureError;
-use super::read::{ReadLimits, Reading, check};
+use super::pieces;
+use super::read::{ReadLimits, check};
 use super::text::list;
-use super::{duplicates, pieces};
-use crate::surface::{Control, Spheres, SurfaceError};
+use crate::surface::Control;
 
 /// Models of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -69,21 +72,10 @@ pub struct Selection {
     pub altloc: Option<char>,
     /// Id of the assembly to build from the selected atoms; the asymmetric unit by default.
     pub assembly: Option<String>,
-}
-
-/// Result of a selection.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Selected {
-    /// Indices of the selected atoms in the columns of the structure: ascending, or by copy in an assembly.
-    pub atoms: Vec<u32>,
-    /// Copies that form the assembly; empty for the asymmetric unit.
-    pub copies: Vec<PlacedCopy>,
-    /// Number of selected atoms before they were copied.
-    pub n_distinct: usize,
-    /// The selected model; the first one if all are selected.
-    pub model: i32,
-    /// Counts of the other atoms of the selected models.
-    pub left_out: LeftOut,
+    /// Atoms whose surface is made.
+    pub context: Context,
+    /// True to mesh the distinct units of the assembly instead of all copies.
+    pub instances: bool,
 }
 
 /// Number of atoms that a task selects or copies, and minimum number that a task moves: about 0.1 ms of work.
@@ -136,17 +128,32 @@ pub fn select_with(
         })?);
     }
     let marks = evaluation.marks(condition)?;
-    let rules =
-        Rules { structure, models, chains, assembly: assembly.as_ref(), marks, hydrogens: *hydrogens, alternatives };
+    let context = match selection.context {
+        Context::Selection => None,
+        Context::Whole => Some(evaluation.marks(&Expression::default().condition)?),
+    };
+    let rules = Rules {
+        structure,
+        models,
+        chains,
+        assembly: assembly.as_ref(),
+        marks,
+        hydrogens: *hydrogens,
+        context,
+        alternatives,
+    };
     let Found { atoms, mut left_out, residues } = rules.find(control)?;
     let first = structure.model.first().copied().unwrap_or(1);
     let model = if let Models::One(model) = models { model } else { first };
-    if atoms.is_empty() {
+    let marks = rules.marks(&atoms, control)?;
+    if !marks.as_ref().map_or(!atoms.is_empty(), |marks| marks.contains(&true)) {
         return Err(StructureError::EmptySelection { holds: holds(structure, selection, model) });
     }
     left_out.name_residues(structure, residues);
-    let selected = Selected { n_distinct: atoms.len(), atoms, copies: Vec::new(), model, left_out };
+    let selected =
+        Selected { n_distinct: atoms.len(), atoms, marks, copies: Vec::new(), units: Vec::new(), model, left_out };
     match assembly {
+        Some(assembly) if selection.instances => assembly.units(selected, limits, control),
         Some(assembly) => assembly.copy(selected, limits, control),
         None => Ok(selected),
     }
@@ -161,10 +168,12 @@ struct Rules<'a> {
     assembly: Option<&'a Assembly<'a>>,
     marks: Marks,
     hydrogens: bool,
+    /// With [`Context::Whole`], marks of the atoms of the default selection, with their hydrogens.
+    context: Option<Marks>,
     alternatives: Alternatives,
 }
 
-/// Selected atoms, and counts of the others.
+/// Atoms to mesh, and counts of the others.
 #[derive(Default)]
 struct Found {
     atoms: Vec<u32>,
@@ -173,7 +182,34 @@ struct Found {
 }
 
 impl Rules<'_> {
-    /// Finds the selected atoms, in parallel.
+    /// Returns true if atom `i` belongs to a selected chain.
+    fn has_chain(&self, i: usize) -> bool {
+        self.chains.as_ref().is_none_or(|chains| chains[self.structure.chain.id(i) as usize])
+    }
+
+    /// Returns true if atom `i` is meshed because of [`Context::Whole`], whether it is selected or not.
+    fn is_context(&self, i: usize) -> bool {
+        self.context.as_ref().is_some_and(|marks| marks.atoms[i] && !self.structure.is_hydrogen(i))
+    }
+
+    /// Marks the selected ones of the `atoms` to mesh; `None` if all of them are selected.
+    fn marks(&self, atoms: &[u32], control: &Control<'_>) -> Result<Option<Vec<bool>>, StructureError> {
+        if self.context.is_none() {
+            return Ok(None);
+        }
+        control.memory.grow(self.structure.len() as u64)?;
+        let mut marks = vec![false; self.structure.len()];
+        for atoms in atoms.chunks(ATOMS_PER_TASK) {
+            check(control)?;
+            for i in atoms.iter().map(|&i| i as usize) {
+                let hydrogen = !self.hydrogens && self.structure.is_hydrogen(i);
+                marks[i] = self.marks.atoms[i] && self.has_chain(i) && !hydrogen;
+            }
+        }
+        Ok(Some(marks))
+    }
+
+    /// Finds the atoms to mesh, in parallel.
     fn find(&self, control: &Control<'_>) -> Result<Found, StructureError> {
         let n = self.structure.len();
         let range = |first| first..n.min(first + ATOMS_PER_TASK);
@@ -190,19 +226,18 @@ impl Rules<'_> {
     }
 
     fn find_in(&self, range: Range<usize>) -> Found {
-        let Self { structure, chains, assembly, .. } = self;
+        let Self { structure, assembly, .. } = self;
         let Found { mut atoms, mut left_out, mut residues } = Found::default();
         for i in range {
             if !self.models.contains(structure.model[i]) {
                 continue;
             }
-            if chains.as_ref().is_some_and(|chains| !chains[structure.chain.id(i) as usize])
-                || assembly.is_some_and(|assembly| !assembly.covers(i))
-            {
+            let context = self.is_context(i);
+            if !(context || self.has_chain(i)) || assembly.is_some_and(|assembly| !assembly.covers(i)) {
                 left_out.other_chains += 1;
             } else if structure.kind[i] == Kind::VirtualSite {
                 left_out.virtual_sites += 1;
-            } else if !self.marks.atoms[i] {
+            } else if !(context || self.marks.atoms[i]) {
                 residues.add(structure.residue.id(i), structure.kind[i]);
             } else if !self.hydrogens && structure.is_hydrogen(i) {
                 left_out.hydrogens += 1;
@@ -310,46 +345,4 @@ fn holds(structure: &Structure, selection: &Selection, model: i32) -> String {
         contents.chain_list(),
         contents.model_list(),
     )
-}
-
-impl Selected {
-    /// Returns the selected atoms as spheres with van der Waals radii.
-    ///
-    /// # Errors
-    /// Returns [`SurfaceError::BadSphere`] if a coordinate is out of range.
-    pub fn spheres(&self, structure: &Structure) -> Result<Spheres, SurfaceError> {
-        let (n, atoms) = (self.atoms.len(), self.atoms.chunks(ATOMS_PER_TASK));
-        let (mut x, mut y, mut z, mut r) = (vec![0.0; n], vec![0.0; n], vec![0.0; n], vec![0.0; n]);
-        let centres = x.chunks_mut(ATOMS_PER_TASK).zip(y.chunks_mut(ATOMS_PER_TASK)).zip(z.chunks_mut(ATOMS_PER_TASK));
-        let mut parts: Vec<_> = atoms.zip(centres).zip(r.chunks_mut(ATOMS_PER_TASK)).collect();
-        pieces::map(&mut parts, |((atoms, ((x, y), z)), r)| {
-            for (row, i) in atoms.iter().map(|&i| i as usize).enumerate() {
-                (x[row], y[row], z[row]) = (structure.x[i], structure.y[i], structure.z[i]);
-                r[row] = structure.vdw_radius(i);
-            }
-        });
-        for PlacedCopy { rows, operator } in &self.copies {
-            let rows = || rows.clone();
-            let moved = (&mut x[rows()], &mut y[rows()], &mut z[rows()]).into_par_iter().with_min_len(ATOMS_PER_TASK);
-            moved.for_each(|(x, y, z)| [*x, *y, *z] = operator.apply([*x, *y, *z]));
-        }
-        Spheres::new(x, y, z, r)
-    }
-
-    /// Rejects an assembly in which more atoms than allowed have the same position.
-    ///
-    /// # Errors
-    /// Returns [`StructureError::TooManyDuplicates`] and the errors of memory and cancellation.
-    pub fn check_duplicates(
-        &self,
-        spheres: &Spheres,
-        limits: &ReadLimits,
-        control: &Control<'_>,
-    ) -> Result<(), StructureError> {
-        if self.copies.is_empty() {
-            // The reader has checked the atoms of the file.
-            return Ok(());
-        }
-        duplicates::check(spheres.len(), |i| (self.model, spheres.centre(i)), &Reading::new(limits, control))
-    }
 }

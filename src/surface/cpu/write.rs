@@ -124,8 +124,7 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
         quantized: scanned.quantize.map(|step| Quantized::zeroed(step, totals.vertices)),
         triangles: Column::zeroed(totals.triangles),
         atom_ids: atom_ids.then(|| Column::zeroed(totals.vertices)),
-        colors: None,
-        parts: Vec::new(),
+        ..Mesh::default()
     };
     let mut rows = match &mut mesh.quantized {
         Some(Quantized { step, positions, normals }) => VertexRows::Quantized { step: *step, positions, normals },
