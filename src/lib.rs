@@ -45,6 +45,8 @@ mod jobs;
 #[cfg(feature = "server")]
 pub mod memory_budget;
 #[cfg(feature = "server")]
+mod reader_line;
+#[cfg(feature = "server")]
 mod single_flight;
 #[cfg(feature = "server")]
 pub mod store;

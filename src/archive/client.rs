@@ -10,11 +10,12 @@ use reqwest::header::{ETAG, HeaderMap, HeaderName, IF_MODIFIED_SINCE, IF_NONE_MA
 use reqwest::redirect::{Attempt, Policy};
 use reqwest::{Client, Proxy, Response, StatusCode, Url};
 use serde::{Deserialize, Serialize};
-use tokio::sync::Semaphore;
+use tokio::time::Instant;
 
 use super::address::{PublicResolver, Refused};
 use super::error::UnavailableReason;
 use super::gzip::{self, StopOnDrop};
+use super::readers::{Busy, Readers};
 use crate::config::{ArchiveConfig, Templates};
 use crate::memory_budget::MemoryReservation;
 use crate::store::Digest;
@@ -48,13 +49,14 @@ pub(super) enum Answer {
     Absent,
 }
 
-/// Resources for checking bodies.
+/// Resources for checking a body.
 #[derive(Debug)]
-pub(super) struct Checks {
+pub(super) struct Checks<'a> {
     /// Inflated bytes after which the check of a gzip file stops.
     pub(super) inflated_bytes: u64,
-    /// Permits to read structures outside of jobs.
-    pub(super) readers: Arc<Semaphore>,
+    pub(super) readers: &'a Readers,
+    /// Time until which a check may begin.
+    pub(super) begin_by: Instant,
 }
 
 /// Failure of a request.
@@ -64,6 +66,8 @@ pub(super) enum Failed {
     TooLarge(Option<u64>),
     /// The memory limit is reached.
     Memory(OutOfMemory),
+    /// No reader was free to check the body.
+    Busy(Busy),
     /// Any other failure: cause, `Retry-After` of the host, details for the log.
     Other { reason: UnavailableReason, retry_after: Option<Duration>, detail: String },
 }
@@ -128,7 +132,7 @@ pub(super) async fn get(
     url: Url,
     known: Option<&Origin>,
     config: &ArchiveConfig,
-    checks: &Checks,
+    checks: &Checks<'_>,
     reservation: MemoryReservation,
     trace: Option<&SpanContext>,
 ) -> Result<Answer, Failed> {
@@ -168,8 +172,7 @@ pub(super) async fn get(
     let text = |name: HeaderName| Some(response.headers().get(name)?.to_str().ok()?.to_owned());
     let origin = Origin { url: name, etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
     let bytes = body(response, config, &reservation).await?;
-    let permit = Arc::clone(&checks.readers).acquire_owned().await;
-    let permit = permit.map_err(|closed| Failed::other(UnavailableReason::Client, &closed))?;
+    let reading = checks.readers.wait(checks.begin_by).await.map_err(Failed::Busy)?;
     // The deadline drops this future, which ends the check.
     let request = StopOnDrop::default();
     let (stop, inflated_bytes) = (Arc::clone(&request.0), checks.inflated_bytes);
@@ -177,7 +180,7 @@ pub(super) async fn get(
         let is_damaged = compressed && !gzip::is_complete_gzip(&bytes, inflated_bytes, &stop);
         let digest = if is_damaged { None } else { Some(Digest::of(&bytes)) };
         let bytes = reservation.attach(bytes);
-        drop(permit);
+        drop(reading);
         Some((bytes, digest?))
     });
     let checked = checked.await.map_err(|error| Failed::other(UnavailableReason::Client, &error))?;

@@ -17,6 +17,7 @@ use super::remote::Remote;
 use crate::client_shares::{ClientShares, ShareExceeded, SharePermit};
 use crate::config::Config;
 use crate::memory_budget::Budget;
+use crate::reader_line::ReaderLine;
 use crate::single_flight::SingleFlight;
 use crate::store::Digest;
 use crate::structure::{EntryId, Stamp};
@@ -94,7 +95,7 @@ impl Archive {
         let archive = &config.archive;
         let files = Files::new(config, memory.clone());
         let shared = ArchiveState {
-            remote: Remote::new(config, memory, Arc::clone(&files.readers)),
+            remote: Remote::new(config, memory, files.readers.clone()),
             files: Arc::new(files),
             shares: ClientShares::new(archive.concurrent, config.server.client_share),
             timeout: Duration::from_millis(archive.timeout_ms),
@@ -112,7 +113,12 @@ impl Archive {
     /// Returns the permits to read structures outside of jobs, one per worker. Reading an entry takes one.
     #[must_use]
     pub fn readers(&self) -> Arc<Semaphore> {
-        Arc::clone(&self.shared.files.readers)
+        Arc::clone(&self.shared.files.readers.permits)
+    }
+
+    /// Returns the requests that wait for one of the [`readers`](Self::readers).
+    pub(crate) fn reader_line(&self) -> Arc<ReaderLine> {
+        Arc::clone(&self.shared.files.readers.line)
     }
 
     /// Returns the archive for a client, which may fetch its share of `archive.concurrent` entries at once.
@@ -254,6 +260,7 @@ impl ArchiveState {
             Err(FetchError::NotFound { .. }) => "absent",
             Err(FetchError::TooLarge { .. }) => "too-large",
             Err(FetchError::Memory { .. }) => "no-memory",
+            Err(FetchError::Busy { .. }) => "busy",
             Err(_) => "unavailable",
         };
         count("remote", result);
@@ -370,6 +377,7 @@ fn count_local<T>(found: &Result<Option<T>, FetchError>) {
         Ok(Some(_)) => count("local", "found"),
         Ok(None) => {}
         Err(FetchError::Memory { .. }) => count("local", "no-memory"),
+        Err(FetchError::Busy { .. }) => count("local", "busy"),
         Err(_) => count("local", "failed"),
     }
 }

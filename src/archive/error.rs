@@ -54,8 +54,10 @@ pub enum FetchError {
     Busy {
         /// Requested entry.
         id: EntryId,
-        /// Time that the request waited.
+        /// Maximum time that the request may wait.
         limit: Duration,
+        /// Estimated time until a reader is free.
+        wait: Duration,
     },
     /// The client was fetching its share of entries for half of `archive.timeout_ms`.
     #[error("entry {id} cannot be fetched now: this client is fetching {limit} entries, which is its share")]

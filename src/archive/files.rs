@@ -5,11 +5,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use tokio::sync::Semaphore;
-use tokio::time::{Instant, timeout_at};
+use tokio::time::Instant;
 
 use super::disk::{Disk, Found};
 use super::error::FetchError;
+use super::readers::{Busy, Readers};
 use crate::config::Config;
 use crate::memory_budget::Budget;
 use crate::store::{Digest, Hasher};
@@ -21,8 +21,7 @@ pub(super) struct Files {
     folder: Folder,
     disk: Disk,
     memory: Budget,
-    /// Permits to read structures outside of jobs.
-    pub(super) readers: Arc<Semaphore>,
+    pub(super) readers: Readers,
     timeout: Duration,
 }
 
@@ -34,7 +33,7 @@ impl Files {
             folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
             disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
             memory,
-            readers: Arc::new(Semaphore::new(config.jobs.workers)),
+            readers: Readers::new(config.jobs.workers),
             timeout: Duration::from_millis(archive.timeout_ms),
         }
     }
@@ -96,19 +95,20 @@ impl Files {
         blocking(move || act(&files.disk)).await
     }
 
-    /// Runs blocking `work` on its own thread, with a permit that it keeps to its end.
+    /// Runs blocking `work` on its own thread, with a permit that it keeps to its end. Waits for the permit at most for
+    /// half of `archive.timeout_ms`.
     async fn with_permit<T: Send + 'static>(
         &self,
         id: &EntryId,
         deadline: Instant,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, FetchError> {
-        let busy = |_elapsed| FetchError::Busy { id: id.clone(), limit: self.timeout };
-        let permit = timeout_at(deadline, Arc::clone(&self.readers).acquire_owned()).await.map_err(busy)?;
-        let permit = permit.map_err(|_closed| FetchError::Internal("the service is stopping"))?;
+        let limit = self.timeout / 2;
+        let busy = |Busy(wait)| FetchError::Busy { id: id.clone(), limit, wait };
+        let reading = self.readers.wait(deadline.min(Instant::now() + limit)).await.map_err(busy)?;
         blocking(move || {
             let value = work();
-            drop(permit);
+            drop(reading);
             value
         })
         .await

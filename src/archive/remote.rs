@@ -11,6 +11,7 @@ use tokio::time::Instant;
 use super::breaker::Breaker;
 use super::client::{self, Answer, Checks, Failed, Origin};
 use super::error::{FetchError, UnavailableReason};
+use super::readers::{Busy, Readers};
 use crate::config::{ArchiveConfig, Config, Template};
 use crate::memory_budget::Budget;
 use crate::structure::EntryId;
@@ -27,7 +28,8 @@ pub(super) struct Remote {
     /// URL templates with the circuit breakers of their hosts.
     sources: Vec<(Template, Arc<Breaker>)>,
     config: ArchiveConfig,
-    checks: Checks,
+    inflated_bytes: u64,
+    readers: Readers,
     /// Pass on the trace context, since its spans are exported.
     sends_trace: bool,
     permits: Semaphore,
@@ -39,8 +41,8 @@ pub(super) struct Remote {
 impl Remote {
     /// Creates the remote archive of a configuration, if it names one. Bodies that arrive are charged to `memory`, and
     /// checked with a permit of `readers`.
-    pub(super) fn new(config: &Config, memory: Budget, readers: Arc<Semaphore>) -> Option<Self> {
-        let checks = Checks { inflated_bytes: config.limits.inflated_bytes, readers };
+    pub(super) fn new(config: &Config, memory: Budget, readers: Readers) -> Option<Self> {
+        let inflated_bytes = config.limits.inflated_bytes;
         let sends_trace = config.telemetry.endpoint.is_some();
         let config = &config.archive;
         let mut sources: Vec<(Template, Arc<Breaker>)> = Vec::new();
@@ -58,7 +60,7 @@ impl Remote {
         }
         let permits = Semaphore::new(config.concurrent);
         let client = OnceCell::new();
-        Some(Self { sources, config: config.clone(), checks, sends_trace, permits, memory, client })
+        Some(Self { sources, config: config.clone(), inflated_bytes, readers, sends_trace, permits, memory, client })
     }
 
     /// Sends a HEAD request for `id` to every URL. Returns the hosts with the status or the error.
@@ -69,6 +71,7 @@ impl Remote {
                 let failed = |failed: Failed| match failed {
                     Failed::TooLarge(_) => "too large".to_owned(),
                     Failed::Memory(error) => error.to_string(),
+                    Failed::Busy(_) => "no reader was free".to_owned(),
                     Failed::Other { detail, .. } => detail,
                 };
                 let client = self.client().await.map_err(failed)?;
@@ -94,7 +97,9 @@ impl Remote {
             match self.fetch_from(id, template, breaker, copy, deadline).await {
                 Ok(Answer::Absent) => {}
                 Ok(answer) => return Ok(answer),
-                Err(error @ (FetchError::TooLarge { .. } | FetchError::Memory { .. })) => return Err(error),
+                Err(error @ (FetchError::TooLarge { .. } | FetchError::Memory { .. } | FetchError::Busy { .. })) => {
+                    return Err(error);
+                }
                 // A later URL may have the entry. If none has, this failure is reported instead of "not found".
                 Err(error) => {
                     failure.get_or_insert(error);
@@ -121,6 +126,10 @@ impl Remote {
                     return Err(FetchError::TooLarge { id: id.clone(), bytes, limit: self.config.max_bytes });
                 }
                 Err(Failed::Memory(error)) => return Err(FetchError::Memory { id: id.clone(), error }),
+                Err(Failed::Busy(Busy(wait))) => {
+                    let limit = Duration::from_millis(self.config.timeout_ms);
+                    return Err(FetchError::Busy { id: id.clone(), limit, wait });
+                }
                 Err(Failed::Other { reason, retry_after, detail }) => (reason, retry_after, detail),
             };
             tracing::debug!(%id, host = breaker.host(), attempt, detail, "an attempt failed");
@@ -177,14 +186,15 @@ impl Remote {
         let span = TraceSpan::start(&SpanParent::current(), "GET", SpanKind::Client, std::time::Instant::now());
         let trace = self.sends_trace.then(|| span.context());
         let reservation = self.memory.reservation();
-        let get = client::get(client, url, known, &self.config, &self.checks, reservation, trace.as_ref());
+        let checks = Checks { inflated_bytes: self.inflated_bytes, readers: &self.readers, begin_by: deadline };
+        let get = client::get(client, url, known, &self.config, &checks, reservation, trace.as_ref());
         let answer = tokio::time::timeout_at(deadline, get)
             .await
             .unwrap_or_else(|_elapsed| Err(Failed::other(UnavailableReason::Timeout, "incomplete at the deadline")));
         describe(&span, id, breaker.host(), &answer);
         span.end();
         match &answer {
-            Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_)) => permit.succeeded(),
+            Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_) | Failed::Busy(_)) => permit.succeeded(),
             Err(Failed::Other { retry_after: Some(wait), reason, .. })
                 if reason.is_temporary() && *wait > Duration::from_millis(self.config.retry_after_ms) =>
             {
@@ -218,6 +228,7 @@ fn describe(span: &TraceSpan, id: &EntryId, host: &str, answer: &Result<Answer, 
         // 410 is reported as 404.
         Ok(Answer::Absent) => (Some(404), None),
         Err(Failed::Memory(_)) => (Some(200), Some("memory limit reached".to_owned())),
+        Err(Failed::Busy(_)) => (Some(200), Some("no reader was free".to_owned())),
         Err(Failed::Other { reason, detail, .. }) => match reason {
             UnavailableReason::Status(status) => (Some(i64::from(*status)), Some(detail.clone())),
             _ => (None, Some(detail.clone())),
@@ -245,7 +256,7 @@ mod tests {
     fn pauses_double_and_are_random() {
         let mut config = Config::default();
         config.archive.backoff_ms = 1000;
-        let remote = Remote::new(&config, Budget::unlimited(), Arc::new(Semaphore::new(1))).unwrap();
+        let remote = Remote::new(&config, Budget::unlimited(), Readers::new(1)).unwrap();
         let longest = |attempt| (0..200).map(|_| remote.pause(attempt, None)).max().unwrap_or_default().as_millis();
         for (attempt, span) in [(1, 1000), (2, 2000), (3, 4000)] {
             let longest = longest(attempt);

@@ -8,7 +8,6 @@ mod kinds;
 mod observed_body;
 mod pace;
 mod range;
-mod reader_line;
 mod request_id;
 mod scopes;
 mod signal;

@@ -98,7 +98,8 @@ pub(super) async fn report(
     let Path(text) = path?;
     let key = ContentKey::parse(&text, caller.namespace).map_err(|_bad| no_such_result(&text))?;
     wait_for_save(&app, &key).await;
-    let bytes = app.store.get(&key.name(REPORT)?).await?.ok_or_else(|| no_such_result(&text))?.bytes;
+    let stored = app.store.get(&key.name(REPORT)?).await?;
+    let bytes = stored.and_then(|stored| jobs::document(&stored.bytes)).ok_or_else(|| no_such_result(&text))?;
     // A report holds the times of one run, so its validator is its own digest.
     let etag =
         HeaderValue::from_str(&format!("\"{}\"", crate::store::Digest::of(&bytes))).map_err(Problem::internal)?;
@@ -136,6 +137,9 @@ pub(super) async fn stored(
     let name = key.name(format.name())?;
     app.pool.settings().budget.check()?;
     let Some((meta, mut body)) = app.store.read(&name, None).await? else { return Ok(None) };
+    if !app.store.is_known_intact(&name, meta) && !jobs::is_stored(&app.store, format, key).await? {
+        return Ok(None);
+    }
     let Some(headers_of_result) = result_headers(app, key, format).await? else { return Ok(None) };
     let mut out = HeaderMap::clone(&headers_of_result);
     let wanted = match range::wanted(headers, &delivery::etag(key), meta.size) {
@@ -178,8 +182,9 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
     if let Some(headers) = app.result_headers.get(key) {
         return Ok(Some(headers));
     }
-    let Some(report) = app.store.get(&key.name(REPORT)?).await? else { return Ok(None) };
-    let report: Value = serde_json::from_slice(&report.bytes).map_err(Problem::internal)?;
+    let stored = app.store.get(&key.name(REPORT)?).await?;
+    let Some(report) = stored.and_then(|stored| jobs::document(&stored.bytes)) else { return Ok(None) };
+    let report: Value = serde_json::from_slice(&report).map_err(Problem::internal)?;
     let mut headers = delivery::summary_headers(&report);
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
     headers.insert(header::CONTENT_DISPOSITION, delivery::disposition(report["id"].as_str(), format));

@@ -13,7 +13,6 @@ use tokio::sync::{Semaphore, watch};
 use tokio::task::{JoinHandle, JoinSet};
 
 use super::problem::Problem;
-use super::reader_line::ReaderLine;
 use super::state::{App, Shared};
 use super::stop::{self, Stop};
 use super::store_health::StoreHealth;
@@ -156,7 +155,7 @@ impl Server {
         let uploads = pool.settings().budget.part(config.limits.memory_bytes / 2);
         let readers = archive.readers();
         let reader_shares = ClientShares::new(config.jobs.workers, config.server.client_share);
-        let reader_line = ReaderLine::new(config.jobs.workers);
+        let reader_line = archive.reader_line();
         let delivery_shares = ClientShares::new(config.jobs.deliveries, config.server.client_share);
         let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
         let (stop, stopping) = watch::channel(Stop::Serve);

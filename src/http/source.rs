@@ -228,9 +228,10 @@ fn archive_problem(error: &FetchError) -> Problem {
             retry_after.iter().fold(problem, |problem, wait| problem.retry_after(*wait))
         }
         FetchError::Memory { error, .. } => (*error).into(),
-        FetchError::Busy { limit, .. } => {
-            Problem::new(Kind::Deadline, detail).with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX))
-        }
+        FetchError::Busy { limit, wait, .. } => Problem::new(Kind::QueueFull, detail)
+            .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX))
+            .with("estimated_wait_s", wait.as_secs_f64())
+            .retry_after(*wait),
         FetchError::Share { limit, .. } => {
             let wait = Duration::from_secs(1);
             Problem::new(Kind::ShareExceeded, detail).with("limit", *limit).retry_after(wait)

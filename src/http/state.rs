@@ -12,7 +12,6 @@ use tokio::time::{Instant, timeout_at};
 
 use super::kinds::Kind;
 use super::problem::Problem;
-use super::reader_line::ReaderLine;
 use super::stop::Stop;
 use super::store_health::StoreHealth;
 use crate::access::Access;
@@ -21,6 +20,7 @@ use crate::client_shares::{ClientShares, SharePermit};
 use crate::config::Config;
 use crate::jobs::{Budget, Client, ContentKey, Failure, JobStore, Pool, Structures};
 use crate::pipeline::Job;
+use crate::reader_line::ReaderLine;
 use crate::single_flight::SingleFlight;
 use crate::store::{Namespace, Secret, Store};
 use crate::surface::{CancelToken, Control, FoundDevice, MemoryMeter as _};

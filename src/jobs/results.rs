@@ -1,14 +1,15 @@
 //! Storing of results: the mesh file and its report, named by their content key.
 
-use std::io::Write as _;
+use std::io::{self, Write};
 use std::sync::Arc;
 
 use bytes::Bytes;
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::{ContentKey, Finished};
 use crate::formats::{Format, FormatError};
-use crate::store::{Pin, Store, StoreError};
+use crate::store::{Digest, Hasher, Pin, Store, StoreError};
 
 /// File name extension of a report.
 pub(crate) const REPORT: &str = "json";
@@ -42,14 +43,87 @@ impl SaveError {
     }
 }
 
-/// Returns true if a mesh and its report are stored. A mesh without its report counts as absent.
-pub(crate) async fn is_stored(store: &Store, format: Format, key: &ContentKey) -> Result<bool, StoreError> {
-    let (mesh, report) = (key.name(format.name())?, key.name(REPORT)?);
-    Ok(store.head(&mesh).await?.is_some() && store.head(&report).await?.is_some())
+/// Sizes and digests of a stored mesh and its report, in the last line of the report's file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+struct Sums {
+    mesh_bytes: u64,
+    #[serde(with = "text")]
+    mesh_sha256: Digest,
+    #[serde(with = "text")]
+    report_sha256: Digest,
 }
 
-/// Stores the report and the mesh as `format`, unless both are stored already. The report comes first, so that every
-/// stored mesh has one. They are not removed before the returned pin is dropped.
+/// Digests as text.
+mod text {
+    use serde::de::Error as _;
+    use serde::{Deserialize as _, Deserializer, Serializer};
+
+    use crate::store::Digest;
+
+    pub(super) fn serialize<S: Serializer>(digest: &Digest, to: S) -> Result<S::Ok, S::Error> {
+        to.collect_str(digest)
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Digest, D::Error> {
+        String::deserialize(from)?.parse().map_err(D::Error::custom)
+    }
+}
+
+/// Returns the file of a report: the document, and a line with the sums of the document and of its mesh.
+pub(super) fn report_file(mut document: Vec<u8>, mesh: &Hasher, mesh_bytes: u64) -> Result<Bytes, SaveError> {
+    let (mesh_sha256, report_sha256) = (mesh.clone().digest(), Digest::of(&document));
+    document.push(b'\n');
+    serde_json::to_writer(&mut document, &Sums { mesh_bytes, mesh_sha256, report_sha256 })
+        .map_err(|e| SaveError::Other(e.to_string()))?;
+    Ok(document.into())
+}
+
+/// Splits the file of a report into the document and the sums. `None` if it is damaged.
+fn split(file: &Bytes) -> Option<(Bytes, Sums)> {
+    let end = file.iter().rposition(|byte| *byte == b'\n')?;
+    let sums: Sums = serde_json::from_slice(&file[end + 1..]).ok()?;
+    let document = file.slice(..end);
+    (Digest::of(&document) == sums.report_sha256).then_some((document, sums))
+}
+
+/// Returns the document in the file of a report; `None` if the file is damaged.
+pub(crate) fn document(file: &Bytes) -> Option<Bytes> {
+    split(file).map(|(document, _)| document)
+}
+
+/// Returns true if a mesh and its report are stored and undamaged. A mesh without its report counts as absent. The mesh
+/// is read if this process has not checked it yet.
+pub(crate) async fn is_stored(store: &Store, format: Format, key: &ContentKey) -> Result<bool, StoreError> {
+    let (mesh, report) = (key.name(format.name())?, key.name(REPORT)?);
+    if store.head(&mesh).await?.is_none() || store.head(&report).await?.is_none() {
+        return Ok(false);
+    }
+    let Some((_, sums)) = store.peek(&report).await?.as_ref().and_then(split) else { return Ok(false) };
+    store.is_intact(&mesh, sums.mesh_bytes, &sums.mesh_sha256).await
+}
+
+/// Writer that hashes what it writes.
+struct Hashing<W> {
+    writer: W,
+    hasher: Hasher,
+    bytes: u64,
+}
+
+impl<W: Write> Write for Hashing<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let n = self.writer.write(bytes)?;
+        self.hasher.update(&bytes[..n]);
+        self.bytes += n as u64;
+        Ok(n)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.writer.flush()
+    }
+}
+
+/// Stores the mesh as `format` and the report, unless both are stored already. The report comes last, because it
+/// contains the digest of the mesh. They are not removed before the returned pin is dropped.
 pub(crate) async fn save(
     store: &Store,
     finished: Arc<Finished>,
@@ -58,14 +132,14 @@ pub(crate) async fn save(
     limit: u64,
 ) -> Result<Pin, SaveError> {
     let (mesh, report) = (key.name(format.name())?, key.name(REPORT)?);
-    // Writing the mesh must not evict its report.
+    // Writing the report must not evict its mesh.
     let pin = store.pin(&mesh);
     if is_stored(store, format, key).await? {
         return Ok(pin);
     }
     let document = serde_json::to_vec(&finished.product.report).map_err(|e| SaveError::Other(e.to_string()))?;
-    store.put(&report, Bytes::from(document)).await?;
-    let (store, runtime) = (store.clone(), tokio::runtime::Handle::current());
+    let (writing, runtime) = (store.clone(), tokio::runtime::Handle::current());
+    let name = mesh.clone();
     let encode = move || {
         let file = finished.product.file(format)?;
         let bytes = file.bytes_bound();
@@ -73,21 +147,24 @@ pub(crate) async fn save(
             return Err(SaveError::TooLarge { bytes, limit });
         }
         let write = || {
-            let mut writer = store.writer(&mesh);
+            let mut writer = Hashing { writer: writing.writer(&name), hasher: Hasher::default(), bytes: 0 };
             file.write(&mut writer).and_then(|()| writer.flush()).map_err(from_io)?;
-            Ok(writer.finish()?)
+            writer.writer.finish()?;
+            report_file(document.clone(), &writer.hasher, writer.bytes)
         };
         match write() {
-            Err(SaveError::Store(StoreError::NoSpace { .. })) if runtime.block_on(store.evict_for(bytes)) => write(),
+            Err(SaveError::Store(StoreError::NoSpace { .. })) if runtime.block_on(writing.evict_for(bytes)) => write(),
             done => done,
         }
     };
-    tokio::task::spawn_blocking(encode).await.map_err(|e| SaveError::Other(e.to_string()))??;
+    let file = tokio::task::spawn_blocking(encode).await.map_err(|e| SaveError::Other(e.to_string()))??;
+    store.set_intact(&mesh).await?;
+    store.put(&report, file).await?;
     Ok(pin)
 }
 
 /// Converts an I/O error of a store writer back into the store's error.
-fn from_io(error: std::io::Error) -> SaveError {
+fn from_io(error: io::Error) -> SaveError {
     match error.downcast::<StoreError>() {
         Ok(error) => error.into(),
         Err(error) => SaveError::Other(error.to_string()),

@@ -12,6 +12,7 @@ use std::time::SystemTime;
 
 use bytes::Bytes;
 use metrics::counter;
+use quick_cache::sync::Cache;
 use tokio::sync::Mutex as AsyncMutex;
 
 use super::backend::Backend;
@@ -30,6 +31,8 @@ use crate::telemetry::CACHE_REQUESTS;
 
 /// Number of locks for writing and removing. Names share them by hash.
 const WRITE_LOCKS: usize = 64;
+/// Number of results that are known to be intact, in a few megabytes. Others are checked again.
+const INTACT_RESULTS: usize = 16_384;
 
 /// Object store in a folder or on S3. Clones share one store.
 ///
@@ -41,7 +44,9 @@ pub(super) struct StoreState {
     pub(super) backend: Backend,
     pub(super) config: StoreConfig,
     index: Mutex<Index>,
-    memory: Memory,
+    pub(super) memory: Memory,
+    /// Results that this process has written or checked, as they were then.
+    pub(super) intact: Cache<Name, Meta>,
     write_locks: [AsyncMutex<()>; WRITE_LOCKS],
     /// Serializes evictions, so that two do not remove twice as much. The value is the time of the last search for
     /// staged files.
@@ -95,6 +100,7 @@ impl Store {
             backend,
             index: Mutex::new(index),
             memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
+            intact: Cache::new(INTACT_RESULTS),
             write_locks: [const { AsyncMutex::const_new(()) }; WRITE_LOCKS],
             last_cleanup: AsyncMutex::new(now),
             clock,

@@ -29,6 +29,7 @@ mod namespace;
 mod object;
 mod quarantine;
 mod records;
+mod results;
 mod s3;
 mod secret;
 mod stale;

@@ -114,10 +114,10 @@ metrics! {
     STORE_ERRORS = "molmesh_store_errors_total", Counter, op: "operations of a store";
     /// Lookups of archive entries.
     ARCHIVE_REQUESTS = "molmesh_archive_requests_total", Counter, source: "local|cache|remote",
-        result: "known|found|absent|unchanged|stale|corrupt|failed|too-large|no-memory|unavailable";
+        result: "known|found|absent|unchanged|stale|corrupt|failed|too-large|no-memory|busy|unavailable";
     /// Time to fetch an entry from the remote archive, including all attempts and pauses.
     ARCHIVE_FETCH = "molmesh_archive_fetch_seconds", Histogram,
-        result: "found|unchanged|absent|too-large|no-memory|unavailable";
+        result: "found|unchanged|absent|too-large|no-memory|busy|unavailable";
     /// 1 while the circuit breaker of a host of the remote archive is open, else 0.
     ARCHIVE_BREAKER = "molmesh_archive_breaker_open", Gauge, host: "hosts of `archive.url`";
     /// Bytes of cached archive entries on disk.

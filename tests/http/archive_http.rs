@@ -537,6 +537,64 @@ async fn concurrent_fetches_are_limited() {
     assert!([UnavailableReason::Timeout, UnavailableReason::Busy].contains(&end), "{end:?}");
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_fetch_that_waits_for_a_reader_ends_in_time() {
+    let remote = Remote::saying(Response::After(Duration::from_millis(300), Box::new(ok(b"x"))));
+    let place = Setup::new(&remote.url(CIF), |c| {
+        c.jobs.workers = 1;
+        c.archive.timeout_ms = 1500;
+        c.archive.breaker_failures = 1;
+    });
+    let archive = place.archive();
+    let readers = archive.readers();
+    let hold = || async { Arc::clone(&readers).acquire_owned().await.unwrap() };
+    let busy = |ended: Result<Entry, FetchError>| assert!(matches!(ended, Err(FetchError::Busy { .. })), "{ended:?}");
+    // Before the folder is read.
+    let held = hold().await;
+    let start = Instant::now();
+    busy(archive.fetch(&id("1aaa")).await);
+    busy(archive.digest(&id("1aaa")).await.map(|_| unreachable!()));
+    assert!(start.elapsed() < Duration::from_secs(5) && remote.count() == 0, "{:?}", start.elapsed());
+    drop(held);
+    // Before a body that has arrived is checked.
+    let fetch = tokio::spawn({
+        let archive = archive.clone();
+        async move { archive.fetch(&id("1aaa")).await }
+    });
+    http_support::wait_for("the request", || remote.count() == 1);
+    let held = hold().await;
+    busy(fetch.await.unwrap());
+    drop(held);
+    // The archive is not to blame, so its circuit breaker is closed.
+    assert_eq!(&archive.fetch(&id("1aaa")).await.unwrap().bytes[..], b"x");
+}
+
+#[test]
+fn an_entry_gets_503_while_no_reader_is_free() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("4pti.pdb"), SAMPLE).unwrap();
+    let backend = Fake::new(Mode::Slow(Duration::from_secs(4)));
+    let server = start(backend, |c| {
+        c.archive.dir = Some(folder.path().to_owned());
+        c.archive.timeout_ms = 1000;
+        c.jobs.workers = 1;
+        c.server.client_share = 1.0;
+    });
+    let get = || server.get("/v1/pdb/4pti/atoms");
+    std::thread::scope(|scope| {
+        // An estimate holds the reader while it meshes a coarse grid.
+        let estimate = scope.spawn(|| server.post("/v1/estimate", &[], SAMPLE).status);
+        std::thread::sleep(Duration::from_millis(500));
+        let start = Instant::now();
+        let reply = get();
+        let problem = reply.problem(503, "queue-full");
+        assert!(reply.header("retry-after").is_some() && problem["limit"] == 500, "{problem}");
+        assert!(start.elapsed() < Duration::from_secs(3), "{:?}", start.elapsed());
+        assert_eq!(estimate.join().unwrap(), 200);
+    });
+    assert_eq!(get().status, 200, "the control");
+}
+
 // ------------------------------------------------------------------------------------------------- copies on disk
 
 #[tokio::test(flavor = "multi_thread")]

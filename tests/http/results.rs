@@ -272,6 +272,66 @@ fn a_damaged_structure_is_neither_used_nor_kept_by_another_upload() {
 }
 
 #[test]
+fn a_damaged_result_is_quarantined_and_computed_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let backend = Fake::new(Mode::Octahedra);
+    let open = || {
+        start(Arc::clone(&backend) as _, |c| {
+            folder.path().clone_into(&mut c.server.data_dir);
+            // Results in memory would hide the file.
+            c.store.memory_object_bytes = 1;
+        })
+    };
+    let started = || backend.started.load(Ordering::SeqCst);
+    let server = open();
+    let post = |server: &Running| server.post("/v1/meshes?format=stl", &[], SAMPLE);
+    let mesh = post(&server).header("content-location").unwrap().to_owned();
+    let whole = server.get(&mesh).body;
+    let report = mesh.replace(".stl", "/report.json");
+    let key = mesh.rsplit('/').next().unwrap().strip_suffix(".stl").unwrap();
+    let at = |place: &str| folder.path().join("store").join(place);
+    let [stored, quarantined] = ["results", "quarantine"].map(|place| at(place).join(format!("{key}.stl")));
+    let mut flipped = whole.clone();
+    flipped[200] ^= 1;
+    // While the service runs, its file may change; a request for a range is no way around the check.
+    for (n, header) in [("accept", "*/*"), ("range", "bytes=0-9")].into_iter().enumerate() {
+        std::fs::write(&stored, &flipped).unwrap();
+        send(server.addr, "GET", &mesh, &[header], b"").problem(404, "not-found");
+        assert!(std::fs::read(&quarantined).unwrap() == flipped && !stored.exists());
+        assert!((server.metric("molmesh_store_errors_total", &["op=\"verify\""]) - (n as f64 + 1.0)).abs() < 0.5);
+        assert_eq!(post(&server).header("content-location"), Some(mesh.as_str()));
+        assert!(server.get(&mesh).body == whole && std::fs::read(&stored).unwrap() == whole);
+        assert_eq!(started(), n + 2, "computed again");
+    }
+    server.join();
+    // Control: an undamaged result is served and not computed again after a restart.
+    let server = open();
+    assert!(server.get(&mesh).body == whole && post(&server).body == whole && started() == 3);
+    server.join();
+    // A job does not succeed with a damaged result, and a damaged report does not hide one.
+    std::fs::write(&stored, &flipped).unwrap();
+    let server = open();
+    let job = server.post("/v1/meshes?format=stl", &[("prefer", "respond-async")], SAMPLE);
+    let job = job.header("location").unwrap().to_owned();
+    assert_eq!(server.get(&format!("{job}?wait=20")).json()["status"], "successful");
+    assert!(server.get(&mesh).body == whole && started() == 4);
+    server.join();
+    let file = at("results").join(format!("{key}.json"));
+    let text = std::fs::read_to_string(&file).unwrap();
+    for damaged in [text.replacen("atoms", "atomz", 1), text[..text.len() / 2].to_owned(), String::new()] {
+        std::fs::write(&file, damaged).unwrap();
+        let server = open();
+        server.get(&report).problem(404, "not-found");
+        server.get(&mesh).problem(404, "not-found");
+        assert!(post(&server).body == whole);
+        assert_eq!([&mesh, &report].map(|path| server.get(path).status), [200, 200]);
+        assert_eq!(server.get("/readyz").status, 200);
+        server.join();
+    }
+    assert_eq!(started(), 7);
+}
+
+#[test]
 fn json_documents_name_entries_and_structures() {
     let server = real(|_| {});
     let json = [("content-type", "application/json")];

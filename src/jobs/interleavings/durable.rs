@@ -18,7 +18,7 @@ use super::super::coalesced_job::QueuedTask;
 use super::super::queue::Queue;
 use super::super::{
     Budget, ContentKey, EndError, Failure, JobId, JobRecord, JobSpec, JobStore, JobView, OnStart, Pool, REPORT,
-    Settings, Status, Structures,
+    Settings, Status, Structures, results,
 };
 use super::task;
 use crate::config::JobsConfig;
@@ -26,7 +26,7 @@ use crate::formats::Format;
 use crate::picture::SelectedRenderer;
 use crate::pipeline::JobLimits;
 use crate::store::interleavings::open_bytes;
-use crate::store::{Name, Namespace, Store};
+use crate::store::{Hasher, Name, Namespace, Store};
 use crate::surface::{OutOfMemory, ReferenceBackend};
 use crate::sync::thread::{self, JoinHandle};
 use crate::telemetry::Tracer;
@@ -100,8 +100,9 @@ impl Fixture {
     fn store_result(&self, entry: &QueuedTask) {
         let maker = self.jobs.0.pool.makers(&entry.task.job).remove(0);
         let key = ContentKey::new(&entry.task.digest, &entry.task.job, Format::Glb, &maker, Namespace::default());
-        for extension in [REPORT, "glb"] {
-            block_on(self.store.put(&key.name(extension).unwrap(), Bytes::from_static(b"x"))).unwrap();
+        let report = results::report_file(b"{}".to_vec(), &Hasher::default(), 0).unwrap();
+        for (extension, bytes) in [("glb", Bytes::new()), (REPORT, report)] {
+            block_on(self.store.put(&key.name(extension).unwrap(), bytes)).unwrap();
         }
     }
 

@@ -28,14 +28,14 @@ impl LineState {
 
 /// Counts of requests that wait for one of the readers of structures or are read, with the mean duration of a read.
 #[derive(Debug)]
-pub(super) struct ReaderLine {
+pub(crate) struct ReaderLine {
     readers: u32,
     state: Mutex<LineState>,
 }
 
 impl ReaderLine {
     /// Creates the line in front of `readers` readers.
-    pub(super) fn new(readers: usize) -> Arc<Self> {
+    pub(crate) fn new(readers: usize) -> Arc<Self> {
         Arc::new(Self { readers: u32::try_from(readers.max(1)).unwrap_or(u32::MAX), state: Mutex::default() })
     }
 
@@ -44,12 +44,12 @@ impl ReaderLine {
     }
 
     /// Estimates the time until a request that arrives now is read.
-    pub(super) fn estimated_wait(&self) -> Duration {
+    pub(crate) fn estimated_wait(&self) -> Duration {
         self.lock().wait(self.readers)
     }
 
     /// Counts a request that waits. `None` if others wait and the estimated wait exceeds `max_wait`.
-    pub(super) fn enter(self: &Arc<Self>, max_wait: Duration) -> Option<Waiting> {
+    pub(crate) fn enter(self: &Arc<Self>, max_wait: Duration) -> Option<Waiting> {
         let mut state = self.lock();
         if state.waiting > 0 && state.wait(self.readers) > max_wait {
             return None;
@@ -60,11 +60,11 @@ impl ReaderLine {
 }
 
 /// Request that waits for a reader. Dropping it ends the wait.
-pub(super) struct Waiting(Arc<ReaderLine>);
+pub(crate) struct Waiting(Arc<ReaderLine>);
 
 impl Waiting {
     /// Ends the wait and begins the read.
-    pub(super) fn begin(self) -> ReadingTime {
+    pub(crate) fn begin(self) -> ReadingTime {
         self.0.lock().reading += 1;
         ReadingTime { line: Arc::clone(&self.0), begun: Instant::now() }
     }
@@ -77,7 +77,7 @@ impl Drop for Waiting {
 }
 
 /// Read in progress. Dropping it adds its duration to the mean.
-pub(super) struct ReadingTime {
+pub(crate) struct ReadingTime {
     line: Arc<ReaderLine>,
     begun: Instant,
 }
