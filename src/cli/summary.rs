@@ -32,6 +32,7 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
     let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
     let models = match report.models {
+        Some(1) => "1 model".to_owned(),
         Some(n) => format!("{} models", grouped(n)),
         None => format!("model {}", report.model),
     };

@@ -19,7 +19,7 @@ use super::guard::Caller;
 use super::kinds::Kind;
 use super::openapi::parameters::JobPath;
 use super::openapi::problem_responses;
-use super::openapi::problems::{MAP, MESHING, ProblemDocument, READING};
+use super::openapi::problems::{MESHING, ProblemDocument, READING};
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
@@ -130,7 +130,7 @@ impl Poll {
 
 problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed]]);
 problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::JobEnded, Kind::RecordUnreadable, Kind::StoreFull, Kind::StoreFailed]]);
-problem_responses!(ResultProblems: [READING, MAP, MESHING, [
+problem_responses!(ResultProblems: [READING, MESHING, [
     Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed,
     Kind::ResultGone, Kind::JobAbandoned,
     Kind::RecordUnreadable,

@@ -14,7 +14,7 @@ use super::openapi::bodies::{AS_FOR_MESHES, STRUCTURE_TO_MESH, StructureFile};
 use super::openapi::meshes::{MeshOrJob, ReportResponse};
 use super::openapi::parameters::{ContentEncodingHeader, MeshParameters, PreferenceHeaders};
 use super::openapi::problem_responses;
-use super::openapi::problems::{BODY, MAP, MESHING, NAMED_STRUCTURE, PARAMETERS, READING, SUBMITTING};
+use super::openapi::problems::{BODY, MESHING, NAMED_STRUCTURE, PARAMETERS, READING, SUBMITTING};
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::preferences::RequestPreferences;
 use super::problem::Problem;
@@ -22,7 +22,7 @@ use super::state::Shared;
 use super::timing::Timing;
 
 problem_responses!(MeshProblems: [
-    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MAP, MESHING, SUBMITTING, [Kind::NotAcceptable],
+    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING, SUBMITTING, [Kind::NotAcceptable],
 ]);
 
 /// Mesh a structure
@@ -44,7 +44,7 @@ pub(super) async fn create(
 }
 
 problem_responses!(ReportProblems: [
-    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MAP, MESHING,
+    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING,
     [Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded],
 ]);
 

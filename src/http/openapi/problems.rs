@@ -36,8 +36,10 @@ pub(in crate::http) const PARAMETERS: &[Kind] = &[Kind::BadRequest, Kind::BadPar
 /// Problems of reading a structure.
 pub(in crate::http) const READING: &[Kind] =
     &[Kind::InflatedTooLarge, Kind::UnreadableStructure, Kind::NoAtoms, Kind::TooManyAtoms, Kind::TooManyDuplicates];
-/// Problems of a job after the structure was read.
+/// Problems of a job after the structure was read, and of its map.
 pub(in crate::http) const MESHING: &[Kind] = &[
+    Kind::UnreadableMap,
+    Kind::MapTooLarge,
     Kind::EmptySelection,
     Kind::TooManyCopies,
     Kind::TooManyParts,
@@ -54,8 +56,6 @@ pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::ShuttingDown,
     Kind::Deadline,
 ];
-/// Problems of reading a map that is sent beside the structure.
-pub(in crate::http) const MAP: &[Kind] = &[Kind::UnreadableMap, Kind::MapTooLarge];
 /// Problems of submitting a job.
 pub(in crate::http) const SUBMITTING: &[Kind] = &[
     Kind::OtherRequest,
