@@ -77,8 +77,9 @@ mod tests {
         ] {
             let error = parsed(pairs).err().unwrap();
             let found = match &error {
-                ParamError::BadValue { name, .. } | ParamError::Repeated { name } => *name,
-                ParamError::BadExpression { name, .. } => *name,
+                ParamError::BadValue { name, .. }
+                | ParamError::Repeated { name }
+                | ParamError::BadExpression { name, .. } => *name,
                 ParamError::Unknown { name, .. } => name.as_str(),
             };
             assert_eq!(found, name, "{error}");

@@ -294,29 +294,21 @@ mod tests {
             (&["QUI".to_owned(), "QUI".to_owned()][..], &[0, 12][..])
         );
         assert_eq!(two.residues.first, [0, 12, 24, 36]);
-        let columns = |listed: &AtomsDocument| {
+        let placed = |listed: &AtomsDocument| -> Vec<(u32, [f64; 3])> {
             let AtomColumns { index, x, y, z, .. } = &listed.atoms;
-            [x, y, z]
-                .map(|axis| axis.clone().unwrap())
-                .map(|axis| index.clone().unwrap().into_iter().zip(axis).collect::<Vec<_>>())
+            let [x, y, z] = [x, y, z].map(|axis| axis.clone().unwrap());
+            index.iter().flatten().enumerate().map(|(row, &i)| (i, [x[row], y[row], z[row]])).collect()
         };
-        let ([x, y, z], moved) = (columns(&one), columns(&two));
+        let (unit, assembly) = (placed(&one), placed(&two));
+        assert_eq!(assembly[..24], unit);
         // Operator 2 of the file: -x, -x + y, -z of a hexagonal cell.
-        let (c, s) = (0.5, 0.866_025_403_8);
-        for row in 0..24 {
-            let file = |axis: &[(u32, f64)]| {
-                let (i, value) = axis[row];
-                (i as usize, value)
-            };
-            let (i, x0) = file(&x);
-            let (y0, z0) = (y[row].1, z[row].1);
-            assert!((x0 - structure.x[i]).abs() < 6e-4 && structure.residue.get(i) == "QUI", "{row}");
-            assert_eq!([moved[0][row], moved[1][row], moved[2][row]], [x[row], y[row], z[row]]);
-            let expected = [-c * x0 - s * y0, -s * x0 + c * y0, -z0];
-            for axis in 0..3 {
-                assert!((moved[axis][row + 24].1 - expected[axis]).abs() < 2e-3, "{row}: {expected:?}");
-                assert_eq!(moved[axis][row + 24].0, x[row].0);
-            }
+        let sine = 0.866_025_403_8;
+        for ((index, [x, y, z]), (copied, moved)) in unit.into_iter().zip(&assembly[24..]) {
+            let row = index as usize;
+            assert!((x - structure.x[row]).abs() < 6e-4 && structure.residue.get(row) == "QUI", "{row}");
+            let expected = [-0.5 * x - sine * y, -sine * x + 0.5 * y, -z];
+            let error = expected.iter().zip(moved).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(error < 2e-3 && *copied == index, "{row}: {error}");
         }
         let bytes = serde_json::to_vec(&two).unwrap().len() as u64;
         assert!(bytes < (BYTES_PER_ATOM + BYTES_PER_POSITION) * two.count as u64 + 1000, "{bytes}");

@@ -6,7 +6,8 @@ import { fetchFile, type Job } from "./api/jobs";
 import { asProblem, Problem } from "./api/problem";
 import { Colors } from "./colors";
 import { load } from "./scene/load";
-import { contextOf, Viewer } from "./scene/viewer";
+import { contextOf } from "./scene/context";
+import { Viewer } from "./scene/viewer";
 import { chooseScheme, fillSchemes, showLegend } from "./ui/legend";
 
 const ATTRIBUTES = ["src", "color", "scheme", "menu", "background", "turn", "alt"] as const;

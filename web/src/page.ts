@@ -4,7 +4,7 @@ import type { Client } from "./api/client";
 import { asProblem, Problem } from "./api/problem";
 import type { Legend } from "./api/colors";
 import type { Parameter, Schemes } from "./api/schema";
-import { entry, type Labels, labels, type Source, type Summary, upload } from "./api/structures";
+import { entry, type Labels, labels, type Source, stored, upload } from "./api/structures";
 import { Colors } from "./colors";
 import { connect } from "./controls";
 import { Display, type DisplayState } from "./display";
@@ -12,7 +12,7 @@ import { Downloads } from "./downloads";
 import { keyboard } from "./keyboard";
 import { Picker } from "./picker";
 import { type Delivery, Remesher, type MeshRequest } from "./remesh";
-import { addressOf, type Choices, coarser, curl, currentAddress, drawn, readAddress, SAMPLE, surface, writeAddress } from "./request";
+import { addressOf, type Choices, coarser, curl, currentAddress, drawn, readAddress, SAMPLE, type State, surface, writeAddress } from "./request";
 import { Stage } from "./stage";
 import { Busy } from "./ui/busy";
 import { ColourControls } from "./ui/colours";
@@ -20,12 +20,6 @@ import { $, el, number, show } from "./ui/dom";
 import { Form } from "./ui/form";
 import { problem as showProblem } from "./ui/problem";
 import { report, timingsOf } from "./ui/report";
-
-/** Parameters and display of a surface. */
-interface State {
-  choices: Choices;
-  display: DisplayState;
-}
 
 /** Time from input to frame, ms, above which a dragged slider shows a coarser preview. */
 const PREVIEW_FROM = 200;
@@ -115,9 +109,9 @@ export class Page {
       this.form?.set(parameter, value);
     };
     const shown = this.shown?.source.name;
-    let kept = "";
-    if (name && shown && name !== shown) kept = `The surface shown is still that of ${shown}.`;
-    else if (shown && request) kept = "The surface and its parameters are as they were before.";
+    const isOther = name && shown && name !== shown;
+    const same = shown && request ? "The surface and its parameters are as they were before." : "";
+    const kept = isOther ? `The surface shown is still that of ${shown}.` : same;
     showProblem($("problem"), found, { name, kept }, {
       takeResolution: (resolution) => set("resolution", String(resolution)),
       reset: (parameter) => set(parameter, undefined),
@@ -151,8 +145,7 @@ export class Page {
     });
     window.addEventListener("popstate", () => {
       // A step to another fragment of the same address opens nothing.
-      if (this.address === currentAddress()) return;
-      void this.visit();
+      if (this.address !== currentAddress()) void this.visit();
     });
   }
 
@@ -173,10 +166,7 @@ export class Page {
 
   /** Returns a structure that was uploaded before. */
   private async known(digest: string, signal: AbortSignal): Promise<Source> {
-    const visited = this.visited.get(`/v1/structures/${digest}`);
-    if (visited) return visited;
-    const summary = await this.client.json<Summary>(`/v1/structures/${encodeURIComponent(digest)}`, { signal });
-    return { path: `/v1/structures/${summary.digest}`, name: summary.id ?? "structure", file: `${(summary.id ?? "structure").toLowerCase()}.cif`, summary };
+    return this.visited.get(`/v1/structures/${digest}`) ?? stored(this.client, digest, signal);
   }
 
   /**
@@ -359,13 +349,9 @@ export class Page {
     $("now").textContent = `${Number(extras["triangles"]).toLocaleString("en")} triangles`;
     this.updateAddress(push);
     if (!previous) this.stage.viewer?.turn(true);
-    this.later(() => this.complete(source, extras, headers));
-  }
-
-  /** Runs `then` after a pause without further meshes. */
-  private later(then: () => void): void {
+    // After a pause without further meshes.
     clearTimeout(this.facts);
-    this.facts = window.setTimeout(then, 300);
+    this.facts = window.setTimeout(() => this.complete(source, extras, headers), 300);
   }
 
   private complete(source: Source, extras: Record<string, unknown>, headers: Headers): void {
@@ -403,10 +389,7 @@ export class Page {
       return;
     }
     this.restore();
-    const again = () => {
-      this.take(request);
-      this.changed(false);
-    };
+    const again = () => (this.take(request), this.changed(false));
     this.problem(error, again, source.name, request);
   }
 

@@ -51,6 +51,12 @@ export function stem(source: Source): string {
   return (source.summary?.id ?? source.name).replaceAll(/[^\w.-]+/g, "_").replace(/\.(pdb|ent|cif|mmcif|bcif)?(\.gz|\.zst)?$/i, "").toLowerCase() || "surface";
 }
 
+/** Parameters and display of a surface. */
+export interface State {
+  choices: Choices;
+  display: DisplayState;
+}
+
 /** Reads structure and parameters from the page's address, which preserves them for reloading and sharing. */
 export function readAddress(known: ReadonlySet<string>): {
   choices: Map<string, string>;

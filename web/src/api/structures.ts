@@ -39,6 +39,13 @@ export async function upload(client: Client, blob: Blob, file: string, signal?: 
   return { path: `/v1/structures/${summary.digest}`, name: summary.id ?? file, file, blob, summary };
 }
 
+/** Returns a structure that was uploaded before. */
+export async function stored(client: Client, digest: string, signal: AbortSignal): Promise<Source> {
+  const summary = await client.json<Summary>(`/v1/structures/${encodeURIComponent(digest)}`, { signal });
+  const name = summary.id ?? "structure";
+  return { path: `/v1/structures/${summary.digest}`, name, file: `${name.toLowerCase()}.cif`, summary };
+}
+
 /** Returns an entry of the archive. */
 export function entry(id: string): Source {
   const name = id.trim();

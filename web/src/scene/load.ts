@@ -44,6 +44,12 @@ export async function load(bytes: ArrayBuffer): Promise<Loaded> {
   return { parts, sphere, extras };
 }
 
+/** Returns Å per unit of the file; 1 if it does not state its units. */
+export function unitScale({ extras }: Loaded): number {
+  const scale = Number(extras["unit_scale"] ?? 1);
+  return Number.isFinite(scale) && scale > 0 ? scale : 1;
+}
+
 /** Returns all meshes with their names in the file, because three.js changes the names of objects. */
 function partsOf(group: Group): Part[] {
   const parts: Part[] = [];

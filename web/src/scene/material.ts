@@ -1,6 +1,6 @@
 /** Material of the surface: hemisphere light, two camera lights, darker hollows and edges, and distance fog. */
 
-import { Color, DataTexture, GLSL3, NearestFilter, RGBAFormat, ShaderMaterial, SRGBColorSpace, UnsignedByteType, Vector2, type BufferGeometry } from "three";
+import { Color, DataTexture, GLSL3, Mesh, NearestFilter, RGBAFormat, ShaderMaterial, SRGBColorSpace, UnsignedByteType, Vector2, type BufferGeometry } from "three";
 
 /** Atoms per row of the palette, a texture width that every device supports. */
 const PALETTE_WIDTH = 1024;
@@ -114,6 +114,22 @@ export class SurfaceMaterial extends ShaderMaterial {
     const uniform = this.uniforms[name];
     if (uniform) uniform.value = value;
   }
+}
+
+/** Returns a material that writes depths and no colours. It is drawn after opaque objects. */
+export function depthsOnly(geometry: BufferGeometry): SurfaceMaterial {
+  const material = new SurfaceMaterial(geometry);
+  material.colorWrite = false;
+  material.transparent = true;
+  return material;
+}
+
+/** Returns a child of `mesh` that draws its depths. */
+export function depthLayer(mesh: Mesh, depths: SurfaceMaterial): Mesh {
+  const layer = new Mesh(mesh.geometry, depths);
+  layer.matrixAutoUpdate = false;
+  layer.frustumCulled = false;
+  return layer;
 }
 
 /** Returns a texture with one colour per atom, for the vertex shader. `rgba` has four sRGB bytes per atom. */

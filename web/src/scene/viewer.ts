@@ -2,8 +2,8 @@
 
 import { type BufferGeometry, Color, DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
-import type { Loaded } from "./load";
-import { SurfaceMaterial } from "./material";
+import { type Loaded, unitScale } from "./load";
+import { depthLayer, depthsOnly, SurfaceMaterial } from "./material";
 import { type Hit, pick, placeOf } from "./pick";
 
 export interface ViewerOptions {
@@ -21,12 +21,6 @@ const TURN = 14_000;
 const MAX_PIXEL_RATIO = 2;
 /** Frame time, ms, above which the resolution is reduced during motion. */
 const SLOW = 40;
-
-/** Returns a WebGL 2 context of `canvas`, or null if the browser has none. */
-export function contextOf(canvas: HTMLCanvasElement, transparent: boolean): WebGL2RenderingContext | null {
-  const attributes = { antialias: true, alpha: transparent, premultipliedAlpha: true, powerPreference: "high-performance" as const, preserveDrawingBuffer: false };
-  return canvas.getContext("webgl2", attributes) as WebGL2RenderingContext | null;
-}
 
 export class Viewer {
   readonly controls: OrbitControls;
@@ -81,9 +75,7 @@ export class Viewer {
     this.scene.remove(...this.meshes);
     this.release();
     const material = (this.material = new SurfaceMaterial(loaded.parts[0]!.geometry));
-    this.depths = new SurfaceMaterial(loaded.parts[0]!.geometry);
-    this.depths.colorWrite = false;
-    this.depths.transparent = true;
+    this.depths = depthsOnly(loaded.parts[0]!.geometry);
     this.meshes = loaded.parts.map(({ name, geometry, matrix }) => {
       const mesh = new Mesh(geometry, material);
       mesh.matrixAutoUpdate = false;
@@ -150,11 +142,7 @@ export class Viewer {
     material.needsUpdate = true;
     for (const mesh of this.meshes) {
       mesh.clear();
-      if (!isTransparent) continue;
-      const layer = new Mesh(mesh.geometry, depths);
-      layer.matrixAutoUpdate = false;
-      layer.frustumCulled = false;
-      mesh.add(layer);
+      if (isTransparent) mesh.add(depthLayer(mesh, depths));
     }
   }
 
@@ -407,10 +395,4 @@ export class Viewer {
     };
     for (const mesh of [...this.meshes, ...(sticks ? [sticks.mesh] : [])]) mesh.onBeforeRender = prepare;
   }
-}
-
-/** Returns Å per unit of the file; 1 if it does not state its units. */
-function unitScale(loaded: Loaded): number {
-  const scale = Number(loaded.extras["unit_scale"] ?? 1);
-  return Number.isFinite(scale) && scale > 0 ? scale : 1;
 }
