@@ -74,7 +74,7 @@ fn parts_and_assemblies_equal_those_of_the_cpu() {
         &[("split", "chain")],
         &[("assembly", "1")],
         &[("assembly", "1"), ("split", "chain"), ("atom_ids", "true")],
-        &[("assembly", "1"), ("split", "residue-group"), ("compress", "quantize")],
+        &[("assembly", "1"), ("split", "residue-group"), ("chains", "A"), ("compress", "quantize")],
         &[("assembly", "1"), ("instances", "true")],
         &[("select", "resi 3-20"), ("context", "whole")],
         &[("assembly", "1"), ("context", "whole"), ("split", "chain")],
