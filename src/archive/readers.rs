@@ -15,7 +15,7 @@ pub(super) struct Readers {
     pub(super) line: Arc<ReaderLine>,
 }
 
-/// No reader was free in time. Estimated time until one is.
+/// No reader was free in time. Holds the estimated time until one is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Busy(pub(super) Duration);
 

@@ -12,7 +12,7 @@ pub(super) const NAMES: [&str; 6] = [POSITIONS, "model", "chains", "select", "al
 /// Selection of atoms that are listed with their positions.
 pub(super) struct Positions {
     pub(super) selection: Selection,
-    /// Text that is equal for equal lists.
+    /// Canonical text of the parameters, equal for equal lists only.
     pub(super) canonical: String,
 }
 

@@ -279,6 +279,7 @@ mod tests {
         let bytes = serde_json::to_vec(&listed).unwrap().len() as u64;
         assert!(bytes < BYTES_PER_ATOM * listed.count as u64, "{bytes}");
     }
+
     #[test]
     fn copies_of_an_assembly_are_listed_with_their_positions() {
         let packed = include_bytes!("../../tests/structures/1pfe.cif.gz");

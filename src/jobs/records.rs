@@ -25,7 +25,7 @@ use crate::telemetry::shorten;
 const RECOVERY_READS: usize = 64;
 
 impl JobStoreState {
-    /// Protects input and record of an unfinished job from eviction.
+    /// Protects the inputs (structure and map) and the record of an unfinished job from eviction.
     pub(super) fn pin(
         &self,
         id: &JobId,

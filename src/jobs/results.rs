@@ -43,7 +43,7 @@ impl SaveError {
     }
 }
 
-/// Sizes and digests of a stored mesh and its report, in the last line of the report's file.
+/// Size of a stored mesh, and digests of the mesh and its report, in the last line of the report's file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 struct Sums {
     mesh_bytes: u64,
@@ -69,7 +69,7 @@ mod text {
     }
 }
 
-/// Returns the file of a report: the document, and a line with the sums of the document and of its mesh.
+/// Returns the file of a report: the document, and a line with the digests of the document and of its mesh.
 pub(super) fn report_file(mut document: Vec<u8>, mesh: &Hasher, mesh_bytes: u64) -> Result<Bytes, SaveError> {
     let (mesh_sha256, report_sha256) = (mesh.clone().digest(), Digest::of(&document));
     document.push(b'\n');
@@ -78,7 +78,7 @@ pub(super) fn report_file(mut document: Vec<u8>, mesh: &Hasher, mesh_bytes: u64)
     Ok(document.into())
 }
 
-/// Splits the file of a report into the document and the sums. `None` if it is damaged.
+/// Splits the file of a report into the document and the digests. `None` if it is damaged.
 fn split(file: &Bytes) -> Option<(Bytes, Sums)> {
     let end = file.iter().rposition(|byte| *byte == b'\n')?;
     let sums: Sums = serde_json::from_slice(&file[end + 1..]).ok()?;

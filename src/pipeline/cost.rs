@@ -101,8 +101,8 @@ fn generated(atoms: usize) -> Result<Spheres, SurfaceError> {
 
 /// Weight of the last job in the averages of a backend.
 const LAST_JOB_WEIGHT: f64 = 0.3;
-/// Bounds of the actual waiting time as a fraction of the estimate. A fraction above 1 is caused by jobs of the CPU, and
-/// would move even more jobs there.
+/// Bounds of the actual waiting time as a fraction of the estimate. Jobs of the CPU cause fractions above 1, which
+/// would move even more jobs to the CPU.
 const OVERLAP: [f64; 2] = [0.02, 1.0];
 
 /// Waiting times of the finished jobs of a backend. Jobs wait for a shorter time than estimated if a device overlaps
@@ -213,7 +213,7 @@ impl Model {
         self.costs = Some([cpu, gpu]);
     }
 
-    /// Assigns a job of `work` units to the backend where it is predicted to end first. `now` is the present wall time
+    /// Assigns a job of `work` units to the backend where it is predicted to end first. `now` is the current wall time
     /// and processor time of this process, s, and `gpus` the number of GPUs that accept jobs; without one, the CPU gets
     /// the job.
     pub fn assign(&mut self, now: [f64; 2], work: f64, gpus: usize) -> Assignment {
@@ -254,7 +254,7 @@ impl Model {
         [wait, self.costs.map_or(0.0, |costs| costs[side as usize].seconds(work))]
     }
 
-    /// Removes the load of a job that was finished at `now`, and learns from its time.
+    /// Removes the load of a job that was finished at `now`, and updates the averages with its time.
     pub fn finish(&mut self, now: [f64; 2], assignment: &Assignment) {
         self.remove(now, assignment);
         if self.costs.is_some() && assignment.side == Side::Gpu {

@@ -1,7 +1,7 @@
-//! Cut of a finished surface by its nearest atoms: the triangles of the selected atoms remain, grouped by part.
+//! Cuts a finished surface: only the triangles of the selected atoms remain, grouped by part.
 //!
-//! A triangle belongs to the part of the nearest atoms of two of its vertices. The nearest atoms of the vertices are
-//! those of `_ATOM`. A vertex on the border of several parts is stored in each of them.
+//! A triangle belongs to the part of the atoms that are nearest to two of its vertices. The nearest atom of a vertex is
+//! that of `_ATOM`. A vertex on the border of several parts is stored in each of them.
 
 use rayon::prelude::*;
 
@@ -29,8 +29,8 @@ pub(super) struct Cut {
 }
 
 impl Cut {
-    /// Returns the division into `parts`, or into one part of all selected atoms. Returns `None` if all atoms to mesh
-    /// are selected.
+    /// Returns the division into `parts`, or into one part of all selected atoms. Returns `None` without
+    /// [`Context::Whole`](crate::structure::Context::Whole).
     ///
     /// # Errors
     /// Returns the errors of memory.
@@ -127,7 +127,7 @@ impl Cut {
         Ok(mesh.triangles.par_iter().with_min_len(ROWS).map(|triangle| self.part(*triangle, ids)).collect())
     }
 
-    /// Keeps the triangles that belong to a part, ordered by part. Returns the rows of each part.
+    /// Keeps the triangles that belong to a part, ordered by part. Returns the rows of each part's triangles.
     fn group(&self, mesh: &mut Mesh, parts: &[u32], n_kept: usize) -> Vec<std::ops::Range<usize>> {
         let mut ends = vec![0; self.names.len().max(1)];
         parts.iter().filter(|part| **part != NONE).for_each(|part| ends[*part as usize] += 1);

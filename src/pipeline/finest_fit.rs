@@ -15,17 +15,17 @@ use crate::surface::{Control, Spheres, SurfaceError, SurfaceLimits, SurfaceParam
 const MAX_PLANS: usize = 10;
 /// Number of grids after which the coarsest one is planned if none has fitted.
 const PLANS_BEFORE_COARSEST: usize = 6;
-/// Cost of the plans from which on the first spacing that fits is taken: about half a second of one core.
+/// Cost of all plans above which the first spacing that fits is taken: about half a second of one core.
 const MAX_COST: f64 = 1.2e6;
 /// Pairs of a sphere and a brick that cost as much as placing a sphere on the lattice.
 const PAIRS_PER_SPHERE: f64 = 16.0;
-/// Load from which on a spacing that fits is fine enough.
+/// Minimum load at which a spacing that fits is fine enough.
 const FULL: f64 = 0.95;
-/// Load that the search aims at. It is below 1 because the load does not follow a power law exactly.
+/// Target load of the search. It is below 1 because the load does not follow a power law exactly.
 const AIM: f64 = 0.97;
 /// Ratio of a spacing that fits and one that does not, at which the search ends.
 const CLOSE: f64 = 1.02;
-/// Number of spheres up to which there is no sample.
+/// Maximum number of spheres that are searched without a sample.
 const MAX_UNSAMPLED: usize = 1 << 16;
 /// Runs of consecutive spheres that make a sample, and their length. Neighbours in a file are neighbours in space, and
 /// share bricks.
@@ -35,7 +35,8 @@ const SAMPLE_RUN: usize = 1 << 12;
 const SAMPLE_MARGIN: f64 = 1.03;
 /// Spacing of the mesh that gives the area, as a multiple of the suggested spacing.
 const SKETCH_FACTOR: f64 = 4.0;
-/// Number of spheres up to which a sketch is meshed. Above, the area of separate spheres is used.
+/// Maximum number of spheres for which a coarse mesh gives the area. Above, the sum of the areas of the spheres is
+/// used.
 const MAX_SKETCHED: usize = 300_000;
 /// Margin of the estimated size of a mesh that must fit.
 const SIZE_MARGIN: f64 = 1.3;
@@ -157,7 +158,7 @@ impl Search {
             (None, _) => None,
             (Some((exceeds, load)), Some((fits, low))) => {
                 let enough = low >= FULL || fits <= CLOSE * exceeds || self.cost > MAX_COST;
-                // Halfway at least every other time, in case the load does not follow a power law.
+                // Bounded, because the load does not follow a power law exactly.
                 let part = ((AIM / low).ln() / (load / low).ln()).clamp(0.1, 0.9);
                 let finer = hundredths(fits * (exceeds / fits).powf(part));
                 (!enough && finer < fits && finer > exceeds).then_some(finer)
@@ -332,7 +333,7 @@ mod tests {
 
     #[test]
     fn a_spacing_for_many_sparse_spheres_is_found_with_few_plans() {
-        // As many as the attack of a million spheres, relative to the limit.
+        // As many, relative to the limit, as a million spheres at the default limit.
         let n = 70_000;
         let at = |i: usize| [i % 40, i / 40 % 40, i / 1600].map(|k| 64.0 * k as f64);
         let (spheres, job) = (spheres(n, at), Job::default());

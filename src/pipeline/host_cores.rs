@@ -1,4 +1,4 @@
-//! Number of cores of the host that a job of a GPU keeps busy, and the share of cores that it leaves to the CPU backend.
+//! Number of cores that a job of a GPU keeps busy on the host, and the share of cores that is left to the CPU backend.
 
 /// Cores that a job keeps busy before any measurement.
 const FIRST_GUESS: f64 = 1.0;
@@ -6,21 +6,21 @@ const FIRST_GUESS: f64 = 1.0;
 const MIN_JOB_TIME: f64 = 0.05;
 /// Weight of the last measurement in the average.
 const LAST_WEIGHT: f64 = 0.3;
-/// Time constant of the average number of GPU jobs, s. Small jobs share a submission and end together: for a moment, the
-/// host seems idle.
+/// Time constant of the average number of GPU jobs, s. Small jobs share a submission and end together, so the host
+/// seems idle until the next ones start.
 const JOBS_TIME: f64 = 0.05;
 /// Minimum share of idle cores: a loaded host still runs a job of the CPU.
 const MIN_SHARE: f64 = 0.05;
 
-/// Measurement of the processor time of GPU jobs, while the CPU backend has no job. For a job of a GPU, the host reads a
-/// file, sorts atoms and sends a mesh.
+/// Measurement of the processor time of GPU jobs, while the CPU backend has no job. For a job of a GPU, the host reads
+/// a file, sorts atoms and sends a mesh.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct HostCores {
     cores: f64,
     per_job: f64,
     /// Duration and processor time of GPU jobs since the last measurement, s.
     sums: [f64; 2],
-    /// Number of GPU jobs, averaged over the last moments.
+    /// Number of GPU jobs, averaged with the time constant [`JOBS_TIME`].
     mean_jobs: f64,
     last: Update,
 }
@@ -35,13 +35,13 @@ struct Update {
 }
 
 impl HostCores {
-    /// Creates the measurement of a host of `cores` cores.
+    /// Starts the measurement on a host with `cores` cores.
     pub(super) const fn new(cores: usize) -> Self {
         let last = Update { at: [0.0; 2], gpu_jobs: 0, gpu_alone: true };
         Self { cores: cores as f64, per_job: FIRST_GUESS, sums: [0.0; 2], mean_jobs: 0.0, last }
     }
 
-    /// Notes that the number of jobs changes at `now`, the wall time and processor time of this process, s.
+    /// Records that the number of jobs changes at `now`, the wall time and processor time of this process, s.
     pub(super) fn update(&mut self, now: [f64; 2], cpu_jobs: usize, gpu_jobs: usize) {
         let Update { at, gpu_jobs: before, gpu_alone } = self.last;
         let [wall, processor] = [0, 1].map(|k| (now[k] - at[k]).max(0.0));

@@ -149,9 +149,9 @@ pub struct JobLimits {
     pub picture: PictureLimits,
     /// Limits of reading a map.
     pub map: MapLimits,
-    /// Size of a mesh file in bytes that the service sends or stores. A run does not check it, because a mesh can be
-    /// written in several formats. The spacing that an error suggests respects it for binary files of the size of the
-    /// mesh in memory, such as GLB.
+    /// Maximum size of a mesh file that the service sends or stores, bytes. A run does not check it, because a mesh can
+    /// be written in several formats. The spacing that an error suggests respects it for binary files of the size of
+    /// the mesh in memory, such as GLB.
     pub max_file_bytes: u64,
 }
 

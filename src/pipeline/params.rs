@@ -13,8 +13,8 @@ pub use canonical::canonical;
 pub use table::{Domain, Parameter, TABLE, usual_range};
 use values::ParsedValues;
 
-use super::nearest::nearest;
 use super::Job;
+use super::nearest::nearest;
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Context, Selection, Split};

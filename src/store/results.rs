@@ -26,7 +26,7 @@ impl Store {
         Ok(self.0.backend.get_whole(name).await?.map(|stored| stored.bytes))
     }
 
-    /// Notes that a result was just written.
+    /// Records that this process has written a result.
     ///
     /// # Errors
     /// Returns a [`StoreError`].

@@ -12,7 +12,8 @@ const MAX_GROUPS: usize = 8;
 /// Maximum deviation of a matrix times its transpose from the identity. Files have six digits.
 const MAX_SKEW: f64 = 0.01;
 
-/// Maximum deviation of the numbers of a matrix from those of a rotation, for instances: 0.1 Å at 1000 Å.
+/// Maximum deviation of the elements of a matrix from those of a rotation, for instances. It moves an atom that is
+/// 1,000 Å from the origin by about 0.1 Å.
 const MAX_DEVIATION: f64 = 1e-4;
 
 /// Rotation or reflection, then a translation in Å: rows of a matrix with the translation in the last column.

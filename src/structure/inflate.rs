@@ -59,7 +59,7 @@ impl Inflated<'_> {
     }
 }
 
-/// Decompresses a file as [`inflate`] does, without checks on the way.
+/// Decompresses a file as [`inflate`] does, without checking the decompressed data.
 pub(super) fn inflate_once<'a>(
     bytes: &'a [u8],
     limit: u64,

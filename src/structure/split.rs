@@ -66,8 +66,7 @@ const BYTES_PER_ROW: u64 = 16;
 
 impl Selected {
     /// Divides the selected atoms into parts, in order of first appearance; `None` for [`Split::None`]. The units of an
-    /// assembly are parts. Adds their
-    /// memory to the meter of `control`.
+    /// assembly are parts. Adds the memory of the parts to the meter of `control`.
     ///
     /// # Errors
     /// Returns [`StructureError::TooManyParts`], [`StructureError::NoEntities`] for [`Split::Entity`] if the file has

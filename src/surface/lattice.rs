@@ -231,8 +231,8 @@ const PART: usize = 1 << 13;
 const MAX_PARTS: usize = 64;
 /// Mean number of atoms of a bucket: they fit the L1 cache.
 const BUCKET: usize = 512;
-/// Number of atoms of a bucket from which on its scratch memory is reserved. The scratch of smaller buckets takes less
-/// than a megabyte per thread.
+/// Minimum number of atoms of a bucket whose scratch memory is reserved. The scratch memory of smaller buckets takes
+/// less than a megabyte per thread.
 const LARGE_BUCKET: usize = 1 << 14;
 /// Atoms between two checks of the cancellation flag: at most a few milliseconds.
 const ATOMS_PER_CHECK: usize = 1 << 13;

@@ -27,7 +27,7 @@ use super::{candidates, grid_limit};
 const BLOCK_TILES: f64 = 262_144.0;
 /// Maximum number of runs of a block.
 const BLOCK_RUNS: f64 = 4096.0;
-/// Number of runs of a block that the limit of grid points does not lower.
+/// Number of runs below which the limit of grid points does not lower the runs of a block.
 const MIN_BLOCK_RUNS: f64 = 4.0;
 /// Number of open tiles below which they are not searched for complete ones.
 const MIN_OPEN: usize = 1 << 15;

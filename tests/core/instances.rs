@@ -1,4 +1,4 @@
-//! Instances of the units of an assembly: placements, refusals, sums and other readers.
+//! Instances of the units of an assembly: placements, rejected requests, sums and other readers.
 #![allow(clippy::pedantic, clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 use molmesh::formats::{Encoder, Format, FormatError};

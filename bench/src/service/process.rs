@@ -23,8 +23,7 @@ pub(super) struct Service {
 
 impl Service {
     /// Starts a service on a free port and waits until it is ready: it has meshed once and, with several backends,
-    /// measured them.
-    /// Its log goes to the file `BACKEND.log` of `logs`, if that folder is given.
+    /// measured them. Its log is written to `BACKEND.log` in the folder `logs`, if that is given.
     ///
     /// # Errors
     /// [`Error::File`] if the binary cannot be started, [`Error::Failed`] with its messages if it ends.

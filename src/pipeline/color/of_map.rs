@@ -32,7 +32,7 @@ pub(super) fn symmetric_range(values: &[f32]) -> Option<[f64; 2]> {
     Some([-end + 0.0, end])
 }
 
-/// Rounds a number to some decimals of its scientific notation.
+/// Rounds a number to `decimals` digits after the first significant one.
 pub(super) fn significant(value: f64, decimals: usize) -> f64 {
     format!("{value:.decimals$e}").parse().unwrap_or(value)
 }

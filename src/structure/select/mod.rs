@@ -192,7 +192,7 @@ impl Rules<'_> {
         self.context.as_ref().is_some_and(|marks| marks.atoms[i] && !self.structure.is_hydrogen(i))
     }
 
-    /// Marks the selected ones of the `atoms` to mesh; `None` if all of them are selected.
+    /// Marks the selected ones of the `atoms` to mesh; `None` without [`Context::Whole`], as all of them are selected.
     fn marks(&self, atoms: &[u32], control: &Control<'_>) -> Result<Option<Vec<bool>>, StructureError> {
         if self.context.is_none() {
             return Ok(None);

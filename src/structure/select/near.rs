@@ -31,7 +31,7 @@ const MAX_TESTED_POINTS: usize = 16;
 const SLACK: f64 = 1e-6;
 
 /// Marks every atom whose distance to an atom of `of` in the same model is at most `distance`. The time is linear if
-/// the atoms of each model are consecutive, as in files of all usual programs.
+/// the atoms of each model are consecutive, as all common programs write them.
 pub(super) fn mark(
     structure: &Structure,
     of: &[bool],

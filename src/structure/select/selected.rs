@@ -15,8 +15,8 @@ use crate::surface::{Control, Spheres, SurfaceError};
 pub struct Selected {
     /// Indices of the atoms to mesh in the columns of the structure: ascending, or by copy in an assembly.
     pub atoms: Vec<u32>,
-    /// With [`Context::Whole`](super::Context::Whole), true for the selected atoms, by index; `None` if all atoms to
-    /// mesh are selected.
+    /// With [`Context::Whole`](super::Context::Whole), true for the selected atoms, by index. `None` otherwise: all
+    /// atoms to mesh are selected.
     pub marks: Option<Vec<bool>>,
     /// Copies that form the assembly; empty for the asymmetric unit and for units.
     pub copies: Vec<PlacedCopy>,

@@ -97,8 +97,8 @@ pub(super) struct CountedBricks {
     /// Per brick, the number of atoms that reach it in the low 16 bits, and the number of atoms that reach one of its
     /// grid points in the high 16 bits. Empty before [`Self::allocate`].
     counts: Vec<u32>,
-    /// First brick per axis that was counted, and the first one after all of these: few of `counts` if there are few
-    /// atoms.
+    /// Range of the counted bricks per axis: the first one, and the one after the last. It covers few of `counts` if
+    /// there are few atoms.
     counted: [[i32; 2]; 3],
 }
 
