@@ -24,15 +24,13 @@ use super::memory::Memory;
 use super::name::{Folder, Name};
 use super::object::{ByteStream, Meta, Pin, Stored, Usage};
 use super::secret::Secret;
-use super::stream;
+use super::{results, stream};
 use crate::config::StoreConfig;
 use crate::sync::{Handle, Mutex, MutexGuard};
 use crate::telemetry::CACHE_REQUESTS;
 
 /// Number of locks for writing and removing. Names share them by hash.
 const WRITE_LOCKS: usize = 64;
-/// Number of results that are known to be intact, in a few megabytes. Others are checked again.
-const INTACT_RESULTS: usize = 16_384;
 
 /// Object store in a folder or on S3. Clones share one store.
 ///
@@ -100,7 +98,7 @@ impl Store {
             backend,
             index: Mutex::new(index),
             memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
-            intact: Cache::new(INTACT_RESULTS),
+            intact: Cache::new(results::INTACT_RESULTS),
             write_locks: [const { AsyncMutex::const_new(()) }; WRITE_LOCKS],
             last_cleanup: AsyncMutex::new(now),
             clock,
@@ -175,7 +173,7 @@ impl Store {
             let Some(meta) = meta else { return Ok(None) };
             meta
         };
-        let range = range.map(|range| within(range, meta.size)).transpose()?.unwrap_or(0..meta.size);
+        let range = range.map(|range| stream::within(range, meta.size)).transpose()?.unwrap_or(0..meta.size);
         Ok(Some((meta, stream::pieces(pin, meta, range))))
     }
 
@@ -192,7 +190,7 @@ impl Store {
                     self.end_read(name, seen, None);
                     return Ok(None);
                 };
-                Some(within(range, meta.size)?)
+                Some(stream::within(range, meta.size)?)
             }
             None => None,
         };
@@ -395,12 +393,4 @@ impl Store {
 /// Counts a lookup of a result.
 fn count(tier: &'static str, hit: bool) {
     counter!(CACHE_REQUESTS, "tier" => tier, "result" => if hit { "hit" } else { "miss" }).increment(1);
-}
-
-/// Clips a range to `size` bytes.
-fn within(range: Range<u64>, size: u64) -> Result<Range<u64>, StoreError> {
-    if range.start >= range.end.min(size) {
-        return Err(StoreError::Range { start: range.start, end: range.end, size });
-    }
-    Ok(range.start..range.end.min(size))
 }

@@ -11,6 +11,8 @@ use super::object::Meta;
 use crate::sync::spawn_blocking;
 use crate::telemetry::shorten;
 
+/// Number of results that are known to be intact, in a few megabytes. Others are checked again.
+pub(super) const INTACT_RESULTS: usize = 16_384;
 /// Bytes that are read and hashed at once.
 const PIECE: u64 = 1 << 20;
 

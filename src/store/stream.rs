@@ -5,6 +5,7 @@ use std::ops::Range;
 use futures_util::{StreamExt as _, TryStreamExt as _};
 use object_store::GetResult;
 
+use super::error::StoreError;
 use super::handle::Store;
 use super::name::Name;
 use super::object::{ByteStream, Meta, Pin};
@@ -33,4 +34,12 @@ pub(super) fn pieces(pin: Pin, meta: Meta, range: Range<u64>) -> ByteStream {
 /// Streams the bytes of an object from S3.
 pub(super) fn remote(store: Store, name: Name, opened: GetResult) -> ByteStream {
     opened.into_stream().map_err(move |e| store.0.backend.fail_at("read", &name)(e)).boxed()
+}
+
+/// Clips a range to `size` bytes.
+pub(super) fn within(range: Range<u64>, size: u64) -> Result<Range<u64>, StoreError> {
+    if range.start >= range.end.min(size) {
+        return Err(StoreError::Range { start: range.start, end: range.end, size });
+    }
+    Ok(range.start..range.end.min(size))
 }

@@ -45,7 +45,7 @@ pub enum SurfaceError {
         limit: u64,
         /// Requested spacing, Å.
         resolution: f64,
-        /// A spacing that would fit, in Å.
+        /// A spacing that would fit, in Å. A backend extrapolates it; the pipeline counts the grid.
         suggested_resolution: f64,
     },
     /// The spheres would reach more grid bricks than allowed in total: too many of them overlap.

@@ -21,7 +21,7 @@ use super::error::SurfaceError;
 use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_u32, to_u64};
 use super::memory::{MemoryMeter as _, OutOfMemory, Reservation};
 use super::params::SurfaceLimits;
-use super::{candidates, grid_limit};
+use super::{candidates, checked_sort, grid_limit};
 
 /// Number of tiles in reach of the runs of a block: their marks take at most 40 MB.
 const BLOCK_TILES: f64 = 262_144.0;
@@ -150,7 +150,17 @@ pub(super) fn check_pairs(
     let mut left = candidates::limit(limits);
     for lattice in lattices {
         let rest = SurfaceLimits { max_candidates: left, ..*limits };
-        match count(lattice, &rest, control) {
+        let bytes = (size_of::<LatticeAtom>() * lattice.atoms.len()) as u64;
+        let counted = if lattice.atoms.is_sorted_by_key(by_tile) {
+            count(lattice, &rest, control)
+        } else {
+            // The arcs of a boundary are in the order of its spheres.
+            let _copy = control.reserve(bytes)?;
+            let mut sorted = Lattice::clone(lattice);
+            checked_sort::sort(&mut sorted.atoms, |a, b| by_tile(a).cmp(&by_tile(b)), control)?;
+            count(&sorted, &rest, control)
+        };
+        match counted {
             Ok(counts) => left -= counts.candidates.min(left),
             Err(SurfaceError::TooManyCandidates { candidates, .. }) => {
                 let so_far = candidates::limit(limits) - left + candidates;
@@ -160,6 +170,11 @@ pub(super) fn check_pairs(
         }
     }
     Ok(())
+}
+
+/// Returns the sort key of the tile of an atom.
+fn by_tile(atom: &LatticeAtom) -> [i32; 3] {
+    tile_order(tile_of(atom.cell))
 }
 
 /// Upper bound of the candidate pairs of a lattice.
@@ -284,7 +299,9 @@ impl<'a> FoundBricks<'a> {
         // Before any brick is allocated.
         let least = reaches.least_grid_points();
         if least > limits.max_grid_points {
-            return Ok(Err(Excess::GridPoints(least)));
+            // The spheres lie in the box, where they may overlap.
+            let all = least.saturating_mul(atoms.len() as u64).min(lattice.box_points).max(least);
+            return Ok(Err(Excess::GridPoints(all)));
         }
         let n_runs = reaches.runs_per_block(limits);
         let mut runs = runs(atoms);
@@ -506,6 +523,21 @@ mod tests {
             other => panic!("{other:?}"),
         }
         assert!(most(&stopped) <= most(&counting));
+    }
+
+    #[test]
+    fn pairs_of_a_lattice_in_any_order_are_counted() {
+        let mut lattice = sparse();
+        let n = count(&lattice, &SurfaceLimits::default(), &Control::default()).unwrap().candidates;
+        lattice.atoms.reverse();
+        lattice.atoms.swap(5, 9000);
+        let check = |max_candidates| {
+            let limits = SurfaceLimits { max_candidates, ..SurfaceLimits::default() };
+            check_pairs(&[&lattice], &limits, &Control::default())
+        };
+        // The upper bound exceeds both limits, so the pairs are counted.
+        assert!(most_pairs(&lattice) > n as f64 && check(n).is_ok());
+        assert!(matches!(check(n - 1), Err(SurfaceError::TooManyCandidates { .. })), "the control");
     }
 
     proptest! {

@@ -130,6 +130,11 @@ const LAYERS: &[Layer] = &[
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
     Layer {
+        name: "reader_line",
+        layers: &[],
+        crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
+    },
+    Layer {
         name: "memory_budget",
         layers: &[("surface", Only(&["MemoryMeter", "OutOfMemory"])), ("telemetry", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
@@ -149,6 +154,7 @@ const LAYERS: &[Layer] = &[
             ("single_flight", Any),
             ("memory_budget", Any),
             ("client_shares", Any),
+            ("reader_line", Any),
             ("tls", Any),
             ("store", Any),
         ],
@@ -189,6 +195,7 @@ const LAYERS: &[Layer] = &[
             ("single_flight", Any),
             ("memory_budget", Any),
             ("client_shares", Any),
+            ("reader_line", Any),
             ("store", Any),
             ("archive", Any),
             ("jobs", Any),
