@@ -77,7 +77,7 @@ export function formatsOf(api: OpenApi): string[] {
 
 /** Colour schemes and palettes of the service. */
 export interface Schemes {
-  /** Values of the parameter `color`. */
+  /** Values of the parameter `color`, except `map`, because the page sends no map. */
   all: string[];
   /** Schemes by properties of atoms. The others need a mesh with colours. */
   ofAtoms: ReadonlySet<string>;
@@ -91,7 +91,8 @@ export function schemesOf(api: OpenApi): Schemes {
   };
   const words = ({ title }: Schema) => title?.split(", ") ?? [];
   const ofAtoms = new Set(words(schema("scheme", "colorAtoms")));
-  return { all: words(schema("color")), ofAtoms, palettes: schema("palette").enum ?? [] };
+  const all = words(schema("color")).filter((scheme) => scheme !== "map");
+  return { all, ofAtoms, palettes: schema("palette").enum ?? [] };
 }
 
 function kindOf(schema: Schema): Kind {
