@@ -56,7 +56,7 @@ export class Stage {
     this.scene = scene;
     this.fetching?.abort();
     const drawn = this.viewer?.show(scene.loaded, fresh) ?? Promise.resolve(performance.now());
-    if (this.viewer) listParts(this.parts, scene.loaded.parts.map(({ name }) => name), this.viewer, this.onParts);
+    if (this.viewer) listParts(this.parts, this.viewer, this.onParts);
     if (!preview) this.kept = scene;
     if (!this.draws) this.showPicture(scene);
     return drawn;

@@ -1,9 +1,9 @@
 /** Loads a GLB for drawing. Positions stay unchanged, also integers; the node transforms them. */
 
-import { Box3, type BufferAttribute, type BufferGeometry, type Group, type Matrix4, type Mesh, Sphere, Vector3 } from "three";
+import { Box3, type BufferAttribute, type BufferGeometry, type Group, type InstancedMesh, Matrix4, type Mesh, Sphere, Vector3 } from "three";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 
-/** Part of a surface, or a whole surface that is not divided. */
+/** Part of a surface, one of its instances, or a whole surface that is not divided. */
 export interface Part {
   name: string;
   geometry: BufferGeometry;
@@ -55,9 +55,22 @@ function partsOf(group: Group): Part[] {
   const parts: Part[] = [];
   group.traverse((object) => {
     const mesh = object as Mesh;
-    if (mesh.isMesh) parts.push({ name: String(mesh.userData["name"] ?? mesh.name), geometry: mesh.geometry, matrix: mesh.matrixWorld.clone() });
+    if (!mesh.isMesh) return;
+    const name = String(mesh.userData["name"] ?? mesh.name);
+    for (const matrix of transformsOf(mesh)) parts.push({ name, geometry: mesh.geometry, matrix });
   });
   return parts;
+}
+
+/** Returns the transforms of a mesh to file units: one, or one for each of its instances. */
+function transformsOf(mesh: Mesh): Matrix4[] {
+  const instanced = mesh as InstancedMesh;
+  if (!instanced.isInstancedMesh) return [mesh.matrixWorld.clone()];
+  return Array.from({ length: instanced.count }, (_, i) => {
+    const matrix = new Matrix4();
+    instanced.getMatrixAt(i, matrix);
+    return matrix.premultiply(mesh.matrixWorld);
+  });
 }
 
 function usesMeshopt(bytes: ArrayBuffer): boolean {

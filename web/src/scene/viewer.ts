@@ -96,12 +96,17 @@ export class Viewer {
 
   /** Returns the names of the visible parts. */
   get shownParts(): string[] {
-    return (this.loaded?.parts ?? []).map(({ name }) => name).filter((name) => !this.hidden.has(name));
+    return this.partNames.filter((name) => !this.hidden.has(name));
   }
 
   /** Returns the names of the hidden parts. */
   get hiddenParts(): string[] {
-    return (this.loaded?.parts ?? []).map(({ name }) => name).filter((name) => this.hidden.has(name));
+    return this.partNames.filter((name) => this.hidden.has(name));
+  }
+
+  /** Returns the names of the parts. Instances of a part share its name. */
+  get partNames(): string[] {
+    return [...new Set((this.loaded?.parts ?? []).map(({ name }) => name))];
   }
 
   /** Shows or hides the parts with this name. */

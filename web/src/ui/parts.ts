@@ -4,7 +4,8 @@ import type { Viewer } from "../scene/viewer";
 import { el } from "./dom";
 
 /** Lists the parts in `home`, or hides `home` if the surface is not divided. Calls `changed` after a change. */
-export function listParts(home: HTMLElement, names: string[], viewer: Viewer, changed: () => void): void {
+export function listParts(home: HTMLElement, viewer: Viewer, changed: () => void): void {
+  const names = viewer.partNames;
   home.hidden = names.length < 2;
   const shown = new Set(viewer.shownParts);
   const entries = home.hidden ? [] : names.map((name) => entry(name, shown.has(name), viewer, changed));
