@@ -26,7 +26,7 @@ pub struct ResidueCount {
     pub atoms: u64,
 }
 
-/// Atoms of the model that are not meshed. Each atom is counted once, under the first field that applies.
+/// Atoms of the selected models that are not meshed. Each atom is counted once, under the first field that applies.
 #[derive(Debug, Clone, Default, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct LeftOutReport {

@@ -139,7 +139,7 @@ pub struct Report {
     /// the report describe the units, each once.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub instances: Option<InstancesReport>,
-    /// Atoms of the meshed models that are not meshed.
+    /// Atoms of the selected models that are not meshed.
     pub left_out: LeftOutReport,
     /// Unreadable values that do not affect the mesh, at most 12; absent if there are none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
