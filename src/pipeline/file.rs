@@ -7,6 +7,7 @@ use crate::formats::{Encoder, Format, FormatError};
 
 /// Output file that is planned but not yet written.
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "a job has one file")]
 pub enum File<'a> {
     /// Mesh file.
     Mesh(Encoder<'a>),
