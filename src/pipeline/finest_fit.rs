@@ -361,9 +361,9 @@ mod tests {
                 for _ in 0..MAX_PLANS {
                     let Some(h) = next else { break };
                     if load(h) <= 1.0 {
-                        search.fits = Some((h, load(h)))
+                        search.fits = Some((h, load(h)));
                     } else {
-                        search.exceeds.push((h, load(h)))
+                        search.exceeds.push((h, load(h)));
                     }
                     next = search.next();
                 }

@@ -199,7 +199,7 @@ fn to_grid(header: &Header<'_>) -> Result<[[f64; 4]; 3], MapError> {
     if origin.iter().any(|v| !v.is_finite()) {
         return Err(malformed("origin (words 50 to 52, byte 196)", format!("{origin:?}"), "three finite numbers"));
     }
-    let (starts, is_moved) = (header.ints(5), origin != [0.0; 3]);
+    let (starts, is_moved) = (header.ints(5), origin.iter().any(|v| v.abs() > 0.0));
     Ok(std::array::from_fn(|k| {
         let row = fraction[axes[k]].map(|v| v * f64::from(intervals[axes[k]]));
         let first: f64 = if is_moved { row.iter().zip(origin).map(|(a, b)| a * b).sum() } else { f64::from(starts[k]) };

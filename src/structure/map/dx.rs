@@ -113,7 +113,7 @@ pub(super) fn read(bytes: &[u8], limits: &MapLimits, control: &Control<'_>) -> R
                 _ => return Err(bad("`class gridpositions`, `gridconnections` or `array`")),
             },
             b"origin" => {
-                head.origin = Some(three(&words[1..], number).ok_or_else(|| bad("`origin` and three numbers"))?)
+                head.origin = Some(three(&words[1..], number).ok_or_else(|| bad("`origin` and three numbers"))?);
             }
             b"delta" => {
                 head.steps.push(three(&words[1..], number).ok_or_else(|| bad("`delta` and three numbers"))?);
