@@ -156,7 +156,9 @@ impl<'s> Assembly<'s> {
         let _sorting = self.sort(&mut atoms, control)?;
         let (rules, counts) = self.rules(&atoms, limits)?;
         let mut placed: IndexMap<Vec<Range<usize>>, Vec<&Generator>> = IndexMap::new();
-        rules.into_iter().for_each(|(generator, rows)| placed.entry(rows).or_default().push(generator));
+        for (generator, rows) in rules {
+            placed.entry(rows).or_default().push(generator);
+        }
         let n_atoms = placed.keys().map(|rows| n_rows(rows)).fold(0, u64::saturating_add);
         let capacity = self.check_atoms(n_atoms, limits)?;
         let of_instance = (size_of::<Operator>() + size_of::<[f64; 4]>()) as u64;
@@ -165,7 +167,9 @@ impl<'s> Assembly<'s> {
         for (rows, generators) in placed {
             check(control)?;
             let first = all.len();
-            rows.iter().for_each(|rows| all.extend_from_slice(&atoms[rows.clone()]));
+            for rows in &rows {
+                all.extend_from_slice(&atoms[rows.clone()]);
+            }
             let mut operators = Vec::new();
             for generator in generators {
                 operators.append(&mut self.expand(generator)?);

@@ -46,15 +46,12 @@ fn merge<T: Copy>(
         for _ in 0..BLOCK {
             let Some(next) = low.get(from_low) else { break };
             let at = from_low + from_high - middle;
-            match items.get(from_high).filter(|other| compare(other, next).is_lt()) {
-                Some(other) => {
-                    items[at] = *other;
-                    from_high += 1;
-                }
-                None => {
-                    items[at] = *next;
-                    from_low += 1;
-                }
+            if let Some(other) = items.get(from_high).filter(|other| compare(other, next).is_lt()) {
+                items[at] = *other;
+                from_high += 1;
+            } else {
+                items[at] = *next;
+                from_low += 1;
             }
         }
     }

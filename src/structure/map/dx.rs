@@ -168,7 +168,7 @@ fn append(values: &mut Vec<f32>, n: usize, lines: &mut Lines<'_>, control: &Cont
             check(control)?;
         }
         let start = lines.rest.iter().position(|b| !b.is_ascii_whitespace()).unwrap_or(lines.rest.len());
-        lines.number += lines.rest[..start].iter().filter(|b| **b == b'\n').count() as u64;
+        lines.number += memchr::memchr_iter(b'\n', &lines.rest[..start]).count() as u64;
         lines.rest = &lines.rest[start..];
         let end = lines.rest.iter().position(u8::is_ascii_whitespace).unwrap_or(lines.rest.len());
         let word = &lines.rest[..end];
