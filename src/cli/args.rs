@@ -254,6 +254,7 @@ pub(crate) struct ColorArgs {
 // Atom selection.
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Atoms")]
+#[expect(clippy::struct_excessive_bools, reason = "each is a flag of the command line")]
 pub(crate) struct SelectionArgs {
     /// Atoms to mesh: an expression such as `polymer,ligand` or `protein and within 5 of (resn HEM)`, made of kinds
     /// (polymer, protein, nucleic, ligand, cofactor, glycan, ion, water, hydrogen, all), chain, resi, resn, name, elem,

@@ -330,6 +330,7 @@ mod tests {
                 range: None,
                 blend: None,
                 source: None,
+                map: None,
                 legend: vec![LegendEntry { label: "A".into(), color: "#4fa59b".into() }],
             }),
             backend: "cpu",

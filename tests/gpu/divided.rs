@@ -4,6 +4,7 @@
 use crate::gpu_support;
 use crate::gpu_support::POSITION_BOUND;
 
+use std::fmt::Write as _;
 use std::time::Duration;
 
 use gpu_support::engine_with;
@@ -16,20 +17,20 @@ const SAMPLE: &str = include_str!("../../samples/4pti.pdb");
 /// Returns two chains that touch, with an assembly of three copies: the identity and two rotations.
 fn dimer() -> String {
     let mut text = format!("{:<80}\n", "REMARK 350 BIOMOLECULE: 1");
-    text += &format!("{:<80}\n", "REMARK 350 APPLY THE FOLLOWING TO CHAINS: A, B");
+    writeln!(text, "{:<80}", "REMARK 350 APPLY THE FOLLOWING TO CHAINS: A, B").unwrap();
     let quarter = [[0.0, -1.0, 0.0, 9.5], [1.0, 0.0, 0.0, 40.0], [0.0, 0.0, 1.0, 0.0]];
     let half = [[-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 3.25]];
     let identity = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
     for (serial, rows) in (1..).zip([identity, quarter, half]) {
         for (k, [a, b, c, t]) in (1..).zip(rows) {
             let line = format!("REMARK 350   BIOMT{k} {serial:>3}{a:>10.6}{b:>10.6}{c:>10.6}{t:>15.5}");
-            text += &format!("{line:<80}\n");
+            writeln!(text, "{line:<80}").unwrap();
         }
     }
     for (chain, shift) in [('A', 0.0), ('B', 14.0)] {
         for line in SAMPLE.lines().filter(|line| line.starts_with("ATOM")) {
             let x: f64 = line[30..38].trim().parse().unwrap();
-            text += &format!("{}{chain}{}{:8.3}{}\n", &line[..21], &line[22..30], x + shift, &line[38..]);
+            writeln!(text, "{}{chain}{}{:8.3}{}", &line[..21], &line[22..30], x + shift, &line[38..]).unwrap();
         }
     }
     text + "END\n"
@@ -39,7 +40,7 @@ fn gpu() -> GpuBackend {
     let build = || Ok(Box::new(engine_with(|_| ())) as Box<dyn Executor>);
     let device = PoolDevice { number: 0, name: "device 0".to_owned(), build: Box::new(build) };
     // Software devices are slow on a busy machine.
-    let settings = &PoolSettings { hang_timeout: Duration::from_secs(600), ..PoolSettings::default() };
+    let settings = &PoolSettings { hang_timeout: Duration::from_mins(10), ..PoolSettings::default() };
     GpuBackend::with_pool(DevicePool::start(vec![device], settings).unwrap())
 }
 
