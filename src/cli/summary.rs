@@ -269,6 +269,7 @@ mod tests {
         assert_eq!(bar(2.0), bar(1.0));
     }
 
+    #[expect(clippy::too_many_lines, reason = "a field per line")]
     fn report() -> Report {
         Report {
             id: Some("4PTI".into()),
