@@ -64,9 +64,13 @@ function described(api: OpenApi, id = "createMesh"): Described[] {
   return (operation?.parameters ?? []).map((parameter) => resolved(api, parameter)).filter((parameter) => parameter.in === "query");
 }
 
-/** Returns the parameters in document order. `format` is chosen by the buttons that download files. */
+/**
+ * Returns the parameters of the form in document order. The buttons that download files choose `format`, and the page
+ * sends no map, to which `color_offset` applies.
+ */
 export function parametersOf(api: OpenApi): Parameter[] {
-  return described(api).filter((parameter) => parameter.name !== "format").map((parameter) => parameterOf(api, parameter));
+  const isOfForm = ({ name }: Described) => name !== "format" && name !== "color_offset";
+  return described(api).filter(isOfForm).map((parameter) => parameterOf(api, parameter));
 }
 
 /** Returns the output formats, by file name extension. */
