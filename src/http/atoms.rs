@@ -282,8 +282,9 @@ mod tests {
 
     #[test]
     fn copies_of_an_assembly_are_listed_with_their_positions() {
-        let packed = include_bytes!("../../tests/structures/1pfe.cif.gz");
-        let structure = structure::read(packed, &ReadLimits::default()).unwrap();
+        // Read at run time: the build of a container has no tests.
+        let packed = std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/structures/1pfe.cif.gz")).unwrap();
+        let structure = structure::read(&packed, &ReadLimits::default()).unwrap();
         let mut selection = Selection { atoms: "ligand".parse().unwrap(), ..Selection::default() };
         let one = document(&structure, Some(&structure::select(&structure, &selection).unwrap()));
         selection.assembly = Some("1".to_owned());

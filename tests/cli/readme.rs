@@ -81,6 +81,7 @@ fn agrees_with_name(name: &str, bytes: &[u8]) -> bool {
         "png" => bytes.starts_with(b"\x89PNG\r\n\x1a\n"),
         "json" | "gltf" => serde_json::from_slice::<Value>(bytes).is_ok_and(|v| v.is_object()),
         "txt" => !bytes.is_empty(),
+        "dx" => bytes.starts_with(b"object 1 class gridpositions"),
         // Four bytes an atom, the last of which is opaque.
         "bin" => !bytes.is_empty() && bytes.len().is_multiple_of(4) && bytes.chunks(4).all(|color| color[3] == 255),
         // 80 bytes of header, a count, 50 bytes for each triangle.
