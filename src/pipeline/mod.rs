@@ -16,6 +16,7 @@ mod host_cores;
 mod instances;
 pub mod integer;
 mod left_out;
+mod limits;
 mod map_file;
 pub mod nearest;
 pub mod params;
@@ -38,6 +39,7 @@ pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::File;
 pub use instances::InstancesReport;
 pub use left_out::{KindCount, LeftOutReport, ResidueCount};
+pub use limits::JobLimits;
 pub use map_file::MapFile;
 pub use parts::PartReport;
 pub use progress::Tracker;
@@ -46,12 +48,12 @@ pub use spacing::Spacing;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
-use crate::picture::{PictureError, PictureLimits, PictureParams};
-use crate::structure::map::{MapError, MapLimits};
+use crate::picture::{PictureError, PictureParams};
+use crate::structure::map::MapError;
 use crate::structure::{self, Context, ReadLimits, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
-    Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits,
-    SurfaceParams, Validation, lattice,
+    Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceParams,
+    Validation, lattice,
 };
 use color::{MeshColors, Scheme};
 use cut::Cut;
@@ -135,30 +137,6 @@ impl Job {
             Spacing::Given | Spacing::MaxTriangles(_) => self.params.resolution,
         };
         SurfaceParams { resolution, atom_ids: self.needs_atoms(), ..self.params.clone() }
-    }
-}
-
-/// Limits of one job.
-#[derive(Debug, Clone, Copy)]
-pub struct JobLimits {
-    /// Limits of reading.
-    pub read: ReadLimits,
-    /// Limits of meshing.
-    pub surface: SurfaceLimits,
-    /// Limits of drawing.
-    pub picture: PictureLimits,
-    /// Limits of reading a map.
-    pub map: MapLimits,
-    /// Maximum size of a mesh file that the service sends or stores, bytes. A run does not check it, because a mesh can
-    /// be written in several formats. The spacing that an error suggests respects it for binary files of the size of
-    /// the mesh in memory, such as GLB.
-    pub max_file_bytes: u64,
-}
-
-impl Default for JobLimits {
-    fn default() -> Self {
-        let (read, surface, picture) = <(ReadLimits, SurfaceLimits, PictureLimits)>::default();
-        Self { read, surface, picture, map: MapLimits::default(), max_file_bytes: u64::MAX }
     }
 }
 
