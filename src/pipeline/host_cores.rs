@@ -4,7 +4,7 @@
 const FIRST_GUESS: f64 = 1.0;
 /// Minimum duration of a measurement, s of GPU jobs.
 const MIN_JOB_TIME: f64 = 0.05;
-/// Weight of the last measurement in the average.
+/// Weight of the last measurement in the average, except for the first one, which replaces the guess.
 const LAST_WEIGHT: f64 = 0.3;
 /// Time constant of the average number of GPU jobs, s. Small jobs share a submission and end together, so the host
 /// seems idle until the next ones start.
@@ -18,6 +18,7 @@ const MIN_SHARE: f64 = 0.05;
 pub(super) struct HostCores {
     cores: f64,
     per_job: f64,
+    is_measured: bool,
     /// Duration and processor time of GPU jobs since the last measurement, s.
     sums: [f64; 2],
     /// Number of GPU jobs, averaged with the time constant [`JOBS_TIME`].
@@ -38,7 +39,8 @@ impl HostCores {
     /// Starts the measurement on a host with `cores` cores.
     pub(super) const fn new(cores: usize) -> Self {
         let last = Update { at: [0.0; 2], gpu_jobs: 0, gpu_alone: true };
-        Self { cores: cores as f64, per_job: FIRST_GUESS, sums: [0.0; 2], mean_jobs: 0.0, last }
+        let (cores, sums) = (cores as f64, [0.0; 2]);
+        Self { cores, per_job: FIRST_GUESS, is_measured: false, sums, mean_jobs: 0.0, last }
     }
 
     /// Records that the number of jobs changes at `now`, the wall time and processor time of this process, s.
@@ -53,8 +55,9 @@ impl HostCores {
         self.last = Update { at: now, gpu_jobs, gpu_alone: cpu_jobs == 0 };
         let [jobs, processor] = self.sums;
         if jobs >= MIN_JOB_TIME {
-            self.per_job += LAST_WEIGHT * (processor / jobs - self.per_job);
-            self.sums = [0.0; 2];
+            let weight = if self.is_measured { LAST_WEIGHT } else { 1.0 };
+            self.per_job += weight * (processor / jobs - self.per_job);
+            (self.is_measured, self.sums) = (true, [0.0; 2]);
         }
     }
 
