@@ -7,3 +7,13 @@ export function contextOf(canvas: HTMLCanvasElement, transparent: boolean): WebG
   };
   return canvas.getContext("webgl2", attributes) as WebGL2RenderingContext | null;
 }
+
+/** Settings of a viewer. */
+export interface ViewerOptions {
+  /** True for a transparent background. */
+  transparent?: boolean;
+  /** Called when the context is lost (true) or restored (false). */
+  onLost?: (lost: boolean) => void;
+  /** Called when the rotation starts or stops. */
+  onTurn?: (turning: boolean) => void;
+}

@@ -2,18 +2,10 @@
 
 import { type BufferGeometry, Color, DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import type { ViewerOptions } from "./context";
 import { type Loaded, unitScale } from "./load";
 import { depthLayer, depthsOnly, SurfaceMaterial } from "./material";
 import { type Hit, pick, placeOf } from "./pick";
-
-export interface ViewerOptions {
-  /** True for a transparent background. */
-  transparent?: boolean;
-  /** Called when the context is lost (true) or restored (false). */
-  onLost?: (lost: boolean) => void;
-  /** Called when the rotation starts or stops. */
-  onTurn?: (turning: boolean) => void;
-}
 
 /** Duration of the initial rotation, ms: one full turn. */
 const TURN = 14_000;
