@@ -1,4 +1,4 @@
-/** Context of a canvas. */
+/** Context of a canvas, and settings of its viewer. */
 
 /** Returns a WebGL 2 context of `canvas`, or null if the browser has none. */
 export function contextOf(canvas: HTMLCanvasElement, transparent: boolean): WebGL2RenderingContext | null {
