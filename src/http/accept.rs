@@ -26,9 +26,9 @@ use tokio::time::Instant;
 use tower::ServiceExt as _;
 
 use super::guard::Peer;
-use super::kinds::Kind;
 use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, MinimumRate, Pace, STREAM_BUFFER, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
+use super::problem_types::ProblemType;
 use super::socket::Guarded;
 use super::stop::{self, Stop};
 use crate::client_shares::{ClientShares, SharePermit};
@@ -153,9 +153,9 @@ fn take_slot(
     config: &ServerConfig,
     peer: Peer,
 ) -> Result<ConnectionSlot, Problem> {
-    let permit = Arc::clone(slots)
-        .try_acquire_owned()
-        .map_err(|_full| Problem::new(Kind::TooManyConnections, "the server has reached its limit of connections"))?;
+    let permit = Arc::clone(slots).try_acquire_owned().map_err(|_full| {
+        Problem::new(ProblemType::TooManyConnections, "the server has reached its limit of connections")
+    })?;
     let is_proxy = config.trusted_proxies.as_ref().is_some_and(|proxies| proxies.contains(peer.0));
     let share = if is_proxy { None } else { Some(shares.take(peer.client().0)?) };
     Ok((permit, share))

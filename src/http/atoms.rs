@@ -12,13 +12,13 @@ use utoipa::ToSchema;
 
 use super::atom_parameters::{self, Positions};
 use super::guard::Caller;
-use super::kinds::Kind;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AtomParameters, ConditionHeaders, EntryPath, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
 use super::parsed_request::Pairs;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
 use crate::structure::{self, Selected, Structure, element};
@@ -88,16 +88,16 @@ struct ResidueColumns {
 problem_responses!(StructureProblems: [
     READING,
     [
-        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed,
-        Kind::EmptySelection, Kind::TooManyCopies, Kind::TooManyCandidates, Kind::TooMuchMemory, Kind::MemoryFull,
-        Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
+        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
+        ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
+        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
     ],
 ]);
 problem_responses!(EntryProblems: [READING, [
-    Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
-    Kind::PreconditionFailed, Kind::EmptySelection, Kind::TooManyCopies, Kind::TooManyCandidates,
-    Kind::TooMuchMemory, Kind::MemoryFull, Kind::QueueFull,
-    Kind::TooManyDeliveries, Kind::ShareExceeded,
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable,
+    ProblemType::PreconditionFailed, ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates,
+    ProblemType::TooMuchMemory, ProblemType::MemoryFull, ProblemType::QueueFull,
+    ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
 ]]);
 
 /// List the atoms of a structure
@@ -153,7 +153,7 @@ async fn answer(
     query: Pairs,
     headers: &HeaderMap,
 ) -> Result<Response, Problem> {
-    let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(ProblemType::BadRequest, e.body_text()))?;
     let positions = atom_parameters::parse(&pairs)?;
     let variant = positions.as_ref().map_or_else(String::new, |positions| positions.canonical.clone());
     let write = async |loaded, delivery| list(app, caller, loaded, delivery, positions).await;

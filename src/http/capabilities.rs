@@ -8,9 +8,9 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
-use super::kinds::Kind;
 use super::openapi::problem_responses;
 use super::page;
+use super::problem_types::ProblemType;
 use super::state::Shared;
 use crate::config::Config;
 use crate::formats::Format;
@@ -239,7 +239,7 @@ struct Radii {
     values: Map<String, Value>,
 }
 
-problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter]]);
+problem_responses!(ShowProblems: [[ProblemType::BadRequest, ProblemType::BadParameter]]);
 
 /// List formats, parameters, limits and devices
 #[utoipa::path(get, path = "/v1/capabilities", tag = "service", operation_id = "capabilities",

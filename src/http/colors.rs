@@ -12,13 +12,13 @@ use bytes::Bytes;
 use super::color_parameters::{self, expected};
 use super::delivery;
 use super::guard::Caller;
-use super::kinds::Kind;
 use super::openapi::meshes::AtomColorsResponse;
 use super::openapi::parameters::{ColorParameters, ConditionHeaders, EntryPath, RangeHeaders, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
 use super::parsed_request::Pairs;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::range::{self, Wanted};
 use super::source::{self, Loaded, StructureSource};
 use super::state::{Delivery, Shared};
@@ -37,15 +37,15 @@ const MAX_ENTRIES: usize = 24;
 problem_responses!(StructureProblems: [
     READING,
     [
-        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed,
-        Kind::RangeNotSatisfiable, Kind::EmptySelection, Kind::TooManyCandidates, Kind::TooMuchMemory, Kind::MemoryFull,
-        Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
+        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
+        ProblemType::RangeNotSatisfiable, ProblemType::EmptySelection, ProblemType::TooManyCandidates, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
+        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
     ],
 ]);
 problem_responses!(EntryProblems: [READING, [
-    Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
-    Kind::PreconditionFailed, Kind::RangeNotSatisfiable, Kind::EmptySelection, Kind::TooManyCandidates,
-    Kind::TooMuchMemory, Kind::MemoryFull, Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded,
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable,
+    ProblemType::PreconditionFailed, ProblemType::RangeNotSatisfiable, ProblemType::EmptySelection, ProblemType::TooManyCandidates,
+    ProblemType::TooMuchMemory, ProblemType::MemoryFull, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
 ]]);
 
 /// Get the colours of the atoms of a structure
@@ -101,7 +101,7 @@ async fn answer(
     query: Pairs,
     headers: &HeaderMap,
 ) -> Result<Response, Problem> {
-    let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(ProblemType::BadRequest, e.body_text()))?;
     let (job, coloring) = color_parameters::parse(&pairs)?;
     let variant = params::canonical(&job);
     let write = async |loaded: Loaded, delivery| {
@@ -135,10 +135,13 @@ async fn list(
 }
 
 fn not_colorable(error: ColorError) -> Problem {
-    Problem::new(Kind::BadParameter, format!("parameter `scheme`: `{}` cannot be applied: {}", error.scheme, error.why))
-        .with("parameter", "scheme")
-        .with("value", error.scheme)
-        .with("expected", expected())
+    Problem::new(
+        ProblemType::BadParameter,
+        format!("parameter `scheme`: `{}` cannot be applied: {}", error.scheme, error.why),
+    )
+    .with("parameter", "scheme")
+    .with("value", error.scheme)
+    .with("expected", expected())
 }
 
 /// Escapes the characters of a JSON text that a header cannot contain.

@@ -3,8 +3,8 @@
 use axum::http::header::{HeaderName, IF_MATCH, IF_NONE_MATCH};
 use axum::http::{HeaderMap, HeaderValue};
 
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 
 /// Returns true if the client has the file with this `etag`, by weak comparison.
 pub(super) fn is_unchanged(headers: &HeaderMap, etag: &HeaderValue) -> bool {
@@ -16,7 +16,7 @@ pub(super) fn check_match(headers: &HeaderMap, etag: &HeaderValue) -> Result<(),
     if !headers.contains_key(IF_MATCH) || tags(headers, IF_MATCH).any(|tag| tag == "*" || tag.as_bytes() == etag) {
         return Ok(());
     }
-    Err(Problem::new(Kind::PreconditionFailed, "no `ETag` in `If-Match` is that of the current file"))
+    Err(Problem::new(ProblemType::PreconditionFailed, "no `ETag` in `If-Match` is that of the current file"))
 }
 
 /// Returns the tags in a header, which may occur several times.

@@ -1,8 +1,8 @@
 //! Declared type of a structure file. The format is detected from the bytes; a `Content-Type` that contradicts them is
 //! rejected, since one of the two is a mistake.
 
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use crate::jobs::Failure;
 use crate::pipeline::JobError;
 use crate::structure::StructureError;
@@ -87,7 +87,7 @@ impl DeclaredType {
 
 fn contradiction(declared: &str, found: &str) -> Problem {
     Problem::new(
-        Kind::UnsupportedMediaType,
+        ProblemType::UnsupportedMediaType,
         format!("the body is declared as {declared}, but its bytes are {found}; omit `Content-Type` or correct it"),
     )
     .with("declared", declared)

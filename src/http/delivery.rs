@@ -12,8 +12,8 @@ use utoipa::ToSchema;
 use utoipa::openapi::schema::Type;
 
 use super::errors::{self, Finding};
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::state::{App, Delivery};
 use super::stream;
 use super::timing::Timing;
@@ -86,7 +86,7 @@ pub(super) fn content_range(part: &Range<u64>, length: u64) -> HeaderValue {
 
 /// Returns the problem of a range outside a file of `length` bytes.
 pub(super) fn range_outside(length: u64) -> Problem {
-    Problem::new(Kind::RangeNotSatisfiable, format!("the file has {length} bytes"))
+    Problem::new(ProblemType::RangeNotSatisfiable, format!("the file has {length} bytes"))
         .with("actual", length)
         .header(header::CONTENT_RANGE, &format!("bytes */{length}"))
 }

@@ -5,8 +5,8 @@ use std::time::Duration;
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use crate::client_shares::ShareExceeded;
 use crate::formats::FormatError;
 use crate::jobs::{AcceptError, EndError, Failure, Refusal, SaveError};
@@ -62,9 +62,9 @@ fn oversized(what: &str, actual: u64, limit: u64, resolution: f64) -> Problem {
     let fits = resolution * (actual as f64 / limit as f64).sqrt();
     let fits = (fits * 105.0).ceil() / 100.0;
     if fits > MAX_RESOLUTION {
-        return Problem::new(Kind::MeshTooLarge, what.to_owned()).with("limit", limit).with("actual", actual);
+        return Problem::new(ProblemType::MeshTooLarge, what.to_owned()).with("limit", limit).with("actual", actual);
     }
-    Problem::new(Kind::MeshTooLarge, format!("{what}; a resolution of {fits} Å would fit"))
+    Problem::new(ProblemType::MeshTooLarge, format!("{what}; a resolution of {fits} Å would fit"))
         .with("limit", limit)
         .with("actual", actual)
         .with("suggested_resolution", fits)
@@ -75,16 +75,16 @@ pub(super) fn format_problem(error: &FormatError, resolution: f64) -> Problem {
     match *error {
         FormatError::GlbTooLarge { bytes, limit } => file_too_large(bytes, limit, resolution),
         FormatError::TooMany { count, limit, .. } => oversized(&error.to_string(), count, limit, resolution),
-        FormatError::AtomIndexTooLarge { limit, .. } => {
-            Problem::new(Kind::MeshTooLarge, error.to_string()).with("limit", limit).with("parameter", "atom_ids")
-        }
+        FormatError::AtomIndexTooLarge { limit, .. } => Problem::new(ProblemType::MeshTooLarge, error.to_string())
+            .with("limit", limit)
+            .with("parameter", "atom_ids"),
         _ => Problem::internal(error),
     }
 }
 
 impl From<ParamError> for Problem {
     fn from(error: ParamError) -> Self {
-        let problem = Self::new(Kind::BadParameter, error.to_string());
+        let problem = Self::new(ProblemType::BadParameter, error.to_string());
         match error {
             ParamError::Unknown { name, nearest } => problem.with("parameter", name).with("nearest", nearest),
             ParamError::Repeated { name } => problem.with("parameter", name),
@@ -103,11 +103,11 @@ impl From<ParamError> for Problem {
 
 impl From<OutOfMemory> for Problem {
     fn from(error: OutOfMemory) -> Self {
-        let full = || Self::new(Kind::MemoryFull, error.to_string()).retry_after(Duration::from_secs(1));
+        let full = || Self::new(ProblemType::MemoryFull, error.to_string()).retry_after(Duration::from_secs(1));
         match error {
             OutOfMemory::Budget { held, limit, .. } => full().with("limit", limit).with("actual", held),
             OutOfMemory::Limit { needed, limit } => {
-                Self::new(Kind::TooMuchMemory, error.to_string()).with("limit", limit).with("actual", needed)
+                Self::new(ProblemType::TooMuchMemory, error.to_string()).with("limit", limit).with("actual", needed)
             }
             OutOfMemory::System { .. } => full(),
         }
@@ -118,23 +118,25 @@ impl From<ShareExceeded> for Problem {
     fn from(ShareExceeded { limit }: ShareExceeded) -> Self {
         let detail =
             format!("this client already uses {limit} slots, its share; the other slots are for other clients");
-        Self::new(Kind::ShareExceeded, detail).with("limit", limit).retry_after(Duration::from_secs(1))
+        Self::new(ProblemType::ShareExceeded, detail).with("limit", limit).retry_after(Duration::from_secs(1))
     }
 }
 
 impl From<Refusal> for Problem {
     fn from(error: Refusal) -> Self {
         match error {
-            Refusal::QueueFull { waiting, limit, wait } => Self::new(Kind::QueueFull, error.to_string())
+            Refusal::QueueFull { waiting, limit, wait } => Self::new(ProblemType::QueueFull, error.to_string())
                 .with("limit", limit)
                 .with("actual", waiting)
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait),
-            Refusal::TooLate { wait, allowed } => Self::new(Kind::QueueFull, error.to_string())
+            Refusal::TooLate { wait, allowed } => Self::new(ProblemType::QueueFull, error.to_string())
                 .with("limit", u64::try_from(allowed.as_millis()).unwrap_or(u64::MAX))
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait.saturating_sub(allowed)),
-            Refusal::Draining => Self::new(Kind::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1)),
+            Refusal::Draining => {
+                Self::new(ProblemType::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1))
+            }
         }
     }
 }
@@ -148,17 +150,19 @@ impl From<Failure> for Problem {
             Failure::Job { error: JobError::Color(error), .. } => error.into(),
             Failure::Job { error: JobError::Map(error), .. } => error.into(),
             Failure::Check { ref diagnostics } => {
-                let problem = Self::new(Kind::UnreadableStructure, error.to_string()).with("parameter", "check");
+                let problem = Self::new(ProblemType::UnreadableStructure, error.to_string()).with("parameter", "check");
                 diagnosed(problem, diagnostics)
             }
-            Failure::Deadline { limit } => Self::new(Kind::Deadline, error.to_string())
+            Failure::Deadline { limit } => Self::new(ProblemType::Deadline, error.to_string())
                 .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX)),
-            Failure::Waited { limit, wait } => Self::new(Kind::QueueFull, error.to_string())
+            Failure::Waited { limit, wait } => Self::new(ProblemType::QueueFull, error.to_string())
                 .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX))
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait),
             Failure::Memory(error) => error.into(),
-            Failure::Stopped => Self::new(Kind::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1)),
+            Failure::Stopped => {
+                Self::new(ProblemType::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1))
+            }
             Failure::Panicked { .. } => Self::internal(error),
         }
     }
@@ -174,8 +178,10 @@ impl From<EndError> for Problem {
             }
             EndError::Save { error: SaveError::Store(error), .. } => error.into(),
             EndError::Save { error: SaveError::Other(error), .. } => Self::internal(error),
-            EndError::Poison { attempts } => Self::new(Kind::JobAbandoned, error.to_string()).with("actual", attempts),
-            EndError::Lost { .. } => Self::new(Kind::JobAbandoned, error.to_string()),
+            EndError::Poison { attempts } => {
+                Self::new(ProblemType::JobAbandoned, error.to_string()).with("actual", attempts)
+            }
+            EndError::Lost { .. } => Self::new(ProblemType::JobAbandoned, error.to_string()),
         }
     }
 }
@@ -186,7 +192,7 @@ impl From<AcceptError> for Problem {
             AcceptError::Refused(refusal) => refusal.into(),
             AcceptError::Store(error) => error.into(),
             AcceptError::OtherRequest => {
-                Self::new(Kind::OtherRequest, error.to_string()).with("parameter", "Idempotency-Key")
+                Self::new(ProblemType::OtherRequest, error.to_string()).with("parameter", "Idempotency-Key")
             }
             AcceptError::Random(_) => Self::internal(error),
         }
@@ -198,31 +204,31 @@ impl From<StoreError> for Problem {
     fn from(error: StoreError) -> Self {
         let wait = Duration::from_secs(5);
         match error {
-            StoreError::TooLarge { bytes, max_bytes } => Self::new(Kind::StoreFull, error.to_string())
+            StoreError::TooLarge { bytes, max_bytes } => Self::new(ProblemType::StoreFull, error.to_string())
                 .with("actual", bytes)
                 .with("limit", max_bytes)
                 .retry_after(wait),
-            StoreError::Full { held, max_bytes, .. } => Self::new(Kind::StoreFull, error.to_string())
+            StoreError::Full { held, max_bytes, .. } => Self::new(ProblemType::StoreFull, error.to_string())
                 .with("actual", held)
                 .with("limit", max_bytes)
                 .retry_after(wait),
             StoreError::NoSpace { .. } => {
                 tracing::error!(%error, "the disk of the store is full");
-                Self::new(Kind::StoreFull, "the disk of the store is full").retry_after(wait)
+                Self::new(ProblemType::StoreFull, "the disk of the store is full").retry_after(wait)
             }
             StoreError::TooManyRecords { limit, .. } => {
-                Self::new(Kind::TooManyJobs, error.to_string()).with("limit", limit).retry_after(wait)
+                Self::new(ProblemType::TooManyJobs, error.to_string()).with("limit", limit).retry_after(wait)
             }
             StoreError::Quarantined { .. } => {
-                Self::new(Kind::RecordUnreadable, "the record of the job cannot be read and is in quarantine")
+                Self::new(ProblemType::RecordUnreadable, "the record of the job cannot be read and is in quarantine")
             }
             StoreError::Damaged { digest } => Self::new(
-                Kind::NoSuchStructure,
+                ProblemType::NoSuchStructure,
                 format!("the stored structure `{digest}` was damaged and has been removed: upload it again"),
             ),
             other => {
                 tracing::error!(error = %other, "the store failed");
-                Self::new(Kind::StoreFailed, "the store cannot be reached").retry_after(wait)
+                Self::new(ProblemType::StoreFailed, "the store cannot be reached").retry_after(wait)
             }
         }
     }
@@ -233,45 +239,47 @@ impl From<StructureError> for Problem {
         use StructureError as E;
         let detail = error.to_string();
         match error {
-            E::UnknownFormat { found } => Self::new(Kind::UnreadableStructure, detail).with("found", found),
-            E::Syntax { line, column, found, expected } => Self::new(Kind::UnreadableStructure, detail)
+            E::UnknownFormat { found } => Self::new(ProblemType::UnreadableStructure, detail).with("found", found),
+            E::Syntax { line, column, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)
                 .with("line", line)
                 .with("column", column)
                 .with("found", found)
                 .with("expected", expected),
-            E::Malformed { place, found, expected } => Self::new(Kind::UnreadableStructure, detail)
-                .with("place", place)
+            E::Malformed { location, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)
+                .with("location", location)
                 .with("found", found)
                 .with("expected", expected),
-            E::Decompress { encoding, .. } => Self::new(Kind::UnreadableStructure, detail).with("encoding", encoding),
-            E::InflatedTooLarge { limit } => Self::new(Kind::InflatedTooLarge, detail).with("limit", limit),
-            E::BadAssembly { id, found, expected } => Self::new(Kind::UnreadableStructure, detail)
-                .with("place", format!("assembly {id}"))
+            E::Decompress { encoding, .. } => {
+                Self::new(ProblemType::UnreadableStructure, detail).with("encoding", encoding)
+            }
+            E::InflatedTooLarge { limit } => Self::new(ProblemType::InflatedTooLarge, detail).with("limit", limit),
+            E::BadAssembly { id, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)
+                .with("location", format!("assembly {id}"))
                 .with("found", found)
                 .with("expected", expected),
-            E::TooManyCopies { limit, .. } => Self::new(Kind::TooManyCopies, detail).with("limit", limit),
+            E::TooManyCopies { limit, .. } => Self::new(ProblemType::TooManyCopies, detail).with("limit", limit),
             E::TooManyDistances { limit } => {
-                Self::new(Kind::TooManyCandidates, detail).with("parameter", "select").with("limit", limit)
+                Self::new(ProblemType::TooManyCandidates, detail).with("parameter", "select").with("limit", limit)
             }
             E::TooManyParts { rule, limit } => {
                 let parameter = rule.split('=').next().unwrap_or(rule);
-                Self::new(Kind::TooManyParts, detail).with("parameter", parameter).with("limit", limit)
+                Self::new(ProblemType::TooManyParts, detail).with("parameter", parameter).with("limit", limit)
             }
-            E::NoEntities => Self::new(Kind::BadParameter, detail)
+            E::NoEntities => Self::new(ProblemType::BadParameter, detail)
                 .with("parameter", "split")
                 .with("value", Split::Entity.name())
                 .with("expected", "none, chain or residue-group"),
             E::AssemblyTooLarge { atoms, limit, .. } => {
-                Self::new(Kind::TooManyAtoms, detail).with("limit", limit).with("actual", atoms)
+                Self::new(ProblemType::TooManyAtoms, detail).with("limit", limit).with("actual", atoms)
             }
-            E::TooManyAtoms { limit } => Self::new(Kind::TooManyAtoms, detail).with("limit", limit),
+            E::TooManyAtoms { limit } => Self::new(ProblemType::TooManyAtoms, detail).with("limit", limit),
             E::TooManyDuplicates { limit, x, y, z } => {
-                Self::new(Kind::TooManyDuplicates, detail).with("limit", limit).with("position", vec![x, y, z])
+                Self::new(ProblemType::TooManyDuplicates, detail).with("limit", limit).with("position", vec![x, y, z])
             }
             E::Memory(error) => error.into(),
             E::Cancelled => Self::from(Failure::Stopped),
-            E::NoAtoms { found } => Self::new(Kind::NoAtoms, detail).with("found", found),
-            E::EmptySelection { holds } => Self::new(Kind::EmptySelection, detail).with("found", holds),
+            E::NoAtoms { found } => Self::new(ProblemType::NoAtoms, detail).with("found", found),
+            E::EmptySelection { holds } => Self::new(ProblemType::EmptySelection, detail).with("found", holds),
             E::NotFound { what, requested, available } => {
                 let parameter = match what {
                     "chain" => "chains",
@@ -279,7 +287,7 @@ impl From<StructureError> for Problem {
                     "alternative location" => "altloc",
                     other => other,
                 };
-                Self::new(Kind::EmptySelection, detail)
+                Self::new(ProblemType::EmptySelection, detail)
                     .with("parameter", parameter)
                     .with("value", requested.trim_matches('`'))
                     .with("expected", available)
@@ -290,7 +298,7 @@ impl From<StructureError> for Problem {
 
 impl From<ColorError> for Problem {
     fn from(error: ColorError) -> Self {
-        Self::new(Kind::BadParameter, error.to_string())
+        Self::new(ProblemType::BadParameter, error.to_string())
             .with("parameter", "color")
             .with("value", error.scheme)
             .with("expected", color::EXPECTED)
@@ -300,18 +308,18 @@ impl From<ColorError> for Problem {
 impl From<MapError> for Problem {
     fn from(error: MapError) -> Self {
         use MapError as E;
-        let problem = |kind| Self::new(kind, error.to_string()).with("parameter", "map");
+        let problem = |problem_type| Self::new(problem_type, error.to_string()).with("parameter", "map");
         match &error {
-            E::UnknownFormat { found } => problem(Kind::UnreadableMap).with("found", found.as_str()),
-            E::Malformed { place, found, expected } => problem(Kind::UnreadableMap)
-                .with("place", place.as_str())
+            E::UnknownFormat { found } => problem(ProblemType::UnreadableMap).with("found", found.as_str()),
+            E::Malformed { location, found, expected } => problem(ProblemType::UnreadableMap)
+                .with("location", location.as_str())
                 .with("found", found.as_str())
                 .with("expected", expected.as_str()),
-            E::Decompress { encoding, .. } => problem(Kind::UnreadableMap).with("encoding", *encoding),
+            E::Decompress { encoding, .. } => problem(ProblemType::UnreadableMap).with("encoding", *encoding),
             E::TooManyPoints { points, limit } => {
-                problem(Kind::MapTooLarge).with("actual", *points).with("limit", *limit)
+                problem(ProblemType::MapTooLarge).with("actual", *points).with("limit", *limit)
             }
-            E::InflatedTooLarge { limit } => problem(Kind::InflatedTooLarge).with("limit", *limit),
+            E::InflatedTooLarge { limit } => problem(ProblemType::InflatedTooLarge).with("limit", *limit),
             E::Memory(error) => (*error).into(),
             E::Cancelled => Self::from(Failure::Stopped),
         }
@@ -322,7 +330,7 @@ impl From<PictureError> for Problem {
     fn from(error: PictureError) -> Self {
         let detail = error.to_string();
         match error {
-            PictureError::TooLarge { side, pixels, limit } => Self::new(Kind::PictureTooLarge, detail)
+            PictureError::TooLarge { side, pixels, limit } => Self::new(ProblemType::PictureTooLarge, detail)
                 .with("parameter", side)
                 .with("limit", limit)
                 .with("actual", pixels),
@@ -340,49 +348,49 @@ impl From<SurfaceError> for Problem {
         let fitting =
             |problem: Self| suggested.into_iter().fold(problem, |problem, h| problem.with("suggested_resolution", h));
         match error {
-            E::NoSpheres => Self::new(Kind::NoAtoms, detail),
+            E::NoSpheres => Self::new(ProblemType::NoAtoms, detail),
             E::BadSphere { index, expected, .. } => {
-                Self::new(Kind::UnreadableStructure, detail).with("atom", index).with("expected", expected)
+                Self::new(ProblemType::UnreadableStructure, detail).with("atom", index).with("expected", expected)
             }
             E::BadParameter { .. } => ParamError::from(error).into(),
             E::GridTooLarge { grid_points, limit, resolution, .. } => fitting(
-                Self::new(Kind::GridTooLarge, detail)
+                Self::new(ProblemType::GridTooLarge, detail)
                     .with("limit", limit)
                     .with("actual", grid_points)
                     .with("resolution", resolution),
             ),
             E::TooManyCandidates { candidates, limit, resolution, .. } => fitting(
-                Self::new(Kind::TooManyCandidates, detail)
+                Self::new(ProblemType::TooManyCandidates, detail)
                     .with("limit", limit)
                     .with("actual", candidates)
                     .with("resolution", resolution),
             ),
             E::MeshTooLarge { bytes, limit, .. } => {
-                fitting(Self::new(Kind::MeshTooLarge, detail).with("limit", limit).with("actual", bytes))
+                fitting(Self::new(ProblemType::MeshTooLarge, detail).with("limit", limit).with("actual", bytes))
             }
-            E::TooManyTriangles { triangles, limit, resolution } => Self::new(Kind::MeshTooLarge, detail)
+            E::TooManyTriangles { triangles, limit, resolution } => Self::new(ProblemType::MeshTooLarge, detail)
                 .with("parameter", "max_triangles")
                 .with("limit", limit)
                 .with("actual", triangles)
                 .with("resolution", resolution),
             E::TooManyOverlaps { overlaps, limit } => {
-                Self::new(Kind::TooManyCandidates, detail).with("limit", limit).with("actual", overlaps)
+                Self::new(ProblemType::TooManyCandidates, detail).with("limit", limit).with("actual", overlaps)
             }
             E::NoSurface { isovalue } => match isovalue {
                 Some(isovalue) => {
-                    Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
+                    Self::new(ProblemType::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
                 }
-                None => Self::new(Kind::NoSurface, detail).with("parameter", "resolution"),
+                None => Self::new(ProblemType::NoSurface, detail).with("parameter", "resolution"),
             },
-            E::NoPatch => Self::new(Kind::NoSurface, detail).with("parameter", "context"),
+            E::NoPatch => Self::new(ProblemType::NoSurface, detail).with("parameter", "context"),
             E::DeviceMemory { needed, available, .. } => {
-                fitting(Self::new(Kind::DeviceMemory, detail).with("limit", available).with("actual", needed))
+                fitting(Self::new(ProblemType::DeviceMemory, detail).with("limit", available).with("actual", needed))
             }
             // The worker has logged the driver's message.
             E::Device { .. } => {
-                Self::new(Kind::DeviceFailed, "no device could run the job").retry_after(Duration::from_secs(1))
+                Self::new(ProblemType::DeviceFailed, "no device could run the job").retry_after(Duration::from_secs(1))
             }
-            E::Deadline => Self::new(Kind::Deadline, detail),
+            E::Deadline => Self::new(ProblemType::Deadline, detail),
             E::Memory(error) => error.into(),
             E::Cancelled => Self::from(Failure::Stopped),
             // Responses are not written to a sink.

@@ -16,13 +16,13 @@ use utoipa::ToSchema;
 
 use super::errors::file_too_large;
 use super::guard::Caller;
-use super::kinds::Kind;
 use super::openapi::bodies::{AS_FOR_MESHES, StructureFile};
 use super::openapi::parameters::{ContentEncodingHeader, MeshParameters};
 use super::openapi::problem_responses;
 use super::openapi::problems::{BODY, NAMED_STRUCTURE, PARAMETERS, ProblemDocument, READING};
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::request_id::RequestId;
 use super::source::Loaded;
 use super::state::Shared;
@@ -89,8 +89,8 @@ pub(super) struct EstimateDocument {
 }
 
 problem_responses!(EstimateProblems: [BODY, NAMED_STRUCTURE, PARAMETERS, READING, [
-    Kind::EmptySelection, Kind::TooManyCopies, Kind::TooManyParts, Kind::TooManyCandidates, Kind::PictureTooLarge,
-    Kind::Internal, Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::Deadline,
+    ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyParts, ProblemType::TooManyCandidates, ProblemType::PictureTooLarge,
+    ProblemType::Internal, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::Deadline,
 ]]);
 
 /// Estimate a mesh

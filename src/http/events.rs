@@ -14,10 +14,10 @@ use tokio::sync::watch;
 
 use super::guard::Caller;
 use super::jobs;
-use super::kinds::Kind;
 use super::openapi::parameters::{JobPath, LastEventIdHeader};
 use super::openapi::problem_responses;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::state::Shared;
 use super::stop::{self, Stop};
 use crate::jobs::{JobId, JobView};
@@ -34,7 +34,7 @@ struct Listener {
 }
 
 problem_responses!(EventsProblems: [[
-    Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed,
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::RecordUnreadable, ProblemType::StoreFailed,
 ]]);
 
 /// Follow a job as server-sent events

@@ -13,9 +13,9 @@ use thiserror::Error;
 
 use super::body_hasher::BodyHasher;
 use super::content_type::DeclaredType;
-use super::kinds::Kind;
 use super::limit::Limit;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use crate::config::LimitsConfig;
 use crate::jobs::MemoryReservation;
 use crate::store::Digest;
@@ -101,7 +101,7 @@ impl FormLimits {
             {
                 self.head_too_long()
             }
-            other => Problem::new(Kind::BadRequest, format!("the form cannot be read: {other}")),
+            other => Problem::new(ProblemType::BadRequest, format!("the form cannot be read: {other}")),
         }
     }
 }
@@ -134,7 +134,7 @@ pub(super) async fn read(
     let boundary = multer::parse_boundary(content_type).map_err(|e| bounds.problem(&e))?;
     if boundary.len() > MAX_BOUNDARY {
         let detail = format!("the form's boundary has more than {MAX_BOUNDARY} characters");
-        return Err(Problem::new(Kind::BadRequest, detail).with("limit", MAX_BOUNDARY));
+        return Err(Problem::new(ProblemType::BadRequest, detail).with("limit", MAX_BOUNDARY));
     }
     // Upper limit of the parser's buffer.
     reservation.grow(bounds.head.max.saturating_add(PIECE as u64))?;
@@ -160,10 +160,12 @@ pub(super) async fn read(
         let (is_structure, is_map) = (matches!(name.as_str(), "file" | "structure"), name == "map");
         let is_file = is_structure || is_map;
         if is_structure && file.is_some() {
-            return Err(Problem::new(Kind::BadRequest, "the form has more than one file").with("parameter", name));
+            return Err(
+                Problem::new(ProblemType::BadRequest, "the form has more than one file").with("parameter", name)
+            );
         }
         if is_map && map.is_some() {
-            return Err(Problem::new(Kind::BadRequest, "the form has more than one map").with("parameter", name));
+            return Err(Problem::new(ProblemType::BadRequest, "the form has more than one map").with("parameter", name));
         }
         let declared = DeclaredType::new(field.content_type().map_or("", |mime| mime.as_ref()));
         let (mut content, mut hasher) = (BytesMut::new(), BodyHasher::default());
@@ -193,7 +195,7 @@ pub(super) async fn read(
     }
     let Some((bytes, digest, declared)) = file else {
         let detail = "the form has no file; it belongs in a field named `file` or `structure`";
-        return Err(Problem::new(Kind::BadRequest, detail).with("expected", "file"));
+        return Err(Problem::new(ProblemType::BadRequest, detail).with("expected", "file"));
     };
     Ok(UploadedFile { bytes, digest, reservation, map, fields, declared })
 }
@@ -208,5 +210,5 @@ fn field_too_long(name: &str) -> Problem {
     let detail = format!(
         "the form field `{shown}` has more than {MAX_FIELD_BYTES} bytes; the file belongs in a field named `file` or `structure`"
     );
-    Problem::new(Kind::BadParameter, detail).with("parameter", shown).with("limit", MAX_FIELD_BYTES)
+    Problem::new(ProblemType::BadParameter, detail).with("parameter", shown).with("limit", MAX_FIELD_BYTES)
 }

@@ -19,9 +19,9 @@ use http_body_util::BodyExt as _;
 use hyper::body::Body as _;
 use tracing::Span;
 
-use super::kinds::Kind;
 use super::observed_body::observed;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::scopes;
 use super::state::{App, Shared};
 use crate::access::{
@@ -235,7 +235,7 @@ fn authorize(
     if !key.allows(scope) {
         let detail = format!("the scope `{}` is required, which the key `{}` does not have", scope.name(), key.id);
         let challenge = format!("Bearer realm=\"molmesh\", error=\"insufficient_scope\", scope=\"{}\"", scope.name());
-        return Err(Problem::new(Kind::ScopeMissing, detail)
+        return Err(Problem::new(ProblemType::ScopeMissing, detail)
             .with("scope", scope.name())
             .header(WWW_AUTHENTICATE, &challenge));
     }
@@ -257,28 +257,28 @@ fn by_signature(signature: SignatureCheck) -> Result<Signature, Problem> {
     match signature {
         SignatureCheck::Valid(signature) => Ok(signature),
         SignatureCheck::Absent => Err(Problem::new(
-            Kind::KeyRequired,
+            ProblemType::KeyRequired,
             "a key is required, in `Authorization: Bearer …` or `X-Api-Key`; a GET may use a signed URL instead",
         )
         .header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\"")),
         SignatureCheck::Invalid => {
             let detail = "the signature does not match this address, which must be used unchanged";
-            Err(Problem::new(Kind::SignatureInvalid, detail))
+            Err(Problem::new(ProblemType::SignatureInvalid, detail))
         }
         SignatureCheck::Expired(end) => {
             let end = rfc3339(end.saturating_mul(1000));
             let detail = format!("the signed URL expired at {end}");
-            Err(Problem::new(Kind::SignatureExpired, detail).with("expired", end))
+            Err(Problem::new(ProblemType::SignatureExpired, detail).with("expired", end))
         }
     }
 }
 
 fn no_key(denied: Denied) -> Problem {
     let problem = match denied {
-        Denied::Unknown => Problem::new(Kind::KeyInvalid, "the key is unknown"),
+        Denied::Unknown => Problem::new(ProblemType::KeyInvalid, "the key is unknown"),
         Denied::Expired(end) => {
             let end = humantime::format_rfc3339_seconds(end).to_string();
-            Problem::new(Kind::KeyExpired, format!("the key expired at {end}")).with("expired", end)
+            Problem::new(ProblemType::KeyExpired, format!("the key expired at {end}")).with("expired", end)
         }
     };
     problem.header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\", error=\"invalid_token\"")
@@ -292,7 +292,7 @@ fn refusal(exceeded: &Exceeded) -> Problem {
         "concurrency" => format!("{limit} requests of this client are running, which is its quota"),
         _ => format!("this client has made {limit} requests in this window, which is its quota"),
     };
-    Problem::new(Kind::QuotaExceeded, what)
+    Problem::new(ProblemType::QuotaExceeded, what)
         .with("violated-policies", vec![policy])
         .with("limit", limit)
         .retry_after_window(wait)

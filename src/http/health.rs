@@ -9,9 +9,9 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::kinds::Kind;
 use super::openapi::problem_responses;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::state::Shared;
 use super::stop::Stop;
 
@@ -70,7 +70,7 @@ impl ReadinessCheck {
     }
 }
 
-problem_responses!(ReadyProblems: [[Kind::NotReady]]);
+problem_responses!(ReadyProblems: [[ProblemType::NotReady]]);
 
 /// Check that the service is ready for requests
 ///
@@ -89,7 +89,7 @@ pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem
         }
         Some(why) => {
             let checks = serde_json::to_value(checks).unwrap_or_default();
-            Err(Problem::new(Kind::NotReady, why).with("checks", checks).retry_after(Duration::from_secs(1)))
+            Err(Problem::new(ProblemType::NotReady, why).with("checks", checks).retry_after(Duration::from_secs(1)))
         }
     }
 }

@@ -16,11 +16,11 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::delivery;
 use super::guard::Caller;
-use super::kinds::Kind;
 use super::openapi::parameters::JobPath;
 use super::openapi::problem_responses;
 use super::openapi::problems::{MESHING, ProblemDocument, READING};
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::state::Shared;
 use super::stop::{self, Stop};
 use crate::jobs::{ContentKey, JobId, JobRecord, JobView, Status, is_stored, rfc3339};
@@ -128,13 +128,13 @@ impl Poll {
     }
 }
 
-problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed]]);
-problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::JobEnded, Kind::RecordUnreadable, Kind::StoreFull, Kind::StoreFailed]]);
+problem_responses!(ShowProblems: [[ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::RecordUnreadable, ProblemType::StoreFailed]]);
+problem_responses!(DismissProblems: [[ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::JobEnded, ProblemType::RecordUnreadable, ProblemType::StoreFull, ProblemType::StoreFailed]]);
 problem_responses!(ResultProblems: [READING, MESHING, [
-    Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed,
-    Kind::ResultGone, Kind::JobAbandoned,
-    Kind::RecordUnreadable,
-    Kind::StoreFull, Kind::StoreFailed,
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::NoResultYet, ProblemType::JobDismissed,
+    ProblemType::ResultGone, ProblemType::JobAbandoned,
+    ProblemType::RecordUnreadable,
+    ProblemType::StoreFull, ProblemType::StoreFailed,
 ]]);
 
 /// Reads the job id from the path.
@@ -150,7 +150,10 @@ impl FromRequestParts<Shared> for JobId {
 /// Returns the problem of an unknown job.
 pub(super) fn no_such_job(id: &str) -> Problem {
     let shown: String = id.chars().take(40).collect();
-    Problem::new(Kind::NoSuchJob, format!("there is no job `{shown}`: jobs are removed some time after their end"))
+    Problem::new(
+        ProblemType::NoSuchJob,
+        format!("there is no job `{shown}`: jobs are removed some time after their end"),
+    )
 }
 
 /// Get the status of a job
@@ -171,7 +174,7 @@ pub(super) async fn show(
 ) -> Result<Response, Problem> {
     let expected = format!("a whole number of seconds up to {MAX_WAIT_S}");
     let bad = |detail: String| {
-        Problem::new(Kind::BadParameter, detail).with("parameter", "wait").with("expected", expected.clone())
+        Problem::new(ProblemType::BadParameter, detail).with("parameter", "wait").with("expected", expected.clone())
     };
     let poll = query
         .map(|Query(poll)| poll)
@@ -205,7 +208,7 @@ pub(super) async fn dismiss(State(app): State<Shared>, caller: Caller, id: JobId
     let view = app.job_store.dismiss(&id, caller.namespace).await?.ok_or_else(|| no_such_job(id.as_str()))?;
     if view.record.status != Status::Dismissed {
         let detail = format!("the job is {} and cannot be cancelled", view.record.status.name());
-        return Err(Problem::new(Kind::JobEnded, detail).with("status_name", view.record.status.name()));
+        return Err(Problem::new(ProblemType::JobEnded, detail).with("status_name", view.record.status.name()));
     }
     Ok(answer(StatusCode::OK, &view, None))
 }
@@ -225,8 +228,9 @@ pub(super) async fn result(State(app): State<Shared>, caller: Caller, id: JobId)
     let record = &view.record;
     match (record.status, &record.result) {
         (Status::Successful, Some(key)) => {
-            let gone =
-                || Problem::new(Kind::ResultGone, "the result was removed after some time; request the mesh again");
+            let gone = || {
+                Problem::new(ProblemType::ResultGone, "the result was removed after some time; request the mesh again")
+            };
             let key = ContentKey::parse(key, caller.namespace).map_err(|_bad| gone())?;
             let format = record.format.parse().map_err(|_bad| gone())?;
             if !is_stored(&app.store, format, &key).await? {
@@ -236,9 +240,13 @@ pub(super) async fn result(State(app): State<Shared>, caller: Caller, id: JobId)
             Ok((StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response())
         }
         (Status::Failed, _) => Err(Problem::recorded(record.problem.as_ref())),
-        (Status::Dismissed, _) => Err(Problem::new(Kind::JobDismissed, "the job was cancelled and has no result")),
-        _ => Err(Problem::new(Kind::NoResultYet, "the job has not ended; poll with `?wait=` or read its events")
-            .retry_after(Duration::from_secs(1))),
+        (Status::Dismissed, _) => {
+            Err(Problem::new(ProblemType::JobDismissed, "the job was cancelled and has no result"))
+        }
+        _ => {
+            Err(Problem::new(ProblemType::NoResultYet, "the job has not ended; poll with `?wait=` or read its events")
+                .retry_after(Duration::from_secs(1)))
+        }
     }
 }
 

@@ -5,8 +5,8 @@ use std::fmt;
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_json::Number;
 
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 
 /// Returns the members of an object in order, with their values as in a query. Omits members that are null, which
 /// generated clients send for parameters without a value.
@@ -23,14 +23,14 @@ pub(super) fn members(bytes: &[u8]) -> Result<Vec<(String, String)>, Problem> {
 
 /// Returns the problem of a body that is not such a document.
 pub(super) fn bad(detail: &str) -> Problem {
-    Problem::new(Kind::BadRequest, format!("the JSON cannot be read: {detail}"))
+    Problem::new(ProblemType::BadRequest, format!("the JSON cannot be read: {detail}"))
         .with("expected", "{\"pdb_id\": \"4pti\", …}")
 }
 
 fn bad_member(name: &str) -> Problem {
     let name: String = name.chars().take(80).collect();
     let detail = format!("member `{name}` is neither text, number, true or false, nor a list of them");
-    Problem::new(Kind::BadParameter, detail).with("parameter", name)
+    Problem::new(ProblemType::BadParameter, detail).with("parameter", name)
 }
 
 /// Value of a member as text. Other values are skipped and not stored.
@@ -141,13 +141,13 @@ mod tests {
     fn invalid_values_are_named() {
         for value in ["{}", "{\"b\": 1}", "[]", "[[]]", "[[1]]", "[null]", "[1, {}]"] {
             let problem = members(format!("{{\"a\": {value}}}").as_bytes()).unwrap_err();
-            assert!(problem.is(Kind::BadParameter), "{value}");
+            assert!(problem.is(ProblemType::BadParameter), "{value}");
             assert_eq!(problem.record("")["parameter"], "a", "{value}");
         }
         for bad in ["[]", "3", "{", "", "{\"a\": }", "{\"a\": 1} x"] {
-            assert!(members(bad.as_bytes()).unwrap_err().is(Kind::BadRequest), "{bad}");
+            assert!(members(bad.as_bytes()).unwrap_err().is(ProblemType::BadRequest), "{bad}");
         }
         let deep = format!("{{\"a\": {}", "[".repeat(60_000));
-        assert!(members(deep.as_bytes()).unwrap_err().is(Kind::BadRequest));
+        assert!(members(deep.as_bytes()).unwrap_err().is(ProblemType::BadRequest));
     }
 }

@@ -1,7 +1,7 @@
 //! Limit of a request body, with the configuration key that sets it.
 
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 
 /// Upper limit with its configuration key.
 #[derive(Debug, Clone, Copy)]
@@ -19,6 +19,6 @@ impl Limit {
     /// Returns the problem of an exceeded limit; `what` begins the sentence.
     pub(super) fn exceeded(self, what: &str, unit: &str) -> Problem {
         let Self { key, max } = self;
-        Problem::new(Kind::BodyTooLarge, format!("{what} more than {max} {unit} ({key})")).with("limit", max)
+        Problem::new(ProblemType::BodyTooLarge, format!("{what} more than {max} {unit} ({key})")).with("limit", max)
     }
 }

@@ -16,10 +16,10 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use tracing::Instrument as _;
 
-use super::kinds::Kind;
 use super::parsed_request::ParsedRequest;
 use super::preferences::{PREFERENCE_APPLIED, RequestPreferences};
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::source::{self, Loaded, StructureSource};
 use super::state::Shared;
 use super::timing::Timing;
@@ -95,9 +95,9 @@ impl MeshRequest {
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
         let namespace = self.preferences.caller.namespace;
-        let key = |maker: String| ContentKey::new(digest, &request.job, *format, &maker, namespace);
+        let key = |arithmetic: String| ContentKey::new(digest, &request.job, *format, &arithmetic, namespace);
         // Any backend may compute the file, and the key depends on the backend.
-        let mut keys: Vec<ContentKey> = app.pool.makers(&request.job).into_iter().map(key).collect();
+        let mut keys: Vec<ContentKey> = app.pool.file_arithmetics(&request.job).into_iter().map(key).collect();
         // A report has no validator.
         if !report {
             let mut rejected = Ok(());
@@ -123,7 +123,7 @@ impl MeshRequest {
             for key in &keys {
                 let stored = match results::stored(app, &self.preferences.caller, key, *format, method, headers).await {
                     // The store has logged its error. The mesh is computed again.
-                    Err(problem) if problem.is(Kind::StoreFailed) => break,
+                    Err(problem) if problem.is(ProblemType::StoreFailed) => break,
                     stored => stored?,
                 };
                 if let Some(mut response) = stored {
@@ -208,7 +208,7 @@ impl MeshRequest {
             return delivery::report(&finished, timing);
         }
         // Another backend may have computed the mesh, with other bytes.
-        let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.maker(), namespace);
+        let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.file_arithmetic(), namespace);
         let is_stored = results::save_later(&app, &finished, format, &key);
         // The current file, one of several possible ones, is known only now.
         conditional::check_match(&headers, &delivery::etag(&key))?;
@@ -269,7 +269,7 @@ impl MeshRequest {
 
     fn failed(&self, failure: Failure) -> Problem {
         let problem = self.parsed.declared.explain(failure);
-        if problem.is(Kind::Deadline) { self.advise(problem) } else { problem }
+        if problem.is(ProblemType::Deadline) { self.advise(problem) } else { problem }
     }
 
     /// Recommends a job to a client whose request cannot be answered in time.

@@ -8,7 +8,6 @@ use axum::http::header::HeaderMap;
 use axum::http::{Extensions, HeaderValue, header};
 use axum::response::Response;
 
-use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::bodies::{AS_FOR_MESHES, STRUCTURE_TO_MESH, StructureFile};
 use super::openapi::meshes::{MeshOrJob, ReportResponse};
@@ -18,11 +17,12 @@ use super::openapi::problems::{BODY, MESHING, NAMED_STRUCTURE, PARAMETERS, READI
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::preferences::RequestPreferences;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::state::Shared;
 use super::timing::Timing;
 
 problem_responses!(MeshProblems: [
-    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING, SUBMITTING, [Kind::NotAcceptable],
+    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING, SUBMITTING, [ProblemType::NotAcceptable],
 ]);
 
 /// Mesh a structure
@@ -45,7 +45,7 @@ pub(super) async fn create(
 
 problem_responses!(ReportProblems: [
     BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING,
-    [Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded],
+    [ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded],
 ]);
 
 /// Mesh a structure and return the report

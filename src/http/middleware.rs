@@ -23,8 +23,8 @@ use futures_util::FutureExt as _;
 use metrics::counter;
 use tower::ServiceBuilder;
 
-use super::kinds::Kind;
 use super::problem::{self, Problem};
+use super::problem_types::ProblemType;
 use super::state::Shared;
 use super::{browsers, guard, observe, origin, request_id};
 use crate::telemetry::PANICS;
@@ -50,7 +50,7 @@ async fn catch_panics(request: Request, next: Next) -> Response {
         Ok(response) => response,
         Err(_payload) => {
             // The panic hook has logged the message and the location.
-            counter!(PANICS, "place" => "http").increment(1);
+            counter!(PANICS, "component" => "http").increment(1);
             Problem::internal("a handler panicked").into_response()
         }
     }
@@ -61,7 +61,9 @@ async fn backstop(State(limit): State<Duration>, request: Request, next: Next) -
         Ok(response) => response,
         Err(_elapsed) => {
             let limit = u64::try_from(limit.as_millis()).unwrap_or(u64::MAX);
-            Problem::new(Kind::Deadline, format!("no response within {limit} ms")).with("limit", limit).into_response()
+            Problem::new(ProblemType::Deadline, format!("no response within {limit} ms"))
+                .with("limit", limit)
+                .into_response()
         }
     }
 }

@@ -4,9 +4,9 @@
 //! threads. A file uses only files of earlier groups in the list below; `tests/core/architecture.rs` checks this order.
 
 // Protocol rules that use no other file.
-mod kinds;
 mod observed_body;
 mod pace;
+mod problem_types;
 mod range;
 mod request_id;
 mod scopes;

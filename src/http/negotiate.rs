@@ -7,8 +7,8 @@ use axum::http::{HeaderMap, HeaderValue};
 use axum::middleware::Next;
 use axum::response::Response;
 
-use super::kinds::Kind;
 use super::problem::{self, Problem};
+use super::problem_types::ProblemType;
 use crate::formats::Format;
 
 /// Media type for clients that treat every mesh as bytes.
@@ -37,7 +37,7 @@ pub(super) fn format(headers: &HeaderMap) -> Result<Format, Problem> {
     let values: Vec<&str> = headers.get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok()).collect();
     choose(&values.join(",")).ok_or_else(|| {
         let available: Vec<&str> = Format::ALL.iter().map(|format| format.media_type()).collect();
-        Problem::new(Kind::NotAcceptable, format!("the available formats are {}", available.join(", ")))
+        Problem::new(ProblemType::NotAcceptable, format!("the available formats are {}", available.join(", ")))
             .with("available", available)
     })
 }

@@ -10,8 +10,8 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
 use super::guard;
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::scopes;
 use super::state::Shared;
 use crate::access::{Access, SignatureCheck, authority};
@@ -38,18 +38,18 @@ fn admit(access: &Access, request: &Request) -> Result<(), Problem> {
         && !access.sites().answers(host.as_str())
     {
         let detail = format!("this service does not answer to `{host}`; the operator can add it to server.hosts");
-        return Err(Problem::new(Kind::WrongHost, detail));
+        return Err(Problem::new(ProblemType::WrongHost, detail));
     }
     if is_foreign(access, request, host.as_ref()) && !has_key(access, request) && !opens_page(request) {
         let detail = "a page of another origin made this request, and the service does not allow that origin";
-        return Err(Problem::new(Kind::CrossSite, detail));
+        return Err(Problem::new(ProblemType::CrossSite, detail));
     }
     Ok(())
 }
 
 /// Returns the host that the request names, with its port. HTTP/1.0 does not require one.
 fn host(request: &Request) -> Result<Option<Authority>, Problem> {
-    let bad = |detail: &str| Problem::new(Kind::BadRequest, detail);
+    let bad = |detail: &str| Problem::new(ProblemType::BadRequest, detail);
     let mut named = request.uri().authority().cloned();
     let mut values = request.headers().get_all(HOST).iter();
     if let Some(value) = values.next() {

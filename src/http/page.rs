@@ -14,8 +14,8 @@ use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 
 /// Content security policy of the viewer. It allows scripts and requests of this server only. It allows WebAssembly,
 /// for the meshopt decoder, but not `eval`. Images may be blobs, since the address of an image cannot carry a key.
@@ -134,7 +134,7 @@ pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: He
     let path = format!("assets/{file}");
     if found(&path).is_none() && file != "icon.svg" {
         let shown: String = file.chars().take(80).collect();
-        return Err(Problem::new(Kind::NotFound, format!("the page has no file `{shown}`; reload the page")));
+        return Err(Problem::new(ProblemType::NotFound, format!("the page has no file `{shown}`; reload the page")));
     }
     answer(&request, &path, ICON)
 }

@@ -8,8 +8,8 @@ use bytes::Bytes;
 
 use super::content_type::DeclaredType;
 use super::form::UploadedFile;
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{App, Shared};
 use super::{json_body, negotiate, upload};
@@ -51,7 +51,7 @@ impl ParsedRequest {
         if let (Some(format), Some(other)) = (format, request.format) {
             let value = other.name();
             let detail = format!("parameter `format`: the path already names {}", format.name());
-            return Err(Problem::new(Kind::BadParameter, detail)
+            return Err(Problem::new(ProblemType::BadParameter, detail)
                 .with("parameter", "format")
                 .with("value", value)
                 .with("expected", format!("no value here, or the path surface.{value}")));
@@ -100,7 +100,7 @@ impl ParsedRequest {
 }
 
 fn parse(query: Pairs) -> Result<(Vec<(String, String)>, Request), Problem> {
-    let Query(pairs) = query.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let Query(pairs) = query.map_err(|e| Problem::new(ProblemType::BadRequest, e.body_text()))?;
     let request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
     Ok((pairs, request))
 }
@@ -119,17 +119,20 @@ fn format_of(file: &str) -> Result<Format, Problem> {
     file.strip_prefix("surface.").and_then(format).ok_or_else(|| {
         let available: Vec<String> = Format::ALL.iter().map(|f| format!("surface.{}", f.name())).collect();
         let detail = format!("a structure has no `{file}`; it has {}", available.join(", "));
-        Problem::new(Kind::NotFound, detail).with("available", available)
+        Problem::new(ProblemType::NotFound, detail).with("available", available)
     })
 }
 
 fn bad_digest(text: &str) -> Problem {
     let shown: String = text.chars().take(80).collect();
     let expected = "the digest of a stored structure, 64 hexadecimal digits in lower case";
-    Problem::new(Kind::BadParameter, format!("member `structure`: `{shown}` is not allowed; expected {expected}"))
-        .with("parameter", "structure")
-        .with("value", shown)
-        .with("expected", expected)
+    Problem::new(
+        ProblemType::BadParameter,
+        format!("member `structure`: `{shown}` is not allowed; expected {expected}"),
+    )
+    .with("parameter", "structure")
+    .with("value", shown)
+    .with("expected", expected)
 }
 
 /// Parses `{"pdb_id": …}` or `{"structure": …}`; the other members are parameters.

@@ -3,7 +3,6 @@
 
 use axum::response::Response;
 
-use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::meshes::{CacheableMeshOrJob, ReportResponse};
 use super::openapi::parameters::{
@@ -12,10 +11,11 @@ use super::openapi::parameters::{
 use super::openapi::problem_responses;
 use super::openapi::problems::{MESHING, PARAMETERS, READING, SUBMITTING};
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 
 problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
-    Kind::NotFound, Kind::NotInArchive, Kind::EntryTooLarge, Kind::PreconditionFailed, Kind::RangeNotSatisfiable,
-    Kind::ArchiveUnavailable,
+    ProblemType::NotFound, ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::PreconditionFailed, ProblemType::RangeNotSatisfiable,
+    ProblemType::ArchiveUnavailable,
 ]]);
 
 /// Mesh an archive entry
@@ -34,8 +34,8 @@ pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
 }
 
 problem_responses!(ReportProblems: [PARAMETERS, READING, MESHING, [
-    Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable, Kind::QueueFull, Kind::TooManyDeliveries,
-    Kind::ShareExceeded,
+    ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable, ProblemType::QueueFull, ProblemType::TooManyDeliveries,
+    ProblemType::ShareExceeded,
 ]]);
 
 /// Mesh an archive entry and return the report

@@ -6,8 +6,8 @@ use axum::http::header::HeaderName;
 use axum::http::{Extensions, HeaderMap};
 
 use super::guard::Caller;
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use crate::jobs::{DEFAULT_URGENCY, Rank};
 
 /// `Prefer` (RFC 7240).
@@ -61,7 +61,7 @@ fn parameter<'a>(member: &'a str, name: &str) -> Option<&'a str> {
 }
 
 fn key(headers: &HeaderMap) -> Result<Option<String>, Problem> {
-    let bad = |detail: String| Problem::new(Kind::BadRequest, detail).with("parameter", "Idempotency-Key");
+    let bad = |detail: String| Problem::new(ProblemType::BadRequest, detail).with("parameter", "Idempotency-Key");
     let mut values = headers.get_all(&IDEMPOTENCY_KEY).iter();
     let Some(value) = values.next() else { return Ok(None) };
     if values.next().is_some() {
@@ -117,7 +117,7 @@ mod tests {
         assert_eq!(preferences(&[(key, "a b\t")]).unwrap().idempotency_key.as_deref(), Some("a b"));
         assert!(preferences(&[(key, "")]).is_err());
         assert!(preferences(&[(key, "a\tb")]).is_err());
-        assert!(preferences(&[(key, "a"), (key, "a")]).unwrap_err().is(Kind::BadRequest));
+        assert!(preferences(&[(key, "a"), (key, "a")]).unwrap_err().is(ProblemType::BadRequest));
         let long: &'static str = Box::leak("x".repeat(MAX_KEY + 1).into_boxed_str());
         assert!(preferences(&[(key, long)]).is_err());
     }

@@ -14,7 +14,7 @@ use axum::response::{IntoResponse, Response};
 use metrics::counter;
 use serde_json::{Map, Value};
 
-use super::kinds::{KINDS, Kind};
+use super::problem_types::{PROBLEM_TYPES, ProblemType};
 use super::request_id::RequestId;
 use crate::telemetry::REJECTED;
 
@@ -24,7 +24,7 @@ pub(super) const MEDIA_TYPE: &str = "application/problem+json";
 /// Error response.
 #[derive(Debug, Clone)]
 pub(super) struct Problem {
-    kind: Kind,
+    problem_type: ProblemType,
     detail: String,
     members: Map<String, Value>,
     retry_after_s: Option<u32>,
@@ -33,24 +33,24 @@ pub(super) struct Problem {
 
 impl Problem {
     /// Creates a problem; `detail` explains this occurrence.
-    pub(super) fn new(kind: Kind, detail: impl Into<String>) -> Self {
-        Self { kind, detail: detail.into(), members: Map::new(), retry_after_s: None, header: None }
+    pub(super) fn new(problem_type: ProblemType, detail: impl Into<String>) -> Self {
+        Self { problem_type, detail: detail.into(), members: Map::new(), retry_after_s: None, header: None }
     }
 
     /// Creates an internal error. The message goes to the log, not to the client.
     pub(super) fn internal(message: impl std::fmt::Display) -> Self {
         tracing::error!(%message, "internal error");
-        Self::new(Kind::Internal, "The request could not be answered.")
+        Self::new(ProblemType::Internal, "The request could not be answered.")
     }
 
-    /// Returns true if the problem is of this kind.
-    pub(super) fn is(&self, kind: Kind) -> bool {
-        self.kind == kind
+    /// Returns true if the problem is of this type.
+    pub(super) fn is(&self, problem_type: ProblemType) -> bool {
+        self.problem_type == problem_type
     }
 
-    /// Returns the name of the kind.
+    /// Returns the name of the problem type.
     pub(super) fn slug(&self) -> &'static str {
-        self.kind.row().slug
+        self.problem_type.row().slug
     }
 
     /// Appends advice to the explanation.
@@ -95,8 +95,8 @@ impl Problem {
         let Some(members) = document.and_then(Value::as_object) else { return lost() };
         let text = |name: &str| members.get(name).and_then(Value::as_str);
         let slug = text("type").and_then(|t| t.rsplit('/').next());
-        let Some(row) = KINDS.iter().find(|row| Some(row.slug) == slug) else { return lost() };
-        let mut problem = Self::new(row.kind, text("detail").unwrap_or_default());
+        let Some(row) = PROBLEM_TYPES.iter().find(|row| Some(row.slug) == slug) else { return lost() };
+        let mut problem = Self::new(row.problem_type, text("detail").unwrap_or_default());
         let own = ["type", "title", "status", "detail", "instance"];
         let others = members.iter().filter(|(name, _)| !own.contains(&name.as_str()));
         problem.members.extend(others.map(|(name, value)| (name.clone(), value.clone())));
@@ -105,7 +105,7 @@ impl Problem {
 
     /// Returns the document as JSON, with a line break.
     pub(super) fn document(&self, instance: &str) -> Vec<u8> {
-        let row = self.kind.row();
+        let row = self.problem_type.row();
         let mut document = Map::new();
         document.insert("type".to_owned(), format!("/problems/{}", row.slug).into());
         document.insert("title".to_owned(), row.title.into());
@@ -121,14 +121,14 @@ impl Problem {
 
 impl From<PathRejection> for Problem {
     fn from(error: PathRejection) -> Self {
-        Self::new(Kind::BadRequest, error.body_text())
+        Self::new(ProblemType::BadRequest, error.body_text())
     }
 }
 
 impl IntoResponse for Problem {
     /// Sets the status and the headers, and attaches the problem for [`render`].
     fn into_response(self) -> Response {
-        let mut response = self.kind.row().status.into_response();
+        let mut response = self.problem_type.row().status.into_response();
         if let Some(wait) = self.retry_after_s {
             response.headers_mut().insert(RETRY_AFTER, HeaderValue::from(wait));
         }
@@ -151,7 +151,7 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
     }
     let problem = response.extensions_mut().remove::<Problem>();
     let problem = problem.unwrap_or_else(|| from_library(status, &path));
-    let row = problem.kind.row();
+    let row = problem.problem_type.row();
     if row.is_rejection {
         counter!(REJECTED, "reason" => row.slug).increment(1);
     }
@@ -170,5 +170,5 @@ fn from_library(status: StatusCode, path: &str) -> Problem {
         StatusCode::METHOD_NOT_ALLOWED => format!("{path} has other methods; the Allow header lists them."),
         _ => status.canonical_reason().unwrap_or("The request could not be answered").to_owned(),
     };
-    Problem::new(Kind::from_status(status), detail)
+    Problem::new(ProblemType::from_status(status), detail)
 }

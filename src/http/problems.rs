@@ -7,10 +7,10 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::kinds::{KINDS, Kind, ProblemEntry};
 use super::openapi::parameters::ProblemPath;
 use super::openapi::problem_responses;
 use super::problem::Problem;
+use super::problem_types::{PROBLEM_TYPES, ProblemEntry, ProblemType};
 
 /// Explanation of a problem type.
 #[derive(Debug, Serialize, ToSchema)]
@@ -35,13 +35,13 @@ fn describe(row: &ProblemEntry) -> ProblemDescription {
     }
 }
 
-problem_responses!(OneProblems: [[Kind::BadRequest, Kind::NotFound]]);
+problem_responses!(OneProblems: [[ProblemType::BadRequest, ProblemType::NotFound]]);
 
 /// List all problem types
 #[utoipa::path(get, path = "/problems", tag = "service", operation_id = "listProblems",
     responses((status = 200, description = "All problem types.", body = Vec<ProblemDescription>)))]
 pub(super) async fn list() -> Response {
-    Json(KINDS.iter().map(describe).collect::<Vec<_>>()).into_response()
+    Json(PROBLEM_TYPES.iter().map(describe).collect::<Vec<_>>()).into_response()
 }
 
 /// Explain a problem type
@@ -50,7 +50,8 @@ pub(super) async fn list() -> Response {
     responses((status = 200, description = "The explanation.", body = ProblemDescription), OneProblems))]
 pub(super) async fn one(path: Result<Path<String>, PathRejection>) -> Result<Response, Problem> {
     let Path(slug) = path?;
-    let row = KINDS.iter().find(|row| row.slug == slug);
-    row.map(|row| Json(describe(row)).into_response())
-        .ok_or_else(|| Problem::new(Kind::NotFound, "there is no problem type with this name; /problems lists all"))
+    let row = PROBLEM_TYPES.iter().find(|row| row.slug == slug);
+    row.map(|row| Json(describe(row)).into_response()).ok_or_else(|| {
+        Problem::new(ProblemType::NotFound, "there is no problem type with this name; /problems lists all")
+    })
 }

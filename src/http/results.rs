@@ -16,11 +16,11 @@ use serde_json::Value;
 use tracing::Instrument as _;
 
 use super::guard::Caller;
-use super::kinds::Kind;
 use super::openapi::meshes::{NotModified, StoredMesh};
 use super::openapi::parameters::{ConditionHeaders, RangeHeaders, ResultFile, ResultPath};
 use super::openapi::problem_responses;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::range::{self, Wanted};
 use super::state::{App, Shared};
 use super::timing::SERVER_TIMING;
@@ -42,11 +42,11 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
 }
 
 problem_responses!(ShowProblems: [[
-    Kind::BadRequest, Kind::BadParameter, Kind::NotFound, Kind::PreconditionFailed, Kind::RangeNotSatisfiable,
-    Kind::MemoryFull, Kind::ShareExceeded, Kind::StoreFailed,
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotFound, ProblemType::PreconditionFailed, ProblemType::RangeNotSatisfiable,
+    ProblemType::MemoryFull, ProblemType::ShareExceeded, ProblemType::StoreFailed,
 ]]);
 problem_responses!(ReportProblems: [[
-    Kind::BadRequest, Kind::BadParameter, Kind::NotFound, Kind::PreconditionFailed, Kind::StoreFailed,
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotFound, ProblemType::PreconditionFailed, ProblemType::StoreFailed,
 ]]);
 
 /// Get a stored mesh
@@ -114,7 +114,7 @@ pub(super) async fn report(
 fn no_such_result(what: &str) -> Problem {
     let shown: String = what.chars().take(80).collect();
     Problem::new(
-        Kind::NotFound,
+        ProblemType::NotFound,
         format!("there is no result `{shown}`: results are stored for some time; request the mesh again"),
     )
 }

@@ -4,8 +4,8 @@
 use axum::extract::{MatchedPath, Query, Request};
 use axum::http::Method;
 
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use crate::access::Scope;
 
 /// Operation with the scope that it needs; `None`: open to everybody.
@@ -103,11 +103,11 @@ pub(super) fn check_parameters(request: &Request) -> Result<(), Problem> {
         return Ok(());
     }
     let pairs = Query::<Vec<(String, String)>>::try_from_uri(request.uri());
-    let Query(pairs) = pairs.map_err(|error| Problem::new(Kind::BadRequest, error.body_text()))?;
+    let Query(pairs) = pairs.map_err(|error| Problem::new(ProblemType::BadRequest, error.body_text()))?;
     let Some((name, _)) = pairs.first() else { return Ok(()) };
     let name: String = name.chars().take(64).collect();
     let detail = format!("unknown parameter `{name}`; this path has none");
-    Err(Problem::new(Kind::BadParameter, detail).with("parameter", name))
+    Err(Problem::new(ProblemType::BadParameter, detail).with("parameter", name))
 }
 
 /// Returns the scope that a request needs; `None`: it is open.

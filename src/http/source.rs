@@ -14,8 +14,8 @@ use bytes::Bytes;
 
 use super::conditional;
 use super::guard::Caller;
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::state::{Delivery, Shared};
 use crate::archive::{Entry, FetchError, UnavailableReason};
 use crate::jobs::{Input, MemoryReservation};
@@ -188,7 +188,7 @@ impl FromRequestParts<Shared> for StructureSource {
 
 /// Returns the parameters of the path, decoded.
 pub(super) async fn path_parameters(parts: &mut Parts, app: &Shared) -> Result<RawPathParams, Problem> {
-    let bad = |e: RawPathParamsRejection| Problem::new(Kind::BadRequest, e.body_text());
+    let bad = |e: RawPathParamsRejection| Problem::new(ProblemType::BadRequest, e.body_text());
     RawPathParams::from_request_parts(parts, app).await.map_err(bad)
 }
 
@@ -206,21 +206,21 @@ fn no_such_structure(digest: &str) -> Problem {
     let shown: String = digest.chars().take(80).collect();
     let detail =
         format!("there is no structure `{shown}`: unused structures are removed after some time; upload it again");
-    Problem::new(Kind::NoSuchStructure, detail)
+    Problem::new(ProblemType::NoSuchStructure, detail)
 }
 
 /// Converts an error of the archive.
 fn archive_problem(error: &FetchError) -> Problem {
     let detail = error.to_string();
     match error {
-        FetchError::NotFound { .. } => Problem::new(Kind::NotInArchive, detail),
+        FetchError::NotFound { .. } => Problem::new(ProblemType::NotInArchive, detail),
         FetchError::Local(error) => folder_problem(error),
         FetchError::TooLarge { bytes, limit, .. } => {
-            let problem = Problem::new(Kind::EntryTooLarge, detail).with("limit", *limit);
+            let problem = Problem::new(ProblemType::EntryTooLarge, detail).with("limit", *limit);
             bytes.iter().fold(problem, |problem, bytes| problem.with("actual", *bytes))
         }
         FetchError::Unavailable { host, reason, retry_after } => {
-            let problem = Problem::new(Kind::ArchiveUnavailable, detail).with("host", host.as_str());
+            let problem = Problem::new(ProblemType::ArchiveUnavailable, detail).with("host", host.as_str());
             let problem = match reason {
                 UnavailableReason::Status(status) => problem.with("found", *status),
                 _ => problem,
@@ -228,13 +228,13 @@ fn archive_problem(error: &FetchError) -> Problem {
             retry_after.iter().fold(problem, |problem, wait| problem.retry_after(*wait))
         }
         FetchError::Memory { error, .. } => (*error).into(),
-        FetchError::Busy { limit, wait, .. } => Problem::new(Kind::QueueFull, detail)
+        FetchError::Busy { limit, wait, .. } => Problem::new(ProblemType::QueueFull, detail)
             .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX))
             .with("estimated_wait_s", wait.as_secs_f64())
             .retry_after(*wait),
         FetchError::Share { limit, .. } => {
             let wait = Duration::from_secs(1);
-            Problem::new(Kind::ShareExceeded, detail).with("limit", *limit).retry_after(wait)
+            Problem::new(ProblemType::ShareExceeded, detail).with("limit", *limit).retry_after(wait)
         }
         FetchError::Internal(_) => Problem::internal(detail),
     }
@@ -244,12 +244,12 @@ fn archive_problem(error: &FetchError) -> Problem {
 fn folder_problem(error: &ArchiveError) -> Problem {
     let detail = error.to_string();
     match error {
-        ArchiveError::BadId { id } => Problem::new(Kind::BadParameter, detail)
+        ArchiveError::BadId { id } => Problem::new(ProblemType::BadParameter, detail)
             .with("parameter", "id")
             .with("value", id.as_str())
             .with("expected", "a PDB id such as 4pti or pdb_00004pti"),
         ArchiveError::TooLarge { bytes, limit, .. } => {
-            Problem::new(Kind::InflatedTooLarge, detail).with("limit", *limit).with("actual", *bytes)
+            Problem::new(ProblemType::InflatedTooLarge, detail).with("limit", *limit).with("actual", *bytes)
         }
         ArchiveError::Io(io) => Problem::internal(format!("{error}: {io}")),
     }

@@ -10,8 +10,8 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, timeout_at};
 
-use super::kinds::Kind;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::stop::Stop;
 use super::store_health::StoreHealth;
 use crate::access::Access;
@@ -134,7 +134,7 @@ impl App {
         let permit = Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {
             let limit = self.config.jobs.deliveries;
             Problem::new(
-                Kind::TooManyDeliveries,
+                ProblemType::TooManyDeliveries,
                 format!("{limit} meshes are being computed or sent, which is the limit"),
             )
             .with("limit", limit)

@@ -12,7 +12,6 @@ use utoipa::ToSchema;
 
 use super::form::UploadedFile;
 use super::guard::Caller;
-use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::bodies::StructureFile;
 use super::openapi::meshes::{CacheableMeshOrJob, NotModified, ReportResponse};
@@ -23,6 +22,7 @@ use super::openapi::parameters::{
 use super::openapi::problem_responses;
 use super::openapi::problems::{BODY, MESHING, PARAMETERS, READING, SUBMITTING};
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
 use super::{delivery, upload};
@@ -115,19 +115,19 @@ struct AssemblyDocument {
 
 problem_responses!(CreateProblems: [
     BODY, READING,
-    [Kind::BadParameter, Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded,
-     Kind::StoreFull, Kind::StoreFailed],
+    [ProblemType::BadParameter, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
+     ProblemType::StoreFull, ProblemType::StoreFailed],
 ]);
 problem_responses!(ShowProblems: [
     READING,
     [
-        Kind::BadRequest, Kind::BadParameter, Kind::NoSuchStructure, Kind::PreconditionFailed,
-        Kind::TooMuchMemory, Kind::MemoryFull,
-        Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed,
+        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
+        ProblemType::TooMuchMemory, ProblemType::MemoryFull,
+        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
     ],
 ]);
 problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
-    Kind::NotFound, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::RangeNotSatisfiable,
+    ProblemType::NotFound, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed, ProblemType::RangeNotSatisfiable,
 ]]);
 
 /// Upload a structure
@@ -158,13 +158,13 @@ pub(super) async fn create(
     if upload::is_json(&headers) {
         let detail =
             "a structure is uploaded as a file, not as JSON; `POST /v1/meshes` takes JSON that names a structure";
-        return Err(Problem::new(Kind::UnsupportedMediaType, detail).with("declared", "application/json"));
+        return Err(Problem::new(ProblemType::UnsupportedMediaType, detail).with("declared", "application/json"));
     }
     let UploadedFile { bytes, digest, reservation, map, fields, declared } =
         upload::receive(&app, &headers, body).await?;
     if let Some(name) = map.map(|_| "map").or(fields.first().map(|(name, _)| name.as_str())) {
         return Err(Problem::new(
-            Kind::BadParameter,
+            ProblemType::BadParameter,
             format!("a structure has no parameter `{name}`; parameters belong to meshes"),
         )
         .with("parameter", name));
@@ -218,7 +218,7 @@ pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
 
 problem_responses!(ReportProblems: [
     PARAMETERS, READING, MESHING,
-    [Kind::NoSuchStructure, Kind::QueueFull, Kind::TooManyDeliveries, Kind::ShareExceeded, Kind::StoreFailed],
+    [ProblemType::NoSuchStructure, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed],
 ]);
 
 /// Mesh an uploaded structure and return the report

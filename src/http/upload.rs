@@ -11,9 +11,9 @@ use futures_util::StreamExt as _;
 use super::body_hasher::BodyHasher;
 use super::content_type::{DeclaredType, GZIP_MAGIC, ZSTD_MAGIC};
 use super::form::{self, UploadedFile};
-use super::kinds::Kind;
 use super::limit::Limit;
 use super::problem::Problem;
+use super::problem_types::ProblemType;
 use super::state::App;
 use crate::jobs::MemoryReservation;
 use crate::store::Digest;
@@ -81,7 +81,7 @@ async fn in_time<T>(app: &App, receive: impl Future<Output = Result<T, Problem>>
     tokio::time::timeout(Duration::from_millis(app.config.server.body_timeout_ms), receive).await.map_err(
         |_elapsed| {
             let ms = app.config.server.body_timeout_ms;
-            Problem::new(Kind::BodyTimeout, format!("the body was not complete after {ms} ms")).with("limit", ms)
+            Problem::new(ProblemType::BodyTimeout, format!("the body was not complete after {ms} ms")).with("limit", ms)
         },
     )?
 }
@@ -92,7 +92,7 @@ fn text<'a>(headers: &'a HeaderMap, name: &axum::http::HeaderName) -> Option<&'a
 
 /// Returns the problem of a body that ends early, most likely because the client left.
 fn broken(error: &dyn std::fmt::Display) -> Problem {
-    Problem::new(Kind::BadRequest, format!("the body cannot be read: {error}"))
+    Problem::new(ProblemType::BadRequest, format!("the body cannot be read: {error}"))
 }
 
 /// Reads a body into one buffer and hashes it while it arrives; a body of one frame is not copied.
@@ -131,7 +131,7 @@ async fn collect(
 type Coding = (&'static str, &'static [u8]);
 
 fn bad_encoding(detail: &str) -> Problem {
-    Problem::new(Kind::UnsupportedEncoding, detail).with("available", vec!["gzip", "zstd", "identity"])
+    Problem::new(ProblemType::UnsupportedEncoding, detail).with("available", vec!["gzip", "zstd", "identity"])
 }
 
 /// Returns the declared coding. The reader detects the coding from the bytes, so the header is only checked.

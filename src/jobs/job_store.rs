@@ -232,9 +232,9 @@ impl JobStore {
 
     /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
     pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<(String, Pin)>, StoreError> {
-        let makers = if task.strict { Vec::new() } else { self.0.pool.makers(&task.job) };
-        for maker in makers {
-            let key = ContentKey::new(&task.digest, &task.job, format, &maker, task.namespace);
+        let arithmetics = if task.strict { Vec::new() } else { self.0.pool.file_arithmetics(&task.job) };
+        for arithmetic in arithmetics {
+            let key = ContentKey::new(&task.digest, &task.job, format, &arithmetic, task.namespace);
             let pin = self.0.store.pin(&key.name(format.name())?);
             if results::is_stored(&self.0.store, format, &key).await? {
                 return Ok(Some((key.to_string(), pin)));

@@ -14,11 +14,11 @@ pub(crate) struct ContentKey {
 }
 
 impl ContentKey {
-    /// Returns the key of a result. `maker` names the arithmetic of the backend, followed by that of a picture's
+    /// Returns the key of a result. `arithmetic` names the arithmetic of the backend, followed by that of a picture's
     /// renderer. The version is part of the key, since a release may change the last bits.
-    pub(crate) fn new(input: &Digest, job: &Job, format: Format, maker: &str, namespace: Namespace) -> Self {
+    pub(crate) fn new(input: &Digest, job: &Job, format: Format, arithmetic: &str, namespace: Namespace) -> Self {
         let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));
-        let text = format!("molmesh {version}\n{maker}\n{}\n{canonical}\n{input}\n", format.name());
+        let text = format!("molmesh {version}\n{arithmetic}\n{}\n{canonical}\n{input}\n", format.name());
         Self { digest: Digest::of(text.as_bytes()), namespace }
     }
 
@@ -52,7 +52,8 @@ mod tests {
         let png = params::parse([("format", "png")]).unwrap().job;
         let wide = params::parse([("format", "png"), ("width", "600")]).unwrap().job;
         let (a, b) = (Digest::of(b"a"), Digest::of(b"b"));
-        let key = |input, job, format, maker| ContentKey::new(input, job, format, maker, Namespace::default());
+        let key =
+            |input, job, format, arithmetic| ContentKey::new(input, job, format, arithmetic, Namespace::default());
         let mut keys = vec![
             key(&a, &plain, Format::Glb, "cpu"),
             key(&b, &plain, Format::Glb, "cpu"),

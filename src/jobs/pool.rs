@@ -10,7 +10,7 @@ use super::devices::DeviceMonitor;
 use super::queue::Queue;
 use super::{Budget, Client, Input, OnStart, Refusal, Structures, Task, Ticket, worker};
 use crate::picture::SelectedRenderer;
-use crate::pipeline::{self, Job, JobLimits, maker};
+use crate::pipeline::{self, Job, JobLimits, file_arithmetic};
 use crate::surface::Backend;
 use crate::telemetry::{JOBS_SUBMITTED, Tracer};
 
@@ -139,10 +139,10 @@ impl Pool {
     }
 
     /// Returns the arithmetics that a job's file may have, provided that the renderer does not fall back.
-    pub(crate) fn makers(&self, job: &Job) -> Vec<String> {
+    pub(crate) fn file_arithmetics(&self, job: &Job) -> Vec<String> {
         let renderer = job.picture.map(|_| self.shared.settings.renderer.renderer.arithmetic());
         let backends = self.shared.backend.arithmetics();
-        backends.iter().map(|backend| maker(backend, renderer.as_deref())).collect()
+        backends.iter().map(|backend| file_arithmetic(backend, renderer.as_deref())).collect()
     }
 
     /// Updates metrics and log with the state of the queue and the devices, as every finished job does.

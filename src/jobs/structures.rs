@@ -48,9 +48,9 @@ enum Charge {
 
 /// A structure that other requests may use as well. Clones share it.
 #[derive(Debug, Clone)]
-pub(crate) struct KeptStructure(Arc<Charged>);
+pub(crate) struct SharedStructure(Arc<Charged>);
 
-impl KeptStructure {
+impl SharedStructure {
     fn bytes(&self) -> u64 {
         self.0.bytes
     }
@@ -61,7 +61,7 @@ impl KeptStructure {
     }
 }
 
-impl Deref for KeptStructure {
+impl Deref for SharedStructure {
     type Target = Structure;
 
     fn deref(&self) -> &Structure {
@@ -75,7 +75,7 @@ pub(crate) enum Input {
     /// Structure file, compressed or not.
     File(Bytes),
     /// Structure in memory, whose file need not be loaded.
-    Kept(KeptStructure),
+    Kept(SharedStructure),
 }
 
 impl Input {
@@ -107,7 +107,7 @@ impl Input {
 #[derive(Debug, Default)]
 struct CacheState {
     /// Least recently used first.
-    kept: Vec<(StructureKey, KeptStructure)>,
+    kept: Vec<(StructureKey, SharedStructure)>,
     /// Structures that a request is reading.
     reading: HashSet<StructureKey>,
 }
@@ -118,13 +118,13 @@ impl CacheState {
     }
 
     /// Removes the least recently used structure that `is_candidate` accepts, and returns its memory in bytes.
-    fn evict(&mut self, is_candidate: impl Fn(&KeptStructure) -> bool) -> Option<u64> {
+    fn evict(&mut self, is_candidate: impl Fn(&SharedStructure) -> bool) -> Option<u64> {
         let found = self.kept.iter().position(|(_, kept)| is_candidate(kept))?;
         Some(self.kept.remove(found).1.bytes())
     }
 
     /// Finds a structure, and makes it the most recently used one.
-    fn find(&mut self, key: &StructureKey) -> Option<KeptStructure> {
+    fn find(&mut self, key: &StructureKey) -> Option<SharedStructure> {
         let found = self.kept.iter().position(|(known, _)| known == key)?;
         self.kept[found..].rotate_left(1);
         self.kept.last().map(|(_, kept)| kept.clone())
@@ -152,7 +152,7 @@ impl Structures {
     }
 
     /// Returns the structure of a file if it is kept.
-    pub(crate) fn find(&self, namespace: Namespace, digest: Digest) -> Option<KeptStructure> {
+    pub(crate) fn find(&self, namespace: Namespace, digest: Digest) -> Option<SharedStructure> {
         self.lock().find(&(namespace, digest))
     }
 
@@ -170,8 +170,8 @@ impl Structures {
         input: &Input,
         limits: &ReadLimits,
         control: &Control<'_>,
-    ) -> Result<KeptStructure, StructureError> {
-        let hit = |kept: KeptStructure| {
+    ) -> Result<SharedStructure, StructureError> {
+        let hit = |kept: SharedStructure| {
             counter!(STRUCTURE_CACHE_REQUESTS, "result" => "hit").increment(1);
             control.memory.also_held(kept.bytes());
             limits.check_atoms(kept.len()).map(|()| kept)
@@ -211,7 +211,7 @@ impl Structures {
             Charge::Used { _reservation: reservation }
         };
         let (file_bytes, atoms) = (input.file_bytes(), input.atoms());
-        let read = KeptStructure(Arc::new(Charged { structure, file_bytes, atoms, bytes, _charge: charge }));
+        let read = SharedStructure(Arc::new(Charged { structure, file_bytes, atoms, bytes, _charge: charge }));
         if is_kept {
             self.keep(key, &read);
         }
@@ -219,7 +219,7 @@ impl Structures {
     }
 
     /// Keeps a structure, and evicts others.
-    fn keep(&self, key: StructureKey, kept: &KeptStructure) {
+    fn keep(&self, key: StructureKey, kept: &SharedStructure) {
         let mut state = self.lock();
         state.kept.push((key, kept.clone()));
         while state.bytes() > self.limit && state.evict(|_| true).is_some() {}
@@ -283,13 +283,13 @@ mod tests {
         (Input::File(text.into()), digest)
     }
 
-    type Got = Result<KeptStructure, StructureError>;
+    type Got = Result<SharedStructure, StructureError>;
 
     fn get_with(structures: &Structures, (input, digest): &File, control: &Control<'_>) -> Got {
         structures.get(Namespace::default(), *digest, input, &ReadLimits::default(), control)
     }
 
-    fn get(structures: &Structures, file: &File) -> KeptStructure {
+    fn get(structures: &Structures, file: &File) -> SharedStructure {
         get_with(structures, file, &Control::default()).unwrap()
     }
 
@@ -368,7 +368,7 @@ mod tests {
         let structures = Structures::new(1 << 30, &budget);
         let file = file(50_000);
         let (start, cancelled) = (Barrier::new(8), AtomicUsize::new(0));
-        let got: Vec<KeptStructure> = std::thread::scope(|scope| {
+        let got: Vec<SharedStructure> = std::thread::scope(|scope| {
             let spawn = |i: usize| {
                 let (structures, file, start, cancelled) = (&structures, &file, &start, &cancelled);
                 scope.spawn(move || {

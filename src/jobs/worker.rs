@@ -173,7 +173,7 @@ fn count_outcome(outcome: &Outcome) -> &'static str {
 }
 
 fn panicked(payload: &(dyn Any + Send)) -> Failure {
-    counter!(PANICS, "place" => "job").increment(1);
+    counter!(PANICS, "component" => "job").increment(1);
     let text = payload.downcast_ref::<&str>().copied().or_else(|| payload.downcast_ref::<String>().map(String::as_str));
     Failure::Panicked { message: text.unwrap_or("no message").to_owned() }
 }

@@ -43,7 +43,7 @@ pub use limits::JobLimits;
 pub use map_file::MapFile;
 pub use parts::PartReport;
 pub use progress::Tracker;
-pub use report::{AssemblyReport, ComponentReport, PictureReport, Quantization, Report, VoidReport, maker};
+pub use report::{AssemblyReport, ComponentReport, PictureReport, Quantization, Report, VoidReport, file_arithmetic};
 pub use spacing::Spacing;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
 

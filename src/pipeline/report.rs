@@ -358,8 +358,8 @@ impl Report {
 
     /// Returns the arithmetic of the file, as in its key: that of the mesh, followed by that of the picture.
     #[must_use]
-    pub fn maker(&self) -> String {
-        maker(&self.arithmetic, self.picture.as_ref().map(|picture| picture.arithmetic.as_str()))
+    pub fn file_arithmetic(&self) -> String {
+        file_arithmetic(&self.arithmetic, self.picture.as_ref().map(|picture| picture.arithmetic.as_str()))
     }
 
     /// Returns the report as the extras of a mesh file. Leaves out fields that differ between runs, because the same
@@ -376,6 +376,6 @@ impl Report {
 
 /// Returns the arithmetic of a file: that of its mesh, followed by that of its picture.
 #[must_use]
-pub fn maker(mesh: &str, picture: Option<&str>) -> String {
+pub fn file_arithmetic(mesh: &str, picture: Option<&str>) -> String {
     picture.map_or_else(|| mesh.to_owned(), |picture| format!("{mesh}+{picture}"))
 }

@@ -29,10 +29,10 @@ pub enum StructureError {
         expected: String,
     },
     /// A binary file could not be read.
-    #[error("{place}: found {found}, expected {expected}")]
+    #[error("{location}: found {found}, expected {expected}")]
     Malformed {
         /// Location, from the outside in: format, category, column, then encoding, row (from 1) or byte (from 0).
-        place: String,
+        location: String,
         /// The content found there.
         found: String,
         /// The expected content.

@@ -126,7 +126,7 @@ metrics! {
     /// instead.
     TRACE_SPANS = "molmesh_trace_spans_total", Counter, result: "exported|failed";
     /// Caught panics.
-    PANICS = "molmesh_panics_total", Counter, place: "job|http";
+    PANICS = "molmesh_panics_total", Counter, component: "job|http";
     /// Always 1; the label is the version.
     BUILD_INFO = "molmesh_build_info", Gauge, version: "the version of this process";
     /// Processor time of all threads of the process.

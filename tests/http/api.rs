@@ -434,7 +434,7 @@ fn binarycif_is_accepted_by_every_operation_that_accepts_text() {
     assert!(report.to_string().contains("does not read BinaryCIF"), "{report}");
     // An invalid file: the problem contains the position.
     let problem = SERVER.post("/v1/meshes", &[], &CRAMBIN[..CRAMBIN.len() / 2]).problem(422, "unreadable-structure");
-    assert!(problem["place"].as_str().unwrap().starts_with("BinaryCIF, byte "), "{problem}");
+    assert!(problem["location"].as_str().unwrap().starts_with("BinaryCIF, byte "), "{problem}");
     assert!(problem["found"].is_string() && problem["expected"].is_string());
 }
 

@@ -108,7 +108,7 @@ fn validators_name_the_result_of_one_backend() {
     let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
     let path = format!("{structure}/surface.glb");
     let with = |name: &str, value: &str| send(server.addr, "GET", &path, &[(name, value)], b"");
-    // The maker is not known before the run.
+    // The arithmetic is not known before the run.
     let head = send(server.addr, "HEAD", &path, &[], b"");
     assert_eq!((head.status, head.header("etag")), (200, None));
     // The slower backend makes the mesh while the other one is busy.

@@ -27,7 +27,7 @@ fn begin(server: &Running, body: &[u8]) -> TcpStream {
 fn a_panic_gives_a_500_without_details_and_keeps_the_workers() {
     let backend = Fake::new(Mode::Panic);
     let server = running(&backend);
-    let panics = || server.metric("molmesh_panics_total", &["place=\"job\""]);
+    let panics = || server.metric("molmesh_panics_total", &["component=\"job\""]);
     let before = panics();
     for n in 0..6 {
         let reply = server.post("/v1/meshes", &[("x-request-id", &format!("panic-{n}"))], SAMPLE);

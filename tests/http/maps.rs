@@ -90,7 +90,7 @@ fn requests_without_a_map_or_with_a_useless_one_are_rejected() {
     let text = String::from_utf8(map(1.0)).unwrap();
     let bad = meshed(&server, text.replace("\n80\n", "\neighty\n").as_bytes());
     let problem = refused(bad, "unreadable-map", "line 108: found `eighty`");
-    assert_eq!((&problem["place"], &problem["parameter"]), (&"line 108".into(), &"map".into()));
+    assert_eq!((&problem["location"], &problem["parameter"]), (&"line 108".into(), &"map".into()));
     refused(meshed(&server, SAMPLE), "unreadable-map", "unknown map format");
     let zipped = gzip(&map(1.0));
     assert_eq!(refused(meshed(&server, &zipped[..60]), "unreadable-map", "gzip")["encoding"], "gzip");

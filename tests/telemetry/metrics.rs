@@ -71,7 +71,7 @@ const ROWS: &[Row] = &[
     (t::ARCHIVE_BREAKER, &["host=\"127.0.0.1\""], dead_archive),
     (t::ARCHIVE_KEPT, &[], archive),
     (t::TRACE_SPANS, &["result=\"exported\""], traces),
-    (t::PANICS, &["place=\"job\""], panics),
+    (t::PANICS, &["component=\"job\""], panics),
     (t::BUILD_INFO, &[concat!("version=\"", env!("CARGO_PKG_VERSION"), "\"")], nothing),
     (t::PROCESS_CPU, &[], nothing),
     (t::PROCESS_RESIDENT, &[], nothing),

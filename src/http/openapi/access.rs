@@ -9,7 +9,7 @@ use utoipa::openapi::{ComponentsBuilder, OpenApi};
 
 use super::problems::responses;
 use crate::access::{SIGNATURE, Scope};
-use crate::http::kinds::Kind;
+use crate::http::problem_types::ProblemType;
 use crate::http::scopes::TABLE;
 
 /// Names of the security schemes.
@@ -18,10 +18,15 @@ const API_KEY: &str = "apiKey";
 const SIGNED: &str = "signedAddress";
 
 /// Problems of an operation that requires a scope.
-const KEY_PROBLEMS: &[Kind] =
-    &[Kind::KeyRequired, Kind::KeyInvalid, Kind::KeyExpired, Kind::ScopeMissing, Kind::QuotaExceeded];
+const KEY_PROBLEMS: &[ProblemType] = &[
+    ProblemType::KeyRequired,
+    ProblemType::KeyInvalid,
+    ProblemType::KeyExpired,
+    ProblemType::ScopeMissing,
+    ProblemType::QuotaExceeded,
+];
 /// Further problems of an operation that accepts signed URLs.
-const SIGNED_URL_PROBLEMS: &[Kind] = &[Kind::SignatureInvalid, Kind::SignatureExpired];
+const SIGNED_URL_PROBLEMS: &[ProblemType] = &[ProblemType::SignatureInvalid, ProblemType::SignatureExpired];
 
 /// Adds the security requirements, from the table that authorizes requests.
 pub(in crate::http) struct SecurityRequirements;

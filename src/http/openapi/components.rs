@@ -7,7 +7,7 @@ use super::bodies::request_bodies;
 
 /// Temporary extension of an error response with its problem types, from which [`share`] derives the name of the
 /// component.
-pub(super) const PROBLEM_TYPES: &str = "x-problem-types";
+pub(super) const PROBLEM_TYPES_EXTENSION: &str = "x-problem-types";
 
 /// Example of a report, as JSON.
 const REPORT_EXAMPLE: &str = include_str!("report_example.json");
@@ -57,7 +57,7 @@ pub(in crate::http) fn share(document: &mut Value) {
             }
             if let Some(name) = response_name(status, response) {
                 if let Some(response) = response.as_object_mut() {
-                    response.remove(PROBLEM_TYPES);
+                    response.remove(PROBLEM_TYPES_EXTENSION);
                 }
                 shared.replace("responses", &name, response);
             }
@@ -122,7 +122,7 @@ fn parameter_name(path: &str, parameter: &Value) -> String {
 
 /// Returns the component name of a response; `None` if the response stays with its operation.
 fn response_name(status: &str, response: &Value) -> Option<String> {
-    let Some(types) = response[PROBLEM_TYPES].as_array() else {
+    let Some(types) = response[PROBLEM_TYPES_EXTENSION].as_array() else {
         let document = &response["content"]["application/json"]["schema"]["$ref"];
         return match status {
             "200" if *document == "#/components/schemas/ReportDocument" => Some("MeshReport".to_owned()),

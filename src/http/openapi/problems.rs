@@ -11,64 +11,74 @@ use utoipa::openapi::{
 };
 use utoipa::{PartialSchema, ToSchema};
 
-use super::components::PROBLEM_TYPES;
-use crate::http::kinds::{KINDS, Kind, ProblemEntry};
+use super::components::PROBLEM_TYPES_EXTENSION;
 use crate::http::problem::MEDIA_TYPE;
+use crate::http::problem_types::{PROBLEM_TYPES, ProblemEntry, ProblemType};
 
 /// Description of the header `Content-Range`.
 pub(super) const CONTENT_RANGE: &str = "`bytes FIRST-LAST/LENGTH`; `bytes */LENGTH` if the range is outside the file.";
 
 /// Problems while a body is received.
-pub(in crate::http) const BODY: &[Kind] = &[
-    Kind::BadRequest,
-    Kind::BodyTimeout,
-    Kind::BodyTooLarge,
-    Kind::UnsupportedMediaType,
-    Kind::UnsupportedEncoding,
-    Kind::TooMuchMemory,
-    Kind::MemoryFull,
+pub(in crate::http) const BODY: &[ProblemType] = &[
+    ProblemType::BadRequest,
+    ProblemType::BodyTimeout,
+    ProblemType::BodyTooLarge,
+    ProblemType::UnsupportedMediaType,
+    ProblemType::UnsupportedEncoding,
+    ProblemType::TooMuchMemory,
+    ProblemType::MemoryFull,
 ];
 /// Further problems of a JSON body that names a structure.
-pub(in crate::http) const NAMED_STRUCTURE: &[Kind] =
-    &[Kind::NoSuchStructure, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable, Kind::StoreFailed];
+pub(in crate::http) const NAMED_STRUCTURE: &[ProblemType] = &[
+    ProblemType::NoSuchStructure,
+    ProblemType::NotInArchive,
+    ProblemType::EntryTooLarge,
+    ProblemType::ArchiveUnavailable,
+    ProblemType::StoreFailed,
+];
 /// Problems of parameters.
-pub(in crate::http) const PARAMETERS: &[Kind] = &[Kind::BadRequest, Kind::BadParameter];
+pub(in crate::http) const PARAMETERS: &[ProblemType] = &[ProblemType::BadRequest, ProblemType::BadParameter];
 /// Problems of reading a structure.
-pub(in crate::http) const READING: &[Kind] =
-    &[Kind::InflatedTooLarge, Kind::UnreadableStructure, Kind::NoAtoms, Kind::TooManyAtoms, Kind::TooManyDuplicates];
+pub(in crate::http) const READING: &[ProblemType] = &[
+    ProblemType::InflatedTooLarge,
+    ProblemType::UnreadableStructure,
+    ProblemType::NoAtoms,
+    ProblemType::TooManyAtoms,
+    ProblemType::TooManyDuplicates,
+];
 /// Problems of a job after the structure was read, and of its map.
-pub(in crate::http) const MESHING: &[Kind] = &[
-    Kind::UnreadableMap,
-    Kind::MapTooLarge,
-    Kind::EmptySelection,
-    Kind::TooManyCopies,
-    Kind::TooManyParts,
-    Kind::GridTooLarge,
-    Kind::TooManyCandidates,
-    Kind::MeshTooLarge,
-    Kind::PictureTooLarge,
-    Kind::DeviceMemory,
-    Kind::NoSurface,
-    Kind::Internal,
-    Kind::DeviceFailed,
-    Kind::TooMuchMemory,
-    Kind::MemoryFull,
-    Kind::ShuttingDown,
-    Kind::Deadline,
+pub(in crate::http) const MESHING: &[ProblemType] = &[
+    ProblemType::UnreadableMap,
+    ProblemType::MapTooLarge,
+    ProblemType::EmptySelection,
+    ProblemType::TooManyCopies,
+    ProblemType::TooManyParts,
+    ProblemType::GridTooLarge,
+    ProblemType::TooManyCandidates,
+    ProblemType::MeshTooLarge,
+    ProblemType::PictureTooLarge,
+    ProblemType::DeviceMemory,
+    ProblemType::NoSurface,
+    ProblemType::Internal,
+    ProblemType::DeviceFailed,
+    ProblemType::TooMuchMemory,
+    ProblemType::MemoryFull,
+    ProblemType::ShuttingDown,
+    ProblemType::Deadline,
 ];
 /// Problems of submitting a job.
-pub(in crate::http) const SUBMITTING: &[Kind] = &[
-    Kind::OtherRequest,
-    Kind::QueueFull,
-    Kind::TooManyJobs,
-    Kind::TooManyDeliveries,
-    Kind::ShareExceeded,
-    Kind::StoreFull,
-    Kind::StoreFailed,
+pub(in crate::http) const SUBMITTING: &[ProblemType] = &[
+    ProblemType::OtherRequest,
+    ProblemType::QueueFull,
+    ProblemType::TooManyJobs,
+    ProblemType::TooManyDeliveries,
+    ProblemType::ShareExceeded,
+    ProblemType::StoreFull,
+    ProblemType::StoreFailed,
 ];
 
 /// Declares a type for `responses(…)` with the problems of one operation:
-/// `problem_responses!(Name: [GROUP, …, [Kind::…, …]])`.
+/// `problem_responses!(Name: [GROUP, …, [ProblemType::…, …]])`.
 macro_rules! problem_responses {
     ($name:ident: [$($group:expr),+ $(,)?]) => {
         /// Problems of an operation.
@@ -77,7 +87,7 @@ macro_rules! problem_responses {
         impl utoipa::IntoResponses for $name {
             fn responses()
             -> std::collections::BTreeMap<String, utoipa::openapi::RefOr<utoipa::openapi::Response>> {
-                let groups: &[&[$crate::http::kinds::Kind]] = &[$(&$group[..]),+];
+                let groups: &[&[$crate::http::problem_types::ProblemType]] = &[$(&$group[..]),+];
                 $crate::http::openapi::problems::responses(groups)
             }
         }
@@ -85,16 +95,16 @@ macro_rules! problem_responses {
 }
 pub(in crate::http) use problem_responses;
 
-/// Returns the responses for some kinds, one per status.
-pub(in crate::http) fn responses(groups: &[&[Kind]]) -> BTreeMap<String, RefOr<Response>> {
+/// Returns the responses for some problem types, one per status.
+pub(in crate::http) fn responses(groups: &[&[ProblemType]]) -> BTreeMap<String, RefOr<Response>> {
     let mut by_status: BTreeMap<String, Vec<&ProblemEntry>> = BTreeMap::new();
-    for row in KINDS.iter().filter(|row| groups.iter().any(|group| group.contains(&row.kind))) {
+    for row in PROBLEM_TYPES.iter().filter(|row| groups.iter().any(|group| group.contains(&row.problem_type))) {
         by_status.entry(row.status.as_u16().to_string()).or_default().push(row);
     }
     by_status.into_iter().map(|(status, rows)| (status, RefOr::T(response(&rows)))).collect()
 }
 
-/// Returns the response for the kinds of one status.
+/// Returns the response for the problem types of one status.
 fn response(rows: &[&ProblemEntry]) -> Response {
     let described: Vec<String> = rows.iter().map(|row| format!("`{}`: {}.", row.slug, row.title)).collect();
     let names: Vec<&str> = rows.iter().map(|row| row.slug).collect();
@@ -102,22 +112,22 @@ fn response(rows: &[&ProblemEntry]) -> Response {
     let mut response = ResponseBuilder::new()
         .description(described.join(" "))
         .content(MEDIA_TYPE, ContentBuilder::new().schema(Some(problem)).build())
-        .extensions(Some(Extensions::from_iter([(PROBLEM_TYPES, Value::from(names))])));
-    let has = |kinds: &[Kind]| rows.iter().any(|row| kinds.contains(&row.kind));
+        .extensions(Some(Extensions::from_iter([(PROBLEM_TYPES_EXTENSION, Value::from(names))])));
+    let has = |problem_types: &[ProblemType]| rows.iter().any(|row| problem_types.contains(&row.problem_type));
     if rows.iter().any(|row| row.status.is_server_error())
-        || has(&[Kind::NoResultYet, Kind::ArchiveUnavailable, Kind::QuotaExceeded])
+        || has(&[ProblemType::NoResultYet, ProblemType::ArchiveUnavailable, ProblemType::QuotaExceeded])
     {
         response = response.header("Retry-After", retry_after());
     }
-    if has(&[Kind::QuotaExceeded]) {
+    if has(&[ProblemType::QuotaExceeded]) {
         response = response
             .header("RateLimit-Policy", header(text(), "Quotas of the client, as a structured field."))
             .header("RateLimit", header(text(), "Remaining quota, as a structured field."));
     }
-    if has(&[Kind::KeyRequired]) {
+    if has(&[ProblemType::KeyRequired]) {
         response = response.header("WWW-Authenticate", header(text(), "`Bearer` and the reason (RFC 6750)."));
     }
-    if has(&[Kind::RangeNotSatisfiable]) {
+    if has(&[ProblemType::RangeNotSatisfiable]) {
         response = response.header("Content-Range", header(text(), CONTENT_RANGE));
     }
     response.build()
@@ -168,7 +178,7 @@ const MEMBERS: &[Member] = &[
     ("line", Some(Type::Integer), "Line in the file or JSON document, from 1."),
     ("column", Some(Type::Integer), "Column in the line, or position in the expression, from 1."),
     (
-        "place",
+        "location",
         Some(Type::String),
         "Position in a binary file: category, column, encoding, row (from 1) or byte (from 0). For an invalid assembly, its id.",
     ),
@@ -191,7 +201,7 @@ impl PartialSchema for ProblemDocument {
             .minimum(Some(400))
             .maximum(Some(599))
             .description(Some("HTTP status of the response."));
-        let types: Vec<Value> = KINDS.iter().map(|row| address(row).into()).collect();
+        let types: Vec<Value> = PROBLEM_TYPES.iter().map(|row| address(row).into()).collect();
         let strings =
             |doc: &str| ArrayBuilder::new().items(Object::with_type(Type::String)).description(Some(doc.to_owned()));
         let nearest = ObjectBuilder::new()
@@ -227,7 +237,7 @@ impl PartialSchema for ProblemDocument {
             .additional_properties(Some(AdditionalProperties::FreeForm(true)))
             .examples([json!({
                 "type": "/problems/bad-parameter",
-                "title": Kind::BadParameter.row().title,
+                "title": ProblemType::BadParameter.row().title,
                 "status": 400,
                 "detail": "unknown parameter `resolutoin`; did you mean `resolution`?",
                 "instance": "0123456789abcdef",

@@ -98,8 +98,8 @@ impl Fixture {
 
     /// Stores a result of the job.
     fn store_result(&self, entry: &QueuedTask) {
-        let maker = self.jobs.0.pool.makers(&entry.task.job).remove(0);
-        let key = ContentKey::new(&entry.task.digest, &entry.task.job, Format::Glb, &maker, Namespace::default());
+        let arithmetic = self.jobs.0.pool.file_arithmetics(&entry.task.job).remove(0);
+        let key = ContentKey::new(&entry.task.digest, &entry.task.job, Format::Glb, &arithmetic, Namespace::default());
         let report = results::report_file(b"{}".to_vec(), &Hasher::default(), 0).unwrap();
         for (extension, bytes) in [("glb", Bytes::new()), (REPORT, report)] {
             block_on(self.store.put(&key.name(extension).unwrap(), bytes)).unwrap();

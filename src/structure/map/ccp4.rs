@@ -111,16 +111,16 @@ pub(super) fn read(bytes: &[u8], limits: &MapLimits, control: &Control<'_>) -> R
     let mode = header.int(4);
     let expected = "0, 1, 2, 6 or 12 (integers of 8 or 16 bits, floats of 32 or 16 bits)";
     let mode = Mode::of(mode).ok_or_else(|| malformed("mode (word 4, byte 12)", mode.to_string(), expected))?;
-    let place = "numbers of columns, rows and sections (words 1 to 3, byte 0)";
-    let side = |n: i32| usize::try_from(n).map_err(|_negative| malformed(place, n.to_string(), "positive numbers"));
+    let location = "numbers of columns, rows and sections (words 1 to 3, byte 0)";
+    let side = |n: i32| usize::try_from(n).map_err(|_negative| malformed(location, n.to_string(), "positive numbers"));
     let [columns, rows, sections] = header.ints(1);
     let size = [side(columns)?, side(rows)?, side(sections)?];
-    let n = number_of_points(size, place, limits)?;
+    let n = number_of_points(size, location, limits)?;
     let to_grid = to_grid(&header)?;
     let extended = header.int(24);
-    let place = "length of the extended header (word 24, byte 92)";
+    let location = "length of the extended header (word 24, byte 92)";
     let extended = usize::try_from(extended)
-        .map_err(|_negative| malformed(place, extended.to_string(), "0 or a positive number"))?;
+        .map_err(|_negative| malformed(location, extended.to_string(), "0 or a positive number"))?;
     let expected = (HEADER as u64).saturating_add(extended as u64).saturating_add((n * mode.bytes()) as u64);
     let data = HEADER.checked_add(extended).and_then(|start| bytes.get(start..)?.get(..n * mode.bytes()));
     let data = data.ok_or_else(|| {
@@ -178,8 +178,8 @@ fn to_grid(header: &Header<'_>) -> Result<[[f64; 4]; 3], MapError> {
     let intervals = header.ints(8);
     if intervals.iter().any(|n| *n <= 0) {
         let [x, y, z] = intervals;
-        let place = "intervals of the cell (words 8 to 10, byte 28)";
-        return Err(malformed(place, format!("{x}, {y}, {z}"), "positive numbers"));
+        let location = "intervals of the cell (words 8 to 10, byte 28)";
+        return Err(malformed(location, format!("{x}, {y}, {z}"), "positive numbers"));
     }
     let (lengths, angles) = (header.floats(11), header.floats(14));
     let bad_cell = || {

@@ -20,7 +20,7 @@ struct Lines<'a> {
 }
 
 impl<'a> Lines<'a> {
-    fn place(&self) -> String {
+    fn location(&self) -> String {
         format!("line {}", self.number)
     }
 
@@ -82,9 +82,9 @@ pub(super) fn read(bytes: &[u8], limits: &MapLimits, control: &Control<'_>) -> R
     let mut head = Head::default();
     let (size, items) = loop {
         let Some(line) = lines.next(control)? else {
-            return Err(malformed(lines.place(), "the end of the file", "`object … class array … data follows`"));
+            return Err(malformed(lines.location(), "the end of the file", "`object … class array … data follows`"));
         };
-        let bad = |expected: &str| malformed(lines.place(), shown(line), expected);
+        let bad = |expected: &str| malformed(lines.location(), shown(line), expected);
         let words = words(line);
         match words[0] {
             b"object" => match after(&words, "class").copied() {
@@ -92,7 +92,7 @@ pub(super) fn read(bytes: &[u8], limits: &MapLimits, control: &Control<'_>) -> R
                     let counts =
                         words.iter().position(|word| *word == b"counts").map_or(&[][..], |at| &words[at + 1..]);
                     let size = three(counts, integer).ok_or_else(|| bad("`counts` and three whole numbers"))?;
-                    number_of_points(size, &lines.place(), limits)?;
+                    number_of_points(size, &lines.location(), limits)?;
                     head.size = Some(size);
                 }
                 Some(b"gridconnections") => {}
@@ -126,17 +126,17 @@ pub(super) fn read(bytes: &[u8], limits: &MapLimits, control: &Control<'_>) -> R
             _ => return Err(bad("`object`, `origin`, `delta` or `attribute`")),
         }
     };
-    let place = lines.place();
-    let n = number_of_points(size, &place, limits)?;
+    let location = lines.location();
+    let n = number_of_points(size, &location, limits)?;
     if items != n {
         let [x, y, z] = size;
-        return Err(malformed(place, format!("{items} items"), format!("{n} for {x} × {y} × {z} points")));
+        return Err(malformed(location, format!("{items} items"), format!("{n} for {x} × {y} × {z} points")));
     }
-    let to_grid = head.to_grid(&place)?;
+    let to_grid = head.to_grid(&location)?;
     // Each number but the last has a digit and a separator, so the memory is at most twice the text.
     if lines.rest.len() as u64 + 1 < 2 * n as u64 {
         let found = format!("{} bytes to the end of the file", lines.rest.len());
-        return Err(malformed(place, found, format!("{n} numbers")));
+        return Err(malformed(location, found, format!("{n} numbers")));
     }
     let (mut values, memory) = allocate(n, control)?;
     append(&mut values, n, &mut lines, control)?;
@@ -146,13 +146,13 @@ pub(super) fn read(bytes: &[u8], limits: &MapLimits, control: &Control<'_>) -> R
 
 impl Head {
     /// Returns the conversion of positions in Å to positions on the grid.
-    fn to_grid(&self, place: &str) -> Result<[[f64; 4]; 3], MapError> {
-        let missing = |what: &str| malformed(place, "an array", format!("{what} before it"));
+    fn to_grid(&self, location: &str) -> Result<[[f64; 4]; 3], MapError> {
+        let missing = |what: &str| malformed(location, "an array", format!("{what} before it"));
         let origin = self.origin.ok_or_else(|| missing("`origin`"))?;
         let [x, y, z] = self.steps[..] else { return Err(missing("three lines `delta`")) };
         let columns = std::array::from_fn(|k| [x[k], y[k], z[k]]);
         let rows = inverse(columns);
-        let rows = rows.ok_or_else(|| malformed(place, "`delta` in one plane", "three independent directions"))?;
+        let rows = rows.ok_or_else(|| malformed(location, "`delta` in one plane", "three independent directions"))?;
         Ok(rows.map(|row| {
             let first: f64 = row.iter().zip(origin).map(|(a, b)| a * b).sum();
             [row[0], row[1], row[2], -first]
@@ -174,7 +174,7 @@ fn append(values: &mut Vec<f32>, n: usize, lines: &mut Lines<'_>, control: &Cont
         let word = &lines.rest[..end];
         let value = fast_float2::parse(word).map_err(|_bad| {
             let found = if word.is_empty() { "the end of the file".to_owned() } else { shown(word) };
-            malformed(lines.place(), found, format!("number {} of {n}", values.len() + 1))
+            malformed(lines.location(), found, format!("number {} of {n}", values.len() + 1))
         })?;
         values.push(value);
         lines.rest = &lines.rest[end..];

@@ -18,10 +18,10 @@ pub enum MapError {
         found: String,
     },
     /// The content is invalid.
-    #[error("the map cannot be read: {place}: found {found}, expected {expected}")]
+    #[error("the map cannot be read: {location}: found {found}, expected {expected}")]
     Malformed {
         /// Location: word and byte (from 0) of a binary file, or line (from 1).
-        place: String,
+        location: String,
         /// The content found there.
         found: String,
         /// The expected content.

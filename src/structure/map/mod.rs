@@ -90,14 +90,14 @@ impl Map {
     pub fn at(&self, [x, y, z]: [f64; 3]) -> Option<f64> {
         let (mut first, mut parts) = (0, [0.0; 3]);
         for (k, [a, b, c, offset]) in self.to_grid.into_iter().enumerate() {
-            let place = a * x + b * y + c * z + offset;
+            let coordinate = a * x + b * y + c * z + offset;
             let last = self.size[k] - 1;
-            if !(0.0..=last as f64).contains(&place) {
+            if !(0.0..=last as f64).contains(&coordinate) {
                 return None;
             }
             #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the grid")]
-            let cell = (place as usize).min(last - 1);
-            parts[k] = place - cell as f64;
+            let cell = (coordinate as usize).min(last - 1);
+            parts[k] = coordinate - cell as f64;
             first += cell * self.strides[k];
         }
         let [sx, sy, sz] = self.strides;
@@ -150,11 +150,11 @@ fn check(control: &Control<'_>) -> Result<(), MapError> {
 }
 
 /// Checks the number of points of a grid and returns it.
-fn number_of_points(size: [usize; 3], place: &str, limits: &MapLimits) -> Result<usize, MapError> {
+fn number_of_points(size: [usize; 3], location: &str, limits: &MapLimits) -> Result<usize, MapError> {
     let points = size.iter().try_fold(1_u64, |points, side| points.checked_mul(*side as u64)).unwrap_or(u64::MAX);
     if size.iter().any(|side| *side < 2) {
         let [x, y, z] = size;
-        return Err(malformed(place, format!("{x} × {y} × {z} points"), "at least 2 points along each axis"));
+        return Err(malformed(location, format!("{x} × {y} × {z} points"), "at least 2 points along each axis"));
     }
     if points > limits.max_points {
         return Err(MapError::TooManyPoints { points, limit: limits.max_points });
@@ -184,8 +184,8 @@ fn inverse(m: [[f64; 3]; 3]) -> Option<[[f64; 3]; 3]> {
     inverse.as_flattened().iter().all(|v| v.is_finite()).then_some(inverse)
 }
 
-fn malformed(place: impl Into<String>, found: impl Into<String>, expected: impl Into<String>) -> MapError {
-    MapError::Malformed { place: place.into(), found: found.into(), expected: expected.into() }
+fn malformed(location: impl Into<String>, found: impl Into<String>, expected: impl Into<String>) -> MapError {
+    MapError::Malformed { location: location.into(), found: found.into(), expected: expected.into() }
 }
 
 /// Returns the beginning of a text for a message, without control characters.

@@ -172,7 +172,7 @@ fn halves_are_those_of_ieee_754() {
 #[test]
 fn bad_maps_name_the_place() {
     let malformed = |bytes: &[u8]| match of(bytes) {
-        Err(MapError::Malformed { place, found, expected }) => format!("{place}: {found}, {expected}"),
+        Err(MapError::Malformed { location, found, expected }) => format!("{location}: {found}, {expected}"),
         other => panic!("{other:?}"),
     };
     let with = |from: &str, to: &str| malformed(dx().replace(from, to).as_bytes());

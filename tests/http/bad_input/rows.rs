@@ -300,7 +300,8 @@ fn mmcif() -> Vec<Row> {
 
 /// BinaryCIF file with an error at a place.
 fn malformed(name: &'static str, body: impl AsRef<[u8]>, place: &'static str, expected: &'static str) -> Row {
-    let named = vec![("place", Is::Contains(place)), ("found", Is::Contains("")), ("expected", Is::Contains(expected))];
+    let named =
+        vec![("location", Is::Contains(place)), ("found", Is::Contains("")), ("expected", Is::Contains(expected))];
     Row { named, ..upload(name, body, 422, "unreadable-structure", 4) }
 }
 
@@ -433,7 +434,7 @@ fn selections() -> Vec<Row> {
         empty_selection("an unknown alternative location", "altloc=Q", "altloc", "Q", "none"),
         empty_selection("no chain without a name", "chains=_", "chains", "_", "A"),
         Row {
-            named: vec![("place", Is::Equal("assembly 1".into())), ("found", Is::Contains("without atoms: X, Y"))],
+            named: vec![("location", Is::Equal("assembly 1".into())), ("found", Is::Contains("without atoms: X, Y"))],
             query: "assembly=1".to_owned(),
             ..upload("an assembly of absent chains", absent_chains(), 422, "unreadable-structure", 4)
         },
