@@ -203,10 +203,9 @@ impl From<StoreError> for Problem {
     fn from(error: StoreError) -> Self {
         let wait = Duration::from_secs(5);
         match error {
-            StoreError::TooLarge { bytes, max_bytes } => Self::new(ProblemType::StoreFull, error.to_string())
-                .with("actual", bytes)
-                .with("limit", max_bytes)
-                .retry_after(wait),
+            StoreError::TooLarge { bytes, max_bytes } => {
+                Self::new(ProblemType::BodyTooLarge, error.to_string()).with("actual", bytes).with("limit", max_bytes)
+            }
             StoreError::Full { held, max_bytes, .. } => Self::new(ProblemType::StoreFull, error.to_string())
                 .with("actual", held)
                 .with("limit", max_bytes)
