@@ -60,7 +60,8 @@ fn two_spheres_overlap_in_lenses() {
     for apart in [0.6, 1.0, 2.0, 3.0, 3.45] {
         let two = exact(&[([0.0; 3], a), ([0.0, 0.6 * apart, 0.8 * apart], b)], VDW, None);
         // Height of the cap on each sphere.
-        let caps = [(a, b), (b, a)].map(|(r, other): (f64, f64)| r - (apart * apart + r * r - other * other) / (2.0 * apart));
+        let caps =
+            [(a, b), (b, a)].map(|(r, other): (f64, f64)| r - (apart * apart + r * r - other * other) / (2.0 * apart));
         for (k, (r, h)) in [(a, caps[0]), (b, caps[1])].into_iter().enumerate() {
             assert_near("area", two.of_spheres[k], 4.0 * PI * r * r - 2.0 * PI * r * h, ROUNDING);
         }
@@ -79,8 +80,7 @@ fn two_spheres_have_a_torus_with_or_without_a_cusp() {
         let rho = (length * length - apart * apart / 4.0).sqrt();
         let angle = (apart / 2.0 / length).asin();
         let cusp = if rho < probe { (rho / probe).acos() } else { 0.0 };
-        let toroidal =
-            2.0 * 2.0 * PI * probe * (rho * (angle - cusp) - probe * (angle.sin() - cusp.sin()));
+        let toroidal = 2.0 * 2.0 * PI * probe * (rho * (angle - cusp) - probe * (angle.sin() - cusp.sin()));
         let contact = 2.0 * 2.0 * PI * r * r * (1.0 + angle.sin());
         assert_near("toroidal", two.toroidal, toroidal, ROUNDING);
         assert_near("contact", two.of_spheres.iter().sum(), contact, ROUNDING);
@@ -289,9 +289,8 @@ fn degenerate_spheres() {
     assert_eq!(fullerene.len(), 60);
     // Three spheres with one common circle, and holes of a lattice that just hold a probe or just do not.
     let common = [at(-1.0, 0.0, 0.0), ([0.0; 3], (r * r - 1.0).sqrt()), at(1.0, 0.0, 0.0)];
-    let holes = |more: f64| -> Vec<Ball> {
-        grid(3, 2.0).into_iter().map(|(c, _)| (c, 3.0_f64.sqrt() - 1.0 + more)).collect()
-    };
+    let holes =
+        |more: f64| -> Vec<Ball> { grid(3, 2.0).into_iter().map(|(c, _)| (c, 3.0_f64.sqrt() - 1.0 + more)).collect() };
     for (what, balls, probe) in [
         ("line", &line[..], 1.4),
         ("line, large probe", &line, 10.0),
@@ -309,9 +308,10 @@ fn degenerate_spheres() {
             assert_near(&format!("{what}, {surface}"), found.volume, sampled_volume(balls, enlarged, 200_000), 0.01);
         }
         let found = exact(balls, SES, Some(probe));
-        let m = mesh(&spheres(balls), &params(SES, Some(probe), 0.15));
+        // The walls of the holes are creased.
+        let spacing = if what == "open holes" { 0.08 } else { 0.15 };
+        let m = mesh(&spheres(balls), &params(SES, Some(probe), spacing));
         let m = Measures::of(&m, Validation::Checksum, &Control::default()).unwrap();
-        println!("{what}: {} {} {found:?}", m.area, m.volume);
         assert_near(&format!("{what}, area"), found.area(), m.area, 0.01);
         assert_near(&format!("{what}, volume"), found.volume, m.volume, 0.005);
     }
@@ -384,8 +384,5 @@ fn overlaps_are_limited_and_the_search_can_be_cancelled() {
     let control = Control { cancel, ..Control::default() };
     assert_eq!(of(1 << 20, &control).unwrap_err(), SurfaceError::Cancelled);
     let isosurface = params(SurfaceKind::Gaussian, None, 0.5);
-    assert_eq!(
-        ExactMeasures::of(&atoms, &isosurface, &SurfaceLimits::default(), &Control::default()).unwrap(),
-        None
-    );
+    assert_eq!(ExactMeasures::of(&atoms, &isosurface, &SurfaceLimits::default(), &Control::default()).unwrap(), None);
 }

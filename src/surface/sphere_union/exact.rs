@@ -231,15 +231,7 @@ impl Search<'_> {
 
     /// Adds the toroidal part of an arc, and the ends of the arc. The arc is part of the edge of a cap on the sphere
     /// around `centre` with the radius `length`.
-    fn toroidal(
-        &self,
-        centre: [f64; 3],
-        length: f64,
-        probe: f64,
-        cap: &Cap,
-        arc: &EdgeArc,
-        part: &mut PartMeasures,
-    ) {
+    fn toroidal(&self, centre: [f64; 3], length: f64, probe: f64, cap: &Cap, arc: &EdgeArc, part: &mut PartMeasures) {
         let to_plane = length * cap.height;
         let edge = length * (1.0 - cap.height * cap.height).max(0.0).sqrt();
         let other = self.centre(&self.atoms[cap.index as usize]);
