@@ -233,11 +233,13 @@ impl Interface {
             Ok((0..).zip(&selected.atoms).filter(|(_, i)| is_named(**i)).map(|(row, _)| row).collect())
         };
         let [first, second] = [rows_of(&self.sides[0])?, rows_of(&self.sides[1])?];
-        let of = |rows: &[u32]| Ok(exact(&spheres.subset(rows), params, limits, control)?.of_spheres);
+        let of = |rows: &[u32]| -> Result<Vec<f64>, SurfaceError> {
+            Ok(exact(&spheres.subset(rows), params, limits, control)?.of_spheres)
+        };
         let mut alone = of(&first)?;
         alone.extend(of(&second)?);
         let rows = [&first[..], &second].concat();
-        let areas: Vec<f64> = of(&rows)?;
+        let areas = of(&rows)?;
         let side = |k: usize, rows: std::ops::Range<usize>| {
             let [alone, together] = [&alone, &areas].map(|areas| areas[rows.clone()].iter().sum::<f64>());
             InterfaceSide { chains: self.sides[k].clone(), alone: round(alone), buried: round(alone - together) }
@@ -325,7 +327,7 @@ impl AtomAreas {
         let area = if self.contact { "contact_area" } else { "area" };
         let buried: &[&str] = if self.alone.is_some() { &["alone", "buried"] } else { &[] };
         let header: Vec<&str> = names.iter().copied().chain([area]).chain(buried.iter().copied()).collect();
-        out.write_all(format!("{}\n", header.join(",")).as_bytes())?;
+        writeln!(out, "{}", header.join(","))?;
         let mut line = Vec::new();
         for Row { first, atoms, area, alone } in self.rows(structure, level) {
             line.clear();

@@ -255,6 +255,8 @@ fn degenerate_spheres() {
             assert_near(&format!("{what}, {surface}, volume"), found.volume, alone.volume, 1e-5);
         };
         same("equal spheres", &[one[0], one[0], one[0]]);
+        let equal = exact(&[one[0], one[0]], surface, None).of_spheres;
+        assert!(equal[0] > 0.0 && equal[1] == 0.0, "the first of equal spheres has the area: {equal:?}");
         same("nested spheres", &[one[0], ([1.1, 2.1, 3.2], 1.2), ([1.0, 2.0, 3.0], 0.3)]);
         same("touching from inside", &[one[0], ([1.5, 2.0, 3.0], 1.2)]);
         same("nearly equal spheres", &[one[0], at(1.0 + 1e-9, 2.0, 3.0)]);
