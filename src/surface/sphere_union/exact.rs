@@ -72,8 +72,6 @@ struct Scratch {
 /// Search for the exposed parts of spheres.
 struct Search<'a> {
     atoms: &'a [LatticeAtom],
-    /// Length by which the spheres are enlarged, Å.
-    enlarged: f64,
     /// Radius of the probe of a solvent-excluded surface, Å.
     probe: Option<f64>,
     /// Point to which the integrals of x·n refer.
@@ -113,7 +111,6 @@ impl ExactMeasures {
         }
         let search = Search {
             atoms: &atoms,
-            enlarged,
             probe: (params.surface == SurfaceKind::Ses && enlarged > 0.0).then_some(enlarged),
             origin: std::array::from_fn(|k| to_i32((0.5 * (low[k] + high[k])).round())),
             overlaps: OverlapCount::new(limits),
