@@ -101,7 +101,7 @@ fn buried_areas_agree_with_freesasa() {
     println!("{interface:?} {a} {b} {both}");
     assert!((first.alone - a).abs() < 5e-4 * a && (second.alone - b).abs() < 5e-4 * b);
     let buried = a + b - both;
-    assert!((2.0 * interface.area - buried).abs() < 1e-3 * both && buried > 500.0, "{interface:?} {buried}");
+    assert!((2.0 * interface.area - buried).abs() < 1e-3 * both && buried > 400.0, "{interface:?} {buried}");
     assert!((2.02 * interface.area - buried).abs() > 1e-3 * both, "the control");
 }
 

@@ -213,11 +213,11 @@ fn random_clusters_match_points() {
 
 #[test]
 fn random_clusters_match_fine_meshes() {
-    for seed in 100..112 {
+    for seed in 100..106 {
         let balls = cluster(seed);
         let balls = &balls[..balls.len().min(20)];
         let found = exact(balls, SES, None);
-        let [coarse, fine] = [0.16, 0.08].map(|spacing| {
+        let [coarse, fine] = [0.2, 0.1].map(|spacing| {
             let mesh = mesh(&spheres(balls), &params(SES, None, spacing));
             let m = Measures::of(&mesh, Validation::Checksum, &Control::default()).unwrap();
             [m.area, m.volume]
@@ -306,16 +306,16 @@ fn degenerate_spheres() {
     ] {
         for (surface, enlarged) in [(VDW, 0.0), (SAS, probe)] {
             let found = exact(balls, surface, (surface == SAS).then_some(probe));
-            assert_near(&format!("{what}, {surface}"), found.area(), sampled_area(balls, enlarged, 20_000), 0.01);
-            assert_near(&format!("{what}, {surface}"), found.volume, sampled_volume(balls, enlarged, 200_000), 0.01);
+            assert_near(&format!("{what}, {surface}"), found.area(), sampled_area(balls, enlarged, 6_000), 0.01);
+            assert_near(&format!("{what}, {surface}"), found.volume, sampled_volume(balls, enlarged, 60_000), 0.01);
         }
         let found = exact(balls, SES, Some(probe));
         // The walls of the holes are creased.
-        let spacing = if what == "open holes" { 0.08 } else { 0.15 };
+        let spacing = if what == "open holes" { 0.08 } else { 0.2 };
         let m = mesh(&spheres(balls), &params(SES, Some(probe), spacing));
         let m = Measures::of(&m, Validation::Checksum, &Control::default()).unwrap();
         assert_near(&format!("{what}, area"), found.area(), m.area, 0.01);
-        assert_near(&format!("{what}, volume"), found.volume, m.volume, 0.005);
+        assert_near(&format!("{what}, volume"), found.volume, m.volume, 0.008);
     }
 }
 

@@ -69,8 +69,8 @@ struct Scratch {
     uncovered: Uncovered,
 }
 
-/// Search for the exposed parts of spheres.
-struct Search<'a> {
+/// FaceSearch for the exposed parts of spheres.
+struct FaceSearch<'a> {
     atoms: &'a [LatticeAtom],
     /// Radius of the probe of a solvent-excluded surface, Å.
     probe: Option<f64>,
@@ -109,7 +109,7 @@ impl ExactMeasures {
             let length = effective_radius(spheres.radius(i), params) + enlarged;
             atoms.push(on_lattice(spheres.centre(i), length, i));
         }
-        let search = Search {
+        let search = FaceSearch {
             atoms: &atoms,
             probe: (params.surface == SurfaceKind::Ses && enlarged > 0.0).then_some(enlarged),
             origin: std::array::from_fn(|k| to_i32((0.5 * (low[k] + high[k])).round())),
@@ -137,7 +137,7 @@ fn on_lattice(centre: [f64; 3], radius: f64, number: usize) -> LatticeAtom {
     }
 }
 
-impl Search<'_> {
+impl FaceSearch<'_> {
     fn run(&self) -> Result<ExactMeasures, SurfaceError> {
         let mut measures = ExactMeasures { of_spheres: vec![0.0; self.atoms.len()], ..ExactMeasures::default() };
         let mut flux = 0.0;
@@ -259,7 +259,7 @@ struct Vertices<'a> {
     ends: &'a [ArcEnd],
     /// Radius of the probe, Å.
     probe: f64,
-    search: &'a Search<'a>,
+    search: &'a FaceSearch<'a>,
 }
 
 impl Vertices<'_> {
