@@ -25,7 +25,13 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     if let Some(path) = &args.atoms {
         job.add_table(Table::Atoms, path, &args.output)?;
     }
+    if args.areas_by.is_some() && args.areas.is_none() {
+        return Err(CliError::usage("`--areas-by` needs `--areas FILE`"));
+    }
     if let Some(path) = &args.areas {
+        if !args.job.surface.exact {
+            return Err(CliError::usage("`--areas` needs `--exact`"));
+        }
         let level = args.areas_by.as_deref().map_or_else(|| Ok(AreaLevel::default()), level_named)?;
         job.add_table(Table::Areas(level), path, &args.output)?;
     }

@@ -107,7 +107,7 @@ async fn answer(
             Ok((text, ()))
         });
         let (text, ()) = listing.await?;
-        Ok(([(header::CONTENT_TYPE, "text/csv; charset=utf-8")], Body::from(text)).into_response())
+        Ok(([(header::CONTENT_TYPE, "text/csv")], Body::from(text)).into_response())
     };
     source.document(app, caller, headers, &canonical, write).await
 }

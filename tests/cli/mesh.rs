@@ -441,7 +441,9 @@ fn the_table_of_areas_has_the_sum_of_the_report() {
     for more in [&["--areas-by", "model"][..], &["--atoms", table.to_str().unwrap()], &["--interface", "A,Z"]] {
         assert_code(&mesh(sample, &output, &[&flags[..], more].concat()), 2);
     }
-    assert_code(&mesh(sample, &output, &["--areas", table.to_str().unwrap()]), 2);
+    for alone in [["--areas", table.to_str().unwrap()], ["--areas-by", "atom"], ["--interface", "A,B"]] {
+        assert_code(&mesh(sample, &output, &alone), 2);
+    }
 }
 
 #[test]
