@@ -21,6 +21,7 @@ use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
+use crate::structure::table::same_residue;
 use crate::structure::{self, Selected, Structure, element};
 
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
@@ -233,14 +234,6 @@ fn positions(structure: &Structure, selected: &Selected) -> [Vec<f64>; 3] {
         all[copy.rows.clone()].iter_mut().for_each(|place| *place = copy.operator.apply(*place));
     }
     [0, 1, 2].map(|axis| all.iter().map(|place| (place[axis] * 1000.0).round() / 1000.0).collect())
-}
-
-fn same_residue(structure: &Structure, a: usize, b: usize) -> bool {
-    structure.residue_number[a] == structure.residue_number[b]
-        && structure.insertion_code[a] == structure.insertion_code[b]
-        && structure.residue.id(a) == structure.residue.id(b)
-        && structure.chain.id(a) == structure.chain.id(b)
-        && structure.model[a] == structure.model[b]
 }
 
 #[cfg(test)]

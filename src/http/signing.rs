@@ -5,7 +5,7 @@ use axum::http::{Method, Uri};
 
 use super::jobs::{MAX_WAIT_S, Poll};
 use super::scopes::{OperationScope, Parameters, TABLE};
-use super::{atom_parameters, color_parameters};
+use super::{area_parameters, atom_parameters, color_parameters};
 use crate::formats::Format;
 use crate::pipeline::params;
 
@@ -79,6 +79,7 @@ fn check_parameters(row: &OperationScope, uri: &Uri) -> Result<(), String> {
     match row.parameters() {
         Parameters::Mesh => check_mesh(format_of(uri.path()).filter(|_| row.path.ends_with("/{file}")), pairs),
         Parameters::Atoms => atom_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
+        Parameters::Areas => area_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Wait => {
             let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;

@@ -1,5 +1,6 @@
 //! Complete run of one job, from a structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
+pub mod areas;
 mod auto;
 mod clock;
 pub mod color;
@@ -30,6 +31,7 @@ use std::ops::Deref;
 
 use thiserror::Error;
 
+pub use areas::{AreaLevel, AtomAreas, ExactReport, Interface};
 pub use auto::AutoBackend;
 pub use clock::{ProgressSink, StageClock};
 pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
@@ -89,6 +91,10 @@ pub struct Job {
     pub map: Option<MapFile>,
     /// Parameters of a picture of the mesh; `None` for a mesh file.
     pub picture: Option<PictureParams>,
+    /// True if exact areas of the surface are requested.
+    pub exact: bool,
+    /// Sets of chains whose buried area is requested, with `exact` only.
+    pub interface: Option<Interface>,
 }
 
 impl Job {
@@ -159,6 +165,8 @@ pub struct Product {
     pub storage: Storage,
     /// Report of the job.
     pub report: Report,
+    /// Exact areas of the atoms, if they are requested.
+    pub areas: Option<AtomAreas>,
     /// PNG of the mesh, if one was drawn. The mesh is empty then.
     pub picture: Option<Vec<u8>>,
     /// Length of the GLB, bytes, if the mesh was streamed into a sink. The columns of `mesh` are empty then.
@@ -267,6 +275,8 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let map = job.map.as_ref().map(read_map).transpose()?;
     let prepare = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, map, &control);
     let colors = job.color.map(prepare).transpose()?;
+    let measure = || areas::measure(&structure, &selected, &spheres, job, &limits.surface, &control);
+    let (exact, areas) = job.exact.then(|| clock.time("exact", measure)).transpose()?.unzip();
     let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
     let cut = Cut::of(&selected, parts.as_deref(), job.validation, &control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
@@ -327,10 +337,11 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     report.color = color;
+    report.exact = exact;
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
-    let mut product = Product { mesh, bounds, storage, report, picture: None, streamed_bytes: None };
+    let mut product = Product { mesh, bounds, storage, report, areas, picture: None, streamed_bytes: None };
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
         let clock = StageClock::new(progress);
         let finish = || sink.finish(&product.meta(), centre, streamed.bounds);

@@ -13,6 +13,8 @@ mod architecture;
 mod bcif_oracles;
 mod cancellation;
 mod cut;
+mod exact_areas;
+mod exact_measures;
 mod formats_oracles;
 mod formats_quantized;
 mod formats_roundtrip;

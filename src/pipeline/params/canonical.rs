@@ -11,7 +11,21 @@ use crate::surface::{PaperParams, SurfaceParams};
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that the compiler requires every new field here.
-    let Job { selection, params, split, spacing, validation, compress, normals, units, color, map, picture } = job;
+    let Job {
+        selection,
+        params,
+        split,
+        spacing,
+        validation,
+        compress,
+        normals,
+        units,
+        color,
+        map,
+        picture,
+        exact,
+        interface,
+    } = job;
     let Selection { model, chains, atoms, altloc, assembly, context, instances } = selection;
     let SurfaceParams {
         surface,
@@ -48,6 +62,13 @@ pub fn canonical(job: &Job) -> String {
     if *split != Split::None {
         text.push_str("&split=");
         text.push_str(split.name());
+    }
+    if *exact {
+        text.push_str("&exact=true");
+    }
+    if let Some(interface) = interface {
+        let written = write!(text, "&interface={:?}", interface.sides);
+        debug_assert!(written.is_ok(), "writing to a string does not fail");
     }
     if *instances {
         text.push_str("&instances=true");

@@ -5,6 +5,7 @@ use std::str::FromStr;
 use super::ParamError;
 use crate::formats::{Compress, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, Style, View};
+use crate::pipeline::areas;
 use crate::pipeline::color::{self, ColorBlend, Palette};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::structure::{Context, Split};
@@ -102,11 +103,15 @@ fn same_number<T: FromStr + PartialEq>(text: &str, default: &str) -> bool {
 /// Domain of a flag.
 pub(super) fn flag(text: &str) -> Option<bool> {
     match text {
-        // Python writes `True`.
-        "true" | "True" | "1" => Some(true),
+        "true" | "True" | "1" => Some(true), // Python writes `True`.
         "false" | "False" | "0" => Some(false),
         _ => None,
     }
+}
+
+/// Returns a flag that is off by default.
+const fn switch(name: &'static str, doc: &'static str) -> Parameter {
+    Parameter { name, domain: Domain::Flag, default: "false", doc }
 }
 
 const fn number(
@@ -143,7 +148,6 @@ const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
 const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
 const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
-
 const BLENDS: &[&str] = &[ColorBlend::Nearest.name(), ColorBlend::Smooth.name()];
 const PALETTES: &[&str] =
     &[Palette::Viridis.name(), Palette::Cividis.name(), Palette::BlueWhiteRed.name(), Palette::RedWhiteBlue.name()];
@@ -226,11 +230,13 @@ pub const TABLE: &[Parameter] = &[
         "Constant b of Dias, Bora and Gomes 2010. gaussian: height; soft-object and inverse-square: radius of support in Å, 0.1 to 50.",
     ),
     number("paper_c", [1e-6, 1.0], "Å²", "absent", "Constant C of Dias, Bora and Gomes 2010; inverse-square only."),
+    switch("atom_ids", "Store the index of the nearest atom with every vertex."),
+    switch("exact", "Adds exact areas and volume to the report, in total and by chain; surface=vdw, sas and ses only."),
     Parameter {
-        name: "atom_ids",
-        domain: Domain::Flag,
-        default: "false",
-        doc: "Store the index of the nearest atom with every vertex.",
+        name: "interface",
+        domain: Domain::Text { expected: areas::EXPECTED },
+        default: "absent",
+        doc: "Adds to the report the exact area that two sets of chains bury; needs exact=true.",
     },
     Parameter {
         name: "color",
@@ -295,12 +301,10 @@ pub const TABLE: &[Parameter] = &[
         default: "asymmetric-unit",
         doc: "Biological assembly to mesh: the selected atoms, copied by the operators of the file. asymmetric-unit meshes the atoms as they are in the file.",
     },
-    Parameter {
-        name: "instances",
-        domain: Domain::Flag,
-        default: "false",
-        doc: "Meshes each distinct set of chains of the assembly once and repeats the mesh by rotations and translations (EXT_mesh_gpu_instancing); glb and gltf only. Surfaces of neighbouring instances are not joined.",
-    },
+    switch(
+        "instances",
+        "Meshes each distinct set of chains of the assembly once and repeats the mesh by rotations and translations (EXT_mesh_gpu_instancing); glb and gltf only. Surfaces of neighbouring instances are not joined.",
+    ),
     Parameter {
         name: "context",
         domain: Domain::Choice(CONTEXTS),

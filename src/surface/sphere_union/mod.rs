@@ -12,8 +12,11 @@ mod caps;
 mod cells;
 mod circle;
 mod distance;
+mod exact;
+mod region;
 #[cfg(test)]
 mod tests;
+mod torus;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -23,6 +26,7 @@ use self::caps::{Cap, Cover, Neighbour, TOLERANCE, dot};
 use self::cells::Cells;
 use self::circle::{Exposed, Uncovered};
 pub(super) use self::distance::{BrickUnion, Feature, Lanes, Nearest};
+pub use self::exact::ExactMeasures;
 use super::candidates::{Comparisons, OverlapCount};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
