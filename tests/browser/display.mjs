@@ -1,4 +1,4 @@
-// Display of the page: sticks of ligands, transparency, chains, assemblies, and links that restore all of them.
+// Display of the page: sticks of ligands, transparency, chains, assemblies, views, and links that restore all of them.
 import { readFileSync } from "node:fs";
 import path from "node:path";
 import {
@@ -111,6 +111,17 @@ await run({
     await page.locator("#palette").selectOption("cividis");
     await page.waitForFunction(() => location.search.includes("palette=cividis"));
     await page.locator("#home").click();
+    await page.waitForFunction(() => !location.search.includes("camera"));
+    // The view belongs to the link, in any order of turning, magnifying and shifting.
+    await page.locator("#view-home").focus();
+    for (const key of ["ArrowRight", "ArrowRight", "ArrowUp", "+"]) await page.keyboard.press(key);
+    await page.waitForFunction(() => location.search.includes("camera=-5.96,0.98,1.15"));
+    const { x, y, width, height } = await page.locator("#view-home").boundingBox();
+    await page.mouse.move(x + width / 2, y + height / 2);
+    await page.mouse.down({ button: "right" });
+    await page.mouse.move(x + width / 2 + 60, y + height / 2 + 30, { steps: 5 });
+    await page.mouse.up({ button: "right" });
+    await page.waitForFunction(() => /camera=-5\.96,0\.98,1\.15,-/.test(location.search));
     await page.mouse.move(1, 1);
     const [expected, wanted] = [await stablePicture(page), await controls(page)];
     const { sticks: drawn, transparency, byChain, assembly, scheme, palette } = wanted;
@@ -133,7 +144,7 @@ await run({
     assert.deepEqual(state, wanted);
     assert.equal(differing(expected, same), 0, "the link shows another picture");
     // Every part of the display changes the picture.
-    for (const name of ["sticks", "transparency", "hide", "color"]) {
+    for (const name of ["sticks", "transparency", "hide", "color", "camera"]) {
       const url = new URL(page.url());
       if (name === "color") url.searchParams.set(name, "element");
       else url.searchParams.delete(name);
@@ -142,14 +153,15 @@ await run({
       assert.ok(differing(expected, other) > 100, `without ${name} the picture is the same`);
     }
     // Values that cannot be used are ignored.
-    const [, odd] = await linked(`${SERVICE_URL}/?pdb=1crn&color=element&transparency=nine&sticks=maybe&hide=%25zz`);
+    const [, odd] = await linked(`${SERVICE_URL}/?pdb=1crn&color=element&transparency=nine&sticks=maybe&hide=%25zz&camera=1,2`);
     assert.deepEqual([odd.sticks, odd.transparency, odd.parts], [false, "0", []]);
+    assert.ok(!/camera/.test(odd.address), odd.address);
   },
 
   "another structure shows all its parts": async () => {
     await waitForMesh(page, () => page.locator("#pdb").fill("1crn").then(() => page.locator("#pdb").press("Enter")));
     const { address, transparency } = await controls(page);
-    assert.ok(!address.includes("hide") && !address.includes("assembly"), address);
+    assert.ok(!/hide|assembly|camera/.test(address), address);
     assert.equal(transparency, "60");
     // Back to the structure with its hidden chains.
     await waitForMesh(page, () => page.goBack());
