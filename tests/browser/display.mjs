@@ -115,14 +115,15 @@ await run({
     // The view belongs to the link, in any order of turning, magnifying and shifting.
     await page.locator("#view-home").focus();
     for (const key of ["ArrowRight", "ArrowRight", "ArrowUp", "+"]) await page.keyboard.press(key);
-    await page.waitForFunction(() => location.search.includes("camera=-5.96,0.98,1.15"));
+    await page.waitForFunction(() => /camera=-5\.96\d*,0\.98\d*,1\.15$/.test(location.search));
     const { x, y, width, height } = await page.locator("#view-home").boundingBox();
     await page.mouse.move(x + width / 2, y + height / 2);
     await page.mouse.down({ button: "right" });
     await page.mouse.move(x + width / 2 + 60, y + height / 2 + 30, { steps: 5 });
     await page.mouse.up({ button: "right" });
-    await page.waitForFunction(() => /camera=-5\.96,0\.98,1\.15,-/.test(location.search));
+    await page.waitForFunction(() => /camera=-5\.96\d*,0\.98\d*,1\.15,-/.test(location.search));
     await page.mouse.move(1, 1);
+    await page.evaluate(() => document.activeElement.blur());
     const [expected, wanted] = [await stablePicture(page), await controls(page)];
     const { sticks: drawn, transparency, byChain, assembly, scheme, palette } = wanted;
     const chosen = [drawn, transparency, byChain, assembly, scheme, palette];
@@ -142,7 +143,8 @@ await run({
     };
     const [same, state] = await linked(page.url());
     assert.deepEqual(state, wanted);
-    assert.equal(differing(expected, same), 0, "the link shows another picture");
+    // The view of the link is rounded.
+    assert.ok(differing(expected, same) < 100, `${differing(expected, same)} values of the picture differ`);
     // Every part of the display changes the picture.
     for (const name of ["sticks", "transparency", "hide", "color", "camera"]) {
       const url = new URL(page.url());
@@ -150,7 +152,7 @@ await run({
       else url.searchParams.delete(name);
       if (name === "color") url.searchParams.delete("palette");
       const [other] = await linked(url.href);
-      assert.ok(differing(expected, other) > 100, `without ${name} the picture is the same`);
+      assert.ok(differing(expected, other) > 500, `without ${name} the picture is the same`);
     }
     // Values that cannot be used are ignored.
     const [, odd] = await linked(`${SERVICE_URL}/?pdb=1crn&color=element&transparency=nine&sticks=maybe&hide=%25zz&camera=1,2`);

@@ -56,9 +56,10 @@ export function moved({ azimuth, elevation, zoom, shift }: View, right: number, 
 
 /** Returns a view as text: azimuth, elevation and magnification, and the centre if it is shifted. Empty for `FRONT`. */
 export function textOfView(view: View): string {
-  const text = (value: number, digits: number) => String(Number(value.toFixed(digits)) || 0);
-  const shift = view.shift.map((value) => text(value, 2));
-  const numbers = [text(view.azimuth, 2), text(view.elevation, 2), text(view.zoom, 3)];
+  // Fewer digits would move edges by a visible fraction of a pixel.
+  const text = (value: number) => String(Number(value.toFixed(4)) || 0);
+  const shift = view.shift.map(text);
+  const numbers = [view.azimuth, view.elevation, view.zoom].map(text);
   const all = shift.some((value) => value !== "0") ? [...numbers, ...shift] : numbers;
   const whole = all.join(",");
   return view !== FRONT && whole === textOfView(FRONT) ? "" : whole;
