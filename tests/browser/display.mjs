@@ -1,8 +1,9 @@
 // Display of the page: sticks of ligands, transparency, chains, assemblies, views, and links that restore all of them.
 import { readFileSync } from "node:fs";
+import http from "node:http";
 import path from "node:path";
 import {
-  assert, assertClean, axe, browser, drop, open, picture, run, stablePicture, start, waitForMesh, ROOT, SERVICE_URL,
+  assert, assertClean, axe, browser, drop, fetchBytes, open, picture, run, stablePicture, start, waitForMesh, ROOT, SERVICE_URL,
   TIMEOUT_MS,
 } from "./lib.mjs";
 
@@ -170,6 +171,34 @@ await run({
     assert.match(page.url(), /hide=A-1,B-2/);
     assert.deepEqual((await controls(page)).parts, [["A-1", false], ["B-1", true], ["A-2", true], ["B-2", false]]);
     assert.ok((await picture(page)).data.length > 0);
+  },
+
+  "the component draws ligands and a transparent surface": async () => {
+    const { bytes } = await fetchBytes("/v1/structures", { method: "POST", body: complex });
+    const src = `${SERVICE_URL}${JSON.parse(bytes).surface}?resolution=1&assembly=1`;
+    const [ready, style] = ["document.addEventListener('molmesh-load', () => (window.loaded = true))", "width: 400px; height: 400px"];
+    const html = `<!doctype html><html lang="en"><title>component</title><script>${ready}</script><molmesh-viewer id="viewer"
+      style="${style}" src="${src}"></molmesh-viewer><script type="module" src="${SERVICE_URL}/molmesh-viewer.js"></script>`;
+    const headers = { "content-type": "text/html" };
+    const server = http.createServer((request, reply) => reply.writeHead(request.url === "/" ? 200 : 204, headers).end(html));
+    await new Promise((resolve) => server.listen(0, "127.0.0.1", resolve));
+    const other = await open(chromium, { url: `http://127.0.0.1:${server.address().port}/` });
+    await other.waitForFunction(() => window.loaded, null, { timeout: TIMEOUT_MS });
+    const set = (name, value) => other.locator("#viewer").evaluate((node, [name, value]) => node.setAttribute(name, value), [name, value]);
+    const opaque = await picture(other, "#viewer");
+    await set("transparency", "70");
+    const clear = await picture(other, "#viewer");
+    assert.ok(differing(opaque, clear) > 5000, "the surface is still opaque");
+    assert.deepEqual(await waitForSticks(other, () => set("sticks", "")), { sticks: 48, bonds: 52 });
+    const withSticks = await picture(other, "#viewer");
+    assert.ok(differing(clear, withSticks) > 500, "no sticks are visible");
+    // Attributes that are removed or invalid have their defaults.
+    await other.locator("#viewer").evaluate((node) => node.removeAttribute("sticks"));
+    assert.equal(differing(clear, await picture(other, "#viewer")), 0);
+    await set("transparency", "nine");
+    assert.equal(differing(opaque, await picture(other, "#viewer")), 0);
+    assert.deepEqual(other.errors, []);
+    server.close();
   },
 
   "the page has no errors": async () => {
