@@ -1,6 +1,7 @@
 //! The reader on all available real structures, compared with a list of their contents, gemmi, biotite and pdbtbx.
 //!
-//! gemmi runs through `tests/tools/gemmi_dump.py`, biotite through `tests/tools/biotite_residues.py`. Missing files and tools are reported as skipped.
+//! gemmi runs through `tests/tools/gemmi_dump.py`, biotite through `tests/tools/biotite_residues.py`. Missing files and
+//! tools are reported as skipped.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,

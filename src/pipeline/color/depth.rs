@@ -78,7 +78,8 @@ pub(super) fn depths(
             let least = hull.iter().map(|plane| -plane.height(centre)).fold(f64::INFINITY, f64::min);
             let most = least + CELL * 3.0_f64.sqrt();
             let near: Vec<&Plane> = hull.iter().filter(|plane| -plane.height(centre) <= most).collect();
-            let depth = |i: u32| near.iter().map(|plane| -plane.height(point(i as usize))).fold(f64::INFINITY, f64::min);
+            let depth =
+                |i: u32| near.iter().map(|plane| -plane.height(point(i as usize))).fold(f64::INFINITY, f64::min);
             Ok(cell.iter().map(|&i| if near.is_empty() { 0.0 } else { single(depth(i).max(0.0)) }).collect())
         })
         .collect::<Result<_, SurfaceError>>()?;
@@ -95,7 +96,8 @@ fn hull(n: usize, point: &(impl Fn(usize) -> Point + Sync), control: &Control<'_
         let point = point(i as usize);
         std::array::from_fn(|k| point[k] + DISPLACEMENT * random(3 * u64::from(i) + k as u64))
     };
-    let facet = |corners: [u32; 3]| Facet { corners, plane: Plane::through(corners.map(displaced)), outside: Vec::new() };
+    let facet =
+        |corners: [u32; 3]| Facet { corners, plane: Plane::through(corners.map(displaced)), outside: Vec::new() };
     let all = indices(n);
     let Some([a, b, c, d]) = tetrahedron(all.clone(), displaced) else { return Ok(Vec::new()) };
     let mut facets: Vec<Facet> = [[a, b, c], [a, c, d], [a, d, b], [b, d, c]].map(facet).into();
@@ -103,7 +105,9 @@ fn hull(n: usize, point: &(impl Fn(usize) -> Point + Sync), control: &Control<'_
     while let Some(from) = facets.iter().rposition(|facet| !facet.outside.is_empty()) {
         control.check()?;
         let height = |i: &u32| facets[from].plane.height(displaced(*i));
-        let Some(eye) = facets[from].outside.iter().copied().max_by(|a, b| height(a).total_cmp(&height(b))) else { break };
+        let Some(eye) = facets[from].outside.iter().copied().max_by(|a, b| height(a).total_cmp(&height(b))) else {
+            break;
+        };
         let mut seen = Vec::new();
         let mut at = 0;
         while at < facets.len() {
@@ -154,7 +158,7 @@ fn tetrahedron(all: Range<u32>, displaced: impl Fn(u32) -> Point + Sync) -> Opti
     let (_, c) = farthest(&|p| length(cross(along, minus(p, from))))?;
     let plane = Plane::through([a, b, c].map(&displaced));
     let (height, d) = farthest(&|p| plane.height(p).abs())?;
-    if !(height > TOLERANCE) {
+    if height <= TOLERANCE {
         return None;
     }
     let is_below = plane.height(displaced(d)) < 0.0;
@@ -251,7 +255,7 @@ mod tests {
 
     #[test]
     fn points_of_a_ball_have_depth_0() {
-        let points: Vec<Point> = (0..20_000_u64)
+        let points: Vec<Point> = (0..2_000_u64)
             .map(|i| {
                 let p: Point = std::array::from_fn(|k| random(3 * i + k as u64));
                 let size = length(p);

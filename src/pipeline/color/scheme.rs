@@ -85,9 +85,9 @@ impl Scheme {
     #[must_use]
     pub const fn palette(self) -> Option<Palette> {
         match self {
-            Self::BFactor
-            | Self::Occupancy
-            | Self::Vertex(VertexProperty::Radial | VertexProperty::Depth) => Some(Palette::Viridis),
+            Self::BFactor | Self::Occupancy | Self::Vertex(VertexProperty::Radial | VertexProperty::Depth) => {
+                Some(Palette::Viridis)
+            }
             Self::Hydrophobicity(_) | Self::Vertex(VertexProperty::Curvature) => Some(Palette::BlueWhiteRed),
             Self::Charge | Self::Vertex(VertexProperty::Map) => Some(Palette::RedWhiteBlue),
             _ => None,

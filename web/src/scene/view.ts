@@ -54,15 +54,18 @@ export function moved({ azimuth, elevation, zoom, shift }: View, right: number, 
   return { azimuth: azimuth - degrees(right), elevation: elevation + degrees(down), zoom: zoom * nearer, shift };
 }
 
-/** Returns a view as text: azimuth, elevation and magnification, and the centre if it is shifted. Empty for `FRONT`. */
-export function textOfView(view: View): string {
+/** Returns azimuth, elevation and magnification, and the centre if it is shifted, separated by commas. */
+function numbersOf(view: View): string {
   // Fewer digits would move edges by a visible fraction of a pixel.
   const text = (value: number) => String(Number(value.toFixed(4)) || 0);
-  const shift = view.shift.map(text);
-  const numbers = [view.azimuth, view.elevation, view.zoom].map(text);
-  const all = shift.some((value) => value !== "0") ? [...numbers, ...shift] : numbers;
-  const whole = all.join(",");
-  return view !== FRONT && whole === textOfView(FRONT) ? "" : whole;
+  const [numbers, shift] = [[view.azimuth, view.elevation, view.zoom].map(text), view.shift.map(text)];
+  return (shift.some((value) => value !== "0") ? [...numbers, ...shift] : numbers).join(",");
+}
+
+/** Returns a view as text; empty for `FRONT`. */
+export function textOfView(view: View): string {
+  const text = numbersOf(view);
+  return text === numbersOf(FRONT) ? "" : text;
 }
 
 /** Returns the view that `textOfView` wrote; `FRONT` if the text is no view. */
