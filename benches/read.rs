@@ -66,7 +66,7 @@ fn million() -> Structure {
             };
             let width = if residue == "LIG" { 8.0 } else { SIDE };
             let [x, y, z] = cube.map(|low| low + width * next());
-            let _ = writeln!(text, "{record} {element} {atom} {residue} {name} {number} {x:.3} {y:.3} {z:.3}");
+            drop(writeln!(text, "{record} {element} {atom} {residue} {name} {number} {x:.3} {y:.3} {z:.3}"));
         }
     }
     read(text.as_bytes(), &ReadLimits::default()).expect("atoms")

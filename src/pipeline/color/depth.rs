@@ -62,18 +62,16 @@ pub(super) fn depths(
     control: &Control<'_>,
 ) -> Result<Vec<f32>, SurfaceError> {
     let hull = hull(n, &point, control)?;
-    let cell_of = |i: usize| point(i).map(|v| (v / CELL).floor());
+    // The bits of the indices of a cell, because floats have no order.
+    let cell_of = |i: u32| point(i as usize).map(|v| (v / CELL).floor().to_bits());
     let mut order: Vec<u32> = indices(n).collect();
-    order.par_sort_unstable_by(|&a, &b| {
-        let [a, b] = [a, b].map(|i| (cell_of(i as usize), i));
-        a.partial_cmp(&b).unwrap_or(std::cmp::Ordering::Equal)
-    });
-    let cells: Vec<&[u32]> = order.chunk_by(|&a, &b| cell_of(a as usize) == cell_of(b as usize)).collect();
+    order.par_sort_unstable_by_key(|&i| (cell_of(i), i));
+    let cells: Vec<&[u32]> = order.chunk_by(|&a, &b| cell_of(a) == cell_of(b)).collect();
     let of_cells: Vec<Vec<f32>> = cells
         .par_iter()
         .map(|cell| {
             control.check()?;
-            let centre = cell_of(cell[0] as usize).map(|v| (v + 0.5) * CELL);
+            let centre = cell_of(cell[0]).map(|bits| (f64::from_bits(bits) + 0.5) * CELL);
             // Within the cell, distances from a plane differ from that of its centre by half its diagonal at most.
             let least = hull.iter().map(|plane| -plane.height(centre)).fold(f64::INFINITY, f64::min);
             let most = least + CELL * 3.0_f64.sqrt();
@@ -98,10 +96,9 @@ fn hull(n: usize, point: &(impl Fn(usize) -> Point + Sync), control: &Control<'_
     };
     let facet =
         |corners: [u32; 3]| Facet { corners, plane: Plane::through(corners.map(displaced)), outside: Vec::new() };
-    let all = indices(n);
-    let Some([a, b, c, d]) = tetrahedron(all.clone(), displaced) else { return Ok(Vec::new()) };
+    let Some([a, b, c, d]) = tetrahedron(n, displaced) else { return Ok(Vec::new()) };
     let mut facets: Vec<Facet> = [[a, b, c], [a, c, d], [a, d, b], [b, d, c]].map(facet).into();
-    assign(&mut facets, all.collect(), displaced);
+    assign(&mut facets, indices(n).collect(), displaced);
     while let Some(from) = facets.iter().rposition(|facet| !facet.outside.is_empty()) {
         control.check()?;
         let height = |i: &u32| facets[from].plane.height(displaced(*i));
@@ -146,9 +143,9 @@ fn assign(facets: &mut [Facet], points: Vec<u32>, displaced: impl Fn(u32) -> Poi
 
 /// Returns four points that span a tetrahedron, with the fourth one below the plane of the others; `None` if all points
 /// lie in one plane.
-fn tetrahedron(all: Range<u32>, displaced: impl Fn(u32) -> Point + Sync) -> Option<[u32; 4]> {
+fn tetrahedron(n: usize, displaced: impl Fn(u32) -> Point + Sync) -> Option<[u32; 4]> {
     let farthest = |measure: &(dyn Fn(Point) -> f64 + Sync)| {
-        let measured = all.clone().into_par_iter().map(|i| (measure(displaced(i)), i));
+        let measured = indices(n).into_par_iter().map(|i| (measure(displaced(i)), i));
         measured.max_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))
     };
     let (_, a) = farthest(&|p| p[0])?;
