@@ -10,8 +10,11 @@ const chromium = await browser();
 // Small, because surfaces are compared by their pictures.
 const viewport = { width: 640, height: 600 };
 
-/** Opens a page and returns a picture of its surface and its luminance. Meshes go through `change` first. */
-async function shown(url, change) {
+/**
+ * Opens a page and returns a picture of its surface, the luminance of its colour, and the result of `act`. Meshes go
+ * through `change` first.
+ */
+async function shown(url, change, act) {
   const before = (page) => change && page.route("**/surface.glb*", async (route) => {
     const response = await route.fetch();
     await route.fulfill({ response, body: change(await response.body()) });
@@ -20,9 +23,10 @@ async function shown(url, change) {
   await page.waitForFunction(() => window.measures.length > 0, null, { timeout: TIMEOUT_MS });
   await page.mouse.move(1, 1);
   const [picture, plain] = [await stablePicture(page), await plainColor(page)];
+  const result = await act?.(page);
   assertClean(page);
   await page.context().close();
-  return { picture, plain };
+  return { picture, plain, result };
 }
 
 /** Returns a copy of a GLB whose material shows outer sides only. */
@@ -85,6 +89,19 @@ await run({
     const [bright, dark] = [luminance(inside, inner), luminance(turned.picture, outer)];
     assert.ok(bright > 0.85 * plain, `inner sides have the luminance ${bright}, the colour has ${plain}`);
     assert.ok(dark < 0.85 * plain, `sides with normals that point away have the luminance ${dark}`);
+    // A click on an inner side finds its atom. Without inner sides, it finds none. The pixel has neighbours on all sides.
+    const { width } = inside;
+    const around = [0, 1, -1, width, -width].flatMap((by) => [by, 5 * by]);
+    const at = inner.findIndex((_, i) => around.every((by) => inner[i + by]));
+    assert.ok(at > 0, "no inner side is large enough for a click");
+    const click = async (page) => {
+      await page.locator("#view").click({ position: { x: at % width, y: Math.floor(at / width) } });
+      return page.locator("#picked").textContent();
+    };
+    const { result: found } = await shown(patch(0), undefined, click);
+    const { result: none } = await shown(patch(0), oneSided, click);
+    assert.match(found, /chain A, protein/);
+    assert.match(none, /Point at the surface/);
   },
 
   "all instances of an assembly are drawn, each in its place": async () => {
