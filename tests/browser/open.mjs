@@ -89,7 +89,7 @@ await run({
     const [bright, dark] = [luminance(inside, inner), luminance(turned.picture, outer)];
     assert.ok(bright > 0.85 * plain, `inner sides have the luminance ${bright}, the colour has ${plain}`);
     assert.ok(dark < 0.85 * plain, `sides with normals that point away have the luminance ${dark}`);
-    // A click on an inner side finds its atom. Without inner sides, it finds none. The pixel has neighbours on all sides.
+    // A click on an inner side finds its atom; without inner sides, none. The pixel has neighbours on all sides.
     const { width } = inside;
     const around = [0, 1, -1, width, -width].flatMap((by) => [by, 5 * by]);
     const at = inner.findIndex((_, i) => around.every((by) => inner[i + by]));

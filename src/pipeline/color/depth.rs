@@ -1,7 +1,7 @@
 //! Depth of vertices below the convex hull of their mesh.
 //!
-//! The hull is built by the quickhull algorithm (Barber, Dobkin and Huhdanpaa, ACM Trans. Math. Softw. 22, 1996). Points
-//! are displaced by up to 0.1 mÅ, so that no four of them lie in one plane and every facet is a triangle.
+//! The hull is built by the quickhull algorithm (Barber, Dobkin and Huhdanpaa, ACM Trans. Math. Softw. 22, 1996).
+//! Points are displaced by up to 10⁻⁴ Å, so that no four of them lie in one plane and every facet is a triangle.
 
 use std::ops::Range;
 
