@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::pipeline::{Job, Spacing};
+use crate::pipeline::{Interface, Job, Spacing};
 use crate::structure::{Context, Selection, Split};
 use crate::surface::{PaperParams, SurfaceParams};
 
@@ -63,13 +63,7 @@ pub fn canonical(job: &Job) -> String {
         text.push_str("&split=");
         text.push_str(split.name());
     }
-    if *exact {
-        text.push_str("&exact=true");
-    }
-    if let Some(interface) = interface {
-        let written = write!(text, "&interface={:?}", interface.sides);
-        debug_assert!(written.is_ok(), "writing to a string does not fail");
-    }
+    text.push_str(&of_exact(*exact, interface.as_ref()));
     if *instances {
         text.push_str("&instances=true");
     }
@@ -98,4 +92,10 @@ pub fn canonical(job: &Job) -> String {
     }
     debug_assert!(paper.is_ok(), "writing to a string does not fail");
     text
+}
+
+/// Returns the text of exact areas; empty if none are requested.
+fn of_exact(exact: bool, interface: Option<&Interface>) -> String {
+    let interface = interface.map(|interface| format!("&interface={:?}", interface.sides));
+    format!("{}{}", if exact { "&exact=true" } else { "" }, interface.unwrap_or_default())
 }

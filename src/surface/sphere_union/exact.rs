@@ -69,7 +69,7 @@ struct Scratch {
     uncovered: Uncovered,
 }
 
-/// FaceSearch for the exposed parts of spheres.
+/// Search for the exposed parts of spheres.
 struct FaceSearch<'a> {
     atoms: &'a [LatticeAtom],
     /// Radius of the probe of a solvent-excluded surface, Å.
