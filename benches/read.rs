@@ -54,7 +54,7 @@ fn million() -> Structure {
     let items = "group_PDB type_symbol label_atom_id label_comp_id auth_asym_id auth_seq_id Cartn_x Cartn_y Cartn_z";
     let mut text = "data_million\nloop_\n".to_owned();
     for item in items.split(' ') {
-        let _ = writeln!(text, "_atom_site.{item}");
+        writeln!(text, "_atom_site.{item}").expect("memory");
     }
     let names = [("N", "N"), ("C", "CA"), ("C", "C"), ("O", "O"), ("C", "CB"), ("C", "CG"), ("C", "CD1"), ("C", "CD2")];
     for chain in 0..100 {
@@ -68,7 +68,7 @@ fn million() -> Structure {
             };
             let width = if residue == "LIG" { 8.0 } else { SIDE };
             let [x, y, z] = cube.map(|low| low + width * next());
-            let _ = writeln!(text, "{record} {element} {atom} {residue} {name} {number} {x:.3} {y:.3} {z:.3}");
+            writeln!(text, "{record} {element} {atom} {residue} {name} {number} {x:.3} {y:.3} {z:.3}").expect("memory");
         }
     }
     read(text.as_bytes(), &ReadLimits::default()).expect("atoms")

@@ -48,7 +48,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
         report.add_timing("encode", encode(&product, format, &mut output, &job.progress)?);
         writing = output.writing;
     }
-    job.areas = product.areas.clone();
+    job.areas.clone_from(&product.areas);
     // The process ends soon, which frees the memory at once.
     std::mem::forget(product);
     job.finish(output, report, format, writing)

@@ -325,8 +325,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
-    report.color = color;
-    report.exact = exact;
+    (report.color, report.exact) = (color, exact);
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);

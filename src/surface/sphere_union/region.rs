@@ -48,8 +48,8 @@ impl EdgeArc {
 }
 
 impl Region {
-    /// Measures the part of the unit sphere outside `caps`, which [`prune`](super::caps::prune) has sorted. Calls `each`
-    /// for each exposed arc of the edge of a cap.
+    /// Measures the part of the unit sphere outside `caps`, which [`prune`](super::caps::prune) has sorted. Calls
+    /// `each` for each exposed arc of the edge of a cap.
     ///
     /// # Errors
     /// Returns the errors of [`Comparisons::add`].

@@ -23,7 +23,7 @@ pub(super) struct ProbePath<'a> {
 
 impl ProbePath<'_> {
     /// Returns the area of the toroidal part, Å², and the integral of x·n over it, Å³, where n is the outward normal at
-    /// x. The part of a torus that intersects itself is left out: other positions of the probe on the same arc reach it.
+    /// x. The part of a torus that intersects itself is left out: other positions of the probe on the arc reach it.
     pub(super) fn measure(&self) -> [f64; 2] {
         let Self { arc, axis, centre, radius, offsets, probe } = *self;
         // A point of the probe has an angle from the direction to the axis, positive on the side of the first sphere.
