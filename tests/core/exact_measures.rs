@@ -1,9 +1,6 @@
 //! Exact areas and volumes compared with closed forms, with points spread over spheres, with fine meshes, with MSMS and
 //! with `FreeSASA`.
 
-<<<<<<< HEAD
-#![allow(clippy::pedantic, clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
-=======
 #![expect(
     clippy::unwrap_used,
     clippy::cast_possible_truncation,
@@ -11,7 +8,6 @@
     clippy::float_cmp,
     reason = "tests fail by panicking, random numbers are from 0 to 1, and exact equality is intended"
 )]
->>>>>>> h-areas
 
 use crate::sphere_surfaces::{Ball, mesh, params, sample, spheres};
 use crate::tools;
@@ -353,19 +349,12 @@ fn solvent_accessible_areas_agree_with_freesasa() {
     let dir = tempfile::tempdir().unwrap();
     let mut structures = vec![("1crn".to_owned(), sample("1crn.cif")), ("4pti".to_owned(), sample("4pti.pdb"))];
     let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/structures");
-<<<<<<< HEAD
-    let bytes = std::fs::read(folder.join("1pfe.cif.gz")).unwrap();
-    let structure = structure::read(&bytes, &ReadLimits::default()).unwrap();
-    let spheres = structure::select(&structure, &Selection::default()).unwrap().spheres(&structure).unwrap();
-    structures.push(("1pfe".to_owned(), spheres));
-=======
     for name in ["1pfe.cif.gz", "1ubq.pdb.gz"] {
         let bytes = std::fs::read(folder.join(name)).unwrap();
         let structure = structure::read(&bytes, &ReadLimits::default()).unwrap();
         let spheres = structure::select(&structure, &Selection::default()).unwrap().spheres(&structure).unwrap();
         structures.push((name.to_owned(), spheres));
     }
->>>>>>> h-areas
     let write = |(name, atoms): &(String, Spheres)| {
         let row = |i: usize| {
             let [x, y, z] = atoms.centre(i);

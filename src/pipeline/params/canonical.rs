@@ -1,12 +1,6 @@
 //! Canonical text of the parameters of a job.
 
-<<<<<<< HEAD
 use crate::pipeline::{Coloring, Job, PictureParams, Spacing};
-=======
-use std::fmt::Write as _;
-
-use crate::pipeline::{Interface, Job, Spacing};
->>>>>>> h-areas
 use crate::structure::{Context, Selection, Split};
 use crate::surface::{PaperParams, SurfaceParams};
 
@@ -63,30 +57,9 @@ pub fn canonical(job: &Job) -> String {
         normals.name(),
         units.name()
     );
-<<<<<<< HEAD
     let paper = |paper: &PaperParams| match paper {
         PaperParams::Gaussian { a, b } | PaperParams::SoftObject { a, b } => format!("paper_a={a}&paper_b={b}"),
         PaperParams::InverseSquare { c, b } => format!("paper_c={c}&paper_b={b}"),
-=======
-    if *split != Split::None {
-        text.push_str("&split=");
-        text.push_str(split.name());
-    }
-    text.push_str(&of_exact(*exact, interface.as_ref()));
-    if *instances {
-        text.push_str("&instances=true");
-    }
-    if *context != Context::Selection {
-        text.push_str("&context=");
-        text.push_str(context.name());
-    }
-    let paper = match paper {
-        None => Ok(()),
-        Some(PaperParams::Gaussian { a, b } | PaperParams::SoftObject { a, b }) => {
-            write!(text, "&paper_a={a}&paper_b={b}")
-        }
-        Some(PaperParams::InverseSquare { c, b }) => write!(text, "&paper_c={c}&paper_b={b}"),
->>>>>>> h-areas
     };
     let optional = [
         (*split != Split::None).then(|| format!("split={}", split.name())),
@@ -104,10 +77,4 @@ pub fn canonical(job: &Job) -> String {
         text.push_str(&parameters);
     }
     text
-}
-
-/// Returns the text of exact areas; empty if none are requested.
-fn of_exact(exact: bool, interface: Option<&Interface>) -> String {
-    let interface = interface.map(|interface| format!("&interface={:?}", interface.sides));
-    format!("{}{}", if exact { "&exact=true" } else { "" }, interface.unwrap_or_default())
 }
