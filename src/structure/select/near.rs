@@ -30,7 +30,7 @@ const MAX_TESTED_POINTS: usize = 16;
 /// Margin of the distance when cells are chosen, Å. It exceeds all rounding of coordinates.
 const SLACK: f64 = 1e-6;
 /// Margin of the squared distance, Å². Squared distances between coordinates with three decimals are multiples of 1e-6
-/// Å², so this decides ties exactly, whatever the rounding.
+/// Å², so this decides ties exactly in spite of rounding.
 const TIE: f64 = 5e-7;
 
 /// Marks every atom whose distance to an atom of `of` in the same model is at most `distance`. The time is linear if
