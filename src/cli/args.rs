@@ -103,7 +103,7 @@ pub(crate) struct MeshArgs {
     /// Mesh file; `-` is stdout
     #[arg(short, long)]
     pub(crate) output: PathBuf,
-    /// glb, gltf, ply, ply-text, stl, obj or vtp [default: by the extension of the output, glb on stdout]
+    /// glb, gltf, ply, ply-text, stl, obj, vtp, vert or face [default: by the extension of the output, glb on stdout]
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
     /// Vertex compression of glb and gltf: none, or quantize (12 bytes instead of 24: 16-bit positions, 8-bit normals)

@@ -8,7 +8,8 @@ pub enum Normals {
     /// One normal per vertex, from the gradient of the density.
     #[default]
     Smooth,
-    /// No vertex normals. STL keeps the normals of its triangles, which are part of the format.
+    /// No vertex normals. STL keeps the normals of its triangles and MSMS those of its vertices, which are part of the
+    /// format.
     None,
 }
 
@@ -74,7 +75,8 @@ impl Units {
 }
 
 impl Format {
-    /// Returns true if the format can hold coordinates in `units`. In metres a molecule is very small, and programs
+    /// Returns true if the format can hold coordinates in `units`. Files of MSMS do not name their unit, so it is
+    /// always the ångström. In metres a molecule is very small, and programs
     /// that merge vertices within a fixed distance would merge all of them. Therefore only formats with a node that
     /// scales the mesh support metres.
     #[must_use]
@@ -82,7 +84,8 @@ impl Format {
         match (self, units) {
             (Self::Glb | Self::Gltf, _) | (_, Units::Angstrom) => true,
             // A picture has no coordinates.
-            (format, Units::Nanometer) => !format.is_picture(),
+            (Self::Vert | Self::Face | Self::Png, Units::Nanometer) => false,
+            (_, Units::Nanometer) => true,
             (_, Units::Meter) => false,
         }
     }

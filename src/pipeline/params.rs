@@ -146,7 +146,8 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
     }
 }
 
-/// Sets the format of a job, for a format that was not given as a parameter. A picture format adds picture parameters.
+/// Sets the format of a job, for a format that was not given as a parameter. A picture format adds picture parameters,
+/// a format with the nearest atom of each vertex sets `atom_ids`.
 ///
 /// # Errors
 /// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals`, `instances` or a picture parameter that the
@@ -173,6 +174,7 @@ pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     if job.normals == Normals::None && format.is_picture() {
         return refuse("normals", job.normals.name(), Normals::Smooth.name(), &|f| !f.is_picture());
     }
+    job.params.atom_ids |= format.needs_atom_ids();
     if format.is_picture() {
         job.picture.get_or_insert_default();
         return Ok(());

@@ -137,7 +137,7 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
 
 const SPLITS: &[&str] = &[Split::None.name(), Split::Chain.name(), Split::Entity.name(), Split::ResidueGroup.name()];
 const CONTEXTS: &[&str] = &[Context::Selection.name(), Context::Whole.name()];
-const FORMATS: &[&str] = &["glb", "gltf", "ply", "ply-text", "stl", "obj", "vtp", "png"];
+const FORMATS: &[&str] = &["glb", "gltf", "ply", "ply-text", "stl", "obj", "vtp", "vert", "face", "png"];
 const VIEWS: &[&str] = &view_names(View::ALL);
 const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
@@ -329,7 +329,7 @@ pub const TABLE: &[Parameter] = &[
         name: "format",
         domain: Domain::Choice(FORMATS),
         default: "glb",
-        doc: "Output format: a mesh format, or png for a picture of the mesh.",
+        doc: "Output format: a mesh format, or png for a picture of the mesh. vert and face are the two files that MSMS writes for one mesh.",
     },
     Parameter {
         name: "compress",
@@ -341,13 +341,13 @@ pub const TABLE: &[Parameter] = &[
         name: "normals",
         domain: Domain::Choice(NORMALS),
         default: "smooth",
-        doc: "Vertex normals. none omits them, and viewers shade each triangle flat; STL always has triangle normals.",
+        doc: "Vertex normals. none omits them, and viewers shade each triangle flat; STL always has triangle normals, and vert vertex normals.",
     },
     Parameter {
         name: "units",
         domain: Domain::Choice(UNITS),
         default: "angstrom",
-        doc: "Unit of the coordinates in the file. glb and gltf scale their node, other formats their numbers (angstrom or nanometer only). Reports are always in Å.",
+        doc: "Unit of the coordinates in the file. glb and gltf scale their node, other formats their numbers (angstrom or nanometer only; vert and face angstrom only). Reports are always in Å.",
     },
     Parameter {
         name: "width",
