@@ -220,6 +220,10 @@ pub(crate) struct SurfaceArgs {
     /// Raw parameter c of the 2010 paper (inverse square: strength in Å²)
     #[arg(long, value_name = "C")]
     pub(crate) paper_c: Option<String>,
+    /// Find cavities, closed regions that hold a probe: keep (list them in the report), drop (also remove their walls
+    /// from the mesh) or only (keep nothing else)
+    #[arg(long, value_name = "MODE")]
+    pub(crate) cavities: Option<String>,
     /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)
     #[arg(long)]
     pub(crate) atom_ids: bool,

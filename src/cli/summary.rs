@@ -78,6 +78,22 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     }
     page.row("validation", &validation(report, style));
     page.row("parts", &parts(report));
+    if let Some(cavities) = report.cavities {
+        let list = report
+            .cavity_list
+            .iter()
+            .flatten()
+            .take(5)
+            .map(|cavity| decimal(cavity.accessible_volume))
+            .collect::<Vec<_>>();
+        let more = if cavities > list.len() as u64 { ", …" } else { "" };
+        let volumes = if list.is_empty() {
+            String::new()
+        } else {
+            format!(": accessible to probes {}{more} Å³", list.join(", "))
+        };
+        page.row("cavities", &format!("{}{volumes}", grouped(cavities)));
+    }
     page.row("area", &format!("{} Å²", decimal(report.area)));
     if let Some(volume) = report.volume {
         page.row("volume", &format!("{} Å³", decimal(volume)));
@@ -317,6 +333,8 @@ mod tests {
             components: 2,
             voids: 1,
             void_list: Vec::new(),
+            cavities: Some(2),
+            cavity_list: None,
             component_list: Vec::new(),
             parts: Vec::new(),
             area: 3200.04,

@@ -20,13 +20,7 @@ fn needs_indices(format: Format, n_vertices: usize) -> bool {
     match format {
         Format::Stl => true,
         Format::Glb | Format::Gltf => u16::try_from(n_vertices).is_ok(),
-        Format::Ply
-        | Format::PlyText
-        | Format::Obj
-        | Format::Vtp
-        | Format::Vert
-        | Format::Face
-        | Format::Png => false,
+        Format::Ply | Format::PlyText | Format::Obj | Format::Vtp | Format::Vert | Format::Face | Format::Png => false,
     }
 }
 

@@ -52,17 +52,8 @@ impl Format {
     ];
 
     /// Formats that hold a mesh.
-    pub const MESHES: [Self; 9] = [
-        Self::Glb,
-        Self::Gltf,
-        Self::Ply,
-        Self::PlyText,
-        Self::Stl,
-        Self::Obj,
-        Self::Vtp,
-        Self::Vert,
-        Self::Face,
-    ];
+    pub const MESHES: [Self; 9] =
+        [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj, Self::Vtp, Self::Vert, Self::Face];
 
     /// Extension of file names, without a dot.
     #[must_use]

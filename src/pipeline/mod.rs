@@ -1,6 +1,7 @@
 //! Complete run of one job, from a structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
 mod auto;
+mod cavities;
 mod clock;
 pub mod color;
 pub mod cost;
@@ -31,6 +32,7 @@ use std::ops::Deref;
 use thiserror::Error;
 
 pub use auto::AutoBackend;
+pub use cavities::{Cavities, CavityReport, LiningResidue};
 pub use clock::{ProgressSink, StageClock};
 pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
 #[cfg(feature = "png")]
@@ -73,6 +75,8 @@ pub struct Job {
     pub params: SurfaceParams,
     /// Division of the mesh into parts.
     pub split: Split,
+    /// Search for cavities; `None` without it.
+    pub cavities: Option<Cavities>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -113,7 +117,7 @@ impl Job {
     }
 
     /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
-    /// on triangles, parts, cuts, instances and pictures need the whole mesh in memory.
+    /// on triangles, parts, cuts, instances, removed components and pictures need the whole mesh in memory.
     fn can_stream(&self) -> bool {
         !self.params.atom_ids
             && self.color.is_none()
@@ -122,6 +126,7 @@ impl Job {
             && self.split == Split::None
             && self.selection.context == Context::Selection
             && !self.selection.instances
+            && self.cavities.is_none_or(|cavities| cavities == Cavities::Keep)
             && self.picture.is_none()
     }
 
@@ -274,7 +279,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
-    let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
+    let (mut output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
         let fitted = fit::mesh(&spheres, job, limit, &limits.surface, choice, &clock, &control).map_err(|error| {
             let plan = MeshPlan::new(&spheres, division, &params, job, limits);
             finest_fit::with_finest_fit(error, &plan, plan.choice(undivided, choice), &control)
@@ -295,6 +300,10 @@ pub fn run_with<S: Deref<Target = Structure>>(
         let written = checked.and_then(write);
         (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, choice, &control))?, None, storage)
     };
+    let search = |mode| {
+        clock.time("cavities", || cavities::search(mode, &spheres, &params, &limits.surface, &mut output, &control))
+    };
+    let cavities = job.cavities.map(search).transpose()?;
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
     let color = |colors: MeshColors| clock.time("color", || colors.apply(&mut mesh, params.resolution, &control));
@@ -327,6 +336,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     report.color = color;
+    report.set_cavities(cavities.map(|cavities| CavityReport::all(&cavities, &structure, &selected)));
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);

@@ -108,6 +108,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     let ParsedValues { options, selection, mut request, .. } = values;
     request.job = Job { selection, params: SurfaceParams::new(&options)?, color, ..request.job };
     check_instances(&request.job)?;
+    check_cavities(&request.job)?;
     if let Some(format) = request.format {
         set_format(&mut request.job, format)?;
     }
@@ -127,6 +128,20 @@ fn check_instances(job: &Job) -> Result<(), ParamError> {
         return Ok(());
     }
     Err(ParamError::BadValue { name: "instances", value: "`true`".to_owned(), expected })
+}
+
+/// Rejects cavities of a surface that is divided or repeated: they are found for all selected atoms together.
+fn check_cavities(job: &Job) -> Result<(), ParamError> {
+    let Some(cavities) = job.cavities else { return Ok(()) };
+    let Selection { context, instances, .. } = &job.selection;
+    let beside = match (job.split, context) {
+        (split, _) if split != Split::None => format!("split={}", split.name()),
+        (_, Context::Whole) => format!("context={}", context.name()),
+        _ if *instances => "instances=true".to_owned(),
+        _ => return Ok(()),
+    };
+    let value = format!("`{}`", cavities.name());
+    Err(ParamError::BadValue { name: "cavities", value, expected: format!("no value beside {beside}") })
 }
 
 /// Maximum length of the value of a parameter, bytes: enough for the names of 1,000 chains. Job records contain values.

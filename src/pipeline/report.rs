@@ -3,6 +3,7 @@
 use serde::Serialize;
 use serde_json::{Map, Value};
 
+use super::cavities::CavityReport;
 use super::color::ColorReport;
 use super::instances::InstancesReport;
 use super::left_out::LeftOutReport;
@@ -209,6 +210,13 @@ pub struct Report {
     pub voids: u64,
     /// Voids with the largest volumes, at most 100.
     pub void_list: Vec<VoidReport>,
+    /// Number of cavities, closed regions that hold a probe; absent without `cavities`. They are found from the atoms
+    /// and do not depend on the mesh.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cavities: Option<u64>,
+    /// Cavities with the largest accessible volumes, at most 100; absent without `cavities`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cavity_list: Option<Vec<CavityReport>>,
     /// Components with the largest areas, at most 100.
     pub component_list: Vec<ComponentReport>,
     /// Parts of the mesh; absent if the request does not divide it.
@@ -328,6 +336,8 @@ impl Report {
             components: components.len() as u64,
             voids: voids.len() as u64,
             void_list: voids.iter().take(100).map(|void| VoidReport::new(void, counts.centre)).collect(),
+            cavities: None,
+            cavity_list: None,
             component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
             parts: Vec::new(),
             area: measures.area,
@@ -350,6 +360,13 @@ impl Report {
         }
     }
 
+    /// Sets the cavities, largest first.
+    pub(super) fn set_cavities(&mut self, list: Option<Vec<CavityReport>>) {
+        self.cavities = list.as_ref().map(|list| list.len() as u64);
+        self.cavity_list = list;
+        self.cavity_list.iter_mut().for_each(|list| list.truncate(100));
+    }
+
     /// Adds time in ms to a stage that ends after the job, such as `encode` and `write`.
     pub fn add_timing(&mut self, stage: &str, ms: f64) {
         let before = self.timings_ms.get(stage).and_then(Value::as_f64).unwrap_or_default();
@@ -367,7 +384,7 @@ impl Report {
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
-        for field in ["timings_ms", "device", "backend_reason", "fallback", "left_out", "warnings", "void_list"] {
+        for field in ["timings_ms", "device", "backend_reason", "fallback", "left_out", "warnings", "void_list", "cavity_list"] {
             map.remove(field);
         }
         map

@@ -13,8 +13,8 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 use tools::files::{MemoryFile, encoded, write_parts};
 use tools::readers::{
-    Contents, accessor_of, gltf_contents, ply_header, read_face, read_obj, read_ply, read_ply_text, read_stl, read_vert,
-    read_vtp, split_glb, split_gltf, u32_at,
+    Contents, accessor_of, gltf_contents, ply_header, read_face, read_obj, read_ply, read_ply_text, read_stl,
+    read_vert, read_vtp, split_glb, split_gltf, u32_at,
 };
 use tools::shapes::{FAR, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres, union};
 
@@ -208,7 +208,8 @@ fn msms_files_hold_vertices_with_their_spheres_and_triangles() {
         let text = read_ply_text(&encode(Format::PlyText, &mesh, &meta()));
         assert_eq!((&vert.positions, &vert.normals), (&text.positions, &text.normals), "{name}");
         // Spheres count from 1; 0 stands for none.
-        let expected = mesh.atom_ids.as_ref().map_or(vec![0; mesh.n_vertices()], |ids| ids.iter().map(|i| i + 1).collect());
+        let expected =
+            mesh.atom_ids.as_ref().map_or(vec![0; mesh.n_vertices()], |ids| ids.iter().map(|i| i + 1).collect());
         assert_eq!(vert.atoms, Some(expected), "{name}");
         assert_eq!(read_face(&encode(Format::Face, &mesh, &meta())), mesh.triangles[..], "{name}");
     }
@@ -385,7 +386,11 @@ fn invalid_meshes_are_rejected_by_the_formats_that_rely_on_their_values() {
         ("triangle 7 refers to vertex 20, but the mesh has 20", &indexed, broken(|m| m.triangles[7][1] = 20)),
         ("refers to vertex 4294967295", &indexed, broken(|m| m.triangles[0][0] = u32::MAX)),
         ("position 3 holds NaN", &all, broken(|m| m.positions[3][2] = f32::NAN)),
-        ("normal 4 holds inf", &[Format::PlyText, Format::Obj, Format::Vert], broken(|m| m.normals[4][0] = f32::INFINITY)),
+        (
+            "normal 4 holds inf",
+            &[Format::PlyText, Format::Obj, Format::Vert],
+            broken(|m| m.normals[4][0] = f32::INFINITY),
+        ),
         ("centre 1 holds inf", &all, broken(|m| m.centre[1] = f64::INFINITY)),
     ];
     for format in Format::MESHES {

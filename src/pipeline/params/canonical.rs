@@ -11,7 +11,8 @@ use crate::surface::{PaperParams, SurfaceParams};
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that the compiler requires every new field here.
-    let Job { selection, params, split, spacing, validation, compress, normals, units, color, map, picture } = job;
+    let Job { selection, params, split, cavities, spacing, validation, compress, normals, units, color, map, picture } =
+        job;
     let Selection { model, chains, atoms, altloc, assembly, context, instances } = selection;
     let SurfaceParams {
         surface,
@@ -48,6 +49,10 @@ pub fn canonical(job: &Job) -> String {
     if *split != Split::None {
         text.push_str("&split=");
         text.push_str(split.name());
+    }
+    if let Some(cavities) = cavities {
+        text.push_str("&cavities=");
+        text.push_str(cavities.name());
     }
     if *instances {
         text.push_str("&instances=true");

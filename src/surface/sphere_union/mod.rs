@@ -11,7 +11,10 @@
 mod caps;
 mod cells;
 mod circle;
+mod components;
 mod distance;
+mod great_circle;
+mod shells;
 #[cfg(test)]
 mod tests;
 
@@ -22,7 +25,9 @@ use rayon::prelude::*;
 use self::caps::{Cap, Cover, Neighbour, TOLERANCE, dot};
 use self::cells::Cells;
 use self::circle::{Exposed, Uncovered};
+pub(super) use self::components::Components;
 pub(super) use self::distance::{BrickUnion, Feature, Lanes, Nearest};
+pub(super) use self::shells::Shell;
 use super::candidates::{Comparisons, OverlapCount};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
