@@ -325,7 +325,7 @@ fn msms_rows<'a>(bytes: &'a [u8], counted: &str, fields: usize) -> Vec<Vec<&'a s
     let text = std::str::from_utf8(bytes).unwrap();
     let words = |line: &'a str| line.split_whitespace().collect::<Vec<_>>();
     let lines: Vec<Vec<&str>> = text.lines().map(words).collect();
-    assert!(lines[0][0] == "#" && lines[0].len() < fields && lines[1] == [counted, "#sphere", "density", "probe_r"]);
+    assert!(lines[0][0] == "#" && lines[0].len() != fields && lines[1] == [counted, "#sphere", "density", "probe_r"]);
     let numbers: Vec<f64> = lines[2].iter().map(|word| word.parse().unwrap()).collect();
     assert_eq!((numbers.len(), numbers[0]), (4, (lines.len() - 3) as f64));
     assert!(lines[3..].iter().all(|line| line.len() == fields));

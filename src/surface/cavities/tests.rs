@@ -35,8 +35,8 @@ fn hollow(centre: [f64; 3], radius: f64, n: u32) -> Vec<Ball> {
     (0..n).map(on).collect()
 }
 
-/// Region of a grid in which the distance from all spheres is at least `probe`, without a way out: volume, distance from
-/// the enlarged spheres at the deepest point, and this point.
+/// Region of a grid in which the distance from all spheres is at least `probe`, without a way out: volume, distance
+/// from the enlarged spheres at the deepest point, and this point.
 #[derive(Debug)]
 struct Region {
     volume: f64,
@@ -117,7 +117,7 @@ fn check(what: &str, balls: &[Ball], probe: f64, cavity: &Cavity, region: &Regio
     let gap = |(c, r): &Ball| (0..3).map(|k| (cavity.centre[k] - c[k]).powi(2)).sum::<f64>().sqrt() - r;
     let clear = balls.iter().map(gap).fold(f64::MAX, f64::min);
     assert!((clear - cavity.radius).abs() < 1e-5, "{what}: a sphere of {} does not fit, {clear} does", cavity.radius);
-    // The region shrinks by its area as the probe grows. A difference of volumes does not depend on the formula of areas.
+    // The region shrinks by its area as the probe grows. Differences of volumes do not use the formula of areas.
     let volume = |probe: f64| cavities(balls, probe).iter().map(|c| c.accessible_volume).sum::<f64>();
     if cavities(balls, probe).len() == 1 {
         close(what, cavity.accessible_area, (volume(probe - 1e-4) - volume(probe + 1e-4)) / 2e-4, 1e-3);

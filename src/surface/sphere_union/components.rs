@@ -2,7 +2,7 @@
 //!
 //! Arcs that share a vertex belong to one component. A face may have several boundary curves; great circles through
 //! them find those that bound the same face. Let F be a face, and let a path on its sphere lead from one boundary curve
-//! of F to another. Where the path leaves F, it crosses a boundary curve of F, and it can come back only across the same
+//! of F to another. Where the path leaves F, it crosses a boundary curve of F, and it can come back only across that
 //! curve. So the parts of the path within F, each of which joins the curves at its ends, join both curves.
 //!
 //! All lengths are in grid spacings.
