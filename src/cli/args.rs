@@ -119,6 +119,12 @@ pub(crate) struct MeshArgs {
     /// Write the atoms of the file to a CSV table, one row per index of `--atom-ids`; `-` is stdout
     #[arg(long, value_name = "FILE")]
     pub(crate) atoms: Option<PathBuf>,
+    /// Write the exact areas of atoms, residues or chains to a CSV table, with `--exact`; `-` is stdout
+    #[arg(long, value_name = "FILE")]
+    pub(crate) areas: Option<PathBuf>,
+    /// Rows of the table of areas: atom, residue or chain [default: residue]
+    #[arg(long, value_name = "LEVEL")]
+    pub(crate) areas_by: Option<String>,
     #[command(flatten)]
     pub(crate) job: JobArgs,
 }
@@ -227,6 +233,12 @@ pub(crate) struct SurfaceArgs {
     /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)
     #[arg(long)]
     pub(crate) atom_ids: bool,
+    /// Add exact areas and volume to the report, in total and by chain; `--surface vdw`, `sas` and `ses` only
+    #[arg(long)]
+    pub(crate) exact: bool,
+    /// Add the exact area that two sets of chains bury; several chains of a side are joined by a slash: H/L,A
+    #[arg(long, value_name = "A,B")]
+    pub(crate) interface: Option<String>,
 }
 
 // Colours.
@@ -234,8 +246,8 @@ pub(crate) struct SurfaceArgs {
 #[command(next_help_heading = "Colours")]
 pub(crate) struct ColorArgs {
     /// Colours of vertices: uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, occupancy,
-    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial, map or none
-    /// [default: none]
+    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial, depth, map or
+    /// none [default: none]
     #[arg(long, value_name = "SCHEME")]
     pub(crate) color: Option<String>,
     /// Palette of a numeric scheme: viridis, cividis, blue-white-red or red-white-blue [default: depends on the scheme]

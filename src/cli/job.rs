@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
-use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
+use molmesh::pipeline::{self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, SurfaceError};
@@ -35,10 +35,31 @@ pub(super) struct CommandJob<'a> {
     pub(super) progress: Progress,
     /// Findings of the strict validator, if it ran.
     findings: Option<Vec<Diagnostic>>,
-    /// Output of the table of atoms, if it is requested.
-    table: Option<Output>,
-    /// The structure, kept for that table.
+    /// Tables that are requested, with their paths and outputs.
+    tables: Vec<(Table, &'a Path, Output)>,
+    /// The structure, kept for the tables.
     structure: OnceCell<Arc<Structure>>,
+    /// Exact areas, kept for their table.
+    pub(super) areas: Option<AtomAreas>,
+}
+
+/// Table that is written beside the mesh.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Table {
+    /// Atoms of the file.
+    Atoms,
+    /// Exact areas.
+    Areas(AreaLevel),
+}
+
+impl Table {
+    /// Returns the name in the report.
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Atoms => "atom_table",
+            Self::Areas(_) => "area_table",
+        }
+    }
 }
 
 impl<'a> CommandJob<'a> {
@@ -80,16 +101,19 @@ impl<'a> CommandJob<'a> {
         let selected = backend::select(&requested)?;
         let progress = Progress::new(!args.quiet);
         let findings = if strict { Some(check(path, &input, &limits)?) } else { None };
-        let (table, structure) = (None, OnceCell::new());
-        let job = Self { path, args, job, limits, cancel, input, selected, progress, findings, table, structure };
+        let (tables, structure, areas) = (Vec::new(), OnceCell::new(), None);
+        let job =
+            Self { path, args, job, limits, cancel, input, selected, progress, findings, tables, structure, areas };
         Ok((job, output))
     }
 
-    /// Adds a table of the atoms in the file `path`, beside the mesh in the file `mesh`.
-    pub(super) fn add_table(&mut self, path: &Path, mesh: &Path) -> Result<(), CliError> {
+    /// Adds a table in the file `path`, beside the mesh in the file `mesh`.
+    pub(super) fn add_table(&mut self, table: Table, path: &'a Path, mesh: &Path) -> Result<(), CliError> {
         output::refuse_input(self.path, path)?;
-        output::refuse_same(path, mesh)?;
-        self.table = Some(Output::open(path, &self.cancel)?);
+        for other in [mesh].into_iter().chain(self.tables.iter().map(|(_, other, _)| *other)) {
+            output::refuse_same(path, other)?;
+        }
+        self.tables.push((table, path, Output::open(path, &self.cancel)?));
         Ok(())
     }
 
@@ -103,7 +127,7 @@ impl<'a> CommandJob<'a> {
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
         let read = |control: &Control<'_>| {
             let structure = structure::read_with(&self.input, &self.limits.read, control).map(Arc::new)?;
-            if self.table.is_some() {
+            if !self.tables.is_empty() {
                 self.structure.get_or_init(|| Arc::clone(&structure));
             }
             Ok(structure)
@@ -143,17 +167,24 @@ impl<'a> CommandJob<'a> {
         }
         let start = Instant::now();
         let mut outputs = vec![output];
-        if let (Some(mut table), Some(structure)) = (self.table.take(), self.structure.get()) {
-            table::write_csv(structure, &mut table).map_err(|source| table.failure(source))?;
-            outputs.push(table);
+        let mut kinds = Vec::new();
+        for (table, _, mut output) in std::mem::take(&mut self.tables) {
+            let written = match (table, self.structure.get(), &self.areas) {
+                (Table::Atoms, Some(structure), _) => table::write_csv(structure, &mut output),
+                (Table::Areas(level), Some(structure), Some(areas)) => areas.write_csv(structure, level, &mut output),
+                _ => return Err(CliError::Internal(format!("the job has no {}", table.name()))),
+            };
+            written.map_err(|source| output.failure(source))?;
+            kinds.push(table.name());
+            outputs.push(output);
         }
         let to_stdout = outputs.iter().any(Output::is_stdout);
         let names: Vec<(String, u64)> = outputs.iter().map(|output| (output.name.clone(), output.bytes)).collect();
         Output::finish(outputs)?;
         report.add_timing("write", (writing + start.elapsed()).as_secs_f64() * 1e3);
         let of = |(name, bytes): &(String, u64), format| Written { name: name.clone(), format, bytes: *bytes };
-        let table = names.get(1).map(|file| of(file, "csv"));
-        let written = WrittenFiles { mesh: of(&names[0], format.name()), table };
+        let tables = kinds.into_iter().zip(&names[1..]).map(|(kind, file)| (kind, of(file, "csv"))).collect();
+        let written = WrittenFiles { mesh: of(&names[0], format.name()), tables };
         write_report(self.args, &report, self.findings.as_deref(), &written, to_stdout)
     }
 }
@@ -248,8 +279,8 @@ fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Writt
     if let Value::Object(map) = &mut value {
         let file = |file: &Written| json!({ "file": file.name, "format": file.format, "bytes": file.bytes });
         map.insert("output".to_owned(), file(&written.mesh));
-        if let Some(table) = &written.table {
-            map.insert("atom_table".to_owned(), file(table));
+        for (kind, table) in &written.tables {
+            map.insert((*kind).to_owned(), file(table));
         }
         let finding = |f: &Diagnostic| json!({ "level": f.level.name(), "message": f.message, "line": f.line });
         if let Some(findings) = findings {

@@ -6,12 +6,12 @@ use std::time::{Duration, Instant};
 
 use molmesh::formats::{Encoder, Format, GlbSink, GlbSinkError};
 use molmesh::pipeline::params::Request;
-use molmesh::pipeline::{JobError, Product, ProgressSink};
+use molmesh::pipeline::{AreaLevel, JobError, Product, ProgressSink};
 use molmesh::surface::SurfaceError;
 
 use super::args::MeshArgs;
 use super::error::CliError;
-use super::job::CommandJob;
+use super::job::{CommandJob, Table};
 use super::output::{Output, is_stdio};
 use super::request;
 
@@ -23,7 +23,17 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let paths = (args.input.as_path(), args.output.as_path());
     let (mut job, mut output) = CommandJob::prepare(job, strict, paths, format, &args.job)?;
     if let Some(path) = &args.atoms {
-        job.add_table(path, &args.output)?;
+        job.add_table(Table::Atoms, path, &args.output)?;
+    }
+    if args.areas_by.is_some() && args.areas.is_none() {
+        return Err(CliError::usage("`--areas-by` needs `--areas FILE`"));
+    }
+    if let Some(path) = &args.areas {
+        if !args.job.surface.exact {
+            return Err(CliError::usage("`--areas` needs `--exact`"));
+        }
+        let level = args.areas_by.as_deref().map_or_else(|| Ok(AreaLevel::default()), level_named)?;
+        job.add_table(Table::Areas(level), path, &args.output)?;
     }
     let product = if format == Format::Glb && output.has_random_access() {
         run_to_file(&job, &output)?
@@ -38,6 +48,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
         report.add_timing("encode", encode(&product, format, &mut output, &job.progress)?);
         writing = output.writing;
     }
+    job.areas.clone_from(&product.areas);
     // The process ends soon, which frees the memory at once.
     std::mem::forget(product);
     job.finish(output, report, format, writing)
@@ -56,6 +67,14 @@ fn named(name: &str) -> Result<Format, CliError> {
             Err(CliError::usage(format!("parameter `format`: `{name}` is not allowed; expected one of {expected}")))
         }
     }
+}
+
+/// Parses the level of a table of areas.
+fn level_named(name: &str) -> Result<AreaLevel, CliError> {
+    AreaLevel::ALL.into_iter().find(|level| level.name() == name).ok_or_else(|| {
+        let expected = AreaLevel::ALL.map(AreaLevel::name).join(", ");
+        CliError::usage(format!("parameter `areas_by`: `{name}` is not allowed; expected one of {expected}"))
+    })
 }
 
 /// Returns the format of an output by its file extension; GLB on stdout.

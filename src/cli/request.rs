@@ -108,11 +108,15 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("split", &atoms.split),
         ("cavities", &surface.cavities),
         ("validation", &args.validation),
+        ("interface", &surface.interface),
     ];
     let mut pairs: Vec<_> =
         own.iter().copied().chain(given).filter_map(|(name, value)| value.clone().map(|value| (name, value))).collect();
     if surface.atom_ids {
         pairs.push(("atom_ids", "true".to_owned()));
+    }
+    if surface.exact {
+        pairs.push(("exact", "true".to_owned()));
     }
     if atoms.instances {
         pairs.push(("instances", "true".to_owned()));
@@ -179,6 +183,8 @@ mod tests {
                 "max_triangles" => vec![&flag, "5000"],
                 "surface" => vec![&flag, "soft-object"],
                 "probe" => vec![&flag, "2", "--surface", "ses"],
+                "exact" => vec![&flag, "--surface", "ses"],
+                "interface" => vec![&flag, "A,B", "--exact", "--surface", "ses"],
                 "preset" => vec![&flag, "blinn"],
                 "select" => vec![&flag, "water"],
                 "format" => vec![&flag, "ply"],

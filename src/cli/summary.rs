@@ -1,6 +1,6 @@
 //! Summary of a report, as text of at most one screen.
 
-use molmesh::pipeline::{ColorReport, InstancesReport, LeftOutReport, PictureReport, Report};
+use molmesh::pipeline::{ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport, Report};
 use molmesh::surface::Validation;
 
 use super::page::Page;
@@ -23,8 +23,8 @@ pub(crate) struct Written {
 pub(crate) struct WrittenFiles {
     /// Mesh or picture.
     pub(crate) mesh: Written,
-    /// Table of the atoms, if it was requested.
-    pub(crate) table: Option<Written>,
+    /// Tables that were requested, with their names in the report.
+    pub(crate) tables: Vec<(&'static str, Written)>,
 }
 
 /// Formats the summary. `findings` are those of the strict validator, if it ran.
@@ -98,8 +98,13 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     if let Some(volume) = report.volume {
         page.row("volume", &format!("{} Å³", decimal(volume)));
     }
+    if let Some(exact) = &report.exact {
+        page.row("exact", &exact_measures(exact));
+    }
     page.row("backend", &format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
-    for Written { name, format, bytes } in [Some(&written.mesh), written.table.as_ref()].into_iter().flatten() {
+    for Written { name, format, bytes } in
+        [&written.mesh].into_iter().chain(written.tables.iter().map(|(_, file)| file))
+    {
         page.row("wrote", &format!("{name} ({format}, {} bytes)", grouped(*bytes)));
     }
     if let Some(findings) = findings {
@@ -107,6 +112,20 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     }
     timings(&mut page, report);
     page.finish()
+}
+
+/// Formats exact areas and volume.
+fn exact_measures(exact: &ExactReport) -> String {
+    let parts = match (exact.contact, exact.toroidal, exact.concave) {
+        (Some(contact), Some(toroidal), Some(concave)) => {
+            let [contact, toroidal, concave] = [contact, toroidal, concave].map(decimal);
+            format!(" (contact {contact}, toroidal {toroidal}, concave {concave})")
+        }
+        _ => String::new(),
+    };
+    let buried = exact.interface.as_ref().map(|interface| format!(", interface {} Å²", decimal(interface.area)));
+    let [area, volume] = [exact.area, exact.volume].map(decimal);
+    format!("area {area} Å²{parts}, volume {volume} Å³{}", buried.unwrap_or_default())
 }
 
 /// Returns the structure's title, cut to one line.
@@ -352,6 +371,7 @@ mod tests {
                 map: None,
                 legend: vec![LegendEntry { label: "A".into(), color: "#4fa59b".into() }],
             }),
+            exact: None,
             backend: "cpu",
             arithmetic: String::new(),
             device: "2 threads".into(),
@@ -379,7 +399,7 @@ mod tests {
     #[test]
     fn summary_is_complete_and_fits_one_screen() {
         let mesh = Written { name: "a.glb".to_owned(), format: "glb", bytes: 720_000 };
-        let text = text(&report(), &WrittenFiles { mesh, table: None }, None, Style::PLAIN);
+        let text = text(&report(), &WrittenFiles { mesh, tables: Vec::new() }, None, Style::PLAIN);
         for part in [
             "4PTI TRYPSIN INHIBITOR",
             "454 of 514",

@@ -44,6 +44,7 @@ and `.`, or a new one.";
         super::meshes::create, super::meshes::report, super::pdb::surface, super::pdb::report, super::estimate::create,
         super::structures::create, super::structures::show, super::structures::surface, super::structures::report,
         super::atoms::of_structure, super::atoms::of_entry, super::colors::of_structure, super::colors::of_entry,
+        super::areas::of_structure, super::areas::of_entry,
         super::jobs::show, super::jobs::dismiss, super::jobs::result, super::events::show,
         super::results::show, super::results::report,
         super::capabilities::show, super::problems::list, super::problems::one,

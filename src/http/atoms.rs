@@ -16,11 +16,12 @@ use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AtomParameters, ConditionHeaders, EntryPath, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
-use super::parsed_request::Pairs;
+use super::parsed_request::{self, Pairs};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
+use crate::structure::table::same_residue;
 use crate::structure::{self, Selected, Structure, element};
 
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
@@ -153,8 +154,7 @@ async fn answer(
     query: Pairs,
     headers: &HeaderMap,
 ) -> Result<Response, Problem> {
-    let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(ProblemType::BadRequest, e.body_text()))?;
-    let positions = atom_parameters::parse(&pairs)?;
+    let positions = atom_parameters::parse(&parsed_request::pairs(query)?)?;
     let variant = positions.as_ref().map_or_else(String::new, |positions| positions.canonical.clone());
     let write = async |loaded, delivery| list(app, caller, loaded, delivery, positions).await;
     source.document(app, caller, headers, &variant, write).await
@@ -234,14 +234,6 @@ fn positions(structure: &Structure, selected: &Selected) -> [Vec<f64>; 3] {
         all[copy.rows.clone()].iter_mut().for_each(|place| *place = copy.operator.apply(*place));
     }
     [0, 1, 2].map(|axis| all.iter().map(|place| (place[axis] * 1000.0).round() / 1000.0).collect())
-}
-
-fn same_residue(structure: &Structure, a: usize, b: usize) -> bool {
-    structure.residue_number[a] == structure.residue_number[b]
-        && structure.insertion_code[a] == structure.insertion_code[b]
-        && structure.residue.id(a) == structure.residue.id(b)
-        && structure.chain.id(a) == structure.chain.id(b)
-        && structure.model[a] == structure.model[b]
 }
 
 #[cfg(test)]

@@ -33,6 +33,7 @@ mod state;
 mod guard;
 
 // Requests: preferences, bodies, structures, parameters.
+mod area_parameters;
 mod atom_parameters;
 mod body_hasher;
 mod color_parameters;
@@ -58,6 +59,7 @@ mod results;
 mod mesh_request;
 mod signing;
 
+mod areas;
 mod atoms;
 mod colors;
 mod estimate;

@@ -11,8 +11,8 @@ use axum::routing::{MethodRouter, get, post};
 
 use super::state::Shared;
 use super::{
-    api_document, atoms, capabilities, colors, estimate, events, guard, health, jobs, meshes, middleware, negotiate,
-    page, pdb, problems, results, scopes, structures,
+    api_document, areas, atoms, capabilities, colors, estimate, events, guard, health, jobs, meshes, middleware,
+    negotiate, page, pdb, problems, results, scopes, structures,
 };
 
 /// Margin of the backstop timeout over the sum of the regular timeouts.
@@ -49,10 +49,12 @@ fn routes() -> Vec<(&'static str, MethodRouter<Shared>)> {
         ("/v1/pdb/{id}/{file}", get(pdb::surface)),
         ("/v1/pdb/{id}/report.json", get(pdb::report)),
         ("/v1/pdb/{id}/atoms", get(atoms::of_entry)),
+        ("/v1/pdb/{id}/areas", get(areas::of_entry)),
         ("/v1/pdb/{id}/colors", get(colors::of_entry)),
         ("/v1/structures", post(structures::create)),
         ("/v1/structures/{digest}", get(structures::show)),
         ("/v1/structures/{digest}/atoms", get(atoms::of_structure)),
+        ("/v1/structures/{digest}/areas", get(areas::of_structure)),
         ("/v1/structures/{digest}/colors", get(colors::of_structure)),
         ("/v1/structures/{digest}/{file}", get(structures::surface)),
         ("/v1/structures/{digest}/report.json", get(structures::report)),

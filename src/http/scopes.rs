@@ -22,6 +22,8 @@ pub(super) enum Parameters {
     Mesh,
     /// Parameters of the list of atoms.
     Atoms,
+    /// Parameters of the areas of atoms.
+    Areas,
     /// Parameters of the colours of atoms.
     Colors,
     /// `wait`.
@@ -38,6 +40,7 @@ impl OperationScope {
             "/v1/meshes" | "/v1/report" | "/v1/estimate" => Parameters::Mesh,
             "/v1/jobs/{id}" if self.method == Method::GET => Parameters::Wait,
             path if path.ends_with("/atoms") => Parameters::Atoms,
+            path if path.ends_with("/areas") => Parameters::Areas,
             path if path.ends_with("/colors") => Parameters::Colors,
             _ if is_file && !is_result => Parameters::Mesh,
             _ => Parameters::None,
@@ -61,10 +64,12 @@ pub(super) const TABLE: &[OperationScope] = &[
     row(Method::GET, "/v1/pdb/{id}/{file}", MESH),
     row(Method::GET, "/v1/pdb/{id}/report.json", MESH),
     row(Method::GET, "/v1/pdb/{id}/atoms", MESH),
+    row(Method::GET, "/v1/pdb/{id}/areas", MESH),
     row(Method::GET, "/v1/pdb/{id}/colors", MESH),
     row(Method::POST, "/v1/structures", MESH),
     row(Method::GET, "/v1/structures/{digest}", READ),
     row(Method::GET, "/v1/structures/{digest}/atoms", READ),
+    row(Method::GET, "/v1/structures/{digest}/areas", MESH),
     row(Method::GET, "/v1/structures/{digest}/colors", READ),
     row(Method::GET, "/v1/structures/{digest}/{file}", MESH),
     row(Method::GET, "/v1/structures/{digest}/report.json", MESH),

@@ -1,5 +1,6 @@
 //! Complete run of one job, from a structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
+pub mod areas;
 mod auto;
 mod cavities;
 mod clock;
@@ -31,6 +32,7 @@ use std::ops::Deref;
 
 use thiserror::Error;
 
+pub use areas::{AreaLevel, AtomAreas, ExactReport, Interface};
 pub use auto::AutoBackend;
 pub use cavities::{Cavities, CavityReport, LiningResidue};
 pub use clock::{ProgressSink, StageClock};
@@ -93,6 +95,10 @@ pub struct Job {
     pub map: Option<MapFile>,
     /// Parameters of a picture of the mesh; `None` for a mesh file.
     pub picture: Option<PictureParams>,
+    /// True if exact areas of the surface are requested.
+    pub exact: bool,
+    /// Sets of chains whose buried area is requested, with `exact` only.
+    pub interface: Option<Interface>,
 }
 
 impl Job {
@@ -164,6 +170,8 @@ pub struct Product {
     pub storage: Storage,
     /// Report of the job.
     pub report: Report,
+    /// Exact areas of the atoms, if they are requested.
+    pub areas: Option<AtomAreas>,
     /// PNG of the mesh, if one was drawn. The mesh is empty then.
     pub picture: Option<Vec<u8>>,
     /// Length of the GLB, bytes, if the mesh was streamed into a sink. The columns of `mesh` are empty then.
@@ -272,6 +280,8 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let map = job.map.as_ref().map(read_map).transpose()?;
     let prepare = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, map, &control);
     let colors = job.color.map(prepare).transpose()?;
+    let measure = || areas::measure(&structure, &selected, &spheres, job, &limits.surface, &control);
+    let (exact, areas) = job.exact.then(|| clock.time("exact", measure)).transpose()?.unzip();
     let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
     let cut = Cut::of(&selected, parts.as_deref(), job.validation, &control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
@@ -308,39 +318,22 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
     let color = |colors: MeshColors| clock.time("color", || colors.apply(&mut mesh, params.resolution, &control));
     let color = colors.map(color).transpose()?;
-    if !job.params.atom_ids {
-        mesh.atom_ids = None;
-    }
-    if let Some(ids) = &mut mesh.atom_ids {
-        // Convert indices of spheres to indices of atoms in the file.
-        for (n, id) in ids.iter_mut().enumerate() {
-            if n.is_multiple_of(IDS_PER_CHECK) {
-                control.check()?;
-            }
-            *id = selected.atoms[*id as usize];
-        }
-    }
+    name_atoms(&mut mesh, job, &selected, &control)?;
     instances::place(&mut mesh, &selected.units, &control)?;
     let measures = match measures {
         // The cut has validated the surface before it divided it.
         Some(measures) if cut.is_some() || measures.validation == job.validation => measures,
-        measures => clock.time(Stage::Measure.name(), || {
-            mesh.make_geometry_contiguous();
-            match measures {
-                Some(measures) => measures.validated(job.validation, &mesh.triangles, &control),
-                None => Measures::of(&mesh, job.validation, &control),
-            }
-        })?,
+        found => clock.time(Stage::Measure.name(), || measures_of(&mut mesh, found, job.validation, &control))?,
     };
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
-    report.color = color;
+    (report.color, report.exact) = (color, exact);
     report.set_cavities(cavities.map(|cavities| CavityReport::all(&cavities, &structure, &selected)));
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
-    let mut product = Product { mesh, bounds, storage, report, picture: None, streamed_bytes: None };
+    let mut product = Product { mesh, bounds, storage, report, areas, picture: None, streamed_bytes: None };
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
         let clock = StageClock::new(progress);
         let finish = || sink.finish(&product.meta(), centre, streamed.bounds);
@@ -349,6 +342,34 @@ pub fn run_with<S: Deref<Target = Structure>>(
         clock.finish().into_iter().for_each(|(stage, ms)| product.report.add_timing(stage, ms));
     }
     Ok(product)
+}
+
+/// Measures and validates a mesh, or only validates it if its measures are `found`.
+fn measures_of(
+    mesh: &mut Mesh,
+    found: Option<Measures>,
+    validation: Validation,
+    control: &Control<'_>,
+) -> Result<Measures, SurfaceError> {
+    mesh.make_geometry_contiguous();
+    match found {
+        Some(measures) => measures.validated(validation, &mesh.triangles, control),
+        None => Measures::of(mesh, validation, control),
+    }
+}
+
+/// Converts indices of spheres to indices of atoms in the file, or drops them if the job does not ask for them.
+fn name_atoms(mesh: &mut Mesh, job: &Job, selected: &Selected, control: &Control<'_>) -> Result<(), JobError> {
+    if !job.params.atom_ids {
+        mesh.atom_ids = None;
+    }
+    for (n, id) in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()).enumerate() {
+        if n.is_multiple_of(IDS_PER_CHECK) {
+            control.check()?;
+        }
+        *id = selected.atoms[*id as usize];
+    }
+    Ok(())
 }
 
 /// Returns the storage options of the mesh of `spheres`, and sets the vertex encoding in `params`.

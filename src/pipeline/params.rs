@@ -109,6 +109,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     request.job = Job { selection, params: SurfaceParams::new(&options)?, color, ..request.job };
     check_instances(&request.job)?;
     check_cavities(&request.job)?;
+    check_exact(&request.job)?;
     if let Some(format) = request.format {
         set_format(&mut request.job, format)?;
     }
@@ -142,6 +143,31 @@ fn check_cavities(job: &Job) -> Result<(), ParamError> {
     };
     let value = format!("`{}`", cavities.name());
     Err(ParamError::BadValue { name: "cavities", value, expected: format!("no value beside {beside}") })
+}
+
+/// Rejects exact areas of a surface that has none, or that is divided or cut.
+fn check_exact(job: &Job) -> Result<(), ParamError> {
+    let Job { params, selection, split, exact, interface, .. } = job;
+    let refuse = |name: &'static str, value: String, expected: String| {
+        Err(ParamError::BadValue { name, value: format!("`{value}`"), expected })
+    };
+    match interface {
+        Some(interface) if !exact => {
+            refuse("interface", interface.to_string(), "no value without exact=true".to_owned())
+        }
+        _ if !exact => Ok(()),
+        _ if params.surface.kernel().is_some() => refuse(
+            "exact",
+            "true".to_owned(),
+            format!("false with surface={}: only vdw, sas and ses have exact areas", params.surface),
+        ),
+        _ if selection.context == Context::Whole || selection.instances || *split != Split::None => {
+            let expected =
+                "false with context=whole, instances, split or model=all, which divide or repeat the surface";
+            refuse("exact", "true".to_owned(), expected.to_owned())
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Maximum length of the value of a parameter, bytes: enough for the names of 1,000 chains. Job records contain values.

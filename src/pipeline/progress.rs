@@ -8,11 +8,12 @@ use super::ProgressSink;
 const UNIT: f64 = 1000.0;
 
 /// Stages with their typical shares of the time, in execution order.
-const STAGES: [(&str, f64); 14] = [
+const STAGES: [(&str, f64); 15] = [
     ("read", 0.10),
     ("select", 0.02),
+    ("exact", 0.01),
     ("bin", 0.03),
-    ("field", 0.40),
+    ("field", 0.39),
     ("classify", 0.05),
     ("scan", 0.02),
     ("interpolate", 0.10),

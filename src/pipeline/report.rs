@@ -3,6 +3,7 @@
 use serde::Serialize;
 use serde_json::{Map, Value};
 
+use super::areas::ExactReport;
 use super::cavities::CavityReport;
 use super::color::ColorReport;
 use super::instances::InstancesReport;
@@ -228,6 +229,9 @@ pub struct Report {
     /// Enclosed volume in Å³, voids subtracted; null if the mesh is cut open.
     #[cfg_attr(feature = "server", schema(required))]
     pub volume: Option<f64>,
+    /// Exact areas and volume of the surface; absent if the request does not ask for them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub exact: Option<ExactReport>,
     /// Units of all lengths, areas and volumes in this report: `angstrom`.
     pub report_units: &'static str,
     /// Units of the coordinates in the mesh file: `angstrom`, `nanometer` or `meter`.
@@ -342,6 +346,7 @@ impl Report {
             parts: Vec::new(),
             area: measures.area,
             volume: (!is_open).then_some(measures.volume),
+            exact: None,
             report_units: Units::Angstrom.name(),
             file_units: counts.storage.units.name(),
             normals: counts.storage.normals.name(),
@@ -384,7 +389,9 @@ impl Report {
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
-        for field in ["timings_ms", "device", "backend_reason", "fallback", "left_out", "warnings", "void_list", "cavity_list"] {
+        // The last digits of `exact` depend on mathematical libraries.
+        let differing = ["timings_ms", "device", "backend_reason", "fallback", "exact"];
+        for field in differing.into_iter().chain(["left_out", "warnings", "void_list", "cavity_list"]) {
             map.remove(field);
         }
         map

@@ -64,7 +64,10 @@ pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
     let resolution = job.spacing.expected(&job.params, atoms);
     let mesh = if job.spacing.max_triangles().is_some() { search_work } else { mesh_work };
     // Reading does not depend on the spacing.
-    0.3 * (atoms + MIN_WORK) + 0.7 * relative_time(job.params.surface) * mesh(atoms, resolution) + drawing(job)
+    0.3 * (atoms + MIN_WORK)
+        + 0.7 * relative_time(job.params.surface) * mesh(atoms, resolution)
+        + exact(job, atoms)
+        + drawing(job)
 }
 
 /// Work of a job besides its atoms and its grid, in atoms: about 1 ms.
@@ -77,7 +80,21 @@ const COUNTED: [f64; 3] = [0.019, 0.00023, 0.0032];
 pub(super) fn counted_work(job: &Job, atoms: u64, counts: [u64; 3]) -> f64 {
     let mesh: f64 = counts.iter().zip(COUNTED).map(|(n, work)| *n as f64 * work).sum();
     let tries = if job.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
-    OVERHEAD + 0.3 * atoms as f64 + tries * relative_time(job.params.surface) * mesh + drawing(job)
+    OVERHEAD
+        + 0.3 * atoms as f64
+        + tries * relative_time(job.params.surface) * mesh
+        + exact(job, atoms as f64)
+        + drawing(job)
+}
+
+/// Work of the exact areas of an atom, in atoms: they take about a third of the time of a solvent-excluded surface.
+const EXACT: f64 = 1.5;
+
+/// Estimates the work of exact areas, in atoms at 0.5 Å.
+fn exact(job: &Job, atoms: f64) -> f64 {
+    // The sides of an interface are measured alone and together.
+    let times = if job.interface.is_some() { 3.0 } else { 1.0 };
+    if job.exact { EXACT * times * atoms } else { 0.0 }
 }
 
 /// Estimates the work of drawing, in atoms at 0.5 Å.

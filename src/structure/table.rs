@@ -49,8 +49,18 @@ pub fn write_csv(structure: &Structure, out: &mut dyn Write) -> io::Result<()> {
     out.write_all(&rows)
 }
 
+/// Returns true if two atoms have the same model, chain, residue name, number and insertion code.
+#[must_use]
+pub fn same_residue(structure: &Structure, a: usize, b: usize) -> bool {
+    structure.residue_number[a] == structure.residue_number[b]
+        && structure.insertion_code[a] == structure.insertion_code[b]
+        && structure.residue.id(a) == structure.residue.id(b)
+        && structure.chain.id(a) == structure.chain.id(b)
+        && structure.model[a] == structure.model[b]
+}
+
 /// Appends a field, in quotes if it contains a separator or a quote.
-fn put_field(rows: &mut Vec<u8>, text: &str) {
+pub(crate) fn put_field(rows: &mut Vec<u8>, text: &str) {
     if !text.contains(['"', ',', '\n', '\r']) {
         rows.extend_from_slice(text.as_bytes());
         return;

@@ -423,6 +423,31 @@ fn the_table_of_atoms_has_the_row_of_every_index() {
 }
 
 #[test]
+fn the_table_of_areas_has_the_sum_of_the_report() {
+    let folder = Folder::new();
+    let sample = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb"));
+    let (output, table) = (folder.path("4pti.glb"), folder.path("4pti.csv"));
+    let flags = ["--surface", "sas", "--exact", "--areas", table.to_str().unwrap(), "--resolution", "1.5"];
+    let done = mesh(sample, &output, &[&flags[..], &["--report", "json"]].concat());
+    assert_code(&done, 0);
+    let report = json(&stdout(&done));
+    assert_eq!(report["area_table"]["format"], "csv");
+    let text = fs::read_to_string(&table).unwrap();
+    let mut rows = text.lines();
+    assert_eq!(rows.next().unwrap(), "residue_name,residue_number,insertion_code,chain,model,atoms,area");
+    let area: f64 = rows.map(|row| row.rsplit(',').next().unwrap().parse::<f64>().unwrap()).sum();
+    assert!((area - report["exact"]["area"].as_f64().unwrap()).abs() < 0.01, "{area} {report}");
+    let done = mesh(sample, &output, &flags);
+    assert!(stderr(&done).contains("exact") && stderr(&done).contains("4pti.csv (csv, "), "{}", stderr(&done));
+    for more in [&["--areas-by", "model"][..], &["--atoms", table.to_str().unwrap()], &["--interface", "A,Z"]] {
+        assert_code(&mesh(sample, &output, &[&flags[..], more].concat()), 2);
+    }
+    for alone in [["--areas", table.to_str().unwrap()], ["--areas-by", "atom"], ["--interface", "A,B"]] {
+        assert_code(&mesh(sample, &output, &alone), 2);
+    }
+}
+
+#[test]
 fn the_table_of_atoms_and_the_mesh_are_written_together() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());

@@ -14,6 +14,8 @@ mod bcif_oracles;
 mod cancellation;
 mod cavities;
 mod cut;
+mod exact_areas;
+mod exact_measures;
 mod formats_oracles;
 mod formats_quantized;
 mod formats_roundtrip;

@@ -15,7 +15,7 @@ use molmesh::surface::{
 };
 
 /// Centre and radius, Å.
-type Ball = ([f64; 3], f64);
+pub(crate) type Ball = ([f64; 3], f64);
 
 /// Largest distance of a vertex from the surface: the tolerance of the root search, a thousandth of an edge where the
 /// surface meets a grid point, and rounding.
@@ -23,18 +23,18 @@ fn tolerance(spacing: f64) -> f64 {
     1.5e-4 + spacing / 1024.0
 }
 
-fn spheres(balls: &[Ball]) -> Spheres {
+pub(crate) fn spheres(balls: &[Ball]) -> Spheres {
     let column = |k: usize| balls.iter().map(|(c, _)| c[k]).collect();
     Spheres::new(column(0), column(1), column(2), balls.iter().map(|(_, r)| *r as f32).collect()).unwrap()
 }
 
-fn params(surface: SurfaceKind, probe: Option<f64>, resolution: f64) -> SurfaceParams {
+pub(crate) fn params(surface: SurfaceKind, probe: Option<f64>, resolution: f64) -> SurfaceParams {
     let options =
         SurfaceOptions { surface: Some(surface), probe, resolution: Some(resolution), ..SurfaceOptions::default() };
     SurfaceParams::new(&options).unwrap()
 }
 
-fn mesh(spheres: &Spheres, params: &SurfaceParams) -> Mesh {
+pub(crate) fn mesh(spheres: &Spheres, params: &SurfaceParams) -> Mesh {
     let backend = CpuBackend::new(Some(2)).unwrap();
     backend.run(spheres, params, &SurfaceLimits::default(), &Control::default()).unwrap().mesh
 }
@@ -46,7 +46,7 @@ fn measures(mesh: &Mesh, what: &str) -> Measures {
     m
 }
 
-fn sample(name: &str) -> Spheres {
+pub(crate) fn sample(name: &str) -> Spheres {
     let bytes = std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("samples").join(name)).unwrap();
     let structure = structure::read(&bytes, &ReadLimits::default()).unwrap();
     structure::select(&structure, &Selection::default()).unwrap().spheres(&structure).unwrap()

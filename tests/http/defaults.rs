@@ -141,6 +141,8 @@ fn a_default_is_valid_with_every_parameter() {
         &[("paper_a", "1"), ("paper_b", "2"), ("surface", "soft-object")],
         &[("paper_c", "0.5"), ("paper_b", "3"), ("surface", "inverse-square")],
         &[("atom_ids", "true")],
+        &[("exact", "true"), ("surface", "sas")],
+        &[("exact", "true"), ("surface", "ses"), ("interface", "A,B")],
         &[("color", "chain")],
         &[("color", "bfactor"), ("palette", "blue-white-red"), ("color_range", "0,50")],
         &[("color", "chain"), ("color_blend", "smooth")],

@@ -148,6 +148,14 @@ fn surfaces(seen: &Seen, server: &Running) {
         get(&colors, &[("range", "bytes=99999999-")], 416);
         get(&format!("{base}/colors"), &[], 400);
         get(&format!("{colors}&chains=Z"), &[], 422);
+        let areas = format!("{base}/areas?surface=sas");
+        let table = get(&areas, &[], 200);
+        assert_eq!(table.header("content-type"), Some("text/csv"));
+        get(&areas, &[("if-none-match", table.header("etag").unwrap())], 304);
+        get(&areas, &[("if-match", "\"other\"")], 412);
+        get(&format!("{base}/areas"), &[], 400);
+        get(&format!("{areas}&interface=A,Z"), &[], 400);
+        get(&format!("{areas}&chains=Z"), &[], 422);
         let atoms = format!("{base}/atoms");
         let tag = get(&atoms, &[], 200).header("etag").unwrap().to_owned();
         get(&atoms, &[("if-none-match", &tag)], 304);
@@ -166,7 +174,9 @@ fn surfaces(seen: &Seen, server: &Running) {
     get(&format!("/v1/structures/{ZERO}/atoms"), &[], 404);
     get("/v1/pdb/9xyz/atoms", &[], 404);
     get(&format!("/v1/structures/{ZERO}/colors?scheme=chain"), &[], 404);
+    get(&format!("/v1/structures/{ZERO}/areas?surface=sas"), &[], 404);
     get("/v1/pdb/9xyz/colors?scheme=chain", &[], 404);
+    get("/v1/pdb/9xyz/areas?surface=sas", &[], 404);
     get("/v1/pdb/9xyz/report.json", &[], 404);
     get(&format!("/v1/structures/{ZERO}/report.json"), &[], 404);
     get(&format!("/v1/results/{ZERO}.glb"), &[], 404);
@@ -233,6 +243,7 @@ fn sizes(seen: &Seen) {
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/surface.glb"), &[], b"");
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/colors?scheme=chain"), &[], b"");
+    seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/areas?surface=sas"), &[], b"");
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/report.json"), &[], b"");
     let remote = Remote::saying(status(500));
     let away = fake(Mode::Octahedra, |c| {
@@ -243,6 +254,7 @@ fn sizes(seen: &Seen) {
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/surface.glb"), &[], b"");
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/atoms"), &[], b"");
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/colors?scheme=chain"), &[], b"");
+    seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/areas?surface=sas"), &[], b"");
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/report.json"), &[], b"");
     let few = fake(Mode::Octahedra, |c| c.limits.labels = 10);
     seen.expect(422, few.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
@@ -283,6 +295,7 @@ fn failures(seen: &Seen) {
         let crowded = fake(Mode::Octahedra, |c| c.limits.memory_bytes = memory_bytes);
         seen.expect(status, crowded.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
         seen.expect(status, crowded.addr, ("GET", "/v1/pdb/4pti/colors?scheme=chain"), &[], b"");
+        seen.expect(status, crowded.addr, ("GET", "/v1/pdb/4pti/areas?surface=sas"), &[], b"");
         for path in UPLOADS {
             seen.expect(status, crowded.addr, ("POST", path), &[], SAMPLE);
         }
@@ -315,6 +328,7 @@ fn restarts(seen: &Seen) {
     get(&server, &structure, 413);
     get(&server, &format!("{structure}/atoms"), 413);
     get(&server, &format!("{structure}/colors?scheme=chain"), 413);
+    get(&server, &format!("{structure}/areas?surface=sas"), 413);
     get(&server, &format!("{surface}?resolution=2"), 413);
     get(&server, &format!("{structure}/report.json"), 413);
     assert!(server.join());
@@ -329,6 +343,7 @@ fn restarts(seen: &Seen) {
         get(&server, &structure, status);
         get(&server, &format!("{structure}/atoms"), status);
         get(&server, &format!("{structure}/colors?scheme=chain"), status);
+        get(&server, &format!("{structure}/areas?surface=sas"), status);
         if status == 503 {
             get(&server, &format!("{surface}?resolution=2"), status);
             get(&server, &format!("{structure}/report.json"), status);

@@ -204,6 +204,8 @@ pub struct Png {
 pub struct Sasa {
     /// Area of all spheres, Å².
     pub area: f64,
+    /// Area of each sphere, Å².
+    pub of_spheres: Vec<f64>,
 }
 
 /// Computes solvent-accessible areas of files with a sphere per line.

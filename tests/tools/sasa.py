@@ -9,10 +9,11 @@ import sys
 import freesasa
 
 freesasa.setVerbosity(freesasa.nowarnings)
-parameters = freesasa.Parameters({"algorithm": freesasa.LeeRichards, "n-slices": 200, "probe-radius": 1.4})
+parameters = freesasa.Parameters({"algorithm": freesasa.LeeRichards, "n-slices": 1000, "probe-radius": 1.4})
 for path in sys.stdin.read().splitlines():
     with open(path, encoding="utf-8") as file:
         rows = [[float(word) for word in line.split()] for line in file]
     coordinates = [value for row in rows for value in row[:3]]
     result = freesasa.calcCoord(coordinates, [row[3] for row in rows], parameters)
-    print(json.dumps({"area": result.totalArea()}))
+    areas = [result.atomArea(i) for i in range(len(rows))]
+    print(json.dumps({"area": result.totalArea(), "of_spheres": areas}))

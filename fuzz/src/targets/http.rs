@@ -33,6 +33,7 @@ pub(super) const WORDS: &[&str] = &[
     "/report.json",
     "/atoms",
     "/colors",
+    "/areas",
     "/estimate",
     "/events",
     "/result",

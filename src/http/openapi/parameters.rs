@@ -9,7 +9,8 @@ use utoipa::{IntoParams, Modify};
 
 use super::components::pascal_case;
 use crate::formats::Format;
-use crate::http::{atom_parameters, color_parameters};
+use crate::http::{area_parameters, atom_parameters, color_parameters};
+use crate::pipeline::AreaLevel;
 use crate::pipeline::params::{self, Domain, TABLE};
 
 const DIGEST_PATTERN: &str = "^[0-9a-f]{64}$";
@@ -191,6 +192,18 @@ parameters!(
         let positions = ParameterBuilder::new().name(atom_parameters::POSITIONS).parameter_in(ParameterIn::Query);
         let positions = positions.required(Required::False).description(Some(doc)).schema(Some(value)).build();
         std::iter::once(positions).chain(atom_parameters::NAMES.iter().filter_map(mesh_parameter)).collect()
+    }
+);
+parameters!(
+    /// Query parameters of the areas of atoms.
+    AreaParameters: {
+        let mesh_parameter = |name: &&str| TABLE.iter().find(|p| p.name == *name).map(query);
+        let levels = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(AreaLevel::ALL.map(AreaLevel::name)));
+        let levels = levels.default(Some(Value::from(AreaLevel::default().name())));
+        let doc = "Rows of the table. Value: atom, residue or chain. Default: residue.";
+        let by = ParameterBuilder::new().name(area_parameters::BY).parameter_in(ParameterIn::Query);
+        let by = by.required(Required::False).description(Some(doc)).schema(Some(levels)).build();
+        std::iter::once(by).chain(area_parameters::NAMES.iter().filter_map(mesh_parameter)).collect()
     }
 );
 parameters!(

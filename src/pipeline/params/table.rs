@@ -5,6 +5,7 @@ use std::str::FromStr;
 use super::ParamError;
 use crate::formats::{Compress, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, Style, View};
+use crate::pipeline::areas;
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::pipeline::{Cavities, color, color::ColorBlend, color::Palette};
 use crate::structure::{Context, Split};
@@ -102,11 +103,15 @@ fn same_number<T: FromStr + PartialEq>(text: &str, default: &str) -> bool {
 /// Domain of a flag.
 pub(super) fn flag(text: &str) -> Option<bool> {
     match text {
-        // Python writes `True`.
-        "true" | "True" | "1" => Some(true),
+        "true" | "True" | "1" => Some(true), // Python writes `True`.
         "false" | "False" | "0" => Some(false),
         _ => None,
     }
+}
+
+/// Returns a flag that is off by default.
+const fn switch(name: &'static str, doc: &'static str) -> Parameter {
+    Parameter { name, domain: Domain::Flag, default: "false", doc }
 }
 
 const fn number(
@@ -225,28 +230,30 @@ pub const TABLE: &[Parameter] = &[
         "Constant b of Dias, Bora and Gomes 2010. gaussian: height; soft-object and inverse-square: radius of support in Å, 0.1 to 50.",
     ),
     number("paper_c", [1e-6, 1.0], "Å²", "absent", "Constant C of Dias, Bora and Gomes 2010; inverse-square only."),
+    switch("atom_ids", "Store the index of the nearest atom with every vertex."),
+    switch("exact", "Adds exact areas and volume to the report, in total and by chain; surface=vdw, sas and ses only."),
     Parameter {
-        name: "atom_ids",
-        domain: Domain::Flag,
-        default: "false",
-        doc: "Store the index of the nearest atom with every vertex.",
+        name: "interface",
+        domain: Domain::Text { expected: areas::EXPECTED },
+        default: "absent",
+        doc: "Adds to the report the exact area that two sets of chains bury; needs exact=true.",
     },
     Parameter {
         name: "color",
         domain: Domain::Text { expected: color::EXPECTED },
         default: "none",
-        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, secondary structure in the file (Jmol), B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7; or by the mean curvature of the surface, the distance from the centroid of the atoms (radial), or the values of a map sent beside the structure (map). STL has no colours.",
+        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, secondary structure in the file (Jmol), B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7; or by the mean curvature of the surface, the distance from the centroid of the atoms (radial), the distance from the convex hull of the mesh (depth), or the values of a map sent beside the structure (map). STL has no colours.",
     },
     Parameter {
         name: "palette",
         domain: Domain::Choice(PALETTES),
-        default: "viridis for bfactor, occupancy and radial, blue-white-red for hydrophobicity and curvature, red-white-blue for charge and map",
-        doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity, charge, curvature, radial and map only.",
+        default: "viridis for bfactor, occupancy, radial and depth, blue-white-red for hydrophobicity and curvature, red-white-blue for charge and map",
+        doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity, charge, curvature, radial, depth and map only.",
     },
     Parameter {
         name: "color_range",
         domain: Domain::Text { expected: "two numbers separated by a comma, the lower one first" },
-        default: "the lowest and highest value of the meshed atoms, or of the mesh for radial; symmetric around 0 for map, with the largest absolute value at the mesh; −4.5,4.5 or −2.02,2.02 for hydrophobicity, −1,1 for charge, −0.5,0.5 for curvature",
+        default: "the lowest and highest value of the meshed atoms, or of the mesh for radial and depth; symmetric around 0 for map, with the largest absolute value at the mesh; −4.5,4.5 or −2.02,2.02 for hydrophobicity, −1,1 for charge, −0.5,0.5 for curvature",
         doc: "Values at the ends of the palette. Values beyond an end have its colour.",
     },
     Parameter {
@@ -294,12 +301,10 @@ pub const TABLE: &[Parameter] = &[
         default: "asymmetric-unit",
         doc: "Biological assembly to mesh: the selected atoms, copied by the operators of the file. asymmetric-unit meshes the atoms as they are in the file.",
     },
-    Parameter {
-        name: "instances",
-        domain: Domain::Flag,
-        default: "false",
-        doc: "Meshes each distinct set of chains of the assembly once and repeats the mesh by rotations and translations (EXT_mesh_gpu_instancing); glb and gltf only. Surfaces of neighbouring instances are not joined.",
-    },
+    switch(
+        "instances",
+        "Meshes each distinct set of chains of the assembly once and repeats the mesh by rotations and translations (EXT_mesh_gpu_instancing); glb and gltf only. Surfaces of neighbouring instances are not joined.",
+    ),
     Parameter {
         name: "context",
         domain: Domain::Choice(CONTEXTS),

@@ -118,6 +118,8 @@ impl ParsedValues {
             "paper_b" => self.options.paper_b = number()?,
             "paper_c" => self.options.paper_c = number()?,
             "atom_ids" => self.options.atom_ids = flag(text).ok_or_else(bad)?,
+            "exact" => self.request.job.exact = flag(text).ok_or_else(bad)?,
+            "interface" => self.request.job.interface = Some(text.parse().ok().ok_or_else(bad)?),
             "color" if text == "none" => self.scheme = None,
             "color" => self.scheme = Some(text.parse().ok().ok_or_else(bad)?),
             "palette" => self.palette = Some(named(&Palette::ALL, Palette::name, text).ok_or_else(bad)?),

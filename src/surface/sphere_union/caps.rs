@@ -57,6 +57,14 @@ pub(super) fn caps(
     comparisons: &mut Comparisons<'_>,
 ) -> Result<Cover, SurfaceError> {
     caps.clear();
+    match add_caps(own, radius, neighbours, caps) {
+        Cover::Whole => Ok(Cover::Whole),
+        Cover::Caps => prune(caps, tolerance / radius, comparisons),
+    }
+}
+
+/// Adds the caps of all `neighbours` on the sphere of number `own`.
+pub(super) fn add_caps(own: u32, radius: f64, neighbours: &[Neighbour], caps: &mut Vec<Cap>) -> Cover {
     for other in neighbours {
         let distance2 = dot(other.to, other.to);
         let (sum, difference) = (radius + other.radius, radius - other.radius);
@@ -66,7 +74,7 @@ pub(super) fn caps(
         if distance2 <= difference * difference {
             // One sphere contains the other. Of equal spheres, the one with the lowest number remains.
             if difference < 0.0 || difference == 0.0 && other.index < own {
-                return Ok(Cover::Whole);
+                return Cover::Whole;
             }
             continue;
         }
@@ -74,12 +82,25 @@ pub(super) fn caps(
         let height = (distance2 + sum * difference) / (2.0 * distance * radius);
         caps.push(Cap { axis: other.to.map(|c| c / distance), height, index: other.index });
     }
+    Cover::Caps
+}
+
+/// Removes each cap that a larger one contains, and sorts the others, largest first. `tolerance` reduces the larger
+/// cap; a negative one enlarges it.
+///
+/// # Errors
+/// Returns the errors of [`Comparisons::add`].
+pub(super) fn prune(
+    caps: &mut Vec<Cap>,
+    tolerance: f64,
+    comparisons: &mut Comparisons<'_>,
+) -> Result<Cover, SurfaceError> {
     sort(caps, comparisons)?;
     let mut kept = 0;
     for i in 0..caps.len() {
         let cap = caps[i];
         comparisons.add(kept)?;
-        match caps[..kept].iter().find(|larger| larger.covers_edge(&cap, tolerance / radius)) {
+        match caps[..kept].iter().find(|larger| larger.covers_edge(&cap, tolerance)) {
             None => {
                 caps[kept] = cap;
                 kept += 1;

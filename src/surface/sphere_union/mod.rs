@@ -13,10 +13,13 @@ mod cells;
 mod circle;
 mod components;
 mod distance;
+mod exact;
 mod great_circle;
+mod region;
 mod shells;
 #[cfg(test)]
 mod tests;
+mod torus;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -27,6 +30,7 @@ use self::cells::Cells;
 use self::circle::{Exposed, Uncovered};
 pub(super) use self::components::Components;
 pub(super) use self::distance::{BrickUnion, Feature, Lanes, Nearest};
+pub use self::exact::ExactMeasures;
 pub(super) use self::shells::Shell;
 use super::candidates::{Comparisons, OverlapCount};
 use super::control::{Control, Stage};

@@ -39,6 +39,7 @@ const LABELS = new Map<string, string>([
   ["uniform:", "another colour"],
   ["curvature", "curvature"],
   ["radial", "distance from the centre"],
+  ["depth", "depth below the convex hull"],
 ]);
 
 /** Returns the label of a scheme; its name if it has none. */

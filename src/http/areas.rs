@@ -1,0 +1,113 @@
+//! `…/areas`: exact areas of the atoms, residues or chains of a structure as CSV, without a mesh.
+
+use axum::body::Body;
+use axum::extract::State;
+use axum::http::header::{self, HeaderMap};
+use axum::response::{IntoResponse, Response};
+
+use super::area_parameters;
+use super::guard::Caller;
+use super::openapi::meshes::NotModified;
+use super::openapi::parameters::{AreaParameters, ConditionHeaders, EntryPath, StructurePath};
+use super::openapi::problem_responses;
+use super::openapi::problems::READING;
+use super::parsed_request::Pairs;
+use super::problem::Problem;
+use super::problem_types::ProblemType;
+use super::source::StructureSource;
+use super::state::Shared;
+use crate::jobs::Failure;
+use crate::pipeline::{AreaLevel, areas};
+
+problem_responses!(StructureProblems: [
+    READING,
+    [
+        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
+        ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
+        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
+    ],
+]);
+problem_responses!(EntryProblems: [READING, [
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable,
+    ProblemType::PreconditionFailed, ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates,
+    ProblemType::TooMuchMemory, ProblemType::MemoryFull, ProblemType::QueueFull,
+    ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
+]]);
+
+/// List the exact areas of a structure
+///
+/// A CSV table with the exact area of the van der Waals or solvent-accessible surface, or of the contact parts of the
+/// solvent-excluded surface, of each residue, atom or chain. No mesh is made. With `interface`, the table has the
+/// chains of both sides, with the areas that they bury.
+#[utoipa::path(get, path = "/v1/structures/{digest}/areas", tag = "structures", operation_id = "listAreas",
+    params(StructurePath, AreaParameters, ConditionHeaders),
+    responses(
+        (status = 200, description = "The areas.", body = String, content_type = "text/csv", headers(
+            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
+            ("Cache-Control" = String, description = "Caching rules."),
+        )),
+        NotModified, StructureProblems,
+    ))]
+pub(super) async fn of_structure(
+    State(app): State<Shared>,
+    caller: Caller,
+    source: StructureSource,
+    query: Pairs,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    answer(&app, &caller, source, query, &headers).await
+}
+
+/// List the exact areas of an archive entry
+///
+/// A CSV table with the exact area of the van der Waals or solvent-accessible surface, or of the contact parts of the
+/// solvent-excluded surface, of each residue, atom or chain. No mesh is made. With `interface`, the table has the
+/// chains of both sides, with the areas that they bury.
+#[utoipa::path(get, path = "/v1/pdb/{id}/areas", tag = "structures", operation_id = "listEntryAreas",
+    params(EntryPath, AreaParameters, ConditionHeaders),
+    responses(
+        (status = 200, description = "The areas.", body = String, content_type = "text/csv", headers(
+            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
+            ("Cache-Control" = String, description = "Caching rules."),
+        )),
+        NotModified, EntryProblems,
+    ))]
+pub(super) async fn of_entry(
+    State(app): State<Shared>,
+    caller: Caller,
+    source: StructureSource,
+    query: Pairs,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    answer(&app, &caller, source, query, &headers).await
+}
+
+/// Memory charged for a row, bytes.
+const BYTES_PER_ROW: u64 = 128;
+
+async fn answer(
+    app: &Shared,
+    caller: &Caller,
+    source: StructureSource,
+    query: Pairs,
+    headers: &HeaderMap,
+) -> Result<Response, Problem> {
+    let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(ProblemType::BadRequest, e.body_text()))?;
+    let area_parameters::Areas { job, level, canonical } = area_parameters::parse(&pairs)?;
+    let surface = app.config.limits.job().surface;
+    let write = async |loaded: super::source::Loaded, delivery| {
+        let listing = loaded.list_atoms(app, caller, delivery, 0, move |structure, limits, control, memory| {
+            let refused = |error| Problem::from(Failure::Job { error, diagnostics: Vec::new() });
+            let areas = areas::measure_selection(structure, &job, (limits, &surface), control).map_err(refused)?;
+            // A residue has several atoms.
+            let atoms_per_row = if level == AreaLevel::Atom { 1 } else { 4 };
+            memory.grow(BYTES_PER_ROW * (areas.len() as u64).div_ceil(atoms_per_row))?;
+            let mut text = Vec::new();
+            areas.write_csv(structure, level, &mut text).map_err(Problem::internal)?;
+            Ok((text, ()))
+        });
+        let (text, ()) = listing.await?;
+        Ok(([(header::CONTENT_TYPE, "text/csv")], Body::from(text)).into_response())
+    };
+    source.document(app, caller, headers, &canonical, write).await
+}

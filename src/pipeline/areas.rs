@@ -1,0 +1,361 @@
+//! Exact areas of a surface of spheres: in total, by chain, residue and atom, and buried between two sets of chains.
+
+use std::fmt;
+use std::io::{self, Write};
+use std::str::FromStr;
+
+use serde::Serialize;
+
+use super::{Job, JobError, SPHERE_BYTES};
+use crate::structure::table::{put_field, same_residue};
+use crate::structure::{self, ReadLimits, Selected, Structure, element};
+use crate::surface::{Control, ExactMeasures, Spheres, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams};
+
+/// Description of the values of `interface`.
+pub(super) const EXPECTED: &str = "the chains of both sides, separated by a comma, such as A,B; several chains of a side are joined by a slash: H/L,A";
+
+/// Two sets of chains without a common chain.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Interface {
+    /// Names of the chains of each side, given by the author.
+    pub sides: [Vec<String>; 2],
+}
+
+impl FromStr for Interface {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        let side = |text: &str| -> Vec<String> { text.split('/').map(|name| name.trim().to_owned()).collect() };
+        let sides: Vec<Vec<String>> = text.split(',').map(side).collect();
+        let sides: [Vec<String>; 2] = sides.try_into().map_err(|_other| ())?;
+        let names = || sides.iter().flatten();
+        let is_valid = names().all(|name| !name.is_empty() && !name.chars().any(char::is_control));
+        let distinct = names().collect::<std::collections::HashSet<_>>().len() == names().count();
+        if is_valid && distinct { Ok(Self { sides }) } else { Err(()) }
+    }
+}
+
+impl fmt::Display for Interface {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [first, second] = &self.sides;
+        write!(f, "{},{}", first.join("/"), second.join("/"))
+    }
+}
+
+/// Exact measures of a surface of spheres, which do not depend on the grid spacing. All cavities are included.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct ExactReport {
+    /// Area in Å².
+    pub area: f64,
+    /// Enclosed volume in Å³.
+    pub volume: f64,
+    /// Area of the contact parts in Å², where the probe touches one atom; `surface=ses` only, like `toroidal` and
+    /// `concave`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub contact: Option<f64>,
+    /// Area of the toroidal parts in Å², where the probe touches two atoms.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub toroidal: Option<f64>,
+    /// Area of the concave parts in Å², where the probe touches three or more atoms.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub concave: Option<f64>,
+    /// Areas of the chains, in the order of their first atoms.
+    pub chains: Vec<ChainArea>,
+    /// Area that two sets of chains bury; absent without `interface`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub interface: Option<InterfaceReport>,
+}
+
+/// Area of the surface on the atoms of a chain.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct ChainArea {
+    /// Name given by the author; empty if the file leaves it blank.
+    pub chain: String,
+    /// Number of atoms, in all copies.
+    pub atoms: u64,
+    /// Area in Å²; with `surface=ses` of the contact parts.
+    pub area: f64,
+}
+
+/// Area that two sets of chains bury. With `surface=ses`, all areas are those of the contact parts.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct InterfaceReport {
+    /// Half of the buried area of both sides in Å².
+    pub area: f64,
+    /// First and second side.
+    pub sides: [InterfaceSide; 2],
+}
+
+/// Side of an interface.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct InterfaceSide {
+    /// Names of its chains.
+    pub chains: Vec<String>,
+    /// Area without the other side in Å².
+    pub alone: f64,
+    /// Area that the other side covers in Å².
+    pub buried: f64,
+}
+
+/// Rows of a table of areas.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum AreaLevel {
+    /// A row for each atom.
+    Atom,
+    /// A row for each residue.
+    #[default]
+    Residue,
+    /// A row for each chain.
+    Chain,
+}
+
+impl AreaLevel {
+    /// All levels.
+    pub const ALL: [Self; 3] = [Self::Atom, Self::Residue, Self::Chain];
+
+    /// Returns the name of the level.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Atom => "atom",
+            Self::Residue => "residue",
+            Self::Chain => "chain",
+        }
+    }
+}
+
+/// Areas of the surface on each atom, Å².
+#[derive(Debug, Clone, PartialEq)]
+pub struct AtomAreas {
+    /// Indices of the atoms in the columns of the structure, in the order of the selection.
+    atoms: Vec<u32>,
+    /// Area of each atom. With an interface, the atoms are those of both sides.
+    areas: Vec<f64>,
+    /// Area of each atom without the other side; with an interface only.
+    alone: Option<Vec<f64>>,
+    /// True if the areas are those of the contact parts of a solvent-excluded surface.
+    contact: bool,
+}
+
+/// Rounds to 0.0001, because the last digits depend on mathematical libraries.
+fn round(value: f64) -> f64 {
+    (value * 1e4).round() / 1e4
+}
+
+/// Measures the atoms that a job selects, without a mesh.
+///
+/// # Errors
+/// Returns the errors of [`super::run`] before meshing.
+pub fn measure_selection(
+    structure: &Structure,
+    job: &Job,
+    (read, surface): (&ReadLimits, &SurfaceLimits),
+    control: &Control<'_>,
+) -> Result<AtomAreas, JobError> {
+    let selected = structure::select_with(structure, &job.selection, read, control)?;
+    control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
+    let spheres = selected.spheres(structure)?;
+    selected.check_duplicates(&spheres, read, control)?;
+    Ok(measure(structure, &selected, &spheres, job, surface, control)?.1)
+}
+
+/// Measures `spheres`, those of the `selected` atoms.
+pub(super) fn measure(
+    structure: &Structure,
+    selected: &Selected,
+    spheres: &Spheres,
+    job: &Job,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<(ExactReport, AtomAreas), SurfaceError> {
+    let params = &job.params;
+    let whole = exact(spheres, params, limits, control)?;
+    let contact = params.surface == SurfaceKind::Ses;
+    control.memory.grow(size_of_val(&*selected.atoms) as u64)?;
+    let mut report = ExactReport {
+        area: round(whole.area()),
+        volume: round(whole.volume),
+        contact: contact.then(|| round(whole.of_spheres.iter().sum())),
+        toroidal: contact.then(|| round(whole.toroidal)),
+        concave: contact.then(|| round(whole.concave)),
+        chains: Vec::new(),
+        interface: None,
+    };
+    let mut areas = AtomAreas { atoms: selected.atoms.clone(), areas: whole.of_spheres, alone: None, contact };
+    report.chains = areas.rows(structure, AreaLevel::Chain).into_iter().map(|row| row.chain(structure)).collect();
+    if let Some(interface) = &job.interface {
+        let (buried, of_atoms) = interface.measure(structure, selected, spheres, params, limits, control)?;
+        report.interface = Some(buried);
+        areas = AtomAreas { contact, ..of_atoms };
+    }
+    Ok((report, areas))
+}
+
+/// Measures a surface of spheres.
+fn exact(
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<ExactMeasures, SurfaceError> {
+    ExactMeasures::of(spheres, params, limits, control)?.ok_or_else(|| SurfaceError::BadParameter {
+        name: "surface",
+        value: format!("`{}`", params.surface),
+        expected: "vdw, sas or ses, which have exact areas".to_owned(),
+    })
+}
+
+impl Interface {
+    fn measure(
+        &self,
+        structure: &Structure,
+        selected: &Selected,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<(InterfaceReport, AtomAreas), SurfaceError> {
+        let all = selected.atoms.len() as u64;
+        // Rows, spheres and areas of each side and of both.
+        let _memory = control.reserve(2 * (SPHERE_BYTES + 16) * all)?;
+        let rows_of = |names: &[String]| -> Result<Vec<u32>, SurfaceError> {
+            let is_named = |i: u32| names.iter().any(|name| name == structure.chain.get(i as usize));
+            for name in names {
+                if !selected.atoms.iter().any(|&i| structure.chain.get(i as usize) == name) {
+                    let expected = "names of chains that are meshed".to_owned();
+                    return Err(SurfaceError::BadParameter { name: "interface", value: format!("`{name}`"), expected });
+                }
+            }
+            Ok((0..).zip(&selected.atoms).filter(|(_, i)| is_named(**i)).map(|(row, _)| row).collect())
+        };
+        let [first, second] = [rows_of(&self.sides[0])?, rows_of(&self.sides[1])?];
+        let of = |rows: &[u32]| -> Result<Vec<f64>, SurfaceError> {
+            Ok(exact(&spheres.subset(rows), params, limits, control)?.of_spheres)
+        };
+        let mut alone = of(&first)?;
+        alone.extend(of(&second)?);
+        let rows = [&first[..], &second].concat();
+        let areas = of(&rows)?;
+        let side = |k: usize, rows: std::ops::Range<usize>| {
+            let [alone, together] = [&alone, &areas].map(|areas| areas[rows.clone()].iter().sum::<f64>());
+            InterfaceSide { chains: self.sides[k].clone(), alone: round(alone), buried: round(alone - together) }
+        };
+        let sides = [side(0, 0..first.len()), side(1, first.len()..rows.len())];
+        let area = round(0.5 * (sides[0].buried + sides[1].buried));
+        let atoms = rows.iter().map(|&row| selected.atoms[row as usize]).collect();
+        Ok((InterfaceReport { area, sides }, AtomAreas { atoms, areas, alone: Some(alone), contact: false }))
+    }
+}
+
+/// Row of a table: some atoms with the sums of their areas.
+struct Row {
+    /// Index of the first atom in the structure.
+    first: usize,
+    atoms: u64,
+    area: f64,
+    alone: f64,
+}
+
+impl Row {
+    fn chain(&self, structure: &Structure) -> ChainArea {
+        let chain = structure.chain.get(self.first).to_owned();
+        ChainArea { chain, atoms: self.atoms, area: round(self.area) }
+    }
+}
+
+impl AtomAreas {
+    /// Returns the number of atoms.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.atoms.len()
+    }
+
+    /// Returns true if there is no atom.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.atoms.is_empty()
+    }
+
+    /// Returns the rows of a table. Chains are in the order of their first atoms, and contain all copies. A residue
+    /// ends with its last consecutive atom.
+    fn rows(&self, structure: &Structure, level: AreaLevel) -> Vec<Row> {
+        let mut rows: Vec<Row> = Vec::new();
+        let mut of_chains = std::collections::HashMap::new();
+        let mut before = None;
+        for (n, &atom) in self.atoms.iter().enumerate() {
+            let i = atom as usize;
+            let row = match level {
+                AreaLevel::Atom => rows.len(),
+                // The first atom of a copy has a lower index than the last one of the copy before.
+                AreaLevel::Residue => {
+                    let is_same = before.is_some_and(|last| last < i && same_residue(structure, last, i));
+                    rows.len() - usize::from(is_same)
+                }
+                AreaLevel::Chain => {
+                    let key = (structure.chain.id(i), structure.model[i]);
+                    *of_chains.entry(key).or_insert(rows.len())
+                }
+            };
+            if row == rows.len() {
+                rows.push(Row { first: i, atoms: 0, area: 0.0, alone: 0.0 });
+            }
+            rows[row].atoms += 1;
+            rows[row].area += self.areas[n];
+            rows[row].alone += self.alone.as_ref().map_or(0.0, |alone| alone[n]);
+            before = Some(i);
+        }
+        rows
+    }
+
+    /// Writes a table as CSV (RFC 4180, lines end in LF) with areas in Å², rounded to 0.0001 Å². With an interface, it
+    /// has the atoms of both sides, and the columns `alone` and `buried`.
+    ///
+    /// # Errors
+    /// Returns the errors of `out`.
+    pub fn write_csv(&self, structure: &Structure, level: AreaLevel, out: &mut dyn Write) -> io::Result<()> {
+        let names: &[&str] = match level {
+            AreaLevel::Atom => {
+                &["index", "name", "element", "residue_name", "residue_number", "insertion_code", "chain", "model"]
+            }
+            AreaLevel::Residue => &["residue_name", "residue_number", "insertion_code", "chain", "model", "atoms"],
+            AreaLevel::Chain => &["chain", "model", "atoms"],
+        };
+        let area = if self.contact { "contact_area" } else { "area" };
+        let buried: &[&str] = if self.alone.is_some() { &["alone", "buried"] } else { &[] };
+        let header: Vec<&str> = names.iter().copied().chain([area]).chain(buried.iter().copied()).collect();
+        writeln!(out, "{}", header.join(","))?;
+        let mut line = Vec::new();
+        for Row { first, atoms, area, alone } in self.rows(structure, level) {
+            line.clear();
+            for name in names {
+                let field = match *name {
+                    "index" => first.to_string(),
+                    "name" => structure.name.get(first).to_owned(),
+                    "element" => element::symbol(structure.element[first]).to_owned(),
+                    "residue_name" => structure.residue.get(first).to_owned(),
+                    "residue_number" => structure.residue_number[first].to_string(),
+                    "insertion_code" => match structure.insertion_code[first] {
+                        0 => String::new(),
+                        code => char::from(code).to_string(),
+                    },
+                    "chain" => structure.chain.get(first).to_owned(),
+                    "model" => structure.model[first].to_string(),
+                    _ => atoms.to_string(),
+                };
+                put_field(&mut line, &field);
+                line.push(b',');
+            }
+            write!(line, "{area:.4}")?;
+            if self.alone.is_some() {
+                write!(line, ",{alone:.4},{:.4}", alone - area)?;
+            }
+            line.push(b'\n');
+            out.write_all(&line)?;
+        }
+        Ok(())
+    }
+}

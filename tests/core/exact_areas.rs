@@ -1,0 +1,143 @@
+//! Exact areas in reports and tables, and buried areas compared with `FreeSASA`.
+
+use std::collections::HashMap;
+
+use molmesh::pipeline::{AreaLevel, Choice, JobError, JobLimits, Product, areas, params, run};
+use molmesh::structure::{self, ReadLimits, Selection, Structure};
+use molmesh::surface::{Control, CpuBackend, SurfaceLimits};
+
+use crate::tools;
+
+/// Two chains of DNA and peptide.
+fn complex() -> (Vec<u8>, Structure) {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/structures/1pfe.cif.gz");
+    let bytes = std::fs::read(path).unwrap();
+    let structure = structure::read(&bytes, &ReadLimits::default()).unwrap();
+    (bytes, structure)
+}
+
+fn product(input: &[u8], pairs: &[(&str, &str)]) -> Result<Product, JobError> {
+    let pairs = [("exact", "true"), ("resolution", "1.5")].into_iter().chain(pairs.iter().copied());
+    let job = params::parse(pairs).unwrap().job;
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "set by a test" };
+    run(input, &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
+}
+
+/// Rows of a table, by the names of its columns.
+fn rows(product: &Product, structure: &Structure, level: AreaLevel) -> Vec<HashMap<String, String>> {
+    let mut text = Vec::new();
+    product.areas.as_ref().unwrap().write_csv(structure, level, &mut text).unwrap();
+    let text = String::from_utf8(text).unwrap();
+    let mut lines = text.lines().map(|line| line.split(',').map(str::to_owned).collect::<Vec<_>>());
+    let names = lines.next().unwrap();
+    lines.map(|fields| names.iter().cloned().zip(fields).collect()).collect()
+}
+
+fn sum(rows: &[HashMap<String, String>], column: &str) -> f64 {
+    rows.iter().map(|row| row[column].parse::<f64>().unwrap()).sum()
+}
+
+#[test]
+fn rows_of_all_levels_have_the_sum_of_the_report() {
+    let (bytes, structure) = complex();
+    for (surface, column) in [("vdw", "area"), ("sas", "area"), ("ses", "contact_area")] {
+        let product = product(&bytes, &[("surface", surface)]).unwrap();
+        let exact = product.report.exact.as_ref().unwrap();
+        let area = exact.contact.unwrap_or(exact.area);
+        for level in AreaLevel::ALL {
+            let rows = rows(&product, &structure, level);
+            assert!((sum(&rows, column) - area).abs() < 1e-4 * rows.len() as f64, "{surface}, {}", level.name());
+            if level != AreaLevel::Atom {
+                assert!((sum(&rows, "atoms") - product.report.atoms as f64).abs() < 0.5);
+            }
+        }
+        let chains: Vec<&str> = exact.chains.iter().map(|chain| chain.chain.as_str()).collect();
+        assert_eq!(chains, ["A", "B"]);
+        assert!((exact.chains.iter().map(|chain| chain.area).sum::<f64>() - area).abs() < 1e-3);
+        let parts = [exact.contact, exact.toroidal, exact.concave].map(Option::unwrap_or_default);
+        assert!(surface != "ses" || (parts.iter().sum::<f64>() - exact.area).abs() < 1e-3, "{parts:?}");
+        // The mesh is coarse, but of the same surface.
+        assert!((product.report.volume.unwrap() / exact.volume - 1.0).abs() < 0.05, "{surface}");
+        // The first residue of the DNA.
+        let first = &rows(&product, &structure, AreaLevel::Residue)[0];
+        assert_eq!((first["chain"].as_str(), first["residue_number"].as_str()), ("A", "1"));
+        let atoms: Vec<_> = rows(&product, &structure, AreaLevel::Atom)
+            .into_iter()
+            .filter(|row| row["chain"] == "A" && row["residue_number"] == "1")
+            .collect();
+        assert_eq!(atoms.len().to_string(), first["atoms"]);
+        assert!((sum(&atoms, column) - first[column].parse::<f64>().unwrap()).abs() < 1e-2);
+    }
+}
+
+#[test]
+fn buried_areas_agree_with_freesasa() {
+    let (bytes, structure) = complex();
+    let selected = structure::select(&structure, &Selection::default()).unwrap();
+    let spheres = selected.spheres(&structure).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let paths = ["A", "B", "AB"].map(|chains| {
+        let row = |(row, &i): (usize, &u32)| {
+            let ([x, y, z], r) = (spheres.centre(row), spheres.radius(row));
+            chains.contains(structure.chain.get(i as usize)).then(|| format!("{x} {y} {z} {r}\n"))
+        };
+        let path = folder.path().join(chains);
+        std::fs::write(&path, selected.atoms.iter().enumerate().filter_map(row).collect::<String>()).unwrap();
+        path
+    });
+    let product = product(&bytes, &[("surface", "sas"), ("interface", "A,B")]).unwrap();
+    let interface = product.report.exact.as_ref().unwrap().interface.as_ref().unwrap();
+    let [first, second] = &interface.sides;
+    for level in AreaLevel::ALL {
+        let rows = rows(&product, &structure, level);
+        assert!((sum(&rows, "buried") - first.buried - second.buried).abs() < 1e-4 * rows.len() as f64);
+        assert!((sum(&rows, "alone") - first.alone - second.alone).abs() < 1e-4 * rows.len() as f64);
+        assert!(rows.iter().all(|row| row["buried"].parse::<f64>().unwrap() > -1e-4));
+    }
+    assert!((interface.area - 0.5 * (first.buried + second.buried)).abs() < 1e-3);
+    let Some(sasa) = tools::sasa(&paths) else { return };
+    let [a, b, both] = [0, 1, 2].map(|k| sasa[k].area);
+    println!("{interface:?} {a} {b} {both}");
+    assert!((first.alone - a).abs() < 5e-4 * a && (second.alone - b).abs() < 5e-4 * b);
+    let buried = a + b - both;
+    assert!((2.0 * interface.area - buried).abs() < 1e-3 * both && buried > 400.0, "{interface:?} {buried}");
+    assert!((2.02 * interface.area - buried).abs() > 1e-3 * both, "the control");
+}
+
+#[test]
+fn areas_without_a_mesh_are_those_of_the_job() {
+    let (bytes, structure) = complex();
+    let pairs = [("surface", "ses"), ("assembly", "1")];
+    let product = product(&bytes, &pairs).unwrap();
+    let job = params::parse(pairs.into_iter().chain([("exact", "true")])).unwrap().job;
+    let (read, surface) = (ReadLimits::default(), SurfaceLimits::default());
+    let found = areas::measure_selection(&structure, &job, (&read, &surface), &Control::default()).unwrap();
+    assert_eq!(Some(&found), product.areas.as_ref());
+    // Copies of a chain have rows of their own, except in the table of chains.
+    let single = self::product(&bytes, &pairs[..1]).unwrap();
+    let count = |product: &Product, level| rows(product, &structure, level).len();
+    assert_eq!(count(&product, AreaLevel::Residue), 2 * count(&single, AreaLevel::Residue));
+    assert_eq!(count(&product, AreaLevel::Chain), count(&single, AreaLevel::Chain));
+}
+
+#[test]
+fn requests_that_have_no_exact_areas_are_rejected() {
+    for (pairs, name) in [
+        (&[("exact", "true")][..], "exact"),
+        (&[("exact", "true"), ("surface", "ses"), ("split", "chain")], "exact"),
+        (&[("exact", "true"), ("surface", "ses"), ("model", "all")], "exact"),
+        (&[("exact", "true"), ("surface", "ses"), ("context", "whole")], "exact"),
+        (&[("surface", "ses"), ("interface", "A,B")], "interface"),
+        (&[("exact", "true"), ("surface", "ses"), ("interface", "A,B,C")], "interface"),
+        (&[("exact", "true"), ("surface", "ses"), ("interface", "A,")], "interface"),
+        (&[("exact", "true"), ("surface", "ses"), ("interface", "A/B,B")], "interface"),
+    ] {
+        let error = params::parse(pairs.iter().copied()).unwrap_err().to_string();
+        assert!(error.contains(&format!("`{name}`")), "{error}");
+    }
+    let (bytes, _) = complex();
+    let error = product(&bytes, &[("surface", "sas"), ("interface", "A,Z")]).unwrap_err().to_string();
+    assert!(error.contains("interface") && error.contains("`Z`"), "{error}");
+    assert!(product(&bytes, &[("surface", "sas"), ("interface", "A,B")]).is_ok());
+}
