@@ -13,8 +13,8 @@ pub use canonical::canonical;
 pub use table::{Domain, Parameter, TABLE, usual_range};
 use values::ParsedValues;
 
-use super::Job;
 use super::nearest::nearest;
+use super::{Cavities, Job};
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Context, Selection, Split};
@@ -131,18 +131,19 @@ fn check_instances(job: &Job) -> Result<(), ParamError> {
     Err(ParamError::BadValue { name: "instances", value: "`true`".to_owned(), expected })
 }
 
-/// Rejects cavities of a surface that is divided or repeated: they are found for all selected atoms together.
+/// Rejects cavities of a surface that is divided or repeated: they are found for all selected atoms together. Exact
+/// measures include the walls that `drop` and `only` remove from the mesh.
 fn check_cavities(job: &Job) -> Result<(), ParamError> {
     let Some(cavities) = job.cavities else { return Ok(()) };
     let Selection { context, instances, .. } = &job.selection;
-    let beside = match (job.split, context) {
-        (split, _) if split != Split::None => format!("split={}", split.name()),
-        (_, Context::Whole) => format!("context={}", context.name()),
-        _ if *instances => "instances=true".to_owned(),
+    let expected = match (job.split, context) {
+        (split, _) if split != Split::None => format!("no value with split={}", split.name()),
+        (_, Context::Whole) => format!("no value with context={}", context.name()),
+        _ if *instances => "no value with instances=true".to_owned(),
+        _ if job.exact && cavities != Cavities::Keep => "keep, or no value, with exact=true".to_owned(),
         _ => return Ok(()),
     };
-    let value = format!("`{}`", cavities.name());
-    Err(ParamError::BadValue { name: "cavities", value, expected: format!("no value beside {beside}") })
+    Err(ParamError::BadValue { name: "cavities", value: format!("`{}`", cavities.name()), expected })
 }
 
 /// Rejects exact areas of a surface that has none, or that is divided or cut.

@@ -115,33 +115,38 @@ fn cavities_of_divided_surfaces_are_rejected() {
     let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
     let all = [&[][..], &[("cavities", "keep")], &[("cavities", "drop")], &[("cavities", "only")]].map(canonical);
     assert!((0..4).all(|i| (0..i).all(|j| all[i] != all[j])), "{all:?}");
-    for (name, value) in [("split", "chain"), ("context", "whole"), ("model", "all"), ("instances", "true")] {
-        let pairs = [
-            ("cavities", "drop"),
-            (name, value),
-            ("assembly", if name == "instances" { "1" } else { "asymmetric-unit" }),
-        ];
-        let Err(ParamError::BadValue { name: named, .. }) = params::parse(pairs) else { panic!("{name}") };
+    let others = [("split", "chain"), ("context", "whole"), ("model", "all"), ("instances", "true"), ("exact", "true")];
+    for (name, value) in others {
+        let pairs = |mode| {
+            let assembly = if name == "instances" { "1" } else { "asymmetric-unit" };
+            [("cavities", mode), (name, value), ("assembly", assembly), ("surface", "ses")]
+        };
+        let Err(ParamError::BadValue { name: named, .. }) = params::parse(pairs("drop")) else { panic!("{name}") };
         assert_eq!(named, "cavities");
+        // The search alone leaves the surface as it is, so that exact measures describe the mesh.
+        assert_eq!(params::parse(pairs("keep")).is_ok(), name == "exact");
     }
-    let wrong = params::parse([("cavities", "all")]).unwrap_err();
-    assert!(wrong.to_string().contains("keep, drop, only") || wrong.to_string().contains("keep"), "{wrong}");
+    let wrong = params::parse([("cavities", "all")]).unwrap_err().to_string();
+    assert!(["`all`", "keep", "drop", "only"].iter().all(|word| wrong.contains(word)), "{wrong}");
 }
 
 /// Compares with the exact solvent-accessible areas of the inner components that MSMS 2.6.1 finds in the same atoms.
 #[test]
 fn cavities_are_those_of_msms() {
-    let areas = |bytes: &[u8]| {
-        let found = meshed(bytes, &[("cavities", "keep"), ("resolution", "1")]);
+    let areas_with = |bytes: &[u8], probe: &str| {
+        let found = meshed(bytes, &[("cavities", "keep"), ("surface", "sas"), ("probe", probe), ("resolution", "1")]);
         let mut areas: Vec<f64> = list(&found).iter().map(|cavity| cavity.accessible_area).collect();
         areas.sort_by(|a, b| b.total_cmp(a));
         areas
     };
+    let areas = |bytes: &[u8]| areas_with(bytes, "1.4");
     let same = |found: &[f64], expected: &[f64]| {
-        assert_eq!(found.len(), expected.len(), "{found:?}");
-        assert!(found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 2e-3), "{found:?}");
+        found.len() == expected.len() && found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 2e-3)
     };
-    same(&areas(include_bytes!("../../samples/4pti.pdb")), &[15.399]);
+    let sample = include_bytes!("../../samples/4pti.pdb");
+    assert!(same(&areas(sample), &[15.399]), "{:?}", areas(sample));
+    // Another probe is the control.
+    assert!(!same(&areas_with(sample, "1.401"), &[15.399]));
     let Some(path) = tools::some_structure("1a0q.pdb.gz") else { return };
     // MSMS finds one of those below 0.1 Å².
     let found: Vec<f64> = areas(&std::fs::read(path).unwrap()).into_iter().filter(|area| *area > 0.1).collect();
@@ -149,5 +154,5 @@ fn cavities_are_those_of_msms() {
         25.072, 10.377, 8.669, 7.955, 4.381, 3.286, 3.149, 2.6, 2.52, 1.743, 1.015, 1.001, 0.828, 0.791, 0.57, 0.538,
         0.48, 0.382, 0.326, 0.271, 0.141, 0.14,
     ];
-    same(&found, &expected);
+    assert!(same(&found, &expected), "{found:?}");
 }

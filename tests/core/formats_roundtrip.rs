@@ -212,6 +212,10 @@ fn msms_files_hold_vertices_with_their_spheres_and_triangles() {
             mesh.atom_ids.as_ref().map_or(vec![0; mesh.n_vertices()], |ids| ids.iter().map(|i| i + 1).collect());
         assert_eq!(vert.atoms, Some(expected), "{name}");
         assert_eq!(read_face(&encode(Format::Face, &mesh, &meta())), mesh.triangles[..], "{name}");
+        // The other orientation is the control.
+        let mut turned = mesh.clone();
+        turned.triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
+        assert_ne!(read_face(&encode(Format::Face, &turned, &meta())), mesh.triangles[..], "{name}");
     }
 }
 

@@ -132,6 +132,9 @@ fn hollow_balls_have_one_cavity_each() {
     let [cavity] = &found[..] else { panic!("{found:?}") };
     let regions = fill(&grid(&one, probe, 0.2), 0.0);
     check("one", &one, probe, cavity, &regions[0], 0.2);
+    // Another probe is the control: the volumes differ by more than the tolerance.
+    let other = cavities(&one, probe + 0.1)[0].accessible_volume;
+    assert!((other / regions[0].volume - 1.0).abs() > 0.04, "{other}");
     assert!(cavity.lining.len() > 100 && cavity.lining.is_sorted());
     assert!((cavity.radius - 5.3).abs() < 0.1, "{}", cavity.radius);
     assert!((0..3).all(|k| (cavity.centre[k] - [0.3, -0.2, 0.1][k]).abs() < 0.3));
