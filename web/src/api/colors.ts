@@ -46,7 +46,7 @@ const LABELS = new Map<string, string>([
 export const labelOf = (scheme: string): string => LABELS.get(scheme) ?? scheme;
 
 /** Parameters of a mesh that affect the colours of its atoms. */
-const SHARED = ["palette", "color_range", "model", "chains", "select", "altloc"];
+const SHARED = ["palette", "color_range", "model", "chains", "select", "altloc", "assembly", "context"];
 
 /** Returns the path of the colours of a structure; null without a colour scheme. */
 export function colorsPath(structure: string, choices: Choices): string | null {
