@@ -1,6 +1,8 @@
 //! Summary of a report, as text of at most one screen.
 
-use molmesh::pipeline::{ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport, Report};
+use molmesh::pipeline::{
+    CavityReport, ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport, Report,
+};
 use molmesh::surface::Validation;
 
 use super::page::Page;
@@ -78,21 +80,8 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     }
     page.row("validation", &validation(report, style));
     page.row("parts", &parts(report));
-    if let Some(cavities) = report.cavities {
-        let list = report
-            .cavity_list
-            .iter()
-            .flatten()
-            .take(5)
-            .map(|cavity| decimal(cavity.accessible_volume))
-            .collect::<Vec<_>>();
-        let more = if cavities > list.len() as u64 { ", …" } else { "" };
-        let volumes = if list.is_empty() {
-            String::new()
-        } else {
-            format!(": accessible to probes {}{more} Å³", list.join(", "))
-        };
-        page.row("cavities", &format!("{}{volumes}", grouped(cavities)));
+    if let Some(found) = report.cavities {
+        page.row("cavities", &cavities(found, report.cavity_list.as_deref().unwrap_or_default()));
     }
     page.row("area", &format!("{} Å²", decimal(report.area)));
     if let Some(volume) = report.volume {
@@ -227,6 +216,18 @@ fn parts(report: &Report) -> String {
     match report.voids {
         0 => format!("{components}, no voids"),
         n => format!("{components}, of which {}", of(n, "void", "voids")),
+    }
+}
+
+/// Formats the number of cavities and the volumes of the largest ones.
+fn cavities(found: u64, largest: &[CavityReport]) -> String {
+    let volumes: Vec<String> = largest.iter().take(5).map(|cavity| decimal(cavity.accessible_volume)).collect();
+    match volumes.len() {
+        0 => grouped(found),
+        n => {
+            let more = if found > n as u64 { ", …" } else { "" };
+            format!("{} (accessible volume {}{more} Å³)", grouped(found), volumes.join(", "))
+        }
     }
 }
 

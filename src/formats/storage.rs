@@ -75,17 +75,15 @@ impl Units {
 }
 
 impl Format {
-    /// Returns true if the format can hold coordinates in `units`. Files of MSMS do not name their unit, so it is
-    /// always the ångström. In metres a molecule is very small, and programs
-    /// that merge vertices within a fixed distance would merge all of them. Therefore only formats with a node that
-    /// scales the mesh support metres.
+    /// Returns true if the format can hold coordinates in `units`. In metres a molecule is very small, and programs that
+    /// merge vertices within a fixed distance would merge all of them. Therefore only formats with a node that scales
+    /// the mesh support metres. Readers of MSMS files expect ångström.
     #[must_use]
     pub const fn holds_units(self, units: Units) -> bool {
         match (self, units) {
             (Self::Glb | Self::Gltf, _) | (_, Units::Angstrom) => true,
             // A picture has no coordinates.
-            (Self::Vert | Self::Face | Self::Png, Units::Nanometer) => false,
-            (_, Units::Nanometer) => true,
+            (format, Units::Nanometer) => !matches!(format, Self::Vert | Self::Face | Self::Png),
             (_, Units::Meter) => false,
         }
     }

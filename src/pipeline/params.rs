@@ -4,6 +4,7 @@
 //! ranges. The module depends on neither HTTP nor flags.
 
 mod canonical;
+mod choices;
 mod table;
 mod values;
 

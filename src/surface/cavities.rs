@@ -100,7 +100,7 @@ impl InnerComponents {
         let memory = control.reserve(8 * mesh.n_vertices() as u64)?;
         let (components, of_vertex) = components_of(mesh, control)?;
         let component = |triangle: &[u32; 3]| of_vertex[triangle[0] as usize];
-        let is_inner = |triangle: &&[u32; 3]| components[component(*triangle) as usize].volume < 0.0;
+        let is_inner = |triangle: &&[u32; 3]| components[component(triangle) as usize].volume < 0.0;
         memory.grow(16 * components.iter().filter(|c| c.volume < 0.0).map(|c| c.triangles).sum::<u64>())?;
         let mut triangles: Vec<_> = mesh.triangles.iter().filter(is_inner).map(|t| (component(t), *t)).collect();
         triangles.sort_by_key(|(component, _)| *component);

@@ -73,7 +73,7 @@ fn cavities_depend_on_neither_the_spacing_nor_the_surface() {
     assert!((void.area / cavity.accessible_area - 1.0).abs() < 0.05, "{void:?} {cavity:?}");
     // Without the parameter, nothing is searched. A wider opening is the control.
     assert_eq!(meshed(&text, &[]).report.cavities, None);
-    assert_eq!(meshed(&hollow(3.0), &[("cavities", "keep")]).report.cavities, Some(0));
+    assert_eq!(meshed(hollow(3.0), &[("cavities", "keep")]).report.cavities, Some(0));
 }
 
 #[test]

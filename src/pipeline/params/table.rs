@@ -3,12 +3,10 @@
 use std::str::FromStr;
 
 use super::ParamError;
-use crate::formats::{Compress, Normals, Units};
-use crate::picture::{Background, MAX_SIDE, Style, View};
-use crate::pipeline::areas;
+use super::choices::{BLENDS, CAVITIES, COMPRESS, CONTEXTS, FORMATS, NORMALS, PALETTES, SPLITS, STYLES, UNITS, VIEWS};
+use crate::picture::{Background, MAX_SIDE};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
-use crate::pipeline::{Cavities, color, color::ColorBlend, color::Palette};
-use crate::structure::{Context, Split};
+use crate::pipeline::{areas, color};
 use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{Preset, SurfaceKind, Validation};
 
@@ -140,25 +138,8 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
     })
 }
 
-const SPLITS: &[&str] = &[Split::None.name(), Split::Chain.name(), Split::Entity.name(), Split::ResidueGroup.name()];
-const CONTEXTS: &[&str] = &[Context::Selection.name(), Context::Whole.name()];
-const CAVITIES: &[&str] = &[Cavities::Keep.name(), Cavities::Drop.name(), Cavities::Only.name()];
-const FORMATS: &[&str] = &["glb", "gltf", "ply", "ply-text", "stl", "obj", "vtp", "vert", "face", "png"];
-const VIEWS: &[&str] = &view_names(View::ALL);
-const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
-const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
-const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
-const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
-const BLENDS: &[&str] = &[ColorBlend::Nearest.name(), ColorBlend::Smooth.name()];
-const PALETTES: &[&str] =
-    &[Palette::Viridis.name(), Palette::Cividis.name(), Palette::BlueWhiteRed.name(), Palette::RedWhiteBlue.name()];
-
-const fn view_names(all: [View; 7]) -> [&'static str; 7] {
-    let [a, b, c, d, e, f, g] = all;
-    [a.name(), b.name(), c.name(), d.name(), e.name(), f.name(), g.name()]
-}
-
-/// All parameters in documentation order. A test compares the bounds with [`crate::surface::SurfaceParams::new`].
+/// All parameters in documentation order. A test checks that the bounds equal those of
+/// [`crate::surface::SurfaceParams::new`].
 pub const TABLE: &[Parameter] = &[
     Parameter {
         name: "preset",

@@ -121,7 +121,9 @@ impl<'a> Components<'a> {
             Ok(())
         })?;
         for (own, caps, pairs) in pairs.into_iter().flatten() {
-            pairs.into_iter().for_each(|[a, b]| sets.union(a, b));
+            for [a, b] in pairs {
+                sets.union(a, b);
+            }
             found.caps.insert(own, caps);
         }
         found.n = sets.number_sets(&mut found.of_arc);
