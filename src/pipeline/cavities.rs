@@ -123,7 +123,11 @@ fn remove(
     let mesh = &mut output.mesh;
     mesh.make_contiguous();
     let inner = InnerComponents::new(mesh, control)?;
-    let found: FxHashSet<u32> = cavities.iter().filter_map(|cavity| inner.around(mesh, cavity.centre)).collect();
+    let mut found = FxHashSet::default();
+    for cavity in cavities {
+        control.check()?;
+        found.extend(inner.around(mesh, cavity.centre));
+    }
     if found.is_empty() && mode == Cavities::Drop {
         return Ok(());
     }

@@ -87,6 +87,8 @@ pub(crate) struct InnerComponents {
     pub(crate) of_vertex: Vec<u32>,
     /// Triangles of components with negative volume, by component.
     triangles: Vec<(u32, [u32; 3])>,
+    /// Lowest and highest positions of these components, relative to the centre of the mesh, Å.
+    bounds: Vec<[[f32; 3]; 2]>,
     _memory: Reservation,
 }
 
@@ -104,19 +106,31 @@ impl InnerComponents {
         memory.grow(16 * components.iter().filter(|c| c.volume < 0.0).map(|c| c.triangles).sum::<u64>())?;
         let mut triangles: Vec<_> = mesh.triangles.iter().filter(is_inner).map(|t| (component(t), *t)).collect();
         triangles.sort_by_key(|(component, _)| *component);
-        Ok(Self { components, of_vertex, triangles, _memory: memory })
+        let bounds = triangles.chunk_by(|a, b| a.0 == b.0).map(|of| bounds(mesh, of)).collect();
+        Ok(Self { components, of_vertex, triangles, bounds, _memory: memory })
     }
 
     /// Returns the inner component of `mesh` that encloses `point`, Å.
     pub(crate) fn around(&self, mesh: &Mesh, point: [f64; 3]) -> Option<u32> {
-        let of = self.triangles.chunk_by(|a, b| a.0 == b.0);
+        let within = |[low, high]: &[[f32; 3]; 2]| {
+            (0..3).all(|k| (f64::from(low[k])..=f64::from(high[k])).contains(&(point[k] - mesh.centre[k])))
+        };
+        let near = self.triangles.chunk_by(|a, b| a.0 == b.0).zip(&self.bounds).filter(|(_, bounds)| within(bounds));
+        let around = near.filter(|(of, _)| solid_angle(mesh, of, point).abs() > 2.0 * PI).map(|(of, _)| of[0].0);
         // The smallest one, if several enclose the point.
-        let around = of.filter(|triangles| solid_angle(mesh, triangles, point).abs() > 2.0 * PI).map(|t| t[0].0);
         around.max_by(|a, b| {
             let volume = |number: &u32| self.components[*number as usize].volume;
             volume(a).total_cmp(&volume(b))
         })
     }
+}
+
+/// Returns the lowest and highest positions of triangles, relative to the centre of the mesh, Å.
+fn bounds(mesh: &Mesh, triangles: &[(u32, [u32; 3])]) -> [[f32; 3]; 2] {
+    let corners = triangles.iter().flat_map(|(_, triangle)| *triangle).map(|v| mesh.position(v as usize));
+    corners.fold([[f32::MAX; 3], [f32::MIN; 3]], |[low, high], p| {
+        [std::array::from_fn(|k| low[k].min(p[k])), std::array::from_fn(|k| high[k].max(p[k]))]
+    })
 }
 
 /// Returns the solid angle of triangles seen from `point`, Å: ±4π within a closed surface, 0 outside (Van Oosterom and

@@ -108,8 +108,8 @@ pub enum SurfaceError {
     /// No triangle of the surface is nearest to a selected atom.
     #[error("no triangle of the surface of the whole structure is nearest to the selected atoms; they may be buried")]
     NoPatch,
-    /// The mesh has no component that is a cavity.
-    #[error("the surface has no cavity that holds a probe of {probe} Å")]
+    /// No component of the mesh encloses a cavity.
+    #[error("no component of the mesh encloses a cavity that holds a probe of {probe} Å")]
     NoCavity {
         /// Radius of the probe, Å.
         probe: f64,
