@@ -290,7 +290,9 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::TooManyOverlaps { .. } => Some("try a smaller --probe, or raise --max-candidates".to_owned()),
         SurfaceError::NoSurface { isovalue: None } => Some("try a finer --resolution".to_owned()),
         SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
-        SurfaceError::NoCavity { .. } => Some("try --cavities keep, which lists all cavities".to_owned()),
+        SurfaceError::NoCavity { .. } => {
+            Some("try a finer --resolution; --cavities keep lists all cavities".to_owned())
+        }
         SurfaceError::NoPatch => Some("try a finer --resolution, or omit --context".to_owned()),
         _ => None,
     }

@@ -226,7 +226,10 @@ fn cavities(found: u64, largest: &[CavityReport]) -> String {
         0 => grouped(found),
         n => {
             let more = if found > n as u64 { ", …" } else { "" };
-            format!("{} (accessible volume {}{more} Å³)", grouped(found), volumes.join(", "))
+            let volumes = volumes.join(", ");
+            let open = largest.iter().filter(|cavity| cavity.enclosed == Some(false)).count();
+            let missing = if open > 0 { format!("; {open} not enclosed by the mesh") } else { String::new() };
+            format!("{} (accessible volume {volumes}{more} Å³{missing})", grouped(found))
         }
     }
 }

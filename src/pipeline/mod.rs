@@ -329,7 +329,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     (report.color, report.exact) = (color, exact);
-    report.set_cavities(cavities.map(|cavities| CavityReport::all(&cavities, &structure, &selected)));
+    report.set_cavities(cavities.as_ref(), &structure, &selected);
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);

@@ -365,13 +365,6 @@ impl Report {
         }
     }
 
-    /// Sets the cavities, largest first.
-    pub(super) fn set_cavities(&mut self, list: Option<Vec<CavityReport>>) {
-        self.cavities = list.as_ref().map(|list| list.len() as u64);
-        self.cavity_list = list;
-        self.cavity_list.iter_mut().for_each(|list| list.truncate(100));
-    }
-
     /// Adds time in ms to a stage that ends after the job, such as `encode` and `write`.
     pub fn add_timing(&mut self, stage: &str, ms: f64) {
         let before = self.timings_ms.get(stage).and_then(Value::as_f64).unwrap_or_default();

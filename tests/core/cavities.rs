@@ -107,7 +107,7 @@ fn walls_of_cavities_are_removed_or_kept_alone() {
     let open = hollow(3.0);
     assert_eq!(meshed(&open, &[("cavities", "drop")]).mesh, meshed(&open, &[]).mesh);
     let nothing = meshed_with(&open, &[("cavities", "only"), ("surface", "ses")]).map(drop);
-    assert_eq!(nothing, Err(JobError::Surface(SurfaceError::NoCavity { probe: 1.4 })));
+    assert_eq!(nothing, Err(JobError::Surface(SurfaceError::NoCavity { probe: 1.4, cavities: 0 })));
 }
 
 #[test]
@@ -128,6 +128,25 @@ fn cavities_of_divided_surfaces_are_rejected() {
     }
     let wrong = params::parse([("cavities", "all")]).unwrap_err().to_string();
     assert!(["`all`", "keep", "drop", "only"].iter().all(|word| wrong.contains(word)), "{wrong}");
+}
+
+#[test]
+fn a_cavity_without_a_closed_wall_in_the_mesh_is_named() {
+    let sample = include_bytes!("../../samples/4pti.pdb");
+    let with = |mode: &str, resolution: &str| {
+        meshed_with(sample, &[("surface", "ses"), ("resolution", resolution), ("cavities", mode)])
+    };
+    // The wall has a thin place, which is open at 0.5 Å.
+    for (resolution, closed) in [("0.5", false), ("0.4", true)] {
+        let [keep, drop] = ["keep", "drop"].map(|mode| with(mode, resolution).unwrap());
+        assert_eq!((keep.report.voids, drop.report.voids), (u64::from(closed), 0), "{resolution}");
+        assert_eq!(list(&keep).iter().map(|cavity| cavity.enclosed).collect::<Vec<_>>(), [None]);
+        assert_eq!(list(&drop).iter().map(|cavity| cavity.enclosed).collect::<Vec<_>>(), [Some(closed)]);
+        assert_eq!(keep.mesh != drop.mesh, closed);
+        let only = with("only", resolution).map(|product| product.report.voids);
+        let missing = JobError::Surface(SurfaceError::NoCavity { probe: 1.4, cavities: 1 });
+        assert_eq!(only, if closed { Ok(1) } else { Err(missing) });
+    }
 }
 
 /// Compares with the exact solvent-accessible areas of the inner components that MSMS 2.6.1 finds in the same atoms.
