@@ -103,7 +103,7 @@ pub(crate) struct MeshArgs {
     /// Mesh file; `-` is stdout
     #[arg(short, long)]
     pub(crate) output: PathBuf,
-    /// glb, gltf, ply, ply-text, stl, obj or vtp [default: by the extension of the output, glb on stdout]
+    /// glb, gltf, ply, ply-text, stl, obj, vtp, vert or face [default: by the extension of the output, glb on stdout]
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
     /// Vertex compression of glb and gltf: none, or quantize (12 bytes instead of 24: 16-bit positions, 8-bit normals)
@@ -226,6 +226,10 @@ pub(crate) struct SurfaceArgs {
     /// Raw parameter c of the 2010 paper (inverse square: strength in Å²)
     #[arg(long, value_name = "C")]
     pub(crate) paper_c: Option<String>,
+    /// Find cavities, closed regions that hold a probe: keep (list them in the report), drop (also remove their walls
+    /// from the mesh) or only (keep nothing else)
+    #[arg(long, value_name = "MODE")]
+    pub(crate) cavities: Option<String>,
     /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)
     #[arg(long)]
     pub(crate) atom_ids: bool,

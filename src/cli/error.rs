@@ -235,7 +235,10 @@ fn surface_code(error: &SurfaceError) -> i32 {
     match error {
         SurfaceError::NoSpheres | SurfaceError::BadSphere { .. } => code::STRUCTURE,
         // The isovalue is above the highest density.
-        SurfaceError::BadParameter { .. } | SurfaceError::NoSurface { .. } | SurfaceError::NoPatch => code::USAGE,
+        SurfaceError::BadParameter { .. }
+        | SurfaceError::NoSurface { .. }
+        | SurfaceError::NoPatch
+        | SurfaceError::NoCavity { .. } => code::USAGE,
         SurfaceError::GridTooLarge { .. }
         | SurfaceError::TooManyCandidates { .. }
         | SurfaceError::TooManyOverlaps { .. }
@@ -287,6 +290,9 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::TooManyOverlaps { .. } => Some("try a smaller --probe, or raise --max-candidates".to_owned()),
         SurfaceError::NoSurface { isovalue: None } => Some("try a finer --resolution".to_owned()),
         SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
+        SurfaceError::NoCavity { .. } => {
+            Some("try a finer --resolution; --cavities keep lists all cavities".to_owned())
+        }
         SurfaceError::NoPatch => Some("try a finer --resolution, or omit --context".to_owned()),
         _ => None,
     }

@@ -106,6 +106,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("assembly", &atoms.assembly),
         ("context", &atoms.context),
         ("split", &atoms.split),
+        ("cavities", &surface.cavities),
         ("validation", &args.validation),
         ("interface", &surface.interface),
     ];
@@ -172,6 +173,7 @@ mod tests {
             let value = match parameter.name {
                 "atom_ids" | "check" => vec![flag.as_str()],
                 "validation" => vec![&flag, "exact"],
+                "cavities" => vec![&flag, "drop"],
                 "compress" => vec![&flag, "quantize"],
                 "normals" => vec![&flag, "none"],
                 "units" => vec![&flag, "nanometer"],

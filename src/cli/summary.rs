@@ -1,6 +1,8 @@
 //! Summary of a report, as text of at most one screen.
 
-use molmesh::pipeline::{ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport, Report};
+use molmesh::pipeline::{
+    CavityReport, ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport, Report,
+};
 use molmesh::surface::Validation;
 
 use super::page::Page;
@@ -78,6 +80,9 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     }
     page.row("validation", &validation(report, style));
     page.row("parts", &parts(report));
+    if let Some(found) = report.cavities {
+        page.row("cavities", &cavities(found, report.cavity_list.as_deref().unwrap_or_default()));
+    }
     page.row("area", &format!("{} Å²", decimal(report.area)));
     if let Some(volume) = report.volume {
         page.row("volume", &format!("{} Å³", decimal(volume)));
@@ -214,6 +219,21 @@ fn parts(report: &Report) -> String {
     }
 }
 
+/// Formats the number of cavities and the volumes of the largest ones.
+fn cavities(found: u64, largest: &[CavityReport]) -> String {
+    let volumes: Vec<String> = largest.iter().take(5).map(|cavity| decimal(cavity.accessible_volume)).collect();
+    match volumes.len() {
+        0 => grouped(found),
+        n => {
+            let more = if found > n as u64 { ", …" } else { "" };
+            let volumes = volumes.join(", ");
+            let open = largest.iter().filter(|cavity| cavity.enclosed == Some(false)).count();
+            let missing = if open > 0 { format!("; {open} not enclosed by the mesh") } else { String::new() };
+            format!("{} (accessible volume {volumes}{more} Å³{missing})", grouped(found))
+        }
+    }
+}
+
 /// Adds the first findings only, as a damaged file can have one in each line.
 fn add_findings(page: &mut Page, findings: &[String]) {
     let of = if findings.len() == 1 { "finding" } else { "findings" };
@@ -336,6 +356,8 @@ mod tests {
             components: 2,
             voids: 1,
             void_list: Vec::new(),
+            cavities: Some(2),
+            cavity_list: None,
             component_list: Vec::new(),
             parts: Vec::new(),
             area: 3200.04,

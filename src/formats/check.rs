@@ -20,7 +20,7 @@ fn needs_indices(format: Format, n_vertices: usize) -> bool {
     match format {
         Format::Stl => true,
         Format::Glb | Format::Gltf => u16::try_from(n_vertices).is_ok(),
-        Format::Ply | Format::PlyText | Format::Obj | Format::Vtp | Format::Png => false,
+        Format::Ply | Format::PlyText | Format::Obj | Format::Vtp | Format::Vert | Format::Face | Format::Png => false,
     }
 }
 
@@ -64,7 +64,7 @@ pub(super) fn check(mesh: &Mesh, format: Format, bounds: Option<Bounds>) -> Resu
     }
     // Adding zero turns −0 into 0. JSON distinguishes them.
     let bounds = bounds.unwrap_or_else(|| mesh.bounds()).map(|row| row.map(|v| v + 0.0));
-    if matches!(format, Format::PlyText | Format::Obj) {
+    if matches!(format, Format::PlyText | Format::Obj | Format::Vert) {
         // The writer relies on a maximum length of lines.
         check_normals(&mesh.normals[..])?;
     }

@@ -79,7 +79,7 @@ pub enum FormatError {
         /// Largest index that is exact.
         limit: u32,
     },
-    /// A coordinate has too many digits for a line of OBJ or text PLY.
+    /// A coordinate has too many digits for a line of a text format.
     #[error("a coordinate of {value} cannot be written as text, the limit is ±{limit}")]
     CoordinateTooLarge {
         /// The coordinate, in the file's units.

@@ -23,22 +23,37 @@ pub enum Format {
     Obj,
     /// VTK XML `PolyData`, appended raw data.
     Vtp,
+    /// Vertices of a mesh, MSMS.
+    Vert,
+    /// Triangles of a mesh, MSMS.
+    Face,
     /// A picture, PNG.
     Png,
 }
 
 /// Error: no format has this name.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("unknown format `{0}`; expected one of glb, gltf, ply, ply-text, stl, obj, vtp, png")]
+#[error("unknown format `{0}`; expected one of glb, gltf, ply, ply-text, stl, obj, vtp, vert, face, png")]
 pub struct UnknownFormat(pub String);
 
 impl Format {
     /// Every format.
-    pub const ALL: [Self; 8] =
-        [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj, Self::Vtp, Self::Png];
+    pub const ALL: [Self; 10] = [
+        Self::Glb,
+        Self::Gltf,
+        Self::Ply,
+        Self::PlyText,
+        Self::Stl,
+        Self::Obj,
+        Self::Vtp,
+        Self::Vert,
+        Self::Face,
+        Self::Png,
+    ];
 
     /// Formats that hold a mesh.
-    pub const MESHES: [Self; 7] = [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj, Self::Vtp];
+    pub const MESHES: [Self; 9] =
+        [Self::Glb, Self::Gltf, Self::Ply, Self::PlyText, Self::Stl, Self::Obj, Self::Vtp, Self::Vert, Self::Face];
 
     /// Extension of file names, without a dot.
     #[must_use]
@@ -60,6 +75,8 @@ impl Format {
             Self::Stl => "stl",
             Self::Obj => "obj",
             Self::Vtp => "vtp",
+            Self::Vert => "vert",
+            Self::Face => "face",
             Self::Png => "png",
         }
     }
@@ -73,7 +90,7 @@ impl Format {
     /// Returns true if files of the format are text.
     #[must_use]
     pub const fn is_text(self) -> bool {
-        matches!(self, Self::Gltf | Self::PlyText | Self::Obj)
+        matches!(self, Self::Gltf | Self::PlyText | Self::Obj | Self::Vert | Self::Face)
     }
 
     /// Returns true if the format can hold quantized vertices.
@@ -88,6 +105,12 @@ impl Format {
         matches!(self, Self::Glb | Self::Gltf)
     }
 
+    /// Returns true if every file of the format contains the nearest atom of each vertex.
+    #[must_use]
+    pub const fn needs_atom_ids(self) -> bool {
+        matches!(self, Self::Vert)
+    }
+
     /// Returns the approximate size of a mesh file, bytes. `mesh_bytes` is the size of the mesh in memory.
     #[must_use]
     pub const fn estimated_bytes(self, mesh_bytes: u64, n_vertices: u64, n_triangles: u64) -> u64 {
@@ -98,12 +121,14 @@ impl Format {
             Self::Stl => n_triangles.saturating_mul(50),
             Self::Obj => n_vertices.saturating_mul(54).saturating_add(n_triangles.saturating_mul(40)),
             Self::PlyText => n_vertices.saturating_mul(50).saturating_add(n_triangles.saturating_mul(20)),
+            Self::Vert => n_vertices.saturating_mul(55),
+            Self::Face => n_triangles.saturating_mul(22),
             Self::Png => 0,
         }
     }
 
-    /// Media type, registered with IANA except those of PLY and VTP: `application/ply` is common,
-    /// `model/x-ply-text` and `model/x-vtp` are specific to molmesh.
+    /// Media type, registered with IANA except those of PLY, VTP and MSMS: `application/ply` is common, those with
+    /// `x-` are specific to molmesh.
     #[must_use]
     pub const fn media_type(self) -> &'static str {
         match self {
@@ -114,6 +139,8 @@ impl Format {
             Self::Stl => "model/stl",
             Self::Obj => "model/obj",
             Self::Vtp => "model/x-vtp",
+            Self::Vert => "model/x-msms-vert",
+            Self::Face => "model/x-msms-face",
             Self::Png => "image/png",
         }
     }

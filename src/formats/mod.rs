@@ -14,6 +14,7 @@ mod error;
 mod format;
 mod gltf;
 mod lines;
+mod msms;
 mod obj;
 mod ply;
 mod ply_text;
@@ -62,6 +63,7 @@ enum Plan {
     Stl(stl::StlPlan),
     Obj(obj::ObjPlan),
     Vtp(vtp::VtpPlan),
+    Msms(msms::MsmsPlan),
 }
 
 impl<'a> Encoder<'a> {
@@ -111,12 +113,14 @@ impl<'a> Encoder<'a> {
             Format::Stl => Plan::Stl(stl::StlPlan::new(mesh, storage.units, meta)?),
             Format::Obj => Plan::Obj(obj::ObjPlan::new(mesh, storage, &summary, meta)?),
             Format::Vtp => Plan::Vtp(vtp::VtpPlan::new(mesh, storage, meta)),
+            Format::Vert => Plan::Msms(msms::MsmsPlan::vertices(mesh, &summary, meta)?),
+            Format::Face => Plan::Msms(msms::MsmsPlan::faces(mesh, meta)),
             Format::Png => return Err(FormatError::NotAMeshFormat { format: format.name() }),
         };
         Ok(Self { mesh, plan })
     }
 
-    /// Returns the exact length of the file, bytes; `None` for OBJ and text PLY.
+    /// Returns the exact length of the file, bytes; `None` for OBJ, text PLY and MSMS.
     #[must_use]
     pub fn encoded_len(&self) -> Option<u64> {
         match &self.plan {
@@ -125,7 +129,7 @@ impl<'a> Encoder<'a> {
             Plan::Ply(plan) => Some(plan.len()),
             Plan::Stl(plan) => Some(plan.len()),
             Plan::Vtp(plan) => Some(plan.len()),
-            Plan::PlyText(_) | Plan::Obj(_) => None,
+            Plan::PlyText(_) | Plan::Obj(_) | Plan::Msms(_) => None,
         }
     }
 
@@ -135,6 +139,7 @@ impl<'a> Encoder<'a> {
         match &self.plan {
             Plan::PlyText(plan) => plan.len_bound(),
             Plan::Obj(plan) => plan.len_bound(),
+            Plan::Msms(plan) => plan.len_bound(),
             _ => self.encoded_len().unwrap_or(u64::MAX),
         }
     }
@@ -154,6 +159,7 @@ impl<'a> Encoder<'a> {
             Plan::Stl(plan) => plan.write(self.mesh, out),
             Plan::Obj(plan) => plan.write(self.mesh, out),
             Plan::Vtp(plan) => plan.write(self.mesh, out),
+            Plan::Msms(plan) => plan.write(self.mesh, out),
         }?;
         out.flush()
     }

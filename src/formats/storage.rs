@@ -8,7 +8,8 @@ pub enum Normals {
     /// One normal per vertex, from the gradient of the density.
     #[default]
     Smooth,
-    /// No vertex normals. STL keeps the normals of its triangles, which are part of the format.
+    /// No vertex normals. STL keeps the normals of its triangles and MSMS those of its vertices, which are part of the
+    /// format.
     None,
 }
 
@@ -74,15 +75,15 @@ impl Units {
 }
 
 impl Format {
-    /// Returns true if the format can hold coordinates in `units`. In metres a molecule is very small, and programs
-    /// that merge vertices within a fixed distance would merge all of them. Therefore only formats with a node that
-    /// scales the mesh support metres.
+    /// Returns true if the format can hold coordinates in `units`. In metres a molecule is very small, and programs that
+    /// merge vertices within a fixed distance would merge all of them. Therefore only formats with a node that scales
+    /// the mesh support metres. Readers of MSMS files expect ångström.
     #[must_use]
     pub const fn holds_units(self, units: Units) -> bool {
         match (self, units) {
             (Self::Glb | Self::Gltf, _) | (_, Units::Angstrom) => true,
             // A picture has no coordinates.
-            (format, Units::Nanometer) => !format.is_picture(),
+            (format, Units::Nanometer) => !matches!(format, Self::Vert | Self::Face | Self::Png),
             (_, Units::Meter) => false,
         }
     }

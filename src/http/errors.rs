@@ -380,6 +380,7 @@ impl From<SurfaceError> for Problem {
                 }
                 None => Self::new(ProblemType::NoSurface, detail).with("parameter", "resolution"),
             },
+            E::NoCavity { .. } => Self::new(ProblemType::NoSurface, detail).with("parameter", "cavities"),
             E::NoPatch => Self::new(ProblemType::NoSurface, detail).with("parameter", "context"),
             E::DeviceMemory { needed, available, .. } => {
                 fitting(Self::new(ProblemType::DeviceMemory, detail).with("limit", available).with("actual", needed))

@@ -2,6 +2,7 @@
 
 pub mod areas;
 mod auto;
+mod cavities;
 mod clock;
 pub mod color;
 pub mod cost;
@@ -33,6 +34,7 @@ use thiserror::Error;
 
 pub use areas::{AreaLevel, AtomAreas, ExactReport, Interface};
 pub use auto::AutoBackend;
+pub use cavities::{Cavities, CavityReport, LiningResidue};
 pub use clock::{ProgressSink, StageClock};
 pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
 #[cfg(feature = "png")]
@@ -75,6 +77,8 @@ pub struct Job {
     pub params: SurfaceParams,
     /// Division of the mesh into parts.
     pub split: Split,
+    /// Search for cavities; `None` without it.
+    pub cavities: Option<Cavities>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -119,7 +123,7 @@ impl Job {
     }
 
     /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
-    /// on triangles, parts, cuts, instances and pictures need the whole mesh in memory.
+    /// on triangles, parts, cuts, instances, removed components and pictures need the whole mesh in memory.
     fn can_stream(&self) -> bool {
         !self.params.atom_ids
             && self.color.is_none()
@@ -128,6 +132,7 @@ impl Job {
             && self.split == Split::None
             && self.selection.context == Context::Selection
             && !self.selection.instances
+            && self.cavities.is_none_or(|cavities| cavities == Cavities::Keep)
             && self.picture.is_none()
     }
 
@@ -284,7 +289,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
-    let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
+    let (mut output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
         let fitted = fit::mesh(&spheres, job, limit, &limits.surface, choice, &clock, &control).map_err(|error| {
             let plan = MeshPlan::new(&spheres, division, &params, job, limits);
             finest_fit::with_finest_fit(error, &plan, plan.choice(undivided, choice), &control)
@@ -305,6 +310,10 @@ pub fn run_with<S: Deref<Target = Structure>>(
         let written = checked.and_then(write);
         (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, choice, &control))?, None, storage)
     };
+    let search = |mode| {
+        clock.time("cavities", || cavities::search(mode, &spheres, &params, &limits.surface, &mut output, &control))
+    };
+    let cavities = job.cavities.map(search).transpose()?;
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
     let color = |colors: MeshColors| clock.time("color", || colors.apply(&mut mesh, params.resolution, &control));
@@ -314,18 +323,13 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let measures = match measures {
         // The cut has validated the surface before it divided it.
         Some(measures) if cut.is_some() || measures.validation == job.validation => measures,
-        measures => clock.time(Stage::Measure.name(), || {
-            mesh.make_geometry_contiguous();
-            match measures {
-                Some(measures) => measures.validated(job.validation, &mesh.triangles, &control),
-                None => Measures::of(&mesh, job.validation, &control),
-            }
-        })?,
+        found => clock.time(Stage::Measure.name(), || measures_of(&mut mesh, found, job.validation, &control))?,
     };
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     (report.color, report.exact) = (color, exact);
+    report.set_cavities(cavities.as_ref(), &structure, &selected);
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
@@ -338,6 +342,20 @@ pub fn run_with<S: Deref<Target = Structure>>(
         clock.finish().into_iter().for_each(|(stage, ms)| product.report.add_timing(stage, ms));
     }
     Ok(product)
+}
+
+/// Measures and validates a mesh, or only validates it if its measures are `found`.
+fn measures_of(
+    mesh: &mut Mesh,
+    found: Option<Measures>,
+    validation: Validation,
+    control: &Control<'_>,
+) -> Result<Measures, SurfaceError> {
+    mesh.make_geometry_contiguous();
+    match found {
+        Some(measures) => measures.validated(validation, &mesh.triangles, control),
+        None => Measures::of(mesh, validation, control),
+    }
 }
 
 /// Converts indices of spheres to indices of atoms in the file, or drops them if the job does not ask for them.

@@ -4,6 +4,7 @@
 //! ranges. The module depends on neither HTTP nor flags.
 
 mod canonical;
+mod choices;
 mod table;
 mod values;
 
@@ -13,8 +14,8 @@ pub use canonical::canonical;
 pub use table::{Domain, Parameter, TABLE, usual_range};
 use values::ParsedValues;
 
-use super::Job;
 use super::nearest::nearest;
+use super::{Cavities, Job};
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Context, Selection, Split};
@@ -108,6 +109,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     let ParsedValues { options, selection, mut request, .. } = values;
     request.job = Job { selection, params: SurfaceParams::new(&options)?, color, ..request.job };
     check_instances(&request.job)?;
+    check_cavities(&request.job)?;
     check_exact(&request.job)?;
     if let Some(format) = request.format {
         set_format(&mut request.job, format)?;
@@ -128,6 +130,21 @@ fn check_instances(job: &Job) -> Result<(), ParamError> {
         return Ok(());
     }
     Err(ParamError::BadValue { name: "instances", value: "`true`".to_owned(), expected })
+}
+
+/// Rejects cavities of a surface that is divided or repeated: they are found for all selected atoms together. Exact
+/// measures include the walls that `drop` and `only` remove from the mesh.
+fn check_cavities(job: &Job) -> Result<(), ParamError> {
+    let Some(cavities) = job.cavities else { return Ok(()) };
+    let Selection { context, instances, .. } = &job.selection;
+    let expected = match (job.split, context) {
+        (split, _) if split != Split::None => format!("no value with split={}", split.name()),
+        (_, Context::Whole) => format!("no value with context={}", context.name()),
+        _ if *instances => "no value with instances=true".to_owned(),
+        _ if job.exact && cavities != Cavities::Keep => "keep, or no value, with exact=true".to_owned(),
+        _ => return Ok(()),
+    };
+    Err(ParamError::BadValue { name: "cavities", value: format!("`{}`", cavities.name()), expected })
 }
 
 /// Rejects exact areas of a surface that has none, or that is divided or cut.
@@ -172,7 +189,8 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
     }
 }
 
-/// Sets the format of a job, for a format that was not given as a parameter. A picture format adds picture parameters.
+/// Sets the format of a job, for a format that was not given as a parameter. A picture format adds picture parameters,
+/// a format with the nearest atom of each vertex sets `atom_ids`.
 ///
 /// # Errors
 /// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals`, `instances` or a picture parameter that the
@@ -199,6 +217,7 @@ pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     if job.normals == Normals::None && format.is_picture() {
         return refuse("normals", job.normals.name(), Normals::Smooth.name(), &|f| !f.is_picture());
     }
+    job.params.atom_ids |= format.needs_atom_ids();
     if format.is_picture() {
         job.picture.get_or_insert_default();
         return Ok(());

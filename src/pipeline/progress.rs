@@ -8,17 +8,18 @@ use super::ProgressSink;
 const UNIT: f64 = 1000.0;
 
 /// Stages with their typical shares of the time, in execution order.
-const STAGES: [(&str, f64); 15] = [
+const STAGES: [(&str, f64); 16] = [
     ("read", 0.10),
     ("select", 0.02),
     ("exact", 0.01),
     ("bin", 0.03),
-    ("field", 0.39),
+    ("field", 0.38),
     ("classify", 0.05),
     ("scan", 0.02),
     ("interpolate", 0.10),
     ("emit", 0.10),
     ("write", 0.05),
+    ("cavities", 0.01),
     ("color", 0.01),
     ("measure", 0.04),
     ("draw", 0.03),

@@ -4,6 +4,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::areas::ExactReport;
+use super::cavities::CavityReport;
 use super::color::ColorReport;
 use super::instances::InstancesReport;
 use super::left_out::LeftOutReport;
@@ -210,6 +211,13 @@ pub struct Report {
     pub voids: u64,
     /// Voids with the largest volumes, at most 100.
     pub void_list: Vec<VoidReport>,
+    /// Number of cavities, closed regions that hold a probe; absent without `cavities`. They are found from the atoms
+    /// and do not depend on the mesh.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cavities: Option<u64>,
+    /// Cavities with the largest accessible volumes, at most 100; absent without `cavities`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cavity_list: Option<Vec<CavityReport>>,
     /// Components with the largest areas, at most 100.
     pub component_list: Vec<ComponentReport>,
     /// Parts of the mesh; absent if the request does not divide it.
@@ -332,6 +340,8 @@ impl Report {
             components: components.len() as u64,
             voids: voids.len() as u64,
             void_list: voids.iter().take(100).map(|void| VoidReport::new(void, counts.centre)).collect(),
+            cavities: None,
+            cavity_list: None,
             component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
             parts: Vec::new(),
             area: measures.area,
@@ -374,7 +384,7 @@ impl Report {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
         // The last digits of `exact` depend on mathematical libraries.
         let differing = ["timings_ms", "device", "backend_reason", "fallback", "exact"];
-        for field in differing.into_iter().chain(["left_out", "warnings", "void_list"]) {
+        for field in differing.into_iter().chain(["left_out", "warnings", "void_list", "cavity_list"]) {
             map.remove(field);
         }
         map

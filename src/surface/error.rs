@@ -108,6 +108,14 @@ pub enum SurfaceError {
     /// No triangle of the surface is nearest to a selected atom.
     #[error("no triangle of the surface of the whole structure is nearest to the selected atoms; they may be buried")]
     NoPatch,
+    /// No component of the mesh encloses a cavity.
+    #[error("no component of the mesh encloses a cavity; the atoms have {cavities} that hold a probe of {probe} Å")]
+    NoCavity {
+        /// Radius of the probe, Å.
+        probe: f64,
+        /// Number of cavities of the spheres.
+        cavities: u64,
+    },
     /// The sink of the mesh failed. It keeps the cause.
     #[error("the mesh sink failed")]
     Sink,

@@ -79,7 +79,8 @@ impl Measures {
     pub fn of(mesh: &Mesh, validation: Validation, control: &Control<'_>) -> Result<Self, SurfaceError> {
         control.check()?;
         let labels = control.reserve(2 * size_of::<u32>() as u64 * mesh.n_vertices() as u64)?;
-        let components = components_of(mesh, control)?;
+        let (mut components, _) = components_of(mesh, control)?;
+        components.retain(|component| component.triangles > 0);
         drop(labels);
         let size = [components.iter().map(|c| c.vertices).sum(), mesh.n_triangles() as u64];
         let (mut checksum, mut degenerate) = (0_u64, false);
@@ -165,8 +166,9 @@ impl Measures {
 /// Triangles between two checks of the cancellation flag: a fraction of a millisecond.
 const TRIANGLES_PER_CHECK: usize = 1 << 14;
 
-/// Returns the connected components of `mesh`, in double precision.
-fn components_of(mesh: &Mesh, control: &Control<'_>) -> Result<Vec<Component>, SurfaceError> {
+/// Returns the connected components of `mesh`, in double precision, and the component of each vertex. A vertex without
+/// triangles is a component of its own. The caller has reserved eight bytes for each vertex.
+pub(super) fn components_of(mesh: &Mesh, control: &Control<'_>) -> Result<(Vec<Component>, Vec<u32>), SurfaceError> {
     let mut joined = UnionFind::new(mesh.n_vertices());
     for chunk in mesh.triangles.chunks(TRIANGLES_PER_CHECK) {
         control.check()?;
@@ -187,8 +189,7 @@ fn components_of(mesh: &Mesh, control: &Control<'_>) -> Result<Vec<Component>, S
             components[of_vertex[triangle[0] as usize] as usize].add(corners);
         }
     }
-    components.retain(|component| component.triangles > 0);
-    Ok(components)
+    Ok((components, of_vertex))
 }
 
 impl Component {

@@ -7,6 +7,7 @@
 pub mod backend;
 pub(crate) mod candidates;
 pub mod cases;
+pub(crate) mod cavities;
 mod checked_sort;
 pub mod column;
 pub mod control;
@@ -34,6 +35,7 @@ pub mod topology;
 mod union_find;
 
 pub use backend::{Backend, BackendIdentity, GridStats, MeshOutput, StreamedMesh};
+pub use cavities::Cavity;
 pub use column::{Column, SharedBytes};
 pub use control::{CancelToken, Control, Observer, Stage};
 pub use cpu::CpuBackend;

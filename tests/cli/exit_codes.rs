@@ -74,10 +74,10 @@ fn bad_flags_exit_with_2() {
         ),
         (&["render", "a.pdb", "-o", "b.png", "--units", "nanometer"], "'--units' is an option of `molmesh mesh`"),
         (&["mesh", "a.pdb", "-o", "b.glb", "--width", "9"], "'--width' is an option of `molmesh render`"),
-        (&["mesh", "a.pdb", "-o", "b.xyz"], "--format: glb, gltf, ply, ply-text, stl, obj, vtp\n"),
+        (&["mesh", "a.pdb", "-o", "b.xyz"], "--format: glb, gltf, ply, ply-text, stl, obj, vtp, vert, face\n"),
         (
             &["mesh", "a.pdb", "-o", "b.glb", "--format", "xyz"],
-            "expected one of glb, gltf, ply, ply-text, stl, obj, vtp\n",
+            "expected one of glb, gltf, ply, ply-text, stl, obj, vtp, vert, face\n",
         ),
         (&["mesh", "a.pdb", "-o", "b.glb", "--format", "png"], "molmesh render writes pictures"),
         (&["serve", "--metrics-listen", "9090"], "expected an address such as 127.0.0.1:8080, or none"),

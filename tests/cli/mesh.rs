@@ -18,6 +18,7 @@ fn magic(format: &str) -> &'static [u8] {
         "stl" => b"molmesh",
         "obj" => b"#",
         "vtp" => b"<?xml version=\"1.0\"?>\n",
+        "vert" | "face" => b"# molmesh ",
         other => panic!("no format {other}"),
     }
 }
@@ -26,7 +27,7 @@ fn magic(format: &str) -> &'static [u8] {
 fn extension_selects_the_format() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
-    for format in ["glb", "gltf", "ply", "stl", "obj", "vtp"] {
+    for format in ["glb", "gltf", "ply", "stl", "obj", "vtp", "vert", "face"] {
         let output = folder.path(&format!("rod.{}", format.to_uppercase()));
         assert_code(&mesh(&input, &output, &[]), 0);
         let bytes = fs::read(&output).unwrap();

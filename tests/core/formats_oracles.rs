@@ -5,7 +5,7 @@ use crate::tools;
 
 use molmesh::formats::{Format, Meta};
 use molmesh::surface::Mesh;
-use tools::files::{Files, encoded};
+use tools::files::{FOR_TRIMESH, Files, encoded};
 use tools::readers::{accessor_offset, ply_header, split_glb};
 use tools::shapes::{
     FAR, area_and_volume, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres, union,
@@ -108,7 +108,7 @@ fn trimesh_measures_the_same_surface_in_every_format() {
     let mut files = Files::new();
     let mut expected = Vec::new();
     for (name, mesh, bodies, euler) in closed() {
-        for format in Format::MESHES.into_iter().filter(|format| *format != Format::Vtp) {
+        for format in FOR_TRIMESH {
             add(&mut files, name, format, &mesh);
             expected.push((format, mesh.clone(), bodies, euler));
         }
@@ -184,7 +184,7 @@ fn vtk_reads_the_same_surface_colours_and_atoms() {
 #[test]
 fn trimesh_reads_empty_and_tiny_files() {
     let mut files = Files::new();
-    for format in Format::MESHES.into_iter().filter(|format| *format != Format::Vtp) {
+    for format in FOR_TRIMESH {
         add(&mut files, "triangle", format, &triangle());
     }
     for format in [Format::Glb, Format::Gltf, Format::Stl] {

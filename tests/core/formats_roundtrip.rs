@@ -13,8 +13,8 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 use tools::files::{MemoryFile, encoded, write_parts};
 use tools::readers::{
-    Contents, accessor_of, gltf_contents, ply_header, read_obj, read_ply, read_ply_text, read_stl, read_vtp, split_glb,
-    split_gltf, u32_at,
+    Contents, accessor_of, gltf_contents, ply_header, read_face, read_obj, read_ply, read_ply_text, read_stl,
+    read_vert, read_vtp, split_glb, split_gltf, u32_at,
 };
 use tools::shapes::{FAR, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres, union};
 
@@ -202,6 +202,24 @@ fn text_formats_round_trip_coordinates_to_their_decimals() {
 }
 
 #[test]
+fn msms_files_hold_vertices_with_their_spheres_and_triangles() {
+    for (name, mesh) in cases() {
+        let vert = read_vert(&encode(Format::Vert, &mesh, &meta()));
+        let text = read_ply_text(&encode(Format::PlyText, &mesh, &meta()));
+        assert_eq!((&vert.positions, &vert.normals), (&text.positions, &text.normals), "{name}");
+        // Spheres count from 1; 0 stands for none.
+        let expected =
+            mesh.atom_ids.as_ref().map_or(vec![0; mesh.n_vertices()], |ids| ids.iter().map(|i| i + 1).collect());
+        assert_eq!(vert.atoms, Some(expected), "{name}");
+        assert_eq!(read_face(&encode(Format::Face, &mesh, &meta())), mesh.triangles[..], "{name}");
+        // The other orientation is the control.
+        let mut turned = mesh.clone();
+        turned.triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
+        assert_ne!(read_face(&encode(Format::Face, &turned, &meta())), mesh.triangles[..], "{name}");
+    }
+}
+
+#[test]
 fn vtp_has_the_columns_of_ply_and_the_part_of_each_triangle() {
     for (name, mesh) in cases() {
         let (vtp, parts) = read_vtp(&encode(Format::Vtp, &mesh, &meta()));
@@ -227,7 +245,7 @@ fn lengths_are_known_before_writing() {
             let len = encode(format, &mesh, &meta()).len() as u64;
             let encoder = encoder(format, &mesh).unwrap();
             let (exact, bound) = (encoder.encoded_len(), encoder.encoded_len_bound());
-            if matches!(format, Format::PlyText | Format::Obj) {
+            if matches!(format, Format::PlyText | Format::Obj | Format::Vert | Format::Face) {
                 assert_eq!(exact, None);
                 assert!(len <= bound && bound <= len + len / 2, "{name}: {len} bytes, bound {bound}");
             } else {
@@ -372,7 +390,11 @@ fn invalid_meshes_are_rejected_by_the_formats_that_rely_on_their_values() {
         ("triangle 7 refers to vertex 20, but the mesh has 20", &indexed, broken(|m| m.triangles[7][1] = 20)),
         ("refers to vertex 4294967295", &indexed, broken(|m| m.triangles[0][0] = u32::MAX)),
         ("position 3 holds NaN", &all, broken(|m| m.positions[3][2] = f32::NAN)),
-        ("normal 4 holds inf", &[Format::PlyText, Format::Obj], broken(|m| m.normals[4][0] = f32::INFINITY)),
+        (
+            "normal 4 holds inf",
+            &[Format::PlyText, Format::Obj, Format::Vert],
+            broken(|m| m.normals[4][0] = f32::INFINITY),
+        ),
         ("centre 1 holds inf", &all, broken(|m| m.centre[1] = f64::INFINITY)),
     ];
     for format in Format::MESHES {
@@ -453,7 +475,8 @@ fn invalid_meshes_never_panic() {
             };
             let narrow = matches!(format, Format::Glb | Format::Gltf) && n == 4;
             assert_eq!(refused(&far_index), narrow || format == Format::Stl, "{format}");
-            assert_eq!(refused(&long_normal), matches!(format, Format::PlyText | Format::Obj), "{format}");
+            let of_text = matches!(format, Format::PlyText | Format::Obj | Format::Vert);
+            assert_eq!(refused(&long_normal), of_text, "{format}");
             assert!(refused(&not_finite) && refused(&short), "{format}");
         }
     }

@@ -12,6 +12,7 @@ mod tools;
 mod architecture;
 mod bcif_oracles;
 mod cancellation;
+mod cavities;
 mod cut;
 mod exact_areas;
 mod exact_measures;

@@ -470,6 +470,8 @@ fn archive_entries_are_cacheable_by_url() {
         ("stl", "model/stl"),
         ("obj", "model/obj"),
         ("vtp", "model/x-vtp"),
+        ("vert", "model/x-msms-vert"),
+        ("face", "model/x-msms-face"),
     ] {
         let other = SERVER.get(&format!("/v1/pdb/4pti/surface.{ext}?resolution=1"));
         assert_eq!((other.status, other.header("content-type")), (200, Some(media_type)));

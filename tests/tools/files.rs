@@ -8,6 +8,10 @@ use molmesh::formats::{Encoder, Format, GlbSink, Meta, Packing, RandomAccess};
 use molmesh::surface::{Mesh, MeshPart, MeshSink, Vertices};
 use tempfile::TempDir;
 
+/// Formats that trimesh reads.
+pub const FOR_TRIMESH: [Format; 6] =
+    [Format::Glb, Format::Gltf, Format::Ply, Format::PlyText, Format::Stl, Format::Obj];
+
 /// Files in a temporary folder, which is removed on drop.
 pub struct Files {
     folder: TempDir,

@@ -319,6 +319,42 @@ pub fn read_vtp(bytes: &[u8]) -> (Contents, Option<Vec<u32>>) {
     (Contents { positions, normals, triangles, atoms, colors, ..Contents::default() }, parts)
 }
 
+/// Returns the fields of the rows of an MSMS file. Checks the header: two comments, then number of rows and of spheres,
+/// density and probe radius.
+fn msms_rows<'a>(bytes: &'a [u8], counted: &str, fields: usize) -> Vec<Vec<&'a str>> {
+    let text = std::str::from_utf8(bytes).unwrap();
+    let words = |line: &'a str| line.split_whitespace().collect::<Vec<_>>();
+    let lines: Vec<Vec<&str>> = text.lines().map(words).collect();
+    assert!(lines[0][0] == "#" && lines[0].len() != fields && lines[1] == [counted, "#sphere", "density", "probe_r"]);
+    let numbers: Vec<f64> = lines[2].iter().map(|word| word.parse().unwrap()).collect();
+    assert_eq!((numbers.len(), numbers[0]), (4, (lines.len() - 3) as f64));
+    assert!(lines[3..].iter().all(|line| line.len() == fields));
+    lines[3..].to_vec()
+}
+
+/// Reads the vertices of MSMS: x y z, normal, analytical face, nearest sphere from 1, type of face. `atoms` holds the
+/// spheres.
+pub fn read_vert(bytes: &[u8]) -> Contents {
+    let mut contents = Contents { atoms: Some(Vec::new()), ..Contents::default() };
+    for row in msms_rows(bytes, "#vertex", 9) {
+        let three = |at: usize| -> [f32; 3] { std::array::from_fn(|k| row[at + k].parse().unwrap()) };
+        contents.positions.push(three(0));
+        contents.normals.push(three(3));
+        assert_eq!((row[6], row[8]), ("0", "0"));
+        contents.atoms.as_mut().unwrap().push(row[7].parse().unwrap());
+    }
+    contents
+}
+
+/// Reads the triangles of MSMS: three vertices from 1, type of face, analytical face.
+pub fn read_face(bytes: &[u8]) -> Vec<[u32; 3]> {
+    let triangle = |row: Vec<&str>| {
+        assert_eq!(row[3..], ["0", "0"]);
+        std::array::from_fn(|k| row[k].parse::<u32>().unwrap() - 1)
+    };
+    msms_rows(bytes, "#faces", 5).into_iter().map(triangle).collect()
+}
+
 pub fn read_obj(bytes: &[u8]) -> Contents {
     let mut contents = Contents::default();
     for line in std::str::from_utf8(bytes).unwrap().lines() {

@@ -46,8 +46,9 @@ fn reference<T: ToSchema>() -> Content {
 /// in `+json` as JSON documents.
 fn whole() -> RefOr<Response> {
     let doc = "The mesh. Its media type follows from the format: `model/gltf-binary` (glb), `model/gltf+json` (gltf), \
-               `application/ply`, `model/x-ply-text`, `model/stl`, `model/obj`, `model/x-vtp` or `image/png`; \
-               `application/octet-stream` if `Accept` prefers it.";
+               `application/ply`, `model/x-ply-text`, `model/stl`, `model/obj`, `model/x-vtp`, \
+               `model/x-msms-vert`, `model/x-msms-face` or `image/png`; `application/octet-stream` if `Accept` \
+               prefers it.";
     let response = ResponseBuilder::new()
         .description(doc)
         .header("Accept-Ranges", text(RANGES))

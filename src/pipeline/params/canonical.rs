@@ -13,6 +13,7 @@ pub fn canonical(job: &Job) -> String {
         selection,
         params,
         split,
+        cavities,
         spacing,
         validation,
         compress,
@@ -63,6 +64,7 @@ pub fn canonical(job: &Job) -> String {
     };
     let optional = [
         (*split != Split::None).then(|| format!("split={}", split.name())),
+        cavities.map(|cavities| format!("cavities={}", cavities.name())),
         exact.then(|| "exact=true".to_owned()),
         interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),
         instances.then(|| "instances=true".to_owned()),

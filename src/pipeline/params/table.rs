@@ -3,12 +3,10 @@
 use std::str::FromStr;
 
 use super::ParamError;
-use crate::formats::{Compress, Normals, Units};
-use crate::picture::{Background, MAX_SIDE, Style, View};
-use crate::pipeline::areas;
-use crate::pipeline::color::{self, ColorBlend, Palette};
+use super::choices::{BLENDS, CAVITIES, COMPRESS, CONTEXTS, FORMATS, NORMALS, PALETTES, SPLITS, STYLES, UNITS, VIEWS};
+use crate::picture::{Background, MAX_SIDE};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
-use crate::structure::{Context, Split};
+use crate::pipeline::{areas, color};
 use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{Preset, SurfaceKind, Validation};
 
@@ -138,23 +136,6 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
         "cutoff_tolerance" => [1e-4, 0.1],
         _ => [min, max],
     })
-}
-
-const SPLITS: &[&str] = &[Split::None.name(), Split::Chain.name(), Split::Entity.name(), Split::ResidueGroup.name()];
-const CONTEXTS: &[&str] = &[Context::Selection.name(), Context::Whole.name()];
-const FORMATS: &[&str] = &["glb", "gltf", "ply", "ply-text", "stl", "obj", "vtp", "png"];
-const VIEWS: &[&str] = &view_names(View::ALL);
-const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
-const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
-const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
-const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
-const BLENDS: &[&str] = &[ColorBlend::Nearest.name(), ColorBlend::Smooth.name()];
-const PALETTES: &[&str] =
-    &[Palette::Viridis.name(), Palette::Cividis.name(), Palette::BlueWhiteRed.name(), Palette::RedWhiteBlue.name()];
-
-const fn view_names(all: [View; 7]) -> [&'static str; 7] {
-    let [a, b, c, d, e, f, g] = all;
-    [a.name(), b.name(), c.name(), d.name(), e.name(), f.name(), g.name()]
 }
 
 /// All parameters in documentation order. A test checks that the bounds equal those of
@@ -318,6 +299,12 @@ pub const TABLE: &[Parameter] = &[
         doc: "Divides the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, or residue-group (polymer, ligand, glycan, ion, water). With context=whole, divides the triangles of one surface by their nearest atoms.",
     },
     Parameter {
+        name: "cavities",
+        domain: Domain::Choice(CAVITIES),
+        default: "absent",
+        doc: "Searches for cavities, closed regions between the atoms that hold a probe, and lists them in the report. keep leaves the mesh as it is, drop removes its inner components around a cavity, only keeps nothing else.",
+    },
+    Parameter {
         name: "validation",
         domain: Domain::Choice(Validation::NAMES),
         default: "checksum",
@@ -333,7 +320,7 @@ pub const TABLE: &[Parameter] = &[
         name: "format",
         domain: Domain::Choice(FORMATS),
         default: "glb",
-        doc: "Output format: a mesh format, or png for a picture of the mesh.",
+        doc: "Output format: a mesh format, or png for a picture of the mesh. vert and face are the two files that MSMS writes for one mesh.",
     },
     Parameter {
         name: "compress",
@@ -345,13 +332,13 @@ pub const TABLE: &[Parameter] = &[
         name: "normals",
         domain: Domain::Choice(NORMALS),
         default: "smooth",
-        doc: "Vertex normals. none omits them, and viewers shade each triangle flat; STL always has triangle normals.",
+        doc: "Vertex normals. none omits them, and viewers shade each triangle flat; STL always has triangle normals, and vert vertex normals.",
     },
     Parameter {
         name: "units",
         domain: Domain::Choice(UNITS),
         default: "angstrom",
-        doc: "Unit of the coordinates in the file. glb and gltf scale their node, other formats their numbers (angstrom or nanometer only). Reports are always in Å.",
+        doc: "Unit of the coordinates in the file. glb and gltf scale their node, other formats their numbers (angstrom or nanometer only; vert and face angstrom only). Reports are always in Å.",
     },
     Parameter {
         name: "width",

@@ -6,9 +6,9 @@ use super::table::flag;
 use super::{Domain, ParamError, Parameter, Request, unknown};
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, PictureParams, Style, View};
-use crate::pipeline::Spacing;
 use crate::pipeline::color::{ColorBlend, Coloring, Palette, Scheme};
 use crate::pipeline::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
+use crate::pipeline::{Cavities, Spacing};
 use crate::structure::{Context, ModelChoice, Selection, Split};
 use crate::surface::{Preset, SurfaceKind, SurfaceOptions, Validation};
 
@@ -147,6 +147,9 @@ impl ParsedValues {
             "instances" => self.selection.instances = flag(text).ok_or_else(bad)?,
             "context" => self.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
             "split" => self.request.job.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
+            "cavities" => {
+                self.request.job.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?);
+            }
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
             "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
             "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,

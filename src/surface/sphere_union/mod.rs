@@ -11,9 +11,12 @@
 mod caps;
 mod cells;
 mod circle;
+mod components;
 mod distance;
 mod exact;
+mod great_circle;
 mod region;
+mod shells;
 #[cfg(test)]
 mod tests;
 mod torus;
@@ -25,8 +28,10 @@ use rayon::prelude::*;
 use self::caps::{Cap, Cover, Neighbour, TOLERANCE, dot};
 use self::cells::Cells;
 use self::circle::{Exposed, Uncovered};
+pub(super) use self::components::Components;
 pub(super) use self::distance::{BrickUnion, Feature, Lanes, Nearest};
 pub use self::exact::ExactMeasures;
+pub(super) use self::shells::Shell;
 use super::candidates::{Comparisons, OverlapCount};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;

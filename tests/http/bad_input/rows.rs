@@ -456,7 +456,7 @@ fn selections() -> Vec<Row> {
 }
 
 /// Media types of meshes and pictures.
-const MEDIA_TYPES: [&str; 8] = [
+const MEDIA_TYPES: [&str; 10] = [
     "model/gltf-binary",
     "model/gltf+json",
     "application/ply",
@@ -464,9 +464,11 @@ const MEDIA_TYPES: [&str; 8] = [
     "model/stl",
     "model/obj",
     "model/x-vtp",
+    "model/x-msms-vert",
+    "model/x-msms-face",
     "image/png",
 ];
-const FILES: [&str; 8] = [
+const FILES: [&str; 10] = [
     "surface.glb",
     "surface.gltf",
     "surface.ply",
@@ -474,6 +476,8 @@ const FILES: [&str; 8] = [
     "surface.stl",
     "surface.obj",
     "surface.vtp",
+    "surface.vert",
+    "surface.face",
     "surface.png",
 ];
 

@@ -1,0 +1,253 @@
+//! Cavities: regions that the centre of a probe sphere can occupy, without a way out.
+//!
+//! They follow from the spheres and the probe alone, and not from a mesh: the boundary of the union of the spheres
+//! enlarged by the probe has one connected component around each cavity, whose enclosed volume is negative.
+
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use super::control::Control;
+use super::cpu::LATTICE_BYTES;
+use super::error::SurfaceError;
+use super::lattice::{Lattice, LatticeAtom};
+use super::measure::{Component, components_of};
+use super::memory::{MemoryMeter, Reservation};
+use super::mesh::Mesh;
+use super::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
+use super::sphere_union::{Components, Shell};
+use super::spheres::Spheres;
+
+/// Maximum error of the radius of the largest sphere in a cavity, Å.
+const RADIUS_ERROR: f64 = 1e-3;
+
+/// Cavity that holds a probe.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Cavity {
+    /// Area of the boundary of the region of the probe's centre, Å².
+    pub accessible_area: f64,
+    /// Volume of the region of the probe's centre, Å³.
+    pub accessible_volume: f64,
+    /// Radius of the largest sphere that fits, Å.
+    pub radius: f64,
+    /// Centre of this sphere, Å.
+    pub centre: [f64; 3],
+    /// Indices of the spheres that a probe in the cavity can touch, ascending.
+    pub lining: Vec<u32>,
+}
+
+/// Finds the cavities of `spheres` with the radii and the probe of `params`, largest accessible volume first.
+///
+/// # Errors
+/// [`SurfaceError::NoSpheres`], [`SurfaceError::BadParameter`] for a radius, [`SurfaceError::TooManyOverlaps`],
+/// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+pub(crate) fn find(
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<Vec<Cavity>, SurfaceError> {
+    let memory = Arc::new(Reservation::new(&control.memory));
+    let control = &Control { memory: Arc::<Reservation>::clone(&memory), observer: &(), ..control.clone() };
+    let params =
+        SurfaceParams { surface: SurfaceKind::Sas, resolution: 1.0, atom_ids: false, quantize: None, ..params.clone() };
+    control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
+    let lattice = Lattice::new(spheres, &params, control)?;
+    // Lengths are in spacings, that is in Å.
+    let components = Components::new(&lattice.atoms, lattice.spacing, limits, control)?;
+    let inner = components.shells().into_iter().filter(|shell| shell.volume < 0.0).collect::<Vec<_>>();
+    let measure = |shell: &Shell| {
+        let search =
+            DepthSearch { components: &components, atoms: &lattice.atoms, shell, cubes: BinaryHeap::new(), best: None };
+        let Some((depth, centre)) = search.run(control)? else { return Ok(None) };
+        let mut lining: Vec<u32> = shell.spheres.iter().map(|i| lattice.atoms[*i as usize].source).collect();
+        lining.sort_unstable();
+        Ok(Some(Cavity {
+            accessible_area: shell.area,
+            accessible_volume: -shell.volume,
+            radius: depth + params.probe,
+            centre,
+            lining,
+        }))
+    };
+    let found = inner.par_iter().map(measure).collect::<Result<Vec<_>, SurfaceError>>()?;
+    let mut found: Vec<Cavity> = found.into_iter().flatten().collect();
+    found.sort_by(|a, b| b.accessible_volume.total_cmp(&a.accessible_volume));
+    Ok(found)
+}
+
+/// Components of a mesh that enclose space outside the molecule.
+pub(crate) struct InnerComponents {
+    /// All components.
+    pub(crate) components: Vec<Component>,
+    /// Component of each vertex.
+    pub(crate) of_vertex: Vec<u32>,
+    /// Triangles of components with negative volume, by component.
+    triangles: Vec<(u32, [u32; 3])>,
+    /// Lowest and highest positions of these components, relative to the centre of the mesh, Å.
+    bounds: Vec<[[f32; 3]; 2]>,
+    _memory: Reservation,
+}
+
+impl InnerComponents {
+    /// Finds the components of `mesh`.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    pub(crate) fn new(mesh: &mut Mesh, control: &Control<'_>) -> Result<Self, SurfaceError> {
+        mesh.make_geometry_contiguous();
+        let memory = control.reserve(8 * mesh.n_vertices() as u64)?;
+        let (components, of_vertex) = components_of(mesh, control)?;
+        let component = |triangle: &[u32; 3]| of_vertex[triangle[0] as usize];
+        let is_inner = |triangle: &&[u32; 3]| components[component(triangle) as usize].volume < 0.0;
+        memory.grow(16 * components.iter().filter(|c| c.volume < 0.0).map(|c| c.triangles).sum::<u64>())?;
+        let mut triangles: Vec<_> = mesh.triangles.iter().filter(is_inner).map(|t| (component(t), *t)).collect();
+        triangles.sort_by_key(|(component, _)| *component);
+        let bounds = triangles.chunk_by(|a, b| a.0 == b.0).map(|of| bounds(mesh, of)).collect();
+        Ok(Self { components, of_vertex, triangles, bounds, _memory: memory })
+    }
+
+    /// Returns the inner component of `mesh` that encloses `point`, Å.
+    pub(crate) fn around(&self, mesh: &Mesh, point: [f64; 3]) -> Option<u32> {
+        let within = |[low, high]: &[[f32; 3]; 2]| {
+            (0..3).all(|k| (f64::from(low[k])..=f64::from(high[k])).contains(&(point[k] - mesh.centre[k])))
+        };
+        let near = self.triangles.chunk_by(|a, b| a.0 == b.0).zip(&self.bounds).filter(|(_, bounds)| within(bounds));
+        let around = near.filter(|(of, _)| solid_angle(mesh, of, point).abs() > 2.0 * PI).map(|(of, _)| of[0].0);
+        // The smallest one, if several enclose the point.
+        around.max_by(|a, b| {
+            let volume = |number: &u32| self.components[*number as usize].volume;
+            volume(a).total_cmp(&volume(b))
+        })
+    }
+}
+
+/// Returns the lowest and highest positions of triangles, relative to the centre of the mesh, Å.
+fn bounds(mesh: &Mesh, triangles: &[(u32, [u32; 3])]) -> [[f32; 3]; 2] {
+    let corners = triangles.iter().flat_map(|(_, triangle)| *triangle).map(|v| mesh.position(v as usize));
+    corners.fold([[f32::MAX; 3], [f32::MIN; 3]], |[low, high], p| {
+        [std::array::from_fn(|k| low[k].min(p[k])), std::array::from_fn(|k| high[k].max(p[k]))]
+    })
+}
+
+/// Returns the solid angle of triangles seen from `point`, Å: ±4π within a closed surface, 0 outside (Van Oosterom and
+/// Strackee 1983).
+fn solid_angle(mesh: &Mesh, triangles: &[(u32, [u32; 3])], point: [f64; 3]) -> f64 {
+    let from: [f64; 3] = std::array::from_fn(|k| point[k] - mesh.centre[k]);
+    let angle = |triangle: &[u32; 3]| {
+        let [a, b, c] = triangle.map(|v| {
+            let p = mesh.position(v as usize);
+            std::array::from_fn::<f64, 3, _>(|k| f64::from(p[k]) - from[k])
+        });
+        let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        let normal = [b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]];
+        let [la, lb, lc] = [a, b, c].map(|v| dot(v, v).sqrt());
+        2.0 * dot(a, normal).atan2(la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb)
+    };
+    triangles.iter().map(|(_, triangle)| angle(triangle)).sum()
+}
+
+/// Cube of a search, with the spheres that can be nearest to one of its points.
+struct Cube {
+    centre: [f64; 3],
+    half: f64,
+    /// Upper bound of the distance of its points from the spheres.
+    bound: f64,
+    near: Vec<u32>,
+}
+
+impl PartialEq for Cube {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+
+impl Eq for Cube {}
+
+impl PartialOrd for Cube {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Ord for Cube {
+    fn cmp(&self, other: &Self) -> Ordering {
+        let key = |cube: &Self| [cube.centre[0], cube.centre[1], cube.centre[2]];
+        let places = key(self).into_iter().zip(key(other)).map(|(a, b)| a.total_cmp(&b));
+        self.bound.total_cmp(&other.bound).then_with(|| places.fold(Ordering::Equal, Ordering::then))
+    }
+}
+
+/// Search for the point of a cavity that is farthest from the spheres, by branch and bound.
+struct DepthSearch<'a> {
+    components: &'a Components<'a>,
+    atoms: &'a [LatticeAtom],
+    shell: &'a Shell,
+    cubes: BinaryHeap<Cube>,
+    /// Distance and place of the deepest point so far, Å.
+    best: Option<(f64, [f64; 3])>,
+}
+
+impl DepthSearch<'_> {
+    /// Returns the distance that points must exceed, Å.
+    fn depth(&self) -> f64 {
+        self.best.map_or(0.0, |(depth, _)| depth)
+    }
+
+    /// Adds a cube unless no point in it can be deeper. The spheres `near` include the nearest one of each point.
+    fn add(&mut self, centre: [f64; 3], half: f64, near: &[u32]) {
+        let diagonal = half * 3.0_f64.sqrt();
+        let distances = near.iter().map(|&i| (distance(&self.atoms[i as usize], centre), i));
+        let distances: Vec<(f64, u32)> = distances.collect();
+        let Some(&(depth, sphere)) = distances.iter().min_by(|a, b| a.0.total_cmp(&b.0)) else { return };
+        if depth > 0.0 && (depth > self.depth() || diagonal <= depth) {
+            let own = &self.atoms[sphere as usize];
+            let n: [f64; 3] = std::array::from_fn(|k| centre[k] - own.position(k));
+            let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
+            let inside = self.components.at(sphere, n.map(|c| c / length)) == Some(self.shell.number);
+            if !inside && diagonal <= depth {
+                // No sphere lies between the centre and any point of the cube.
+                return;
+            }
+            if inside && depth > self.depth() {
+                self.best = Some((depth, centre));
+            }
+        }
+        let bound = depth + diagonal;
+        if bound > self.depth() + RADIUS_ERROR {
+            let near = distances.iter().filter(|(distance, _)| *distance <= depth + 2.0 * diagonal);
+            self.cubes.push(Cube { centre, half, bound, near: near.map(|(_, i)| *i).collect() });
+        }
+    }
+
+    /// Returns the distance and the point, Å; `None` if no point lies in the cavity.
+    fn run(mut self, control: &Control<'_>) -> Result<Option<(f64, [f64; 3])>, SurfaceError> {
+        let [low, high] = self.shell.bounds;
+        let half = (0..3).map(|k| 0.5 * (high[k] - low[k])).fold(0.0, f64::max);
+        let all: Vec<u32> = (0..).take(self.atoms.len()).collect();
+        self.add(std::array::from_fn(|k| 0.5 * (low[k] + high[k])), half, &all);
+        while let Some(Cube { centre, half, bound, near }) = self.cubes.pop() {
+            control.check()?;
+            if bound <= self.depth() + RADIUS_ERROR {
+                break;
+            }
+            for corner in 0..8_u8 {
+                let sign = |k: usize| if corner >> k & 1 == 0 { -0.5 } else { 0.5 };
+                self.add(std::array::from_fn(|k| centre[k] + sign(k) * half), 0.5 * half, &near);
+            }
+        }
+        Ok(self.best)
+    }
+}
+
+/// Returns the distance of a point from a sphere, negative within it, Å.
+fn distance(atom: &LatticeAtom, point: [f64; 3]) -> f64 {
+    let squares: [f64; 3] = std::array::from_fn(|k| (point[k] - atom.position(k)).powi(2));
+    (squares[0] + squares[1] + squares[2]).sqrt() - f64::from(atom.inv_length2).sqrt().recip()
+}
+
+#[cfg(test)]
+mod tests;
