@@ -1,5 +1,7 @@
-//! Reading speed in bytes of inflated text per second, on one thread and on all, and time of selections. Run it with
-//! `cargo bench --bench read`, `-- million` for the selections in a generated structure of a million atoms only.
+//! Reading speed in bytes of inflated text per second, on one thread and on all, and time of selections.
+//!
+//! Run with `cargo bench --bench read`; append `-- million` to time only selections, in a generated structure of a
+//! million atoms.
 //!
 //! Reads the small files of `samples/`, and large files of the folder in `MOLMESH_STRUCTURES`, if it is set. Create
 //! `6zu5.bcif` there with `target/test-tools/venv/bin/python tests/tools/write_bcif.py compressed 6zu5.cif.gz
@@ -54,7 +56,7 @@ fn million() -> Structure {
     let items = "group_PDB type_symbol label_atom_id label_comp_id auth_asym_id auth_seq_id Cartn_x Cartn_y Cartn_z";
     let mut text = "data_million\nloop_\n".to_owned();
     for item in items.split(' ') {
-        writeln!(text, "_atom_site.{item}").expect("memory");
+        writeln!(text, "_atom_site.{item}").expect("writing to a string");
     }
     let names = [("N", "N"), ("C", "CA"), ("C", "C"), ("O", "O"), ("C", "CB"), ("C", "CG"), ("C", "CD1"), ("C", "CD2")];
     for chain in 0..100 {
@@ -68,7 +70,8 @@ fn million() -> Structure {
             };
             let width = if residue == "LIG" { 8.0 } else { SIDE };
             let [x, y, z] = cube.map(|low| low + width * next());
-            writeln!(text, "{record} {element} {atom} {residue} {name} {number} {x:.3} {y:.3} {z:.3}").expect("memory");
+            writeln!(text, "{record} {element} {atom} {residue} {name} {number} {x:.3} {y:.3} {z:.3}")
+                .expect("writing to a string");
         }
     }
     read(text.as_bytes(), &ReadLimits::default()).expect("atoms")

@@ -8,9 +8,10 @@ resident memory, threads, open files by kind, and the gauges of memory, jobs and
 after 90 seconds, caches are small, and the warm-up fills them, so that any further growth is a leak.
 
 A leak raises the lowest resident memory of each minute, and running jobs hardly change it. Structures in memory, up to
-their limit, are subtracted, also from the values before and after the load. The slope is that of Theil and Sen: the median of the slopes between all pairs of minutes.
-The 95 % interval is a bootstrap of the residuals in blocks of five minutes, because neighbouring minutes depend on each
-other. Idle threads keep a few MiB each, so a change of their number is printed beside the slope.
+their limit, are subtracted, also from the values before and after the load. The slope is that of Theil and Sen: the
+median of the slopes between all pairs of minutes. The 95 % interval is a bootstrap of the residuals in blocks of five
+minutes, because neighbouring minutes depend on each other. Idle threads keep a few MiB each, so a change of their
+number is printed beside the slope.
 
 The exit code is 1 if a response was wrong, if a count has increased, if the upper end of the interval is above 1 % per
 hour, or if the resident memory two minutes after the load is more than 20 % above its idle value. That is the value two

@@ -46,8 +46,8 @@ pub struct StoreConfig {
     /// Capacity for results and inputs together, bytes. Default 10 GiB: thousands of meshes. The least recently used
     /// objects are evicted.
     pub max_bytes: u64,
-    /// Number of results, their reports and inputs together. Default 500,000: their index takes up to 200 MB of memory.
-    /// The least recently used objects are evicted.
+    /// Maximum number of results, their reports and inputs together. Default 500,000: their index takes up to 200 MB of
+    /// memory. The least recently used objects are evicted.
     pub max_objects: u64,
     /// Time that a result is kept after its last use, ms. Default 86,400,000 (a day): most repeated requests come soon.
     pub result_ttl_ms: u64,

@@ -111,7 +111,8 @@ impl Format {
         matches!(self, Self::Vert)
     }
 
-    /// Returns the approximate size of a mesh file, bytes. `mesh_bytes` is the size of the mesh in memory.
+    /// Returns the approximate size of a mesh file, bytes; 0 for pictures, whose size does not depend on the mesh.
+    /// `mesh_bytes` is the size of the mesh in memory.
     #[must_use]
     pub const fn estimated_bytes(self, mesh_bytes: u64, n_vertices: u64, n_triangles: u64) -> u64 {
         match self {

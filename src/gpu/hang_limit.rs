@@ -7,7 +7,7 @@ const MAX_SLOWDOWN: f64 = 100.0;
 
 /// Maximum time of a build and of the first submission, as a multiple of the minimum limit of a submission. Drivers
 /// take seconds to open a device and to compile its pipelines, and some compile them at their first use.
-const MAX_FIRST: u32 = 3;
+const FIRST_FACTOR: u32 = 3;
 
 /// Returns the time limit of a submission: `minimum`, or more for a large amount of `work` on a slow device. `fastest`
 /// is the shortest time per unit of work so far, s; without it, the limit is that of a build.
@@ -18,7 +18,7 @@ pub(super) fn of_submission(minimum: Duration, work: u64, fastest: Option<f64>) 
 
 /// Returns the time limit of a build: opening a device and compiling its pipelines. `minimum` is that of a submission.
 pub(super) const fn of_build(minimum: Duration) -> Duration {
-    minimum.saturating_mul(MAX_FIRST)
+    minimum.saturating_mul(FIRST_FACTOR)
 }
 
 #[cfg(test)]

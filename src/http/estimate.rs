@@ -26,7 +26,6 @@ use super::problem_types::ProblemType;
 use super::request_id::RequestId;
 use super::source::Loaded;
 use super::state::Shared;
-use crate::formats::Format;
 use crate::pipeline::{self, Choice, Estimate};
 use crate::surface::Control;
 
@@ -76,7 +75,7 @@ pub(super) struct EstimateDocument {
     /// Triangles; null like `bricks`.
     #[schema(required)]
     triangles: Option<u64>,
-    /// Size of the mesh file in bytes; null like `bricks`.
+    /// Size of the mesh file in bytes, 0 for pictures; null like `bricks`.
     #[schema(required)]
     mesh_bytes: Option<u64>,
     /// SHA-256 digest of the structure, in hexadecimal.
@@ -140,10 +139,9 @@ pub(super) async fn create(
     let guess = seconds * estimate.atoms as f64 / estimate.distinct_atoms as f64;
     let seconds = estimate.work(&job).map_or(guess, |units| app.pool.seconds(units));
     let wait = app.pool.estimated_wait().as_secs_f64();
-    // The size of a picture does not depend on the mesh.
-    let limit = if format.is_picture() { u64::MAX } else { app.config.limits.output_bytes };
-    let problem = refusal(&estimate, format, limit);
     let mesh = estimate.mesh.as_ref().ok();
+    let bytes = mesh.map(|m| format.estimated_bytes(m.bytes, m.vertices, m.triangles));
+    let problem = refusal(&estimate, bytes, app.config.limits.output_bytes);
     let document = EstimateDocument {
         accepted: problem.is_none(),
         problem: problem.map(|problem| problem.record(instance.as_str())),
@@ -159,7 +157,7 @@ pub(super) async fn create(
         area: mesh.map(|m| m.area),
         vertices: mesh.map(|m| m.vertices),
         triangles: mesh.map(|m| m.triangles),
-        mesh_bytes: mesh.map(|m| m.bytes),
+        mesh_bytes: bytes,
         structure: digest.to_string(),
         seconds,
         wait_seconds: wait,
@@ -168,14 +166,10 @@ pub(super) async fn create(
     Ok(([(CACHE_CONTROL, "no-store")], Json(document)).into_response())
 }
 
-/// Returns the problem for which the mesh would be rejected; `None` if there is none. `limit` is the maximum size of
-/// its file, bytes.
-fn refusal(estimate: &Estimate, format: Format, limit: u64) -> Option<Problem> {
-    match &estimate.mesh {
-        Ok(mesh) => {
-            let bytes = format.estimated_bytes(mesh.bytes, mesh.vertices, mesh.triangles);
-            (bytes > limit).then(|| file_too_large(bytes, limit, estimate.resolution))
-        }
-        Err(error) => Some(Problem::from(error.clone())),
-    }
+/// Returns the problem for which the mesh would be rejected; `None` if there is none. `bytes` and `limit` are the size
+/// and the maximum size of its file.
+fn refusal(estimate: &Estimate, bytes: Option<u64>, limit: u64) -> Option<Problem> {
+    let too_large = bytes.filter(|bytes| *bytes > limit);
+    let problem = too_large.map(|bytes| file_too_large(bytes, limit, estimate.resolution));
+    problem.or_else(|| estimate.mesh.as_ref().err().map(|error| Problem::from(error.clone())))
 }

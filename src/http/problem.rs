@@ -33,8 +33,8 @@ pub(super) struct Problem {
 
 impl Problem {
     /// Creates a problem; `detail` explains this occurrence.
-    pub(super) fn new(problem_type: ProblemType, detail: impl Into<String>) -> Self {
-        Self { kind: problem_type, detail: detail.into(), members: Map::new(), retry_after_s: None, header: None }
+    pub(super) fn new(kind: ProblemType, detail: impl Into<String>) -> Self {
+        Self { kind, detail: detail.into(), members: Map::new(), retry_after_s: None, header: None }
     }
 
     /// Creates an internal error. The message goes to the log, not to the client.
@@ -44,8 +44,8 @@ impl Problem {
     }
 
     /// Returns true if the problem is of this type.
-    pub(super) fn is(&self, problem_type: ProblemType) -> bool {
-        self.kind == problem_type
+    pub(super) fn is(&self, kind: ProblemType) -> bool {
+        self.kind == kind
     }
 
     /// Returns the name of the problem type.

@@ -113,7 +113,7 @@ impl JobStoreState {
         let mut jobs = self.lock();
         let inserted = Arc::clone(jobs.entry(id.clone()).or_insert_with(|| Arc::clone(job)));
         let n_ended = jobs.len().saturating_sub(*self.open.borrow());
-        // Some more, so that not every insertion sorts.
+        // Slack of 10 %, so that not every insertion sorts.
         if n_ended > MAX_ENDED + MAX_ENDED / 10 {
             let mut ended: Vec<_> = jobs.values().filter_map(|job| job.ended()).collect();
             ended.sort_unstable();

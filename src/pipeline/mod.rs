@@ -318,7 +318,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
     let color = |colors: MeshColors| clock.time("color", || colors.apply(&mut mesh, params.resolution, &control));
     let color = colors.map(color).transpose()?;
-    name_atoms(&mut mesh, job, &selected, &control)?;
+    to_atom_indices(&mut mesh, job, &selected, &control)?;
     instances::place(&mut mesh, &selected.units, &control)?;
     let measures = match measures {
         // The cut has validated the surface before it divided it.
@@ -359,7 +359,7 @@ fn measures_of(
 }
 
 /// Converts indices of spheres to indices of atoms in the file, or drops them if the job does not ask for them.
-fn name_atoms(mesh: &mut Mesh, job: &Job, selected: &Selected, control: &Control<'_>) -> Result<(), JobError> {
+fn to_atom_indices(mesh: &mut Mesh, job: &Job, selected: &Selected, control: &Control<'_>) -> Result<(), JobError> {
     if !job.params.atom_ids {
         mesh.atom_ids = None;
     }

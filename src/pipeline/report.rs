@@ -382,14 +382,16 @@ impl Report {
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
-        // The last digits of `exact` depend on mathematical libraries.
-        let differing = ["timings_ms", "device", "backend_reason", "fallback", "exact"];
-        for field in differing.into_iter().chain(["left_out", "warnings", "void_list", "cavity_list"]) {
+        for field in EXCLUDED_EXTRAS {
             map.remove(field);
         }
         map
     }
 }
+
+/// Fields of the report that mesh files do not contain. The last digits of `exact` depend on mathematical libraries.
+const EXCLUDED_EXTRAS: [&str; 9] =
+    ["timings_ms", "device", "backend_reason", "fallback", "exact", "left_out", "warnings", "void_list", "cavity_list"];
 
 /// Returns the arithmetic of a file: that of its mesh, followed by that of its picture.
 #[must_use]

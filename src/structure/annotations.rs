@@ -227,8 +227,8 @@ impl<'a> Confidences<'a> {
     /// Returns the value of the residue of atom `i`; `None` if the table lacks it.
     #[must_use]
     pub fn get(&self, structure: &Structure, i: usize) -> Option<f64> {
-        let place = (structure.model[i], structure.label_chain.id(i), structure.residue_number[i]);
-        let (residue, value) = self.of_residues.get(&place)?;
+        let residue_id = (structure.model[i], structure.label_chain.id(i), structure.residue_number[i]);
+        let (residue, value) = self.of_residues.get(&residue_id)?;
         (*residue == structure.residue.get(i)).then_some(*value)
     }
 }

@@ -25,7 +25,7 @@ fn filter(config: &LogConfig) -> Result<EnvFilter, TelemetryError> {
 /// Returns a [`TelemetryError`] if the filter is invalid or another logger is installed.
 pub fn init_logs(config: &LogConfig) -> Result<(), TelemetryError> {
     let filter = filter(config)?;
-    // A log that cannot be written loses lines. To report this on standard error would panic, because it is the log.
+    // Drop lines that cannot be written. Reporting the error on standard error, which is the log, would panic.
     let builder =
         tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).log_internal_errors(false);
     let installed = match config.format {
@@ -36,8 +36,8 @@ pub fn init_logs(config: &LogConfig) -> Result<(), TelemetryError> {
     };
     installed.map_err(|e| TelemetryError::Install { what: "the log", reason: e.to_string() })?;
     std::panic::set_hook(Box::new(|info| {
-        let place = info.location().map(ToString::to_string).unwrap_or_default();
-        tracing::error!(place, message = info.payload_as_str().unwrap_or("no message"), "panic");
+        let location = info.location().map(ToString::to_string).unwrap_or_default();
+        tracing::error!(location, message = info.payload_as_str().unwrap_or("no message"), "panic");
     }));
     Ok(())
 }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use bcif_support::{block, byte_array, category, column, file, i32s, run_length};
 use cli_support::{Folder, MemoryLimit, Service};
-use http_support::{connect, gzip, send};
+use http_support::{connect, gzip, send, send_on};
 
 /// Limit of the service, MiB.
 const BUDGET: u64 = 256;
@@ -47,7 +47,13 @@ fn a_burst_of_large_uploads_stays_within_the_memory_limit() {
                 "/v1/structures" => target.to_owned(),
                 _ => format!("{target}{separator}isovalue=1.{n:03}"),
             };
-            scope.spawn(move || send(addr, "POST", &target, &[], body).status)
+            scope.spawn(move || {
+                let stream = connect(addr);
+                // The service answers within `jobs.deadline_ms`, a minute, and on a loaded machine a little later.
+                stream.set_read_timeout(Some(Duration::from_mins(2))).unwrap();
+                stream.set_write_timeout(Some(Duration::from_mins(2))).unwrap();
+                send_on(stream, "POST", &target, &[], body).status
+            })
         };
         let clients: Vec<_> = (0..24).map(ask).collect();
         clients.into_iter().map(|client| client.join().unwrap()).collect()

@@ -51,7 +51,7 @@ fn stops_on_signals_without_warnings() {
     }
 }
 
-/// Without a place for its log, the service loses lines and goes on.
+/// A service whose log cannot be written drops lines and continues.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_log_that_cannot_be_written_stops_nothing() {

@@ -370,6 +370,10 @@ fn estimates_report_the_cost_and_a_spacing_that_fits() {
     let ratio = fits["triangles"].as_f64().unwrap() / report["triangles"].as_f64().unwrap();
     assert!((0.8..1.25).contains(&ratio), "{ratio}");
     assert!(fits["seconds"].as_f64().unwrap() > 0.0);
+    // The size is that of the file in the requested format.
+    let stl = estimate("?resolution=1&format=stl");
+    assert_eq!(stl["mesh_bytes"].as_u64(), stl["triangles"].as_u64().map(|n| 50 * n));
+    assert_ne!(fits["mesh_bytes"], stl["mesh_bytes"], "the control");
     let refused = estimate("?resolution=0.3");
     assert_eq!(
         (&refused["accepted"], &refused["problem"]["type"]),

@@ -339,7 +339,11 @@ impl Reply {
 
 /// Sends one request on a new connection and reads the response.
 pub(crate) fn send(addr: SocketAddr, method: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Reply {
-    let mut stream = connect(addr);
+    send_on(connect(addr), method, path, headers, body)
+}
+
+/// Sends a request on a new connection with a timeout of its own, and reads the response.
+pub(crate) fn send_on(mut stream: TcpStream, method: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Reply {
     let mut head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n");
     if !body.is_empty() || method == "POST" {
         head += &format!("content-length: {}\r\n", body.len());

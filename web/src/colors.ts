@@ -59,6 +59,11 @@ export class Colors {
     this.explain(legend);
   }
 
+  /** Stops fetching colours. */
+  stop(): void {
+    this.abort?.abort();
+  }
+
   private clear(): void {
     this.path = null;
     this.viewer.colour(null, 0, this.keepsFile);

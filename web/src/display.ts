@@ -105,7 +105,7 @@ export class Display {
     this.veil();
   }
 
-  /** Shows the view and, if they are switched on, the ligands of a surface, which the viewer shows already. */
+  /** Applies the view, and draws the ligands if switched on, of the surface that the viewer shows. */
   follow(source: Source, choices: Choices): void {
     if (this.nextView !== null) this.viewer.view = viewOfText(this.nextView);
     this.nextView = null;

@@ -79,6 +79,8 @@ export class MolmeshViewer extends HTMLElement {
 
   disconnectedCallback(): void {
     this.abort?.abort();
+    this.colors?.stop();
+    this.ligands?.clear();
     this.viewer?.dispose();
     this.viewer = null;
     this.colors = null;

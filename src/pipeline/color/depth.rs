@@ -6,17 +6,19 @@
 use std::ops::Range;
 
 use rayon::prelude::*;
+use rustc_hash::FxHashMap;
 
 use super::vertex::{cross, dot, length, single};
-use crate::surface::{Control, SurfaceError};
+use crate::surface::{Control, MemoryMeter, SurfaceError};
 
 /// Distance by which points may lie outside the hull, Å.
 const TOLERANCE: f64 = 0.01;
 /// Maximum displacement of a point along each axis, Å.
 const DISPLACEMENT: f64 = 1e-4;
-/// Edge length of the cells whose vertices share a list of near facets, Å.
-const CELL: f64 = 8.0;
-
+/// Number of vertices, or of facets near them, below which all distances are computed.
+const FEW: usize = 16;
+/// Memory of a facet, of its entries in tables and of the lists of facets that are near vertices, bytes.
+const FACET_BYTES: u64 = 320;
 /// Minimum number of points that a task assigns to facets.
 const POINTS_PER_TASK: usize = 1 << 12;
 
@@ -61,35 +63,64 @@ pub(super) fn depths(
     point: impl Fn(usize) -> Point + Sync,
     control: &Control<'_>,
 ) -> Result<Vec<f32>, SurfaceError> {
-    let hull = hull(n, &point, control)?;
-    // The bits of the indices of a cell, because floats have no order.
-    let cell_of = |i: u32| point(i as usize).map(|v| (v / CELL).floor().to_bits());
-    let mut order: Vec<u32> = indices(n).collect();
-    order.par_sort_unstable_by_key(|&i| (cell_of(i), i));
-    let cells: Vec<&[u32]> = order.chunk_by(|&a, &b| cell_of(a) == cell_of(b)).collect();
-    let of_cells: Vec<Vec<f32>> = cells
-        .par_iter()
-        .map(|cell| {
-            control.check()?;
-            let centre = cell_of(cell[0]).map(|bits| (f64::from_bits(bits) + 0.5) * CELL);
-            // Within the cell, distances from a plane differ from that of its centre by half its diagonal at most.
-            let least = hull.iter().map(|plane| -plane.height(centre)).fold(f64::INFINITY, f64::min);
-            let most = least + CELL * 3.0_f64.sqrt();
-            let near: Vec<&Plane> = hull.iter().filter(|plane| -plane.height(centre) <= most).collect();
-            let depth =
-                |i: u32| near.iter().map(|plane| -plane.height(point(i as usize))).fold(f64::INFINITY, f64::min);
-            Ok(cell.iter().map(|&i| if near.is_empty() { 0.0 } else { single(depth(i).max(0.0)) }).collect())
-        })
-        .collect::<Result<_, SurfaceError>>()?;
+    let memory = control.reserve(0)?;
+    let hull = hull(n, &point, &memory, control)?;
+    let mut found: Vec<(u32, f32)> = indices(n).map(|i| (i, 0.0)).collect();
+    if !hull.is_empty() {
+        measure(&mut found, &hull, &point, control)?;
+    }
     let mut depths = vec![0.0; n];
-    for (i, depth) in order.iter().zip(of_cells.iter().flatten()) {
-        depths[*i as usize] = *depth;
+    for (i, depth) in found {
+        depths[i as usize] = depth;
     }
     Ok(depths)
 }
 
+/// Sets the depth of each vertex, given by its index, below the planes of a hull. Divides the vertices in halves with
+/// ever fewer planes.
+fn measure(
+    vertices: &mut [(u32, f32)],
+    planes: &[Plane],
+    point: &(impl Fn(usize) -> Point + Sync),
+    control: &Control<'_>,
+) -> Result<(), SurfaceError> {
+    control.check()?;
+    let [mut low, mut high] = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
+    for (i, _) in &*vertices {
+        let point = point(*i as usize);
+        low = std::array::from_fn(|k| low[k].min(point[k]));
+        high = std::array::from_fn(|k| high[k].max(point[k]));
+    }
+    let centre = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
+    let sides = minus(high, low);
+    let lowest =
+        |point: Point, planes: &[Plane]| planes.iter().map(|plane| -plane.height(point)).fold(f64::INFINITY, f64::min);
+    // In the bounding box, distances from a plane differ from that of the centre by half the diagonal at most.
+    let most = lowest(centre, planes) + length(sides);
+    let near: Vec<Plane> = planes.iter().filter(|plane| -plane.height(centre) <= most).copied().collect();
+    if vertices.len().min(near.len()) <= FEW {
+        for (i, depth) in vertices {
+            *depth = single(lowest(point(*i as usize), &near).max(0.0));
+        }
+        return Ok(());
+    }
+    let axis = if sides[0] >= sides[1].max(sides[2]) { 0 } else { 1 + usize::from(sides[2] > sides[1]) };
+    let along = |(i, _): &(u32, f32)| point(*i as usize)[axis];
+    let middle = vertices.len() / 2;
+    vertices.select_nth_unstable_by(middle, |a, b| along(a).total_cmp(&along(b)));
+    let (below, above) = vertices.split_at_mut(middle);
+    let half = |vertices| measure(vertices, &near, point, control);
+    let (below, above) = rayon::join(|| half(below), || half(above));
+    below.and(above)
+}
+
 /// Returns the planes of the convex hull of `n` points, up to the tolerance; none if the points lie in one plane.
-fn hull(n: usize, point: &(impl Fn(usize) -> Point + Sync), control: &Control<'_>) -> Result<Vec<Plane>, SurfaceError> {
+fn hull(
+    n: usize,
+    point: &(impl Fn(usize) -> Point + Sync),
+    memory: &impl MemoryMeter,
+    control: &Control<'_>,
+) -> Result<Vec<Plane>, SurfaceError> {
     let displaced = |i: u32| -> Point {
         let point = point(i as usize);
         std::array::from_fn(|k| point[k] + DISPLACEMENT * random(3 * u64::from(i) + k as u64))
@@ -97,30 +128,53 @@ fn hull(n: usize, point: &(impl Fn(usize) -> Point + Sync), control: &Control<'_
     let facet =
         |corners: [u32; 3]| Facet { corners, plane: Plane::through(corners.map(displaced)), outside: Vec::new() };
     let Some([a, b, c, d]) = tetrahedron(n, displaced) else { return Ok(Vec::new()) };
-    let mut facets: Vec<Facet> = [[a, b, c], [a, c, d], [a, d, b], [b, d, c]].map(facet).into();
-    assign(&mut facets, indices(n).collect(), displaced);
-    while let Some(from) = facets.iter().rposition(|facet| !facet.outside.is_empty()) {
+    let (mut facets, mut next, mut counted) = (FxHashMap::default(), 0_u64, 0);
+    // Facet of each directed edge. Its neighbour at the edge has the opposite one.
+    let mut facet_of: FxHashMap<[u32; 2], u64> = FxHashMap::default();
+    // Facets that have had points outside.
+    let mut pending = Vec::new();
+    let mut new: Vec<Facet> = [[a, b, c], [a, c, d], [a, d, b], [b, d, c]].map(facet).into();
+    let mut points: Vec<u32> = indices(n).collect();
+    loop {
         control.check()?;
-        let height = |i: &u32| facets[from].plane.height(displaced(*i));
-        let Some(eye) = facets[from].outside.iter().copied().max_by(|a, b| height(a).total_cmp(&height(b))) else {
-            break;
-        };
-        let mut seen = Vec::new();
-        let mut at = 0;
-        while at < facets.len() {
-            if facets[at].plane.height(displaced(eye)) > 0.0 { seen.push(facets.swap_remove(at)) } else { at += 1 }
+        assign(&mut new, points, displaced);
+        for facet in new {
+            facet_of.extend(edges(facet.corners).map(|edge| (edge, next)));
+            pending.extend((!facet.outside.is_empty()).then_some(next));
+            facets.insert(next, facet);
+            next += 1;
         }
-        let mut edges: Vec<[u32; 2]> =
-            seen.iter().flat_map(|Facet { corners: [a, b, c], .. }| [[*a, *b], [*b, *c], [*c, *a]]).collect();
-        edges.sort_unstable();
-        // The edges of the horizon belong to one of the facets only.
-        let horizon = edges.iter().filter(|[a, b]| edges.binary_search(&[*b, *a]).is_err());
-        let mut new: Vec<Facet> = horizon.map(|[a, b]| facet([*a, *b, eye])).collect();
-        // A point above a facet that is replaced is above a new one, or inside.
-        assign(&mut new, seen.into_iter().flat_map(|facet| facet.outside).filter(|i| *i != eye).collect(), displaced);
-        facets.append(&mut new);
+        let uncounted = facets.len().saturating_sub(counted);
+        memory.grow(FACET_BYTES * uncounted as u64)?;
+        counted += uncounted;
+        let Some(from) = std::iter::from_fn(|| pending.pop()).find(|id| facets.contains_key(id)) else { break };
+        let heights = facets[&from].outside.iter().map(|&i| (facets[&from].plane.height(displaced(i)), i));
+        let Some((_, eye)) = heights.max_by(|a, b| a.0.total_cmp(&b.0)) else { break };
+        let top = displaced(eye);
+        // The facets below the point are connected. The edges of their outline are the horizon.
+        let (mut seen, mut horizon) = (vec![from], Vec::new());
+        points = Vec::new();
+        while let Some(id) = seen.pop() {
+            let Some(Facet { corners, outside, .. }) = facets.remove(&id) else { continue };
+            points.extend(outside.into_iter().filter(|i| *i != eye));
+            for [a, b] in edges(corners) {
+                facet_of.remove(&[a, b]);
+                match facet_of.get(&[b, a]) {
+                    Some(neighbour) if facets[neighbour].plane.height(top) > 0.0 => seen.push(*neighbour),
+                    Some(_) => horizon.push([a, b]),
+                    None => {}
+                }
+            }
+        }
+        // A point above a facet that was removed is above a new one, or inside.
+        new = horizon.into_iter().map(|[a, b]| facet([a, b, eye])).collect();
     }
-    Ok(facets.into_iter().map(|facet| facet.plane).collect())
+    Ok(facets.into_values().map(|facet| facet.plane).collect())
+}
+
+/// Returns the directed edges of a triangle.
+fn edges([a, b, c]: [u32; 3]) -> [[u32; 2]; 3] {
+    [[a, b], [b, c], [c, a]]
 }
 
 /// Returns the indices of `n` points. Meshes have 32-bit indices.

@@ -1,6 +1,6 @@
 //! Colours that do not follow from the nearest atom alone: values of vertices, and blended colours.
 //!
-//! Both are computed on the host from the finished mesh, so that every backend gives the same ones.
+//! Both kinds of colours are computed on the host from the finished mesh, so that every backend gives the same ones.
 
 use super::{depth, of_map};
 use crate::formats::linear_of_srgb;
@@ -9,7 +9,7 @@ use crate::surface::{Column, Control, Mesh, SurfaceError, Vertices};
 
 /// Memory of a value and its sums while values are computed, bytes per vertex.
 const VALUE_BYTES: u64 = 20;
-/// The same for depths: lists of points outside the hull and of sorted points.
+/// Memory of computing depths, bytes per vertex: lists of points outside the hull, and of indices with depths.
 const DEPTH_BYTES: u64 = 40;
 /// Memory of blending, bytes per vertex: a colour, the sum of its neighbours and their number.
 const BLEND_BYTES: u64 = 22;

@@ -89,7 +89,7 @@ impl<'a> Category<'a> {
         Ok(Self { name, rows, columns: columns.ok_or_else(|| missing("`columns`"))? })
     }
 
-    fn place(&self) -> String {
+    fn location(&self) -> String {
         format!("BinaryCIF, {}", decode(self.name))
     }
 
@@ -188,11 +188,11 @@ impl<'a> BinaryBlock<'a> {
         };
         let value = |category, item, max| -> Result<Option<String>, StructureError> {
             let Some(category) = self.category(category) else { return Ok(None) };
-            Ok(category.value(item, max, reading.limits).map_err(|f| f.within(category.place()))?)
+            Ok(category.value(item, max, reading.limits).map_err(|f| f.within(category.location()))?)
         };
         let entry = value("entry", "id", 80)?;
         let title = value("struct", "title", MAX_TITLE)?;
-        let place = self.category("atom_site").map(Category::place).unwrap_or_default();
+        let location = self.category("atom_site").map(Category::location).unwrap_or_default();
         let source = SourceFields {
             format: SourceFormat::BinaryCif,
             id: entry.or_else(|| self.name.clone()),
@@ -201,7 +201,7 @@ impl<'a> BinaryBlock<'a> {
             annotations: categories.annotations(),
             assemblies: categories.assemblies(),
             radii: Vec::new(),
-            warnings: warnings.messages(|fault| fault.within(&place).into()).into_iter().chain(unread).collect(),
+            warnings: warnings.messages(|fault| fault.within(&location).into()).into_iter().chain(unread).collect(),
         };
         columns.finish(tables, source, reading).map(Some)
     }
@@ -221,7 +221,7 @@ impl<'a> BinaryBlock<'a> {
                     }
                 }
                 Err(fault) => {
-                    let error = StructureError::from(fault.within(category.place()));
+                    let error = StructureError::from(fault.within(category.location()));
                     let what = known.forget(item_ix);
                     unread.push(format!("{error}; {what} are unknown"));
                     // The other items of the same group are useless without this one.
@@ -242,7 +242,7 @@ impl<'a> BinaryBlock<'a> {
         let limits = reading.limits;
         let Some(category) = self.category("atom_site").filter(|category| category.rows > 0) else { return Ok(None) };
         let bounds = category.bounds(limits).ok_or(StructureError::TooManyAtoms { limit: limits.max_atoms })?;
-        let within = |fault: Box<Fault>| fault.within(category.place());
+        let within = |fault: Box<Fault>| fault.within(category.location());
         let raw = category.columns().map_err(within)?;
         let layout = layout(&raw).map_err(within)?;
         if let Some(missing) = layout.missing() {

@@ -170,7 +170,7 @@ fn halves_are_those_of_ieee_754() {
 }
 
 #[test]
-fn bad_maps_name_the_place() {
+fn bad_maps_name_the_location() {
     let malformed = |bytes: &[u8]| match of(bytes) {
         Err(MapError::Malformed { location, found, expected }) => format!("{location}: {found}, {expected}"),
         other => panic!("{other:?}"),

@@ -149,9 +149,9 @@ fn square([x, y, z]: Point) -> f64 {
 
 /// Points in the cells of a uniform grid.
 struct PointGrid {
-    /// Distance at which cells are out of reach, Å.
+    /// Distance beyond which a cell holds no near point, Å.
     reach: f64,
-    /// Squared distance of the farthest points that are near, Å².
+    /// Maximum squared distance of a near point, Å².
     distance2: f64,
     low: Point,
     cell: f64,

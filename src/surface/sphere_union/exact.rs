@@ -81,8 +81,8 @@ struct FaceSearch<'a> {
 }
 
 impl ExactMeasures {
-    /// Measures the surface of `spheres`; `None` if it is an isosurface. The memory of the result stays added to the
-    /// meter of `control`.
+    /// Measures the surface of `spheres`; `None` if it is an isosurface. The memory of the result remains charged to
+    /// `control`.
     ///
     /// # Errors
     /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::BadParameter`] if scale and offset leave a radius that is too

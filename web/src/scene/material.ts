@@ -59,7 +59,7 @@ const vec3 KEY = vec3(0.38, 0.62, 0.69);
 const vec3 FILL = vec3(-0.75, -0.1, 0.65);
 void main() {
   #ifdef NORMALS
-  // Triangles that are seen from inside are lit as their visible side is.
+  // Flip the normals of back faces, so that the visible side is lit.
   vec3 n = (gl_FrontFacing ? 1.0 : -1.0) * normalize(vNormal);
   #else
   vec3 n = normalize(cross(dFdx(vEye), dFdy(vEye)));
