@@ -209,11 +209,9 @@ fn tetrahedron(n: usize, displaced: impl Fn(u32) -> Point + Sync) -> Option<[u32
     let (_, c) = farthest(&|p| length(cross(along, minus(p, from))))?;
     let plane = Plane::through([a, b, c].map(&displaced));
     let (height, d) = farthest(&|p| plane.height(p).abs())?;
-    if height <= TOLERANCE {
-        return None;
-    }
     let is_below = plane.height(displaced(d)) < 0.0;
-    Some(if is_below { [a, b, c, d] } else { [a, c, b, d] })
+    // The height is not a number if all points lie on one line.
+    (height > TOLERANCE).then_some(if is_below { [a, b, c, d] } else { [a, c, b, d] })
 }
 
 fn minus(a: Point, b: Point) -> Point {
