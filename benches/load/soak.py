@@ -5,10 +5,10 @@
 
 The script first measures the peak rate, then sends requests at half of it or at `--rate`. Every five seconds it samples
 resident memory, threads, open files by kind, and the gauges of memory, jobs and connections. Stored objects expire
-after 90 seconds, and the warm-up reaches the limits of the store, so that any further growth is a leak.
+after 90 seconds, caches are small, and the warm-up fills them, so that any further growth is a leak.
 
 A leak raises the lowest resident memory of each minute, and running jobs hardly change it. Structures in memory, up to
-their limit, are subtracted. The slope is that of Theil and Sen: the median of the slopes between all pairs of minutes.
+their limit, are subtracted, also from the values before and after the load. The slope is that of Theil and Sen: the median of the slopes between all pairs of minutes.
 The 95 % interval is a bootstrap of the residuals in blocks of five minutes, because neighbouring minutes depend on each
 other. Idle threads keep a few MiB each, so a change of their number is printed beside the slope.
 
@@ -31,7 +31,7 @@ from statistics import median
 from mixed import Expected, Load, Server, folder
 
 KEPT = ["store.result_ttl_ms=90000", "store.input_ttl_ms=90000", "store.job_ttl_ms=90000", "store.sweep_ms=10000"]
-KEPT += ["store.max_bytes=2GiB", "store.memory_bytes=32MiB", "limits.structure_cache_bytes=32MiB"]
+KEPT += ["store.max_bytes=2GiB", "store.memory_bytes=8MiB", "limits.structure_cache_bytes=8MiB"]
 # Limits of the growth of the resident memory, % per hour, and of its excess over the idle value, %.
 MAX_GROWTH, MAX_EXCESS = 1.0, 20.0
 # Seconds without requests after which all stored objects have expired and all connections are closed.
@@ -151,7 +151,7 @@ def main():
     warm = [sample for sample in samples if sample["at"] >= 60 * args.warm_up]
     middle = median(sample["rss"] for sample in warm)
     per_hour, low, high = growth(warm)
-    excess = 100 * (after["rss"] / before["rss"] - 1)
+    excess = 100 * ((after["rss"] - after.get(CACHE, 0)) / (before["rss"] - before.get(CACHE, 0)) - 1)
     print(load.report())
     print(f"pace: {sent:.1f} requests/s, {100 * sent / peak_rate:.0f} % of the peak")
     interval = f"95 % interval {low:+.2f} to {high:+.2f}"

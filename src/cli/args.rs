@@ -242,8 +242,8 @@ pub(crate) struct SurfaceArgs {
 #[command(next_help_heading = "Colours")]
 pub(crate) struct ColorArgs {
     /// Colours of vertices: uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, occupancy,
-    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial, map or none
-    /// [default: none]
+    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial, depth, map or
+    /// none [default: none]
     #[arg(long, value_name = "SCHEME")]
     pub(crate) color: Option<String>,
     /// Palette of a numeric scheme: viridis, cividis, blue-white-red or red-white-blue [default: depends on the scheme]

@@ -46,6 +46,9 @@ pub struct StoreConfig {
     /// Capacity for results and inputs together, bytes. Default 10 GiB: thousands of meshes. The least recently used
     /// objects are evicted.
     pub max_bytes: u64,
+    /// Number of results, their reports and inputs together. Default 500,000: their index takes up to 200 MB of memory.
+    /// The least recently used objects are evicted.
+    pub max_objects: u64,
     /// Time that a result is kept after its last use, ms. Default 86,400,000 (a day): most repeated requests come soon.
     pub result_ttl_ms: u64,
     /// Time that an input is kept after its last use, ms. Default 604,800,000 (7 days): users mesh a structure again
@@ -76,6 +79,7 @@ impl Default for StoreConfig {
             check_timeout_ms: 10_000,
             sweep_ms: 60_000,
             max_bytes: 10 << 30,
+            max_objects: 500_000,
             result_ttl_ms: 86_400_000,
             input_ttl_ms: 604_800_000,
             job_ttl_ms: 86_400_000,

@@ -88,6 +88,20 @@ impl Format {
         matches!(self, Self::Glb | Self::Gltf)
     }
 
+    /// Returns the approximate size of a mesh file, bytes. `mesh_bytes` is the size of the mesh in memory.
+    #[must_use]
+    pub const fn estimated_bytes(self, mesh_bytes: u64, n_vertices: u64, n_triangles: u64) -> u64 {
+        match self {
+            Self::Glb | Self::Ply | Self::Vtp => mesh_bytes,
+            // Base64.
+            Self::Gltf => mesh_bytes.saturating_mul(4) / 3,
+            Self::Stl => n_triangles.saturating_mul(50),
+            Self::Obj => n_vertices.saturating_mul(54).saturating_add(n_triangles.saturating_mul(40)),
+            Self::PlyText => n_vertices.saturating_mul(50).saturating_add(n_triangles.saturating_mul(20)),
+            Self::Png => 0,
+        }
+    }
+
     /// Media type, registered with IANA except those of PLY and VTP: `application/ply` is common,
     /// `model/x-ply-text` and `model/x-vtp` are specific to molmesh.
     #[must_use]

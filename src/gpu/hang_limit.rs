@@ -5,8 +5,8 @@ use std::time::Duration;
 /// Maximum time of a submission on a slow device, as a multiple of its estimated time.
 const MAX_SLOWDOWN: f64 = 100.0;
 
-/// Maximum time of a build and of the first submission, as a multiple of the minimum limit of a submission. Drivers take
-/// seconds to open a device and to compile its pipelines, and some compile them at their first use.
+/// Maximum time of a build and of the first submission, as a multiple of the minimum limit of a submission. Drivers
+/// take seconds to open a device and to compile its pipelines, and some compile them at their first use.
 const MAX_FIRST: u32 = 3;
 
 /// Returns the time limit of a submission: `minimum`, or more for a large amount of `work` on a slow device. `fastest`

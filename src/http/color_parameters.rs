@@ -6,7 +6,8 @@ use crate::pipeline::params::{self, ParamError};
 use crate::pipeline::{Coloring, Job, color};
 
 /// Names of the parameters.
-pub(super) const NAMES: [&str; 7] = ["scheme", "palette", "color_range", "model", "chains", "select", "altloc"];
+pub(super) const NAMES: [&str; 9] =
+    ["scheme", "palette", "color_range", "model", "chains", "select", "altloc", "assembly", "context"];
 
 /// Parses the parameters.
 ///
@@ -59,6 +60,8 @@ mod tests {
     #[test]
     fn parameters_are_those_of_a_mesh_with_scheme_instead_of_color() {
         assert_eq!(parsed(&[("scheme", "bfactor"), ("chains", "A")]).unwrap().1.scheme, color::Scheme::BFactor);
+        let (job, _) = parsed(&[("scheme", "bfactor"), ("assembly", "1"), ("context", "whole")]).unwrap();
+        assert_eq!(job.selection.assembly.as_deref(), Some("1"));
         for (pairs, name) in [
             (&[][..], "scheme"),
             (&[("scheme", "none")], "scheme"),

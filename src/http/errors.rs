@@ -59,8 +59,7 @@ pub(super) fn file_too_large(bytes: u64, limit: u64, resolution: f64) -> Problem
 /// explanation. These numbers grow with the inverse square of the spacing.
 #[expect(clippy::cast_precision_loss, reason = "an estimate: 52 bits suffice")]
 fn oversized(what: &str, actual: u64, limit: u64, resolution: f64) -> Problem {
-    let fits = resolution * (actual as f64 / limit as f64).sqrt();
-    let fits = (fits * 105.0).ceil() / 100.0;
+    let fits = (resolution * (actual as f64 / limit as f64).sqrt() * 105.0).ceil() / 100.0;
     if fits > MAX_RESOLUTION {
         return Problem::new(ProblemType::MeshTooLarge, what.to_owned()).with("limit", limit).with("actual", actual);
     }
@@ -204,10 +203,9 @@ impl From<StoreError> for Problem {
     fn from(error: StoreError) -> Self {
         let wait = Duration::from_secs(5);
         match error {
-            StoreError::TooLarge { bytes, max_bytes } => Self::new(ProblemType::StoreFull, error.to_string())
-                .with("actual", bytes)
-                .with("limit", max_bytes)
-                .retry_after(wait),
+            StoreError::TooLarge { bytes, max_bytes } => {
+                Self::new(ProblemType::BodyTooLarge, error.to_string()).with("actual", bytes).with("limit", max_bytes)
+            }
             StoreError::Full { held, max_bytes, .. } => Self::new(ProblemType::StoreFull, error.to_string())
                 .with("actual", held)
                 .with("limit", max_bytes)

@@ -26,6 +26,7 @@ use super::problem_types::ProblemType;
 use super::request_id::RequestId;
 use super::source::Loaded;
 use super::state::Shared;
+use crate::formats::Format;
 use crate::pipeline::{self, Choice, Estimate};
 use crate::surface::Control;
 
@@ -141,7 +142,7 @@ pub(super) async fn create(
     let wait = app.pool.estimated_wait().as_secs_f64();
     // The size of a picture does not depend on the mesh.
     let limit = if format.is_picture() { u64::MAX } else { app.config.limits.output_bytes };
-    let problem = refusal(&estimate, limit);
+    let problem = refusal(&estimate, format, limit);
     let mesh = estimate.mesh.as_ref().ok();
     let document = EstimateDocument {
         accepted: problem.is_none(),
@@ -169,10 +170,12 @@ pub(super) async fn create(
 
 /// Returns the problem for which the mesh would be rejected; `None` if there is none. `limit` is the maximum size of
 /// its file, bytes.
-fn refusal(estimate: &Estimate, limit: u64) -> Option<Problem> {
+fn refusal(estimate: &Estimate, format: Format, limit: u64) -> Option<Problem> {
     match &estimate.mesh {
-        Ok(mesh) if mesh.bytes > limit => Some(file_too_large(mesh.bytes, limit, estimate.resolution)),
-        Ok(_) => None,
+        Ok(mesh) => {
+            let bytes = format.estimated_bytes(mesh.bytes, mesh.vertices, mesh.triangles);
+            (bytes > limit).then(|| file_too_large(bytes, limit, estimate.resolution))
+        }
         Err(error) => Some(Problem::from(error.clone())),
     }
 }

@@ -99,8 +99,14 @@ impl ParsedRequest {
     }
 }
 
-fn parse(query: Pairs) -> Result<(Vec<(String, String)>, Request), Problem> {
+/// Returns the pairs of a query.
+pub(super) fn pairs(query: Pairs) -> Result<Vec<(String, String)>, Problem> {
     let Query(pairs) = query.map_err(|e| Problem::new(ProblemType::BadRequest, e.body_text()))?;
+    Ok(pairs)
+}
+
+fn parse(query: Pairs) -> Result<(Vec<(String, String)>, Request), Problem> {
+    let pairs = pairs(query)?;
     let request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
     Ok((pairs, request))
 }

@@ -24,7 +24,7 @@ pub(super) const MEDIA_TYPE: &str = "application/problem+json";
 /// Error response.
 #[derive(Debug, Clone)]
 pub(super) struct Problem {
-    problem_type: ProblemType,
+    kind: ProblemType,
     detail: String,
     members: Map<String, Value>,
     retry_after_s: Option<u32>,
@@ -34,7 +34,7 @@ pub(super) struct Problem {
 impl Problem {
     /// Creates a problem; `detail` explains this occurrence.
     pub(super) fn new(problem_type: ProblemType, detail: impl Into<String>) -> Self {
-        Self { problem_type, detail: detail.into(), members: Map::new(), retry_after_s: None, header: None }
+        Self { kind: problem_type, detail: detail.into(), members: Map::new(), retry_after_s: None, header: None }
     }
 
     /// Creates an internal error. The message goes to the log, not to the client.
@@ -45,12 +45,12 @@ impl Problem {
 
     /// Returns true if the problem is of this type.
     pub(super) fn is(&self, problem_type: ProblemType) -> bool {
-        self.problem_type == problem_type
+        self.kind == problem_type
     }
 
     /// Returns the name of the problem type.
     pub(super) fn slug(&self) -> &'static str {
-        self.problem_type.row().slug
+        self.kind.row().slug
     }
 
     /// Appends advice to the explanation.
@@ -105,7 +105,7 @@ impl Problem {
 
     /// Returns the document as JSON, with a line break.
     pub(super) fn document(&self, instance: &str) -> Vec<u8> {
-        let row = self.problem_type.row();
+        let row = self.kind.row();
         let mut document = Map::new();
         document.insert("type".to_owned(), format!("/problems/{}", row.slug).into());
         document.insert("title".to_owned(), row.title.into());
@@ -128,7 +128,7 @@ impl From<PathRejection> for Problem {
 impl IntoResponse for Problem {
     /// Sets the status and the headers, and attaches the problem for [`render`].
     fn into_response(self) -> Response {
-        let mut response = self.problem_type.row().status.into_response();
+        let mut response = self.kind.row().status.into_response();
         if let Some(wait) = self.retry_after_s {
             response.headers_mut().insert(RETRY_AFTER, HeaderValue::from(wait));
         }
@@ -151,7 +151,7 @@ pub(super) async fn render(request: Request, next: Next) -> Response {
     }
     let problem = response.extensions_mut().remove::<Problem>();
     let problem = problem.unwrap_or_else(|| from_library(status, &path));
-    let row = problem.problem_type.row();
+    let row = problem.kind.row();
     if row.is_rejection {
         counter!(REJECTED, "reason" => row.slug).increment(1);
     }

@@ -11,8 +11,8 @@ use axum::routing::{MethodRouter, get, post};
 
 use super::state::Shared;
 use super::{
-    api_document, areas, atoms, capabilities, colors, estimate, events, guard, health, jobs, meshes, middleware, negotiate,
-    page, pdb, problems, results, scopes, structures,
+    api_document, areas, atoms, capabilities, colors, estimate, events, guard, health, jobs, meshes, middleware,
+    negotiate, page, pdb, problems, results, scopes, structures,
 };
 
 /// Margin of the backstop timeout over the sum of the regular timeouts.

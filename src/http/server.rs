@@ -31,8 +31,8 @@ use crate::telemetry::{self, Recorder, TelemetryError, Traces};
 /// Interval of metrics upkeep.
 const UPKEEP: Duration = Duration::from_secs(5);
 
-/// Number of results whose headers are cached, about 1 KB each.
-const CACHED_HEADERS: usize = 4096;
+/// Number of results whose headers are cached, about 2 KB each.
+const CACHED_HEADERS: usize = 1024;
 
 /// Time for cancelled jobs to stop and for their records to be written.
 const CANCELLING: Duration = Duration::from_secs(1);

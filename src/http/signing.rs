@@ -46,12 +46,28 @@ fn check_file(row: &OperationScope, path: &str) -> Result<(), String> {
     if !row.path.ends_with("/{file}") {
         return Ok(());
     }
-    let (stem, extension) = path.rsplit('/').next().and_then(|file| file.split_once('.')).unwrap_or_default();
-    let is_mesh = Format::ALL.into_iter().any(|format| format.name() == extension);
+    let stem = path.rsplit('/').next().and_then(|file| file.split_once('.')).unwrap_or_default().0;
+    let is_mesh = format_of(path).is_some();
     let is_named = if is_result(row) { stem.len() == 64 } else { stem == "surface" };
     let expected = if is_result(row) { "a result has a name of 64 digits" } else { "a structure has `surface`" };
     let of = || format!("{expected} and one of the extensions {}", Format::ALL.map(Format::name).join(", "));
     if is_mesh && is_named { Ok(()) } else { Err(of()) }
+}
+
+/// Returns the format that the extension of a path names.
+fn format_of(path: &str) -> Option<Format> {
+    let (_, extension) = path.rsplit('/').next()?.split_once('.')?;
+    Format::ALL.into_iter().find(|format| format.name() == extension)
+}
+
+/// Checks the parameters of a mesh; `file` is the format that the path names.
+fn check_mesh(file: Option<Format>, pairs: Vec<(String, String)>) -> Result<(), String> {
+    let mut request = params::parse(pairs).map_err(|error| error.to_string())?;
+    if file.is_some() && request.format.is_some() {
+        return Err("parameter `format`: the path already names the format".to_owned());
+    }
+    let format = file.or(request.format).unwrap_or_default();
+    params::set_format(&mut request.job, format).map_err(|error| error.to_string())
 }
 
 fn is_result(row: &OperationScope) -> bool {
@@ -61,7 +77,7 @@ fn is_result(row: &OperationScope) -> bool {
 fn check_parameters(row: &OperationScope, uri: &Uri) -> Result<(), String> {
     let Query(pairs) = Query::<Vec<(String, String)>>::try_from_uri(uri).map_err(|error| error.body_text())?;
     match row.parameters() {
-        Parameters::Mesh => params::parse(pairs).map(drop).map_err(|error| error.to_string()),
+        Parameters::Mesh => check_mesh(format_of(uri.path()).filter(|_| row.path.ends_with("/{file}")), pairs),
         Parameters::Atoms => atom_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Areas => area_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
@@ -110,6 +126,8 @@ mod tests {
             ("/v1/results/7.glb", "64 digits"),
             ("/v1/pdb/4pti/surface.glb?resolutoin=1", "did you mean `resolution`"),
             ("/v1/pdb/4pti/surface.glb?resolution=fine", "parameter `resolution`"),
+            ("/v1/pdb/4pti/surface.glb?format=glb", "already names the format"),
+            ("/v1/pdb/4pti/surface.glb?width=100", "`width`"),
             ("/v1/jobs/7?wait=99", "more than 55"),
             ("/v1/jobs/7?wiat=9", "unknown field `wiat`"),
             ("/v1/jobs/7/result?wait=9", "`wait`; this path has none"),

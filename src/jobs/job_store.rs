@@ -25,8 +25,9 @@ use crate::store::{Digest, Namespace, Pin, Secret, Store, StoreError};
 use crate::sync::{Handle, timeout};
 use crate::telemetry::JOBS_RECOVERED;
 
-/// Number of ended jobs that are held in memory; older ones are read from the store.
-const MAX_ENDED: usize = 10_000;
+/// Number of ended jobs that are held in memory; older ones are read from the store. A record takes up to 64 KiB, the
+/// size of a request without its structure.
+pub(super) const MAX_ENDED: usize = 256;
 /// Maximum time that the acceptance of a job whose result is stored waits for its end to be recorded.
 const STORED_WAIT: Duration = Duration::from_secs(5);
 /// Number of records of begun and ended jobs that are written concurrently, so that others find a free thread.
@@ -108,13 +109,15 @@ impl JobStoreState {
     }
 
     /// Adds a job to the map, unless there is one with this id, and returns the job in the map.
-    fn insert(&self, id: &JobId, job: &Arc<DurableJob>) -> Arc<DurableJob> {
+    pub(super) fn insert(&self, id: &JobId, job: &Arc<DurableJob>) -> Arc<DurableJob> {
         let mut jobs = self.lock();
         let inserted = Arc::clone(jobs.entry(id.clone()).or_insert_with(|| Arc::clone(job)));
-        if jobs.len() > MAX_ENDED + MAX_ENDED / 10 {
+        let n_ended = jobs.len().saturating_sub(*self.open.borrow());
+        // Some more, so that not every insertion sorts.
+        if n_ended > MAX_ENDED + MAX_ENDED / 10 {
             let mut ended: Vec<_> = jobs.values().filter_map(|job| job.ended()).collect();
             ended.sort_unstable();
-            for (_, id) in ended.iter().take(jobs.len().saturating_sub(MAX_ENDED)) {
+            for (_, id) in ended.iter().take(n_ended - MAX_ENDED) {
                 jobs.remove(id);
             }
         }

@@ -30,10 +30,19 @@ pub(crate) enum SaveError {
     },
     /// The store failed.
     #[error(transparent)]
-    Store(#[from] StoreError),
+    Store(StoreError),
     /// Anything else.
     #[error("{0}")]
     Other(String),
+}
+
+impl From<StoreError> for SaveError {
+    fn from(error: StoreError) -> Self {
+        match error {
+            StoreError::TooLarge { bytes, max_bytes } => Self::TooLarge { bytes, limit: max_bytes },
+            error => Self::Store(error),
+        }
+    }
 }
 
 impl SaveError {

@@ -3,7 +3,7 @@
 //! A structure is found by the digest of its file and within its namespace only. It is charged to the memory budget,
 //! which takes the memory back before it rejects anything.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::ops::Deref;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
@@ -23,6 +23,9 @@ use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
 /// Namespace and digest of a file. All other input of the reader is the same for the whole service, except limits.
 type StructureKey = (Namespace, Digest);
 
+/// Memory of a structure besides its atoms and texts, bytes: its columns are some 40 allocations. Without it, the cache
+/// would take several times its limit for structures of one atom.
+const OVERHEAD: u64 = 4 << 10;
 /// Time between two checks of a request that waits for another one to read its structure.
 const POLL: Duration = Duration::from_millis(20);
 
@@ -106,28 +109,47 @@ impl Input {
 
 #[derive(Debug, Default)]
 struct CacheState {
+    /// Structures, each with the number of its last use.
+    kept: HashMap<StructureKey, (u64, SharedStructure)>,
     /// Least recently used first.
-    kept: Vec<(StructureKey, SharedStructure)>,
+    by_use: BTreeMap<u64, StructureKey>,
+    /// Number of uses.
+    uses: u64,
+    /// Memory of all structures, bytes.
+    bytes: u64,
     /// Structures that a request is reading.
     reading: HashSet<StructureKey>,
 }
 
 impl CacheState {
-    fn bytes(&self) -> u64 {
-        self.kept.iter().map(|(_, kept)| kept.bytes()).sum()
+    /// Adds a structure as the most recently used one.
+    fn insert(&mut self, key: StructureKey, structure: SharedStructure) {
+        self.remove(&key);
+        self.uses += 1;
+        self.bytes += structure.bytes();
+        self.by_use.insert(self.uses, key);
+        self.kept.insert(key, (self.uses, structure));
+    }
+
+    fn remove(&mut self, key: &StructureKey) -> Option<SharedStructure> {
+        let (used, structure) = self.kept.remove(key)?;
+        self.by_use.remove(&used);
+        self.bytes -= structure.bytes();
+        Some(structure)
     }
 
     /// Removes the least recently used structure that `is_candidate` accepts, and returns its memory in bytes.
     fn evict(&mut self, is_candidate: impl Fn(&SharedStructure) -> bool) -> Option<u64> {
-        let found = self.kept.iter().position(|(_, kept)| is_candidate(kept))?;
-        Some(self.kept.remove(found).1.bytes())
+        let accepted = |key: &&StructureKey| self.kept.get(*key).is_some_and(|(_, structure)| is_candidate(structure));
+        let found = *self.by_use.values().find(accepted)?;
+        self.remove(&found).map(|structure| structure.bytes())
     }
 
     /// Finds a structure, and makes it the most recently used one.
     fn find(&mut self, key: &StructureKey) -> Option<SharedStructure> {
-        let found = self.kept.iter().position(|(known, _)| known == key)?;
-        self.kept[found..].rotate_left(1);
-        self.kept.last().map(|(_, kept)| kept.clone())
+        let found = self.remove(key)?;
+        self.insert(*key, found.clone());
+        Some(found)
     }
 }
 
@@ -202,6 +224,7 @@ impl Structures {
         reservation.also_held(file.len() as u64);
         let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
         let structure = structure::read_with(file, limits, &charged)?;
+        reservation.grow(OVERHEAD)?;
         let bytes = reservation.bytes();
         control.memory.also_held(bytes);
         let is_kept = bytes <= self.limit;
@@ -221,8 +244,8 @@ impl Structures {
     /// Keeps a structure, and evicts others.
     fn keep(&self, key: StructureKey, kept: &SharedStructure) {
         let mut state = self.lock();
-        state.kept.push((key, kept.clone()));
-        while state.bytes() > self.limit && state.evict(|_| true).is_some() {}
+        state.insert(key, kept.clone());
+        while state.bytes > self.limit && state.evict(|_| true).is_some() {}
         publish(&state);
     }
 
@@ -261,7 +284,7 @@ impl Drop for ReadingMark<'_> {
 
 #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
 fn publish(state: &CacheState) {
-    gauge!(STRUCTURE_CACHE_BYTES).set(state.bytes() as f64);
+    gauge!(STRUCTURE_CACHE_BYTES).set(state.bytes as f64);
 }
 
 #[cfg(test)]
@@ -294,7 +317,7 @@ mod tests {
     }
 
     fn is_kept(structures: &Structures, file: &File) -> bool {
-        structures.lock().kept.iter().any(|((_, digest), _)| *digest == file.1)
+        structures.lock().kept.keys().any(|(_, digest)| *digest == file.1)
     }
 
     fn size(file: &File) -> u64 {
@@ -328,9 +351,22 @@ mod tests {
         let structures = Structures::new(limit, &budget);
         for i in [0, 1, 0, 2, 3] {
             get(&structures, &files[i]);
-            assert!(structures.lock().bytes() <= limit);
+            assert!(structures.lock().bytes <= limit);
         }
         assert_eq!([0, 1, 2, 3].map(|i| is_kept(&structures, &files[i])), [true, false, true, false]);
+    }
+
+    #[test]
+    fn small_structures_are_charged_for_their_allocations() {
+        // 400 structures of one atom and some texts.
+        let structures = Structures::new(400 * (OVERHEAD + 1000), &Budget::unlimited());
+        for i in 0..1000_u32 {
+            get(&structures, &(file(1).0, Digest::of(&i.to_le_bytes())));
+        }
+        let state = structures.lock();
+        assert!((400..=400 * 5 / 4).contains(&state.kept.len()), "{} structures", state.kept.len());
+        assert_eq!(state.bytes, state.kept.values().map(|(_, kept)| kept.bytes()).sum::<u64>());
+        assert_eq!(state.by_use.len(), state.kept.len());
     }
 
     #[test]
@@ -342,7 +378,7 @@ mod tests {
         for i in [1, 2] {
             get(&structures, &files[i]);
         }
-        let (held, reservation) = (structures.lock().bytes(), budget.reservation());
+        let (held, reservation) = (structures.lock().bytes, budget.reservation());
         // Only the least recently used structure that no request uses is freed.
         reservation.grow((1 << 20) - held + 1).unwrap();
         assert_eq!([0, 1, 2].map(|i| is_kept(&structures, &files[i])), [true, false, true]);
@@ -352,7 +388,7 @@ mod tests {
         reservation.grow(most - reservation.bytes()).unwrap();
         drop(in_use);
         reservation.grow((1 << 20) - reservation.bytes()).unwrap();
-        assert_eq!(structures.lock().bytes(), 0);
+        assert_eq!(structures.lock().bytes, 0);
         // Memory that is taken regardless of the limit does not make the check fail either.
         drop(reservation);
         get(&structures, &files[0]);
@@ -388,6 +424,6 @@ mod tests {
         assert!(got.len() >= 6 && got.len() + cancelled.into_inner() == 8);
         assert!(got.iter().all(|kept| Arc::ptr_eq(&kept.0, &got[0].0)));
         assert!(structures.lock().reading.is_empty());
-        assert_eq!(held(&budget), structures.lock().bytes());
+        assert_eq!(held(&budget), structures.lock().bytes);
     }
 }

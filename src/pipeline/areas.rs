@@ -289,11 +289,12 @@ impl AtomAreas {
         for (n, &atom) in self.atoms.iter().enumerate() {
             let i = atom as usize;
             let row = match level {
+                AreaLevel::Atom => rows.len(),
                 // The first atom of a copy has a lower index than the last one of the copy before.
-                AreaLevel::Residue if before.is_some_and(|last| last < i && same_residue(structure, last, i)) => {
-                    rows.len() - 1
+                AreaLevel::Residue => {
+                    let is_same = before.is_some_and(|last| last < i && same_residue(structure, last, i));
+                    rows.len() - usize::from(is_same)
                 }
-                AreaLevel::Atom | AreaLevel::Residue => rows.len(),
                 AreaLevel::Chain => {
                     let key = (structure.chain.id(i), structure.model[i]);
                     *of_chains.entry(key).or_insert(rows.len())

@@ -218,7 +218,8 @@ impl Model {
     /// the job.
     pub fn assign(&mut self, now: [f64; 2], work: f64, gpus: usize) -> Assignment {
         let [cpu_jobs, gpu_jobs] = self.loads.map(|load| load.jobs);
-        let idle_share = self.host.idle_share(now, cpu_jobs, gpu_jobs);
+        self.host.update(now, cpu_jobs, gpu_jobs);
+        let idle_share = self.host.idle_share();
         let ends = self.costs.filter(|_| gpus > 0).map(|_| {
             let [cpu, gpu] = [Side::Cpu, Side::Gpu].map(|side| self.estimates(side, now[0], work, gpus));
             // The CPU runs its jobs one after the other, on the cores that the jobs of the GPUs leave idle.

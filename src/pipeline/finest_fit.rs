@@ -34,10 +34,10 @@ const SAMPLE_RUN: usize = 1 << 12;
 /// Margin of a spacing that was found with a sample.
 const SAMPLE_MARGIN: f64 = 1.03;
 /// Spacing of the mesh that gives the area, as a multiple of the suggested spacing.
-const SKETCH_FACTOR: f64 = 4.0;
+const AREA_SPACING_FACTOR: f64 = 4.0;
 /// Maximum number of spheres for which a coarse mesh gives the area. Above, the sum of the areas of the spheres is
 /// used.
-const MAX_SKETCHED: usize = 300_000;
+const MAX_MESHED_SPHERES: usize = 300_000;
 /// Margin of the estimated size of a mesh that must fit.
 const SIZE_MARGIN: f64 = 1.3;
 /// Factor of the spacing if the grid fits but the boundary of the spheres does not, and the number of such steps.
@@ -282,9 +282,9 @@ fn with_fitting_mesh(
     if excess(most) <= 1.0 {
         return Ok(spacing);
     }
-    let area = if plan.spheres.len() <= MAX_SKETCHED {
+    let area = if plan.spheres.len() <= MAX_MESHED_SPHERES {
         let coarse = MeshPlan { params: &SurfaceParams { resolution: spacing, ..params.clone() }, ..*plan };
-        match coarse.areas(SKETCH_FACTOR * spacing, choice, control) {
+        match coarse.areas(AREA_SPACING_FACTOR * spacing, choice, control) {
             Ok([whole, _]) => most.min(SIZE_MARGIN * whole),
             Err(error) if ends_work(&error) => return Err(error),
             Err(_) => most,

@@ -61,12 +61,11 @@ impl HostCores {
         }
     }
 
-    /// Returns the share of cores, from 0.05 to 1, that the jobs of GPUs leave idle at the moment `now` of [`update`].
+    /// Returns the share of cores, from 0.05 to 1, that the jobs of GPUs leave idle at the last [`update`].
     ///
     /// [`update`]: Self::update
-    pub(super) fn idle_share(&mut self, now: [f64; 2], cpu_jobs: usize, gpu_jobs: usize) -> f64 {
-        self.update(now, cpu_jobs, gpu_jobs);
-        let jobs = self.mean_jobs.max(gpu_jobs as f64);
+    pub(super) fn idle_share(&self) -> f64 {
+        let jobs = self.mean_jobs.max(self.last.gpu_jobs as f64);
         (1.0 - self.per_job * jobs / self.cores).clamp(MIN_SHARE, 1.0)
     }
 }
@@ -100,13 +99,16 @@ mod tests {
         assert!((host.per_job - 0.5).abs() < 1e-3, "{host:?}");
         let now = [now[0] + 9.0, now[1]];
         for (jobs, share) in [(0, 1.0), (8, 0.5), (16, MIN_SHARE), (99, MIN_SHARE)] {
-            assert!((host.idle_share(now, 0, jobs) - share).abs() < 1e-3, "{jobs}: {host:?}");
+            host.update(now, 0, jobs);
+            assert!((host.idle_share() - share).abs() < 1e-3, "{jobs}: {host:?}");
         }
         // Eight jobs end together: half of the cores may be needed again at once.
         host.update(now, 0, 8);
         let ended = [now[0] + 0.2, now[1] + 0.8];
-        assert!(host.idle_share(ended, 0, 0) < 0.55, "{host:?}");
-        assert!(host.idle_share([ended[0] + 0.5, ended[1]], 0, 0) > 0.99, "{host:?}");
+        host.update(ended, 0, 0);
+        assert!(host.idle_share() < 0.55, "{host:?}");
+        host.update([ended[0] + 0.5, ended[1]], 0, 0);
+        assert!(host.idle_share() > 0.99, "{host:?}");
     }
 
     #[cfg(target_os = "linux")]

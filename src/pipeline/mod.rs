@@ -309,18 +309,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
     let color = |colors: MeshColors| clock.time("color", || colors.apply(&mut mesh, params.resolution, &control));
     let color = colors.map(color).transpose()?;
-    if !job.params.atom_ids {
-        mesh.atom_ids = None;
-    }
-    if let Some(ids) = &mut mesh.atom_ids {
-        // Convert indices of spheres to indices of atoms in the file.
-        for (n, id) in ids.iter_mut().enumerate() {
-            if n.is_multiple_of(IDS_PER_CHECK) {
-                control.check()?;
-            }
-            *id = selected.atoms[*id as usize];
-        }
-    }
+    name_atoms(&mut mesh, job, &selected, &control)?;
     instances::place(&mut mesh, &selected.units, &control)?;
     let measures = match measures {
         // The cut has validated the surface before it divided it.
@@ -349,6 +338,20 @@ pub fn run_with<S: Deref<Target = Structure>>(
         clock.finish().into_iter().for_each(|(stage, ms)| product.report.add_timing(stage, ms));
     }
     Ok(product)
+}
+
+/// Converts indices of spheres to indices of atoms in the file, or drops them if the job does not ask for them.
+fn name_atoms(mesh: &mut Mesh, job: &Job, selected: &Selected, control: &Control<'_>) -> Result<(), JobError> {
+    if !job.params.atom_ids {
+        mesh.atom_ids = None;
+    }
+    for (n, id) in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()).enumerate() {
+        if n.is_multiple_of(IDS_PER_CHECK) {
+            control.check()?;
+        }
+        *id = selected.atoms[*id as usize];
+    }
+    Ok(())
 }
 
 /// Returns the storage options of the mesh of `spheres`, and sets the vertex encoding in `params`.

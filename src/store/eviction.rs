@@ -9,6 +9,7 @@ use super::error::StoreError;
 use super::handle::Store;
 use super::index::{EvictionCandidate, ReserveError};
 use super::name::{Folder, Name};
+use super::object::Usage;
 use super::stale::STALE;
 use crate::telemetry::{STORE_REMOVED, shorten};
 
@@ -73,7 +74,7 @@ impl Store {
         let expired = self.index().expired(now, |folder| self.ttl(folder));
         (swept.expired, swept.bytes) = self.remove_all(&expired, "ttl", &mut swept.failed).await;
         // The capacity may have been lowered, or other processes may have written.
-        let (excess, _) = self.index().excess(0, self.0.config.max_bytes);
+        let (excess, _) = self.index().excess(0, self.capacity());
         let (evicted, bytes) = self.remove_all(&excess, "cap", &mut swept.failed).await;
         (swept.evicted, swept.bytes) = (evicted, swept.bytes + bytes);
         let mut uses = self.index().unsaved_uses(SAVE_USE);
@@ -104,6 +105,11 @@ impl Store {
         }
     }
 
+    /// Returns the capacity for results and inputs.
+    fn capacity(&self) -> Usage {
+        Usage { bytes: self.0.config.max_bytes, objects: self.0.config.max_objects }
+    }
+
     /// Returns a reservation of 0 bytes for an object.
     pub(super) fn empty_reservation(&self, name: &Name) -> SpaceReservation {
         SpaceReservation { store: self.clone(), bytes: 0, capped: name.folder().is_capped() }
@@ -111,18 +117,18 @@ impl Store {
 
     /// Reserves `more` bytes for a writer that has reserved `had`.
     async fn reserve(&self, had: u64, more: u64) -> Result<(), StoreError> {
-        let max_bytes = self.0.config.max_bytes;
+        let (cap, max_bytes) = (self.capacity(), self.0.config.max_bytes);
         let bytes = had.saturating_add(more);
         if bytes > max_bytes {
             return Err(StoreError::TooLarge { bytes, max_bytes });
         }
-        if self.index().reserve(more, max_bytes).is_ok() {
+        if self.index().reserve(more, cap).is_ok() {
             return Ok(());
         }
         let _one_at_a_time = self.0.last_cleanup.lock().await;
         let mut held = max_bytes;
         for _ in 0..ATTEMPTS {
-            let outcome = self.index().reserve(more, max_bytes);
+            let outcome = self.index().reserve(more, cap);
             match outcome {
                 Ok(()) => return Ok(()),
                 Err(ReserveError::Held(by_others)) => {
@@ -146,7 +152,7 @@ impl Store {
     pub(crate) async fn evict_for(&self, bytes: u64) -> bool {
         let _one_at_a_time = self.0.last_cleanup.lock().await;
         let free = self.0.backend.free_bytes().await;
-        let candidates = self.index().oldest(bytes.saturating_mul(2));
+        let candidates = self.index().oldest(Usage { bytes: bytes.saturating_mul(2), objects: 0 });
         let evictable: u64 = candidates.iter().map(|candidate| candidate.bytes).sum();
         if free.is_some_and(|free| free.saturating_add(evictable) < bytes) {
             return false;
@@ -158,7 +164,7 @@ impl Store {
 
     /// Returns true if an object of `bytes` fits into the capacity, and twice into the free space of the disk.
     pub(crate) async fn has_space(&self, bytes: u64) -> bool {
-        let (_, missing) = self.index().excess(bytes, self.0.config.max_bytes);
+        let (_, missing) = self.index().excess(bytes, self.capacity());
         missing == 0 && self.0.backend.free_bytes().await.is_none_or(|free| free / 2 >= bytes)
     }
 

@@ -143,11 +143,12 @@ impl Store {
         let Some(seen) = self.begin_read(name) else { return Ok(None) };
         let read = self.0.backend.get_whole(name).await?;
         self.end_read(name, seen, read.as_ref().map(|stored| stored.meta));
+        let copy = read.as_ref().and_then(|stored| self.0.memory.copy(name, &stored.bytes));
         let index = self.index();
         if let Some(stored) = &read
             && index.is_current(name, seen)
         {
-            self.0.memory.put(name, stored.clone());
+            self.0.memory.put(name, copy, stored.meta);
         }
         Ok(read)
     }
@@ -317,18 +318,17 @@ impl Store {
     /// so that it never counts twice. Caches small results in memory.
     pub(super) fn commit(&self, name: &Name, size: u64, bytes: Option<&Bytes>, reservation: &mut SpaceReservation) {
         let (used, modified) = (self.now(), SystemTime::now());
+        let copy = bytes.and_then(|bytes| self.0.memory.copy(name, bytes));
         let mut index = self.index();
         index.commit(name, size, used);
         index.release(reservation.take());
-        match bytes {
-            Some(bytes) => self.0.memory.put(name, Stored { bytes: bytes.clone(), meta: Meta { size, modified } }),
-            None => self.0.memory.remove(name),
-        }
+        self.0.memory.put(name, copy, Meta { size, modified });
     }
 
     /// Removes an object that the index has marked as being removed, under the lock of its name.
     pub(super) async fn remove(&self, name: &Name) -> Result<(), StoreError> {
         self.0.memory.remove(name);
+        self.0.intact.remove(name);
         let removed = self.0.backend.delete(name).await;
         self.index().end_removal(name, removed.is_ok());
         removed
@@ -384,6 +384,7 @@ impl Store {
             None if index.is_current(name, seen) => {
                 index.forget(name);
                 self.0.memory.remove(name);
+                self.0.intact.remove(name);
             }
             None => {}
         }

@@ -215,11 +215,11 @@ impl Index {
         (is_removable && !names.is_empty()).then_some(EvictionCandidate { names, bytes, used })
     }
 
-    /// Reserves `bytes` within the capacity `cap`, or returns the objects to evict.
-    pub(super) fn reserve(&mut self, bytes: u64, cap: u64) -> Result<(), ReserveError> {
+    /// Reserves `bytes` for an object within the capacity `cap`, or returns the objects to evict.
+    pub(super) fn reserve(&mut self, bytes: u64, cap: Usage) -> Result<(), ReserveError> {
         let (candidates, missing) = self.excess(bytes, cap);
         if missing > 0 {
-            let taken = self.used_bytes() - candidates.iter().map(|candidate| candidate.bytes).sum::<u64>();
+            let taken = self.used().bytes - candidates.iter().map(|candidate| candidate.bytes).sum::<u64>();
             return Err(ReserveError::Held(taken));
         }
         if !candidates.is_empty() {
@@ -229,32 +229,40 @@ impl Index {
         Ok(())
     }
 
-    /// Returns the least recently used objects to evict so that `bytes` more fit into `cap`, and the bytes that are
-    /// missing even then.
-    pub(super) fn excess(&self, bytes: u64, cap: u64) -> (Vec<EvictionCandidate>, u64) {
-        let missing = self.used_bytes().saturating_add(bytes).saturating_sub(cap);
+    /// Returns the least recently used objects to evict so that an object of `bytes` more fits into `cap`, and the bytes
+    /// that are missing even then. Pinned objects, which are few, may exceed the number of objects.
+    pub(super) fn excess(&self, bytes: u64, cap: Usage) -> (Vec<EvictionCandidate>, u64) {
+        let used = self.used();
+        let missing = Usage {
+            bytes: used.bytes.saturating_add(bytes).saturating_sub(cap.bytes),
+            objects: (used.objects + u64::from(bytes > 0)).saturating_sub(cap.objects),
+        };
         let chosen = self.oldest(missing);
         let found = chosen.iter().map(|candidate| candidate.bytes).sum();
-        (chosen, missing.saturating_sub(found))
+        (chosen, missing.bytes.saturating_sub(found))
     }
 
-    /// Returns the least recently used objects, of at least `missing` bytes if there are so many.
-    pub(super) fn oldest(&self, mut missing: u64) -> Vec<EvictionCandidate> {
+    /// Returns the least recently used objects, of at least `missing` bytes and objects if there are so many.
+    pub(super) fn oldest(&self, mut missing: Usage) -> Vec<EvictionCandidate> {
         let mut chosen = Vec::new();
         let mut candidates = self.candidates(self.by_use.values().filter(|name| name.folder().is_capped()));
-        while missing > 0 {
+        while missing.bytes > 0 || missing.objects > 0 {
             let Some(candidate) = candidates.next() else { break };
-            missing = missing.saturating_sub(candidate.bytes);
+            missing.bytes = missing.bytes.saturating_sub(candidate.bytes);
+            missing.objects = missing.objects.saturating_sub(candidate.names.len() as u64);
             chosen.push(candidate);
         }
         drop(candidates);
         chosen
     }
 
-    /// Returns the bytes that count against the capacity: on disk and reserved.
-    fn used_bytes(&self) -> u64 {
-        let capped = Folder::ALL.into_iter().filter(|folder| folder.is_capped());
-        capped.map(|folder| self.usage(folder).bytes).sum::<u64>() + self.reserved
+    /// Returns what counts against the capacity: objects on disk, and reserved bytes.
+    fn used(&self) -> Usage {
+        let capped = Folder::ALL.into_iter().filter(|folder| folder.is_capped()).map(|folder| self.usage(folder));
+        capped.fold(Usage { bytes: self.reserved, objects: 0 }, |sum, usage| Usage {
+            bytes: sum.bytes + usage.bytes,
+            objects: sum.objects + usage.objects,
+        })
     }
 
     /// Releases reserved bytes.
@@ -306,6 +314,8 @@ mod tests {
         Name::from_file_name(Folder::Inputs, &id.repeat(64)).unwrap()
     }
 
+    const CAP: Usage = Usage { bytes: 30, objects: 100 };
+
     fn at(seconds: u64) -> SystemTime {
         SystemTime::UNIX_EPOCH + Duration::from_secs(seconds)
     }
@@ -345,7 +355,7 @@ mod tests {
         for (id, used) in [("a", 1), ("b", 2), ("c", 3)] {
             index.commit(&name(id), 10, at(used));
         }
-        let Err(ReserveError::Remove(candidates)) = index.reserve(20, 30) else {
+        let Err(ReserveError::Remove(candidates)) = index.reserve(20, CAP) else {
             panic!("reserved more than the capacity")
         };
         assert_eq!(candidates.iter().map(|c| c.names.clone()).collect::<Vec<_>>(), [[name("a")], [name("b")]]);
@@ -355,12 +365,33 @@ mod tests {
         index.unpin(&name("b"));
         assert!(index.begin_removal(&candidates[1]) && !index.begin_removal(&candidates[1]));
         index.end_removal(&name("b"), true);
-        assert_eq!((index.reserve(10, 30), index.usage(Folder::Inputs)), (Ok(()), Usage { bytes: 20, objects: 2 }));
+        assert_eq!((index.reserve(10, CAP), index.usage(Folder::Inputs)), (Ok(()), Usage { bytes: 20, objects: 2 }));
         index.pin(&name("a"));
         index.pin(&name("c"));
-        assert_eq!(index.reserve(1, 30), Err(ReserveError::Held(30)));
+        assert_eq!(index.reserve(1, CAP), Err(ReserveError::Held(30)));
         index.release(10);
-        assert_eq!(index.reserve(10, 30), Ok(()));
+        assert_eq!(index.reserve(10, CAP), Ok(()));
+    }
+
+    #[test]
+    fn the_number_of_objects_is_limited() {
+        let mut index = Index::default();
+        let cap = Usage { bytes: 1000, objects: 3 };
+        for (id, used) in [("a", 1), ("b", 2), ("c", 3)] {
+            assert_eq!(index.reserve(10, cap), Ok(()));
+            index.commit(&name(id), 10, at(used));
+            index.release(10);
+        }
+        // Job records have caps of their own.
+        index.commit(&Name::ended_job("1").unwrap(), 10, at(0));
+        let Err(ReserveError::Remove(candidates)) = index.reserve(10, cap) else { panic!("reserved a fourth object") };
+        assert_eq!(candidates.iter().map(|c| c.names.clone()).collect::<Vec<_>>(), [[name("a")]]);
+        assert_eq!(index.excess(0, cap), (Vec::new(), 0), "three objects are within the capacity");
+        assert_eq!(index.excess(0, Usage { objects: 1, ..cap }).0.len(), 2, "the capacity was lowered");
+        for id in ["a", "b", "c"] {
+            index.pin(&name(id));
+        }
+        assert_eq!(index.reserve(10, cap), Ok(()), "objects in use do not reject others");
     }
 
     #[test]
@@ -372,19 +403,20 @@ mod tests {
             index.commit(&result(key, "glb"), 90, at(used + 1));
         }
         let ttl = |_: Folder| Duration::from_secs(8);
+        let cap = Usage { bytes: 200, objects: 100 };
         let chosen = |found: &[EvictionCandidate]| found.iter().flat_map(|v| v.names.clone()).collect::<Vec<_>>();
         // The later use of either counts for both.
         assert_eq!(index.expired(at(9), ttl), []);
         let oldest = [result("a", "glb"), result("a", "json")];
         assert_eq!(chosen(&index.expired(at(10), ttl)), oldest);
-        assert_eq!(chosen(&index.excess(1, 200).0), oldest, "a part of the group would suffice");
-        let chosen_before = index.excess(1, 200).0;
+        assert_eq!(chosen(&index.excess(1, cap).0), oldest, "a part of the group would suffice");
+        let chosen_before = index.excess(1, cap).0;
         index.touch(&result("a", "glb"), at(20));
         assert!(!index.begin_removal(&chosen_before[0]), "the group was used");
-        assert_eq!(chosen(&index.excess(1, 200).0), [result("b", "glb"), result("b", "json")]);
+        assert_eq!(chosen(&index.excess(1, cap).0), [result("b", "glb"), result("b", "json")]);
         index.pin(&result("b", "glb"));
-        assert_eq!(chosen(&index.excess(1, 200).0), oldest, "the report is pinned with its mesh");
-        let candidates = index.excess(1, 200).0;
+        assert_eq!(chosen(&index.excess(1, cap).0), oldest, "the report is pinned with its mesh");
+        let candidates = index.excess(1, cap).0;
         assert!(index.begin_removal(&candidates[0]) && oldest.iter().all(|name| index.begin_read(name).is_none()));
     }
 }

@@ -1,10 +1,11 @@
 //! In-memory cache of small results.
 
+use bytes::Bytes;
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 
 use super::name::{Folder, Name};
-use super::object::Stored;
+use super::object::{Meta, Stored};
 
 /// Memory of an entry besides its data, bytes.
 const OVERHEAD: u64 = 256;
@@ -36,12 +37,18 @@ impl Memory {
         self.cache.get(name)
     }
 
-    /// Caches a result if it is small enough. Drops an existing entry in any case.
-    pub(super) fn put(&self, name: &Name, stored: Stored) {
-        if name.folder() == Folder::Results && stored.bytes.len() as u64 <= self.largest {
-            self.cache.insert(name.clone(), stored);
-        } else {
-            self.remove(name);
+    /// Returns a copy of an object to cache; `None` if it is no result or too large. The bytes of a writer or a request
+    /// may be a small part of a buffer of a megabyte, which they would keep.
+    pub(super) fn copy(&self, name: &Name, bytes: &Bytes) -> Option<Bytes> {
+        let is_cached = name.folder() == Folder::Results && bytes.len() as u64 <= self.largest;
+        is_cached.then(|| Bytes::copy_from_slice(bytes))
+    }
+
+    /// Caches the [copy](Self::copy) of an object, or drops an existing entry.
+    pub(super) fn put(&self, name: &Name, copy: Option<Bytes>, meta: Meta) {
+        match copy {
+            Some(bytes) => self.cache.insert(name.clone(), Stored { bytes, meta }),
+            None => self.remove(name),
         }
     }
 

@@ -1,6 +1,7 @@
 //! Validated object names. Every path that depends on client input is built here.
 
 use std::fmt;
+use std::sync::Arc;
 
 use object_store::path::Path;
 use thiserror::Error;
@@ -54,7 +55,8 @@ pub(crate) const OWNER_DIGITS: usize = 8;
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Name {
     folder: Folder,
-    file: Box<str>,
+    /// Shared, because the index holds each name several times.
+    file: Arc<str>,
 }
 
 impl Name {

@@ -77,6 +77,40 @@ async fn a_full_disk_evicts_twice_the_size_and_tries_once_more() {
     assert_eq!(store.usage(Folder::Results).objects, 2);
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn cached_results_keep_no_buffer_of_their_writer() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Store::open(&StoreConfig::default(), dir.path()).await.unwrap();
+    let mut writer = store.writer(&name(1));
+    let write = move || io::Write::write_all(&mut writer, &body(1000)).map(|()| writer.finish());
+    tokio::task::spawn_blocking(write).await.unwrap().unwrap().unwrap();
+    let mut part = vec![7; 1 << 20];
+    part.truncate(1000);
+    store.put(&name(2), part.into()).await.unwrap();
+    for number in [1, 2] {
+        let cached = store.0.memory.get(&name(number)).expect("a small result is cached").bytes;
+        store.0.memory.remove(&name(number));
+        let buffer = cached.try_into_mut().expect("the only reference");
+        assert_eq!(buffer, body(1000));
+        assert!(buffer.capacity() < 2000, "{} bytes are kept", buffer.capacity());
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn removed_results_are_forgotten() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Store::open(&StoreConfig::default(), dir.path()).await.unwrap();
+    for number in 1..=3 {
+        store.put(&name(number), body(10)).await.unwrap();
+        store.set_intact(&name(number)).await.unwrap();
+    }
+    assert_eq!(store.0.intact.len(), 3);
+    store.delete(&name(1)).await.unwrap();
+    assert_eq!(store.0.intact.len(), 2);
+    store.sweep(store.now() + Duration::from_hours(1000)).await;
+    assert_eq!(store.0.intact.len(), 0);
+}
+
 #[tokio::test]
 async fn the_last_use_survives_a_restart() {
     let dir = tempfile::tempdir().unwrap();

@@ -87,7 +87,7 @@ pub enum SurfaceError {
         suggested_resolution: f64,
     },
     /// The triangle limit cannot be met at any spacing that still shows the surface.
-    #[error("the mesh has {triangles} triangles at {resolution} Å, and no coarser one has {limit} or fewer")]
+    #[error("the mesh has {triangles} triangles at the coarsest spacing, {resolution} Å; the limit is {limit}")]
     TooManyTriangles {
         /// Smallest number of triangles found.
         triangles: u64,

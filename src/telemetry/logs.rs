@@ -25,7 +25,9 @@ fn filter(config: &LogConfig) -> Result<EnvFilter, TelemetryError> {
 /// Returns a [`TelemetryError`] if the filter is invalid or another logger is installed.
 pub fn init_logs(config: &LogConfig) -> Result<(), TelemetryError> {
     let filter = filter(config)?;
-    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    // A log that cannot be written loses lines. To report this on standard error would panic, because it is the log.
+    let builder =
+        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).log_internal_errors(false);
     let installed = match config.format {
         LogFormat::Pretty => {
             builder.with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr())).finish().try_init()

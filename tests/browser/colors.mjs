@@ -117,7 +117,7 @@ await run({
       const [share, control] = [await picture(page), plain].map((taken) => shareOf(taken, legend));
       assert.ok(share > 0.01 && control < 0.001, `${scheme}: ${share}, without colours ${control}`);
     }
-    assert.deepEqual(ofVertices, ["curvature", "radial"]);
+    assert.deepEqual(ofVertices, ["curvature", "radial", "depth"]);
     assert.equal(surfaces(), before + ofVertices.length);
     // A mesh with colours takes those of atoms, and one colour, without another mesh.
     await choose("element");

@@ -1,8 +1,9 @@
-// Display of the page: sticks of ligands, transparency, chains, assemblies, and links that restore all of them.
+// Display of the page: sticks of ligands, transparency, chains, assemblies, views, and links that restore all of them.
 import { readFileSync } from "node:fs";
+import http from "node:http";
 import path from "node:path";
 import {
-  assert, assertClean, axe, browser, drop, open, picture, run, stablePicture, start, waitForMesh, ROOT, SERVICE_URL,
+  assert, assertClean, axe, browser, drop, fetchBytes, open, picture, run, stablePicture, start, waitForMesh, ROOT, SERVICE_URL,
   TIMEOUT_MS,
 } from "./lib.mjs";
 
@@ -111,7 +112,19 @@ await run({
     await page.locator("#palette").selectOption("cividis");
     await page.waitForFunction(() => location.search.includes("palette=cividis"));
     await page.locator("#home").click();
+    await page.waitForFunction(() => !location.search.includes("camera"));
+    // The view belongs to the link, in any order of turning, magnifying and shifting.
+    await page.locator("#view-home").focus();
+    for (const key of ["ArrowRight", "ArrowRight", "ArrowUp", "+"]) await page.keyboard.press(key);
+    await page.waitForFunction(() => /camera=-5\.96\d*,0\.98\d*,1\.15$/.test(location.search));
+    const { x, y, width, height } = await page.locator("#view-home").boundingBox();
+    await page.mouse.move(x + width / 2, y + height / 2);
+    await page.mouse.down({ button: "right" });
+    await page.mouse.move(x + width / 2 + 60, y + height / 2 + 30, { steps: 5 });
+    await page.mouse.up({ button: "right" });
+    await page.waitForFunction(() => /camera=-5\.96\d*,0\.98\d*,1\.15,-/.test(location.search));
     await page.mouse.move(1, 1);
+    await page.evaluate(() => document.activeElement.blur());
     const [expected, wanted] = [await stablePicture(page), await controls(page)];
     const { sticks: drawn, transparency, byChain, assembly, scheme, palette } = wanted;
     const chosen = [drawn, transparency, byChain, assembly, scheme, palette];
@@ -131,31 +144,61 @@ await run({
     };
     const [same, state] = await linked(page.url());
     assert.deepEqual(state, wanted);
-    assert.equal(differing(expected, same), 0, "the link shows another picture");
+    // The view of the link is rounded.
+    assert.ok(differing(expected, same) < 100, `${differing(expected, same)} values of the picture differ`);
     // Every part of the display changes the picture.
-    for (const name of ["sticks", "transparency", "hide", "color"]) {
+    for (const name of ["sticks", "transparency", "hide", "color", "camera"]) {
       const url = new URL(page.url());
       if (name === "color") url.searchParams.set(name, "element");
       else url.searchParams.delete(name);
       if (name === "color") url.searchParams.delete("palette");
       const [other] = await linked(url.href);
-      assert.ok(differing(expected, other) > 100, `without ${name} the picture is the same`);
+      assert.ok(differing(expected, other) > 500, `without ${name} the picture is the same`);
     }
     // Values that cannot be used are ignored.
-    const [, odd] = await linked(`${SERVICE_URL}/?pdb=1crn&color=element&transparency=nine&sticks=maybe&hide=%25zz`);
+    const [, odd] = await linked(`${SERVICE_URL}/?pdb=1crn&color=element&transparency=nine&sticks=maybe&hide=%25zz&camera=1,2`);
     assert.deepEqual([odd.sticks, odd.transparency, odd.parts], [false, "0", []]);
+    assert.ok(!/camera/.test(odd.address), odd.address);
   },
 
   "another structure shows all its parts": async () => {
     await waitForMesh(page, () => page.locator("#pdb").fill("1crn").then(() => page.locator("#pdb").press("Enter")));
     const { address, transparency } = await controls(page);
-    assert.ok(!address.includes("hide") && !address.includes("assembly"), address);
+    assert.ok(!/hide|assembly|camera/.test(address), address);
     assert.equal(transparency, "60");
     // Back to the structure with its hidden chains.
     await waitForMesh(page, () => page.goBack());
     assert.match(page.url(), /hide=A-1,B-2/);
     assert.deepEqual((await controls(page)).parts, [["A-1", false], ["B-1", true], ["A-2", true], ["B-2", false]]);
     assert.ok((await picture(page)).data.length > 0);
+  },
+
+  "the component draws ligands and a transparent surface": async () => {
+    const { bytes } = await fetchBytes("/v1/structures", { method: "POST", body: complex });
+    const src = `${SERVICE_URL}${JSON.parse(bytes).surface}?resolution=1&assembly=1`;
+    const [ready, style] = ["document.addEventListener('molmesh-load', () => (window.loaded = true))", "width: 400px; height: 400px"];
+    const html = `<!doctype html><html lang="en"><title>component</title><script>${ready}</script><molmesh-viewer id="viewer"
+      style="${style}" src="${src}"></molmesh-viewer><script type="module" src="${SERVICE_URL}/molmesh-viewer.js"></script>`;
+    const headers = { "content-type": "text/html" };
+    const server = http.createServer((request, reply) => reply.writeHead(request.url === "/" ? 200 : 204, headers).end(html));
+    await new Promise((resolve) => server.listen(0, "127.0.0.1", resolve));
+    const other = await open(chromium, { url: `http://127.0.0.1:${server.address().port}/` });
+    await other.waitForFunction(() => window.loaded, null, { timeout: TIMEOUT_MS });
+    const set = (name, value) => other.locator("#viewer").evaluate((node, [name, value]) => node.setAttribute(name, value), [name, value]);
+    const opaque = await picture(other, "#viewer");
+    await set("transparency", "70");
+    const clear = await picture(other, "#viewer");
+    assert.ok(differing(opaque, clear) > 5000, "the surface is still opaque");
+    assert.deepEqual(await waitForSticks(other, () => set("sticks", "")), { sticks: 48, bonds: 52 });
+    const withSticks = await picture(other, "#viewer");
+    assert.ok(differing(clear, withSticks) > 500, "no sticks are visible");
+    // Attributes that are removed or invalid have their defaults.
+    await other.locator("#viewer").evaluate((node) => node.removeAttribute("sticks"));
+    assert.equal(differing(clear, await picture(other, "#viewer")), 0);
+    await set("transparency", "nine");
+    assert.equal(differing(opaque, await picture(other, "#viewer")), 0);
+    assert.deepEqual(other.errors, []);
+    server.close();
   },
 
   "the page has no errors": async () => {

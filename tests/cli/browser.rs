@@ -67,6 +67,11 @@ fn display_follows_its_controls_and_its_address() {
 }
 
 #[test]
+fn open_surfaces_and_instances_are_drawn() {
+    drive("open.mjs", &[], &[]);
+}
+
+#[test]
 fn failed_request_keeps_the_previous_surface() {
     drive("previous.mjs", &[], &[]);
 }

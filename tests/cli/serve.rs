@@ -9,7 +9,7 @@ use std::process::Command;
 #[cfg(target_os = "linux")]
 use std::time::{Duration, Instant};
 
-use cli_support::{Folder, Service, assert_code, run, stderr};
+use cli_support::{Folder, Service, assert_code, molmesh, run, stderr};
 
 #[test]
 fn example_command_of_the_banner_works() {
@@ -48,6 +48,36 @@ fn stops_on_signals_without_warnings() {
             }
         }
         assert_eq!(listening, 1, "{lines}");
+    }
+}
+
+/// Without a place for its log, the service loses lines and goes on.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_log_that_cannot_be_written_stops_nothing() {
+    let folder = Folder::new();
+    let listen = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
+    for log in ["pretty", "json"] {
+        let mut child = molmesh()
+            .args(["serve", "--listen", &listen, "--metrics-listen", "127.0.0.1:0", "--log", log, "--data-dir"])
+            .arg(folder.path("data"))
+            .args(["--devices", "cpu", "--set", "log.filter=debug"])
+            .stderr(std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap())
+            .spawn()
+            .unwrap();
+        let url = format!("http://{listen}/readyz");
+        let ready = || run(["healthcheck", "--url", &url]).status.success();
+        let start = std::time::Instant::now();
+        while !ready() {
+            assert_eq!(child.try_wait().unwrap(), None, "{log}");
+            assert!(start.elapsed().as_secs() < 30, "the service is not ready after 30 s");
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+        for _ in 0..5 {
+            assert!(ready(), "{log}");
+        }
+        child.kill().unwrap();
+        child.wait().unwrap();
     }
 }
 

@@ -221,6 +221,12 @@ fn remarks_describe_assemblies_of_pdb_files() {
         let error = select(&parse(broken.as_bytes()), &of("1")).unwrap_err();
         assert!(matches!(&error, StructureError::BadAssembly { found, .. } if found == "`2`"), "{error}");
     }
+    // So does an operator whose last row is missing, even the last one of the file.
+    for first in ["   BIOMT3   1", "   BIOMT3   2"] {
+        let line = text.lines().find(|line| line.contains(first)).unwrap();
+        let structure = parse(text.replacen(&format!("{line}\n"), "", 1).as_bytes());
+        assert!(matches!(select(&structure, &of("1")), Err(StructureError::BadAssembly { .. })), "{line}");
+    }
     // An assembly without a number is the first; the blank chain is `NULL`.
     let blank =
         text.replace("ALA A", "ALA  ").replace("TO CHAINS: A,", "TO CHAINS: NULL,").replacen("BIOMOLECULE: 1", "", 1);

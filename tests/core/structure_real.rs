@@ -1,6 +1,7 @@
-//! The reader on all available real structures, compared with a list of their contents, gemmi and pdbtbx.
+//! The reader on all available real structures, compared with a list of their contents, gemmi, biotite and pdbtbx.
 //!
-//! gemmi runs through `tests/tools/gemmi_dump.py`. Missing files and tools are reported as skipped.
+//! gemmi runs through `tests/tools/gemmi_dump.py`, biotite through `tests/tools/biotite_residues.py`. Missing files and
+//! tools are reported as skipped.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
@@ -289,6 +290,89 @@ fn agrees_with_gemmi_except_for_listed_differences() {
     let explained = DISAGREEMENTS.iter().filter(|(f, ..)| read.iter().any(|file| file == f));
     let expected: Vec<_> = explained.map(|(f, name, n, _)| ((*f).to_owned(), *name, *n)).collect();
     assert_eq!(found, expected, "disagreements found, and those that the table explains");
+}
+
+// ---- biotite ----
+
+/// Files whose residues biotite 1.6.0 reads differently, with the number of residues of the first model that differ and
+/// the reason.
+const BIOTITE_DIFFERS: &[(&str, usize, &str)] = &[
+    (
+        "md_1tw7_charmm.pdb.gz",
+        15_725,
+        "TIP3 ends in column 21 and 14669 in column 27; biotite cuts both and reads no chain",
+    ),
+    ("odd_a_structure.pdb.gz", 184, "atoms after an ENDMDL without a MODEL are a second model here"),
+];
+
+/// Files that biotite 1.6.0 rejects, with its message.
+const BIOTITE_REFUSES: [(&str, &str); 1] = [
+    // A line without occupancy and B-factor.
+    ("odd_occupancy.pdb.gz", "could not convert string to float: ''"),
+];
+
+/// Report of `tests/tools/biotite_residues.py`.
+#[derive(serde::Deserialize)]
+#[serde(untagged)]
+enum Biotites {
+    Read { models: Vec<usize>, residues: Vec<Residue> },
+    Rejected(String),
+}
+
+/// Chain, number with insertion code, name and number of atoms of a residue.
+type Residue = (String, String, String, usize);
+
+/// Returns the residues of the first model, sorted.
+fn residues(s: &Structure) -> Vec<Residue> {
+    let mut found: BTreeMap<(String, String, String), usize> = BTreeMap::new();
+    for i in (0..s.len()).filter(|&i| s.model[i] == s.model[0]) {
+        let code = Some(s.insertion_code[i]).filter(|code| *code != 0).map(char::from);
+        let number = format!("{}{}", s.residue_number[i], code.map(String::from).unwrap_or_default());
+        *found.entry((s.chain.get(i).to_owned(), number, s.residue.get(i).to_owned())).or_default() += 1;
+    }
+    found.into_iter().map(|((chain, number, name), n)| (chain, number, name, n)).collect()
+}
+
+#[test]
+fn agrees_with_biotite_on_chains_residues_and_counts() {
+    // Large files take minutes and cover nothing more.
+    let listed = sources().into_iter().filter(|(_, atoms, _)| atoms.is_some_and(|n| (1..60_000).contains(&n)));
+    let listed = listed.map(|(file, ..)| file).filter(|file| !OURS_ALONE.contains(&file.as_str()));
+    let files: Vec<String> = listed.chain(SAMPLES.map(str::to_owned)).collect();
+    let paths: Vec<PathBuf> = files.iter().map(|file| path(file)).collect();
+    let Some(reports) = tools::python::<Biotites>("biotite_residues.py", &paths) else { return };
+    let (mut differing, mut rejected) = (Vec::new(), Vec::new());
+    for (file, report) in files.iter().zip(reports) {
+        let (models, theirs) = match report {
+            Biotites::Read { models, residues } => (models, residues),
+            Biotites::Rejected(error) => {
+                rejected.push((file.as_str(), error));
+                continue;
+            }
+        };
+        let s = structure(file);
+        let ours = residues(&s);
+        let only = |a: &[Residue], b: &[Residue]| a.iter().filter(|row| b.binary_search(row).is_err()).count();
+        let n = only(&ours, &theirs).max(only(&theirs, &ours));
+        if n > 0 {
+            differing.push((file.as_str(), n));
+            continue;
+        }
+        let sizes: Vec<usize> = s.model.chunk_by(|a, b| a == b).map(<[i32]>::len).collect();
+        assert_eq!(sizes, models, "{file}: atoms of each model");
+        // The comparison finds an atom that moves to another residue.
+        let mut moved = ours.clone();
+        moved[0].3 += 1;
+        assert_eq!(only(&moved, &theirs), 1, "{file}");
+    }
+    let is_read = |file: &str| files.iter().any(|other| other == file);
+    let expected: Vec<_> = BIOTITE_DIFFERS.iter().filter(|row| is_read(row.0)).map(|row| (row.0, row.1)).collect();
+    assert_eq!(differing, expected, "differences found, and those that the table explains");
+    let expected: Vec<_> = BIOTITE_REFUSES.iter().filter(|row| is_read(row.0)).collect();
+    assert_eq!(rejected.len(), expected.len(), "{rejected:?}");
+    for ((file, error), (listed, words)) in rejected.iter().zip(expected) {
+        assert!(file == listed && error.contains(words), "{file}: {error}");
+    }
 }
 
 // ---- pdbtbx ----

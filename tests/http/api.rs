@@ -665,7 +665,14 @@ fn atoms_of_a_mesh_are_listed_with_their_positions() {
 fn colours_of_atoms_are_those_of_the_vertices() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
-    for (scheme, more) in [("element", ""), ("bfactor", "&palette=cividis"), ("charge", "&chains=A")] {
+    let cases = [
+        ("element", ""),
+        ("bfactor", "&palette=cividis"),
+        ("charge", "&chains=A"),
+        // The range is that of the whole, not of the selected atoms.
+        ("bfactor", "&context=whole&select=resi%2010-30"),
+    ];
+    for (scheme, more) in cases {
         let path = format!("{structure}/colors?scheme={scheme}{more}");
         let reply = server.get(&path);
         assert_eq!((reply.status, reply.header("content-type")), (200, Some("application/octet-stream")), "{scheme}");

@@ -153,6 +153,11 @@ const ROWS: &[Row] = &[
     ),
     ("store.max_bytes", "store-full", "http/store::objects_over_the_capacity_are_rejected"),
     (
+        "store.max_objects",
+        "molmesh_store_removed_total",
+        "http/store::the_least_recently_used_objects_beyond_the_number_are_evicted",
+    ),
+    (
         "store.result_ttl_ms",
         "molmesh_store_removed_total",
         "http/store::objects_expire_by_folder_and_use_prolongs_their_life",

@@ -190,8 +190,8 @@ fn a_result_that_exceeds_the_store_is_not_found_later() {
     assert_eq!(made.header("content-location"), None, "a result that is not kept has no address");
     // Work that requires the store is rejected.
     let refused = server.post("/v1/meshes", &[("prefer", "respond-async")], &sample(1));
-    assert_eq!(refused.problem(503, "store-full")["limit"], 3_000);
-    server.post("/v1/structures", &[], SAMPLE).problem(503, "store-full");
+    assert_eq!(refused.problem(413, "body-too-large")["limit"], 3_000);
+    server.post("/v1/structures", &[], SAMPLE).problem(413, "body-too-large");
 }
 
 #[test]

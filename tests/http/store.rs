@@ -46,6 +46,7 @@ on_both!(
     a_dropped_writer_leaves_nothing,
     least_recently_used_objects_are_evicted,
     objects_over_the_capacity_are_rejected,
+    the_least_recently_used_objects_beyond_the_number_are_evicted,
     writers_evict_objects,
     objects_expire_by_folder_and_use_prolongs_their_life,
     pinned_objects_are_neither_evicted_nor_expired,
@@ -401,6 +402,32 @@ async fn objects_expire_by_folder_and_use_prolongs_their_life(mut place: TestSto
     assert_eq!(store.sweep(now + 7 * HOUR).await.expired, 1);
     assert_eq!(there().await, [false; 4]);
     assert_eq!(Folder::ALL.map(|f| store.usage(f)), [usage(0, 0); 3]);
+}
+
+async fn the_least_recently_used_objects_beyond_the_number_are_evicted(mut place: TestStore) {
+    place.config.max_objects = 3;
+    let store = place.open().await;
+    for name in [result(1), input(1), result(2), job(1), job(2)] {
+        put(&store, &name, 10).await;
+    }
+    assert!(get(&store, &result(1)).await.is_some());
+    put(&store, &result(3), 10).await;
+    let there = async |names: &[Name]| {
+        let mut there = Vec::new();
+        for name in names {
+            there.push(has(&store, name).await);
+        }
+        there
+    };
+    let all = [input(1), result(1), result(2), result(3), job(1), job(2)];
+    assert_eq!(there(&all).await, [false, true, true, true, true, true], "records of jobs have caps of their own");
+    let mut writer = store.writer(&result(4));
+    blocking(move || writer.write_all(&noise(10, 1)).map(|()| writer.finish())).await.unwrap().unwrap();
+    assert_eq!(there(&all).await, [false, true, false, true, true, true]);
+    drop(store);
+    place.config.max_objects = 1;
+    let swept = place.open().await.sweep(SystemTime::now()).await;
+    assert_eq!((swept.expired, swept.evicted), (0, 2));
 }
 
 async fn pinned_objects_are_neither_evicted_nor_expired(mut place: TestStore) {

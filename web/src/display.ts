@@ -1,13 +1,13 @@
-/** Display of the surface apart from parameters: sticks of ligands, transparency, hidden parts. */
+/** Display of the surface apart from parameters: sticks of ligands, transparency, hidden parts, view. */
 
-import { atomColors, colorsPath } from "./api/colors";
 import type { Client } from "./api/client";
-import { Problem } from "./api/problem";
-import { type Source, positions } from "./api/structures";
+import type { Source } from "./api/structures";
+import { Ligands } from "./ligands";
 import type { Choices } from "./request";
-import { MAX_ATOMS, sticks } from "./scene/sticks";
+import { transparencyOf } from "./scene/context";
+import { textOfView, viewOfText } from "./scene/view";
 import type { Viewer } from "./scene/viewer";
-import { $, number } from "./ui/dom";
+import { $ } from "./ui/dom";
 
 export interface DisplayState {
   /** True if ligands are drawn as sticks. */
@@ -16,29 +16,28 @@ export interface DisplayState {
   transparency: number;
   /** Names of hidden parts. */
   hidden: readonly string[];
+  /** View as text; empty for the initial one. */
+  view: string;
 }
 
-/** Selection that is drawn as sticks. It includes cofactors and glycans. */
-const SELECT = "ligand";
-/** Parameters of the mesh that select atoms, besides `select`. */
-const SHARED = ["model", "chains", "altloc", "assembly"];
-const MAX_TRANSPARENCY = 90;
+/** Time without movement, ms, after which the address contains the view. Browsers limit its changes per second. */
+const REST = 300;
 
 /** Reads the display from the pairs of the page's address. */
 export function readDisplay(pairs: URLSearchParams): DisplayState {
-  const value = Number(pairs.get("transparency"));
-  const transparency = Number.isFinite(value) ? Math.min(MAX_TRANSPARENCY, Math.max(0, Math.round(value))) : 0;
   const hidden = (pairs.get("hide") ?? "").split(",").filter(Boolean).map(unescaped);
-  return { sticks: pairs.get("sticks") === "true", transparency, hidden };
+  const view = textOfView(viewOfText(pairs.get("camera") ?? ""));
+  return { sticks: pairs.get("sticks") === "true", transparency: transparencyOf(pairs.get("transparency")), hidden, view };
 }
 
 /** Returns the pairs of the page's address, in the form of `readDisplay`. */
-export function displayPairs({ sticks, transparency, hidden }: DisplayState): [string, string][] {
+export function displayPairs({ sticks, transparency, hidden, view }: DisplayState): [string, string][] {
   const pairs: [string, string][] = [];
   if (sticks) pairs.push(["sticks", "true"]);
   if (transparency) pairs.push(["transparency", String(transparency)]);
   // Names may contain commas.
   if (hidden.length) pairs.push(["hide", hidden.map(encodeURIComponent).join(",")]);
+  if (view) pairs.push(["camera", view]);
   return pairs;
 }
 
@@ -63,18 +62,25 @@ export class Display {
   private readonly sticks = $<HTMLInputElement>("sticks");
   private readonly transparency = $<HTMLInputElement>("transparency");
   private readonly byChain = $<HTMLInputElement>("by-chain");
-  private readonly note = $("sticks-note");
+  private readonly ligands: Ligands;
   /** Structure and parameters of the shown surface. */
   private shown: { source: Source; choices: Choices } | null = null;
-  /** Path of the atoms that are drawn or being fetched. */
-  private path = "";
-  private abort: AbortController | null = null;
+  /** View of the address. It changes when the camera has come to rest. */
+  private view = "";
+  /** View of the next surface; null if it does not change. */
+  private nextView: string | null = null;
+  private rest = 0;
 
   constructor(
-    private readonly client: Client,
+    client: Client,
     private readonly viewer: Viewer,
     private readonly actions: DisplayActions,
   ) {
+    this.ligands = new Ligands(client, viewer, (note) => ($("sticks-note").textContent = note));
+    viewer.controls.addEventListener("change", () => {
+      clearTimeout(this.rest);
+      this.rest = window.setTimeout(() => this.rested(), REST);
+    });
     this.sticks.addEventListener("change", () => {
       this.update();
       actions.changed();
@@ -87,19 +93,22 @@ export class Display {
 
   get state(): DisplayState {
     const transparency = this.transparency.valueAsNumber;
-    return { sticks: this.sticks.checked, transparency, hidden: this.viewer.hiddenParts };
+    return { sticks: this.sticks.checked, transparency, hidden: this.viewer.hiddenParts, view: this.view };
   }
 
   /** Sets the display of the next surface, which `follow` names. */
-  set state({ sticks, transparency, hidden }: DisplayState) {
+  set state({ sticks, transparency, hidden, view }: DisplayState) {
+    this.view = this.nextView = view;
     this.sticks.checked = sticks;
     this.transparency.value = String(transparency);
     this.viewer.hideParts(hidden);
     this.veil();
   }
 
-  /** Shows the ligands of a structure, if they are switched on. */
+  /** Shows the view and, if they are switched on, the ligands of a surface, which the viewer shows already. */
   follow(source: Source, choices: Choices): void {
+    if (this.nextView !== null) this.viewer.view = viewOfText(this.nextView);
+    this.nextView = null;
     this.shown = { source, choices };
     this.byChain.checked = choices.get("split") === "chain";
     this.update();
@@ -113,55 +122,15 @@ export class Display {
   }
 
   private update(): void {
-    if (!this.sticks.checked || !this.shown) return this.clear("");
+    if (!this.sticks.checked || !this.shown) return this.ligands.clear();
     const { source, choices } = this.shown;
-    const shared = [...choices].filter(([name]) => SHARED.includes(name));
-    const selection = new Map([["select", SELECT], ...shared]);
-    const path = `${source.path} ${JSON.stringify([...selection])}`;
-    if (path === this.path) return;
-    this.clear("Reading the ligands…");
-    this.path = path;
-    const abort = (this.abort = new AbortController());
-    this.draw(source, selection, abort.signal).catch((error: unknown) => {
-      if (abort.signal.aborted) return;
-      const isEmpty = error instanceof Problem && error.is("empty-selection");
-      this.clear(isEmpty ? "No ligands in the selected chains." : "");
-      // An empty selection is the same for the next surface.
-      if (isEmpty) this.path = path;
-      else this.actions.failed(error);
-    });
+    this.ligands.show(source.path, choices).catch((error: unknown) => this.actions.failed(error));
   }
 
-  /** Fetches the selected atoms and their colours, and draws them. */
-  private async draw(source: Source, selection: Choices, signal: AbortSignal): Promise<void> {
-    const colors = colorsPath(source.path, new Map([...selection, ["color", "element"]])) ?? "";
-    const [atoms, { rgba }] = await Promise.all([
-      positions(this.client, source, selection, signal),
-      atomColors(this.client, colors, signal),
-    ]);
-    signal.throwIfAborted();
-    const { x, y, z, index, elements, residues } = atoms;
-    if (x.length > MAX_ATOMS) {
-      this.note.textContent = `${number(x.length)} atoms of ligands; at most ${number(MAX_ATOMS)} can be drawn.`;
-      return;
-    }
-    const own = new Uint8Array(4 * index.length);
-    index.forEach((row, i) => own.set(rgba.subarray(4 * row, 4 * row + 4), 4 * i));
-    const started = performance.now();
-    const { geometry, bonds } = sticks({ x, y, z, elements, rgba: own });
-    this.viewer.showSticks(geometry);
-    // Read by the browser tests.
-    performance.measure("molmesh:sticks", { start: started, detail: { sticks: x.length, bonds } });
-    const names = [...new Set(residues)];
-    const listed = names.slice(0, 8).join(", ");
-    this.note.textContent = `${number(x.length)} atoms: ${listed}${names.length > 8 ? ", …" : ""}`;
-  }
-
-  /** Removes the sticks and writes a note. */
-  private clear(note: string): void {
-    this.abort?.abort();
-    this.path = "";
-    this.viewer.showSticks(null);
-    this.note.textContent = note;
+  private rested(): void {
+    const view = textOfView(this.viewer.view);
+    if (view === this.view) return;
+    this.view = view;
+    this.actions.changed();
   }
 }

@@ -5,12 +5,13 @@ import { Client } from "./api/client";
 import { fetchFile, type Job } from "./api/jobs";
 import { asProblem, Problem } from "./api/problem";
 import { Colors } from "./colors";
+import { Ligands } from "./ligands";
 import { load } from "./scene/load";
-import { contextOf } from "./scene/context";
+import { contextOf, transparencyOf } from "./scene/context";
 import { Viewer } from "./scene/viewer";
 import { chooseScheme, fillSchemes, showLegend } from "./ui/legend";
 
-const ATTRIBUTES = ["src", "color", "scheme", "menu", "background", "turn", "alt"] as const;
+const ATTRIBUTES = ["src", "color", "scheme", "menu", "sticks", "transparency", "background", "turn", "alt"] as const;
 
 const STYLE = `
 :host { display: block; position: relative; min-height: 12rem }
@@ -33,6 +34,7 @@ export class MolmeshViewer extends HTMLElement {
   private readonly menu = document.createElement("select");
   private readonly legend = document.createElement("div");
   private colors: Colors | null = null;
+  private ligands: Ligands | null = null;
   /** The content between the tags, shown if there is no surface. */
   private readonly fallback = document.createElement("slot");
   /** The reason why there is no surface, shown if there is no content between the tags. */
@@ -70,6 +72,7 @@ export class MolmeshViewer extends HTMLElement {
       return this.fail(error);
     }
     this.colors ??= new Colors(this.client, this.viewer, (legend) => showLegend(this.legend, legend), true);
+    this.ligands ??= new Ligands(this.client, this.viewer, () => undefined);
     this.applyAttributes();
     void this.load(this.src);
   }
@@ -79,12 +82,13 @@ export class MolmeshViewer extends HTMLElement {
     this.viewer?.dispose();
     this.viewer = null;
     this.colors = null;
+    this.ligands = null;
   }
 
   attributeChangedCallback(name: (typeof ATTRIBUTES)[number], before: string | null, after: string | null): void {
     if (!this.viewer || before === after) return;
     if (name === "src") void this.load(after ?? "");
-    else if (name === "scheme") this.paint();
+    else if (name === "scheme" || name === "sticks") this.paint();
     else this.applyAttributes();
   }
 
@@ -154,25 +158,29 @@ export class MolmeshViewer extends HTMLElement {
     this.viewer?.move(...move);
   }
 
-  /** Applies the attribute `scheme` to a surface of this service. */
+  /** Applies the attributes `scheme` and `sticks` to a surface of this service. */
   private paint(): void {
     const scheme = this.getAttribute("scheme") ?? "none";
     chooseScheme(this.menu, scheme);
     const { pathname, searchParams, origin } = new URL(this.src, document.baseURI);
     const structure = /^(.*\/v1\/(?:pdb|structures)\/[^/]+)\/surface\.glb$/.exec(pathname)?.[1];
     this.menu.hidden = !this.hasAttribute("menu") || !structure;
+    if (!structure || !this.hasAttribute("sticks")) this.ligands?.clear();
     if (!structure) return showLegend(this.legend, null);
-    const choices = new Map([...searchParams, ["color", scheme]] as [string, string][]);
-    this.colors?.apply(origin + structure, choices).catch((error: unknown) => {
+    const failed = (error: unknown) => {
       const { document } = asProblem(error);
       this.tell("error", { message: document.detail ?? document.title, problem: error instanceof Problem ? document : null });
-    });
+    };
+    const choices = new Map([...searchParams, ["color", scheme]] as [string, string][]);
+    this.colors?.apply(origin + structure, choices).catch(failed);
+    if (this.hasAttribute("sticks")) this.ligands?.show(origin + structure, choices).catch(failed);
   }
 
   private applyAttributes(): void {
     this.paint();
     this.canvas.setAttribute("aria-label", this.getAttribute("alt") ?? "A molecular surface; arrow keys turn it");
     this.style.background = this.getAttribute("background") ?? "";
+    this.viewer?.setTransparency(transparencyOf(this.getAttribute("transparency")) / 100);
     this.viewer?.theme(this.getAttribute("background") ?? "#ffffff", this.getAttribute("color") ?? "#58ad9d");
   }
 

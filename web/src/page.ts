@@ -188,7 +188,7 @@ export class Page {
       if (state) this.form?.fill(state.choices);
       else if (isOther) this.form?.forget();
       if (state) this.nextDisplay = state.display;
-      else if (isOther && this.display) this.nextDisplay = { ...this.display.state, hidden: [] };
+      else if (isOther && this.display) this.nextDisplay = { ...this.display.state, hidden: [], view: "" };
       this.target = source;
       this.changed(false);
     } catch (error) {
@@ -348,7 +348,8 @@ export class Page {
     report($("report"), extras, timingsOf(headers));
     $("now").textContent = `${Number(extras["triangles"]).toLocaleString("en")} triangles`;
     this.updateAddress(push);
-    if (!previous) this.stage.viewer?.turn(true);
+    if (!previous && !this.display?.state.view) this.stage.viewer?.turn(true);
+    show($("joined"), choices.get("instances") === "true");
     // After a pause without further meshes.
     clearTimeout(this.facts);
     this.facts = window.setTimeout(() => this.complete(source, extras, headers), 300);

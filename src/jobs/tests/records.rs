@@ -1,9 +1,12 @@
 //! Number of job records, and faults while they are read and written.
 
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use super::{Fixture, MAX_WAIT, ended, new_id};
 use crate::config::JobsConfig;
+use crate::jobs::durable_job::DurableJob;
+use crate::jobs::job_store::MAX_ENDED;
 use crate::jobs::record::{JobRecord, now_ms};
 use crate::jobs::{AcceptError, JobId, Status};
 use crate::store::{Folder, Namespace, StoreError};
@@ -42,6 +45,26 @@ async fn records_are_limited_in_total_and_for_each_client() {
         assert_eq!(fixture.store.usage(Folder::Jobs).objects, 3);
     }
     assert!(fixture.jobs.view(&open[2], Namespace::default()).await.unwrap().is_some());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn few_ended_jobs_stay_in_memory() {
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let open = fixture.store_record().await;
+    let record = fixture.on_record(&open).await;
+    let insert = |record: JobRecord| {
+        let id = record.id.clone();
+        fixture.jobs.0.insert(&id, &Arc::new(DurableJob::new(record)));
+        id
+    };
+    insert(record.clone());
+    let ended = |n: u64| JobRecord { id: new_id(), status: Status::Successful, finished_ms: Some(n), ..record.clone() };
+    let ids: Vec<JobId> = (0..3 * MAX_ENDED as u64).map(|n| insert(ended(n))).collect();
+    let jobs = fixture.jobs.0.lock();
+    let n = jobs.len();
+    assert!((MAX_ENDED..=MAX_ENDED + MAX_ENDED / 10 + 1).contains(&n), "{n}");
+    assert!(jobs.contains_key(&open), "open jobs stay");
+    assert!(ids[ids.len() - MAX_ENDED + 1..].iter().all(|id| jobs.contains_key(id)), "the last ones to end stay");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -2,6 +2,7 @@
 //! sphere is nearest to it.
 
 mod blend;
+mod depth;
 mod of_map;
 mod of_mesh;
 mod palette;

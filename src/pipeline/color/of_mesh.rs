@@ -42,6 +42,7 @@ impl MeshColors {
             ColorSource::Vertices(match property {
                 VertexProperty::Curvature => ValueSource::Curvature,
                 VertexProperty::Radial => ValueSource::Radial(centroid(structure, selected)),
+                VertexProperty::Depth => ValueSource::Depth,
                 VertexProperty::Map => {
                     let map = map.ok_or_else(|| ColorError::without_map(coloring.scheme))?;
                     ValueSource::Map(Box::new(map), coloring.offset)

@@ -9,7 +9,7 @@ use super::vertex::VertexProperty;
 /// Description of the valid values of the parameter `color`.
 pub const EXPECTED: &str = "none, uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, \
                             occupancy, plddt, hydrophobicity, hydrophobicity:wimley-white, charge, curvature, \
-                            radial, map";
+                            radial, depth, map";
 
 /// Hydrophobicity scale.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,7 +50,7 @@ pub enum Scheme {
 }
 
 /// Schemes by name, except [`Scheme::Uniform`].
-const NAMED: [(&str, Scheme); 14] = [
+const NAMED: [(&str, Scheme); 15] = [
     ("element", Scheme::Element),
     ("chain", Scheme::Chain),
     ("entity", Scheme::Entity),
@@ -64,6 +64,7 @@ const NAMED: [(&str, Scheme); 14] = [
     ("charge", Scheme::Charge),
     ("curvature", Scheme::Vertex(VertexProperty::Curvature)),
     ("radial", Scheme::Vertex(VertexProperty::Radial)),
+    ("depth", Scheme::Vertex(VertexProperty::Depth)),
     ("map", Scheme::Vertex(VertexProperty::Map)),
 ];
 
@@ -84,7 +85,9 @@ impl Scheme {
     #[must_use]
     pub const fn palette(self) -> Option<Palette> {
         match self {
-            Self::BFactor | Self::Occupancy | Self::Vertex(VertexProperty::Radial) => Some(Palette::Viridis),
+            Self::BFactor | Self::Occupancy | Self::Vertex(VertexProperty::Radial | VertexProperty::Depth) => {
+                Some(Palette::Viridis)
+            }
             Self::Hydrophobicity(_) | Self::Vertex(VertexProperty::Curvature) => Some(Palette::BlueWhiteRed),
             Self::Charge | Self::Vertex(VertexProperty::Map) => Some(Palette::RedWhiteBlue),
             _ => None,

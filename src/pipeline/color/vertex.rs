@@ -2,13 +2,15 @@
 //!
 //! Both are computed on the host from the finished mesh, so that every backend gives the same ones.
 
-use super::of_map;
+use super::{depth, of_map};
 use crate::formats::linear_of_srgb;
 use crate::structure::map::Map;
 use crate::surface::{Column, Control, Mesh, SurfaceError, Vertices};
 
 /// Memory of a value and its sums while values are computed, bytes per vertex.
 const VALUE_BYTES: u64 = 20;
+/// The same for depths: lists of points outside the hull and of sorted points.
+const DEPTH_BYTES: u64 = 40;
 /// Memory of blending, bytes per vertex: a colour, the sum of its neighbours and their number.
 const BLEND_BYTES: u64 = 22;
 /// Rounds of blending at a grid spacing of 1 Å. Each round averages over neighbours, which are about 0.7 grid spacings
@@ -24,6 +26,8 @@ pub enum VertexProperty {
     Curvature,
     /// Distance from the centroid of the meshed atoms, Å.
     Radial,
+    /// Distance from the convex hull of the mesh, Å.
+    Depth,
     /// Value of the map that is sent beside the structure, near the vertex.
     Map,
 }
@@ -33,6 +37,7 @@ pub(super) enum ValueSource {
     Curvature,
     /// Distance from this centroid of the meshed atoms.
     Radial([f64; 3]),
+    Depth,
     /// Map, sampled at this distance from the surface, Å.
     Map(Box<Map>, f64),
 }
@@ -40,7 +45,8 @@ pub(super) enum ValueSource {
 /// Returns the value of each vertex; NaN for those without one.
 pub(super) fn values(mesh: &Mesh, source: &ValueSource, control: &Control<'_>) -> Result<Vec<f32>, SurfaceError> {
     control.check()?;
-    let _memory = control.reserve(VALUE_BYTES * mesh.n_vertices() as u64)?;
+    let bytes = if matches!(source, ValueSource::Depth) { DEPTH_BYTES } else { VALUE_BYTES };
+    let _memory = control.reserve(bytes * mesh.n_vertices() as u64)?;
     Ok(match source {
         ValueSource::Curvature => curvatures(mesh),
         ValueSource::Radial(centroid) => {
@@ -48,6 +54,7 @@ pub(super) fn values(mesh: &Mesh, source: &ValueSource, control: &Control<'_>) -
             let distance = |i| length(std::array::from_fn(|k| origin[k] + f64::from(mesh.position(i)[k])));
             (0..mesh.n_vertices()).map(|i| single(distance(i))).collect()
         }
+        ValueSource::Depth => depth::depths(mesh.n_vertices(), |i| mesh.position(i).map(f64::from), control)?,
         ValueSource::Map(map, offset) => of_map::values(mesh, map, *offset, control)?,
     })
 }
@@ -157,15 +164,15 @@ pub(super) fn single(value: f64) -> f32 {
     value as f32
 }
 
-fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-fn length(a: [f64; 3]) -> f64 {
+pub(super) fn length(a: [f64; 3]) -> f64 {
     dot(a, a).sqrt()
 }
 

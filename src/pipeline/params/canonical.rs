@@ -1,8 +1,6 @@
 //! Canonical text of the parameters of a job.
 
-use std::fmt::Write as _;
-
-use crate::pipeline::{Interface, Job, Spacing};
+use crate::pipeline::{Coloring, Job, PictureParams, Spacing};
 use crate::structure::{Context, Selection, Split};
 use crate::surface::{PaperParams, SurfaceParams};
 
@@ -37,7 +35,7 @@ pub fn canonical(job: &Job) -> String {
         radius_offset,
         cutoff_tolerance,
         preset,
-        paper,
+        paper: paper_params,
         atom_ids,
         // Follows from `compress` and the spheres.
         quantize: _,
@@ -59,43 +57,24 @@ pub fn canonical(job: &Job) -> String {
         normals.name(),
         units.name()
     );
-    if *split != Split::None {
-        text.push_str("&split=");
-        text.push_str(split.name());
-    }
-    text.push_str(&of_exact(*exact, interface.as_ref()));
-    if *instances {
-        text.push_str("&instances=true");
-    }
-    if *context != Context::Selection {
-        text.push_str("&context=");
-        text.push_str(context.name());
-    }
-    let paper = match paper {
-        None => Ok(()),
-        Some(PaperParams::Gaussian { a, b } | PaperParams::SoftObject { a, b }) => {
-            write!(text, "&paper_a={a}&paper_b={b}")
-        }
-        Some(PaperParams::InverseSquare { c, b }) => write!(text, "&paper_c={c}&paper_b={b}"),
+    let paper = |paper: &PaperParams| match paper {
+        PaperParams::Gaussian { a, b } | PaperParams::SoftObject { a, b } => format!("paper_a={a}&paper_b={b}"),
+        PaperParams::InverseSquare { c, b } => format!("paper_c={c}&paper_b={b}"),
     };
-    if let Some(color) = color {
+    let optional = [
+        (*split != Split::None).then(|| format!("split={}", split.name())),
+        exact.then(|| "exact=true".to_owned()),
+        interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),
+        instances.then(|| "instances=true".to_owned()),
+        (*context != Context::Selection).then(|| format!("context={}", context.name())),
+        paper_params.as_ref().map(paper),
+        color.as_ref().map(Coloring::canonical),
+        map.as_ref().map(|map| format!("map={}", map.digest())),
+        picture.as_ref().map(PictureParams::canonical),
+    ];
+    for parameters in optional.into_iter().flatten() {
         text.push('&');
-        text.push_str(&color.canonical());
+        text.push_str(&parameters);
     }
-    if let Some(map) = map {
-        text.push_str("&map=");
-        text.push_str(map.digest());
-    }
-    if let Some(picture) = picture {
-        text.push('&');
-        text.push_str(&picture.canonical());
-    }
-    debug_assert!(paper.is_ok(), "writing to a string does not fail");
     text
-}
-
-/// Returns the text of exact areas; empty if none are requested.
-fn of_exact(exact: bool, interface: Option<&Interface>) -> String {
-    let interface = interface.map(|interface| format!("&interface={:?}", interface.sides));
-    format!("{}{}", if exact { "&exact=true" } else { "" }, interface.unwrap_or_default())
 }

@@ -242,18 +242,18 @@ pub const TABLE: &[Parameter] = &[
         name: "color",
         domain: Domain::Text { expected: color::EXPECTED },
         default: "none",
-        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, secondary structure in the file (Jmol), B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7; or by the mean curvature of the surface, the distance from the centroid of the atoms (radial), or the values of a map sent beside the structure (map). STL has no colours.",
+        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, secondary structure in the file (Jmol), B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7; or by the mean curvature of the surface, the distance from the centroid of the atoms (radial), the distance from the convex hull of the mesh (depth), or the values of a map sent beside the structure (map). STL has no colours.",
     },
     Parameter {
         name: "palette",
         domain: Domain::Choice(PALETTES),
-        default: "viridis for bfactor, occupancy and radial, blue-white-red for hydrophobicity and curvature, red-white-blue for charge and map",
-        doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity, charge, curvature, radial and map only.",
+        default: "viridis for bfactor, occupancy, radial and depth, blue-white-red for hydrophobicity and curvature, red-white-blue for charge and map",
+        doc: "Colours from the lowest to the highest value; for color=bfactor, occupancy, hydrophobicity, charge, curvature, radial, depth and map only.",
     },
     Parameter {
         name: "color_range",
         domain: Domain::Text { expected: "two numbers separated by a comma, the lower one first" },
-        default: "the lowest and highest value of the meshed atoms, or of the mesh for radial; symmetric around 0 for map, with the largest absolute value at the mesh; −4.5,4.5 or −2.02,2.02 for hydrophobicity, −1,1 for charge, −0.5,0.5 for curvature",
+        default: "the lowest and highest value of the meshed atoms, or of the mesh for radial and depth; symmetric around 0 for map, with the largest absolute value at the mesh; −4.5,4.5 or −2.02,2.02 for hydrophobicity, −1,1 for charge, −0.5,0.5 for curvature",
         doc: "Values at the ends of the palette. Values beyond an end have its colour.",
     },
     Parameter {

@@ -61,23 +61,30 @@ impl Remark350 {
     fn operator_row(&mut self, text: &str, reading: &Reading<'_>) -> Result<(), StructureError> {
         let (number, rest) = text.split_at_checked(1).unwrap_or_default();
         match number {
-            "1" => self.rows.clear(),
+            "1" => self.end_operator(reading)?,
             "2" | "3" => {}
             _ => return Ok(()),
         }
         let mut words = rest.split_ascii_whitespace().skip(1);
         self.rows.push([(); 4].map(|()| words.next().and_then(|word| number::real(word.as_bytes(), 0, word.len()))));
-        if number == "3" {
-            reading.text.grow(BYTES_PER_OPERATOR)?;
-            let rows = std::mem::take(&mut self.rows);
-            let operator = <[_; 3]>::try_from(rows).ok().and_then(Operator::of);
-            self.assemblies.add_operator((self.assemblies.n_operators() + 1).to_string(), operator);
+        if number == "3" { self.end_operator(reading) } else { Ok(()) }
+    }
+
+    /// Adds the current operator, if it has rows. It is invalid unless it has three.
+    fn end_operator(&mut self, reading: &Reading<'_>) -> Result<(), StructureError> {
+        let rows = std::mem::take(&mut self.rows);
+        if rows.is_empty() {
+            return Ok(());
         }
+        reading.text.grow(BYTES_PER_OPERATOR)?;
+        let operator = <[_; 3]>::try_from(rows).ok().and_then(Operator::of);
+        self.assemblies.add_operator((self.assemblies.n_operators() + 1).to_string(), operator);
         Ok(())
     }
 
     /// Adds the current rule to its assemblies, if it has operators.
     fn end_rule(&mut self, reading: &Reading<'_>) -> Result<(), StructureError> {
+        self.end_operator(reading)?;
         let last = self.assemblies.n_operators();
         let first = std::mem::replace(&mut self.first, last) + 1;
         let Some(chains) = self.chains.take().filter(|_| first <= last) else { return Ok(()) };

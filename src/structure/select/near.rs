@@ -29,6 +29,9 @@ const LONG_DISTANCE: f64 = 8.0;
 const MAX_TESTED_POINTS: usize = 16;
 /// Margin of the distance when cells are chosen, Å. It exceeds all rounding of coordinates.
 const SLACK: f64 = 1e-6;
+/// Margin of the squared distance, Å². Squared distances between coordinates with three decimals are multiples of 1e-6
+/// Å², so this decides ties exactly, whatever the rounding.
+const TIE: f64 = 5e-7;
 
 /// Marks every atom whose distance to an atom of `of` in the same model is at most `distance`. The time is linear if
 /// the atoms of each model are consecutive, as all common programs write them.
@@ -146,7 +149,9 @@ fn square([x, y, z]: Point) -> f64 {
 
 /// Points in the cells of a uniform grid.
 struct PointGrid {
-    distance: f64,
+    /// Distance at which cells are out of reach, Å.
+    reach: f64,
+    /// Squared distance of the farthest points that are near, Å².
     distance2: f64,
     low: Point,
     cell: f64,
@@ -193,8 +198,8 @@ impl PointGrid {
         // There are at most as many occupied cells as points.
         memory.grow((4 * n_cells + n_points * (size_of::<PointBox>() + size_of::<Point>() + 8)) as u64)?;
         let mut grid = Self {
-            distance,
-            distance2: distance * distance,
+            reach: (distance * distance + TIE).sqrt() + SLACK,
+            distance2: distance * distance + TIE,
             low: all.low,
             cell,
             n,
@@ -248,7 +253,7 @@ impl PointGrid {
 
     /// Returns true if a point of the grid is within the distance.
     fn is_near(&self, point: Point, tests: &mut Tests<'_>) -> Result<bool, StructureError> {
-        let reach = self.distance + SLACK;
+        let reach = self.reach;
         let outside = (0..3).any(|k| {
             let beyond = self.n[k] as f64 * self.cell + reach;
             !(-reach..=beyond).contains(&(point[k] - self.low[k]))
@@ -329,6 +334,15 @@ mod tests {
     }
 
     #[test]
+    fn ties_are_near() {
+        for first in (0..4000).step_by(101) {
+            let s = atoms(&[[first, 0, 0], [first + 1900, 0, 0], [first + 3801, 0, 0]]);
+            assert_eq!(near(&s, &[true, false, false], 1.9), [true, true, false], "{first}");
+            assert_eq!(near(&s, &[false, true, false], 1.9), [true, true, false], "{first}");
+        }
+    }
+
+    #[test]
     fn marks_are_those_of_all_pairs_at_every_scale() {
         let mut random = 3_u64;
         let mut next = |side: i32| {
@@ -344,13 +358,15 @@ mod tests {
             let s = atoms(&positions);
             for share in [1, 7, 350] {
                 let of: Vec<bool> = (0..s.len()).map(|i| i % share == 0).collect();
-                for distance in [0.001, 1.0, 2.0, 3.75, 5.0, 20.0, 50.0] {
+                for thousandths in [1, 1_000, 1_900, 2_000, 3_750, 5_000, 20_000, 50_000] {
+                    let distance = f64::from(thousandths) / 1000.0;
                     let is_near = |i: usize| {
-                        let apart = |j: usize| {
-                            let [x, y, z] = [&s.x, &s.y, &s.z].map(|c| c[i] - c[j]);
-                            x * x + y * y + z * z
+                        // Exact, in units of 0.001 Å.
+                        let apart = |j: usize| -> i64 {
+                            let (a, b) = (positions[i], positions[j]);
+                            (0..3).map(|k| i64::from(a[k] - b[k]).pow(2)).sum()
                         };
-                        (0..s.len()).any(|j| of[j] && apart(j) <= distance * distance)
+                        (0..s.len()).any(|j| of[j] && apart(j) <= i64::from(thousandths).pow(2))
                     };
                     let expected: Vec<bool> = (0..s.len()).map(is_near).collect();
                     assert_eq!(near(&s, &of, distance), expected, "case {i}, every {share}th, {distance} Å");

@@ -39,13 +39,14 @@ const LABELS = new Map<string, string>([
   ["uniform:", "another colour"],
   ["curvature", "curvature"],
   ["radial", "distance from the centre"],
+  ["depth", "depth below the convex hull"],
 ]);
 
 /** Returns the label of a scheme; its name if it has none. */
 export const labelOf = (scheme: string): string => LABELS.get(scheme) ?? scheme;
 
 /** Parameters of a mesh that affect the colours of its atoms. */
-const SHARED = ["palette", "color_range", "model", "chains", "select", "altloc"];
+const SHARED = ["palette", "color_range", "model", "chains", "select", "altloc", "assembly", "context"];
 
 /** Returns the path of the colours of a structure; null without a colour scheme. */
 export function colorsPath(structure: string, choices: Choices): string | null {

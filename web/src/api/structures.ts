@@ -139,9 +139,9 @@ export interface Positions {
   residues: string[];
 }
 
-/** Fetches the atoms of a structure that `selection` names, with the copies of an assembly. */
-export async function positions(client: Client, source: Source, selection: Choices, signal: AbortSignal): Promise<Positions> {
-  const path = `${source.path}/atoms${query(selection, { positions: "true" })}`;
+/** Fetches the atoms of a structure, by its path, that `selection` names, with the copies of an assembly. */
+export async function positions(client: Client, structure: string, selection: Choices, signal: AbortSignal): Promise<Positions> {
+  const path = `${structure}/atoms${query(selection, { positions: "true" })}`;
   const { atoms, elements, residues } = await client.json<AtomsDocument>(path, { signal });
   const { x = [], y = [], z = [], index = [] } = atoms;
   return { x, y, z, index, elements: atoms.element.map((i) => elements[i] ?? "?"), residues: residues.name };

@@ -8,6 +8,15 @@ export function contextOf(canvas: HTMLCanvasElement, transparent: boolean): WebG
   return canvas.getContext("webgl2", attributes) as WebGL2RenderingContext | null;
 }
 
+/** Maximum transparency of a surface, per cent. */
+const MAX_TRANSPARENCY = 90;
+
+/** Returns a transparency in per cent, 0 to 90; 0 if the text is no number. */
+export function transparencyOf(text: string | null): number {
+  const value = Number(text);
+  return Number.isFinite(value) ? Math.min(MAX_TRANSPARENCY, Math.max(0, Math.round(value))) : 0;
+}
+
 /** Settings of a viewer. */
 export interface ViewerOptions {
   /** True for a transparent background. */

@@ -1,6 +1,9 @@
 /** Loads a GLB for drawing. Positions stay unchanged, also integers; the node transforms them. */
 
-import { Box3, type BufferAttribute, type BufferGeometry, type Group, type InstancedMesh, Matrix4, type Mesh, Sphere, Vector3 } from "three";
+import {
+  Box3, type BufferAttribute, type BufferGeometry, DoubleSide, type Group, type InstancedMesh, type Material, Matrix4, type Mesh,
+  Sphere, Vector3,
+} from "three";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 
 /** Part of a surface, one of its instances, or a whole surface that is not divided. */
@@ -15,6 +18,8 @@ export interface Loaded {
   /** At least one. All have the same attributes. */
   parts: Part[];
   sphere: Sphere;
+  /** True if both sides of the triangles are drawn, as for open surfaces. */
+  twoSided: boolean;
   /** Parameters and report in the file, without values that differ between runs. */
   extras: Record<string, unknown>;
 }
@@ -31,7 +36,7 @@ export async function load(bytes: ArrayBuffer): Promise<Loaded> {
   }
   const gltf = await loader.parseAsync(bytes, "");
   gltf.scene.updateMatrixWorld(true);
-  const parts = partsOf(gltf.scene);
+  const { parts, twoSided } = partsOf(gltf.scene);
   if (!parts.length) throw new Error("the file holds no surface");
   const box = new Box3();
   for (const { geometry, matrix } of parts) {
@@ -41,7 +46,7 @@ export async function load(bytes: ArrayBuffer): Promise<Loaded> {
   }
   const sphere = box.getBoundingSphere(new Sphere(new Vector3(), 1));
   const extras = ((gltf.asset as { extras?: Record<string, unknown> }).extras ?? {}) as Record<string, unknown>;
-  return { parts, sphere, extras };
+  return { parts, sphere, twoSided, extras };
 }
 
 /** Returns Å per unit of the file; 1 if it does not state its units. */
@@ -51,15 +56,17 @@ export function unitScale({ extras }: Loaded): number {
 }
 
 /** Returns all meshes with their names in the file, because three.js changes the names of objects. */
-function partsOf(group: Group): Part[] {
+function partsOf(group: Group): Pick<Loaded, "parts" | "twoSided"> {
   const parts: Part[] = [];
+  let twoSided = false;
   group.traverse((object) => {
     const mesh = object as Mesh;
     if (!mesh.isMesh) return;
+    twoSided ||= (mesh.material as Material).side === DoubleSide;
     const name = String(mesh.userData["name"] ?? mesh.name);
     for (const matrix of transformsOf(mesh)) parts.push({ name, geometry: mesh.geometry, matrix });
   });
-  return parts;
+  return { parts, twoSided };
 }
 
 /** Returns the transforms of a mesh to file units: one, or one for each of its instances. */

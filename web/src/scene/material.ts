@@ -1,6 +1,9 @@
 /** Material of the surface: hemisphere light, two camera lights, darker hollows and edges, and distance fog. */
 
-import { Color, DataTexture, GLSL3, Mesh, NearestFilter, RGBAFormat, ShaderMaterial, SRGBColorSpace, UnsignedByteType, Vector2, type BufferGeometry } from "three";
+import {
+  Color, DataTexture, DoubleSide, FrontSide, GLSL3, Mesh, NearestFilter, RGBAFormat, ShaderMaterial, SRGBColorSpace, UnsignedByteType, Vector2,
+  type BufferGeometry,
+} from "three";
 
 /** Atoms per row of the palette, a texture width that every device supports. */
 const PALETTE_WIDTH = 1024;
@@ -56,7 +59,8 @@ const vec3 KEY = vec3(0.38, 0.62, 0.69);
 const vec3 FILL = vec3(-0.75, -0.1, 0.65);
 void main() {
   #ifdef NORMALS
-  vec3 n = normalize(vNormal);
+  // Triangles that are seen from inside are lit as their visible side is.
+  vec3 n = (gl_FrontFacing ? 1.0 : -1.0) * normalize(vNormal);
   #else
   vec3 n = normalize(cross(dFdx(vEye), dFdy(vEye)));
   #endif
@@ -81,7 +85,8 @@ void main() {
 }`;
 
 export class SurfaceMaterial extends ShaderMaterial {
-  constructor(geometry: BufferGeometry) {
+  /** `twoSided`: both sides of the triangles are drawn, otherwise the outer one. */
+  constructor(geometry: BufferGeometry, twoSided = false) {
     const defines: Record<string, string> = {};
     if (geometry.hasAttribute("normal")) defines["NORMALS"] = "1";
     if (geometry.hasAttribute("_atom")) defines["ATOMS"] = "1";
@@ -90,6 +95,7 @@ export class SurfaceMaterial extends ShaderMaterial {
       vertexShader: VERTEX,
       fragmentShader: FRAGMENT,
       defines,
+      side: twoSided ? DoubleSide : FrontSide,
       vertexColors: geometry.hasAttribute("color"),
       uniforms: {
         plain: { value: new Color("#5fb3a1") },
@@ -117,8 +123,8 @@ export class SurfaceMaterial extends ShaderMaterial {
 }
 
 /** Returns a material that writes depths and no colours. It is drawn after opaque objects. */
-export function depthsOnly(geometry: BufferGeometry): SurfaceMaterial {
-  const material = new SurfaceMaterial(geometry);
+export function depthsOnly(geometry: BufferGeometry, twoSided: boolean): SurfaceMaterial {
+  const material = new SurfaceMaterial(geometry, twoSided);
   material.colorWrite = false;
   material.transparent = true;
   return material;

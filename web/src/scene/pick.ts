@@ -24,9 +24,9 @@ export interface Hit {
 
 /**
  * Finds the first triangle that faces the origin of `ray`, and the atom of its corner nearest to the intersection.
- * `ray` is in scene coordinates; `matrix` transforms the mesh into them.
+ * `ray` is in scene coordinates; `matrix` transforms the mesh into them. With `twoSided`, triangles may face away.
  */
-export function pick(geometry: BufferGeometry, matrix: Matrix4, ray: Ray): Hit | null {
+export function pick(geometry: BufferGeometry, matrix: Matrix4, ray: Ray, twoSided: boolean): Hit | null {
   const positions = column(geometry, "position");
   const index = geometry.getIndex()?.array;
   if (!positions || !index) return null;
@@ -44,9 +44,10 @@ export function pick(geometry: BufferGeometry, matrix: Matrix4, ray: Ray): Hit |
     const fx = array[c]! - ax, fy = array[c + 1]! - ay, fz = array[c + 2]! - az;
     // Möller–Trumbore. Back faces have a determinant that is not positive.
     const px = dy * fz - dz * fy, py = dz * fx - dx * fz, pz = dx * fy - dy * fx;
-    const det = ex * px + ey * py + ez * pz;
-    if (det <= 0) continue;
-    const sx = ox - ax, sy = oy - ay, sz = oz - az;
+    const signed = ex * px + ey * py + ez * pz;
+    if (twoSided ? signed === 0 : signed <= 0) continue;
+    const [det, side] = [Math.abs(signed), Math.sign(signed)];
+    const sx = side * (ox - ax), sy = side * (oy - ay), sz = side * (oz - az);
     const u = sx * px + sy * py + sz * pz;
     if (u < 0 || u > det) continue;
     const qx = sy * ez - sz * ey, qy = sz * ex - sx * ez, qz = sx * ey - sy * ex;

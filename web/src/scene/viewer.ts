@@ -1,14 +1,15 @@
 /** Viewer of a surface on a canvas. Draws only when something has changed. */
 
-import { type BufferGeometry, Color, DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, Vector3, WebGLRenderer } from "three";
+import { type BufferGeometry, Color, DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, type Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import type { ViewerOptions } from "./context";
 import { type Loaded, unitScale } from "./load";
 import { depthLayer, depthsOnly, SurfaceMaterial } from "./material";
 import { type Hit, pick, placeOf } from "./pick";
+import { FRONT, moved, place, type View, viewOf } from "./view";
 
-/** Duration of the initial rotation, ms: one full turn. */
-const TURN = 14_000;
+/** Duration of the initial rotation, s: one full turn. */
+const TURN = 14;
 /** Maximum device pixels per CSS pixel. More is not visible. */
 const MAX_PIXEL_RATIO = 2;
 /** Frame time, ms, above which the resolution is reduced during motion. */
@@ -38,7 +39,8 @@ export class Viewer {
   private frame = 0;
   private lastFrame = 0;
   private slowness = 0;
-  private turnUntil = 0;
+  /** Remaining time of the rotation, s. */
+  private turnLeft = 0;
   private settle = 0;
   private readonly size = new ResizeObserver(() => this.resize());
   private readonly reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
@@ -63,11 +65,12 @@ export class Viewer {
 
   /** Shows a surface. Resets the view if `fresh`. Resolves in the frame after the one that shows it. */
   show(loaded: Loaded, fresh: boolean): Promise<number> {
-    const first = !this.loaded;
+    const isFirst = !this.loaded;
     this.scene.remove(...this.meshes);
     this.release();
-    const material = (this.material = new SurfaceMaterial(loaded.parts[0]!.geometry));
-    this.depths = depthsOnly(loaded.parts[0]!.geometry);
+    const [{ geometry: first }] = loaded.parts as [Loaded["parts"][0]];
+    const material = (this.material = new SurfaceMaterial(first, loaded.twoSided));
+    this.depths = depthsOnly(first, loaded.twoSided);
     this.meshes = loaded.parts.map(({ name, geometry, matrix }) => {
       const mesh = new Mesh(geometry, material);
       mesh.matrixAutoUpdate = false;
@@ -81,7 +84,7 @@ export class Viewer {
     this.scene.add(...this.meshes);
     this.applyStyle();
     this.applyTransparency();
-    if (fresh || first) this.reset();
+    if (fresh || isFirst) this.reset();
     else this.clip();
     return this.drawn();
   }
@@ -171,13 +174,17 @@ export class Viewer {
 
   /** Resets the view to the whole surface from the front. */
   reset(): void {
+    this.view = FRONT;
+  }
+
+  /** View of the surface; the initial one without a surface. */
+  get view(): View {
+    return this.loaded ? viewOf(this.camera, this.controls.target, this.loaded.sphere) : FRONT;
+  }
+
+  set view(view: View) {
     if (!this.loaded) return;
-    const { center, radius } = this.loaded.sphere;
-    const aspect = Math.min(1, this.camera.aspect);
-    const distance = (0.8 * radius) / Math.sin((this.camera.fov * Math.PI) / 360) / aspect;
-    this.controls.target.copy(center);
-    this.camera.up.set(0, 1, 0);
-    this.camera.position.copy(center).add(new Vector3(0.25, 0.2, 1).normalize().multiplyScalar(distance));
+    place(this.camera, this.controls.target, this.loaded.sphere, view);
     this.clip();
     this.controls.update();
     this.invalidate();
@@ -185,40 +192,34 @@ export class Viewer {
 
   /** Starts or stops the rotation. Unless `byUser`, it turns once, or not at all if reduced motion is preferred. */
   turn(on: boolean, byUser = false): void {
-    const now = performance.now();
-    const was = this.isTurning;
-    this.turnUntil = !on || (this.reducedMotion.matches && !byUser) ? 0 : byUser ? Number.POSITIVE_INFINITY : now + TURN;
+    const was = this.controls.autoRotate;
+    this.turnLeft = !on || (this.reducedMotion.matches && !byUser) ? 0 : byUser ? Number.POSITIVE_INFINITY : TURN;
     this.controls.autoRotate = this.isTurning;
-    this.controls.autoRotateSpeed = (60_000 / TURN);
+    this.controls.autoRotateSpeed = 60 / TURN;
     if (was !== this.isTurning) this.options.onTurn?.(this.isTurning);
     this.invalidate();
   }
 
   get isTurning(): boolean {
-    return this.turnUntil > performance.now();
+    return this.turnLeft > 0;
   }
 
   /** Turns by angles (radians) and zooms by a factor. Used by the keyboard. */
   move(right: number, down: number, nearer = 1): void {
     this.turn(false);
-    const offset = this.camera.position.clone().sub(this.controls.target);
-    const sphere = { r: offset.length(), theta: Math.atan2(offset.x, offset.z), phi: Math.acos(Math.max(-1, Math.min(1, offset.y / offset.length()))) };
-    sphere.theta -= right;
-    sphere.phi = Math.max(0.02, Math.min(Math.PI - 0.02, sphere.phi - down));
-    offset.setFromSphericalCoords(sphere.r / nearer, sphere.phi, sphere.theta);
-    this.camera.position.copy(this.controls.target).add(offset);
-    this.controls.update();
-    this.invalidate();
+    this.view = moved(this.view, right, down, nearer);
   }
 
   /** Returns the atom under a point of the canvas, with (0, 0) in the middle and (1, 1) in the upper right corner. */
   pick(x: number, y: number): Hit | null {
-    if (!this.loaded) return null;
+    const { loaded } = this;
+    if (!loaded) return null;
     const caster = new Raycaster();
     this.camera.updateMatrixWorld();
     caster.setFromCamera(new Vector2(x, y), this.camera);
     const { ray } = caster;
-    const hits = this.loaded.parts.filter((_, i) => this.meshes[i]?.visible).map(({ geometry, matrix }) => pick(geometry, matrix, ray));
+    const shown = loaded.parts.filter((_, i) => this.meshes[i]?.visible);
+    const hits = shown.map(({ geometry, matrix }) => pick(geometry, matrix, ray, loaded.twoSided));
     const distance = ({ point }: Hit) => point.distanceToSquared(ray.origin);
     return hits.reduce((best, hit) => (hit && (!best || distance(hit) < distance(best)) ? hit : best), null);
   }
@@ -310,7 +311,11 @@ export class Viewer {
     const step = now - this.lastFrame;
     this.lastFrame = now;
     if (step < 500) this.slowness += 0.3 * (step - this.slowness);
-    if (turning) this.controls.update(Math.min(step, 100) / 1000);
+    if (turning) {
+      const time = Math.min(step / 1000, 0.1, this.turnLeft);
+      this.turnLeft -= time;
+      this.controls.update(time);
+    }
     // Without a GPU, a lower resolution keeps motion smooth. The full resolution returns at rest.
     const moving = step < 250;
     this.sharpen(moving && this.slowness > SLOW ? Math.max(0.5, Math.sqrt(SLOW / this.slowness)) : 1);

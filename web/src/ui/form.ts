@@ -8,6 +8,9 @@ import { field, type Field, type Offer } from "./field";
 /** Storage parameters, which do not apply to pictures. */
 const STORAGE = ["compress", "normals", "units", "atom_ids"];
 
+/** Formats that can repeat a mesh (parameter `instances`). Others contain the joined surface of the assembly. */
+const REPEATING = ["glb", "gltf"];
+
 /** Parameters whose values name parts of one structure. */
 const PARTS = ["model", "chains", "altloc", "assembly"];
 
@@ -73,7 +76,8 @@ export class Form {
   /** Returns the values in `choices` that apply to a file of `format`. */
   of(format: string, choices: Choices): Choices {
     const isApart = [...this.fields.values()].some(({ parameter }) => parameter.format === format);
-    return this.chosen(choices, ({ name, format: only }) => (only === "" && !(isApart && STORAGE.includes(name))) || only === format);
+    const isExcluded = (name: string) => (isApart && STORAGE.includes(name)) || (name === "instances" && !REPEATING.includes(format));
+    return this.chosen(choices, ({ name, format: only }) => (only === "" && !isExcluded(name)) || only === format);
   }
 
   private chosen(choices: Choices, which: (parameter: Parameter) => boolean): Choices {
