@@ -137,7 +137,7 @@ pub(crate) struct JobArgs {
     pub(crate) backend: BackendName,
     #[command(flatten)]
     pub(crate) devices: DeviceArgs,
-    /// Threads of the CPU backend; one per core by default
+    /// Threads of the computation on the CPU; one per core by default
     #[arg(long, value_name = "N")]
     pub(crate) threads: Option<usize>,
     /// Format of the report
@@ -236,7 +236,7 @@ pub(crate) struct SurfaceArgs {
     /// Add exact areas and volume to the report, in total and by chain; `--surface vdw`, `sas` and `ses` only
     #[arg(long)]
     pub(crate) exact: bool,
-    /// Add the exact area that two sets of chains bury; several chains of a side are joined by a slash: H/L,A
+    /// Add the surface area buried between two sets of chains, with `--exact`; a slash joins chains of a side: H/L,A
     #[arg(long, value_name = "A,B")]
     pub(crate) interface: Option<String>,
 }

@@ -75,6 +75,11 @@ impl<'a> CommandJob<'a> {
         let purpose = if format.is_picture() { Purpose::Picture } else { Purpose::Mesh };
         let mut requested = BackendRequest::for_command(args, purpose);
         backend::check(&requested)?;
+        if let Some(n) = args.threads {
+            // Reading, exact areas and colours run on the global threads.
+            let built = rayon::ThreadPoolBuilder::new().num_threads(n).build_global();
+            built.map_err(|error| CliError::Internal(error.to_string()))?;
+        }
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
         output::refuse_input(path, output)?;

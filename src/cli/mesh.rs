@@ -32,7 +32,11 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
         if !args.job.surface.exact {
             return Err(CliError::usage("`--areas` needs `--exact`"));
         }
-        let level = args.areas_by.as_deref().map_or_else(|| Ok(AreaLevel::default()), level_named)?;
+        let name = args.areas_by.as_deref().unwrap_or(AreaLevel::default().name());
+        let level = name.parse().map_err(|()| {
+            let expected = AreaLevel::ALL.map(AreaLevel::name).join(", ");
+            CliError::usage(format!("`--areas-by`: `{name}` is not allowed; expected one of {expected}"))
+        })?;
         job.add_table(Table::Areas(level), path, &args.output)?;
     }
     let product = if format == Format::Glb && output.has_random_access() {
@@ -67,14 +71,6 @@ fn named(name: &str) -> Result<Format, CliError> {
             Err(CliError::usage(format!("parameter `format`: `{name}` is not allowed; expected one of {expected}")))
         }
     }
-}
-
-/// Parses the level of a table of areas.
-fn level_named(name: &str) -> Result<AreaLevel, CliError> {
-    AreaLevel::ALL.into_iter().find(|level| level.name() == name).ok_or_else(|| {
-        let expected = AreaLevel::ALL.map(AreaLevel::name).join(", ");
-        CliError::usage(format!("parameter `areas_by`: `{name}` is not allowed; expected one of {expected}"))
-    })
 }
 
 /// Returns the format of an output by its file extension; GLB on stdout.

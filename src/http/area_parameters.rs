@@ -1,11 +1,13 @@
 //! Parameters of `…/areas`: `by`, and those of a mesh that affect its exact areas.
 
-use crate::pipeline::nearest::nearest;
 use crate::pipeline::params::{self, ParamError};
 use crate::pipeline::{AreaLevel, Job};
+use crate::surface::SurfaceKind;
 
 /// Name of the parameter that selects the rows.
 pub(super) const BY: &str = "by";
+/// Values of `surface`.
+pub(super) const SURFACES: [SurfaceKind; 3] = [SurfaceKind::Vdw, SurfaceKind::Sas, SurfaceKind::Ses];
 /// Names of the parameters.
 pub(super) const NAMES: [&str; 11] = [
     BY,
@@ -34,18 +36,23 @@ pub(super) struct Areas {
 /// # Errors
 /// Returns a [`ParamError`], including if no surface with exact areas is named.
 pub(super) fn parse(pairs: &[(String, String)]) -> Result<Areas, ParamError> {
-    if let Some((name, _)) = pairs.iter().find(|(name, _)| !NAMES.contains(&name.as_str())) {
-        let name = name.chars().take(64).collect::<String>();
-        return Err(ParamError::Unknown { nearest: nearest(&name, NAMES), name });
+    params::check_names(pairs, &NAMES)?;
+    let surface = value_of(pairs, "surface").unwrap_or("no value");
+    if !SURFACES.iter().any(|kind| kind.name() == surface) {
+        let expected = format!("{}, which have exact areas", SURFACES.map(SurfaceKind::name).join(", "));
+        return Err(ParamError::bad_value("surface", surface, expected));
+    }
+    if value_of(pairs, "model").is_some_and(|model| model.trim() == "all") {
+        return Err(ParamError::bad_value("model", "all", "the number of one model"));
     }
     let (own, of_mesh): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == BY);
     let of_mesh = of_mesh.iter().map(|(name, value)| (name.as_str(), value.as_str()));
-    let job = params::parse(of_mesh.chain([("exact", "true")])).map_err(|error| rename_exact(pairs, error))?.job;
+    let job = params::parse(of_mesh.chain([("exact", "true")]))?.job;
     let level = match &own[..] {
         [] => AreaLevel::default(),
         [(_, value)] => {
-            let named = AreaLevel::ALL.into_iter().find(|level| level.name() == value);
-            named.ok_or_else(|| bad(BY, value, &AreaLevel::ALL.map(AreaLevel::name).join(", ")))?
+            let levels = || AreaLevel::ALL.map(AreaLevel::name).join(", ");
+            value.parse().map_err(|()| ParamError::bad_value(BY, value, levels()))?
         }
         _ => return Err(ParamError::Repeated { name: BY }),
     };
@@ -53,21 +60,8 @@ pub(super) fn parse(pairs: &[(String, String)]) -> Result<Areas, ParamError> {
     Ok(Areas { job, level, canonical })
 }
 
-fn bad(name: &'static str, value: &str, expected: &str) -> ParamError {
-    let value = format!("`{}`", value.chars().take(64).collect::<String>());
-    ParamError::BadValue { name, value, expected: expected.to_owned() }
-}
-
-/// Replaces `exact`, which these requests do not have, in an error by the parameter that causes it.
-fn rename_exact(pairs: &[(String, String)], error: ParamError) -> ParamError {
-    if !matches!(error, ParamError::BadValue { name: "exact", .. }) {
-        return error;
-    }
-    let surface = pairs.iter().find(|(name, _)| name == "surface").map_or("gaussian", |(_, value)| value);
-    match surface {
-        "vdw" | "sas" | "ses" => bad("model", "all", "the number of one model"),
-        other => bad("surface", other, "vdw, sas or ses, which have exact areas"),
-    }
+fn value_of<'a>(pairs: &'a [(String, String)], name: &str) -> Option<&'a str> {
+    pairs.iter().find(|(other, _)| other == name).map(|(_, value)| value.as_str())
 }
 
 #[cfg(test)]

@@ -1,5 +1,8 @@
 //! `…/areas`: exact areas of the atoms, residues or chains of a structure as CSV, without a mesh.
 
+use std::sync::Arc;
+use std::time::Instant;
+
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::header::{self, HeaderMap};
@@ -11,13 +14,13 @@ use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AreaParameters, ConditionHeaders, EntryPath, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
-use super::parsed_request::Pairs;
+use super::parsed_request::{self, Pairs};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
-use super::source::StructureSource;
+use super::source::{Loaded, StructureSource};
 use super::state::Shared;
 use crate::jobs::Failure;
-use crate::pipeline::{AreaLevel, areas};
+use crate::pipeline::areas;
 
 problem_responses!(StructureProblems: [
     READING,
@@ -38,7 +41,7 @@ problem_responses!(EntryProblems: [READING, [
 ///
 /// A CSV table with the exact area of the van der Waals or solvent-accessible surface, or of the contact parts of the
 /// solvent-excluded surface, of each residue, atom or chain. No mesh is made. With `interface`, the table has the
-/// chains of both sides, with the areas that they bury.
+/// chains of both sides, with the surface area buried between them.
 #[utoipa::path(get, path = "/v1/structures/{digest}/areas", tag = "structures", operation_id = "listAreas",
     params(StructurePath, AreaParameters, ConditionHeaders),
     responses(
@@ -62,7 +65,7 @@ pub(super) async fn of_structure(
 ///
 /// A CSV table with the exact area of the van der Waals or solvent-accessible surface, or of the contact parts of the
 /// solvent-excluded surface, of each residue, atom or chain. No mesh is made. With `interface`, the table has the
-/// chains of both sides, with the areas that they bury.
+/// chains of both sides, with the surface area buried between them.
 #[utoipa::path(get, path = "/v1/pdb/{id}/areas", tag = "structures", operation_id = "listEntryAreas",
     params(EntryPath, AreaParameters, ConditionHeaders),
     responses(
@@ -92,16 +95,19 @@ async fn answer(
     query: Pairs,
     headers: &HeaderMap,
 ) -> Result<Response, Problem> {
-    let axum::extract::Query(pairs) = query.map_err(|e| Problem::new(ProblemType::BadRequest, e.body_text()))?;
-    let area_parameters::Areas { job, level, canonical } = area_parameters::parse(&pairs)?;
+    let area_parameters::Areas { job, level, canonical } = area_parameters::parse(&parsed_request::pairs(query)?)?;
     let surface = app.config.limits.job().surface;
-    let write = async |loaded: super::source::Loaded, delivery| {
+    let write = async |loaded: Loaded, delivery| {
+        app.admit_work(caller)?;
+        let (meter, payer) = (Arc::clone(app), caller.clone());
         let listing = loaded.list_atoms(app, caller, delivery, 0, move |structure, limits, control, memory| {
             let refused = |error| Problem::from(Failure::Job { error, diagnostics: Vec::new() });
-            let areas = areas::measure_selection(structure, &job, (limits, &surface), control).map_err(refused)?;
-            // A residue has several atoms.
-            let atoms_per_row = if level == AreaLevel::Atom { 1 } else { 4 };
-            memory.grow(BYTES_PER_ROW * (areas.len() as u64).div_ceil(atoms_per_row))?;
+            let start = Instant::now();
+            let measured = areas::measure_selection(structure, &job, (limits, &surface), control);
+            meter.charge(&payer, start.elapsed());
+            let areas = measured.map_err(refused)?;
+            // A row may have one atom only.
+            memory.grow(BYTES_PER_ROW * areas.len() as u64)?;
             let mut text = Vec::new();
             areas.write_csv(structure, level, &mut text).map_err(Problem::internal)?;
             Ok((text, ()))

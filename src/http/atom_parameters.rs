@@ -1,6 +1,5 @@
 //! Parameters of `…/atoms`: `positions`, and those of a mesh that select its atoms.
 
-use crate::pipeline::nearest::nearest;
 use crate::pipeline::params::{self, ParamError};
 use crate::structure::Selection;
 
@@ -21,23 +20,15 @@ pub(super) struct Positions {
 /// # Errors
 /// Returns a [`ParamError`], including if atoms are selected without positions.
 pub(super) fn parse(pairs: &[(String, String)]) -> Result<Option<Positions>, ParamError> {
-    if let Some((name, _)) = pairs.iter().find(|(name, _)| !NAMES.contains(&name.as_str())) {
-        let name = name.chars().take(64).collect::<String>();
-        return Err(ParamError::Unknown { nearest: nearest(&name, NAMES), name });
-    }
+    params::check_names(pairs, &NAMES)?;
     let (own, of_mesh): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == POSITIONS);
     let job = params::parse(of_mesh.iter().map(|(name, value)| (name, value)))?.job;
-    let bad = |value: &str, expected: &str| ParamError::BadValue {
-        name: POSITIONS,
-        value: format!("`{}`", value.chars().take(64).collect::<String>()),
-        expected: expected.to_owned(),
-    };
     let positions = match &own[..] {
         [] => false,
         [(_, value)] => match value.as_str() {
             "true" => true,
             "false" => false,
-            other => return Err(bad(other, "true or false")),
+            other => return Err(ParamError::bad_value(POSITIONS, other, "true or false")),
         },
         _ => return Err(ParamError::Repeated { name: POSITIONS }),
     };
@@ -46,7 +37,8 @@ pub(super) fn parse(pairs: &[(String, String)]) -> Result<Option<Positions>, Par
         return Ok(Some(Positions { selection: job.selection, canonical }));
     }
     if job.selection != Selection::default() {
-        return Err(bad("false", "true, which the parameters that select atoms need"));
+        let expected = "true, which the parameters that select atoms need";
+        return Err(ParamError::bad_value(POSITIONS, "false", expected));
     }
     Ok(None)
 }

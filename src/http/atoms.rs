@@ -21,7 +21,6 @@ use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
-use crate::structure::table::same_residue;
 use crate::structure::{self, Selected, Structure, element};
 
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
@@ -203,7 +202,7 @@ fn document(structure: &Structure, selected: Option<&Selected>) -> AtomsDocument
         }
         atoms.name.push(structure.name.id(i));
         atoms.element.push(element_at[number]);
-        if row > 0 && !copies.contains(&row) && same_residue(structure, index(row - 1), i) {
+        if row > 0 && !copies.contains(&row) && structure.same_residue(index(row - 1), i) {
             continue;
         }
         residues.first.push(row);

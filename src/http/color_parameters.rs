@@ -1,7 +1,6 @@
 //! Parameters of `…/colors`: those of a mesh that affect the colours, with `scheme` instead of `color`.
 
 use crate::pipeline::color::Scheme;
-use crate::pipeline::nearest::nearest;
 use crate::pipeline::params::{self, ParamError};
 use crate::pipeline::{Coloring, Job, color};
 
@@ -14,10 +13,7 @@ pub(super) const NAMES: [&str; 9] =
 /// # Errors
 /// Returns a [`ParamError`], including if there is no scheme or a parameter applies to meshes only.
 pub(super) fn parse(pairs: &[(String, String)]) -> Result<(Job, Coloring), ParamError> {
-    if let Some((name, _)) = pairs.iter().find(|(name, _)| !NAMES.contains(&name.as_str())) {
-        let name = name.chars().take(64).collect::<String>();
-        return Err(ParamError::Unknown { nearest: nearest(&name, NAMES), name });
-    }
+    params::check_names(pairs, &NAMES)?;
     let renamed = pairs.iter().map(|(name, value)| (if name == "scheme" { "color" } else { name }, value));
     let job = params::parse(renamed).map_err(rename_color)?.job;
     let is_named = pairs.iter().any(|(name, _)| name == "scheme");

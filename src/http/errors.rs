@@ -282,6 +282,7 @@ impl From<StructureError> for Problem {
                 let parameter = match what {
                     "chain" => "chains",
                     "selected chain" => "select",
+                    "interface chain" => "interface",
                     "alternative location" => "altloc",
                     other => other,
                 };

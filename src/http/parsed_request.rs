@@ -46,20 +46,10 @@ impl ParsedRequest {
         file: Option<&str>,
         query: Pairs,
     ) -> Result<Self, Problem> {
-        let format = file.map(format_of).transpose()?;
-        let (pairs, mut request) = parse(query)?;
-        if let (Some(format), Some(other)) = (format, request.format) {
-            let value = other.name();
-            let detail = format!("parameter `format`: the path already names {}", format.name());
-            return Err(Problem::new(ProblemType::BadParameter, detail)
-                .with("parameter", "format")
-                .with("value", value)
-                .with("expected", format!("no value here, or the path surface.{value}")));
-        }
-        let report = format.is_none();
-        let format = format.or(request.format).unwrap_or_default();
-        params::set_format(&mut request.job, format)?;
+        let pairs = self::pairs(query)?;
+        let (request, format) = parse_address(file, &pairs)?;
         app.accepts(&request.job)?;
+        let report = file.is_none();
         Ok(Self { source, request, map: None, pairs, format, report, declared: DeclaredType::Neutral })
     }
 
@@ -103,6 +93,24 @@ impl ParsedRequest {
 pub(super) fn pairs(query: Pairs) -> Result<Vec<(String, String)>, Problem> {
     let Query(pairs) = query.map_err(|e| Problem::new(ProblemType::BadRequest, e.body_text()))?;
     Ok(pairs)
+}
+
+/// Parses the parameters of an address that ends in `surface.{ext}` (`file`), or in `report.json` (`None`). Returns
+/// the format as well.
+pub(super) fn parse_address(file: Option<&str>, pairs: &[(String, String)]) -> Result<(Request, Format), Problem> {
+    let named = file.map(format_of).transpose()?;
+    let mut request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
+    if let (Some(named), Some(other)) = (named, request.format) {
+        let value = other.name();
+        let detail = format!("parameter `format`: the path already names {}", named.name());
+        return Err(Problem::new(ProblemType::BadParameter, detail)
+            .with("parameter", "format")
+            .with("value", value)
+            .with("expected", format!("no value here, or the path surface.{value}")));
+    }
+    let format = named.or(request.format).unwrap_or_default();
+    params::set_format(&mut request.job, format)?;
+    Ok((request, format))
 }
 
 fn parse(query: Pairs) -> Result<(Vec<(String, String)>, Request), Problem> {

@@ -53,6 +53,11 @@ impl Problem {
         self.kind.row().slug
     }
 
+    /// Returns the explanation of this occurrence.
+    pub(super) fn into_detail(self) -> String {
+        self.detail
+    }
+
     /// Appends advice to the explanation.
     pub(super) fn advise(mut self, advice: &str) -> Self {
         self.detail.push_str("; ");

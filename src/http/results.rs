@@ -119,7 +119,8 @@ fn no_such_result(what: &str) -> Problem {
     )
 }
 
-fn parse(file: &str, namespace: Namespace) -> Option<(ContentKey, Format)> {
+/// Parses the name of the file of a result.
+pub(super) fn parse(file: &str, namespace: Namespace) -> Option<(ContentKey, Format)> {
     let (key, extension) = file.split_once('.')?;
     let format = Format::ALL.into_iter().find(|format| format.name() == extension)?;
     Some((ContentKey::parse(key, namespace).ok()?, format))

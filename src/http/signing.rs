@@ -4,10 +4,12 @@ use axum::extract::Query;
 use axum::http::{Method, Uri};
 
 use super::jobs::{MAX_WAIT_S, Poll};
+use super::parsed_request::parse_address;
+use super::problem::Problem;
 use super::scopes::{OperationScope, Parameters, TABLE};
-use super::{area_parameters, atom_parameters, color_parameters};
+use super::{area_parameters, atom_parameters, color_parameters, results};
 use crate::formats::Format;
-use crate::pipeline::params;
+use crate::store::Namespace;
 
 /// Checks that a signature can open `target`, a path with or without a query.
 ///
@@ -28,8 +30,14 @@ pub fn check_signable(target: &str) -> Result<(), String> {
     if row.scope.is_none() {
         return Err("this path needs no signature".to_owned());
     }
-    check_file(row, uri.path())?;
-    check_parameters(row, &uri)
+    let file = uri.path().rsplit('/').next().filter(|_| row.path.ends_with("/{file}"));
+    if let Some(file) = file.filter(|_| row.path.starts_with("/v1/results/"))
+        && results::parse(file, Namespace::default()).is_none()
+    {
+        let extensions = Format::ALL.map(Format::name).join(", ");
+        return Err(format!("a result has a name of 64 digits and one of the extensions {extensions}"));
+    }
+    check_parameters(row, file, &uri)
 }
 
 /// Returns true if a route matches a path.
@@ -41,43 +49,10 @@ fn matches(route: &str, path: &str) -> bool {
     route.split('/').all(fits) && segments.next().is_none()
 }
 
-/// Checks the name of a mesh file.
-fn check_file(row: &OperationScope, path: &str) -> Result<(), String> {
-    if !row.path.ends_with("/{file}") {
-        return Ok(());
-    }
-    let stem = path.rsplit('/').next().and_then(|file| file.split_once('.')).unwrap_or_default().0;
-    let is_mesh = format_of(path).is_some();
-    let is_named = if is_result(row) { stem.len() == 64 } else { stem == "surface" };
-    let expected = if is_result(row) { "a result has a name of 64 digits" } else { "a structure has `surface`" };
-    let of = || format!("{expected} and one of the extensions {}", Format::ALL.map(Format::name).join(", "));
-    if is_mesh && is_named { Ok(()) } else { Err(of()) }
-}
-
-/// Returns the format that the extension of a path names.
-fn format_of(path: &str) -> Option<Format> {
-    let (_, extension) = path.rsplit('/').next()?.split_once('.')?;
-    Format::ALL.into_iter().find(|format| format.name() == extension)
-}
-
-/// Checks the parameters of a mesh; `file` is the format that the path names.
-fn check_mesh(file: Option<Format>, pairs: Vec<(String, String)>) -> Result<(), String> {
-    let mut request = params::parse(pairs).map_err(|error| error.to_string())?;
-    if file.is_some() && request.format.is_some() {
-        return Err("parameter `format`: the path already names the format".to_owned());
-    }
-    let format = file.or(request.format).unwrap_or_default();
-    params::set_format(&mut request.job, format).map_err(|error| error.to_string())
-}
-
-fn is_result(row: &OperationScope) -> bool {
-    row.path.starts_with("/v1/results/")
-}
-
-fn check_parameters(row: &OperationScope, uri: &Uri) -> Result<(), String> {
+fn check_parameters(row: &OperationScope, file: Option<&str>, uri: &Uri) -> Result<(), String> {
     let Query(pairs) = Query::<Vec<(String, String)>>::try_from_uri(uri).map_err(|error| error.body_text())?;
     match row.parameters() {
-        Parameters::Mesh => check_mesh(format_of(uri.path()).filter(|_| row.path.ends_with("/{file}")), pairs),
+        Parameters::Mesh => parse_address(file, &pairs).map(drop).map_err(Problem::into_detail),
         Parameters::Atoms => atom_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Areas => area_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
@@ -121,12 +96,12 @@ mod tests {
             ("/v1/meshes", "GET only"),
             ("/v1/estimate?resolution=1", "GET only"),
             ("/docs", "needs no signature"),
-            ("/v1/pdb/4pti/surface.txt", "one of the extensions glb"),
-            ("/v1/pdb/4pti/mesh.glb", "`surface`"),
+            ("/v1/pdb/4pti/surface.txt", "it has surface.glb"),
+            ("/v1/pdb/4pti/mesh.glb", "no `mesh.glb`"),
             ("/v1/results/7.glb", "64 digits"),
             ("/v1/pdb/4pti/surface.glb?resolutoin=1", "did you mean `resolution`"),
             ("/v1/pdb/4pti/surface.glb?resolution=fine", "parameter `resolution`"),
-            ("/v1/pdb/4pti/surface.glb?format=glb", "already names the format"),
+            ("/v1/pdb/4pti/surface.glb?format=glb", "already names glb"),
             ("/v1/pdb/4pti/surface.glb?width=100", "`width`"),
             ("/v1/jobs/7?wait=99", "more than 55"),
             ("/v1/jobs/7?wiat=9", "unknown field `wiat`"),

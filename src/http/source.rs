@@ -1,5 +1,6 @@
 //! The structure that a request names: uploaded bytes, a stored structure or an archive entry.
 
+use std::env::consts::{ARCH, OS};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -145,8 +146,8 @@ impl StructureSource {
     }
 
     /// Returns a response with the document that `write` makes of the structure, or 304 if the client has it. `write`
-    /// holds the delivery slot of the request until its work has stopped. The `ETag` is derived from the digest and
-    /// from `variant`, the parameters of the document.
+    /// holds the delivery slot of the request until its work has stopped. The `ETag` is that of
+    /// [`etag`] with `variant`, the parameters of the document.
     pub(super) async fn document<F>(
         self,
         app: &Shared,
@@ -196,9 +197,11 @@ fn validators(digest: &Digest, variant: &str) -> Result<[(HeaderName, HeaderValu
     Ok([(header::ETAG, etag(digest, variant)?), (header::CACHE_CONTROL, CACHE)])
 }
 
-/// Returns the `ETag` of a document of a structure: the digest of its file, combined with the parameters `variant`.
+/// Returns the `ETag` of a document of a structure: a digest of its file, the parameters `variant` and the program,
+/// because the last digits of numbers depend on the version and on mathematical libraries.
 pub(super) fn etag(digest: &Digest, variant: &str) -> Result<HeaderValue, Problem> {
-    let digest = if variant.is_empty() { *digest } else { Digest::of(format!("{digest}&{variant}").as_bytes()) };
+    let program = concat!("molmesh ", env!("CARGO_PKG_VERSION"));
+    let digest = Digest::of(format!("{program} {OS} {ARCH}\n{digest}&{variant}").as_bytes());
     HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)
 }
 

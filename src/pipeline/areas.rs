@@ -7,17 +7,19 @@ use std::str::FromStr;
 use serde::Serialize;
 
 use super::{Job, JobError, SPHERE_BYTES};
-use crate::structure::table::{put_field, same_residue};
-use crate::structure::{self, ReadLimits, Selected, Structure, element};
-use crate::surface::{Control, ExactMeasures, Spheres, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams};
+use crate::structure::{self, ReadLimits, Selected, Structure, select, table};
+use crate::surface::{Control, ExactMeasures, Spheres, SurfaceError, SurfaceKind, SurfaceLimits};
 
 /// Description of the values of `interface`.
-pub(super) const EXPECTED: &str = "the chains of both sides, separated by a comma, such as A,B; several chains of a side are joined by a slash: H/L,A";
+pub(crate) const EXPECTED: &str = "the chains of both sides, separated by a comma, such as A,B; several chains of a side are joined by a slash: H/L,A";
+
+/// Number of atoms between two checks for cancellation.
+const ATOMS_PER_CHECK: u32 = 1 << 16;
 
 /// Two sets of chains without a common chain.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Interface {
-    /// Names of the chains of each side, given by the author.
+    /// Author names of the chains of each side; `_` is the blank chain.
     pub sides: [Vec<String>; 2],
 }
 
@@ -42,7 +44,8 @@ impl fmt::Display for Interface {
     }
 }
 
-/// Exact measures of a surface of spheres, which do not depend on the grid spacing. All cavities are included.
+/// Exact measures of a surface of spheres, which do not depend on the grid spacing. The area includes the walls of
+/// voids; the volume excludes voids.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct ExactReport {
@@ -62,7 +65,7 @@ pub struct ExactReport {
     pub concave: Option<f64>,
     /// Areas of the chains, in the order of their first atoms.
     pub chains: Vec<ChainArea>,
-    /// Area that two sets of chains bury; absent without `interface`.
+    /// Surface area buried between two sets of chains; absent without `interface`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub interface: Option<InterfaceReport>,
 }
@@ -79,7 +82,7 @@ pub struct ChainArea {
     pub area: f64,
 }
 
-/// Area that two sets of chains bury. With `surface=ses`, all areas are those of the contact parts.
+/// Surface area buried between two sets of chains. With `surface=ses`, all areas are those of the contact parts.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct InterfaceReport {
@@ -128,6 +131,14 @@ impl AreaLevel {
     }
 }
 
+impl FromStr for AreaLevel {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        Self::ALL.into_iter().find(|level| level.name() == text).ok_or(())
+    }
+}
+
 /// Areas of the surface on each atom, Å².
 #[derive(Debug, Clone, PartialEq)]
 pub struct AtomAreas {
@@ -160,7 +171,10 @@ pub fn measure_selection(
     control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
     let spheres = selected.spheres(structure)?;
     selected.check_duplicates(&spheres, read, control)?;
-    Ok(measure(structure, &selected, &spheres, job, surface, control)?.1)
+    match &job.interface {
+        Some(interface) => Ok(interface.measure(structure, &selected, &spheres, job, surface, control)?.1),
+        None => Ok(whole(structure, &selected, &spheres, job, surface, control)?.1),
+    }
 }
 
 /// Measures `spheres`, those of the `selected` atoms.
@@ -171,10 +185,26 @@ pub(super) fn measure(
     job: &Job,
     limits: &SurfaceLimits,
     control: &Control<'_>,
+) -> Result<(ExactReport, AtomAreas), JobError> {
+    let (mut report, mut areas) = whole(structure, selected, spheres, job, limits, control)?;
+    if let Some(interface) = &job.interface {
+        let (buried, of_sides) = interface.measure(structure, selected, spheres, job, limits, control)?;
+        (report.interface, areas) = (Some(buried), of_sides);
+    }
+    Ok((report, areas))
+}
+
+/// Measures all spheres, without an interface.
+fn whole(
+    structure: &Structure,
+    selected: &Selected,
+    spheres: &Spheres,
+    job: &Job,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
 ) -> Result<(ExactReport, AtomAreas), SurfaceError> {
-    let params = &job.params;
-    let whole = exact(spheres, params, limits, control)?;
-    let contact = params.surface == SurfaceKind::Ses;
+    let whole = ExactMeasures::of(spheres, &job.params, limits, control)?;
+    let contact = job.params.surface == SurfaceKind::Ses;
     control.memory.grow(size_of_val(&*selected.atoms) as u64)?;
     let mut report = ExactReport {
         area: round(whole.area()),
@@ -185,56 +215,61 @@ pub(super) fn measure(
         chains: Vec::new(),
         interface: None,
     };
-    let mut areas = AtomAreas { atoms: selected.atoms.clone(), areas: whole.of_spheres, alone: None, contact };
+    let areas = AtomAreas { atoms: selected.atoms.clone(), areas: whole.of_spheres, alone: None, contact };
     report.chains = areas.rows(structure, AreaLevel::Chain).into_iter().map(|row| row.chain(structure)).collect();
-    if let Some(interface) = &job.interface {
-        let (buried, of_atoms) = interface.measure(structure, selected, spheres, params, limits, control)?;
-        report.interface = Some(buried);
-        areas = AtomAreas { contact, ..of_atoms };
-    }
     Ok((report, areas))
 }
 
-/// Measures a surface of spheres.
-fn exact(
-    spheres: &Spheres,
-    params: &SurfaceParams,
-    limits: &SurfaceLimits,
-    control: &Control<'_>,
-) -> Result<ExactMeasures, SurfaceError> {
-    ExactMeasures::of(spheres, params, limits, control)?.ok_or_else(|| SurfaceError::BadParameter {
-        name: "surface",
-        value: format!("`{}`", params.surface),
-        expected: "vdw, sas or ses, which have exact areas".to_owned(),
-    })
-}
-
 impl Interface {
+    /// Returns the rows of the selected atoms of each side.
+    fn rows(
+        &self,
+        structure: &Structure,
+        selected: &Selected,
+        control: &Control<'_>,
+    ) -> Result<[Vec<u32>; 2], JobError> {
+        let side = |k: usize| select::chains(structure, self.sides[k].iter().map(String::as_str), "interface chain");
+        let sides = [side(0)?, side(1)?];
+        let mut is_meshed = vec![false; sides[0].len()];
+        let mut rows = [Vec::new(), Vec::new()];
+        for (row, &atom) in (0_u32..).zip(&selected.atoms) {
+            if row.is_multiple_of(ATOMS_PER_CHECK) {
+                control.check()?;
+            }
+            let chain = structure.chain.id(atom as usize) as usize;
+            is_meshed[chain] = true;
+            for (rows, side) in rows.iter_mut().zip(&sides) {
+                if side[chain] {
+                    rows.push(row);
+                }
+            }
+        }
+        let mut absent = structure.chain.texts().enumerate().filter(|(chain, _)| !is_meshed[*chain]);
+        match absent.find(|(chain, _)| sides.iter().any(|side| side[*chain])) {
+            None => Ok(rows),
+            Some((_, name)) => {
+                let expected = "names of chains that are meshed".to_owned();
+                Err(SurfaceError::BadParameter { name: "interface", value: format!("`{name}`"), expected }.into())
+            }
+        }
+    }
+
+    /// Measures the selected atoms of each side, alone and together.
     fn measure(
         &self,
         structure: &Structure,
         selected: &Selected,
         spheres: &Spheres,
-        params: &SurfaceParams,
+        job: &Job,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<(InterfaceReport, AtomAreas), SurfaceError> {
+    ) -> Result<(InterfaceReport, AtomAreas), JobError> {
         let all = selected.atoms.len() as u64;
         // Rows, spheres and areas of each side and of both.
-        let _memory = control.reserve(2 * (SPHERE_BYTES + 16) * all)?;
-        let rows_of = |names: &[String]| -> Result<Vec<u32>, SurfaceError> {
-            let is_named = |i: u32| names.iter().any(|name| name == structure.chain.get(i as usize));
-            for name in names {
-                if !selected.atoms.iter().any(|&i| structure.chain.get(i as usize) == name) {
-                    let expected = "names of chains that are meshed".to_owned();
-                    return Err(SurfaceError::BadParameter { name: "interface", value: format!("`{name}`"), expected });
-                }
-            }
-            Ok((0..).zip(&selected.atoms).filter(|(_, i)| is_named(**i)).map(|(row, _)| row).collect())
-        };
-        let [first, second] = [rows_of(&self.sides[0])?, rows_of(&self.sides[1])?];
+        let _memory = control.reserve(2 * (SPHERE_BYTES + 16) * all).map_err(SurfaceError::from)?;
+        let [first, second] = self.rows(structure, selected, control)?;
         let of = |rows: &[u32]| -> Result<Vec<f64>, SurfaceError> {
-            Ok(exact(&spheres.subset(rows), params, limits, control)?.of_spheres)
+            Ok(ExactMeasures::of(&spheres.subset(rows), &job.params, limits, control)?.of_spheres)
         };
         let mut alone = of(&first)?;
         alone.extend(of(&second)?);
@@ -247,7 +282,8 @@ impl Interface {
         let sides = [side(0, 0..first.len()), side(1, first.len()..rows.len())];
         let area = round(0.5 * (sides[0].buried + sides[1].buried));
         let atoms = rows.iter().map(|&row| selected.atoms[row as usize]).collect();
-        Ok((InterfaceReport { area, sides }, AtomAreas { atoms, areas, alone: Some(alone), contact: false }))
+        let contact = job.params.surface == SurfaceKind::Ses;
+        Ok((InterfaceReport { area, sides }, AtomAreas { atoms, areas, alone: Some(alone), contact }))
     }
 }
 
@@ -292,13 +328,10 @@ impl AtomAreas {
                 AreaLevel::Atom => rows.len(),
                 // The first atom of a copy has a lower index than the last one of the copy before.
                 AreaLevel::Residue => {
-                    let is_same = before.is_some_and(|last| last < i && same_residue(structure, last, i));
+                    let is_same = before.is_some_and(|last| last < i && structure.same_residue(last, i));
                     rows.len() - usize::from(is_same)
                 }
-                AreaLevel::Chain => {
-                    let key = (structure.chain.id(i), structure.model[i]);
-                    *of_chains.entry(key).or_insert(rows.len())
-                }
+                AreaLevel::Chain => *of_chains.entry(structure.chain.id(i)).or_insert(rows.len()),
             };
             if row == rows.len() {
                 rows.push(Row { first: i, atoms: 0, area: 0.0, alone: 0.0 });
@@ -317,45 +350,28 @@ impl AtomAreas {
     /// # Errors
     /// Returns the errors of `out`.
     pub fn write_csv(&self, structure: &Structure, level: AreaLevel, out: &mut dyn Write) -> io::Result<()> {
-        let names: &[&str] = match level {
-            AreaLevel::Atom => {
-                &["index", "name", "element", "residue_name", "residue_number", "insertion_code", "chain", "model"]
-            }
-            AreaLevel::Residue => &["residue_name", "residue_number", "insertion_code", "chain", "model", "atoms"],
-            AreaLevel::Chain => &["chain", "model", "atoms"],
+        let columns = match level {
+            AreaLevel::Atom => 0..8,
+            AreaLevel::Residue => 3..8,
+            AreaLevel::Chain => 6..8,
         };
-        let area = if self.contact { "contact_area" } else { "area" };
-        let buried: &[&str] = if self.alone.is_some() { &["alone", "buried"] } else { &[] };
-        let header: Vec<&str> = names.iter().copied().chain([area]).chain(buried.iter().copied()).collect();
-        writeln!(out, "{}", header.join(","))?;
-        let mut line = Vec::new();
-        for Row { first, atoms, area, alone } in self.rows(structure, level) {
-            line.clear();
-            for name in names {
-                let field = match *name {
-                    "index" => first.to_string(),
-                    "name" => structure.name.get(first).to_owned(),
-                    "element" => element::symbol(structure.element[first]).to_owned(),
-                    "residue_name" => structure.residue.get(first).to_owned(),
-                    "residue_number" => structure.residue_number[first].to_string(),
-                    "insertion_code" => match structure.insertion_code[first] {
-                        0 => String::new(),
-                        code => char::from(code).to_string(),
-                    },
-                    "chain" => structure.chain.get(first).to_owned(),
-                    "model" => structure.model[first].to_string(),
-                    _ => atoms.to_string(),
-                };
-                put_field(&mut line, &field);
-                line.push(b',');
-            }
-            write!(line, "{area:.4}")?;
-            if self.alone.is_some() {
-                write!(line, ",{alone:.4},{:.4}", alone - area)?;
-            }
-            line.push(b'\n');
-            out.write_all(&line)?;
+        let counts = level != AreaLevel::Atom;
+        let mut header = table::COLUMNS[columns.clone()].to_vec();
+        header.extend(counts.then_some("atoms"));
+        header.push(if self.contact { "contact_area" } else { "area" });
+        if self.alone.is_some() {
+            header.extend(["alone", "buried"]);
         }
-        Ok(())
+        table::write_rows(out, &header, self.rows(structure, level), |text, Row { first, atoms, area, alone }| {
+            table::put_columns(text, structure, first, columns.clone());
+            if counts {
+                write!(text, ",{atoms}")?;
+            }
+            write!(text, ",{area:.4}")?;
+            if self.alone.is_some() {
+                write!(text, ",{alone:.4},{:.4}", alone - area)?;
+            }
+            Ok(())
+        })
     }
 }

@@ -15,7 +15,7 @@ pub use table::{Domain, Parameter, TABLE, usual_range};
 use values::ParsedValues;
 
 use super::nearest::nearest;
-use super::{Cavities, Job};
+use super::{Cavities, Interface, Job};
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Context, Selection, Split};
@@ -60,6 +60,14 @@ pub enum ParamError {
     },
 }
 
+impl ParamError {
+    /// Returns the error for `value`, of which it shows at most 64 characters.
+    pub(crate) fn bad_value(name: &'static str, value: &str, expected: impl Into<String>) -> Self {
+        let value = format!("`{}`", value.chars().take(64).collect::<String>());
+        Self::BadValue { name, value, expected: expected.into() }
+    }
+}
+
 /// Parsed parameters.
 #[derive(Debug, Clone, Default)]
 pub struct Request {
@@ -90,7 +98,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
             return Err(ParamError::Repeated { name: parameter.name });
         }
         if value.len() > MAX_VALUE_BYTES {
-            return Err(parameter.bad_value(value, format!("at most {MAX_VALUE_BYTES} bytes")));
+            return Err(ParamError::bad_value(parameter.name, value, format!("at most {MAX_VALUE_BYTES} bytes")));
         }
         // A default value conflicts with no other parameter, because clients may send all defaults. An explicit format
         // still overrides `Accept`.
@@ -150,26 +158,20 @@ fn check_cavities(job: &Job) -> Result<(), ParamError> {
 /// Rejects exact areas of a surface that has none, or that is divided or cut.
 fn check_exact(job: &Job) -> Result<(), ParamError> {
     let Job { params, selection, split, exact, interface, .. } = job;
-    let refuse = |name: &'static str, value: String, expected: String| {
-        Err(ParamError::BadValue { name, value: format!("`{value}`"), expected })
-    };
-    match interface {
-        Some(interface) if !exact => {
-            refuse("interface", interface.to_string(), "no value without exact=true".to_owned())
-        }
-        _ if !exact => Ok(()),
-        _ if params.surface.kernel().is_some() => refuse(
-            "exact",
-            "true".to_owned(),
-            format!("false with surface={}: only vdw, sas and ses have exact areas", params.surface),
-        ),
-        _ if selection.context == Context::Whole || selection.instances || *split != Split::None => {
-            let expected =
-                "false with context=whole, instances, split or model=all, which divide or repeat the surface";
-            refuse("exact", "true".to_owned(), expected.to_owned())
-        }
-        _ => Ok(()),
+    if !exact {
+        let refuse = |interface: &Interface| {
+            Err(ParamError::bad_value("interface", &interface.to_string(), "exact=true beside it"))
+        };
+        return interface.as_ref().map_or(Ok(()), refuse);
     }
+    let expected = if params.surface.kernel().is_some() {
+        format!("false with surface={}: only vdw, sas and ses have exact areas", params.surface)
+    } else if selection.context == Context::Whole || selection.instances || *split != Split::None {
+        "false with context=whole, instances, split or model=all, which divide or repeat the surface".to_owned()
+    } else {
+        return Ok(());
+    };
+    Err(ParamError::bad_value("exact", "true", expected))
 }
 
 /// Maximum length of the value of a parameter, bytes: enough for the names of 1,000 chains. Job records contain values.
@@ -182,11 +184,8 @@ pub(crate) const PICTURES: [&str; 7] = ["width", "height", "view", "azimuth", "e
 pub(crate) const SPACINGS: [&str; 3] = ["resolution", "detail", "max_triangles"];
 
 fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
-    ParamError::BadValue {
-        name,
-        value: format!("`{}`", value.chars().take(64).collect::<String>()),
-        expected: format!("no value beside `{other}`: only one of {} sets the grid spacing", SPACINGS.join(", ")),
-    }
+    let all = SPACINGS.join(", ");
+    ParamError::bad_value(name, value, format!("no value beside `{other}`: only one of {all} sets the grid spacing"))
 }
 
 /// Sets the format of a job, for a format that was not given as a parameter. A picture format adds picture parameters,
@@ -234,8 +233,21 @@ pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
 /// Returns the error for an unknown name.
 #[must_use]
 pub fn unknown(name: &str) -> ParamError {
-    let nearest = nearest(name, TABLE.iter().map(|p| p.name));
-    ParamError::Unknown { name: name.chars().take(64).collect(), nearest }
+    unknown_of(name, TABLE.iter().map(|p| p.name))
+}
+
+fn unknown_of(name: &str, known: impl IntoIterator<Item = &'static str>) -> ParamError {
+    ParamError::Unknown { name: name.chars().take(64).collect(), nearest: nearest(name, known) }
+}
+
+/// Checks that all parameters are among `known`.
+///
+/// # Errors
+/// Returns [`ParamError::Unknown`] for the first one that is not.
+#[cfg(feature = "server")]
+pub(crate) fn check_names(pairs: &[(String, String)], known: &'static [&'static str]) -> Result<(), ParamError> {
+    let bad = pairs.iter().find(|(name, _)| !known.contains(&name.as_str()));
+    bad.map_or(Ok(()), |(name, _)| Err(unknown_of(name, known.iter().copied())))
 }
 
 impl From<SurfaceError> for ParamError {

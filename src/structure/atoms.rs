@@ -120,6 +120,16 @@ impl Structure {
         if self.radius.is_empty() { radii::TABLE } else { radii::OF_FILE }
     }
 
+    /// Returns true if two atoms have the same model, chain, residue name, number and insertion code.
+    #[must_use]
+    pub fn same_residue(&self, a: usize, b: usize) -> bool {
+        self.residue_number[a] == self.residue_number[b]
+            && self.insertion_code[a] == self.insertion_code[b]
+            && self.residue.id(a) == self.residue.id(b)
+            && self.chain.id(a) == self.chain.id(b)
+            && self.model[a] == self.model[b]
+    }
+
     /// Returns true if atom `i` is hydrogen or deuterium.
     #[must_use]
     pub fn is_hydrogen(&self, i: usize) -> bool {

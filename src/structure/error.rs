@@ -142,7 +142,8 @@ pub enum StructureError {
     /// The requested model, chain, alternative location or assembly does not exist.
     #[error("{what} {requested} is not in the file; it has {available}")]
     NotFound {
-        /// `model`, `chain`, `selected chain` (of an expression), `alternative location` or `assembly`.
+        /// `model`, `chain`, `selected chain` (of an expression), `interface chain`, `alternative location` or
+        /// `assembly`.
         what: &'static str,
         /// The requested value.
         requested: String,

@@ -1,12 +1,14 @@
 //! Table of the atoms of a file as CSV (RFC 4180, lines end in LF).
 
 use std::io::{self, Write};
+use std::ops::Range;
 
 use super::atoms::Structure;
 use super::element;
 
 /// Names of the columns.
-const HEADER: &str = "index,name,element,residue_name,residue_number,insertion_code,chain,model,kind\n";
+pub(crate) const COLUMNS: [&str; 9] =
+    ["index", "name", "element", "residue_name", "residue_number", "insertion_code", "chain", "model", "kind"];
 /// Bytes of text collected for one write.
 const BLOCK_BYTES: usize = 1 << 16;
 
@@ -16,51 +18,59 @@ const BLOCK_BYTES: usize = 1 << 16;
 /// # Errors
 /// Returns the errors of `out`.
 pub fn write_csv(structure: &Structure, out: &mut dyn Write) -> io::Result<()> {
-    let mut rows = Vec::with_capacity(2 * BLOCK_BYTES);
-    rows.extend_from_slice(HEADER.as_bytes());
-    for i in 0..structure.len() {
-        let symbol = usize::from(structure.element[i]).checked_sub(1).map_or("?", |z| element::SYMBOLS[z]);
-        let code = structure.insertion_code[i];
-        let (mut index, mut number, mut model) = (itoa::Buffer::new(), itoa::Buffer::new(), itoa::Buffer::new());
-        let mut bytes = [0; 4];
-        let fields = [
-            index.format(i),
-            structure.name.get(i),
-            symbol,
-            structure.residue.get(i),
-            number.format(structure.residue_number[i]),
-            if code == 0 { "" } else { char::from(code).encode_utf8(&mut bytes) },
-            structure.chain.get(i),
-            model.format(structure.model[i]),
-            structure.kind[i].name(),
-        ];
-        for (column, text) in fields.into_iter().enumerate() {
-            if column > 0 {
-                rows.push(b',');
-            }
-            put_field(&mut rows, text);
-        }
-        rows.push(b'\n');
-        if rows.len() >= BLOCK_BYTES {
-            out.write_all(&rows)?;
-            rows.clear();
-        }
-    }
-    out.write_all(&rows)
+    write_rows(out, &COLUMNS, 0..structure.len(), |text, i| {
+        put_columns(text, structure, i, 0..COLUMNS.len());
+        Ok(())
+    })
 }
 
-/// Returns true if two atoms have the same model, chain, residue name, number and insertion code.
-#[must_use]
-pub fn same_residue(structure: &Structure, a: usize, b: usize) -> bool {
-    structure.residue_number[a] == structure.residue_number[b]
-        && structure.insertion_code[a] == structure.insertion_code[b]
-        && structure.residue.id(a) == structure.residue.id(b)
-        && structure.chain.id(a) == structure.chain.id(b)
-        && structure.model[a] == structure.model[b]
+/// Writes the names of the columns, then `rows`. `put` appends the fields of a row, separated by commas.
+pub(crate) fn write_rows<R>(
+    out: &mut dyn Write,
+    names: &[&str],
+    rows: impl IntoIterator<Item = R>,
+    mut put: impl FnMut(&mut Vec<u8>, R) -> io::Result<()>,
+) -> io::Result<()> {
+    let mut text = Vec::with_capacity(2 * BLOCK_BYTES);
+    text.extend_from_slice(names.join(",").as_bytes());
+    text.push(b'\n');
+    for row in rows {
+        put(&mut text, row)?;
+        text.push(b'\n');
+        if text.len() >= BLOCK_BYTES {
+            out.write_all(&text)?;
+            text.clear();
+        }
+    }
+    out.write_all(&text)
+}
+
+/// Appends the given [`COLUMNS`] of atom `i`.
+pub(crate) fn put_columns(text: &mut Vec<u8>, structure: &Structure, i: usize, columns: Range<usize>) {
+    let code = structure.insertion_code[i];
+    let (mut index, mut number, mut model) = (itoa::Buffer::new(), itoa::Buffer::new(), itoa::Buffer::new());
+    let mut bytes = [0; 4];
+    let fields = [
+        index.format(i),
+        structure.name.get(i),
+        element::symbol(structure.element[i]),
+        structure.residue.get(i),
+        number.format(structure.residue_number[i]),
+        if code == 0 { "" } else { char::from(code).encode_utf8(&mut bytes) },
+        structure.chain.get(i),
+        model.format(structure.model[i]),
+        structure.kind[i].name(),
+    ];
+    for (n, field) in fields[columns].iter().enumerate() {
+        if n > 0 {
+            text.push(b',');
+        }
+        put_field(text, field);
+    }
 }
 
 /// Appends a field, in quotes if it contains a separator or a quote.
-pub(crate) fn put_field(rows: &mut Vec<u8>, text: &str) {
+fn put_field(rows: &mut Vec<u8>, text: &str) {
     if !text.contains(['"', ',', '\n', '\r']) {
         rows.extend_from_slice(text.as_bytes());
         return;
@@ -88,7 +98,7 @@ mod tests {
         let records: Vec<&str> = file.lines().filter(|l| l.starts_with("ATOM") || l.starts_with("HETATM")).collect();
         let table = csv(file.as_bytes());
         let rows: Vec<&str> = table.lines().collect();
-        assert_eq!((rows[0], rows.len()), (HEADER.trim_end(), records.len() + 1));
+        assert_eq!((rows[0], rows.len()), (COLUMNS.join(",").as_str(), records.len() + 1));
         for (i, (row, line)) in rows[1..].iter().zip(&records).enumerate() {
             let [name, residue, chain, number, code] = [12..16, 17..20, 21..22, 22..26, 26..27].map(|c| line[c].trim());
             let start = format!("{i},{name},{},{residue},{number},{code},{chain},1,", line[76..78].trim());

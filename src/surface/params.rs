@@ -136,7 +136,7 @@ impl Default for SurfaceParams {
     }
 }
 
-fn bad(name: &'static str, value: impl fmt::Display, expected: impl Into<String>) -> SurfaceError {
+pub(super) fn bad(name: &'static str, value: impl fmt::Display, expected: impl Into<String>) -> SurfaceError {
     SurfaceError::BadParameter { name, value: value.to_string(), expected: expected.into() }
 }
 

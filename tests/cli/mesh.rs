@@ -439,8 +439,13 @@ fn the_table_of_areas_has_the_sum_of_the_report() {
     assert!((area - report["exact"]["area"].as_f64().unwrap()).abs() < 0.01, "{area} {report}");
     let done = mesh(sample, &output, &flags);
     assert!(stderr(&done).contains("exact") && stderr(&done).contains("4pti.csv (csv, "), "{}", stderr(&done));
-    for more in [&["--areas-by", "model"][..], &["--atoms", table.to_str().unwrap()], &["--interface", "A,Z"]] {
-        assert_code(&mesh(sample, &output, &[&flags[..], more].concat()), 2);
+    for (more, code) in [
+        (["--areas-by", "model"], 2),
+        (["--atoms", table.to_str().unwrap()], 2),
+        (["--interface", "A"], 2),
+        (["--interface", "A,Z"], 4),
+    ] {
+        assert_code(&mesh(sample, &output, &[&flags[..], &more].concat()), code);
     }
     for alone in [["--areas", table.to_str().unwrap()], ["--areas-by", "atom"], ["--interface", "A,B"]] {
         assert_code(&mesh(sample, &output, &alone), 2);

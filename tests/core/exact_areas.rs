@@ -114,11 +114,31 @@ fn areas_without_a_mesh_are_those_of_the_job() {
     let (read, surface) = (ReadLimits::default(), SurfaceLimits::default());
     let found = areas::measure_selection(&structure, &job, (&read, &surface), &Control::default()).unwrap();
     assert_eq!(Some(&found), product.areas.as_ref());
+    let buried = [("surface", "ses"), ("interface", "A,B")];
+    let job = params::parse(buried.into_iter().chain([("exact", "true")])).unwrap().job;
+    let of_sides = areas::measure_selection(&structure, &job, (&read, &surface), &Control::default()).unwrap();
+    assert_eq!(Some(&of_sides), self::product(&bytes, &buried).unwrap().areas.as_ref());
+    assert_ne!(found, of_sides);
     // Copies of a chain have rows of their own, except in the table of chains.
     let single = self::product(&bytes, &pairs[..1]).unwrap();
     let count = |product: &Product, level| rows(product, &structure, level).len();
     assert_eq!(count(&product, AreaLevel::Residue), 2 * count(&single, AreaLevel::Residue));
     assert_eq!(count(&product, AreaLevel::Chain), count(&single, AreaLevel::Chain));
+}
+
+#[test]
+fn an_interface_names_the_blank_chain() {
+    let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb")).unwrap();
+    let chain_of = |line: &str| if line[22..26].trim().parse::<u32>().is_ok_and(|n| n < 30) { "B" } else { " " };
+    let lines = text.lines().filter(|line| line.starts_with("ATOM"));
+    let renamed = |line: &str| [&line[..21], chain_of(line), &line[22..]].concat();
+    let named = lines.map(renamed).collect::<Vec<_>>().join("\n");
+    let product = product(named.as_bytes(), &[("surface", "vdw"), ("interface", "B,_")]).unwrap();
+    let exact = product.report.exact.unwrap();
+    let interface = exact.interface.unwrap();
+    // Both sides together are the whole.
+    let together = interface.sides.iter().map(|side| side.alone - side.buried).sum::<f64>();
+    assert!((together - exact.area).abs() < 1e-3 && interface.area > 50.0, "{interface:?}");
 }
 
 #[test]
@@ -137,7 +157,10 @@ fn requests_that_have_no_exact_areas_are_rejected() {
         assert!(error.contains(&format!("`{name}`")), "{error}");
     }
     let (bytes, _) = complex();
-    let error = product(&bytes, &[("surface", "sas"), ("interface", "A,Z")]).unwrap_err().to_string();
-    assert!(error.contains("interface") && error.contains("`Z`"), "{error}");
+    for (interface, more, name) in [("A,Z", &[][..], "`Z`"), ("A,B", &[("chains", "A")], "`B`"), ("A,_", &[], "`_`")] {
+        let pairs = [&[("surface", "sas"), ("interface", interface)], more].concat();
+        let error = product(&bytes, &pairs).unwrap_err().to_string();
+        assert!(error.contains("interface") && error.contains(name), "{error}");
+    }
     assert!(product(&bytes, &[("surface", "sas"), ("interface", "A,B")]).is_ok());
 }

@@ -25,7 +25,7 @@ const SES: SurfaceKind = SurfaceKind::Ses;
 
 fn exact_of(spheres: &Spheres, surface: SurfaceKind, probe: Option<f64>) -> ExactMeasures {
     let params = params(surface, probe, 0.5);
-    ExactMeasures::of(spheres, &params, &SurfaceLimits::default(), &Control::default()).unwrap().unwrap()
+    ExactMeasures::of(spheres, &params, &SurfaceLimits::default(), &Control::default()).unwrap()
 }
 
 fn exact(balls: &[Ball], surface: SurfaceKind, probe: Option<f64>) -> ExactMeasures {
@@ -248,55 +248,76 @@ fn solvent_excluded_areas_are_those_of_msms() {
     }
 }
 
+/// Radius of the degenerate arrangements, Å.
+const R: f64 = 1.7;
+
+fn at(x: f64, y: f64, z: f64) -> Ball {
+    ([x, y, z], R)
+}
+
 #[test]
-fn degenerate_spheres() {
-    let r = 1.7;
-    let at = |x: f64, y: f64, z: f64| ([x, y, z], r);
+fn spheres_in_others_have_no_area() {
     let one = [at(1.0, 2.0, 3.0)];
     for surface in [VDW, SAS, SES] {
         let alone = exact(&one, surface, None);
-        let same = |what: &str, balls: &[Ball]| {
+        for (what, balls) in [
+            ("equal", &[one[0], one[0], one[0]][..]),
+            ("nested", &[one[0], ([1.1, 2.1, 3.2], 1.2), ([1.0, 2.0, 3.0], 0.3)]),
+            ("touching from inside", &[one[0], ([1.5, 2.0, 3.0], 1.2)]),
+            ("nearly equal", &[one[0], at(1.0 + 1e-9, 2.0, 3.0)]),
+        ] {
             let found = exact(balls, surface, None);
             assert_near(&format!("{what}, {surface}, area"), found.area(), alone.area(), 1e-5);
             assert_near(&format!("{what}, {surface}, volume"), found.volume, alone.volume, 1e-5);
-        };
-        same("equal spheres", &[one[0], one[0], one[0]]);
+        }
+        let moved = exact(&[one[0], at(1.01, 2.0, 3.0)], surface, None);
+        assert!(!near(moved.area(), alone.area(), 1e-5), "the control");
         let equal = exact(&[one[0], one[0]], surface, None).of_spheres;
         assert!(equal[0] > 0.0 && equal[1] == 0.0, "the first of equal spheres has the area: {equal:?}");
-        same("nested spheres", &[one[0], ([1.1, 2.1, 3.2], 1.2), ([1.0, 2.0, 3.0], 0.3)]);
-        same("touching from inside", &[one[0], ([1.5, 2.0, 3.0], 1.2)]);
-        same("nearly equal spheres", &[one[0], at(1.0 + 1e-9, 2.0, 3.0)]);
     }
-    let touching = [at(0.0, 0.0, 0.0), at(3.4, 0.0, 0.0)];
-    let found = exact(&touching, VDW, None);
-    assert_near("touching", found.area(), 8.0 * PI * r * r, 1e-5);
-    // Without a probe, all surfaces are the van der Waals surface.
+    let touching = exact(&[at(0.0, 0.0, 0.0), at(2.0 * R, 0.0, 0.0)], VDW, None);
+    assert_near("touching", touching.area(), 8.0 * PI * R * R, 1e-5);
+}
+
+#[test]
+fn all_surfaces_without_a_probe_are_the_van_der_waals_surface() {
     let balls = cluster(5);
     let vdw = exact(&balls, VDW, None);
     for surface in [SAS, SES] {
         assert_eq!(exact(&balls, surface, Some(0.0)), vdw);
+        assert_ne!(exact(&balls, surface, Some(0.1)), vdw, "the control");
     }
-    let line: Vec<Ball> = (0..7).map(|i| at(f64::from(i), 0.0, 0.0)).collect();
-    let grid = |n: i32, spacing: f64| -> Vec<Ball> {
-        let row = |i: i32| f64::from(i) * spacing;
-        (0..n.pow(3)).map(|i| at(row(i % n), row(i / n % n), row(i / n / n))).collect()
-    };
+}
+
+/// Returns spheres at the corners of a truncated icosahedron.
+fn fullerene() -> Vec<Ball> {
     let golden = f64::midpoint(1.0, 5.0_f64.sqrt());
-    let mut fullerene: Vec<Ball> = Vec::new();
+    let mut balls: Vec<Ball> = Vec::new();
     for kind in [[0.0, 1.0, 3.0 * golden], [1.0, 2.0 + golden, 2.0 * golden], [2.0, 1.0 + 2.0 * golden, golden]] {
         for signs in 0..8 {
             for turn in 0..3 {
                 let v: [f64; 3] = std::array::from_fn(|k| kind[k] * if signs >> k & 1 == 0 { 0.725 } else { -0.725 });
                 let p: [f64; 3] = std::array::from_fn(|k| v[(k + turn) % 3]);
-                if !fullerene.iter().any(|(c, _)| (0..3).all(|k| (c[k] - p[k]).abs() < 1e-6)) {
-                    fullerene.push((p, r));
+                if !balls.iter().any(|(c, _)| (0..3).all(|k| (c[k] - p[k]).abs() < 1e-6)) {
+                    balls.push((p, R));
                 }
             }
         }
     }
-    assert_eq!(fullerene.len(), 60);
+    assert_eq!(balls.len(), 60);
+    balls
+}
+
+#[test]
+fn symmetric_spheres_match_points_and_meshes() {
+    let line: Vec<Ball> = (0..7).map(|i| at(f64::from(i), 0.0, 0.0)).collect();
+    let grid = |n: i32, spacing: f64| -> Vec<Ball> {
+        let row = |i: i32| f64::from(i) * spacing;
+        (0..n.pow(3)).map(|i| at(row(i % n), row(i / n % n), row(i / n / n))).collect()
+    };
+    let fullerene = fullerene();
     // Three spheres with one common circle, and holes of a lattice that just hold a probe or just do not.
-    let common = [at(-1.0, 0.0, 0.0), ([0.0; 3], (r * r - 1.0).sqrt()), at(1.0, 0.0, 0.0)];
+    let common = [at(-1.0, 0.0, 0.0), ([0.0; 3], (R * R - 1.0).sqrt()), at(1.0, 0.0, 0.0)];
     let holes =
         |more: f64| -> Vec<Ball> { grid(3, 2.0).into_iter().map(|(c, _)| (c, 3.0_f64.sqrt() - 1.0 + more)).collect() };
     for (what, balls, probe) in [
@@ -312,8 +333,10 @@ fn degenerate_spheres() {
     ] {
         for (surface, enlarged) in [(VDW, 0.0), (SAS, probe)] {
             let found = exact(balls, surface, (surface == SAS).then_some(probe));
-            assert_near(&format!("{what}, {surface}"), found.area(), sampled_area(balls, enlarged, 6_000), 0.01);
-            assert_near(&format!("{what}, {surface}"), found.volume, sampled_volume(balls, enlarged, 60_000), 0.01);
+            let sampled = [sampled_area(balls, enlarged, 6_000), sampled_volume(balls, enlarged, 60_000)];
+            assert_near(&format!("{what}, {surface}"), found.area(), sampled[0], 0.01);
+            assert_near(&format!("{what}, {surface}"), found.volume, sampled[1], 0.01);
+            assert!(!near(1.03 * found.area(), sampled[0], 0.01) && !near(1.03 * found.volume, sampled[1], 0.01));
         }
         let found = exact(balls, SES, Some(probe));
         // The walls of the holes are creased.
@@ -391,5 +414,6 @@ fn overlaps_are_limited_and_the_search_can_be_cancelled() {
     let control = Control { cancel, ..Control::default() };
     assert_eq!(of(1 << 20, &control).unwrap_err(), SurfaceError::Cancelled);
     let isosurface = params(SurfaceKind::Gaussian, None, 0.5);
-    assert_eq!(ExactMeasures::of(&atoms, &isosurface, &SurfaceLimits::default(), &Control::default()).unwrap(), None);
+    let error = ExactMeasures::of(&atoms, &isosurface, &SurfaceLimits::default(), &Control::default()).unwrap_err();
+    assert!(matches!(error, SurfaceError::BadParameter { name: "surface", .. }), "{error:?}");
 }

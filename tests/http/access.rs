@@ -224,6 +224,10 @@ fn computing_time_is_limited_but_other_requests_are_served() {
         let problem = post("a", path, 2, more).problem(429, "quota-exceeded");
         assert_eq!(problem["violated-policies"], serde_json::json!(["work"]), "{path}");
     }
+    let structure = post("a", "/v1/structures", 2, &[]).header("location").unwrap().to_owned();
+    let problem =
+        with(&server, keys.text("a"), &format!("{structure}/areas?surface=sas")).problem(429, "quota-exceeded");
+    assert_eq!(problem["violated-policies"], serde_json::json!(["work"]));
     assert_eq!(with(&server, keys.text("a"), "/v1/capabilities").status, 200);
     wait_for("stored results cost no computing time", || post("a", "/v1/meshes", 1, &[]).status == 200);
     assert_eq!(post("b", "/v1/meshes", 3, &[]).status, 200, "each key has its own quota");

@@ -8,7 +8,10 @@ use std::sync::{Arc, LazyLock};
 
 use bcif_support::CRAMBIN;
 use http_support::{Fake, Mode, Running, SAMPLE, gzip, log_lines, send, start};
+use molmesh::pipeline::{AreaLevel, areas, params};
+use molmesh::structure::{self, ReadLimits};
 use molmesh::surface::cpu::CpuBackend;
+use molmesh::surface::{Control, SurfaceLimits};
 
 /// Server with the fake backend that all tests share. It is never stopped.
 static SERVER: LazyLock<Running> = LazyLock::new(|| {
@@ -661,6 +664,31 @@ fn atoms_of_a_mesh_are_listed_with_their_positions() {
         assert_eq!(ask(&format!("?{query}")).problem(400, "bad-parameter")["parameter"], parameter, "{query}");
     }
     ask("?positions=true&select=ligand").problem(422, "empty-selection");
+}
+
+#[test]
+fn areas_are_those_of_the_library() {
+    let address = SERVER.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    let (read, surface) = (ReadLimits::default(), SurfaceLimits::default());
+    let structure = structure::read(SAMPLE, &read).unwrap();
+    let mut tags = std::collections::BTreeSet::new();
+    for (query, level) in [
+        ("surface=ses", AreaLevel::Residue),
+        ("surface=ses&by=atom", AreaLevel::Atom),
+        ("surface=ses&by=chain", AreaLevel::Chain),
+        ("surface=sas&by=chain", AreaLevel::Chain),
+    ] {
+        let reply = SERVER.get(&format!("{address}/areas?{query}"));
+        assert_eq!((reply.status, reply.header("content-type")), (200, Some("text/csv")), "{query}");
+        let kind = query.split('&').next().and_then(|pair| pair.split_once('='));
+        let job = params::parse(kind.into_iter().chain([("exact", "true")])).unwrap().job;
+        let areas = areas::measure_selection(&structure, &job, (&read, &surface), &Control::default()).unwrap();
+        let mut expected = Vec::new();
+        areas.write_csv(&structure, level, &mut expected).unwrap();
+        assert_eq!(reply.text(), String::from_utf8(expected).unwrap(), "{query}");
+        tags.insert(reply.header("etag").unwrap().to_owned());
+    }
+    assert_eq!(tags.len(), 4);
 }
 
 #[test]

@@ -154,7 +154,7 @@ fn surfaces(seen: &Seen, server: &Running) {
         get(&areas, &[("if-none-match", table.header("etag").unwrap())], 304);
         get(&areas, &[("if-match", "\"other\"")], 412);
         get(&format!("{base}/areas"), &[], 400);
-        get(&format!("{areas}&interface=A,Z"), &[], 400);
+        get(&format!("{areas}&interface=A,Z"), &[], 422);
         get(&format!("{areas}&chains=Z"), &[], 422);
         let atoms = format!("{base}/atoms");
         let tag = get(&atoms, &[], 200).header("etag").unwrap().to_owned();

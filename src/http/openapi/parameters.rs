@@ -10,8 +10,9 @@ use utoipa::{IntoParams, Modify};
 use super::components::pascal_case;
 use crate::formats::Format;
 use crate::http::{area_parameters, atom_parameters, color_parameters};
-use crate::pipeline::AreaLevel;
 use crate::pipeline::params::{self, Domain, TABLE};
+use crate::pipeline::{AreaLevel, areas};
+use crate::surface::SurfaceKind;
 
 const DIGEST_PATTERN: &str = "^[0-9a-f]{64}$";
 const DIGEST_EXAMPLE: &str = "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087";
@@ -118,6 +119,17 @@ fn query(parameter: &params::Parameter) -> Parameter {
         .build()
 }
 
+/// Returns the parameters of a mesh that have these names.
+fn mesh_parameters(names: &[&str]) -> impl Iterator<Item = Parameter> {
+    names.iter().filter_map(|name| TABLE.iter().find(|parameter| parameter.name == *name)).map(query)
+}
+
+/// Describes a query parameter that is not, or not in this form, one of a mesh.
+fn own(name: &str, required: Required, doc: impl Into<String>, schema: ObjectBuilder) -> Parameter {
+    let builder = ParameterBuilder::new().name(name).parameter_in(ParameterIn::Query).required(required);
+    builder.description(Some(doc.into())).schema(Some(schema)).build()
+}
+
 fn path(name: &str, doc: &str) -> ParameterBuilder {
     let builder = ParameterBuilder::new().name(name).parameter_in(ParameterIn::Path);
     builder.required(Required::True).description(Some(doc))
@@ -174,36 +186,44 @@ parameters!(
 parameters!(
     /// Query parameters of the colours of atoms.
     ColorParameters: {
-        let mesh_parameter = |name: &&str| TABLE.iter().find(|p| p.name == *name).map(query);
         let value = ObjectBuilder::new().schema_type(Type::String).title(Some(color_parameters::expected())).examples(["chain"]);
         let doc = format!("Colour scheme. Value: {}.", color_parameters::expected());
-        let scheme = ParameterBuilder::new().name("scheme").parameter_in(ParameterIn::Query);
-        let scheme = scheme.required(Required::True).description(Some(doc)).schema(Some(value)).build();
-        std::iter::once(scheme).chain(color_parameters::NAMES.iter().filter_map(mesh_parameter)).collect()
+        let scheme = own("scheme", Required::True, doc, value);
+        std::iter::once(scheme).chain(mesh_parameters(&color_parameters::NAMES)).collect()
     }
 );
 parameters!(
     /// Query parameters of the list of atoms.
     AtomParameters: {
-        let mesh_parameter = |name: &&str| TABLE.iter().find(|p| p.name == *name).map(query);
         let value = ObjectBuilder::new().schema_type(Type::Boolean).default(Some(Value::from(false)));
         let doc = "Lists only the atoms of a mesh with the same parameters, with the copies of an assembly, and adds their \
                    indices in the file and their positions. The parameters that select atoms need it. Default: false.";
-        let positions = ParameterBuilder::new().name(atom_parameters::POSITIONS).parameter_in(ParameterIn::Query);
-        let positions = positions.required(Required::False).description(Some(doc)).schema(Some(value)).build();
-        std::iter::once(positions).chain(atom_parameters::NAMES.iter().filter_map(mesh_parameter)).collect()
+        let positions = own(atom_parameters::POSITIONS, Required::False, doc, value);
+        std::iter::once(positions).chain(mesh_parameters(&atom_parameters::NAMES)).collect()
     }
 );
 parameters!(
     /// Query parameters of the areas of atoms.
     AreaParameters: {
-        let mesh_parameter = |name: &&str| TABLE.iter().find(|p| p.name == *name).map(query);
-        let levels = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(AreaLevel::ALL.map(AreaLevel::name)));
+        let text = || ObjectBuilder::new().schema_type(Type::String);
+        let levels = text().enum_values(Some(AreaLevel::ALL.map(AreaLevel::name)));
         let levels = levels.default(Some(Value::from(AreaLevel::default().name())));
-        let doc = "Rows of the table. Value: atom, residue or chain. Default: residue.";
-        let by = ParameterBuilder::new().name(area_parameters::BY).parameter_in(ParameterIn::Query);
-        let by = by.required(Required::False).description(Some(doc)).schema(Some(levels)).build();
-        std::iter::once(by).chain(area_parameters::NAMES.iter().filter_map(mesh_parameter)).collect()
+        let surfaces = text().enum_values(Some(area_parameters::SURFACES.map(SurfaceKind::name)));
+        let interfaces = text().min_length(Some(1)).max_length(Some(params::MAX_VALUE_BYTES));
+        let interfaces = interfaces.title(Some(areas::EXPECTED));
+        let rows = "Rows of the table. Value: atom, residue or chain. Default: residue.";
+        let doc = format!(
+            "Compares two sets of chains: the rows are those of both sides together, with the areas `alone` and \
+             `buried`. Value: {}.", areas::EXPECTED
+        );
+        let own = vec![
+            own(area_parameters::BY, Required::False, rows, levels),
+            own("surface", Required::True, "Type of the surface. Value: vdw, sas or ses.", surfaces),
+            own("interface", Required::False, doc, interfaces),
+        ];
+        let others = mesh_parameters(&area_parameters::NAMES);
+        let others: Vec<_> = others.filter(|other| own.iter().all(|own| own.name != other.name)).collect();
+        own.into_iter().chain(others).collect()
     }
 );
 parameters!(

@@ -66,6 +66,7 @@ pub fn canonical(job: &Job) -> String {
         (*split != Split::None).then(|| format!("split={}", split.name())),
         cavities.map(|cavities| format!("cavities={}", cavities.name())),
         exact.then(|| "exact=true".to_owned()),
+        // Quotes the names, which may contain `&`.
         interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),
         instances.then(|| "instances=true".to_owned()),
         (*context != Context::Selection).then(|| format!("context={}", context.name())),

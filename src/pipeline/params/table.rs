@@ -71,13 +71,7 @@ pub struct Parameter {
 impl Parameter {
     /// Returns the error for a value that is not valid.
     pub(super) fn invalid(&self, value: &str) -> ParamError {
-        self.bad_value(value, self.domain.expected())
-    }
-
-    /// Returns the error for a value that is not the `expected` one.
-    pub(super) fn bad_value(&self, value: &str, expected: String) -> ParamError {
-        let value = format!("`{}`", value.chars().take(64).collect::<String>());
-        ParamError::BadValue { name: self.name, value, expected }
+        ParamError::bad_value(self.name, value, self.domain.expected())
     }
 
     /// Returns true if `text` equals the declared default. Defaults in words, such as `the first model of the file`,
@@ -217,7 +211,7 @@ pub const TABLE: &[Parameter] = &[
         name: "interface",
         domain: Domain::Text { expected: areas::EXPECTED },
         default: "absent",
-        doc: "Adds to the report the exact area that two sets of chains bury; needs exact=true.",
+        doc: "Adds to the report the exact surface area buried between two sets of chains; needs exact=true.",
     },
     Parameter {
         name: "color",

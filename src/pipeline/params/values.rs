@@ -72,9 +72,8 @@ impl ParsedValues {
             (rule, ..) => Some(("split", rule.name().to_owned(), Split::None.name())),
         };
         if let Some((name, value, instead)) = other {
-            let value = format!("`{}`", value.chars().take(64).collect::<String>());
             let expected = format!("{instead} with model={ALL_MODELS}, which makes one part of each model");
-            return Err(ParamError::BadValue { name, value, expected });
+            return Err(ParamError::bad_value(name, &value, expected));
         }
         *split = Split::Model;
         Ok(())

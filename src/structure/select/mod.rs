@@ -270,7 +270,7 @@ const SELECTED_CHAIN: &str = "selected chain";
 
 /// Returns, for each text of the chain column, true if it is one of `requested`. `_` is the blank chain unless a chain
 /// has this name.
-fn chains<'a>(
+pub(crate) fn chains<'a>(
     structure: &'a Structure,
     requested: impl IntoIterator<Item = &'a str>,
     what: &'static str,

@@ -21,7 +21,7 @@ use crate::surface::error::SurfaceError;
 use crate::surface::kernel::Shape;
 use crate::surface::lattice::{LatticeAtom, effective_radius, to_f32, to_i32, to_u32};
 use crate::surface::memory::Reservation;
-use crate::surface::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
+use crate::surface::params::{SurfaceKind, SurfaceLimits, SurfaceParams, bad};
 use crate::surface::spheres::Spheres;
 
 /// Exact measures of a surface of spheres.
@@ -81,20 +81,21 @@ struct FaceSearch<'a> {
 }
 
 impl ExactMeasures {
-    /// Measures the surface of `spheres`; `None` if it is an isosurface. The memory of the result remains charged to
-    /// `control`.
+    /// Measures the surface of `spheres`. The memory of the result remains charged to `control`.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::BadParameter`] if scale and offset leave a radius that is too
-    /// small, [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::BadParameter`] for an isosurface or if scale and offset leave
+    /// a radius that is too small, [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub fn of(
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Option<Self>, SurfaceError> {
-        let Shape::Sphere { enlarged } = Shape::new(params) else { return Ok(None) };
-        let Some([low, high]) = spheres.bounds() else { return Ok(Some(Self::default())) };
+    ) -> Result<Self, SurfaceError> {
+        let Shape::Sphere { enlarged } = Shape::new(params) else {
+            return Err(bad("surface", format!("`{}`", params.surface), "vdw, sas or ses, which have exact areas"));
+        };
+        let Some([low, high]) = spheres.bounds() else { return Ok(Self::default()) };
         params.check_radius(spheres.radius_range().0)?;
         control.memory.grow((size_of::<f64>() * spheres.len()) as u64)?;
         // All other memory is released at the end.
@@ -116,7 +117,7 @@ impl ExactMeasures {
             overlaps: OverlapCount::new(limits),
             control,
         };
-        search.run().map(Some)
+        search.run()
     }
 
     /// Returns the area of the whole surface, Å².
