@@ -75,9 +75,9 @@ impl Units {
 }
 
 impl Format {
-    /// Returns true if the format can hold coordinates in `units`. In metres a molecule is very small, and programs that
-    /// merge vertices within a fixed distance would merge all of them. Therefore only formats with a node that scales
-    /// the mesh support metres. Readers of MSMS files expect ångström.
+    /// Returns true if the format can hold coordinates in `units`. In metres a molecule is very small, and programs
+    /// that merge vertices within a fixed distance would merge all of them. Therefore only formats with a node that
+    /// scales the mesh support metres. Readers of MSMS files expect ångström.
     #[must_use]
     pub const fn holds_units(self, units: Units) -> bool {
         match (self, units) {

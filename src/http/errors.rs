@@ -333,8 +333,7 @@ impl From<PictureError> for Problem {
                 .with("parameter", side)
                 .with("limit", limit)
                 .with("actual", pixels),
-            // The other errors are parameter errors.
-            _ => Self::internal(detail),
+            _ => Self::internal(detail), // The parameters have been checked before.
         }
     }
 }

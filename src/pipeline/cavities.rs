@@ -65,8 +65,8 @@ pub struct CavityReport {
     pub atoms: u64,
     /// Residues of these atoms, by chain and number.
     pub residues: Vec<LiningResidue>,
-    /// True if an inner component of the mesh encloses the cavity, so that `drop` removed it or `only` kept it; false if
-    /// the grid is too coarse for the wall. Absent with `keep`.
+    /// True if an inner component of the mesh encloses the cavity, so that `drop` removed it or `only` kept it; false
+    /// if the grid is too coarse for the wall. Absent with `keep`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub enclosed: Option<bool>,
 }

@@ -19,6 +19,7 @@ mod instances;
 pub mod integer;
 mod left_out;
 mod limits;
+mod load;
 mod map_file;
 pub mod nearest;
 pub mod params;
@@ -54,7 +55,7 @@ pub use work::{estimate_atoms, estimate_work, mesh_work};
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureParams};
 use crate::structure::map::MapError;
-use crate::structure::{self, Context, ReadLimits, Selected, Selection, Split, Structure, StructureError};
+use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceParams,
     Validation, lattice,
@@ -63,6 +64,7 @@ use color::{MeshColors, Scheme};
 use cut::Cut;
 use divided::{Division, divided};
 use estimate::MeshPlan;
+use load::{SPHERE_BYTES, load};
 use report::Counts;
 
 /// Number of atom indices that are converted between two checks for cancellation.
@@ -380,34 +382,4 @@ fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage 
     };
     let packing = params.quantize.map_or(Packing::Full, Packing::Quantized);
     Storage { packing, normals: job.normals, units: job.units }
-}
-
-/// Memory of selecting, bytes per atom of the structure.
-const INDEX_BYTES: u64 = 8;
-/// Memory of a sphere, bytes.
-const SPHERE_BYTES: u64 = 28;
-
-/// Reads a structure and selects its spheres.
-fn load<S: Deref<Target = Structure>>(
-    read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
-    job: &Job,
-    limits: &ReadLimits,
-    clock: &StageClock<'_>,
-    control: &Control<'_>,
-) -> Result<(S, Selected, Spheres), JobError> {
-    let read = clock.time("read", || read(control))?;
-    let structure = &*read;
-    control.check()?;
-    // Selecting holds an index for each atom, and a sphere for each selected one.
-    control.memory.grow(INDEX_BYTES * structure.len() as u64).map_err(SurfaceError::from)?;
-    let (selected, spheres) = clock.time("select", || -> Result<_, JobError> {
-        let selected = structure::select_with(structure, &job.selection, limits, control)?;
-        control.check()?;
-        control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
-        let spheres = selected.spheres(structure)?;
-        selected.check_instances(&spheres, &job.selection)?;
-        selected.check_duplicates(&spheres, limits, control)?;
-        Ok((selected, spheres))
-    })?;
-    Ok((read, selected, spheres))
 }

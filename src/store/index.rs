@@ -229,8 +229,8 @@ impl Index {
         Ok(())
     }
 
-    /// Returns the least recently used objects to evict so that another object of `bytes` fits into `cap`, and the bytes
-    /// that are missing even then. Pinned objects, which are few, may exceed the number of objects.
+    /// Returns the least recently used objects to evict so that another object of `bytes` fits into `cap`, and the
+    /// bytes that are missing even then. Pinned objects, which are few, may exceed the number of objects.
     pub(super) fn excess(&self, bytes: u64, cap: Usage) -> (Vec<EvictionCandidate>, u64) {
         let used = self.used();
         let missing = Usage {

@@ -81,6 +81,11 @@ fn agrees_with_name(name: &str, bytes: &[u8]) -> bool {
         "png" => bytes.starts_with(b"\x89PNG\r\n\x1a\n"),
         "json" | "gltf" => serde_json::from_slice::<Value>(bytes).is_ok_and(|v| v.is_object()),
         "txt" => !bytes.is_empty(),
+        "csv" => {
+            let text = String::from_utf8_lossy(bytes);
+            let mut columns = text.lines().map(|line| line.split(',').count());
+            columns.next().is_some_and(|n| n > 1 && columns.clone().count() > 0 && columns.all(|other| other == n))
+        }
         "dx" => bytes.starts_with(b"object 1 class gridpositions"),
         // Four bytes an atom, the last of which is opaque.
         "bin" => !bytes.is_empty() && bytes.len().is_multiple_of(4) && bytes.chunks(4).all(|color| color[3] == 255),

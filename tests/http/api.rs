@@ -118,7 +118,7 @@ fn formats_are_negotiated() {
         assert_eq!((reply.status, reply.header("content-type")), (status, Some(media_type)), "{query} {accept}");
         assert!(reply.complete);
         if status == 406 {
-            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 8);
+            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 10);
         } else {
             assert!(reply.body.len() > 1000);
         }
@@ -534,7 +534,7 @@ fn health_version_and_capabilities() {
     assert_eq!(SERVER.get("/readyz").json()["status"], "ready");
     assert_eq!(SERVER.get("/version").json()["version"], env!("CARGO_PKG_VERSION"));
     let can = SERVER.get("/v1/capabilities").json();
-    assert_eq!(can["formats"].as_array().unwrap().len(), 8);
+    assert_eq!(can["formats"].as_array().unwrap().len(), 10);
     assert_eq!(can["surfaces"].as_array().unwrap().len(), 6);
     assert_eq!(can["presets"]["ses-like"]["isovalue"], 1.9);
     assert_eq!(can["backends"][0]["reason"], "set by a test");
