@@ -143,6 +143,8 @@ fn a_default_is_valid_with_every_parameter() {
         &[("atom_ids", "true")],
         &[("exact", "true"), ("surface", "sas")],
         &[("exact", "true"), ("surface", "ses"), ("interface", "A,B")],
+        &[("cavities", "keep")],
+        &[("cavities", "drop"), ("surface", "ses")],
         &[("color", "chain")],
         &[("color", "bfactor"), ("palette", "blue-white-red"), ("color_range", "0,50")],
         &[("color", "chain"), ("color_blend", "smooth")],
