@@ -8,6 +8,8 @@ use crate::surface::SurfaceKind;
 pub(super) const BY: &str = "by";
 /// Values of `surface`.
 pub(super) const SURFACES: [SurfaceKind; 3] = [SurfaceKind::Vdw, SurfaceKind::Sas, SurfaceKind::Ses];
+/// Parameters whose description differs from that of a mesh.
+pub(super) const REDEFINED: [&str; 2] = ["surface", "interface"];
 /// Names of the parameters.
 pub(super) const NAMES: [&str; 11] = [
     BY,

@@ -4,6 +4,7 @@
 use serde_json::{Map, Value, json};
 
 use super::bodies::request_bodies;
+use crate::http::area_parameters;
 
 /// Temporary extension of an error response with its problem types, from which [`share`] derives the name of the
 /// component.
@@ -112,12 +113,20 @@ impl Components {
     }
 }
 
-/// Returns a parameter's own name; for a path parameter, preceded by the first segment after the version: `jobs-id`.
+/// Returns a parameter's own name. The first segment after the version precedes that of a path parameter (`jobs-id`),
+/// `areas` that of a parameter which areas define differently.
 /// A component with the name `file` would hide the type `File` of TypeScript.
 fn parameter_name(path: &str, parameter: &Value) -> String {
     let name = parameter["name"].as_str().unwrap_or_default();
     let segment = path.trim_start_matches("/v1").split('/').nth(1).unwrap_or_default();
-    if parameter["in"] == "path" { format!("{segment}-{name}") } else { name.to_owned() }
+    let is_of_areas = path.ends_with("/areas") && area_parameters::REDEFINED.contains(&name);
+    if parameter["in"] == "path" {
+        format!("{segment}-{name}")
+    } else if is_of_areas {
+        format!("areas-{name}")
+    } else {
+        name.to_owned()
+    }
 }
 
 /// Returns the component name of a response; `None` if the response stays with its operation.
