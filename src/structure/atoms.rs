@@ -123,11 +123,8 @@ impl Structure {
     /// Returns true if two atoms have the same model, chain, residue name, number and insertion code.
     #[must_use]
     pub fn same_residue(&self, a: usize, b: usize) -> bool {
-        self.residue_number[a] == self.residue_number[b]
-            && self.insertion_code[a] == self.insertion_code[b]
-            && self.residue.id(a) == self.residue.id(b)
-            && self.chain.id(a) == self.chain.id(b)
-            && self.model[a] == self.model[b]
+        let names = |i: usize| (self.residue.id(i), self.chain.id(i), self.insertion_code[i]);
+        names(a) == names(b) && (self.residue_number[a], self.model[a]) == (self.residue_number[b], self.model[b])
     }
 
     /// Returns true if atom `i` is hydrogen or deuterium.
