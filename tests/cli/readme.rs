@@ -81,7 +81,7 @@ fn agrees_with_name(name: &str, bytes: &[u8]) -> bool {
         "png" => bytes.starts_with(b"\x89PNG\r\n\x1a\n"),
         "json" | "gltf" => serde_json::from_slice::<Value>(bytes).is_ok_and(|v| v.is_object()),
         "txt" => !bytes.is_empty(),
-        "vert" | "face" => bytes.starts_with(b"# molmesh ") && bytes.iter().filter(|c| **c == b'\n').count() > 100,
+        "vert" | "face" => bytes.starts_with(b"# molmesh ") && String::from_utf8_lossy(bytes).lines().count() > 100,
         "csv" => {
             let text = String::from_utf8_lossy(bytes);
             let mut columns = text.lines().map(|line| line.split(',').count());
