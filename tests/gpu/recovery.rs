@@ -98,13 +98,14 @@ fn the_cpu_replaces_a_device_that_is_lost_permanently() {
     assert!(why.contains("down after 3 rebuilds") && !why.contains('\n'), "{why}");
 }
 
-/// Keeps a device busy for about three seconds with a loop. Small dispatches are measured first.
+/// Keeps a device busy for about eight seconds with a loop, longer than the limit of a first job. Small dispatches are
+/// measured first.
 fn occupy(device: &wgpu::Device, queue: &wgpu::Queue) {
     const SHADER: &str = "
         @group(0) @binding(0) var<storage, read_write> out: array<u32>;
         @compute @workgroup_size(1) fn main() {
             var x = out[0];
-            for (var i = 0u; i < 20000u; i++) { x = x * 1664525u + (x >> 3u) + 1013904223u; }
+            for (var i = 0u; i < 40000u; i++) { x = x * 1664525u + (x >> 3u) + 1013904223u; }
             out[0] = x;
         }";
     let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
@@ -144,7 +145,7 @@ fn occupy(device: &wgpu::Device, queue: &wgpu::Queue) {
         begun.elapsed().as_secs_f64()
     };
     run(1);
-    let n = 256.0 * 3.0 / run(256);
+    let n = 256.0 * 8.0 / run(256);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "at most the largest dispatch")]
     run(n.clamp(256.0, 65_535.0) as u32);
 }
