@@ -76,8 +76,9 @@ mod shaders {
     use naga::{AddressSpace, Module, StorageAccess, TypeInner};
 
     /// Generated tables: names of the table and its layouts, folder of the shaders, and shaders in execution order.
-    const TABLES: [(&str, &str, &str, &[&str]); 2] = [
-        ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "interpolate", "emit", "measure"]),
+    const TABLES: [(&str, &str, &str, &[&str]); 3] = [
+        ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "refine", "interpolate", "emit", "measure"]),
+        ("SPHERE_SHADERS", "SPHERE_LAYOUTS", "spheres/", &["field", "refine", "interpolate"]),
         ("PICTURE", "PICTURE_LAYOUTS", "picture/", &["vertex", "fragment", "resolve", "finish"]),
     ];
 
@@ -88,7 +89,7 @@ mod shaders {
             n += names.len();
             let mut layouts = BTreeSet::new();
             // The meshing stages address their buffers by enum.
-            let by_enum = table == "SHADERS";
+            let by_enum = table != "PICTURE";
             let buffer = if by_enum { "BufferId" } else { "&str" };
             writeln!(generated, "pub(super) static {table}: [Shader<{buffer}>; {}] = [", names.len())
                 .expect("writing to a string cannot fail");

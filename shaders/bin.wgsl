@@ -1,4 +1,5 @@
-// Stage `bin`: candidate atoms of every brick, in canonical order. One workgroup per brick.
+// Stage `bin`: candidate atoms of every brick, in canonical order, and for a boundary of spheres its candidate arcs. One
+// workgroup per brick and section; the arcs are the second section of all tables and are treated like atoms.
 //
 // Atoms are sorted by tile and brick, so the atoms of a run of bricks along x within a tile are one range. Each lane
 // looks up one range. Then the lanes divide the atoms of 64 ranges evenly and keep those in reach, in order.
@@ -71,16 +72,28 @@ fn part(lo: i32, hi: i32, t: i32) -> vec2<i32> {
     return vec2<i32>(first, min(hi, 8 * t + 7) - first + 1);
 }
 
-// Minimum gap along one axis, in spacings, between a brick and the atoms of a brick `step` bricks away.
+// Atoms or arcs.
+struct Section {
+    // Maximum reach.
+    reach: f32,
+    // Number of bricks before and behind a brick, per axis, whose atoms may reach it.
+    back: i32,
+    ahead: i32,
+    // First entry in `first_atoms`.
+    first: u32,
+}
+
+// Minimum gap along one axis, in spacings, between a brick and the atoms of a brick `step` bricks away. Atoms lie up to
+// half a spacing before the grid points of their brick, arcs up to a spacing behind them.
 fn brick_gap(step: i32) -> f32 {
-    return max(max(f32(8 * step) - 8.5, f32(-8 * step) - 7.5), 0.0);
+    return max(max(f32(8 * step) - 8.5, f32(-8 * step) - 8.0), 0.0);
 }
 
 // First atom and number of atoms of range `index` of those that may hold candidates of `brick`. Ranges are in the order
 // of the atoms: by tile, and by row within a tile.
-fn range_at(tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
-    let lo = brick - vec3<i32>(i32(params.back));
-    let hi = brick + vec3<i32>(i32(params.ahead));
+fn range_at(section: Section, tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
+    let lo = brick - vec3<i32>(section.back);
+    let hi = brick + vec3<i32>(section.ahead);
     let first = lo >> vec3<u32>(3u);
     let n_x = (hi.x >> 3u) - first.x + 1;
     let n_y = hi.y - lo.y + 1;
@@ -103,12 +116,12 @@ fn range_at(tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
     let row = vec2<i32>(y.x + left % y.y, z.x + left / y.y);
     // Maximum extent of the reach along x in this row.
     let gap = vec2<f32>(brick_gap(row.x - brick.y), brick_gap(row.y - brick.z));
-    let rest = params.reach * params.reach - dot(gap, gap);
+    let rest = section.reach * section.reach - dot(gap, gap);
     if (rest < 0.0) {
         return vec2<u32>(0u);
     }
     let far = sqrt(rest) + 0.01;
-    let x_lo = max(max(lo.x, 8 * t.x), brick.x - i32(floor((far + 7.5) / 8.0)));
+    let x_lo = max(max(lo.x, 8 * t.x), brick.x - i32(floor((far + 8.0) / 8.0)));
     let x_hi = min(min(hi.x, 8 * t.x + 7), brick.x + i32(floor((far + 8.5) / 8.0)));
     if (x_lo > x_hi) {
         return vec2<u32>(0u);
@@ -118,9 +131,9 @@ fn range_at(tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
         return vec2<u32>(0u);
     }
     let base = u32(row.y & 7) << 6u | u32(row.x & 7) << 3u;
-    let start = first_atoms[bricks_before(at, base | u32(x_lo & 7))];
+    let start = first_atoms[section.first + bricks_before(at, base | u32(x_lo & 7))];
     let last = base | u32(x_hi & 7);
-    let end = first_atoms[bricks_before(at, last) + select(0u, 1u, brick_exists(at, last))];
+    let end = first_atoms[section.first + bricks_before(at, last) + select(0u, 1u, brick_exists(at, last))];
     return vec2<u32>(start, end - start);
 }
 
@@ -146,9 +159,16 @@ fn main(
     @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let slot = workgroup_number(workgroup, workgroups);
-    if (slot >= params.n_own + params.n_halo) {
+    let number = workgroup_number(workgroup, workgroups);
+    let n_slots = params.n_own + params.n_halo;
+    if (number >= params.n_sections * n_slots) {
         return;
+    }
+    var section = Section(params.reach, i32(params.back), i32(params.ahead), 0u);
+    var slot = number;
+    if (number >= n_slots) {
+        section = Section(params.arc_reach, i32(params.arc_back), i32(params.arc_ahead), params.n_bricks + 1u);
+        slot = number - n_slots;
     }
     let id = brick_in(slot);
     let tile = bricks[id] >> 9u;
@@ -156,9 +176,9 @@ fn main(
     let brick = tiles[tile].coord * 8 + within;
     let tile_origin = tiles[tile].coord * 64;
     let lo = vec3<f32>(within * 8);
-    let span = vec3<i32>(i32(params.back + params.ahead) + 1);
-    let n_x = ((brick.x + i32(params.ahead)) >> 3u) - ((brick.x - i32(params.back)) >> 3u) + 1;
-    let n_ranges = u32(span.z * span.y * n_x);
+    let span = section.back + section.ahead + 1;
+    let n_x = ((brick.x + section.ahead) >> 3u) - ((brick.x - section.back) >> 3u) + 1;
+    let n_ranges = u32(span * span * n_x);
     if (lane < 12u) {
         atomicStore(&hits[lane], 0u);
     }
@@ -172,7 +192,7 @@ fn main(
         for (var first = 0u; first < n_ranges; first += LANES) {
             var range = vec2<u32>(0u);
             if (first + lane < n_ranges) {
-                range = range_at(tile, brick, first + lane);
+                range = range_at(section, tile, brick, first + lane);
             }
             workgroupBarrier();
             range_start[lane] = range.x;
@@ -259,7 +279,7 @@ fn main(
             n = vec2<u32>(0u);
         }
         if (lane == 0u) {
-            heads[slot] = vec4<u32>(start, n.x, n.x + n.y, id);
+            heads[number] = vec4<u32>(start, n.x, n.x + n.y, id);
         }
         if (n.x + n.y <= STAGED) {
             for (var i = lane; i < n.x + n.y; i += LANES) {

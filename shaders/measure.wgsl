@@ -13,7 +13,6 @@
 #include shared/chunk.wgsl
 #include shared/record.wgsl
 #include shared/counters.wgsl
-#include shared/crossing.wgsl
 #include shared/triangles.wgsl
 #include shared/block.wgsl
 #include shared/sheets.wgsl
@@ -24,7 +23,7 @@
 @group(0) @binding(1) var<storage, read> tiles: array<Tile>;
 @group(0) @binding(2) var<storage, read> bricks: array<u32>;
 @group(0) @binding(3) var<storage, read> halo: array<u32>;
-@group(0) @binding(4) var<storage, read> field: array<f32>;
+@group(0) @binding(4) var<storage, read> crossings: array<f32>;
 @group(0) @binding(5) var<storage, read> inside: array<u32>;
 @group(0) @binding(6) var<storage, read> cases: array<vec2<u32>>;
 @group(0) @binding(7) var<storage, read> records: array<BrickRecord>;

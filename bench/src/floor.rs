@@ -9,7 +9,8 @@
 //! | field | the lists, 32 B per atom | 2 KiB per brick | 2 multiply-adds per pair of grid point and atom |
 //! | classify | 2 KiB per brick | 292 B per brick | – |
 //! | scan | 4 B per brick | 8 B per brick | – |
-//! | interpolate | 2 KiB, 248 B and the lists of a brick with surface, 32 B per atom | 24 B per vertex, quantized 12 B | 10 per vertex and atom that reaches the vertex's brick |
+//! | refine | 2 KiB, 64 B and the lists of a brick with surface, 32 B per atom | 4 B per vertex | 10 per vertex and atom that reaches the vertex's brick |
+//! | interpolate | 2 KiB, 248 B, 4 B per vertex and the lists of a brick with surface, 32 B per atom | 24 B per vertex, quantized 12 B | 10 per vertex and atom that reaches the vertex's brick |
 //! | emit | 300 B per brick with surface | 12 B per triangle | – |
 //! | measure | 96 B per brick with surface, 4 B per vertex | 68 B per brick with surface | – |
 
@@ -41,11 +42,15 @@ impl Work {
             Stage::Field => (4.0 * entries + 32.0 * atoms + 2048.0 * bricks, 2.0 * 512.0 * pairs),
             Stage::Classify => ((2048.0 + 292.0) * bricks, 0.0),
             Stage::Scan => (12.0 * bricks, 0.0),
-            Stage::Interpolate => {
+            Stage::Refine | Stage::Interpolate => {
                 let lists = 4.0 * entries * surface / bricks.max(1.0);
-                let each = if meshed.mesh.quantized.is_some() { 12.0 } else { 24.0 };
+                let (brick, vertex) = match stage {
+                    Stage::Refine => (2048.0 + 64.0, 4.0),
+                    _ if meshed.mesh.quantized.is_some() => (2048.0 + 248.0, 4.0 + 12.0),
+                    _ => (2048.0 + 248.0, 4.0 + 24.0),
+                };
                 let reach = pairs / job.plan.n_reached.max(1) as f64;
-                ((2048.0 + 248.0) * surface + lists + 32.0 * atoms + each * vertices, 10.0 * vertices * reach)
+                (brick * surface + lists + 32.0 * atoms + vertex * vertices, 10.0 * vertices * reach)
             }
             Stage::Emit => (300.0 * surface + 12.0 * triangles, 0.0),
             Stage::Measure => ((64.0 + 32.0 + 68.0) * surface + 4.0 * vertices, 0.0),

@@ -98,7 +98,7 @@ const fn single(v: f64) -> f32 {
 impl GridUniform {
     /// Creates the grid of a job, with at most `limit` points.
     fn new(job: &Prepared, limit: u64) -> Result<Self> {
-        let (lattice, params) = (&job.lattice, job.plan.params(&job.lattice, &job.profile, &job.params));
+        let (lattice, params) = (&job.lattice, job.plan.params(&job.lattice, &job.params));
         let bounds = [0, 1, 2].map(|k| bounds(lattice, k));
         let sides = bounds.map(|(lo, hi)| hi - lo + 1.0);
         let n_points = sides.iter().product::<f64>();
@@ -257,10 +257,11 @@ impl Program2010 {
         let mut encoder = self.gpu.encoder();
         encoder.clear_buffer(&field.0, 0, None);
         encoder.clear_buffer(&dense.0, 0, None);
-        let kernel = match job.profile.kernel {
-            Kernel::Gaussian => 0,
-            Kernel::SoftObject => 1,
-            Kernel::InverseSquare => 2,
+        let kernel = match job.params.surface.kernel() {
+            Some(Kernel::Gaussian) => 0,
+            Some(Kernel::SoftObject) => 1,
+            Some(Kernel::InverseSquare) => 2,
+            None => return Err(Error::failed("the program of 2010 makes isosurfaces only")),
         };
         let step = |n: u32| [Some(n); 2];
         let threads = u64::from(grid.n_atoms).div_ceil(64);

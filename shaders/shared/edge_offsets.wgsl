@@ -1,5 +1,5 @@
-// Offsets of vertices along their edges, as integers of `32 - sheet_bits` bits. Requires `params`, `field`,
-// shared/bits, shared/crossing and shared/sheets.
+// Offsets of vertices along their edges, as integers of `32 - sheet_bits` bits. Requires `params`, `crossings`,
+// shared/bits and shared/sheets.
 //
 // For rounded positions, the offset is the coordinate along the edge in steps, relative to an origin. Otherwise it is
 // the parameter of the crossing in units of `offset_unit`.
@@ -20,14 +20,12 @@ fn axis_of(edge: u32) -> vec3<bool> {
     return vec3<u32>(0u, 1u, 2u) == vec3<u32>((edge >> 6u) / 27u);
 }
 
-// Density at a grid point of the block. A brick that does not exist is out of reach of all atoms.
-fn density_at(at: vec3<u32>) -> f32 {
+// Parameter of the vertex on an edge.
+fn parameter_on(edge: u32) -> f32 {
+    let at = first_point(edge);
     let slot = slots[at.x >> 3u | at.y >> 3u << 1u | at.z >> 3u << 2u];
-    if (slot == NONE) {
-        return 0.0;
-    }
     let point = at & vec3<u32>(7u);
-    return field[slot * 512u + point.z * 64u + point.y * 8u + point.x];
+    return crossings[3u * (slot * 512u + point.z * 64u + point.y * 8u + point.x) + (edge >> 6u) / 27u];
 }
 
 // Rounded position of a point, in steps relative to the centre. `p` is relative to the brick's first grid point, and
@@ -40,7 +38,7 @@ fn steps_at(first: vec3<f32>, p: vec3<f32>) -> vec3<f32> {
 fn offset_on(edge: u32, first: vec3<f32>, origin: vec3<f32>) -> u32 {
     let at = first_point(edge);
     let axis = axis_of(edge);
-    let t = crossing_at(density_at(at), density_at(at + vec3<u32>(axis)));
+    let t = parameter_on(edge);
     if (params.steps_per_angstrom > 0.0) {
         let p = steps_at(first, vec3<f32>(at) + vec3<f32>(axis) * t) - origin;
         return bitcast<u32>(i32(select(select(p.z, p.y, axis.y), p.x, axis.x)));

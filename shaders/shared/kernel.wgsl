@@ -48,7 +48,12 @@ fn density(c: Column, z: Axis, u_min: f32) -> vec4<f32> {
     return t2 / max(u, vec4<f32>(u_min));
 }
 
-// -dF/du up to a factor that all atoms have in common.
+// Density at u.
+fn density_at(u: f32, u_min: f32) -> f32 {
+    return density(column(u), z_axis(vec4<f32>(0.0)), u_min).x;
+}
+
+// -dF/du up to the factor `slope_scale`, which all atoms have in common.
 fn slope(u: f32, u_min: f32) -> f32 {
     if (KERNEL == GAUSSIAN) {
         return exp2(params.slope_offset - params.rate * u) - params.slope_tail;

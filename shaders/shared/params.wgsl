@@ -53,6 +53,19 @@ struct Params {
     base_vertex: u32,
     // Factor of positions before rounding to integers, 1/Å; 0 for vertices in single precision.
     steps_per_angstrom: f32,
+    // -dF/du is the slope times this.
+    slope_scale: f32,
+    // Number of bricks of the job.
+    n_bricks: u32,
+    // Surfaces of spheres: distance at the surface, and maximum distance of vertices from it.
+    level: f32,
+    tolerance: f32,
+    // Number of sections of the atoms: 2 with the arcs of a boundary, else 1.
+    n_sections: u32,
+    // `reach`, `back` and `ahead` of the arcs.
+    arc_reach: f32,
+    arc_back: u32,
+    arc_ahead: u32,
 }
 
 // Index of a workgroup. Dispatches have two dimensions, because one has too few workgroups for large grids.

@@ -12,7 +12,7 @@ use super::pool::{self, DevicePool, PoolDevice};
 use super::scheduler::PoolSettings;
 use crate::surface::{
     Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Reservation, Spheres, Stage, SurfaceError,
-    SurfaceKind, SurfaceLimits, SurfaceParams, backend::one_atom,
+    SurfaceLimits, SurfaceParams, backend::one_atom,
 };
 
 /// Backend that meshes on devices.
@@ -111,10 +111,6 @@ impl Backend for GpuBackend {
         let status = self.pool.status();
         let up: Vec<&str> = status.iter().filter(|d| d.down.is_none()).map(|d| d.name.as_str()).collect();
         pool::describe(&up)
-    }
-
-    fn supports(&self, surface: SurfaceKind) -> bool {
-        surface.kernel().is_some()
     }
 
     fn write(

@@ -6,24 +6,29 @@
 pub enum BufferId {
     /// Rows of parameters, one per dispatch.
     Params,
-    /// Atoms on the lattice.
+    /// Atoms on the lattice, and bounding spheres of arcs behind them.
     Atoms,
-    /// Reach of each atom, in spacings.
+    /// Reach of each atom and arc, in spacings.
     Reaches,
+    /// Boundary of a union of spheres: rows of caps and arcs.
+    Boundary,
     /// Tile table.
     Tiles,
     /// Bricks by tile and index.
     Bricks,
-    /// First atom of each brick.
+    /// First atom of each brick, then first arc of each brick.
     FirstAtoms,
     /// Halo bricks of the chunk and the table of their slots.
     Halo,
     /// Candidate lists.
     Lists,
-    /// Header of each candidate list: start, number of atoms that reach a grid point, number of all candidates, brick.
+    /// Header of each candidate list: start, number of atoms that reach a grid point, number of all candidates, brick. Lists of atoms
+    /// come first, then those of arcs.
     Heads,
-    /// Densities.
+    /// Densities, or distances to the surface.
     Field,
+    /// Parameter of the vertex on each edge: three per grid point.
+    Crossings,
     /// Bits of the grid points inside the surface.
     Inside,
     /// Result of `classify` for each brick: crossing edges, vertices per layer, neighbours.
@@ -52,10 +57,11 @@ pub enum BufferId {
 
 impl BufferId {
     /// Buffers of which each job has its own: all except [`Self::Cases`], in the order of the variants.
-    pub(super) const OF_JOB: [Self; 21] = [
+    pub(super) const OF_JOB: [Self; 23] = [
         Self::Params,
         Self::Atoms,
         Self::Reaches,
+        Self::Boundary,
         Self::Tiles,
         Self::Bricks,
         Self::FirstAtoms,
@@ -63,6 +69,7 @@ impl BufferId {
         Self::Lists,
         Self::Heads,
         Self::Field,
+        Self::Crossings,
         Self::Inside,
         Self::Records,
         Self::Counts,

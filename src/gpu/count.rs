@@ -8,11 +8,11 @@ use super::output_layout::{BODY_OFFSET, narrow};
 use super::plan::layout::Params;
 use super::recording::PendingSubmission;
 
-/// Number of the stages that run before the size of the output is known: `bin` to `scan`.
-pub(super) const N_COUNT_STAGES: usize = 4;
+/// Number of the stages that run before the size of the output is known: `bin` to `refine`.
+pub(super) const N_COUNT_STAGES: usize = 5;
 
 impl Engine {
-    /// Submits the stages `bin` to `scan` of a chunk.
+    /// Submits the stages `bin` to `refine` of a chunk.
     pub(super) fn submit_count(&self, state: &JobState, chunk: usize) -> Result<PendingSubmission, GpuError> {
         let loaded = &state.loaded;
         let own = &loaded.chunks[chunk];

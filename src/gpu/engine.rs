@@ -54,7 +54,7 @@ impl DeviceLimits {
         let binding = max_binding(limits);
         Self {
             memory: 64 << 30,
-            chunk_bricks: binding / (4 * layout::BRICK_POINTS),
+            chunk_bricks: binding / layout::CROSSING_BYTES,
             piece_bytes: binding,
             readback_bytes: limits.max_buffer_size.min(8 << 30),
             idle_bytes: [8 << 30, 2 << 30],
@@ -187,8 +187,8 @@ impl Engine {
         let limits = ChunkLimits { bricks: self.budget.chunk_bricks, candidates: self.max_binding / 4 };
         let tiles = partition.map_or(0..plan.tiles.len(), |partition| partition.tiles.clone());
         plan.chunks(tiles, limits).ok_or_else(|| {
-            let tile = plan.candidates.iter().max().map_or(0, |n| 4 * n) + 512 * 4 * layout::BRICK_POINTS;
-            out_of_memory(job, tile, self.budget.chunk_bricks * 4 * layout::BRICK_POINTS)
+            let tile = plan.candidates.iter().max().map_or(0, |n| 4 * n) + 512 * layout::CROSSING_BYTES;
+            out_of_memory(job, tile, self.budget.chunk_bricks * layout::CROSSING_BYTES)
         })
     }
 
@@ -212,8 +212,8 @@ impl Engine {
             self.workspaces.clear();
             return Err(error);
         }
-        let variant = Variant { kernel: job.prepared.profile.kernel, nearest: params.atom_ids };
-        let params = plan.params(lattice, &job.prepared.profile, params);
+        let variant = Variant { kernel: params.surface.kernel(), nearest: params.atom_ids };
+        let params = plan.params(lattice, params);
         let write = |id: BufferId, offset: usize, bytes: &[u8]| {
             if !bytes.is_empty() {
                 self.queue.write_buffer(workspace.buffer(id), offset as u64, bytes);
@@ -228,6 +228,11 @@ impl Engine {
             write(BufferId::Atoms, run.start * size_of::<LatticeAtom>(), atoms);
             write(BufferId::Reaches, run.start * 4, bytemuck::cast_slice(&plan.reaches[run]));
         }
+        let arcs = &plan.arcs;
+        write(BufferId::Atoms, size_of_val(&lattice.atoms[..]), bytemuck::cast_slice(&arcs.bounds));
+        write(BufferId::Reaches, size_of_val(&plan.reaches[..]), bytemuck::cast_slice(&arcs.reaches));
+        write(BufferId::FirstAtoms, size_of_val(&plan.first_atoms[..]), bytemuck::cast_slice(&arcs.first));
+        write(BufferId::Boundary, 0, bytemuck::cast_slice(&arcs.rows));
         write(BufferId::Tiles, 0, bytemuck::cast_slice(&plan.tiles));
         write(BufferId::Bricks, 0, bytemuck::cast_slice(&plan.bricks));
         write(BufferId::FirstAtoms, 0, bytemuck::cast_slice(&plan.first_atoms));

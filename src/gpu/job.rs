@@ -5,10 +5,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use super::error::GpuError;
-use super::plan::Plan;
+use super::plan::{Arcs, Plan};
 use super::sheets::SheetBlocks;
-use crate::surface::cpu::{LATTICE_BYTES, scan};
-use crate::surface::kernel::Profile;
+use crate::surface::cpu::{LATTICE_BYTES, distance, scan};
 use crate::surface::lattice::Lattice;
 use crate::surface::{
     CancelToken, Control, MemoryMeter, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
@@ -25,8 +24,6 @@ pub struct Prepared {
     pub lattice: Lattice,
     /// Bricks of the lattice.
     pub plan: Plan,
-    /// Density of an atom.
-    pub profile: Profile,
     /// Surface parameters.
     pub params: SurfaceParams,
     /// Limits.
@@ -49,22 +46,17 @@ impl Prepared {
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
         control.check()?;
-        let profile = Profile::new(params.kernel_for("gpu")?, params);
         candidates::check(spheres, params, limits)?;
         control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
         let lattice = Lattice::new(spheres, params, control)?;
         control.check()?;
-        let plan = Plan::new(&lattice, limits, control)?;
+        let mut plan = Plan::new(&lattice, limits, control)?;
+        if let Some((union, bounds)) = distance::boundary(&lattice, params, limits, control)? {
+            control.check()?;
+            plan.arcs = Arcs::new(&union, &bounds, &lattice, &mut plan, limits, control)?;
+        }
         let memory = Arc::clone(&control.memory);
-        Ok(Self {
-            lattice,
-            plan,
-            profile,
-            params: params.clone(),
-            limits: *limits,
-            memory,
-            is_counted: AtomicBool::new(false),
-        })
+        Ok(Self { lattice, plan, params: params.clone(), limits: *limits, memory, is_counted: AtomicBool::new(false) })
     }
 
     /// Checks the size of a mesh, given as numbers of vertices and triangles, against the limits.
@@ -76,7 +68,7 @@ impl Prepared {
     /// mesh to the meter.
     pub(super) fn check_mesh(&self, size: [u64; 2]) -> Result<(), SurfaceError> {
         if size[1] == 0 {
-            Err(SurfaceError::NoSurface { isovalue: Some(self.params.isovalue) })
+            Err(SurfaceError::NoSurface { isovalue: self.params.level() })
         } else {
             self.check_size(size)?;
             if !self.is_counted.swap(true, Ordering::Relaxed) {

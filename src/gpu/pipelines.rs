@@ -1,47 +1,83 @@
-//! Compute pipelines of the stages, compiled once. Stages that depend on the kernel have one pipeline per kernel.
+//! Compute pipelines of the stages, compiled once. Stages that depend on the kernel have one pipeline per kernel, and
+//! those that depend on the type of the surface have a second shader, for surfaces of spheres.
 
 use wgpu::{BindGroupLayout, ComputePipeline, Device};
 
 use super::buffers::BufferId;
-use super::shaders::{Binding, SHADERS, Shader};
+use super::shaders::{Binding, SHADERS, SPHERE_SHADERS, Shader};
 use crate::surface::{Kernel, Stage};
 
 /// Number of stages that run on a device.
-pub(super) const N_STAGES: usize = 7;
+pub(super) const N_STAGES: usize = 8;
 /// Stages that run on a device, in order.
-pub(super) const STAGES: [Stage; N_STAGES] =
-    [Stage::Bin, Stage::Field, Stage::Classify, Stage::Scan, Stage::Interpolate, Stage::Emit, Stage::Measure];
+pub(super) const STAGES: [Stage; N_STAGES] = [
+    Stage::Bin,
+    Stage::Field,
+    Stage::Classify,
+    Stage::Scan,
+    Stage::Refine,
+    Stage::Interpolate,
+    Stage::Emit,
+    Stage::Measure,
+];
+/// Stages that have a second shader for surfaces of spheres, in order.
+const SPHERE_STAGES: [Stage; 3] = [Stage::Field, Stage::Refine, Stage::Interpolate];
 
 /// Bytes of the timestamps of a submission: begin and end of every stage.
 pub(super) const TIMESTAMP_BYTES: u64 = 16 * N_STAGES as u64;
 
-/// One pipeline per stage and variant.
+/// One pipeline per shader and variant.
 #[derive(Debug)]
 pub(super) struct Pipelines {
+    /// Layouts by [`ShaderIndex`].
     layouts: Vec<BindGroupLayout>,
-    /// Variants per stage: one per kernel, and for `interpolate` a second one that computes the nearest atoms.
+    /// Variants per shader: one per kernel if it depends on the kernel, each with a second one that computes the nearest
+    /// atoms in `interpolate`.
     variants: Vec<Vec<ComputePipeline>>,
+}
+
+/// Index of a shader among those of all stages, followed by those of surfaces of spheres.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct ShaderIndex(usize);
+
+impl ShaderIndex {
+    /// Returns the index of the shader of `stage` for a type of surface.
+    pub(super) fn new(stage: Stage, variant: Variant) -> Self {
+        let second = SPHERE_STAGES.iter().position(|other| *other == stage).filter(|_| variant.kernel.is_none());
+        Self(second.map_or(stage_index(stage), |index| N_STAGES + index))
+    }
+
+    /// Returns all shaders with their indices.
+    pub(super) fn all() -> impl Iterator<Item = (Self, &'static Shader<BufferId>)> {
+        (0..).map(Self).zip(SHADERS.iter().chain(&SPHERE_SHADERS))
+    }
+
+    /// Returns the index as a number.
+    pub(super) const fn get(self) -> usize {
+        self.0
+    }
 }
 
 /// Properties of a job that select the variants of its pipelines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Variant {
-    pub(super) kernel: Kernel,
+    /// Kernel of an isosurface; `None` for a surface of spheres.
+    pub(super) kernel: Option<Kernel>,
     pub(super) nearest: bool,
 }
 
 impl Variant {
     const fn kernel_number(self) -> usize {
         match self.kernel {
-            Kernel::Gaussian => 0,
-            Kernel::SoftObject => 1,
-            Kernel::InverseSquare => 2,
+            None | Some(Kernel::Gaussian) => 0,
+            Some(Kernel::SoftObject) => 1,
+            Some(Kernel::InverseSquare) => 2,
         }
     }
 
     fn index(self, stage: Stage) -> usize {
         match stage {
-            Stage::Field => self.kernel_number(),
+            Stage::Field | Stage::Refine => self.kernel_number(),
             Stage::Interpolate => 2 * self.kernel_number() + usize::from(self.nearest),
             _ => 0,
         }
@@ -56,23 +92,42 @@ pub(super) const fn stage_index(stage: Stage) -> usize {
 impl Pipelines {
     /// Compiles all pipelines. The callbacks of the device receive the errors.
     pub(super) fn new(device: &Device) -> Self {
-        let (layouts, variants) =
-            STAGES.iter().zip(&SHADERS).map(|(stage, shader)| compile(device, *stage, shader)).unzip();
+        let stages = STAGES.iter().map(|stage| (*stage, true)).chain(SPHERE_STAGES.map(|stage| (stage, false)));
+        let (layouts, variants) = ShaderIndex::all()
+            .zip(stages)
+            .map(|((_, shader), (stage, has_kernel))| compile(device, shader, &constants(stage, has_kernel)))
+            .unzip();
         Self { layouts, variants }
     }
 
-    /// Bind group layout of `stage`.
-    pub(super) fn layout(&self, stage: Stage) -> &BindGroupLayout {
-        &self.layouts[stage_index(stage)]
+    /// Bind group layout of a shader.
+    pub(super) fn layout(&self, shader: ShaderIndex) -> &BindGroupLayout {
+        &self.layouts[shader.get()]
     }
 
     /// Pipeline of `stage` for `variant`.
     pub(super) fn pipeline(&self, stage: Stage, variant: Variant) -> &ComputePipeline {
-        &self.variants[stage_index(stage)][variant.index(stage)]
+        &self.variants[ShaderIndex::new(stage, variant).get()][variant.index(stage)]
     }
 }
 
-fn compile(device: &Device, stage: Stage, shader: &Shader<BufferId>) -> (BindGroupLayout, Vec<ComputePipeline>) {
+/// Constants of the variants of a shader.
+fn constants(stage: Stage, has_kernel: bool) -> Vec<Vec<(&'static str, f64)>> {
+    let kernels = [0.0, 1.0, 2.0].map(|kernel| vec![("KERNEL", kernel)]);
+    let nearest = |other: &Vec<_>| [0.0, 1.0].map(|nearest| [&other[..], &[("NEAREST", nearest)]].concat());
+    match (stage, has_kernel) {
+        (Stage::Field | Stage::Refine, true) => kernels.to_vec(),
+        (Stage::Interpolate, true) => kernels.iter().flat_map(nearest).collect(),
+        (Stage::Interpolate, false) => nearest(&Vec::new()).to_vec(),
+        _ => vec![Vec::new()],
+    }
+}
+
+fn compile(
+    device: &Device,
+    shader: &Shader<BufferId>,
+    constants: &[Vec<(&str, f64)>],
+) -> (BindGroupLayout, Vec<ComputePipeline>) {
     let label = format!("molmesh.{}", shader.stage);
     let entries: Vec<_> = shader.bindings.iter().map(Binding::layout).collect();
     let layout =
@@ -86,15 +141,6 @@ fn compile(device: &Device, stage: Stage, shader: &Shader<BufferId>) -> (BindGro
         label: Some(&label),
         source: wgpu::ShaderSource::Wgsl(shader.source.into()),
     });
-    let kernels = [0.0, 1.0, 2.0].map(|kernel| ("KERNEL", kernel));
-    let constants: Vec<Vec<(&str, f64)>> = match stage {
-        Stage::Field => kernels.iter().map(|kernel| vec![*kernel]).collect(),
-        Stage::Interpolate => {
-            let with = |kernel: &(&'static str, f64)| [0.0, 1.0].map(|nearest| vec![*kernel, ("NEAREST", nearest)]);
-            kernels.iter().flat_map(with).collect()
-        }
-        _ => vec![vec![]],
-    };
     let build = |constants: &Vec<(&str, f64)>| {
         device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(&label),

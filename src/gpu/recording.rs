@@ -109,19 +109,19 @@ impl<'a> Recording<'a> {
                 current = Some(dispatch.variant);
             }
             let offset = u32::try_from(dispatch.row * ROW).unwrap_or_default();
-            pass.set_bind_group(0, dispatch.workspace.bind_group(stage), &[offset]);
+            pass.set_bind_group(0, dispatch.workspace.bind_group(stage, dispatch.variant), &[offset]);
             let n = dispatch.workgroups;
             pass.dispatch_workgroups(n.min(MAX_WORKGROUPS), n.div_ceil(MAX_WORKGROUPS), 1);
         }
     }
 
-    /// Records the stages `bin` to `scan` of one chunk per job; the parameters are those of the chunks.
+    /// Records the stages `bin` to `refine` of one chunk per job; the parameters are those of the chunks.
     pub(super) fn count_stages(&mut self, jobs: &[(Dispatch<'_>, Params)]) {
         for (job, _) in jobs {
             self.encoder.clear_buffer(job.workspace.buffer(BufferId::Counters), 0, None);
             self.encoder.clear_buffer(job.workspace.buffer(BufferId::Groups), 0, None);
         }
-        for stage in [Stage::Bin, Stage::Field, Stage::Classify, Stage::Scan] {
+        for stage in [Stage::Bin, Stage::Field, Stage::Classify, Stage::Scan, Stage::Refine] {
             let dispatches: Vec<_> =
                 jobs.iter().map(|(job, params)| Dispatch { workgroups: workgroups(stage, params), ..*job }).collect();
             self.stage(stage, &dispatches);
@@ -174,7 +174,8 @@ impl<'a> Recording<'a> {
 /// Number of workgroups of `stage`.
 pub(super) fn workgroups(stage: Stage, params: &Params) -> u32 {
     match stage {
-        Stage::Bin | Stage::Field => params.n_own + params.n_halo,
+        Stage::Bin => params.n_sections * (params.n_own + params.n_halo),
+        Stage::Field | Stage::Refine => params.n_own + params.n_halo,
         Stage::Classify => params.n_own.div_ceil(4),
         Stage::Scan => params.n_own.div_ceil(GROUP),
         _ => params.piece_bricks,

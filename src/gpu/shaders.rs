@@ -126,7 +126,15 @@ mod tests {
                 triangle_capacity,
                 zero,
                 base_vertex,
-                steps_per_angstrom
+                steps_per_angstrom,
+                slope_scale,
+                n_bricks,
+                level,
+                tolerance,
+                n_sections,
+                arc_reach,
+                arc_back,
+                arc_ahead
             ),
             host!("BrickRecord", BrickRecord, crossing, layers, neighbours),
             host!("Counters", Counters, list_end, vertices, triangles, flat, checksum, degenerate, sheet_words, bounds),
@@ -159,6 +167,7 @@ mod tests {
     fn structs_have_the_same_layout_on_both_sides() {
         assert_eq!(LAYOUTS.len(), host().len(), "every struct in a buffer is compared");
         assert_eq!(differences(LAYOUTS, &host()), Vec::<String>::new());
+        assert_eq!(differences(SPHERE_LAYOUTS, &host()), Vec::<String>::new());
     }
 
     #[test]
@@ -206,8 +215,8 @@ mod tests {
     #[test]
     fn shaders_are_in_stage_order() {
         let names: Vec<_> = SHADERS.iter().map(|shader| shader.stage).collect();
-        let stages: Vec<_> = Stage::ALL[..7].iter().map(|stage| stage.name()).collect();
+        let stages: Vec<_> = Stage::ALL[..8].iter().map(|stage| stage.name()).collect();
         assert_eq!(names, stages);
-        assert!(SHADERS.iter().all(|shader| shader.bindings[0].access == Access::Uniform));
+        assert!(SHADERS.iter().chain(&SPHERE_SHADERS).all(|shader| shader.bindings[0].access == Access::Uniform));
     }
 }

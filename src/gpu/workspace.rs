@@ -4,11 +4,11 @@ use wgpu::{BindGroup, Buffer, BufferUsages, Device};
 
 use super::buffers::BufferId;
 use super::output_layout::{OutputRows, TRIANGLE_BYTES, VertexBytes};
-use super::pipelines::{Pipelines, STAGES, stage_index};
-use super::plan::layout::{BRICK_POINTS, BrickRecord, Counters, Params, Tile};
+use super::pipelines::{Pipelines, ShaderIndex, Variant};
+use super::plan::layout::{BRICK_POINTS, BrickRecord, CROSSING_BYTES, Counters, Params, Tile};
 use super::plan::{Chunk, Plan};
 use super::readback::size_class;
-use super::shaders::SHADERS;
+use super::shaders::Shader;
 use crate::surface::Stage;
 use crate::surface::lattice::LatticeAtom;
 
@@ -31,15 +31,17 @@ impl BufferSizes {
         let slots = max(&Chunk::n_slots);
         let size = |id: BufferId| match id {
             BufferId::Params => ROW * PARAM_ROWS,
-            BufferId::Atoms => bytes(plan.reaches.len(), size_of::<LatticeAtom>()),
-            BufferId::Reaches => bytes(plan.reaches.len(), 4),
+            BufferId::Atoms => bytes(plan.n_atoms() + plan.arcs.len(), size_of::<LatticeAtom>()),
+            BufferId::Reaches => bytes(plan.n_atoms() + plan.arcs.len(), 4),
+            BufferId::Boundary => bytes(plan.arcs.rows.len(), 16),
             BufferId::Tiles => bytes(plan.tiles.len(), size_of::<Tile>()),
             BufferId::Bricks | BufferId::Counts => bytes(n_bricks, 4),
-            BufferId::FirstAtoms => bytes(n_bricks + 1, 4),
+            BufferId::FirstAtoms => bytes(plan.first_atoms.len() + plan.arcs.first.len(), 4),
             BufferId::Halo => max(&|c| 4 * c.halo_table_len()),
             BufferId::Lists => max(&|c| 4 * c.candidates),
-            BufferId::Heads => 16 * slots,
+            BufferId::Heads => 16 * slots * u64::from(plan.n_sections()),
             BufferId::Field => 4 * BRICK_POINTS * slots,
+            BufferId::Crossings => CROSSING_BYTES * slots,
             BufferId::Inside => bytes(n_bricks, 64),
             BufferId::Records => bytes(n_bricks, size_of::<BrickRecord>()),
             BufferId::Offsets => bytes(n_bricks, 8),
@@ -108,8 +110,7 @@ impl Workspace {
     }
 
     fn bind(&mut self, device: &Device, pipelines: &Pipelines) {
-        let bind_group = |stage: &Stage| {
-            let shader = &SHADERS[stage_index(*stage)];
+        let bind_group = |(index, shader): (ShaderIndex, &Shader<BufferId>)| {
             let entries: Vec<_> = shader
                 .bindings
                 .iter()
@@ -123,11 +124,11 @@ impl Workspace {
                 .collect();
             device.create_bind_group(&wgpu::BindGroupDescriptor {
                 label: Some(shader.stage),
-                layout: pipelines.layout(*stage),
+                layout: pipelines.layout(index),
                 entries: &entries,
             })
         };
-        self.bind_groups = STAGES.iter().map(bind_group).collect();
+        self.bind_groups = ShaderIndex::all().map(bind_group).collect();
     }
 
     /// Returns a buffer.
@@ -136,8 +137,8 @@ impl Workspace {
     }
 
     /// Returns the bind group of `stage`.
-    pub(super) fn bind_group(&self, stage: Stage) -> &BindGroup {
-        &self.bind_groups[stage_index(stage)]
+    pub(super) fn bind_group(&self, stage: Stage, variant: Variant) -> &BindGroup {
+        &self.bind_groups[ShaderIndex::new(stage, variant).get()]
     }
 
     /// Bytes of all its buffers.

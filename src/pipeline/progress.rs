@@ -8,7 +8,7 @@ use super::ProgressSink;
 const UNIT: f64 = 1000.0;
 
 /// Stages with their typical shares of the time, in execution order.
-const STAGES: [(&str, f64); 16] = [
+const STAGES: [(&str, f64); 17] = [
     ("read", 0.10),
     ("select", 0.02),
     ("exact", 0.01),
@@ -16,7 +16,8 @@ const STAGES: [(&str, f64); 16] = [
     ("field", 0.38),
     ("classify", 0.05),
     ("scan", 0.02),
-    ("interpolate", 0.10),
+    ("refine", 0.02),
+    ("interpolate", 0.08),
     ("emit", 0.10),
     ("write", 0.05),
     ("cavities", 0.01),
@@ -28,7 +29,7 @@ const STAGES: [(&str, f64); 16] = [
 ];
 
 /// Stages that run at the same time on different bricks.
-const INTERLEAVED: [&str; 5] = ["field", "classify", "interpolate", "emit", "write"];
+const INTERLEAVED: [&str; 6] = ["field", "classify", "refine", "interpolate", "emit", "write"];
 
 /// Progress of each stage. Several threads may update and read it.
 #[derive(Debug, Default)]

@@ -13,7 +13,7 @@ const BLOCK: usize = 1 << 14;
 /// # Errors
 /// [`SurfaceError::Cancelled`] and [`SurfaceError::Memory`]. The items are in no particular order then, and some of
 /// them may be lost.
-pub(super) fn sort<T: Copy + Send + Sync>(
+pub(crate) fn sort<T: Copy + Send + Sync>(
     items: &mut [T],
     compare: impl Fn(&T, &T) -> Ordering + Copy + Sync,
     control: &Control<'_>,

@@ -18,6 +18,8 @@ pub enum Stage {
     Classify,
     /// Exclusive scan over bricks: first vertex and triangle of each brick.
     Scan,
+    /// Vertices moved along their edges to the surface. On the CPU, `interpolate` does it for isosurfaces.
+    Refine,
     /// Vertex positions and normals.
     Interpolate,
     /// Triangle indices.
@@ -30,8 +32,17 @@ pub enum Stage {
 
 impl Stage {
     /// Every stage, in the order in which they run.
-    pub const ALL: [Self; 8] =
-        [Self::Bin, Self::Field, Self::Classify, Self::Scan, Self::Interpolate, Self::Emit, Self::Measure, Self::Write];
+    pub const ALL: [Self; 9] = [
+        Self::Bin,
+        Self::Field,
+        Self::Classify,
+        Self::Scan,
+        Self::Refine,
+        Self::Interpolate,
+        Self::Emit,
+        Self::Measure,
+        Self::Write,
+    ];
 
     /// The stage's name, as shaders, reports and `Server-Timing` spell it.
     #[must_use]
@@ -41,6 +52,7 @@ impl Stage {
             Self::Field => "field",
             Self::Classify => "classify",
             Self::Scan => "scan",
+            Self::Refine => "refine",
             Self::Interpolate => "interpolate",
             Self::Emit => "emit",
             Self::Write => "write",

@@ -39,7 +39,7 @@ pub struct LatticeAtom {
     pub cell: [i32; 3],
     /// 1/ρ² in units of the spacing: u = d² × this.
     pub inv_length2: f32,
-    /// The centre's offset from `cell`, in [−½, ½] spacings.
+    /// The centre's offset from `cell`: in [−½, ½] spacings for an atom, in [0, 1] for the bounding sphere of an arc.
     pub frac: [f32; 3],
     /// Index of the sphere in the caller's input.
     pub source: u32,
@@ -69,7 +69,7 @@ pub struct Lattice {
     /// Cells of the box around all supports.
     pub box_cells: u64,
     /// Upper bound of the grid points in bricks that an atom reaches, from the box around all supports.
-    pub(super) box_points: u64,
+    pub(crate) box_points: u64,
 }
 
 impl Lattice {

@@ -235,7 +235,7 @@ impl SurfaceParams {
     /// [`SurfaceError::BadParameter`] names `surface` if that is a surface of spheres.
     pub(crate) fn kernel_for(&self, backend: &str) -> Result<Kernel, SurfaceError> {
         let expected =
-            || format!("one of {} from the {backend} backend; the cpu backend makes all", Kernel::NAMES.join(", "));
+            || format!("one of {} from the {backend} backend; cpu and gpu make all", Kernel::NAMES.join(", "));
         self.surface.kernel().ok_or_else(|| bad("surface", format!("`{}`", self.surface), expected()))
     }
 

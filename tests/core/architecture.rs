@@ -214,7 +214,7 @@ const MAX_MAP_LINES: usize = 150;
 /// Folders and files with code.
 pub(crate) const CODE: &[&str] = &["build.rs", "src", "shaders", "tests", "bench", "benches", "fuzz", "examples"];
 
-const STAGES: &[&str] = &["bin", "field", "classify", "scan", "interpolate", "emit", "measure"];
+const STAGES: &[&str] = &["bin", "field", "classify", "scan", "refine", "interpolate", "emit", "measure"];
 /// Maximum number of types with the same name.
 const MAX_TYPES_PER_NAME: usize = 2;
 /// Maximum number of terms in the glossary.

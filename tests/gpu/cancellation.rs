@@ -4,7 +4,7 @@ use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use molmesh::gpu::{DevicePool, Executor, GpuBackend, PoolDevice, PoolSettings};
-use molmesh::surface::{Backend as _, CancelToken, Control, Kernel, Observer, Stage, SurfaceError, SurfaceLimits};
+use molmesh::surface::{Backend as _, CancelToken, Control, Observer, Stage, SurfaceError, SurfaceKind, SurfaceLimits};
 
 use crate::gpu_support::{engine_with, params, spheres};
 
@@ -32,7 +32,7 @@ fn jobs_end_soon_after_cancellation_at_any_time() {
     // 27,000 separate atoms have about 14 million triangles.
     let at = |i: usize| [i % 30, i / 30 % 30, i / 900].map(|k| 4.0 * k as f64);
     let rows: Vec<[f64; 4]> = (0..27_000).map(at).map(|[x, y, z]| [x, y, z, 1.7]).collect();
-    let (spheres, params) = (spheres(&rows), params(Kernel::Gaussian, 0.4));
+    let (spheres, params) = (spheres(&rows), params(SurfaceKind::Gaussian, 0.4));
     let attempt = |delay: Duration| {
         let (start, cancel) = (Start::default(), CancelToken::default());
         let control = Control { cancel: cancel.clone(), observer: &start, ..Control::default() };

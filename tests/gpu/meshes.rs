@@ -7,7 +7,7 @@ use crate::measure_support::agree;
 use std::sync::Arc;
 
 use gpu_support::{
-    KERNELS, POSITION_BOUND, Random, engine, engine_with, job, measures, mesh_of, params, quantized, run, sample,
+    POSITION_BOUND, Random, SURFACES, engine, engine_with, job, measures, mesh_of, params, quantized, run, sample,
     spheres,
 };
 use molmesh::gpu::plan::ChunkLimits;
@@ -72,10 +72,10 @@ fn assert_measured(gpu: &MeshOutput, what: &str) {
 fn structures_are_equal_to_the_cpu_with_every_kernel() {
     for name in ["4pti.pdb", "1crn.cif"] {
         let spheres = sample(name);
-        for kernel in KERNELS {
-            let params = params(kernel, 0.5);
+        for surface in SURFACES {
+            let params = params(surface, 0.5);
             let meshed = mesh_of(&mut engine(), &spheres, &params);
-            assert_equal(&meshed, &spheres, &params, &format!("{name} {kernel}"));
+            assert_equal(&meshed, &spheres, &params, &format!("{name} {surface}"));
         }
     }
 }
@@ -109,11 +109,11 @@ fn assert_quantized(engine: &mut Engine, spheres: &Spheres, params: &SurfacePara
 fn quantized_vertices_equal_those_of_the_host_with_every_kernel() {
     for name in ["4pti.pdb", "1crn.cif"] {
         let spheres = sample(name);
-        for kernel in KERNELS {
-            let params = params(kernel, 0.5);
-            let meshed = assert_quantized(&mut engine(), &spheres, &params, &format!("{name} {kernel}"));
+        for surface in SURFACES {
+            let params = params(surface, 0.5);
+            let meshed = assert_quantized(&mut engine(), &spheres, &params, &format!("{name} {surface}"));
             let (found, cpu) = (measures(&meshed), measures(&cpu(&spheres, &quantized(&spheres, &params))));
-            assert!(found.closed && found.oriented && found.manifold, "{name} {kernel}: {found:?}");
+            assert!(found.closed && found.oriented && found.manifold, "{name} {surface}: {found:?}");
             assert_eq!((found.euler, found.components.len()), (cpu.euler, cpu.components.len()));
             assert!((found.area / cpu.area - 1.0).abs() < 1e-5 && (found.volume / cpu.volume - 1.0).abs() < 1e-5);
         }
@@ -124,10 +124,10 @@ fn quantized_vertices_equal_those_of_the_host_with_every_kernel() {
 fn edge_cases_are_quantized_like_on_the_host() {
     for (name, rows, resolution) in edge_cases() {
         let spheres = spheres(&rows);
-        for kernel in KERNELS {
-            let params = params(kernel, resolution);
+        for surface in SURFACES {
+            let params = params(surface, resolution);
             if run(&mut engine(), &job(&spheres, &params)).is_ok() {
-                assert_quantized(&mut engine(), &spheres, &params, &format!("{name} {kernel}"));
+                assert_quantized(&mut engine(), &spheres, &params, &format!("{name} {surface}"));
             }
         }
     }
@@ -168,7 +168,7 @@ fn jobs_with_both_vertex_layouts_share_a_submission() {
     let mut random = Random(5);
     let clouds: Vec<Spheres> = (2..=7).map(|n| spheres(&random.cloud(n * n * 7, 6.0 * n as f64))).collect();
     let wanted = |(i, cloud): (usize, &Spheres)| {
-        let plain = params(KERNELS[i % 3], 0.5);
+        let plain = params(SURFACES[i % 3], 0.5);
         job(cloud, &if i % 2 == 0 { plain } else { quantized(cloud, &plain) })
     };
     let jobs: Vec<_> = clouds.iter().enumerate().map(wanted).collect();
@@ -189,7 +189,7 @@ fn jobs_with_both_vertex_layouts_share_a_submission() {
 #[test]
 fn idle_readback_buffers_are_kept_between_jobs_and_released_on_request() {
     let spheres = sample("1crn.cif");
-    let wanted = params(KERNELS[0], 0.4);
+    let wanted = params(SURFACES[0], 0.4);
     let held = |idle_bytes| {
         let mut engine = engine_with(|b| (b.small_bytes, b.idle_bytes) = (0, idle_bytes));
         let mesh = mesh_of(&mut engine, &spheres, &wanted).mesh;
@@ -215,7 +215,7 @@ fn idle_readback_buffers_are_kept_between_jobs_and_released_on_request() {
 fn a_device_with_reserved_memory_allocates_no_readback_buffer() {
     const RESERVE: u64 = 64 << 20;
     let spheres = sample("1crn.cif");
-    let wanted = params(KERNELS[0], 0.4);
+    let wanted = params(SURFACES[0], 0.4);
     let ways: [Change; 2] = [|_| (), |b| b.small_bytes = 0];
     for way in ways {
         let engine = || {
@@ -260,7 +260,7 @@ fn a_device_with_reserved_memory_allocates_no_readback_buffer() {
 #[test]
 fn a_quantized_mesh_takes_less_memory_and_less_of_a_limit() {
     let spheres = sample("1crn.cif");
-    let plain = params(KERNELS[0], 0.4);
+    let plain = params(SURFACES[0], 0.4);
     let small = quantized(&spheres, &plain);
     let held = |params: &SurfaceParams| {
         let mut engine = engine_with(|b| b.small_bytes = 0);
@@ -285,7 +285,7 @@ fn a_quantized_mesh_takes_less_memory_and_less_of_a_limit() {
 /// With a very wide spacing vertices lie out of reach of all atoms. Their normals come from the adjacent triangles.
 #[test]
 fn quantized_vertices_without_a_gradient_have_normals() {
-    let (spheres, params) = (spheres(&[[0.0, 0.0, 0.0, 1.7]]), params(KERNELS[0], 8.0));
+    let (spheres, params) = (spheres(&[[0.0, 0.0, 0.0, 1.7]]), params(SURFACES[0], 8.0));
     let small = quantized(&spheres, &params);
     for small_bytes in [0, 16 << 20] {
         let mut engine = engine_with(|b| b.small_bytes = small_bytes);
@@ -303,7 +303,7 @@ fn quantized_vertices_without_a_gradient_have_normals() {
 #[test]
 fn control_the_comparison_finds_differences() {
     let spheres = sample("1crn.cif");
-    let good = cpu(&spheres, &params(KERNELS[0], 1.0)).mesh;
+    let good = cpu(&spheres, &params(SURFACES[0], 1.0)).mesh;
     assert_eq!(difference(&good, &good), None);
     let changed = |change: &dyn Fn(&mut Mesh)| {
         let mut mesh = good.clone();
@@ -347,26 +347,26 @@ fn edge_cases() -> Vec<(&'static str, Vec<[f64; 4]>, f64)> {
 fn edge_cases_are_equal_to_the_cpu() {
     for (name, rows, resolution) in edge_cases() {
         let spheres = spheres(&rows);
-        for kernel in KERNELS {
-            let params = params(kernel, resolution);
+        for surface in SURFACES {
+            let params = params(surface, resolution);
             let meshed = match run(&mut engine(), &job(&spheres, &params)) {
                 Ok(finished) => finished.meshed,
                 Err(e) => {
                     // The CPU finds no surface either.
                     let cpu = CpuBackend::new(Some(2)).unwrap();
                     let same = cpu.run(&spheres, &params, &SurfaceLimits::default(), &Control::default()).unwrap_err();
-                    assert_eq!(e, GpuError::Surface(same), "{name} {kernel}");
+                    assert_eq!(e, GpuError::Surface(same), "{name} {surface}");
                     continue;
                 }
             };
-            assert_equal(&meshed, &spheres, &params, &format!("{name} {kernel}"));
+            assert_equal(&meshed, &spheres, &params, &format!("{name} {surface}"));
         }
     }
 }
 
 #[test]
 fn parameters_of_the_paper_and_presets_are_equal_to_the_cpu() {
-    use molmesh::surface::{Kernel, Preset};
+    use molmesh::surface::{Preset, SurfaceKind};
     let spheres = sample("1crn.cif");
     let all = [
         SurfaceOptions { preset: Some(Preset::SesLike), ..SurfaceOptions::default() },
@@ -375,14 +375,14 @@ fn parameters_of_the_paper_and_presets_are_equal_to_the_cpu() {
         SurfaceOptions { smoothness: Some(40.0), cutoff_tolerance: Some(1e-6), ..SurfaceOptions::default() },
         SurfaceOptions { paper_a: Some(0.5), paper_b: Some(4.0), isovalue: Some(0.7), ..SurfaceOptions::default() },
         SurfaceOptions {
-            surface: Some(Kernel::SoftObject.into()),
+            surface: Some(SurfaceKind::SoftObject),
             paper_a: Some(1.5),
             paper_b: Some(3.0),
             isovalue: Some(0.6),
             ..SurfaceOptions::default()
         },
         SurfaceOptions {
-            surface: Some(Kernel::InverseSquare.into()),
+            surface: Some(SurfaceKind::InverseSquare),
             paper_c: Some(0.8),
             paper_b: Some(5.0),
             isovalue: Some(0.9),
@@ -418,7 +418,7 @@ fn chunks_pieces_and_readback_buffers_change_no_byte() {
     let cloud: Vec<[f64; 4]> =
         random.cloud(1500, 70.0).iter().map(|[x, y, z, r]| [x - 20.0, y + 3.0, z - 40.0, *r]).collect();
     let crowd = spheres(&cloud);
-    let params = params(KERNELS[0], 0.5);
+    let params = params(SURFACES[0], 0.5);
     let whole = mesh_of(&mut engine(), &crowd, &params);
     assert_equal(&whole, &crowd, &params, "whole");
     // Large enough to be cut by every budget below.
@@ -453,7 +453,7 @@ fn dispatches_may_exceed_one_dimension() {
         .map(|i| [i % 20, i / 20 % 20, i / 400].map(|k| 41.3 * f64::from(k) - 300.0))
         .map(|[x, y, z]| [x, y, z, 1.4])
         .collect();
-    let (spheres, params) = (spheres(&rows), params(KERNELS[1], 0.5));
+    let (spheres, params) = (spheres(&rows), params(SURFACES[1], 0.5));
     let job = job(&spheres, &params);
     assert!(job.prepared.plan.bricks.len() > 70_000, "{} bricks", job.prepared.plan.bricks.len());
     let meshed = run(&mut engine(), &job).unwrap().meshed;
@@ -463,7 +463,7 @@ fn dispatches_may_exceed_one_dimension() {
 #[test]
 fn output_is_made_again_if_the_estimate_is_too_low() {
     let spheres = sample("1crn.cif");
-    let params = params(KERNELS[0], 0.5);
+    let params = params(SURFACES[0], 0.5);
     let whole = mesh_of(&mut engine(), &spheres, &params);
     for rows in [[1, 256], [128, 1], [20, 20]] {
         let mut engine = engine_with(|b| b.rows_per_brick = rows);
@@ -476,7 +476,7 @@ fn output_is_made_again_if_the_estimate_is_too_low() {
 #[test]
 fn sheets_are_made_again_if_the_estimate_is_too_low() {
     let crowd = spheres(&Random(11).cloud(900, 60.0));
-    let params = params(KERNELS[0], 0.6);
+    let params = params(SURFACES[0], 0.6);
     let whole = mesh_of(&mut engine(), &crowd, &params);
     assert_measured(&whole, "whole");
     let changes: [Change; 3] = [|b| b.small_bytes = 1 << 30, |b| b.small_bytes = 0, |b| b.chunk_bricks = 900];
@@ -501,10 +501,10 @@ fn measures_equal_those_of_the_cpu() {
     let relative = |a: f64, b: f64| (a / b - 1.0).abs();
     let crowd = spheres(&Random(11).cloud(4000, 70.0));
     for (name, spheres, h) in [("4pti", sample("4pti.pdb"), 0.4), ("crowd", crowd, 0.7)] {
-        for kernel in KERNELS {
-            let single = params(kernel, h);
+        for surface in SURFACES {
+            let single = params(surface, h);
             for params in [quantized(&spheres, &single), single] {
-                let what = format!("{name} {kernel} {:?}", params.quantize);
+                let what = format!("{name} {surface} {:?}", params.quantize);
                 let found = mesh_of(&mut engine(), &spheres, &params).measures.unwrap();
                 let expected = cpu(&spheres, &params).measures.unwrap();
                 assert_eq!(
@@ -537,13 +537,13 @@ fn jobs_that_share_a_submission_are_independent() {
     let mut random = Random(5);
     let clouds: Vec<Spheres> = (1..=9).map(|n| spheres(&random.cloud(n * n * 7, 6.0 * n as f64))).collect();
     let mut jobs: Vec<_> =
-        clouds.iter().zip(KERNELS.iter().cycle()).map(|(cloud, &kernel)| job(cloud, &params(kernel, 0.5))).collect();
+        clouds.iter().zip(SURFACES.iter().cycle()).map(|(cloud, &surface)| job(cloud, &params(surface, 0.5))).collect();
     // A job without a surface, a cancelled one, and a late one.
     let high = SurfaceOptions { isovalue: Some(1e6), ..SurfaceOptions::default() };
     jobs.push(job(&clouds[2], &SurfaceParams::new(&high).unwrap()));
-    jobs.push(job(&clouds[3], &params(KERNELS[0], 0.5)));
+    jobs.push(job(&clouds[3], &params(SURFACES[0], 0.5)));
     jobs[10].cancel.cancel();
-    jobs.push(job(&clouds[3], &params(KERNELS[0], 0.5)));
+    jobs.push(job(&clouds[3], &params(SURFACES[0], 0.5)));
     jobs[11].deadline = Some(std::time::Instant::now());
     let mut answers = gpu_support::run_all(&mut engine(), &jobs);
     assert_eq!(answers.len(), 12);
@@ -561,7 +561,7 @@ fn jobs_that_share_a_submission_are_independent() {
 
 #[test]
 fn meshes_outlive_the_engine_and_return_their_memory() {
-    let params = params(KERNELS[0], 1.0);
+    let params = params(SURFACES[0], 1.0);
     let spheres = sample("1crn.cif");
     // As a small job, and counted first.
     let ways: [Change; 2] = [|_| (), |b| b.small_bytes = 0];
@@ -586,7 +586,7 @@ fn meshes_outlive_the_engine_and_return_their_memory() {
 #[test]
 fn a_job_beyond_the_memory_is_rejected_with_numbers() {
     let spheres = sample("1crn.cif");
-    let params = params(KERNELS[0], 0.3);
+    let params = params(SURFACES[0], 0.3);
     let mut engine = engine_with(|b| b.memory = 1 << 20);
     let error = run(&mut engine, &job(&spheres, &params)).unwrap_err();
     let GpuError::OutOfMemory { needed, available, suggested_resolution } = error else { panic!("{error}") };
@@ -601,14 +601,14 @@ fn a_job_beyond_the_memory_is_rejected_with_numbers() {
 
 #[test]
 fn stage_times_are_reported_if_the_device_has_timestamps() {
-    let (spheres, params) = (sample("1crn.cif"), params(KERNELS[0], 0.7));
+    let (spheres, params) = (sample("1crn.cif"), params(SURFACES[0], 0.7));
     let has_timestamps = gpu_support::device().0.features().contains(wgpu::Features::TIMESTAMP_QUERY);
     for small_bytes in [0, 16 << 20] {
         let mut engine = engine_with(|b| b.small_bytes = small_bytes);
         let finished = run(&mut engine, &job(&spheres, &params)).unwrap();
         if has_timestamps {
             let stages: Vec<_> = finished.stages.iter().map(|(stage, _)| *stage).collect();
-            assert_eq!(stages, molmesh::surface::Stage::ALL[..7]);
+            assert_eq!(stages, molmesh::surface::Stage::ALL[..8]);
             assert!(finished.stages.iter().all(|(_, ns)| *ns < 60_000_000_000), "{:?}", finished.stages);
             assert!(finished.stages.iter().map(|(_, ns)| ns).sum::<u64>() > 1000, "{:?}", finished.stages);
         } else {
@@ -619,7 +619,7 @@ fn stage_times_are_reported_if_the_device_has_timestamps() {
 
 #[test]
 fn a_lost_device_is_an_error_without_panic() {
-    let (spheres, params) = (sample("1crn.cif"), params(KERNELS[0], 0.7));
+    let (spheres, params) = (sample("1crn.cif"), params(SURFACES[0], 0.7));
     for small in [0, 16 << 20] {
         let (device, queue) = gpu_support::device();
         let mut budget = DeviceLimits::of(&device.limits());

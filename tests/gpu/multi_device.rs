@@ -8,14 +8,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
-use gpu_support::{KERNELS, Random, engine, job, params, quantized, run, sample, spheres};
+use gpu_support::{Random, SURFACES, engine, job, params, quantized, run, sample, spheres};
 use molmesh::gpu::{
     CompletedJob, DeviceLimits, DevicePool, Engine, Executor, Finished, GpuBackend, GpuError, GpuJob, PartitionHandle,
     PoolDevice, PoolSettings,
 };
 use molmesh::surface::{
-    Backend, Control, Kernel, Measures, Mesh, Quantized, Spheres, Step, SurfaceError, SurfaceLimits, SurfaceOptions,
-    SurfaceParams, Validation,
+    Backend, Control, Measures, Mesh, Quantized, Spheres, Step, SurfaceError, SurfaceKind, SurfaceLimits,
+    SurfaceOptions, SurfaceParams, Validation,
 };
 
 /// Runs every job on all devices if possible.
@@ -80,8 +80,8 @@ fn crowd(n: usize) -> Spheres {
     spheres(&cloud.iter().map(|[x, y, z, r]| [x - 20.0, y + 3.0, z - 40.0, *r]).collect::<Vec<_>>())
 }
 
-fn with_ids(kernel: Kernel, resolution: f64) -> SurfaceParams {
-    let (surface, resolution) = (Some(kernel.into()), Some(resolution));
+fn with_ids(surface: SurfaceKind, resolution: f64) -> SurfaceParams {
+    let (surface, resolution) = (Some(surface.into()), Some(resolution));
     SurfaceParams::new(&SurfaceOptions { surface, resolution, atom_ids: true, ..SurfaceOptions::default() }).unwrap()
 }
 
@@ -117,16 +117,16 @@ fn a_multi_device_mesh_has_the_bytes_of_one_device() {
         ("two atoms far apart", far, 0.5),
     ];
     for (name, spheres, resolution) in cases {
-        for (i, kernel) in KERNELS.into_iter().enumerate() {
+        for (i, surface) in SURFACES.into_iter().enumerate() {
             // Nearest atoms in one case of three.
             let ids = (name.len() + i) % 3 == 1;
-            let params = if ids { with_ids(kernel, resolution) } else { params(kernel, resolution) };
+            let params = if ids { with_ids(surface, resolution) } else { params(surface, resolution) };
             // Quantized vertices in two cases of three.
             let small = !(name.len() + i).is_multiple_of(3);
             let job = job(&spheres, &if small { quantized(&spheres, &params) } else { params });
             for (n, pool) in &pools {
                 let parts = job.prepared.plan.partitions(*n);
-                let what = format!("{name} {kernel} on {n}");
+                let what = format!("{name} {surface} on {n}");
                 let ran = pool.run(&job).unwrap();
                 let mesh = assert_same(&ran, &job, parts.len(), &what);
                 assert_eq!((mesh.atom_ids.is_some(), mesh.quantized.is_some()), (ids, small));
@@ -146,7 +146,7 @@ fn a_multi_device_mesh_has_the_bytes_of_one_device() {
 
 #[test]
 fn control_the_comparison_finds_differences_and_partitions_depend_on_each_other() {
-    let job = job(&crowd(300), &with_ids(KERNELS[0], 0.8));
+    let job = job(&crowd(300), &with_ids(SURFACES[0], 0.8));
     let ran = pool(2, |_| (), SETTINGS).run(&job).unwrap();
     let good = assert_same(&ran, &job, 2, "two");
     assert!(n_across(&good, &job, 2) > 20, "the boundary does not cross the surface");
@@ -178,7 +178,7 @@ fn a_partition_may_have_no_surface() {
     // A molecule, and atoms behind it that are too small for the grid.
     let mut rows: Vec<[f64; 4]> = Random(3).cloud(60, 20.0);
     rows.extend((0..60).map(|i| [1.0, 1.0, 301.0 + 100.0 * f64::from(i), 0.3]));
-    let job = job(&spheres(&rows), &params(KERNELS[1], 2.0));
+    let job = job(&spheres(&rows), &params(SURFACES[1], 2.0));
     for n in [2, 3] {
         let parts = job.prepared.plan.partitions(n);
         let last = &job.prepared.plan.tiles[parts[n - 1].tiles.start];
@@ -194,7 +194,7 @@ type Change = fn(&mut DeviceLimits);
 #[test]
 fn partitions_in_chunks_pieces_and_readback_buffers_have_the_same_bytes() {
     let crowd = crowd(900);
-    let plain = with_ids(KERNELS[0], 0.5);
+    let plain = with_ids(SURFACES[0], 0.5);
     let jobs = [job(&crowd, &plain), job(&crowd, &quantized(&crowd, &plain))];
     let cut: [(&str, Change); 3] = [
         ("chunks", |b| b.chunk_bricks = 900),
@@ -212,7 +212,7 @@ fn partitions_in_chunks_pieces_and_readback_buffers_have_the_same_bytes() {
 
 #[test]
 fn the_number_of_devices_depends_on_settings_and_job_size() {
-    let job = job(&crowd(300), &params(KERNELS[0], 1.0));
+    let job = job(&crowd(300), &params(SURFACES[0], 1.0));
     let bricks = job.prepared.plan.bricks.len() as u64;
     let by = |n, min_partition_bricks| {
         let pool = pool(n, |_| (), PoolSettings { min_partition_bricks, ..SETTINGS });
@@ -227,7 +227,7 @@ fn the_number_of_devices_depends_on_settings_and_job_size() {
 fn all_devices_are_reported() {
     let backend = GpuBackend::with_pool(pool(2, |_| (), SETTINGS));
     let meshed =
-        backend.run(&crowd(200), &params(KERNELS[0], 1.0), &SurfaceLimits::default(), &Control::default()).unwrap();
+        backend.run(&crowd(200), &params(SURFACES[0], 1.0), &SurfaceLimits::default(), &Control::default()).unwrap();
     assert_eq!(meshed.made_by.unwrap().device, "2 devices: device 0, device 1");
     assert!(backend.devices().iter().all(|device| (device.finished, device.partitions) == (1, 1)));
 }
@@ -244,14 +244,14 @@ fn errors_are_those_of_one_device() {
     let none = SurfaceOptions { isovalue: Some(1e6), ..SurfaceOptions::default() };
     let error = refused(&job(&crowd, &SurfaceParams::new(&none).unwrap()));
     assert!(matches!(error, GpuError::Surface(SurfaceError::NoSurface { .. })), "{error}");
-    let whole = run(&mut engine(), &job(&crowd, &params(KERNELS[0], 0.8))).unwrap().meshed.mesh;
+    let whole = run(&mut engine(), &job(&crowd, &params(SURFACES[0], 0.8))).unwrap().meshed.mesh;
     let bytes = whole.bytes();
     // Limits above and below the size of a partition.
     for max_mesh_bytes in [bytes - 1, bytes / 10] {
         let limits = SurfaceLimits { max_mesh_bytes, ..SurfaceLimits::default() };
         let prepared =
-            molmesh::gpu::Prepared::new(&crowd, &params(KERNELS[0], 0.8), &limits, &Control::default()).unwrap();
-        let error = refused(&GpuJob { prepared: Arc::new(prepared), ..job(&crowd, &params(KERNELS[0], 0.8)) });
+            molmesh::gpu::Prepared::new(&crowd, &params(SURFACES[0], 0.8), &limits, &Control::default()).unwrap();
+        let error = refused(&GpuJob { prepared: Arc::new(prepared), ..job(&crowd, &params(SURFACES[0], 0.8)) });
         assert!(matches!(error, GpuError::Surface(SurfaceError::MeshTooLarge { .. })), "{error}");
     }
     assert!(two.status().iter().all(|device| device.failed == 0));
@@ -261,7 +261,7 @@ fn errors_are_those_of_one_device() {
 fn concurrent_callers_neither_deadlock_nor_mix_partitions() {
     let three = pool(3, |_| (), SETTINGS);
     let jobs: Vec<GpuJob> =
-        (1..=4).map(|i| job(&crowd(100 * i), &params(KERNELS[i % 3], 1.0 + 0.1 * i as f64))).collect();
+        (1..=4).map(|i| job(&crowd(100 * i), &params(SURFACES[i % 3], 1.0 + 0.1 * i as f64))).collect();
     let alone: Vec<Mesh> = jobs.iter().map(|job| run(&mut engine(), job).unwrap().meshed.mesh).collect();
     std::thread::scope(|scope| {
         for (job, mesh) in jobs.iter().zip(&alone) {
@@ -390,7 +390,7 @@ fn faulty_pool(fault: Fault, good_builds: usize) -> (DevicePool, Arc<Gate>) {
 
 #[test]
 fn a_job_is_retried_on_one_device_if_another_fails() {
-    let (crowd, params) = (crowd(300), params(KERNELS[0], 0.9));
+    let (crowd, params) = (crowd(300), params(SURFACES[0], 0.9));
     let job = job(&crowd, &quantized(&crowd, &params));
     for fault in [Fault::LostHalfWay, Fault::LostAtOnce, Fault::Panics] {
         let (pool, _gate) = faulty_pool(fault, usize::MAX);
@@ -404,7 +404,7 @@ fn a_job_is_retried_on_one_device_if_another_fails() {
 
 #[test]
 fn a_device_that_is_lost_permanently_leaves_jobs_to_the_other() {
-    let job = job(&crowd(300), &params(KERNELS[0], 0.9));
+    let job = job(&crowd(300), &params(SURFACES[0], 0.9));
     let (pool, _gate) = faulty_pool(Fault::LostHalfWay, 1);
     let ran = pool.run(&job).unwrap();
     assert_same(&ran, &job, 1, "lost for good");
@@ -417,7 +417,7 @@ fn a_device_that_is_lost_permanently_leaves_jobs_to_the_other() {
 #[test]
 fn cancellation_and_deadline_end_a_wait_for_other_partitions() {
     let started = Instant::now();
-    let fresh = || job(&crowd(300), &params(KERNELS[0], 0.9));
+    let fresh = || job(&crowd(300), &params(SURFACES[0], 0.9));
     let (pool, _gate) = faulty_pool(Fault::Idles, usize::MAX);
     let mut late = fresh();
     late.deadline = Some(started + Duration::from_millis(1500));

@@ -9,7 +9,7 @@ use std::sync::Mutex;
 
 use gpu_fakes::Step::{Block, Finish, Lose};
 use gpu_fakes::{FakeDevice, SETTINGS, pool, start, wait_for, wait_for_load};
-use gpu_support::{KERNELS, Random, engine_with, params, run, sample, spheres};
+use gpu_support::{Random, SURFACES, engine_with, params, run, sample, spheres};
 use molmesh::gpu::{DeviceLimits, Engine, Executor, GpuError, GpuJob, NextJob};
 use molmesh::surface::CancelToken;
 
@@ -21,7 +21,7 @@ fn once(job: &GpuJob) -> NextJob {
 
 /// Two jobs that are counted first, and one that is not.
 fn jobs() -> [GpuJob; 3] {
-    let params = params(KERNELS[0], 0.5);
+    let params = params(SURFACES[0], 0.5);
     let cloud = spheres(&Random(7).cloud(400, 20.0));
     [sample("1crn.cif"), cloud, spheres(&[[0.0, 0.0, 0.0, 1.7]])].map(|spheres| gpu_support::job(&spheres, &params))
 }

@@ -7,7 +7,7 @@ use crate::gpu_support;
 use std::collections::HashMap;
 
 use bytemuck::{Pod, pod_collect_to_vec};
-use gpu_support::{FIELD_BOUND, KERNELS, Random, engine_with, job, params, sample, spheres};
+use gpu_support::{FIELD_BOUND, Random, SURFACES, engine_with, job, params, sample, spheres};
 use molmesh::gpu::GpuJob;
 use molmesh::gpu::plan::Plan;
 use molmesh::gpu::plan::layout::{BrickRecord, Counters, GROUP, NONE};
@@ -17,10 +17,12 @@ use molmesh::surface::cpu::stage_results::{
 };
 use molmesh::surface::lattice::LatticeAtom;
 use molmesh::surface::quantize::{BEYOND, normal};
-use molmesh::surface::{Kernel, Spheres, Stage, Step, SurfaceLimits};
+use molmesh::surface::{Spheres, Stage, Step, SurfaceKind, SurfaceLimits};
 
 /// Maximum distance of vertices that are made from the same densities, Å.
 const POSITION_BOUND: f32 = 1e-4;
+/// Depth below a surface of spheres up to which distances are exact, spacings.
+const EXACT_DEPTH: f32 = 0.05;
 /// Maximum difference of normals, per component.
 const NORMAL_BOUND: f32 = 1e-3;
 
@@ -53,8 +55,8 @@ fn coords(plan: &Plan) -> Vec<Vec<i32>> {
 }
 
 impl Setup {
-    fn new(spheres: &Spheres, kernel: Kernel, resolution: f64) -> Self {
-        let params = params(kernel, resolution);
+    fn new(spheres: &Spheres, surface: SurfaceKind, resolution: f64) -> Self {
+        let params = params(surface, resolution);
         let job = job(spheres, &params);
         let cpu = run_stages(&job.prepared.lattice, &params, &SurfaceLimits::default()).unwrap();
         let rows = [cpu.mesh.n_vertices(), cpu.mesh.n_triangles()].map(u32_of);
@@ -87,7 +89,24 @@ impl Setup {
     }
 
     /// Candidate lists of the CPU in the layout of the device: entries, and (start, reaching, all, brick) per brick.
+    /// Lists of arcs follow those of atoms. Their order does not affect the stages.
     fn lists(&self) -> (Vec<u32>, Vec<[u32; 4]>) {
+        let (mut entries, mut heads) = self.atom_lists();
+        let plan = &self.job.prepared.plan;
+        if plan.n_sections() == 2 {
+            let arcs: HashMap<Vec<u8>, u32> =
+                plan.arcs.bounds.iter().map(raw_atom).zip(u32_of(plan.n_atoms())..).collect();
+            for (id, brick) in self.bricks.iter().enumerate() {
+                let start = u32_of(entries.len());
+                entries.extend(brick.iter().flat_map(|b| &b.arcs).map(|arc| arcs[&raw_atom(arc)]));
+                let n = u32_of(entries.len()) - start;
+                heads.push([start, n, n, u32_of(id)]);
+            }
+        }
+        (entries, heads)
+    }
+
+    fn atom_lists(&self) -> (Vec<u32>, Vec<[u32; 4]>) {
         let (mut entries, mut heads) = (Vec::new(), Vec::new());
         for (id, brick) in self.bricks.iter().enumerate() {
             let start = u32_of(entries.len());
@@ -96,6 +115,28 @@ impl Setup {
             heads.push([start, u32_of(reaching.len()), u32_of(reaching.len() + gap.len()), u32_of(id)]);
         }
         (entries, heads)
+    }
+
+    /// Parameters of the vertices on the crossing edges of each brick, three per grid point, from the positions of the
+    /// mesh of the CPU; not a number on all other edges.
+    fn crossings(&self) -> Vec<f32> {
+        let lattice = &self.job.prepared.lattice;
+        let mut all = vec![f32::NAN; 3 * 512 * self.surface.len()];
+        for (id, brick) in self.surface.iter().enumerate() {
+            let Some(brick) = brick else { continue };
+            let mut vertex = brick.first[0] as usize;
+            for (word, bits) in brick.crossing.iter().enumerate() {
+                let (z, axis) = (word / 3, word % 3);
+                for bit in (0..64).filter(|bit| bits >> bit & 1 == 1) {
+                    let point = [i32::from(bit as u8 & 7), i32::from(bit as u8 >> 3), i32::try_from(z).unwrap()][axis];
+                    let first = 8 * brick.coord[axis] + point - lattice.centre[axis];
+                    let at = f64::from(self.cpu.mesh.positions[vertex][axis]) / lattice.spacing - f64::from(first);
+                    all[3 * (512 * id + 64 * z + bit) + axis] = at as f32;
+                    vertex += 1;
+                }
+            }
+        }
+        all
     }
 
     fn fields(&self) -> Vec<f32> {
@@ -159,6 +200,11 @@ impl Setup {
     }
 }
 
+/// Bytes of an atom without its index in the input, which several arcs share.
+fn raw_atom(atom: &LatticeAtom) -> Vec<u8> {
+    raw(&[LatticeAtom { source: 0, ..*atom }])
+}
+
 fn raw<T: bytemuck::NoUninit>(values: &[T]) -> Vec<u8> {
     bytemuck::cast_slice(values).to_vec()
 }
@@ -186,28 +232,46 @@ fn differs_by(got: &[f32], expected: &[f32], bound: f32, min: f32) -> Option<Str
     Some(format!("value {at}: {}, expected {}", got[at], expected[at]))
 }
 
-/// Setups for every stage: a structure with each kernel, atoms across bricks and tiles, a dense crowd, one atom.
+/// Setups for every stage: a structure with each surface, atoms across bricks and tiles, a dense crowd, one atom.
 fn setups() -> Vec<(String, Setup)> {
-    let mut all: Vec<(String, Setup)> = KERNELS
+    let mut all: Vec<(String, Setup)> = SURFACES
         .iter()
-        .map(|&kernel| (format!("4pti {kernel}"), Setup::new(&sample("4pti.pdb"), kernel, 0.7)))
+        .map(|&surface| (format!("4pti {surface}"), Setup::new(&sample("4pti.pdb"), surface, 0.7)))
         .collect();
     let seams: Vec<[f64; 4]> = (0..60)
         .map(|i| f64::from(i) * 1.1)
         .map(|s| [s - 40.0, 0.4 * s - 31.9, 31.7 - 0.7 * s, 1.3 + 0.01 * s])
         .collect();
-    all.push(("seams".to_owned(), Setup::new(&spheres(&seams), Kernel::Gaussian, 0.5)));
+    all.push(("seams".to_owned(), Setup::new(&spheres(&seams), SurfaceKind::Gaussian, 0.5)));
     // Lists that take a second pass; within one tile, because the CPU assigns atoms to tiles without slack.
     let crowd: Vec<[f64; 4]> =
         Random(5).cloud(700, 6.0).iter().map(|[x, y, z, r]| [x + 8.0, y + 8.0, z + 8.0, *r]).collect();
-    all.push(("crowd".to_owned(), Setup::new(&spheres(&crowd), Kernel::Gaussian, 0.5)));
-    all.push(("one atom".to_owned(), Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5)));
+    all.push(("crowd".to_owned(), Setup::new(&spheres(&crowd), SurfaceKind::Gaussian, 0.5)));
+    // Coinciding and touching spheres, one within another, and a ring of probes.
+    let odd = [
+        [0.0, 0.0, 0.0, 1.5],
+        [0.0, 0.0, 0.0, 1.5],
+        [0.3, 0.0, 0.0, 0.5],
+        [3.0, 0.0, 0.0, 1.5],
+        [3.0, 3.0, 0.0, 1.5],
+        [0.0, 3.0, 0.0, 1.5],
+    ];
+    all.push(("ring".to_owned(), Setup::new(&spheres(&odd), SurfaceKind::Ses, 0.3)));
+    all.push(("one atom".to_owned(), Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), SurfaceKind::Gaussian, 0.5)));
     all
 }
 
-/// Candidate lists by brick, independent of their order in the buffer.
-fn by_brick(entries: &[u32], heads: &[[u32; 4]]) -> Vec<(u32, Vec<u32>)> {
-    let list = |h: &[u32; 4]| (h[1], entries[h[0] as usize..(h[0] + h[2]) as usize].to_vec());
+/// Candidate lists by brick, independent of their order in the buffer. Lists of arcs, numbered from `first_arc` on, are
+/// sorted.
+fn by_brick(entries: &[u32], heads: &[[u32; 4]], first_arc: usize) -> Vec<(u32, Vec<u32>)> {
+    let list = |h: &[u32; 4]| {
+        let mut list = entries[h[0] as usize..(h[0] + h[2]) as usize].to_vec();
+        let of_arcs = list.first().is_some_and(|first| *first as usize >= first_arc);
+        if of_arcs {
+            list.sort_unstable();
+        }
+        (if of_arcs { h[2] } else { h[1] }, list)
+    };
     heads.iter().map(list).collect()
 }
 
@@ -219,12 +283,19 @@ fn bin_finds_the_same_candidates_in_the_same_order() {
         let out = setup.run(Stage::Bin, &zero, &[BufferId::Lists, BufferId::Heads, BufferId::Counters]);
         let (entries, heads): (Vec<u32>, Vec<[u32; 4]>) = (cast(&out[0]), cast(&out[1]));
         let (expected, expected_heads) = setup.lists();
-        let (got, want) = (by_brick(&entries, &heads), by_brick(&expected, &expected_heads));
-        assert_eq!(unequal(&got, &want), None, "{name}");
-        assert!(heads.iter().zip(0..).all(|(h, id)| h[3] == id), "{name}");
-        assert_eq!(cast::<Counters>(&out[2])[0].list_end as usize, expected.len(), "{name}");
         let plan = &setup.job.prepared.plan;
-        assert_eq!(plan.candidates.iter().sum::<u64>(), expected.len() as u64, "{name}");
+        let [got, want] = [(&entries, &heads), (&expected, &expected_heads)]
+            .map(|(entries, heads)| by_brick(entries, heads, plan.n_atoms()));
+        assert_eq!(unequal(&got, &want), None, "{name}");
+        let ids = (0..u32_of(plan.bricks.len())).cycle();
+        assert!(heads.iter().zip(ids).all(|(h, id)| h[3] == id), "{name}");
+        assert_eq!(cast::<Counters>(&out[2])[0].list_end as usize, expected.len(), "{name}");
+        let counted = plan.candidates.iter().sum::<u64>();
+        // Arcs are also counted in bricks out of reach of the atoms.
+        assert!(
+            counted == expected.len() as u64 || plan.n_sections() == 2 && counted > expected.len() as u64,
+            "{name}"
+        );
         // Negative controls: a missing atom, and two atoms in another order.
         let mut wrong = got.clone();
         let longest = (0..wrong.len()).max_by_key(|&i| wrong[i].1.len()).unwrap();
@@ -240,7 +311,7 @@ fn bin_finds_the_same_candidates_in_the_same_order() {
 
 #[test]
 fn bin_counts_lists_that_do_not_fit_and_writes_nothing_beyond_the_capacity() {
-    let mut setup = Setup::new(&sample("1crn.cif"), Kernel::Gaussian, 0.7);
+    let mut setup = Setup::new(&sample("1crn.cif"), SurfaceKind::Gaussian, 0.7);
     let all = setup.lists().0.len();
     setup.stages.params.list_capacity = u32_of(all / 2);
     setup.stages.poison(BufferId::Lists);
@@ -261,7 +332,10 @@ fn field_is_within_its_bound_and_marks_inside_grid_points() {
             &[(BufferId::Lists, raw(&entries)), (BufferId::Heads, raw(&heads))],
             &[BufferId::Field, BufferId::Inside],
         );
-        let (got, expected) = (cast::<f32>(&out[0]), setup.fields());
+        // Of grid points deeper inside a surface of spheres, only the side of the surface is exact.
+        let most = if setup.job.prepared.params.surface.kernel().is_some() { f32::MAX } else { 1.0 + EXACT_DEPTH };
+        let [got, expected] = [cast::<f32>(&out[0]), setup.fields()]
+            .map(|values| values.iter().map(|value| value.min(most)).collect::<Vec<_>>());
         assert_eq!(differs_by(&got, &expected, FIELD_BOUND, 0.1), None, "{name}");
         let iso = setup.stages.params.isovalue;
         let bits = |half: &[f32]| (0..).zip(half).fold(0, |word, (i, f)| word | u32::from(*f >= iso) << i);
@@ -327,6 +401,38 @@ fn scan_numbers_bricks_in_order() {
 }
 
 #[test]
+fn refine_moves_vertices_to_the_same_points() {
+    for (name, setup) in setups() {
+        let (entries, heads) = setup.lists();
+        let inputs = [
+            (BufferId::Lists, raw(&entries)),
+            (BufferId::Heads, raw(&heads)),
+            (BufferId::Field, raw(&setup.fields())),
+            (BufferId::Inside, raw(&setup.inside())),
+        ];
+        setup.poison(&[BufferId::Crossings]);
+        let out = setup.run(Stage::Refine, &inputs, &[BufferId::Crossings]);
+        let (got, expected) = (cast::<f32>(&out[0]), setup.crossings());
+        let bound = POSITION_BOUND / setup.stages.params.spacing;
+        let error = |got: &[f32]| {
+            let wrong = |(a, b): (&f32, &f32)| {
+                if b.is_nan() { a.to_bits() != 0xa5a5_a5a5 } else { (a - b).abs() > bound || a.is_nan() }
+            };
+            let at = got.iter().zip(&expected).position(wrong)?;
+            Some(format!("edge {at}: {}, expected {}", got[at], expected[at]))
+        };
+        assert_eq!((got.len(), error(&got)), (expected.len(), None), "{name}");
+        // Negative controls: a vertex twice the bound away, and an edge without a vertex.
+        let [some, none] = [false, true].map(|nan| expected.iter().position(|t| t.is_nan() == nan).unwrap());
+        for (edge, value) in [(some, got[some] + 2.0 * bound), (none, 0.5)] {
+            let mut wrong = got.clone();
+            wrong[edge] = value;
+            assert!(error(&wrong).is_some(), "{name}");
+        }
+    }
+}
+
+#[test]
 fn interpolate_is_within_its_bounds() {
     for (name, setup) in setups() {
         setup.poison(&[BufferId::Positions, BufferId::Normals]);
@@ -359,6 +465,7 @@ fn interpolate_inputs(setup: &Setup) -> Vec<(BufferId, Vec<u8>)> {
         (BufferId::Lists, raw(&entries)),
         (BufferId::Heads, raw(&heads)),
         (BufferId::Field, raw(&setup.fields())),
+        (BufferId::Crossings, raw(&setup.crossings())),
         (BufferId::Records, raw(&setup.records())),
         (BufferId::Counts, raw(&setup.counts())),
         (BufferId::Offsets, raw(&setup.offsets())),
@@ -433,7 +540,7 @@ fn interpolate_quantizes_like_the_host() {
 
 #[test]
 fn interpolate_marks_coordinates_that_are_not_numbers() {
-    let mut setup = Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5);
+    let mut setup = Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), SurfaceKind::Gaussian, 0.5);
     let spacing = setup.stages.params.spacing;
     for (bad, marked) in [(f32::NAN, true), (f32::INFINITY, true), (spacing, false)] {
         setup.stages.params.spacing = bad;
@@ -450,7 +557,7 @@ fn interpolate_marks_coordinates_that_are_not_numbers() {
 /// has that direction.
 #[test]
 fn interpolate_shortens_the_same_normals_as_the_host() {
-    let mut setup = Setup::new(&spheres(&[[0.3, 0.1, 0.2, 1.7]]), Kernel::Gaussian, 0.5);
+    let mut setup = Setup::new(&spheres(&[[0.3, 0.1, 0.2, 1.7]]), SurfaceKind::Gaussian, 0.5);
     let [positions, _] = single(&mut setup);
     let (h, centre) = (f64::from(setup.stages.params.spacing), setup.stages.params.centre);
     let atom = setup.job.prepared.lattice.atoms[0];
@@ -514,7 +621,7 @@ fn emit_makes_the_same_triangles() {
 
 #[test]
 fn emit_counts_triangles_with_a_corner_twice() {
-    let setup = Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5);
+    let setup = Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), SurfaceKind::Gaussian, 0.5);
     // Without crossing edges before a word, several vertices have the same number.
     let mut records = setup.records();
     for record in &mut records {
@@ -619,7 +726,7 @@ fn block_difference(block: &Block, brick: &SurfaceResults) -> Option<String> {
 /// Inputs of `measure`.
 fn measure_inputs(setup: &Setup) -> Vec<(BufferId, Vec<u8>)> {
     vec![
-        (BufferId::Field, raw(&setup.fields())),
+        (BufferId::Crossings, raw(&setup.crossings())),
         (BufferId::Inside, raw(&setup.inside())),
         (BufferId::Records, raw(&setup.records())),
         (BufferId::Counts, raw(&setup.counts())),
@@ -637,8 +744,8 @@ fn many_sheets() -> Vec<(String, Setup)> {
         .map(|(z, a)| (9.0 * z, 9.0 * (1.0 - z * z).max(0.0).sqrt(), a))
         .map(|(z, r, a)| [r * a.cos(), r * a.sin(), z, 1.6])
         .collect();
-    let dust = |h| (format!("dust {h}"), Setup::new(&spheres(&dust), Kernel::SoftObject, h));
-    vec![dust(1.3), dust(2.1), ("shell".to_owned(), Setup::new(&spheres(&shell), Kernel::Gaussian, 1.1))]
+    let dust = |h| (format!("dust {h}"), Setup::new(&spheres(&dust), SurfaceKind::SoftObject, h));
+    vec![dust(1.3), dust(2.1), ("shell".to_owned(), Setup::new(&spheres(&shell), SurfaceKind::Gaussian, 1.1))]
 }
 
 #[test]
@@ -684,7 +791,7 @@ fn measure_finds_the_same_sheets_and_sums() {
 
 #[test]
 fn measure_sums_the_positions_that_interpolate_rounds() {
-    let mut setup = Setup::new(&sample("4pti.pdb"), Kernel::Gaussian, 0.7);
+    let mut setup = Setup::new(&sample("4pti.pdb"), SurfaceKind::Gaussian, 0.7);
     let [positions, _] = single(&mut setup);
     let inputs = measure_inputs(&setup);
     let triangles = setup.cpu.mesh.triangles.clone();
@@ -720,7 +827,7 @@ fn measure_sums_the_positions_that_interpolate_rounds() {
 
 #[test]
 fn measure_counts_blocks_that_do_not_fit_and_writes_nothing_beyond_the_capacity() {
-    let mut setup = Setup::new(&sample("1crn.cif"), Kernel::Gaussian, 0.7);
+    let mut setup = Setup::new(&sample("1crn.cif"), SurfaceKind::Gaussian, 0.7);
     let inputs = measure_inputs(&setup);
     let run = |setup: &Setup| {
         setup.poison(&[BufferId::Sheets]);

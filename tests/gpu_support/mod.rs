@@ -8,8 +8,8 @@ pub(crate) use crate::tools::shapes::Random;
 
 use molmesh::gpu::{DeviceLimits, Engine, Executor, Finished, GpuError, GpuJob, Prepared};
 use molmesh::surface::{
-    CancelToken, Control, Kernel, Measures, MeshOutput, Spheres, Step, SurfaceLimits, SurfaceOptions, SurfaceParams,
-    Validation,
+    CancelToken, Control, Measures, MeshOutput, Spheres, Step, SurfaceKind, SurfaceLimits, SurfaceOptions,
+    SurfaceParams, Validation,
 };
 
 /// Maximum relative difference of densities of two backends; of densities below 0.1, relative to 0.1.
@@ -20,7 +20,14 @@ pub(crate) const FIELD_BOUND: f32 = 1e-5;
 /// a tenth of that.
 pub(crate) const POSITION_BOUND: f32 = 0.5 * 2.0 * FIELD_BOUND / 0.04 + 6.0 * 3.8e-6;
 
-pub(crate) const KERNELS: [Kernel; 3] = [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare];
+pub(crate) const SURFACES: [SurfaceKind; 6] = [
+    SurfaceKind::Gaussian,
+    SurfaceKind::SoftObject,
+    SurfaceKind::InverseSquare,
+    SurfaceKind::Vdw,
+    SurfaceKind::Sas,
+    SurfaceKind::Ses,
+];
 
 /// Opens a Vulkan device with the limits of its adapter.
 pub(crate) fn device() -> (wgpu::Device, wgpu::Queue) {
@@ -87,9 +94,8 @@ pub(crate) fn spheres(rows: &[[f64; 4]]) -> Spheres {
     Spheres::new(column(0), column(1), column(2), radii).expect("usable spheres")
 }
 
-pub(crate) fn params(kernel: Kernel, resolution: f64) -> SurfaceParams {
-    let options =
-        SurfaceOptions { surface: Some(kernel.into()), resolution: Some(resolution), ..SurfaceOptions::default() };
+pub(crate) fn params(surface: SurfaceKind, resolution: f64) -> SurfaceParams {
+    let options = SurfaceOptions { surface: Some(surface), resolution: Some(resolution), ..SurfaceOptions::default() };
     SurfaceParams::new(&options).expect("valid")
 }
 

@@ -129,7 +129,7 @@ mod tests {
         assert_eq!([paper["field"], paper["classify"], paper["scan"]], [[64, 0], [256, 0], [256, 2048]]);
         let ours = shapes(stage_shaders()).unwrap();
         let names: Vec<&str> = stage_shaders().map(|(name, _)| name).collect();
-        assert_eq!(names, Stage::ALL[..7].iter().map(|stage| stage.name()).collect::<Vec<_>>());
+        assert_eq!(names, Stage::ALL[..8].iter().map(|stage| stage.name()).collect::<Vec<_>>());
         assert!(ours.values().all(|[threads, _]| *threads >= 64) && ours["field"][1] > 0, "{ours:?}");
         // With more than 12 KiB, an H100 (228 KiB, 1 KiB reserved per workgroup) runs fewer than 17 workgroups at once.
         assert!(ours["measure"][1] <= 12 << 10, "{ours:?}");

@@ -81,6 +81,22 @@ pub struct Params {
     pub base_vertex: u32,
     /// Factor of positions before rounding to integers, 1/Å; 0 for vertices in single precision.
     pub steps_per_angstrom: f32,
+    /// −dF/du is the slope times this.
+    pub slope_scale: f32,
+    /// Number of bricks of the job.
+    pub n_bricks: u32,
+    /// Surfaces of spheres: distance at the surface.
+    pub level: f32,
+    /// Surfaces of spheres: maximum distance of vertices from the surface.
+    pub tolerance: f32,
+    /// Number of sections of the atoms: 2 with the arcs of a boundary, else 1.
+    pub n_sections: u32,
+    /// Maximum reach of an arc.
+    pub arc_reach: f32,
+    /// Number of bricks before a brick, per axis, whose arcs may reach it.
+    pub arc_back: u32,
+    /// Number of bricks behind a brick, per axis, whose arcs may reach it.
+    pub arc_ahead: u32,
 }
 
 /// Tile: 8 × 8 × 8 bricks, and one bit for each, set if the brick exists.
@@ -148,6 +164,8 @@ impl Counters {
 
 /// Number of grid points of a brick.
 pub const BRICK_POINTS: u64 = lattice::BRICK_POINTS as u64;
+/// Bytes of the vertices' parameters on the edges of a brick: the largest buffer that grows with the bricks of a chunk.
+pub const CROSSING_BYTES: u64 = 3 * 4 * BRICK_POINTS;
 /// Number of bricks of a group; `classify` adds up the counts of each group for `scan`.
 pub const GROUP: u32 = 1024;
 

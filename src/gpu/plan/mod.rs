@@ -4,20 +4,23 @@
 //! Bricks are numbered by tile (z, y, x) and within a tile by `64·z + 8·y + x`. Atoms have the same order, so the atoms
 //! of a run of bricks are one range.
 
+pub mod arcs;
 pub mod chunk;
 pub mod layout;
 pub mod partition;
 
 use rayon::prelude::*;
 
+pub use self::arcs::Arcs;
 pub use self::chunk::{Chunk, ChunkLimits};
 use self::layout::{NONE, Params, Tile, halves};
 pub use self::partition::Partition;
+use crate::surface::cpu::distance;
 use crate::surface::cpu::field::Constants;
 use crate::surface::grid_limit;
-use crate::surface::kernel::Profile;
+use crate::surface::kernel::Shape;
 use crate::surface::lattice::{BRICK, Lattice, tile_order, to_f32, to_u32, to_u64};
-use crate::surface::occupancy::{BrickBits, Occupancy, TileOccupancy, count_ones};
+use crate::surface::occupancy::{AtomBrick, BrickBits, Occupancy, TileOccupancy, count_ones};
 use crate::surface::{Control, Step, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// Bricks of a job.
@@ -39,6 +42,8 @@ pub struct Plan {
     pub pairs: u64,
     /// Maximum of `reaches`.
     pub max_reach: f32,
+    /// Arcs of the boundary; empty unless the surface needs them.
+    pub arcs: Arcs,
 }
 
 impl Plan {
@@ -56,7 +61,8 @@ impl Plan {
         let rows = per_tile * occupied.len() + 2 * size_of::<u32>() * (n_bricks + 1);
         control.memory.grow((rows + size_of::<f32>() * occupancy.reaches.len()) as u64)?;
         let tiles: Vec<Tile> = occupied.par_iter().zip(&bases).map(|(own, &base)| tile(occupied, own, base)).collect();
-        let (bricks, first_atoms) = list_bricks(&occupancy, n_bricks);
+        let bricks = list_bricks(&occupancy, n_bricks);
+        let first_atoms = first_of_bricks(&tiles, &bricks, &occupancy.atom_bricks, 0);
         Ok(Self {
             tiles,
             bricks,
@@ -66,7 +72,20 @@ impl Plan {
             pairs: occupancy.n_pairs(),
             max_reach: occupancy.max_reach,
             reaches: occupancy.reaches,
+            arcs: Arcs::default(),
         })
+    }
+
+    /// Number of atoms.
+    #[must_use]
+    pub fn n_atoms(&self) -> usize {
+        self.reaches.len()
+    }
+
+    /// Number of sections of the atoms: 2 with the arcs of a boundary, else 1.
+    #[must_use]
+    pub fn n_sections(&self) -> u32 {
+        if self.arcs.first.is_empty() { 1 } else { 2 }
     }
 
     /// First brick of tile `t`, or the number of bricks if `t` is the number of tiles.
@@ -76,31 +95,58 @@ impl Plan {
 
     /// Parameters that all dispatches of the job have in common.
     #[must_use]
-    pub fn params(&self, lattice: &Lattice, profile: &Profile, params: &SurfaceParams) -> Params {
-        let field = Constants::new(profile, lattice.spacing);
-        // An atom lies at most half a spacing outside the grid points of its brick.
+    pub fn params(&self, lattice: &Lattice, params: &SurfaceParams) -> Params {
+        // An atom lies at most half a spacing before the grid points of its brick, an arc at most a spacing behind them.
         let bricks = |reach: f32| u32::try_from(to_u64(f64::from(reach) / f64::from(BRICK))).unwrap_or(u32::MAX);
+        let of_field = match &lattice.shape {
+            Shape::Density(profile) => density_params(&Constants::new(profile, lattice.spacing), params),
+            Shape::Sphere { .. } => distance_params(lattice, params),
+        };
         Params {
             centre: lattice.centre,
             spacing: to_f32(lattice.spacing),
-            isovalue: to_f32(params.isovalue),
-            support: field.support,
-            share: field.share,
-            rate: field.rate,
-            tail_share: field.tail_share,
-            tail_rate: field.tail_rate,
-            tail_end: field.tail_end,
-            amplitude: field.amplitude,
-            u_min: field.u_min,
-            slope_offset: field.slope_offset,
-            slope_tail: field.slope_tail,
             reach: self.max_reach,
-            back: bricks(self.max_reach + 7.51),
+            back: bricks(self.max_reach + 8.01),
             ahead: bricks(self.max_reach + 8.51),
+            arc_reach: self.arcs.max_reach,
+            arc_back: bricks(self.arcs.max_reach + 8.01),
+            arc_ahead: bricks(self.arcs.max_reach + 8.51),
+            n_sections: self.n_sections(),
             n_tiles: to_u32(self.tiles.len()),
+            n_bricks: to_u32(self.bricks.len()),
             steps_per_angstrom: params.quantize.map_or(0.0, Step::per_angstrom),
-            ..bytemuck::Zeroable::zeroed()
+            ..of_field
         }
+    }
+}
+
+/// Parameters of an isosurface; all others are 0.
+fn density_params(field: &Constants, params: &SurfaceParams) -> Params {
+    Params {
+        isovalue: to_f32(params.isovalue),
+        support: field.support,
+        share: field.share,
+        rate: field.rate,
+        tail_share: field.tail_share,
+        tail_rate: field.tail_rate,
+        tail_end: field.tail_end,
+        amplitude: field.amplitude,
+        u_min: field.u_min,
+        slope_offset: field.slope_offset,
+        slope_tail: field.slope_tail,
+        slope_scale: field.slope_scale,
+        ..bytemuck::Zeroable::zeroed()
+    }
+}
+
+/// Parameters of a surface of spheres; all others are 0.
+fn distance_params(lattice: &Lattice, params: &SurfaceParams) -> Params {
+    Params {
+        isovalue: distance::SURFACE,
+        support: 1.0,
+        level: to_f32(distance::level(lattice, params)),
+        tolerance: distance::tolerance(lattice),
+        ..bytemuck::Zeroable::zeroed()
     }
 }
 
@@ -142,23 +188,29 @@ fn tile(tiles: &[TileOccupancy], own: &TileOccupancy, base: u32) -> Tile {
     tile
 }
 
-/// Columns [`Plan::bricks`] and [`Plan::first_atoms`].
-fn list_bricks(occupancy: &Occupancy, n_bricks: usize) -> (Vec<u32>, Vec<u32>) {
-    let (mut bricks, mut first_atoms) = (Vec::with_capacity(n_bricks), Vec::with_capacity(n_bricks + 1));
-    let mut atom_bricks = occupancy.atom_bricks.iter().peekable();
-    let mut at = 0;
+/// Column [`Plan::bricks`].
+fn list_bricks(occupancy: &Occupancy, n_bricks: usize) -> Vec<u32> {
+    let mut bricks = Vec::with_capacity(n_bricks);
     for (t, own) in (0..).zip(&occupancy.tiles) {
-        for local in set_bits(&own.occupied) {
-            bricks.push(t << 9 | local);
-            first_atoms.push(at);
-            // The brick that holds an atom is always occupied, so this loop passes every atom.
-            while let Some(brick) = atom_bricks.next_if(|brick| brick.local == local && brick.tile == own.tile) {
-                at += brick.n_atoms;
-            }
+        bricks.extend(set_bits(&own.occupied).map(|local| t << 9 | local));
+    }
+    bricks
+}
+
+/// First atom of each brick, counted from `at`, and the end of the last one. A brick of `atom_bricks` that does not
+/// exist ends the list of atoms; bricks that hold an atom are always occupied.
+fn first_of_bricks(tiles: &[Tile], bricks: &[u32], atom_bricks: &[AtomBrick], mut at: u32) -> Vec<u32> {
+    let mut first = Vec::with_capacity(bricks.len() + 1);
+    let mut atom_bricks = atom_bricks.iter().peekable();
+    for brick in bricks {
+        first.push(at);
+        let (tile, local) = (tiles[(brick >> 9) as usize].coord, brick & 511);
+        while let Some(brick) = atom_bricks.next_if(|brick| brick.local == local && brick.tile == tile) {
+            at += brick.n_atoms;
         }
     }
-    first_atoms.push(at);
-    (bricks, first_atoms)
+    first.push(at);
+    first
 }
 
 /// Positions of the set bits, ascending.

@@ -117,9 +117,8 @@ mod tests {
     use std::collections::{BTreeSet, HashMap};
 
     use super::*;
-    use crate::surface::kernel::Profile;
     use crate::surface::lattice::{BRICK, Lattice};
-    use crate::surface::{Control, Kernel, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams};
+    use crate::surface::{Control, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams};
 
     fn plan(resolution: f64) -> (Lattice, Plan) {
         let at = |i: u32, k: f64| 70.0 * (f64::from(i) * k).sin();
@@ -204,7 +203,7 @@ mod tests {
         for resolution in [1.0, 0.4, 0.1] {
             let (lattice, plan) = plan(resolution);
             let params = SurfaceParams::default();
-            let params = plan.params(&lattice, &Profile::new(Kernel::Gaussian, &params), &params);
+            let params = plan.params(&lattice, &params);
             let (back, ahead) = (params.back.cast_signed(), params.ahead.cast_signed());
             let parts = plan.partitions(5);
             let coords = coords(&plan);

@@ -1,5 +1,5 @@
 //! Van der Waals, solvent-accessible and solvent-excluded surfaces: level sets of the distance to the boundary of a
-//! union of spheres, in the stages `field`, `classify` and `interpolate`.
+//! union of spheres, in the stages `field`, `refine` and `interpolate`.
 //!
 //! Every distance depends on the point and the boundary alone: spheres and arcs out of reach do not affect its bits. As
 //! for densities, the signs at the grid points determine the topology. Vertices are then moved along their edges to the
@@ -9,25 +9,50 @@ use std::ops::Range;
 
 use super::RunContext;
 use super::bin::{Bricks, NORMAL_ONLY, Tiles};
-use super::classify::ClassifiedBricks;
-use super::edge::Edge;
 use super::field::{BrickField, GridPointRange};
+use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::{EDGE_MARGIN, Lattice, LatticeAtom, to_f32};
-use crate::surface::params::SurfaceKind;
-use crate::surface::simd::LANES;
-use crate::surface::sphere_union::{BrickUnion, Feature, Lanes, Nearest, SphereUnion};
+use crate::surface::lattice::{Lattice, LatticeAtom, to_f32};
+use crate::surface::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
+use crate::surface::sphere_union::{BrickUnion, Feature, Lanes, SphereUnion};
 
 /// Value at a grid point on the surface. Grid points more than a spacing outside are 0, those more than a spacing
 /// inside 2.
-pub(super) const SURFACE: f32 = 1.0;
+pub(crate) const SURFACE: f32 = 1.0;
 
 /// Maximum distance of vertices from the surface, Å.
 const TOLERANCE: f64 = 1e-4;
 /// Minimum of [`TOLERANCE`] in spacings: coordinates within a brick are rounded.
 const ROUNDING: f32 = 4e-6;
-/// Maximum number of steps of a root search. Every fourth one halves the bracket.
-const MAX_STEPS: usize = 64;
+
+/// Returns the distance at the surface, spacings.
+pub(crate) fn level(lattice: &Lattice, params: &SurfaceParams) -> f64 {
+    if params.surface == SurfaceKind::Ses { params.probe / lattice.spacing } else { 0.0 }
+}
+
+/// Returns the maximum distance of vertices from the surface, spacings.
+pub(crate) fn tolerance(lattice: &Lattice) -> f32 {
+    to_f32(TOLERANCE / lattice.spacing).max(ROUNDING)
+}
+
+/// Finds the boundary of the spheres of `lattice` and a bounding sphere of each of its arcs. Returns `None` for surfaces
+/// at which the distance to the nearest sphere is exact, and for isosurfaces.
+///
+/// # Errors
+/// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+pub(crate) fn boundary(
+    lattice: &Lattice,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<Option<(SphereUnion, Vec<LatticeAtom>)>, SurfaceError> {
+    let level = level(lattice, params);
+    if level == 0.0 {
+        return Ok(None);
+    }
+    // Distances are exact up to a spacing inside the surface.
+    SphereUnion::new(&lattice.atoms, lattice.spacing, level + 1.0, limits, control).map(Some)
+}
 
 /// Distance to the boundary of a union of spheres.
 pub(super) struct DistanceField {
@@ -35,10 +60,10 @@ pub(super) struct DistanceField {
     /// outside and on the boundary.
     boundary: Option<Boundary>,
     /// Distance at the surface, spacings.
-    level: f32,
-    tolerance: f32,
+    pub(super) level: f32,
+    pub(super) tolerance: f32,
     /// True if the nearest sphere of each vertex is requested.
-    atom_ids: bool,
+    pub(super) atom_ids: bool,
 }
 
 /// Boundary whose arcs are assigned to tiles by their bounding spheres.
@@ -56,17 +81,17 @@ impl DistanceField {
     /// memory is allocated beyond the limits, [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub(super) fn new(lattice: &Lattice, context: RunContext<'_>) -> Result<Self, SurfaceError> {
         let RunContext { params, limits, control, .. } = context;
-        let tolerance = to_f32(TOLERANCE / lattice.spacing).max(ROUNDING);
-        let atom_ids = params.atom_ids;
-        if params.surface != SurfaceKind::Ses || params.probe == 0.0 {
-            return Ok(Self { boundary: None, level: 0.0, tolerance, atom_ids });
-        }
-        let level = params.probe / lattice.spacing;
-        // Distances are exact up to a spacing inside the surface.
-        let (union, bounds) = SphereUnion::new(&lattice.atoms, lattice.spacing, level + 1.0, limits, control)?;
-        let bounds = Lattice { atoms: bounds.into(), ..lattice.clone() };
-        let tiles = Tiles::new(&bounds, limits, control)?;
-        Ok(Self { boundary: Some(Boundary { union, bounds, tiles }), level: to_f32(level), tolerance, atom_ids })
+        let found = boundary(lattice, params, limits, control)?.map(|(union, bounds)| {
+            let bounds = Lattice { atoms: bounds.into(), ..lattice.clone() };
+            let tiles = Tiles::new(&bounds, limits, control)?;
+            Ok::<_, SurfaceError>(Boundary { union, bounds, tiles })
+        });
+        Ok(Self {
+            boundary: found.transpose()?,
+            level: to_f32(level(lattice, params)),
+            tolerance: tolerance(lattice),
+            atom_ids: params.atom_ids,
+        })
     }
 
     /// Returns the number of ordered pairs of overlapping spheres; 0 if the surface needs no boundary of their union.
@@ -114,7 +139,7 @@ impl DistanceField {
         spheres.load(origin, candidates, arcs);
     }
 
-    fn union(&self) -> Option<&SphereUnion> {
+    pub(super) fn union(&self) -> Option<&SphereUnion> {
         self.boundary.as_ref().map(|boundary| &boundary.union)
     }
 
@@ -130,41 +155,6 @@ impl DistanceField {
                 let value = (SURFACE + (distance - self.level)).clamp(0.0, 2.0 * SURFACE);
                 // Outside all spheres, the distance itself is not needed.
                 out[(z * 8 + y) * 8 + x] = if distance > 0.0 { value } else { 0.0 };
-            }
-        }
-    }
-
-    /// Moves the vertices of a brick, starting with the `first`, along their edges to the surface. Adds the nearest
-    /// feature of each, and the nearest sphere if atom ids are requested.
-    pub(super) fn refine(
-        &self,
-        spheres: &mut BrickUnion,
-        fields: &[&BrickField; 8],
-        first: usize,
-        found: &mut ClassifiedBricks,
-    ) {
-        let ClassifiedBricks { t, edges, features, spheres: nearest, .. } = found;
-        let (edges, t) = (&edges[first..], &mut t[first..]);
-        features.resize(first + t.len(), Feature::default());
-        if self.atom_ids {
-            nearest.resize(first + t.len(), 0);
-        }
-        // For vertices that are close together, few spheres and arcs can be the nearest ones.
-        for order in by_cube(edges).chunks(LANES) {
-            let mut search = RootSearch::new(order, edges, t, fields);
-            for step in 0..MAX_STEPS {
-                let points = search.points();
-                let at = spheres.nearest(self.union(), self.level, &points);
-                if search.advance(self, spheres, &points, &at, step) {
-                    break;
-                }
-            }
-            for (lane, i) in order.iter().enumerate() {
-                t[*i] = search.t[lane].clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
-                features[first + i] = search.features[lane];
-                if let Some(sphere) = nearest.get_mut(first + i) {
-                    *sphere = search.spheres[lane];
-                }
             }
         }
     }
@@ -200,99 +190,4 @@ impl DistanceField {
 fn blocks(range: GridPointRange) -> impl Iterator<Item = (usize, usize, usize)> {
     let layers = (0..range.z_layers).step_by(2);
     layers.flat_map(move |z| (0..range.y_pairs).flat_map(move |pair| [0, 4].map(move |x| (z, 2 * pair, x))))
-}
-
-/// Returns the indices of edges, sorted by cubes of 4 × 4 × 4 grid points, then of 2 × 2 × 2.
-fn by_cube(edges: &[Edge]) -> Vec<usize> {
-    let cube = |edge: &Edge| {
-        let bit = |b: u16| (edge.x() >> b & 1) | (edge.y() >> b & 1) << 1 | (edge.z() >> b & 1) << 2;
-        usize::from(bit(2) << 3 | bit(1))
-    };
-    let mut starts = [0; 65];
-    for edge in edges {
-        starts[cube(edge) + 1] += 1;
-    }
-    for i in 0..64 {
-        starts[i + 1] += starts[i];
-    }
-    let mut order = vec![0; edges.len()];
-    for (i, edge) in edges.iter().enumerate() {
-        let at = &mut starts[cube(edge)];
-        order[*at] = i;
-        *at += 1;
-    }
-    order
-}
-
-/// Search for the surface on a vector of edges: Newton's method within a bracket, with bisection if it is slow.
-struct RootSearch {
-    /// First point of each edge.
-    base: Lanes,
-    axis: [usize; LANES],
-    /// True if the first point is inside.
-    from_inside: [bool; LANES],
-    /// Ends of the bracket: parameters of one point on each side of the surface.
-    ends: [[f32; LANES]; 2],
-    /// Current parameters.
-    t: [f32; LANES],
-    features: [Feature; LANES],
-    spheres: [u32; LANES],
-    done: [bool; LANES],
-}
-
-impl RootSearch {
-    /// Starts the search on the edges `of`. Unused lanes repeat the last edge.
-    fn new(of: &[usize], edges: &[Edge], t: &[f32], fields: &[&BrickField; 8]) -> Self {
-        let index = |lane: usize| of[lane.min(of.len() - 1)];
-        let edge = |lane: usize| edges[index(lane)];
-        let coordinate = |k: usize, edge: Edge| f32::from([edge.x(), edge.y(), edge.z()][k]);
-        Self {
-            base: std::array::from_fn(|k| std::array::from_fn(|lane| coordinate(k, edge(lane)))),
-            axis: std::array::from_fn(|lane| usize::from(edge(lane).axis())),
-            from_inside: std::array::from_fn(|lane| fields[0][edge(lane).grid_point()] >= SURFACE),
-            ends: [[0.0; LANES], [1.0; LANES]],
-            t: std::array::from_fn(|lane| t[index(lane)]),
-            features: [Feature::default(); LANES],
-            spheres: [0; LANES],
-            done: [false; LANES],
-        }
-    }
-
-    fn points(&self) -> Lanes {
-        let along = |k: usize, lane: usize| if self.axis[lane] == k { self.t[lane] } else { 0.0 };
-        std::array::from_fn(|k| std::array::from_fn(|lane| self.base[k][lane] + along(k, lane)))
-    }
-
-    /// Stores the nearest features of `points`, the points at the current parameters, and chooses the next parameters.
-    /// Returns true if all vertices lie on the surface.
-    fn advance(
-        &mut self,
-        field: &DistanceField,
-        spheres: &BrickUnion,
-        points: &Lanes,
-        found: &Nearest,
-        step: usize,
-    ) -> bool {
-        for lane in 0..LANES {
-            if self.done[lane] {
-                continue;
-            }
-            (self.features[lane], self.spheres[lane]) = (spheres.feature(found, lane), spheres.sphere(found, lane));
-            let (t, value) = (self.t[lane], found.distance[lane] - field.level);
-            // Replaces the end that is on the same side of the surface.
-            let end = usize::from((value >= 0.0) != self.from_inside[lane]);
-            self.ends[end][lane] = t;
-            let [from, to] = [self.ends[0][lane], self.ends[1][lane]];
-            if value.abs() <= field.tolerance || to - from <= field.tolerance {
-                self.done[lane] = true;
-                continue;
-            }
-            let normal = spheres.outward(found, points, lane);
-            let length = (normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]).sqrt();
-            let next = t + value * length / normal[self.axis[lane]];
-            let bisect = step % 4 == 3 || !(from < next && next < to);
-            self.t[lane] = if bisect { 0.5 * (from + to) } else { next };
-        }
-        self.done == [true; LANES]
-    }
 }

@@ -40,6 +40,8 @@ pub(crate) struct Constants {
     /// as it does not affect a direction, so numbers stay near 1.
     pub(crate) slope_offset: f32,
     pub(crate) slope_tail: f32,
+    /// −dF/du is the slope times this.
+    pub(crate) slope_scale: f32,
     /// Radius of an atom as a fraction of its ρ.
     pub(crate) radius_per_length: f32,
 }
@@ -65,6 +67,11 @@ impl Constants {
             u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
             slope_offset: to_f32(rate),
             slope_tail: to_f32(profile.tolerance),
+            slope_scale: to_f32(match profile.kernel {
+                Kernel::Gaussian => factor * profile.decay,
+                Kernel::SoftObject => factor * 2.0 / 9.0,
+                Kernel::InverseSquare => factor,
+            }),
             radius_per_length: to_f32(profile.radius_per_length()),
         }
     }

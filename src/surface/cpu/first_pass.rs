@@ -268,7 +268,7 @@ impl TileScratch {
                     pass.context.control.check()?;
                     let origin = slot_origin(tile, slot);
                     distance.load(spheres, &pass.lattice.atoms, bricks.of(slot), arcs.of(slot), origin);
-                    distance.refine(spheres, &around.fields, first, found);
+                    pass.context.control.span(Stage::Refine, || distance.refine(spheres, &around.fields, first, found));
                 }
             }
         }

@@ -11,7 +11,7 @@
 mod bin;
 mod brick_atoms;
 mod classify;
-mod distance;
+pub(crate) mod distance;
 mod edge;
 mod emit;
 pub(crate) mod field;
@@ -19,6 +19,7 @@ mod first_pass;
 mod interpolate;
 mod measure;
 mod neighbours;
+mod refine;
 pub(crate) mod scan;
 mod sheets;
 mod slabs;

@@ -3,17 +3,18 @@
 
 use super::bin::{Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, SurfaceBrick};
-use super::field::{self, BrickField, Constants, GridPointRange};
+use super::distance;
+use super::field::{self, BrickField, GridPointRange};
 use super::write::{self, Destination};
-use super::{RunContext, Tile};
+use super::{Field, RunContext, Tile};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::join::Sheet;
-use crate::surface::kernel::Profile;
-use crate::surface::lattice::{BRICK, BRICK_POINTS, Lattice, to_f32};
+use crate::surface::lattice::{BRICK, BRICK_POINTS, Lattice, LatticeAtom, to_f32};
 use crate::surface::mesh::Mesh;
 use crate::surface::params::{SurfaceLimits, SurfaceParams};
 use crate::surface::sink::{MeshPart, MeshSink, SinkFailed};
+use crate::surface::sphere_union::BrickUnion;
 use crate::surface::sums::edge_shares;
 
 /// A brick with candidates.
@@ -25,7 +26,9 @@ pub struct BrickResults {
     pub reaching: Vec<u32>,
     /// Atoms that reach only the gap up to its neighbours' first grid points, ascending.
     pub gap_only: Vec<u32>,
-    /// Densities, x fastest.
+    /// Bounding spheres of the arcs in reach.
+    pub arcs: Vec<LatticeAtom>,
+    /// Densities or distances to the surface, x fastest.
     pub field: BrickField,
     /// Grid points inside: word z, bit `8·y + x`.
     pub inside: [u64; 8],
@@ -113,29 +116,46 @@ pub fn run_stages(
 ) -> Result<StageResults, SurfaceError> {
     let control = Control::default();
     let tiles = Tiles::new(lattice, limits, &control)?;
-    let constants = Constants::new(&Profile::new(params.kernel_for("gpu")?, params), lattice.spacing);
-    let iso = to_f32(params.isovalue);
+    let context = RunContext { params, limits, control: &control, free_threads: 1 };
+    let field = Field::new(lattice, context)?;
+    let iso = match field {
+        Field::Density(_) => to_f32(params.isovalue),
+        Field::Distance(_) => distance::SURFACE,
+    };
+    let bounds = field.bounds().map_or(&[][..], |bounds| &bounds.atoms[..]);
+    let (mut arcs, mut union) = (Bricks::default(), BrickUnion::default());
     let mut bricks = Vec::new();
     for t in 0..tiles.len() {
         let mut tile = Bricks::default();
         tile.fill(lattice, tiles.coords[t], &(0..SIDE - 1), tiles.atoms(t), |_| Ok(()))?;
+        if let Field::Distance(distance) = &field {
+            distance.fill_arcs(&mut arcs, tiles.coords[t], &(0..SIDE - 1), |_| Ok(()))?;
+        }
         for slot in (0..SLOTS).filter(|&slot| slot_brick(slot).iter().all(|&b| b < 8) && !tile.of(slot).is_empty()) {
             let origin = slot_origin(tiles.coords[t], slot);
-            let mut field = [0.0; BRICK_POINTS];
+            let mut values = [0.0; BRICK_POINTS];
             let whole = GridPointRange { y_pairs: 4, z_layers: 8 };
-            field::evaluate(&constants, &lattice.atoms, tile.of(slot), origin, whole, &mut field);
+            match &field {
+                Field::Density(constants) => {
+                    field::evaluate(constants, &lattice.atoms, tile.of(slot), origin, whole, &mut values);
+                }
+                Field::Distance(distance) => {
+                    distance.load(&mut union, &lattice.atoms, tile.of(slot), arcs.of(slot), origin);
+                    distance.evaluate(&mut union, whole, &mut values);
+                }
+            }
             let (gap_only, reaching) = tile.of(slot).iter().partition::<Vec<u32>, _>(|&c| c & NORMAL_ONLY != 0);
             bricks.push(BrickResults {
                 coord: origin.map(|c| c.div_euclid(BRICK)),
                 reaching,
                 gap_only: gap_only.iter().map(|c| c & !NORMAL_ONLY).collect(),
-                inside: classify::inside_bits(&field, iso),
-                field,
+                arcs: arcs.of(slot).iter().map(|i| bounds[(i & !NORMAL_ONLY) as usize]).collect(),
+                inside: classify::inside_bits(&values, iso),
+                field: values,
             });
         }
     }
-    let scanned =
-        super::scan_lattice(lattice.clone(), RunContext { params, limits, control: &control, free_threads: 1 })?;
+    let scanned = super::scan_lattice(lattice.clone(), context)?;
     let mesh = write::write(&scanned, params.atom_ids, &control, None)?.mesh;
     let mut surface: Vec<SurfaceResults> = scanned.done.iter().flat_map(surface_of).collect();
     let written = write::write_pieces(&scanned, &control, &Destination::Sink(&Discard))?;

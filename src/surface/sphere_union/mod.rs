@@ -40,7 +40,7 @@ use super::params::SurfaceLimits;
 
 /// Exposed part of the circle of two spheres.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Arc {
+pub(crate) struct Arc {
     /// Centre of the circle, relative to the cell of the arc's bounding sphere.
     centre: [f32; 3],
     /// Unit vector along the axis of the circle.
@@ -52,6 +52,16 @@ pub(super) struct Arc {
     radius: f32,
     /// Cosine and sine of the half-angle.
     half: [f32; 2],
+}
+
+#[cfg(feature = "gpu")]
+impl Arc {
+    /// Returns the arc in the layout of the shaders: centre and radius, axis and cosine, middle and sine, side.
+    pub(crate) fn rows(&self) -> [[f32; 4]; 4] {
+        let row = |[x, y, z]: [f32; 3], w| [x, y, z, w];
+        let [cos, sin] = self.half;
+        [row(self.centre, self.radius), row(self.axis, cos), row(self.middle, sin), row(self.side, 0.0)]
+    }
 }
 
 /// Cells whose boundary is found by one task. Few lists are freed quickly.
@@ -67,13 +77,13 @@ type CapGroup = [[f32; GROUP]; 4];
 
 /// Boundary of a union of spheres.
 #[derive(Debug, Default)]
-pub(super) struct SphereUnion {
+pub(crate) struct SphereUnion {
     /// First group of caps of each sphere, and the one after its last; `None` if no part of the sphere is exposed.
     faces: Vec<Option<[u32; 2]>>,
     caps: Vec<CapGroup>,
     arcs: Vec<Arc>,
     /// Number of ordered pairs of overlapping spheres, including the pairs that stand for comparisons of caps.
-    pub(super) n_overlaps: u64,
+    pub(crate) n_overlaps: u64,
 }
 
 /// Boundary of the spheres of some cells.
@@ -107,7 +117,7 @@ impl SphereUnion {
     /// # Errors
     /// [`SurfaceError::TooManyOverlaps`] if more pairs of spheres overlap than candidate pairs are allowed;
     /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
-    pub(super) fn new(
+    pub(crate) fn new(
         atoms: &[LatticeAtom],
         spacing: f64,
         reach: f64,
@@ -165,8 +175,17 @@ impl SphereUnion {
     }
 
     /// Returns arc `i`.
-    pub(super) fn arc(&self, i: u32) -> &Arc {
+    pub(crate) fn arc(&self, i: u32) -> &Arc {
         &self.arcs[i as usize]
+    }
+
+    /// Returns the caps of sphere `i`, each as axis and height; `None` if no part of the sphere is exposed.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn caps(&self, i: usize) -> Option<impl Iterator<Item = [f32; 4]>> {
+        let [first, end] = self.faces[i]?;
+        let of_group = |group: &CapGroup| -> [[f32; 4]; GROUP] { std::array::from_fn(|k| group.map(|row| row[k])) };
+        let caps = self.caps[first as usize..end as usize].iter().flat_map(of_group);
+        Some(caps.filter(|[.., height]| *height < f32::INFINITY))
     }
 
     /// Returns true if the point of sphere `i` in the direction `n`, a unit vector, lies in no other sphere.
@@ -245,7 +264,8 @@ impl Sphere<'_> {
         let (shift, bound) = if cos > 0.0 { (circle.radius * cos, circle.radius * sin) } else { (0.0, circle.radius) };
         let centre: [f64; 3] = std::array::from_fn(|k| circle.centre[k] + f64::from(self.atom.frac[k]));
         let of_bound: [f64; 3] = std::array::from_fn(|k| centre[k] + shift * middle[k]);
-        let cell = of_bound.map(|c| to_i32(c.round()));
+        // The brick of this grid point contains the centre, which lies within the sphere: devices have this brick.
+        let cell = of_bound.map(|c| to_i32(c.floor()));
         part.bounds.push(LatticeAtom {
             cell: std::array::from_fn(|k| self.atom.cell[k] + cell[k]),
             inv_length2: to_f32((bound + reach).powi(-2)),
