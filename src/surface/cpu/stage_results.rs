@@ -139,7 +139,7 @@ pub fn run_stages(
     let mesh = write::write(&scanned, params.atom_ids, &control, None)?.mesh;
     let mut surface: Vec<SurfaceResults> = scanned.done.iter().flat_map(surface_of).collect();
     let written = write::write_pieces(&scanned, &control, &Destination::Sink(&Discard))?;
-    let runs = written.iter().flat_map(|piece| (0..piece.sums.bricks.len()).map(|ix| (&piece.sums, ix)));
+    let runs = written.sums.iter().flat_map(|sums| (0..sums.bricks.len()).map(move |ix| (sums, ix)));
     for (result, (sums, ix)) in surface.iter_mut().zip(runs) {
         let brick = &sums.bricks[ix];
         let sheets = &sums.sheets[brick.first as usize..][..usize::from(brick.n)];
