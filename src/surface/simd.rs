@@ -97,12 +97,15 @@ dispatched! {
     }
 }
 
-/// Names the arithmetic that determines the last bits of results on this processor: fused or not, and the system and
-/// architecture, whose mathematical functions differ. The width of vectors does not matter.
+/// Number of the method: increased by every change of the code that changes the bytes of meshes.
+const METHOD: u32 = 2;
+
+/// Names the arithmetic that determines the last bits of results on this processor: the method, the system and
+/// architecture, whose mathematical functions differ, and fused or not. The width of vectors does not matter.
 #[must_use]
 pub fn arithmetic() -> String {
     let fused = if is_fused() { "fma" } else { "no-fma" };
-    format!("{} {} {fused}", std::env::consts::OS, std::env::consts::ARCH)
+    format!("method {METHOD} {} {} {fused}", std::env::consts::OS, std::env::consts::ARCH)
 }
 
 /// The vector extension that the dispatched functions use here, for display.

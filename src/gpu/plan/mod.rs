@@ -134,7 +134,7 @@ fn density_params(field: &Constants, params: &SurfaceParams) -> Params {
         u_min: field.u_min,
         slope_offset: field.slope_offset,
         slope_tail: field.slope_tail,
-        slope_scale: field.slope_scale,
+        slope_scale: field.slope_amplitude,
         ..bytemuck::Zeroable::zeroed()
     }
 }

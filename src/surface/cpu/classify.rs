@@ -354,7 +354,7 @@ fn edge_parameters(crossing: &[u64; 24], n: u16, fields: &[&BrickField; 8], iso:
             let own = Edge::new(z, bit, axis);
             let [f0, f1] = at_ends(own, fields);
             if let Some(((above, drop), edge)) = ends.next() {
-                (*above, *drop, *edge) = (f0 - iso, f0 - f1, own);
+                (*above, *drop, *edge) = (f0 - iso, f0 - f1, own.starting_inside(f0 >= iso));
             }
         }
     }

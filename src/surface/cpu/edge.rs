@@ -7,9 +7,11 @@ const SIDE: usize = N as usize;
 /// a power of two so that a mask bounds an index.
 pub(super) const EDGES: usize = (3 * SIDE * SIDE * SIDE).next_power_of_two();
 
-/// Edge of a brick: `z << 8 | (8·y + x) << 2 | axis` of its first grid point.
+/// Edge of a brick: `z << 8 | (8·y + x) << 2 | axis` of its first grid point, and bit 11 if that point is inside.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Edge(u16);
+
+const STARTS_INSIDE: u16 = 1 << 11;
 
 impl Edge {
     /// The edge along `axis` from the grid point at `bit` of layer z.
@@ -17,6 +19,18 @@ impl Edge {
     pub(super) fn new(z: usize, bit: usize, axis: usize) -> Self {
         // Eleven bits.
         Self(u16::try_from((z & 7) << 8 | (bit & 63) << 2 | axis & 3).unwrap_or_default())
+    }
+
+    /// The same edge, with the side of its first grid point.
+    #[inline(always)]
+    pub(super) fn starting_inside(self, inside: bool) -> Self {
+        Self(self.0 & !STARTS_INSIDE | if inside { STARTS_INSIDE } else { 0 })
+    }
+
+    /// Returns true if the first grid point is inside.
+    #[inline(always)]
+    pub(super) fn starts_inside(self) -> bool {
+        self.0 & STARTS_INSIDE != 0
     }
 
     /// 0 x, 1 y, 2 z.
@@ -102,10 +116,14 @@ mod tests {
     #[test]
     fn edges_return_their_coordinates() {
         for (z, y, x, axis) in (0..8 * 8 * 8 * 3).map(|i| (i / 192, i / 24 % 8, i / 3 % 8, i % 3)) {
-            let edge = Edge::new(z, 8 * y + x, axis);
-            assert_eq!([edge.x(), edge.y(), edge.z(), edge.axis()].map(usize::from), [x, y, z, axis]);
-            assert_eq!((edge.grid_point(), edge.index()), ((z * 8 + y) * 8 + x, 3 * ((z * 9 + y) * 9 + x) + axis));
-            assert_eq!(usize::from(CELL_OF[edge.index()]), edge.grid_point());
+            let plain = Edge::new(z, 8 * y + x, axis);
+            for (edge, inside) in [(plain, false), (plain.starting_inside(true), true)] {
+                assert_eq!([edge.x(), edge.y(), edge.z(), edge.axis()].map(usize::from), [x, y, z, axis]);
+                assert_eq!((edge.grid_point(), edge.index()), ((z * 8 + y) * 8 + x, 3 * ((z * 9 + y) * 9 + x) + axis));
+                assert_eq!((edge.key(), edge.first_layers()), (plain.key(), plain.first_layers()));
+                assert_eq!(usize::from(CELL_OF[edge.index()]), edge.grid_point());
+                assert_eq!((edge.starts_inside(), edge.starting_inside(false)), (inside, plain));
+            }
         }
         assert_eq!(CELL_OF[Edge::new(1, 8 * 3, 1).index_from([8, 0, 0])], (8 + 3) * 8 + 7, "beyond x");
         assert_eq!(CELL_OF[Edge::new(0, 0, 2).index_from([0, 8, 8])], (7 * 8 + 7) * 8, "beyond y and z");

@@ -32,7 +32,7 @@ pub(crate) struct Constants {
     pub(crate) tail_rate: f32,
     /// Gaussian: the linear term's value at the support.
     pub(crate) tail_end: f32,
-    /// Soft object, inverse square: factor of the density.
+    /// Factor of the density.
     pub(crate) amplitude: f32,
     /// Inverse square: lower bound of u, as a factor of 1/ρ².
     pub(crate) u_min: f32,
@@ -40,8 +40,11 @@ pub(crate) struct Constants {
     /// as it does not affect a direction, so numbers stay near 1.
     pub(crate) slope_offset: f32,
     pub(crate) slope_tail: f32,
-    /// −dF/du is the slope times this.
-    pub(crate) slope_scale: f32,
+    /// Gaussian: the density without its amplitude is the slope minus `slope_decay` times the rest of u up to the
+    /// support.
+    pub(crate) slope_decay: f32,
+    /// Factor of the slope, for all kernels: −dF/du is this times the slope.
+    pub(crate) slope_amplitude: f32,
     /// Radius of an atom as a fraction of its ρ.
     pub(crate) radius_per_length: f32,
 }
@@ -53,6 +56,11 @@ impl Constants {
         let support = profile.support();
         let factor = if gaussian { profile.amplitude / profile.cutoff_norm() } else { profile.amplitude };
         let rate = profile.decay * std::f64::consts::LOG2_E;
+        let slope_factor = match profile.kernel {
+            Kernel::Gaussian => profile.decay,
+            Kernel::SoftObject => 2.0 / 9.0,
+            Kernel::InverseSquare => 1.0,
+        };
         let tail_rate = factor * profile.tolerance * profile.decay;
         let tail_offset = -factor * profile.tolerance * (1.0 + profile.decay * support);
         Self {
@@ -67,11 +75,8 @@ impl Constants {
             u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
             slope_offset: to_f32(rate),
             slope_tail: to_f32(profile.tolerance),
-            slope_scale: to_f32(match profile.kernel {
-                Kernel::Gaussian => factor * profile.decay,
-                Kernel::SoftObject => factor * 2.0 / 9.0,
-                Kernel::InverseSquare => factor,
-            }),
+            slope_decay: to_f32(profile.tolerance * profile.decay),
+            slope_amplitude: to_f32(factor * slope_factor),
             radius_per_length: to_f32(profile.radius_per_length()),
         }
     }

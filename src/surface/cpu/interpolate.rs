@@ -1,15 +1,19 @@
 //! Stage `interpolate`: vertex positions on crossing edges, analytic normals, and nearest atoms on request.
+//!
+//! `classify` places a vertex by linear interpolation. One sum over the atoms there gives the density and its gradient,
+//! hence the normal and one step of Newton's method along the edge. The gradient at the new place differs from this one
+//! by the second derivative times the step, so the normal is not computed again.
 
 use std::ops::Range;
 
-use super::Field;
 use super::bin::NORMAL_ONLY;
 use super::brick_atoms::BrickAtoms;
 use super::edge::Edge;
 use super::field::Constants;
+use super::{Field, Scanned};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::{Lattice, LatticeAtom, to_f32};
+use crate::surface::lattice::{EDGE_MARGIN, LatticeAtom, to_f32};
 use crate::surface::mesh::{normal_row, position_row};
 use crate::surface::params::Kernel;
 use crate::surface::quantize::Step;
@@ -22,6 +26,8 @@ use crate::surface::sphere_union::Feature;
 pub(super) struct VertexBatch {
     p: [Vec<f32>; 3],
     n: [Vec<f32>; 3],
+    /// Densities without their common factor.
+    density: Vec<f32>,
     atoms: BrickAtoms,
 }
 
@@ -29,7 +35,7 @@ impl VertexBatch {
     /// Computes the positions of a brick's vertices; pads them to whole vectors by repeating the last one.
     fn fill(&mut self, edges: &[Edge], t: &[f32]) {
         let padded = t.len().next_multiple_of(LANES);
-        for column in self.p.iter_mut().chain(&mut self.n) {
+        for column in self.p.iter_mut().chain(&mut self.n).chain([&mut self.density]) {
             column.resize(padded, 0.0);
         }
         positions(edges, t, &mut self.p);
@@ -124,6 +130,8 @@ pub(super) fn take<'a, T>(rest: &mut &'a mut [T], n: usize) -> &'a mut [T] {
 /// Destination of a brick's vertices.
 pub(super) struct VertexTarget<'a> {
     pub(super) rows: VertexRows<'a>,
+    /// Final parameter of each vertex along its edge.
+    pub(super) t: &'a mut [f32],
     /// Nearest sphere of each vertex, in the caller's numbering.
     pub(super) atom_ids: Option<&'a mut [u32]>,
 }
@@ -139,29 +147,32 @@ const BLOCK: usize = 4096;
 /// # Errors
 /// [`SurfaceError::Cancelled`].
 pub(super) fn interpolate(
-    lattice: &Lattice,
-    field: &Field,
+    scanned: &Scanned,
     source: &BrickVertices<'_>,
     batch: &mut VertexBatch,
     target: VertexTarget<'_>,
     control: &Control<'_>,
 ) -> Result<usize, SurfaceError> {
+    let Scanned { lattice, field, .. } = scanned;
     let BrickVertices { origin, candidates, features, spheres, t, edges } = *source;
     batch.fill(edges, t);
     match field {
         Field::Density(constants) => {
-            batch.n.iter_mut().for_each(|column| column.fill(0.0));
+            batch.n.iter_mut().chain([&mut batch.density]).for_each(|column| column.fill(0.0));
             for block in candidates.chunks(BLOCK) {
                 control.check()?;
                 batch.atoms.fill(&lattice.atoms, block, origin);
-                gradients(constants, &mut batch.atoms, &batch.p, &mut batch.n);
+                sums(constants, &mut batch.atoms, &batch.p, &mut batch.n, &mut batch.density);
             }
+            refine(constants, scanned.level, edges, t, &batch.n, &batch.density, target.t);
+            positions(edges, target.t, &mut batch.p);
             if let Some(ids) = target.atom_ids {
                 nearest_atoms(&lattice.atoms, constants.radius_per_length, candidates, origin, &batch.p, ids);
             }
         }
         Field::Distance(distance) => {
             control.check()?;
+            target.t.copy_from_slice(t);
             distance.normals(&lattice.atoms, features, origin, &batch.p, &mut batch.n);
             if let Some(ids) = target.atom_ids {
                 ids.iter_mut().zip(spheres).for_each(|(id, sphere)| *id = lattice.atoms[*sphere as usize].source);
@@ -245,16 +256,22 @@ fn round(
 }
 }
 
-/// Adds −∇F of the candidates to the sum of each vertex, up to a common factor.
+/// Adds −∇F and F of the candidates to the sums of each vertex, each up to a common factor.
 #[inline(always)]
-fn sum_gradients<const FMA: bool>(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
+fn sum_candidates<const FMA: bool>(
+    c: &Constants,
+    around: &mut BrickAtoms,
+    p: &[Vec<f32>; 3],
+    n: &mut [Vec<f32>; 3],
+    density: &mut [f32],
+) {
     let [px, py, pz] = p;
     let [nx, ny, nz] = n;
     let lanes = px.as_chunks::<LANES>().0.iter().zip(py.as_chunks::<LANES>().0).zip(pz.as_chunks::<LANES>().0);
     let outs = nx.chunks_exact_mut(LANES).zip(ny.chunks_exact_mut(LANES)).zip(nz.chunks_exact_mut(LANES));
-    for (((px, py), pz), ((nx, ny), nz)) in lanes.zip(outs) {
-        let mut sum = [[0.0_f32; LANES]; 3];
-        for (sum, column) in sum.iter_mut().zip([&*nx, &*ny, &*nz]) {
+    for ((((px, py), pz), ((nx, ny), nz)), density) in lanes.zip(outs).zip(density.chunks_exact_mut(LANES)) {
+        let mut sum = [[0.0_f32; LANES]; 4];
+        for (sum, column) in sum.iter_mut().zip([&*nx, &*ny, &*nz, &*density]) {
             sum.copy_from_slice(column);
         }
         for &[x, y, z, inv] in around.reach(c.support, [extent(px), extent(py), extent(pz)]) {
@@ -262,41 +279,79 @@ fn sum_gradients<const FMA: bool>(c: &Constants, around: &mut BrickAtoms, p: &[V
             for i in 0..LANES {
                 let (dx, dy, dz) = (px[i] - x, py[i] - y, pz[i] - z);
                 let u = fma::<FMA>(dx, dx, fma::<FMA>(dy, dy, dz * dz)) * inv;
-                let slope = match c.kernel {
+                let (slope, value) = match c.kernel {
                     Kernel::Gaussian => {
                         let exponent = fma::<FMA>(-c.rate, u, c.slope_offset);
-                        exp2::<FMA>(if exponent > -100.0 { exponent } else { -100.0 }) - c.slope_tail
+                        let slope = exp2::<FMA>(if exponent > -100.0 { exponent } else { -100.0 }) - c.slope_tail;
+                        (slope, fma::<FMA>(c.slope_decay, u - c.support, slope))
                     }
-                    Kernel::SoftObject => (1.0 - u) * fma::<FMA>(u, -6.0, 11.0),
+                    Kernel::SoftObject => {
+                        let rest = 1.0 - u;
+                        (rest * fma::<FMA>(u, -6.0, 11.0), rest * rest * fma::<FMA>(u, -4.0 / 9.0, 1.0))
+                    }
                     Kernel::InverseSquare => {
                         let u = if u > u_min { u } else { u_min };
-                        (1.0 - u * u) / (u * u)
+                        let ratio = (1.0 - u) / (u * u);
+                        (ratio * (1.0 + u), ratio * (u - u * u))
                     }
                 };
-                let slope = if u < c.support { slope * inv } else { 0.0 };
+                let (slope, value) = if u < c.support { (slope * inv, value) } else { (0.0, 0.0) };
                 sum[0][i] = fma::<FMA>(slope, dx, sum[0][i]);
                 sum[1][i] = fma::<FMA>(slope, dy, sum[1][i]);
                 sum[2][i] = fma::<FMA>(slope, dz, sum[2][i]);
+                sum[3][i] += value;
             }
         }
         nx.copy_from_slice(&sum[0]);
         ny.copy_from_slice(&sum[1]);
         nz.copy_from_slice(&sum[2]);
+        density.copy_from_slice(&sum[3]);
     }
 }
 
 dispatched! {
-fn gradients(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
+fn sums(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3], density: &mut [f32]) {
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
+        // One copy of the loop per kernel.
+        let of = |kernel| Constants { kernel, ..*c };
         match c.kernel {
-            Kernel::Gaussian => sum_gradients::<true>(&Constants { kernel: Kernel::Gaussian, ..*c }, around, p, n),
-            Kernel::SoftObject => sum_gradients::<true>(&Constants { kernel: Kernel::SoftObject, ..*c }, around, p, n),
-            Kernel::InverseSquare => {
-                sum_gradients::<true>(&Constants { kernel: Kernel::InverseSquare, ..*c }, around, p, n);
-            }
+            Kernel::Gaussian => sum_candidates::<true>(&of(Kernel::Gaussian), around, p, n, density),
+            Kernel::SoftObject => sum_candidates::<true>(&of(Kernel::SoftObject), around, p, n, density),
+            Kernel::InverseSquare => sum_candidates::<true>(&of(Kernel::InverseSquare), around, p, n, density),
         }
     } else {
-        sum_gradients::<false>(c, around, p, n);
+        sum_candidates::<false>(c, around, p, n, density);
+    }
+}
+}
+
+dispatched! {
+/// Moves vertices along their edges by one step of Newton's method on ln F, which is closer to linear than F. `n` and
+/// `density` are the sums of [`sum_candidates`] at the parameters `t0`.
+fn refine(
+    c: &Constants,
+    isovalue: f32,
+    edges: &[Edge],
+    t0: &[f32],
+    n: &[Vec<f32>; 3],
+    density: &[f32],
+    t: &mut [f32],
+) {
+    let [x, y, z] = n;
+    let sums = x.iter().zip(y).zip(z).zip(density);
+    for (((t, t0), edge), (((x, y), z), density)) in t.iter_mut().zip(t0).zip(edges).zip(sums) {
+        let along = if edge.axis() == 0 { x } else if edge.axis() == 1 { y } else { z };
+        let value = c.amplitude * density;
+        // Rational approximation of ln(F/isovalue): a library's logarithm differs between platforms.
+        let log = 2.0 * (value - isovalue) / (value + isovalue);
+        // −dF/dt is twice the amplitude times the sum.
+        let step = log * value / (2.0 * c.slope_amplitude * along);
+        // The end of the edge that is on the other side of the surface.
+        let end = if (value >= isovalue) == edge.starts_inside() { 1.0 } else { 0.0 };
+        let rest = end - t0;
+        // Without a root of the tangent before that end, halves the rest. All comparisons with NaN are false.
+        let step = if (step * rest >= 0.0) & (step.abs() < rest.abs()) { step } else { 0.5 * rest };
+        *t = (t0 + step).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
     }
 }
 }

@@ -211,6 +211,8 @@ const NO_BRICK: u16 = u16::MAX;
 struct Scanned {
     lattice: Lattice,
     field: Field,
+    /// Value of the field on the surface.
+    level: f32,
     tiles: Tiles,
     done: Vec<Tile>,
     totals: Totals,
@@ -271,6 +273,7 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
     control.check()?;
     let field = control.span(Stage::Bin, || checked_field(&lattice, context))?;
     control.check()?;
+    let level = field.level(params);
     let slabs = slabs::cut(&tiles, free_threads);
     control.memory.grow(RESULT_BYTES * slabs.len() as u64)?;
     let pass = Pass {
@@ -279,7 +282,7 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
         slabs: &slabs,
         partial_tiles: slabs::PartialTiles::default(),
         field: &field,
-        iso: field.level(params),
+        iso: level,
         context,
         counters: first_pass::PassCounters::default(),
     };
@@ -304,7 +307,7 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
         overlaps: field.overlaps(),
     };
     let pieces = pieces(&mut done);
-    Ok(Scanned { lattice, field, tiles, done, totals, grid, pieces, quantize: params.quantize })
+    Ok(Scanned { lattice, field, level, tiles, done, totals, grid, pieces, quantize: params.quantize })
 }
 
 impl Tile {
@@ -313,17 +316,19 @@ impl Tile {
         [self.found.before(piece.bricks.start), self.found.before(piece.bricks.end)]
     }
 
-    /// The surface brick in `slot`: its index in the tile, and the brick with the global id of its first vertex.
+    /// The surface brick in `slot`: its index in the tile, and the brick with the global id of its first vertex. `t` are
+    /// the final parameters of all vertices.
     #[inline(always)]
-    fn numbered(&self, slot: usize) -> Option<(usize, NumberedBrick<'_>)> {
+    fn numbered<'a>(&'a self, slot: usize, t: &'a [f32]) -> Option<(usize, NumberedBrick<'a>)> {
         let [x, y, z] = slot_brick(slot);
         let ix = usize::from(self.bricks[(z * 8 + y) * 8 + x]);
         let brick = self.found.bricks.get(ix)?;
         let end = self.found.bricks.get(ix + 1).map_or(self.found.vertices, |next| next.vertex);
         let own = brick.vertex as usize..end as usize;
-        let (t, edges) = (&self.found.t[own.clone()], &self.found.edges[own]);
+        let at = self.first_vertex;
+        let (t, edges) = (&t[at + own.start..at + own.end], &self.found.edges[own]);
         // `scan` checked that ids fit 32 bits.
-        let first = to_u32(self.first_vertex) + brick.vertex;
+        let first = to_u32(at) + brick.vertex;
         Some((ix, NumberedBrick { brick, first, t, edges }))
     }
 }

@@ -103,6 +103,8 @@ pub struct StageResults {
     pub surface: Vec<SurfaceResults>,
     /// The mesh.
     pub mesh: Mesh,
+    /// Parameter of each vertex along its edge.
+    pub t: Vec<f32>,
 }
 
 /// Runs every stage and keeps the intermediate results.
@@ -159,14 +161,14 @@ pub fn run_stages(
     let mesh = write::write(&scanned, params.atom_ids, &control, None)?.mesh;
     let mut surface: Vec<SurfaceResults> = scanned.done.iter().flat_map(surface_of).collect();
     let written = write::write_pieces(&scanned, &control, &Destination::Sink(&Discard))?;
-    let runs = written.iter().flat_map(|piece| (0..piece.sums.bricks.len()).map(|ix| (&piece.sums, ix)));
+    let runs = written.sums.iter().flat_map(|sums| (0..sums.bricks.len()).map(move |ix| (sums, ix)));
     for (result, (sums, ix)) in surface.iter_mut().zip(runs) {
         let brick = &sums.bricks[ix];
         let sheets = &sums.sheets[brick.first as usize..][..usize::from(brick.n)];
         result.sheets = sheets.iter().map(SheetResults::new).collect();
         result.shared = sums.shared_by(ix)[0].iter().map(|vertex| [vertex.key, vertex.sheet]).collect();
     }
-    Ok(StageResults { bricks, surface, mesh })
+    Ok(StageResults { bricks, surface, mesh, t: written.t })
 }
 
 fn surface_of(tile: &Tile) -> Vec<SurfaceResults> {

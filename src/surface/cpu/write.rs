@@ -1,11 +1,12 @@
-//! The second pass: `interpolate` and `emit` write the rows of every piece, in memory or into a sink.
+//! The second pass: `interpolate` writes the vertices of every piece, then `emit` its triangles, in memory or into a
+//! sink. `emit` sums over triangles, whose corners may belong to other pieces, so all vertices come first.
 //!
 //! In memory, a piece is written to its final position. For a sink, it is written to a scratch buffer of the thread,
 //! which the sink reads.
 
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use super::bin::{Tiles, slot_origin};
 use super::emit;
@@ -23,7 +24,7 @@ use crate::surface::lattice::Lattice;
 use crate::surface::measure::Measures;
 use crate::surface::mesh::{Mesh, Quantized, joined_bounds};
 use crate::surface::quantize::Step;
-use crate::surface::sink::{MeshPart, MeshSink, SinkFailed};
+use crate::surface::sink::{MeshPart, MeshSink, SinkFailed, Vertices};
 
 thread_local! {
     // Kept per thread, as in the first pass.
@@ -57,8 +58,8 @@ struct ScratchRows {
 /// Rows of the mesh that a piece fills.
 pub(super) struct PieceRows<'a> {
     rows: VertexRows<'a>,
-    triangles: &'a mut [[u32; 3]],
     atom_ids: Option<&'a mut [u32]>,
+    triangles: &'a mut [[u32; 3]],
 }
 
 /// Destination of the rows.
@@ -68,14 +69,16 @@ pub(super) enum Destination<'a> {
     Sink(&'a dyn MeshSink),
 }
 
-/// Summary of a piece.
-pub(super) struct PieceSummary {
+/// Summary of all pieces.
+pub(super) struct Written {
     /// Vertices whose gradient vanishes.
     flat: usize,
-    /// Sums over its triangles.
-    pub(super) sums: SheetSums,
-    /// Bounds of its positions, Å.
+    /// Bounds of the positions, Å.
     bounds: Option<[[f32; 3]; 2]>,
+    /// Final parameters of all vertices.
+    pub(super) t: Vec<f32>,
+    /// Sums over the triangles of each piece.
+    pub(super) sums: Vec<SheetSums>,
 }
 
 /// Runs `interpolate` and `emit` for every piece. The output has measures unless the mesh is in memory and not closed.
@@ -92,11 +95,11 @@ pub(super) fn write(
     let failed = |SinkFailed| SurfaceError::Sink;
     let [n_vertices, n_triangles] = [scanned.totals.vertices, scanned.totals.triangles];
     sink.begin(n_vertices, n_triangles).map_err(failed)?;
-    let _sums = control.reserve(SHEET_BYTES * scanned.grid.surface_bricks)?;
+    let _working = control.reserve(working_bytes(scanned))?;
     let written = write_pieces(scanned, control, &Destination::Sink(sink))?;
     let measures = control.span(Stage::Measure, || measures(scanned, &written));
     let measures = match measures {
-        Some(measures) if written.iter().all(|piece| piece.flat == 0) => measures,
+        Some(measures) if written.flat == 0 => measures,
         // The normal of a vertex without a gradient depends on the triangles around it, and measuring a mesh that is
         // not closed requires the whole mesh. In both cases the mesh is computed again in memory and sent again.
         _ => {
@@ -105,7 +108,7 @@ pub(super) fn write(
             output.measure(control)?.clone()
         }
     };
-    let bounds = bounds_of(&written).unwrap_or_default();
+    let bounds = written.bounds.unwrap_or_default();
     let mesh = Mesh { centre: scanned.lattice.centre(), ..Mesh::default() };
     let streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds });
     Ok(MeshOutput { streamed, measures: Some(measures), ..MeshOutput::new(mesh, scanned.grid) })
@@ -134,64 +137,84 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
     let of_piece = pieces.iter().map(|piece| {
         let [n, m] = scanned.size_of(piece);
         let atom_ids = ids.as_mut().map(|ids| take(ids, n));
-        Mutex::new(PieceRows { rows: rows.take(n), triangles: take(&mut triangles, m), atom_ids })
+        Mutex::new(PieceRows { rows: rows.take(n), atom_ids, triangles: take(&mut triangles, m) })
     });
-    let _sums = control.reserve(SHEET_BYTES * scanned.grid.surface_bricks)?;
+    let _working = control.reserve(working_bytes(scanned))?;
     let written = write_pieces(scanned, control, &Destination::Memory(of_piece.collect()))?;
-    if written.iter().any(|piece| piece.flat > 0) {
+    if written.flat > 0 {
         control.span(Stage::Interpolate, || mesh.fill_flat_normals());
     }
     let measures = control.span(Stage::Measure, || measures(scanned, &written));
-    Ok(MeshOutput { measures, bounds: bounds_of(&written), ..MeshOutput::new(mesh, scanned.grid) })
-}
-
-/// Returns the bounds of the positions of all pieces, Å.
-fn bounds_of(written: &[PieceSummary]) -> Option<[[f32; 3]; 2]> {
-    written.iter().filter_map(|piece| piece.bounds).reduce(joined_bounds)
+    Ok(MeshOutput { measures, bounds: written.bounds, ..MeshOutput::new(mesh, scanned.grid) })
 }
 
 /// Memory of the sums of a brick, bytes: its sheet, the copy in a group of bricks, and the component if it is separate.
 /// Few bricks have several sheets.
 const SHEET_BYTES: u64 = 3 * size_of::<Sheet>() as u64;
 
+/// Memory of the second pass besides the rows, bytes.
+fn working_bytes(scanned: &Scanned) -> u64 {
+    SHEET_BYTES * scanned.grid.surface_bricks + (size_of::<f32>() * scanned.totals.vertices) as u64
+}
+
 /// Writes all pieces, in parallel.
 pub(super) fn write_pieces(
     scanned: &Scanned,
     control: &Control<'_>,
     destination: &Destination<'_>,
-) -> Result<Vec<PieceSummary>, SurfaceError> {
-    let Scanned { pieces, .. } = scanned;
+) -> Result<Written, SurfaceError> {
+    let Scanned { pieces, totals, .. } = scanned;
+    let mut t = vec![0.0; totals.vertices];
+    let mut rest = &mut t[..];
+    let of_piece: Vec<_> = pieces.iter().map(|piece| Mutex::new(take(&mut rest, scanned.size_of(piece)[0]))).collect();
     let writer = Writer { scanned, control };
-    let finished = AtomicUsize::new(0);
-    threads::each(pieces.len(), |i| {
-        control.check()?;
-        let written = SCRATCH.with_borrow_mut(|PieceScratch { stages, rows }| match destination {
+    let vertices = writer.each(Stage::Interpolate, |piece, i, PieceScratch { stages, rows }| {
+        let t = &mut **lock(&of_piece[i]);
+        match destination {
             Destination::Memory(of_piece) => {
-                let mut rows = of_piece[i].lock().unwrap_or_else(PoisonError::into_inner);
-                writer.write(&pieces[i], &mut rows, stages)
+                let PieceRows { rows, atom_ids, .. } = &mut *lock(&of_piece[i]);
+                writer.interpolate(piece, rows, atom_ids.as_deref_mut(), t, &mut stages.batch)
             }
-            Destination::Sink(sink) => writer.write_to_sink(&pieces[i], rows, stages, *sink),
-        })?;
-        let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
-        control.observer.progress(Stage::Emit, n, pieces.len());
-        Ok(written)
-    })
+            Destination::Sink(sink) => writer.vertices_to_sink(piece, rows, t, &mut stages.batch, *sink),
+        }
+    })?;
+    drop(of_piece);
+    let sums = writer.each(Stage::Emit, |piece, i, PieceScratch { stages, rows }| match destination {
+        Destination::Memory(of_piece) => Ok(writer.emit(piece, lock(&of_piece[i]).triangles, &t, stages)),
+        Destination::Sink(sink) => writer.triangles_to_sink(piece, rows, &t, stages, *sink),
+    })?;
+    let flat = vertices.iter().map(|piece| piece.flat).sum();
+    let bounds = vertices.iter().filter_map(|piece| piece.bounds).reduce(joined_bounds);
+    Ok(Written { flat, bounds, t, sums })
+}
+
+/// Locks rows that one thread alone uses.
+fn lock<T>(rows: &Mutex<T>) -> MutexGuard<'_, T> {
+    rows.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Returns the measures of the mesh that consists of the pieces; `None` if it is not closed.
-fn measures(scanned: &Scanned, written: &[PieceSummary]) -> Option<Measures> {
+fn measures(scanned: &Scanned, written: &Written) -> Option<Measures> {
     let Scanned { lattice, tiles, done, totals, pieces, .. } = scanned;
-    let sums: Vec<&SheetSums> = written.iter().map(|piece| &piece.sums).collect();
     let near = |piece: usize| {
         let Piece { tile, bricks } = &pieces[piece];
         let found = &done[*tile].found.bricks[bricks.clone()];
-        let near = TileNeighbours::new(tiles, done, done[*tile].coord);
+        let near = TileNeighbours::new(tiles, done, done[*tile].coord, &written.t);
         move |brick: usize, n: usize| {
             let (other, ix, _) = near.of(usize::from(found[brick].slot), n)?;
             Some((done[other].first_piece + ix / PIECE_BRICKS, ix % PIECE_BRICKS))
         }
     };
+    let sums: Vec<&SheetSums> = written.sums.iter().collect();
     join::measures(&sums, near, lattice.spacing, [totals.vertices, totals.triangles])
+}
+
+/// Summary of a piece's vertices.
+struct PieceVertices {
+    /// Vertices whose gradient vanishes.
+    flat: usize,
+    /// Bounds of the positions, Å.
+    bounds: Option<[[f32; 3]; 2]>,
 }
 
 /// Shared inputs of the second pass.
@@ -201,16 +224,34 @@ struct Writer<'a> {
 }
 
 impl Writer<'_> {
-    /// Writes a piece into the scratch, then into `sink`.
-    fn write_to_sink(
+    /// Runs `work` for every piece, in parallel, with the scratch of the thread.
+    fn each<T: Send + Sync>(
+        &self,
+        stage: Stage,
+        work: impl Fn(&Piece, usize, &mut PieceScratch) -> Result<T, SurfaceError> + Sync,
+    ) -> Result<Vec<T>, SurfaceError> {
+        let pieces = &self.scanned.pieces;
+        let finished = AtomicUsize::new(0);
+        threads::each(pieces.len(), |i| {
+            self.control.check()?;
+            let done = SCRATCH.with_borrow_mut(|scratch| work(&pieces[i], i, scratch))?;
+            let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
+            self.control.observer.progress(stage, n, pieces.len());
+            Ok(done)
+        })
+    }
+
+    /// Writes the vertices of a piece into the scratch, then into `sink`.
+    fn vertices_to_sink(
         &self,
         piece: &Piece,
         scratch: &mut ScratchRows,
-        stages: &mut Stages,
+        t: &mut [f32],
+        batch: &mut VertexBatch,
         sink: &dyn MeshSink,
-    ) -> Result<PieceSummary, SurfaceError> {
-        let [n, m] = self.scanned.size_of(piece);
-        let rows = match self.scanned.quantize {
+    ) -> Result<PieceVertices, SurfaceError> {
+        let [n, _] = self.scanned.size_of(piece);
+        let mut rows = match self.scanned.quantize {
             None => VertexRows::Single {
                 positions: first(&mut scratch.positions, n),
                 normals: first(&mut scratch.normals, n),
@@ -220,37 +261,70 @@ impl Writer<'_> {
                 VertexRows::Quantized { step, positions: first(positions, n), normals: first(normals, n) }
             }
         };
-        let mut rows = PieceRows { rows, triangles: first(&mut scratch.triangles, m), atom_ids: None };
-        let written = self.write(piece, &mut rows, stages)?;
+        let written = self.interpolate(piece, &mut rows, None, t, batch)?;
+        self.part_to_sink(piece, rows.as_vertices(), &[], sink)?;
+        Ok(written)
+    }
+
+    /// Writes the triangles of a piece into the scratch, then into `sink`.
+    fn triangles_to_sink(
+        &self,
+        piece: &Piece,
+        scratch: &mut ScratchRows,
+        t: &[f32],
+        stages: &mut Stages,
+        sink: &dyn MeshSink,
+    ) -> Result<SheetSums, SurfaceError> {
+        let [_, n] = self.scanned.size_of(piece);
+        let triangles = first(&mut scratch.triangles, n);
+        let sums = self.emit(piece, triangles, t, stages);
+        let none = match self.scanned.quantize {
+            None => Vertices::Single { positions: &[], normals: &[] },
+            Some(step) => Vertices::Quantized { step, positions: &[], normals: &[] },
+        };
+        self.part_to_sink(piece, none, triangles, sink)?;
+        Ok(sums)
+    }
+
+    /// Hands rows of a piece to `sink`.
+    fn part_to_sink(
+        &self,
+        piece: &Piece,
+        vertices: Vertices<'_>,
+        triangles: &[[u32; 3]],
+        sink: &dyn MeshSink,
+    ) -> Result<(), SurfaceError> {
         let tile = &self.scanned.done[piece.tile];
         let [start, _] = tile.span(piece);
         let part = MeshPart {
             first_vertex: tile.first_vertex + start.vertices,
-            vertices: rows.rows.as_vertices(),
+            vertices,
             first_triangle: tile.first_triangle + start.triangles,
-            triangles: rows.triangles,
+            triangles,
         };
-        self.control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
-        Ok(written)
+        self.control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)
     }
 
-    /// Writes the vertices and triangles of a piece and sums over them.
-    fn write(
-        &self,
-        piece: &Piece,
-        rows: &mut PieceRows<'_>,
-        stages: &mut Stages,
-    ) -> Result<PieceSummary, SurfaceError> {
-        let flat = self.control.span(Stage::Interpolate, || self.interpolate(piece, rows, &mut stages.batch))?;
-        let sums = self.control.span(Stage::Emit, || self.emit(piece, rows.triangles, stages));
-        Ok(PieceSummary { flat, sums, bounds: rows.rows.as_vertices().bounds() })
-    }
-
-    /// Writes the vertices. Returns the number of vertices without a gradient.
+    /// Writes the vertices, and their final parameters to `t`.
     fn interpolate(
         &self,
         piece: &Piece,
-        out: &mut PieceRows<'_>,
+        rows: &mut VertexRows<'_>,
+        atom_ids: Option<&mut [u32]>,
+        t: &mut [f32],
+        batch: &mut VertexBatch,
+    ) -> Result<PieceVertices, SurfaceError> {
+        let flat = self.control.span(Stage::Interpolate, || self.vertices(piece, rows, atom_ids, t, batch))?;
+        Ok(PieceVertices { flat, bounds: rows.as_vertices().bounds() })
+    }
+
+    /// Writes the vertices brick by brick. Returns the number of vertices without a gradient.
+    fn vertices(
+        &self,
+        piece: &Piece,
+        rows: &mut VertexRows<'_>,
+        mut atom_ids: Option<&mut [u32]>,
+        t: &mut [f32],
         batch: &mut VertexBatch,
     ) -> Result<usize, SurfaceError> {
         let tile = &self.scanned.done[piece.tile];
@@ -262,10 +336,11 @@ impl Writer<'_> {
             if all.is_empty() {
                 continue;
             }
-            let rows = all.start - base..all.end - base;
+            let of_brick = all.start - base..all.end - base;
             let target = VertexTarget {
-                rows: out.rows.slice(rows.clone()),
-                atom_ids: out.atom_ids.as_deref_mut().map(|ids| &mut ids[rows]),
+                rows: rows.slice(of_brick.clone()),
+                t: &mut t[of_brick.clone()],
+                atom_ids: atom_ids.as_deref_mut().map(|ids| &mut ids[of_brick]),
             };
             let source = BrickVertices {
                 origin: slot_origin(tile.coord, usize::from(brick.slot)),
@@ -275,17 +350,21 @@ impl Writer<'_> {
                 t: &found.t[all.clone()],
                 edges: &found.edges[all],
             };
-            let Scanned { lattice, field, .. } = self.scanned;
-            flat += interpolate::interpolate(lattice, field, &source, batch, target, self.control)?;
+            flat += interpolate::interpolate(self.scanned, &source, batch, target, self.control)?;
         }
         Ok(flat)
     }
 
-    /// Writes the triangles. Returns the sums over them.
-    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], stages: &mut Stages) -> SheetSums {
+    /// Writes the triangles. Returns the sums over them. `t` are the final parameters of all vertices.
+    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], t: &[f32], stages: &mut Stages) -> SheetSums {
+        self.control.span(Stage::Emit, || self.triangles(piece, triangles, t, stages))
+    }
+
+    /// Writes the triangles brick by brick.
+    fn triangles(&self, piece: &Piece, triangles: &mut [[u32; 3]], t: &[f32], stages: &mut Stages) -> SheetSums {
         let (scanned, Stages { table, sheets, .. }) = (self.scanned, stages);
         let tile = &scanned.done[piece.tile];
-        let near = TileNeighbours::new(&scanned.tiles, &scanned.done, tile.coord);
+        let near = TileNeighbours::new(&scanned.tiles, &scanned.done, tile.coord, t);
         let found = &tile.found;
         let base = found.before(piece.bricks.start).triangles;
         let mut sums = SheetSums::with_capacity(piece.bricks.len());
@@ -327,11 +406,14 @@ impl Scanned {
 /// A tile and its neighbours towards +x, +y, +z.
 pub(super) struct TileNeighbours<'a> {
     tiles: [Option<(usize, &'a Tile)>; 8],
+    /// Final parameters of all vertices.
+    t: &'a [f32],
 }
 
 impl<'a> TileNeighbours<'a> {
-    pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3]) -> Self {
+    pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3], t: &'a [f32]) -> Self {
         Self {
+            t,
             tiles: std::array::from_fn(|n| {
                 let coord = std::array::from_fn(|k| coord[k] + i32::from(n >> k & 1 == 1));
                 tiles.index.get(&coord).map(|&t| (t as usize, &done[t as usize]))
@@ -344,9 +426,9 @@ impl<'a> TileNeighbours<'a> {
     #[inline(always)]
     pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, NumberedBrick<'a>)> {
         let (slot, beyond) = neighbours::neighbour_slot(slot, n);
-        let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
-        let (ix, numbered) = tile.numbered(slot)?;
-        Some((t, ix, numbered))
+        let (other, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
+        let (ix, numbered) = tile.numbered(slot, self.t)?;
+        Some((other, ix, numbered))
     }
 }
 
