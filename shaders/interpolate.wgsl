@@ -106,7 +106,8 @@ fn main(
     for (var base = 0u; base < n; base += LANES) {
         let vertex = base + lane;
         let mine = vertex < n;
-        var edge = Edge(0u, 0u, 0u);
+        // The vertex, and the linearly interpolated crossing.
+        var at = vec3<f32>(0.0);
         var p = vec3<f32>(0.0);
         var gradient = vec3<f32>(0.0);
         var nearest = 3.402823e38;
@@ -120,7 +121,8 @@ fn main(
             }
             // No barriers follow, so lanes without a vertex may skip the rest.
             if (mine && start == 0u) {
-                edge = edge_of(vertex);
+                let edge = edge_of(vertex);
+                at = vertex_of(edge);
                 let inner = field[slots[0] * 512u + edge.z * 64u + edge.bit];
                 p = point_on(edge, crossing_at(inner, density_beyond(edge)));
             }
@@ -133,7 +135,7 @@ fn main(
                 }
                 if (NEAREST) {
                     for (var i = 0u; i < in_piece; i++) {
-                        let d = length(p - staged[i].xyz) - radius_of(staged[i]);
+                        let d = length(at - staged[i].xyz) - radius_of(staged[i]);
                         if (d < nearest) {
                             nearest = d;
                             source = start + i;
@@ -146,7 +148,7 @@ fn main(
             if (NEAREST) {
                 sources[first + vertex] = atoms[lists[head.x + source]].source;
             }
-            write_vertex(first + vertex, origin, vertex_of(edge), gradient);
+            write_vertex(first + vertex, origin, at, gradient);
         }
     }
     workgroupBarrier();

@@ -21,17 +21,20 @@
 @group(0) @binding(8) var<storage, read> inside: array<u32>;
 @group(0) @binding(9) var<storage, read_write> crossings: array<f32>;
 
+// Maximum step, as a share of the rest of the edge. Same value as `MAX_SHARE` in `surface/cpu/interpolate.rs`.
+const MAX_SHARE: f32 = 0.75;
+
 // Parameter of the isosurface on an edge, by one step on the logarithm of the density from t, where the density is
 // `value` and has the derivative `derivative` along the edge. The root lies between t and the end of the edge on the
-// other side of the surface. A step that leaves this interval is replaced by half of it.
+// other side of the surface.
 fn newton(t: f32, from_inside: bool, value: f32, derivative: f32) -> f32 {
-    let end = select(0.0, 1.0, (value >= params.isovalue) == from_inside);
+    let rest = select(0.0, 1.0, (value >= params.isovalue) == from_inside) - t;
     // 2 (r - 1)/(r + 1) approximates ln r for the ratio r.
     let log_ratio = 2.0 * (value - params.isovalue) / (value + params.isovalue);
-    let next = t - log_ratio * value / derivative;
+    let share = -log_ratio * value / derivative / rest;
     // False for a number that is not finite.
-    let is_within = min(t, end) < next && next < max(t, end);
-    return clamp(select(0.5 * (t + end), next, is_within), EDGE_MARGIN, 1.0 - EDGE_MARGIN);
+    let is_within = 0.0 <= share && share < MAX_SHARE;
+    return clamp(t + select(MAX_SHARE, share, is_within) * rest, EDGE_MARGIN, 1.0 - EDGE_MARGIN);
 }
 
 @compute @workgroup_size(64)

@@ -6,6 +6,7 @@
 use super::backend::{Backend, GridStats, MeshOutput};
 use super::cases::{CASES, cell_edge};
 use super::control::{Control, Stage};
+use super::cpu::MAX_SHARE;
 use super::cpu::scan;
 use super::error::SurfaceError;
 use super::kernel::{MIN_DISTANCE2, Profile};
@@ -238,13 +239,12 @@ fn vertices(
 }
 
 /// Returns the parameter of a vertex after one step of Newton's method on ln F from `t`. `ratio` is F over the
-/// isovalue, `per_slope` F over dF/dt. The step approximates the logarithm as the other backends do, and halves the rest
-/// of the edge where it would leave it.
+/// isovalue, `per_slope` F over dF/dt. Approximates the logarithm and limits the step as the other backends do.
 fn refined(t: f64, starts_inside: bool, ratio: f64, per_slope: f64) -> f64 {
     let end = if (ratio >= 1.0) == starts_inside { 1.0 } else { 0.0 };
-    let newton = t - 2.0 * (ratio - 1.0) / (ratio + 1.0) * per_slope;
-    let in_bracket = if end > t { t <= newton && newton < end } else { end < newton && newton <= t };
-    if in_bracket { newton } else { 0.5 * (t + end) }
+    let (step, rest) = (-2.0 * (ratio - 1.0) / (ratio + 1.0) * per_slope, end - t);
+    let (share, limit) = (step / rest, f64::from(MAX_SHARE));
+    t + rest * if (0.0..limit).contains(&share) { share } else { limit }
 }
 
 /// Returns the triangles of every cell.

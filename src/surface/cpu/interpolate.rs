@@ -21,6 +21,9 @@ use crate::surface::simd::{LANES, dispatched, exp2, extent, fma};
 use crate::surface::sink::Vertices;
 use crate::surface::sphere_union::Feature;
 
+/// Maximum step of a vertex, as a share of the rest of its edge up to the end on the other side of the surface.
+pub(in crate::surface) const MAX_SHARE: f32 = 0.75;
+
 /// Vertices of one brick, in spacings relative to its first grid point, and the atoms around them.
 #[derive(Debug, Default)]
 pub(super) struct VertexBatch {
@@ -349,9 +352,11 @@ fn refine(
         // The end of the edge that is on the other side of the surface.
         let end = if (value >= isovalue) == edge.starts_inside() { 1.0 } else { 0.0 };
         let rest = end - t0;
-        // Without a root of the tangent before that end, halves the rest. All comparisons with NaN are false.
-        let step = if (step * rest >= 0.0) & (step.abs() < rest.abs()) { step } else { 0.5 * rest };
-        *t = (t0 + step).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
+        // A step towards the other side, limited so that the vertex moves continuously with the density. All comparisons
+        // with NaN are false.
+        let share = step / rest;
+        let share = if (share >= 0.0) & (share < MAX_SHARE) { share } else { MAX_SHARE };
+        *t = (t0 + share * rest).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
     }
 }
 }

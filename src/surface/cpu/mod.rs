@@ -37,6 +37,7 @@ use self::classify::{ClassifiedBricks, CountsBefore};
 use self::distance::DistanceField;
 use self::field::Constants;
 use self::first_pass::Pass;
+pub(super) use self::interpolate::MAX_SHARE;
 use self::neighbours::NumberedBrick;
 use self::scan::Totals;
 use super::backend::{Backend, GridStats, MeshOutput};
