@@ -45,7 +45,7 @@ pub(super) struct SurfaceBrick {
 pub(super) struct ClassifiedBricks {
     /// Bricks with surface, by slot.
     pub(super) bricks: Vec<SurfaceBrick>,
-    /// Parameter of each vertex along its edge, from the owning grid point, in vertex order.
+    /// Parameter of each vertex along its edge, from the owning grid point, in vertex order. `interpolate` refines it.
     pub(super) t: Vec<f32>,
     /// Edge of each vertex, in vertex order.
     pub(super) edges: Vec<Edge>,

@@ -72,8 +72,6 @@ pub(super) struct BrickVertices<'a> {
     pub(super) features: &'a [Feature],
     /// Sphere that is nearest to each vertex, for surfaces of spheres, if requested.
     pub(super) spheres: &'a [u32],
-    /// Parameter of each vertex along its edge.
-    pub(super) t: &'a [f32],
     /// Edge of each vertex.
     pub(super) edges: &'a [Edge],
 }
@@ -133,7 +131,7 @@ pub(super) fn take<'a, T>(rest: &mut &'a mut [T], n: usize) -> &'a mut [T] {
 /// Destination of a brick's vertices.
 pub(super) struct VertexTarget<'a> {
     pub(super) rows: VertexRows<'a>,
-    /// Final parameter of each vertex along its edge.
+    /// Parameter of each vertex along its edge: that of `classify`, replaced by the final one.
     pub(super) t: &'a mut [f32],
     /// Nearest sphere of each vertex, in the caller's numbering.
     pub(super) atom_ids: Option<&'a mut [u32]>,
@@ -157,8 +155,8 @@ pub(super) fn interpolate(
     control: &Control<'_>,
 ) -> Result<usize, SurfaceError> {
     let Scanned { lattice, field, .. } = scanned;
-    let BrickVertices { origin, candidates, features, spheres, t, edges } = *source;
-    batch.fill(edges, t);
+    let BrickVertices { origin, candidates, features, spheres, edges } = *source;
+    batch.fill(edges, target.t);
     match field {
         Field::Density(constants) => {
             batch.n.iter_mut().chain([&mut batch.density]).for_each(|column| column.fill(0.0));
@@ -167,7 +165,7 @@ pub(super) fn interpolate(
                 batch.atoms.fill(&lattice.atoms, block, origin);
                 sums(constants, &mut batch.atoms, &batch.p, &mut batch.n, &mut batch.density);
             }
-            refine(constants, scanned.level, edges, t, &batch.n, &batch.density, target.t);
+            newton_step(constants, scanned.level, edges, &batch.n, &batch.density, target.t);
             positions(edges, target.t, &mut batch.p);
             if let Some(ids) = target.atom_ids {
                 nearest_atoms(&lattice.atoms, constants.radius_per_length, candidates, origin, &batch.p, ids);
@@ -175,7 +173,6 @@ pub(super) fn interpolate(
         }
         Field::Distance(distance) => {
             control.check()?;
-            target.t.copy_from_slice(t);
             distance.normals(&lattice.atoms, features, origin, &batch.p, &mut batch.n);
             if let Some(ids) = target.atom_ids {
                 ids.iter_mut().zip(spheres).for_each(|(id, sphere)| *id = lattice.atoms[*sphere as usize].source);
@@ -330,19 +327,11 @@ fn sums(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<
 
 dispatched! {
 /// Moves vertices along their edges by one step of Newton's method on ln F, which is closer to linear than F. `n` and
-/// `density` are the sums of [`sum_candidates`] at the parameters `t0`.
-fn refine(
-    c: &Constants,
-    isovalue: f32,
-    edges: &[Edge],
-    t0: &[f32],
-    n: &[Vec<f32>; 3],
-    density: &[f32],
-    t: &mut [f32],
-) {
+/// `density` are the sums of [`sum_candidates`] at the parameters `t`.
+fn newton_step(c: &Constants, isovalue: f32, edges: &[Edge], n: &[Vec<f32>; 3], density: &[f32], t: &mut [f32]) {
     let [x, y, z] = n;
     let sums = x.iter().zip(y).zip(z).zip(density);
-    for (((t, t0), edge), (((x, y), z), density)) in t.iter_mut().zip(t0).zip(edges).zip(sums) {
+    for ((t, edge), (((x, y), z), density)) in t.iter_mut().zip(edges).zip(sums) {
         let along = if edge.axis() == 0 { x } else if edge.axis() == 1 { y } else { z };
         let value = c.amplitude * density;
         // Rational approximation of ln(F/isovalue): a library's logarithm differs between platforms.
@@ -351,12 +340,12 @@ fn refine(
         let step = log * value / (2.0 * c.slope_amplitude * along);
         // The end of the edge that is on the other side of the surface.
         let end = if (value >= isovalue) == edge.starts_inside() { 1.0 } else { 0.0 };
-        let rest = end - t0;
+        let rest = end - *t;
         // A step towards the other side, limited so that the vertex moves continuously with the density. All comparisons
         // with NaN are false.
         let share = step / rest;
         let share = if (share >= 0.0) & (share < MAX_SHARE) { share } else { MAX_SHARE };
-        *t = (t0 + share * rest).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
+        *t = (*t + share * rest).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
     }
 }
 }

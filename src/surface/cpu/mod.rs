@@ -117,8 +117,8 @@ impl Backend for CpuBackend {
             // Only the mesh outlives the run.
             let memory = Arc::new(Reservation::new(&control.memory));
             let of_scan = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-            let scanned = scan(spheres, RunContext { params, limits, control: &of_scan, free_threads })?;
-            write::write(&scanned, params.atom_ids, control, sink)
+            let context = RunContext { params, limits, control: &of_scan, free_threads };
+            write::write(scan(spheres, context)?, context, control, sink)
         })
     }
 }
@@ -317,19 +317,17 @@ impl Tile {
         [self.found.before(piece.bricks.start), self.found.before(piece.bricks.end)]
     }
 
-    /// The surface brick in `slot`: its index in the tile, and the brick with the global id of its first vertex. `t` are
-    /// the final parameters of all vertices.
+    /// The surface brick in `slot`: its index in the tile, and the brick with the global id of its first vertex.
     #[inline(always)]
-    fn numbered<'a>(&'a self, slot: usize, t: &'a [f32]) -> Option<(usize, NumberedBrick<'a>)> {
+    fn numbered(&self, slot: usize) -> Option<(usize, NumberedBrick<'_>)> {
         let [x, y, z] = slot_brick(slot);
         let ix = usize::from(self.bricks[(z * 8 + y) * 8 + x]);
         let brick = self.found.bricks.get(ix)?;
         let end = self.found.bricks.get(ix + 1).map_or(self.found.vertices, |next| next.vertex);
         let own = brick.vertex as usize..end as usize;
-        let at = self.first_vertex;
-        let (t, edges) = (&t[at + own.start..at + own.end], &self.found.edges[own]);
+        let (t, edges) = (&self.found.t[own.clone()], &self.found.edges[own]);
         // `scan` checked that ids fit 32 bits.
-        let first = to_u32(at) + brick.vertex;
+        let first = to_u32(self.first_vertex) + brick.vertex;
         Some((ix, NumberedBrick { brick, first, t, edges }))
     }
 }

@@ -157,10 +157,10 @@ pub fn run_stages(
             });
         }
     }
-    let scanned = super::scan_lattice(lattice.clone(), context)?;
-    let mesh = write::write(&scanned, params.atom_ids, &control, None)?.mesh;
+    let mesh = write::write(super::scan_lattice(lattice.clone(), context)?, context, &control, None)?.mesh;
+    let mut scanned = super::scan_lattice(lattice.clone(), context)?;
     let mut surface: Vec<SurfaceResults> = scanned.done.iter().flat_map(surface_of).collect();
-    let written = write::write_pieces(&scanned, &control, &Destination::Sink(&Discard))?;
+    let written = write::write_pieces(&mut scanned, &control, &Destination::Sink(&Discard))?;
     let runs = written.sums.iter().flat_map(|sums| (0..sums.bricks.len()).map(move |ix| (sums, ix)));
     for (result, (sums, ix)) in surface.iter_mut().zip(runs) {
         let brick = &sums.bricks[ix];
@@ -168,7 +168,8 @@ pub fn run_stages(
         result.sheets = sheets.iter().map(SheetResults::new).collect();
         result.shared = sums.shared_by(ix)[0].iter().map(|vertex| [vertex.key, vertex.sheet]).collect();
     }
-    Ok(StageResults { bricks, surface, mesh, t: written.t })
+    let t = scanned.done.into_iter().flat_map(|tile| tile.found.t).collect();
+    Ok(StageResults { bricks, surface, mesh, t })
 }
 
 fn surface_of(tile: &Tile) -> Vec<SurfaceResults> {

@@ -14,7 +14,7 @@ use super::interpolate::{self, BrickVertices, VertexBatch, VertexRows, VertexTar
 use super::neighbours::{self, NumberedBrick};
 use super::sheets::Sheets;
 use super::table::{BrickTable, Rounding};
-use super::{PIECE_BRICKS, Piece, Scanned, Tile, threads};
+use super::{PIECE_BRICKS, Piece, RunContext, Scanned, Tile, scan_lattice, threads};
 use crate::surface::backend::{MeshOutput, StreamedMesh};
 use crate::surface::column::Column;
 use crate::surface::control::{Control, Stage};
@@ -75,8 +75,6 @@ pub(super) struct Written {
     flat: usize,
     /// Bounds of the positions, Å.
     bounds: Option<[[f32; 3]; 2]>,
-    /// Final parameters of all vertices.
-    pub(super) t: Vec<f32>,
     /// Sums over the triangles of each piece.
     pub(super) sums: Vec<SheetSums>,
 }
@@ -86,36 +84,39 @@ pub(super) struct Written {
 /// # Errors
 /// [`SurfaceError::Cancelled`], [`SurfaceError::Sink`].
 pub(super) fn write(
-    scanned: &Scanned,
-    atom_ids: bool,
+    mut scanned: Scanned,
+    context: RunContext<'_>,
     control: &Control<'_>,
     sink: Option<&dyn MeshSink>,
 ) -> Result<MeshOutput, SurfaceError> {
-    let Some(sink) = sink else { return in_memory(scanned, atom_ids, control) };
+    let Some(sink) = sink else { return in_memory(&mut scanned, context.params.atom_ids, control) };
     let failed = |SinkFailed| SurfaceError::Sink;
     let [n_vertices, n_triangles] = [scanned.totals.vertices, scanned.totals.triangles];
     sink.begin(n_vertices, n_triangles).map_err(failed)?;
-    let _working = control.reserve(working_bytes(scanned))?;
-    let written = write_pieces(scanned, control, &Destination::Sink(sink))?;
-    let measures = control.span(Stage::Measure, || measures(scanned, &written));
+    let _sums = control.reserve(SHEET_BYTES * scanned.grid.surface_bricks)?;
+    let written = write_pieces(&mut scanned, control, &Destination::Sink(sink))?;
+    let measures = control.span(Stage::Measure, || measures(&scanned, &written));
+    let (grid, centre) = (scanned.grid, scanned.lattice.centre());
     let measures = match measures {
         Some(measures) if written.flat == 0 => measures,
         // The normal of a vertex without a gradient depends on the triangles around it, and measuring a mesh that is
-        // not closed requires the whole mesh. In both cases the mesh is computed again in memory and sent again.
+        // not closed requires the whole mesh. In both cases, which are rare, the mesh is computed again in memory and
+        // sent again. Vertices have moved, so it starts at the first pass.
         _ => {
-            let mut output = in_memory(scanned, false, control)?;
+            let mut output = in_memory(&mut scan_lattice(scanned.lattice, context)?, false, control)?;
             sink.part(&MeshPart::whole(&output.mesh)).map_err(failed)?;
             output.measure(control)?.clone()
         }
     };
     let bounds = written.bounds.unwrap_or_default();
-    let mesh = Mesh { centre: scanned.lattice.centre(), ..Mesh::default() };
+    let mesh = Mesh { centre, ..Mesh::default() };
     let streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds });
-    Ok(MeshOutput { streamed, measures: Some(measures), ..MeshOutput::new(mesh, scanned.grid) })
+    Ok(MeshOutput { streamed, measures: Some(measures), ..MeshOutput::new(mesh, grid) })
 }
 
-fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
-    let Scanned { lattice, totals, pieces, .. } = scanned;
+fn in_memory(scanned: &mut Scanned, atom_ids: bool, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
+    let Scanned { lattice, totals, pieces, grid, .. } = &*scanned;
+    let grid = *grid;
     let of_ids = if atom_ids { size_of::<u32>() * totals.vertices } else { 0 };
     let [n, m] = [totals.vertices, totals.triangles].map(|n| n as u64);
     control.memory.grow(Mesh::bytes_for(n, m, scanned.quantize.is_some()) + of_ids as u64)?;
@@ -139,53 +140,61 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
         let atom_ids = ids.as_mut().map(|ids| take(ids, n));
         Mutex::new(PieceRows { rows: rows.take(n), atom_ids, triangles: take(&mut triangles, m) })
     });
-    let _working = control.reserve(working_bytes(scanned))?;
+    let _sums = control.reserve(SHEET_BYTES * grid.surface_bricks)?;
     let written = write_pieces(scanned, control, &Destination::Memory(of_piece.collect()))?;
     if written.flat > 0 {
         control.span(Stage::Interpolate, || mesh.fill_flat_normals());
     }
     let measures = control.span(Stage::Measure, || measures(scanned, &written));
-    Ok(MeshOutput { measures, bounds: written.bounds, ..MeshOutput::new(mesh, scanned.grid) })
+    Ok(MeshOutput { measures, bounds: written.bounds, ..MeshOutput::new(mesh, grid) })
 }
 
 /// Memory of the sums of a brick, bytes: its sheet, the copy in a group of bricks, and the component if it is separate.
 /// Few bricks have several sheets.
 const SHEET_BYTES: u64 = 3 * size_of::<Sheet>() as u64;
 
-/// Memory of the second pass besides the rows, bytes.
-fn working_bytes(scanned: &Scanned) -> u64 {
-    SHEET_BYTES * scanned.grid.surface_bricks + (size_of::<f32>() * scanned.totals.vertices) as u64
-}
-
-/// Writes all pieces, in parallel.
+/// Writes all pieces, in parallel. Replaces the parameters of vertices by the final ones, so it runs once.
 pub(super) fn write_pieces(
-    scanned: &Scanned,
+    scanned: &mut Scanned,
     control: &Control<'_>,
     destination: &Destination<'_>,
 ) -> Result<Written, SurfaceError> {
-    let Scanned { pieces, totals, .. } = scanned;
-    let mut t = vec![0.0; totals.vertices];
-    let mut rest = &mut t[..];
-    let of_piece: Vec<_> = pieces.iter().map(|piece| Mutex::new(take(&mut rest, scanned.size_of(piece)[0]))).collect();
+    let mut t: Vec<Vec<f32>> = scanned.done.iter_mut().map(|tile| std::mem::take(&mut tile.found.t)).collect();
+    let vertices = write_vertices(scanned, control, destination, &mut t)?;
+    for (tile, t) in scanned.done.iter_mut().zip(t) {
+        tile.found.t = t;
+    }
     let writer = Writer { scanned, control };
-    let vertices = writer.each(Stage::Interpolate, |piece, i, PieceScratch { stages, rows }| {
-        let t = &mut **lock(&of_piece[i]);
-        match destination {
-            Destination::Memory(of_piece) => {
-                let PieceRows { rows, atom_ids, .. } = &mut *lock(&of_piece[i]);
-                writer.interpolate(piece, rows, atom_ids.as_deref_mut(), t, &mut stages.batch)
-            }
-            Destination::Sink(sink) => writer.vertices_to_sink(piece, rows, t, &mut stages.batch, *sink),
-        }
-    })?;
-    drop(of_piece);
-    let sums = writer.each(Stage::Emit, |piece, i, PieceScratch { stages, rows }| match destination {
-        Destination::Memory(of_piece) => Ok(writer.emit(piece, lock(&of_piece[i]).triangles, &t, stages)),
-        Destination::Sink(sink) => writer.triangles_to_sink(piece, rows, &t, stages, *sink),
+    let sums = writer.each(Stage::Emit, |i, piece, PieceScratch { stages, rows }| match destination {
+        Destination::Memory(of_piece) => Ok(writer.emit(piece, lock(&of_piece[i]).triangles, stages)),
+        Destination::Sink(sink) => writer.triangles_to_sink(piece, rows, stages, *sink),
     })?;
     let flat = vertices.iter().map(|piece| piece.flat).sum();
     let bounds = vertices.iter().filter_map(|piece| piece.bounds).reduce(joined_bounds);
-    Ok(Written { flat, bounds, t, sums })
+    Ok(Written { flat, bounds, sums })
+}
+
+/// Writes the vertices of all pieces, in parallel. `t` are the parameters of the vertices of each tile.
+fn write_vertices(
+    scanned: &Scanned,
+    control: &Control<'_>,
+    destination: &Destination<'_>,
+    t: &mut [Vec<f32>],
+) -> Result<Vec<PieceVertices>, SurfaceError> {
+    let mut rest: Vec<&mut [f32]> = t.iter_mut().map(Vec::as_mut_slice).collect();
+    let own = |piece: &Piece| Mutex::new(take(&mut rest[piece.tile], scanned.size_of(piece)[0]));
+    let t: Vec<Mutex<&mut [f32]>> = scanned.pieces.iter().map(own).collect();
+    let writer = Writer { scanned, control };
+    writer.each(Stage::Interpolate, |i, piece, PieceScratch { stages, rows }| {
+        let (t, batch) = (&mut **lock(&t[i]), &mut stages.batch);
+        match destination {
+            Destination::Memory(of_piece) => {
+                let PieceRows { rows, atom_ids, .. } = &mut *lock(&of_piece[i]);
+                writer.interpolate(piece, rows, atom_ids.as_deref_mut(), t, batch)
+            }
+            Destination::Sink(sink) => writer.vertices_to_sink(piece, rows, t, batch, *sink),
+        }
+    })
 }
 
 /// Locks rows that one thread alone uses.
@@ -196,16 +205,16 @@ fn lock<T>(rows: &Mutex<T>) -> MutexGuard<'_, T> {
 /// Returns the measures of the mesh that consists of the pieces; `None` if it is not closed.
 fn measures(scanned: &Scanned, written: &Written) -> Option<Measures> {
     let Scanned { lattice, tiles, done, totals, pieces, .. } = scanned;
+    let sums: Vec<&SheetSums> = written.sums.iter().collect();
     let near = |piece: usize| {
         let Piece { tile, bricks } = &pieces[piece];
         let found = &done[*tile].found.bricks[bricks.clone()];
-        let near = TileNeighbours::new(tiles, done, done[*tile].coord, &written.t);
+        let near = TileNeighbours::new(tiles, done, done[*tile].coord);
         move |brick: usize, n: usize| {
             let (other, ix, _) = near.of(usize::from(found[brick].slot), n)?;
             Some((done[other].first_piece + ix / PIECE_BRICKS, ix % PIECE_BRICKS))
         }
     };
-    let sums: Vec<&SheetSums> = written.sums.iter().collect();
     join::measures(&sums, near, lattice.spacing, [totals.vertices, totals.triangles])
 }
 
@@ -228,13 +237,13 @@ impl Writer<'_> {
     fn each<T: Send + Sync>(
         &self,
         stage: Stage,
-        work: impl Fn(&Piece, usize, &mut PieceScratch) -> Result<T, SurfaceError> + Sync,
+        work: impl Fn(usize, &Piece, &mut PieceScratch) -> Result<T, SurfaceError> + Sync,
     ) -> Result<Vec<T>, SurfaceError> {
         let pieces = &self.scanned.pieces;
         let finished = AtomicUsize::new(0);
         threads::each(pieces.len(), |i| {
             self.control.check()?;
-            let done = SCRATCH.with_borrow_mut(|scratch| work(&pieces[i], i, scratch))?;
+            let done = SCRATCH.with_borrow_mut(|scratch| work(i, &pieces[i], scratch))?;
             let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
             self.control.observer.progress(stage, n, pieces.len());
             Ok(done)
@@ -271,13 +280,12 @@ impl Writer<'_> {
         &self,
         piece: &Piece,
         scratch: &mut ScratchRows,
-        t: &[f32],
         stages: &mut Stages,
         sink: &dyn MeshSink,
     ) -> Result<SheetSums, SurfaceError> {
         let [_, n] = self.scanned.size_of(piece);
         let triangles = first(&mut scratch.triangles, n);
-        let sums = self.emit(piece, triangles, t, stages);
+        let sums = self.emit(piece, triangles, stages);
         let none = match self.scanned.quantize {
             None => Vertices::Single { positions: &[], normals: &[] },
             Some(step) => Vertices::Quantized { step, positions: &[], normals: &[] },
@@ -305,7 +313,7 @@ impl Writer<'_> {
         self.control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)
     }
 
-    /// Writes the vertices, and their final parameters to `t`.
+    /// Writes the vertices and replaces their parameters `t` by the final ones.
     fn interpolate(
         &self,
         piece: &Piece,
@@ -347,7 +355,6 @@ impl Writer<'_> {
                 candidates: &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize],
                 features: found.features.get(all.clone()).unwrap_or_default(),
                 spheres: found.spheres.get(all.clone()).unwrap_or_default(),
-                t: &found.t[all.clone()],
                 edges: &found.edges[all],
             };
             flat += interpolate::interpolate(self.scanned, &source, batch, target, self.control)?;
@@ -355,16 +362,16 @@ impl Writer<'_> {
         Ok(flat)
     }
 
-    /// Writes the triangles. Returns the sums over them. `t` are the final parameters of all vertices.
-    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], t: &[f32], stages: &mut Stages) -> SheetSums {
-        self.control.span(Stage::Emit, || self.triangles(piece, triangles, t, stages))
+    /// Writes the triangles. Returns the sums over them.
+    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], stages: &mut Stages) -> SheetSums {
+        self.control.span(Stage::Emit, || self.triangles(piece, triangles, stages))
     }
 
     /// Writes the triangles brick by brick.
-    fn triangles(&self, piece: &Piece, triangles: &mut [[u32; 3]], t: &[f32], stages: &mut Stages) -> SheetSums {
+    fn triangles(&self, piece: &Piece, triangles: &mut [[u32; 3]], stages: &mut Stages) -> SheetSums {
         let (scanned, Stages { table, sheets, .. }) = (self.scanned, stages);
         let tile = &scanned.done[piece.tile];
-        let near = TileNeighbours::new(&scanned.tiles, &scanned.done, tile.coord, t);
+        let near = TileNeighbours::new(&scanned.tiles, &scanned.done, tile.coord);
         let found = &tile.found;
         let base = found.before(piece.bricks.start).triangles;
         let mut sums = SheetSums::with_capacity(piece.bricks.len());
@@ -406,14 +413,11 @@ impl Scanned {
 /// A tile and its neighbours towards +x, +y, +z.
 pub(super) struct TileNeighbours<'a> {
     tiles: [Option<(usize, &'a Tile)>; 8],
-    /// Final parameters of all vertices.
-    t: &'a [f32],
 }
 
 impl<'a> TileNeighbours<'a> {
-    pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3], t: &'a [f32]) -> Self {
+    pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3]) -> Self {
         Self {
-            t,
             tiles: std::array::from_fn(|n| {
                 let coord = std::array::from_fn(|k| coord[k] + i32::from(n >> k & 1 == 1));
                 tiles.index.get(&coord).map(|&t| (t as usize, &done[t as usize]))
@@ -426,9 +430,9 @@ impl<'a> TileNeighbours<'a> {
     #[inline(always)]
     pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, NumberedBrick<'a>)> {
         let (slot, beyond) = neighbours::neighbour_slot(slot, n);
-        let (other, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
-        let (ix, numbered) = tile.numbered(slot, self.t)?;
-        Some((other, ix, numbered))
+        let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
+        let (ix, numbered) = tile.numbered(slot)?;
+        Some((t, ix, numbered))
     }
 }
 
