@@ -22,6 +22,7 @@ mod formats_roundtrip;
 mod formats_storage;
 mod instances;
 mod language;
+mod level_sets;
 mod links;
 mod make_test;
 mod maps;

@@ -96,15 +96,19 @@ fn a_single_sphere_has_its_analytic_area_and_volume() {
             assert_eq!((m.euler, m.components.len()), (2, 1));
             areas.push((h, (m.area - 4.0 * std::f64::consts::PI * r * r).abs()));
             volumes.push((h, (m.volume - 4.0 / 3.0 * std::f64::consts::PI * r.powi(3)).abs()));
-            let bound = 0.6 * h * h;
+            let (mut off, mut turned) = (0.0_f64, 0.0_f64);
             for (p, n) in meshed.mesh.positions.iter().zip(&meshed.mesh.normals) {
                 let c = [0.123, -4.321, 7.007];
                 let d: [f64; 3] = std::array::from_fn(|k| f64::from(p[k]) + meshed.mesh.centre[k] - c[k]);
                 let length = d.iter().map(|c| c * c).sum::<f64>().sqrt();
-                assert!((length - r).abs() < bound, "{kernel} {h}: {length}");
+                off = off.max((length - r).abs());
                 let cosine: f64 = (0..3).map(|k| d[k] / length * f64::from(n[k])).sum();
-                assert!(cosine > 1.0 - 1e-5, "{kernel} {h}: {cosine}");
+                turned = turned.max(cosine.min(1.0).acos());
             }
+            // The step squares the error of linear interpolation. It moves vertices on edges along the surface most,
+            // and the normal is that before the step.
+            assert!(off < (8.0 * h.powi(4)).min(0.015), "{kernel} {h}: {off} Å");
+            assert!(turned < (3.5 * h * h).min(0.12), "{kernel} {h}: {turned} rad");
         }
         assert!(order(&areas) >= 1.9, "{kernel}: area of order {} {areas:?}", order(&areas));
         assert!(order(&volumes) >= 1.9, "{kernel}: volume of order {} {volumes:?}", order(&volumes));
@@ -167,7 +171,19 @@ fn two_overlapping_atoms_converge_to_the_integrated_truth() {
     }
 }
 
-/// Each vertex is at the linear interpolation of the exact densities of its edge, and its normal is the exact gradient.
+/// Parameter on an edge with the densities `ends` (over the isovalue) after one step on the logarithm, at most three
+/// quarters of the rest of the edge, from the linearly interpolated one, which comes first. `at` returns the density and its derivative.
+fn stepped(ends: [f64; 2], at: impl Fn(f64) -> (f64, f64)) -> [f64; 2] {
+    let within = |t: f64| t.clamp(1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
+    let t = within((ends[0] - 1.0) / (ends[0] - ends[1]));
+    let (value, slope) = at(t);
+    let rest = f64::from((value >= 1.0) == (ends[0] >= 1.0)) - t;
+    let share = -2.0 * (value - 1.0) / (value + 1.0) * value / slope / rest;
+    [t, within(t + rest * if (0.0..0.75).contains(&share) { share } else { 0.75 })]
+}
+
+/// Each vertex is one step from the linear interpolation of the exact densities of its edge. Its normal is the exact
+/// gradient there.
 #[test]
 fn vertices_and_normals_agree_with_the_brute_force_field() {
     let rows = Random(7).cloud(300, 18.0);
@@ -178,28 +194,35 @@ fn vertices_and_normals_agree_with_the_brute_force_field() {
             let density = Density::new(&at, &params).unwrap();
             let meshed = run(&at, &params);
             assert_sound(&meshed, kernel.name());
-            let mut worst = (0.0_f64, 0.0_f64);
+            let (mut off, mut n_linear, mut turned) = (Vec::new(), 0, 0.0_f64);
             for (p, n) in meshed.mesh.positions.iter().zip(&meshed.mesh.normals).step_by(17) {
                 let x: [f64; 3] = std::array::from_fn(|k| f64::from(p[k]) + meshed.mesh.centre[k]);
                 let lattice = x.map(|c| c / h);
                 let axis = (0..3).max_by(|&a, &b| fraction(lattice[a]).total_cmp(&fraction(lattice[b]))).unwrap();
                 let mut low = lattice.map(f64::round);
                 low[axis] = lattice[axis].floor();
-                let mut high = low;
-                high[axis] += 1.0;
-                let [f0, f1] = [low, high].map(|s| density.value(s.map(|c| c * h)));
-                assert!((f0 >= 1.0) != (f1 >= 1.0) || (f0 - 1.0).abs() < 1e-5 || (f1 - 1.0).abs() < 1e-5);
-                let t = ((f0 - 1.0) / (f0 - f1)).clamp(1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
-                worst.0 = worst.0.max((low[axis] + t - lattice[axis]).abs() * h);
-                let g = density.gradient(x);
+                let along = |t: f64| {
+                    let mut point = low;
+                    point[axis] += t;
+                    point.map(|c| c * h)
+                };
+                let ends = [0.0, 1.0].map(|t| density.value(along(t)));
+                let crosses = (ends[0] >= 1.0) != (ends[1] >= 1.0);
+                assert!(crosses || ends.iter().any(|f| (f - 1.0).abs() < 1e-5), "{ends:?}");
+                let [linear, t] = stepped(ends, |t| (density.value(along(t)), density.gradient(along(t))[axis] * h));
+                off.push((low[axis] + t - lattice[axis]).abs() * h);
+                n_linear += usize::from((low[axis] + linear - lattice[axis]).abs() * h < 2e-4);
+                let g = density.gradient(along(linear));
                 let length = g.iter().map(|c| c * c).sum::<f64>().sqrt();
                 if length > 1e-2 {
                     let cosine: f64 = (0..3).map(|k| -g[k] / length * f64::from(n[k])).sum();
-                    worst.1 = worst.1.max(1.0 - cosine);
+                    turned = turned.max(1.0 - cosine);
                 }
             }
-            assert!(worst.0 < 2e-4, "{kernel} {h}: vertices off by {} Å", worst.0);
-            assert!(worst.1 < 1e-5, "{kernel} {h}: normals off by 1 − cos = {}", worst.1);
+            let worst = off.iter().copied().fold(0.0, f64::max);
+            assert!(worst < 1e-3, "{kernel} {h}: vertices off by {worst} Å");
+            assert!(n_linear * 5 < off.len(), "{kernel} {h}: {n_linear} of {} did not move", off.len());
+            assert!(turned < 1e-5, "{kernel} {h}: normals off by 1 − cos = {turned}");
         }
     }
 }
@@ -322,7 +345,7 @@ fn atoms_at_tile_and_brick_borders_have_sound_meshes() {
                 assert_sound(&run(&spheres(&[[at[0], at[1], at[2], 1.7]]), &params(Kernel::Gaussian, 0.5)), "swept");
             assert_eq!((m.euler, m.components.len()), (2, 1), "{at:?}");
             // Chords reduce a sphere of 3.4 spacings by a few per cent.
-            assert!((m.volume - 20.58).abs() < 0.8, "{at:?} {}", m.volume);
+            assert!((19.5..20.58).contains(&m.volume), "{at:?} {}", m.volume);
         }
     }
 }

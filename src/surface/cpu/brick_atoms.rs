@@ -1,11 +1,14 @@
-//! Atoms around a brick's vertices, and the subset that reaches a few of these.
+//! Atoms around a brick's vertices, the subset that reaches a few of these, and the nearest one.
 
 use super::bin::NORMAL_ONLY;
 use crate::surface::lattice::LatticeAtom;
-use crate::surface::simd::LANES;
+use crate::surface::simd::{LANES, dispatched};
 
 /// Factor that exceeds the rounding errors of u, for a vertex and for the box around it.
 const MARGIN: f32 = 1.0 + 1e-4;
+
+/// Margin for the rounding of distances between atoms and vertices, grid spacings.
+const ROUNDING: f32 = 0.01;
 
 /// A brick's candidates in its own coordinates.
 #[derive(Debug, Default)]
@@ -64,6 +67,61 @@ impl BrickAtoms {
         }
         &near[..n.min(near.len())]
     }
+}
+
+dispatched! {
+/// Finds the candidate whose sphere is nearest to each vertex: the distance to its centre minus its radius is smallest.
+/// Among equals, takes the first in canonical order.
+pub(super) fn nearest_atoms(
+    atoms: &[LatticeAtom],
+    radius_per_length: f32,
+    candidates: &[u32],
+    origin: [i32; 3],
+    p: &[Vec<f32>; 3],
+    ids: &mut [u32],
+) {
+    let mut spheres: [Vec<f32>; 4] = std::array::from_fn(|_| Vec::with_capacity(candidates.len()));
+    for &candidate in candidates {
+        let atom = &atoms[(candidate & !NORMAL_ONLY) as usize];
+        for k in 0..3 {
+            spheres[k].push((atom.cell[k] - origin[k]) as f32 + atom.frac[k]);
+        }
+        spheres[3].push(radius_per_length / atom.inv_length2.sqrt());
+    }
+    let [x, y, z, radius] = &spheres;
+    let mut from_middle = vec![0.0_f32; candidates.len()];
+    let [px, py, pz] = p;
+    let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
+    for (ids, ((px, py), pz)) in ids.chunks_mut(LANES).zip(lanes) {
+        // No vertex is farther from the middle of their box than its half-diagonal. So a sphere that is farther from
+        // the middle than the nearest one, by more than the diagonal, is the nearest to no vertex.
+        let bounds = [px, py, pz].map(|column| {
+            column.iter().fold([f32::MAX, f32::MIN], |[low, high], &v| [low.min(v), high.max(v)])
+        });
+        let [cx, cy, cz] = bounds.map(|[low, high]| 0.5 * (low + high));
+        let [sx, sy, sz] = bounds.map(|[low, high]| high - low);
+        let mut least = f32::MAX;
+        for (i, distance) in from_middle.iter_mut().enumerate() {
+            let (dx, dy, dz) = (cx - x[i], cy - y[i], cz - z[i]);
+            *distance = (dx * dx + dy * dy + dz * dz).sqrt() - radius[i];
+            least = least.min(*distance);
+        }
+        let most = least + (sx * sx + sy * sy + sz * sz).sqrt() + ROUNDING;
+        let (mut best, mut source) = ([f32::MAX; LANES], [0_u32; LANES]);
+        for (at, _) in from_middle.iter().enumerate().filter(|(_, distance)| **distance <= most) {
+            let (x, y, z, radius) = (x[at], y[at], z[at], radius[at]);
+            let id = atoms[(candidates[at] & !NORMAL_ONLY) as usize].source;
+            for i in 0..LANES {
+                let (dx, dy, dz) = (px[i] - x, py[i] - y, pz[i] - z);
+                let distance = (dx * dx + dy * dy + dz * dz).sqrt() - radius;
+                let closer = distance < best[i];
+                best[i] = if closer { distance } else { best[i] };
+                source[i] = if closer { id } else { source[i] };
+            }
+        }
+        ids.copy_from_slice(&source[..ids.len()]);
+    }
+}
 }
 
 #[cfg(test)]

@@ -1,19 +1,17 @@
 //! Stage `interpolate`: vertex positions on crossing edges, analytic normals, and nearest atoms on request.
 //!
-//! `classify` places a vertex by linear interpolation. One sum over the atoms there gives the density and its gradient,
-//! hence the normal and one step of Newton's method along the edge. The gradient at the new place differs from this one
-//! by the second derivative times the step, so the normal is not computed again.
+//! `classify` places a vertex by linear interpolation. One sum over the atoms there gives its normal, and density and
+//! slope for a step along the edge. That changes the normal by an error of second order, so it is not summed again.
 
 use std::ops::Range;
 
-use super::bin::NORMAL_ONLY;
-use super::brick_atoms::BrickAtoms;
+use super::brick_atoms::{BrickAtoms, nearest_atoms};
 use super::edge::Edge;
 use super::field::Constants;
 use super::{Field, Scanned};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::{EDGE_MARGIN, LatticeAtom, to_f32};
+use crate::surface::lattice::{EDGE_MARGIN, to_f32};
 use crate::surface::mesh::{normal_row, position_row};
 use crate::surface::params::Kernel;
 use crate::surface::quantize::Step;
@@ -24,9 +22,12 @@ use crate::surface::sphere_union::Feature;
 /// Maximum step of a vertex, as a share of the rest of its edge up to the end on the other side of the surface.
 pub(in crate::surface) const MAX_SHARE: f32 = 0.75;
 
-/// Vertices of one brick, in spacings relative to its first grid point, and the atoms around them.
+/// Vertices of one brick, in spacings relative to its first grid point, and the atoms around them. Columns are padded to
+/// whole vectors by repeating the last vertex.
 #[derive(Debug, Default)]
 pub(super) struct VertexBatch {
+    edges: Vec<Edge>,
+    t: Vec<f32>,
     p: [Vec<f32>; 3],
     n: [Vec<f32>; 3],
     /// Densities without their common factor.
@@ -35,17 +36,19 @@ pub(super) struct VertexBatch {
 }
 
 impl VertexBatch {
-    /// Computes the positions of a brick's vertices; pads them to whole vectors by repeating the last one.
+    /// Loads a brick's vertices and computes their positions.
     fn fill(&mut self, edges: &[Edge], t: &[f32]) {
         let padded = t.len().next_multiple_of(LANES);
+        self.edges.clear();
+        self.edges.extend_from_slice(edges);
+        self.edges.resize(padded, edges[edges.len() - 1]);
+        self.t.clear();
+        self.t.extend_from_slice(t);
+        self.t.resize(padded, t[t.len() - 1]);
         for column in self.p.iter_mut().chain(&mut self.n).chain([&mut self.density]) {
             column.resize(padded, 0.0);
         }
-        positions(edges, t, &mut self.p);
-        for column in &mut self.p {
-            let last = column[t.len() - 1];
-            column[t.len()..].fill(last);
-        }
+        positions(&self.edges, &self.t, &mut self.p);
     }
 }
 
@@ -137,9 +140,6 @@ pub(super) struct VertexTarget<'a> {
     pub(super) atom_ids: Option<&'a mut [u32]>,
 }
 
-/// Margin for the rounding of distances between atoms and vertices, grid spacings.
-const ROUNDING: f32 = 0.01;
-
 /// Candidates whose gradients are summed together: their coordinates take 200 KB and stay in the core's cache.
 const BLOCK: usize = 4096;
 
@@ -165,8 +165,9 @@ pub(super) fn interpolate(
                 batch.atoms.fill(&lattice.atoms, block, origin);
                 sums(constants, &mut batch.atoms, &batch.p, &mut batch.n, &mut batch.density);
             }
-            newton_step(constants, scanned.level, edges, &batch.n, &batch.density, target.t);
-            positions(edges, target.t, &mut batch.p);
+            newton_step(constants, scanned.level, &batch.edges, &batch.n, &batch.density, &mut batch.t);
+            positions(&batch.edges, &batch.t, &mut batch.p);
+            target.t.copy_from_slice(&batch.t[..edges.len()]);
             if let Some(ids) = target.atom_ids {
                 nearest_atoms(&lattice.atoms, constants.radius_per_length, candidates, origin, &batch.p, ids);
             }
@@ -336,71 +337,14 @@ fn newton_step(c: &Constants, isovalue: f32, edges: &[Edge], n: &[Vec<f32>; 3], 
         let value = c.amplitude * density;
         // Rational approximation of ln(F/isovalue): a library's logarithm differs between platforms.
         let log = 2.0 * (value - isovalue) / (value + isovalue);
-        // −dF/dt is twice the amplitude times the sum.
-        let step = log * value / (2.0 * c.slope_amplitude * along);
         // The end of the edge that is on the other side of the surface.
         let end = if (value >= isovalue) == edge.starts_inside() { 1.0 } else { 0.0 };
         let rest = end - *t;
-        // A step towards the other side, limited so that the vertex moves continuously with the density. All comparisons
-        // with NaN are false.
-        let share = step / rest;
+        // −dF/dt is twice the amplitude times the sum. The limit keeps the vertex a continuous function of the density.
+        // All comparisons with NaN are false.
+        let share = log * value / (2.0 * c.slope_amplitude * along * rest);
         let share = if (share >= 0.0) & (share < MAX_SHARE) { share } else { MAX_SHARE };
         *t = (*t + share * rest).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
-    }
-}
-}
-
-dispatched! {
-/// Finds the candidate whose sphere is nearest to each vertex: the distance to its centre minus its radius is smallest.
-/// Among equals, takes the first in canonical order.
-fn nearest_atoms(
-    atoms: &[LatticeAtom],
-    radius_per_length: f32,
-    candidates: &[u32],
-    origin: [i32; 3],
-    p: &[Vec<f32>; 3],
-    ids: &mut [u32],
-) {
-    let mut spheres: [Vec<f32>; 4] = std::array::from_fn(|_| Vec::with_capacity(candidates.len()));
-    for &candidate in candidates {
-        let atom = &atoms[(candidate & !NORMAL_ONLY) as usize];
-        for k in 0..3 {
-            spheres[k].push((atom.cell[k] - origin[k]) as f32 + atom.frac[k]);
-        }
-        spheres[3].push(radius_per_length / atom.inv_length2.sqrt());
-    }
-    let [x, y, z, radius] = &spheres;
-    let mut from_middle = vec![0.0_f32; candidates.len()];
-    let [px, py, pz] = p;
-    let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
-    for (ids, ((px, py), pz)) in ids.chunks_mut(LANES).zip(lanes) {
-        // No vertex is farther from the middle of their box than its half-diagonal. So a sphere that is farther from
-        // the middle than the nearest one, by more than the diagonal, is the nearest to no vertex.
-        let bounds = [px, py, pz].map(|column| {
-            column.iter().fold([f32::MAX, f32::MIN], |[low, high], &v| [low.min(v), high.max(v)])
-        });
-        let [cx, cy, cz] = bounds.map(|[low, high]| 0.5 * (low + high));
-        let [sx, sy, sz] = bounds.map(|[low, high]| high - low);
-        let mut least = f32::MAX;
-        for (i, distance) in from_middle.iter_mut().enumerate() {
-            let (dx, dy, dz) = (cx - x[i], cy - y[i], cz - z[i]);
-            *distance = (dx * dx + dy * dy + dz * dz).sqrt() - radius[i];
-            least = least.min(*distance);
-        }
-        let most = least + (sx * sx + sy * sy + sz * sz).sqrt() + ROUNDING;
-        let (mut best, mut source) = ([f32::MAX; LANES], [0_u32; LANES]);
-        for (at, _) in from_middle.iter().enumerate().filter(|(_, distance)| **distance <= most) {
-            let (x, y, z, radius) = (x[at], y[at], z[at], radius[at]);
-            let id = atoms[(candidates[at] & !NORMAL_ONLY) as usize].source;
-            for i in 0..LANES {
-                let (dx, dy, dz) = (px[i] - x, py[i] - y, pz[i] - z);
-                let distance = (dx * dx + dy * dy + dz * dz).sqrt() - radius;
-                let closer = distance < best[i];
-                best[i] = if closer { distance } else { best[i] };
-                source[i] = if closer { id } else { source[i] };
-            }
-        }
-        ids.copy_from_slice(&source[..ids.len()]);
     }
 }
 }

@@ -7,11 +7,13 @@ use std::num::NonZeroU16;
 
 use glam::Vec3A;
 
-use super::neighbours::{NeighbourVertex, NumberedBrick, shared_vertices};
+use super::neighbours::{NeighbourVertex, NumberedBrick, TileNeighbours, shared_vertices};
 use super::sheets::Sheets;
 use super::table::BrickTable;
-use crate::surface::join::{BrickSheets, SharedVertex, Sheet, SheetSums};
+use super::{PIECE_BRICKS, Piece, Scanned};
+use crate::surface::join::{self, BrickSheets, SharedVertex, Sheet, SheetSums};
 use crate::surface::lattice::to_u32;
+use crate::surface::measure::Measures;
 use crate::surface::simd::dispatched;
 use crate::surface::sums::{edge_shares, sum_lanes};
 
@@ -60,6 +62,22 @@ impl SheetSums {
         sum_by_sheet(table, sheets, &mut self.sheets[first..]);
         note_vertices(self, table, sheets, around, first);
     }
+}
+
+/// Returns the measures of the mesh that consists of the pieces; `None` if it is not closed.
+pub(super) fn of_pieces(scanned: &Scanned, sums: &[SheetSums]) -> Option<Measures> {
+    let Scanned { lattice, tiles, done, totals, pieces, .. } = scanned;
+    let sums: Vec<&SheetSums> = sums.iter().collect();
+    let near = |piece: usize| {
+        let Piece { tile, bricks } = &pieces[piece];
+        let found = &done[*tile].found.bricks[bricks.clone()];
+        let near = TileNeighbours::new(tiles, done, done[*tile].coord);
+        move |brick: usize, n: usize| {
+            let (other, ix, _) = near.of(usize::from(found[brick].slot), n)?;
+            Some((done[other].first_piece + ix / PIECE_BRICKS, ix % PIECE_BRICKS))
+        }
+    };
+    join::measures(&sums, near, lattice.spacing, [totals.vertices, totals.triangles])
 }
 
 dispatched! {

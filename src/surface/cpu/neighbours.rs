@@ -1,6 +1,7 @@
 //! Vertices of the neighbours towards +x, +y, +z that a brick's cells use.
 
-use super::bin::{SIDE, slot_brick};
+use super::Tile;
+use super::bin::{SIDE, Tiles, slot_brick};
 use super::classify::SurfaceBrick;
 use super::edge::Edge;
 
@@ -100,6 +101,32 @@ pub(super) fn neighbour_slot(slot: usize, n: usize) -> (usize, [usize; 3]) {
     let beyond = moved.map(|m| m / 8);
     let [x, y, z] = moved.map(|m| m % 8);
     ((z * SIDE + y) * SIDE + x, beyond)
+}
+
+/// A tile and its neighbours towards +x, +y, +z.
+pub(super) struct TileNeighbours<'a> {
+    tiles: [Option<(usize, &'a Tile)>; 8],
+}
+
+impl<'a> TileNeighbours<'a> {
+    pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3]) -> Self {
+        Self {
+            tiles: std::array::from_fn(|n| {
+                let coord = std::array::from_fn(|k| coord[k] + i32::from(n >> k & 1 == 1));
+                tiles.index.get(&coord).map(|&t| (t as usize, &done[t as usize]))
+            }),
+        }
+    }
+
+    /// The neighbour `n` (bits: 0 x, 1 y, 2 z; 0 is the brick itself) of the brick in `slot`, if the surface intersects
+    /// it: the index of its tile, its index in the tile, and the brick.
+    #[inline(always)]
+    pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, NumberedBrick<'a>)> {
+        let (slot, beyond) = neighbour_slot(slot, n);
+        let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
+        let (ix, numbered) = tile.numbered(slot)?;
+        Some((t, ix, numbered))
+    }
 }
 
 #[cfg(test)]

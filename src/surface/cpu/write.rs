@@ -8,20 +8,18 @@ use std::cell::RefCell;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use super::bin::{Tiles, slot_origin};
-use super::emit;
+use super::bin::slot_origin;
 use super::interpolate::{self, BrickVertices, VertexBatch, VertexRows, VertexTarget, take};
-use super::neighbours::{self, NumberedBrick};
+use super::neighbours::{NumberedBrick, TileNeighbours};
 use super::sheets::Sheets;
 use super::table::{BrickTable, Rounding};
-use super::{PIECE_BRICKS, Piece, RunContext, Scanned, Tile, scan_lattice, threads};
+use super::{Piece, RunContext, Scanned, emit, measure, scan_lattice, threads};
 use crate::surface::backend::{MeshOutput, StreamedMesh};
 use crate::surface::column::Column;
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
-use crate::surface::join::{self, Sheet, SheetSums};
+use crate::surface::join::{Sheet, SheetSums};
 use crate::surface::lattice::Lattice;
-use crate::surface::measure::Measures;
 use crate::surface::mesh::{Mesh, Quantized, joined_bounds};
 use crate::surface::quantize::Step;
 use crate::surface::sink::{MeshPart, MeshSink, SinkFailed, Vertices};
@@ -95,7 +93,7 @@ pub(super) fn write(
     sink.begin(n_vertices, n_triangles).map_err(failed)?;
     let _sums = control.reserve(SHEET_BYTES * scanned.grid.surface_bricks)?;
     let written = write_pieces(&mut scanned, control, &Destination::Sink(sink))?;
-    let measures = control.span(Stage::Measure, || measures(&scanned, &written));
+    let measures = control.span(Stage::Measure, || measure::of_pieces(&scanned, &written.sums));
     let (grid, centre) = (scanned.grid, scanned.lattice.centre());
     let measures = match measures {
         Some(measures) if written.flat == 0 => measures,
@@ -115,8 +113,7 @@ pub(super) fn write(
 }
 
 fn in_memory(scanned: &mut Scanned, atom_ids: bool, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
-    let Scanned { lattice, totals, pieces, grid, .. } = &*scanned;
-    let grid = *grid;
+    let (Scanned { lattice, totals, pieces, .. }, grid) = (&*scanned, scanned.grid);
     let of_ids = if atom_ids { size_of::<u32>() * totals.vertices } else { 0 };
     let [n, m] = [totals.vertices, totals.triangles].map(|n| n as u64);
     control.memory.grow(Mesh::bytes_for(n, m, scanned.quantize.is_some()) + of_ids as u64)?;
@@ -145,7 +142,7 @@ fn in_memory(scanned: &mut Scanned, atom_ids: bool, control: &Control<'_>) -> Re
     if written.flat > 0 {
         control.span(Stage::Interpolate, || mesh.fill_flat_normals());
     }
-    let measures = control.span(Stage::Measure, || measures(scanned, &written));
+    let measures = control.span(Stage::Measure, || measure::of_pieces(scanned, &written.sums));
     Ok(MeshOutput { measures, bounds: written.bounds, ..MeshOutput::new(mesh, grid) })
 }
 
@@ -200,22 +197,6 @@ fn write_vertices(
 /// Locks rows that one thread alone uses.
 fn lock<T>(rows: &Mutex<T>) -> MutexGuard<'_, T> {
     rows.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// Returns the measures of the mesh that consists of the pieces; `None` if it is not closed.
-fn measures(scanned: &Scanned, written: &Written) -> Option<Measures> {
-    let Scanned { lattice, tiles, done, totals, pieces, .. } = scanned;
-    let sums: Vec<&SheetSums> = written.sums.iter().collect();
-    let near = |piece: usize| {
-        let Piece { tile, bricks } = &pieces[piece];
-        let found = &done[*tile].found.bricks[bricks.clone()];
-        let near = TileNeighbours::new(tiles, done, done[*tile].coord);
-        move |brick: usize, n: usize| {
-            let (other, ix, _) = near.of(usize::from(found[brick].slot), n)?;
-            Some((done[other].first_piece + ix / PIECE_BRICKS, ix % PIECE_BRICKS))
-        }
-    };
-    join::measures(&sums, near, lattice.spacing, [totals.vertices, totals.triangles])
 }
 
 /// Summary of a piece's vertices.
@@ -407,32 +388,6 @@ impl Scanned {
         let Lattice { spacing, centre, .. } = &self.lattice;
         let offset = std::array::from_fn(|k| f64::from(origin[k] - centre[k]));
         Rounding { step, spacing: *spacing, offset }
-    }
-}
-
-/// A tile and its neighbours towards +x, +y, +z.
-pub(super) struct TileNeighbours<'a> {
-    tiles: [Option<(usize, &'a Tile)>; 8],
-}
-
-impl<'a> TileNeighbours<'a> {
-    pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3]) -> Self {
-        Self {
-            tiles: std::array::from_fn(|n| {
-                let coord = std::array::from_fn(|k| coord[k] + i32::from(n >> k & 1 == 1));
-                tiles.index.get(&coord).map(|&t| (t as usize, &done[t as usize]))
-            }),
-        }
-    }
-
-    /// The neighbour `n` (bits: 0 x, 1 y, 2 z; 0 is the brick itself) of the brick in `slot`, if the surface intersects
-    /// it: the index of its tile, its index in the tile, and the brick.
-    #[inline(always)]
-    pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, NumberedBrick<'a>)> {
-        let (slot, beyond) = neighbours::neighbour_slot(slot, n);
-        let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
-        let (ix, numbered) = tile.numbered(slot)?;
-        Some((t, ix, numbered))
     }
 }
 
