@@ -1,9 +1,9 @@
 // Signed distance to the boundary of a union of spheres, in spacings and positive inside, as in
 // `surface/sphere_union/distance.rs`. Requires `params`, `atoms`, `lists`, `heads` and `boundary`.
 //
-// The rows of `boundary` begin with one per sphere and arc: the first of its own rows and the one after the last. A
-// sphere has its caps: axis and height. An arc has four rows: centre and radius, axis and cosine of the half-angle,
-// middle and sine of the half-angle, side.
+// The rows of `boundary` begin with one per sphere and arc: the first of its own rows, and for a sphere the one after the
+// last. An arc has four rows: centre and radius, axis and cosine of the half-angle, middle and sine of the half-angle,
+// side. A sphere has eight rows for each group of eight caps: two each of axis x, y, z and height.
 
 // Range of rows of a sphere without a face.
 const COVERED: u32 = 0xffffffffu;
@@ -47,13 +47,21 @@ fn is_exposed(sphere: u32, n: vec3<f32>) -> bool {
     if (rows.x == COVERED) {
         return false;
     }
-    for (var i = rows.x; i < rows.y; i++) {
-        let cap = bitcast<vec4<f32>>(boundary[i]);
-        if (dot(n, cap.xyz) > cap.w) {
+    for (var i = rows.x; i < rows.y; i += 8u) {
+        if (is_covered(n, i) || is_covered(n, i + 1u)) {
             return false;
         }
     }
     return true;
+}
+
+// Returns true if one of four caps of a group, whose columns begin at row `first`, covers a direction.
+fn is_covered(n: vec3<f32>, first: u32) -> bool {
+    let x = bitcast<vec4<f32>>(boundary[first]);
+    let y = bitcast<vec4<f32>>(boundary[first + 2u]);
+    let z = bitcast<vec4<f32>>(boundary[first + 4u]);
+    let height = bitcast<vec4<f32>>(boundary[first + 6u]);
+    return any(n.x * x + n.y * y + n.z * z > height);
 }
 
 // Arc relative to the first grid point of a brick.

@@ -233,6 +233,7 @@ impl Engine {
         write(BufferId::Reaches, size_of_val(&plan.reaches[..]), bytemuck::cast_slice(&arcs.reaches));
         write(BufferId::FirstAtoms, size_of_val(&plan.first_atoms[..]), bytemuck::cast_slice(&arcs.first));
         write(BufferId::Boundary, 0, bytemuck::cast_slice(&arcs.rows));
+        write(BufferId::Boundary, size_of_val(&arcs.rows[..]), arcs.caps());
         write(BufferId::Tiles, 0, bytemuck::cast_slice(&plan.tiles));
         write(BufferId::Bricks, 0, bytemuck::cast_slice(&plan.bricks));
         write(BufferId::FirstAtoms, 0, bytemuck::cast_slice(&plan.first_atoms));

@@ -53,7 +53,7 @@ impl Prepared {
         let mut plan = Plan::new(&lattice, limits, control)?;
         if let Some((union, bounds)) = distance::boundary(&lattice, params, limits, control)? {
             control.check()?;
-            plan.arcs = Arcs::new(&union, &bounds, &lattice, &mut plan, limits, control)?;
+            plan.arcs = Arcs::new(union, &bounds, &lattice, &mut plan, limits, control)?;
         }
         let memory = Arc::clone(&control.memory);
         Ok(Self { lattice, plan, params: params.clone(), limits: *limits, memory, is_counted: AtomicBool::new(false) })

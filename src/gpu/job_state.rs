@@ -165,7 +165,7 @@ impl JobState {
             grid_points: plan.n_reached * layout::BRICK_POINTS,
             box_cells: lattice.box_cells,
             candidates: plan.pairs,
-            overlaps: plan.arcs.n_overlaps,
+            overlaps: plan.arcs.n_overlaps(),
         };
         let timed = self.times.iter().any(|&ns| ns > 0);
         let stages = if timed { STAGES.into_iter().zip(self.times).collect() } else { Vec::new() };

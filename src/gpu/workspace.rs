@@ -33,7 +33,7 @@ impl BufferSizes {
             BufferId::Params => ROW * PARAM_ROWS,
             BufferId::Atoms => bytes(plan.n_atoms() + plan.arcs.len(), size_of::<LatticeAtom>()),
             BufferId::Reaches => bytes(plan.n_atoms() + plan.arcs.len(), 4),
-            BufferId::Boundary => bytes(plan.arcs.rows.len(), 16),
+            BufferId::Boundary => bytes(plan.arcs.rows.len(), 16) + plan.arcs.caps().len() as u64,
             BufferId::Tiles => bytes(plan.tiles.len(), size_of::<Tile>()),
             BufferId::Bricks | BufferId::Counts => bytes(n_bricks, 4),
             BufferId::FirstAtoms => bytes(plan.first_atoms.len() + plan.arcs.first.len(), 4),

@@ -437,19 +437,24 @@ type Change = fn(&mut DeviceLimits);
 
 #[test]
 fn chunks_pieces_and_readback_buffers_change_no_byte() {
+    for surface in [SurfaceKind::Gaussian, SurfaceKind::Ses] {
+        check_cuts(&params(surface, 0.5));
+    }
+}
+
+fn check_cuts(params: &SurfaceParams) {
     let mut random = Random(11);
     let cloud: Vec<[f64; 4]> =
         random.cloud(1500, 70.0).iter().map(|[x, y, z, r]| [x - 20.0, y + 3.0, z - 40.0, *r]).collect();
     let crowd = spheres(&cloud);
-    let params = params(SURFACES[0], 0.5);
-    let whole = mesh_of(&mut engine(), &crowd, &params);
-    assert_equal(&whole, &crowd, &params, "whole");
+    let whole = mesh_of(&mut engine(), &crowd, params);
+    assert_equal(&whole, &crowd, params, "whole");
     // Large enough to be cut by every budget below.
-    let plan = job(&crowd, &params).prepared;
+    let plan = job(&crowd, params).prepared;
     let chunks = plan.plan.chunks(0..plan.plan.tiles.len(), ChunkLimits { bricks: 900, candidates: 1 << 30 }).unwrap();
     assert!(chunks.len() > 4 && chunks.iter().all(|c| c.n_slots() <= 900), "{} chunks", chunks.len());
     assert!(whole.mesh.n_triangles() * 12 > 5 << 20, "{} triangles", whole.mesh.n_triangles());
-    let again = mesh_of(&mut engine(), &crowd, &params);
+    let again = mesh_of(&mut engine(), &crowd, params);
     assert_eq!(bytes(&whole.mesh), bytes(&again.mesh), "two runs");
     let cut: [(&str, Change); 4] = [
         ("chunks", |b| b.chunk_bricks = 900),
@@ -459,12 +464,12 @@ fn chunks_pieces_and_readback_buffers_change_no_byte() {
     ];
     for (what, change) in cut {
         let mut engine = engine_with(change);
-        let meshed = mesh_of(&mut engine, &crowd, &params);
+        let meshed = mesh_of(&mut engine, &crowd, params);
         assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{what}");
         assert_eq!((&meshed.grid, &meshed.measures), (&whole.grid, &whole.measures), "{what}");
         // Atoms in reverse order, with reused buffers.
         let backwards: Vec<[f64; 4]> = cloud.iter().rev().copied().collect();
-        let other = mesh_of(&mut engine, &spheres(&backwards), &params);
+        let other = mesh_of(&mut engine, &spheres(&backwards), params);
         assert_eq!(bytes(&other.mesh), bytes(&whole.mesh), "{what}, other order");
     }
 }

@@ -1,5 +1,7 @@
 //! Boundary of a union of spheres in the layout of the shaders, with its arcs assigned to the bricks of a plan.
 
+use rayon::prelude::*;
+
 use super::{Plan, first_of_bricks};
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, tile_of, tile_order, to_u32};
 use crate::surface::occupancy::Occupancy;
@@ -20,11 +22,16 @@ pub struct Arcs {
     pub max_reach: f32,
     /// Per brick: its first arc, numbered behind the atoms. The last entry is the number of atoms and arcs.
     pub first: Vec<u32>,
-    /// Rows of the boundary, as `shaders/shared/sphere_union.wgsl` describes them.
+    /// Rows of spheres and arcs, as `shaders/shared/sphere_union.wgsl` describes them. The caps follow them.
     pub rows: Vec<[u32; 4]>,
-    /// Number of ordered pairs of overlapping spheres.
-    pub n_overlaps: u64,
+    /// Boundary, which holds the caps.
+    union: SphereUnion,
 }
+
+/// Rows of a group of caps.
+const GROUP_ROWS: u32 = 8;
+/// Arcs or spheres per task.
+const PART: usize = 1 << 12;
 
 impl Arcs {
     /// Prepares the arcs of `union`, given with their bounding spheres, and adds their candidates to those of `plan`.
@@ -32,7 +39,7 @@ impl Arcs {
     /// # Errors
     /// Those of [`Occupancy::new`].
     pub(crate) fn new(
-        union: &SphereUnion,
+        union: SphereUnion,
         bounds: &[LatticeAtom],
         lattice: &Lattice,
         plan: &mut Plan,
@@ -40,15 +47,12 @@ impl Arcs {
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
         let n_atoms = plan.n_atoms();
-        let n_caps: usize = (0..n_atoms).filter_map(|i| union.caps(i)).map(Iterator::count).sum();
-        let n_rows = n_atoms + 5 * bounds.len() + n_caps;
-        let per_arc = size_of::<LatticeAtom>() + size_of::<f32>() + size_of::<u32>();
-        let bytes = per_arc * bounds.len() + size_of::<[u32; 4]>() * n_rows + size_of::<u32>() * plan.bricks.len();
+        let per_arc = size_of::<LatticeAtom>() + size_of::<BrickOrder>() + size_of::<f32>() + 5 * size_of::<[u32; 4]>();
+        let bytes = per_arc * bounds.len() + size_of::<u32>() * plan.bricks.len() + size_of::<[u32; 4]>() * n_atoms;
         control.memory.grow(bytes as u64)?;
-        let mut order: Vec<u32> = (0..to_u32(bounds.len())).collect();
-        let key = |i: &u32| brick_order(&bounds[*i as usize]);
-        checked_sort::sort(&mut order, |a, b| key(a).cmp(&key(b)).then(a.cmp(b)), control)?;
-        let sorted: Vec<LatticeAtom> = order.iter().map(|i| bounds[*i as usize]).collect();
+        let mut order: Vec<BrickOrder> = bounds.par_iter().zip(0..to_u32(bounds.len())).map(brick_order).collect();
+        checked_sort::sort(&mut order, Ord::cmp, control)?;
+        let sorted: Vec<LatticeAtom> = order.par_iter().map(|(.., i)| bounds[*i as usize]).collect();
         let sorted = Lattice { atoms: sorted.into(), ..lattice.clone() };
         let occupancy = Occupancy::new(&sorted, limits, control)?;
         let mut counted = occupancy.tiles.iter().peekable();
@@ -59,13 +63,25 @@ impl Arcs {
         let first = first_of_bricks(&plan.tiles, &plan.bricks, &occupancy.atom_bricks, to_u32(n_atoms));
         debug_assert_eq!(first.last().map(|end| *end as usize), Some(n_atoms + bounds.len()), "every arc has a brick");
         Ok(Self {
-            rows: rows(union, n_atoms, &order),
+            rows: rows(&union, n_atoms, &order),
             bounds: sorted.atoms.to_vec(),
             max_reach: occupancy.max_reach,
             reaches: occupancy.reaches,
             first,
-            n_overlaps: union.n_overlaps,
+            union,
         })
+    }
+
+    /// Returns the caps in the layout of the shaders, bytes.
+    #[must_use]
+    pub fn caps(&self) -> &[u8] {
+        self.union.cap_bytes()
+    }
+
+    /// Returns the number of ordered pairs of overlapping spheres.
+    #[must_use]
+    pub fn n_overlaps(&self) -> u64 {
+        self.union.n_overlaps
     }
 
     /// Returns the number of arcs.
@@ -81,26 +97,29 @@ impl Arcs {
     }
 }
 
-/// Returns the sort key of the tile and the brick of an atom.
-fn brick_order(atom: &LatticeAtom) -> ([i32; 3], [i32; 3]) {
-    let [x, y, z] = atom.cell.map(|c| c.div_euclid(BRICK));
-    (tile_order(tile_of(atom.cell)), [z, y, x])
+/// Sort key of an arc: its tile, its brick within the tile, and its index.
+type BrickOrder = ([i32; 3], u32, u32);
+
+fn brick_order((atom, index): (&LatticeAtom, u32)) -> BrickOrder {
+    let [x, y, z] = atom.cell.map(|c| (c.div_euclid(BRICK) & 7).unsigned_abs());
+    (tile_order(tile_of(atom.cell)), z << 6 | y << 3 | x, index)
 }
 
-/// Returns the rows of the boundary, with the arcs in the given order.
-fn rows(union: &SphereUnion, n_atoms: usize, order: &[u32]) -> Vec<[u32; 4]> {
-    let n_heads = n_atoms + order.len();
-    let mut rows = vec![[0; 4]; n_heads];
-    for i in 0..n_atoms {
-        let first = to_u32(rows.len());
-        let caps = union.caps(i);
-        let head = if caps.is_some() { first } else { COVERED };
-        rows.extend(caps.into_iter().flatten().map(|row| row.map(f32::to_bits)));
-        rows[i] = [head, to_u32(rows.len()), 0, 0];
-    }
-    for (i, arc) in (n_atoms..).zip(order) {
-        rows[i] = [to_u32(rows.len()), 0, 0, 0];
-        rows.extend(union.arc(*arc).rows().map(|row| row.map(f32::to_bits)));
-    }
+/// Returns the rows of the spheres and of the arcs in the given order.
+fn rows(union: &SphereUnion, n_atoms: usize, order: &[BrickOrder]) -> Vec<[u32; 4]> {
+    let n_heads = to_u32(n_atoms + order.len());
+    let first_cap = n_heads + 4 * to_u32(order.len());
+    let sphere = |i: usize| match union.face(i) {
+        Some(groups) => {
+            let [first, end] = groups.map(|group| first_cap + GROUP_ROWS * group);
+            [first, end, 0, 0]
+        }
+        None => [COVERED, COVERED, 0, 0],
+    };
+    let mut rows: Vec<[u32; 4]> = Vec::with_capacity(first_cap as usize);
+    rows.par_extend((0..n_atoms).into_par_iter().with_min_len(PART).map(sphere));
+    rows.par_extend((0..to_u32(order.len())).into_par_iter().with_min_len(PART).map(|i| [n_heads + 4 * i, 0, 0, 0]));
+    let arc = |(.., i): &BrickOrder| union.arc(*i).rows().map(|row| row.map(f32::to_bits));
+    rows.par_extend(order.par_iter().with_min_len(PART).flat_map_iter(arc));
     rows
 }

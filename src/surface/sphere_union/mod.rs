@@ -76,7 +76,7 @@ const GROUP: usize = 8;
 type CapGroup = [[f32; GROUP]; 4];
 
 /// Boundary of a union of spheres.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct SphereUnion {
     /// First group of caps of each sphere, and the one after its last; `None` if no part of the sphere is exposed.
     faces: Vec<Option<[u32; 2]>>,
@@ -179,13 +179,17 @@ impl SphereUnion {
         &self.arcs[i as usize]
     }
 
-    /// Returns the caps of sphere `i`, each as axis and height; `None` if no part of the sphere is exposed.
+    /// Returns the first group of caps of sphere `i`, and the one after its last; `None` if no part of the sphere is
+    /// exposed.
     #[cfg(feature = "gpu")]
-    pub(crate) fn caps(&self, i: usize) -> Option<impl Iterator<Item = [f32; 4]>> {
-        let [first, end] = self.faces[i]?;
-        let of_group = |group: &CapGroup| -> [[f32; 4]; GROUP] { std::array::from_fn(|k| group.map(|row| row[k])) };
-        let caps = self.caps[first as usize..end as usize].iter().flat_map(of_group);
-        Some(caps.filter(|[.., height]| *height < f32::INFINITY))
+    pub(crate) fn face(&self, i: usize) -> Option<[u32; 2]> {
+        self.faces[i]
+    }
+
+    /// Returns the groups of caps as bytes: the columns of a group are axis x, y, z and height.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn cap_bytes(&self) -> &[u8] {
+        bytemuck::cast_slice(&self.caps)
     }
 
     /// Returns true if the point of sphere `i` in the direction `n`, a unit vector, lies in no other sphere.
