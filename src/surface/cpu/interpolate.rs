@@ -22,8 +22,8 @@ use crate::surface::sphere_union::Feature;
 /// Maximum step of a vertex, as a share of the rest of its edge up to the end on the other side of the surface.
 pub(in crate::surface) const MAX_SHARE: f32 = 0.75;
 
-/// Vertices of one brick, in spacings relative to its first grid point, and the atoms around them. Columns are padded to
-/// whole vectors by repeating the last vertex.
+/// Vertices of one brick, in spacings relative to its first grid point, and the atoms around them. The last vertex is
+/// repeated up to whole vectors.
 #[derive(Debug, Default)]
 pub(super) struct VertexBatch {
     edges: Vec<Edge>,
