@@ -171,9 +171,8 @@ fn two_overlapping_atoms_converge_to_the_integrated_truth() {
     }
 }
 
-/// Parameters on an edge with the densities `ends` (over the isovalue): the linearly interpolated one, and that after one
-/// step on the logarithm, of at most three quarters of the rest of the edge. `at` returns the density and its
-/// derivative.
+/// Parameters on an edge with the densities `ends` (over the isovalue): the linearly interpolated one, and that after
+/// one step on the logarithm, of at most three quarters of the rest of the edge. `at` returns density and derivative.
 fn stepped(ends: [f64; 2], at: impl Fn(f64) -> (f64, f64)) -> [f64; 2] {
     let within = |t: f64| t.clamp(1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
     let t = within((ends[0] - 1.0) / (ends[0] - ends[1]));
