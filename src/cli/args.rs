@@ -189,7 +189,7 @@ pub(crate) struct SurfaceArgs {
     #[arg(long, value_name = "Å")]
     pub(crate) probe: Option<String>,
     /// Values of parameters that are not given: default, ses-like, vdw-like, molstar, blinn or quicksurf. `ses-like`
-    /// approximates the solvent-excluded surface: its area is off by -4.3 to +11.8 % and its volume by -0.3 to +4.7 %
+    /// approximates the solvent-excluded surface: its area is off by -4.3 to +11.9 % and its volume by -0.3 to +4.7 %
     /// over eleven proteins, more for small structures (volume +9 to +15 % for short DNA helices)
     #[arg(long, value_name = "PRESET")]
     pub(crate) preset: Option<String>,
