@@ -357,6 +357,10 @@ impl From<SurfaceError> for Problem {
                     .with("actual", grid_points)
                     .with("resolution", resolution),
             ),
+            E::PocketGridTooLarge { grid_points, limit, .. } => Self::new(ProblemType::GridTooLarge, detail)
+                .with("parameter", "pockets")
+                .with("limit", limit)
+                .with("actual", grid_points),
             E::TooManyCandidates { candidates, limit, resolution, .. } => fitting(
                 Self::new(ProblemType::TooManyCandidates, detail)
                     .with("limit", limit)

@@ -9,6 +9,7 @@ use super::color::ColorReport;
 use super::instances::InstancesReport;
 use super::left_out::LeftOutReport;
 use super::parts::PartReport;
+use super::pockets::PocketReport;
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
 use crate::structure::{Selected, Structure};
@@ -218,6 +219,13 @@ pub struct Report {
     /// Cavities with the largest accessible volumes, at most 100; absent without `cavities`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cavity_list: Option<Vec<CavityReport>>,
+    /// Number of pockets, regions outside the molecule that the probe can enter and a large probe cannot; absent without
+    /// `pockets`. They are found from the atoms and do not depend on the mesh.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pockets: Option<u64>,
+    /// Pockets with the largest volumes, at most 100; absent without `pockets`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pocket_list: Option<Vec<PocketReport>>,
     /// Components with the largest areas, at most 100.
     pub component_list: Vec<ComponentReport>,
     /// Parts of the mesh; absent if the request does not divide it.
@@ -342,6 +350,8 @@ impl Report {
             void_list: voids.iter().take(100).map(|void| VoidReport::new(void, counts.centre)).collect(),
             cavities: None,
             cavity_list: None,
+            pockets: None,
+            pocket_list: None,
             component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
             parts: Vec::new(),
             area: measures.area,
@@ -390,8 +400,18 @@ impl Report {
 }
 
 /// Fields of the report that mesh files do not contain. The last digits of `exact` depend on mathematical libraries.
-const EXCLUDED_EXTRAS: [&str; 9] =
-    ["timings_ms", "device", "backend_reason", "fallback", "exact", "left_out", "warnings", "void_list", "cavity_list"];
+const EXCLUDED_EXTRAS: [&str; 10] = [
+    "timings_ms",
+    "device",
+    "backend_reason",
+    "fallback",
+    "exact",
+    "left_out",
+    "warnings",
+    "void_list",
+    "cavity_list",
+    "pocket_list",
+];
 
 /// Returns the arithmetic of a file: that of its mesh, followed by that of its picture.
 #[must_use]
