@@ -31,12 +31,14 @@ pub const DEFAULT_POCKET_PROBE: f64 = 4.0;
 pub const POCKET_PROBES: [f64; 2] = [1.0, 20.0];
 /// Spacing of the grid, Å.
 const SPACING: f64 = 0.6;
-/// Distance from the points that the large probe covers within which points belong to no pocket: 2.4 Å along each axis.
-const REMOVED: usize = 4;
+/// Distance along each axis from the points that the large probe covers within which points belong to no pocket, Å.
+const REMOVED: f64 = 2.4;
 /// Volume of the smallest pocket, Å³.
 const MIN_VOLUME: f64 = 5.0;
-/// Largest distance of a vertex from a pocket that it lines, in spacings.
-const LINING: f64 = 2.0;
+/// Largest distance of a vertex from a pocket that it lines, Å.
+const LINING: f64 = 1.2;
+/// Maximum number of grid points: rows, runs and regions have numbers of 32 bits.
+const MAX_GRID_POINTS: u64 = 1 << 32;
 /// Memory of a sphere that is sorted by height, bytes.
 const BALL_BYTES: u64 = 40;
 /// Spheres of a task.
@@ -66,6 +68,8 @@ pub struct Pockets {
     /// Pockets, largest volume first.
     pub list: Vec<Pocket>,
     regions: Regions,
+    /// Spacing of the grid, Å.
+    spacing: f64,
     /// First point of the grid, in spacings.
     origin: [i32; 3],
     _memory: Arc<Reservation>,
@@ -75,7 +79,8 @@ impl Pockets {
     /// Returns the index of the pocket that a point of a surface lines, Å: that of the nearest grid point in a pocket,
     /// at most 1.2 Å away.
     pub(crate) fn lined_at(&self, point: [f64; 3]) -> Option<u32> {
-        self.regions.nearest(std::array::from_fn(|k| point[k] / SPACING - f64::from(self.origin[k])), LINING)
+        let local = std::array::from_fn(|k| point[k] / self.spacing - f64::from(self.origin[k]));
+        self.regions.nearest(local, LINING / self.spacing)
     }
 }
 
@@ -110,55 +115,67 @@ pub(crate) fn find(
     limits: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<Pockets, SurfaceError> {
+    find_at(SPACING, spheres, params, pocket_probe, limits, control)
+}
+
+/// Finds pockets on a grid of this spacing, Å.
+fn find_at(
+    spacing: f64,
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    pocket_probe: f64,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<Pockets, SurfaceError> {
     let memory = Arc::new(Reservation::new(&control.memory));
     let control = &Control { memory: Arc::<Reservation>::clone(&memory), observer: &(), ..control.clone() };
     let params = SurfaceParams {
         surface: SurfaceKind::Sas,
-        resolution: SPACING,
+        resolution: spacing,
         atom_ids: false,
         quantize: None,
         ..params.clone()
     };
-    let [small, large] = [params.probe, pocket_probe].map(|probe| probe / SPACING);
+    let [small, large] = [params.probe, pocket_probe].map(|probe| probe / spacing);
     let grid = {
         let working = Arc::new(Reservation::new(&control.memory));
         let control = &Control { memory: Arc::<Reservation>::clone(&working), ..control.clone() };
         control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
-        Grid::new(&Lattice::new(spheres, &params, control)?.atoms, small, large, limits)?
+        Grid::new(&Lattice::new(spheres, &params, control)?, small, large, limits)?
     };
     control.memory.grow(BALL_BYTES * grid.balls.len() as u64)?;
-    // Points outside the molecule. Those that are in no pocket become the outside.
     let outside = grid.reached(small, control)?;
-    let mut pocket = grid.reached(large, control)?.dilated(&Element::cube(REMOVED), control)?;
+    let mut pocket = grid.reached(large, control)?.dilated(&Element::cube(REMOVED / spacing), control)?;
     pocket.combine(&outside, |removed, outside| outside & !removed);
-    let regions = Regions::new(&pocket, MIN_VOLUME / SPACING.powi(3), control)?;
+    let cell = spacing.powi(3);
+    let regions = Regions::new(&pocket, MIN_VOLUME / cell, control)?;
     let measured = regions.measure(&outside, pocket, control)?;
     let mut lining = vec![Vec::new(); measured.len()];
     for (pocket, source) in grid.lining(small, &regions, control)? {
         lining[pocket as usize].push(source);
     }
-    let cell = SPACING.powi(3);
     let list = measured.into_iter().zip(lining).map(|(region, mut lining)| {
         lining.sort_unstable();
         Pocket {
             volume: region.points as f64 * cell,
-            area: region.area * SPACING * SPACING,
-            depth: (region.depth2 as f64).sqrt() * SPACING,
+            area: region.area * spacing * spacing,
+            depth: (region.depth2 as f64).sqrt() * spacing,
             centre: std::array::from_fn(|k| {
-                (region.sums[k] as f64 / region.points as f64 + f64::from(grid.origin[k])) * SPACING
+                (region.sums[k] as f64 / region.points as f64 + f64::from(grid.origin[k])) * spacing
             }),
             openings: region.openings,
             lining,
         }
     });
     let (list, origin) = (list.collect(), grid.origin);
-    Ok(Pockets { list, regions, origin, _memory: memory })
+    Ok(Pockets { list, regions, spacing, origin, _memory: memory })
 }
 
 impl Grid {
     /// Returns the grid around atoms whose radii include the small probe. The large probe fits between the atoms and
     /// the sides of the grid. Probes are in spacings.
-    fn new(atoms: &[LatticeAtom], small: f64, large: f64, limits: &SurfaceLimits) -> Result<Self, SurfaceError> {
+    fn new(lattice: &Lattice, small: f64, large: f64, limits: &SurfaceLimits) -> Result<Self, SurfaceError> {
+        let atoms = &lattice.atoms;
         let radius = |atom: &LatticeAtom| f64::from(atom.inv_length2).sqrt().recip() - small;
         let largest = atoms.iter().map(radius).fold(0.0, f64::max);
         let margin = largest + large.max(small) + 1.0;
@@ -168,9 +185,9 @@ impl Grid {
         let sides = [0, 1, 2].map(|k| high[k] - low[k] + 1.0);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "casts saturate, as wanted")]
         let (grid_points, size) = (sides.iter().product::<f64>() as u64, sides.map(|side| side as usize));
-        if grid_points > limits.max_grid_points {
-            let limit = limits.max_grid_points;
-            return Err(SurfaceError::PocketGridTooLarge { grid_points, limit, spacing: SPACING });
+        let limit = limits.max_grid_points.min(MAX_GRID_POINTS);
+        if grid_points > limit {
+            return Err(SurfaceError::PocketGridTooLarge { grid_points, limit, spacing: lattice.spacing });
         }
         let ball = |atom: &LatticeAtom| Ball {
             centre: [0, 1, 2].map(|k| atom.position(k) - low[k]),

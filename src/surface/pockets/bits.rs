@@ -40,8 +40,10 @@ impl Element {
         })
     }
 
-    /// Returns the points of a cube that are at most `reach` spacings away along each axis.
-    pub(super) fn cube(reach: usize) -> Self {
+    /// Returns the points within a distance along each axis, in spacings.
+    pub(super) fn cube(half: f64) -> Self {
+        // Quotients of lengths may be slightly less than a whole number.
+        let reach = whole(half + 1e-9);
         Self::new(reach, |_, _| Some(reach))
     }
 
@@ -269,7 +271,7 @@ mod tests {
                 (Element::ball(1.0), 1.0),
                 (Element::ball(2.4), 2.4),
                 (Element::ball(6.7), 6.7),
-                (Element::cube(4), f64::NAN),
+                (Element::cube(4.0), f64::NAN),
             ] {
                 let is_near = |a: &[usize; 3], b: &[usize; 3]| {
                     let d = [0, 1, 2].map(|k| a[k].abs_diff(b[k]));
