@@ -5,6 +5,7 @@ mod auto;
 mod cavities;
 mod clock;
 pub mod color;
+mod components;
 pub mod cost;
 mod cut;
 mod divided;
@@ -39,6 +40,7 @@ pub use auto::AutoBackend;
 pub use cavities::{Cavities, CavityReport, LiningResidue};
 pub use clock::{ProgressSink, StageClock};
 pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
+pub use components::{ComponentReport, VoidReport};
 #[cfg(feature = "png")]
 pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
@@ -50,7 +52,7 @@ pub use map_file::MapFile;
 pub use parts::PartReport;
 pub use pockets::PocketReport;
 pub use progress::Tracker;
-pub use report::{AssemblyReport, ComponentReport, PictureReport, Quantization, Report, VoidReport, file_arithmetic};
+pub use report::{AssemblyReport, PictureReport, Quantization, Report, file_arithmetic};
 pub use spacing::Spacing;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
 
@@ -58,8 +60,9 @@ use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, U
 use crate::picture::{PictureError, PictureParams};
 use crate::structure::map::MapError;
 use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
+use crate::surface::pockets::find as find_pockets;
 use crate::surface::{
-    self, Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceParams,
+    Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceParams,
     Validation, lattice,
 };
 use color::{MeshColors, Scheme};
@@ -291,10 +294,8 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let colors = job.color.map(prepare).transpose()?;
     let measure = || areas::measure(&structure, &selected, &spheres, job, &limits.surface, &control);
     let (exact, areas) = job.exact.then(|| clock.time("exact", measure)).transpose()?.unzip();
-    let find_pockets = |probe| {
-        clock.time("pockets", || surface::pockets::find(&spheres, &job.params, probe, &limits.surface, &control))
-    };
-    let pockets = job.pockets.map(find_pockets).transpose()?;
+    let find = |probe| clock.time("pockets", || find_pockets(&spheres, &job.params, probe, &limits.surface, &control));
+    let pockets = job.pockets.map(find).transpose()?;
     let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
     let cut = Cut::of(&selected, parts.as_deref(), job.validation, &control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
@@ -329,7 +330,9 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let cavities = job.cavities.map(search).transpose()?;
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
-    let color = |colors: MeshColors| clock.time("color", || colors.apply(&mut mesh, params.resolution, pockets.as_ref(), &control));
+    let color = |colors: MeshColors| {
+        clock.time("color", || colors.apply(&mut mesh, params.resolution, pockets.as_ref(), &control))
+    };
     let color = colors.map(color).transpose()?;
     to_atom_indices(&mut mesh, job, &selected, &control)?;
     instances::place(&mut mesh, &selected.units, &control)?;

@@ -6,6 +6,7 @@ use serde_json::{Map, Value};
 use super::areas::ExactReport;
 use super::cavities::CavityReport;
 use super::color::ColorReport;
+use super::components::{ComponentReport, VoidReport};
 use super::instances::InstancesReport;
 use super::left_out::LeftOutReport;
 use super::parts::PartReport;
@@ -14,48 +15,6 @@ use super::{Choice, Job};
 use crate::formats::{Storage, Units};
 use crate::structure::{Selected, Structure};
 use crate::surface::{BackendIdentity, Component, GridStats, Measures, SurfaceKind, Validation};
-
-/// Connected component of the mesh.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
-pub struct ComponentReport {
-    /// Number of triangles.
-    pub triangles: u64,
-    /// Number of vertices.
-    pub vertices: u64,
-    /// Area in Å².
-    pub area: f64,
-    /// Volume in Å³, negative for a void; null if the mesh is cut open.
-    #[cfg_attr(feature = "server", schema(required))]
-    pub volume: Option<f64>,
-}
-
-impl ComponentReport {
-    fn new(&Component { triangles, vertices, area, volume, .. }: &Component, is_open: bool) -> Self {
-        Self { triangles, vertices, area, volume: (!is_open).then_some(volume) }
-    }
-}
-
-/// Void: a closed surface that encloses space outside the molecule. Most voids are gaps between atoms; no probe has
-/// tested whether a solvent molecule fits.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
-pub struct VoidReport {
-    /// Centroid in the coordinates of the structure, in Å.
-    pub center: [f64; 3],
-    /// Volume in Å³.
-    pub volume: f64,
-    /// Area in Å².
-    pub area: f64,
-}
-
-impl VoidReport {
-    /// Converts a component. `centre` is the centre of the mesh in the coordinates of the structure, in Å.
-    fn new(void: &Component, centre: [f64; 3]) -> Self {
-        let centroid = void.centroid();
-        Self { center: std::array::from_fn(|k| centre[k] + centroid[k]), volume: -void.volume, area: void.area }
-    }
-}
 
 /// Biological assembly.
 #[derive(Debug, Clone, Serialize)]
@@ -219,8 +178,8 @@ pub struct Report {
     /// Cavities with the largest accessible volumes, at most 100; absent without `cavities`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cavity_list: Option<Vec<CavityReport>>,
-    /// Number of pockets, regions outside the molecule that the probe can enter and a large probe cannot; absent without
-    /// `pockets`. They are found from the atoms and do not depend on the mesh.
+    /// Number of pockets, regions outside the molecule that the probe can enter and a large probe cannot; absent
+    /// without `pockets`. They are found from the atoms and do not depend on the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pockets: Option<u64>,
     /// Pockets with the largest volumes, at most 100; absent without `pockets`.

@@ -1,7 +1,7 @@
 //! Pockets: depressions of the molecule that a small probe can enter and a large one cannot.
 //!
-//! The definition is that of `KVFinder` (Oliveira et al., BMC Bioinformatics 15, 2014; Guerra et al., BMC Bioinformatics
-//! 22, 2021), evaluated on a grid. It has four sets of grid points:
+//! The definition is that of `KVFinder` (Oliveira et al., BMC Bioinformatics 15, 2014; Guerra et al., BMC
+//! Bioinformatics 22, 2021), evaluated on a grid. It has four sets of grid points:
 //!
 //! - the points outside the molecule, within the radius of the small probe from a place where its centre can be,
 //! - the points that the large probe covers, which are found in the same way,
@@ -231,12 +231,7 @@ impl Grid {
     }
 
     /// Returns pairs of a pocket and the index of a sphere that lines it, each once.
-    fn lining(
-        &self,
-        probe: f64,
-        regions: &Regions,
-        control: &Control<'_>,
-    ) -> Result<Vec<(u32, u32)>, SurfaceError> {
+    fn lining(&self, probe: f64, regions: &Regions, control: &Control<'_>) -> Result<Vec<(u32, u32)>, SurfaceError> {
         let of_balls = |balls: &[Ball]| {
             control.check()?;
             let mut found = Vec::new();

@@ -103,9 +103,8 @@ impl MeshColors {
                     _ => (extremes(values.iter().copied()).map(round), None),
                 };
                 let range = range.or(scheme.range()).unwrap_or(of_values);
-                let color = |value: f32| {
-                    opaque(if value.is_nan() { OTHER } else { scaled(palette, range, f64::from(value)) })
-                };
+                let color =
+                    |value: f32| opaque(if value.is_nan() { OTHER } else { scaled(palette, range, f64::from(value)) });
                 // Values of a map may have any scale.
                 let legend = match map {
                     Some(_) => stops(palette, range, |value| significant(value, 5)),

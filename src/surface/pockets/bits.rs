@@ -284,8 +284,7 @@ mod tests {
                 let found = grid.dilated(&element, &Control::default()).unwrap();
                 let mut all = BitGrid::new(size, &Control::default()).unwrap();
                 all.invert();
-                let expected: Vec<_> =
-                    points(&all).into_iter().filter(|a| set.iter().any(|b| is_near(a, b))).collect();
+                let expected: Vec<_> = points(&all).into_iter().filter(|a| set.iter().any(|b| is_near(a, b))).collect();
                 assert_eq!(points(&found), expected, "{size:?} {near}");
                 assert_ne!(points(&found), set);
             }

@@ -189,8 +189,8 @@ fn a_hole_of_known_volume_is_a_pocket_with_two_openings() {
     }
 }
 
-/// Returns a hollow ball of 900 inner and 900 outer spheres with this inner radius. The wall is so thick that the points
-/// within 2.4 Å along each axis of the large probe outside do not reach through it.
+/// Returns a hollow ball of 900 inner and 900 outer spheres with this inner radius. The wall is so thick that the
+/// points within 2.4 Å along each axis of the large probe outside do not reach through it.
 fn hollow(inner: f64) -> Vec<Shape> {
     let on = |i: u32| {
         let z = 1.0 - (2.0 * f64::from(i % 900) + 1.0) / 900.0;
@@ -235,9 +235,8 @@ fn pockets_do_not_depend_on_the_order_of_the_spheres_on_threads_and_on_shifts_of
         pocket.lining.reverse();
     }
     assert_eq!(other, expected);
-    let moved = |by: f64| -> Vec<Shape> {
-        balls.iter().map(|(c, r)| ([c[0] + by, c[1] - 2.0 * by, c[2] + by], *r)).collect()
-    };
+    let moved =
+        |by: f64| -> Vec<Shape> { balls.iter().map(|(c, r)| ([c[0] + by, c[1] - 2.0 * by, c[2] + by], *r)).collect() };
     let volumes = |list: &[Pocket]| list.iter().map(|pocket| pocket.volume).collect::<Vec<_>>();
     let shifted = pockets(&moved(30.0 * SPACING));
     assert_eq!(volumes(&shifted), volumes(&expected));
