@@ -230,6 +230,13 @@ pub(crate) struct SurfaceArgs {
     /// from the mesh) or only (keep nothing else)
     #[arg(long, value_name = "MODE")]
     pub(crate) cavities: Option<String>,
+    /// Find pockets, regions outside the molecule that the probe can enter and a large probe cannot, and list them in
+    /// the report
+    #[arg(long)]
+    pub(crate) pockets: bool,
+    /// Radius of the large probe of the search for pockets, in Å [default: 4]
+    #[arg(long, value_name = "Å")]
+    pub(crate) pocket_probe: Option<String>,
     /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)
     #[arg(long)]
     pub(crate) atom_ids: bool,
@@ -246,8 +253,8 @@ pub(crate) struct SurfaceArgs {
 #[command(next_help_heading = "Colours")]
 pub(crate) struct ColorArgs {
     /// Colours of vertices: uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, occupancy,
-    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial, depth, map or
-    /// none [default: none]
+    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial, depth,
+    /// pocket, map or none [default: none]
     #[arg(long, value_name = "SCHEME")]
     pub(crate) color: Option<String>,
     /// Palette of a numeric scheme: viridis, cividis, blue-white-red or red-white-blue [default: depends on the scheme]

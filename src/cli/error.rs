@@ -240,6 +240,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         | SurfaceError::NoPatch
         | SurfaceError::NoCavity { .. } => code::USAGE,
         SurfaceError::GridTooLarge { .. }
+        | SurfaceError::PocketGridTooLarge { .. }
         | SurfaceError::TooManyCandidates { .. }
         | SurfaceError::TooManyOverlaps { .. }
         | SurfaceError::MeshTooLarge { .. }
@@ -279,6 +280,7 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
     };
     match error {
         SurfaceError::GridTooLarge { .. } => coarser_or("raise --max-grid-points"),
+        SurfaceError::PocketGridTooLarge { .. } => Some("omit --pockets, or raise --max-grid-points".to_owned()),
         SurfaceError::MeshTooLarge { .. } => coarser_or("raise --max-mesh-bytes"),
         SurfaceError::TooManyCandidates { suggested_resolution: Some(_), .. } => coarser_or("raise --max-candidates"),
         SurfaceError::TooManyCandidates { .. } => {

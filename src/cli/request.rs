@@ -107,6 +107,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("context", &atoms.context),
         ("split", &atoms.split),
         ("cavities", &surface.cavities),
+        ("pocket_probe", &surface.pocket_probe),
         ("validation", &args.validation),
         ("interface", &surface.interface),
     ];
@@ -117,6 +118,9 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
     }
     if surface.exact {
         pairs.push(("exact", "true".to_owned()));
+    }
+    if surface.pockets {
+        pairs.push(("pockets", "true".to_owned()));
     }
     if atoms.instances {
         pairs.push(("instances", "true".to_owned()));
@@ -174,6 +178,8 @@ mod tests {
                 "atom_ids" | "check" => vec![flag.as_str()],
                 "validation" => vec![&flag, "exact"],
                 "cavities" => vec![&flag, "drop"],
+                "pockets" => vec![&flag],
+                "pocket_probe" => vec![&flag, "5", "--pockets"],
                 "compress" => vec![&flag, "quantize"],
                 "normals" => vec![&flag, "none"],
                 "units" => vec![&flag, "nanometer"],

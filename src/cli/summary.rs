@@ -1,7 +1,7 @@
 //! Summary of a report, as text of at most one screen.
 
 use molmesh::pipeline::{
-    CavityReport, ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport, Report,
+    CavityReport, ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport, PocketReport, Report,
 };
 use molmesh::surface::Validation;
 
@@ -82,6 +82,9 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     page.row("parts", &parts(report));
     if let Some(found) = report.cavities {
         page.row("cavities", &cavities(found, report.cavity_list.as_deref().unwrap_or_default()));
+    }
+    if let Some(found) = report.pockets {
+        page.row("pockets", &pockets(found, report.pocket_list.as_deref().unwrap_or_default()));
     }
     page.row("area", &format!("{} Å²", decimal(report.area)));
     if let Some(volume) = report.volume {
@@ -234,6 +237,13 @@ fn cavities(found: u64, largest: &[CavityReport]) -> String {
     }
 }
 
+/// Formats the number of pockets and the volumes of the largest ones.
+fn pockets(found: u64, largest: &[PocketReport]) -> String {
+    let volumes: Vec<String> = largest.iter().take(5).map(|pocket| decimal(pocket.volume)).collect();
+    let more = if found > volumes.len() as u64 { ", …" } else { "" };
+    if volumes.is_empty() { grouped(found) } else { format!("{} ({}{more} Å³)", grouped(found), volumes.join(", ")) }
+}
+
 /// Adds the first findings only, as a damaged file can have one in each line.
 fn add_findings(page: &mut Page, findings: &[String]) {
     let of = if findings.len() == 1 { "finding" } else { "findings" };
@@ -358,6 +368,8 @@ mod tests {
             void_list: Vec::new(),
             cavities: Some(2),
             cavity_list: None,
+            pockets: Some(0),
+            pocket_list: None,
             component_list: Vec::new(),
             parts: Vec::new(),
             area: 3200.04,

@@ -345,35 +345,31 @@ impl From<SurfaceError> for Problem {
         let suggested = error.suggested_resolution();
         let fitting =
             |problem: Self| suggested.into_iter().fold(problem, |problem, h| problem.with("suggested_resolution", h));
+        let exceeded = |kind: ProblemType, limit: u64, actual: u64| {
+            Self::new(kind, error.to_string()).with("limit", limit).with("actual", actual)
+        };
         match error {
             E::NoSpheres => Self::new(ProblemType::NoAtoms, detail),
             E::BadSphere { index, expected, .. } => {
                 Self::new(ProblemType::UnreadableStructure, detail).with("atom", index).with("expected", expected)
             }
             E::BadParameter { .. } => ParamError::from(error).into(),
-            E::GridTooLarge { grid_points, limit, resolution, .. } => fitting(
-                Self::new(ProblemType::GridTooLarge, detail)
-                    .with("limit", limit)
-                    .with("actual", grid_points)
-                    .with("resolution", resolution),
-            ),
-            E::TooManyCandidates { candidates, limit, resolution, .. } => fitting(
-                Self::new(ProblemType::TooManyCandidates, detail)
-                    .with("limit", limit)
-                    .with("actual", candidates)
-                    .with("resolution", resolution),
-            ),
-            E::MeshTooLarge { bytes, limit, .. } => {
-                fitting(Self::new(ProblemType::MeshTooLarge, detail).with("limit", limit).with("actual", bytes))
+            E::GridTooLarge { grid_points, limit, resolution, .. } => {
+                fitting(exceeded(ProblemType::GridTooLarge, limit, grid_points).with("resolution", resolution))
             }
+            E::PocketGridTooLarge { grid_points, limit, .. } => {
+                exceeded(ProblemType::GridTooLarge, limit, grid_points).with("parameter", "pockets")
+            }
+            E::TooManyCandidates { candidates, limit, resolution, .. } => {
+                fitting(exceeded(ProblemType::TooManyCandidates, limit, candidates).with("resolution", resolution))
+            }
+            E::MeshTooLarge { bytes, limit, .. } => fitting(exceeded(ProblemType::MeshTooLarge, limit, bytes)),
             E::TooManyTriangles { triangles, limit, resolution } => Self::new(ProblemType::MeshTooLarge, detail)
                 .with("parameter", "max_triangles")
                 .with("limit", limit)
                 .with("actual", triangles)
                 .with("resolution", resolution),
-            E::TooManyOverlaps { overlaps, limit } => {
-                Self::new(ProblemType::TooManyCandidates, detail).with("limit", limit).with("actual", overlaps)
-            }
+            E::TooManyOverlaps { overlaps, limit } => exceeded(ProblemType::TooManyCandidates, limit, overlaps),
             E::NoSurface { isovalue } => match isovalue {
                 Some(isovalue) => {
                     Self::new(ProblemType::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
@@ -383,7 +379,7 @@ impl From<SurfaceError> for Problem {
             E::NoCavity { .. } => Self::new(ProblemType::NoSurface, detail).with("parameter", "cavities"),
             E::NoPatch => Self::new(ProblemType::NoSurface, detail).with("parameter", "context"),
             E::DeviceMemory { needed, available, .. } => {
-                fitting(Self::new(ProblemType::DeviceMemory, detail).with("limit", available).with("actual", needed))
+                fitting(exceeded(ProblemType::DeviceMemory, available, needed))
             }
             // The worker has logged the driver's message.
             E::Device { .. } => {

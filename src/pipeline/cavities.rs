@@ -34,7 +34,7 @@ impl Cavities {
     }
 }
 
-/// Residue that lines a cavity.
+/// Residue that lines a cavity or a pocket.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct LiningResidue {
@@ -47,6 +47,22 @@ pub struct LiningResidue {
     pub insertion: Option<char>,
     /// Residue name.
     pub name: String,
+}
+
+impl LiningResidue {
+    /// Returns the residues of atoms, given by rows of `selected`, by chain and number.
+    pub(super) fn all(lining: &[u32], structure: &Structure, selected: &Selected) -> Vec<Self> {
+        let atoms = lining.iter().map(|&row| selected.atoms[row as usize] as usize);
+        let residue = |i: usize| Self {
+            chain: structure.chain.get(i).to_owned(),
+            number: structure.residue_number[i],
+            insertion: Some(char::from(structure.insertion_code[i])).filter(|code| *code != '\0'),
+            name: structure.residue.get(i).to_owned(),
+        };
+        let mut residues: Vec<Self> = atoms.map(residue).collect::<FxHashSet<_>>().into_iter().collect();
+        residues.sort_unstable();
+        residues
+    }
 }
 
 /// Cavity: a closed region that holds a probe. It does not depend on the grid spacing and the type of the surface.
@@ -81,22 +97,13 @@ pub(super) struct FoundCavities {
 impl CavityReport {
     /// Returns the report of a cavity, whose lining are rows of `selected`.
     fn new(cavity: &Cavity, enclosed: Option<bool>, structure: &Structure, selected: &Selected) -> Self {
-        let atoms = cavity.lining.iter().map(|&row| selected.atoms[row as usize] as usize);
-        let residue = |i: usize| LiningResidue {
-            chain: structure.chain.get(i).to_owned(),
-            number: structure.residue_number[i],
-            insertion: Some(char::from(structure.insertion_code[i])).filter(|code| *code != '\0'),
-            name: structure.residue.get(i).to_owned(),
-        };
-        let mut residues: Vec<LiningResidue> = atoms.map(residue).collect::<FxHashSet<_>>().into_iter().collect();
-        residues.sort_unstable();
         Self {
             center: cavity.centre,
             radius: cavity.radius,
             accessible_volume: cavity.accessible_volume,
             accessible_area: cavity.accessible_area,
             atoms: cavity.lining.len() as u64,
-            residues,
+            residues: LiningResidue::all(&cavity.lining, structure, selected),
             enclosed,
         }
     }

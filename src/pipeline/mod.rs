@@ -5,6 +5,7 @@ mod auto;
 mod cavities;
 mod clock;
 pub mod color;
+mod components;
 pub mod cost;
 mod cut;
 mod divided;
@@ -24,6 +25,7 @@ mod map_file;
 pub mod nearest;
 pub mod params;
 mod parts;
+mod pockets;
 mod progress;
 mod report;
 pub mod spacing;
@@ -38,6 +40,7 @@ pub use auto::AutoBackend;
 pub use cavities::{Cavities, CavityReport, LiningResidue};
 pub use clock::{ProgressSink, StageClock};
 pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
+pub use components::{ComponentReport, VoidReport};
 #[cfg(feature = "png")]
 pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
@@ -47,8 +50,9 @@ pub use left_out::{KindCount, LeftOutReport, ResidueCount};
 pub use limits::JobLimits;
 pub use map_file::MapFile;
 pub use parts::PartReport;
+pub use pockets::PocketReport;
 pub use progress::Tracker;
-pub use report::{AssemblyReport, ComponentReport, PictureReport, Quantization, Report, VoidReport, file_arithmetic};
+pub use report::{AssemblyReport, PictureReport, Quantization, Report, file_arithmetic};
 pub use spacing::Spacing;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
 
@@ -56,6 +60,7 @@ use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, U
 use crate::picture::{PictureError, PictureParams};
 use crate::structure::map::MapError;
 use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
+use crate::surface::pockets::find as find_pockets;
 use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceParams,
     Validation, lattice,
@@ -81,6 +86,8 @@ pub struct Job {
     pub split: Split,
     /// Search for cavities; `None` without it.
     pub cavities: Option<Cavities>,
+    /// Radius of the large probe of a search for pockets, Å; `None` without it.
+    pub pockets: Option<f64>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -104,8 +111,8 @@ pub struct Job {
 }
 
 impl Job {
-    /// Checks the size of the picture, and that there is a map if and only if the colours need one, before any other
-    /// work.
+    /// Checks the size of the picture, that there is a map if and only if the colours need one, and that pockets are
+    /// searched for if they are coloured, before any other work.
     ///
     /// # Errors
     /// Returns [`JobError::Picture`] if the picture exceeds the limits, and [`JobError::Color`].
@@ -115,6 +122,9 @@ impl Job {
             (Some(scheme), None) => return Err(ColorError::without_map(scheme).into()),
             (None, Some(_)) => return Err(ColorError::unused_map(scheme).into()),
             _ => {}
+        }
+        if let Some(scheme) = scheme.filter(|scheme| scheme.needs_pockets() && self.pockets.is_none()) {
+            return Err(ColorError::without_pockets(scheme).into());
         }
         self.picture.map_or(Ok(()), |picture| picture.check(limits.picture)).map_err(JobError::Picture)
     }
@@ -284,6 +294,8 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let colors = job.color.map(prepare).transpose()?;
     let measure = || areas::measure(&structure, &selected, &spheres, job, &limits.surface, &control);
     let (exact, areas) = job.exact.then(|| clock.time("exact", measure)).transpose()?.unzip();
+    let find = |probe| clock.time("pockets", || find_pockets(&spheres, &job.params, probe, &limits.surface, &control));
+    let pockets = job.pockets.map(find).transpose()?;
     let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
     let cut = Cut::of(&selected, parts.as_deref(), job.validation, &control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
@@ -318,7 +330,9 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let cavities = job.cavities.map(search).transpose()?;
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
-    let color = |colors: MeshColors| clock.time("color", || colors.apply(&mut mesh, params.resolution, &control));
+    let color = |colors: MeshColors| {
+        clock.time("color", || colors.apply(&mut mesh, params.resolution, pockets.as_ref(), &control))
+    };
     let color = colors.map(color).transpose()?;
     to_atom_indices(&mut mesh, job, &selected, &control)?;
     instances::place(&mut mesh, &selected.units, &control)?;
@@ -332,6 +346,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     (report.color, report.exact) = (color, exact);
     report.set_cavities(cavities.as_ref(), &structure, &selected);
+    report.set_pockets(pockets.as_ref(), &structure, &selected);
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);

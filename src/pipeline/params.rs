@@ -113,11 +113,13 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         }
     }
     let color = values.coloring()?;
+    let pockets = values.pockets()?;
     values.divide_models()?;
     let ParsedValues { options, selection, mut request, .. } = values;
-    request.job = Job { selection, params: SurfaceParams::new(&options)?, color, ..request.job };
+    request.job = Job { selection, params: SurfaceParams::new(&options)?, color, pockets, ..request.job };
     check_instances(&request.job)?;
     check_cavities(&request.job)?;
+    check_pockets(&request.job)?;
     check_exact(&request.job)?;
     if let Some(format) = request.format {
         set_format(&mut request.job, format)?;
@@ -144,15 +146,40 @@ fn check_instances(job: &Job) -> Result<(), ParamError> {
 /// measures include the walls that `drop` and `only` remove from the mesh.
 fn check_cavities(job: &Job) -> Result<(), ParamError> {
     let Some(cavities) = job.cavities else { return Ok(()) };
-    let Selection { context, instances, .. } = &job.selection;
-    let expected = match (job.split, context) {
-        (split, _) if split != Split::None => format!("no value with split={}", split.name()),
-        (_, Context::Whole) => format!("no value with context={}", context.name()),
-        _ if *instances => "no value with instances=true".to_owned(),
-        _ if job.exact && cavities != Cavities::Keep => "keep, or no value, with exact=true".to_owned(),
-        _ => return Ok(()),
+    let expected = match divided_by(job) {
+        Some(divided) => format!("no value with {divided}"),
+        None if job.exact && cavities != Cavities::Keep => "keep, or no value, with exact=true".to_owned(),
+        None => return Ok(()),
     };
     Err(ParamError::BadValue { name: "cavities", value: format!("`{}`", cavities.name()), expected })
+}
+
+/// Rejects pockets of a surface that is divided or repeated: they are found for all selected atoms together. The large
+/// probe must be larger than the other one.
+fn check_pockets(job: &Job) -> Result<(), ParamError> {
+    let Some(large) = job.pockets else { return Ok(()) };
+    if let Some(divided) = divided_by(job) {
+        let coloured = job.color.is_some_and(|color| color.scheme.needs_pockets());
+        let (name, value, otherwise) =
+            if coloured { ("color", "pocket", "another value") } else { ("pockets", "true", "false") };
+        return Err(ParamError::bad_value(name, value, format!("{otherwise} with {divided}")));
+    }
+    let probe = job.params.probe;
+    if large <= probe {
+        let expected = format!("a radius above that of the probe, {probe} Å");
+        return Err(ParamError::bad_value("pocket_probe", &large.to_string(), expected));
+    }
+    Ok(())
+}
+
+/// Returns the parameter that divides or repeats the surface, with its value.
+fn divided_by(job: &Job) -> Option<String> {
+    let Selection { context, instances, .. } = &job.selection;
+    match (job.split, context) {
+        (split, _) if split != Split::None => Some(format!("split={}", split.name())),
+        (_, Context::Whole) => Some(format!("context={}", context.name())),
+        _ => instances.then(|| "instances=true".to_owned()),
+    }
 }
 
 /// Rejects exact areas of a surface that has none, or that is divided or cut.

@@ -8,10 +8,11 @@ use super::ProgressSink;
 const UNIT: f64 = 1000.0;
 
 /// Stages with their typical shares of the time, in execution order.
-const STAGES: [(&str, f64); 17] = [
-    ("read", 0.10),
+const STAGES: [(&str, f64); 18] = [
+    ("read", 0.09),
     ("select", 0.02),
     ("exact", 0.01),
+    ("pockets", 0.01),
     ("bin", 0.03),
     ("field", 0.38),
     ("classify", 0.05),

@@ -6,55 +6,15 @@ use serde_json::{Map, Value};
 use super::areas::ExactReport;
 use super::cavities::CavityReport;
 use super::color::ColorReport;
+use super::components::{ComponentReport, VoidReport};
 use super::instances::InstancesReport;
 use super::left_out::LeftOutReport;
 use super::parts::PartReport;
+use super::pockets::PocketReport;
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
 use crate::structure::{Selected, Structure};
 use crate::surface::{BackendIdentity, Component, GridStats, Measures, SurfaceKind, Validation};
-
-/// Connected component of the mesh.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
-pub struct ComponentReport {
-    /// Number of triangles.
-    pub triangles: u64,
-    /// Number of vertices.
-    pub vertices: u64,
-    /// Area in Å².
-    pub area: f64,
-    /// Volume in Å³, negative for a void; null if the mesh is cut open.
-    #[cfg_attr(feature = "server", schema(required))]
-    pub volume: Option<f64>,
-}
-
-impl ComponentReport {
-    fn new(&Component { triangles, vertices, area, volume, .. }: &Component, is_open: bool) -> Self {
-        Self { triangles, vertices, area, volume: (!is_open).then_some(volume) }
-    }
-}
-
-/// Void: a closed surface that encloses space outside the molecule. Most voids are gaps between atoms; no probe has
-/// tested whether a solvent molecule fits.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
-pub struct VoidReport {
-    /// Centroid in the coordinates of the structure, in Å.
-    pub center: [f64; 3],
-    /// Volume in Å³.
-    pub volume: f64,
-    /// Area in Å².
-    pub area: f64,
-}
-
-impl VoidReport {
-    /// Converts a component. `centre` is the centre of the mesh in the coordinates of the structure, in Å.
-    fn new(void: &Component, centre: [f64; 3]) -> Self {
-        let centroid = void.centroid();
-        Self { center: std::array::from_fn(|k| centre[k] + centroid[k]), volume: -void.volume, area: void.area }
-    }
-}
 
 /// Biological assembly.
 #[derive(Debug, Clone, Serialize)]
@@ -218,6 +178,13 @@ pub struct Report {
     /// Cavities with the largest accessible volumes, at most 100; absent without `cavities`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cavity_list: Option<Vec<CavityReport>>,
+    /// Number of pockets, regions outside the molecule that the probe can enter and a large probe cannot; absent
+    /// without `pockets`. They are found from the atoms and do not depend on the mesh.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pockets: Option<u64>,
+    /// Pockets with the largest volumes, at most 100; absent without `pockets`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pocket_list: Option<Vec<PocketReport>>,
     /// Components with the largest areas, at most 100.
     pub component_list: Vec<ComponentReport>,
     /// Parts of the mesh; absent if the request does not divide it.
@@ -342,6 +309,8 @@ impl Report {
             void_list: voids.iter().take(100).map(|void| VoidReport::new(void, counts.centre)).collect(),
             cavities: None,
             cavity_list: None,
+            pockets: None,
+            pocket_list: None,
             component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
             parts: Vec::new(),
             area: measures.area,
@@ -390,8 +359,18 @@ impl Report {
 }
 
 /// Fields of the report that mesh files do not contain. The last digits of `exact` depend on mathematical libraries.
-const EXCLUDED_EXTRAS: [&str; 9] =
-    ["timings_ms", "device", "backend_reason", "fallback", "exact", "left_out", "warnings", "void_list", "cavity_list"];
+const EXCLUDED_EXTRAS: [&str; 10] = [
+    "timings_ms",
+    "device",
+    "backend_reason",
+    "fallback",
+    "exact",
+    "left_out",
+    "warnings",
+    "void_list",
+    "cavity_list",
+    "pocket_list",
+];
 
 /// Returns the arithmetic of a file: that of its mesh, followed by that of its picture.
 #[must_use]

@@ -116,6 +116,19 @@ pub enum SurfaceError {
         /// Number of cavities of the spheres.
         cavities: u64,
     },
+    /// More grid points than allowed would be needed to search for pockets.
+    #[error(
+        "the search for pockets would need {grid_points} grid points at {spacing} Å, the limit is {limit}; a smaller \
+         selection or pocket_probe needs fewer"
+    )]
+    PocketGridTooLarge {
+        /// Points of the box around the molecule and the large probe.
+        grid_points: u64,
+        /// Grid points allowed.
+        limit: u64,
+        /// Spacing, Å.
+        spacing: f64,
+    },
     /// The sink of the mesh failed. It keeps the cause.
     #[error("the mesh sink failed")]
     Sink,

@@ -28,6 +28,7 @@ mod make_test;
 mod maps;
 mod peers;
 mod picture;
+mod pockets;
 mod real_structures;
 mod spacing;
 mod sphere_surfaces;

@@ -145,6 +145,8 @@ fn a_default_is_valid_with_every_parameter() {
         &[("exact", "true"), ("surface", "ses"), ("interface", "A,B")],
         &[("cavities", "keep")],
         &[("cavities", "drop"), ("surface", "ses")],
+        &[("pockets", "true"), ("pocket_probe", "5")],
+        &[("color", "pocket")],
         &[("color", "chain")],
         &[("color", "bfactor"), ("palette", "blue-white-red"), ("color_range", "0,50")],
         &[("color", "chain"), ("color_blend", "smooth")],

@@ -129,6 +129,11 @@ impl ColorError {
         Self { scheme: scheme.to_string(), why: why.to_owned() }
     }
 
+    /// Returns the error of a job without a search for pockets.
+    pub(super) fn without_pockets(scheme: Scheme) -> Self {
+        Self { scheme: scheme.to_string(), why: "it needs a search for pockets: set pockets=true".to_owned() }
+    }
+
     /// Returns the error of a map that no colour needs.
     pub(super) fn unused_map(scheme: Option<Scheme>) -> Self {
         let scheme = scheme.map_or_else(|| "none".to_owned(), |scheme| scheme.to_string());

@@ -1,17 +1,22 @@
 //! Colours of the vertices of a mesh: those of the nearest atoms, or of properties of the vertices.
 
+use rayon::prelude::*;
+
 use super::super::JobError;
 use super::of_map::{significant, symmetric_range};
-use super::tables::OTHER;
+use super::palette::Rgb;
+use super::tables::{OTHER, category};
 use super::vertex::{self, ValueSource, VertexProperty};
 use super::{AtomColors, ColorBlend, ColorError, ColorReport, Coloring, MapReport, Palette, Scheme};
-use super::{extremes, of_vertices, round, scaled, stops};
+use super::{MAX_ENTRIES, entry, extremes, of_vertices, round, scaled, stops};
 use crate::structure::Structure;
 use crate::structure::map::Map;
-use crate::surface::{Control, Mesh, SurfaceError};
+use crate::surface::{Column, Control, Mesh, Pockets, SurfaceError};
 
 /// Memory of a colour, bytes.
 const COLOR_BYTES: u64 = 4;
+/// Memory of the number of a pocket, bytes.
+const INDEX_BYTES: u64 = 8;
 
 /// Colours of a job, before its mesh exists.
 pub(in super::super) struct MeshColors {
@@ -24,6 +29,8 @@ enum ColorSource {
     Atoms { of_spheres: Vec<[u8; 4]>, report: ColorReport },
     /// Values of the vertices.
     Vertices(ValueSource),
+    /// Pockets that the vertices line.
+    Pockets,
 }
 
 impl MeshColors {
@@ -39,15 +46,17 @@ impl MeshColors {
         control: &Control<'_>,
     ) -> Result<Self, JobError> {
         let source = if let Scheme::Vertex(property) = coloring.scheme {
-            ColorSource::Vertices(match property {
-                VertexProperty::Curvature => ValueSource::Curvature,
-                VertexProperty::Radial => ValueSource::Radial(centroid(structure, selected)),
-                VertexProperty::Depth => ValueSource::Depth,
+            let vertices = ColorSource::Vertices;
+            match property {
+                VertexProperty::Curvature => vertices(ValueSource::Curvature),
+                VertexProperty::Radial => vertices(ValueSource::Radial(centroid(structure, selected))),
+                VertexProperty::Depth => vertices(ValueSource::Depth),
+                VertexProperty::Pocket => ColorSource::Pockets,
                 VertexProperty::Map => {
                     let map = map.ok_or_else(|| ColorError::without_map(coloring.scheme))?;
-                    ValueSource::Map(Box::new(map), coloring.offset)
+                    vertices(ValueSource::Map(Box::new(map), coloring.offset))
                 }
-            })
+            }
         } else {
             control.memory.grow(COLOR_BYTES * selected.len() as u64).map_err(SurfaceError::from)?;
             let colors = AtomColors::new(structure, selected, &coloring)?;
@@ -57,7 +66,8 @@ impl MeshColors {
         Ok(Self { coloring, source })
     }
 
-    /// Sets the colours of the vertices. `resolution` is the grid spacing, Å. Returns the report.
+    /// Sets the colours of the vertices. `resolution` is the grid spacing, Å; `pockets` are those of the scheme
+    /// `pocket`. Returns the report.
     ///
     /// # Errors
     /// Returns [`JobError::Color`] if the map has no value at any vertex, and the errors of memory and cancellation.
@@ -65,6 +75,7 @@ impl MeshColors {
         self,
         mesh: &mut Mesh,
         resolution: f64,
+        pockets: Option<&Pockets>,
         control: &Control<'_>,
     ) -> Result<ColorReport, JobError> {
         control.check()?;
@@ -77,6 +88,10 @@ impl MeshColors {
             ColorSource::Atoms { of_spheres, report } => {
                 (mesh.atom_ids.as_deref().map(|ids| of_vertices(ids, |id| of_spheres[id as usize])), report)
             }
+            ColorSource::Pockets => {
+                let pockets = pockets.ok_or_else(|| ColorError::without_pockets(scheme))?;
+                of_pockets(mesh, pockets, scheme, control)?
+            }
             ColorSource::Vertices(source) => {
                 let values = vertex::values(mesh, &source, control)?;
                 let palette = palette.or(scheme.palette()).unwrap_or(Palette::Viridis);
@@ -88,11 +103,8 @@ impl MeshColors {
                     _ => (extremes(values.iter().copied()).map(round), None),
                 };
                 let range = range.or(scheme.range()).unwrap_or(of_values);
-                let color = |value: f32| {
-                    let color = if value.is_nan() { OTHER } else { scaled(palette, range, f64::from(value)) };
-                    let [_, r, g, b] = color.to_be_bytes();
-                    [r, g, b, u8::MAX]
-                };
+                let color =
+                    |value: f32| opaque(if value.is_nan() { OTHER } else { scaled(palette, range, f64::from(value)) });
                 // Values of a map may have any scale.
                 let legend = match map {
                     Some(_) => stops(palette, range, |value| significant(value, 5)),
@@ -117,6 +129,40 @@ impl MeshColors {
         mesh.colors = colors;
         Ok(report)
     }
+}
+
+/// Returns the colours of the pockets that the vertices line, and their report. Vertices at no pocket are grey.
+fn of_pockets(
+    mesh: &Mesh,
+    pockets: &Pockets,
+    scheme: Scheme,
+    control: &Control<'_>,
+) -> Result<(Option<Column<[u8; 4]>>, ColorReport), SurfaceError> {
+    let _memory = control.reserve(INDEX_BYTES * mesh.n_vertices() as u64)?;
+    let lined = |i: usize| {
+        let position = mesh.position(i);
+        pockets.lined_at(std::array::from_fn(|k| mesh.centre[k] + f64::from(position[k])))
+    };
+    let lined: Vec<Option<u32>> = (0..mesh.n_vertices()).into_par_iter().map(lined).collect();
+    control.check()?;
+    let color = |pocket: Option<u32>| opaque(pocket.map_or(OTHER, category));
+    let legend = (0..).zip(&pockets.list).take(MAX_ENTRIES).map(|(i, _)| entry((i + 1).to_string(), category(i)));
+    let report = ColorReport {
+        scheme: scheme.to_string(),
+        palette: None,
+        range: None,
+        blend: None,
+        source: None,
+        map: None,
+        legend: legend.collect(),
+    };
+    Ok((Some(of_vertices(&lined, color)), report))
+}
+
+/// Returns the bytes of an opaque colour.
+fn opaque(color: Rgb) -> [u8; 4] {
+    let [_, r, g, b] = color.to_be_bytes();
+    [r, g, b, u8::MAX]
 }
 
 /// Describes a map and counts the vertices without a value.

@@ -9,7 +9,7 @@ use super::vertex::VertexProperty;
 /// Description of the valid values of the parameter `color`.
 pub const EXPECTED: &str = "none, uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, \
                             occupancy, plddt, hydrophobicity, hydrophobicity:wimley-white, charge, curvature, \
-                            radial, depth, map";
+                            radial, depth, pocket, map";
 
 /// Hydrophobicity scale.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,7 +50,7 @@ pub enum Scheme {
 }
 
 /// Schemes by name, except [`Scheme::Uniform`].
-const NAMED: [(&str, Scheme); 15] = [
+const NAMED: [(&str, Scheme); 16] = [
     ("element", Scheme::Element),
     ("chain", Scheme::Chain),
     ("entity", Scheme::Entity),
@@ -65,6 +65,7 @@ const NAMED: [(&str, Scheme); 15] = [
     ("curvature", Scheme::Vertex(VertexProperty::Curvature)),
     ("radial", Scheme::Vertex(VertexProperty::Radial)),
     ("depth", Scheme::Vertex(VertexProperty::Depth)),
+    ("pocket", Scheme::Vertex(VertexProperty::Pocket)),
     ("map", Scheme::Vertex(VertexProperty::Map)),
 ];
 
@@ -79,6 +80,12 @@ impl Scheme {
     #[must_use]
     pub const fn needs_map(self) -> bool {
         matches!(self, Self::Vertex(VertexProperty::Map))
+    }
+
+    /// Returns true if the scheme needs a search for pockets.
+    #[must_use]
+    pub const fn needs_pockets(self) -> bool {
+        matches!(self, Self::Vertex(VertexProperty::Pocket))
     }
 
     /// Returns the default palette of a numeric scheme; `None` for other schemes.

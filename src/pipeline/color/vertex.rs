@@ -28,6 +28,8 @@ pub enum VertexProperty {
     Radial,
     /// Distance from the convex hull of the mesh, Å.
     Depth,
+    /// Pocket that the vertex lines.
+    Pocket,
     /// Value of the map that is sent beside the structure, near the vertex.
     Map,
 }

@@ -14,6 +14,7 @@ pub fn canonical(job: &Job) -> String {
         params,
         split,
         cavities,
+        pockets,
         spacing,
         validation,
         compress,
@@ -65,6 +66,7 @@ pub fn canonical(job: &Job) -> String {
     let optional = [
         (*split != Split::None).then(|| format!("split={}", split.name())),
         cavities.map(|cavities| format!("cavities={}", cavities.name())),
+        pockets.map(|probe| format!("pockets={probe}")),
         exact.then(|| "exact=true".to_owned()),
         // Quotes the names, which may contain `&`.
         interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),

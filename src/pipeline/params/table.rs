@@ -8,7 +8,7 @@ use crate::picture::{Background, MAX_SIDE};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::pipeline::{areas, color};
 use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
-use crate::surface::{Preset, SurfaceKind, Validation};
+use crate::surface::{POCKET_PROBES, Preset, SurfaceKind, Validation};
 
 /// Domain of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -125,6 +125,7 @@ pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
         "isovalue" => [0.2, 4.0],
         "smoothness" => [0.4, 10.0],
         "probe" => [1.0, 2.0],
+        "pocket_probe" => [3.0, 8.0],
         "radius_scale" => [0.5, 2.0],
         "radius_offset" => [-1.0, 3.0],
         "cutoff_tolerance" => [1e-4, 0.1],
@@ -217,7 +218,7 @@ pub const TABLE: &[Parameter] = &[
         name: "color",
         domain: Domain::Text { expected: color::EXPECTED },
         default: "none",
-        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, secondary structure in the file (Jmol), B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7; or by the mean curvature of the surface, the distance from the centroid of the atoms (radial), the distance from the convex hull of the mesh (depth), or the values of a map sent beside the structure (map). STL has no colours.",
+        doc: "Colours every vertex by its nearest atom: element (Jmol), chain, entity, residue name, secondary structure in the file (Jmol), B-factor, occupancy, pLDDT (classes of the AlphaFold database), hydrophobicity of the residue (Kyte–Doolittle or Wimley–White) or its formal charge at pH 7; or by the mean curvature of the surface, the distance from the centroid of the atoms (radial), the distance from the convex hull of the mesh (depth), the pocket that the vertex lines (pocket), or the values of a map sent beside the structure (map). STL has no colours.",
     },
     Parameter {
         name: "palette",
@@ -298,6 +299,17 @@ pub const TABLE: &[Parameter] = &[
         default: "absent",
         doc: "Searches for cavities, closed regions between the atoms that hold a probe, and lists them in the report. keep leaves the mesh as it is, drop removes its inner components around a cavity, only keeps nothing else.",
     },
+    switch(
+        "pockets",
+        "Searches for pockets, regions outside the molecule that the probe can enter and a large probe cannot, and lists them in the report. color=pocket implies it.",
+    ),
+    number(
+        "pocket_probe",
+        POCKET_PROBES,
+        "Å",
+        "4",
+        "Radius of the large probe of the search for pockets, larger than that of the probe; with pockets=true or color=pocket only.",
+    ),
     Parameter {
         name: "validation",
         domain: Domain::Choice(Validation::NAMES),

@@ -10,7 +10,7 @@ use crate::pipeline::color::{ColorBlend, Coloring, Palette, Scheme};
 use crate::pipeline::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::pipeline::{Cavities, Spacing};
 use crate::structure::{Context, ModelChoice, Selection, Split};
-use crate::surface::{Preset, SurfaceKind, SurfaceOptions, Validation};
+use crate::surface::{DEFAULT_POCKET_PROBE, Preset, SurfaceKind, SurfaceOptions, Validation};
 
 /// Default of `color_offset`: the radius of a water molecule, Å.
 const DEFAULT_COLOR_OFFSET: f64 = 1.4;
@@ -28,6 +28,8 @@ pub(super) struct ParsedValues {
     color_range: Option<[f64; 2]>,
     color_blend: ColorBlend,
     color_offset: Option<f64>,
+    pockets: bool,
+    pocket_probe: Option<f64>,
     pub(super) request: Request,
 }
 
@@ -57,6 +59,17 @@ impl ParsedValues {
         }
         let offset = color_offset.unwrap_or(DEFAULT_COLOR_OFFSET);
         Ok(scheme.map(|scheme| Coloring { scheme, palette, range, blend, offset }))
+    }
+
+    /// Returns the radius of the large probe if pockets are listed or coloured, Å.
+    pub(super) fn pockets(&self) -> Result<Option<f64>, ParamError> {
+        if self.pockets || self.scheme.is_some_and(Scheme::needs_pockets) {
+            return Ok(Some(self.pocket_probe.unwrap_or(DEFAULT_POCKET_PROBE)));
+        }
+        let unused = |probe: f64| {
+            ParamError::bad_value("pocket_probe", &probe.to_string(), "no value without pockets=true or color=pocket")
+        };
+        self.pocket_probe.map_or(Ok(None), |probe| Err(unused(probe)))
     }
 
     /// Divides the mesh by model if all models are meshed.
@@ -149,6 +162,8 @@ impl ParsedValues {
             "cavities" => {
                 self.request.job.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?);
             }
+            "pockets" => self.pockets = flag(text).ok_or_else(bad)?,
+            "pocket_probe" => self.pocket_probe = Some(bounded().ok_or_else(bad)?),
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
             "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
             "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,

@@ -40,6 +40,7 @@ const LABELS = new Map<string, string>([
   ["curvature", "curvature"],
   ["radial", "distance from the centre"],
   ["depth", "depth below the convex hull"],
+  ["pocket", "pockets"],
 ]);
 
 /** Returns the label of a scheme; its name if it has none. */
