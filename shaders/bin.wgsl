@@ -1,5 +1,5 @@
-// Stage `bin`: candidate atoms of every brick, in canonical order, and for a boundary of spheres its candidate arcs. One
-// workgroup per brick and section; the arcs are the second section of all tables and are treated like atoms.
+// Stage `bin`: candidate atoms of every brick, in canonical order, and for a boundary of spheres its candidate arcs.
+// One workgroup per brick and section; the arcs are the second section of all tables and are treated like atoms.
 //
 // Atoms are sorted by tile and brick, so the atoms of a run of bricks along x within a tile are one range. Each lane
 // looks up one range. Then the lanes divide the atoms of 64 ranges evenly and keep those in reach, in order.

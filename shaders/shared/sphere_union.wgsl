@@ -1,9 +1,9 @@
 // Signed distance to the boundary of a union of spheres, in spacings and positive inside, as in
 // `surface/sphere_union/distance.rs`. Requires `params`, `atoms`, `lists`, `heads` and `boundary`.
 //
-// The rows of `boundary` begin with one per sphere and arc: the first of its own rows, and for a sphere the one after the
-// last. An arc has four rows: centre and radius, axis and cosine of the half-angle, middle and sine of the half-angle,
-// side. A sphere has eight rows for each group of eight caps: two each of axis x, y, z and height.
+// The rows of `boundary` begin with one per sphere and arc: the first of its own rows, and for a sphere the one after
+// the last. An arc has four rows: centre and radius, axis and cosine of the half-angle, middle and sine of the
+// half-angle, side. A sphere has eight rows for each group of eight caps: two each of axis x, y, z and height.
 
 // Range of rows of a sphere without a face.
 const COVERED: u32 = 0xffffffffu;
@@ -125,8 +125,8 @@ fn deepest_at(around: Around, x: vec3<f32>) -> Nearest {
     return found;
 }
 
-// Returns true if the boundary point nearest to `x` may lie on an arc: the nearest point of the sphere in which `x` lies
-// deepest is covered. Deep points need no exact distance.
+// Returns true if the boundary point nearest to `x` may lie on an arc: the nearest point of the sphere in which `x`
+// lies deepest is covered. Deep points need no exact distance.
 fn needs_arcs(around: Around, x: vec3<f32>, found: Nearest) -> bool {
     if (params.n_sections < 2u || found.distance <= 0.0 || found.distance >= params.level + MARGIN) {
         return false;

@@ -175,10 +175,9 @@ mod tests {
         for parameter in params::TABLE {
             let flag = format!("--{}", parameter.name.replace('_', "-"));
             let value = match parameter.name {
-                "atom_ids" | "check" => vec![flag.as_str()],
+                "atom_ids" | "check" | "pockets" => vec![flag.as_str()],
                 "validation" => vec![&flag, "exact"],
                 "cavities" => vec![&flag, "drop"],
-                "pockets" => vec![&flag],
                 "pocket_probe" => vec![&flag, "5", "--pockets"],
                 "compress" => vec![&flag, "quantize"],
                 "normals" => vec![&flag, "none"],

@@ -22,8 +22,8 @@ pub enum BufferId {
     Halo,
     /// Candidate lists.
     Lists,
-    /// Header of each candidate list: start, number of atoms that reach a grid point, number of all candidates, brick. Lists of atoms
-    /// come first, then those of arcs.
+    /// Header of each candidate list: start, number of atoms that reach a grid point, number of all candidates, brick.
+    /// Lists of atoms come first, then those of arcs.
     Heads,
     /// Densities, or distances to the surface.
     Field,

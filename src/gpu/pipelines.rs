@@ -31,8 +31,8 @@ pub(super) const TIMESTAMP_BYTES: u64 = 16 * N_STAGES as u64;
 pub(super) struct Pipelines {
     /// Layouts by [`ShaderIndex`].
     layouts: Vec<BindGroupLayout>,
-    /// Variants per shader: one per kernel if it depends on the kernel, each with a second one that computes the nearest
-    /// atoms in `interpolate`.
+    /// Variants per shader: one per kernel if it depends on the kernel, each with a second one that computes the
+    /// nearest atoms in `interpolate`.
     variants: Vec<Vec<ComputePipeline>>,
 }
 

@@ -838,7 +838,8 @@ fn control_missing_parts_are_reported() {
     files.extend(whole("shaders", "wgsl"));
     files.retain(|f| f != "src/surface/cpu/scan.rs");
     assert_eq!(missing_parts(&files, None), ["src/surface/cpu/scan.rs"]);
-    let tests = "fn bin_x() {} fn field_x() {} fn classify_x() {} fn scan_x() {} fn emit_x() {} fn measure_x() {}";
+    let tests = "fn bin_x() {} fn field_x() {} fn classify_x() {} fn scan_x() {} fn refine_x() {} fn emit_x() {}
+        fn measure_x() {}";
     assert_eq!(missing_parts(&[], Some(tests)), ["tests/gpu/stages.rs::interpolate_*"]);
 }
 

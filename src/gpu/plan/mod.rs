@@ -96,7 +96,7 @@ impl Plan {
     /// Parameters that all dispatches of the job have in common.
     #[must_use]
     pub fn params(&self, lattice: &Lattice, params: &SurfaceParams) -> Params {
-        // An atom lies at most half a spacing before the grid points of its brick, an arc at most a spacing behind them.
+        // An atom lies at most half a spacing before the grid points of its brick, an arc at most a spacing behind.
         let bricks = |reach: f32| u32::try_from(to_u64(f64::from(reach) / f64::from(BRICK))).unwrap_or(u32::MAX);
         let of_field = match &lattice.shape {
             Shape::Density(profile) => density_params(&Constants::new(profile, lattice.spacing), params),

@@ -35,8 +35,8 @@ pub(crate) fn tolerance(lattice: &Lattice) -> f32 {
     to_f32(TOLERANCE / lattice.spacing).max(ROUNDING)
 }
 
-/// Finds the boundary of the spheres of `lattice` and a bounding sphere of each of its arcs. Returns `None` for surfaces
-/// at which the distance to the nearest sphere is exact, and for isosurfaces.
+/// Finds the boundary of the spheres of `lattice` and a bounding sphere of each of its arcs. Returns `None` for
+/// surfaces at which the distance to the nearest sphere is exact, and for isosurfaces.
 ///
 /// # Errors
 /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
