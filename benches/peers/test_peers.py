@@ -169,7 +169,8 @@ class Runs(unittest.TestCase):
             ours, case = json.loads(done.stdout), gpu_field.Case(atoms, 2.0)
             measured, _ = gpu_field.measure(gpu_field.NumpyBaseline(), case, 0, 1)
         self.assertEqual((measured["triangles"], measured["bad_edges"]), (ours["triangles"], 0))
-        self.assertAlmostEqual(measured["volume"] / ours["volume"], 1, places=5)
+        # The array program interpolates linearly; molmesh then moves the vertices to the isosurface.
+        self.assertLess(abs(measured["volume"] / ours["volume"] - 1), 0.1)
         self.assertLess(measured["largest_field_error"], 1e-5)
         self.assertEqual(gpu_field.open_edges(SIDES[1:], 4), 3)
 

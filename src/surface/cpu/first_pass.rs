@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use super::bin::{Bricks, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, ClassifiedBricks, Inside, Neighbourhood};
+use super::distance::DistanceField;
 use super::field::{self, BrickField, GridPointRange};
 use super::slabs::{PartialTiles, Slab};
 use super::{Field, NO_BRICK, RunContext, Tile, scan};
@@ -167,9 +168,12 @@ impl Pass<'_> {
         for z in layers.start..=layers.end {
             self.context.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z))?;
             if z > layers.start {
-                self.context
-                    .control
-                    .span(Stage::Classify, || scratch.classify(self, coord, z - 1, &mut found, &mut bricks))?;
+                self.context.control.span(Stage::Classify, || scratch.classify(self, z - 1, &mut found, &mut bricks));
+                if let Field::Distance(field) = self.field {
+                    self.context
+                        .control
+                        .span(Stage::Refine, || scratch.refine(self, field, coord, z - 1, &mut found))?;
+                }
             }
         }
         self.context.control.span(Stage::Classify, || found.shrink_to_fit());
@@ -235,44 +239,56 @@ impl TileScratch {
 
     /// Classifies every brick of layer z that has, or borders on, grid points inside; requires the layer above to be
     /// the last one evaluated. Writes the index of each local brick's record to `local`.
-    ///
-    /// # Errors
-    /// Returns [`SurfaceError::Cancelled`].
-    fn classify(
-        &mut self,
-        pass: &Pass<'_>,
-        tile: [i32; 3],
-        z: usize,
-        found: &mut ClassifiedBricks,
-        local: &mut [u16],
-    ) -> Result<(), SurfaceError> {
-        const NOTHING: BrickField = [0.0; BRICK_POINTS];
-        let Self { bricks, arcs, spheres, layers, slots } = self;
+    fn classify(&self, pass: &Pass<'_>, z: usize, found: &mut ClassifiedBricks, local: &mut [u16]) {
         for y in 0..SIDE - 1 {
-            let rows = layers.iter().fold(0, |rows, layer| rows | layer.rows[y] | layer.rows[y + 1]);
+            let rows = self.layers.iter().fold(0, |rows, layer| rows | layer.rows[y] | layer.rows[y + 1]);
             let mut left = (rows | rows >> 1) & ((1 << (SIDE - 1)) - 1);
             while left != 0 {
                 let x = left.trailing_zeros() as usize;
                 left &= left - 1;
                 let slot = (z * SIDE + y) * SIDE + x;
-                let near: [(usize, &Layer); 8] =
-                    std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(z + (n >> 2)) % 2]));
-                let around = Neighbourhood {
-                    inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NONE_INSIDE)),
-                    fields: near.map(|(i, layer)| layer.fields.get(i).map_or(&NOTHING, |AlignedField(field)| field)),
-                };
-                let first = found.t.len();
-                let Some(record) = found.add(slot, &around, pass.iso, bricks.of(slot)) else { continue };
-                local[(z * 8 + y) * 8 + x] = record;
-                if let Field::Distance(distance) = pass.field {
-                    pass.context.control.check()?;
-                    let origin = slot_origin(tile, slot);
-                    distance.load(spheres, &pass.lattice.atoms, bricks.of(slot), arcs.of(slot), origin);
-                    pass.context.control.span(Stage::Refine, || distance.refine(spheres, &around.fields, first, found));
+                let around = neighbourhood(&self.layers, &self.slots, slot);
+                if let Some(record) = found.add(slot, &around, pass.iso, self.bricks.of(slot)) {
+                    local[(z * 8 + y) * 8 + x] = record;
                 }
             }
         }
+    }
+
+    /// Moves the vertices of layer z, which was classified last, to the surface.
+    ///
+    /// # Errors
+    /// Returns [`SurfaceError::Cancelled`].
+    fn refine(
+        &mut self,
+        pass: &Pass<'_>,
+        field: &DistanceField,
+        tile: [i32; 3],
+        z: usize,
+        found: &mut ClassifiedBricks,
+    ) -> Result<(), SurfaceError> {
+        let Self { bricks, arcs, spheres, layers, slots } = self;
+        let first = found.bricks.partition_point(|brick| usize::from(brick.slot) < z * SIDE * SIDE);
+        for ix in first..found.bricks.len() {
+            pass.context.control.check()?;
+            let slot = usize::from(found.bricks[ix].slot);
+            let vertices = found.before(ix).vertices..found.before(ix + 1).vertices;
+            field.load(spheres, &pass.lattice.atoms, bricks.of(slot), arcs.of(slot), slot_origin(tile, slot));
+            field.refine(spheres, &neighbourhood(layers, slots, slot).fields, vertices, found);
+        }
         Ok(())
+    }
+}
+
+/// Returns the inside bits and the fields of the brick in a slot and of its neighbours.
+fn neighbourhood<'a>(layers: &'a [Layer; 2], slots: &[u16], slot: usize) -> Neighbourhood<'a> {
+    const NOTHING: &BrickField = &[0.0; BRICK_POINTS];
+    let z = slot / (SIDE * SIDE);
+    let near: [(usize, &Layer); 8] =
+        std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(z + (n >> 2)) % 2]));
+    Neighbourhood {
+        inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NONE_INSIDE)),
+        fields: near.map(|(i, layer)| layer.fields.get(i).map_or(NOTHING, |AlignedField(field)| field)),
     }
 }
 

@@ -1,6 +1,8 @@
 //! Stage `refine` of surfaces of spheres: moves vertices along their edges to the surface. For isosurfaces,
 //! `interpolate` does it, from the same sum over atoms as the normals.
 
+use std::ops::Range;
+
 use super::classify::ClassifiedBricks;
 use super::distance::{DistanceField, SURFACE};
 use super::edge::Edge;
@@ -13,20 +15,20 @@ use crate::surface::sphere_union::{BrickUnion, Feature, Lanes, Nearest};
 const MAX_STEPS: usize = 64;
 
 impl DistanceField {
-    /// Moves the vertices of a brick, starting with the `first`, along their edges to the surface. Adds the nearest
+    /// Moves the vertices `range`, those of a brick, along their edges to the surface. Adds the nearest
     /// feature of each, and the nearest sphere if atom ids are requested.
     pub(super) fn refine(
         &self,
         spheres: &mut BrickUnion,
         fields: &[&BrickField; 8],
-        first: usize,
+        range: Range<usize>,
         found: &mut ClassifiedBricks,
     ) {
         let ClassifiedBricks { t, edges, features, spheres: nearest, .. } = found;
-        let (edges, t) = (&edges[first..], &mut t[first..]);
-        features.resize(first + t.len(), Feature::default());
+        let (edges, t) = (&edges[range.clone()], &mut t[range.clone()]);
+        features.resize(range.end, Feature::default());
         if self.atom_ids {
-            nearest.resize(first + t.len(), 0);
+            nearest.resize(range.end, 0);
         }
         // For vertices that are close together, few spheres and arcs can be the nearest ones.
         for order in by_cube(edges).chunks(LANES) {
@@ -40,8 +42,8 @@ impl DistanceField {
             }
             for (lane, i) in order.iter().enumerate() {
                 t[*i] = search.t[lane].clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
-                features[first + i] = search.features[lane];
-                if let Some(sphere) = nearest.get_mut(first + i) {
+                features[range.start + i] = search.features[lane];
+                if let Some(sphere) = nearest.get_mut(range.start + i) {
                     *sphere = search.spheres[lane];
                 }
             }
