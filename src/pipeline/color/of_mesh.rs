@@ -90,7 +90,8 @@ impl MeshColors {
             }
             ColorSource::Pockets => {
                 let pockets = pockets.ok_or_else(|| ColorError::without_pockets(scheme))?;
-                of_pockets(mesh, pockets, scheme, control)?
+                let (colors, report) = of_pockets(mesh, pockets, scheme, control)?;
+                (Some(colors), report)
             }
             ColorSource::Vertices(source) => {
                 let values = vertex::values(mesh, &source, control)?;
@@ -137,7 +138,7 @@ fn of_pockets(
     pockets: &Pockets,
     scheme: Scheme,
     control: &Control<'_>,
-) -> Result<(Option<Column<[u8; 4]>>, ColorReport), SurfaceError> {
+) -> Result<(Column<[u8; 4]>, ColorReport), SurfaceError> {
     let _memory = control.reserve(INDEX_BYTES * mesh.n_vertices() as u64)?;
     let lined = |i: usize| {
         let position = mesh.position(i);
@@ -156,7 +157,7 @@ fn of_pockets(
         map: None,
         legend: legend.collect(),
     };
-    Ok((Some(of_vertices(&lined, color)), report))
+    Ok((of_vertices(&lined, color), report))
 }
 
 /// Returns the bytes of an opaque colour.

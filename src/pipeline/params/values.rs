@@ -107,6 +107,7 @@ impl ParsedValues {
             let Domain::Number { min, max, .. } = parameter.domain else { return None };
             text.trim().parse::<f64>().ok().filter(|value| (min..=max).contains(value)).map(|value| value + 0.0)
         };
+        let job = &mut self.request.job;
         match parameter.name {
             "preset" => self.options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
             "surface" => self.options.surface = Some(SurfaceKind::from_str(text).ok().ok_or_else(bad)?),
@@ -159,9 +160,7 @@ impl ParsedValues {
             "instances" => self.selection.instances = flag(text).ok_or_else(bad)?,
             "context" => self.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
             "split" => self.request.job.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
-            "cavities" => {
-                self.request.job.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?);
-            }
+            "cavities" => job.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?),
             "pockets" => self.pockets = flag(text).ok_or_else(bad)?,
             "pocket_probe" => self.pocket_probe = Some(bounded().ok_or_else(bad)?),
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),

@@ -97,8 +97,12 @@ impl BitGrid {
     pub(super) fn invert(&mut self) {
         let last = self.last_mask();
         self.words.par_chunks_mut(self.row_words.max(1)).for_each(|row| {
-            row.iter_mut().for_each(|word| *word = !*word);
-            row.iter_mut().next_back().into_iter().for_each(|word| *word &= last);
+            for word in &mut *row {
+                *word = !*word;
+            }
+            if let Some(word) = row.last_mut() {
+                *word &= last;
+            }
         });
     }
 
