@@ -59,8 +59,8 @@ metrics! {
     JOBS_FALLBACK = "molmesh_jobs_fallback_total", Counter;
     /// Time of each stage of a job.
     STAGE_DURATION = "molmesh_job_stage_duration_seconds", Histogram,
-        stage: "queue|check|read|select|exact|bin|field|classify|scan|interpolate|emit|write|measure|\
-                roundtrip|color|draw|png|encode";
+        stage: "queue|check|read|select|exact|pockets|bin|field|classify|scan|refine|interpolate|emit|write|\
+                cavities|measure|roundtrip|color|draw|png|encode";
     /// Results of synchronous requests that were not stored.
     RESULTS_NOT_STORED = "molmesh_results_not_stored_total", Counter, reason: "busy|failed";
     /// Jobs waiting in the queue.

@@ -172,13 +172,17 @@ fn the_table_and_the_core_agree_on_every_range() {
             continue;
         }
         numbers += 1;
-        // Only some surfaces have a probe, and only colours by a map an offset.
-        let other = match parameter.name {
-            "probe" => Some(("surface", "ses".to_owned())),
-            "color_offset" => Some(("color", "map".to_owned())),
-            _ => None,
+        // Only some surfaces and pockets have a probe, and only colours by a map an offset.
+        let others: &[(&str, &str)] = match parameter.name {
+            "probe" => &[("surface", "ses")],
+            "pocket_probe" => &[("pockets", "true"), ("surface", "ses"), ("probe", "0.5")],
+            "color_offset" => &[("color", "map")],
+            _ => &[],
         };
-        let give = |value: f64| parse(other.clone().into_iter().chain([(parameter.name, value.to_string())]));
+        let give = |value: f64| {
+            let others = others.iter().map(|(name, value)| (*name, (*value).to_owned()));
+            parse(others.chain([(parameter.name, value.to_string())]))
+        };
         for good in [min, max] {
             give(good).unwrap_or_else(|e| panic!("{e}"));
         }
@@ -186,7 +190,7 @@ fn the_table_and_the_core_agree_on_every_range() {
             assert!(matches!(give(bad), Err(ParamError::BadValue { .. })), "{} {bad}", parameter.name);
         }
     }
-    assert_eq!(numbers, 10);
+    assert_eq!(numbers, 11);
     let mut integers = 0;
     for parameter in TABLE {
         let Domain::Integer { min, max } = parameter.domain else { continue };
