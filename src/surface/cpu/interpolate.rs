@@ -343,7 +343,7 @@ fn newton_step(c: &Constants, isovalue: f32, edges: &[Edge], n: &[Vec<f32>; 3], 
         // −dF/dt is twice the amplitude times the sum. The limit keeps the vertex a continuous function of the density.
         // All comparisons with NaN are false.
         let share = log * value / (2.0 * c.slope_amplitude * along * rest);
-        let share = if (share >= 0.0) & (share < MAX_SHARE) { share } else { MAX_SHARE };
+        let share = if (0.0..MAX_SHARE).contains(&share) { share } else { MAX_SHARE };
         *t = (*t + share * rest).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
     }
 }

@@ -64,7 +64,7 @@ fn by_brute_force(balls: &[Shape], probe: f64, pocket_probe: f64) -> Vec<f64> {
     const N: i64 = 60;
     let at = |i: i64| (i - N / 2) as f64 * SPACING;
     let all: Vec<[i64; 3]> = (0..N).flat_map(|z| (0..N).flat_map(move |y| (0..N).map(move |x| [x, y, z]))).collect();
-    let number = |[x, y, z]: [i64; 3]| ((z * N + y) * N + x) as usize;
+    let number = |[x, y, z]: [i64; 3]| usize::try_from((z * N + y) * N + x).unwrap();
     let reached = |probe: f64| {
         let is_centre = |point: &[i64; 3]| {
             balls.iter().all(|(centre, radius)| {
@@ -260,6 +260,25 @@ fn lining_spheres_are_near_the_pocket() {
     assert_eq!(found.lined_at([1e9, 0.0, f64::MAX]), None);
 }
 
+/// Memory that is left, bytes.
+#[derive(Debug)]
+struct Budget(std::sync::atomic::AtomicI64);
+
+impl crate::surface::MemoryMeter for Budget {
+    fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
+        let left = self.0.fetch_sub(bytes.cast_signed(), std::sync::atomic::Ordering::Relaxed);
+        if left >= bytes.cast_signed() {
+            return Ok(());
+        }
+        self.shrink(bytes);
+        Err(OutOfMemory::System { needed: bytes })
+    }
+
+    fn shrink(&self, bytes: u64) {
+        self.0.fetch_add(bytes.cast_signed(), std::sync::atomic::Ordering::Relaxed);
+    }
+}
+
 #[test]
 fn limits_and_cancellation_end_the_search() {
     let control = Control::default();
@@ -276,23 +295,6 @@ fn limits_and_cancellation_end_the_search() {
     // Two spheres that are far from each other, with any limit.
     let far = [([0.0; 3], 1.0), ([1e5; 3], 1.0)];
     assert!(matches!(search(&far, u64::MAX, &control), Err(SurfaceError::PocketGridTooLarge { .. })));
-
-    #[derive(Debug)]
-    struct Budget(std::sync::atomic::AtomicI64);
-    impl crate::surface::MemoryMeter for Budget {
-        fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
-            let left = self.0.fetch_sub(bytes.cast_signed(), std::sync::atomic::Ordering::Relaxed);
-            if left >= bytes.cast_signed() {
-                return Ok(());
-            }
-            self.shrink(bytes);
-            Err(OutOfMemory::System { needed: bytes })
-        }
-
-        fn shrink(&self, bytes: u64) {
-            self.0.fetch_add(bytes.cast_signed(), std::sync::atomic::Ordering::Relaxed);
-        }
-    }
     let n = cluster(CLUSTER.0, CLUSTER.1);
     let with = |bytes: i64| {
         let memory = Arc::new(Budget(bytes.into()));
