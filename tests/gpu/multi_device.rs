@@ -81,7 +81,7 @@ fn crowd(n: usize) -> Spheres {
 }
 
 fn with_ids(surface: SurfaceKind, resolution: f64) -> SurfaceParams {
-    let (surface, resolution) = (Some(surface.into()), Some(resolution));
+    let (surface, resolution) = (Some(surface), Some(resolution));
     SurfaceParams::new(&SurfaceOptions { surface, resolution, atom_ids: true, ..SurfaceOptions::default() }).unwrap()
 }
 
