@@ -19,6 +19,7 @@ use super::{Cavities, Interface, Job};
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Context, Selection, Split};
+use crate::surface::pockets::SPACING as POCKET_SPACING;
 use crate::surface::{SurfaceError, SurfaceParams};
 
 /// Errors of parsing parameters.
@@ -165,6 +166,10 @@ fn check_pockets(job: &Job) -> Result<(), ParamError> {
         return Err(ParamError::bad_value(name, value, format!("{otherwise} with {divided}")));
     }
     let probe = job.params.probe;
+    if probe < POCKET_SPACING {
+        let expected = format!("at least {} Å with pockets, the spacing of their grid", POCKET_SPACING);
+        return Err(ParamError::bad_value("probe", &probe.to_string(), expected));
+    }
     if large <= probe {
         let expected = format!("a radius above that of the probe, {probe} Å");
         return Err(ParamError::bad_value("pocket_probe", &large.to_string(), expected));
@@ -176,6 +181,7 @@ fn check_pockets(job: &Job) -> Result<(), ParamError> {
 fn divided_by(job: &Job) -> Option<String> {
     let Selection { context, instances, .. } = &job.selection;
     match (job.split, context) {
+        (Split::Model, _) => Some("model=all".to_owned()),
         (split, _) if split != Split::None => Some(format!("split={}", split.name())),
         (_, Context::Whole) => Some(format!("context={}", context.name())),
         _ => instances.then(|| "instances=true".to_owned()),

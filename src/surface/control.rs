@@ -18,7 +18,7 @@ pub enum Stage {
     Classify,
     /// Exclusive scan over bricks: first vertex and triangle of each brick.
     Scan,
-    /// Vertices moved along their edges to the surface. On the CPU, `interpolate` does it for isosurfaces.
+    /// Parameters of vertices on the surface. For isosurfaces, the CPU finds them in `interpolate`.
     Refine,
     /// Vertex positions and normals.
     Interpolate,

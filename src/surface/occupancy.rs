@@ -138,7 +138,7 @@ impl Excess {
 ///
 /// # Errors
 /// [`SurfaceError::TooManyCandidates`], and the other errors of counting.
-pub(super) fn check_pairs(
+pub(crate) fn check_pairs(
     lattices: &[&Lattice],
     limits: &SurfaceLimits,
     control: &Control<'_>,

@@ -1,4 +1,4 @@
-//! Pockets: depressions of the molecule that a small probe can enter and a large one cannot.
+//! Pockets: regions outside the molecule that a small probe can enter and a large one cannot.
 //!
 //! The definition is that of `KVFinder` (Oliveira et al., BMC Bioinformatics 15, 2014; Guerra et al., BMC
 //! Bioinformatics 22, 2021), evaluated on a grid. It has four sets of grid points:
@@ -30,7 +30,7 @@ pub const DEFAULT_POCKET_PROBE: f64 = 4.0;
 /// Smallest and largest radius of the large probe, Å. The time grows with its square.
 pub const POCKET_PROBES: [f64; 2] = [1.0, 20.0];
 /// Spacing of the grid, Å.
-const SPACING: f64 = 0.6;
+pub(crate) const SPACING: f64 = 0.6;
 /// Distance along each axis from the points that the large probe covers within which points belong to no pocket, Å.
 const REMOVED: f64 = 2.4;
 /// Volume of the smallest pocket, Å³.
@@ -55,7 +55,7 @@ pub struct Pocket {
     pub depth: f64,
     /// Centroid, Å.
     pub centre: [f64; 3],
-    /// Number of connected regions where the pocket borders on space outside the molecule.
+    /// Number of connected regions where the pocket borders on other points outside the molecule.
     pub openings: u32,
     /// Indices of the spheres that are at most the radius of the small probe away from a grid point of the pocket,
     /// ascending.

@@ -175,7 +175,7 @@ fn the_table_and_the_core_agree_on_every_range() {
         // Only some surfaces and pockets have a probe, and only colours by a map an offset.
         let others: &[(&str, &str)] = match parameter.name {
             "probe" => &[("surface", "ses")],
-            "pocket_probe" => &[("pockets", "true"), ("surface", "ses"), ("probe", "0.5")],
+            "pocket_probe" => &[("pockets", "true"), ("surface", "ses"), ("probe", "0.7")],
             "color_offset" => &[("color", "map")],
             _ => &[],
         };

@@ -1,10 +1,10 @@
-//! Boundary of a union of spheres in the layout of the shaders, with its arcs assigned to the bricks of a plan.
+//! Boundary of a union of spheres for the shaders, with its arcs listed by brick.
 
 use rayon::prelude::*;
 
 use super::{Plan, first_of_bricks};
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, tile_of, tile_order, to_u32};
-use crate::surface::occupancy::Occupancy;
+use crate::surface::occupancy::{self, Occupancy};
 use crate::surface::sphere_union::SphereUnion;
 use crate::surface::{Control, SurfaceError, SurfaceLimits, checked_sort};
 
@@ -54,6 +54,7 @@ impl Arcs {
         checked_sort::sort(&mut order, Ord::cmp, control)?;
         let sorted: Vec<LatticeAtom> = order.par_iter().map(|(.., i)| bounds[*i as usize]).collect();
         let sorted = Lattice { atoms: sorted.into(), ..lattice.clone() };
+        occupancy::check_pairs(&[lattice, &sorted], limits, control)?;
         let occupancy = Occupancy::new(&sorted, limits, control)?;
         let mut counted = occupancy.tiles.iter().peekable();
         for (tile, candidates) in plan.tiles.iter().zip(&mut plan.candidates) {

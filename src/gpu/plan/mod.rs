@@ -82,7 +82,8 @@ impl Plan {
         self.reaches.len()
     }
 
-    /// Number of sections of the atoms: 2 with the arcs of a boundary, else 1.
+    /// Number of candidate lists per brick: 2 with a boundary, for atoms and arcs, else 1. A boundary without arcs also
+    /// has two, because its caps are needed.
     #[must_use]
     pub fn n_sections(&self) -> u32 {
         if self.arcs.first.is_empty() { 1 } else { 2 }
@@ -197,8 +198,8 @@ fn list_bricks(occupancy: &Occupancy, n_bricks: usize) -> Vec<u32> {
     bricks
 }
 
-/// First atom of each brick, counted from `at`, and the end of the last one. A brick of `atom_bricks` that does not
-/// exist ends the list of atoms; bricks that hold an atom are always occupied.
+/// First atom of each brick, counted from `at`, and the end of the last one. Requires that `bricks` contains every brick
+/// of `atom_bricks`: a brick that holds an atom is occupied.
 fn first_of_bricks(tiles: &[Tile], bricks: &[u32], atom_bricks: &[AtomBrick], mut at: u32) -> Vec<u32> {
     let mut first = Vec::with_capacity(bricks.len() + 1);
     let mut atom_bricks = atom_bricks.iter().peekable();

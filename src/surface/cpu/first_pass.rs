@@ -1,5 +1,5 @@
 //! First pass over a tile, or a slab of it. Finds the candidates of its bricks, evaluates `field` in a scratch buffer,
-//! and keeps the results of `classify`.
+//! and keeps the results of `classify`, refined for surfaces of spheres.
 
 use std::cell::RefCell;
 use std::ops::Range;
@@ -110,7 +110,8 @@ pub(super) struct Pass<'a> {
 }
 
 impl Pass<'_> {
-    /// Runs `bin`, `field` and `classify` for the `i`th slab. Returns its tile once all slabs of the tile are finished.
+    /// Runs `bin`, `field`, `classify` and, for surfaces of spheres, `refine` for the `i`th slab. Returns its tile once
+    /// all slabs of the tile are finished.
     ///
     /// # Errors
     /// Returns [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`] or [`SurfaceError::MeshTooLarge`] as

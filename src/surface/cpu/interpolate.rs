@@ -340,8 +340,8 @@ fn newton_step(c: &Constants, isovalue: f32, edges: &[Edge], n: &[Vec<f32>; 3], 
         // The end of the edge that is on the other side of the surface.
         let end = if (value >= isovalue) == edge.starts_inside() { 1.0 } else { 0.0 };
         let rest = end - *t;
-        // −dF/dt is twice the amplitude times the sum. The limit keeps the vertex a continuous function of the density.
-        // All comparisons with NaN are false.
+        // −dF/dt is twice the amplitude times the sum. The limit keeps the vertex on its edge, and its position
+        // continuous where the density is monotonic. Comparisons with NaN are false.
         let share = log * value / (2.0 * c.slope_amplitude * along * rest);
         let share = if (0.0..MAX_SHARE).contains(&share) { share } else { MAX_SHARE };
         *t = (*t + share * rest).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);

@@ -1,4 +1,4 @@
-//! Native CPU backend: seven stages over occupied bricks, parallel over tiles, with SIMD.
+//! Native CPU backend: eight stages over occupied bricks, parallel over tiles, with SIMD.
 //!
 //! First pass (`first_pass.rs`): `bin` assigns atoms to tiles. For each tile, or a slab of it, a thread finds the
 //! candidates of the bricks and evaluates `field` in a scratch buffer that fits the core's cache; `classify` keeps
@@ -309,6 +309,13 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
     };
     let pieces = pieces(&mut done);
     Ok(Scanned { lattice, field, level, tiles, done, totals, grid, pieces, quantize: params.quantize })
+}
+
+impl Scanned {
+    /// Returns the lattice and frees everything else.
+    fn into_lattice(self) -> Lattice {
+        self.lattice
+    }
 }
 
 impl Tile {

@@ -3,14 +3,13 @@
 
 use super::bin::{Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, SurfaceBrick};
-use super::distance;
 use super::field::{self, BrickField, GridPointRange};
 use super::write::{self, Destination};
 use super::{Field, RunContext, Tile};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::join::Sheet;
-use crate::surface::lattice::{BRICK, BRICK_POINTS, Lattice, LatticeAtom, to_f32};
+use crate::surface::lattice::{BRICK, BRICK_POINTS, Lattice, LatticeAtom};
 use crate::surface::mesh::Mesh;
 use crate::surface::params::{SurfaceLimits, SurfaceParams};
 use crate::surface::sink::{MeshPart, MeshSink, SinkFailed};
@@ -120,10 +119,7 @@ pub fn run_stages(
     let tiles = Tiles::new(lattice, limits, &control)?;
     let context = RunContext { params, limits, control: &control, free_threads: 1 };
     let field = Field::new(lattice, context)?;
-    let iso = match field {
-        Field::Density(_) => to_f32(params.isovalue),
-        Field::Distance(_) => distance::SURFACE,
-    };
+    let iso = field.level(params);
     let bounds = field.bounds().map_or(&[][..], |bounds| &bounds.atoms[..]);
     let (mut arcs, mut union) = (Bricks::default(), BrickUnion::default());
     let mut bricks = Vec::new();

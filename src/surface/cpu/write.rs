@@ -91,7 +91,7 @@ pub(super) fn write(
     let failed = |SinkFailed| SurfaceError::Sink;
     let [n_vertices, n_triangles] = [scanned.totals.vertices, scanned.totals.triangles];
     sink.begin(n_vertices, n_triangles).map_err(failed)?;
-    let _sums = control.reserve(SHEET_BYTES * scanned.grid.surface_bricks)?;
+    let sums = control.reserve(SHEET_BYTES * scanned.grid.surface_bricks)?;
     let written = write_pieces(&mut scanned, control, &Destination::Sink(sink))?;
     let measures = control.span(Stage::Measure, || measure::of_pieces(&scanned, &written.sums));
     let (grid, centre) = (scanned.grid, scanned.lattice.centre());
@@ -101,7 +101,9 @@ pub(super) fn write(
         // not closed requires the whole mesh. In both cases, which are rare, the mesh is computed again in memory and
         // sent again. Vertices have moved, so it starts at the first pass.
         _ => {
-            let mut output = in_memory(&mut scan_lattice(scanned.lattice, context)?, false, control)?;
+            drop((written.sums, sums));
+            let lattice = scanned.into_lattice();
+            let mut output = in_memory(&mut scan_lattice(lattice, context)?, false, control)?;
             sink.part(&MeshPart::whole(&output.mesh)).map_err(failed)?;
             output.measure(control)?.clone()
         }
