@@ -29,8 +29,8 @@ const MAX_SHARE: f32 = 0.75;
 // other side of the surface.
 fn newton(t: f32, from_inside: bool, value: f32, derivative: f32) -> f32 {
     let rest = select(0.0, 1.0, (value >= params.isovalue) == from_inside) - t;
-    // 2 (r - 1)/(r + 1) approximates ln r for the ratio r. The step is `step / whole` of the rest. It is compared before
-    // the division, because the derivative may be 0.
+    // 2 (r - 1)/(r + 1) approximates ln r for the ratio r. The step is `step / whole` of the rest. It is compared
+    // before the division, because the derivative may be 0.
     let step = -2.0 * (value - params.isovalue) * value;
     let whole = (value + params.isovalue) * derivative * rest;
     let is_within = step * sign(whole) >= 0.0 && abs(step) < MAX_SHARE * abs(whole);

@@ -198,8 +198,8 @@ fn list_bricks(occupancy: &Occupancy, n_bricks: usize) -> Vec<u32> {
     bricks
 }
 
-/// First atom of each brick, counted from `at`, and the end of the last one. Requires that `bricks` contains every brick
-/// of `atom_bricks`: a brick that holds an atom is occupied.
+/// First atom of each brick, counted from `at`, and the end of the last one. Requires that `bricks` contains every
+/// brick of `atom_bricks`: a brick that holds an atom is occupied.
 fn first_of_bricks(tiles: &[Tile], bricks: &[u32], atom_bricks: &[AtomBrick], mut at: u32) -> Vec<u32> {
     let mut first = Vec::with_capacity(bricks.len() + 1);
     let mut atom_bricks = atom_bricks.iter().peekable();

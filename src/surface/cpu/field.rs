@@ -36,8 +36,8 @@ pub(crate) struct Constants {
     pub(crate) amplitude: f32,
     /// Inverse square: lower bound of u, as a factor of 1/ρ².
     pub(crate) u_min: f32,
-    /// Gaussian: the slope is `2^(slope_offset − rate·u) − slope_tail`. It omits the factor `slope_amplitude`, so numbers
-    /// stay near 1.
+    /// Gaussian: the slope is `2^(slope_offset − rate·u) − slope_tail`. It omits the factor `slope_amplitude`, so
+    /// numbers stay near 1.
     pub(crate) slope_offset: f32,
     pub(crate) slope_tail: f32,
     /// Gaussian: the density without its amplitude is the slope minus `slope_decay` times the rest of u up to the

@@ -97,13 +97,11 @@ pub(super) fn write(
     let (grid, centre) = (scanned.grid, scanned.lattice.centre());
     let measures = match measures {
         Some(measures) if written.flat == 0 => measures,
-        // The normal of a vertex without a gradient depends on the triangles around it, and measuring a mesh that is
-        // not closed requires the whole mesh. In both cases, which are rare, the mesh is computed again in memory and
-        // sent again. Vertices have moved, so it starts at the first pass.
+        // Normals of vertices without a gradient depend on triangles, and measuring an open mesh requires all of it.
+        // In both cases, which are rare, the mesh is computed again from the first pass, as vertices have moved.
         _ => {
             drop((written.sums, sums));
-            let lattice = scanned.into_lattice();
-            let mut output = in_memory(&mut scan_lattice(lattice, context)?, false, control)?;
+            let mut output = in_memory(&mut scan_lattice(scanned.into_lattice(), context)?, false, control)?;
             sink.part(&MeshPart::whole(&output.mesh)).map_err(failed)?;
             output.measure(control)?.clone()
         }
