@@ -167,7 +167,7 @@ fn check_pockets(job: &Job) -> Result<(), ParamError> {
     }
     let probe = job.params.probe;
     if probe < POCKET_SPACING {
-        let expected = format!("at least {} Å with pockets, the spacing of their grid", POCKET_SPACING);
+        let expected = format!("at least {POCKET_SPACING} Å with pockets, the spacing of their grid");
         return Err(ParamError::bad_value("probe", &probe.to_string(), expected));
     }
     if large <= probe {
