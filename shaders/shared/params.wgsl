@@ -57,7 +57,7 @@ struct Params {
     slope_scale: f32,
     // Number of bricks of the job.
     n_bricks: u32,
-    // Surfaces of spheres: distance at the surface, and maximum distance of vertices from it.
+    // Surfaces of spheres: depth of the surface below the boundary, and maximum distance of vertices from it.
     level: f32,
     tolerance: f32,
     // Number of sections of the atoms: 2 with the arcs of a boundary, else 1.

@@ -76,14 +76,13 @@ fn difference(here: &Mesh, there: &Mesh, spacing: f64) -> Vec<String> {
     }
     let (a, b) = (measures(here), measures(there));
     for (what, a, b) in [("area", a.area, b.area), ("volume", volume(here), b.volume)] {
-        if (a / b - 1.0).abs() > 0.03 {
+        if (a / b - 1.0).abs() > 0.015 {
             wrong.push(format!("{what} {a} of {b}"));
         }
     }
     let edges: HashSet<[i64; 3]> = here.positions.iter().map(|p| edge(p, spacing)).collect();
     let missing = there.positions.iter().filter(|p| !edges.contains(&edge(p, spacing))).count();
-    // Vertices close to a grid point belong to any of its edges.
-    if missing * 200 > there.n_vertices() {
+    if missing > 0 {
         wrong.push(format!("{missing} vertices of {} are missing", there.n_vertices()));
     }
     // Central differences are not the gradient, but they do not point inwards.
@@ -169,8 +168,8 @@ fn different_surfaces_are_detected() {
     let crambin = crambin();
     let at = |isovalue| params(&SurfaceOptions { isovalue: Some(isovalue), ..SurfaceOptions::default() });
     let soup = run(&crambin, &at(1.0)).unwrap();
-    let wrong = difference(&soup, &cpu(&crambin, &at(1.3)), 0.5);
-    assert!(wrong.len() >= 3, "{wrong:?}");
+    let wrong = difference(&soup, &cpu(&crambin, &at(1.01)), 0.5);
+    assert!(wrong.len() >= 2, "{wrong:?}");
     let mut flipped = soup.clone();
     flipped.normals.iter_mut().for_each(|n| *n = n.map(|c| -c));
     assert_eq!(difference(&flipped, &cpu(&crambin, &at(1.0)), 0.5).len(), 1);
