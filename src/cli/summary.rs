@@ -108,13 +108,11 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
 
 /// Formats exact areas and volume.
 fn exact_measures(exact: &ExactReport) -> String {
-    let parts = match (exact.contact, exact.toroidal, exact.concave) {
-        (Some(contact), Some(toroidal), Some(concave)) => {
-            let [contact, toroidal, concave] = [contact, toroidal, concave].map(decimal);
-            format!(" (contact {contact}, toroidal {toroidal}, concave {concave})")
-        }
-        _ => String::new(),
-    };
+    let parts = exact.parts.as_ref().map(|parts| {
+        let [contact, toroidal, concave] = [parts.contact, parts.toroidal, parts.concave].map(decimal);
+        format!(" (contact {contact}, toroidal {toroidal}, concave {concave})")
+    });
+    let parts = parts.unwrap_or_default();
     let buried = exact.interface.as_ref().map(|interface| format!(", interface {} Å²", decimal(interface.area)));
     let [area, volume] = [exact.area, exact.volume].map(decimal);
     format!("area {area} Å²{parts}, volume {volume} Å³{}", buried.unwrap_or_default())

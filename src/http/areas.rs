@@ -39,9 +39,9 @@ problem_responses!(EntryProblems: [READING, [
 
 /// List the exact areas of a structure
 ///
-/// A CSV table with the exact area of the van der Waals or solvent-accessible surface, or of the contact parts of the
-/// solvent-excluded surface, of each residue, atom or chain. No mesh is made. With `interface`, the table has the
-/// chains of both sides, with the surface area buried between them.
+/// A CSV table with the exact area of the van der Waals, solvent-accessible or solvent-excluded surface of each
+/// residue, atom or chain. No mesh is made. With `interface`, the table has the chains of both sides, with the surface
+/// area buried between them.
 #[utoipa::path(get, path = "/v1/structures/{digest}/areas", tag = "structures", operation_id = "listAreas",
     params(StructurePath, AreaParameters, ConditionHeaders),
     responses(
@@ -63,9 +63,9 @@ pub(super) async fn of_structure(
 
 /// List the exact areas of an archive entry
 ///
-/// A CSV table with the exact area of the van der Waals or solvent-accessible surface, or of the contact parts of the
-/// solvent-excluded surface, of each residue, atom or chain. No mesh is made. With `interface`, the table has the
-/// chains of both sides, with the surface area buried between them.
+/// A CSV table with the exact area of the van der Waals, solvent-accessible or solvent-excluded surface of each
+/// residue, atom or chain. No mesh is made. With `interface`, the table has the chains of both sides, with the surface
+/// area buried between them.
 #[utoipa::path(get, path = "/v1/pdb/{id}/areas", tag = "structures", operation_id = "listEntryAreas",
     params(EntryPath, AreaParameters, ConditionHeaders),
     responses(

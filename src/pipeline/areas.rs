@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::{Job, JobError, SPHERE_BYTES};
 use crate::structure::{self, ReadLimits, Selected, Structure, select, table};
-use crate::surface::{Control, ExactMeasures, Spheres, SurfaceError, SurfaceKind, SurfaceLimits};
+use crate::surface::{AreaParts, Control, ExactMeasures, Spheres, SurfaceError, SurfaceKind, SurfaceLimits};
 
 /// Description of the values of `interface`.
 pub(crate) const EXPECTED: &str = "the chains of both sides, separated by a comma, such as A,B; several chains of a side are joined by a slash: H/L,A";
@@ -53,16 +53,9 @@ pub struct ExactReport {
     pub area: f64,
     /// Enclosed volume in Å³.
     pub volume: f64,
-    /// Area of the contact parts in Å², where the probe touches one atom; `surface=ses` only, like `toroidal` and
-    /// `concave`.
+    /// Parts of this area; `surface=ses` only.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub contact: Option<f64>,
-    /// Area of the toroidal parts in Å², where the probe touches two atoms.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub toroidal: Option<f64>,
-    /// Area of the concave parts in Å², where the probe touches three or more atoms.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub concave: Option<f64>,
+    pub parts: Option<AreaPartsReport>,
     /// Areas of the chains, in the order of their first atoms.
     pub chains: Vec<ChainArea>,
     /// Surface area buried between two sets of chains; absent without `interface`.
@@ -78,11 +71,33 @@ pub struct ChainArea {
     pub chain: String,
     /// Number of atoms, in all copies.
     pub atoms: u64,
-    /// Area in Å²; with `surface=ses` of the contact parts.
+    /// Area in Å².
     pub area: f64,
+    /// Parts of this area; `surface=ses` only. Toroidal and concave parts are divided between the atoms that the probe
+    /// touches.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub parts: Option<AreaPartsReport>,
 }
 
-/// Surface area buried between two sets of chains. With `surface=ses`, all areas are those of the contact parts.
+/// Parts of an area of a solvent-excluded surface.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct AreaPartsReport {
+    /// Area of the contact parts in Å², where the probe touches one atom.
+    pub contact: f64,
+    /// Area of the toroidal parts in Å², where the probe touches two atoms.
+    pub toroidal: f64,
+    /// Area of the concave parts in Å², where the probe touches three or more atoms.
+    pub concave: f64,
+}
+
+impl AreaPartsReport {
+    fn new(parts: AreaParts) -> Self {
+        Self { contact: round(parts.contact), toroidal: round(parts.toroidal), concave: round(parts.concave) }
+    }
+}
+
+/// Surface area buried between two sets of chains.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct InterfaceReport {
@@ -145,11 +160,11 @@ pub struct AtomAreas {
     /// Indices of the atoms in the columns of the structure, in the order of the selection.
     atoms: Vec<u32>,
     /// Area of each atom. With an interface, the atoms are those of both sides.
-    areas: Vec<f64>,
+    areas: Vec<AreaParts>,
     /// Area of each atom without the other side; with an interface only.
     alone: Option<Vec<f64>>,
-    /// True if the areas are those of the contact parts of a solvent-excluded surface.
-    contact: bool,
+    /// True for a solvent-excluded surface, whose areas have parts.
+    has_parts: bool,
 }
 
 /// Rounds to 0.0001, because the last digits depend on mathematical libraries.
@@ -204,19 +219,24 @@ fn whole(
     control: &Control<'_>,
 ) -> Result<(ExactReport, AtomAreas), SurfaceError> {
     let whole = ExactMeasures::of(spheres, &job.params, limits, control)?;
-    let contact = job.params.surface == SurfaceKind::Ses;
+    let has_parts = job.params.surface == SurfaceKind::Ses;
     control.memory.grow(size_of_val(&*selected.atoms) as u64)?;
+    let parts = whole.parts();
     let mut report = ExactReport {
-        area: round(whole.area()),
+        area: round(parts.total()),
         volume: round(whole.volume),
-        contact: contact.then(|| round(whole.of_spheres.iter().sum())),
-        toroidal: contact.then(|| round(whole.toroidal)),
-        concave: contact.then(|| round(whole.concave)),
+        parts: has_parts.then(|| AreaPartsReport::new(parts)),
         chains: Vec::new(),
         interface: None,
     };
-    let areas = AtomAreas { atoms: selected.atoms.clone(), areas: whole.of_spheres, alone: None, contact };
-    report.chains = areas.rows(structure, AreaLevel::Chain).into_iter().map(|row| row.chain(structure)).collect();
+    let areas = AtomAreas { atoms: selected.atoms.clone(), areas: whole.of_spheres, alone: None, has_parts };
+    let chain = |Row { first, atoms, parts, .. }| ChainArea {
+        chain: structure.chain.get(first).to_owned(),
+        atoms,
+        area: round(parts.total()),
+        parts: has_parts.then(|| AreaPartsReport::new(parts)),
+    };
+    report.chains = areas.rows(structure, AreaLevel::Chain).into_iter().map(chain).collect();
     Ok((report, areas))
 }
 
@@ -266,24 +286,26 @@ impl Interface {
     ) -> Result<(InterfaceReport, AtomAreas), JobError> {
         let all = selected.atoms.len() as u64;
         // Rows, spheres and areas of each side and of both.
-        let _memory = control.reserve(2 * (SPHERE_BYTES + 16) * all).map_err(SurfaceError::from)?;
+        let _memory = control.reserve(2 * (SPHERE_BYTES + 32) * all).map_err(SurfaceError::from)?;
         let [first, second] = self.rows(structure, selected, control)?;
-        let of = |rows: &[u32]| -> Result<Vec<f64>, SurfaceError> {
+        let of = |rows: &[u32]| -> Result<Vec<AreaParts>, SurfaceError> {
             Ok(ExactMeasures::of(&spheres.subset(rows), &job.params, limits, control)?.of_spheres)
         };
-        let mut alone = of(&first)?;
-        alone.extend(of(&second)?);
+        let totals = |areas: &[AreaParts]| areas.iter().map(AreaParts::total).collect();
+        let mut alone: Vec<f64> = totals(&of(&first)?);
+        alone.extend::<Vec<f64>>(totals(&of(&second)?));
         let rows = [&first[..], &second].concat();
         let areas = of(&rows)?;
         let side = |k: usize, rows: std::ops::Range<usize>| {
-            let [alone, together] = [&alone, &areas].map(|areas| areas[rows.clone()].iter().sum::<f64>());
+            let alone: f64 = alone[rows.clone()].iter().sum();
+            let together: f64 = areas[rows].iter().map(AreaParts::total).sum();
             InterfaceSide { chains: self.sides[k].clone(), alone: round(alone), buried: round(alone - together) }
         };
         let sides = [side(0, 0..first.len()), side(1, first.len()..rows.len())];
         let area = round(0.5 * (sides[0].buried + sides[1].buried));
         let atoms = rows.iter().map(|&row| selected.atoms[row as usize]).collect();
-        let contact = job.params.surface == SurfaceKind::Ses;
-        Ok((InterfaceReport { area, sides }, AtomAreas { atoms, areas, alone: Some(alone), contact }))
+        let has_parts = job.params.surface == SurfaceKind::Ses;
+        Ok((InterfaceReport { area, sides }, AtomAreas { atoms, areas, alone: Some(alone), has_parts }))
     }
 }
 
@@ -292,15 +314,8 @@ struct Row {
     /// Index of the first atom in the structure.
     first: usize,
     atoms: u64,
-    area: f64,
+    parts: AreaParts,
     alone: f64,
-}
-
-impl Row {
-    fn chain(&self, structure: &Structure) -> ChainArea {
-        let chain = structure.chain.get(self.first).to_owned();
-        ChainArea { chain, atoms: self.atoms, area: round(self.area) }
-    }
 }
 
 impl AtomAreas {
@@ -334,10 +349,10 @@ impl AtomAreas {
                 AreaLevel::Chain => *of_chains.entry(structure.chain.id(i)).or_insert(rows.len()),
             };
             if row == rows.len() {
-                rows.push(Row { first: i, atoms: 0, area: 0.0, alone: 0.0 });
+                rows.push(Row { first: i, atoms: 0, parts: AreaParts::default(), alone: 0.0 });
             }
             rows[row].atoms += 1;
-            rows[row].area += self.areas[n];
+            rows[row].parts += self.areas[n];
             rows[row].alone += self.alone.as_ref().map_or(0.0, |alone| alone[n]);
             before = Some(i);
         }
@@ -345,7 +360,8 @@ impl AtomAreas {
     }
 
     /// Writes a table as CSV (RFC 4180, lines end in LF) with areas in Å², rounded to 0.0001 Å². With an interface, it
-    /// has the atoms of both sides, and the columns `alone` and `buried`.
+    /// has the atoms of both sides, and the columns `alone` and `buried`. With a solvent-excluded surface, it has the
+    /// columns `contact`, `toroidal` and `concave`.
     ///
     /// # Errors
     /// Returns the errors of `out`.
@@ -358,16 +374,23 @@ impl AtomAreas {
         let counts = level != AreaLevel::Atom;
         let mut header = table::COLUMNS[columns.clone()].to_vec();
         header.extend(counts.then_some("atoms"));
-        header.push(if self.contact { "contact_area" } else { "area" });
+        header.push("area");
+        if self.has_parts {
+            header.extend(["contact", "toroidal", "concave"]);
+        }
         if self.alone.is_some() {
             header.extend(["alone", "buried"]);
         }
-        table::write_rows(out, &header, self.rows(structure, level), |text, Row { first, atoms, area, alone }| {
+        table::write_rows(out, &header, self.rows(structure, level), |text, Row { first, atoms, parts, alone }| {
             table::put_columns(text, structure, first, columns.clone());
             if counts {
                 write!(text, ",{atoms}")?;
             }
+            let area = parts.total();
             write!(text, ",{area:.4}")?;
+            if self.has_parts {
+                write!(text, ",{:.4},{:.4},{:.4}", parts.contact, parts.toroidal, parts.concave)?;
+            }
             if self.alone.is_some() {
                 write!(text, ",{alone:.4},{:.4}", alone - area)?;
             }

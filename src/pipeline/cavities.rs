@@ -73,6 +73,10 @@ pub struct CavityReport {
     pub center: [f64; 3],
     /// Radius of this sphere in Å, with an error of at most 0.001 Å.
     pub radius: f64,
+    /// Volume of the region that the probe covers in Å³: the solvent-excluded volume of the cavity.
+    pub volume: f64,
+    /// Area of the boundary of this region in Å²: the solvent-excluded surface of the cavity.
+    pub area: f64,
     /// Volume that the centre of the probe can occupy in Å³.
     pub accessible_volume: f64,
     /// Area of the solvent-accessible surface of the cavity in Å².
@@ -100,6 +104,8 @@ impl CavityReport {
         Self {
             center: cavity.centre,
             radius: cavity.radius,
+            volume: cavity.volume,
+            area: cavity.area,
             accessible_volume: cavity.accessible_volume,
             accessible_area: cavity.accessible_area,
             atoms: cavity.lining.len() as u64,

@@ -31,6 +31,10 @@ pub struct Cavity {
     pub accessible_area: f64,
     /// Volume of the region of the probe's centre, Å³.
     pub accessible_volume: f64,
+    /// Area of the solvent-excluded surface: of the boundary of the region that the probe covers, Å².
+    pub area: f64,
+    /// Volume of the region that the probe covers, Å³.
+    pub volume: f64,
     /// Radius of the largest sphere that fits, Å.
     pub radius: f64,
     /// Centre of this sphere, Å.
@@ -58,7 +62,8 @@ pub(crate) fn find(
     let lattice = Lattice::new(spheres, &params, control)?;
     // Lengths are in spacings, that is in Å.
     let components = Components::new(&lattice.atoms, lattice.spacing, limits, control)?;
-    let inner = components.shells().into_iter().filter(|shell| shell.volume < 0.0).collect::<Vec<_>>();
+    let shells = components.shells(params.probe, limits, control)?;
+    let inner: Vec<Shell> = shells.into_iter().filter(|shell| shell.measures.accessible_volume < 0.0).collect();
     let measure = |shell: &Shell| {
         let search =
             DepthSearch { components: &components, atoms: &lattice.atoms, shell, cubes: BinaryHeap::new(), best: None };
@@ -66,8 +71,10 @@ pub(crate) fn find(
         let mut lining: Vec<u32> = shell.spheres.iter().map(|i| lattice.atoms[*i as usize].source).collect();
         lining.sort_unstable();
         Ok(Some(Cavity {
-            accessible_area: shell.area,
-            accessible_volume: -shell.volume,
+            accessible_area: shell.measures.accessible_area,
+            accessible_volume: -shell.measures.accessible_volume,
+            area: shell.measures.area,
+            volume: -shell.measures.volume,
             radius: depth + params.probe,
             centre,
             lining,

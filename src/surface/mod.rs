@@ -51,5 +51,5 @@ pub use quantize::Step;
 pub use reference::ReferenceBackend;
 pub use simd::arithmetic;
 pub use sink::{MeshPart, MeshSink, SinkFailed, Vertices};
-pub use sphere_union::ExactMeasures;
+pub use sphere_union::{AreaParts, ExactMeasures};
 pub use spheres::Spheres;

@@ -71,6 +71,10 @@ fn cavities_depend_on_neither_the_spacing_nor_the_surface() {
     let void = &meshed(&text, &[("surface", "sas"), ("resolution", "0.4")]).report.void_list[0];
     assert!((void.volume / cavity.accessible_volume - 1.0).abs() < 0.01, "{void:?} {cavity:?}");
     assert!((void.area / cavity.accessible_area - 1.0).abs() < 0.05, "{void:?} {cavity:?}");
+    // The mesh of the solvent-excluded surface encloses the region that the probe covers.
+    let void = &expected.report.void_list[0];
+    assert!((void.volume / cavity.volume - 1.0).abs() < 0.003, "{void:?} {cavity:?}");
+    assert!((void.area / cavity.area - 1.0).abs() < 0.01, "{void:?} {cavity:?}");
     // Without the parameter, nothing is searched. A wider opening is the control.
     assert_eq!(meshed(&text, &[]).report.cavities, None);
     assert_eq!(meshed(hollow(3.0), &[("cavities", "keep")]).report.cavities, Some(0));

@@ -56,7 +56,7 @@ fn one_sphere_and_spheres_far_apart() {
         let two = exact(&[([0.0; 3], r), ([0.0, 90.0, 5.0], r)], surface, None);
         assert_near("two areas", two.area(), 2.0 * area, ROUNDING);
         assert_near("two volumes", two.volume, 2.0 * volume, ROUNDING);
-        assert_eq!((one.toroidal, one.concave, two.toroidal), (0.0, 0.0, 0.0));
+        assert_eq!((one.parts().toroidal, one.parts().concave, two.parts().toroidal), (0.0, 0.0, 0.0));
     }
 }
 
@@ -69,7 +69,7 @@ fn two_spheres_overlap_in_lenses() {
         let caps =
             [(a, b), (b, a)].map(|(r, other): (f64, f64)| r - (apart * apart + r * r - other * other) / (2.0 * apart));
         for (k, (r, h)) in [(a, caps[0]), (b, caps[1])].into_iter().enumerate() {
-            assert_near("area", two.of_spheres[k], 4.0 * PI * r * r - 2.0 * PI * r * h, ROUNDING);
+            assert_near("area", two.of_spheres[k].total(), 4.0 * PI * r * r - 2.0 * PI * r * h, ROUNDING);
         }
         let cap = |r: f64, h: f64| PI * h * h * (3.0 * r - h) / 3.0;
         let volume = 4.0 / 3.0 * PI * (a.powi(3) + b.powi(3)) - cap(a, caps[0]) - cap(b, caps[1]);
@@ -88,9 +88,12 @@ fn two_spheres_have_a_torus_with_or_without_a_cusp() {
         let cusp = if rho < probe { (rho / probe).acos() } else { 0.0 };
         let toroidal = 2.0 * 2.0 * PI * probe * (rho * (angle - cusp) - probe * (angle.sin() - cusp.sin()));
         let contact = 2.0 * 2.0 * PI * r * r * (1.0 + angle.sin());
-        assert_near("toroidal", two.toroidal, toroidal, ROUNDING);
-        assert_near("contact", two.of_spheres.iter().sum(), contact, ROUNDING);
-        assert_eq!(two.concave, 0.0);
+        assert_near("toroidal", two.parts().toroidal, toroidal, ROUNDING);
+        assert_near("contact", two.parts().contact, contact, ROUNDING);
+        assert_eq!(two.parts().concave, 0.0);
+        for half in &two.of_spheres {
+            assert_near("half of the torus", half.toroidal, 0.5 * toroidal, ROUNDING);
+        }
         // Volume of revolution, with distances from the middle plane along the axis.
         let n = 200_000;
         let (neck, end) = (probe * cusp.sin(), apart / 2.0 + r);
@@ -130,8 +133,12 @@ fn three_spheres_have_concave_triangles() {
     assert!(height > probe, "no cusp");
     let [a, b, c] = balls.map(|(at, _)| [at[0], at[1], -height].map(|v| v / (r + probe)));
     let excess = angle_at(a, b, c) + angle_at(b, c, a) + angle_at(c, a, b) - PI;
-    assert_near("concave", three.concave, 2.0 * probe * probe * excess, ROUNDING);
-    assert!(!near(three.concave, 2.002 * probe * probe * excess, ROUNDING), "the control");
+    let concave = 2.0 * probe * probe * excess;
+    assert_near("concave", three.parts().concave, concave, ROUNDING);
+    assert!(!near(three.parts().concave, 1.001 * concave, ROUNDING), "the control");
+    for third in &three.of_spheres {
+        assert_near("a third of the triangles", third.concave, concave / 3.0, ROUNDING);
+    }
 }
 
 /// Returns evenly spread points of a unit sphere.
@@ -238,11 +245,55 @@ fn random_clusters_match_fine_meshes() {
 }
 
 #[test]
+fn areas_of_spheres_are_those_of_the_triangles_nearest_to_their_contacts() {
+    const PROBE: f64 = 1.4;
+    let (mut divided, mut equal_shares, mut n) = ([0.0; 2], 0, 0);
+    for seed in [101, 104] {
+        let balls: Vec<Ball> = cluster(seed).into_iter().take(20).collect();
+        let found = exact(&balls, SES, None);
+        let mesh = mesh(&spheres(&balls), &params(SES, None, 0.1));
+        let mut areas = vec![0.0; balls.len()];
+        for triangle in &mesh.triangles {
+            let corners = triangle.map(|v| mesh.position(v as usize).map(f64::from));
+            let normals = triangle.map(|v| mesh.normals[v as usize].map(f64::from));
+            let mean = |of: [[f64; 3]; 3]| std::array::from_fn(|k| (of[0][k] + of[1][k] + of[2][k]) / 3.0);
+            let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
+            let [middle, normal]: [[f64; 3]; 2] = [mean(corners), mean(normals)];
+            let probe = |k: usize| mesh.centre[k] + middle[k] + PROBE * normal[k] / length(normal);
+            let apart = |of: &dyn Fn(usize) -> f64, x: [f64; 3]| length(std::array::from_fn(|k| of(k) - x[k]));
+            // Distance of the centroid from the point of contact of each sphere that the probe touches.
+            let contact = |i: usize| {
+                let (centre, r) = balls[i];
+                let to_probe = apart(&probe, centre);
+                let at = |k: usize| centre[k] + r * (probe(k) - centre[k]) / to_probe;
+                let centroid = std::array::from_fn(|k| mesh.centre[k] + middle[k]);
+                (to_probe < r + PROBE + 0.01).then(|| (apart(&at, centroid), i))
+            };
+            let nearest = (0..balls.len()).filter_map(contact).min_by(|a, b| a.0.total_cmp(&b.0));
+            let [u, v]: [[f64; 3]; 2] =
+                [1, 2].map(|corner: usize| std::array::from_fn(|k| corners[corner][k] - corners[0][k]));
+            let cross = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+            areas[nearest.unwrap().1] += 0.5 * length(cross);
+        }
+        for (i, (parts, area)) in found.of_spheres.iter().zip(&areas).enumerate() {
+            assert!((parts.total() - area).abs() < 0.02 * area + 0.05, "{seed}, sphere {i}: {parts:?} and {area}");
+            divided[0] += parts.toroidal;
+            divided[1] += parts.concave;
+            n += 1;
+            let mean = found.parts().concave / balls.len() as f64;
+            equal_shares += usize::from((parts.contact + parts.toroidal + mean - area).abs() < 0.02 * area + 0.05);
+        }
+    }
+    assert!(equal_shares < n / 2, "the control: {equal_shares} of {n}");
+    assert!(divided.iter().all(|area| *area > 50.0), "the surfaces have parts to divide: {divided:?}");
+}
+
+#[test]
 fn solvent_excluded_areas_are_those_of_msms() {
     // Sums of the analytic areas of all components, computed by MSMS 2.6.1 with these radii and a probe of 1.4 Å.
     for (name, msms) in [("1crn.cif", 2319.1), ("4pti.pdb", 3144.8)] {
         let found = exact_of(&sample(name), SES, None);
-        println!("{name}: {} {} {} {}", found.area(), found.toroidal, found.concave, found.volume);
+        println!("{name}: {:?} {}", found.parts(), found.volume);
         assert_near(name, found.area(), msms, 1e-4);
         assert!(!near(found.area(), 1.001 * msms, 1e-4), "the control");
     }
@@ -273,7 +324,10 @@ fn spheres_in_others_have_no_area() {
         let moved = exact(&[one[0], at(1.01, 2.0, 3.0)], surface, None);
         assert!(!near(moved.area(), alone.area(), 1e-5), "the control");
         let equal = exact(&[one[0], one[0]], surface, None).of_spheres;
-        assert!(equal[0] > 0.0 && equal[1] == 0.0, "the first of equal spheres has the area: {equal:?}");
+        assert!(
+            equal[0].total() > 0.0 && equal[1].total() == 0.0,
+            "the first of equal spheres has the area: {equal:?}"
+        );
     }
     let touching = exact(&[at(0.0, 0.0, 0.0), at(2.0 * R, 0.0, 0.0)], VDW, None);
     assert_near("touching", touching.area(), 8.0 * PI * R * R, 1e-5);
@@ -361,9 +415,13 @@ fn areas_do_not_depend_on_the_order_and_the_threads() {
     let reversed = on(2, &atoms.subset(&rows));
     assert_near("area", one.area(), reversed.area(), 1e-9);
     for (i, area) in one.of_spheres.iter().enumerate() {
-        assert_near("area of a sphere", *area, reversed.of_spheres[atoms.len() - 1 - i], 1e-9);
+        let other = reversed.of_spheres[atoms.len() - 1 - i];
+        for (area, other) in
+            [(area.contact, other.contact), (area.toroidal, other.toroidal), (area.concave, other.concave)]
+        {
+            assert_near("area of a sphere", area, other, 1e-9);
+        }
     }
-    assert_near("sum of the parts", one.of_spheres.iter().sum::<f64>() + one.toroidal + one.concave, one.area(), 1e-9);
 }
 
 #[test]
@@ -394,7 +452,7 @@ fn solvent_accessible_areas_agree_with_freesasa() {
         assert_near(name, found.area(), sasa.area, 5e-4);
         assert!(!near(found.area(), 1.001 * sasa.area, 5e-4), "the control");
         for (i, (area, other)) in found.of_spheres.iter().zip(&sasa.of_spheres).enumerate() {
-            assert!((area - other).abs() < 0.15, "{name}, sphere {i}: {area} and {other}");
+            assert!((area.total() - other).abs() < 0.15, "{name}, sphere {i}: {area:?} and {other}");
         }
     }
 }

@@ -111,10 +111,7 @@ impl<'a> Components<'a> {
         sets.number_sets(&mut numbers);
         let mut found =
             Self { atoms, arcs, of_arc: numbers, starts, by_sphere, caps: FxHashMap::default(), tolerance, n: 0 };
-        let several = |own: &u32| {
-            let mut sets = found.on(*own).iter().map(|arc| found.of_arc[*arc as usize]);
-            sets.next().is_some_and(|first| sets.any(|other| other != first))
-        };
+        let several = |own: &u32| !found.on(*own).is_empty() && found.only(*own).is_none();
         let pairs = search.for_each_sphere(several, |own, scratch, out, _| {
             let pairs = found.shared_faces(own, &scratch.caps, &mut scratch.uncovered);
             out.push((own, scratch.caps.clone(), pairs));
@@ -133,18 +130,6 @@ impl<'a> Components<'a> {
     /// Returns the numbers of the arcs on a sphere.
     pub(super) fn on(&self, sphere: u32) -> &[u32] {
         &self.by_sphere[self.starts[sphere as usize] as usize..self.starts[sphere as usize + 1] as usize]
-    }
-
-    /// Returns an arc with its axis and circle as seen from a sphere on which it lies: relative centre, axis to the
-    /// other sphere, and the ends in clockwise order about this axis.
-    pub(super) fn seen(&self, arc: u32, sphere: u32) -> ([f64; 3], [f64; 3], [f64; 2]) {
-        let arc = &self.arcs[arc as usize];
-        let [cos, sin] = arc.half;
-        if arc.spheres[0] == sphere {
-            return (arc.centre, arc.axis, [sin, cos]);
-        }
-        let shift = self.between(sphere, arc.spheres[0]);
-        (add(arc.centre, shift), arc.axis.map(|c| -c), [-sin, cos])
     }
 
     /// Returns the vector from the centre of sphere `a` to that of sphere `b`.
@@ -196,13 +181,25 @@ impl<'a> Components<'a> {
         distances.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(0, |(_, arc)| arc)
     }
 
+    /// Returns the component of the arc on a sphere that is nearest to the point in the direction `n`.
+    pub(super) fn nearest(&self, sphere: u32, n: [f64; 3]) -> u32 {
+        self.only(sphere).unwrap_or_else(|| self.of_arc[self.nearest_arc(sphere, n) as usize])
+    }
+
+    /// Returns the component of all arcs on a sphere; `None` if there are several or none.
+    fn only(&self, sphere: u32) -> Option<u32> {
+        let mut of_arcs = self.on(sphere).iter().map(|arc| self.of_arc[*arc as usize]);
+        let first = of_arcs.next()?;
+        of_arcs.all(|other| other == first).then_some(first)
+    }
+
     /// Returns the component of the exposed point of a sphere in the direction `n`, a unit vector; `None` for a sphere
     /// without arcs.
     pub(in crate::surface) fn at(&self, sphere: u32, n: [f64; 3]) -> Option<u32> {
         let arcs = self.on(sphere);
         let first = self.of_arc[*arcs.first()? as usize];
-        if arcs.iter().all(|arc| self.of_arc[*arc as usize] == first) {
-            return Some(first);
+        if let Some(only) = self.only(sphere) {
+            return Some(only);
         }
         let caps = self.caps.get(&sphere)?;
         let (plane, mut uncovered) = (GreatCircle::through(n, self.middle(arcs[0], sphere)), Uncovered::default());
@@ -368,10 +365,6 @@ pub(super) fn add(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 
 pub(super) fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|k| a[k] - b[k])
-}
-
-pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 pub(super) fn unit(v: [f64; 3]) -> [f64; 3] {

@@ -3,8 +3,10 @@
 //! The contact part of a solvent-excluded surface on a sphere is the exposed part of the enlarged sphere, scaled to the
 //! radius of the sphere. A toroidal part belongs to an arc, a concave part to a vertex. A concave part is the polygon
 //! that the planes of the vertex's arcs bound on the sphere of the probe, without the parts within the probe at other
-//! vertices (Quan and Stamm, J. Comput. Phys. 322, 2016).
+//! vertices (Quan and Stamm, J. Comput. Phys. 322, 2016). A point of a toroidal or concave part counts for the sphere
+//! whose point of contact with the probe is nearest.
 
+use std::ops::AddAssign;
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -12,6 +14,8 @@ use rayon::prelude::*;
 use super::caps::{self, Cap, Cover, Neighbour, TOLERANCE, dot};
 use super::cells::Cells;
 use super::circle::Uncovered;
+use super::components::Components;
+use super::concave::{ArcEnd, Vertices};
 use super::region::{EdgeArc, Region};
 use super::torus::ProbePath;
 use super::{CELLS_PER_PART, radius};
@@ -24,60 +28,106 @@ use crate::surface::memory::Reservation;
 use crate::surface::params::{SurfaceKind, SurfaceLimits, SurfaceParams, bad};
 use crate::surface::spheres::Spheres;
 
+/// Areas of the parts of a surface of spheres, Å².
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct AreaParts {
+    /// Exposed part of a van der Waals or solvent-accessible surface; part of a solvent-excluded surface where the
+    /// probe touches one sphere.
+    pub contact: f64,
+    /// Part of a solvent-excluded surface where the probe touches two spheres; 0 for other surfaces.
+    pub toroidal: f64,
+    /// Part of a solvent-excluded surface where the probe touches three or more spheres; 0 for other surfaces.
+    pub concave: f64,
+}
+
+impl AreaParts {
+    /// Returns the sum of all parts, Å².
+    #[must_use]
+    pub fn total(&self) -> f64 {
+        self.contact + self.toroidal + self.concave
+    }
+}
+
+impl AddAssign for AreaParts {
+    fn add_assign(&mut self, other: Self) {
+        self.contact += other.contact;
+        self.toroidal += other.toroidal;
+        self.concave += other.concave;
+    }
+}
+
 /// Exact measures of a surface of spheres.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ExactMeasures {
-    /// Area of the part of the surface on each sphere, Å², in the order of the spheres: the exposed part of a van der
-    /// Waals or solvent-accessible surface, the contact part of a solvent-excluded one.
-    pub of_spheres: Vec<f64>,
-    /// Area of the toroidal parts of a solvent-excluded surface, Å²; 0 for other surfaces.
-    pub toroidal: f64,
-    /// Area of the concave parts of a solvent-excluded surface, Å²; 0 for other surfaces.
-    pub concave: f64,
+    /// Areas of each sphere, in the order of the spheres.
+    pub of_spheres: Vec<AreaParts>,
     /// Enclosed volume, Å³.
     pub volume: f64,
+}
+
+/// Exact measures of a component of the boundary, and of the solvent-excluded surface that belongs to it alone.
+#[derive(Debug, Clone, Copy, Default)]
+pub(in crate::surface) struct ComponentMeasures {
+    /// Area of the boundary, Å².
+    pub(in crate::surface) accessible_area: f64,
+    /// Volume that the boundary encloses, Å³; negative for a cavity.
+    pub(in crate::surface) accessible_volume: f64,
+    /// Area of the solvent-excluded surface, Å².
+    pub(in crate::surface) area: f64,
+    /// Volume that it encloses, Å³; negative for a cavity.
+    pub(in crate::surface) volume: f64,
 }
 
 /// Spheres that are converted between two checks of the cancellation flag.
 const PER_CHECK: usize = 1 << 14;
 
-/// End of an arc: a vertex of the boundary.
-struct ArcEnd {
-    /// Sphere of the probe at the vertex, in Å.
-    probe: LatticeAtom,
-    /// Unit vector along the arc, away from the vertex.
-    tangent: [f64; 3],
-}
-
 /// Measures of the spheres, or of the vertices, of some cells.
 #[derive(Default)]
-struct PartMeasures {
-    /// Area of each sphere, by number.
-    of_spheres: Vec<(u32, f64)>,
-    toroidal: f64,
-    concave: f64,
-    /// Integral of x·n over the surface, Å³: three times the volume.
-    flux: f64,
-    ends: Vec<ArcEnd>,
+pub(super) struct PartMeasures {
+    /// Areas of spheres, by number. A sphere may have several entries.
+    pub(super) of_spheres: Vec<(u32, AreaParts)>,
+    pub(super) of_components: Vec<(u32, Integrals)>,
+    pub(super) ends: Vec<ArcEnd>,
+}
+
+impl PartMeasures {
+    fn bytes(&self) -> usize {
+        size_of_val(&*self.of_spheres) + size_of_val(&*self.of_components) + size_of_val(&*self.ends)
+    }
+}
+
+/// Area, Å², and integral of x·n, Å³, over a boundary and a solvent-excluded surface. The integral is three times the
+/// volume.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Integrals {
+    pub(super) accessible: [f64; 2],
+    pub(super) excluded: [f64; 2],
 }
 
 /// Buffers that a thread reuses.
 #[derive(Default)]
-struct Scratch {
-    neighbours: Vec<Neighbour>,
-    caps: Vec<Cap>,
-    uncovered: Uncovered,
+pub(super) struct Scratch {
+    pub(super) neighbours: Vec<Neighbour>,
+    pub(super) caps: Vec<Cap>,
+    /// Spheres that the probe touches at a vertex, and the directions of the points of contact.
+    pub(super) contacts: Vec<(u32, [f64; 3])>,
+    /// Caps that bound the points nearest to one point of contact.
+    pub(super) of_contact: Vec<Cap>,
+    pub(super) regions: Vec<(u32, Region)>,
+    pub(super) uncovered: Uncovered,
 }
 
 /// Search for the exposed parts of spheres.
-struct FaceSearch<'a> {
-    atoms: &'a [LatticeAtom],
+pub(super) struct FaceSearch<'a> {
+    pub(super) atoms: &'a [LatticeAtom],
+    /// Components of the boundary; without them, everything is one component.
+    pub(super) components: Option<&'a Components<'a>>,
     /// Radius of the probe of a solvent-excluded surface, Å.
-    probe: Option<f64>,
+    pub(super) probe: Option<f64>,
     /// Point to which the integrals of x·n refer.
-    origin: [i32; 3],
-    overlaps: OverlapCount,
-    control: &'a Control<'a>,
+    pub(super) origin: [i32; 3],
+    pub(super) overlaps: OverlapCount,
+    pub(super) control: &'a Control<'a>,
 }
 
 impl ExactMeasures {
@@ -97,11 +147,11 @@ impl ExactMeasures {
         };
         let Some([low, high]) = spheres.bounds() else { return Ok(Self::default()) };
         params.check_radius(spheres.radius_range().0)?;
-        control.memory.grow((size_of::<f64>() * spheres.len()) as u64)?;
+        control.memory.grow((size_of::<AreaParts>() * spheres.len()) as u64)?;
         // All other memory is released at the end.
         let memory = Arc::new(Reservation::new(&control.memory));
         let control = &Control { memory, ..control.clone() };
-        control.memory.grow(((size_of::<LatticeAtom>() + size_of::<(u32, f64)>()) * spheres.len()) as u64)?;
+        control.memory.grow((size_of::<LatticeAtom>() * spheres.len()) as u64)?;
         let mut atoms = Vec::with_capacity(spheres.len());
         for i in 0..spheres.len() {
             if i.is_multiple_of(PER_CHECK) {
@@ -112,18 +162,60 @@ impl ExactMeasures {
         }
         let search = FaceSearch {
             atoms: &atoms,
+            components: None,
             probe: (params.surface == SurfaceKind::Ses && enlarged > 0.0).then_some(enlarged),
             origin: std::array::from_fn(|k| to_i32((0.5 * (low[k] + high[k])).round())),
             overlaps: OverlapCount::new(limits),
             control,
         };
-        search.run()
+        let (of_spheres, of_components) = search.run()?;
+        Ok(Self { of_spheres, volume: of_components[0].excluded[1] / 3.0 })
+    }
+
+    /// Returns the areas of the parts of the whole surface.
+    #[must_use]
+    pub fn parts(&self) -> AreaParts {
+        let mut sum = AreaParts::default();
+        self.of_spheres.iter().for_each(|parts| sum += *parts);
+        sum
     }
 
     /// Returns the area of the whole surface, Å².
     #[must_use]
     pub fn area(&self) -> f64 {
-        self.of_spheres.iter().sum::<f64>() + self.toroidal + self.concave
+        self.parts().total()
+    }
+}
+
+impl Components<'_> {
+    /// Measures all components, whose atoms are on a lattice with a spacing of 1 Å and have radii that include `probe`.
+    ///
+    /// # Errors
+    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    pub(super) fn measure(
+        &self,
+        probe: f64,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<Vec<ComponentMeasures>, SurfaceError> {
+        let memory = Arc::new(Reservation::new(&control.memory));
+        let control = &Control { memory, ..control.clone() };
+        control.memory.grow((size_of::<AreaParts>() * self.atoms.len()) as u64)?;
+        let search = FaceSearch {
+            atoms: self.atoms,
+            components: Some(self),
+            probe: Some(probe).filter(|probe| *probe > 0.0),
+            origin: self.atoms.first().map_or([0; 3], |atom| atom.cell),
+            overlaps: OverlapCount::new(limits),
+            control,
+        };
+        let measures = |Integrals { accessible, excluded }| ComponentMeasures {
+            accessible_area: accessible[0],
+            accessible_volume: accessible[1] / 3.0,
+            area: excluded[0],
+            volume: excluded[1] / 3.0,
+        };
+        Ok(search.run()?.1.into_iter().map(measures).collect())
     }
 }
 
@@ -139,16 +231,24 @@ fn on_lattice(centre: [f64; 3], radius: f64, number: usize) -> LatticeAtom {
 }
 
 impl FaceSearch<'_> {
-    fn run(&self) -> Result<ExactMeasures, SurfaceError> {
-        let mut measures = ExactMeasures { of_spheres: vec![0.0; self.atoms.len()], ..ExactMeasures::default() };
-        let mut flux = 0.0;
+    /// Returns the areas of each sphere and the integrals of each component.
+    fn run(&self) -> Result<(Vec<AreaParts>, Vec<Integrals>), SurfaceError> {
+        let mut areas = vec![AreaParts::default(); self.atoms.len()];
+        let mut integrals = vec![Integrals::default(); self.components.map_or(1, |components| components.n as usize)];
+        let mut add = |part: &PartMeasures| {
+            part.of_spheres.iter().for_each(|(sphere, parts)| areas[*sphere as usize] += *parts);
+            for (component, part) in &part.of_components {
+                let sum = &mut integrals[*component as usize];
+                for k in 0..2 {
+                    sum.accessible[k] += part.accessible[k];
+                    sum.excluded[k] += part.excluded[k];
+                }
+            }
+        };
         let mut ends = Vec::new();
         let cells = Cells::new(self.atoms, self.control)?;
-        let faces = self.each(&cells, |own, scratch, part, comparisons| self.face(own, scratch, part, comparisons))?;
-        for part in faces {
-            part.of_spheres.iter().for_each(|&(sphere, area)| measures.of_spheres[sphere as usize] = area);
-            measures.toroidal += part.toroidal;
-            flux += part.flux;
+        for part in self.each(&cells, |own, scratch, part, comparisons| self.face(own, scratch, part, comparisons))? {
+            add(&part);
             ends.extend(part.ends);
         }
         if let Some(probe) = self.probe.filter(|_| !ends.is_empty()) {
@@ -159,13 +259,9 @@ impl FaceSearch<'_> {
             let concave = |own, scratch: &mut Scratch, part: &mut PartMeasures, comparisons: &mut Comparisons<'_>| {
                 vertices.concave(own, scratch, part, comparisons)
             };
-            for part in self.each(&cells, concave)? {
-                measures.concave += part.concave;
-                flux += part.flux;
-            }
+            self.each(&cells, concave)?.iter().for_each(add);
         }
-        measures.volume = flux / 3.0;
-        Ok(measures)
+        Ok((areas, integrals))
     }
 
     /// Calls `measure` for each sphere with its neighbours, in parallel by groups of cells. Returns the results in the
@@ -182,12 +278,12 @@ impl FaceSearch<'_> {
                 let around = cells.around(cell);
                 for &own in cells.of(cell) {
                     self.control.check()?;
-                    let before = part.ends.len();
+                    let before = part.bytes();
                     around.neighbours(own, &mut scratch.neighbours);
                     self.overlaps.add(scratch.neighbours.len() as u64)?;
                     measure(own, scratch, &mut part, &mut comparisons)?;
                     // The capacity of a growing list is up to twice its length. The third part is its copy.
-                    self.control.memory.grow((3 * size_of::<ArcEnd>() * (part.ends.len() - before)) as u64)?;
+                    self.control.memory.grow(3 * (part.bytes() - before) as u64)?;
                 }
             }
             comparisons.count()?;
@@ -197,49 +293,77 @@ impl FaceSearch<'_> {
     }
 
     /// Returns the centre of a sphere relative to the origin.
-    fn centre(&self, atom: &LatticeAtom) -> [f64; 3] {
+    pub(super) fn centre(&self, atom: &LatticeAtom) -> [f64; 3] {
         std::array::from_fn(|k| f64::from(atom.cell[k] - self.origin[k]) + f64::from(atom.frac[k]))
     }
 
-    /// Measures the face of sphere `own`, and the toroidal parts between it and spheres with higher numbers.
+    /// Returns the component of an arc of the edge of a cap on sphere `own`.
+    fn component(&self, own: u32, cap: &Cap, arc: &EdgeArc) -> u32 {
+        let Some(components) = self.components else { return 0 };
+        let sin = (1.0 - cap.height * cap.height).max(0.0).sqrt();
+        components.nearest(own, std::array::from_fn(|k| cap.height * cap.axis[k] + sin * arc.middle[k]))
+    }
+
+    /// Measures the faces of sphere `own`, and the toroidal parts between it and spheres with higher numbers.
     fn face(
         &self,
         own: u32,
-        Scratch { neighbours, caps, uncovered }: &mut Scratch,
+        Scratch { neighbours, caps, uncovered, regions, .. }: &mut Scratch,
         part: &mut PartMeasures,
         comparisons: &mut Comparisons<'_>,
     ) -> Result<(), SurfaceError> {
-        let atom = &self.atoms[own as usize];
-        let length = radius(atom);
+        let length = radius(&self.atoms[own as usize]);
         // Equal edges must not bound the face twice: of caps that differ by less than the tolerance, one remains.
-        if caps::caps(own, length, neighbours, -TOLERANCE, caps, comparisons)? == Cover::Whole {
+        if caps::caps(own, length, neighbours, -TOLERANCE, caps, comparisons)? == Cover::Whole
+            || self.components.is_some_and(|components| components.on(own).is_empty())
+        {
             return Ok(());
         }
-        let centre = self.centre(atom);
-        let region = Region::outside(caps, uncovered, comparisons, |cap, arc| {
+        Region::outside(caps, uncovered, comparisons, regions, |cap, arc| {
+            let component = self.component(own, cap, arc);
             if let Some(probe) = self.probe.filter(|_| cap.index > own) {
-                self.toroidal(centre, length, probe, cap, arc, part);
+                self.toroidal([own, cap.index], component, probe, cap, arc, part);
             }
+            component
         })?;
+        let centre = self.centre(&self.atoms[own as usize]);
         let contact = length - self.probe.unwrap_or_default();
-        part.of_spheres.push((atom.source, contact * contact * region.solid_angle));
-        part.flux += contact * contact * (contact * region.solid_angle + dot(centre, region.vector));
+        for (component, Region { solid_angle, vector }) in &*regions {
+            let [accessible, excluded] = [length, contact].map(|r| {
+                let area = r * r;
+                [area * solid_angle, area * (r * solid_angle + dot(centre, *vector))]
+            });
+            part.of_spheres.push((own, AreaParts { contact: excluded[0], ..AreaParts::default() }));
+            part.of_components.push((*component, Integrals { accessible, excluded }));
+        }
         Ok(())
     }
 
-    /// Adds the toroidal part of an arc, and the ends of the arc. The arc is part of the edge of a cap on the sphere
-    /// around `centre` with the radius `length`.
-    fn toroidal(&self, centre: [f64; 3], length: f64, probe: f64, cap: &Cap, arc: &EdgeArc, part: &mut PartMeasures) {
+    /// Adds the toroidal part of an arc, and the ends of the arc. The arc is part of the edge of the cap of the second
+    /// sphere on the first one.
+    fn toroidal(
+        &self,
+        spheres: [u32; 2],
+        component: u32,
+        probe: f64,
+        cap: &Cap,
+        arc: &EdgeArc,
+        part: &mut PartMeasures,
+    ) {
+        let [first, second] = spheres.map(|sphere| &self.atoms[sphere as usize]);
+        let (length, centre, other) = (radius(first), self.centre(first), self.centre(second));
         let to_plane = length * cap.height;
         let edge = length * (1.0 - cap.height * cap.height).max(0.0).sqrt();
-        let other = self.centre(&self.atoms[cap.index as usize]);
         let distance = dot(cap.axis, std::array::from_fn(|k| other[k] - centre[k]));
         let middle: [f64; 3] = std::array::from_fn(|k| centre[k] + to_plane * cap.axis[k]);
         let offsets = [to_plane, distance - to_plane];
         let path = ProbePath { arc, axis: cap.axis, centre: middle, radius: edge, offsets, probe };
-        let [area, flux] = path.measure();
-        part.toroidal += area;
-        part.flux += flux;
+        let (areas, flux) = path.measure();
+        for (sphere, toroidal) in spheres.into_iter().zip(areas) {
+            part.of_spheres.push((sphere, AreaParts { toroidal, ..AreaParts::default() }));
+        }
+        let excluded = [areas[0] + areas[1], flux];
+        part.of_components.push((component, Integrals { excluded, ..Integrals::default() }));
         // The ends of a very short arc are one vertex, and its planes cancel each other.
         if arc.is_circle() || 2.0 * edge * arc.half_angle < TOLERANCE {
             return;
@@ -250,55 +374,7 @@ impl FaceSearch<'_> {
                 middle[k] + f64::from(self.origin[k]) + edge * (cos * arc.middle[k] - side * sin * arc.along[k])
             });
             let tangent = std::array::from_fn(|k| sin * arc.middle[k] + side * cos * arc.along[k]);
-            part.ends.push(ArcEnd { probe: on_lattice(at, probe, part.ends.len()), tangent });
+            part.ends.push(ArcEnd { probe: on_lattice(at, probe, part.ends.len()), tangent, spheres, component });
         }
-    }
-}
-
-/// Vertices of the boundary, each as the ends of its arcs.
-struct Vertices<'a> {
-    ends: &'a [ArcEnd],
-    /// Radius of the probe, Å.
-    probe: f64,
-    search: &'a FaceSearch<'a>,
-}
-
-impl Vertices<'_> {
-    /// Measures the concave part of a vertex if `own` is the first of its ends.
-    fn concave(
-        &self,
-        own: u32,
-        Scratch { neighbours, caps, uncovered }: &mut Scratch,
-        part: &mut PartMeasures,
-        comparisons: &mut Comparisons<'_>,
-    ) -> Result<(), SurfaceError> {
-        let is_same = |other: &Neighbour| dot(other.to, other.to) < TOLERANCE * TOLERANCE;
-        if neighbours.iter().any(|other| other.index < own && is_same(other)) {
-            return Ok(());
-        }
-        caps.clear();
-        // The part lies on the other side of the plane of each arc. Fewer than three planes bound no polygon.
-        let planes = neighbours.iter().filter(|other| is_same(other));
-        caps.extend(planes.map(|end| Cap {
-            axis: self.ends[end.index as usize].tangent,
-            height: 0.0,
-            index: end.index,
-        }));
-        if caps.len() < 3 {
-            return Ok(());
-        }
-        neighbours.retain(|other| !is_same(other));
-        let covered = caps::add_caps(own, self.probe, neighbours, caps) == Cover::Whole
-            || caps::prune(caps, -TOLERANCE / self.probe, comparisons)? == Cover::Whole;
-        if covered {
-            return Ok(());
-        }
-        let Region { solid_angle, vector } = Region::outside(caps, uncovered, comparisons, |_, _| {})?;
-        let centre = self.search.centre(&self.ends[own as usize].probe);
-        let area = self.probe * self.probe;
-        part.concave += area * solid_angle;
-        // The outward normal points to the centre of the probe.
-        part.flux -= area * (self.probe * solid_angle + dot(centre, vector));
-        Ok(())
     }
 }

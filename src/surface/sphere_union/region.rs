@@ -48,8 +48,9 @@ impl EdgeArc {
 }
 
 impl Region {
-    /// Measures the part of the unit sphere outside `caps`, which [`prune`](super::caps::prune) has sorted. Calls
-    /// `each` for each exposed arc of the edge of a cap.
+    /// Measures the part of the unit sphere outside `caps`, which [`prune`](super::caps::prune) has sorted. `component`
+    /// returns the component of each exposed arc of the edge of a cap. Fills `regions` with the components, each with
+    /// the region that its arcs bound; a sphere without caps is component 0.
     ///
     /// # Errors
     /// Returns the errors of [`Comparisons::add`].
@@ -57,25 +58,35 @@ impl Region {
         caps: &[Cap],
         uncovered: &mut Uncovered,
         comparisons: &mut Comparisons<'_>,
-        mut each: impl FnMut(&Cap, &EdgeArc),
-    ) -> Result<Self, SurfaceError> {
-        let Some(largest) = caps.first() else { return Ok(Self { solid_angle: 4.0 * PI, vector: [0.0; 3] }) };
+        regions: &mut Vec<(u32, Self)>,
+        mut component: impl FnMut(&Cap, &EdgeArc) -> u32,
+    ) -> Result<(), SurfaceError> {
+        regions.clear();
+        let Some(largest) = caps.first() else {
+            regions.push((0, Self { solid_angle: 4.0 * PI, vector: [0.0; 3] }));
+            return Ok(());
+        };
         // The integrand is singular opposite to the pole, so that point lies within a cap, far from the boundary.
         let pole = largest.axis.map(|c| -c);
-        let mut region = Self::default();
         for cap in caps {
             let circle = Circle::new(1.0, cap);
             circle.uncover(cap, caps, 0.0, uncovered, comparisons)?;
             uncovered.arcs(|arc| {
                 let arc = EdgeArc::new(&circle, arc);
-                region.subtract(cap, circle.sin, &arc, pole);
-                each(cap, &arc);
+                let number = component(cap, &arc);
+                let at = regions.iter().position(|(other, _)| *other == number).unwrap_or_else(|| {
+                    regions.push((number, Self::default()));
+                    regions.len() - 1
+                });
+                regions[at].1.subtract(cap, circle.sin, &arc, pole);
             });
         }
         let most = 2.0 * PI * (1.0 + largest.height);
-        let turns = ((region.solid_angle - 0.5 * most) / (4.0 * PI)).round();
-        region.solid_angle = (region.solid_angle - 4.0 * PI * turns).clamp(0.0, most);
-        Ok(region)
+        for (_, region) in regions {
+            let turns = ((region.solid_angle - 0.5 * most) / (4.0 * PI)).round();
+            region.solid_angle = (region.solid_angle - 4.0 * PI * turns).clamp(0.0, most);
+        }
+        Ok(())
     }
 
     /// Subtracts the integrals along an arc counter-clockwise about the axis of the cap: the region lies to its right.

@@ -1,7 +1,5 @@
 //! Toroidal part of a solvent-excluded surface: the probe touches two spheres and moves along an arc.
 
-use std::f64::consts::PI;
-
 use super::caps::dot;
 use super::region::EdgeArc;
 
@@ -22,32 +20,40 @@ pub(super) struct ProbePath<'a> {
 }
 
 impl ProbePath<'_> {
-    /// Returns the area of the toroidal part, Å², and the integral of x·n over it, Å³, where n is the outward normal at
-    /// x. The part of a torus that intersects itself is left out: other positions of the probe on the arc reach it.
-    pub(super) fn measure(&self) -> [f64; 2] {
-        let Self { arc, axis, centre, radius, offsets, probe } = *self;
+    /// Returns the areas of the toroidal part that are nearer to the point of contact with each sphere, Å², and the
+    /// integral of x·n over the whole part, Å³, where n is the outward normal at x. The part of a torus that intersects
+    /// itself is left out: other positions of the probe on the arc reach it.
+    pub(super) fn measure(&self) -> ([f64; 2], f64) {
+        let Self { radius, offsets, probe, .. } = *self;
         // A point of the probe has an angle from the direction to the axis, positive on the side of the first sphere.
         let [high, low] = [offsets[0].atan2(radius), -offsets[1].atan2(radius)];
         let cusp = if radius < probe { (radius / probe).acos() } else { 0.0 };
-        let [sides, all] = [[[low.max(cusp), high], [low, high.min(-cusp)]], [[low, high], [PI, PI]]];
-        let turn = 2.0 * arc.half_angle;
-        let mut sums = [0.0; 2];
-        for [from, to] in if radius < probe { sides } else { all } {
-            if from >= to {
-                continue;
+        let middle = 0.5 * (high + low);
+        let (mut areas, mut flux) = ([0.0; 2], 0.0);
+        for (area, [low, high]) in areas.iter_mut().zip([[middle, high], [low, middle]]) {
+            for [from, to] in [[low.max(cusp), high], [low, high.min(-cusp)]].into_iter().filter(|[from, to]| from < to)
+            {
+                let sums = self.between(from, to);
+                *area += sums[0];
+                flux += sums[1];
             }
-            let ((s0, c0), (s1, c1)) = (from.sin_cos(), to.sin_cos());
-            let (one, cos, sin) = (to - from, s1 - s0, c0 - c1);
-            let cos2 = 0.5 * (one + s1 * c1 - s0 * c0);
-            let sin_cos = 0.5 * (s1 * s1 - s0 * s0);
-            sums[0] += probe * turn * (radius * one - probe * cos);
-            let of_path = (radius * radius + probe * probe) * cos - radius * probe * (cos2 + one);
-            // The normal is the direction to the probe: outward from the axis by the cosine, along it by the sine.
-            let outward = 2.0 * arc.half[1] * (radius * cos - probe * cos2);
-            let along = turn * (radius * sin - probe * sin_cos);
-            let normal = dot(centre, arc.middle) * outward + dot(centre, axis) * along;
-            sums[1] += probe * (turn * of_path + normal);
         }
-        sums
+        (areas, flux)
+    }
+
+    /// Returns the area between two angles and the integral of x·n over it.
+    fn between(&self, from: f64, to: f64) -> [f64; 2] {
+        let Self { arc, axis, centre, radius, probe, .. } = *self;
+        let turn = 2.0 * arc.half_angle;
+        let ((s0, c0), (s1, c1)) = (from.sin_cos(), to.sin_cos());
+        let (one, cos, sin) = (to - from, s1 - s0, c0 - c1);
+        let cos2 = 0.5 * (one + s1 * c1 - s0 * c0);
+        let sin_cos = 0.5 * (s1 * s1 - s0 * s0);
+        let of_path = (radius * radius + probe * probe) * cos - radius * probe * (cos2 + one);
+        // The normal is the direction to the probe: outward from the axis by the cosine, along it by the sine.
+        let outward = 2.0 * arc.half[1] * (radius * cos - probe * cos2);
+        let along = turn * (radius * sin - probe * sin_cos);
+        let normal = dot(centre, arc.middle) * outward + dot(centre, axis) * along;
+        [probe * turn * (radius * one - probe * cos), probe * (turn * of_path + normal)]
     }
 }
