@@ -1,16 +1,17 @@
 //! Cuts a finished surface: only the triangles of the selected atoms remain, grouped by part.
 //!
-//! A triangle belongs to the part of the atoms that are nearest to two of its vertices. The nearest atom of a vertex is
-//! that of `_ATOM`. A vertex on the border of several parts is stored in each of them.
+//! A triangle belongs to the part of two of its vertices. A vertex belongs to the part of its nearest atom, that of
+//! `_ATOM`, or to the pocket that it lines. A vertex on the border of several parts is stored in each of them.
 
 use rayon::prelude::*;
 
 use super::parts::Run;
+use super::pockets::lined_by;
 use crate::structure::{AtomPart, Selected};
 use crate::surface::cpu::scan;
 use crate::surface::mesh::joined_bounds;
 use crate::surface::{
-    Column, Component, Control, Measures, Mesh, MeshOutput, PartRange, Stage, SurfaceError, Validation,
+    Column, Component, Control, Measures, Mesh, MeshOutput, PartRange, Pockets, Stage, SurfaceError, Validation,
 };
 
 /// Rows per task, and triangles between two checks for cancellation.
@@ -18,18 +19,26 @@ const ROWS: usize = 1 << 16;
 /// Part of atoms and triangles that are not selected; number of a vertex that has none.
 const NONE: u32 = u32::MAX;
 
-/// Division of a surface by the atoms that are nearest to its triangles.
-pub(super) struct Cut {
+/// Rule that assigns vertices to parts.
+enum Rule<'a> {
     /// Part of each sphere, or [`NONE`].
-    part_of: Vec<u32>,
+    NearestAtom(Vec<u32>),
+    /// Parts are the pockets; the last part has the other vertices.
+    Pocket(&'a Pockets),
+}
+
+/// Division of a surface by the parts of its vertices.
+pub(super) struct Cut<'a> {
+    rule: Rule<'a>,
     /// Names of the parts; empty for a mesh without parts.
     names: Vec<String>,
     /// Validation of a surface from which the cut removes nothing.
     validation: Validation,
 }
 
-impl Cut {
-    /// Returns the division into `parts`, or into one part of all selected atoms. Returns `None` without
+impl<'a> Cut<'a> {
+    /// Returns the division into `parts`, those of `pockets` if it is given, or into one part of all selected atoms.
+    /// Returns `None` if the surface is not cut: without pockets and
     /// [`Context::Whole`](crate::structure::Context::Whole).
     ///
     /// # Errors
@@ -37,9 +46,14 @@ impl Cut {
     pub(super) fn of(
         selected: &Selected,
         parts: Option<&[AtomPart]>,
+        pockets: Option<&'a Pockets>,
         validation: Validation,
         control: &Control<'_>,
     ) -> Result<Option<Self>, SurfaceError> {
+        let names = parts.unwrap_or_default().iter().map(|part| part.name.clone()).collect();
+        if let Some(pockets) = pockets {
+            return Ok(Some(Self { rule: Rule::Pocket(pockets), names, validation }));
+        }
         if selected.marks.is_none() {
             return Ok(None);
         }
@@ -55,26 +69,40 @@ impl Cut {
                 part_of
             }
         };
-        let names = parts.unwrap_or_default().iter().map(|part| part.name.clone()).collect();
-        Ok(Some(Self { part_of, names, validation }))
+        Ok(Some(Self { rule: Rule::NearestAtom(part_of), names, validation }))
     }
 
-    /// Returns the area of the triangles of selected atoms, Å². `mesh` has atom indices.
+    /// Returns true if the mesh needs atom indices.
+    pub(super) const fn needs_atom_ids(&self) -> bool {
+        matches!(self.rule, Rule::NearestAtom(_))
+    }
+
+    /// Returns the area of the triangles that remain, Å². `mesh` has atom indices if the cut needs them.
     pub(super) fn area(&self, mesh: &Mesh) -> f64 {
-        let ids = mesh.atom_ids.as_deref().unwrap_or_default();
+        let of_vertices = self.parts_of_vertices(mesh);
         let of_chunk = |chunk: &[[u32; 3]]| {
-            let kept = chunk.iter().filter(|triangle| self.part(**triangle, ids) != NONE);
+            let kept = chunk.iter().filter(|triangle| part(**triangle, &of_vertices) != NONE);
             kept.map(|triangle| area_of(mesh, *triangle)).sum::<f64>()
         };
         ordered_sum(&mesh.triangles, of_chunk)
     }
 
-    /// Returns the part of a triangle.
-    fn part(&self, triangle: [u32; 3], ids: &[u32]) -> u32 {
-        owner(triangle.map(|v| self.part_of[ids[v as usize] as usize]))
+    /// Returns the part of each vertex. Without atom indices that the cut needs, the result is empty.
+    fn parts_of_vertices(&self, mesh: &Mesh) -> Vec<u32> {
+        match &self.rule {
+            Rule::NearestAtom(part_of) => {
+                let ids = mesh.atom_ids.as_deref().unwrap_or_default();
+                ids.par_iter().with_min_len(ROWS).map(|id| part_of[*id as usize]).collect()
+            }
+            Rule::Pocket(pockets) => {
+                let rest = u32::try_from(pockets.list.len()).unwrap_or(NONE);
+                lined_by(mesh, pockets).map(|pocket| pocket.unwrap_or(rest)).collect()
+            }
+        }
     }
 
-    /// Cuts the mesh of `whole`, which has atom indices. Adds the memory of the result to the meter of `control`.
+    /// Cuts the mesh of `whole`, which has atom indices if the cut needs them. Adds the memory of the result to the
+    /// meter of `control`.
     ///
     /// # Errors
     /// Returns [`SurfaceError::NoPatch`] if no triangle remains, [`SurfaceError::MeshTooLarge`], and the errors of
@@ -88,7 +116,7 @@ impl Cut {
         let was_closed = whole.measure(control)?.closed;
         let mesh = &mut whole.mesh;
         mesh.make_contiguous();
-        let _parts = control.reserve(4 * mesh.n_triangles() as u64)?;
+        let _parts = control.reserve(4 * (mesh.n_triangles() + mesh.n_vertices()) as u64)?;
         let parts = control.span(Stage::Emit, || self.parts_of_triangles(mesh))?;
         control.check()?;
         let n_kept = parts.iter().filter(|part| **part != NONE).count();
@@ -121,10 +149,11 @@ impl Cut {
 
     /// Returns the part of each triangle.
     fn parts_of_triangles(&self, mesh: &Mesh) -> Result<Vec<u32>, SurfaceError> {
-        let Some(ids) = mesh.atom_ids.as_deref() else {
+        if self.needs_atom_ids() && mesh.atom_ids.is_none() {
             return Err(SurfaceError::Device { why: "the mesh has no atom indices".into() });
-        };
-        Ok(mesh.triangles.par_iter().with_min_len(ROWS).map(|triangle| self.part(*triangle, ids)).collect())
+        }
+        let of_vertices = self.parts_of_vertices(mesh);
+        Ok(mesh.triangles.par_iter().with_min_len(ROWS).map(|triangle| part(*triangle, &of_vertices)).collect())
     }
 
     /// Keeps the triangles that belong to a part, ordered by part. Returns the rows of each part's triangles.
@@ -195,6 +224,11 @@ impl Cut {
         mesh.parts = parts.collect();
         Ok(())
     }
+}
+
+/// Returns the part of a triangle.
+fn part(triangle: [u32; 3], of_vertices: &[u32]) -> u32 {
+    owner(triangle.map(|v| of_vertices[v as usize]))
 }
 
 /// Returns the part of a triangle whose vertices belong to these parts: that of two vertices. If all three differ, the

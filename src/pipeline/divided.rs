@@ -17,13 +17,13 @@ use crate::surface::{
 pub(super) enum Division<'a> {
     /// Mesh of each part on its own.
     Parts(&'a [AtomPart]),
-    /// Triangles of one surface, by their nearest atoms.
-    Cut(&'a Cut),
+    /// Triangles of one surface, by the parts of their vertices.
+    Cut(&'a Cut<'a>),
 }
 
 impl<'a> Division<'a> {
     /// Returns the division by `cut`, which has priority, or into `parts`.
-    pub(super) fn of(parts: Option<&'a [AtomPart]>, cut: Option<&'a Cut>) -> Option<Self> {
+    pub(super) fn of(parts: Option<&'a [AtomPart]>, cut: Option<&'a Cut<'a>>) -> Option<Self> {
         cut.map(Self::Cut).or_else(|| parts.map(Self::Parts))
     }
 
@@ -36,7 +36,7 @@ impl<'a> Division<'a> {
     }
 
     /// Returns the division of one surface.
-    pub(super) const fn cut(self) -> Option<&'a Cut> {
+    pub(super) const fn cut(self) -> Option<&'a Cut<'a>> {
         match self {
             Self::Parts(_) => None,
             Self::Cut(cut) => Some(cut),
@@ -96,11 +96,12 @@ impl DividedBackend<'_> {
     }
 
     /// Meshes all spheres and cuts the mesh. Limits apply to the mesh before the cut.
-    fn cut(&self, cut: &Cut, run: &Run<'_>, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
+    fn cut(&self, cut: &Cut<'_>, run: &Run<'_>, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
         // The mesh before the cut is freed at the end of this function.
         let memory = Arc::new(Reservation::new(&control.memory));
         let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-        let with_atoms = SurfaceParams { atom_ids: true, ..run.params.clone() };
+        let atom_ids = run.params.atom_ids || cut.needs_atom_ids();
+        let with_atoms = SurfaceParams { atom_ids, ..run.params.clone() };
         let whole = self.inner.run(run.spheres, &with_atoms, run.limits, &metered)?;
         let mut output = cut.apply(whole, run, control)?;
         if !run.params.atom_ids {

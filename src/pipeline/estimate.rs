@@ -77,7 +77,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
         AtomColors::new(&structure, &selected.atoms, coloring)?;
     }
     let parts = selected.parts(&structure, job.split, &limits.read, control)?;
-    let cut = Cut::of(&selected, parts.as_deref(), job.validation, control)?;
+    let cut = Cut::of(&selected, parts.as_deref(), None, job.validation, control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
     let backend = divided(choice.backend, division);
     let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
@@ -187,7 +187,7 @@ pub(super) fn n_vertices(area: f64, spacing: f64) -> u64 {
 pub(super) struct MeshPlan<'a> {
     pub(super) spheres: &'a Spheres,
     pub(super) parts: Option<&'a [AtomPart]>,
-    pub(super) cut: Option<&'a Cut>,
+    pub(super) cut: Option<&'a Cut<'a>>,
     pub(super) params: &'a SurfaceParams,
     pub(super) limits: &'a SurfaceLimits,
     /// Bytes that colours and atom indices add to a vertex.

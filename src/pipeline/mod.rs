@@ -60,7 +60,6 @@ use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, U
 use crate::picture::{PictureError, PictureParams};
 use crate::structure::map::MapError;
 use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
-use crate::surface::pockets::find as find_pockets;
 use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceParams,
     Validation, lattice,
@@ -86,7 +85,7 @@ pub struct Job {
     pub split: Split,
     /// Search for cavities; `None` without it.
     pub cavities: Option<Cavities>,
-    /// Radius of the large probe of a search for pockets, Å; `None` without it.
+    /// Radius of the large probe of a search for pockets, Å. Colours and parts that need pockets imply a search.
     pub pockets: Option<f64>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
@@ -111,8 +110,8 @@ pub struct Job {
 }
 
 impl Job {
-    /// Checks the size of the picture, that there is a map if and only if the colours need one, and that pockets are
-    /// searched for if they are coloured, before any other work.
+    /// Checks the size of the picture, and that there is a map if and only if the colours need one, before any other
+    /// work.
     ///
     /// # Errors
     /// Returns [`JobError::Picture`] if the picture exceeds the limits, and [`JobError::Color`].
@@ -122,9 +121,6 @@ impl Job {
             (Some(scheme), None) => return Err(ColorError::without_map(scheme).into()),
             (None, Some(_)) => return Err(ColorError::unused_map(scheme).into()),
             _ => {}
-        }
-        if let Some(scheme) = scheme.filter(|scheme| scheme.needs_pockets() && self.pockets.is_none()) {
-            return Err(ColorError::without_pockets(scheme).into());
         }
         self.picture.map_or(Ok(()), |picture| picture.check(limits.picture)).map_err(JobError::Picture)
     }
@@ -294,10 +290,13 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let colors = job.color.map(prepare).transpose()?;
     let measure = || areas::measure(&structure, &selected, &spheres, job, &limits.surface, &control);
     let (exact, areas) = job.exact.then(|| clock.time("exact", measure)).transpose()?.unzip();
-    let find = |probe| clock.time("pockets", || find_pockets(&spheres, &job.params, probe, &limits.surface, &control));
-    let pockets = job.pockets.map(find).transpose()?;
-    let parts = selected.parts(&structure, job.split, &limits.read, &control)?;
-    let cut = Cut::of(&selected, parts.as_deref(), job.validation, &control)?;
+    let pockets = pockets::search(job, &spheres, &limits.surface, &clock, &control)?;
+    let of_pockets = pockets.as_ref().filter(|_| job.split == Split::Pocket);
+    let parts = match of_pockets {
+        Some(found) => Some(pockets::parts(found, selected.atoms.len(), &limits.read)?),
+        None => selected.parts(&structure, job.split, &limits.read, &control)?,
+    };
+    let cut = Cut::of(&selected, parts.as_deref(), of_pockets, job.validation, &control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
     let backend = divided(choice.backend, division);
     let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });

@@ -147,7 +147,7 @@ fn check_instances(job: &Job) -> Result<(), ParamError> {
 /// measures include the walls that `drop` and `only` remove from the mesh.
 fn check_cavities(job: &Job) -> Result<(), ParamError> {
     let Some(cavities) = job.cavities else { return Ok(()) };
-    let expected = match divided_by(job) {
+    let expected = match divided_by(job.split, &job.selection) {
         Some(divided) => format!("no value with {divided}"),
         None if job.exact && cavities != Cavities::Keep => "keep, or no value, with exact=true".to_owned(),
         None => return Ok(()),
@@ -159,10 +159,15 @@ fn check_cavities(job: &Job) -> Result<(), ParamError> {
 /// probe must be larger than the other one.
 fn check_pockets(job: &Job) -> Result<(), ParamError> {
     let Some(large) = job.pockets else { return Ok(()) };
-    if let Some(divided) = divided_by(job) {
+    let splits = job.split == Split::Pocket;
+    let split = if splits { Split::None } else { job.split };
+    if let Some(divided) = divided_by(split, &job.selection) {
         let coloured = job.color.is_some_and(|color| color.scheme.needs_pockets());
-        let (name, value, otherwise) =
-            if coloured { ("color", "pocket", "another value") } else { ("pockets", "true", "false") };
+        let (name, value, otherwise) = match (splits, coloured) {
+            (true, _) => ("split", "pocket", "another value"),
+            (false, true) => ("color", "pocket", "another value"),
+            (false, false) => ("pockets", "true", "false"),
+        };
         return Err(ParamError::bad_value(name, value, format!("{otherwise} with {divided}")));
     }
     let probe = job.params.probe;
@@ -178,11 +183,9 @@ fn check_pockets(job: &Job) -> Result<(), ParamError> {
 }
 
 /// Returns the parameter that divides or repeats the surface, with its value.
-fn divided_by(job: &Job) -> Option<String> {
-    let Selection { context, instances, .. } = &job.selection;
-    match (job.split, context) {
-        (Split::Model, _) => Some("model=all".to_owned()),
-        (split, _) if split != Split::None => Some(format!("split={}", split.name())),
+fn divided_by(split: Split, Selection { context, instances, .. }: &Selection) -> Option<String> {
+    match (split, context) {
+        (split, _) if split != Split::None => Some(split.parameter().to_owned()),
         (_, Context::Whole) => Some(format!("context={}", context.name())),
         _ => instances.then(|| "instances=true".to_owned()),
     }

@@ -1,10 +1,13 @@
 //! Pockets of the report.
 
+use rayon::prelude::*;
 use serde::Serialize;
 
-use super::{LiningResidue, Report};
-use crate::structure::{Selected, Structure};
-use crate::surface::{Pocket, Pockets};
+use super::clock::StageClock;
+use super::{Job, LiningResidue, Report};
+use crate::structure::{AtomPart, ReadLimits, Selected, Split, Structure, StructureError};
+use crate::surface::pockets::find;
+use crate::surface::{Control, DEFAULT_POCKET_PROBE, Mesh, Pocket, Pockets, Spheres, SurfaceError, SurfaceLimits};
 
 /// Pocket: a region outside the molecule that the probe can enter and a large probe cannot. It does not depend on the
 /// mesh and the type of the surface.
@@ -40,6 +43,61 @@ impl PocketReport {
             residues: LiningResidue::all(&pocket.lining, structure, selected),
         }
     }
+}
+
+impl Job {
+    /// Returns the radius of the large probe if pockets are listed, coloured or parts of the mesh, Å.
+    fn pocket_probe(&self) -> Option<f64> {
+        let needed = self.split == Split::Pocket || self.color.is_some_and(|color| color.scheme.needs_pockets());
+        self.pockets.or_else(|| needed.then_some(DEFAULT_POCKET_PROBE))
+    }
+}
+
+/// Finds the pockets of `spheres` if the job needs them.
+///
+/// # Errors
+/// Returns the errors of [`find`].
+pub(super) fn search(
+    job: &Job,
+    spheres: &Spheres,
+    limits: &SurfaceLimits,
+    clock: &StageClock<'_>,
+    control: &Control<'_>,
+) -> Result<Option<Pockets>, SurfaceError> {
+    let find = |probe| clock.time("pockets", || find(spheres, &job.params, probe, limits, control));
+    job.pocket_probe().map(find).transpose()
+}
+
+/// Returns the index of the pocket that each vertex lines.
+pub(super) fn lined_by<'a>(
+    mesh: &'a Mesh,
+    pockets: &'a Pockets,
+) -> impl IndexedParallelIterator<Item = Option<u32>> + 'a {
+    (0..mesh.n_vertices()).into_par_iter().map(|i| {
+        let position = mesh.position(i);
+        pockets.lined_at(std::array::from_fn(|k| mesh.centre[k] + f64::from(position[k])))
+    })
+}
+
+/// Returns the parts of `split=pocket`: the pockets, largest first, each with the rows of the atoms that line it, and
+/// the rest of `n_atoms` atoms.
+///
+/// # Errors
+/// [`StructureError::TooManyParts`].
+pub(super) fn parts(found: &Pockets, n_atoms: usize, limits: &ReadLimits) -> Result<Vec<AtomPart>, StructureError> {
+    let limit = limits.max_parts;
+    if found.list.len() as u64 >= limit {
+        return Err(StructureError::TooManyParts { rule: Split::Pocket.parameter(), limit });
+    }
+    let mut lines = vec![false; n_atoms];
+    found.list.iter().flat_map(|pocket| &pocket.lining).for_each(|row| lines[*row as usize] = true);
+    let name = |number: usize| format!("pocket {number}");
+    let pockets = (1..).zip(&found.list);
+    let mut parts: Vec<AtomPart> =
+        pockets.map(|(number, pocket)| AtomPart { name: name(number), rows: pocket.lining.clone() }).collect();
+    let rows = (0..).zip(lines).filter(|(_, lines)| !lines).map(|(row, _)| row).collect();
+    parts.push(AtomPart { name: "other".to_owned(), rows });
+    Ok(parts)
 }
 
 impl Report {

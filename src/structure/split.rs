@@ -25,11 +25,13 @@ pub enum Split {
     Model,
     /// One part per group of kinds: polymer, ligand (with cofactors), glycan, ion, water.
     ResidueGroup,
+    /// One part per pocket, and one of the rest. Vertices decide, not atoms.
+    Pocket,
 }
 
 impl Split {
     /// All values of the parameter `split`.
-    pub const ALL: [Self; 4] = [Self::None, Self::Chain, Self::Entity, Self::ResidueGroup];
+    pub const ALL: [Self; 5] = [Self::None, Self::Chain, Self::Entity, Self::ResidueGroup, Self::Pocket];
 
     /// Returns the value of the parameter `split`, or the name of the rule.
     #[must_use]
@@ -40,6 +42,20 @@ impl Split {
             Self::Entity => "entity",
             Self::Model => "model",
             Self::ResidueGroup => "residue-group",
+            Self::Pocket => "pocket",
+        }
+    }
+
+    /// Returns the parameter that divides the surface, with its value.
+    #[must_use]
+    pub const fn parameter(self) -> &'static str {
+        match self {
+            Self::None => "split=none",
+            Self::Chain => "split=chain",
+            Self::Entity => "split=entity",
+            Self::ResidueGroup => "split=residue-group",
+            Self::Pocket => "split=pocket",
+            Self::Model => "model=all",
         }
     }
 }
@@ -65,8 +81,8 @@ const UNKNOWN_ENTITY: &str = "unknown";
 const BYTES_PER_ROW: u64 = 16;
 
 impl Selected {
-    /// Divides the selected atoms into parts, in order of first appearance; `None` for [`Split::None`]. The units of an
-    /// assembly are parts. Adds the memory of the parts to the meter of `control`.
+    /// Divides the selected atoms into parts, in order of first appearance; `None` for rules that do not divide atoms.
+    /// The units of an assembly are parts. Adds the memory of the parts to the meter of `control`.
     ///
     /// # Errors
     /// Returns [`StructureError::TooManyParts`], [`StructureError::NoEntities`] for [`Split::Entity`] if the file has
@@ -85,7 +101,7 @@ impl Selected {
             let part = |unit: &Unit| AtomPart { name: unit.name.clone(), rows: unit.rows.clone().map(row).collect() };
             return Ok(Some(self.units.iter().map(part).collect()));
         }
-        if split == Split::None {
+        if matches!(split, Split::None | Split::Pocket) {
             return Ok(None);
         }
         if split == Split::Entity && structure.entities.iter().all(String::is_empty) {
@@ -115,7 +131,7 @@ impl Selected {
             let part = match found.get(&key) {
                 Some(&part) => part,
                 None if parts.len() as u64 >= limits.max_parts => {
-                    return Err(StructureError::TooManyParts { rule: rule(split), limit: limits.max_parts });
+                    return Err(StructureError::TooManyParts { rule: split.parameter(), limit: limits.max_parts });
                 }
                 None => {
                     found.insert(key, parts.len());
@@ -132,7 +148,7 @@ impl Selected {
 /// Returns the name of the part of atom `i`, without the number of a copy.
 fn name(structure: &Structure, split: Split, i: usize) -> &str {
     let (name, if_empty) = match split {
-        Split::None | Split::Model => ("", ""),
+        Split::None | Split::Model | Split::Pocket => ("", ""),
         Split::Chain => (structure.chain.get(i), BLANK_CHAIN),
         Split::Entity => {
             let entity = structure.entities.get(structure.label_chain.id(i) as usize);
@@ -162,16 +178,5 @@ fn shown(split: Split, (number, name): (i64, &str)) -> String {
         Split::Model => format!("model {number}"),
         _ if number == 0 => name,
         _ => format!("{name}-{number}"),
-    }
-}
-
-/// Returns the parameter that divides atoms by a rule.
-const fn rule(split: Split) -> &'static str {
-    match split {
-        Split::None => "split=none",
-        Split::Chain => "split=chain",
-        Split::Entity => "split=entity",
-        Split::ResidueGroup => "split=residue-group",
-        Split::Model => "model=all",
     }
 }

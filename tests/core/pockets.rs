@@ -2,7 +2,8 @@
 #![allow(clippy::pedantic, clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 use molmesh::pipeline::params::{self, ParamError};
-use molmesh::pipeline::{Choice, ColorError, JobError, JobLimits, PocketReport, Product, run};
+use molmesh::pipeline::{Choice, JobError, JobLimits, PocketReport, Product, run};
+use molmesh::structure::ReadLimits;
 use molmesh::surface::{Control, CpuBackend, SurfaceError, SurfaceLimits};
 
 use crate::tools;
@@ -110,12 +111,59 @@ fn vertices_at_a_pocket_have_its_colour() {
     }
 }
 
+/// Returns true if the colours differ.
+fn is_corner([a, b, c]: [[u8; 4]; 3]) -> bool {
+    a != b && b != c && c != a
+}
+
+#[test]
+fn pockets_are_parts_of_one_surface() {
+    for surface in ["gaussian", "ses"] {
+        let extra = [("surface", surface), ("compress", "quantize")];
+        for extra in [&extra[..1], &extra] {
+            let pairs = |more: &[(&'static str, &'static str)]| [more, extra].concat();
+            let product = meshed(UBIQUITIN, &pairs(&[("split", "pocket"), ("color", "pocket")]));
+            let whole = meshed(UBIQUITIN, &pairs(&[("color", "pocket")]));
+            let (report, parts) = (&product.report, &product.report.parts);
+            let names: Vec<&str> = parts.iter().map(|part| part.name.as_str()).collect();
+            assert_eq!(names, ["pocket 1", "pocket 2", "other"]);
+            assert_eq!((report.triangles, report.closed), (whole.report.triangles, true));
+            assert!((report.area / whole.report.area - 1.0).abs() < 1e-6);
+            assert!((parts.iter().map(|part| part.area).sum::<f64>() / report.area - 1.0).abs() < 1e-6);
+            assert!(parts.iter().all(|part| part.volume.is_none() && part.triangles > 10));
+            for (part, pocket) in parts.iter().zip(list(&product)) {
+                assert_eq!(part.atoms, pocket.atoms);
+            }
+            // Two vertices of a triangle have the colour of its pocket, or one of three where two pockets meet.
+            let mesh = &product.mesh;
+            let colors = mesh.colors.as_ref().unwrap();
+            for (range, entry) in mesh.parts.iter().zip(&report.color.as_ref().unwrap().legend) {
+                let rgb = u32::from_str_radix(&entry.color[1..], 16).unwrap().to_be_bytes();
+                for triangle in &mesh.triangles[range.triangles.clone()] {
+                    let n = triangle.iter().filter(|v| colors[**v as usize][..3] == rgb[1..]).count();
+                    let shown = triangle.map(|v| colors[v as usize]);
+                    assert!(n >= 2 || n == 1 && is_corner(shown), "{surface}, {}: {shown:?}, {rgb:?}", range.name);
+                }
+            }
+        }
+    }
+    let limits = JobLimits { read: ReadLimits { max_parts: 2, ..ReadLimits::default() }, ..JobLimits::default() };
+    let error = meshed_with(UBIQUITIN, &[("split", "pocket")], &limits).unwrap_err();
+    assert!(error.to_string().contains("split=pocket"), "{error}");
+}
+
 #[test]
 fn parameters_of_pockets_are_checked() {
     let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
-    let all = [&[][..], &[("pockets", "true")], &[("pockets", "true"), ("pocket_probe", "5")], &[("color", "pocket")]]
-        .map(canonical);
-    assert!((0..4).all(|i| (0..i).all(|j| all[i] != all[j])), "{all:?}");
+    let all = [
+        &[][..],
+        &[("pockets", "true")],
+        &[("pockets", "true"), ("pocket_probe", "5")],
+        &[("color", "pocket")],
+        &[("split", "pocket")],
+    ]
+    .map(canonical);
+    assert!((0..5).all(|i| (0..i).all(|j| all[i] != all[j])), "{all:?}");
     assert_eq!(canonical(&[("pockets", "true"), ("pocket_probe", "4.0")]), all[1]);
     let refused = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).map(drop).unwrap_err();
     for (pairs, name) in [
@@ -129,17 +177,14 @@ fn parameters_of_pockets_are_checked() {
         (&[("pockets", "true"), ("context", "whole")], "pockets"),
         (&[("pockets", "true"), ("instances", "true"), ("assembly", "1")], "pockets"),
         (&[("color", "pocket"), ("split", "chain")], "color"),
+        (&[("split", "pocket"), ("context", "whole")], "split"),
+        (&[("split", "pocket"), ("model", "all")], "split"),
+        (&[("split", "pocket"), ("cavities", "drop")], "cavities"),
         (&[("color", "pocket"), ("palette", "cividis")], "palette"),
     ] {
         let ParamError::BadValue { name: named, .. } = refused(pairs) else { panic!("{pairs:?}") };
         assert_eq!(named, name, "{pairs:?}");
     }
-    // A job that colours pockets without a search is rejected before any work.
-    let mut job = params::parse([("color", "pocket")]).unwrap().job;
-    job.check(&JobLimits::default()).unwrap();
-    job.pockets = None;
-    let Err(JobError::Color(ColorError { why, .. })) = job.check(&JobLimits::default()) else { panic!("accepted") };
-    assert!(why.contains("pockets=true"), "{why}");
 }
 
 #[test]

@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::super::JobError;
+use super::super::pockets::lined_by;
 use super::of_map::{significant, symmetric_range};
 use super::palette::Rgb;
 use super::tables::{OTHER, category};
@@ -140,11 +141,7 @@ fn of_pockets(
     control: &Control<'_>,
 ) -> Result<(Column<[u8; 4]>, ColorReport), SurfaceError> {
     let _memory = control.reserve(INDEX_BYTES * mesh.n_vertices() as u64)?;
-    let lined = |i: usize| {
-        let position = mesh.position(i);
-        pockets.lined_at(std::array::from_fn(|k| mesh.centre[k] + f64::from(position[k])))
-    };
-    let lined: Vec<Option<u32>> = (0..mesh.n_vertices()).into_par_iter().map(lined).collect();
+    let lined: Vec<Option<u32>> = lined_by(mesh, pockets).collect();
     control.check()?;
     let color = |pocket: Option<u32>| opaque(pocket.map_or(OTHER, category));
     let legend = (0..).zip(&pockets.list).take(MAX_ENTRIES).map(|(i, _)| entry((i + 1).to_string(), category(i)));

@@ -291,7 +291,7 @@ pub const TABLE: &[Parameter] = &[
         name: "split",
         domain: Domain::Choice(SPLITS),
         default: "none",
-        doc: "Divides the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, or residue-group (polymer, ligand, glycan, ion, water). With context=whole, divides the triangles of one surface by their nearest atoms.",
+        doc: "Divides the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, or residue-group (polymer, ligand, glycan, ion, water). With context=whole, divides the triangles of one surface by their nearest atoms. pocket divides the triangles of one surface by the pockets that they line.",
     },
     Parameter {
         name: "cavities",
@@ -301,14 +301,14 @@ pub const TABLE: &[Parameter] = &[
     },
     switch(
         "pockets",
-        "Searches for pockets, regions outside the molecule that the probe can enter and a large probe cannot, and lists them in the report. color=pocket implies it.",
+        "Searches for pockets, regions outside the molecule that the probe can enter and a large probe cannot, and lists them in the report. color=pocket and split=pocket imply it.",
     ),
     number(
         "pocket_probe",
         POCKET_PROBES,
         "Å",
         "4",
-        "Radius of the large probe of the search for pockets, larger than that of the probe; with pockets=true or color=pocket only.",
+        "Radius of the large probe of the search for pockets, larger than that of the probe; with pockets=true, color=pocket or split=pocket only.",
     ),
     Parameter {
         name: "validation",

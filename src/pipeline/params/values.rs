@@ -61,13 +61,18 @@ impl ParsedValues {
         Ok(scheme.map(|scheme| Coloring { scheme, palette, range, blend, offset }))
     }
 
-    /// Returns the radius of the large probe if pockets are listed or coloured, Å.
+    /// Returns the radius of the large probe if pockets are listed, coloured or parts, Å.
     pub(super) fn pockets(&self) -> Result<Option<f64>, ParamError> {
-        if self.pockets || self.scheme.is_some_and(Scheme::needs_pockets) {
+        let needed = self.scheme.is_some_and(Scheme::needs_pockets) || self.request.job.split == Split::Pocket;
+        if self.pockets || needed {
             return Ok(Some(self.pocket_probe.unwrap_or(DEFAULT_POCKET_PROBE)));
         }
         let unused = |probe: f64| {
-            ParamError::bad_value("pocket_probe", &probe.to_string(), "no value without pockets=true or color=pocket")
+            ParamError::bad_value(
+                "pocket_probe",
+                &probe.to_string(),
+                "no value without pockets=true, color=pocket or split=pocket",
+            )
         };
         self.pocket_probe.map_or(Ok(None), |probe| Err(unused(probe)))
     }
