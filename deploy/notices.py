@@ -63,7 +63,7 @@ def files(folder):
     return found
 
 
-def stand_in(package):
+def fallback_text(package):
     """Returns name and text of a licence for a crate without a licence file."""
     allowed = package["license"] or ""
     if re.search(r"\bApache-2\.0\b", allowed):
@@ -98,7 +98,7 @@ def texts(packages, page, musl):
             add(path.read_text(encoding="utf-8", errors="replace"), f"{who} ({path.relative_to(folder)})")
         # A notice is not a licence.
         if not any(not path.name.lower().startswith("notice") for path in own):
-            text = stand_in(package)
+            text = fallback_text(package)
             if text is None:
                 missing.append(f"{who}: {package['license']}")
             else:

@@ -1,5 +1,5 @@
 // Stage `bin`: candidate atoms of every brick, in canonical order, and for a boundary of spheres its candidate arcs.
-// One workgroup per brick and section; the arcs are the second section of all tables and are treated like atoms.
+// One workgroup per brick and kind of candidate: atoms, then arcs. All tables have the arcs after the atoms.
 //
 // Atoms are sorted by tile and brick, so the atoms of a run of bricks along x within a tile are one range. Each lane
 // looks up one range. Then the lanes divide the atoms of 64 ranges evenly and keep those in reach, in order.
@@ -73,7 +73,7 @@ fn part(lo: i32, hi: i32, t: i32) -> vec2<i32> {
 }
 
 // Atoms or arcs.
-struct Section {
+struct Candidates {
     // Maximum reach.
     reach: f32,
     // Number of bricks before and behind a brick, per axis, whose atoms may reach it.
@@ -91,9 +91,9 @@ fn brick_gap(step: i32) -> f32 {
 
 // First atom and number of atoms of range `index` of those that may hold candidates of `brick`. Ranges are in the order
 // of the atoms: by tile, and by row within a tile.
-fn range_at(section: Section, tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
-    let lo = brick - vec3<i32>(section.back);
-    let hi = brick + vec3<i32>(section.ahead);
+fn range_at(kind: Candidates, tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
+    let lo = brick - vec3<i32>(kind.back);
+    let hi = brick + vec3<i32>(kind.ahead);
     let first = lo >> vec3<u32>(3u);
     let n_x = (hi.x >> 3u) - first.x + 1;
     let n_y = hi.y - lo.y + 1;
@@ -116,7 +116,7 @@ fn range_at(section: Section, tile: u32, brick: vec3<i32>, index: u32) -> vec2<u
     let row = vec2<i32>(y.x + left % y.y, z.x + left / y.y);
     // Maximum extent of the reach along x in this row.
     let gap = vec2<f32>(brick_gap(row.x - brick.y), brick_gap(row.y - brick.z));
-    let rest = section.reach * section.reach - dot(gap, gap);
+    let rest = kind.reach * kind.reach - dot(gap, gap);
     if (rest < 0.0) {
         return vec2<u32>(0u);
     }
@@ -131,9 +131,9 @@ fn range_at(section: Section, tile: u32, brick: vec3<i32>, index: u32) -> vec2<u
         return vec2<u32>(0u);
     }
     let base = u32(row.y & 7) << 6u | u32(row.x & 7) << 3u;
-    let start = first_atoms[section.first + bricks_before(at, base | u32(x_lo & 7))];
+    let start = first_atoms[kind.first + bricks_before(at, base | u32(x_lo & 7))];
     let last = base | u32(x_hi & 7);
-    let end = first_atoms[section.first + bricks_before(at, last) + select(0u, 1u, brick_exists(at, last))];
+    let end = first_atoms[kind.first + bricks_before(at, last) + select(0u, 1u, brick_exists(at, last))];
     return vec2<u32>(start, end - start);
 }
 
@@ -161,13 +161,13 @@ fn main(
 ) {
     let number = workgroup_number(workgroup, workgroups);
     let n_slots = params.n_own + params.n_halo;
-    if (number >= params.n_sections * n_slots) {
+    if (number >= params.n_kinds * n_slots) {
         return;
     }
-    var section = Section(params.reach, i32(params.back), i32(params.ahead), 0u);
+    var kind = Candidates(params.reach, i32(params.back), i32(params.ahead), 0u);
     var slot = number;
     if (number >= n_slots) {
-        section = Section(params.arc_reach, i32(params.arc_back), i32(params.arc_ahead), params.n_bricks + 1u);
+        kind = Candidates(params.arc_reach, i32(params.arc_back), i32(params.arc_ahead), params.n_bricks + 1u);
         slot = number - n_slots;
     }
     let id = brick_in(slot);
@@ -176,8 +176,8 @@ fn main(
     let brick = tiles[tile].coord * 8 + within;
     let tile_origin = tiles[tile].coord * 64;
     let lo = vec3<f32>(within * 8);
-    let span = section.back + section.ahead + 1;
-    let n_x = ((brick.x + section.ahead) >> 3u) - ((brick.x - section.back) >> 3u) + 1;
+    let span = kind.back + kind.ahead + 1;
+    let n_x = ((brick.x + kind.ahead) >> 3u) - ((brick.x - kind.back) >> 3u) + 1;
     let n_ranges = u32(span * span * n_x);
     if (lane < 12u) {
         atomicStore(&hits[lane], 0u);
@@ -192,7 +192,7 @@ fn main(
         for (var first = 0u; first < n_ranges; first += LANES) {
             var range = vec2<u32>(0u);
             if (first + lane < n_ranges) {
-                range = range_at(section, tile, brick, first + lane);
+                range = range_at(kind, tile, brick, first + lane);
             }
             workgroupBarrier();
             range_start[lane] = range.x;

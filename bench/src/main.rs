@@ -12,9 +12,9 @@ mod paper;
 mod program_2010;
 mod rates;
 mod service;
-mod stand_in;
 mod stats;
 mod structures;
+mod substitute;
 
 use std::io::Write as _;
 use std::path::Path;

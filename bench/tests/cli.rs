@@ -43,12 +43,12 @@ fn a_small_run_writes_consistent_tables_and_figures() {
     let [out, figures, page] = ["out", "figures", "page.md"].map(|name| folder.path().join(name));
     let flags = ["--device", "cpu", "--only", "110d", "--kernels", "soft-object", "--runs", "1", "--growth", "1000"];
     let [said, _] = run(0, command().args(["paper", "--reference-limit", "60", "--out"]).arg(&out).args(flags));
-    assert!(said.contains("| 110D *(stand-in)* | soft-object | 120 |") && said.contains("all equal"), "{said}");
+    assert!(said.contains("| 110D *(substitute)* | soft-object | 120 |") && said.contains("all equal"), "{said}");
     assert_eq!(said, fs::read_to_string(out.join("paper.md")).unwrap());
     let results = results(&out);
     let row = &results["rows"][0];
-    assert_eq!((&row["id"], &row["atoms"], &row["stand_in"]), (&"110D".into(), &120.into(), &true.into()));
-    assert_eq!((&row["source"], &row["cpu"]["paper_seconds"]), (&"stand-in: generated".into(), &0.45.into()));
+    assert_eq!((&row["id"], &row["atoms"], &row["substitute"]), (&"110D".into(), &120.into(), &true.into()));
+    assert_eq!((&row["source"], &row["cpu"]["paper_seconds"]), (&"substitute: generated".into(), &0.45.into()));
     for side in [&row["cpu"], &row["gpu"]] {
         let off = side["cubes"].as_f64().unwrap() / side["paper_cubes"].as_f64().unwrap() - 1.0;
         assert!(off.abs() < 0.01, "{side}");
@@ -64,7 +64,7 @@ fn a_small_run_writes_consistent_tables_and_figures() {
     fs::write(&page, "<!-- measured: table-1 -->\n<!-- end -->\n<!-- measured: table-2 --><!-- end -->").unwrap();
     run(0, command().arg("figures").arg(&out).arg("--out").arg(&figures).arg("--page").arg(&page));
     let page = fs::read_to_string(page).unwrap();
-    assert!(page.contains("| 110D *(stand-in)*") && page.contains("Not run."), "{page}");
+    assert!(page.contains("| 110D *(substitute)*") && page.contains("Not run."), "{page}");
     let svg = fs::read_to_string(figures.join("growth-cpu.svg")).unwrap();
     assert!(svg.contains("sequential reference ∝ n^") && svg.contains("</svg>"), "{svg}");
     assert!(!figures.join("growth-gpu.svg").exists());
@@ -74,7 +74,7 @@ fn a_small_run_writes_consistent_tables_and_figures() {
 fn runs_beyond_the_limit_are_skipped() {
     let flags = ["--only", "1BIJ", "--kernels", "gaussian", "--programs", "reference", "--reference-limit", "0.5"];
     let [said, _] = run(0, command().args(["paper", "--device", "cpu"]).args(flags));
-    assert!(said.contains("not run: about ") && said.contains("| 1BIJ *(stand-in)* |"), "{said}");
+    assert!(said.contains("not run: about ") && said.contains("| 1BIJ *(substitute)* |"), "{said}");
 }
 
 #[test]
@@ -88,7 +88,7 @@ fn all_programs_create_the_same_triangles_on_a_software_device() {
     let paths = [data.to_str().unwrap(), "--out", out.to_str().unwrap()];
     let [said, _] =
         run(0, command().args(["paper", "--runs", "1", "--growth", "100"]).args(flags).arg("--data").args(paths));
-    assert!(said.contains("GPU: none; its programs ran on software") && !said.contains("stand-in"), "{said}");
+    assert!(said.contains("GPU: none; its programs ran on software") && !said.contains("substitute"), "{said}");
     assert!(said.contains("3 comparisons of numbers of triangles on the same grid: all equal"), "{said}");
     assert!(said.contains("454 (381)"), "{said}");
     let results = results(&out);
@@ -156,7 +156,7 @@ fn invalid_arguments_are_rejected_before_any_work() {
 }
 
 #[test]
-fn structures_are_fetched_once_and_replace_stand_ins() {
+fn structures_are_fetched_once_and_replace_substitutes() {
     let gz = {
         let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
         encoder.write_all(SAMPLE).unwrap();
@@ -179,7 +179,7 @@ fn structures_are_fetched_once_and_replace_stand_ins() {
     assert!(said.contains("exists") && remote.count() == 3, "{said}");
     let paper = ["paper", "--only", "2INS", "--kernels", "gaussian", "--programs", "cpu", "--runs", "1", "--data"];
     let [said, progress] = run(0, command().args(paper).arg(&data));
-    assert!(progress.contains("file 2ins.pdb.gz") && !said.contains("stand-in"), "{said}\n{progress}");
+    assert!(progress.contains("file 2ins.pdb.gz") && !said.contains("substitute"), "{said}\n{progress}");
 }
 
 #[test]

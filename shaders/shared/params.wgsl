@@ -60,8 +60,8 @@ struct Params {
     // Surfaces of spheres: depth of the surface below the boundary, and maximum distance of vertices from it.
     level: f32,
     tolerance: f32,
-    // Number of sections of the atoms: 2 with the arcs of a boundary, else 1.
-    n_sections: u32,
+    // Number of kinds of candidates: 2 with the arcs of a boundary, else 1 (atoms).
+    n_kinds: u32,
     // `reach`, `back` and `ahead` of the arcs.
     arc_reach: f32,
     arc_back: u32,

@@ -35,7 +35,7 @@ fn sphere_at(index: u32, origin: vec3<i32>) -> vec4<f32> {
 // Candidates of the brick in a slot.
 fn around_slot(slot: u32, origin: vec3<i32>) -> Around {
     var arcs = vec4<u32>(0u);
-    if (params.n_sections == 2u) {
+    if (params.n_kinds == 2u) {
         arcs = heads[params.n_own + params.n_halo + slot];
     }
     return Around(heads[slot], arcs, origin);
@@ -128,7 +128,7 @@ fn deepest_at(around: Around, x: vec3<f32>) -> Nearest {
 // Returns true if the boundary point nearest to `x` may lie on an arc: the nearest point of the sphere in which `x`
 // lies deepest is covered. Deep points need no exact distance.
 fn needs_arcs(around: Around, x: vec3<f32>, found: Nearest) -> bool {
-    if (params.n_sections < 2u || found.distance <= 0.0 || found.distance >= params.level + MARGIN) {
+    if (params.n_kinds < 2u || found.distance <= 0.0 || found.distance >= params.level + MARGIN) {
         return false;
     }
     let sphere = sphere_at(found.sphere, around.origin);

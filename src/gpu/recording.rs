@@ -174,7 +174,7 @@ impl<'a> Recording<'a> {
 /// Number of workgroups of `stage`.
 pub(super) fn workgroups(stage: Stage, params: &Params) -> u32 {
     match stage {
-        Stage::Bin => params.n_sections * (params.n_own + params.n_halo),
+        Stage::Bin => params.n_kinds * (params.n_own + params.n_halo),
         Stage::Field | Stage::Refine => params.n_own + params.n_halo,
         Stage::Classify => params.n_own.div_ceil(4),
         Stage::Scan => params.n_own.div_ceil(GROUP),

@@ -131,7 +131,7 @@ mod tests {
                 n_bricks,
                 level,
                 tolerance,
-                n_sections,
+                n_kinds,
                 arc_reach,
                 arc_back,
                 arc_ahead

@@ -39,7 +39,7 @@ impl BufferSizes {
             BufferId::FirstAtoms => bytes(plan.first_atoms.len() + plan.arcs.first.len(), 4),
             BufferId::Halo => max(&|c| 4 * c.halo_table_len()),
             BufferId::Lists => max(&|c| 4 * c.candidates),
-            BufferId::Heads => 16 * slots * u64::from(plan.n_sections()),
+            BufferId::Heads => 16 * slots * u64::from(plan.n_kinds()),
             BufferId::Field => 4 * BRICK_POINTS * slots,
             BufferId::Crossings => CROSSING_BYTES * slots,
             BufferId::Inside => bytes(n_bricks, 64),

@@ -93,7 +93,7 @@ impl Setup {
     fn lists(&self) -> (Vec<u32>, Vec<[u32; 4]>) {
         let (mut entries, mut heads) = self.atom_lists();
         let plan = &self.job.prepared.plan;
-        if plan.n_sections() == 2 {
+        if plan.n_kinds() == 2 {
             let arcs: HashMap<Vec<u8>, u32> =
                 plan.arcs.bounds.iter().map(raw_atom).zip(u32_of(plan.n_atoms())..).collect();
             for (id, brick) in self.bricks.iter().enumerate() {
@@ -287,7 +287,7 @@ fn bin_finds_the_same_candidates_in_the_same_order() {
         let counted = plan.candidates.iter().sum::<u64>();
         // Arcs are also counted in bricks out of reach of the atoms.
         assert!(
-            counted == expected.len() as u64 || plan.n_sections() == 2 && counted > expected.len() as u64,
+            counted == expected.len() as u64 || plan.n_kinds() == 2 && counted > expected.len() as u64,
             "{name}"
         );
         // Negative controls: a missing atom, and two atoms in another order.

@@ -7,7 +7,7 @@ use super::fit::fits;
 use super::result::{Cell, Document, Growth, Roofline, Row, Side};
 
 /// Marks rows in which another structure replaces the paper's.
-const MARK: &str = "stand-in";
+const MARK: &str = "substitute";
 
 /// Formats all results as a page.
 pub(super) fn page(document: &Document) -> String {
@@ -91,7 +91,7 @@ fn machine(document: &Document) -> String {
 
 /// Formats the first columns of a row.
 fn structure(row: &Row) -> String {
-    let mark = if row.stand_in { format!(" *({MARK})*") } else { String::new() };
+    let mark = if row.substitute { format!(" *({MARK})*") } else { String::new() };
     let atoms = if row.atoms == row.paper_atoms {
         row.atoms.to_string()
     } else {
@@ -300,11 +300,11 @@ mod tests {
     }
 
     #[test]
-    fn rows_mark_stand_ins_and_contain_the_papers_seconds() {
+    fn rows_mark_substitutes_and_contain_the_papers_seconds() {
         let page = page(&made_up(true));
         let rows: Vec<&str> = page.lines().filter(|line| line.starts_with("| 1BIJ")).collect();
         assert_eq!(rows.len(), 2, "{page}");
-        assert!(rows.iter().all(|row| row.contains("*(stand-in)*")), "{rows:?}");
+        assert!(rows.iter().all(|row| row.contains("*(substitute)*")), "{rows:?}");
         assert!(rows[0].contains("| 250 s |") && rows[1].contains("| 15.0 s |"), "{rows:?}");
         // 4387 atoms: 4.387 s against 87.74 ms, on the device half of each.
         assert!(rows[0].contains("| 4.39 s | 3 | 87.7 ms | 3 | 50.0 × | 2855 × |"), "{rows:?}");
@@ -313,7 +313,7 @@ mod tests {
             page.lines().filter(|l| l.starts_with("| 1BIJ")).map(|l| l.matches('|').count()).collect();
         assert_eq!(columns, [12, 14]);
         let mut real = made_up(true);
-        real.rows.iter_mut().for_each(|row| row.stand_in = false);
+        real.rows.iter_mut().for_each(|row| row.substitute = false);
         assert!(!self::page(&real).contains(MARK));
     }
 

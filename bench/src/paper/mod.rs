@@ -35,7 +35,7 @@ pub(crate) struct PaperArgs {
     #[arg(long, value_name = "WHICH", default_value = "auto")]
     device: DeviceChoice,
     /// Folder with structures of the paper, named by PDB id (.pdb, .ent, .cif, .bcif, plain or compressed); generated
-    /// stand-ins, marked in the tables, replace missing ones
+    /// substitutes, marked in the tables, replace missing ones
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
     /// Programs to run

@@ -55,7 +55,7 @@ pub(crate) struct Row {
     pub(crate) atoms: usize,
     pub(crate) source: String,
     /// True if another structure replaces the paper's.
-    pub(crate) stand_in: bool,
+    pub(crate) substitute: bool,
     /// Part for the paper's Table 1.
     pub(crate) cpu: Side,
     /// Part for the paper's Table 2.
@@ -251,8 +251,8 @@ pub(crate) mod tests {
                 kernel: "gaussian".to_owned(),
                 paper_atoms: entry.atoms,
                 atoms: entry.atoms,
-                source: "stand-in: made up".to_owned(),
-                stand_in: true,
+                source: "substitute: generated".to_owned(),
+                substitute: true,
                 cpu: side(false, ["reference", "cpu"], entry.cpu[0], entry.cubes[0]),
                 gpu: side(true, ["paper", "gpu"], entry.gpu[0], entry.cubes[1]),
             }

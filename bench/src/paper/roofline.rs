@@ -37,7 +37,8 @@ pub(super) fn measure(selected: &Selected, plan: &Plan) -> Result<Vec<Roofline>>
     let found = rows::find(entry, plan)?;
     let [_, grid] = rows::grids(entry, &found.spheres, Kernel::Gaussian)?;
     let params = surface(Kernel::Gaussian, grid.spacing)?;
-    let structure = format!("{}{}, the paper's Gaussian", entry.id, if found.stand_in { " (stand-in)" } else { "" });
+    let structure =
+        format!("{}{}, the paper's Gaussian", entry.id, if found.substitute { " (substitute)" } else { "" });
     let mut first = stages(selected, &found.spheres, &params, plan.runs, &rates, structure)?;
     if plan.programs.contains(&Program::Paper) {
         let times = timed(&mut *Program::Paper.on(selected)?, &found.spheres, &params, [WARM_UP, plan.runs])?;

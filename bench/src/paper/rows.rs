@@ -9,24 +9,24 @@ use super::result::{Cell, Row, Side, Timed};
 use super::{NOT_SELECTED, Opened, Plan};
 use crate::error::{Error, Result};
 use crate::grid::{self, Grid};
-use crate::{note, program_2010, stand_in, structures};
+use crate::{note, program_2010, structures, substitute};
 
 /// Number of unmeasured runs of programs other than the reference.
 const WARM_UP: usize = 2;
 /// The reference runs once if a run takes longer than this, s.
 const SHORT: f64 = 2.0;
 
-/// Structure of the tables, or its stand-in.
+/// Structure of the tables, or its substitute.
 #[derive(Debug)]
 pub(super) struct Found {
     pub(super) spheres: Spheres,
     /// Description of the source.
     pub(super) source: String,
     /// True if it replaces the paper's structure.
-    pub(super) stand_in: bool,
+    pub(super) substitute: bool,
 }
 
-/// Finds the structure of a row: its file in `data`, the built-in sample, or a stand-in.
+/// Finds the structure of a row: its file in `data`, the built-in sample, or a substitute.
 ///
 /// # Errors
 /// Returns an [`Error`] if a file contains no structure, or the folder cannot be read.
@@ -34,20 +34,24 @@ pub(super) fn find(entry: &Entry, plan: &Plan) -> Result<Found> {
     let file = |id: &str| plan.data.as_ref().map_or(Ok(None), |folder| structures::find(folder, id));
     if let Some(path) = file(entry.id)? {
         let source = format!("file {}", structures::file_name(&path));
-        return Ok(Found { spheres: structures::read(&path, None)?, source, stand_in: false });
+        return Ok(Found { spheres: structures::read(&path, None)?, source, substitute: false });
     }
     if entry.id == "4PTI" {
-        return Ok(Found { spheres: structures::sample()?, source: "the built-in sample".to_owned(), stand_in: false });
+        return Ok(Found {
+            spheres: structures::sample()?,
+            source: "the built-in sample".to_owned(),
+            substitute: false,
+        });
     }
     // 2HHB is also haemoglobin, with three atoms fewer.
     if entry.id == "1BIJ"
         && let Some(path) = file("2HHB")?
     {
-        let source = format!("stand-in: 2HHB, file {}", structures::file_name(&path));
-        return Ok(Found { spheres: structures::read(&path, None)?, source, stand_in: true });
+        let source = format!("substitute: 2HHB, file {}", structures::file_name(&path));
+        return Ok(Found { spheres: structures::read(&path, None)?, source, substitute: true });
     }
-    let spheres = stand_in::generate(entry.atoms, entry.cubes[0])?;
-    Ok(Found { spheres, source: "stand-in: generated".to_owned(), stand_in: true })
+    let spheres = substitute::generate(entry.atoms, entry.cubes[0])?;
+    Ok(Found { spheres, source: "substitute: generated".to_owned(), substitute: true })
 }
 
 /// Measures the rows of `plan`, and passes each to `done`.
@@ -70,7 +74,7 @@ pub(super) fn measure(plan: &Plan, done: &mut dyn FnMut(Row) -> Result<()>) -> R
                 paper_atoms: entry.atoms,
                 atoms: found.spheres.len(),
                 source: found.source.clone(),
-                stand_in: found.stand_in,
+                substitute: found.substitute,
                 cpu: case.side(cpu, [Program::Reference, Program::Cpu], entry.cpu[k], entry.cubes[0])?,
                 gpu: case.side(gpu, [Program::Paper, Program::Gpu], entry.gpu[k], entry.cubes[1])?,
             })?;
@@ -180,20 +184,20 @@ mod tests {
     }
 
     #[test]
-    fn files_are_preferred_to_the_sample_and_the_sample_to_stand_ins() {
+    fn files_are_preferred_to_the_sample_and_the_sample_to_substitutes() {
         let folder = tempfile::tempdir().unwrap();
         let found = |id: &str| {
             let entry = ENTRIES.iter().find(|entry| entry.id == id).unwrap();
             let found = find(entry, &plan(Some(folder.path()))).unwrap();
-            (found.source, found.stand_in, found.spheres.len())
+            (found.source, found.substitute, found.spheres.len())
         };
         assert_eq!(found("4PTI"), ("the built-in sample".to_owned(), false, 454));
-        assert_eq!(found("1BK2"), ("stand-in: generated".to_owned(), true, 468));
+        assert_eq!(found("1BK2"), ("substitute: generated".to_owned(), true, 468));
         for name in ["PDB1BK2.ENT", "2hhb.pdb"] {
             fs::write(folder.path().join(name), structures::SAMPLE).unwrap();
         }
         assert_eq!(found("1BK2"), ("file PDB1BK2.ENT".to_owned(), false, 454));
-        assert_eq!(found("1BIJ"), ("stand-in: 2HHB, file 2hhb.pdb".to_owned(), true, 454));
+        assert_eq!(found("1BIJ"), ("substitute: 2HHB, file 2hhb.pdb".to_owned(), true, 454));
         fs::write(folder.path().join("1bij.pdb"), structures::SAMPLE).unwrap();
         assert!(!found("1BIJ").1);
     }

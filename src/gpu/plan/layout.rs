@@ -89,8 +89,8 @@ pub struct Params {
     pub level: f32,
     /// Surfaces of spheres: maximum distance of vertices from the surface.
     pub tolerance: f32,
-    /// Number of sections of the atoms: 2 with the arcs of a boundary, else 1.
-    pub n_sections: u32,
+    /// Number of kinds of candidates: 2 with the arcs of a boundary, else 1 (atoms).
+    pub n_kinds: u32,
     /// Maximum reach of an arc.
     pub arc_reach: f32,
     /// Number of bricks before a brick, per axis, whose arcs may reach it.

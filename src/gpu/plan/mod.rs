@@ -85,7 +85,7 @@ impl Plan {
     /// Number of candidate lists per brick: 2 with a boundary, for atoms and arcs, else 1. A boundary without arcs also
     /// has two, because its caps are needed.
     #[must_use]
-    pub fn n_sections(&self) -> u32 {
+    pub fn n_kinds(&self) -> u32 {
         if self.arcs.first.is_empty() { 1 } else { 2 }
     }
 
@@ -112,7 +112,7 @@ impl Plan {
             arc_reach: self.arcs.max_reach,
             arc_back: bricks(self.arcs.max_reach + 8.01),
             arc_ahead: bricks(self.arcs.max_reach + 8.51),
-            n_sections: self.n_sections(),
+            n_kinds: self.n_kinds(),
             n_tiles: to_u32(self.tiles.len()),
             n_bricks: to_u32(self.bricks.len()),
             steps_per_angstrom: params.quantize.map_or(0.0, Step::per_angstrom),

@@ -1,4 +1,4 @@
-//! Generated stand-ins for unavailable structures, with the same number of atoms in a box of the same size.
+//! Generated substitutes for unavailable structures, with the same number of atoms in a box of the same size.
 //!
 //! The grid of the paper consists of whole cubes of 0.4 Å over the bounding box of the atom centres plus a margin of 5
 //! Å. This gives the exact number of cubes for the four structures with known coordinates. A number of cubes is
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn stand_ins_have_the_atoms_and_box_of_their_entries() {
+    fn substitutes_have_the_atoms_and_box_of_their_entries() {
         for entry in &ENTRIES {
             let sides = sides(entry.cubes[0]).unwrap();
             assert_eq!(cubes(sides), entry.cubes[0], "{}", entry.id);
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn impossible_stand_ins_are_rejected() {
+    fn impossible_substitutes_are_rejected() {
         assert!(spheres(1000, [5.0; 3]).unwrap_err().to_string().contains("too small for 1000"));
         // A prime.
         assert!(generate(10, 1_000_003).unwrap_err().to_string().contains("1000003"));
