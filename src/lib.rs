@@ -71,6 +71,9 @@ pub use surface::Mesh;
 pub fn mesh(bytes: &[u8], options: &Options) -> Result<Mesh, Error> {
     let choice = pipeline::Choice { backend: &surface::CpuBackend::default(), reason: "library" };
     let (limits, control) = (pipeline::JobLimits::default(), surface::Control::default());
+    // A compressed mesh has no columns.
+    let quantized = Options { compress: formats::Compress::Quantize, ..options.clone() };
+    let options = if options.compress == formats::Compress::Meshopt { &quantized } else { options };
     let mut product = pipeline::run(bytes, options, &limits, &choice, &control, &(), None)?;
     product.mesh.make_contiguous();
     Ok(product.mesh)

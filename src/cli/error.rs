@@ -153,6 +153,7 @@ impl CliError {
             Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
             Self::Job { source: JobError::Color(_), .. } => code::STRUCTURE,
             Self::Job { source: JobError::Map(error), .. } => map_code(error),
+            Self::Job { source: JobError::Format(error), .. } => format_code(error),
             Self::Strict { .. } => code::STRUCTURE,
             Self::Format(error) => format_code(error),
             Self::NoBackend { .. } => code::BACKEND,

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::str::FromStr;
 use std::time::{Duration, Instant};
 
-use molmesh::formats::{Encoder, Format, GlbSink, GlbSinkError};
+use molmesh::formats::{Format, GlbSink, GlbSinkError};
 use molmesh::pipeline::params::Request;
 use molmesh::pipeline::{AreaLevel, JobError, Product, ProgressSink};
 use molmesh::surface::SurfaceError;
@@ -110,7 +110,7 @@ fn sink_failure(output: &Output, cause: Option<GlbSinkError>) -> CliError {
 fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn ProgressSink) -> Result<f64, CliError> {
     sink.progress("encode", 0.0);
     let start = Instant::now();
-    let written = Encoder::new(format, product.storage, &product.mesh, &product.meta())?.write(out);
+    let written = product.file(format)?.write(out);
     let encoding = start.elapsed().saturating_sub(out.writing);
     written.map_err(|source| out.failure(source))?;
     Ok(encoding.as_secs_f64() * 1e3)

@@ -125,7 +125,7 @@ fn maximum(values: &[u32]) -> Option<u32> {
 }
 
 /// Rejects triangles with the index of a vertex that does not exist.
-fn in_range(triangles: &[[u32; 3]], n_vertices: usize) -> Result<(), FormatError> {
+pub(super) fn in_range(triangles: &[[u32; 3]], n_vertices: usize) -> Result<(), FormatError> {
     let beyond = |index: u32| index as usize >= n_vertices;
     if !maximum(triangles.as_flattened()).is_some_and(beyond) {
         return Ok(());

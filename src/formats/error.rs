@@ -101,6 +101,15 @@ pub enum FormatError {
         /// The format's name.
         format: &'static str,
     },
+    /// Pieces are compressed from quantized vertices only.
+    #[error("meshopt compression needs a mesh with quantized vertices")]
+    NotQuantized,
+    /// The encoder of the compression failed.
+    #[error("the mesh cannot be compressed: {reason}")]
+    Compression {
+        /// Message of the encoder.
+        reason: String,
+    },
     /// Only glTF and GLB repeat a mesh.
     #[error("{format} cannot hold instances, glb and gltf can")]
     InstancesNotSupported {

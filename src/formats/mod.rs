@@ -28,7 +28,7 @@ use std::io::{self, Write};
 
 pub use error::FormatError;
 pub use format::{Format, UnknownFormat};
-pub use gltf::{GlbSink, GlbSinkError, RandomAccess, linear_of_srgb};
+pub use gltf::{CompressedGlb, GlbSink, GlbSinkError, Pieces, RandomAccess, linear_of_srgb};
 pub use quantize::{Compress, Packing, Step};
 pub use storage::{Normals, Storage, Units};
 

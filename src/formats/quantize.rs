@@ -1,5 +1,6 @@
 //! Storage of glTF vertices in 12 bytes instead of 24. [`surface::quantize`](crate::surface::quantize) rounds them.
 
+use super::Format;
 use crate::surface::Mesh;
 pub use crate::surface::quantize::{Step, normal};
 
@@ -11,11 +12,13 @@ pub enum Compress {
     None,
     /// Vertices as small integers: see [`Packing::Quantized`].
     Quantize,
+    /// Quantized vertices and indices in compressed pieces: see [`Pieces`](super::Pieces).
+    Meshopt,
 }
 
 impl Compress {
     /// All values.
-    pub const ALL: [Self; 2] = [Self::None, Self::Quantize];
+    pub const ALL: [Self; 3] = [Self::None, Self::Quantize, Self::Meshopt];
 
     /// Returns the value of the parameter.
     #[must_use]
@@ -23,6 +26,17 @@ impl Compress {
         match self {
             Self::None => "none",
             Self::Quantize => "quantize",
+            Self::Meshopt => "meshopt",
+        }
+    }
+
+    /// Returns true if files of `format` can be stored this way.
+    #[must_use]
+    pub const fn is_held_by(self, format: Format) -> bool {
+        match self {
+            Self::None => true,
+            Self::Quantize => format.holds_quantized(),
+            Self::Meshopt => matches!(format, Format::Glb),
         }
     }
 }

@@ -148,6 +148,8 @@ impl From<Failure> for Problem {
             Failure::Job { error: JobError::Picture(error), .. } => error.into(),
             Failure::Job { error: JobError::Color(error), .. } => error.into(),
             Failure::Job { error: JobError::Map(error), .. } => error.into(),
+            // Compression rejects no mesh for its size, so no resolution is suggested.
+            Failure::Job { error: JobError::Format(error), .. } => format_problem(&error, 0.0),
             Failure::Check { ref diagnostics } => {
                 let problem = Self::new(ProblemType::UnreadableStructure, error.to_string()).with("parameter", "check");
                 diagnosed(problem, diagnostics)

@@ -11,6 +11,7 @@ use metrics::{counter, histogram};
 use super::coalesced_job::QueuedTask;
 use super::pool::WorkerContext;
 use super::{Failure, Finished, JobId, MemoryReservation, OnStart, Outcome};
+use crate::formats::Pieces;
 use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report};
 use crate::structure::strict_validator::{self, Diagnostic, Level, MAX_UNREAD_BYTES};
 use crate::structure::{ReadLimits, StructureError};
@@ -187,8 +188,8 @@ fn count(report: &Report) {
 }
 
 /// Memory use of a product, bytes.
-fn bytes_of(Product { mesh, picture, .. }: &Product) -> u64 {
-    let drawn = picture.as_ref().map_or(0, Vec::len) as u64;
+fn bytes_of(Product { mesh, pieces, picture, .. }: &Product) -> u64 {
+    let drawn = picture.as_ref().map_or(0, Vec::len) as u64 + pieces.as_ref().map_or(0, Pieces::bytes);
     let optional = mesh.atom_ids.as_ref().map_or(0, Column::len) + mesh.colors.as_ref().map_or(0, Column::len);
     mesh.bytes() + 4 * optional as u64 + drawn
 }

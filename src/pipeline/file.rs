@@ -1,9 +1,31 @@
-//! Output file of a product: a mesh file or a picture.
+//! Product of a job and its output file: a mesh file or a picture.
 
 use std::io::{self, Write};
 
-use super::Product;
-use crate::formats::{Encoder, Format, FormatError};
+use super::{AtomAreas, Job, JobError, ProgressSink, Report, StageClock};
+use crate::formats::{Compress, CompressedGlb, Encoder, Format, FormatError, Meta, Pieces, Storage};
+use crate::surface::{Control, Mesh, SurfaceError};
+
+/// Finished job.
+#[derive(Debug, Clone)]
+pub struct Product {
+    /// Mesh.
+    pub mesh: Mesh,
+    /// Lowest and highest position of `mesh` relative to its centre, per axis, if the backend delivered them, Å.
+    pub bounds: Option<[[f32; 3]; 2]>,
+    /// Encoding in a file.
+    pub storage: Storage,
+    /// Report of the job.
+    pub report: Report,
+    /// Exact areas of the atoms, if they are requested.
+    pub areas: Option<AtomAreas>,
+    /// Compressed form of the mesh, for [`Compress::Meshopt`]. The columns of `mesh` are empty then.
+    pub pieces: Option<Pieces>,
+    /// PNG of the mesh, if one was drawn. The mesh is empty then.
+    pub picture: Option<Vec<u8>>,
+    /// Length of the GLB, bytes, if the mesh was streamed into a sink. The columns of `mesh` are empty then.
+    pub streamed_bytes: Option<u64>,
+}
 
 /// Output file that is planned but not yet written.
 #[derive(Debug)]
@@ -11,23 +33,56 @@ use crate::formats::{Encoder, Format, FormatError};
 pub enum File<'a> {
     /// Mesh file.
     Mesh(Encoder<'a>),
+    /// GLB of a compressed mesh.
+    Compressed(CompressedGlb<'a>),
     /// PNG of a picture.
     Picture(&'a [u8]),
 }
 
 impl Product {
+    /// Returns the metadata for a mesh file.
+    #[must_use]
+    pub fn meta(&self) -> Meta {
+        Meta { name: self.report.id.clone(), extras: self.report.extras() }
+    }
+
     /// Plans the file of this product in `format`.
     ///
     /// # Errors
     /// Returns a [`FormatError`]; [`FormatError::NotAMeshFormat`] for a picture that was not drawn.
     pub fn file(&self, format: Format) -> Result<File<'_>, FormatError> {
-        match &self.picture {
-            Some(picture) if format.is_picture() => Ok(File::Picture(picture)),
-            _ => {
-                let (mesh, meta) = (&self.mesh, self.meta());
-                Ok(File::Mesh(Encoder::with_bounds(format, self.storage, mesh, self.bounds, &meta)?))
+        let (mesh, meta) = (&self.mesh, self.meta());
+        match (&self.picture, &self.pieces) {
+            (Some(picture), _) if format.is_picture() => Ok(File::Picture(picture)),
+            (_, Some(pieces)) if format == Format::Glb => {
+                Ok(File::Compressed(CompressedGlb::new(mesh, pieces, &meta)?))
             }
+            _ => Ok(File::Mesh(Encoder::with_bounds(format, self.storage, mesh, self.bounds, &meta)?)),
         }
+    }
+
+    /// Compresses the mesh and drops its columns if the job asks for it. Checks for cancellation between pieces.
+    pub(super) fn compress(
+        &mut self,
+        job: &Job,
+        control: &Control<'_>,
+        progress: &dyn ProgressSink,
+    ) -> Result<(), JobError> {
+        if job.compress != Compress::Meshopt {
+            return Ok(());
+        }
+        let Self { mesh, storage, bounds, .. } = self;
+        mesh.make_contiguous();
+        let grow = |bytes| {
+            control.check()?;
+            control.memory.grow(bytes).map_err(|error| JobError::from(SurfaceError::from(error)))
+        };
+        let clock = StageClock::new(progress);
+        let compress = || Pieces::new(mesh, *storage, *bounds, grow, |bytes| control.memory.shrink(bytes));
+        self.pieces = Some(clock.time("encode", compress)?);
+        mesh.drop_columns();
+        self.report.add_timings(clock);
+        Ok(())
     }
 }
 
@@ -37,6 +92,7 @@ impl File<'_> {
     pub fn bytes(&self) -> Option<u64> {
         match self {
             Self::Mesh(encoder) => encoder.encoded_len(),
+            Self::Compressed(file) => Some(file.encoded_len()),
             Self::Picture(bytes) => Some(bytes.len() as u64),
         }
     }
@@ -46,6 +102,7 @@ impl File<'_> {
     pub fn bytes_bound(&self) -> u64 {
         match self {
             Self::Mesh(encoder) => encoder.encoded_len_bound(),
+            Self::Compressed(file) => file.encoded_len(),
             Self::Picture(bytes) => bytes.len() as u64,
         }
     }
@@ -57,6 +114,7 @@ impl File<'_> {
     pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
         match self {
             Self::Mesh(encoder) => encoder.write(out),
+            Self::Compressed(file) => file.write(out),
             Self::Picture(bytes) => out.write_all(bytes).and_then(|()| out.flush()),
         }
     }

@@ -44,7 +44,7 @@ pub use components::{ComponentReport, VoidReport};
 #[cfg(feature = "png")]
 pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
-pub use file::File;
+pub use file::{File, Product};
 pub use instances::InstancesReport;
 pub use left_out::{KindCount, LeftOutReport, ResidueCount};
 pub use limits::JobLimits;
@@ -56,7 +56,7 @@ pub use report::{AssemblyReport, PictureReport, Quantization, Report, file_arith
 pub use spacing::Spacing;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
 
-use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
+use crate::formats::{Compress, FormatError, GlbSink, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureParams};
 use crate::structure::map::MapError;
 use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
@@ -131,12 +131,14 @@ impl Job {
     }
 
     /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
-    /// on triangles, parts, cuts, instances, removed components and pictures need the whole mesh in memory.
+    /// on triangles, parts, cuts, instances, removed components, compression and pictures need the whole mesh in
+    /// memory.
     fn can_stream(&self) -> bool {
         !self.params.atom_ids
             && self.color.is_none()
             && self.validation == Validation::Checksum
             && self.spacing.max_triangles().is_none()
+            && self.compress != Compress::Meshopt
             && self.split == Split::None
             && self.selection.context == Context::Selection
             && !self.selection.instances
@@ -167,33 +169,6 @@ pub struct Choice<'a> {
     pub reason: &'a str,
 }
 
-/// Finished job.
-#[derive(Debug, Clone)]
-pub struct Product {
-    /// Mesh.
-    pub mesh: Mesh,
-    /// Lowest and highest position of `mesh` relative to its centre, per axis, if the backend delivered them, Å.
-    pub bounds: Option<[[f32; 3]; 2]>,
-    /// Encoding in a file.
-    pub storage: Storage,
-    /// Report of the job.
-    pub report: Report,
-    /// Exact areas of the atoms, if they are requested.
-    pub areas: Option<AtomAreas>,
-    /// PNG of the mesh, if one was drawn. The mesh is empty then.
-    pub picture: Option<Vec<u8>>,
-    /// Length of the GLB, bytes, if the mesh was streamed into a sink. The columns of `mesh` are empty then.
-    pub streamed_bytes: Option<u64>,
-}
-
-impl Product {
-    /// Returns the metadata for a mesh file.
-    #[must_use]
-    pub fn meta(&self) -> Meta {
-        Meta { name: self.report.id.clone(), extras: self.report.extras() }
-    }
-}
-
 /// Error of a job.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum JobError {
@@ -212,6 +187,9 @@ pub enum JobError {
     /// Reading the map failed.
     #[error(transparent)]
     Map(MapError),
+    /// The mesh cannot be compressed.
+    #[error(transparent)]
+    Format(#[from] FormatError),
 }
 
 impl From<StructureError> for JobError {
@@ -342,6 +320,8 @@ pub fn run_with<S: Deref<Target = Structure>>(
     };
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
+    // The clock ends here.
+    let control = Control { observer: &(), ..control };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     (report.color, report.exact) = (color, exact);
     report.set_cavities(cavities.as_ref(), &structure, &selected);
@@ -349,13 +329,15 @@ pub fn run_with<S: Deref<Target = Structure>>(
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
-    let mut product = Product { mesh, bounds, storage, report, areas, picture: None, streamed_bytes: None };
+    let mut product =
+        Product { mesh, bounds, storage, report, areas, pieces: None, picture: None, streamed_bytes: None };
+    product.compress(job, &control, progress)?;
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
         let clock = StageClock::new(progress);
         let finish = || sink.finish(&product.meta(), centre, streamed.bounds);
         let bytes = clock.time("encode", finish).map_err(|SinkFailed| SurfaceError::Sink)?;
         product.streamed_bytes = Some(bytes);
-        clock.finish().into_iter().for_each(|(stage, ms)| product.report.add_timing(stage, ms));
+        product.report.add_timings(clock);
     }
     Ok(product)
 }
@@ -392,7 +374,7 @@ fn to_atom_indices(mesh: &mut Mesh, job: &Job, selected: &Selected, control: &Co
 fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage {
     params.quantize = match job.compress {
         Compress::None => None,
-        Compress::Quantize => Some(Step::covering(lattice::extent(spheres, params))),
+        Compress::Quantize | Compress::Meshopt => Some(Step::covering(lattice::extent(spheres, params))),
     };
     let packing = params.quantize.map_or(Packing::Full, Packing::Quantized);
     Storage { packing, normals: job.normals, units: job.units }

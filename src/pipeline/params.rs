@@ -239,8 +239,9 @@ pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
             expected: format!("{instead} for {format}, or one of the formats {}", formats.join(", ")),
         })
     };
-    if job.compress != Compress::None && !format.holds_quantized() {
-        return refuse("compress", job.compress.name(), Compress::None.name(), &|f| f.holds_quantized());
+    if !job.compress.is_held_by(format) {
+        let instead: Vec<_> = Compress::ALL.into_iter().filter(|c| c.is_held_by(format)).map(Compress::name).collect();
+        return refuse("compress", job.compress.name(), &instead.join(", "), &|f| job.compress.is_held_by(f));
     }
     if !format.holds_units(job.units) {
         let instead: Vec<_> = Units::ALL.into_iter().filter(|u| format.holds_units(*u)).map(Units::name).collect();

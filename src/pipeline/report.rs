@@ -11,7 +11,7 @@ use super::instances::InstancesReport;
 use super::left_out::LeftOutReport;
 use super::parts::PartReport;
 use super::pockets::PocketReport;
-use super::{Choice, Job};
+use super::{Choice, Job, StageClock};
 use crate::formats::{Storage, Units};
 use crate::structure::{Selected, Structure};
 use crate::surface::{BackendIdentity, Component, GridStats, Measures, SurfaceKind, Validation};
@@ -338,6 +338,11 @@ impl Report {
     pub fn add_timing(&mut self, stage: &str, ms: f64) {
         let before = self.timings_ms.get(stage).and_then(Value::as_f64).unwrap_or_default();
         self.timings_ms.insert(stage.to_owned(), Value::from(((before + ms) * 1e3).round() / 1e3));
+    }
+
+    /// Adds the times of the stages of `clock`.
+    pub(super) fn add_timings(&mut self, clock: StageClock<'_>) {
+        clock.finish().into_iter().for_each(|(stage, ms)| self.add_timing(stage, ms));
     }
 
     /// Returns the arithmetic of the file, as in its key: that of the mesh, followed by that of the picture.

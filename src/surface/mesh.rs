@@ -312,6 +312,13 @@ impl Mesh {
         [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
     }
 
+    /// Frees all columns of vertices and triangles. Centre, parts and placements remain.
+    pub(crate) fn drop_columns(&mut self) {
+        let Self { positions, normals, quantized, triangles, atom_ids, colors, .. } = self;
+        (*positions, *normals, *triangles) = (Column::default(), Column::default(), Column::default());
+        (*quantized, *atom_ids, *colors) = (None, None, None);
+    }
+
     /// Bytes of positions, normals and indices.
     #[must_use]
     pub fn bytes(&self) -> u64 {

@@ -1,5 +1,5 @@
 //! JSON document of a glTF: one scene and one node translated to the mesh's centre. The node has one mesh of one
-//! primitive, or a child node with a mesh for each part.
+//! primitive, or a child node with a mesh for each part. A mesh in compressed pieces has a primitive for each piece.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -16,6 +16,7 @@ use serde_json::{Map, Value, json};
 use super::layout::{
     ATOM_BYTES, AtomType, BufferLayout, BufferSpan, COLOR_BYTES, Drawn, IndexType, ROTATION_BYTES, TRANSLATION_BYTES,
 };
+use super::pieces::Pieces;
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, GENERATOR, Meta, Packing, Step, Storage, Units};
 
@@ -32,13 +33,32 @@ const QUANTIZED: &str = "KHR_mesh_quantization";
 /// Extension that repeats a mesh. Marked as required: a program without it would show one instance.
 const INSTANCING: &str = "EXT_mesh_gpu_instancing";
 
-/// Returns the document as a JSON object. With a layout it has one buffer without a URI, which the caller adds if
+/// Content of the buffers that a document describes.
+#[derive(Clone, Copy)]
+pub(super) enum Content<'a> {
+    /// Columns of the whole mesh.
+    Columns(&'a BufferLayout),
+    /// Compressed pieces of the mesh.
+    Pieces(&'a Pieces),
+}
+
+impl Content<'_> {
+    /// Returns the translations and rotations of instances.
+    fn placements(self) -> Option<[BufferSpan; 2]> {
+        match self {
+            Self::Columns(layout) => layout.placements,
+            Self::Pieces(pieces) => pieces.placements,
+        }
+    }
+}
+
+/// Returns the document as a JSON object. With content, it has a first buffer without a URI, which the caller adds if
 /// needed.
 pub(super) fn document(
     centre: [f64; 3],
     summary: &Summary,
     storage: Storage,
-    layout: Option<&BufferLayout>,
+    content: Option<Content<'_>>,
     drawn: &[Drawn<'_>],
     meta: &Meta,
 ) -> Result<Map<String, Value>, FormatError> {
@@ -48,7 +68,7 @@ pub(super) fn document(
         scene: Some(Index::new(0)),
         ..Root::default()
     };
-    let step = layout.and_then(|_drawn| storage.packing.step());
+    let step = content.and_then(|_drawn| storage.packing.step());
     if let Some(step) = step {
         if !step.holds(&summary.bounds) {
             return Err(FormatError::OutOfQuantizationRange { reach: step.reach(), step: step.length() });
@@ -56,8 +76,9 @@ pub(super) fn document(
         root.extensions_used.push(QUANTIZED.to_owned());
         root.extensions_required.push(QUANTIZED.to_owned());
     }
-    let meshes = layout.map_or_else(Vec::new, |layout| meshes(&mut root, layout, drawn, name.as_deref(), summary));
-    let placements = layout.map_or_else(Vec::new, |layout| placements(&mut root, layout, drawn));
+    let meshes = content.map_or_else(Vec::new, |content| meshes(&mut root, content, drawn, name.as_deref(), summary));
+    let placements = content.and_then(Content::placements);
+    let placements = placements.map_or_else(Vec::new, |spans| attributes_of_instances(&mut root, spans, drawn));
     let node = root.push(Node { name, translation: Some([0.0; 3]), ..Node::default() });
     root.push(Scene { nodes: vec![node], name: None, extensions: None, extras: None });
     if let [Drawn { name: None, .. }] = drawn {
@@ -84,6 +105,9 @@ pub(super) fn document(
     for (node, attributes) in (1..).zip(placements) {
         value["nodes"][node]["extensions"] = json!({ INSTANCING: { "attributes": attributes } });
     }
+    if let Some(Content::Pieces(pieces)) = content {
+        pieces.add_extensions(&mut value);
+    }
     value["asset"]["extras"] = Value::Object(extras(centre, units, step, meta));
     match value {
         Value::Object(map) => Ok(map),
@@ -108,31 +132,38 @@ fn extras(centre: [f64; 3], units: Units, step: Option<Step>, meta: &Meta) -> Ma
     extras
 }
 
-/// Adds buffer, views, accessors, material and a mesh for each element of `drawn`. Returns the meshes.
+/// Adds buffers, views, accessors, material and a mesh for each element of `drawn`. Returns the meshes.
 fn meshes(
     root: &mut Root,
-    layout: &BufferLayout,
+    content: Content<'_>,
     drawn: &[Drawn<'_>],
     name: Option<&str>,
     summary: &Summary,
 ) -> Vec<Index<GltfMesh>> {
-    let columns = BufferColumns::new(root, layout, drawn.len() > 1, summary);
-    let mesh = |part: &Drawn<'_>| {
-        let primitive = columns.primitive(root, layout, part);
+    let primitives: Vec<Vec<Primitive>> = match content {
+        Content::Columns(layout) => {
+            let buffer = buffer(root, layout.len);
+            let material = root.push(material(layout.colors.is_some(), summary));
+            let columns = BufferColumns::new(root, buffer, layout, drawn.len() > 1, material);
+            drawn.iter().map(|part| vec![columns.primitive(root, layout, part)]).collect()
+        }
+        Content::Pieces(pieces) => pieces.primitives(root, drawn.len(), summary),
+    };
+    let mesh = |(part, primitives): (&Drawn<'_>, Vec<Primitive>)| {
         root.push(GltfMesh {
-            primitives: vec![primitive],
+            primitives,
             name: part.name.or(name).map(str::to_owned),
             weights: None,
             extensions: None,
             extras: None,
         })
     };
-    drawn.iter().map(mesh).collect()
+    drawn.iter().zip(primitives).map(mesh).collect()
 }
 
 /// Adds views and accessors of the instances of each element of `drawn`. Returns the attributes of the extension.
-fn placements(root: &mut Root, layout: &BufferLayout, drawn: &[Drawn<'_>]) -> Vec<Value> {
-    let Some([translations, rotations]) = layout.placements else { return Vec::new() };
+fn attributes_of_instances(root: &mut Root, spans: [BufferSpan; 2], drawn: &[Drawn<'_>]) -> Vec<Value> {
+    let [translations, rotations] = spans;
     root.extensions_used.push(INSTANCING.to_owned());
     root.extensions_required.push(INSTANCING.to_owned());
     let mut column = |span, row_bytes, shape| {
@@ -148,6 +179,11 @@ fn placements(root: &mut Root, layout: &BufferLayout, drawn: &[Drawn<'_>]) -> Ve
         json!({ "TRANSLATION": translation.value(), "ROTATION": rotation.value() })
     };
     drawn.iter().map(&mut attributes).collect()
+}
+
+/// Adds a buffer without a URI.
+pub(super) fn buffer(root: &mut Root, bytes: u64) -> Index<Buffer> {
+    root.push(Buffer { byte_length: USize64(bytes), name: None, uri: None, extensions: None, extras: None })
 }
 
 /// Column of the buffer.
@@ -182,18 +218,23 @@ impl BufferColumn {
     }
 }
 
-/// Columns of the buffer, and the material. All primitives share them.
-struct BufferColumns {
+/// Columns of a buffer, and the material, of one or several primitives.
+pub(super) struct BufferColumns {
     attributes: Vec<(Semantic, BufferColumn)>,
     indices: BufferColumn,
     material: Index<Material>,
 }
 
 impl BufferColumns {
-    /// Adds buffer, views and material. `shared` views, which accessors of several parts use, must have a stride.
-    fn new(root: &mut Root, layout: &BufferLayout, shared: bool, summary: &Summary) -> Self {
-        let byte_length = USize64(layout.len);
-        let buffer = root.push(Buffer { byte_length, name: None, uri: None, extensions: None, extras: None });
+    /// Adds views of `buffer`: those of the attributes in the order of the layout, then that of the indices. `shared`
+    /// views, which accessors of several parts use, must have a stride.
+    pub(super) fn new(
+        root: &mut Root,
+        buffer: Index<Buffer>,
+        layout: &BufferLayout,
+        shared: bool,
+        material: Index<Material>,
+    ) -> Self {
         let packing = layout.storage.packing;
         let [position, normal] = match packing {
             Packing::Full => [ComponentType::F32, ComponentType::F32],
@@ -232,12 +273,11 @@ impl BufferColumns {
         };
         let view = view(root, buffer, span, None, Some(Target::ElementArrayBuffer));
         let indices = BufferColumn { view, row_bytes: index_type.bytes(), component, shape: Type::Scalar };
-        let material = root.push(material(layout.colors.is_some(), summary));
         Self { attributes, indices, material }
     }
 
     /// Adds the accessors of a part. Returns its primitive.
-    fn primitive(&self, root: &mut Root, layout: &BufferLayout, part: &Drawn<'_>) -> Primitive {
+    pub(super) fn primitive(&self, root: &mut Root, layout: &BufferLayout, part: &Drawn<'_>) -> Primitive {
         let count = |rows: &Range<u64>| rows.end - rows.start;
         let mut attributes = BTreeMap::new();
         for (semantic, column) in &self.attributes {
@@ -285,7 +325,8 @@ fn view(
     })
 }
 
-fn material(coloured: bool, summary: &Summary) -> Material {
+/// Returns the material of a surface.
+pub(super) fn material(coloured: bool, summary: &Summary) -> Material {
     Material {
         name: Some("surface".to_owned()),
         alpha_mode: Valid(if summary.translucent { AlphaMode::Blend } else { AlphaMode::Opaque }),

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use super::buffer::write_buffer;
-use super::document::document;
+use super::document::{Content, document};
 use super::layout::{BufferLayout, Drawn};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
@@ -58,40 +58,15 @@ impl GlbPlan {
         summary: &Summary,
         meta: &Meta,
     ) -> Result<Self, FormatError> {
-        let document = document(centre, summary, storage, layout.as_ref(), drawn, meta)?;
+        let content = layout.as_ref().map(Content::Columns);
+        let document = document(centre, summary, storage, content, drawn, meta)?;
         let json = serde_json::to_vec(&document).map_err(|e| FormatError::Json { reason: e.to_string() })?;
         Self::wrap(json, layout)
     }
 
-    fn wrap(mut json: Vec<u8>, layout: Option<BufferLayout>) -> Result<Self, FormatError> {
-        json.resize(json.len().next_multiple_of(4), b' ');
-        if layout.is_some_and(is_large) {
-            let around = HEADER_BYTES + 2 * CHUNK_HEADER_BYTES;
-            let head = (json.len() as u64 + around).next_multiple_of(HEAD_BYTES);
-            json.resize(usize::try_from(head - around).unwrap_or(json.len()), b' ');
-        }
-        let json_len = json.len() as u64;
-        let bin_len = layout.map(|layout| layout.len.next_multiple_of(4));
-        let bytes = HEADER_BYTES + CHUNK_HEADER_BYTES + json_len + bin_len.map_or(0, |len| CHUNK_HEADER_BYTES + len);
-        let len = Self::check_len(bytes)?;
-        // No chunk is longer than the file.
-        let fits = |n: u64| u32::try_from(n).unwrap_or(u32::MAX);
-        let mut head = Vec::with_capacity(json.len() + 28);
-        for word in [MAGIC, VERSION, len, fits(json_len), JSON] {
-            head.extend_from_slice(&word.to_le_bytes());
-        }
-        head.append(&mut json);
-        if let Some(bin_len) = bin_len {
-            for word in [fits(bin_len), BIN] {
-                head.extend_from_slice(&word.to_le_bytes());
-            }
-        }
+    fn wrap(json: Vec<u8>, layout: Option<BufferLayout>) -> Result<Self, FormatError> {
+        let (head, len) = head(json, layout.map(|layout| layout.len), layout.is_some_and(is_large))?;
         Ok(Self { head, layout, len })
-    }
-
-    /// Returns the file length as the header stores it.
-    pub(super) fn check_len(bytes: u64) -> Result<u32, FormatError> {
-        u32::try_from(bytes).map_err(|_overflow| FormatError::GlbTooLarge { bytes, limit: u64::from(u32::MAX) })
     }
 
     /// Everything before the buffer.
@@ -121,6 +96,39 @@ impl GlbPlan {
     }
 }
 
+/// Returns everything before a buffer of `buffer_bytes`, and the length of the file. With `aligned`, the buffer begins
+/// at a multiple of [`HEAD_BYTES`].
+pub(super) fn head(mut json: Vec<u8>, buffer_bytes: Option<u64>, aligned: bool) -> Result<(Vec<u8>, u32), FormatError> {
+    json.resize(json.len().next_multiple_of(4), b' ');
+    if aligned {
+        let around = HEADER_BYTES + 2 * CHUNK_HEADER_BYTES;
+        let head = (json.len() as u64 + around).next_multiple_of(HEAD_BYTES);
+        json.resize(usize::try_from(head - around).unwrap_or(json.len()), b' ');
+    }
+    let json_len = json.len() as u64;
+    let bin_len = buffer_bytes.map(|bytes| bytes.next_multiple_of(4));
+    let bytes = HEADER_BYTES + CHUNK_HEADER_BYTES + json_len + bin_len.map_or(0, |len| CHUNK_HEADER_BYTES + len);
+    let len = check_len(bytes)?;
+    // No chunk is longer than the file.
+    let fits = |n: u64| u32::try_from(n).unwrap_or(u32::MAX);
+    let mut head = Vec::with_capacity(json.len() + 28);
+    for word in [MAGIC, VERSION, len, fits(json_len), JSON] {
+        head.extend_from_slice(&word.to_le_bytes());
+    }
+    head.append(&mut json);
+    if let Some(bin_len) = bin_len {
+        for word in [fits(bin_len), BIN] {
+            head.extend_from_slice(&word.to_le_bytes());
+        }
+    }
+    Ok((head, len))
+}
+
+/// Returns the file length as the header stores it.
+pub(super) fn check_len(bytes: u64) -> Result<u32, FormatError> {
+    u32::try_from(bytes).map_err(|_overflow| FormatError::GlbTooLarge { bytes, limit: u64::from(u32::MAX) })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -140,8 +148,8 @@ mod tests {
     #[test]
     fn glb_limit_is_exact() {
         // A GLB's length is a multiple of 4: the largest is 4,294,967,292 bytes.
-        assert_eq!(GlbPlan::check_len(4_294_967_295).unwrap(), u32::MAX);
-        assert!(GlbPlan::check_len(4_294_967_296).is_err());
+        assert_eq!(check_len(4_294_967_295).unwrap(), u32::MAX);
+        assert!(check_len(4_294_967_296).is_err());
     }
 
     #[test]

@@ -7,7 +7,7 @@ use base64::write::EncoderWriter;
 use serde_json::Value;
 
 use super::buffer::write_buffer;
-use super::document::document;
+use super::document::{Content, document};
 use super::layout::{BufferLayout, Drawn};
 use crate::formats::block::BLOCK_BYTES;
 use crate::formats::check::Summary;
@@ -32,7 +32,8 @@ impl GltfPlan {
         meta: &Meta,
     ) -> Result<Self, FormatError> {
         let layout = BufferLayout::of(mesh, storage, summary)?;
-        let mut document = document(mesh.centre, summary, storage, layout.as_ref(), &Drawn::of(mesh, summary), meta)?;
+        let content = layout.as_ref().map(Content::Columns);
+        let mut document = document(mesh.centre, summary, storage, content, &Drawn::of(mesh, summary), meta)?;
         // The entry of the buffer comes last and is formatted here, so that `write` can insert the base64 into it.
         document.shift_remove("buffers");
         let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };

@@ -148,7 +148,7 @@ impl BufferLayout {
         Self::new([n_vertices, n_triangles, placed], most, storage, mesh.colors.is_some(), atoms).map(Some)
     }
 
-    fn new(
+    pub(super) fn new(
         [n_vertices, n_triangles, n_placements]: [u64; 3],
         n_indexed: u64,
         storage: Storage,
@@ -175,6 +175,20 @@ impl BufferLayout {
             (n_placements > 0).then(|| [TRANSLATION_BYTES, ROTATION_BYTES].map(|of| span(of * n_placements)));
         let indices = (index_type, span(3 * n_triangles * index_type.bytes()));
         Ok(Self { storage, positions, normals, colors, atoms, placements, indices, len: end })
+    }
+
+    /// Returns the layout `by` bytes further on in a longer buffer.
+    pub(super) fn moved(self, by: u64) -> Self {
+        let moved = |span: BufferSpan| BufferSpan { offset: span.offset + by, ..span };
+        Self {
+            positions: moved(self.positions),
+            normals: self.normals.map(moved),
+            colors: self.colors.map(moved),
+            atoms: self.atoms.map(|(atom_type, span)| (atom_type, moved(span))),
+            placements: self.placements.map(|spans| spans.map(moved)),
+            indices: (self.indices.0, moved(self.indices.1)),
+            ..self
+        }
     }
 
     /// Returns the layout of a mesh without colours and atoms; `None` if it has no triangles.

@@ -5,13 +5,18 @@
 //! coordinates, so 32-bit floats keep their precision far from the origin.
 
 mod buffer;
+mod compressed;
 mod document;
 mod glb;
 mod json;
 mod layout;
+mod numbering;
+mod pieces;
 mod sink;
 
 pub use buffer::linear_of_srgb;
+pub use compressed::CompressedGlb;
 pub(super) use glb::GlbPlan;
 pub(super) use json::GltfPlan;
+pub use pieces::Pieces;
 pub use sink::{GlbSink, GlbSinkError, RandomAccess};

@@ -9,7 +9,7 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use thiserror::Error;
 
 use super::buffer::ColumnRows;
-use super::glb::{GlbPlan, HEAD_BYTES, is_large};
+use super::glb::{GlbPlan, HEAD_BYTES, check_len, is_large};
 use super::layout::{BufferLayout, Drawn};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
@@ -110,7 +110,7 @@ impl<'a> GlbSink<'a> {
         let size = *self.size.get_or_init(|| [n_vertices as u64, n_triangles as u64]);
         let layout = BufferLayout::plain(size, self.storage())?;
         if let Some(layout) = layout {
-            GlbPlan::check_len(HEAD_BYTES + layout.len.next_multiple_of(4))?;
+            check_len(HEAD_BYTES + layout.len.next_multiple_of(4))?;
         }
         if let Some(layout) = self.layout.get_or_init(|| layout).filter(|&layout| !is_large(layout)) {
             lock(&self.small).resize(usize::try_from(layout.len).unwrap_or(0), 0);

@@ -332,7 +332,7 @@ pub const TABLE: &[Parameter] = &[
         name: "compress",
         domain: Domain::Choice(COMPRESS),
         default: "none",
-        doc: "Vertex storage of glb and gltf: quantize uses 12 bytes per vertex instead of 24 (16-bit positions, 8-bit normals; KHR_mesh_quantization).",
+        doc: "Storage of glb and gltf: quantize uses 12 bytes per vertex instead of 24 (16-bit positions, 8-bit normals; KHR_mesh_quantization). meshopt, for glb only, also compresses vertices and indices to about a fifth of the size (EXT_meshopt_compression).",
     },
     Parameter {
         name: "normals",
