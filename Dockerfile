@@ -25,8 +25,8 @@ COPY . .
 RUN --mount=type=cache,target=/root/.npm sh web/build.sh
 
 FROM ${RUST_IMAGE} AS build
-# Python collects the licences of linked crates.
-RUN apt-get update && apt-get install -y --no-install-recommends python3 && rm -rf /var/lib/apt/lists/*
+# Meshes are compressed by C++ code. Python collects the licences of linked crates.
+RUN apt-get update && apt-get install -y --no-install-recommends g++ python3 && rm -rf /var/lib/apt/lists/*
 WORKDIR /build
 COPY . .
 COPY --from=viewer /build/web/dist web/dist

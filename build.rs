@@ -4,10 +4,13 @@
 //! that the device code requests (none beyond WebGPU's). The table of shaders lists the bindings by name and the
 //! layouts of all structs in buffers. All broken shaders are reported at once.
 
+use std::path::PathBuf;
+
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rerun-if-changed=shaders");
     built_by();
+    link_cpp();
     page::build();
     #[cfg(feature = "gpu")]
     shaders::build();
@@ -22,6 +25,29 @@ fn built_by() {
     });
     println!("cargo::rustc-env=MOLMESH_TARGET={target}");
     println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
+}
+
+/// Links the library of C++ statically on Linux. Only meshoptimizer uses it, for memory allocation, and the executable
+/// should start quickly and run without it. Without a static library the dynamic one is linked, as by default.
+fn link_cpp() {
+    let [os, host, target] =
+        ["CARGO_CFG_TARGET_OS", "HOST", "TARGET"].map(|name| std::env::var(name).unwrap_or_default());
+    // The compiler of the host has libraries for its own architecture only.
+    if os != "linux" || host.split('-').next() != target.split('-').next() {
+        return;
+    }
+    println!("cargo::rerun-if-env-changed=CXX");
+    let compiler = std::env::var_os("CXX").unwrap_or_else(|| "c++".into());
+    let found = std::process::Command::new(compiler).arg("-print-file-name=libstdc++.a").output().ok();
+    let library = found.and_then(|output| Some(PathBuf::from(String::from_utf8(output.stdout).ok()?.trim())));
+    let out = PathBuf::from(std::env::var_os("OUT_DIR").expect("cargo sets OUT_DIR")).join("cpp");
+    // The linker uses the first folder with either kind of library.
+    let copied = library.filter(|path| path.is_absolute()).is_some_and(|path| {
+        std::fs::create_dir_all(&out).and_then(|()| std::fs::copy(path, out.join("libstdc++.a"))).is_ok()
+    });
+    if copied {
+        println!("cargo::rustc-link-search=native={}", out.display());
+    }
 }
 
 /// Generates the table of the files of the web page in `web/dist`. It is empty if the page was not built.

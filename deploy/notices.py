@@ -2,7 +2,7 @@
 """Writes the licences of everything in the binary to standard output.
 
 Covers the crates that cargo links into `molmesh` (normal dependencies for the target and features) with all their
-licence and notice files, the standard library, musl if the target uses it, and, with the service, third-party parts of
+licence and notice files, meshoptimizer, the standard library, musl if the target uses it, and, with the service, third-party parts of
 the web pages. For a crate without a licence file, the text of a licence that it names is used: Apache-2.0, or MIT with
 its authors. If the crate permits neither, the command fails and names it.
 
@@ -109,6 +109,7 @@ def texts(packages, page, musl):
             add((web / name).read_text(encoding="utf-8"), f"Swagger UI ({name})")
         for name, file in VIEWER:
             add((ROOT / "web" / "licences" / file).read_text(encoding="utf-8"), f"{name} (in the page at /)")
+    add(mit("2016-2026 Arseny Kapoulkine"), "meshoptimizer, in the crate meshopt (MIT)")
     if musl:
         add(mit("2005-2020 Rich Felker, et al."), "musl libc (MIT)")
     std = "the Rust standard library (MIT OR Apache-2.0)"
@@ -137,6 +138,9 @@ def main():
         print("  Swagger UI, in the page at /docs: Apache-2.0")
         for name, _ in VIEWER:
             print(f"  {name}, in the page at /: MIT")
+    print("  meshoptimizer, in the crate meshopt: MIT")
+    if "-linux-" in target:
+        print("  libstdc++: GPL-3.0-or-later with the GCC Runtime Library Exception, which permits this use without conditions")
     if musl:
         print("  musl libc: MIT")
     print("  the Rust standard library: MIT OR Apache-2.0")

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Builds the command line (`mesh` and `render` on the CPU, without service and GPU) as the static file dist/molmesh,
-# which runs on any Linux with the same processor architecture. Installs the standard library for musl and Debian's
-# musl-tools if they are missing. Exits with 3 if these are not available, and with the build's status if the build
+# which runs on any Linux with the same processor architecture. Installs the standard library for musl, and Debian's
+# musl-tools and g++, if they are missing. Exits with 3 if these are not available, and with the build's status if the build
 # fails.
 #
 # `static.sh PROFILE` builds with another Cargo profile than release, for tests: only target/TARGET/PROFILE/molmesh.
@@ -22,6 +22,11 @@ if [ ! -d "$(rustc --print sysroot)/lib/rustlib/$target/lib" ]; then
 fi
 # The allocator is written in C.
 command -v musl-gcc >/dev/null || (install_packages musl-tools) || impossible "musl-gcc is not installed"
+# The compression of meshes is written in C++. Debian has no C++ compiler for musl. That of the host works, because the
+# code needs of the C++ library only memory allocation.
+command -v g++ >/dev/null || (install_packages g++) || impossible "g++ is not installed"
+cxx=CXX_${target//-/_}
+export "$cxx=${!cxx:-g++}"
 profile=${1:-release}
 cargo build --profile "$profile" --locked --bin molmesh --no-default-features --features cli --target "$target"
 if [ "$profile" != release ]; then

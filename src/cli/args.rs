@@ -106,8 +106,8 @@ pub(crate) struct MeshArgs {
     /// glb, gltf, ply, ply-text, stl, obj, vtp, vert or face [default: by the extension of the output, glb on stdout]
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
-    /// Vertex compression of glb and gltf: none, or quantize (12 bytes instead of 24: 16-bit positions, 8-bit normals)
-    /// [default: none]
+    /// Storage of glb and gltf: none, quantize (12 bytes per vertex instead of 24: 16-bit positions, 8-bit normals), or
+    /// meshopt (glb only: quantized and compressed to about a fifth) [default: none]
     #[arg(long, value_name = "METHOD")]
     pub(crate) compress: Option<String>,
     /// Vertex normals: smooth, or none (smaller files, flat shading) [default: smooth]

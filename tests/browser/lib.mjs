@@ -200,6 +200,12 @@ export function withIndices(bytes, change) {
   return copy;
 }
 
+/** Returns the address of the same mesh without compression, which the functions here read and change. */
+export const uncompressed = (address) => address.replace("compress=meshopt", "compress=none");
+
+/** Fetches the mesh that the page requests, without compression. */
+export const fetchUncompressed = (route) => route.fetch({ url: uncompressed(route.request().url()) });
+
 /** Reverses the winding of every triangle. */
 export const inverted = (bytes) =>
   withIndices(bytes, (array) => {

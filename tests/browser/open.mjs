@@ -2,7 +2,7 @@
 import { readFileSync } from "node:fs";
 import path from "node:path";
 import {
-  assert, assertClean, browser, drop, inverted, open, plainColor, run, silhouette, stablePicture, start, waitForMesh, ROOT,
+  assert, assertClean, browser, drop, fetchUncompressed, inverted, open, plainColor, run, silhouette, stablePicture, start, waitForMesh, ROOT,
   SERVICE_URL, TIMEOUT_MS,
 } from "./lib.mjs";
 
@@ -16,7 +16,7 @@ const viewport = { width: 640, height: 600 };
  */
 async function shown(url, change, act) {
   const before = (page) => change && page.route("**/surface.glb*", async (route) => {
-    const response = await route.fetch();
+    const response = await fetchUncompressed(route);
     await route.fulfill({ response, body: change(await response.body()) });
   });
   const page = await open(chromium, { url, viewport, before });

@@ -1,8 +1,8 @@
 // The page at `/`.
 import { readFileSync } from "node:fs";
 import {
-  assert, assertClean, axe, browser, deferred, degenerate, drop, fetchBytes, inverted, meshesShown, open, picture,
-  pictureFault, plainColor, reportValue, run, sample, silhouette, slide, stablePicture, start, waitForFrames,
+  assert, assertClean, axe, browser, deferred, degenerate, drop, fetchBytes, fetchUncompressed, glb, inverted, meshesShown, open, picture,
+  pictureFault, plainColor, reportValue, run, sample, silhouette, slide, stablePicture, start, uncompressed, waitForFrames,
   waitForMesh, SERVICE_URL, TIMEOUT_MS,
 } from "./lib.mjs";
 
@@ -10,7 +10,7 @@ const chromium = await browser();
 const page = await start(chromium);
 const surfaces = (p) => p.requests.filter((line) => line.includes("/surface.glb"));
 const path = (line) => line.slice(line.indexOf("/v1/"));
-const meshOf = async (p) => (await fetchBytes(path(surfaces(p).at(-1)))).bytes;
+const meshOf = async (p) => (await fetchBytes(uncompressed(path(surfaces(p).at(-1))))).bytes;
 const atomsOf = (file) => readFileSync(sample(file), "utf8").split("\n").filter((l) => /^(ATOM|HETATM)/.test(l));
 const pinned = (p) => p.locator("#picked").textContent();
 
@@ -32,7 +32,7 @@ await run({
     for (const [change, expected] of [[inverted, /dark/], [degenerate, /silhouette/]]) {
       const other = await start(chromium, {
         before: (p) => p.route("**/surface.glb*", async (route) => {
-          const reply = await route.fetch();
+          const reply = await fetchUncompressed(route);
           await route.fulfill({ response: reply, body: change(await reply.body()) });
         }),
       });
@@ -309,7 +309,7 @@ await run({
   },
 
   "a lost WebGL context gives a message, and the surface returns after it is restored": async () => {
-    const png = (await fetchBytes(path(surfaces(page).at(-1)).replace("surface.glb", "surface.png").replace("?atom_ids=true", ""))).status === 200;
+    const png = (await fetchBytes(path(surfaces(page).at(-1)).replace("surface.glb", "surface.png").replace("?atom_ids=true&compress=meshopt", ""))).status === 200;
     await page.evaluate(() => {
       window.lose = document.querySelector("#view").getContext("webgl2").getExtension("WEBGL_lose_context");
       window.lose.loseContext();
@@ -325,19 +325,26 @@ await run({
     assert.equal(pictureFault(await picture(page), await meshOf(page), await plainColor(page)), null);
   },
 
-  "meshes compressed with meshopt are shown under the content security policy": async () => {
-    const { packed } = await import("./meshopt.mjs");
-    const other = await start(chromium, {
-      before: (p) => p.route("**/surface.glb*", async (route) => {
-        const reply = await route.fetch();
-        await route.fulfill({ response: reply, body: await packed(await reply.body()) });
-      }),
-    });
-    assert.equal(pictureFault(await picture(other), await meshOf(page), await plainColor(page)), null);
-    assert.ok(other.requests.some((line) => line.includes("meshopt")));
-    assert.ok(!page.requests.some((line) => line.includes("meshopt")), "the decoder was loaded without need");
-    assertClean(other);
-    await other.context().close();
+  "meshes are compressed and decoded under the content security policy, unless the user chooses otherwise": async () => {
+    const isDecoder = (line) => line.includes("/assets/meshopt");
+    assert.ok(page.requests.some(isDecoder) && surfaces(page).every((line) => line.includes("compress=meshopt")));
+    assert.ok(!page.url().includes("compress") && !(await page.locator("#curl").textContent()).includes("compress"));
+    // Several pieces are one surface, which is not divided.
+    const fine = await start(chromium, { url: `${SERVICE_URL}/?resolution=0.3` });
+    const { json } = glb((await fetchBytes(path(surfaces(fine).at(-1)))).bytes);
+    assert.ok(json.meshes.length === 1 && json.meshes[0].primitives.length > 1);
+    assert.ok(await fine.locator("#parts").isHidden());
+    assert.equal(pictureFault(await picture(fine), await meshOf(fine), await plainColor(fine)), null);
+    assertClean(fine);
+    await fine.context().close();
+    for (const compress of ["none", "quantize"]) {
+      const other = await start(chromium, { url: `${SERVICE_URL}/?compress=${compress}` });
+      assert.equal(pictureFault(await picture(other), await meshOf(page), await plainColor(page)), null);
+      assert.match(surfaces(other).at(-1), new RegExp(`compress=${compress}`));
+      assert.ok(!other.requests.some(isDecoder), "the decoder was loaded without need");
+      assertClean(other);
+      await other.context().close();
+    }
   },
 
   "the page has no errors and sent requests to the service alone": async () => {

@@ -195,6 +195,7 @@ await run({
     // A packed mesh waits for its decoder; meanwhile a plain mesh is requested and shown.
     const other = await start(chromium, {
       viewport,
+      url: `${SERVICE_URL}/?compress=none`,
       before: (p) => p.route(entry, async (route) => {
         const reply = await route.fetch();
         await route.fulfill({ response: reply, body: await packed(await reply.body()) });

@@ -7,12 +7,14 @@ import { assert, browser, fetchBytes, glb, inverted, open, run, MODULES, ROOT, S
 const PAGE = `<!doctype html><html lang="en"><meta charset="utf-8"><title>variants</title>
 <script type="importmap">{ "imports": { "three": "/three/build/three.module.js" } }</script>
 <script type="module" src="/@google/model-viewer/dist/model-viewer.min.js"></script>
+<script>self.ModelViewerElement = { meshoptDecoderLocation: "/meshoptimizer/meshopt_decoder.cjs" };</script>
 <model-viewer id="viewer" style="width: 300px; height: 300px"></model-viewer>
 <script type="module">
 import * as THREE from "three";
 import { GLTFLoader } from "/three/examples/jsm/loaders/GLTFLoader.js";
+import { MeshoptDecoder } from "/three/examples/jsm/libs/meshopt_decoder.module.js";
 window.load = async (url) => {
-  const { scene } = await new GLTFLoader().loadAsync(url);
+  const { scene } = await new GLTFLoader().setMeshoptDecoder(MeshoptDecoder).loadAsync(url);
   const meshes = [];
   scene.traverse((object) => object.isMesh && meshes.push(object));
   scene.updateMatrixWorld(true);
@@ -36,7 +38,7 @@ window.load = async (url) => {
   const instances = meshes[0].isInstancedMesh ? meshes[0].count : null;
   return {
     size, volume, triangles, instances, kinds: [...kinds], colors: [...colors], shades: [...shades],
-    parts: meshes.map((mesh) => mesh.userData.name ?? mesh.name), indexBytes: meshes[0].geometry.index.array.BYTES_PER_ELEMENT,
+    parts: [...new Set(meshes.map((mesh) => mesh.userData.name ?? mesh.parent.userData.name ?? mesh.name))], indexBytes: meshes[0].geometry.index.array.BYTES_PER_ELEMENT,
   };
 };
 window.view = (url) => new Promise((resolve, reject) => {

@@ -23,7 +23,7 @@ fn fails(input: impl AsRef<[u8]>, flags: &[&str], code: i32) -> String {
 
 #[test]
 fn bad_parameters_exit_with_2() {
-    let cases: [(&[&str], &str); 16] = [
+    let cases: [(&[&str], &str); 18] = [
         (&["--resolution", "0"], "resolution"),
         (&["--resolution", "-1"], "resolution"),
         (&["--resolution", "fine"], "`fine`"),
@@ -37,7 +37,9 @@ fn bad_parameters_exit_with_2() {
         (&["--altloc", "AB"], "altloc"),
         (&["--select", "everything"], "select"),
         (&["--threads", "0"], "threads"),
-        (&["--compress", "zip"], "none, quantize"),
+        (&["--compress", "zip"], "none, quantize, meshopt"),
+        (&["--compress", "meshopt", "--format", "gltf"], "expected none, quantize for gltf, or one of the formats glb"),
+        (&["--compress", "meshopt", "--format", "stl"], "parameter `compress`: `meshopt` is not allowed"),
         (&["--compress", "quantize", "--format", "stl"], "glb, gltf"),
         (&["--isovalue", "900000"], "isovalue"),
     ];

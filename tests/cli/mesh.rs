@@ -133,6 +133,8 @@ fn stored_forms_are_the_same_in_a_file_and_in_a_pipe() {
         &["--detail", "5", "--units", "nanometer", "--compress", "quantize"],
         &["--units", "meter", "--normals", "none", "--compress", "quantize"],
         &["--max-triangles", "9000"],
+        &["--compress", "meshopt"],
+        &["--compress", "meshopt", "--max-triangles", "9000", "--atom-ids"],
     ] {
         let output = folder.path("out.glb");
         assert_code(&mesh(sample, &output, &[flags, &["--quiet"]].concat()), 0);

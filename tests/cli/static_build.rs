@@ -70,6 +70,7 @@ fn writes_the_same_bytes_as_the_usual_executable() {
             ("glb", &["--resolution", "0.5"][..]),
             ("glb", &["--surface", "soft-object", "--threads", "3"]),
             ("glb", &["--compress", "quantize", "--ligands", "--waters"]),
+            ("glb", &["--compress", "meshopt", "--color", "chain", "--atom-ids"]),
             ("ply", &["--surface", "inverse-square", "--atom-ids", "--resolution", "1"]),
             ("stl", &["--validation", "exact"]),
             ("obj", &["--normals", "none"]),

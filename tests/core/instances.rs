@@ -14,7 +14,7 @@ use crate::tools::files::Files;
 use crate::tools::readers::{accessor_of, accessor_offset, split_glb, split_gltf, u32_at};
 
 /// Operators: rows of matrix and translation. The second is a third of a turn.
-const OPERATORS: [[f64; 12]; 3] = [
+pub(crate) const OPERATORS: [[f64; 12]; 3] = [
     [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0],
     [-0.5, -0.866025, 0.0, 60.125, 0.866025, -0.5, 0.0, 0.0, 0.0, 0.0, 1.0, 7.0],
     [0.0, 0.0, 1.0, -55.5, 1.0, 0.0, 0.0, 10.0, 0.0, 1.0, 0.0, 300.0],
@@ -22,7 +22,7 @@ const OPERATORS: [[f64; 12]; 3] = [
 const REFLECTION: [f64; 12] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0];
 
 /// Returns a dimer with an assembly of these rules: chains, and numbers of operators.
-fn with_rules(rules: &[(&str, &[[f64; 12]])]) -> String {
+pub(crate) fn with_rules(rules: &[(&str, &[[f64; 12]])]) -> String {
     let mut text = format!("{:<80}\n", "REMARK 350 BIOMOLECULE: 1");
     let mut serial = 0;
     for (chains, operators) in rules {

@@ -16,6 +16,7 @@ mod cavities;
 mod cut;
 mod exact_areas;
 mod exact_measures;
+mod formats_meshopt;
 mod formats_oracles;
 mod formats_quantized;
 mod formats_roundtrip;

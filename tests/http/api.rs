@@ -270,6 +270,8 @@ fn errors_name_bad_parameters_and_expected_values() {
         ("validation=trust", "validation", None),
         ("compress=draco", "compress", None),
         ("compress=quantize&format=ply", "compress", None),
+        ("compress=meshopt&format=ply", "compress", None),
+        ("compress=meshopt&format=gltf", "compress", None),
         ("detial=3", "detial", Some("detail")),
         ("max_triangle=100", "max_triangle", Some("max_triangles")),
         ("normal=none", "normal", Some("normals")),
@@ -354,7 +356,7 @@ fn only_glb_and_gltf_are_quantized() {
     assert_eq!(refused.problem(400, "bad-parameter")["parameter"], "compress");
     let can = server.get("/v1/capabilities").json();
     let compress = can["parameters"].as_array().unwrap().iter().find(|p| p["name"] == "compress").unwrap();
-    assert_eq!(compress["values"], serde_json::json!(["none", "quantize"]));
+    assert_eq!(compress["values"], serde_json::json!(["none", "quantize", "meshopt"]));
 }
 
 #[test]

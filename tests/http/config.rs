@@ -256,6 +256,7 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         &[("atom_ids", "true")],
         &[("validation", "exact")],
         &[("compress", "quantize")],
+        &[("compress", "meshopt")],
         &[("normals", "none")],
         &[("units", "nanometer")],
         &[("units", "meter")],

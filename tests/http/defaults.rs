@@ -162,6 +162,7 @@ fn a_default_is_valid_with_every_parameter() {
         &[("validation", "exact")],
         &[("check", "strict")],
         &[("compress", "quantize")],
+        &[("compress", "meshopt")],
         &[("normals", "none")],
         &[("units", "meter")],
         &[("width", "40")],
@@ -215,6 +216,7 @@ fn errors_of_conflicts_name_the_sent_parameters() {
         (&[("width", "512"), ("azimuth", "1")], Format::Stl, &["`azimuth`"]),
         (&[("azimuth", "0"), ("style", "gouraud")], Format::Obj, &["`style`"]),
         (&[("compress", "quantize")], Format::Ply, &["`compress`"]),
+        (&[("compress", "meshopt")], Format::Gltf, &["`compress`"]),
         (&[("instances", "true"), ("assembly", "1")], Format::Stl, &["`instances`"]),
         (&[("instances", "true")], Format::Glb, &["`instances`"]),
     ] {

@@ -137,6 +137,7 @@ fn parameters_that_do_not_apply_to_the_format_are_rejected() {
         ("format=png&background=plaid", "background"),
         ("format=png&style=cubist", "style"),
         ("format=png&compress=quantize", "compress"),
+        ("format=png&compress=meshopt", "compress"),
         ("format=png&normals=none", "normals"),
         ("format=png&units=nanometer", "units"),
         ("width=100", "width"),

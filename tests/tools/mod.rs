@@ -6,6 +6,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 pub mod files;
+pub mod meshopt;
 pub mod readers;
 pub mod shapes;
 
@@ -123,6 +124,22 @@ pub fn gltf_validate(paths: &[impl AsRef<Path>]) -> Option<Vec<GltfReport>> {
         return missing("gltf-validator");
     }
     Some(ask(Path::new("node"), "validate_gltf.mjs", paths))
+}
+
+/// Result of `decode_meshopt.mjs` for a file.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Decoded {
+    /// Error of a decoder.
+    pub error: Option<String>,
+}
+
+/// Decodes compressed GLB files with the decoders of meshoptimizer and three.js, which write the decoded buffer beside
+/// each file. Returns one result per path in their order.
+pub fn decode_meshopt(paths: &[impl AsRef<Path>]) -> Option<Vec<Decoded>> {
+    if !installed_here().join("node/.stamp").is_file() {
+        return missing("meshoptimizer");
+    }
+    Some(ask(Path::new("node"), "decode_meshopt.mjs", paths))
 }
 
 /// Result of `promql.py` for an expression.

@@ -17,9 +17,14 @@ export function surface(source: Source, extension: string, choices: Choices, mor
   return `${source.path}/surface.${extension}${query(choices, more)}`;
 }
 
-/** Returns the path of a mesh for display, with an atom id per vertex for atom selection. */
+/**
+ * Returns the path of a mesh for display, with an atom id per vertex for atom selection. The mesh is compressed unless
+ * the user has chosen otherwise or the browser has no WebAssembly, which the decoder needs.
+ */
 export function drawn(source: Source, choices: Choices): string {
-  return surface(source, "glb", choices, { atom_ids: "true" });
+  const more: Record<string, string> = { atom_ids: "true" };
+  if (!choices.has("compress") && typeof WebAssembly !== "undefined") more["compress"] = "meshopt";
+  return surface(source, "glb", choices, more);
 }
 
 /** Returns the parameters of a preview with the given grid spacing, Å. */

@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn vertices_are_numbered_by_first_use_wherever_they_are() {
+    fn near_and_far_vertices_are_numbered_by_first_use() {
         for far in [0, 7, 1_000, u32::MAX - 1] {
             let triangles = [[500, 502, 501], [501, 502, far], [far, 500, 501]];
             let Numbering { vertices, triangles } = Numbering::new(&triangles);

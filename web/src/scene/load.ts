@@ -6,7 +6,10 @@ import {
 } from "three";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 
-/** Part of a surface, one of its instances, or a whole surface that is not divided. */
+/**
+ * Part of a surface, one of its instances, or a whole surface that is not divided. A compressed surface consists of
+ * pieces, which share the name of their part.
+ */
 export interface Part {
   name: string;
   geometry: BufferGeometry;
@@ -63,7 +66,8 @@ function partsOf(group: Group): Pick<Loaded, "parts" | "twoSided"> {
     const mesh = object as Mesh;
     if (!mesh.isMesh) return;
     twoSided ||= (mesh.material as Material).side === DoubleSide;
-    const name = String(mesh.userData["name"] ?? mesh.name);
+    // The pieces of a part are children of an object that has its name.
+    const name = String(mesh.userData["name"] ?? mesh.parent?.userData["name"] ?? mesh.name);
     for (const matrix of transformsOf(mesh)) parts.push({ name, geometry: mesh.geometry, matrix });
   });
   return { parts, twoSided };
