@@ -2,9 +2,9 @@
 """Writes the licences of everything in the binary to standard output.
 
 Covers the crates that cargo links into `molmesh` (normal dependencies for the target and features) with all their
-licence and notice files, meshoptimizer, the standard library, musl if the target uses it, and, with the service, third-party parts of
-the web pages. For a crate without a licence file, the text of a licence that it names is used: Apache-2.0, or MIT with
-its authors. If the crate permits neither, the command fails and names it.
+licence and notice files, meshoptimizer, the standard library, musl if the target uses it, and, with the service,
+third-party parts of the web pages. For a crate without a licence file, the text of a licence that it names is used:
+Apache-2.0, or MIT with its authors. If the crate permits neither, the command fails and names it.
 
 Usage: deploy/notices.py [--target TRIPLE] [--features cli,server,gpu]
 """

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Builds the command line (`mesh` and `render` on the CPU, without service and GPU) as the static file dist/molmesh,
 # which runs on any Linux with the same processor architecture. Installs the standard library for musl, and Debian's
-# musl-tools and g++, if they are missing. Exits with 3 if these are not available, and with the build's status if the build
-# fails.
+# musl-tools and g++, if they are missing. Exits with 3 if these are not available, and with the build's status if the
+# build fails.
 #
 # `static.sh PROFILE` builds with another Cargo profile than release, for tests: only target/TARGET/PROFILE/molmesh.
 set -euo pipefail

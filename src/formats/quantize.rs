@@ -39,6 +39,16 @@ impl Compress {
             Self::Meshopt => matches!(format, Format::Glb),
         }
     }
+
+    /// Approximate size of a compressed vertex with its triangles, colour and atom index, bytes; 0 without compression.
+    #[must_use]
+    pub const fn compressed_vertex_bytes(self) -> u64 {
+        match self {
+            Self::None | Self::Quantize => 0,
+            // 9 to 11 in proteins at 0.25 to 2 Å.
+            Self::Meshopt => 10,
+        }
+    }
 }
 
 /// Storage of glTF vertices.

@@ -26,7 +26,7 @@ use super::problem_types::ProblemType;
 use super::request_id::RequestId;
 use super::source::Loaded;
 use super::state::Shared;
-use crate::pipeline::{self, Choice, Estimate};
+use crate::pipeline::{self, Choice, Estimate, MeshEstimate};
 use crate::surface::Control;
 
 /// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and grid points are exact; the size of the mesh
@@ -140,7 +140,11 @@ pub(super) async fn create(
     let seconds = estimate.work(&job).map_or(guess, |units| app.pool.seconds(units));
     let wait = app.pool.estimated_wait().as_secs_f64();
     let mesh = estimate.mesh.as_ref().ok();
-    let bytes = mesh.map(|m| format.estimated_bytes(m.bytes, m.vertices, m.triangles));
+    let file_bytes = |m: &MeshEstimate| match job.compress.compressed_vertex_bytes() {
+        0 => format.estimated_bytes(m.bytes, m.vertices, m.triangles),
+        bytes => bytes.saturating_mul(m.vertices),
+    };
+    let bytes = mesh.map(file_bytes);
     let problem = refusal(&estimate, bytes, app.config.limits.output_bytes);
     let document = EstimateDocument {
         accepted: problem.is_none(),

@@ -14,6 +14,7 @@ use super::finest_fit::with_finest_fit;
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
 use super::{parts, work};
+use crate::formats::Compress;
 use crate::structure::{AtomPart, Structure, StructureError};
 use crate::surface::cpu::{LATTICE_BYTES, check_work, scan};
 use crate::surface::lattice::{Lattice, slightly_coarser};
@@ -108,7 +109,8 @@ pub fn estimate<S: Deref<Target = Structure>>(
     };
     let mesh = mesh.and_then(|mesh| {
         let bytes = mesh.bytes + job.attribute_bytes() * mesh.vertices;
-        control.memory.check(bytes.saturating_add(plan.bytes_before_cut(&mesh)))?;
+        let held = bytes.saturating_add(plan.compressed_bytes(mesh.vertices));
+        control.memory.check(held.saturating_add(plan.bytes_before_cut(&mesh)))?;
         Ok(MeshEstimate { bytes, ..mesh })
     });
     let mesh = match mesh.map_err(|error| with_finest_fit(error, &plan, choice, control)) {
@@ -150,7 +152,8 @@ pub(super) fn check_memory(
     control: &Control<'_>,
 ) -> Result<(), SurfaceError> {
     let (memory, params) = (&control.memory, plan.params);
-    let attributes = |vertices: u64| vertices.saturating_mul(job.attribute_bytes());
+    let attributes =
+        |vertices: u64| vertices.saturating_mul(job.attribute_bytes()).saturating_add(plan.compressed_bytes(vertices));
     let vertices = n_vertices(plan.spheres.area(params), params.resolution);
     let most = params.mesh_bytes(vertices, vertices.saturating_mul(2)).saturating_add(attributes(vertices));
     // A surface before its cut has at most the same size, besides its atom indices.
@@ -192,6 +195,8 @@ pub(super) struct MeshPlan<'a> {
     pub(super) limits: &'a SurfaceLimits,
     /// Bytes that colours and atom indices add to a vertex.
     pub(super) attribute_bytes: u64,
+    /// Storage of the mesh in its file.
+    pub(super) compress: Compress,
     /// Maximum size of the mesh's file.
     pub(super) max_file_bytes: u64,
 }
@@ -223,7 +228,12 @@ impl<'a> MeshPlan<'a> {
         let max_file_bytes = if job.picture.is_some() { u64::MAX } else { limits.max_file_bytes };
         let (limits, attribute_bytes) = (&limits.surface, job.attribute_bytes());
         let (parts, cut) = (division.and_then(Division::parts), division.and_then(Division::cut));
-        Self { spheres, parts, cut, params, limits, attribute_bytes, max_file_bytes }
+        Self { spheres, parts, cut, params, limits, attribute_bytes, compress: job.compress, max_file_bytes }
+    }
+
+    /// Returns the memory of a compressed mesh, which is held besides the mesh, bytes.
+    pub(super) fn compressed_bytes(&self, vertices: u64) -> u64 {
+        vertices.saturating_mul(self.compress.compressed_vertex_bytes())
     }
 
     /// Returns the choice of the backend that estimates the mesh: the one that does not divide it if the plan cuts the

@@ -29,7 +29,6 @@ pub struct Product {
 
 /// Output file that is planned but not yet written.
 #[derive(Debug)]
-#[expect(clippy::large_enum_variant, reason = "a job has one file")]
 pub enum File<'a> {
     /// Mesh file.
     Mesh(Encoder<'a>),

@@ -275,7 +275,8 @@ fn with_fitting_mesh(
         let bytes = params.mesh_bytes(vertices, vertices.saturating_mul(2));
         let with_attributes = bytes.saturating_add(plan.attribute_bytes.saturating_mul(vertices));
         let of_mesh = bytes as f64 / limits.max_mesh_bytes.max(1) as f64;
-        let held = with_attributes as f64 / control.memory.available().max(1) as f64;
+        let held = with_attributes.saturating_add(plan.compressed_bytes(vertices)) as f64
+            / control.memory.available().max(1) as f64;
         of_mesh.max(held).max(with_attributes as f64 / plan.max_file_bytes.max(1) as f64)
     };
     let most = plan.spheres.area(params);

@@ -14,9 +14,7 @@ use gltf_json::mesh::Primitive;
 
 use super::buffer::ColumnRows;
 use super::document::{BufferColumns, buffer, material};
-use super::layout::{
-    ATOM_BYTES, AtomType, BufferLayout, BufferSpan, COLOR_BYTES, Drawn, IndexType, ROTATION_BYTES, TRANSLATION_BYTES,
-};
+use super::layout::{AtomType, BufferLayout, BufferSpan, Drawn, IndexType, ROTATION_BYTES, TRANSLATION_BYTES};
 use super::numbering::Numbering;
 use crate::formats::check::{Summary, check, in_range};
 use crate::formats::{Format, FormatError, Normals, Packing, Storage};
@@ -74,7 +72,8 @@ struct Piece {
 pub struct Pieces {
     pub(super) storage: Storage,
     pub(super) summary: Summary,
-    pieces: Vec<Piece>,
+    /// In the order of the buffer.
+    all: Vec<Piece>,
     /// Translations and rotations of instances, uncompressed, behind the pieces.
     pub(super) placements: Option<[BufferSpan; 2]>,
 }
@@ -120,23 +119,23 @@ impl Pieces {
             let translations = BufferSpan { offset, len: TRANSLATION_BYTES * placed };
             [translations, BufferSpan { offset: offset + translations.len, len: ROTATION_BYTES * placed }]
         });
-        Ok(Self { storage, summary, pieces, placements })
+        Ok(Self { storage, summary, all: pieces, placements })
     }
 
     /// Memory of the pieces, bytes.
     #[must_use]
     pub fn bytes(&self) -> u64 {
-        self.pieces.iter().map(|piece| piece.data.len() as u64).sum()
+        self.all.iter().map(|piece| piece.data.len() as u64).sum()
     }
 
     /// Returns true if the mesh has no triangles.
     pub(super) fn is_empty(&self) -> bool {
-        self.pieces.is_empty()
+        self.all.is_empty()
     }
 
     /// Returns the compressed data in the order of the buffer.
     pub(super) fn data(&self) -> impl Iterator<Item = &[u8]> {
-        self.pieces.iter().map(|piece| &piece.data[..])
+        self.all.iter().map(|piece| &piece.data[..])
     }
 
     /// Returns the length of the buffer, bytes.
@@ -146,17 +145,17 @@ impl Pieces {
 
     /// Returns the layout of the first piece.
     pub(super) fn layout(&self) -> Option<&BufferLayout> {
-        self.pieces.first().map(|piece| &piece.layout)
+        self.all.first().map(|piece| &piece.layout)
     }
 
     /// Adds the buffers, views and accessors of all pieces. Returns the primitives of each part.
     pub(super) fn primitives(&self, root: &mut Root, n_parts: usize, summary: &Summary) -> Vec<Vec<Primitive>> {
         let _compressed = buffer(root, self.buffer_bytes());
-        let decoded = buffer(root, self.pieces.iter().map(Piece::decoded_bytes).sum());
+        let decoded = buffer(root, self.all.iter().map(Piece::decoded_bytes).sum());
         let material = root.push(material(self.layout().is_some_and(|layout| layout.colors.is_some()), summary));
         let mut primitives = vec![Vec::new(); n_parts];
         let mut offset = 0;
-        for piece in &self.pieces {
+        for piece in &self.all {
             let layout = piece.layout.moved(offset);
             let columns = BufferColumns::new(root, decoded, &layout, true, material);
             let (vertices, triangles) = (0..piece.n_vertices, 0..piece.n_triangles);
@@ -171,7 +170,7 @@ impl Pieces {
     pub(super) fn add_extensions(&self, document: &mut Value) {
         let mut start = 0;
         let mut views = 0..;
-        for piece in &self.pieces {
+        for piece in &self.all {
             for (stream, view) in piece.streams.iter().zip(&mut views) {
                 let extension = &mut document["bufferViews"][view]["extensions"][MESHOPT];
                 *extension = json!({
@@ -264,11 +263,11 @@ impl<'a> Source<'a> {
         }
         if let Some(colors) = self.colors {
             let bytes = written(ColumnRows::Colors(&gathered(colors, vertices)), &layout)?;
-            streams.attribute(bytes.as_chunks::<{ COLOR_BYTES as usize }>().0, None)?;
+            streams.attribute(bytes.as_chunks::<8>().0, None)?;
         }
         if let Some(atoms) = self.atoms {
             let bytes = written(ColumnRows::Atoms(&gathered(atoms, vertices)), &layout)?;
-            streams.attribute(bytes.as_chunks::<{ ATOM_BYTES as usize }>().0, None)?;
+            streams.attribute(bytes.as_chunks::<4>().0, None)?;
         }
         streams.indices(triangles, layout.indices.0)?;
         let Streams { all: streams, mut data, .. } = streams;
@@ -311,6 +310,7 @@ impl Streams {
     }
 }
 
+#[expect(clippy::needless_pass_by_value, reason = "the form that `map_err` needs")]
 fn failed(error: meshopt::Error) -> FormatError {
     FormatError::Compression { reason: error.to_string() }
 }
