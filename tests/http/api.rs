@@ -341,6 +341,22 @@ fn only_glb_and_gltf_are_quantized() {
     let entry = server.get("/v1/pdb/4pti/surface.glb?compress=quantize");
     assert!(entry.body == small.body);
 
+    let packed = server.post("/v1/meshes?compress=meshopt", &[], SAMPLE);
+    assert_eq!((packed.status, packed.header("content-type")), (200, Some("model/gltf-binary")));
+    assert_eq!(packed.header("content-length").unwrap(), packed.body.len().to_string());
+    assert_eq!(packed.header("molmesh-triangles"), plain.header("molmesh-triangles"));
+    assert_eq!(document(&packed.body)["extensionsRequired"][1], "EXT_meshopt_compression");
+    assert!(2 * packed.body.len() < small.body.len() && packed.header("etag") != small.header("etag"));
+    let again = server.get("/v1/pdb/4pti/surface.glb?compress=meshopt");
+    assert!(again.body == packed.body);
+    // The estimate of the file is close.
+    let estimate = server.post("/v1/estimate?compress=meshopt", &[], SAMPLE).json();
+    let ratio = estimate["mesh_bytes"].as_f64().unwrap() / packed.body.len() as f64;
+    assert!((0.8..1.25).contains(&ratio), "{ratio}");
+    let refused = server.get("/v1/pdb/4pti/surface.gltf?compress=meshopt").problem(400, "bad-parameter");
+    assert_eq!(refused["parameter"], "compress");
+    assert!(refused["expected"].as_str().unwrap().contains("one of the formats glb"), "{refused}");
+
     // The format need not come from the query.
     let accept = server.post("/v1/meshes?compress=quantize", &[("accept", "model/stl")], SAMPLE);
     for refused in [accept, server.get("/v1/pdb/4pti/surface.obj?compress=quantize")] {
