@@ -237,6 +237,9 @@ pub(crate) struct SurfaceArgs {
     /// Radius of the large probe of the search for pockets, in Å [default: 4]
     #[arg(long, value_name = "Å")]
     pub(crate) pocket_probe: Option<String>,
+    /// Simplify the mesh within this error, in Å
+    #[arg(long, value_name = "Å")]
+    pub(crate) simplify: Option<String>,
     /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)
     #[arg(long)]
     pub(crate) atom_ids: bool,

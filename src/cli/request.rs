@@ -108,6 +108,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("split", &atoms.split),
         ("cavities", &surface.cavities),
         ("pocket_probe", &surface.pocket_probe),
+        ("simplify", &surface.simplify),
         ("validation", &args.validation),
         ("interface", &surface.interface),
     ];

@@ -86,6 +86,11 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     if let Some(found) = report.pockets {
         page.row("pockets", &pockets(found, report.pocket_list.as_deref().unwrap_or_default()));
     }
+    if let Some(found) = report.simplification {
+        let [most, mean] = [found.max_deviation, found.mean_deviation];
+        let before = grouped(found.triangles_before);
+        page.row("simplified", &format!("from {before} triangles, deviation up to {most:.3} Å, mean {mean:.4} Å"));
+    }
     page.row("area", &format!("{} Å²", decimal(report.area)));
     if let Some(volume) = report.volume {
         page.row("volume", &format!("{} Å³", decimal(volume)));
@@ -367,6 +372,7 @@ mod tests {
             cavities: Some(2),
             cavity_list: None,
             pockets: Some(0),
+            simplification: None,
             pocket_list: None,
             component_list: Vec::new(),
             parts: Vec::new(),

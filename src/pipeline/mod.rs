@@ -28,6 +28,7 @@ mod parts;
 mod pockets;
 mod progress;
 mod report;
+mod simplify;
 pub mod spacing;
 mod work;
 
@@ -53,6 +54,7 @@ pub use parts::PartReport;
 pub use pockets::PocketReport;
 pub use progress::Tracker;
 pub use report::{AssemblyReport, PictureReport, Quantization, Report, file_arithmetic};
+pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
 
@@ -87,6 +89,8 @@ pub struct Job {
     pub cavities: Option<Cavities>,
     /// Radius of the large probe of a search for pockets, Å. Colours and parts that need pockets imply a search.
     pub pockets: Option<f64>,
+    /// Error within which the mesh is simplified, Å; `None` for all its triangles.
+    pub simplify: Option<f64>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -131,14 +135,15 @@ impl Job {
     }
 
     /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
-    /// on triangles, parts, cuts, instances, removed components, compression and pictures need the whole mesh in
-    /// memory.
+    /// on triangles, parts, cuts, instances, removed components, compression, simplification and pictures need the
+    /// whole mesh in memory.
     fn can_stream(&self) -> bool {
         !self.params.atom_ids
             && self.color.is_none()
             && self.validation == Validation::Checksum
             && self.spacing.max_triangles().is_none()
             && self.compress != Compress::Meshopt
+            && self.simplify.is_none()
             && self.split == Split::None
             && self.selection.context == Context::Selection
             && !self.selection.instances
@@ -305,6 +310,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
         clock.time("cavities", || cavities::search(mode, &spheres, &params, &limits.surface, &mut output, &control))
     };
     let cavities = job.cavities.map(search).transpose()?;
+    let simplification = simplify::apply(job, params.resolution, &mut output, &clock, &control)?;
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
     let color = |colors: MeshColors| {
@@ -323,7 +329,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     // The clock ends here.
     let control = Control { observer: &(), ..control };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
-    (report.color, report.exact) = (color, exact);
+    (report.color, report.exact, report.simplification) = (color, exact, simplification);
     report.set_cavities(cavities.as_ref(), &structure, &selected);
     report.set_pockets(pockets.as_ref(), &structure, &selected);
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);

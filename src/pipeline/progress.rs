@@ -8,13 +8,13 @@ use super::ProgressSink;
 const UNIT: f64 = 1000.0;
 
 /// Stages with their typical shares of the time, in execution order.
-const STAGES: [(&str, f64); 18] = [
+const STAGES: [(&str, f64); 19] = [
     ("read", 0.09),
     ("select", 0.02),
     ("exact", 0.01),
     ("pockets", 0.01),
     ("bin", 0.03),
-    ("field", 0.38),
+    ("field", 0.37),
     ("classify", 0.05),
     ("scan", 0.02),
     ("refine", 0.02),
@@ -22,6 +22,7 @@ const STAGES: [(&str, f64); 18] = [
     ("emit", 0.10),
     ("write", 0.05),
     ("cavities", 0.01),
+    ("simplify", 0.01),
     ("color", 0.01),
     ("measure", 0.04),
     ("draw", 0.03),

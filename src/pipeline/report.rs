@@ -11,6 +11,7 @@ use super::instances::InstancesReport;
 use super::left_out::LeftOutReport;
 use super::parts::PartReport;
 use super::pockets::PocketReport;
+use super::simplify::SimplificationReport;
 use super::{Choice, Job, StageClock};
 use crate::formats::{Storage, Units};
 use crate::structure::{Selected, Structure};
@@ -185,6 +186,9 @@ pub struct Report {
     /// Pockets with the largest volumes, at most 100; absent without `pockets`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pocket_list: Option<Vec<PocketReport>>,
+    /// Simplification of the mesh; absent without `simplify`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub simplification: Option<SimplificationReport>,
     /// Components with the largest areas, at most 100.
     pub component_list: Vec<ComponentReport>,
     /// Parts of the mesh; absent if the request does not divide it.
@@ -311,6 +315,7 @@ impl Report {
             cavity_list: None,
             pockets: None,
             pocket_list: None,
+            simplification: None,
             component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
             parts: Vec::new(),
             area: measures.area,

@@ -286,10 +286,7 @@ fn bin_finds_the_same_candidates_in_the_same_order() {
         assert_eq!(cast::<Counters>(&out[2])[0].list_end as usize, expected.len(), "{name}");
         let counted = plan.candidates.iter().sum::<u64>();
         // Arcs are also counted in bricks out of reach of the atoms.
-        assert!(
-            counted == expected.len() as u64 || plan.n_kinds() == 2 && counted > expected.len() as u64,
-            "{name}"
-        );
+        assert!(counted == expected.len() as u64 || plan.n_kinds() == 2 && counted > expected.len() as u64, "{name}");
         // Negative controls: a missing atom, and two atoms in another order.
         let mut wrong = got.clone();
         let longest = (0..wrong.len()).max_by_key(|&i| wrong[i].1.len()).unwrap();

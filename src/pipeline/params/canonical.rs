@@ -15,6 +15,7 @@ pub fn canonical(job: &Job) -> String {
         split,
         cavities,
         pockets,
+        simplify,
         spacing,
         validation,
         compress,
@@ -67,6 +68,7 @@ pub fn canonical(job: &Job) -> String {
         (*split != Split::None).then(|| format!("split={}", split.name())),
         cavities.map(|cavities| format!("cavities={}", cavities.name())),
         pockets.map(|probe| format!("pockets={probe}")),
+        simplify.map(|error| format!("simplify={error}")),
         exact.then(|| "exact=true".to_owned()),
         // Quotes the names, which may contain `&`.
         interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),

@@ -8,7 +8,7 @@ use crate::picture::{Background, MAX_SIDE};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::pipeline::{areas, color};
 use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
-use crate::surface::{POCKET_PROBES, Preset, SurfaceKind, Validation};
+use crate::surface::{POCKET_PROBES, Preset, SIMPLIFY_ERRORS, SurfaceKind, Validation};
 
 /// Domain of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -309,6 +309,13 @@ pub const TABLE: &[Parameter] = &[
         "Å",
         "4",
         "Radius of the large probe of the search for pockets, larger than that of the probe; with pockets=true, color=pocket or split=pocket only.",
+    ),
+    number(
+        "simplify",
+        SIMPLIFY_ERRORS,
+        "Å",
+        "absent",
+        "Error within which the mesh is simplified: fewer and larger triangles, whose vertices are vertices of the original mesh. A closed manifold mesh remains one. The report states the measured deviation.",
     ),
     Parameter {
         name: "validation",

@@ -168,6 +168,7 @@ impl ParsedValues {
             "cavities" => job.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?),
             "pockets" => self.pockets = flag(text).ok_or_else(bad)?,
             "pocket_probe" => self.pocket_probe = Some(bounded().ok_or_else(bad)?),
+            "simplify" => self.request.job.simplify = Some(bounded().ok_or_else(bad)?),
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
             "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
             "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,

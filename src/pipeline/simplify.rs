@@ -1,0 +1,45 @@
+//! Simplification of the mesh of a job, and its report.
+
+use serde::Serialize;
+
+use super::Job;
+use super::clock::StageClock;
+use crate::surface::simplify::simplify;
+use crate::surface::{Control, Measures, MeshOutput, SurfaceError, Validation};
+
+/// Number of triangles that a simplification removed, and the distance between both surfaces.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct SimplificationReport {
+    /// Number of triangles before.
+    pub triangles_before: u64,
+    /// Largest distance between the surfaces in Å, at samples: vertices of the original mesh, and centroids of triangles
+    /// of the simplified one.
+    pub max_deviation: f64,
+    /// Mean distance at the same samples in Å.
+    pub mean_deviation: f64,
+}
+
+/// Simplifies the mesh of `output` if the job asks for it. `spacing` is its grid spacing, Å.
+///
+/// # Errors
+/// Returns the errors of memory and cancellation.
+pub(super) fn apply(
+    job: &Job,
+    spacing: f64,
+    output: &mut MeshOutput,
+    clock: &StageClock<'_>,
+    control: &Control<'_>,
+) -> Result<Option<SimplificationReport>, SurfaceError> {
+    let Some(error) = job.simplify else { return Ok(None) };
+    let found = clock.time("simplify", || simplify(&mut output.mesh, error, spacing, control))?;
+    // The checksum would not tell the boundary of a cut mesh from a defect.
+    let validation = if output.mesh.cut { Validation::Exact } else { job.validation };
+    output.measures = Some(Measures::of(&output.mesh, validation, control)?);
+    output.bounds = None;
+    Ok(Some(SimplificationReport {
+        triangles_before: found.triangles,
+        max_deviation: found.deviation.maximum,
+        mean_deviation: found.deviation.mean,
+    }))
+}

@@ -1,0 +1,70 @@
+//! Topology of a piece of a mesh.
+
+use rustc_hash::FxHashMap;
+
+/// Fans at the boundary of a piece: the first outward boundary edge of each fan, and the vertex at the end of its last.
+pub(super) type BoundaryFans = FxHashMap<[u32; 2], u32>;
+
+/// Topology of an oriented manifold with a boundary. Two pieces with equal boundary fans can replace each other in a
+/// closed manifold mesh, unless a chord is an edge of another piece too.
+#[derive(Debug, PartialEq)]
+pub(super) struct Topology {
+    pub(super) fans: BoundaryFans,
+    /// Edges within the piece that join two vertices of its boundary, with ascending vertices.
+    pub(super) chords: Vec<[u32; 2]>,
+}
+
+/// Returns the topology of triangles; `None` if they are not an oriented manifold with a boundary. A vertex of the
+/// boundary may have several fans, because other pieces join them.
+pub(super) fn topology(triangles: &[[u32; 3]]) -> Option<Topology> {
+    // Third vertex of the triangle of each directed edge.
+    let mut third: FxHashMap<[u32; 2], u32> = FxHashMap::default();
+    third.reserve(3 * triangles.len());
+    let n_vertices = triangles.iter().flatten().max().map_or(0, |most| *most as usize + 1);
+    // Triangles at each vertex that no fan contains yet.
+    let mut left = vec![0_u32; n_vertices];
+    for &[a, b, c] in triangles {
+        if a == b || b == c || c == a {
+            return None;
+        }
+        for (from, to, other) in [(a, b, c), (b, c, a), (c, a, b)] {
+            if third.insert([from, to], other).is_some() {
+                return None;
+            }
+            left[from as usize] += 1;
+        }
+    }
+    let mut fans = BoundaryFans::default();
+    let mut on_boundary = vec![false; n_vertices];
+    for &[v, first] in third.keys().filter(|[v, first]| !third.contains_key(&[*first, *v])) {
+        let mut last = first;
+        while let Some(next) = third.get(&[v, last]) {
+            left[v as usize] = left[v as usize].checked_sub(1)?;
+            last = *next;
+        }
+        fans.insert([v, first], last);
+        on_boundary[v as usize] = true;
+    }
+    // The other vertices have one closed fan each.
+    for &[v, first] in third.keys() {
+        if left[v as usize] == 0 {
+            continue;
+        }
+        let (mut last, mut n) = (first, 0);
+        loop {
+            last = *third.get(&[v, last])?;
+            n += 1;
+            if last == first {
+                break;
+            }
+        }
+        if n < 3 || n != left[v as usize] || on_boundary[v as usize] {
+            return None;
+        }
+        left[v as usize] = 0;
+    }
+    let is_chord = |[v, w]: &[u32; 2]| v < w && on_boundary[*v as usize] && on_boundary[*w as usize];
+    let is_inner = |[v, w]: &[u32; 2]| third.contains_key(&[*w, *v]);
+    let chords = third.keys().filter(|edge| is_chord(edge) && is_inner(edge)).copied().collect();
+    Some(Topology { fans, chords })
+}

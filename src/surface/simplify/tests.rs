@@ -1,0 +1,143 @@
+//! Simplified meshes remain closed manifolds near the original.
+
+use std::f64::consts::PI;
+
+use super::*;
+use crate::surface::{Backend as _, CpuBackend, Measures, Spheres, SurfaceKind, SurfaceLimits, SurfaceOptions};
+use crate::surface::{SurfaceParams, Validation};
+
+/// Returns the mesh of spheres in a row, which overlap.
+fn row(n: u32, surface: SurfaceKind, resolution: f64) -> Mesh {
+    let centres = (0..n).map(|i| 2.0 * f64::from(i)).collect();
+    let count = n as usize;
+    let spheres = Spheres::new(centres, vec![0.3; count], vec![-0.2; count], vec![1.7; count]).unwrap();
+    let options = SurfaceOptions { surface: Some(surface), resolution: Some(resolution), ..SurfaceOptions::default() };
+    let params = SurfaceParams::new(&options).unwrap();
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let mut mesh = backend.run(&spheres, &params, &SurfaceLimits::default(), &Control::default()).unwrap().mesh;
+    mesh.make_contiguous();
+    mesh
+}
+
+fn measures(mesh: &Mesh) -> Measures {
+    Measures::of(mesh, Validation::Exact, &Control::default()).unwrap()
+}
+
+#[test]
+fn simplified_meshes_are_closed_manifolds_within_the_error() {
+    for surface in [SurfaceKind::Gaussian, SurfaceKind::Ses, SurfaceKind::Vdw] {
+        let mesh = row(12, surface, 0.2);
+        let whole = measures(&mesh);
+        let mut before = mesh.n_triangles();
+        for error in [0.003, 0.01, 0.1] {
+            let mut simplified = mesh.clone();
+            let found = simplify(&mut simplified, error, 0.2, &Control::default()).unwrap();
+            let m = measures(&simplified);
+            let what = format!("{surface} {error}: {found:?}");
+            assert!(m.closed && m.oriented && m.manifold, "{what}");
+            assert_eq!((m.euler, found.triangles), (whole.euler, mesh.n_triangles() as u64), "{what}");
+            assert!(simplified.n_triangles() < before, "{what}: {} of {before}", simplified.n_triangles());
+            before = simplified.n_triangles();
+            assert!(found.deviation.maximum < 3.0 * error && found.deviation.mean < error, "{what}");
+            assert!((m.volume / whole.volume - 1.0).abs() < 2.0 * error && m.volume != whole.volume, "{what}");
+            // Every vertex is used, and is one of the original with its normal.
+            let used: std::collections::HashSet<u32> = simplified.triangles.iter().flatten().copied().collect();
+            assert_eq!(used.len(), simplified.n_vertices());
+            let original: std::collections::HashSet<_> = mesh
+                .positions
+                .iter()
+                .zip(&mesh.normals[..])
+                .map(|(p, n)| (p.map(f32::to_bits), n.map(f32::to_bits)))
+                .collect();
+            let own = simplified.positions.iter().zip(&simplified.normals[..]);
+            assert!(own.map(|(p, n)| (p.map(f32::to_bits), n.map(f32::to_bits))).all(|v| original.contains(&v)));
+        }
+    }
+}
+
+#[test]
+fn deviations_are_distances() {
+    // An octahedron instead of a sphere: the centroids of its triangles are the farthest points.
+    let mesh = row(1, SurfaceKind::Vdw, 0.1);
+    let at = |axis: usize, sign: f32| {
+        let far = |v: &u32| sign * mesh.position(*v as usize)[axis];
+        (0..to_u32(mesh.n_vertices())).max_by(|a, b| far(a).total_cmp(&far(b))).unwrap()
+    };
+    let corner = |axis: usize, bits: usize| at(axis, if bits >> axis & 1 == 0 { 1.0 } else { -1.0 });
+    let face = |bits: usize| {
+        let [x, y, z] = [0, 1, 2].map(|axis| corner(axis, bits));
+        if bits.count_ones() % 2 == 0 { [x, y, z] } else { [y, x, z] }
+    };
+    let octahedron = Mesh { triangles: (0..8).map(face).collect::<Vec<_>>().into(), ..mesh.clone() };
+    let found = Deviation::sampled(&octahedron, &mesh.triangles, 2.4, &Control::default()).unwrap();
+    let farthest = 1.7 * (1.0 - 1.0 / 3.0_f64.sqrt());
+    assert!((found.maximum - farthest).abs() < 0.02, "{found:?}, expected {farthest}");
+    let none = Deviation::sampled(&mesh, &mesh.triangles, 2.4, &Control::default()).unwrap();
+    // Distances have single precision.
+    assert!(none.maximum < 1e-3, "{none:?}");
+    assert!((measures(&octahedron).volume - 4.0 / 3.0 * 1.7_f64.powi(3)).abs() < 0.1 * PI);
+}
+
+#[test]
+fn the_result_does_not_depend_on_the_number_of_threads() {
+    let mesh = row(12, SurfaceKind::Gaussian, 0.25);
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let mut simplified = mesh.clone();
+        pool.install(|| simplify(&mut simplified, 0.05, 0.25, &Control::default()).unwrap());
+        simplified
+    };
+    let one = on(1);
+    assert_eq!(one, on(2));
+    assert_eq!(one, on(7));
+}
+
+fn tetrahedron() -> [[u32; 3]; 4] {
+    [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]
+}
+
+#[test]
+fn a_chord_of_two_pieces_remains_in_one() {
+    let piece = |triangles: Option<u32>, chords: &[[u32; 2]], original: &[[u32; 2]]| PieceResult {
+        triangles: triangles.map(|v| vec![[v; 3]]),
+        chords: chords.to_vec(),
+        original_chords: original.to_vec(),
+    };
+    let kept = |mut results: Vec<PieceResult>| {
+        keep_conflicting(&mut results);
+        results.iter().map(|result| result.triangles.is_none()).collect::<Vec<_>>()
+    };
+    let (new, other) = ([[3, 7]], [[2, 9]]);
+    assert_eq!(kept(vec![piece(Some(0), &new, &[]), piece(Some(1), &other, &[])]), [false, false]);
+    assert_eq!(kept(vec![piece(Some(0), &new, &[]), piece(Some(1), &new, &[])]), [false, true]);
+    assert_eq!(kept(vec![piece(Some(0), &new, &[]), piece(None, &[], &new)]), [true, true]);
+    // The second piece is kept because of the first one, and the third one because of the second.
+    let chain = vec![piece(Some(0), &new, &[]), piece(Some(1), &new, &other), piece(Some(2), &other, &[])];
+    assert_eq!(kept(chain), [false, true, true]);
+}
+
+#[test]
+fn pieces_that_are_no_manifolds_with_a_boundary_are_found() {
+    // Two triangles of a square, and the same square divided the other way.
+    let square = [[0, 1, 2], [0, 2, 3]];
+    let boundary = topology(&square).unwrap().fans;
+    assert_eq!(boundary, [([0, 1], 3), ([1, 2], 0), ([2, 3], 1), ([3, 0], 2)].into_iter().collect());
+    assert_eq!(topology(&[[0, 1, 3], [1, 2, 3]]).unwrap().fans, boundary);
+    assert_eq!((topology(&square).unwrap().chords, topology(&tetrahedron()).unwrap().chords), (vec![[0, 2]], vec![]));
+    assert_ne!(topology(&square[..1]).unwrap().fans, boundary, "another boundary");
+    assert_eq!(topology(&tetrahedron()).unwrap().fans, fans::BoundaryFans::default());
+    for (what, triangles) in [
+        ("degenerate", &[[0, 1, 1]][..]),
+        ("an edge with three triangles", &[[0, 1, 2], [0, 1, 3]]),
+        ("two equal triangles back to back", &[[0, 1, 2], [1, 0, 2]]),
+        (
+            "two tetrahedra at a vertex",
+            &[[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2], [0, 5, 4], [0, 4, 6], [0, 6, 5], [4, 5, 6]],
+        ),
+        ("a tetrahedron at a boundary", &[[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2], [0, 4, 5]]),
+    ] {
+        assert_eq!(topology(triangles), None, "{what}");
+    }
+    // Two fans at a vertex of the boundary are allowed: another piece joins them.
+    assert!(topology(&[[0, 1, 2], [0, 3, 4]]).is_some());
+}
