@@ -302,7 +302,9 @@ pub fn run_with<S: Deref<Target = Structure>>(
         let plan = MeshPlan::new(&spheres, division, &params, job, limits);
         let choice = plan.choice(undivided, choice);
         let checked = if sink.is_none() { estimate::check_memory(&plan, job, choice, &control) } else { Ok(()) };
-        let write = |()| clock.pass(|| backend.write(&spheres, &params, &limits.surface, &control, sink));
+        // Rounded vertices may coincide, and a simplification must not take them for one vertex.
+        let exact = SurfaceParams { quantize: params.quantize.filter(|_| job.simplify.is_none()), ..params.clone() };
+        let write = |()| clock.pass(|| backend.write(&spheres, &exact, &limits.surface, &control, sink));
         let written = checked.and_then(write);
         (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, choice, &control))?, None, storage)
     };
@@ -310,7 +312,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
         clock.time("cavities", || cavities::search(mode, &spheres, &params, &limits.surface, &mut output, &control))
     };
     let cavities = job.cavities.map(search).transpose()?;
-    let simplification = simplify::apply(job, params.resolution, &mut output, &clock, &control)?;
+    let simplification = simplify::apply(job, &params, &mut output, &clock, &control)?;
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
     let color = |colors: MeshColors| {

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::Job;
 use super::clock::StageClock;
 use crate::surface::simplify::simplify;
-use crate::surface::{Control, Measures, MeshOutput, SurfaceError, Validation};
+use crate::surface::{Control, Measures, Mesh, MeshOutput, SurfaceError, SurfaceParams, Validation};
 
 /// Number of triangles that a simplification removed, and the distance between both surfaces.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -20,23 +20,26 @@ pub struct SimplificationReport {
     pub mean_deviation: f64,
 }
 
-/// Simplifies the mesh of `output` if the job asks for it. `spacing` is its grid spacing, Å.
+/// Simplifies the mesh of `output` if the job asks for it, and quantizes it if `params` ask for it.
 ///
 /// # Errors
 /// Returns the errors of memory and cancellation.
 pub(super) fn apply(
     job: &Job,
-    spacing: f64,
+    params: &SurfaceParams,
     output: &mut MeshOutput,
     clock: &StageClock<'_>,
     control: &Control<'_>,
 ) -> Result<Option<SimplificationReport>, SurfaceError> {
     let Some(error) = job.simplify else { return Ok(None) };
-    let found = clock.time("simplify", || simplify(&mut output.mesh, error, spacing, control))?;
+    let found = clock.time("simplify", || simplify(&mut output.mesh, error, params.resolution, control))?;
+    output.bounds = None;
+    *output =
+        std::mem::replace(output, MeshOutput::new(Mesh::default(), output.grid)).deliver(params, control, None)?;
     // The checksum would not tell the boundary of a cut mesh from a defect.
     let validation = if output.mesh.cut { Validation::Exact } else { job.validation };
+    output.mesh.make_geometry_contiguous();
     output.measures = Some(Measures::of(&output.mesh, validation, control)?);
-    output.bounds = None;
     Ok(Some(SimplificationReport {
         triangles_before: found.triangles,
         max_deviation: found.deviation.maximum,

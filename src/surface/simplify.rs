@@ -11,6 +11,7 @@
 
 mod deviation;
 mod fans;
+mod grid;
 
 use std::ops::Range;
 
@@ -18,7 +19,9 @@ use meshopt::{SimplifyOptions, VertexDataAdapter};
 use rayon::prelude::*;
 
 pub use self::deviation::Deviation;
-use self::fans::{BoundaryFans, topology};
+use self::deviation::{Distances, centroid};
+use self::fans::topology;
+use self::grid::{Corners, TriangleGrid};
 use super::control::Control;
 use super::error::SurfaceError;
 use super::lattice::{to_i32, to_u32};
@@ -30,6 +33,9 @@ pub const SIMPLIFY_ERRORS: [f64; 2] = [0.001, 10.0];
 
 /// Edge length of a cube, in grid spacings: some thousand triangles.
 const SIDE: f64 = 24.0;
+/// Errors of the simplifier that are tried, relative to the error. The simplifier averages squared distances, so that
+/// the largest distance is about twice its error. Where an average hides a larger one, the next error is tried.
+const TRIES: [f64; 3] = [0.5, 0.25, 0.125];
 /// Memory of a triangle while the mesh is simplified, bytes: its cube and index, and copies in pieces.
 const TRIANGLE_BYTES: u64 = 64;
 
@@ -40,6 +46,24 @@ pub struct Simplification {
     pub triangles: u64,
     /// Distance between the surfaces.
     pub deviation: Deviation,
+}
+
+/// Edge length of the cubes, Å.
+#[derive(Debug, Clone, Copy)]
+struct CubeSide(f64);
+
+impl CubeSide {
+    /// Returns the edge length of a cell for searches: a few triangles of the original mesh.
+    #[expect(clippy::cast_possible_truncation, reason = "a length of a few Å")]
+    fn cell(self) -> f32 {
+        (self.0 / SIDE * 2.0) as f32
+    }
+
+    /// Returns the lower end of a cube along an axis, Å.
+    #[expect(clippy::cast_possible_truncation, reason = "positions have single precision")]
+    fn position(self, cube: i32) -> f32 {
+        (self.0 * f64::from(cube)) as f32
+    }
 }
 
 /// Cube of a triangle: its part and its position, in edge lengths.
@@ -62,13 +86,13 @@ pub(crate) fn simplify(
     mesh.make_contiguous();
     let _memory = control.reserve(TRIANGLE_BYTES * mesh.n_triangles() as u64)?;
     let before: Vec<[u32; 3]> = mesh.triangles.to_vec();
-    let side = SIDE * spacing;
+    let side = CubeSide(SIDE * spacing);
     for shift in [0.0, 0.5] {
         let sorted = by_cube(mesh, &mesh.triangles, side, shift, control)?;
         let pieces: Vec<&[(Cube, u32)]> = sorted.chunk_by(|a, b| a.0 == b.0).collect();
         let simplified = |piece: &&[(Cube, u32)]| {
             control.check()?;
-            Ok(Piece::new(mesh, piece).simplified(error))
+            Ok(Piece::new(mesh, piece).simplified(error, side))
         };
         let mut results = pieces.par_iter().map(simplified).collect::<Result<Vec<_>, SurfaceError>>()?;
         keep_conflicting(&mut results);
@@ -100,7 +124,7 @@ pub(crate) fn simplify(
 fn by_cube(
     mesh: &Mesh,
     triangles: &[[u32; 3]],
-    side: f64,
+    side: CubeSide,
     shift: f64,
     control: &Control<'_>,
 ) -> Result<Sorted, SurfaceError> {
@@ -109,7 +133,7 @@ fn by_cube(
         let corners = triangle.map(|v| mesh.position(v as usize));
         let cell = |k: usize| {
             let middle = corners.iter().map(|corner| f64::from(corner[k])).sum::<f64>() / 3.0;
-            to_i32((middle / side + shift).floor())
+            to_i32((middle / side.0 + shift).floor())
         };
         ((part_of(&mesh.parts, i), std::array::from_fn(cell)), to_u32(i))
     };
@@ -154,14 +178,23 @@ impl Piece {
         Self { vertices, positions, triangles }
     }
 
-    /// Simplifies the piece with the largest of some errors that keeps it a manifold with the same boundary.
-    fn simplified(&self, error: f64) -> PieceResult {
+    /// Simplifies the piece with the largest of some errors that keeps it a manifold with the same boundary, within
+    /// `error` of itself.
+    fn simplified(&self, error: f64, side: CubeSide) -> PieceResult {
         let Some(before) = topology(&self.triangles) else { return PieceResult::default() };
         let in_mesh = |edge: &[u32; 2]| edge.map(|v| self.vertices[v as usize]);
         let original_chords = before.chords.iter().map(in_mesh).collect();
-        let Some((found, chords)) = self.checked(error, &before.fans) else {
-            return PieceResult { original_chords, ..PieceResult::default() };
-        };
+        let original = TriangleGrid::new(self.triangles.iter().map(|t| self.corners(t)).collect(), side.cell());
+        let found = TRIES.into_iter().find_map(|share| {
+            let found = self.within(share * error)?;
+            let after = topology(&found).filter(|after| after.fans == before.fans)?;
+            let simplified = TriangleGrid::new(found.iter().map(|t| self.corners(t)).collect(), side.cell());
+            let centroids = found.iter().map(|t| centroid(self.corners(t)));
+            let distances = Distances::of(self.positions.iter().copied(), &simplified);
+            let maximum = distances.with(Distances::of(centroids, &original)).maximum;
+            (maximum <= error).then_some((found, after.chords))
+        });
+        let Some((found, chords)) = found else { return PieceResult { original_chords, ..PieceResult::default() } };
         PieceResult {
             triangles: Some(found.iter().map(|triangle| triangle.map(|v| self.vertices[v as usize])).collect()),
             chords: chords.iter().map(in_mesh).collect(),
@@ -169,20 +202,18 @@ impl Piece {
         }
     }
 
-    /// Returns simplified triangles with the given boundary, and their chords.
-    fn checked(&self, error: f64, boundary: &BoundaryFans) -> Option<(Vec<[u32; 3]>, Vec<[u32; 2]>)> {
+    fn corners(&self, triangle: &[u32; 3]) -> Corners {
+        triangle.map(|v| self.positions[v as usize])
+    }
+
+    /// Returns the triangles of the piece after a simplification with this error, Å; `None` if it changes nothing.
+    fn within(&self, error: f64) -> Option<Vec<[u32; 3]>> {
         let options = SimplifyOptions::LockBorder | SimplifyOptions::ErrorAbsolute;
         let stride = size_of::<[f32; 3]>();
         let vertices = VertexDataAdapter::new(bytemuck::cast_slice(&self.positions), stride, 0).ok()?;
-        [1.0, 0.5, 0.25].into_iter().find_map(|share| {
-            #[expect(clippy::cast_possible_truncation, reason = "single precision is enough for an error")]
-            let error = (error * share) as f32;
-            let indices = self.triangles.as_flattened();
-            let found = meshopt::simplify(indices, &vertices, 0, error, options, None);
-            let found = found.as_chunks::<3>().0.to_vec();
-            let after = topology(&found).filter(|after| after.fans == *boundary)?;
-            Some((found, after.chords))
-        })
+        #[expect(clippy::cast_possible_truncation, reason = "single precision is enough for an error")]
+        let found = meshopt::simplify(self.triangles.as_flattened(), &vertices, 0, error as f32, options, None);
+        (found.len() < 3 * self.triangles.len()).then(|| found.as_chunks::<3>().0.to_vec())
     }
 }
 

@@ -1,0 +1,171 @@
+//! Distances of points from triangles, with a uniform grid of cells.
+
+/// Triangle: its corners, Å.
+pub(super) type Corners = [[f32; 3]; 3];
+
+/// Largest number of cells per axis.
+const MAX_CELLS: f32 = 64.0;
+
+/// Triangles by the cells that their bounding boxes overlap.
+pub(super) struct TriangleGrid {
+    low: [f32; 3],
+    /// Edge length of a cell, Å.
+    cell: f32,
+    size: [i32; 3],
+    /// First entry of each cell; the last element is the number of entries.
+    starts: Vec<u32>,
+    entries: Vec<u32>,
+    triangles: Vec<Corners>,
+}
+
+impl TriangleGrid {
+    /// Sorts triangles into cells with an edge length of about `cell`, Å.
+    pub(super) fn new(triangles: Vec<Corners>, cell: f32) -> Self {
+        let corners = || triangles.iter().flatten();
+        let bound = |k: usize, sign: f32| corners().map(|p| sign * p[k]).fold(f32::NEG_INFINITY, f32::max);
+        let low: [f32; 3] = std::array::from_fn(|k| -bound(k, -1.0));
+        let extent = (0..3).map(|k| bound(k, 1.0) - low[k]).fold(0.0, f32::max);
+        let cell = cell.max(extent / MAX_CELLS);
+        let size = std::array::from_fn(|k| floor((bound(k, 1.0) - low[k]) / cell) + 1);
+        let n_cells = size.iter().map(|n| usize::try_from(*n).unwrap_or(0)).product::<usize>();
+        let mut grid =
+            Self { low, cell, size, starts: vec![0; n_cells + 1], entries: Vec::new(), triangles: Vec::new() };
+        let mut starts = std::mem::take(&mut grid.starts);
+        for triangle in &triangles {
+            grid.for_each_cell(triangle, |at| starts[at + 1] += 1);
+        }
+        for at in 0..n_cells {
+            starts[at + 1] += starts[at];
+        }
+        let mut next = starts.clone();
+        let mut entries = vec![0; starts[n_cells] as usize];
+        for (number, triangle) in (0..).zip(&triangles) {
+            grid.for_each_cell(triangle, |at| {
+                entries[next[at] as usize] = number;
+                next[at] += 1;
+            });
+        }
+        Self { starts, entries, triangles, ..grid }
+    }
+
+    /// Calls `each` for the cells that the bounding box of a triangle overlaps.
+    fn for_each_cell(&self, [a, b, c]: &Corners, mut each: impl FnMut(usize)) {
+        let low = self.cell_of(std::array::from_fn(|k| a[k].min(b[k]).min(c[k])));
+        let high = self.cell_of(std::array::from_fn(|k| a[k].max(b[k]).max(c[k])));
+        for z in low[2]..=high[2] {
+            for y in low[1]..=high[1] {
+                (low[0]..=high[0]).filter_map(|x| self.index([x, y, z])).for_each(&mut each);
+            }
+        }
+    }
+
+    fn cell_of(&self, point: [f32; 3]) -> [i32; 3] {
+        std::array::from_fn(|k| floor((point[k] - self.low[k]) / self.cell))
+    }
+
+    /// Returns the index of a cell; `None` outside the grid.
+    fn index(&self, cell: [i32; 3]) -> Option<usize> {
+        let is_inside = (0..3).all(|k| (0..self.size[k]).contains(&cell[k]));
+        let [x, y, z] = cell;
+        is_inside.then(|| usize::try_from((z * self.size[1] + y) * self.size[0] + x).ok()).flatten()
+    }
+
+    /// Returns the distance of a point from the nearest triangle, Å; infinity if there is no triangle.
+    pub(super) fn distance(&self, point: [f32; 3]) -> f32 {
+        let own = self.cell_of(point);
+        // Cells in this distance, in cells, are the nearest and the farthest ones of the grid.
+        let gap = |k: usize| (-own[k]).max(own[k] - self.size[k] + 1).max(0);
+        let span = |k: usize| own[k].max(self.size[k] - 1 - own[k]);
+        let [first, last] = [(0..3).map(gap).max(), (0..3).map(span).max()].map(Option::unwrap_or_default);
+        // Distance from the sides of the own cell.
+        let inside = (0..3).map(|k| {
+            let from_low = point[k] - self.low[k] - own[k] as f32 * self.cell;
+            from_low.min(self.cell - from_low)
+        });
+        let inside = inside.fold(self.cell, f32::min).max(0.0);
+        let mut nearest2 = f32::INFINITY;
+        for ring in first..=last {
+            // All points of the cells in this ring and beyond are at least this far away.
+            let reach = if ring == 0 { 0.0 } else { (ring - 1) as f32 * self.cell + inside };
+            if nearest2 <= reach * reach {
+                break;
+            }
+            self.for_each_of_ring(own, ring, |number| {
+                let corners = self.triangles[number as usize];
+                if box_distance2(point, corners) < nearest2 {
+                    nearest2 = nearest2.min(distance2(point, corners));
+                }
+            });
+        }
+        nearest2.sqrt()
+    }
+
+    /// Calls `each` for the entries of the cells whose largest difference from `own` along an axis is `ring`.
+    fn for_each_of_ring(&self, [x, y, z]: [i32; 3], ring: i32, mut each: impl FnMut(u32)) {
+        let within = |k: usize, at: i32| (at - ring).max(0)..=(at + ring).min(self.size[k] - 1);
+        for cz in within(2, z) {
+            for cy in within(1, y) {
+                let is_side = (cz - z).abs() == ring || (cy - y).abs() == ring;
+                let step = if is_side || ring == 0 { 1 } else { 2 * ring };
+                let mut cx = x - ring;
+                while cx <= x + ring {
+                    if let Some(at) = self.index([cx, cy, cz]) {
+                        self.entries[self.starts[at] as usize..self.starts[at + 1] as usize]
+                            .iter()
+                            .copied()
+                            .for_each(&mut each);
+                    }
+                    cx += step;
+                }
+            }
+        }
+    }
+}
+
+#[expect(clippy::cast_possible_truncation, reason = "casts saturate, and cells outside the grid are skipped")]
+fn floor(value: f32) -> i32 {
+    value.floor().clamp(-1e9, 1e9) as i32
+}
+
+fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn sub(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
+    std::array::from_fn(|k| a[k] - b[k])
+}
+
+/// Returns the squared distance of a point from the bounding box of a triangle.
+fn box_distance2(p: [f32; 3], [a, b, c]: Corners) -> f32 {
+    let gap = |k: usize| {
+        let (low, high) = (a[k].min(b[k]).min(c[k]), a[k].max(b[k]).max(c[k]));
+        (low - p[k]).max(p[k] - high).max(0.0)
+    };
+    let gaps = std::array::from_fn(gap);
+    dot(gaps, gaps)
+}
+
+/// Returns the squared distance of a point from a triangle.
+fn distance2(p: [f32; 3], [a, b, c]: Corners) -> f32 {
+    let (u, v, w) = (sub(b, a), sub(c, a), sub(p, a));
+    let [uu, uv, vv] = [dot(u, u), dot(u, v), dot(v, v)];
+    let (wu, wv) = (dot(w, u), dot(w, v));
+    let area = uu * vv - uv * uv;
+    if area > 0.0 {
+        let (s, t) = ((vv * wu - uv * wv) / area, (uu * wv - uv * wu) / area);
+        if s >= 0.0 && t >= 0.0 && s + t <= 1.0 {
+            let off: [f32; 3] = std::array::from_fn(|k| w[k] - s * u[k] - t * v[k]);
+            return dot(off, off);
+        }
+    }
+    [(a, b), (b, c), (c, a)].map(|(from, to)| to_segment2(p, from, to)).into_iter().fold(f32::INFINITY, f32::min)
+}
+
+/// Returns the squared distance of a point from a line segment.
+fn to_segment2(p: [f32; 3], from: [f32; 3], to: [f32; 3]) -> f32 {
+    let (along, w) = (sub(to, from), sub(p, from));
+    let length2 = dot(along, along);
+    let t = if length2 > 0.0 { (dot(w, along) / length2).clamp(0.0, 1.0) } else { 0.0 };
+    let off: [f32; 3] = std::array::from_fn(|k| w[k] - t * along[k]);
+    dot(off, off)
+}
