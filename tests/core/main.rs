@@ -31,6 +31,7 @@ mod peers;
 mod picture;
 mod pockets;
 mod real_structures;
+mod simplify;
 mod spacing;
 mod sphere_surfaces;
 mod split;

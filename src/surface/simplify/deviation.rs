@@ -8,6 +8,9 @@ use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::mesh::Mesh;
 
+/// Largest number of samples per cube on each surface.
+const SAMPLES: usize = 256;
+
 /// Distance between two surfaces, at samples on both: vertices of the original, and centroids of triangles of the
 /// simplified mesh.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -56,8 +59,8 @@ impl Deviation {
         cubes.dedup();
         let of_cube = |cube: &Cube| {
             control.check()?;
-            let vertices = original.of(*cube).map(|corners| corners[0]);
-            let centroids = simplified.of(*cube).map(centroid);
+            let vertices = samples(original.of(*cube)).map(|corners| corners[0]);
+            let centroids = samples(simplified.of(*cube)).map(centroid);
             let [from, to] = [&simplified, &original].map(|surface| surface.around(*cube, side));
             Ok(Distances::of(vertices, &from).with(Distances::of(centroids, &to)))
         };
@@ -65,6 +68,12 @@ impl Deviation {
         let Distances { sum, maximum, n } = of_cubes.into_iter().fold(Distances::default(), Distances::with);
         Ok(Self { maximum, mean: sum / n.max(1) as f64 })
     }
+}
+
+/// Returns every n-th triangle.
+fn samples(triangles: impl ExactSizeIterator<Item = Corners>) -> impl Iterator<Item = Corners> {
+    let step = triangles.len().div_ceil(SAMPLES).max(1);
+    triangles.step_by(step)
 }
 
 /// Returns the centroid of a triangle.
@@ -81,7 +90,7 @@ struct Surface<'a> {
 
 impl Surface<'_> {
     /// Returns the triangles of a cube.
-    fn of(&self, cube: Cube) -> impl Iterator<Item = Corners> {
+    fn of(&self, cube: Cube) -> impl ExactSizeIterator<Item = Corners> {
         let [start, end] = [
             self.by_cube.partition_point(|(other, _)| *other < cube),
             self.by_cube.partition_point(|(other, _)| *other <= cube),
