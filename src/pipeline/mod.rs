@@ -275,10 +275,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let (exact, areas) = job.exact.then(|| clock.time("exact", measure)).transpose()?.unzip();
     let pockets = pockets::search(job, &spheres, &limits.surface, &clock, &control)?;
     let of_pockets = pockets.as_ref().filter(|_| job.split == Split::Pocket);
-    let parts = match of_pockets {
-        Some(found) => Some(pockets::parts(found, selected.atoms.len(), &limits.read)?),
-        None => selected.parts(&structure, job.split, &limits.read, &control)?,
-    };
+    let parts = pockets::parts(of_pockets, &structure, &selected, job.split, &limits.read, &control)?;
     let cut = Cut::of(&selected, parts.as_deref(), of_pockets, job.validation, &control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
     let backend = divided(choice.backend, division);
@@ -302,9 +299,8 @@ pub fn run_with<S: Deref<Target = Structure>>(
         let plan = MeshPlan::new(&spheres, division, &params, job, limits);
         let choice = plan.choice(undivided, choice);
         let checked = if sink.is_none() { estimate::check_memory(&plan, job, choice, &control) } else { Ok(()) };
-        // Rounded vertices may coincide, and a simplification must not take them for one vertex.
-        let exact = SurfaceParams { quantize: params.quantize.filter(|_| job.simplify.is_none()), ..params.clone() };
-        let write = |()| clock.pass(|| backend.write(&spheres, &exact, &limits.surface, &control, sink));
+        let meshed = simplify::params_of_input(job, &params);
+        let write = |()| clock.pass(|| backend.write(&spheres, &meshed, &limits.surface, &control, sink));
         let written = checked.and_then(write);
         (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, choice, &control))?, None, storage)
     };

@@ -122,6 +122,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     check_cavities(&request.job)?;
     check_pockets(&request.job)?;
     check_exact(&request.job)?;
+    check_simplify(&request.job)?;
     if let Some(format) = request.format {
         set_format(&mut request.job, format)?;
     }
@@ -189,6 +190,19 @@ fn divided_by(split: Split, Selection { context, instances, .. }: &Selection) ->
         (_, Context::Whole) => Some(format!("context={}", context.name())),
         _ => instances.then(|| "instances=true".to_owned()),
     }
+}
+
+/// Rejects the simplification of a surface that is divided: its parts share borders, but no vertices.
+fn check_simplify(job: &Job) -> Result<(), ParamError> {
+    let Some(error) = job.simplify else { return Ok(()) };
+    let expected = match (job.split, job.selection.context) {
+        (Split::Pocket, _) => "no value with split=pocket, which divides one surface",
+        (split, Context::Whole) if split != Split::None => {
+            "no value with split and context=whole, which divide one surface"
+        }
+        _ => return Ok(()),
+    };
+    Err(ParamError::bad_value("simplify", &error.to_string(), expected))
 }
 
 /// Rejects exact areas of a surface that has none, or that is divided or cut.

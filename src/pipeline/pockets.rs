@@ -79,17 +79,25 @@ pub(super) fn lined_by<'a>(
     })
 }
 
-/// Returns the parts of `split=pocket`: the pockets, largest first, each with the rows of the atoms that line it, and
-/// the rest of `n_atoms` atoms.
+/// Returns the parts of the selected atoms. Those of `found` pockets are the pockets, largest first, each with the rows
+/// of the atoms that line it, and the rest.
 ///
 /// # Errors
-/// [`StructureError::TooManyParts`].
-pub(super) fn parts(found: &Pockets, n_atoms: usize, limits: &ReadLimits) -> Result<Vec<AtomPart>, StructureError> {
+/// Returns [`StructureError::TooManyParts`], and the errors of [`Selected::parts`] without pockets.
+pub(super) fn parts(
+    found: Option<&Pockets>,
+    structure: &Structure,
+    selected: &Selected,
+    split: Split,
+    limits: &ReadLimits,
+    control: &Control<'_>,
+) -> Result<Option<Vec<AtomPart>>, StructureError> {
+    let Some(found) = found else { return selected.parts(structure, split, limits, control) };
     let limit = limits.max_parts;
     if found.list.len() as u64 >= limit {
-        return Err(StructureError::TooManyParts { rule: Split::Pocket.parameter(), limit });
+        return Err(StructureError::TooManyParts { rule: split.parameter(), limit });
     }
-    let mut lines = vec![false; n_atoms];
+    let mut lines = vec![false; selected.atoms.len()];
     found.list.iter().flat_map(|pocket| &pocket.lining).for_each(|row| lines[*row as usize] = true);
     let name = |number: usize| format!("pocket {number}");
     let pockets = (1..).zip(&found.list);
@@ -97,7 +105,7 @@ pub(super) fn parts(found: &Pockets, n_atoms: usize, limits: &ReadLimits) -> Res
         pockets.map(|(number, pocket)| AtomPart { name: name(number), rows: pocket.lining.clone() }).collect();
     let rows = (0..).zip(lines).filter(|(_, lines)| !lines).map(|(row, _)| row).collect();
     parts.push(AtomPart { name: "other".to_owned(), rows });
-    Ok(parts)
+    Ok(Some(parts))
 }
 
 impl Report {

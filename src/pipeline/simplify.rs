@@ -13,14 +13,21 @@ use crate::surface::{Control, Measures, Mesh, MeshOutput, SurfaceError, SurfaceP
 pub struct SimplificationReport {
     /// Number of triangles before.
     pub triangles_before: u64,
-    /// Largest distance between the surfaces in Å, at samples: vertices of the original mesh, and centroids of triangles
-    /// of the simplified one.
+    /// Largest distance between the surfaces in Å, at samples: vertices of the original mesh, and centroids of
+    /// triangles of the simplified one.
     pub max_deviation: f64,
     /// Mean distance at the same samples in Å.
     pub mean_deviation: f64,
 }
 
-/// Simplifies the mesh of `output` if the job asks for it, and quantizes it if `params` ask for it.
+/// Returns the parameters of the mesh before a simplification, which must not take rounded vertices that coincide for
+/// one vertex.
+pub(super) fn params_of_input(job: &Job, params: &SurfaceParams) -> SurfaceParams {
+    SurfaceParams { quantize: params.quantize.filter(|_| job.simplify.is_none()), ..params.clone() }
+}
+
+/// Simplifies the mesh of `output` if the job asks for it, and quantizes it if `params` ask for it. A mesh that is
+/// written already is unchanged.
 ///
 /// # Errors
 /// Returns the errors of memory and cancellation.
@@ -31,18 +38,25 @@ pub(super) fn apply(
     clock: &StageClock<'_>,
     control: &Control<'_>,
 ) -> Result<Option<SimplificationReport>, SurfaceError> {
-    let Some(error) = job.simplify else { return Ok(None) };
-    let found = clock.time("simplify", || simplify(&mut output.mesh, error, params.resolution, control))?;
-    output.bounds = None;
-    *output =
-        std::mem::replace(output, MeshOutput::new(Mesh::default(), output.grid)).deliver(params, control, None)?;
-    // The checksum would not tell the boundary of a cut mesh from a defect.
-    let validation = if output.mesh.cut { Validation::Exact } else { job.validation };
-    output.mesh.make_geometry_contiguous();
-    output.measures = Some(Measures::of(&output.mesh, validation, control)?);
-    Ok(Some(SimplificationReport {
-        triangles_before: found.triangles,
-        max_deviation: found.deviation.maximum,
-        mean_deviation: found.deviation.mean,
-    }))
+    if output.streamed.is_some() {
+        return Ok(None);
+    }
+    let simplified = |error| {
+        let found = clock.time("simplify", || simplify(&mut output.mesh, error, params.resolution, control))?;
+        (output.measures, output.bounds) = (None, None);
+        Ok::<_, SurfaceError>(SimplificationReport {
+            triangles_before: found.triangles,
+            max_deviation: found.deviation.maximum,
+            mean_deviation: found.deviation.mean,
+        })
+    };
+    let report = job.simplify.map(simplified).transpose()?;
+    let whole = std::mem::replace(output, MeshOutput::new(Mesh::default(), output.grid));
+    *output = whole.deliver(params, control, None)?;
+    if output.measures.is_none() && output.mesh.cut {
+        // The checksum would not tell the boundary of a cut mesh from a defect.
+        output.mesh.make_geometry_contiguous();
+        output.measures = Some(Measures::of(&output.mesh, Validation::Exact, control)?);
+    }
+    Ok(report)
 }

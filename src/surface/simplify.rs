@@ -85,14 +85,14 @@ pub(crate) fn simplify(
 ) -> Result<Simplification, SurfaceError> {
     mesh.make_contiguous();
     let _memory = control.reserve(TRIANGLE_BYTES * mesh.n_triangles() as u64)?;
-    let before: Vec<[u32; 3]> = mesh.triangles.to_vec();
+    let (before, parts) = (mesh.triangles.to_vec(), part_ranges(mesh));
     let side = CubeSide(SIDE * spacing);
     for shift in [0.0, 0.5] {
-        let sorted = by_cube(mesh, &mesh.triangles, side, shift, control)?;
+        let sorted = by_cube(mesh, &mesh.triangles, &part_ranges(mesh), side, shift, control)?;
         let pieces: Vec<&[(Cube, u32)]> = sorted.chunk_by(|a, b| a.0 == b.0).collect();
         let simplified = |piece: &&[(Cube, u32)]| {
             control.check()?;
-            Ok(Piece::new(mesh, piece).simplified(error, side))
+            Ok(CubePiece::new(mesh, piece).simplified(error, side))
         };
         let mut results = pieces.par_iter().map(simplified).collect::<Result<Vec<_>, SurfaceError>>()?;
         keep_conflicting(&mut results);
@@ -113,17 +113,23 @@ pub(crate) fn simplify(
             first += n;
         }
     }
-    let deviation = Deviation::sampled(mesh, &before, side, control)?;
+    let deviation = Deviation::sampled(mesh, &before, &parts, side, control)?;
     let triangles = before.len() as u64;
     drop(before);
     compact(mesh);
     Ok(Simplification { triangles, deviation })
 }
 
-/// Returns the triangles by cube. `shift` moves the cubes, in edge lengths.
+/// Returns the rows of the triangles of each part; none without parts.
+fn part_ranges(mesh: &Mesh) -> Vec<Range<usize>> {
+    mesh.parts.iter().map(|part| part.triangles.clone()).collect()
+}
+
+/// Returns `triangles` of vertices of `mesh` by cube. `shift` moves the cubes, in edge lengths.
 fn by_cube(
     mesh: &Mesh,
     triangles: &[[u32; 3]],
+    parts: &[Range<usize>],
     side: CubeSide,
     shift: f64,
     control: &Control<'_>,
@@ -135,7 +141,7 @@ fn by_cube(
             let middle = corners.iter().map(|corner| f64::from(corner[k])).sum::<f64>() / 3.0;
             to_i32((middle / side.0 + shift).floor())
         };
-        ((part_of(&mesh.parts, i), std::array::from_fn(cell)), to_u32(i))
+        ((part_of(parts, i), std::array::from_fn(cell)), to_u32(i))
     };
     let mut sorted: Sorted = triangles.par_iter().enumerate().map(cube).collect();
     super::checked_sort::sort(&mut sorted, Ord::cmp, control)?;
@@ -143,13 +149,13 @@ fn by_cube(
 }
 
 /// Returns the part of a triangle; 0 without parts.
-fn part_of(parts: &[PartRange], triangle: usize) -> u32 {
-    to_u32(parts.partition_point(|part| part.triangles.end <= triangle).min(parts.len().saturating_sub(1)))
+fn part_of(parts: &[Range<usize>], triangle: usize) -> u32 {
+    to_u32(parts.partition_point(|rows| rows.end <= triangle).min(parts.len().saturating_sub(1)))
 }
 
 /// Result of the simplification of a piece. Vertices are those of the mesh.
 #[derive(Default)]
-struct PieceResult {
+struct CubeResult {
     /// Triangles; `None` if the piece is kept.
     triangles: Option<Vec<[u32; 3]>>,
     /// Edges within the piece that join vertices of its boundary, after and before the simplification.
@@ -158,7 +164,7 @@ struct PieceResult {
 }
 
 /// Triangles of a cube with their vertices.
-struct Piece {
+struct CubePiece {
     /// Numbers of the vertices in the mesh, ascending.
     vertices: Vec<u32>,
     positions: Vec<[f32; 3]>,
@@ -166,7 +172,7 @@ struct Piece {
     triangles: Vec<[u32; 3]>,
 }
 
-impl Piece {
+impl CubePiece {
     fn new(mesh: &Mesh, piece: &[(Cube, u32)]) -> Self {
         let triangles = piece.iter().map(|(_, i)| mesh.triangles[*i as usize]);
         let mut vertices: Vec<u32> = triangles.clone().flatten().collect();
@@ -180,8 +186,8 @@ impl Piece {
 
     /// Simplifies the piece with the largest of some errors that keeps it a manifold with the same boundary, within
     /// `error` of itself.
-    fn simplified(&self, error: f64, side: CubeSide) -> PieceResult {
-        let Some(before) = topology(&self.triangles) else { return PieceResult::default() };
+    fn simplified(&self, error: f64, side: CubeSide) -> CubeResult {
+        let Some(before) = topology(&self.triangles) else { return CubeResult::default() };
         let in_mesh = |edge: &[u32; 2]| edge.map(|v| self.vertices[v as usize]);
         let original_chords = before.chords.iter().map(in_mesh).collect();
         let original = TriangleGrid::new(self.triangles.iter().map(|t| self.corners(t)).collect(), side.cell());
@@ -194,8 +200,8 @@ impl Piece {
             let maximum = distances.with(Distances::of(centroids, &original)).maximum;
             (maximum <= error).then_some((found, after.chords))
         });
-        let Some((found, chords)) = found else { return PieceResult { original_chords, ..PieceResult::default() } };
-        PieceResult {
+        let Some((found, chords)) = found else { return CubeResult { original_chords, ..CubeResult::default() } };
+        CubeResult {
             triangles: Some(found.iter().map(|triangle| triangle.map(|v| self.vertices[v as usize])).collect()),
             chords: chords.iter().map(in_mesh).collect(),
             original_chords,
@@ -218,7 +224,7 @@ impl Piece {
 }
 
 /// Keeps pieces as they are so that no two pieces have the same chord.
-fn keep_conflicting(results: &mut [PieceResult]) {
+fn keep_conflicting(results: &mut [CubeResult]) {
     loop {
         let mut chords: Vec<([u32; 2], usize)> = Vec::new();
         for (n, result) in results.iter().enumerate() {

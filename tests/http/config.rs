@@ -190,7 +190,7 @@ fn the_table_and_the_core_agree_on_every_range() {
             assert!(matches!(give(bad), Err(ParamError::BadValue { .. })), "{} {bad}", parameter.name);
         }
     }
-    assert_eq!(numbers, 11);
+    assert_eq!(numbers, 12);
     let mut integers = 0;
     for parameter in TABLE {
         let Domain::Integer { min, max } = parameter.domain else { continue };

