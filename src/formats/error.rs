@@ -101,7 +101,7 @@ pub enum FormatError {
         /// The format's name.
         format: &'static str,
     },
-    /// Pieces are compressed from quantized vertices only.
+    /// The mesh to compress has no quantized vertices.
     #[error("meshopt compression needs a mesh with quantized vertices")]
     NotQuantized,
     /// The encoder of the compression failed.

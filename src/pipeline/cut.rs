@@ -1,7 +1,8 @@
-//! Cuts a finished surface: only the triangles of the selected atoms remain, grouped by part.
+//! Cuts a finished surface into parts. With `context=whole`, only the triangles of the selected atoms remain.
 //!
-//! A triangle belongs to the part of two of its vertices. A vertex belongs to the part of its nearest atom, that of
-//! `_ATOM`, or to the pocket that it lines. A vertex on the border of several parts is stored in each of them.
+//! A triangle belongs to the part to which two or three of its vertices belong. A vertex belongs to the part of its
+//! nearest atom (that of `_ATOM`), or with `split=pocket` to the pocket that it lines. A vertex on the border of
+//! several parts is stored in each of them.
 
 use rayon::prelude::*;
 
@@ -16,14 +17,14 @@ use crate::surface::{
 
 /// Rows per task, and triangles between two checks for cancellation.
 const ROWS: usize = 1 << 16;
-/// Part of atoms and triangles that are not selected; number of a vertex that has none.
+/// Marker: part of an atom or triangle that is not selected, and number of a vertex that has none yet.
 const NONE: u32 = u32::MAX;
 
 /// Rule that assigns vertices to parts.
 enum Rule<'a> {
     /// Part of each sphere, or [`NONE`].
     NearestAtom(Vec<u32>),
-    /// Parts are the pockets; the last part has the other vertices.
+    /// Pocket that the vertex lines. The last part has the vertices that line none.
     Pocket(&'a Pockets),
 }
 
@@ -37,8 +38,8 @@ pub(super) struct Cut<'a> {
 }
 
 impl<'a> Cut<'a> {
-    /// Returns the division into `parts`, those of `pockets` if it is given, or into one part of all selected atoms.
-    /// Returns `None` if the surface is not cut: without pockets and
+    /// Returns the division into `parts`, or without parts into one part of all selected atoms. With `pockets`, `parts`
+    /// are these pockets. Returns `None` if the surface is not cut: without pockets and without
     /// [`Context::Whole`](crate::structure::Context::Whole).
     ///
     /// # Errors
@@ -87,7 +88,7 @@ impl<'a> Cut<'a> {
         ordered_sum(&mesh.triangles, of_chunk)
     }
 
-    /// Returns the part of each vertex. Without atom indices that the cut needs, the result is empty.
+    /// Returns the part of each vertex. The result is empty if the mesh lacks atom indices that the cut needs.
     fn parts_of_vertices(&self, mesh: &Mesh) -> Vec<u32> {
         match &self.rule {
             Rule::NearestAtom(part_of) => {

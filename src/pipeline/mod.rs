@@ -89,7 +89,7 @@ pub struct Job {
     pub cavities: Option<Cavities>,
     /// Radius of the large probe of a search for pockets, Å. Colours and parts that need pockets imply a search.
     pub pockets: Option<f64>,
-    /// Error within which the mesh is simplified, Å; `None` for all its triangles.
+    /// Error of the simplification of the mesh, Å; `None` to keep all triangles.
     pub simplify: Option<f64>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
@@ -324,7 +324,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     };
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
-    // The clock ends here.
+    // The report takes the times of the clock, which observes nothing later.
     let control = Control { observer: &(), ..control };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     (report.color, report.exact, report.simplification) = (color, exact, simplification);

@@ -192,7 +192,8 @@ fn divided_by(split: Split, Selection { context, instances, .. }: &Selection) ->
     }
 }
 
-/// Rejects the simplification of a surface that is divided: its parts share borders, but no vertices.
+/// Rejects the simplification of one surface that is divided into parts. Vertices on borders are stored once per part,
+/// so the check for common edges would not find those of two parts.
 fn check_simplify(job: &Job) -> Result<(), ParamError> {
     let Some(error) = job.simplify else { return Ok(()) };
     let expected = match (job.split, job.selection.context) {

@@ -31,7 +31,7 @@ pub struct PocketReport {
 }
 
 impl PocketReport {
-    /// Returns the report of a pocket, whose lining are rows of `selected`.
+    /// Returns the report of a pocket. Its lining has rows of `selected`.
     fn new(pocket: &Pocket, structure: &Structure, selected: &Selected) -> Self {
         Self {
             volume: pocket.volume,
@@ -46,7 +46,7 @@ impl PocketReport {
 }
 
 impl Job {
-    /// Returns the radius of the large probe if pockets are listed, coloured or parts of the mesh, Å.
+    /// Returns the radius of the large probe, Å, if the job lists pockets, colours them or makes parts of them.
     fn pocket_probe(&self) -> Option<f64> {
         let needed = self.split == Split::Pocket || self.color.is_some_and(|color| color.scheme.needs_pockets());
         self.pockets.or_else(|| needed.then_some(DEFAULT_POCKET_PROBE))
@@ -64,11 +64,11 @@ pub(super) fn search(
     clock: &StageClock<'_>,
     control: &Control<'_>,
 ) -> Result<Option<Pockets>, SurfaceError> {
-    let find = |probe| clock.time("pockets", || find(spheres, &job.params, probe, limits, control));
-    job.pocket_probe().map(find).transpose()
+    let search = |probe| clock.time("pockets", || find(spheres, &job.params, probe, limits, control));
+    job.pocket_probe().map(search).transpose()
 }
 
-/// Returns the index of the pocket that each vertex lines.
+/// Returns the index of the pocket that each vertex lines; `None` for vertices that line no pocket.
 pub(super) fn lined_by<'a>(
     mesh: &'a Mesh,
     pockets: &'a Pockets,
@@ -79,11 +79,12 @@ pub(super) fn lined_by<'a>(
     })
 }
 
-/// Returns the parts of the selected atoms. Those of `found` pockets are the pockets, largest first, each with the rows
-/// of the atoms that line it, and the rest.
+/// Returns the parts of the selected atoms. With `found` pockets, there is one part per pocket, largest first, and a
+/// last part `other`. The part of a pocket has the atoms that line it; an atom can line several pockets. The last part
+/// has the atoms that line none. Without pockets, the rule `split` divides the atoms.
 ///
 /// # Errors
-/// Returns [`StructureError::TooManyParts`], and the errors of [`Selected::parts`] without pockets.
+/// Returns [`StructureError::TooManyParts`], and without pockets the errors of [`Selected::parts`].
 pub(super) fn parts(
     found: Option<&Pockets>,
     structure: &Structure,
@@ -97,13 +98,13 @@ pub(super) fn parts(
     if found.list.len() as u64 >= limit {
         return Err(StructureError::TooManyParts { rule: split.parameter(), limit });
     }
-    let mut lines = vec![false; selected.atoms.len()];
-    found.list.iter().flat_map(|pocket| &pocket.lining).for_each(|row| lines[*row as usize] = true);
+    let mut is_lining = vec![false; selected.atoms.len()];
+    found.list.iter().flat_map(|pocket| &pocket.lining).for_each(|row| is_lining[*row as usize] = true);
     let name = |number: usize| format!("pocket {number}");
     let pockets = (1..).zip(&found.list);
     let mut parts: Vec<AtomPart> =
         pockets.map(|(number, pocket)| AtomPart { name: name(number), rows: pocket.lining.clone() }).collect();
-    let rows = (0..).zip(lines).filter(|(_, lines)| !lines).map(|(row, _)| row).collect();
+    let rows = (0..).zip(is_lining).filter(|(_, is_lining)| !is_lining).map(|(row, _)| row).collect();
     parts.push(AtomPart { name: "other".to_owned(), rows });
     Ok(Some(parts))
 }

@@ -7,11 +7,11 @@ use super::clock::StageClock;
 use crate::surface::simplify::simplify;
 use crate::surface::{Control, Measures, Mesh, MeshOutput, SurfaceError, SurfaceParams, Validation};
 
-/// Number of triangles that a simplification removed, and the distance between both surfaces.
+/// Size of the mesh before its simplification, and distance between the original and the simplified surface.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct SimplificationReport {
-    /// Number of triangles before.
+    /// Number of triangles before the simplification.
     pub triangles_before: u64,
     /// Largest distance between the surfaces in Å, at samples: vertices of the original mesh, and centroids of
     /// triangles of the simplified one.
@@ -20,17 +20,17 @@ pub struct SimplificationReport {
     pub mean_deviation: f64,
 }
 
-/// Returns the parameters of the mesh before a simplification, which must not take rounded vertices that coincide for
-/// one vertex.
+/// Returns the parameters with which the mesh is computed: without quantization if it will be simplified. Rounding can
+/// make vertices coincide, and meshoptimizer treats these as one vertex.
 pub(super) fn params_of_input(job: &Job, params: &SurfaceParams) -> SurfaceParams {
     SurfaceParams { quantize: params.quantize.filter(|_| job.simplify.is_none()), ..params.clone() }
 }
 
-/// Simplifies the mesh of `output` if the job asks for it, and quantizes it if `params` ask for it. A mesh that is
-/// written already is unchanged.
+/// Simplifies the mesh of `output` if the job requires it, and then quantizes it if `params` require it. Does nothing
+/// if the mesh was streamed into a sink.
 ///
 /// # Errors
-/// Returns the errors of memory and cancellation.
+/// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
 pub(super) fn apply(
     job: &Job,
     params: &SurfaceParams,

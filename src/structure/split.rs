@@ -25,7 +25,7 @@ pub enum Split {
     Model,
     /// One part per group of kinds: polymer, ligand (with cofactors), glycan, ion, water.
     ResidueGroup,
-    /// One part per pocket, and one of the rest. Vertices decide, not atoms.
+    /// One part per pocket, with the triangles that line it, and one for the rest of the surface.
     Pocket,
 }
 

@@ -1,13 +1,14 @@
-//! Simplification: fewer triangles, within an error.
+//! Simplification of a mesh: fewer triangles, near the original surface.
 //!
-//! Cubes divide the triangles into pieces. Each piece is simplified on its own by meshoptimizer (quadric error metric,
-//! Garland and Heckbert 1997), which keeps the boundary of the piece. A second pass with shifted cubes simplifies the
-//! boundaries of the first. The vertices that remain are vertices of the original mesh, with their normals, colours and
-//! atom indices.
+//! Space is divided into cubes, and the triangles whose centroids lie in one cube form a piece. meshoptimizer
+//! simplifies each piece on its own (quadric error metric, Garland and Heckbert 1997) and does not change the boundary
+//! of the piece. A second pass with shifted cubes simplifies the triangles at the boundaries of the first pass. The
+//! vertices that remain are vertices of the original mesh, with their normals, colours and atom indices.
 //!
-//! The simplifier may pinch a surface. So each piece is checked: it must remain a manifold with the same boundary, so
-//! that a closed manifold mesh remains one. Otherwise the piece is simplified with a smaller error, or kept. Two pieces
-//! may also get the same edge between two vertices of their boundaries; then one of them is kept.
+//! meshoptimizer can join two sheets of a surface at a vertex or an edge, which would not be a manifold. So each result
+//! is checked: it must be a manifold with the same boundary as the piece. Then a closed manifold mesh remains one. A
+//! piece that fails is simplified with a smaller error; if all errors fail, it stays unchanged. Two pieces can also
+//! both create the same edge between two vertices of their boundaries. Then only one of them is simplified.
 
 mod deviation;
 mod fans;
@@ -28,23 +29,23 @@ use super::lattice::{to_i32, to_u32};
 use super::measure::Component;
 use super::mesh::{Mesh, PartRange, bounds_of};
 
-/// Smallest and largest error, Å.
+/// Smallest and largest value of the parameter `simplify`, Å.
 pub const SIMPLIFY_ERRORS: [f64; 2] = [0.001, 10.0];
 
-/// Edge length of a cube, in grid spacings: some thousand triangles.
+/// Edge length of a cube, in grid spacings. A piece then has some thousand triangles.
 const SIDE: f64 = 24.0;
-/// Errors of the simplifier that are tried, relative to the error. The simplifier averages squared distances, so that
-/// the largest distance is about twice its error. Where an average hides a larger one, the next error is tried.
+/// Errors that are passed to meshoptimizer one after another, relative to the permitted error. Its error is an average
+/// of squared distances, so the largest distance is about twice as large, and in places larger. Then the next is tried.
 const TRIES: [f64; 3] = [0.5, 0.25, 0.125];
-/// Memory of a triangle while the mesh is simplified, bytes: its cube and index, and copies in pieces.
+/// Memory per triangle while the mesh is simplified, bytes: its cube and index, and copies of its corners.
 const TRIANGLE_BYTES: u64 = 64;
 
 /// Result of a simplification.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Simplification {
-    /// Number of triangles before.
+    /// Number of triangles before the simplification.
     pub triangles: u64,
-    /// Distance between the surfaces.
+    /// Distance between the original and the simplified surface.
     pub deviation: Deviation,
 }
 
@@ -53,7 +54,7 @@ pub struct Simplification {
 struct CubeSide(f64);
 
 impl CubeSide {
-    /// Returns the edge length of a cell for searches: a few triangles of the original mesh.
+    /// Returns the edge length of a cell of a [`TriangleGrid`], Å: two grid spacings, so that a cell has few triangles.
     #[expect(clippy::cast_possible_truncation, reason = "a length of a few Å")]
     fn cell(self) -> f32 {
         (self.0 / SIDE * 2.0) as f32
@@ -66,14 +67,15 @@ impl CubeSide {
     }
 }
 
-/// Cube of a triangle: its part and its position, in edge lengths.
+/// Cube of a triangle: the part of the triangle, and the position of the cube, in edge lengths.
 type Cube = (u32, [i32; 3]);
 
 /// Cube and index of each triangle, sorted.
-type Sorted = Vec<(Cube, u32)>;
+type TrianglesByCube = Vec<(Cube, u32)>;
 
-/// Simplifies `mesh` with an error, Å. `spacing` is the grid spacing of the mesh, Å. Parts remain parts; the areas,
-/// volumes and bounds of parts are those of the result.
+/// Simplifies `mesh`. Each of two passes may move the surface by up to `error`, Å, measured at vertices and centroids.
+/// `spacing` is the grid spacing of the mesh, Å. Each part is simplified on its own, and its area, volume and bounds
+/// are measured again.
 ///
 /// # Errors
 /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
@@ -95,7 +97,7 @@ pub(crate) fn simplify(
             Ok(CubePiece::new(mesh, piece).simplified(error, side))
         };
         let mut results = pieces.par_iter().map(simplified).collect::<Result<Vec<_>, SurfaceError>>()?;
-        keep_conflicting(&mut results);
+        revert_conflicts(&mut results);
         let mut n_of_parts = vec![0; mesh.parts.len().max(1)];
         let mut triangles = Vec::new();
         for (piece, result) in pieces.iter().zip(results) {
@@ -120,12 +122,13 @@ pub(crate) fn simplify(
     Ok(Simplification { triangles, deviation })
 }
 
-/// Returns the rows of the triangles of each part; none without parts.
+/// Returns the range of triangles of each part; empty for a mesh without parts.
 fn part_ranges(mesh: &Mesh) -> Vec<Range<usize>> {
     mesh.parts.iter().map(|part| part.triangles.clone()).collect()
 }
 
-/// Returns `triangles` of vertices of `mesh` by cube. `shift` moves the cubes, in edge lengths.
+/// Sorts `triangles`, which refer to vertices of `mesh`, by cube. `parts` are their ranges of parts. `shift` moves the
+/// cubes, in edge lengths.
 fn by_cube(
     mesh: &Mesh,
     triangles: &[[u32; 3]],
@@ -133,17 +136,17 @@ fn by_cube(
     side: CubeSide,
     shift: f64,
     control: &Control<'_>,
-) -> Result<Sorted, SurfaceError> {
+) -> Result<TrianglesByCube, SurfaceError> {
     control.check()?;
     let cube = |(i, triangle): (usize, &[u32; 3])| {
         let corners = triangle.map(|v| mesh.position(v as usize));
-        let cell = |k: usize| {
+        let along = |k: usize| {
             let middle = corners.iter().map(|corner| f64::from(corner[k])).sum::<f64>() / 3.0;
             to_i32((middle / side.0 + shift).floor())
         };
-        ((part_of(parts, i), std::array::from_fn(cell)), to_u32(i))
+        ((part_of(parts, i), std::array::from_fn(along)), to_u32(i))
     };
-    let mut sorted: Sorted = triangles.par_iter().enumerate().map(cube).collect();
+    let mut sorted: TrianglesByCube = triangles.par_iter().enumerate().map(cube).collect();
     super::checked_sort::sort(&mut sorted, Ord::cmp, control)?;
     Ok(sorted)
 }
@@ -153,22 +156,24 @@ fn part_of(parts: &[Range<usize>], triangle: usize) -> u32 {
     to_u32(parts.partition_point(|rows| rows.end <= triangle).min(parts.len().saturating_sub(1)))
 }
 
-/// Result of the simplification of a piece. Vertices are those of the mesh.
+/// Result of the simplification of a piece, with the vertex numbers of the mesh.
 #[derive(Default)]
 struct CubeResult {
-    /// Triangles; `None` if the piece is kept.
+    /// Simplified triangles; `None` if the piece stays unchanged.
     triangles: Option<Vec<[u32; 3]>>,
-    /// Edges within the piece that join vertices of its boundary, after and before the simplification.
+    /// Chords after the simplification: inner edges of the piece that join two vertices of its boundary.
     chords: Vec<[u32; 2]>,
+    /// Chords before the simplification.
     original_chords: Vec<[u32; 2]>,
 }
 
-/// Triangles of a cube with their vertices.
+/// Piece: the triangles of a cube, with their vertices.
 struct CubePiece {
     /// Numbers of the vertices in the mesh, ascending.
     vertices: Vec<u32>,
+    /// Positions of these vertices, Å.
     positions: Vec<[f32; 3]>,
-    /// Triangles of vertices of the piece.
+    /// Triangles, as indices of `vertices`.
     triangles: Vec<[u32; 3]>,
 }
 
@@ -184,8 +189,9 @@ impl CubePiece {
         Self { vertices, positions, triangles }
     }
 
-    /// Simplifies the piece with the largest of some errors that keeps it a manifold with the same boundary, within
-    /// `error` of itself.
+    /// Simplifies the piece with the first error of [`TRIES`] that passes all checks: the result is a manifold with the
+    /// same boundary, and vertices of the piece and centroids of the result are at most `error`, Å, away from the
+    /// other.
     fn simplified(&self, error: f64, side: CubeSide) -> CubeResult {
         let Some(before) = topology(&self.triangles) else { return CubeResult::default() };
         let in_mesh = |edge: &[u32; 2]| edge.map(|v| self.vertices[v as usize]);
@@ -212,7 +218,8 @@ impl CubePiece {
         triangle.map(|v| self.positions[v as usize])
     }
 
-    /// Returns the triangles of the piece after a simplification with this error, Å; `None` if it changes nothing.
+    /// Returns the triangles of the piece after meshoptimizer has simplified it with this error, Å; `None` if it
+    /// removes none.
     fn within(&self, error: f64) -> Option<Vec<[u32; 3]>> {
         let options = SimplifyOptions::LockBorder | SimplifyOptions::ErrorAbsolute;
         let stride = size_of::<[f32; 3]>();
@@ -223,8 +230,9 @@ impl CubePiece {
     }
 }
 
-/// Keeps pieces as they are so that no two pieces have the same chord.
-fn keep_conflicting(results: &mut [CubeResult]) {
+/// Returns simplified pieces to their original triangles until no two pieces have the same chord: their common edge
+/// would have four triangles.
+fn revert_conflicts(results: &mut [CubeResult]) {
     loop {
         let mut chords: Vec<([u32; 2], usize)> = Vec::new();
         for (n, result) in results.iter().enumerate() {
@@ -232,23 +240,23 @@ fn keep_conflicting(results: &mut [CubeResult]) {
             chords.extend(own.iter().map(|chord| (*chord, n)));
         }
         chords.par_sort_unstable();
-        let mut kept = Vec::new();
+        let mut reverted = Vec::new();
         for group in chords.chunk_by(|a, b| a.0 == b.0).filter(|group| group.len() > 1) {
             let simplified = group.iter().map(|(_, n)| *n).filter(|n| results[*n].triangles.is_some());
-            // One piece may keep its chord if it is new in all of them.
+            // If the chord is new in all these pieces, the first of them stays simplified.
             let n_free = usize::from(group.iter().all(|(_, n)| results[*n].triangles.is_some()));
-            kept.extend(simplified.skip(n_free));
+            reverted.extend(simplified.skip(n_free));
         }
-        if kept.is_empty() {
+        if reverted.is_empty() {
             return;
         }
-        for n in kept {
+        for n in reverted {
             results[n].triangles = None;
         }
     }
 }
 
-/// Removes unused vertices, and measures the parts.
+/// Removes unused vertices, and updates the ranges and measures of the parts.
 fn compact(mesh: &mut Mesh) {
     let mut used = vec![false; mesh.n_vertices()];
     mesh.triangles.iter().flatten().for_each(|v| used[*v as usize] = true);
@@ -264,7 +272,7 @@ fn compact(mesh: &mut Mesh) {
     mesh.parts = measured;
 }
 
-/// Returns a part with the measures of its triangles.
+/// Returns `part` with the area, volume and bounds of its triangles in `mesh`.
 fn measure(mesh: &Mesh, part: &PartRange) -> PartRange {
     let mut sum = Component::default();
     for triangle in &mesh.triangles[part.triangles.clone()] {

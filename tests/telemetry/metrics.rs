@@ -362,7 +362,7 @@ fn table() -> String {
 }
 
 #[test]
-fn the_documentation_kinds_every_metric() {
+fn the_documentation_lists_every_metric() {
     const MARKS: [&str; 2] = ["<!-- metrics -->\n", "<!-- end of metrics -->"];
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/operate/monitoring.md");
     let text = std::fs::read_to_string(&path).unwrap();

@@ -1,4 +1,4 @@
-//! GLB whose vertices and indices are compressed. The length is known because the pieces are compressed already.
+//! GLB whose vertices and indices are compressed. The pieces are compressed before, so the length of the file is known.
 
 use std::io::{self, Write};
 
@@ -24,7 +24,8 @@ impl<'a> CompressedGlb<'a> {
     /// Plans the file of `mesh`, whose `pieces` are compressed.
     ///
     /// # Errors
-    /// Returns a [`FormatError`] of a mesh that is too large or beyond the range of its step.
+    /// Returns [`FormatError::GlbTooLarge`], or [`FormatError::OutOfQuantizationRange`] for positions beyond the range
+    /// of the step.
     pub fn new(mesh: &'a Mesh, pieces: &'a Pieces, meta: &Meta) -> Result<Self, FormatError> {
         let Pieces { storage, summary, .. } = pieces;
         let content = (!pieces.is_empty()).then_some(Content::Pieces(pieces));

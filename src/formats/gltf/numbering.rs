@@ -1,5 +1,5 @@
-//! Numbering of the vertices of a piece by their first use. The index codec stores a new vertex without its number, and
-//! vertices next to each other differ little.
+//! Numbering of the vertices of a piece by their first use. This makes files small: the index codec does not store the
+//! number of a vertex at its first use, and consecutive vertices differ little.
 
 use rustc_hash::FxHashMap;
 
@@ -10,7 +10,7 @@ const NONE: u32 = u32::MAX;
 pub(super) struct Numbering {
     /// Vertices of the mesh in the order of their numbers.
     pub(super) vertices: Vec<u32>,
-    /// Triangles, in the numbers of the piece.
+    /// Triangles, as indices of `vertices`.
     pub(super) triangles: Vec<[u32; 3]>,
 }
 
@@ -21,8 +21,8 @@ impl Numbering {
     /// Numbers the vertices of `triangles`.
     pub(super) fn new(triangles: &[[u32; 3]]) -> Self {
         let n = triangles.len();
-        // A run of triangles owns about half as many vertices, which are consecutive. A table finds these. A map finds
-        // the others, which belong to earlier or later runs.
+        // Most vertices of a run of triangles are consecutive, about half as many as triangles. A table finds these. A
+        // hash map finds the others, which belong to earlier or later runs.
         let middle = triangles.get(n / 2).map_or(0, |triangle| triangle[0] as usize);
         let first = middle.saturating_sub(n);
         let (mut near, mut far) = (vec![NONE; 2 * n], FxHashMap::default());

@@ -21,11 +21,11 @@ use crate::formats::{Format, FormatError, Normals, Packing, Storage};
 use crate::surface::quantize::Step;
 use crate::surface::{Mesh, Vertices};
 
-/// Extension of compressed buffer views. Marked as required: there is no uncompressed copy.
+/// Extension of compressed buffer views. Marked as required, because the file has no uncompressed copy.
 const MESHOPT: &str = "EXT_meshopt_compression";
 
 /// Maximum number of triangles of a piece. The vertices of such a piece, about half as many and 3 % for its seams,
-/// have 16-bit indices. Smaller pieces have more seams, larger ones leave cores idle.
+/// fit 16-bit indices. Smaller pieces have more seams; larger ones leave cores idle.
 const PIECE_TRIANGLES: usize = 96 << 10;
 
 /// Version of the vertex codec: the one that the extension defines. The newer one is for `KHR_meshopt_compression`.
@@ -47,7 +47,9 @@ struct Stream {
     stride: u64,
     /// Number of elements.
     count: usize,
+    /// Mode of the extension: `ATTRIBUTES` or `TRIANGLES`.
     mode: &'static str,
+    /// Filter of the extension, which the decoder applies.
     filter: Option<&'static str>,
 }
 
@@ -64,10 +66,11 @@ struct Piece {
     bounds: [[f32; 3]; 2],
     /// Streams in the order of the views: attributes, then indices. Each starts at a multiple of 4.
     streams: Vec<Stream>,
+    /// Compressed streams.
     data: Vec<u8>,
 }
 
-/// Compressed mesh.
+/// Mesh in compressed pieces.
 #[derive(Debug, Clone)]
 pub struct Pieces {
     pub(super) storage: Storage,
@@ -79,7 +82,7 @@ pub struct Pieces {
 }
 
 impl Pieces {
-    /// Compresses a mesh with quantized vertices. `bounds` are those of its positions, if known, Å.
+    /// Compresses a mesh with quantized vertices. `bounds` are the lowest and highest position, if known, Å.
     ///
     /// Runs on all threads of the current pool. Calls `grow` with a number of bytes before it allocates them, several
     /// times for each piece, and stops at its first error. Calls `shrink` with bytes that are free again.
@@ -104,8 +107,8 @@ impl Pieces {
             grow(numbering_bytes)?;
             let numbering = Numbering::new(rows);
             let layout = layout(&numbering, storage, mesh.colors.is_some(), atoms)?;
-            // A gathered column, its form in the file, and the output of the encoder, which is as long at most; the
-            // input of the filter of normals is four times as long as its output.
+            // A column of the piece, its form in the file, and the output of the encoder, each at most as long as the
+            // decoded piece. The filter of normals needs 16 bytes of input per vertex.
             let scratch = 3 * layout.len + 16 * numbering.vertices.len() as u64;
             grow(scratch)?;
             let piece = source.compress(part, &numbering, layout)?;
@@ -166,7 +169,8 @@ impl Pieces {
         primitives
     }
 
-    /// Adds the extension to the views and to the second buffer, which exists only after decoding.
+    /// Adds the extension to the views and to the second buffer, which exists only after decoding. The first views of
+    /// the document are those of the pieces, in the order of their streams.
     pub(super) fn add_extensions(&self, document: &mut Value) {
         let mut start = 0;
         let mut views = 0..;
@@ -197,13 +201,13 @@ impl Pieces {
 }
 
 impl Piece {
-    /// Returns the length of the decoded piece, with which the next one starts at a multiple of 4, bytes.
+    /// Returns the length of the decoded piece, padded so that the next one starts at a multiple of 4, bytes.
     fn decoded_bytes(&self) -> u64 {
         self.layout.len.next_multiple_of(4)
     }
 }
 
-/// Divides the triangles of each part into runs of almost equal length. Returns the part of each run.
+/// Divides the triangles of each part into runs of almost equal length. Returns each run with the index of its part.
 fn runs(drawn: &[Drawn<'_>]) -> Vec<(usize, Range<usize>)> {
     let bound = |row: u64| usize::try_from(row).unwrap_or(usize::MAX);
     let runs = drawn.iter().enumerate().flat_map(|(part, rows)| {
@@ -227,7 +231,7 @@ fn layout(
     BufferLayout::new([n_vertices, n_triangles, 0], n_indexed, storage, colors, atoms)
 }
 
-/// Mesh whose pieces are compressed.
+/// Columns of the mesh that is compressed.
 struct Source<'a> {
     step: Step,
     positions: &'a [[i16; 4]],

@@ -315,7 +315,7 @@ pub const TABLE: &[Parameter] = &[
         SIMPLIFY_ERRORS,
         "Å",
         "absent",
-        "Error within which the mesh is simplified: fewer and larger triangles, whose vertices are vertices of the original mesh. A closed manifold mesh remains one. The report states the measured deviation.",
+        "Error of a simplification of the mesh: fewer and larger triangles, whose vertices are vertices of the original mesh. A closed manifold mesh remains one. The report states the measured deviation, which can be somewhat larger than the error.",
     ),
     Parameter {
         name: "validation",
@@ -339,7 +339,7 @@ pub const TABLE: &[Parameter] = &[
         name: "compress",
         domain: Domain::Choice(COMPRESS),
         default: "none",
-        doc: "Storage of glb and gltf: quantize uses 12 bytes per vertex instead of 24 (16-bit positions, 8-bit normals; KHR_mesh_quantization). meshopt, for glb only, also compresses vertices and indices to about a fifth of the size (EXT_meshopt_compression).",
+        doc: "Storage of glb and gltf: quantize uses 12 bytes per vertex instead of 24 (16-bit positions, 8-bit normals; KHR_mesh_quantization). meshopt, for glb only, also compresses vertices and indices; the file has about a fifth of the size (EXT_meshopt_compression).",
     },
     Parameter {
         name: "normals",

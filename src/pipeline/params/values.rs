@@ -61,7 +61,7 @@ impl ParsedValues {
         Ok(scheme.map(|scheme| Coloring { scheme, palette, range, blend, offset }))
     }
 
-    /// Returns the radius of the large probe if pockets are listed, coloured or parts, Å.
+    /// Returns the radius of the large probe, Å, if the job lists pockets, colours them or makes parts of them.
     pub(super) fn pockets(&self) -> Result<Option<f64>, ParamError> {
         let needed = self.scheme.is_some_and(Scheme::needs_pockets) || self.request.job.split == Split::Pocket;
         if self.pockets || needed {

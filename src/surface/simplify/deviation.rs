@@ -5,12 +5,12 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use super::grid::{Corners, TriangleGrid};
-use super::{Cube, CubeSide, by_cube, part_ranges};
+use super::{Cube, CubeSide, TrianglesByCube, by_cube, part_ranges};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::mesh::Mesh;
 
-/// Largest number of samples per cube on each surface.
+/// Maximum number of samples per cube on each surface.
 const SAMPLES: usize = 256;
 
 /// Distance between two surfaces, at samples on both: vertices of the original, and centroids of triangles of the
@@ -39,13 +39,18 @@ impl Distances {
             .fold(Self::default(), |all, distance| all.with(Self { sum: distance, maximum: distance, n: 1 }))
     }
 
+    /// Returns the statistics of both sets of distances together.
     pub(super) fn with(self, other: Self) -> Self {
         Self { sum: self.sum + other.sum, maximum: self.maximum.max(other.maximum), n: self.n + other.n }
     }
 }
 
 impl Deviation {
-    /// Measures the distance between `mesh` and the triangles `before` with their parts, which share its vertices.
+    /// Measures the distance between the triangles of `mesh`, and those `before` its simplification, which refer to the
+    /// same vertices. `parts_before` are their ranges of parts.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
     pub(super) fn sampled(
         mesh: &Mesh,
         before: &[[u32; 3]],
@@ -75,7 +80,7 @@ impl Deviation {
     }
 }
 
-/// Returns every n-th triangle.
+/// Returns every n-th triangle, at most [`SAMPLES`].
 fn samples(triangles: impl ExactSizeIterator<Item = Corners>) -> impl Iterator<Item = Corners> {
     let step = triangles.len().div_ceil(SAMPLES).max(1);
     triangles.step_by(step)
@@ -86,11 +91,11 @@ pub(super) fn centroid([a, b, c]: Corners) -> [f32; 3] {
     std::array::from_fn(|k| (a[k] + b[k] + c[k]) / 3.0)
 }
 
-/// Triangles by cube.
+/// Triangles of a surface, with an index by cube.
 struct Surface<'a> {
     mesh: &'a Mesh,
     triangles: &'a [[u32; 3]],
-    by_cube: Vec<(Cube, u32)>,
+    by_cube: TrianglesByCube,
 }
 
 impl Surface<'_> {
@@ -103,11 +108,12 @@ impl Surface<'_> {
         self.by_cube[start..end].iter().map(|(_, i)| self.corners(*i as usize))
     }
 
+    /// Returns the corners of triangle `i`, Å.
     fn corners(&self, i: usize) -> Corners {
         self.triangles[i].map(|v| self.mesh.position(v as usize))
     }
 
-    /// Returns the triangles in and near a cube; all triangles if there are none.
+    /// Returns the triangles in and near a cube; all triangles of the surface if none is near.
     fn around(&self, (part, [x, y, z]): Cube, side: CubeSide) -> TriangleGrid {
         let steps = || -1..=1;
         let cubes = steps().flat_map(|dx| steps().flat_map(move |dy| steps().map(move |dz| [x + dx, y + dy, z + dz])));

@@ -2,15 +2,16 @@
 
 use rustc_hash::FxHashMap;
 
-/// Fans at the boundary of a piece: the first outward boundary edge of each fan, and the vertex at the end of its last.
+/// Fans of triangles around the vertices of the boundary. The key is the edge with which a fan begins, as its boundary
+/// vertex and its other end. The value is the other end of the edge with which the fan ends.
 pub(super) type BoundaryFans = FxHashMap<[u32; 2], u32>;
 
-/// Topology of an oriented manifold with a boundary. Two pieces with equal boundary fans can replace each other in a
-/// closed manifold mesh, unless a chord is an edge of another piece too.
+/// Topology of an oriented manifold with a boundary. In a closed manifold mesh, a piece can be replaced by another one
+/// with equal boundary fans, unless one of its chords is also an edge of another piece.
 #[derive(Debug, PartialEq)]
 pub(super) struct Topology {
     pub(super) fans: BoundaryFans,
-    /// Edges within the piece that join two vertices of its boundary, with ascending vertices.
+    /// Chords: inner edges that join two vertices of the boundary. The lower vertex is the first.
     pub(super) chords: Vec<[u32; 2]>,
 }
 

@@ -1,4 +1,4 @@
-//! Distances of points from triangles, with a uniform grid of cells.
+//! Distances of points from the nearest of many triangles, which a uniform grid of cells finds.
 
 /// Triangle: its corners, Å.
 pub(super) type Corners = [[f32; 3]; 3];
@@ -8,12 +8,15 @@ const MAX_CELLS: f32 = 64.0;
 
 /// Triangles by the cells that their bounding boxes overlap.
 pub(super) struct TriangleGrid {
+    /// Lowest corner, Å.
     low: [f32; 3],
     /// Edge length of a cell, Å.
     cell: f32,
+    /// Number of cells along each axis.
     size: [i32; 3],
     /// First entry of each cell; the last element is the number of entries.
     starts: Vec<u32>,
+    /// Numbers of the triangles of each cell.
     entries: Vec<u32>,
     triangles: Vec<Corners>,
 }
@@ -73,11 +76,11 @@ impl TriangleGrid {
     /// Returns the distance of a point from the nearest triangle, Å; infinity if there is no triangle.
     pub(super) fn distance(&self, point: [f32; 3]) -> f32 {
         let own = self.cell_of(point);
-        // Cells in this distance, in cells, are the nearest and the farthest ones of the grid.
+        // Distances of the nearest and the farthest cell of the grid, in cells.
         let gap = |k: usize| (-own[k]).max(own[k] - self.size[k] + 1).max(0);
         let span = |k: usize| own[k].max(self.size[k] - 1 - own[k]);
         let [first, last] = [(0..3).map(gap).max(), (0..3).map(span).max()].map(Option::unwrap_or_default);
-        // Distance from the sides of the own cell.
+        // Distance of the point from the nearest side of its own cell.
         let inside = (0..3).map(|k| {
             let from_low = point[k] - self.low[k] - own[k] as f32 * self.cell;
             from_low.min(self.cell - from_low)

@@ -104,14 +104,14 @@ fn a_chord_of_two_pieces_remains_in_one() {
         original_chords: original.to_vec(),
     };
     let kept = |mut results: Vec<CubeResult>| {
-        keep_conflicting(&mut results);
+        revert_conflicts(&mut results);
         results.iter().map(|result| result.triangles.is_none()).collect::<Vec<_>>()
     };
     let (new, other) = ([[3, 7]], [[2, 9]]);
     assert_eq!(kept(vec![piece(Some(0), &new, &[]), piece(Some(1), &other, &[])]), [false, false]);
     assert_eq!(kept(vec![piece(Some(0), &new, &[]), piece(Some(1), &new, &[])]), [false, true]);
     assert_eq!(kept(vec![piece(Some(0), &new, &[]), piece(None, &[], &new)]), [true, true]);
-    // The second piece is kept because of the first one, and the third one because of the second.
+    // The second piece is reverted because of the first one, and the third one because of the second.
     let chain = vec![piece(Some(0), &new, &[]), piece(Some(1), &new, &other), piece(Some(2), &other, &[])];
     assert_eq!(kept(chain), [false, true, true]);
 }

@@ -10,7 +10,7 @@ use crate::surface::lattice::LatticeAtom;
 
 /// End of an arc: a vertex of the boundary.
 pub(super) struct ArcEnd {
-    /// Sphere of the probe at the vertex, in Å.
+    /// Probe at the vertex, on a lattice with a spacing of 1 Å.
     pub(super) probe: LatticeAtom,
     /// Unit vector along the arc, away from the vertex.
     pub(super) tangent: [f64; 3],
@@ -20,7 +20,7 @@ pub(super) struct ArcEnd {
     pub(super) component: u32,
 }
 
-/// Vertices of the boundary, each as the ends of its arcs.
+/// Vertices of the boundary. Each is represented by the ends of all arcs that meet there.
 pub(super) struct Vertices<'a> {
     pub(super) ends: &'a [ArcEnd],
     /// Radius of the probe, Å.
@@ -29,7 +29,11 @@ pub(super) struct Vertices<'a> {
 }
 
 impl Vertices<'_> {
-    /// Measures the concave part of a vertex if `own` is the first of its ends.
+    /// Adds to `part` the measures of the concave part at the vertex of end `own`, if it is the first end of the
+    /// vertex.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Comparisons::add`].
     pub(super) fn concave(
         &self,
         own: u32,
@@ -44,7 +48,8 @@ impl Vertices<'_> {
         caps.clear();
         contacts.clear();
         let centre = self.search.centre(&self.ends[own as usize].probe);
-        // The part lies on the other side of the plane of each arc. Fewer than three planes bound no polygon.
+        // The plane of each arc through the probe's centre bounds the part, which lies on the side away from the arc.
+        // Fewer than three planes bound no polygon.
         for other in neighbours.iter().filter(|other| is_same(other)) {
             let end = &self.ends[other.index as usize];
             caps.push(Cap { axis: end.tangent, height: 0.0, index: other.index });
@@ -64,7 +69,7 @@ impl Vertices<'_> {
             return Ok(());
         }
         for (sphere, contact) in &*contacts {
-            // The points that are nearer to this point of contact than to any other.
+            // Measures the points that are nearer to this point of contact than to any other.
             of_contact.clone_from(caps);
             for (other, direction) in &*contacts {
                 let difference: [f64; 3] = std::array::from_fn(|k| direction[k] - contact[k]);

@@ -65,7 +65,8 @@ pub struct ExactMeasures {
     pub volume: f64,
 }
 
-/// Exact measures of a component of the boundary, and of the solvent-excluded surface that belongs to it alone.
+/// Exact measures of a component of the boundary, and of the solvent-excluded surface that the probe makes with its
+/// centre on this component, without regard to probes on other components.
 #[derive(Debug, Clone, Copy, Default)]
 pub(in crate::surface) struct ComponentMeasures {
     /// Area of the boundary, Å².
@@ -74,33 +75,37 @@ pub(in crate::surface) struct ComponentMeasures {
     pub(in crate::surface) accessible_volume: f64,
     /// Area of the solvent-excluded surface, Å².
     pub(in crate::surface) area: f64,
-    /// Volume that it encloses, Å³; negative for a cavity.
+    /// Volume that the solvent-excluded surface encloses, Å³; negative for a cavity.
     pub(in crate::surface) volume: f64,
 }
 
 /// Spheres that are converted between two checks of the cancellation flag.
 const PER_CHECK: usize = 1 << 14;
 
-/// Measures of the spheres, or of the vertices, of some cells.
+/// Measures of the spheres, or of the probes at vertices, of a run of cells.
 #[derive(Default)]
 pub(super) struct PartMeasures {
     /// Areas of spheres, by number. A sphere may have several entries.
     pub(super) of_spheres: Vec<(u32, AreaParts)>,
+    /// Integrals of components, by number. A component may have several entries.
     pub(super) of_components: Vec<(u32, Integrals)>,
     pub(super) ends: Vec<ArcEnd>,
 }
 
 impl PartMeasures {
+    /// Returns the memory of all entries, bytes.
     fn bytes(&self) -> usize {
         size_of_val(&*self.of_spheres) + size_of_val(&*self.of_components) + size_of_val(&*self.ends)
     }
 }
 
-/// Area, Å², and integral of x·n, Å³, over a boundary and a solvent-excluded surface. The integral is three times the
-/// volume.
+/// Integrals over a surface: its area, Å², and the integral of x·n, Å³, where n is the outward normal at x. The latter
+/// is three times the enclosed volume.
 #[derive(Clone, Copy, Default)]
 pub(super) struct Integrals {
+    /// Those of the boundary of the spheres.
     pub(super) accessible: [f64; 2],
+    /// Those of the solvent-excluded surface; without a probe, those of the boundary.
     pub(super) excluded: [f64; 2],
 }
 
@@ -111,16 +116,16 @@ pub(super) struct Scratch {
     pub(super) caps: Vec<Cap>,
     /// Spheres that the probe touches at a vertex, and the directions of the points of contact.
     pub(super) contacts: Vec<(u32, [f64; 3])>,
-    /// Caps that bound the points nearest to one point of contact.
+    /// Caps outside which the points of a concave part are nearest to one point of contact.
     pub(super) of_contact: Vec<Cap>,
     pub(super) regions: Vec<(u32, Region)>,
     pub(super) uncovered: Uncovered,
 }
 
-/// Search for the exposed parts of spheres.
+/// Measurement of the exposed parts of spheres.
 pub(super) struct FaceSearch<'a> {
     pub(super) atoms: &'a [LatticeAtom],
-    /// Components of the boundary; without them, everything is one component.
+    /// Components of the boundary; `None` to measure it as one.
     pub(super) components: Option<&'a Components<'a>>,
     /// Radius of the probe of a solvent-excluded surface, Å.
     pub(super) probe: Option<f64>,
@@ -297,7 +302,7 @@ impl FaceSearch<'_> {
         std::array::from_fn(|k| f64::from(atom.cell[k] - self.origin[k]) + f64::from(atom.frac[k]))
     }
 
-    /// Returns the component of an arc of the edge of a cap on sphere `own`.
+    /// Returns the component of an exposed arc of the edge of a cap on sphere `own`.
     fn component(&self, own: u32, cap: &Cap, arc: &EdgeArc) -> u32 {
         let Some(components) = self.components else { return 0 };
         let sin = (1.0 - cap.height * cap.height).max(0.0).sqrt();
@@ -339,8 +344,8 @@ impl FaceSearch<'_> {
         Ok(())
     }
 
-    /// Adds the toroidal part of an arc, and the ends of the arc. The arc is part of the edge of the cap of the second
-    /// sphere on the first one.
+    /// Adds to `part` the toroidal part of an arc, and the ends of the arc. The arc lies on the edge of `cap`, which
+    /// the second of the `spheres` covers on the first one.
     fn toroidal(
         &self,
         spheres: [u32; 2],

@@ -1,8 +1,8 @@
 //! Solid angle and vector area of the part of a unit sphere that no cap covers, from its exposed arcs.
 //!
 //! The area between a pole p and an arc of a boundary is the integral of p·(n × dn)/(1 + p·n) along the arc. Its sum
-//! over the boundary is the area of the region up to multiples of 4π, however many pieces and holes the region has. The
-//! largest cap bounds the area, which selects the multiple.
+//! over the boundary is the area of the region up to a multiple of 4π, for any number of connected pieces and holes.
+//! The area is at most that outside the largest cap, which determines the multiple.
 
 use std::f64::consts::PI;
 
@@ -17,7 +17,7 @@ use crate::surface::error::SurfaceError;
 pub(super) struct Region {
     /// Solid angle, steradian.
     pub(super) solid_angle: f64,
-    /// Integral of the direction over the part.
+    /// Vector area: integral of the unit normal over the part.
     pub(super) vector: [f64; 3],
 }
 

@@ -20,7 +20,8 @@ pub(in crate::surface) struct Shell {
 }
 
 impl Components<'_> {
-    /// Measures all components, whose atoms are on a lattice with a spacing of 1 Å and have radii that include `probe`.
+    /// Returns all components with their measures, spheres and bounds. The atoms are on a lattice with a spacing of 1
+    /// Å, and their radii include that of the `probe`, Å.
     ///
     /// # Errors
     /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].

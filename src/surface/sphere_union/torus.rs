@@ -16,13 +16,14 @@ pub(super) struct ProbePath<'a> {
     pub(super) radius: f64,
     /// Distances of the centre of the circle from those of the spheres along the axis, Å, positive between them.
     pub(super) offsets: [f64; 2],
+    /// Radius of the probe, Å.
     pub(super) probe: f64,
 }
 
 impl ProbePath<'_> {
-    /// Returns the areas of the toroidal part that are nearer to the point of contact with each sphere, Å², and the
-    /// integral of x·n over the whole part, Å³, where n is the outward normal at x. The part of a torus that intersects
-    /// itself is left out: other positions of the probe on the arc reach it.
+    /// Returns the area of the toroidal part that counts for each sphere, Å², and the integral of x·n over the whole
+    /// part, Å³, where n is the outward normal at x. A point counts for the sphere whose point of contact is nearer.
+    /// Where the torus intersects itself, the area that the probe covers at other positions on the arc is left out.
     pub(super) fn measure(&self) -> ([f64; 2], f64) {
         let Self { radius, offsets, probe, .. } = *self;
         // A point of the probe has an angle from the direction to the axis, positive on the side of the first sphere.
@@ -41,7 +42,7 @@ impl ProbePath<'_> {
         (areas, flux)
     }
 
-    /// Returns the area between two angles and the integral of x·n over it.
+    /// Returns the area between two angles, Å², and the integral of x·n over it, Å³.
     fn between(&self, from: f64, to: f64) -> [f64; 2] {
         let Self { arc, axis, centre, radius, probe, .. } = *self;
         let turn = 2.0 * arc.half_angle;
