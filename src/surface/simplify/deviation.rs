@@ -63,8 +63,9 @@ impl Deviation {
             Ok::<_, SurfaceError>(Surface { mesh, triangles, by_cube })
         };
         let (original, simplified) = (surface(before, parts_before)?, surface(&mesh.triangles, &part_ranges(mesh))?);
-        let all = [&original, &simplified].into_iter().flat_map(|surface| &surface.by_cube);
-        let mut cubes: Vec<Cube> = all.map(|(cube, _)| *cube).collect();
+        let surfaces = [&original, &simplified].into_iter();
+        let pieces = surfaces.flat_map(|surface| surface.by_cube.chunk_by(|a, b| a.0 == b.0));
+        let mut cubes: Vec<Cube> = pieces.map(|piece| piece[0].0).collect();
         cubes.par_sort_unstable();
         cubes.dedup();
         let of_cube = |cube: &Cube| {
