@@ -19,6 +19,7 @@ use crate::structure::{AtomPart, Structure, StructureError};
 use crate::surface::cpu::{LATTICE_BYTES, check_work, scan};
 use crate::surface::lattice::{Lattice, slightly_coarser};
 use crate::surface::params::MAX_RESOLUTION;
+use crate::surface::simplify::TRIANGLE_BYTES;
 use crate::surface::{
     Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
 };
@@ -152,8 +153,11 @@ pub(super) fn check_memory(
     control: &Control<'_>,
 ) -> Result<(), SurfaceError> {
     let (memory, params) = (&control.memory, plan.params);
+    // A vertex has two triangles.
+    let simplification = 2 * TRIANGLE_BYTES * u64::from(job.simplify.is_some());
+    let per_vertex = job.attribute_bytes() + simplification;
     let attributes =
-        |vertices: u64| vertices.saturating_mul(job.attribute_bytes()).saturating_add(plan.compressed_bytes(vertices));
+        |vertices: u64| vertices.saturating_mul(per_vertex).saturating_add(plan.compressed_bytes(vertices));
     let vertices = n_vertices(plan.spheres.area(params), params.resolution);
     let most = params.mesh_bytes(vertices, vertices.saturating_mul(2)).saturating_add(attributes(vertices));
     // A surface before its cut has at most the same size, besides its atom indices.

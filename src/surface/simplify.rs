@@ -38,7 +38,7 @@ const SIDE: f64 = 24.0;
 /// of squared distances, so the largest distance is about twice as large, and in places larger. Then the next is tried.
 const TRIES: [f64; 3] = [0.5, 0.25, 0.125];
 /// Memory per triangle while the mesh is simplified, bytes: its cube and index, and copies of its corners.
-const TRIANGLE_BYTES: u64 = 64;
+pub(crate) const TRIANGLE_BYTES: u64 = 112;
 
 /// Result of a simplification.
 #[derive(Debug, Clone, Copy, PartialEq)]
