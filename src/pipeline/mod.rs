@@ -299,7 +299,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
         let plan = MeshPlan::new(&spheres, division, &params, job, limits);
         let choice = plan.choice(undivided, choice);
         let checked = if sink.is_none() { estimate::check_memory(&plan, job, choice, &control) } else { Ok(()) };
-        let meshed = simplify::params_of_input(job, &params);
+        let meshed = simplify::params_of_input(job, &params)?;
         let write = |()| clock.pass(|| backend.write(&spheres, &meshed, &limits.surface, &control, sink));
         let written = checked.and_then(write);
         (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, choice, &control))?, None, storage)

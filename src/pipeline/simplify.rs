@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::Job;
 use super::clock::StageClock;
-use crate::surface::simplify::simplify;
+use crate::surface::simplify::{check_error, simplify};
 use crate::surface::{Control, Measures, Mesh, MeshOutput, SurfaceError, SurfaceParams, Validation};
 
 /// Size of the mesh before its simplification, and distance between the original and the simplified surface.
@@ -20,10 +20,14 @@ pub struct SimplificationReport {
     pub mean_deviation: f64,
 }
 
-/// Returns the parameters with which the mesh is computed: without quantization if it will be simplified. Rounding can
-/// make vertices coincide, and meshoptimizer treats these as one vertex.
-pub(super) fn params_of_input(job: &Job, params: &SurfaceParams) -> SurfaceParams {
-    SurfaceParams { quantize: params.quantize.filter(|_| job.simplify.is_none()), ..params.clone() }
+/// Returns the parameters of the mesh before a simplification, which must not take rounded vertices that coincide for
+/// one vertex.
+///
+/// # Errors
+/// [`SurfaceError::BadParameter`] if the error of the simplification is too large for the grid.
+pub(super) fn params_of_input(job: &Job, params: &SurfaceParams) -> Result<SurfaceParams, SurfaceError> {
+    job.simplify.map_or(Ok(()), |error| check_error(error, params.resolution))?;
+    Ok(SurfaceParams { quantize: params.quantize.filter(|_| job.simplify.is_none()), ..params.clone() })
 }
 
 /// Simplifies the mesh of `output` if the job requires it, and then quantizes it if `params` require it. Does nothing

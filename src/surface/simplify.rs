@@ -28,6 +28,7 @@ use super::error::SurfaceError;
 use super::lattice::{to_i32, to_u32};
 use super::measure::Component;
 use super::mesh::{Mesh, PartRange, bounds_of};
+use super::params::bad;
 
 /// Smallest and largest value of the parameter `simplify`, Å.
 pub const SIMPLIFY_ERRORS: [f64; 2] = [0.001, 10.0];
@@ -37,6 +38,8 @@ const SIDE: f64 = 24.0;
 /// Errors that are passed to meshoptimizer one after another, relative to the permitted error. Its error is an average
 /// of squared distances, so the largest distance is about twice as large, and in places larger. Then the next is tried.
 const TRIES: [f64; 3] = [0.5, 0.25, 0.125];
+/// Largest error, in grid spacings: larger ones need larger cubes.
+const MAX_SPACINGS: f64 = 10.0;
 /// Memory per triangle while the mesh is simplified, bytes: its cube and index, and copies of its corners.
 pub(crate) const TRIANGLE_BYTES: u64 = 112;
 
@@ -73,51 +76,71 @@ type Cube = (u32, [i32; 3]);
 /// Cube and index of each triangle, sorted.
 type TrianglesByCube = Vec<(Cube, u32)>;
 
+/// Checks an error for a grid spacing, both in Å.
+///
+/// # Errors
+/// [`SurfaceError::BadParameter`] for an error of more than 10 grid spacings.
+pub(crate) fn check_error(error: f64, spacing: f64) -> Result<(), SurfaceError> {
+    let most = MAX_SPACINGS * spacing;
+    if error <= most {
+        return Ok(());
+    }
+    let expected = format!("at most {MAX_SPACINGS} grid spacings: {most:.3} Å with this grid");
+    Err(bad("simplify", format!("`{error}`"), &expected))
+}
+
 /// Simplifies `mesh`. Each of two passes may move the surface by up to `error`, Å, measured at vertices and centroids.
 /// `spacing` is the grid spacing of the mesh, Å. Each part is simplified on its own, and its area, volume and bounds
 /// are measured again.
 ///
 /// # Errors
-/// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+/// Returns the errors of [`check_error`], [`SurfaceError::Memory`] and [`SurfaceError::Cancelled`].
 pub(crate) fn simplify(
     mesh: &mut Mesh,
     error: f64,
     spacing: f64,
     control: &Control<'_>,
 ) -> Result<Simplification, SurfaceError> {
+    check_error(error, spacing)?;
     mesh.make_contiguous();
     let _memory = control.reserve(TRIANGLE_BYTES * mesh.n_triangles() as u64)?;
-    let (before, parts) = (mesh.triangles.to_vec(), part_ranges(mesh));
+    let positions: Vec<[f32; 3]> = (0..mesh.n_vertices()).into_par_iter().map(|v| mesh.position(v)).collect();
+    let (rows, parts) = (mesh.triangles.to_vec(), part_ranges(mesh));
+    let before = Triangles { positions: &positions, rows: &rows, parts: &parts };
     let side = CubeSide(SIDE * spacing);
     for shift in [0.0, 0.5] {
-        let sorted = by_cube(mesh, &mesh.triangles, &part_ranges(mesh), side, shift, control)?;
+        let parts = part_ranges(mesh);
+        let triangles = Triangles { positions: &positions, rows: &mesh.triangles, parts: &parts };
+        let sorted = triangles.by_cube(side, shift, control)?;
         let pieces: Vec<&[(Cube, u32)]> = sorted.chunk_by(|a, b| a.0 == b.0).collect();
         let simplified = |piece: &&[(Cube, u32)]| {
             control.check()?;
-            Ok(CubePiece::new(mesh, piece).simplified(error, side))
+            Ok(CubePiece::new(&triangles, piece).simplified(error, side))
         };
         let mut results = pieces.par_iter().map(simplified).collect::<Result<Vec<_>, SurfaceError>>()?;
         revert_conflicts(&mut results);
         let mut n_of_parts = vec![0; mesh.parts.len().max(1)];
-        let mut triangles = Vec::new();
+        let mut rows = Vec::new();
         for (piece, result) in pieces.iter().zip(results) {
-            let first = triangles.len();
+            let first = rows.len();
             match result.triangles {
-                Some(simplified) => triangles.extend(simplified),
-                None => triangles.extend(piece.iter().map(|(_, i)| mesh.triangles[*i as usize])),
+                Some(simplified) => rows.extend(simplified),
+                None => rows.extend(piece.iter().map(|(_, i)| triangles.rows[*i as usize])),
             }
-            n_of_parts[piece[0].0.0 as usize] += triangles.len() - first;
+            n_of_parts[piece[0].0.0 as usize] += rows.len() - first;
         }
-        mesh.triangles = triangles.into();
+        mesh.triangles = rows.into();
         let mut first = 0;
         for (part, n) in mesh.parts.iter_mut().zip(n_of_parts) {
             part.triangles = first..first + n;
             first += n;
         }
     }
-    let deviation = Deviation::sampled(mesh, &before, &parts, side, control)?;
-    let triangles = before.len() as u64;
-    drop(before);
+    let parts = part_ranges(mesh);
+    let after = Triangles { positions: &positions, rows: &mesh.triangles, parts: &parts };
+    let deviation = Deviation::sampled(before, after, error, side, control)?;
+    let triangles = rows.len() as u64;
+    drop((rows, positions));
     compact(mesh);
     Ok(Simplification { triangles, deviation })
 }
@@ -127,28 +150,34 @@ fn part_ranges(mesh: &Mesh) -> Vec<Range<usize>> {
     mesh.parts.iter().map(|part| part.triangles.clone()).collect()
 }
 
-/// Sorts `triangles`, which refer to vertices of `mesh`, by cube. `parts` are their ranges of parts. `shift` moves the
-/// cubes, in edge lengths.
-fn by_cube(
-    mesh: &Mesh,
-    triangles: &[[u32; 3]],
-    parts: &[Range<usize>],
-    side: CubeSide,
-    shift: f64,
-    control: &Control<'_>,
-) -> Result<TrianglesByCube, SurfaceError> {
-    control.check()?;
-    let cube = |(i, triangle): (usize, &[u32; 3])| {
-        let corners = triangle.map(|v| mesh.position(v as usize));
-        let along = |k: usize| {
-            let middle = corners.iter().map(|corner| f64::from(corner[k])).sum::<f64>() / 3.0;
-            to_i32((middle / side.0 + shift).floor())
+/// Triangles of a mesh.
+#[derive(Debug, Clone, Copy)]
+struct Triangles<'a> {
+    /// Positions of the vertices, Å.
+    positions: &'a [[f32; 3]],
+    rows: &'a [[u32; 3]],
+    /// Range of the triangles of each part; empty without parts.
+    parts: &'a [Range<usize>],
+}
+
+impl Triangles<'_> {
+    /// Returns the corners of triangle `i`, Å.
+    fn corners(&self, i: usize) -> Corners {
+        self.rows[i].map(|v| self.positions[v as usize])
+    }
+
+    /// Sorts the triangles by cube. `shift` moves the cubes, in edge lengths.
+    fn by_cube(&self, side: CubeSide, shift: f64, control: &Control<'_>) -> Result<TrianglesByCube, SurfaceError> {
+        control.check()?;
+        let cube = |i: usize| {
+            let middle = centroid(self.corners(i));
+            let along = |k: usize| to_i32((f64::from(middle[k]) / side.0 + shift).floor());
+            ((part_of(self.parts, i), std::array::from_fn(along)), to_u32(i))
         };
-        ((part_of(parts, i), std::array::from_fn(along)), to_u32(i))
-    };
-    let mut sorted: TrianglesByCube = triangles.par_iter().enumerate().map(cube).collect();
-    super::checked_sort::sort(&mut sorted, Ord::cmp, control)?;
-    Ok(sorted)
+        let mut sorted: TrianglesByCube = (0..self.rows.len()).into_par_iter().map(cube).collect();
+        super::checked_sort::sort(&mut sorted, Ord::cmp, control)?;
+        Ok(sorted)
+    }
 }
 
 /// Returns the part of a triangle; 0 without parts.
@@ -178,14 +207,14 @@ struct CubePiece {
 }
 
 impl CubePiece {
-    fn new(mesh: &Mesh, piece: &[(Cube, u32)]) -> Self {
-        let triangles = piece.iter().map(|(_, i)| mesh.triangles[*i as usize]);
+    fn new(of: &Triangles<'_>, piece: &[(Cube, u32)]) -> Self {
+        let triangles = piece.iter().map(|(_, i)| of.rows[*i as usize]);
         let mut vertices: Vec<u32> = triangles.clone().flatten().collect();
         vertices.sort_unstable();
         vertices.dedup();
         let number = |v| to_u32(vertices.partition_point(|other| *other < v));
         let triangles = triangles.map(|triangle| triangle.map(number)).collect();
-        let positions = vertices.iter().map(|v| mesh.position(*v as usize)).collect();
+        let positions = vertices.iter().map(|v| of.positions[*v as usize]).collect();
         Self { vertices, positions, triangles }
     }
 

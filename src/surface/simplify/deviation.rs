@@ -1,15 +1,14 @@
 //! Distance between a mesh and its simplification, at samples on both.
 
-use std::ops::Range;
-
 use rayon::prelude::*;
 
 use super::grid::{Corners, TriangleGrid};
-use super::{Cube, CubeSide, TrianglesByCube, by_cube, part_ranges};
+use super::{Cube, CubeSide, Triangles, TrianglesByCube};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::mesh::Mesh;
 
+/// Maximum number of cubes with samples.
+const CUBES: usize = 1000;
 /// Maximum number of samples per cube on each surface.
 const SAMPLES: usize = 256;
 
@@ -46,23 +45,23 @@ impl Distances {
 }
 
 impl Deviation {
-    /// Measures the distance between the triangles of `mesh`, and those `before` its simplification, which refer to the
-    /// same vertices. `parts_before` are their ranges of parts.
+    /// Measures the distance between the triangles before and after a simplification with this error, Å.
     ///
     /// # Errors
     /// [`SurfaceError::Cancelled`].
     pub(super) fn sampled(
-        mesh: &Mesh,
-        before: &[[u32; 3]],
-        parts_before: &[Range<usize>],
+        before: Triangles<'_>,
+        after: Triangles<'_>,
+        error: f64,
         side: CubeSide,
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
-        let surface = |triangles, parts: &[Range<usize>]| {
-            let by_cube = by_cube(mesh, triangles, parts, side, 0.0, control)?;
-            Ok::<_, SurfaceError>(Surface { mesh, triangles, by_cube })
-        };
-        let (original, simplified) = (surface(before, parts_before)?, surface(&mesh.triangles, &part_ranges(mesh))?);
+        // Both passes may move the surface by the error.
+        #[expect(clippy::cast_possible_truncation, reason = "positions have single precision")]
+        let margin = 2.0 * (error as f32 + side.cell());
+        let surface = |triangles: Triangles<'_>| triangles.by_cube(side, 0.0, control);
+        let original = Surface { triangles: before, by_cube: surface(before)?, margin };
+        let simplified = Surface { triangles: after, by_cube: surface(after)?, margin };
         let surfaces = [&original, &simplified].into_iter();
         let pieces = surfaces.flat_map(|surface| surface.by_cube.chunk_by(|a, b| a.0 == b.0));
         let mut cubes: Vec<Cube> = pieces.map(|piece| piece[0].0).collect();
@@ -75,7 +74,8 @@ impl Deviation {
             let [from, to] = [&simplified, &original].map(|surface| surface.around(*cube, side));
             Ok(Distances::of(vertices, &from).with(Distances::of(centroids, &to)))
         };
-        let of_cubes = cubes.par_iter().map(of_cube).collect::<Result<Vec<_>, SurfaceError>>()?;
+        let sampled: Vec<Cube> = cubes.iter().copied().step_by(cubes.len().div_ceil(CUBES).max(1)).collect();
+        let of_cubes = sampled.par_iter().map(of_cube).collect::<Result<Vec<_>, SurfaceError>>()?;
         let Distances { sum, maximum, n } = of_cubes.into_iter().fold(Distances::default(), Distances::with);
         Ok(Self { maximum, mean: sum / n.max(1) as f64 })
     }
@@ -94,9 +94,10 @@ pub(super) fn centroid([a, b, c]: Corners) -> [f32; 3] {
 
 /// Triangles of a surface, with an index by cube.
 struct Surface<'a> {
-    mesh: &'a Mesh,
-    triangles: &'a [[u32; 3]],
+    triangles: Triangles<'a>,
     by_cube: TrianglesByCube,
+    /// Distance from a cube within which the triangles are searched that are nearest to its samples, Å.
+    margin: f32,
 }
 
 impl Surface<'_> {
@@ -106,19 +107,14 @@ impl Surface<'_> {
             self.by_cube.partition_point(|(other, _)| *other < cube),
             self.by_cube.partition_point(|(other, _)| *other <= cube),
         ];
-        self.by_cube[start..end].iter().map(|(_, i)| self.corners(*i as usize))
-    }
-
-    /// Returns the corners of triangle `i`, Å.
-    fn corners(&self, i: usize) -> Corners {
-        self.triangles[i].map(|v| self.mesh.position(v as usize))
+        self.by_cube[start..end].iter().map(|(_, i)| self.triangles.corners(*i as usize))
     }
 
     /// Returns the triangles in and near a cube; all triangles of the surface if none is near.
     fn around(&self, (part, [x, y, z]): Cube, side: CubeSide) -> TriangleGrid {
         let steps = || -1..=1;
         let cubes = steps().flat_map(|dx| steps().flat_map(move |dy| steps().map(move |dz| [x + dx, y + dy, z + dz])));
-        let margin = 2.0 * side.cell();
+        let margin = self.margin;
         let [low, high] = [0, 1].map(|end| [x, y, z].map(|c| side.position(c + end)));
         let is_near = |corners: &Corners| {
             (0..3).all(|k| {
@@ -127,7 +123,7 @@ impl Surface<'_> {
         };
         let mut near: Vec<Corners> = cubes.flat_map(|cube| self.of((part, cube))).filter(is_near).collect();
         if near.is_empty() {
-            near = (0..self.triangles.len()).map(|i| self.corners(i)).collect();
+            near = (0..self.triangles.rows.len()).map(|i| self.triangles.corners(i)).collect();
         }
         TriangleGrid::new(near, side.cell())
     }

@@ -69,10 +69,15 @@ fn deviations_are_distances() {
         if bits.count_ones().is_multiple_of(2) { [x, y, z] } else { [y, x, z] }
     };
     let octahedron = Mesh { triangles: (0..8).map(face).collect::<Vec<_>>().into(), ..mesh.clone() };
-    let found = Deviation::sampled(&octahedron, &mesh.triangles, &[], CubeSide(2.4), &Control::default()).unwrap();
+    let sampled = |after: &Mesh| {
+        let triangles = |rows| Triangles { positions: &mesh.positions, rows, parts: &[] };
+        let (before, after) = (triangles(&mesh.triangles), triangles(&after.triangles));
+        Deviation::sampled(before, after, 0.5, CubeSide(2.4), &Control::default()).unwrap()
+    };
+    let found = sampled(&octahedron);
     let farthest = 1.7 * (1.0 - 1.0 / 3.0_f64.sqrt());
     assert!((found.maximum - farthest).abs() < 0.02, "{found:?}, expected {farthest}");
-    let none = Deviation::sampled(&mesh, &mesh.triangles, &[], CubeSide(2.4), &Control::default()).unwrap();
+    let none = sampled(&mesh);
     // Distances have single precision.
     assert!(none.maximum < 1e-3, "{none:?}");
     assert!((measures(&octahedron).volume - 4.0 / 3.0 * 1.7_f64.powi(3)).abs() < 0.1 * PI);
@@ -140,4 +145,13 @@ fn pieces_that_are_no_manifolds_with_a_boundary_are_found() {
     }
     // Two fans at a vertex of the boundary are allowed: another piece joins them.
     assert!(topology(&[[0, 1, 2], [0, 3, 4]]).is_some());
+}
+
+#[test]
+fn large_errors_are_rejected_with_the_limit() {
+    let mut mesh = row(1, SurfaceKind::Vdw, 0.5);
+    let error = simplify(&mut mesh, 5.1, 0.5, &Control::default()).unwrap_err();
+    assert!(matches!(error, SurfaceError::BadParameter { name: "simplify", .. }), "{error}");
+    assert!(error.to_string().contains("at most 10 grid spacings: 5.000 Å"), "{error}");
+    assert!(simplify(&mut mesh, 5.0, 0.5, &Control::default()).is_ok());
 }
