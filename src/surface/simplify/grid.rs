@@ -35,7 +35,8 @@ impl TriangleGrid {
             Self { low, cell, size, starts: vec![0; n_cells + 1], entries: Vec::new(), triangles: Vec::new() };
         let mut starts = std::mem::take(&mut grid.starts);
         for triangle in &triangles {
-            grid.for_each_cell(triangle, |at| starts[at + 1] += 1);
+            let [low, high] = grid.cells_of(triangle);
+            grid.for_each_cell(low, high, |at| starts[at + 1] += 1);
         }
         for at in 0..n_cells {
             starts[at + 1] += starts[at];
@@ -43,7 +44,8 @@ impl TriangleGrid {
         let mut next = starts.clone();
         let mut entries = vec![0; starts[n_cells] as usize];
         for (number, triangle) in (0..).zip(&triangles) {
-            grid.for_each_cell(triangle, |at| {
+            let [low, high] = grid.cells_of(triangle);
+            grid.for_each_cell(low, high, |at| {
                 entries[next[at] as usize] = number;
                 next[at] += 1;
             });
@@ -51,13 +53,21 @@ impl TriangleGrid {
         Self { starts, entries, triangles, ..grid }
     }
 
-    /// Calls `each` for the cells that the bounding box of a triangle overlaps.
-    fn for_each_cell(&self, [a, b, c]: &Corners, mut each: impl FnMut(usize)) {
-        let low = self.cell_of(std::array::from_fn(|k| a[k].min(b[k]).min(c[k])));
-        let high = self.cell_of(std::array::from_fn(|k| a[k].max(b[k]).max(c[k])));
-        for z in low[2]..=high[2] {
-            for y in low[1]..=high[1] {
-                (low[0]..=high[0]).filter_map(|x| self.index([x, y, z])).for_each(&mut each);
+    /// Returns the first and the last cell that the bounding box of a triangle overlaps, per axis.
+    fn cells_of(&self, [a, b, c]: &Corners) -> [[i32; 3]; 2] {
+        [
+            self.cell_of(std::array::from_fn(|k| a[k].min(b[k]).min(c[k]))),
+            self.cell_of(std::array::from_fn(|k| a[k].max(b[k]).max(c[k]))),
+        ]
+    }
+
+    /// Calls `each` for the indices of the cells from `low` to `high` within the grid.
+    fn for_each_cell(&self, low: [i32; 3], high: [i32; 3], mut each: impl FnMut(usize)) {
+        let within = |k: usize| low[k].max(0)..=high[k].min(self.size[k] - 1);
+        for z in within(2) {
+            for y in within(1) {
+                let row = (z * self.size[1] + y) * self.size[0];
+                within(0).filter_map(|x| usize::try_from(row + x).ok()).for_each(&mut each);
             }
         }
     }
@@ -66,61 +76,28 @@ impl TriangleGrid {
         std::array::from_fn(|k| floor((point[k] - self.low[k]) / self.cell))
     }
 
-    /// Returns the index of a cell; `None` outside the grid.
-    fn index(&self, cell: [i32; 3]) -> Option<usize> {
-        let is_inside = (0..3).all(|k| (0..self.size[k]).contains(&cell[k]));
-        let [x, y, z] = cell;
-        is_inside.then(|| usize::try_from((z * self.size[1] + y) * self.size[0] + x).ok()).flatten()
-    }
-
     /// Returns the distance of a point from the nearest triangle, Å; infinity if there is no triangle.
     pub(super) fn distance(&self, point: [f32; 3]) -> f32 {
-        let own = self.cell_of(point);
-        // Distances of the nearest and the farthest cell of the grid, in cells.
-        let gap = |k: usize| (-own[k]).max(own[k] - self.size[k] + 1).max(0);
-        let span = |k: usize| own[k].max(self.size[k] - 1 - own[k]);
-        let [first, last] = [(0..3).map(gap).max(), (0..3).map(span).max()].map(Option::unwrap_or_default);
-        // Distance of the point from the nearest side of its own cell.
-        let inside = (0..3).map(|k| {
-            let from_low = point[k] - self.low[k] - own[k] as f32 * self.cell;
-            from_low.min(self.cell - from_low)
-        });
-        let inside = inside.fold(self.cell, f32::min).max(0.0);
         let mut nearest2 = f32::INFINITY;
-        for ring in first..=last {
-            // All points of the cells in this ring and beyond are at least this far away.
-            let reach = if ring == 0 { 0.0 } else { (ring - 1) as f32 * self.cell + inside };
-            if nearest2 <= reach * reach {
-                break;
-            }
-            self.for_each_of_ring(own, ring, |number| {
-                let corners = self.triangles[number as usize];
-                if box_distance2(point, corners) < nearest2 {
-                    nearest2 = nearest2.min(distance2(point, corners));
+        // Most points are near a triangle.
+        let mut radius = self.cell / 8.0;
+        loop {
+            let [low, high] = [-radius, radius].map(|by| self.cell_of(point.map(|c| c + by)));
+            self.for_each_cell(low, high, |at| {
+                for number in &self.entries[self.starts[at] as usize..self.starts[at + 1] as usize] {
+                    let corners = self.triangles[*number as usize];
+                    if box_distance2(point, corners) < nearest2 {
+                        nearest2 = nearest2.min(distance2(point, corners));
+                    }
                 }
             });
-        }
-        nearest2.sqrt()
-    }
-
-    /// Calls `each` for the entries of the cells whose largest difference from `own` along an axis is `ring`.
-    fn for_each_of_ring(&self, [x, y, z]: [i32; 3], ring: i32, mut each: impl FnMut(u32)) {
-        let within = |k: usize, at: i32| (at - ring).max(0)..=(at + ring).min(self.size[k] - 1);
-        for cz in within(2, z) {
-            for cy in within(1, y) {
-                let is_side = (cz - z).abs() == ring || (cy - y).abs() == ring;
-                let step = if is_side || ring == 0 { 1 } else { 2 * ring };
-                let mut cx = x - ring;
-                while cx <= x + ring {
-                    if let Some(at) = self.index([cx, cy, cz]) {
-                        self.entries[self.starts[at] as usize..self.starts[at + 1] as usize]
-                            .iter()
-                            .copied()
-                            .for_each(&mut each);
-                    }
-                    cx += step;
-                }
+            let is_all = (0..3).all(|k| low[k] <= 0 && high[k] >= self.size[k] - 1);
+            if nearest2 <= radius * radius || is_all {
+                return nearest2.sqrt();
             }
+            // A triangle that is nearer than the nearest one so far has a part within its distance. The margin is for
+            // rounding.
+            radius = if nearest2.is_finite() { 1.01 * nearest2.sqrt() } else { 4.0 * radius };
         }
     }
 }

@@ -155,3 +155,25 @@ fn large_errors_are_rejected_with_the_limit() {
     assert!(error.to_string().contains("at most 10 grid spacings: 5.000 Å"), "{error}");
     assert!(simplify(&mut mesh, 5.0, 0.5, &Control::default()).is_ok());
 }
+
+#[test]
+fn distances_from_a_grid_are_those_of_a_search_through_all_triangles() {
+    let mesh = row(3, SurfaceKind::Ses, 0.4);
+    let corners: Vec<Corners> = mesh.triangles.iter().map(|t| t.map(|v| mesh.positions[v as usize])).collect();
+    let point = |i: u16| [0.37, 1.13, 2.71].map(|k: f32| 7.0 * (f32::from(i) * k).sin());
+    for cell in [0.1, 0.8, 20.0] {
+        let grid = TriangleGrid::new(corners.clone(), cell);
+        for i in 0..300 {
+            // With one triangle, a grid has one cell, or few.
+            let alone = corners.iter().map(|one| TriangleGrid::new(vec![*one], 100.0).distance(point(i)));
+            let expected = alone.fold(f32::INFINITY, f32::min);
+            let found = grid.distance(point(i));
+            assert!(
+                (found - expected).abs() <= 1e-5 * expected.max(1.0),
+                "{cell}, {:?}: {found}, {expected}",
+                point(i)
+            );
+        }
+    }
+    assert!(TriangleGrid::new(Vec::new(), 1.0).distance([0.0; 3]).is_infinite());
+}
