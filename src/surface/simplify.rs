@@ -40,6 +40,8 @@ const SIDE: f64 = 24.0;
 const TRIES: [f64; 3] = [0.5, 0.25, 0.125];
 /// Largest error, in grid spacings: larger ones need larger cubes.
 const MAX_SPACINGS: f64 = 10.0;
+/// Triangles between two checks of the cancellation flag: a few milliseconds.
+const PER_CHECK: usize = 1 << 16;
 /// Memory per triangle while the mesh is simplified, bytes: its cube and index, and copies of its corners.
 pub(crate) const TRIANGLE_BYTES: u64 = 112;
 
@@ -122,6 +124,7 @@ pub(crate) fn simplify(
         let mut n_of_parts = vec![0; mesh.parts.len().max(1)];
         let mut rows = Vec::new();
         for (piece, result) in pieces.iter().zip(results) {
+            control.check()?;
             let first = rows.len();
             match result.triangles {
                 Some(simplified) => rows.extend(simplified),
@@ -141,7 +144,7 @@ pub(crate) fn simplify(
     let deviation = Deviation::sampled(before, after, error, side, control)?;
     let triangles = rows.len() as u64;
     drop((rows, positions));
-    compact(mesh);
+    compact(mesh, control)?;
     Ok(Simplification { triangles, deviation })
 }
 
@@ -286,19 +289,30 @@ fn revert_conflicts(results: &mut [CubeResult]) {
 }
 
 /// Removes unused vertices, and updates the ranges and measures of the parts.
-fn compact(mesh: &mut Mesh) {
-    let mut used = vec![false; mesh.n_vertices()];
-    mesh.triangles.iter().flatten().for_each(|v| used[*v as usize] = true);
-    let rows: Vec<u32> = (0..).zip(&used).filter(|(_, used)| **used).map(|(row, _)| row).collect();
-    let number = |v: u32| to_u32(rows.partition_point(|row| *row < v));
-    mesh.triangles.par_chunks_mut(1 << 14).flatten_iter().for_each(|triangle| *triangle = triangle.map(number));
+fn compact(mesh: &mut Mesh, control: &Control<'_>) -> Result<(), SurfaceError> {
+    let mut numbers = vec![0_u32; mesh.n_vertices()];
+    for some in mesh.triangles.chunks(PER_CHECK) {
+        control.check()?;
+        some.as_flattened().iter().for_each(|v| numbers[*v as usize] = 1);
+    }
+    let mut rows = Vec::new();
+    for (row, number) in (0..).zip(&mut numbers).filter(|(_, used)| **used == 1) {
+        *number = to_u32(rows.len());
+        rows.push(row);
+    }
+    mesh.triangles.par_chunks_mut(PER_CHECK).try_for_each(|some| {
+        control.check()?;
+        some.as_flattened_mut().iter_mut().for_each(|v| *v = numbers[*v as usize]);
+        Ok::<_, SurfaceError>(())
+    })?;
     for part in &mut mesh.parts {
-        let ends = [part.vertices.start, part.vertices.end].map(to_u32).map(number);
-        part.vertices = ends[0] as usize..ends[1] as usize;
+        let [start, end] = [part.vertices.start, part.vertices.end].map(to_u32);
+        part.vertices = rows.partition_point(|row| *row < start)..rows.partition_point(|row| *row < end);
     }
     mesh.take_vertices(&rows);
     let measured = mesh.parts.iter().map(|part| measure(mesh, part)).collect();
     mesh.parts = measured;
+    Ok(())
 }
 
 /// Returns `part` with the area, volume and bounds of its triangles in `mesh`.

@@ -284,6 +284,29 @@ fn jobs_of_ten_seconds_end_soon_after_cancellation_at_any_time() {
 }
 
 #[test]
+fn simplifications_end_soon_after_cancellation_at_any_time() {
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "set by a test" };
+    let (input, job) = (lattice(12), job(&[("resolution", "0.5"), ("simplify", "0.1")]));
+    let run = |control: &Control<'_>, progress: &dyn ProgressSink| {
+        pipeline::run(&input, &job, &JobLimits::default(), &choice, control, progress, None)
+    };
+    let whole = run(&Control::default(), &()).unwrap().report.timings_ms["simplify"].as_f64().unwrap();
+    let time = Duration::from_secs_f64(whole / 1e3);
+    for part in [0.0, 0.2, 0.4, 0.6, 0.8] {
+        assert_in_time("simplify", || {
+            let at = CancelIn { delay: time.mul_f64(part), ..CancelIn::new("simplify") };
+            let stopped = run(&at.control(), &at);
+            let late = at.time();
+            // The last part may be over already.
+            let cancelled = matches!(stopped, Err(JobError::Surface(SurfaceError::Cancelled)));
+            assert!(cancelled || (part > 0.3 && stopped.is_ok()), "simplify after {part} of {time:?}");
+            late
+        });
+    }
+}
+
+#[test]
 fn pictures_end_soon_after_cancellation_at_any_time() {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
