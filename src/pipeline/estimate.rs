@@ -19,7 +19,7 @@ use crate::structure::{AtomPart, Structure, StructureError};
 use crate::surface::cpu::{LATTICE_BYTES, check_work, scan};
 use crate::surface::lattice::{Lattice, slightly_coarser};
 use crate::surface::params::MAX_RESOLUTION;
-use crate::surface::simplify::TRIANGLE_BYTES;
+use crate::surface::simplify::{TRIANGLE_BYTES, check_error};
 use crate::surface::{
     Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
 };
@@ -102,7 +102,8 @@ pub fn estimate<S: Deref<Target = Structure>>(
     let lattices = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
-    let mesh = refused.map_or_else(|| plan.mesh(&lattices, choice, control), Err);
+    let simplifies = job.simplify.map_or(Ok(()), |error| check_error(error, params.resolution));
+    let mesh = simplifies.and_then(|()| refused.map_or_else(|| plan.mesh(&lattices, choice, control), Err));
     drop(lattices);
     let mesh = match (mesh, job.spacing) {
         (Ok(mesh), Spacing::MaxTriangles(limit)) => Ok(mesh.at_most(limit, &params)),

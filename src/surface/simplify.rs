@@ -38,8 +38,8 @@ const SIDE: f64 = 24.0;
 /// Errors that are passed to meshoptimizer one after another, relative to the permitted error. Its error is an average
 /// of squared distances, so the largest distance is about twice as large, and in places larger. Then the next is tried.
 const TRIES: [f64; 3] = [0.5, 0.25, 0.125];
-/// Largest error, in grid spacings: larger ones need larger cubes.
-const MAX_SPACINGS: f64 = 10.0;
+/// Largest error, in grid spacings: with larger ones, most results fail the checks.
+const MAX_SPACINGS: f64 = 2.0;
 /// Triangles between two checks of the cancellation flag: a few milliseconds.
 const PER_CHECK: usize = 1 << 16;
 /// Memory per triangle while the mesh is simplified, bytes: its cube and index, and copies of its corners.
@@ -81,7 +81,7 @@ type TrianglesByCube = Vec<(Cube, u32)>;
 /// Checks an error for a grid spacing, both in Å.
 ///
 /// # Errors
-/// [`SurfaceError::BadParameter`] for an error of more than 10 grid spacings.
+/// [`SurfaceError::BadParameter`] for an error of more than 2 grid spacings.
 pub(crate) fn check_error(error: f64, spacing: f64) -> Result<(), SurfaceError> {
     let most = MAX_SPACINGS * spacing;
     if error <= most {
@@ -231,7 +231,7 @@ impl CubePiece {
         let original = TriangleGrid::new(self.triangles.iter().map(|t| self.corners(t)).collect(), side.cell());
         let found = TRIES.into_iter().find_map(|share| {
             let found = self.within(share * error)?;
-            let after = topology(&found).filter(|after| after.fans == before.fans)?;
+            let after = topology(&found).filter(|after| after.fans == before.fans && after.euler == before.euler)?;
             let simplified = TriangleGrid::new(found.iter().map(|t| self.corners(t)).collect(), side.cell());
             let centroids = found.iter().map(|t| centroid(self.corners(t)));
             let distances = Distances::of(self.positions.iter().copied(), &simplified);

@@ -1,6 +1,8 @@
 //! Topology of a piece of a mesh.
 
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
+
+use crate::surface::lattice::to_u32;
 
 /// Fans of triangles around the vertices of the boundary. The key is the edge with which a fan begins, as its boundary
 /// vertex and its other end. The value is the other end of the edge with which the fan ends.
@@ -13,6 +15,9 @@ pub(super) struct Topology {
     pub(super) fans: BoundaryFans,
     /// Chords: inner edges that join two vertices of the boundary. The lower vertex is the first.
     pub(super) chords: Vec<[u32; 2]>,
+    /// Twice the number of vertices, less the number of triangles: with the same boundary, it changes with the Euler
+    /// characteristic, so that a component or a handle that disappears alone is found.
+    pub(super) euler: i64,
 }
 
 /// Returns the topology of triangles; `None` if they are not an oriented manifold with a boundary. A vertex of the
@@ -68,5 +73,7 @@ pub(super) fn topology(triangles: &[[u32; 3]]) -> Option<Topology> {
     }
     let joins_boundary = |[v, w]: [u32; 2]| on_boundary[v as usize] && on_boundary[w as usize];
     let chords = edges().filter(|edge| edge[0] < edge[1] && joins_boundary(*edge) && is_inner(*edge)).collect();
-    Some(Topology { fans, chords })
+    let used: FxHashSet<u32> = triangles.iter().flatten().copied().collect();
+    let [n_vertices, n_triangles] = [used.len(), triangles.len()].map(|n| i64::from(to_u32(n)));
+    Some(Topology { fans, chords, euler: 2 * n_vertices - n_triangles })
 }
