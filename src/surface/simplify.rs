@@ -18,10 +18,11 @@ use std::ops::Range;
 
 use meshopt::{SimplifyOptions, VertexDataAdapter};
 use rayon::prelude::*;
+use rustc_hash::FxHashSet;
 
 pub use self::deviation::Deviation;
 use self::deviation::{Distances, centroid};
-use self::fans::topology;
+use self::fans::{BoundaryFans, topology};
 use self::grid::{Corners, TriangleGrid};
 use super::control::Control;
 use super::error::SurfaceError;
@@ -29,6 +30,7 @@ use super::lattice::{to_i32, to_u32};
 use super::measure::Component;
 use super::mesh::{Mesh, PartRange, bounds_of};
 use super::params::bad;
+use super::union_find::UnionFind;
 
 /// Smallest and largest value of the parameter `simplify`, Å.
 pub const SIMPLIFY_ERRORS: [f64; 2] = [0.001, 10.0];
@@ -228,10 +230,14 @@ impl CubePiece {
         let Some(before) = topology(&self.triangles) else { return CubeResult::default() };
         let in_mesh = |edge: &[u32; 2]| edge.map(|v| self.vertices[v as usize]);
         let original_chords = before.chords.iter().map(in_mesh).collect();
+        let components = ClosedComponents::new(self, &before.fans);
         let original = TriangleGrid::new(self.triangles.iter().map(|t| self.corners(t)).collect(), side.cell());
         let found = TRIES.into_iter().find_map(|share| {
             let found = self.within(share * error)?;
             let after = topology(&found).filter(|after| after.fans == before.fans && after.euler == before.euler)?;
+            if !components.remain_in(self, &found) {
+                return None;
+            }
             let simplified = TriangleGrid::new(found.iter().map(|t| self.corners(t)).collect(), side.cell());
             let centroids = found.iter().map(|t| centroid(self.corners(t)));
             let distances = Distances::of(self.positions.iter().copied(), &simplified);
@@ -244,6 +250,16 @@ impl CubePiece {
             chords: chords.iter().map(in_mesh).collect(),
             original_chords,
         }
+    }
+
+    /// Returns the signed volume of each of `n` components, Å³.
+    fn volumes(&self, triangles: &[[u32; 3]], of_vertex: &[u32], n: u32) -> Vec<f64> {
+        let mut sums = vec![Component::default(); n as usize];
+        for triangle in triangles {
+            let sum = &mut sums[of_vertex[triangle[0] as usize] as usize];
+            sum.add(self.corners(triangle).map(|corner| corner.map(f64::from)));
+        }
+        sums.into_iter().map(|sum| sum.volume).collect()
     }
 
     fn corners(&self, triangle: &[u32; 3]) -> Corners {
@@ -259,6 +275,37 @@ impl CubePiece {
         #[expect(clippy::cast_possible_truncation, reason = "single precision is enough for an error")]
         let found = meshopt::simplify(self.triangles.as_flattened(), &vertices, 0, error as f32, options, None);
         (found.len() < 3 * self.triangles.len()).then(|| found.as_chunks::<3>().0.to_vec())
+    }
+}
+
+/// Closed components of a piece.
+struct ClosedComponents {
+    /// Component of each vertex of the piece.
+    of_vertex: Vec<u32>,
+    /// Signed volume of each component, Å³; `None` for those with a boundary.
+    volumes: Vec<Option<f64>>,
+}
+
+impl ClosedComponents {
+    fn new(piece: &CubePiece, fans: &BoundaryFans) -> Self {
+        let mut sets = UnionFind::new(piece.vertices.len());
+        for [a, b, c] in &piece.triangles {
+            sets.union(*a, *b);
+            sets.union(*a, *c);
+        }
+        let mut of_vertex = Vec::new();
+        let n = sets.number_sets(&mut of_vertex);
+        let open: FxHashSet<u32> = fans.keys().map(|[v, _]| of_vertex[*v as usize]).collect();
+        let volumes = (0..).zip(piece.volumes(&piece.triangles, &of_vertex, n));
+        let volumes = volumes.map(|(component, volume)| (!open.contains(&component)).then_some(volume)).collect();
+        Self { of_vertex, volumes }
+    }
+
+    /// Returns true if the simplified triangles leave each closed component at least half of its volume.
+    fn remain_in(&self, piece: &CubePiece, simplified: &[[u32; 3]]) -> bool {
+        let after = piece.volumes(simplified, &self.of_vertex, to_u32(self.volumes.len()));
+        let remains = |(before, after): (&Option<f64>, f64)| before.is_none_or(|before| after / before >= 0.5);
+        self.volumes.iter().zip(after).all(remains)
     }
 }
 

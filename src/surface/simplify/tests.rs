@@ -177,3 +177,20 @@ fn distances_from_a_grid_are_those_of_a_search_through_all_triangles() {
     }
     assert!(TriangleGrid::new(Vec::new(), 1.0).distance([0.0; 3]).is_infinite());
 }
+
+#[test]
+fn closed_components_keep_half_of_their_volume() {
+    let positions = vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.1, 0.1, 0.1]];
+    let outwards = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
+    // The last vertex belongs to the component, as if an edge had been collapsed.
+    let triangles = [&outwards[..], &[[4, 0, 1]]].concat();
+    let piece = CubePiece { vertices: vec![0, 1, 2, 3, 4], positions, triangles };
+    let closed = ClosedComponents::new(&piece, &fans::BoundaryFans::default());
+    assert!(closed.remain_in(&piece, &outwards));
+    let inverted = outwards.map(|[a, b, c]| [a, c, b]);
+    assert!(!closed.remain_in(&piece, &inverted));
+    let flatter = outwards.map(|triangle| triangle.map(|v| if v == 3 { 4 } else { v }));
+    assert!(!closed.remain_in(&piece, &flatter));
+    let open = ClosedComponents::new(&piece, &[([0, 1], 2)].into_iter().collect());
+    assert!(open.remain_in(&piece, &flatter), "components with a boundary are not measured");
+}
