@@ -24,6 +24,9 @@ use super::spheres::Spheres;
 /// Maximum error of the radius of the largest sphere in a cavity, Å.
 const RADIUS_ERROR: f64 = 1e-3;
 
+/// Maximum error of the radius of the largest probe that can enter a cavity, in radii of the probe.
+const OPENING_ERROR: f64 = 1.0 / 16.0;
+
 /// Cavity that holds a probe.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Cavity {
@@ -39,6 +42,9 @@ pub struct Cavity {
     pub radius: f64,
     /// Centre of this sphere, Å.
     pub centre: [f64; 3],
+    /// Radius of the largest probe that can enter from outside, Å: at most [`OPENING_ERROR`] times the radius of the
+    /// probe too small. 0 if no probe of that radius can.
+    pub opening: f64,
     /// Indices of the spheres that a probe in the cavity can touch, ascending.
     pub lining: Vec<u32>,
 }
@@ -62,8 +68,7 @@ pub(crate) fn find(
     let lattice = Lattice::new(spheres, &params, control)?;
     // Lengths are in spacings, that is in Å.
     let components = Components::new(&lattice.atoms, lattice.spacing, limits, control)?;
-    let shells = components.shells(params.probe, limits, control)?;
-    let inner: Vec<Shell> = shells.into_iter().filter(|shell| shell.measures.accessible_volume < 0.0).collect();
+    let inner = regions(&components, components.shells(params.probe, limits, control)?, control)?;
     let measure = |shell: &Shell| {
         let search =
             DepthSearch { components: &components, atoms: &lattice.atoms, shell, cubes: BinaryHeap::new(), best: None };
@@ -77,13 +82,80 @@ pub(crate) fn find(
             volume: -shell.measures.volume,
             radius: depth + params.probe,
             centre,
+            opening: 0.0,
             lining,
         }))
     };
     let found = inner.par_iter().map(measure).collect::<Result<Vec<_>, SurfaceError>>()?;
     let mut found: Vec<Cavity> = found.into_iter().flatten().collect();
     found.sort_by(|a, b| b.accessible_volume.total_cmp(&a.accessible_volume));
+    let openings = Openings { spheres, params: &params, limits, control };
+    openings.search([0.0, params.probe], &mut found.iter_mut().collect::<Vec<_>>())?;
     Ok(found)
+}
+
+/// Search for the largest probes that can enter cavities, by bisection.
+struct Openings<'a> {
+    spheres: &'a Spheres,
+    /// Parameters of a solvent-accessible surface with a grid spacing of 1 Å.
+    params: &'a SurfaceParams,
+    limits: &'a SurfaceLimits,
+    control: &'a Control<'a>,
+}
+
+impl Openings<'_> {
+    /// Sets the openings of `cavities`. A probe of the larger of two radii, Å, cannot enter any of them; the smaller
+    /// radius is 0 or that of a probe that can enter all of them.
+    fn search(&self, [low, high]: [f64; 2], cavities: &mut [&mut Cavity]) -> Result<(), SurfaceError> {
+        for cavity in &mut *cavities {
+            cavity.opening = low;
+        }
+        if cavities.is_empty() || high - low <= OPENING_ERROR * self.params.probe {
+            return Ok(());
+        }
+        let middle = 0.5 * (low + high);
+        let centres: Vec<[f64; 3]> = cavities.iter().map(|cavity| cavity.centre).collect();
+        let closed = self.closed(middle, &centres)?;
+        let (mut narrow, mut wide) = (Vec::new(), Vec::new());
+        for (cavity, closed) in cavities.iter_mut().zip(closed) {
+            if closed { narrow.push(&mut **cavity) } else { wide.push(&mut **cavity) }
+        }
+        self.search([low, middle], &mut narrow)?;
+        self.search([middle, high], &mut wide)
+    }
+
+    /// Returns true for each point that a probe of radius `probe`, Å, cannot reach from outside. The points lie outside
+    /// the spheres enlarged by the probe, so a component that encloses one is the wall of a cavity, or lies around it.
+    fn closed(&self, probe: f64, points: &[[f64; 3]]) -> Result<Vec<bool>, SurfaceError> {
+        let memory = Arc::new(Reservation::new(&self.control.memory));
+        let control = Control { memory, ..self.control.clone() };
+        control.memory.grow(LATTICE_BYTES * self.spheres.len() as u64)?;
+        let params = SurfaceParams { probe, ..self.params.clone() };
+        let lattice = Lattice::new(self.spheres, &params, &control)?;
+        let components = Components::new(&lattice.atoms, lattice.spacing, self.limits, &control)?;
+        Ok(components.around(points, &control)?.iter().map(|around| !around.is_empty()).collect())
+    }
+}
+
+/// Returns the boundaries of the cavities: inner components, each with the outer ones that lie directly within it.
+fn regions(components: &Components<'_>, shells: Vec<Shell>, control: &Control<'_>) -> Result<Vec<Shell>, SurfaceError> {
+    let (mut inner, mut outer): (Vec<Shell>, Vec<Shell>) =
+        shells.into_iter().partition(|shell| shell.measures.accessible_volume < 0.0);
+    let within = |point: [f64; 3], [low, high]: [[f64; 3]; 2]| (0..3).all(|k| (low[k]..=high[k]).contains(&point[k]));
+    outer.retain(|shell| inner.iter().any(|cavity| within(shell.point, cavity.bounds)));
+    let points: Vec<[f64; 3]> = outer.iter().map(|shell| shell.point).collect();
+    for (island, around) in outer.iter().zip(components.around(&points, control)?) {
+        let enclosing = inner.iter_mut().filter(|cavity| around.contains(&cavity.components[0]));
+        // The smallest one, if they are nested: its bounds lie within those of the others.
+        let smallest = enclosing.min_by(|a, b| {
+            let size = |shell: &Shell| (0..3).map(|k| shell.bounds[1][k] - shell.bounds[0][k]).product::<f64>();
+            size(a).total_cmp(&size(b))
+        });
+        if let Some(cavity) = smallest {
+            cavity.add(island);
+        }
+    }
+    Ok(inner)
 }
 
 /// Components of a mesh that enclose space outside the molecule.
@@ -214,7 +286,8 @@ impl DepthSearch<'_> {
             let own = &self.atoms[sphere as usize];
             let n: [f64; 3] = std::array::from_fn(|k| centre[k] - own.position(k));
             let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
-            let inside = self.components.at(sphere, n.map(|c| c / length)) == Some(self.shell.number);
+            let component = self.components.at(sphere, n.map(|c| c / length));
+            let inside = component.is_some_and(|component| self.shell.components.contains(&component));
             if !inside && diagonal <= depth {
                 // No sphere lies between the centre and any point of the cube.
                 return;

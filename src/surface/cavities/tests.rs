@@ -4,6 +4,7 @@ use std::f64::consts::PI;
 
 use super::*;
 use crate::surface::params::SurfaceOptions;
+use crate::surface::sphere_union::ExactMeasures;
 
 /// Centre and radius, Å.
 type Ball = ([f64; 3], f64);
@@ -137,6 +138,7 @@ fn hollow_balls_have_one_cavity_each() {
     assert!((other / regions[0].volume - 1.0).abs() > 0.04, "{other}");
     assert!(cavity.lining.len() > 100 && cavity.lining.is_sorted());
     assert!((cavity.radius - 5.3).abs() < 0.1, "{}", cavity.radius);
+    assert!(cavity.opening <= 0.0, "the spheres overlap, but {} is open", cavity.opening);
     assert!((0..3).all(|k| (cavity.centre[k] - [0.3, -0.2, 0.1][k]).abs() < 0.3));
     // Two of them, and a third one apart that is too small for a probe.
     let mut two = [hollow([0.0; 3], 7.0, 130), hollow([17.0, 0.0, 0.0], 6.0, 110)].concat();
@@ -149,6 +151,41 @@ fn hollow_balls_have_one_cavity_each() {
     close("smaller", found[1].accessible_volume, least, 0.02);
     // A smaller probe finds the third one.
     assert_eq!(cavities(&two, 0.7).len(), 3);
+}
+
+#[test]
+fn molecules_inside_a_cavity_reduce_it() {
+    let probe = 1.4;
+    let wall = hollow([0.0; 3], 12.5, 420);
+    let with = |inside: &[Ball]| [&wall[..], inside].concat();
+    let [empty] = &cavities(&wall, probe)[..] else { panic!("one cavity") };
+    // One atom, which touches no other atom: its measures have closed forms.
+    let found = cavities(&with(&[([0.2, 0.1, -0.3], 1.7)]), probe);
+    let [one] = &found[..] else { panic!("{found:?}") };
+    let (area, volume) = (|r: f64| 4.0 * PI * r * r, |r: f64| 4.0 / 3.0 * PI * r * r * r);
+    close("area", one.area, empty.area + area(1.7), 1e-7);
+    close("volume", one.volume, empty.volume - volume(1.7), 1e-7);
+    close("accessible area", one.accessible_area, empty.accessible_area + area(3.1), 1e-7);
+    close("accessible volume", one.accessible_volume, empty.accessible_volume - volume(3.1), 1e-7);
+    assert_eq!(one.lining, [&empty.lining[..], &[420]].concat());
+    assert!(one.radius < 0.6 * empty.radius, "{one:?}");
+    // A hollow molecule with a cavity of its own, and an atom outside all of them.
+    let shell = hollow([0.2, 0.1, -0.3], 5.2, 80);
+    let mut nested = with(&shell);
+    nested.push(([25.0, 0.0, 0.0], 1.7));
+    let found = cavities(&nested, probe);
+    let ([own], [outer, inner]) = (&cavities(&shell, probe)[..], &found[..]) else { panic!("{found:?}") };
+    assert_eq!(inner.lining.iter().map(|i| i - 420).collect::<Vec<_>>(), own.lining);
+    let exact = ExactMeasures::of(&spheres(&shell), &params(probe), &SurfaceLimits::default(), &Control::default());
+    let exact = exact.unwrap();
+    close("area of the cavity inside", inner.area, own.area, 1e-7);
+    close("area around it", outer.area, empty.area + exact.area() - own.area, 1e-7);
+    close("volume around it", outer.volume, empty.volume - exact.volume - own.volume, 1e-7);
+    // The flood fill counts grid points, also in the thin gap between both walls.
+    let regions = fill(&grid(&nested, probe, 0.5), 0.0);
+    let most = regions.iter().map(|region| region.volume).fold(0.0, f64::max);
+    close("flood fill", outer.accessible_volume, most, 0.05);
+    assert!(empty.accessible_volume > 1.5 * most, "control: the empty cavity is larger");
 }
 
 #[test]
@@ -177,6 +214,13 @@ fn a_cubic_hole_has_the_symmetry_of_its_spheres() {
     check("cube", &balls, probe, cavity, &fill(&grid(&balls, probe, 0.03), 0.0)[0], 0.03);
     assert!((cavity.radius - (0.5 * side * 3.0_f64.sqrt() - 1.8)).abs() < RADIUS_ERROR, "{cavity:?}");
     assert_eq!(cavity.lining, (0..8).collect::<Vec<_>>());
+    // The openings are the centres of the faces.
+    for radius in [1.8, 1.75, 1.7] {
+        let balls: Vec<Ball> = balls.iter().map(|(centre, _)| (*centre, radius)).collect();
+        let widest = side / 2.0_f64.sqrt() - radius;
+        let [Cavity { opening, .. }] = cavities(&balls, probe)[..] else { panic!("{radius}") };
+        assert!((widest - probe * OPENING_ERROR..widest).contains(&opening), "{radius}: {opening} of {widest}");
+    }
     // The lattice of the same cube has a hole in each cell, which touches the next ones at the centres of faces if the
     // spheres just reach them.
     let lattice = |n: i32, radius: f64| -> Vec<Ball> {

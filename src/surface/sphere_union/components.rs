@@ -7,6 +7,8 @@
 //!
 //! All lengths are in grid spacings.
 
+use std::sync::{Mutex, PoisonError};
+
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
@@ -27,6 +29,9 @@ use crate::surface::union_find::UnionFind;
 const JOIN: f64 = 2e-3;
 /// Ends of arcs are stored once per vertex, up to this distance, Å.
 const SAME: f64 = JOIN / 4.0;
+
+/// Memory of a component that is one sphere, with its measures, bytes.
+const WHOLE_BYTES: u64 = 256;
 
 /// Exposed arc of the circle of two spheres.
 #[derive(Debug, Clone, Copy)]
@@ -67,8 +72,7 @@ impl Arc {
     }
 }
 
-/// Boundary of a union of spheres, divided into connected components. Spheres that overlap no other one have no arcs
-/// and are left out.
+/// Boundary of a union of spheres, divided into connected components.
 pub(in crate::surface) struct Components<'a> {
     pub(super) atoms: &'a [LatticeAtom],
     pub(super) arcs: Vec<Arc>,
@@ -80,6 +84,8 @@ pub(in crate::surface) struct Components<'a> {
     by_sphere: Vec<u32>,
     /// Caps of the spheres on which several sets of arcs lie.
     caps: FxHashMap<u32, Vec<Cap>>,
+    /// Spheres whose whole surface is exposed, ascending. They have no arcs. Their components have the last numbers.
+    pub(super) whole: Vec<u32>,
     tolerance: f64,
     pub(super) n: u32,
 }
@@ -98,9 +104,16 @@ impl<'a> Components<'a> {
         let (tolerance, cells, overlaps) =
             (TOLERANCE / spacing, Cells::new(atoms, control)?, OverlapCount::new(limits));
         let search = CapSearch { atoms, cells: &cells, overlaps: &overlaps, tolerance, control };
+        let whole = Mutex::new(Vec::new());
         let arcs: Vec<Vec<Arc>> = search.for_each_sphere(
             |_| true,
-            |own, scratch, arcs, comparisons| arcs_of(atoms, own, scratch, tolerance, arcs, comparisons),
+            |own, scratch, arcs, comparisons| {
+                if scratch.caps.is_empty() {
+                    control.memory.grow(WHOLE_BYTES)?;
+                    whole.lock().unwrap_or_else(PoisonError::into_inner).push(own);
+                }
+                arcs_of(atoms, own, scratch, tolerance, arcs, comparisons)
+            },
         )?;
         let arcs = arcs.concat();
         control.memory.grow(5 * size_of::<u32>() as u64 * (arcs.len() + atoms.len()) as u64)?;
@@ -109,8 +122,10 @@ impl<'a> Components<'a> {
         let (starts, by_sphere) = index(atoms.len(), &arcs);
         let mut numbers = Vec::new();
         sets.number_sets(&mut numbers);
-        let mut found =
-            Self { atoms, arcs, of_arc: numbers, starts, by_sphere, caps: FxHashMap::default(), tolerance, n: 0 };
+        let mut whole = whole.into_inner().unwrap_or_else(PoisonError::into_inner);
+        whole.sort_unstable();
+        let caps = FxHashMap::default();
+        let mut found = Self { atoms, arcs, of_arc: numbers, starts, by_sphere, caps, whole, tolerance, n: 0 };
         let several = |own: &u32| !found.on(*own).is_empty() && found.only(*own).is_none();
         let pairs = search.for_each_sphere(several, |own, scratch, out, _| {
             let pairs = found.shared_faces(own, &scratch.caps, &mut scratch.uncovered);
@@ -123,7 +138,7 @@ impl<'a> Components<'a> {
             }
             found.caps.insert(own, caps);
         }
-        found.n = sets.number_sets(&mut found.of_arc);
+        found.n = sets.number_sets(&mut found.of_arc) + to_u32(found.whole.len());
         Ok(found)
     }
 
@@ -193,18 +208,27 @@ impl<'a> Components<'a> {
         of_arcs.all(|other| other == first).then_some(first)
     }
 
-    /// Returns the component of the exposed point of a sphere in the direction `n`, a unit vector; `None` for a sphere
-    /// without arcs.
+    /// Returns a component with a face on a sphere; `None` if no part of the sphere is exposed.
+    pub(super) fn first(&self, sphere: u32) -> Option<u32> {
+        let arc = self.on(sphere).first().map(|arc| self.of_arc[*arc as usize]);
+        arc.or_else(|| self.whole.binary_search(&sphere).ok().map(|i| self.first_whole() + to_u32(i)))
+    }
+
+    /// Returns the component of the first sphere whose whole surface is exposed.
+    pub(super) fn first_whole(&self) -> u32 {
+        self.n - to_u32(self.whole.len())
+    }
+
+    /// Returns the component of the exposed point of a sphere in the direction `n`, a unit vector; `None` if no part of
+    /// the sphere is exposed.
     pub(in crate::surface) fn at(&self, sphere: u32, n: [f64; 3]) -> Option<u32> {
-        let arcs = self.on(sphere);
-        let first = self.of_arc[*arcs.first()? as usize];
         if let Some(only) = self.only(sphere) {
             return Some(only);
         }
-        let caps = self.caps.get(&sphere)?;
+        let (arcs, Some(caps)) = (self.on(sphere), self.caps.get(&sphere)) else { return self.first(sphere) };
         let (plane, mut uncovered) = (GreatCircle::through(n, self.middle(arcs[0], sphere)), Uncovered::default());
         plane.uncover(caps, self.tolerance / radius(&self.atoms[sphere as usize]), &mut uncovered);
-        let (mut deepest, mut found) = (f64::MIN, first);
+        let (mut deepest, mut found) = (f64::MIN, self.of_arc[arcs[0] as usize]);
         uncovered.arcs(|part| {
             // The part that contains the start of the plane, up to rounding.
             let [cos, sin] = part.half;

@@ -80,7 +80,7 @@ impl Vertices<'_> {
             if caps::prune(of_contact, -TOLERANCE / self.probe, comparisons)? == Cover::Whole {
                 continue;
             }
-            Region::outside(of_contact, uncovered, comparisons, regions, |_, _| 0)?;
+            Region::outside(of_contact, 0, uncovered, comparisons, regions, |_, _| 0)?;
             for (_, Region { solid_angle, vector }) in &*regions {
                 let area = self.probe * self.probe;
                 let concave = area * solid_angle;

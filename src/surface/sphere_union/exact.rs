@@ -79,6 +79,15 @@ pub(in crate::surface) struct ComponentMeasures {
     pub(in crate::surface) volume: f64,
 }
 
+impl AddAssign for ComponentMeasures {
+    fn add_assign(&mut self, other: Self) {
+        self.accessible_area += other.accessible_area;
+        self.accessible_volume += other.accessible_volume;
+        self.area += other.area;
+        self.volume += other.volume;
+    }
+}
+
 /// Spheres that are converted between two checks of the cancellation flag.
 const PER_CHECK: usize = 1 << 14;
 
@@ -318,13 +327,12 @@ impl FaceSearch<'_> {
         comparisons: &mut Comparisons<'_>,
     ) -> Result<(), SurfaceError> {
         let length = radius(&self.atoms[own as usize]);
+        let Some(first) = self.components.map_or(Some(0), |components| components.first(own)) else { return Ok(()) };
         // Equal edges must not bound the face twice: of caps that differ by less than the tolerance, one remains.
-        if caps::caps(own, length, neighbours, -TOLERANCE, caps, comparisons)? == Cover::Whole
-            || self.components.is_some_and(|components| components.on(own).is_empty())
-        {
+        if caps::caps(own, length, neighbours, -TOLERANCE, caps, comparisons)? == Cover::Whole {
             return Ok(());
         }
-        Region::outside(caps, uncovered, comparisons, regions, |cap, arc| {
+        Region::outside(caps, first, uncovered, comparisons, regions, |cap, arc| {
             let component = self.component(own, cap, arc);
             if let Some(probe) = self.probe.filter(|_| cap.index > own) {
                 self.toroidal([own, cap.index], component, probe, cap, arc, part);

@@ -16,6 +16,7 @@ mod concave;
 mod distance;
 mod exact;
 mod great_circle;
+mod rays;
 mod region;
 mod shells;
 #[cfg(test)]

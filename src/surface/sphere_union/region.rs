@@ -49,13 +49,14 @@ impl EdgeArc {
 
 impl Region {
     /// Measures the part of the unit sphere outside `caps`, which [`prune`](super::caps::prune) has sorted. `component`
-    /// returns the component of each exposed arc of the edge of a cap. Fills `regions` with the components, each with
-    /// the region that its arcs bound; a sphere without caps is component 0.
+    /// returns the component of each exposed arc of the edge of a cap; a sphere without caps is component `whole`.
+    /// Fills `regions` with the components, each with the region that its arcs bound.
     ///
     /// # Errors
     /// Returns the errors of [`Comparisons::add`].
     pub(super) fn outside(
         caps: &[Cap],
+        whole: u32,
         uncovered: &mut Uncovered,
         comparisons: &mut Comparisons<'_>,
         regions: &mut Vec<(u32, Self)>,
@@ -63,7 +64,7 @@ impl Region {
     ) -> Result<(), SurfaceError> {
         regions.clear();
         let Some(largest) = caps.first() else {
-            regions.push((0, Self { solid_angle: 4.0 * PI, vector: [0.0; 3] }));
+            regions.push((whole, Self { solid_angle: 4.0 * PI, vector: [0.0; 3] }));
             return Ok(());
         };
         // The integrand is singular opposite to the pole, so that point lies within a cap, far from the boundary.

@@ -2,21 +2,44 @@
 
 use super::components::{Components, add};
 use super::exact::ComponentMeasures;
+use super::radius;
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::to_u32;
 use crate::surface::params::SurfaceLimits;
 
-/// Connected component of the boundary. Lengths are in Å.
+/// Connected component of the boundary, or several that bound one region. Lengths are in Å.
 #[derive(Debug, Clone)]
 pub(in crate::surface) struct Shell {
-    /// Number of the component.
-    pub(in crate::surface) number: u32,
+    /// Numbers of the components.
+    pub(in crate::surface) components: Vec<u32>,
     pub(in crate::surface) measures: ComponentMeasures,
     /// Numbers of the spheres with a face in it, ascending.
     pub(in crate::surface) spheres: Vec<u32>,
-    /// Lowest and highest coordinates of its arcs. A cavity lies within them: its faces bulge inwards.
+    /// Lowest and highest coordinates of its arcs, or of its sphere. A cavity lies within them: its faces bulge
+    /// inwards.
     pub(in crate::surface) bounds: [[f64; 3]; 2],
+    /// Point on an arc, or the centre of its sphere.
+    pub(in crate::surface) point: [f64; 3],
+}
+
+impl Shell {
+    /// Adds an outer component that lies within this cavity.
+    pub(in crate::surface) fn add(&mut self, island: &Self) {
+        self.components.extend(&island.components);
+        self.measures += island.measures;
+        self.spheres.extend(&island.spheres);
+        self.spheres.sort_unstable();
+        self.spheres.dedup();
+    }
+
+    /// Extends the bounds to a sphere.
+    fn extend(&mut self, centre: [f64; 3], radius: f64) {
+        let [low, high] = &mut self.bounds;
+        for k in 0..3 {
+            (low[k], high[k]) = (low[k].min(centre[k] - radius), high[k].max(centre[k] + radius));
+        }
+    }
 }
 
 impl Components<'_> {
@@ -32,10 +55,11 @@ impl Components<'_> {
         control: &Control<'_>,
     ) -> Result<Vec<Shell>, SurfaceError> {
         let shell = |(number, measures)| Shell {
-            number,
+            components: vec![number],
             measures,
             spheres: Vec::new(),
             bounds: [[f64::MAX; 3], [f64::MIN; 3]],
+            point: [0.0; 3],
         };
         let mut shells: Vec<Shell> = (0..).zip(self.measure(probe, limits, control)?).map(shell).collect();
         for own in 0..to_u32(self.atoms.len()) {
@@ -53,11 +77,17 @@ impl Components<'_> {
                 [cos, sin] if cos > 0.0 => (add(from, to).map(|c| 0.5 * c), arc.radius * sin),
                 _ => (arc.centre, arc.radius),
             };
-            let [low, high] = &mut shells[*set as usize].bounds;
-            for k in 0..3 {
-                let c = self.atoms[arc.spheres[0] as usize].position(k) + centre[k];
-                (low[k], high[k]) = (low[k].min(c - reach), high[k].max(c + reach));
-            }
+            let atom = &self.atoms[arc.spheres[0] as usize];
+            let (shell, at) =
+                (&mut shells[*set as usize], |x: [f64; 3]| std::array::from_fn(|k| atom.position(k) + x[k]));
+            shell.point = at(from);
+            shell.extend(at(centre), reach);
+        }
+        for (&sphere, number) in self.whole.iter().zip(self.first_whole()..) {
+            let (atom, shell) = (&self.atoms[sphere as usize], &mut shells[number as usize]);
+            shell.spheres.push(sphere);
+            shell.point = std::array::from_fn(|k| atom.position(k));
+            shell.extend(shell.point, radius(atom));
         }
         Ok(shells)
     }
