@@ -81,9 +81,9 @@ pub struct CavityReport {
     pub accessible_volume: f64,
     /// Area of the solvent-accessible surface of the cavity in Å².
     pub accessible_area: f64,
-    /// Radius of the largest probe that can enter the cavity from outside in Å, at most 1/16 of the radius of the probe
-    /// too small. 0 if no probe of that radius can enter.
-    pub opening: f64,
+    /// Radius of the largest probe that can enter the cavity from outside in Å, rounded down to a multiple of 1/16 of
+    /// the radius of the probe. 0 if not even a probe of 1/16 of that radius can enter.
+    pub opening_radius: f64,
     /// Number of atoms that the probe can touch.
     pub atoms: u64,
     /// Residues of these atoms, by chain and number.
@@ -111,7 +111,7 @@ impl CavityReport {
             area: cavity.area,
             accessible_volume: cavity.accessible_volume,
             accessible_area: cavity.accessible_area,
-            opening: cavity.opening,
+            opening_radius: cavity.opening_radius,
             atoms: cavity.lining.len() as u64,
             residues: LiningResidue::all(&cavity.lining, structure, selected),
             enclosed,

@@ -1,7 +1,8 @@
 //! Cavities: regions that the centre of a probe sphere can occupy, without a way out.
 //!
 //! They follow from the spheres and the probe alone, and not from a mesh: the boundary of the union of the spheres
-//! enlarged by the probe has one connected component around each cavity, whose enclosed volume is negative.
+//! enlarged by the probe has one connected component around each cavity, whose enclosed volume is negative. Islands,
+//! which are outer components within a cavity, also bound it.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
@@ -24,8 +25,8 @@ use super::spheres::Spheres;
 /// Maximum error of the radius of the largest sphere in a cavity, Å.
 const RADIUS_ERROR: f64 = 1e-3;
 
-/// Maximum error of the radius of the largest probe that can enter a cavity, in radii of the probe.
-const OPENING_ERROR: f64 = 1.0 / 16.0;
+/// Number of steps between the radius of the probe and 0 in the search for openings.
+const OPENING_STEPS: u32 = 16;
 
 /// Cavity that holds a probe.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,9 +43,9 @@ pub struct Cavity {
     pub radius: f64,
     /// Centre of this sphere, Å.
     pub centre: [f64; 3],
-    /// Radius of the largest probe that can enter from outside, Å: at most [`OPENING_ERROR`] times the radius of the
-    /// probe too small. 0 if no probe of that radius can.
-    pub opening: f64,
+    /// Radius of the largest probe that can enter from outside, Å, rounded down to a multiple of 1/16 of the radius of
+    /// the probe.
+    pub opening_radius: f64,
     /// Indices of the spheres that a probe in the cavity can touch, ascending.
     pub lining: Vec<u32>,
 }
@@ -60,42 +61,16 @@ pub(crate) fn find(
     limits: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<Vec<Cavity>, SurfaceError> {
-    let memory = Arc::new(Reservation::new(&control.memory));
-    let control = &Control { memory: Arc::<Reservation>::clone(&memory), observer: &(), ..control.clone() };
     let params =
         SurfaceParams { surface: SurfaceKind::Sas, resolution: 1.0, atom_ids: false, quantize: None, ..params.clone() };
-    control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
-    let lattice = Lattice::new(spheres, &params, control)?;
-    // Lengths are in spacings, that is in Å.
-    let components = Components::new(&lattice.atoms, lattice.spacing, limits, control)?;
-    let inner = regions(&components, components.shells(params.probe, limits, control)?, control)?;
-    let measure = |shell: &Shell| {
-        let search =
-            DepthSearch { components: &components, atoms: &lattice.atoms, shell, cubes: BinaryHeap::new(), best: None };
-        let Some((depth, centre)) = search.run(control)? else { return Ok(None) };
-        let mut lining: Vec<u32> = shell.spheres.iter().map(|i| lattice.atoms[*i as usize].source).collect();
-        lining.sort_unstable();
-        Ok(Some(Cavity {
-            accessible_area: shell.measures.accessible_area,
-            accessible_volume: -shell.measures.accessible_volume,
-            area: shell.measures.area,
-            volume: -shell.measures.volume,
-            radius: depth + params.probe,
-            centre,
-            opening: 0.0,
-            lining,
-        }))
-    };
-    let found = inner.par_iter().map(measure).collect::<Result<Vec<_>, SurfaceError>>()?;
-    let mut found: Vec<Cavity> = found.into_iter().flatten().collect();
-    found.sort_by(|a, b| b.accessible_volume.total_cmp(&a.accessible_volume));
-    let openings = Openings { spheres, params: &params, limits, control };
-    openings.search([0.0, params.probe], &mut found.iter_mut().collect::<Vec<_>>())?;
-    Ok(found)
+    let boundary = Boundary { spheres, params: &params, limits, control };
+    let mut cavities = boundary.cavities()?;
+    boundary.find_openings(&mut cavities)?;
+    Ok(cavities)
 }
 
-/// Search for the largest probes that can enter cavities, by bisection.
-struct Openings<'a> {
+/// Boundary of the spheres enlarged by a probe.
+struct Boundary<'a> {
     spheres: &'a Spheres,
     /// Parameters of a solvent-accessible surface with a grid spacing of 1 Å.
     params: &'a SurfaceParams,
@@ -103,57 +78,111 @@ struct Openings<'a> {
     control: &'a Control<'a>,
 }
 
-impl Openings<'_> {
-    /// Sets the openings of `cavities`. A probe of the larger of two radii, Å, cannot enter any of them; the smaller
-    /// radius is 0 or that of a probe that can enter all of them.
-    fn search(&self, [low, high]: [f64; 2], cavities: &mut [&mut Cavity]) -> Result<(), SurfaceError> {
-        for cavity in &mut *cavities {
-            cavity.opening = low;
-        }
-        if cavities.is_empty() || high - low <= OPENING_ERROR * self.params.probe {
-            return Ok(());
-        }
-        let middle = 0.5 * (low + high);
-        let centres: Vec<[f64; 3]> = cavities.iter().map(|cavity| cavity.centre).collect();
-        let closed = self.closed(middle, &centres)?;
-        let (mut narrow, mut wide) = (Vec::new(), Vec::new());
-        for (cavity, closed) in cavities.iter_mut().zip(closed) {
-            if closed { narrow.push(&mut **cavity) } else { wide.push(&mut **cavity) }
-        }
-        self.search([low, middle], &mut narrow)?;
-        self.search([middle, high], &mut wide)
-    }
-
-    /// Returns true for each point that a probe of radius `probe`, Å, cannot reach from outside. The points lie outside
-    /// the spheres enlarged by the probe, so a component that encloses one is the wall of a cavity, or lies around it.
-    fn closed(&self, probe: f64, points: &[[f64; 3]]) -> Result<Vec<bool>, SurfaceError> {
+impl Boundary<'_> {
+    /// Returns a control whose memory is released when it is dropped, and the spheres enlarged by `probe`, Å.
+    fn enlarged(&self, probe: f64) -> Result<(Control<'_>, Lattice), SurfaceError> {
         let memory = Arc::new(Reservation::new(&self.control.memory));
-        let control = Control { memory, ..self.control.clone() };
+        let control = Control { memory, observer: &(), ..self.control.clone() };
         control.memory.grow(LATTICE_BYTES * self.spheres.len() as u64)?;
         let params = SurfaceParams { probe, ..self.params.clone() };
         let lattice = Lattice::new(self.spheres, &params, &control)?;
-        let components = Components::new(&lattice.atoms, lattice.spacing, self.limits, &control)?;
-        Ok(components.around(points, &control)?.iter().map(|around| !around.is_empty()).collect())
+        Ok((control, lattice))
+    }
+
+    /// Returns the cavities, without their openings.
+    fn cavities(&self) -> Result<Vec<Cavity>, SurfaceError> {
+        let probe = self.params.probe;
+        let (control, lattice) = &self.enlarged(probe)?;
+        // Lengths are in spacings, that is in Å.
+        let components = Components::new(&lattice.atoms, lattice.spacing, self.limits, control)?;
+        let shells = cavity_shells(&components, components.shells(probe, self.limits, control)?, control)?;
+        let measure = |shell: &Shell| {
+            let atoms = &lattice.atoms;
+            let search = DepthSearch { components: &components, atoms, shell, cubes: BinaryHeap::new(), best: None };
+            let Some((depth, centre)) = search.run(control)? else { return Ok(None) };
+            let mut lining: Vec<u32> = shell.spheres.iter().map(|i| atoms[*i as usize].source).collect();
+            lining.sort_unstable();
+            Ok(Some(Cavity {
+                accessible_area: shell.measures.accessible_area,
+                accessible_volume: -shell.measures.accessible_volume,
+                area: shell.measures.area,
+                volume: -shell.measures.volume,
+                radius: depth + probe,
+                centre,
+                opening_radius: 0.0,
+                lining,
+            }))
+        };
+        let found = shells.par_iter().map(measure).collect::<Result<Vec<_>, SurfaceError>>()?;
+        let mut found: Vec<Cavity> = found.into_iter().flatten().collect();
+        found.sort_by(|a, b| b.accessible_volume.total_cmp(&a.accessible_volume));
+        Ok(found)
+    }
+
+    /// Sets the opening radii of `cavities`: tries smaller and smaller probes until all of them are open.
+    fn find_openings(&self, cavities: &mut [Cavity]) -> Result<(), SurfaceError> {
+        let mut closed: Vec<&mut Cavity> = cavities.iter_mut().collect();
+        for step in (1..OPENING_STEPS).rev() {
+            let probe = self.params.probe * f64::from(step) / f64::from(OPENING_STEPS);
+            if closed.is_empty() || probe <= 0.0 {
+                break;
+            }
+            let centres: Vec<[f64; 3]> = closed.iter().map(|cavity| cavity.centre).collect();
+            let is_closed = self.is_closed(probe, &centres)?;
+            let mut remaining = Vec::new();
+            for (cavity, is_closed) in closed.into_iter().zip(is_closed) {
+                if is_closed {
+                    remaining.push(cavity);
+                } else {
+                    cavity.opening_radius = probe;
+                }
+            }
+            closed = remaining;
+        }
+        Ok(())
+    }
+
+    /// Returns true for each point that a probe of radius `probe`, Å, cannot reach from outside: a component encloses
+    /// it. The points lie outside the spheres enlarged by the probe.
+    fn is_closed(&self, probe: f64, points: &[[f64; 3]]) -> Result<Vec<bool>, SurfaceError> {
+        let (control, lattice) = &self.enlarged(probe)?;
+        let components = Components::new(&lattice.atoms, lattice.spacing, self.limits, control)?;
+        Ok(components.around(points, control)?.iter().map(|around| !around.is_empty()).collect())
     }
 }
 
-/// Returns the boundaries of the cavities: inner components, each with the outer ones that lie directly within it.
-fn regions(components: &Components<'_>, shells: Vec<Shell>, control: &Control<'_>) -> Result<Vec<Shell>, SurfaceError> {
-    let (mut inner, mut outer): (Vec<Shell>, Vec<Shell>) =
+/// Returns the boundaries of the cavities: inner components, each with its islands. An island is an outer component
+/// within a cavity.
+fn cavity_shells(
+    components: &Components<'_>,
+    shells: Vec<Shell>,
+    control: &Control<'_>,
+) -> Result<Vec<Shell>, SurfaceError> {
+    let (mut inner, outer): (Vec<Shell>, Vec<Shell>) =
         shells.into_iter().partition(|shell| shell.measures.accessible_volume < 0.0);
     let within = |point: [f64; 3], [low, high]: [[f64; 3]; 2]| (0..3).all(|k| (low[k]..=high[k]).contains(&point[k]));
-    outer.retain(|shell| inner.iter().any(|cavity| within(shell.point, cavity.bounds)));
-    let points: Vec<[f64; 3]> = outer.iter().map(|shell| shell.point).collect();
-    for (island, around) in outer.iter().zip(components.around(&points, control)?) {
-        let enclosing = inner.iter_mut().filter(|cavity| around.contains(&cavity.components[0]));
-        // The smallest one, if they are nested: its bounds lie within those of the others.
-        let smallest = enclosing.min_by(|a, b| {
-            let size = |shell: &Shell| (0..3).map(|k| shell.bounds[1][k] - shell.bounds[0][k]).product::<f64>();
-            size(a).total_cmp(&size(b))
-        });
-        if let Some(cavity) = smallest {
-            cavity.add(island);
+    let mut islands = Vec::new();
+    for shell in outer {
+        control.check()?;
+        if inner.iter().any(|cavity| within(shell.point, cavity.bounds)) {
+            islands.push(shell);
         }
+    }
+    let points: Vec<[f64; 3]> = islands.iter().map(|island| island.point).collect();
+    let numbers: Vec<u32> = inner.iter().map(|cavity| cavity.components[0]).collect();
+    for (island, around) in islands.iter().zip(components.around(&points, control)?) {
+        let enclosing = around.iter().filter_map(|number| numbers.binary_search(number).ok());
+        // The smallest one, if they are nested: its bounds lie within those of the others.
+        let size = |i: &usize| (0..3).map(|k| inner[*i].bounds[1][k] - inner[*i].bounds[0][k]).product::<f64>();
+        if let Some(cavity) = enclosing.min_by(|a, b| size(a).total_cmp(&size(b))) {
+            inner[cavity].add(island);
+        }
+    }
+    for cavity in &mut inner {
+        control.check()?;
+        cavity.spheres.sort_unstable();
+        cavity.spheres.dedup();
+        cavity.components.sort_unstable();
     }
     Ok(inner)
 }
@@ -287,7 +316,7 @@ impl DepthSearch<'_> {
             let n: [f64; 3] = std::array::from_fn(|k| centre[k] - own.position(k));
             let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
             let component = self.components.at(sphere, n.map(|c| c / length));
-            let inside = component.is_some_and(|component| self.shell.components.contains(&component));
+            let inside = component.is_some_and(|component| self.shell.components.binary_search(&component).is_ok());
             if !inside && diagonal <= depth {
                 // No sphere lies between the centre and any point of the cube.
                 return;

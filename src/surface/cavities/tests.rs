@@ -138,7 +138,7 @@ fn hollow_balls_have_one_cavity_each() {
     assert!((other / regions[0].volume - 1.0).abs() > 0.04, "{other}");
     assert!(cavity.lining.len() > 100 && cavity.lining.is_sorted());
     assert!((cavity.radius - 5.3).abs() < 0.1, "{}", cavity.radius);
-    assert!(cavity.opening <= 0.0, "the spheres overlap, but {} is open", cavity.opening);
+    assert!(cavity.opening_radius <= 0.0, "the spheres overlap, but {} is open", cavity.opening_radius);
     assert!((0..3).all(|k| (cavity.centre[k] - [0.3, -0.2, 0.1][k]).abs() < 0.3));
     // Two of them, and a third one apart that is too small for a probe.
     let mut two = [hollow([0.0; 3], 7.0, 130), hollow([17.0, 0.0, 0.0], 6.0, 110)].concat();
@@ -218,8 +218,11 @@ fn a_cubic_hole_has_the_symmetry_of_its_spheres() {
     for radius in [1.8, 1.75, 1.7] {
         let balls: Vec<Ball> = balls.iter().map(|(centre, _)| (*centre, radius)).collect();
         let widest = side / 2.0_f64.sqrt() - radius;
-        let [Cavity { opening, .. }] = cavities(&balls, probe)[..] else { panic!("{radius}") };
-        assert!((widest - probe * OPENING_ERROR..widest).contains(&opening), "{radius}: {opening} of {widest}");
+        let [Cavity { opening_radius: opening, .. }] = cavities(&balls, probe)[..] else { panic!("{radius}") };
+        assert!(
+            (widest - probe / f64::from(OPENING_STEPS)..widest).contains(&opening),
+            "{radius}: {opening} of {widest}"
+        );
     }
     // The lattice of the same cube has a hole in each cell, which touches the next ones at the centres of faces if the
     // spheres just reach them.

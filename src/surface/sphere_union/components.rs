@@ -225,7 +225,8 @@ impl<'a> Components<'a> {
         if let Some(only) = self.only(sphere) {
             return Some(only);
         }
-        let (arcs, Some(caps)) = (self.on(sphere), self.caps.get(&sphere)) else { return self.first(sphere) };
+        let Some(caps) = self.caps.get(&sphere) else { return self.first(sphere) };
+        let arcs = self.on(sphere);
         let (plane, mut uncovered) = (GreatCircle::through(n, self.middle(arcs[0], sphere)), Uncovered::default());
         plane.uncover(caps, self.tolerance / radius(&self.atoms[sphere as usize]), &mut uncovered);
         let (mut deepest, mut found) = (f64::MIN, self.of_arc[arcs[0] as usize]);

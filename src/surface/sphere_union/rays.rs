@@ -13,11 +13,11 @@ use crate::surface::lattice::to_i32;
 const PER_CHECK: usize = 1 << 16;
 
 /// Part of a ray within a sphere: distances from its origin, and the number of the sphere.
-type Crossing = ([f64; 2], u32);
+type Interval = ([f64; 2], u32);
 
 impl Components<'_> {
-    /// Returns the components that enclose each of `points`, ascending. A point on a component counts as inside or
-    /// outside of it.
+    /// Returns the components that enclose each of `points`, ascending. If a point lies on a component, that component
+    /// may or may not be returned.
     ///
     /// A ray leaves a component as often as it enters it, and once more if it starts inside.
     ///
@@ -35,7 +35,7 @@ impl Components<'_> {
         for (ray, point) in (0..).zip(points) {
             columns.entry([column(point[1]), column(point[2])]).or_default().push(ray);
         }
-        let mut crossings: Vec<Vec<Crossing>> = vec![Vec::new(); points.len()];
+        let mut intervals: Vec<Vec<Interval>> = vec![Vec::new(); points.len()];
         for (some, first) in self.atoms.chunks(PER_CHECK).zip((0..).step_by(PER_CHECK)) {
             control.check()?;
             for (atom, sphere) in some.iter().zip(first..) {
@@ -47,23 +47,23 @@ impl Components<'_> {
                     let square = r * r - to[1] * to[1] - to[2] * to[2];
                     let end = to[0] + square.max(0.0).sqrt();
                     if square > 0.0 && end > 0.0 {
-                        control.memory.grow(2 * size_of::<Crossing>() as u64)?;
-                        crossings[ray as usize].push(([2.0 * to[0] - end, end], sphere));
+                        control.memory.grow(2 * size_of::<Interval>() as u64)?;
+                        intervals[ray as usize].push(([2.0 * to[0] - end, end], sphere));
                     }
                 }
             }
         }
-        let around = |(point, crossings): (&[f64; 3], &mut Vec<Crossing>)| {
+        let around = |(point, intervals): (&[f64; 3], &mut Vec<Interval>)| {
             control.check()?;
-            crossings.sort_unstable_by(|a, b| a.0[0].total_cmp(&b.0[0]));
-            Ok(self.odd(*point, crossings))
+            intervals.sort_unstable_by(|a, b| a.0[0].total_cmp(&b.0[0]));
+            Ok(self.odd(*point, intervals))
         };
-        points.par_iter().zip(&mut crossings).map(around).collect()
+        points.par_iter().zip(&mut intervals).map(around).collect()
     }
 
-    /// Returns the components that a ray from `point` crosses an odd number of times, ascending. `crossings` are sorted
+    /// Returns the components that a ray from `point` crosses an odd number of times, ascending. `intervals` are sorted
     /// by their start.
-    fn odd(&self, point: [f64; 3], crossings: &[Crossing]) -> Vec<u32> {
+    fn odd(&self, point: [f64; 3], intervals: &[Interval]) -> Vec<u32> {
         let mut odd: Vec<u32> = Vec::new();
         let mut cross = |at: f64, sphere: u32| {
             let atom = &self.atoms[sphere as usize];
@@ -76,7 +76,7 @@ impl Components<'_> {
             }
         };
         let mut last: Option<(f64, u32)> = None;
-        for &([start, end], sphere) in crossings {
+        for &([start, end], sphere) in intervals {
             if last.is_none_or(|(last, _)| start > last) {
                 if let Some((end, sphere)) = last {
                     cross(end, sphere);

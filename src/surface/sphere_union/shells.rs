@@ -11,7 +11,7 @@ use crate::surface::params::SurfaceLimits;
 /// Connected component of the boundary, or several that bound one region. Lengths are in Å.
 #[derive(Debug, Clone)]
 pub(in crate::surface) struct Shell {
-    /// Numbers of the components.
+    /// Numbers of the components, ascending.
     pub(in crate::surface) components: Vec<u32>,
     pub(in crate::surface) measures: ComponentMeasures,
     /// Numbers of the spheres with a face in it, ascending.
@@ -19,18 +19,16 @@ pub(in crate::surface) struct Shell {
     /// Lowest and highest coordinates of its arcs, or of its sphere. A cavity lies within them: its faces bulge
     /// inwards.
     pub(in crate::surface) bounds: [[f64; 3]; 2],
-    /// Point on an arc, or the centre of its sphere.
+    /// Point to test for its enclosing components: an end of an arc, or the centre of a sphere without arcs.
     pub(in crate::surface) point: [f64; 3],
 }
 
 impl Shell {
-    /// Adds an outer component that lies within this cavity.
-    pub(in crate::surface) fn add(&mut self, island: &Self) {
-        self.components.extend(&island.components);
-        self.measures += island.measures;
-        self.spheres.extend(&island.spheres);
-        self.spheres.sort_unstable();
-        self.spheres.dedup();
+    /// Adds the components, measures and spheres of another shell. Sorts nothing and keeps the bounds.
+    pub(in crate::surface) fn add(&mut self, other: &Self) {
+        self.components.extend(&other.components);
+        self.measures += other.measures;
+        self.spheres.extend(&other.spheres);
     }
 
     /// Extends the bounds to a sphere.
@@ -78,13 +76,14 @@ impl Components<'_> {
                 _ => (arc.centre, arc.radius),
             };
             let atom = &self.atoms[arc.spheres[0] as usize];
-            let (shell, at) =
-                (&mut shells[*set as usize], |x: [f64; 3]| std::array::from_fn(|k| atom.position(k) + x[k]));
+            let at = |x: [f64; 3]| std::array::from_fn(|k| atom.position(k) + x[k]);
+            let shell = &mut shells[*set as usize];
             shell.point = at(from);
             shell.extend(at(centre), reach);
         }
         for (&sphere, number) in self.whole.iter().zip(self.first_whole()..) {
-            let (atom, shell) = (&self.atoms[sphere as usize], &mut shells[number as usize]);
+            let atom = &self.atoms[sphere as usize];
+            let shell = &mut shells[number as usize];
             shell.spheres.push(sphere);
             shell.point = std::array::from_fn(|k| atom.position(k));
             shell.extend(shell.point, radius(atom));
