@@ -289,6 +289,9 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::TooManyCandidates { .. } => {
             Some("try a coarser --resolution or smaller radii, or raise --max-candidates".to_owned())
         }
+        SurfaceError::TooManyTriangles { simplify: Some(_), triangles, .. } => {
+            Some(format!("try a larger --simplify, a coarser --resolution, or --max-triangles {triangles}"))
+        }
         SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
         SurfaceError::DeviceMemory { .. } => coarser_or("try --backend cpu"),
         SurfaceError::Device { .. } => Some(format!("try --backend cpu{DOCTOR}")),

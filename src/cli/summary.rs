@@ -134,11 +134,9 @@ fn title(report: &Report) -> String {
 fn surface(report: &Report) -> String {
     let smoothness = report.smoothness.map(|a| format!(", smoothness {a}")).unwrap_or_default();
     let preset = Some(report.preset).filter(|p| *p != "default").map(|p| format!(" (preset {p})")).unwrap_or_default();
-    let from = match (report.detail, report.max_triangles) {
+    let from = match (report.detail, report.max_triangles.zip(report.tries)) {
         (Some(level), _) => format!(" (detail {level})"),
-        (None, Some(most)) => {
-            format!(" (for at most {} triangles, {} tries)", grouped(most), report.tries.unwrap_or_default())
-        }
+        (None, Some((most, tries))) => format!(" (for at most {} triangles, {tries} tries)", grouped(most)),
         (None, None) => String::new(),
     };
     let isovalue = report.isovalue.map(|level| format!(", isovalue {level}")).unwrap_or_default();

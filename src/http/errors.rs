@@ -366,7 +366,7 @@ impl From<SurfaceError> for Problem {
                 fitting(exceeded(ProblemType::TooManyCandidates, limit, candidates).with("resolution", resolution))
             }
             E::MeshTooLarge { bytes, limit, .. } => fitting(exceeded(ProblemType::MeshTooLarge, limit, bytes)),
-            E::TooManyTriangles { triangles, limit, resolution } => Self::new(ProblemType::MeshTooLarge, detail)
+            E::TooManyTriangles { triangles, limit, resolution, .. } => Self::new(ProblemType::MeshTooLarge, detail)
                 .with("parameter", "max_triangles")
                 .with("limit", limit)
                 .with("actual", triangles)

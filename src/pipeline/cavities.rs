@@ -178,19 +178,9 @@ fn remove(
         };
     }
     let keeps = |vertex: u32| walls.contains(&inner.of_vertex[vertex as usize]) == (mode == Cavities::Only);
-    let n_vertices = mesh.n_vertices();
-    let memory = control.reserve(8 * n_vertices as u64)?;
-    let (mut numbers, mut rows) = (vec![0_u32; n_vertices], Vec::new());
-    for (vertex, number) in (0..).zip(&mut numbers).filter(|(vertex, _)| keeps(*vertex)) {
-        *number = u32::try_from(rows.len()).unwrap_or(u32::MAX);
-        rows.push(vertex);
-    }
-    control.check()?;
-    let kept = mesh.triangles.iter().filter(|triangle| keeps(triangle[0]));
-    let triangles: Column<[u32; 3]> = kept.map(|triangle| triangle.map(|v| numbers[v as usize])).collect();
+    let triangles: Column<[u32; 3]> = mesh.triangles.iter().filter(|triangle| keeps(triangle[0])).copied().collect();
     mesh.triangles = triangles;
-    mesh.take_vertices(&rows);
-    drop(memory);
+    mesh.drop_unused_vertices(control)?;
     (output.measures, output.bounds) = (None, None);
     Ok(enclosed)
 }

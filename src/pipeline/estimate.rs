@@ -102,7 +102,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
     let lattices = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
-    let simplifies = job.simplify.map_or(Ok(()), |error| check_error(error, params.resolution));
+    let simplifies = job.simplify.map_or(Ok(()), |wanted| check_error(wanted.error, params.resolution));
     let mesh = simplifies.and_then(|()| refused.map_or_else(|| plan.mesh(&lattices, choice, control), Err));
     drop(lattices);
     let mesh = match (mesh, job.spacing) {
@@ -110,10 +110,11 @@ pub fn estimate<S: Deref<Target = Structure>>(
         (mesh, _) => mesh,
     };
     let mesh = mesh.and_then(|mesh| {
-        let bytes = mesh.bytes + job.attribute_bytes() * mesh.vertices;
-        let held = bytes.saturating_add(plan.compressed_bytes(mesh.vertices));
+        let with_attributes = |mesh: &MeshEstimate| mesh.bytes + job.attribute_bytes() * mesh.vertices;
+        let held = with_attributes(&mesh).saturating_add(plan.compressed_bytes(mesh.vertices));
         control.memory.check(held.saturating_add(plan.bytes_before_cut(&mesh)))?;
-        Ok(MeshEstimate { bytes, ..mesh })
+        let mesh = job.max_triangles().map_or(mesh, |limit| mesh.at_most(limit, &params));
+        Ok(MeshEstimate { bytes: with_attributes(&mesh), ..mesh })
     });
     let mesh = match mesh.map_err(|error| with_finest_fit(error, &plan, choice, control)) {
         Err(error) if ends_work(&error) => return Err(error.into()),

@@ -273,7 +273,7 @@ fn no_fit(job: &Job, limit: u64, resolution: f64, triangles: u64) -> SurfaceErro
     match triangles {
         0 if job.selection.context == Context::Whole => SurfaceError::NoPatch,
         0 => SurfaceError::NoSurface { isovalue: job.params.level() },
-        _ => SurfaceError::TooManyTriangles { triangles, limit, resolution },
+        _ => SurfaceError::TooManyTriangles { triangles, limit, resolution, simplify: None },
     }
 }
 

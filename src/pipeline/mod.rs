@@ -63,8 +63,8 @@ use crate::picture::{PictureError, PictureParams};
 use crate::structure::map::MapError;
 use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
-    Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceParams,
-    Validation, lattice,
+    Backend, Control, Measures, Mesh, MeshOutput, MeshSink, Simplify, SinkFailed, Spheres, Stage, SurfaceError,
+    SurfaceParams, Validation, lattice,
 };
 use color::{MeshColors, Scheme};
 use cut::Cut;
@@ -89,8 +89,8 @@ pub struct Job {
     pub cavities: Option<Cavities>,
     /// Radius of the large probe of a search for pockets, Å. Colours and parts that need pockets imply a search.
     pub pockets: Option<f64>,
-    /// Error of the simplification of the mesh, Å; `None` to keep all triangles.
-    pub simplify: Option<f64>,
+    /// Simplification of the mesh; `None` to keep all triangles.
+    pub simplify: Option<Simplify>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -149,6 +149,11 @@ impl Job {
             && !self.selection.instances
             && self.cavities.is_none_or(|cavities| cavities == Cavities::Keep)
             && self.picture.is_none()
+    }
+
+    /// Returns the limit on triangles, which applies to the choice of the grid spacing or to the simplification.
+    fn max_triangles(&self) -> Option<u64> {
+        self.simplify.and_then(|wanted| wanted.max_triangles).or_else(|| self.spacing.max_triangles())
     }
 
     /// Returns the bytes that colours and atom indices add to a vertex of a GLB.

@@ -20,7 +20,7 @@ use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Context, Selection, Split};
 use crate::surface::pockets::SPACING as POCKET_SPACING;
-use crate::surface::{SurfaceError, SurfaceParams};
+use crate::surface::{Simplify, SurfaceError, SurfaceParams};
 
 /// Errors of parsing parameters.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -88,7 +88,7 @@ pub struct Request {
 pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V)>) -> Result<Request, ParamError> {
     let mut seen = [false; TABLE.len()];
     let mut values = ParsedValues::default();
-    let mut spacing = None;
+    let mut spacings: Vec<(&'static str, String)> = Vec::new();
     for (name, value) in pairs {
         let (name, value) = (name.as_ref(), value.as_ref());
         let Some(index) = TABLE.iter().position(|p| p.name == name) else {
@@ -107,11 +107,13 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
             continue;
         }
         values.set(parameter, value)?;
-        if SPACINGS.contains(&parameter.name)
-            && let Some(other) = spacing.replace(parameter.name)
-        {
-            return Err(contradiction(parameter.name, value, other));
+        if SPACINGS.contains(&parameter.name) {
+            spacings.push((parameter.name, value.to_owned()));
         }
+    }
+    values.limit_triangles(&mut spacings);
+    if let [(other, _), (name, value), ..] = &spacings[..] {
+        return Err(contradiction(name, value, other));
     }
     let color = values.coloring()?;
     let pockets = values.pockets()?;
@@ -195,7 +197,7 @@ fn divided_by(split: Split, Selection { context, instances, .. }: &Selection) ->
 /// Rejects the simplification of one surface that is divided into parts. Vertices on borders are stored once per part,
 /// so the check for common edges would not find those of two parts.
 fn check_simplify(job: &Job) -> Result<(), ParamError> {
-    let Some(error) = job.simplify else { return Ok(()) };
+    let Some(Simplify { error, .. }) = job.simplify else { return Ok(()) };
     let expected = match (job.split, job.selection.context) {
         (Split::Pocket, _) => "no value with split=pocket, which divides one surface",
         (split, Context::Whole) if split != Split::None => {
@@ -231,7 +233,7 @@ pub const MAX_VALUE_BYTES: usize = 4096;
 /// Parameters of a picture.
 pub(crate) const PICTURES: [&str; 7] = ["width", "height", "view", "azimuth", "elevation", "background", "style"];
 
-/// Parameters that set the grid spacing and exclude each other.
+/// Parameters that set the grid spacing and exclude each other. With `simplify`, `max_triangles` does not set it.
 pub(crate) const SPACINGS: [&str; 3] = ["resolution", "detail", "max_triangles"];
 
 fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {

@@ -287,7 +287,7 @@ impl Report {
             resolution: counts.resolution,
             resolution_from: job.spacing.parameter(),
             detail: job.spacing.detail(),
-            max_triangles: job.spacing.max_triangles(),
+            max_triangles: job.max_triangles(),
             tries: counts.tries,
             isovalue: params.level(),
             smoothness: gaussian.then_some(params.smoothness),

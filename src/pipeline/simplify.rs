@@ -26,7 +26,7 @@ pub struct SimplificationReport {
 /// # Errors
 /// [`SurfaceError::BadParameter`] if the error of the simplification is too large for the grid.
 pub(super) fn params_of_input(job: &Job, params: &SurfaceParams) -> Result<SurfaceParams, SurfaceError> {
-    job.simplify.map_or(Ok(()), |error| check_error(error, params.resolution))?;
+    job.simplify.map_or(Ok(()), |wanted| check_error(wanted.error, params.resolution))?;
     Ok(SurfaceParams { quantize: params.quantize.filter(|_| job.simplify.is_none()), ..params.clone() })
 }
 
@@ -34,7 +34,7 @@ pub(super) fn params_of_input(job: &Job, params: &SurfaceParams) -> Result<Surfa
 /// if the mesh was streamed into a sink.
 ///
 /// # Errors
-/// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+/// Returns the errors of [`simplify`], [`SurfaceError::Memory`] and [`SurfaceError::Cancelled`].
 pub(super) fn apply(
     job: &Job,
     params: &SurfaceParams,
@@ -45,8 +45,8 @@ pub(super) fn apply(
     if output.streamed.is_some() {
         return Ok(None);
     }
-    let simplified = |error| {
-        let found = clock.time("simplify", || simplify(&mut output.mesh, error, params.resolution, control))?;
+    let simplified = |wanted| {
+        let found = clock.time("simplify", || simplify(&mut output.mesh, wanted, params.resolution, control))?;
         (output.measures, output.bounds) = (None, None);
         Ok::<_, SurfaceError>(SimplificationReport {
             triangles_before: found.triangles,

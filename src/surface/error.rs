@@ -86,8 +86,12 @@ pub enum SurfaceError {
         /// A spacing that would fit, in Å.
         suggested_resolution: f64,
     },
-    /// The triangle limit cannot be met at any spacing that still shows the surface.
-    #[error("the mesh has {triangles} triangles at the coarsest spacing, {resolution} Å; the limit is {limit}")]
+    /// The triangle limit cannot be met at any spacing that still shows the surface, or with the error of a
+    /// simplification.
+    #[error("{}; the limit is {limit}", simplify.map_or_else(
+        || format!("the mesh has {triangles} triangles at the coarsest spacing, {resolution} Å"),
+        |error| format!("the mesh has {triangles} triangles after simplification with an error of {error} Å"),
+    ))]
     TooManyTriangles {
         /// Smallest number of triangles found.
         triangles: u64,
@@ -95,6 +99,8 @@ pub enum SurfaceError {
         limit: u64,
         /// Spacing with that number of triangles, Å.
         resolution: f64,
+        /// Error of the simplification, Å; `None` if the spacing was searched.
+        simplify: Option<f64>,
     },
     /// No grid point lies inside the surface.
     #[error("{}", isovalue.map_or_else(

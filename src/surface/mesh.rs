@@ -7,7 +7,9 @@ use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
 use super::column::Column;
-use super::lattice::to_f32;
+use super::control::Control;
+use super::error::SurfaceError;
+use super::lattice::{to_f32, to_u32};
 use super::quantize::{self, Step};
 use super::sink::Vertices;
 
@@ -267,6 +269,34 @@ impl Mesh {
         }
         self.atom_ids = self.atom_ids.take().map(|column| taken(&column, rows));
         self.colors = self.colors.take().map(|column| taken(&column, rows));
+    }
+
+    /// Drops the vertices that no triangle uses, and numbers the others in their order. Returns the old numbers of the
+    /// vertices that remain. All columns must be contiguous.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    pub(crate) fn drop_unused_vertices(&mut self, control: &Control<'_>) -> Result<Vec<u32>, SurfaceError> {
+        /// Triangles between two checks of the cancellation flag: a few milliseconds.
+        const PER_CHECK: usize = 1 << 16;
+        let _memory = control.reserve(8 * self.n_vertices() as u64)?;
+        let mut numbers = vec![0_u32; self.n_vertices()];
+        for some in self.triangles.chunks(PER_CHECK) {
+            control.check()?;
+            some.as_flattened().iter().for_each(|v| numbers[*v as usize] = 1);
+        }
+        let mut rows = Vec::new();
+        for (row, number) in (0..).zip(&mut numbers).filter(|(_, used)| **used == 1) {
+            *number = to_u32(rows.len());
+            rows.push(row);
+        }
+        self.triangles.par_chunks_mut(PER_CHECK).try_for_each(|some| {
+            control.check()?;
+            some.as_flattened_mut().iter_mut().for_each(|v| *v = numbers[*v as usize]);
+            Ok::<_, SurfaceError>(())
+        })?;
+        self.take_vertices(&rows);
+        Ok(rows)
     }
 
     /// Vertices whose normal is zero.

@@ -35,6 +35,12 @@ use super::union_find::UnionFind;
 /// Smallest and largest value of the parameter `simplify`, Å.
 pub const SIMPLIFY_ERRORS: [f64; 2] = [0.001, 10.0];
 
+/// Shifts of the cubes in each pass, in edge lengths. The passes after [`MIN_PASSES`] run only while the mesh has too
+/// many triangles.
+const SHIFTS: [f64; 4] = [0.0, 0.5, 0.25, 0.75];
+/// Number of passes without a limit on triangles.
+const MIN_PASSES: usize = 2;
+
 /// Edge length of a cube, in grid spacings. A piece then has some thousand triangles.
 const SIDE: f64 = 24.0;
 /// Errors that are passed to meshoptimizer one after another, relative to the permitted error. Its error is an average
@@ -42,10 +48,17 @@ const SIDE: f64 = 24.0;
 const TRIES: [f64; 3] = [0.5, 0.25, 0.125];
 /// Largest error, in grid spacings: with larger ones, most results fail the checks.
 const MAX_SPACINGS: f64 = 2.0;
-/// Triangles between two checks of the cancellation flag: a few milliseconds.
-const PER_CHECK: usize = 1 << 16;
 /// Memory per triangle while the mesh is simplified, bytes: its cube and index, and copies of its corners.
 pub(crate) const TRIANGLE_BYTES: u64 = 112;
+
+/// Value of the parameter `simplify`, with the limit on triangles that it must reach.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Simplify {
+    /// Permitted error of each pass, Å.
+    pub error: f64,
+    /// Number of triangles at which the simplification ends; `None` to remove as many as the error permits.
+    pub max_triangles: Option<u64>,
+}
 
 /// Result of a simplification.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -93,33 +106,41 @@ pub(crate) fn check_error(error: f64, spacing: f64) -> Result<(), SurfaceError> 
     Err(bad("simplify", format!("`{error}`"), &expected))
 }
 
-/// Simplifies `mesh`. Each of two passes may move the surface by up to `error`, Å, measured at vertices and centroids.
-/// `spacing` is the grid spacing of the mesh, Å. Each part is simplified on its own, and its area, volume and bounds
-/// are measured again.
+/// Simplifies `mesh`. Each pass may move the surface by up to the error of `wanted`, measured at vertices and
+/// centroids. `spacing` is the grid spacing of the mesh, Å. Each part is simplified on its own, and its area, volume
+/// and bounds are measured again.
 ///
 /// # Errors
-/// Returns the errors of [`check_error`], [`SurfaceError::Memory`] and [`SurfaceError::Cancelled`].
+/// Returns the errors of [`check_error`], [`SurfaceError::TooManyTriangles`] if the error is too small for the limit on
+/// triangles, [`SurfaceError::Memory`] and [`SurfaceError::Cancelled`].
 pub(crate) fn simplify(
     mesh: &mut Mesh,
-    error: f64,
+    wanted: Simplify,
     spacing: f64,
     control: &Control<'_>,
 ) -> Result<Simplification, SurfaceError> {
+    let Simplify { error, max_triangles } = wanted;
     check_error(error, spacing)?;
     mesh.make_contiguous();
-    let _memory = control.reserve(TRIANGLE_BYTES * mesh.n_triangles() as u64)?;
+    let memory = control.reserve(TRIANGLE_BYTES * mesh.n_triangles() as u64)?;
     let positions: Vec<[f32; 3]> = (0..mesh.n_vertices()).into_par_iter().map(|v| mesh.position(v)).collect();
     let (rows, parts) = (mesh.triangles.to_vec(), part_ranges(mesh));
     let before = Triangles { positions: &positions, rows: &rows, parts: &parts };
     let side = CubeSide(SIDE * spacing);
-    for shift in [0.0, 0.5] {
+    for (pass, shift) in SHIFTS.into_iter().enumerate() {
+        let excess = max_triangles.map_or(f64::INFINITY, |limit| mesh.n_triangles() as f64 / limit as f64);
+        if excess <= 1.0 || pass >= MIN_PASSES && max_triangles.is_none() {
+            break;
+        }
+        // The boundaries of the pieces stay fine in the first pass, so both passes share the reduction.
+        let share = if pass == 0 { excess.sqrt().recip() } else { excess.recip() };
         let parts = part_ranges(mesh);
         let triangles = Triangles { positions: &positions, rows: &mesh.triangles, parts: &parts };
         let sorted = triangles.by_cube(side, shift, control)?;
         let pieces: Vec<&[(Cube, u32)]> = sorted.chunk_by(|a, b| a.0 == b.0).collect();
         let simplified = |piece: &&[(Cube, u32)]| {
             control.check()?;
-            Ok(CubePiece::new(&triangles, piece).simplified(error, side))
+            Ok(CubePiece::new(&triangles, piece).simplified(error, share, side))
         };
         let mut results = pieces.par_iter().map(simplified).collect::<Result<Vec<_>, SurfaceError>>()?;
         revert_conflicts(&mut results);
@@ -141,11 +162,15 @@ pub(crate) fn simplify(
             first += n;
         }
     }
+    if let Some(limit) = max_triangles.filter(|limit| mesh.n_triangles() as u64 > *limit) {
+        let triangles = mesh.n_triangles() as u64;
+        return Err(SurfaceError::TooManyTriangles { triangles, limit, resolution: spacing, simplify: Some(error) });
+    }
     let parts = part_ranges(mesh);
     let after = Triangles { positions: &positions, rows: &mesh.triangles, parts: &parts };
     let deviation = Deviation::sampled(before, after, error, side, control)?;
     let triangles = rows.len() as u64;
-    drop((rows, positions));
+    drop((rows, positions, memory));
     compact(mesh, control)?;
     Ok(Simplification { triangles, deviation })
 }
@@ -223,17 +248,17 @@ impl CubePiece {
         Self { vertices, positions, triangles }
     }
 
-    /// Simplifies the piece with the first error of [`TRIES`] that passes all checks: the result is a manifold with the
-    /// same boundary, and vertices of the piece and centroids of the result are at most `error`, Å, away from the
-    /// other.
-    fn simplified(&self, error: f64, side: CubeSide) -> CubeResult {
+    /// Simplifies the piece to a `share` of its triangles, with the first error of [`TRIES`] that passes all checks:
+    /// the result is a manifold with the same boundary, and vertices of the piece and centroids of the result are at
+    /// most `error`, Å, away from the other.
+    fn simplified(&self, error: f64, share: f64, side: CubeSide) -> CubeResult {
         let Some(before) = topology(&self.triangles) else { return CubeResult::default() };
         let in_mesh = |edge: &[u32; 2]| edge.map(|v| self.vertices[v as usize]);
         let original_chords = before.chords.iter().map(in_mesh).collect();
         let components = ClosedComponents::new(self, &before.fans);
         let original = TriangleGrid::new(self.triangles.iter().map(|t| self.corners(t)).collect(), side.cell());
-        let found = TRIES.into_iter().find_map(|share| {
-            let found = self.within(share * error)?;
+        let found = TRIES.into_iter().find_map(|part| {
+            let found = self.within(part * error, share)?;
             let after = topology(&found).filter(|after| after.fans == before.fans && after.euler == before.euler)?;
             if !components.remain_in(self, &found) {
                 return None;
@@ -266,14 +291,16 @@ impl CubePiece {
         triangle.map(|v| self.positions[v as usize])
     }
 
-    /// Returns the triangles of the piece after meshoptimizer has simplified it with this error, Å; `None` if it
-    /// removes none.
-    fn within(&self, error: f64) -> Option<Vec<[u32; 3]>> {
+    /// Returns the triangles of the piece after meshoptimizer has simplified it with this error, Å, or to a `share` of
+    /// its triangles; `None` if it removes none.
+    fn within(&self, error: f64, share: f64) -> Option<Vec<[u32; 3]>> {
         let options = SimplifyOptions::LockBorder | SimplifyOptions::ErrorAbsolute;
         let stride = size_of::<[f32; 3]>();
         let vertices = VertexDataAdapter::new(bytemuck::cast_slice(&self.positions), stride, 0).ok()?;
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a part of a small number")]
+        let target = 3 * (share * self.triangles.len() as f64) as usize;
         #[expect(clippy::cast_possible_truncation, reason = "single precision is enough for an error")]
-        let found = meshopt::simplify(self.triangles.as_flattened(), &vertices, 0, error as f32, options, None);
+        let found = meshopt::simplify(self.triangles.as_flattened(), &vertices, target, error as f32, options, None);
         (found.len() < 3 * self.triangles.len()).then(|| found.as_chunks::<3>().0.to_vec())
     }
 }
@@ -337,26 +364,11 @@ fn revert_conflicts(results: &mut [CubeResult]) {
 
 /// Removes unused vertices, and updates the ranges and measures of the parts.
 fn compact(mesh: &mut Mesh, control: &Control<'_>) -> Result<(), SurfaceError> {
-    let mut numbers = vec![0_u32; mesh.n_vertices()];
-    for some in mesh.triangles.chunks(PER_CHECK) {
-        control.check()?;
-        some.as_flattened().iter().for_each(|v| numbers[*v as usize] = 1);
-    }
-    let mut rows = Vec::new();
-    for (row, number) in (0..).zip(&mut numbers).filter(|(_, used)| **used == 1) {
-        *number = to_u32(rows.len());
-        rows.push(row);
-    }
-    mesh.triangles.par_chunks_mut(PER_CHECK).try_for_each(|some| {
-        control.check()?;
-        some.as_flattened_mut().iter_mut().for_each(|v| *v = numbers[*v as usize]);
-        Ok::<_, SurfaceError>(())
-    })?;
+    let rows = mesh.drop_unused_vertices(control)?;
     for part in &mut mesh.parts {
         let [start, end] = [part.vertices.start, part.vertices.end].map(to_u32);
         part.vertices = rows.partition_point(|row| *row < start)..rows.partition_point(|row| *row < end);
     }
-    mesh.take_vertices(&rows);
     let measured = mesh.parts.iter().map(|part| measure(mesh, part)).collect();
     mesh.parts = measured;
     Ok(())

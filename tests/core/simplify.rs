@@ -3,8 +3,9 @@
 
 use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError};
-use molmesh::pipeline::{Choice, JobLimits, Product, run};
-use molmesh::surface::{Control, CpuBackend, Measures, Validation};
+use molmesh::pipeline::{Choice, JobError, JobLimits, Product, estimate, run};
+use molmesh::structure;
+use molmesh::surface::{Control, CpuBackend, Measures, SurfaceError, Validation};
 
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 const CHAINS: &[u8] = include_bytes!("../structures/1ubq.pdb.gz");
@@ -33,8 +34,7 @@ fn simplified_meshes_are_smaller_closed_and_near_the_surface() {
             &[("split", "residue-group"), ("select", "all")],
             &[("context", "whole"), ("select", "resi 1-20")],
             &[("cavities", "drop")],
-            &[("max_triangles", "20000")],
-            &[("max_triangles", "20000"), ("compress", "meshopt")],
+            &[("detail", "4"), ("compress", "meshopt")],
         ] {
             let pairs = [&[("surface", surface)][..], extra].concat();
             let whole = meshed(SAMPLE, &pairs);
@@ -61,6 +61,59 @@ fn simplified_meshes_are_smaller_closed_and_near_the_surface() {
             }
             assert!(glb(&product).len() < glb(&whole).len() * 9 / 10, "{what}");
         }
+    }
+}
+
+#[test]
+fn a_limit_on_triangles_ends_the_simplification() {
+    let control = &Control::default();
+    let (backend, limits) = (CpuBackend::new(Some(2)).unwrap(), JobLimits::default());
+    let choice = Choice { backend: &backend, reason: "" };
+    for surface in ["gaussian", "ses"] {
+        for extra in
+            [&[][..], &[("detail", "5")], &[("compress", "meshopt")], &[("split", "residue-group"), ("select", "all")]]
+        {
+            let mut deviations = Vec::new();
+            for limit in ["20000", "8000"] {
+                let pairs =
+                    [&[("surface", surface), ("simplify", "0.7"), ("max_triangles", limit)][..], extra].concat();
+                let report = meshed(SAMPLE, &pairs).report;
+                let (most, found) = (limit.parse::<u64>().unwrap(), report.simplification.unwrap());
+                let what = format!("{pairs:?}: {} triangles, {found:?}", report.triangles);
+                assert!(report.triangles <= most && report.triangles > most * 9 / 10, "{what}");
+                assert!(report.closed && report.manifold && found.max_deviation < 1.4, "{what}");
+                assert_eq!((report.max_triangles, report.tries), (Some(most), None), "{what}");
+                assert_eq!(report.resolution_from, if extra == [("detail", "5")] { "detail" } else { "resolution" });
+                deviations.push(found.mean_deviation);
+                let read = |control: &Control<'_>| structure::read_with(SAMPLE, &limits.read, control).map(Box::new);
+                let job = params::parse(pairs).unwrap().job;
+                let expected = estimate(read, &job, &limits, &choice, control).unwrap().mesh.unwrap();
+                assert_eq!(expected.triangles, most, "{what}");
+            }
+            assert!(deviations[0] < deviations[1], "{surface} {extra:?}: {deviations:?}");
+        }
+    }
+    let job = params::parse([("simplify", "0.02"), ("max_triangles", "1000")]).unwrap().job;
+    match run(SAMPLE, &job, &limits, &choice, control, &(), None) {
+        Err(JobError::Surface(SurfaceError::TooManyTriangles { triangles, limit: 1000, resolution, simplify })) => {
+            assert!(triangles > 10_000 && (resolution, simplify) == (0.5, Some(0.02)));
+        }
+        other => panic!("{:?}", other.map(drop)),
+    }
+    // A limit above the number of triangles changes nothing.
+    let whole = meshed(SAMPLE, &[]);
+    let unchanged = meshed(SAMPLE, &[("simplify", "0.1"), ("max_triangles", "4000000")]);
+    assert_eq!(unchanged.mesh.triangles, whole.mesh.triangles);
+    // Distances have single precision.
+    assert!(unchanged.report.simplification.unwrap().max_deviation < 2e-3);
+    // Without a simplification, the limit sets the spacing.
+    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+    assert_ne!(canonical(&[("simplify", "1")]), canonical(&[("simplify", "1"), ("max_triangles", "9000")]));
+    for several in [[("resolution", "0.6"), ("max_triangles", "9000")], [("detail", "3"), ("resolution", "0.6")]] {
+        let Err(ParamError::BadValue { name, .. }) = params::parse(several) else { panic!("{several:?}") };
+        assert_eq!(name, several[1].0);
+        let simplified = params::parse([&several[..], &[("simplify", "0.1")]].concat());
+        assert_eq!(simplified.is_ok(), name == "max_triangles", "{several:?}");
     }
 }
 

@@ -73,6 +73,7 @@ fn the_limit_holds_for_every_structure_and_kernel() {
                         triangles,
                         limit: reported,
                         resolution,
+                        simplify: None,
                     })) => {
                         refused += 1;
                         // The error is correct: its spacing gives this number of triangles, and it is the coarsest one

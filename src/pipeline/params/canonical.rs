@@ -68,7 +68,8 @@ pub fn canonical(job: &Job) -> String {
         (*split != Split::None).then(|| format!("split={}", split.name())),
         cavities.map(|cavities| format!("cavities={}", cavities.name())),
         pockets.map(|probe| format!("pockets={probe}")),
-        simplify.map(|error| format!("simplify={error}")),
+        simplify.map(|wanted| format!("simplify={}", wanted.error)),
+        simplify.and_then(|wanted| wanted.max_triangles).map(|limit| format!("max_triangles={limit}")),
         exact.then(|| "exact=true".to_owned()),
         // Quotes the names, which may contain `&`.
         interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),

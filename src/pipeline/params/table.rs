@@ -154,7 +154,7 @@ pub const TABLE: &[Parameter] = &[
         [MIN_RESOLUTION, MAX_RESOLUTION],
         "Å",
         "0.5",
-        "Grid spacing. At most one of resolution, detail and max_triangles can be set.",
+        "Grid spacing. At most one of resolution, detail and max_triangles can be set; with simplify, max_triangles as well.",
     ),
     Parameter {
         name: "detail",
@@ -166,7 +166,7 @@ pub const TABLE: &[Parameter] = &[
         name: "max_triangles",
         domain: Domain::Integer { min: MIN_TRIANGLE_LIMIT as i64, max: MAX_TRIANGLE_LIMIT as i64 },
         default: "absent",
-        doc: "Maximum number of triangles: selects the finest grid spacing from 0.25 to 4 Å that does not exceed it. Replaces resolution.",
+        doc: "Maximum number of triangles: selects the finest grid spacing from 0.25 to 4 Å that does not exceed it, and replaces resolution. With simplify, the mesh at resolution or detail is simplified to this number.",
     },
     number(
         "isovalue",
@@ -315,7 +315,7 @@ pub const TABLE: &[Parameter] = &[
         SIMPLIFY_ERRORS,
         "Å",
         "absent",
-        "Error of a simplification of the mesh: fewer and larger triangles, whose vertices are vertices of the original mesh. A closed manifold mesh remains one. The report states the measured deviation, which can be somewhat larger than the error.",
+        "Error of a simplification of the mesh: fewer and larger triangles, whose vertices are vertices of the original mesh. A closed manifold mesh remains one. With max_triangles, ends at that number. The report states the measured deviation, which can be somewhat larger than the error.",
     ),
     Parameter {
         name: "validation",

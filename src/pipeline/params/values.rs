@@ -10,7 +10,7 @@ use crate::pipeline::color::{ColorBlend, Coloring, Palette, Scheme};
 use crate::pipeline::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::pipeline::{Cavities, Spacing};
 use crate::structure::{Context, ModelChoice, Selection, Split};
-use crate::surface::{DEFAULT_POCKET_PROBE, Preset, SurfaceKind, SurfaceOptions, Validation};
+use crate::surface::{DEFAULT_POCKET_PROBE, Preset, Simplify, SurfaceKind, SurfaceOptions, Validation};
 
 /// Default of `color_offset`: the radius of a water molecule, Å.
 const DEFAULT_COLOR_OFFSET: f64 = 1.4;
@@ -30,6 +30,7 @@ pub(super) struct ParsedValues {
     color_offset: Option<f64>,
     pockets: bool,
     pocket_probe: Option<f64>,
+    max_triangles: Option<u64>,
     pub(super) request: Request,
 }
 
@@ -75,6 +76,19 @@ impl ParsedValues {
             )
         };
         self.pocket_probe.map_or(Ok(None), |probe| Err(unused(probe)))
+    }
+
+    /// Applies `max_triangles`: to the simplification if there is one, otherwise to the choice of the grid spacing.
+    /// Removes it from the parameters that set the spacing if it does not.
+    pub(super) fn limit_triangles(&mut self, spacings: &mut Vec<(&'static str, String)>) {
+        let Some(limit) = self.max_triangles else { return };
+        let job = &mut self.request.job;
+        if let Some(wanted) = &mut job.simplify {
+            wanted.max_triangles = Some(limit);
+            spacings.retain(|(name, _)| *name != "max_triangles");
+        } else {
+            job.spacing = Spacing::MaxTriangles(limit);
+        }
     }
 
     /// Divides the mesh by model if all models are meshed.
@@ -124,13 +138,13 @@ impl ParsedValues {
             }
             "max_triangles" => {
                 let allowed = u64::from(MIN_TRIANGLE_LIMIT)..=u64::from(MAX_TRIANGLE_LIMIT);
-                job.spacing = Spacing::MaxTriangles(whole(text).filter(|n| allowed.contains(n)).ok_or_else(bad)?);
+                self.max_triangles = Some(whole(text).filter(|n| allowed.contains(n)).ok_or_else(bad)?);
             }
             "isovalue" => self.options.isovalue = number()?,
             "smoothness" => self.options.smoothness = number()?,
             "radius_scale" => self.options.radius_scale = number()?,
             "radius_offset" => self.options.radius_offset = number()?,
-            "simplify" => job.simplify = Some(bounded().ok_or_else(bad)?),
+            "simplify" => job.simplify = Some(Simplify { error: bounded().ok_or_else(bad)?, max_triangles: None }),
             "cutoff_tolerance" => self.options.cutoff_tolerance = number()?,
             "paper_a" => self.options.paper_a = number()?,
             "paper_b" => self.options.paper_b = number()?,

@@ -7,6 +7,10 @@ use crate::surface::{Backend as _, CpuBackend, Measures, Spheres, SurfaceKind, S
 use crate::surface::{SurfaceParams, Validation};
 
 /// Returns the mesh of spheres in a row, which overlap.
+fn within(error: f64) -> Simplify {
+    Simplify { error, max_triangles: None }
+}
+
 fn row(n: u32, surface: SurfaceKind, resolution: f64) -> Mesh {
     let centres = (0..n).map(|i| 2.0 * f64::from(i)).collect();
     let count = n as usize;
@@ -31,7 +35,7 @@ fn simplified_meshes_are_closed_manifolds_within_the_error() {
         let mut before = mesh.n_triangles();
         for error in [0.003, 0.01, 0.1] {
             let mut simplified = mesh.clone();
-            let found = simplify(&mut simplified, error, 0.2, &Control::default()).unwrap();
+            let found = simplify(&mut simplified, within(error), 0.2, &Control::default()).unwrap();
             let m = measures(&simplified);
             let what = format!("{surface} {error}: {found:?}");
             assert!(m.closed && m.oriented && m.manifold, "{what}");
@@ -89,7 +93,7 @@ fn the_result_does_not_depend_on_the_number_of_threads() {
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let mut simplified = mesh.clone();
-        pool.install(|| simplify(&mut simplified, 0.05, 0.25, &Control::default()).unwrap());
+        pool.install(|| simplify(&mut simplified, within(0.05), 0.25, &Control::default()).unwrap());
         simplified
     };
     let one = on(1);
@@ -150,10 +154,10 @@ fn pieces_that_are_no_manifolds_with_a_boundary_are_found() {
 #[test]
 fn large_errors_are_rejected_with_the_limit() {
     let mut mesh = row(1, SurfaceKind::Vdw, 0.5);
-    let error = simplify(&mut mesh, 1.1, 0.5, &Control::default()).unwrap_err();
+    let error = simplify(&mut mesh, within(1.1), 0.5, &Control::default()).unwrap_err();
     assert!(matches!(error, SurfaceError::BadParameter { name: "simplify", .. }), "{error}");
     assert!(error.to_string().contains("at most 2 grid spacings: 1.000 Å"), "{error}");
-    assert!(simplify(&mut mesh, 1.0, 0.5, &Control::default()).is_ok());
+    assert!(simplify(&mut mesh, within(1.0), 0.5, &Control::default()).is_ok());
 }
 
 #[test]
