@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
+use molmesh::pipeline::tileset::{Tileset, TilesetReport, WriteError};
 use molmesh::pipeline::{self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
@@ -63,16 +64,37 @@ impl Table {
 }
 
 impl<'a> CommandJob<'a> {
-    /// Prepares a job and opens its output. Cheap steps come first: flags, output, input, backend.
+    /// Prepares a job and opens its output.
     pub(super) fn prepare(
-        mut job: Job,
+        job: Job,
         strict: bool,
         (path, output): (&'a Path, &Path),
         format: Format,
         args: &'a JobArgs,
     ) -> Result<(Self, Output), CliError> {
-        let limits = request::limits(&args.limits);
         let purpose = if format.is_picture() { Purpose::Picture } else { Purpose::Mesh };
+        let open = |cancel: &CancelToken| {
+            output::refuse_input(path, output)?;
+            if let Some(map) = args.color.map.as_deref() {
+                output::refuse_input(map, output)?;
+            }
+            let output = Output::open(output, cancel)?;
+            output.refuse_terminal(format)?;
+            Ok(output)
+        };
+        Self::prepare_for(purpose, job, strict, path, args, open)
+    }
+
+    /// Prepares a job whose output `open` opens. Cheap steps come first: flags, output, input, backend.
+    pub(super) fn prepare_for<T>(
+        purpose: Purpose,
+        mut job: Job,
+        strict: bool,
+        path: &'a Path,
+        args: &'a JobArgs,
+        open: impl FnOnce(&CancelToken) -> Result<T, CliError>,
+    ) -> Result<(Self, T), CliError> {
+        let limits = request::limits(&args.limits);
         let mut requested = BackendRequest::for_command(args, purpose);
         backend::check(&requested)?;
         if let Some(n) = args.threads {
@@ -82,21 +104,16 @@ impl<'a> CommandJob<'a> {
         }
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
-        output::refuse_input(path, output)?;
         let map = args.color.map.as_deref();
-        if let Some(map) = map {
-            output::refuse_input(map, output)?;
-            if is_stdio(map) && is_stdio(path) {
-                return Err(CliError::usage("the structure and the map cannot both be read from stdin"));
-            }
+        if map.is_some_and(|map| is_stdio(map) && is_stdio(path)) {
+            return Err(CliError::usage("the structure and the map cannot both be read from stdin"));
         }
         let needs_map = job.color.is_some_and(|color| color.scheme.needs_map());
         if needs_map != map.is_some() {
             let message = if needs_map { "`--color map` needs `--map FILE`" } else { "`--map` needs `--color map`" };
             return Err(CliError::usage(message));
         }
-        let output = Output::open(output, &cancel)?;
-        output.refuse_terminal(format)?;
+        let output = open(&cancel)?;
         let input = read(path, limits.read.max_inflated_bytes)?;
         if let Some(map) = map {
             // The command line makes no content keys.
@@ -138,6 +155,22 @@ impl<'a> CommandJob<'a> {
             Ok(structure)
         };
         pipeline::run_with(read, &self.job, &self.limits, &choice, &self.control(), &self.progress, sink)
+    }
+
+    /// Meshes all tiles of a tileset and passes each file to `write`.
+    pub(super) fn write_tileset(
+        &self,
+        write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
+    ) -> Result<TilesetReport, CliError> {
+        let read = |control: &Control<'_>| structure::read_with(&self.input, &self.limits.read, control).map(Box::new);
+        let control = self.control();
+        let tileset = Tileset::new(read, self.job.clone(), &self.limits.read, &control, &self.progress);
+        let tileset = tileset.map_err(|error| self.failure(error))?;
+        let backend = self.selected.backend.as_ref();
+        tileset.write(backend, &self.limits.surface, &control, &self.progress, write).map_err(|error| match error {
+            WriteError::Job(error) => self.failure(error),
+            WriteError::File { path, source } => CliError::Output { name: path, source },
+        })
     }
 
     /// Draws the picture of a product.

@@ -34,6 +34,7 @@ mod style;
 mod summary;
 #[cfg(feature = "server")]
 mod survey;
+mod tileset;
 
 use std::io::{self, Write};
 
@@ -59,6 +60,7 @@ fn run() -> i32 {
     let result = match args.command {
         Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
         Command::Render(args) => panics::contained(|| render::run(&args)),
+        Command::Tileset(args) => panics::contained(|| tileset::run(&args)),
         #[cfg(feature = "server")]
         Command::Serve(args) => serve::run(&args),
         #[cfg(feature = "server")]

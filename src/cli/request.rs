@@ -2,10 +2,11 @@
 
 use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError, Request};
+use molmesh::pipeline::tileset;
 use molmesh::pipeline::{Job, JobLimits};
 use molmesh::structure::read::DISTANCES_PER_PAIR;
 
-use super::args::{JobArgs, LimitArgs, MeshArgs, PictureArgs, RenderArgs};
+use super::args::{JobArgs, LimitArgs, MeshArgs, PictureArgs, RenderArgs, TilesetArgs};
 use super::error::CliError;
 
 /// Parses the flags of `mesh`.
@@ -13,6 +14,13 @@ pub(super) fn parse_mesh(args: &MeshArgs) -> Result<Request, CliError> {
     let own =
         [("format", &args.format), ("compress", &args.compress), ("normals", &args.normals), ("units", &args.units)];
     parse(&own, &args.job)
+}
+
+/// Parses the flags of `tileset`.
+pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
+    let request = parse(&[], &args.job)?;
+    tileset::check(&request.job).map_err(|error| refusal(&error))?;
+    Ok(request)
 }
 
 /// Parses the flags of `render`.

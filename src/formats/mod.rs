@@ -22,6 +22,7 @@ pub mod quantize;
 mod stl;
 mod storage;
 mod text;
+pub mod tileset;
 mod vtp;
 
 use std::io::{self, Write};

@@ -30,6 +30,7 @@ mod progress;
 mod report;
 mod simplify;
 pub mod spacing;
+pub mod tileset;
 mod work;
 
 use std::ops::Deref;

@@ -9,6 +9,7 @@ pub(crate) mod candidates;
 pub mod cases;
 pub(crate) mod cavities;
 pub(crate) mod checked_sort;
+pub(crate) mod clip;
 pub mod column;
 pub mod control;
 pub mod cpu;
@@ -33,6 +34,7 @@ pub mod sink;
 pub(crate) mod sphere_union;
 pub mod spheres;
 mod sums;
+pub(crate) mod threads;
 pub mod topology;
 mod union_find;
 

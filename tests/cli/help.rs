@@ -24,6 +24,7 @@ fn help_is_stable() {
     snapshot("molmesh", &["--help"]);
     snapshot("mesh", &["mesh", "--help"]);
     snapshot("render", &["render", "--help"]);
+    snapshot("tileset", &["tileset", "--help"]);
     snapshot("serve", &["serve", "--help"]);
     snapshot("doctor", &["doctor", "--help"]);
     snapshot("config", &["config", "--help"]);

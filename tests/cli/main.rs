@@ -32,3 +32,4 @@ mod render;
 mod serve;
 mod static_build;
 mod stop;
+mod tileset;

@@ -45,3 +45,4 @@ mod structure_pdb;
 mod structure_real;
 mod structure_select;
 mod surface;
+mod tileset;

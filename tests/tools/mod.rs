@@ -126,6 +126,35 @@ pub fn gltf_validate(paths: &[impl AsRef<Path>]) -> Option<Vec<GltfReport>> {
     Some(ask(Path::new("node"), "validate_gltf.mjs", paths))
 }
 
+/// Result of `walk_tileset.mjs` for a tileset.
+#[derive(Debug, Clone, Deserialize)]
+pub struct WalkedTileset {
+    /// Error of the traversal.
+    pub error: Option<String>,
+    /// Tiles.
+    pub tiles: Vec<WalkedTile>,
+}
+
+/// Tile of a tileset.
+#[derive(Debug, Clone, Deserialize)]
+pub struct WalkedTile {
+    /// Level, 0 for the root.
+    pub level: usize,
+    /// Path of the mesh, if the tile has one.
+    pub content: Option<String>,
+    /// Centre and half axes, in the axes of the tileset.
+    #[serde(rename = "box")]
+    pub bounds: Vec<f64>,
+}
+
+/// Walks tilesets with 3d-tiles-tools. Returns one result per path of `tileset.json` in their order.
+pub fn walk_tileset(paths: &[impl AsRef<Path>]) -> Option<Vec<WalkedTileset>> {
+    if !installed_here().join("node/.stamp").is_file() {
+        return missing("3d-tiles-tools");
+    }
+    Some(ask(Path::new("node"), "walk_tileset.mjs", paths))
+}
+
 /// Result of `decode_meshopt.mjs` for a file.
 #[derive(Debug, Clone, Deserialize)]
 pub struct Decoded {

@@ -148,7 +148,7 @@ else
     rm -rf "$tools/node"
     mkdir -p "$tools/node"
     cp "$here/package.json" "$here/package-lock.json" "$tools/node/"
-    (cd "$tools/node" && npm ci --silent --no-audit --no-fund >&2) || fail "npm cannot install tests/tools/package.json"
+    (cd "$tools/node" && npm ci --silent --ignore-scripts --no-audit --no-fund >&2) || fail "npm cannot install tests/tools/package.json"
     echo "$stamp" >"$tools/node/.stamp"
 fi
 

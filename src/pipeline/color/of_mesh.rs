@@ -73,7 +73,7 @@ impl MeshColors {
     /// # Errors
     /// Returns [`JobError::Color`] if the map has no value at any vertex, and the errors of memory and cancellation.
     pub(in super::super) fn apply(
-        self,
+        &self,
         mesh: &mut Mesh,
         resolution: f64,
         pockets: Option<&Pockets>,
@@ -85,9 +85,9 @@ impl MeshColors {
         if matches!(scheme, Scheme::Vertex(_)) || blend == ColorBlend::Smooth {
             mesh.make_geometry_contiguous();
         }
-        let (mut colors, mut report) = match self.source {
+        let (mut colors, mut report) = match &self.source {
             ColorSource::Atoms { of_spheres, report } => {
-                (mesh.atom_ids.as_deref().map(|ids| of_vertices(ids, |id| of_spheres[id as usize])), report)
+                (mesh.atom_ids.as_deref().map(|ids| of_vertices(ids, |id| of_spheres[id as usize])), report.clone())
             }
             ColorSource::Pockets => {
                 let pockets = pockets.ok_or_else(|| ColorError::without_pockets(scheme))?;
@@ -95,9 +95,9 @@ impl MeshColors {
                 (Some(colors), report)
             }
             ColorSource::Vertices(source) => {
-                let values = vertex::values(mesh, &source, control)?;
+                let values = vertex::values(mesh, source, control)?;
                 let palette = palette.or(scheme.palette()).unwrap_or(Palette::Viridis);
-                let (of_values, map) = match &source {
+                let (of_values, map) = match source {
                     ValueSource::Map(map, offset) => {
                         let of_values = symmetric_range(&values).ok_or_else(|| outside(scheme, map, *offset))?;
                         (of_values, Some(report_of_map(map, *offset, &values)))

@@ -26,7 +26,6 @@ mod slabs;
 #[doc(hidden)]
 pub mod stage_results;
 mod table;
-mod threads;
 mod write;
 
 use std::ops::Range;
@@ -50,7 +49,7 @@ use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
 use super::sink::MeshSink;
 use super::spheres::Spheres;
-use super::{candidates, occupancy, simd};
+use super::{candidates, occupancy, simd, threads};
 
 /// Native CPU backend.
 #[derive(Debug, Default)]

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 ///
 /// # Errors
 /// The first error of `work`; items that have not started by then are skipped.
-pub(super) fn each<T: Send + Sync, E: Send + Sync>(
+pub(crate) fn each<T: Send + Sync, E: Send + Sync>(
     n: usize,
     work: impl Fn(usize) -> Result<T, E> + Sync,
 ) -> Result<Vec<T>, E> {

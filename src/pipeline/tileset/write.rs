@@ -1,0 +1,118 @@
+//! All files of a tileset.
+
+use std::collections::BTreeSet;
+use std::io;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use serde::Serialize;
+use thiserror::Error;
+
+use super::Tileset;
+use crate::formats::tileset::{TileAddress, subtree, tileset_document};
+use crate::pipeline::{JobError, ProgressSink};
+use crate::surface::{Backend, Control, SurfaceLimits, threads};
+
+/// Contents of a tileset.
+#[derive(Debug, Clone, Serialize)]
+pub struct TilesetReport {
+    /// PDB id or data block name; null if the file has none.
+    pub id: Option<String>,
+    /// Number of meshed atoms.
+    pub atoms: u64,
+    /// Levels, coarsest first.
+    pub levels: Vec<LevelReport>,
+    /// Number of files.
+    pub files: u64,
+    /// Size of all files, bytes.
+    pub bytes: u64,
+}
+
+/// Contents of a level.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct LevelReport {
+    /// Grid spacing in Å, which is also the geometric error.
+    pub spacing: f64,
+    /// Number of tiles with triangles.
+    pub tiles: u64,
+    /// Number of triangles.
+    pub triangles: u64,
+    /// Size of the tiles, bytes.
+    pub bytes: u64,
+    /// Size of the largest tile, bytes.
+    pub largest_tile: u64,
+}
+
+/// Failure of writing a tileset.
+#[derive(Debug, Error)]
+pub enum WriteError {
+    /// Meshing failed.
+    #[error(transparent)]
+    Job(#[from] JobError),
+    /// A file cannot be written.
+    #[error("cannot write {path}: {source}")]
+    File {
+        /// Path within the tileset.
+        path: String,
+        /// Cause.
+        source: io::Error,
+    },
+}
+
+impl Tileset {
+    /// Meshes all tiles, in parallel, and passes each file with its path to `write`. `tileset.json` comes last, so that
+    /// an incomplete tileset cannot be opened.
+    ///
+    /// # Errors
+    /// Returns a [`WriteError`] for the first tile that cannot be meshed or written.
+    pub fn write(
+        &self,
+        backend: &dyn Backend,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+        progress: &dyn ProgressSink,
+        write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
+    ) -> Result<TilesetReport, WriteError> {
+        let store = |path: &str, bytes: &[u8]| {
+            write(path, bytes).map_err(|source| WriteError::File { path: path.to_owned(), source })?;
+            Ok::<_, WriteError>(bytes.len() as u64)
+        };
+        let addresses: Vec<TileAddress> = self.tiles.iter().copied().collect();
+        let done = AtomicUsize::new(0);
+        // Not by parallel iterators: a thread that waits within a tile would begin other tiles, without a limit.
+        let made = threads::each(addresses.len(), |i| {
+            let address = addresses[i];
+            let tile = self.tile(address, backend, limits, control)?;
+            let n = done.fetch_add(1, Ordering::Relaxed) + 1;
+            progress.progress("tiles", n as f64 / addresses.len() as f64);
+            let Some(tile) = tile else { return Ok(None) };
+            let bytes = store(&format!("{}.glb", address.path()), &tile.glb)?;
+            Ok::<_, WriteError>(Some((address, tile.triangles, bytes)))
+        })?;
+        let made: Vec<(TileAddress, u64, u64)> = made.into_iter().flatten().collect();
+        let level = |level| LevelReport { spacing: self.spacing(level), ..LevelReport::default() };
+        let mut levels: Vec<LevelReport> = (0..self.layout.levels).map(level).collect();
+        for (address, triangles, bytes) in &made {
+            let level = &mut levels[address.level as usize];
+            level.tiles += 1;
+            level.triangles += triangles;
+            level.bytes += bytes;
+            level.largest_tile = level.largest_tile.max(*bytes);
+        }
+        let with_content: BTreeSet<TileAddress> = made.iter().map(|(address, ..)| *address).collect();
+        let (mut files, mut bytes) = (made.len() as u64, levels.iter().map(|level| level.bytes).sum::<u64>());
+        let (bounds, is_tile) = (self.bounds(), |tile| self.tiles.contains(&tile));
+        let subtree_levels = bounds.subtree_levels();
+        for root in self.tiles.iter().filter(|tile| tile.level.is_multiple_of(subtree_levels)) {
+            let file = subtree(*root, subtree_levels, is_tile, |tile| with_content.contains(&tile));
+            bytes += store(&format!("subtrees/{}.subtree", root.path()), &file.map_err(encoding)?)?;
+            files += 1;
+        }
+        let document = serde_json::to_vec_pretty(&tileset_document(&bounds)).map_err(encoding)?;
+        bytes += store("tileset.json", &document)?;
+        Ok(TilesetReport { id: self.name.clone(), atoms: self.n_atoms() as u64, levels, files: files + 1, bytes })
+    }
+}
+
+fn encoding(error: serde_json::Error) -> WriteError {
+    WriteError::File { path: "tileset.json".to_owned(), source: error.into() }
+}

@@ -1,0 +1,111 @@
+//! `molmesh tileset`: files, reports and errors.
+
+use crate::cli_support;
+use crate::tools;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+
+use cli_support::{Folder, assert_code, molmesh, stderr, stdout};
+use serde_json::Value;
+
+/// Returns all files with an extension in a folder and its subfolders, relative to it.
+fn files(folder: &Path, extension: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut open = vec![folder.to_owned()];
+    while let Some(next) = open.pop() {
+        for entry in fs::read_dir(next).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                open.push(path);
+            } else if path.extension().is_some_and(|other| other == extension) {
+                found.push(path.strip_prefix(folder).unwrap().to_owned());
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+/// Runs `molmesh tileset` on the sample.
+fn tileset(output: &Path, more: &[&str]) -> Output {
+    let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
+    molmesh().args(["tileset", sample, "-o"]).arg(output).args(more).output().unwrap()
+}
+
+/// Returns the JSON of a GLB.
+fn json_of(glb: &[u8]) -> Value {
+    let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
+    serde_json::from_slice(&glb[20..20 + length]).unwrap()
+}
+
+#[test]
+fn a_tileset_has_the_files_that_its_documents_list() {
+    let folder = Folder::new();
+    let output = folder.path("tiles");
+    let made = tileset(&output, &["--resolution", "0.25", "--color", "element", "--report", "json"]);
+    assert_code(&made, 0);
+    let report: Value = serde_json::from_str(&stdout(&made)).unwrap();
+    let levels = report["levels"].as_array().unwrap();
+    assert_eq!(levels.last().unwrap()["spacing"], 0.25);
+    let glbs = files(&output, "glb");
+    let subtrees = files(&output, "subtree");
+    let bytes: u64 = ["glb", "subtree", "json"]
+        .iter()
+        .flat_map(|kind| files(&output, kind))
+        .map(|path| fs::metadata(output.join(path)).unwrap().len())
+        .sum();
+    assert_eq!(report["files"], glbs.len() + subtrees.len() + 1);
+    assert_eq!(report["bytes"], bytes);
+    assert_eq!(levels.iter().map(|level| level["tiles"].as_u64().unwrap()).sum::<u64>(), glbs.len() as u64);
+    let paths: Vec<PathBuf> = glbs.iter().map(|path| output.join(path)).collect();
+    for valid in tools::gltf_validate(&paths).unwrap_or_default() {
+        valid.assert_clean();
+    }
+    let Some(walked) = tools::walk_tileset(&[output.join("tileset.json")]) else { return };
+    let tools::WalkedTileset { error: None, tiles } = &walked[0] else { panic!("{:?}", walked[0].error) };
+    let mut contents: Vec<PathBuf> = tiles.iter().filter_map(|tile| tile.content.as_ref().map(PathBuf::from)).collect();
+    contents.sort();
+    assert_eq!(contents, glbs);
+    for tile in tiles {
+        let Some(content) = &tile.content else { continue };
+        assert!(content.starts_with(&format!("{}/", tile.level)), "{content}");
+        // The axes of the tileset are x, -z and y of the mesh, whose centre is that of the tile.
+        let json = json_of(&fs::read(output.join(content)).unwrap());
+        let centre: Vec<f64> =
+            json["nodes"][0]["translation"].as_array().unwrap().iter().filter_map(Value::as_f64).collect();
+        let expected = [tile.bounds[0], tile.bounds[2], -tile.bounds[1]];
+        assert!((0..3).all(|k| (centre[k] - expected[k]).abs() < 1e-4), "{content}: {centre:?} {expected:?}");
+        let side = 64.0 * levels[tile.level]["spacing"].as_f64().unwrap();
+        assert!((tile.bounds[3] - 0.5 * side).abs() < 1e-9, "{content}");
+    }
+}
+
+#[test]
+fn a_folder_with_files_and_parameters_of_whole_meshes_are_rejected() {
+    let folder = Folder::new();
+    let output = folder.path("tiles");
+    fs::create_dir(&output).unwrap();
+    let other = output.join("notes.txt");
+    fs::write(&other, "mine").unwrap();
+    let full = tileset(&output, &[]);
+    assert_code(&full, 2);
+    assert!(stderr(&full).contains("is not empty"), "{}", stderr(&full));
+    assert_eq!(fs::read_dir(&output).unwrap().count(), 1);
+    fs::remove_file(other).unwrap();
+    for more in [
+        &["--split", "chain"][..],
+        &["--cavities", "keep"],
+        &["--simplify", "0.1"],
+        &["--max-triangles", "1000"],
+        &["--color", "depth"],
+        &["--exact", "--surface", "ses"],
+        &["--paper-b", "1", "--paper-a", "1"],
+    ] {
+        let refused = tileset(&output, more);
+        assert_code(&refused, 2);
+        assert!(stderr(&refused).contains("tile"), "{more:?}: {}", stderr(&refused));
+        assert!(!output.join("tileset.json").exists());
+    }
+}

@@ -1,0 +1,125 @@
+//! Tiles of a tileset compared with the mesh of the whole structure.
+#![allow(clippy::pedantic, clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
+
+use std::collections::HashMap;
+use std::fmt::Write;
+
+use molmesh::formats::tileset::TileAddress;
+use molmesh::pipeline::tileset::{Tileset, check};
+use molmesh::pipeline::{Choice, JobLimits, params, run};
+use molmesh::structure::{self, ReadLimits};
+use molmesh::surface::{Control, CpuBackend, Measures, Mesh, SurfaceLimits, Validation};
+
+const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
+
+fn tileset(pairs: &[(&str, &str)]) -> Tileset {
+    tileset_of(SAMPLE, pairs)
+}
+
+fn tileset_of(file: &[u8], pairs: &[(&str, &str)]) -> Tileset {
+    let job = params::parse(pairs.iter().copied()).unwrap().job;
+    check(&job).unwrap();
+    let read = |control: &Control<'_>| structure::read_with(file, &ReadLimits::default(), control).map(Box::new);
+    Tileset::new(read, job, &ReadLimits::default(), &Control::default(), &()).unwrap()
+}
+
+/// Returns the meshes of all tiles of a level.
+fn meshes(tileset: &Tileset, level: u32) -> Vec<Mesh> {
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let tiles = tileset.tiles().iter().filter(|tile| tile.level == level);
+    let mesh =
+        |tile: &TileAddress| tileset.mesh(*tile, &backend, &SurfaceLimits::default(), &Control::default()).unwrap();
+    tiles.filter_map(mesh).collect()
+}
+
+/// Joins meshes. Vertices that are at most 2e-5 Å apart become one.
+fn welded(meshes: &[Mesh]) -> Mesh {
+    const CELL: f64 = 1e-3;
+    let mut joined = Mesh::default();
+    let mut cells: HashMap<[i64; 3], Vec<u32>> = HashMap::new();
+    let (mut positions, mut normals, mut triangles) = (Vec::<[f64; 3]>::new(), Vec::new(), Vec::new());
+    for mesh in meshes {
+        let mut numbers = Vec::new();
+        for v in 0..mesh.n_vertices() {
+            let p: [f64; 3] = std::array::from_fn(|k| mesh.centre[k] + f64::from(mesh.position(v)[k]));
+            let cell = p.map(|c| (c / CELL).round() as i64);
+            let around = (0..27_i64).map(|i| [cell[0] + i % 3 - 1, cell[1] + i / 3 % 3 - 1, cell[2] + i / 9 - 1]);
+            let near = |v: &u32| (0..3).all(|k| (positions[*v as usize][k] - p[k]).abs() < 2e-5);
+            let same = around.filter_map(|cell| cells.get(&cell)).flatten().copied().find(near);
+            numbers.push(same.unwrap_or_else(|| {
+                cells.entry(cell).or_default().push(positions.len() as u32);
+                positions.push(p);
+                normals.push(mesh.normals[v]);
+                positions.len() as u32 - 1
+            }));
+        }
+        triangles.extend(mesh.triangles.iter().map(|triangle| triangle.map(|v| numbers[v as usize])));
+    }
+    joined.positions = positions.iter().map(|p| p.map(|c| c as f32)).collect();
+    joined.normals = normals.into_iter().collect();
+    joined.triangles = triangles.into_iter().collect();
+    joined
+}
+
+fn measured(mesh: &Mesh) -> Measures {
+    Measures::of(mesh, Validation::Exact, &Control::default()).unwrap()
+}
+
+#[test]
+fn tiles_of_each_level_join_to_a_closed_mesh() {
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "" };
+    for surface in ["gaussian", "soft-object", "vdw", "sas", "ses"] {
+        let pairs = [("surface", surface), ("resolution", "0.25"), ("color", "element"), ("atom_ids", "true")];
+        let tileset = tileset(&pairs);
+        let levels = tileset.bounds().levels;
+        assert!(levels > 2, "{levels} levels");
+        for level in 0..levels {
+            let all = meshes(&tileset, level);
+            let joined = welded(&all);
+            let (found, resolution) = (measured(&joined), tileset.spacing(level).to_string());
+            let what = format!("{surface}, {resolution} Å: {} tiles", all.len());
+            assert!(found.closed && found.oriented && found.manifold, "{what}");
+            assert!(all.len() > 1 || level == 0, "{what}");
+            let job = params::parse([("surface", surface), ("resolution", &*resolution)]).unwrap().job;
+            let whole = run(SAMPLE, &job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
+            assert_eq!(joined.triangles.len() as u64, whole.report.triangles, "{what}");
+            assert!(
+                (found.area / whole.report.area - 1.0).abs() < 1e-6,
+                "{what}: {} {}",
+                found.area,
+                whole.report.area
+            );
+            assert!((found.volume / whole.report.volume.unwrap() - 1.0).abs() < 1e-6, "{what}");
+            for mesh in &all {
+                assert!(mesh.colors.as_ref().is_some_and(|colors| colors.len() == mesh.n_vertices()));
+                assert!(mesh.atom_ids.as_ref().is_some_and(|ids| ids.iter().all(|id| *id < 1000)));
+            }
+            // Without one of its tiles, the mesh is open.
+            if all.len() > 1 {
+                assert!(!measured(&welded(&all[1..])).closed, "{what}");
+            }
+        }
+    }
+}
+
+#[test]
+fn coarse_levels_group_atoms_and_keep_the_shape() {
+    // A bar of 432 × 24 × 24 Å with an atom for every 27 Å³.
+    let mut text = String::new();
+    for i in 0..144 * 8 * 8 {
+        let [x, y, z] = [i / 64, i / 8 % 8, i % 8].map(|c| 3.0 * f64::from(c));
+        let residue = i / 64 + 1;
+        writeln!(text, "ATOM  {:5}  CA  ALA A{residue:4}    {x:8.3}{y:8.3}{z:8.3}  1.00  0.00           C", i + 1)
+            .unwrap();
+    }
+    let tileset = tileset_of(text.as_bytes(), &[("resolution", "1")]);
+    let levels = tileset.bounds().levels;
+    assert_eq!((0..levels).map(|level| tileset.spacing(level)).collect::<Vec<_>>(), [8.0, 4.0, 2.0, 1.0]);
+    let found: Vec<Measures> = (0..levels).map(|level| measured(&welded(&meshes(&tileset, level)))).collect();
+    for level in &found {
+        assert!(level.closed && level.oriented && level.manifold);
+        assert!((level.volume / found[3].volume - 1.0).abs() < 0.3, "{} {}", level.volume, found[3].volume);
+    }
+    assert_eq!(found[0].components.len(), 1);
+}
