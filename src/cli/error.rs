@@ -246,6 +246,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         | SurfaceError::TooManyOverlaps { .. }
         | SurfaceError::MeshTooLarge { .. }
         | SurfaceError::TooManyTriangles { .. }
+        | SurfaceError::TooManyTiles { .. }
         | SurfaceError::DeviceMemory { .. }
         | SurfaceError::Memory(_)
         | SurfaceError::Deadline => code::LIMIT,
@@ -289,8 +290,9 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::TooManyCandidates { .. } => {
             Some("try a coarser --resolution or smaller radii, or raise --max-candidates".to_owned())
         }
-        SurfaceError::TooManyTriangles { simplify: Some(_), triangles, .. } => {
-            Some(format!("try a larger --simplify, a coarser --resolution, or --max-triangles {triangles}"))
+        SurfaceError::TooManyTiles { .. } => Some("try a coarser --resolution".to_owned()),
+        SurfaceError::TooManyTriangles { simplify: Some(_), .. } => {
+            Some("try a larger --simplify, a coarser --resolution, or a larger --max-triangles".to_owned())
         }
         SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
         SurfaceError::DeviceMemory { .. } => coarser_or("try --backend cpu"),

@@ -35,7 +35,7 @@ pub(super) struct CommandJob<'a> {
     selected: SelectedBackend,
     pub(super) progress: Progress,
     /// Findings of the strict validator, if it ran.
-    findings: Option<Vec<Diagnostic>>,
+    pub(super) findings: Option<Vec<Diagnostic>>,
     /// Tables that are requested, with their paths and outputs.
     tables: Vec<(Table, &'a Path, Output)>,
     /// The structure, kept for the tables.
@@ -157,9 +157,10 @@ impl<'a> CommandJob<'a> {
         pipeline::run_with(read, &self.job, &self.limits, &choice, &self.control(), &self.progress, sink)
     }
 
-    /// Meshes all tiles of a tileset and passes each file to `write`.
+    /// Meshes all tiles of a tileset and passes each file to `write`. `folder` is for messages.
     pub(super) fn write_tileset(
         &self,
+        folder: &Path,
         write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
     ) -> Result<TilesetReport, CliError> {
         let read = |control: &Control<'_>| structure::read_with(&self.input, &self.limits.read, control).map(Box::new);
@@ -169,7 +170,9 @@ impl<'a> CommandJob<'a> {
         let backend = self.selected.backend.as_ref();
         tileset.write(backend, &self.limits.surface, &control, &self.progress, write).map_err(|error| match error {
             WriteError::Job(error) => self.failure(error),
-            WriteError::File { path, source } => CliError::Output { name: path, source },
+            WriteError::File { path, source } => {
+                CliError::Output { name: folder.join(path).display().to_string(), source }
+            }
         })
     }
 
@@ -295,9 +298,7 @@ fn write_report(
     match args.report {
         ReportStyle::Text if args.quiet => Ok(()),
         ReportStyle::Text => {
-            let lines: Option<Vec<String>> =
-                findings.map(|all| all.iter().map(|f| format!("{}: {}", f.level.name(), finding(f))).collect());
-            let text = summary::text(report, written, lines.as_deref(), Style::stderr());
+            let text = summary::text(report, written, findings.map(finding_lines).as_deref(), Style::stderr());
             // The mesh is finished, so a closed stderr is not an error.
             drop(io::stderr().write_all(text.as_bytes()));
             Ok(())
@@ -311,6 +312,16 @@ fn write_report(
     }
 }
 
+/// Formats findings on one line each.
+pub(super) fn finding_lines(findings: &[Diagnostic]) -> Vec<String> {
+    findings.iter().map(|f| format!("{}: {}", f.level.name(), finding(f))).collect()
+}
+
+/// Returns findings as JSON.
+pub(super) fn findings_json(findings: &[Diagnostic]) -> Value {
+    findings.iter().map(|f| json!({ "level": f.level.name(), "message": f.message, "line": f.line })).collect()
+}
+
 fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &WrittenFiles) -> Result<String, CliError> {
     let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialized: {e}"));
     let mut value = serde_json::to_value(report).map_err(failed)?;
@@ -320,9 +331,8 @@ fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Writt
         for (kind, table) in &written.tables {
             map.insert((*kind).to_owned(), file(table));
         }
-        let finding = |f: &Diagnostic| json!({ "level": f.level.name(), "message": f.message, "line": f.line });
         if let Some(findings) = findings {
-            map.insert("findings".to_owned(), findings.iter().map(finding).collect());
+            map.insert("findings".to_owned(), findings_json(findings));
         }
     }
     let mut text = serde_json::to_string_pretty(&value).map_err(failed)?;

@@ -153,7 +153,7 @@ fn repeated(report: &Report, instances: &InstancesReport) -> String {
 }
 
 /// Formats the numbers of atoms that were left out, by residue name and reason.
-fn left_out(left_out: &LeftOutReport) -> String {
+pub(super) fn left_out(left_out: &LeftOutReport) -> String {
     let LeftOutReport {
         total,
         other_chains,
@@ -246,7 +246,7 @@ fn pockets(found: u64, largest: &[PocketReport]) -> String {
 }
 
 /// Adds the first findings only, as a damaged file can have one in each line.
-fn add_findings(page: &mut Page, findings: &[String]) {
+pub(super) fn add_findings(page: &mut Page, findings: &[String]) {
     let of = if findings.len() == 1 { "finding" } else { "findings" };
     page.row("check", &format!("{} {of} of the strict validator", findings.len()));
     for finding in findings.iter().take(5) {

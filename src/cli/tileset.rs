@@ -2,69 +2,118 @@
 
 use std::fs;
 use std::io::{self, Write as _};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use molmesh::pipeline::params::Request;
-use molmesh::pipeline::tileset::TilesetReport;
+use molmesh::pipeline::tileset::{MAX_LEVELS, TilesetReport};
+use serde_json::Value;
 
 use super::args::{ReportStyle, TilesetArgs};
 use super::backend::Purpose;
 use super::error::CliError;
-use super::job::CommandJob;
+use super::job::{CommandJob, finding_lines, findings_json};
+use super::output::is_stdio;
 use super::page::Page;
-use super::request;
 use super::style::Style;
+use super::{request, summary};
 
 /// Runs the command.
 pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
     let Request { job, strict, .. } = request::parse_tileset(args)?;
     let start = Instant::now();
-    let folder = args.output.as_path();
-    let (job, ()) =
-        CommandJob::prepare_for(Purpose::Mesh, job, strict, &args.input, &args.job, |_| create_empty(folder))?;
-    let write = |path: &str, bytes: &[u8]| {
-        let path = folder.join(path);
-        path.parent().map_or(Ok(()), fs::create_dir_all)?;
-        fs::write(path, bytes)
-    };
-    let report = job.write_tileset(write)?;
+    let open = |_: &_| Folder::create(&args.output);
+    let (job, mut folder) = CommandJob::prepare_for(Purpose::Mesh, job, strict, &args.input, &args.job, open)?;
+    let report = job.write_tileset(&folder.path, |path, bytes| folder.write(path, bytes))?;
+    folder.complete = true;
+    let findings = job.findings.clone();
+    // Ends the progress bar.
     drop(job);
     match args.job.report {
         ReportStyle::Text if args.job.quiet => Ok(()),
         ReportStyle::Text => {
-            let text = summary(&report, folder, start.elapsed().as_secs_f64(), Style::stderr());
+            let lines = findings.as_deref().map(finding_lines);
+            let text = text(&report, lines.as_deref(), &folder.path, start.elapsed().as_secs_f64(), Style::stderr());
             // The tileset is complete, so a closed stderr is not an error.
             drop(io::stderr().write_all(text.as_bytes()));
             Ok(())
         }
         ReportStyle::Json => {
             let failed = |error: serde_json::Error| CliError::Internal(error.to_string());
-            super::print(&format!("{}\n", serde_json::to_string_pretty(&report).map_err(failed)?))
+            let mut value = serde_json::to_value(&report).map_err(failed)?;
+            if let (Value::Object(map), Some(findings)) = (&mut value, &findings) {
+                map.insert("findings".to_owned(), findings_json(findings));
+            }
+            super::print(&format!("{value:#}\n"))
         }
     }
 }
 
-/// Creates the folder, unless it exists and is empty.
-fn create_empty(folder: &Path) -> Result<(), CliError> {
-    let failed = |source| CliError::Output { name: folder.display().to_string(), source };
-    fs::create_dir_all(folder).map_err(failed)?;
-    if fs::read_dir(folder).map_err(failed)?.next().is_some() {
-        let message = format!("`{}` is not empty", folder.display());
-        return Err(CliError::Usage { message, hint: Some("name another folder with -o".to_owned()) });
+/// Folder of a tileset. Dropping it before it is complete removes its files.
+struct Folder {
+    path: PathBuf,
+    /// True if the command created the folder.
+    is_new: bool,
+    complete: bool,
+}
+
+impl Folder {
+    /// Creates a folder, or uses an empty one.
+    fn create(path: &Path) -> Result<Self, CliError> {
+        if is_stdio(path) {
+            return Err(CliError::usage("a tileset has several files and cannot be written to stdout"));
+        }
+        let failed = |source| CliError::Output { name: path.display().to_string(), source };
+        let is_new = !path.exists();
+        fs::create_dir_all(path).map_err(failed)?;
+        if fs::read_dir(path).map_err(failed)?.next().is_some() {
+            let message = format!("`{}` is not empty", path.display());
+            return Err(CliError::Usage { message, hint: Some("name another folder with -o".to_owned()) });
+        }
+        Ok(Self { path: path.to_owned(), is_new, complete: false })
     }
-    Ok(())
+
+    /// Writes a file, whose path is relative to the folder.
+    fn write(&self, path: &str, bytes: &[u8]) -> io::Result<()> {
+        let path = self.path.join(path);
+        path.parent().map_or(Ok(()), fs::create_dir_all)?;
+        fs::write(path, bytes)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        if self.complete {
+            return;
+        }
+        // The command already fails with another error, so errors are ignored. Files of others remain.
+        let mut names: Vec<String> = (0..MAX_LEVELS).map(|level| level.to_string()).collect();
+        names.push("subtrees".to_owned());
+        for name in names {
+            drop(fs::remove_dir_all(self.path.join(name)));
+        }
+        drop(fs::remove_file(self.path.join("tileset.json")));
+        if self.is_new {
+            drop(fs::remove_dir(&self.path));
+        }
+    }
 }
 
 /// Formats the report as text.
-fn summary(report: &TilesetReport, folder: &Path, seconds: f64, style: Style) -> String {
+fn text(report: &TilesetReport, findings: Option<&[String]>, folder: &Path, seconds: f64, style: Style) -> String {
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &format!("{} atoms", report.atoms));
+    if report.left_out.total > 0 {
+        page.row("left out", &summary::left_out(&report.left_out));
+    }
     for (number, level) in report.levels.iter().enumerate() {
         let megabytes = level.bytes as f64 / 1e6;
         page.row(
             &format!("level {number}"),
             &format!("{} Å: {} tiles, {} triangles, {megabytes:.1} MB", level.spacing, level.tiles, level.triangles),
         );
+    }
+    if let Some(findings) = findings {
+        summary::add_findings(&mut page, findings);
     }
     let megabytes = report.bytes as f64 / 1e6;
     page.row("time", &format!("{seconds:.1} s"));

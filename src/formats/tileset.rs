@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use super::GENERATOR;
 
-/// Maximum number of levels of a subtree: its bits then have at most 40 KB.
+/// Maximum number of levels of a subtree: its bits then have at most 42 KB.
 const MAX_SUBTREE_LEVELS: u32 = 6;
 
 /// Address of a tile: its level, 0 for the root, and its coordinates in tiles of that level.
@@ -94,15 +94,13 @@ pub fn tileset_document(bounds: &TilesetBounds) -> Value {
 
 /// Returns the binary file of the subtree with this number of levels at `root`. `tile` returns true for tiles of the
 /// tileset, `content` for those with a file.
-///
-/// # Errors
-/// Returns the error of the JSON encoder.
+#[must_use]
 pub fn subtree(
     root: TileAddress,
     levels: u32,
     tile: impl Fn(TileAddress) -> bool,
     content: impl Fn(TileAddress) -> bool,
-) -> Result<Vec<u8>, serde_json::Error> {
+) -> Vec<u8> {
     let inner: Vec<TileAddress> = (0..levels).flat_map(|level| all(root, level)).collect();
     let children: Vec<TileAddress> = all(root, levels).collect();
     let (mut views, mut buffer) = (Vec::new(), Vec::new());
@@ -131,10 +129,10 @@ pub fn subtree(
         document["buffers"] = json!([{ "byteLength": buffer.len() }]);
         document["bufferViews"] = views.into();
     }
-    let mut json = serde_json::to_vec(&document)?;
+    let mut json = document.to_string().into_bytes();
     json.resize(json.len().next_multiple_of(8), b' ');
     let lengths = [json.len() as u64, buffer.len() as u64].map(u64::to_le_bytes);
-    Ok([b"subt", &1_u32.to_le_bytes()[..], &lengths.concat(), &json, &buffer].concat())
+    [b"subt", &1_u32.to_le_bytes()[..], &lengths.concat(), &json, &buffer].concat()
 }
 
 /// Returns all tiles `levels` below a root, in Morton order.
@@ -149,7 +147,7 @@ mod tests {
     #[test]
     fn bits_are_in_morton_order_of_each_level() {
         let marked = TileAddress { level: 2, at: [1, 2, 3] };
-        let file = subtree(TileAddress::ROOT, 5, |tile| tile.level < 3, |tile| tile == marked).unwrap();
+        let file = subtree(TileAddress::ROOT, 5, |tile| tile.level < 3, |tile| tile == marked);
         let json_bytes = usize::try_from(u64::from_le_bytes(file[8..16].try_into().unwrap())).unwrap();
         assert_eq!((&file[..8], file.len() % 8, json_bytes % 8), (&b"subt\x01\0\0\0"[..], 0, 0));
         let json: Value = serde_json::from_slice(&file[24..24 + json_bytes]).unwrap();

@@ -371,6 +371,9 @@ impl From<SurfaceError> for Problem {
                 .with("limit", limit)
                 .with("actual", triangles)
                 .with("resolution", resolution),
+            E::TooManyTiles { limit, resolution } => {
+                Self::new(ProblemType::GridTooLarge, detail).with("limit", limit).with("resolution", resolution)
+            }
             E::TooManyOverlaps { overlaps, limit } => exceeded(ProblemType::TooManyCandidates, limit, overlaps),
             E::NoSurface { isovalue } => match isovalue {
                 Some(isovalue) => {

@@ -135,6 +135,14 @@ pub enum SurfaceError {
         /// Spacing, Å.
         spacing: f64,
     },
+    /// A tileset would have too many tiles.
+    #[error("the tileset would have more than {limit} tiles at {resolution} Å; a coarser grid needs fewer")]
+    TooManyTiles {
+        /// Tiles allowed.
+        limit: u64,
+        /// Spacing of the last level, Å.
+        resolution: f64,
+    },
     /// The sink of the mesh failed. It keeps the cause.
     #[error("the mesh sink failed")]
     Sink,

@@ -83,6 +83,23 @@ fn a_tileset_has_the_files_that_its_documents_list() {
 }
 
 #[test]
+fn a_command_that_fails_removes_its_files() {
+    let folder = Folder::new();
+    let output = folder.path("tiles");
+    let empty = tileset(&output, &["--isovalue", "1000"]);
+    assert_code(&empty, 2);
+    assert!(stderr(&empty).contains("isovalue 1000"), "{}", stderr(&empty));
+    assert!(!output.exists());
+    // Some tiles exceed the limit.
+    let too_small = tileset(&output, &["--max-grid-points", "600000", "--resolution", "0.25"]);
+    assert_ne!(too_small.status.code(), Some(0));
+    assert!(!output.exists(), "{}", stderr(&too_small));
+    let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
+    assert_code(&molmesh().args(["tileset", sample, "-o", "-"]).output().unwrap(), 2);
+    assert!(!Path::new("-").exists());
+}
+
+#[test]
 fn a_folder_with_files_and_parameters_of_whole_meshes_are_rejected() {
     let folder = Folder::new();
     let output = folder.path("tiles");
@@ -100,6 +117,8 @@ fn a_folder_with_files_and_parameters_of_whole_meshes_are_rejected() {
         &["--simplify", "0.1"],
         &["--max-triangles", "1000"],
         &["--color", "depth"],
+        &["--color", "element", "--color-blend", "smooth"],
+        &["--validation", "exact"],
         &["--exact", "--surface", "ses"],
         &["--paper-b", "1", "--paper-a", "1"],
     ] {

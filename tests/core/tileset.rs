@@ -6,9 +6,9 @@ use std::fmt::Write;
 
 use molmesh::formats::tileset::TileAddress;
 use molmesh::pipeline::tileset::{Tileset, check};
-use molmesh::pipeline::{Choice, JobLimits, params, run};
+use molmesh::pipeline::{Choice, JobError, JobLimits, params, run};
 use molmesh::structure::{self, ReadLimits};
-use molmesh::surface::{Control, CpuBackend, Measures, Mesh, SurfaceLimits, Validation};
+use molmesh::surface::{Control, CpuBackend, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
 
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 
@@ -122,4 +122,13 @@ fn coarse_levels_group_atoms_and_keep_the_shape() {
         assert!((level.volume / found[3].volume - 1.0).abs() < 0.3, "{} {}", level.volume, found[3].volume);
     }
     assert_eq!(found[0].components.len(), 1);
+}
+
+#[test]
+fn too_many_tiles_are_rejected() {
+    let job = |resolution| params::parse([("radius_offset", "10"), ("resolution", resolution)]).unwrap().job;
+    let read = |control: &Control<'_>| structure::read_with(SAMPLE, &ReadLimits::default(), control).map(Box::new);
+    let new = |resolution| Tileset::new(read, job(resolution), &ReadLimits::default(), &Control::default(), &());
+    let Err(JobError::Surface(SurfaceError::TooManyTiles { limit, .. })) = new("0.01") else { panic!("accepted") };
+    assert!(new("0.2").is_ok_and(|tileset| (tileset.tiles().len() as u64) < limit));
 }

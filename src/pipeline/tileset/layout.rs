@@ -5,7 +5,7 @@ use crate::formats::tileset::{TileAddress, TilesetBounds};
 /// Cells of the grid along the edge of a tile. A tile in a protein then has about 40,000 triangles.
 pub(super) const CELLS: f64 = 64.0;
 /// Maximum number of levels: enough for the largest coordinates at the finest spacing.
-const MAX_LEVELS: u32 = 24;
+pub const MAX_LEVELS: u32 = 24;
 /// Distance between the coarsest spheres and the faces of the cube, in spacings of the root.
 const MARGIN: f64 = 2.0;
 

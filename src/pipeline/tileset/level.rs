@@ -10,8 +10,12 @@ use crate::surface::{Control, Spheres, SurfaceError, SurfaceParams};
 /// Spacing above which atoms are grouped, Å: a coarser grid misses single atoms, and all atoms would be too many for
 /// its few cells.
 const GROUP_ABOVE: f64 = 2.5;
-/// Memory of a sphere of a level, bytes: its columns, its row, its cell, its place in the index, and its group.
-const BYTES: u64 = 96;
+/// Memory of a sphere in the index, bytes: its number, and its share of the buckets.
+const INDEX_BYTES: u64 = 12;
+/// Memory of a group of atoms, bytes: the columns of its sphere, and its row.
+const GROUP_BYTES: u64 = 32;
+/// Memory of an atom while the index is sorted, bytes.
+const SORT_BYTES: u64 = 32;
 /// Spheres between two checks of the cancellation flag: a few milliseconds.
 const PER_CHECK: usize = 1 << 14;
 
@@ -21,9 +25,10 @@ pub(super) struct TilesetLevel {
     pub(super) spheres: Arc<Spheres>,
     /// Atom that represents each sphere, as a row of the selected atoms; `None` if sphere and row are the same.
     rows: Option<Vec<u32>>,
-    /// Edge length of the cells of the index, Å.
+    /// Edge length of the buckets of the index, Å.
     side: f64,
-    cells: FxHashMap<[i64; 3], Range<usize>>,
+    /// Range in `order` of the spheres of each bucket.
+    buckets: FxHashMap<[i64; 3], Range<usize>>,
     order: Vec<u32>,
 }
 
@@ -39,38 +44,40 @@ impl TilesetLevel {
         [spacing, side]: [f64; 2],
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
-        control.memory.grow(BYTES * atoms.len() as u64)?;
+        let _sorting = control.reserve(SORT_BYTES * atoms.len() as u64)?;
         let (spheres, rows) = if spacing <= GROUP_ABOVE {
             (Arc::clone(atoms), None)
         } else {
             let (spheres, rows) = grouped(atoms, params, spacing, control)?;
+            control.memory.grow(GROUP_BYTES * spheres.len() as u64)?;
             (Arc::new(spheres), Some(rows))
         };
+        control.memory.grow(INDEX_BYTES * spheres.len() as u64)?;
         let mut keys = Vec::with_capacity(spheres.len());
         for i in 0..spheres.len() {
             if i.is_multiple_of(PER_CHECK) {
                 control.check()?;
             }
-            keys.push((cell(spheres.centre(i), side), u32::try_from(i).unwrap_or(u32::MAX)));
+            keys.push((cube(spheres.centre(i), side), u32::try_from(i).unwrap_or(u32::MAX)));
         }
         keys.sort_unstable();
-        let mut cells = FxHashMap::default();
+        let mut buckets = FxHashMap::default();
         let mut first = 0;
         for group in keys.chunk_by(|a, b| a.0 == b.0) {
-            cells.insert(group[0].0, first..first + group.len());
+            buckets.insert(group[0].0, first..first + group.len());
             first += group.len();
         }
-        Ok(Self { spheres, rows, side, cells, order: keys.into_iter().map(|(_, i)| i).collect() })
+        Ok(Self { spheres, rows, side, buckets, order: keys.into_iter().map(|(_, i)| i).collect() })
     }
 
     /// Returns the spheres whose centres are at most `margin` away from a box along each axis, ascending. Lengths are
     /// in Å.
     pub(super) fn near(&self, [low, high]: [[f64; 3]; 2], margin: f64) -> Vec<u32> {
         let [low, high] = [low.map(|c| c - margin), high.map(|c| c + margin)];
-        let [from, to] = [cell(low, self.side), cell(high, self.side)];
+        let [from, to] = [cube(low, self.side), cube(high, self.side)];
         let columns = (from[2]..=to[2]).flat_map(|z| (from[1]..=to[1]).map(move |y| [y, z]));
-        let cells = columns.flat_map(|[y, z]| (from[0]..=to[0]).map(move |x| [x, y, z]));
-        let all = cells.filter_map(|cell| self.cells.get(&cell)).flat_map(|range| &self.order[range.clone()]);
+        let buckets = columns.flat_map(|[y, z]| (from[0]..=to[0]).map(move |x| [x, y, z]));
+        let all = buckets.filter_map(|at| self.buckets.get(&at)).flat_map(|range| &self.order[range.clone()]);
         let within = |i: &u32| {
             let c = self.spheres.centre(*i as usize);
             (0..3).all(|k| (low[k]..=high[k]).contains(&c[k]))
@@ -86,9 +93,9 @@ impl TilesetLevel {
     }
 }
 
-/// Returns the cell of a point.
+/// Returns the cube of edge length `side`, Å, that contains a point.
 #[expect(clippy::cast_possible_truncation, reason = "coordinates are limited")]
-fn cell(c: [f64; 3], side: f64) -> [i64; 3] {
+fn cube(c: [f64; 3], side: f64) -> [i64; 3] {
     c.map(|c| (c / side).floor() as i64)
 }
 
@@ -105,7 +112,7 @@ fn grouped(
         if i.is_multiple_of(PER_CHECK) {
             control.check()?;
         }
-        keys.push((cell(atoms.centre(i), spacing), i));
+        keys.push((cube(atoms.centre(i), spacing), i));
     }
     keys.sort_unstable();
     let effective = |radius: f32| f64::from(radius) * params.radius_scale + params.radius_offset;

@@ -15,16 +15,26 @@ use std::sync::Arc;
 use serde_json::{Map, Value};
 
 use self::layout::Layout;
+pub use self::layout::MAX_LEVELS;
 use self::level::TilesetLevel;
 pub use self::write::{LevelReport, TilesetReport, WriteError};
-use super::color::{MeshColors, Scheme};
+use super::color::{ColorBlend, MeshColors, Scheme};
 use super::params::ParamError;
 use super::{Job, JobError, ProgressSink, StageClock, load, to_atom_indices};
 use crate::formats::tileset::{TileAddress, TilesetBounds};
 use crate::formats::{CompressedGlb, Meta, Packing, Pieces, Step, Storage};
 use crate::structure::{Context, ReadLimits, Selected, Split, Structure, StructureError};
 use crate::surface::clip::influence;
-use crate::surface::{Backend, Control, Mesh, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+use crate::surface::{
+    Backend, Control, Mesh, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, Validation,
+};
+
+/// Maximum number of tiles.
+const MAX_TILES: usize = 1_000_000;
+/// Memory of the address of a tile, bytes.
+const TILE_BYTES: u64 = 64;
+/// Spheres between two checks of the cancellation flag.
+const PER_CHECK: usize = 1 << 10;
 
 /// Levels and tiles of a structure.
 pub struct Tileset {
@@ -44,7 +54,7 @@ pub struct Tileset {
 pub struct TileFile {
     /// GLB, compressed with meshopt.
     pub glb: Vec<u8>,
-    /// Number of triangles.
+    /// Number of triangles, including skirts.
     pub triangles: u64,
 }
 
@@ -58,12 +68,15 @@ pub fn check(job: &Job) -> Result<(), ParamError> {
     let measured = job.cavities.is_some() || job.pockets.is_some() || job.exact;
     let vertex_scheme = |scheme: &Scheme| matches!(scheme, Scheme::Vertex(_));
     let scheme = job.color.as_ref().map(|color| &color.scheme).filter(|scheme| vertex_scheme(scheme));
+    let smooth = job.color.is_some_and(|color| color.blend == ColorBlend::Smooth);
     let refused = [
         ("split", divided, "no split, instances, model=all and context=whole"),
         ("cavities", measured, "no cavities, pockets and exact measures"),
         ("simplify", job.simplify.is_some() || job.max_triangles().is_some(), "no simplify and max_triangles"),
         ("paper_b", job.params.paper.is_some(), "radii of the atoms, because coarse levels group atoms"),
         ("color", scheme.is_some(), "a scheme that colours atoms"),
+        ("color_blend", smooth, "sharp borders between colours"),
+        ("validation", job.validation != Validation::default(), "no validation"),
     ];
     match refused.into_iter().find(|(_, is_refused, _)| *is_refused) {
         Some((name, _, expected)) => {
@@ -98,14 +111,25 @@ impl Tileset {
         let (mut levels, mut tiles) = (Vec::new(), BTreeSet::new());
         for number in (0..layout.levels).rev() {
             let level = TilesetLevel::new(&spheres, &params, [layout.spacing(number), layout.side(number)], control)?;
-            tiles.append(&mut tiles.iter().filter_map(|tile: &TileAddress| tile.parent()).collect());
+            let finer = tiles.iter().take_while(|tile: &&TileAddress| tile.level == number + 1);
+            let mut parents: BTreeSet<TileAddress> = finer.filter_map(|tile| tile.parent()).collect();
+            tiles.append(&mut parents);
             let reach = influence(&level.spheres, &params);
             for i in 0..level.spheres.len() {
-                if i.is_multiple_of(1 << 14) {
+                if i.is_multiple_of(PER_CHECK) {
                     control.check()?;
                 }
                 let centre = level.spheres.centre(i);
-                tiles.extend(layout.touched(number, [centre.map(|c| c - reach), centre.map(|c| c + reach)]));
+                for tile in layout.touched(number, [centre.map(|c| c - reach), centre.map(|c| c + reach)]) {
+                    if !tiles.insert(tile) {
+                        continue;
+                    }
+                    control.memory.grow(TILE_BYTES).map_err(SurfaceError::from)?;
+                    if tiles.len() > MAX_TILES {
+                        let (limit, resolution) = (MAX_TILES as u64, params.resolution);
+                        return Err(SurfaceError::TooManyTiles { limit, resolution }.into());
+                    }
+                }
             }
             levels.push(level);
         }
@@ -125,12 +149,6 @@ impl Tileset {
         &self.tiles
     }
 
-    /// Returns the number of selected atoms.
-    #[must_use]
-    pub fn n_atoms(&self) -> usize {
-        self.selected.atoms.len()
-    }
-
     /// Returns the grid spacing of a level, Å.
     #[must_use]
     pub fn spacing(&self, level: u32) -> f64 {
@@ -148,7 +166,7 @@ impl Tileset {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Option<TileFile>, JobError> {
-        // All memory but that of the file is released at the end.
+        // Releases all memory that is counted for the tile. The file is not counted.
         let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
         let mesh = self.mesh(address, backend, limits, control)?;
         mesh.map(|mesh| self.compressed(mesh, address, control)).transpose()
@@ -165,7 +183,10 @@ impl Tileset {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Option<Mesh>, JobError> {
-        let Some(level) = self.levels.get(address.level as usize) else { return Ok(None) };
+        if !self.tiles.contains(&address) {
+            return Ok(None);
+        }
+        let level = &self.levels[address.level as usize];
         let (spacing, bounds) = (self.layout.spacing(address.level), self.layout.tile(address));
         let params = SurfaceParams {
             resolution: spacing,
@@ -186,13 +207,12 @@ impl Tileset {
         for id in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()) {
             *id = level.row(near[*id as usize]);
         }
-        // Smooth colours need the vertices around the tile.
-        if let Some(colors) = &self.colors {
-            colors.apply(&mut mesh, spacing, None, control)?;
-        }
         mesh.clip(bounds, control)?;
         if mesh.triangles.is_empty() {
             return Ok(None);
+        }
+        if let Some(colors) = &self.colors {
+            colors.apply(&mut mesh, spacing, None, control)?;
         }
         to_atom_indices(&mut mesh, &self.job, &self.selected, control)?;
         Ok(Some(mesh))

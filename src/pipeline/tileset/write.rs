@@ -9,8 +9,8 @@ use thiserror::Error;
 
 use super::Tileset;
 use crate::formats::tileset::{TileAddress, subtree, tileset_document};
-use crate::pipeline::{JobError, ProgressSink};
-use crate::surface::{Backend, Control, SurfaceLimits, threads};
+use crate::pipeline::{JobError, LeftOutReport, ProgressSink};
+use crate::surface::{Backend, Control, SurfaceError, SurfaceLimits, threads};
 
 /// Contents of a tileset.
 #[derive(Debug, Clone, Serialize)]
@@ -19,6 +19,8 @@ pub struct TilesetReport {
     pub id: Option<String>,
     /// Number of meshed atoms.
     pub atoms: u64,
+    /// Atoms of the selected models that are not meshed.
+    pub left_out: LeftOutReport,
     /// Levels, coarsest first.
     pub levels: Vec<LevelReport>,
     /// Number of files.
@@ -34,7 +36,7 @@ pub struct LevelReport {
     pub spacing: f64,
     /// Number of tiles with triangles.
     pub tiles: u64,
-    /// Number of triangles.
+    /// Number of triangles, including skirts.
     pub triangles: u64,
     /// Size of the tiles, bytes.
     pub bytes: u64,
@@ -89,6 +91,9 @@ impl Tileset {
             Ok::<_, WriteError>(Some((address, tile.triangles, bytes)))
         })?;
         let made: Vec<(TileAddress, u64, u64)> = made.into_iter().flatten().collect();
+        if made.is_empty() {
+            return Err(JobError::from(SurfaceError::NoSurface { isovalue: self.job.params.level() }).into());
+        }
         let level = |level| LevelReport { spacing: self.spacing(level), ..LevelReport::default() };
         let mut levels: Vec<LevelReport> = (0..self.layout.levels).map(level).collect();
         for (address, triangles, bytes) in &made {
@@ -104,15 +109,11 @@ impl Tileset {
         let subtree_levels = bounds.subtree_levels();
         for root in self.tiles.iter().filter(|tile| tile.level.is_multiple_of(subtree_levels)) {
             let file = subtree(*root, subtree_levels, is_tile, |tile| with_content.contains(&tile));
-            bytes += store(&format!("subtrees/{}.subtree", root.path()), &file.map_err(encoding)?)?;
+            bytes += store(&format!("subtrees/{}.subtree", root.path()), &file)?;
             files += 1;
         }
-        let document = serde_json::to_vec_pretty(&tileset_document(&bounds)).map_err(encoding)?;
-        bytes += store("tileset.json", &document)?;
-        Ok(TilesetReport { id: self.name.clone(), atoms: self.n_atoms() as u64, levels, files: files + 1, bytes })
+        bytes += store("tileset.json", tileset_document(&bounds).to_string().as_bytes())?;
+        let (atoms, left_out) = (self.selected.atoms.len() as u64, LeftOutReport::new(&self.selected.left_out));
+        Ok(TilesetReport { id: self.name.clone(), atoms, left_out, levels, files: files + 1, bytes })
     }
-}
-
-fn encoding(error: serde_json::Error) -> WriteError {
-    WriteError::File { path: "tileset.json".to_owned(), source: error.into() }
 }

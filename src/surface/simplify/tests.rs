@@ -6,11 +6,11 @@ use super::*;
 use crate::surface::{Backend as _, CpuBackend, Measures, Spheres, SurfaceKind, SurfaceLimits, SurfaceOptions};
 use crate::surface::{SurfaceParams, Validation};
 
-/// Returns the mesh of spheres in a row, which overlap.
 fn within(error: f64) -> Simplify {
     Simplify { error, max_triangles: None }
 }
 
+/// Returns the mesh of spheres in a row, which overlap.
 fn row(n: u32, surface: SurfaceKind, resolution: f64) -> Mesh {
     let centres = (0..n).map(|i| 2.0 * f64::from(i)).collect();
     let count = n as usize;
