@@ -371,9 +371,7 @@ impl From<SurfaceError> for Problem {
                 .with("limit", limit)
                 .with("actual", triangles)
                 .with("resolution", resolution),
-            E::TooManyTiles { limit, resolution } => {
-                Self::new(ProblemType::GridTooLarge, detail).with("limit", limit).with("resolution", resolution)
-            }
+            E::TooManyTiles { limit, .. } => Self::new(ProblemType::GridTooLarge, detail).with("limit", limit),
             E::TooManyOverlaps { overlaps, limit } => exceeded(ProblemType::TooManyCandidates, limit, overlaps),
             E::NoSurface { isovalue } => match isovalue {
                 Some(isovalue) => {
