@@ -132,3 +132,15 @@ fn too_many_tiles_are_rejected() {
     let Err(JobError::Surface(SurfaceError::TooManyTiles { limit, .. })) = new("0.01") else { panic!("accepted") };
     assert!(new("0.2").is_ok_and(|tileset| (tileset.tiles().len() as u64) < limit));
 }
+
+#[test]
+fn no_level_misses_atoms_that_are_far_apart() {
+    let text = "2\n\nC 1.3 2.7 3.1\nC 2000.7 33.3 77.7\n";
+    for surface in ["gaussian", "vdw", "ses"] {
+        let tileset = tileset_of(text.as_bytes(), &[("surface", surface), ("select", "all")]);
+        for level in 0..tileset.bounds().levels {
+            let found = measured(&welded(&meshes(&tileset, level)));
+            assert!(found.closed && found.components.len() == 2, "{surface} {level}: {}", found.components.len());
+        }
+    }
+}

@@ -10,6 +10,9 @@ use crate::surface::{Control, Spheres, SurfaceError, SurfaceParams};
 /// Spacing above which atoms are grouped, Å: a coarser grid misses single atoms, and all atoms would be too many for
 /// its few cells.
 const GROUP_ABOVE: f64 = 2.5;
+/// Radius below which a group of atoms moves to a grid point, in spacings. Groups in the interior of a protein have
+/// about 0.65.
+const SMALL: f64 = 0.5;
 /// Memory of a sphere in the index, bytes: its number, and its share of the buckets.
 const INDEX_BYTES: u64 = 12;
 /// Memory of a group of atoms, bytes: the columns of its sphere, and its row.
@@ -99,7 +102,8 @@ fn cube(c: [f64; 3], side: f64) -> [i64; 3] {
     c.map(|c| (c / side).floor() as i64)
 }
 
-/// Returns a sphere for the atoms in each cell of a grid, Å: at the mean of their centres, with their total volume.
+/// Returns a sphere for the atoms in each cell of a grid, Å: at the mean of their centres, with their total volume. A
+/// small sphere lies at the nearest grid point instead.
 /// Also returns the atom nearest to this mean.
 fn grouped(
     atoms: &Spheres,
@@ -129,10 +133,13 @@ fn grouped(
         let distance2 = |i: usize| (0..3).map(|k| (atoms.centre(i)[k] - mean[k]).powi(2)).sum::<f64>();
         let nearest = group.iter().map(|(_, i)| *i).min_by(|a, b| distance2(*a).total_cmp(&distance2(*b)));
         let cubes = group.iter().map(|(_, i)| effective(atoms.radius(*i)).powi(3)).sum::<f64>();
-        x.push(mean[0]);
-        y.push(mean[1]);
-        z.push(mean[2]);
-        radii.push(given(cubes.cbrt()));
+        let radius = cubes.cbrt();
+        // The grid would miss a small sphere between its points.
+        let centre = if radius < SMALL * spacing { mean.map(|c| (c / spacing).round() * spacing) } else { mean };
+        x.push(centre[0]);
+        y.push(centre[1]);
+        z.push(centre[2]);
+        radii.push(given(radius));
         rows.push(u32::try_from(nearest.unwrap_or_default()).unwrap_or(u32::MAX));
     }
     Ok((Spheres::new(x, y, z, radii)?, rows))

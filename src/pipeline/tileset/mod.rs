@@ -18,7 +18,7 @@ use self::layout::Layout;
 pub use self::layout::MAX_LEVELS;
 use self::level::TilesetLevel;
 pub use self::write::{LevelReport, TilesetReport, WriteError};
-use super::color::{ColorBlend, MeshColors, Scheme};
+use super::color::{ColorBlend, Coloring, MeshColors, Scheme};
 use super::params::ParamError;
 use super::{Job, JobError, ProgressSink, StageClock, load, to_atom_indices};
 use crate::formats::tileset::{TileAddress, TilesetBounds};
@@ -64,23 +64,26 @@ pub struct TileFile {
 /// Returns [`ParamError::BadValue`].
 pub fn check(job: &Job) -> Result<(), ParamError> {
     let selection = &job.selection;
-    let divided = job.split != Split::None || selection.instances || selection.context != Context::Selection;
-    let measured = job.cavities.is_some() || job.pockets.is_some() || job.exact;
-    let vertex_scheme = |scheme: &Scheme| matches!(scheme, Scheme::Vertex(_));
-    let scheme = job.color.as_ref().map(|color| &color.scheme).filter(|scheme| vertex_scheme(scheme));
-    let smooth = job.color.is_some_and(|color| color.blend == ColorBlend::Smooth);
+    let of_vertices = |color: &Coloring| matches!(color.scheme, Scheme::Vertex(_));
     let refused = [
-        ("split", divided, "no split, instances, model=all and context=whole"),
-        ("cavities", measured, "no cavities, pockets and exact measures"),
-        ("simplify", job.simplify.is_some() || job.max_triangles().is_some(), "no simplify and max_triangles"),
-        ("paper_b", job.params.paper.is_some(), "radii of the atoms, because coarse levels group atoms"),
-        ("color", scheme.is_some(), "a scheme that colours atoms"),
-        ("color_blend", smooth, "sharp borders between colours"),
-        ("validation", job.validation != Validation::default(), "no validation"),
+        ("split", job.split != Split::None && job.split != Split::Model, "none"),
+        ("model", job.split == Split::Model, "one model"),
+        ("instances", selection.instances, "false"),
+        ("context", selection.context != Context::Selection, "selection"),
+        ("cavities", job.cavities.is_some(), "no value"),
+        ("color", job.color.as_ref().is_some_and(of_vertices), "a scheme that colours atoms"),
+        ("color_blend", job.color.is_some_and(|color| color.blend == ColorBlend::Smooth), "nearest"),
+        ("pockets", job.pockets.is_some(), "false"),
+        ("exact", job.exact, "false"),
+        ("max_triangles", job.max_triangles().is_some(), "no value"),
+        ("simplify", job.simplify.is_some(), "no value"),
+        ("paper_b", job.params.paper.is_some(), "no value"),
+        ("validation", job.validation != Validation::default(), "checksum"),
     ];
     match refused.into_iter().find(|(_, is_refused, _)| *is_refused) {
         Some((name, _, expected)) => {
-            Err(ParamError::bad_value(name, "a tileset", format!("{expected}: tiles are computed independently")))
+            let expected = format!("{expected} for a tileset, whose tiles are computed independently");
+            Err(ParamError::BadValue { name, value: "the value".to_owned(), expected })
         }
         None => Ok(()),
     }
