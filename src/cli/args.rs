@@ -328,6 +328,9 @@ pub(crate) struct SelectionArgs {
     /// Id of the biological assembly to build [default: asymmetric-unit, the atoms as they are in the file]
     #[arg(long, value_name = "ID")]
     pub(crate) assembly: Option<String>,
+    /// Tile of the tileset of the structure to mesh, instead of the whole structure
+    #[arg(long, value_name = "LEVEL/X/Y/Z")]
+    pub(crate) tile: Option<String>,
     /// Mesh each distinct set of chains of the assembly once and repeat the mesh (glb and gltf only); surfaces of
     /// neighbouring instances are not joined
     #[arg(long)]

@@ -9,7 +9,9 @@ use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
 use molmesh::pipeline::tileset::{Tileset, TilesetReport, WriteError};
-use molmesh::pipeline::{self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
+use molmesh::pipeline::{
+    self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report, StageClock,
+};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, SurfaceError};
@@ -165,10 +167,11 @@ impl<'a> CommandJob<'a> {
     ) -> Result<TilesetReport, CliError> {
         let read = |control: &Control<'_>| structure::read_with(&self.input, &self.limits.read, control).map(Box::new);
         let control = self.control();
-        let tileset = Tileset::new(read, self.job.clone(), &self.limits.read, &control, &self.progress);
+        let clock = StageClock::new(&self.progress);
+        let tileset = Tileset::new(read, &self.job, &self.limits.read, &control, &clock);
         let tileset = tileset.map_err(|error| self.failure(error))?;
-        let backend = self.selected.backend.as_ref();
-        tileset.write(backend, &self.limits.surface, &control, &self.progress, write).map_err(|error| match error {
+        let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
+        tileset.write(&choice, &self.limits.surface, &control, &self.progress, write).map_err(|error| match error {
             WriteError::Job(error) => self.failure(error),
             WriteError::File { path, source } => {
                 CliError::Output { name: folder.join(path).display().to_string(), source }

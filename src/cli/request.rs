@@ -18,8 +18,12 @@ pub(super) fn parse_mesh(args: &MeshArgs) -> Result<Request, CliError> {
 
 /// Parses the flags of `tileset`.
 pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
-    let request = parse(&[], &args.job)?;
+    let compress = Some("meshopt".to_owned());
+    let request = parse(&[("compress", &compress)], &args.job)?;
     tileset::check(&request.job).map_err(|error| refusal(&error))?;
+    if args.job.selection.tile.is_some() {
+        return Err(CliError::usage("`--tile` is for `molmesh mesh`; a tileset has all tiles"));
+    }
     Ok(request)
 }
 
@@ -117,6 +121,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("cavities", &surface.cavities),
         ("pocket_probe", &surface.pocket_probe),
         ("simplify", &surface.simplify),
+        ("tile", &atoms.tile),
         ("validation", &args.validation),
         ("interface", &surface.interface),
     ];
@@ -187,6 +192,7 @@ mod tests {
                 "atom_ids" | "check" | "pockets" => vec![flag.as_str()],
                 "validation" => vec![&flag, "exact"],
                 "cavities" => vec![&flag, "drop"],
+                "tile" => vec![&flag, "1/0/1/0"],
                 "pocket_probe" => vec![&flag, "5", "--pockets"],
                 "compress" => vec![&flag, "quantize"],
                 "normals" => vec![&flag, "none"],
@@ -223,7 +229,7 @@ mod tests {
             let changed = ask(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
             assert_ne!(key(&changed), key(&ask(&[]).unwrap()), "{flag} changes nothing");
             // A parameter that changes the mesh changes the picture.
-            if !["format", "compress", "normals", "units", "instances"].contains(&parameter.name) {
+            if !["format", "compress", "normals", "units", "instances", "tile"].contains(&parameter.name) {
                 assert_ne!(key(&drawn(&value).unwrap()), key(&drawn(&[]).unwrap()), "{flag} changes no picture");
             }
         }

@@ -5,8 +5,9 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use molmesh::formats::tileset::MAX_LEVELS;
 use molmesh::pipeline::params::Request;
-use molmesh::pipeline::tileset::{MAX_LEVELS, TilesetReport};
+use molmesh::pipeline::tileset::TilesetReport;
 use serde_json::Value;
 
 use super::args::{ReportStyle, TilesetArgs};

@@ -4,10 +4,15 @@
 //! reverses this rotation, so that positions in the tileset are those of the structure. Tile addresses refer to the
 //! rotated axes.
 
+use std::str::FromStr;
+
 use serde_json::{Value, json};
+use thiserror::Error;
 
 use super::GENERATOR;
 
+/// Maximum number of levels: enough for the largest coordinates at the finest spacing.
+pub const MAX_LEVELS: u32 = 24;
 /// Maximum number of levels of a subtree: its bits then have at most 42 KB.
 const MAX_SUBTREE_LEVELS: u32 = 6;
 
@@ -37,11 +42,33 @@ impl TileAddress {
         format!("{level}/{x}/{y}/{z}")
     }
 
+    /// Returns true if its level is below `levels` and it lies in the cube of that level.
+    pub(crate) fn is_valid(self, levels: u32) -> bool {
+        self.level < levels && self.at.iter().all(|c| *c < 1 << self.level)
+    }
+
     /// Returns the tile `levels` deeper whose position in Morton order among all tiles there is `index`.
     fn descendant(self, levels: u32, index: u32) -> Self {
         let coordinate = |k: u32| (0..levels).fold(0, |c, bit| c | (index >> (3 * bit + k) & 1) << bit);
         let [x, y, z] = self.at.map(|c| c << levels);
         Self { level: self.level + levels, at: [x | coordinate(0), y | coordinate(1), z | coordinate(2)] }
+    }
+}
+
+/// Error for a text that is not the path of a tile.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+#[error("the address of a tile is level/x/y/z")]
+pub struct BadAddress;
+
+impl FromStr for TileAddress {
+    type Err = BadAddress;
+
+    fn from_str(text: &str) -> Result<Self, BadAddress> {
+        let numbers: Vec<u32> = text.split('/').map_while(|part| part.parse().ok()).collect();
+        let [level, x, y, z] = numbers[..] else { return Err(BadAddress) };
+        let address = Self { level, at: [x, y, z] };
+        // The canonical text only: equal tiles have equal paths.
+        (address.is_valid(MAX_LEVELS) && address.path() == text).then_some(address).ok_or(BadAddress)
     }
 }
 
@@ -66,10 +93,19 @@ impl TilesetBounds {
     }
 }
 
-/// Returns `tileset.json`. The contents have the address's path and the extension `glb`, the subtrees lie in the folder
-/// `subtrees`.
+/// Templates of the URIs of tiles and subtrees, relative to `tileset.json`. The text `{level}/{x}/{y}/{z}` stands for
+/// the address of a tile.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TilesetUris {
+    /// GLB of a tile.
+    pub content: String,
+    /// Subtree below a tile.
+    pub subtrees: String,
+}
+
+/// Returns `tileset.json`.
 #[must_use]
-pub fn tileset_document(bounds: &TilesetBounds) -> Value {
+pub fn tileset_document(bounds: &TilesetBounds, uris: &TilesetUris) -> Value {
     let TilesetBounds { centre: [x, y, z], side, levels, error } = *bounds;
     let half = 0.5 * side;
     json!({
@@ -81,12 +117,12 @@ pub fn tileset_document(bounds: &TilesetBounds) -> Value {
             "boundingVolume": { "box": [x, -z, y, half, 0, 0, 0, half, 0, 0, 0, half] },
             "geometricError": error,
             "refine": "REPLACE",
-            "content": { "uri": "{level}/{x}/{y}/{z}.glb" },
+            "content": { "uri": uris.content },
             "implicitTiling": {
                 "subdivisionScheme": "OCTREE",
                 "availableLevels": levels,
                 "subtreeLevels": bounds.subtree_levels(),
-                "subtrees": { "uri": "subtrees/{level}/{x}/{y}/{z}.subtree" },
+                "subtrees": { "uri": uris.subtrees },
             },
         },
     })

@@ -36,6 +36,7 @@ and `.`, or a new one.";
     tags(
         (name = "meshes", description = "Compute meshes, reports and estimates."),
         (name = "structures", description = "Upload structures and list their contents."),
+        (name = "tilesets", description = "Levels of detail of large structures, in tiles."),
         (name = "jobs", description = "Follow asynchronous jobs."),
         (name = "results", description = "Fetch stored meshes and their reports."),
         (name = "service", description = "Capabilities, problem types and health."),
@@ -45,6 +46,8 @@ and `.`, or a new one.";
         super::structures::create, super::structures::show, super::structures::surface, super::structures::report,
         super::atoms::of_structure, super::atoms::of_entry, super::colors::of_structure, super::colors::of_entry,
         super::areas::of_structure, super::areas::of_entry,
+        super::tilesets::of_structure, super::tilesets::of_entry,
+        super::tilesets::subtree_of_structure, super::tilesets::subtree_of_entry,
         super::jobs::show, super::jobs::dismiss, super::jobs::result, super::events::show,
         super::results::show, super::results::report,
         super::capabilities::show, super::problems::list, super::problems::one,

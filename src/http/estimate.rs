@@ -118,7 +118,7 @@ pub(super) async fn create(
     // An estimate is about half the work of a mesh, so it takes a delivery slot as well.
     let delivery = app.delivery(caller.client)?;
     let digest = source.digest(&app, &caller).await?;
-    let Loaded { input, digest, reservation } = source.find(&app, &caller, &digest).await?;
+    let Loaded { input, digest, reservation } = source.find(&app, &caller, &digest, None).await?;
     drop(source);
     let seconds = app.pool.expected(&input, &job);
     let reading = app.read(caller.client, (reservation, delivery), {

@@ -82,7 +82,7 @@ impl MeshRequest {
         let loaded = if self.parsed.request.strict || self.is_answered_with_job() {
             source.load(&self.app, caller).await?
         } else {
-            source.find(&self.app, caller, &digest).await?
+            source.find(&self.app, caller, &digest, Some(&self.parsed.request.job)).await?
         };
         self.timing.lap("load");
         self.compute(loaded).await

@@ -13,6 +13,7 @@ mod scopes;
 mod signal;
 mod socket;
 mod store_health;
+mod tilesets;
 mod timing;
 
 mod stop;

@@ -12,7 +12,7 @@ use axum::routing::{MethodRouter, get, post};
 use super::state::Shared;
 use super::{
     api_document, areas, atoms, capabilities, colors, estimate, events, guard, health, jobs, meshes, middleware,
-    negotiate, page, pdb, problems, results, scopes, structures,
+    negotiate, page, pdb, problems, results, scopes, structures, tilesets,
 };
 
 /// Margin of the backstop timeout over the sum of the regular timeouts.
@@ -58,6 +58,10 @@ fn routes() -> Vec<(&'static str, MethodRouter<Shared>)> {
         ("/v1/structures/{digest}/colors", get(colors::of_structure)),
         ("/v1/structures/{digest}/{file}", get(structures::surface)),
         ("/v1/structures/{digest}/report.json", get(structures::report)),
+        ("/v1/pdb/{id}/tileset.json", get(tilesets::of_entry)),
+        ("/v1/pdb/{id}/tileset.subtree", get(tilesets::subtree_of_entry)),
+        ("/v1/structures/{digest}/tileset.json", get(tilesets::of_structure)),
+        ("/v1/structures/{digest}/tileset.subtree", get(tilesets::subtree_of_structure)),
         ("/v1/estimate", post(estimate::create)),
         // Jobs and results.
         ("/v1/jobs/{id}", get(jobs::show).delete(jobs::dismiss)),

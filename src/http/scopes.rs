@@ -26,6 +26,10 @@ pub(super) enum Parameters {
     Areas,
     /// Parameters of the colours of atoms.
     Colors,
+    /// Parameters of a tileset.
+    Tileset,
+    /// Parameters of a subtree.
+    Subtree,
     /// `wait`.
     Wait,
     None,
@@ -42,6 +46,8 @@ impl OperationScope {
             path if path.ends_with("/atoms") => Parameters::Atoms,
             path if path.ends_with("/areas") => Parameters::Areas,
             path if path.ends_with("/colors") => Parameters::Colors,
+            path if path.ends_with("/tileset.json") => Parameters::Tileset,
+            path if path.ends_with("/tileset.subtree") => Parameters::Subtree,
             _ if is_file && !is_result => Parameters::Mesh,
             _ => Parameters::None,
         }
@@ -73,6 +79,10 @@ pub(super) const TABLE: &[OperationScope] = &[
     row(Method::GET, "/v1/structures/{digest}/colors", READ),
     row(Method::GET, "/v1/structures/{digest}/{file}", MESH),
     row(Method::GET, "/v1/structures/{digest}/report.json", MESH),
+    row(Method::GET, "/v1/pdb/{id}/tileset.json", MESH),
+    row(Method::GET, "/v1/pdb/{id}/tileset.subtree", MESH),
+    row(Method::GET, "/v1/structures/{digest}/tileset.json", MESH),
+    row(Method::GET, "/v1/structures/{digest}/tileset.subtree", MESH),
     row(Method::POST, "/v1/estimate", MESH),
     row(Method::GET, "/v1/jobs/{id}", READ),
     row(Method::DELETE, "/v1/jobs/{id}", MESH),

@@ -56,6 +56,9 @@ fn check_parameters(row: &OperationScope, file: Option<&str>, uri: &Uri) -> Resu
         Parameters::Atoms => atom_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Areas => area_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
+        Parameters::Tileset | Parameters::Subtree => {
+            Err("a signature opens one address, and a tileset has many; send a key".to_owned())
+        }
         Parameters::Wait => {
             let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;
             if poll.wait() <= MAX_WAIT_S { Ok(()) } else { Err(format!("`wait` is more than {MAX_WAIT_S} s")) }
@@ -103,6 +106,7 @@ mod tests {
             ("/v1/pdb/4pti/surface.glb?resolution=fine", "parameter `resolution`"),
             ("/v1/pdb/4pti/surface.glb?format=glb", "already names glb"),
             ("/v1/pdb/4pti/surface.glb?width=100", "`width`"),
+            ("/v1/pdb/4pti/tileset.json", "a tileset has many"),
             ("/v1/jobs/7?wait=99", "more than 55"),
             ("/v1/jobs/7?wiat=9", "unknown field `wiat`"),
             ("/v1/jobs/7/result?wait=9", "`wait`; this path has none"),

@@ -20,6 +20,7 @@ use super::problem_types::ProblemType;
 use super::state::{Delivery, Shared};
 use crate::archive::{Entry, FetchError, UnavailableReason};
 use crate::jobs::{Input, MemoryReservation};
+use crate::pipeline::Job;
 use crate::store::{Digest, Name};
 use crate::structure::{ArchiveError, EntryId, ReadLimits, Structure};
 use crate::surface::Control;
@@ -106,11 +107,18 @@ impl StructureSource {
         }
     }
 
-    /// Returns the structure in memory if there is one, or the file. `digest` is the one that [`Self::digest`] returned
-    /// for this caller, which has checked that the structure exists.
-    pub(super) async fn find(&self, app: &Shared, caller: &Caller, digest: &Digest) -> Result<Loaded, Problem> {
+    /// Returns the structure in memory if there is one, for a `job` on a tile also as a part of its tileset, or the
+    /// file. `digest` is the one that [`Self::digest`] returned for this caller, which has checked that the structure
+    /// exists.
+    pub(super) async fn find(
+        &self,
+        app: &Shared,
+        caller: &Caller,
+        digest: &Digest,
+        job: Option<&Job>,
+    ) -> Result<Loaded, Problem> {
         let namespace = caller.namespace;
-        match (self, app.structures().find(namespace, *digest)) {
+        match (self, app.structures().find(namespace, *digest, job)) {
             (Self::Stored(_) | Self::Entry(_), Some(kept)) => {
                 if let Self::Stored(_) = self {
                     app.store.touch(&Name::input(digest).within(namespace), app.store.now());
@@ -166,7 +174,7 @@ impl StructureSource {
             return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
         }
         let delivery = app.delivery(caller.client)?;
-        let loaded = self.find(app, caller, &digest).await?;
+        let loaded = self.find(app, caller, &digest, None).await?;
         let validators = self::validators(&loaded.digest, variant)?;
         Ok((validators, write(loaded, delivery).await?).into_response())
     }

@@ -39,7 +39,7 @@ pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
 pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
 pub(crate) use results::{REPORT, SaveError, document, is_stored, save};
-pub(crate) use structures::{Input, Structures};
+pub(crate) use structures::{Input, SharedTileset, Structures};
 pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;

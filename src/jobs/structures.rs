@@ -13,15 +13,17 @@ use metrics::{counter, gauge};
 
 use super::MemoryReservation;
 use crate::memory_budget::{Budget, Buffers, Reclaim};
-use crate::pipeline::estimate_atoms;
+use crate::pipeline::tileset::Tileset;
+use crate::pipeline::{Job, JobError, StageClock, estimate_atoms, params};
 use crate::store::{Digest, Namespace};
 use crate::structure::{self, ReadLimits, Structure, StructureError};
-use crate::surface::{Control, MemoryMeter as _};
+use crate::surface::{CancelToken, Control, MemoryMeter as _, OutOfMemory, SurfaceError};
 use crate::sync::{Condvar, Mutex, MutexGuard};
 use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
 
-/// Namespace and digest of a file. All other input of the reader is the same for the whole service, except limits.
-type StructureKey = (Namespace, Digest);
+/// Namespace, and digest of a file or of a tileset. All other input of the reader is the same for the whole service,
+/// except limits.
+type CacheKey = (Namespace, Digest);
 
 /// Memory of a structure besides its atoms and texts, bytes: its columns are some 40 allocations. Without it, the cache
 /// would take several times its limit for structures of one atom.
@@ -29,46 +31,81 @@ const OVERHEAD: u64 = 4 << 10;
 /// Time between two checks of a request that waits for another one to read its structure.
 const POLL: Duration = Duration::from_millis(20);
 
-/// A structure, and the memory that it is charged to.
+/// A structure or a tileset, and the memory that it is charged to.
 #[derive(Debug)]
-struct Charged {
-    structure: Structure,
-    /// Size of its file, bytes.
+struct Charged<T> {
+    value: T,
+    /// Size of the structure file, bytes.
     file_bytes: usize,
     /// Number of atoms as estimated from the file, so that estimates of work do not depend on its presence in memory.
     atoms: f64,
-    /// Memory of the structure, bytes.
+    /// Memory of the value, bytes.
     bytes: u64,
     _charge: Charge,
 }
 
-/// Charge of a structure. The metric of the budget counts it only if the structure is not kept.
+/// Charge of a value. The metric of the budget counts it only if the value is not kept.
 #[derive(Debug)]
 enum Charge {
     Kept { _buffers: Buffers },
     Used { _reservation: Arc<MemoryReservation> },
 }
 
-/// A structure that other requests may use as well. Clones share it.
-#[derive(Debug, Clone)]
-pub(crate) struct SharedStructure(Arc<Charged>);
+/// A structure or a tileset that other requests may use as well. Clones share it.
+#[derive(Debug)]
+pub(crate) struct Shared<T>(Arc<Charged<T>>);
 
-impl SharedStructure {
+/// A structure that other requests may use as well.
+pub(crate) type SharedStructure = Shared<Structure>;
+/// A prepared tileset that other requests may use as well.
+pub(crate) type SharedTileset = Shared<Tileset<SharedStructure>>;
+
+impl<T> Clone for Shared<T> {
+    fn clone(&self) -> Self {
+        Self(Arc::clone(&self.0))
+    }
+}
+
+impl<T> Shared<T> {
     fn bytes(&self) -> u64 {
         self.0.bytes
     }
 
-    /// Returns true if a request uses the structure.
+    /// Returns true if a request uses the value.
     fn is_used(&self) -> bool {
         Arc::strong_count(&self.0) > 1
     }
 }
 
-impl Deref for SharedStructure {
-    type Target = Structure;
+impl<T> Deref for Shared<T> {
+    type Target = T;
 
-    fn deref(&self) -> &Structure {
-        &self.0.structure
+    fn deref(&self) -> &T {
+        &self.0.value
+    }
+}
+
+/// Value of the cache.
+#[derive(Debug, Clone)]
+enum Kept {
+    Structure(SharedStructure),
+    Tileset(SharedTileset),
+}
+
+impl Kept {
+    fn bytes(&self) -> u64 {
+        match self {
+            Self::Structure(kept) => kept.bytes(),
+            Self::Tileset(kept) => kept.bytes(),
+        }
+    }
+
+    /// Returns true if a request uses the value, or a tileset its structure.
+    fn is_used(&self) -> bool {
+        match self {
+            Self::Structure(kept) => kept.is_used(),
+            Self::Tileset(kept) => kept.is_used(),
+        }
     }
 }
 
@@ -109,57 +146,57 @@ impl Input {
 
 #[derive(Debug, Default)]
 struct CacheState {
-    /// Structures, each with the number of its last use.
-    kept: HashMap<StructureKey, (u64, SharedStructure)>,
+    /// Values, each with the number of its last use.
+    kept: HashMap<CacheKey, (u64, Kept)>,
     /// Least recently used first.
-    by_use: BTreeMap<u64, StructureKey>,
+    by_use: BTreeMap<u64, CacheKey>,
     /// Number of uses.
     uses: u64,
-    /// Memory of all structures, bytes.
+    /// Memory of all values, bytes.
     bytes: u64,
-    /// Structures that a request is reading.
-    reading: HashSet<StructureKey>,
+    /// Values that a request is making.
+    making: HashSet<CacheKey>,
 }
 
 impl CacheState {
-    /// Adds a structure as the most recently used one.
-    fn insert(&mut self, key: StructureKey, structure: SharedStructure) {
+    /// Adds a value as the most recently used one.
+    fn insert(&mut self, key: CacheKey, value: Kept) {
         self.remove(&key);
         self.uses += 1;
-        self.bytes += structure.bytes();
+        self.bytes += value.bytes();
         self.by_use.insert(self.uses, key);
-        self.kept.insert(key, (self.uses, structure));
+        self.kept.insert(key, (self.uses, value));
     }
 
-    fn remove(&mut self, key: &StructureKey) -> Option<SharedStructure> {
-        let (used, structure) = self.kept.remove(key)?;
+    fn remove(&mut self, key: &CacheKey) -> Option<Kept> {
+        let (used, value) = self.kept.remove(key)?;
         self.by_use.remove(&used);
-        self.bytes -= structure.bytes();
-        Some(structure)
+        self.bytes -= value.bytes();
+        Some(value)
     }
 
-    /// Removes the least recently used structure that `is_candidate` accepts, and returns its memory in bytes.
-    fn evict(&mut self, is_candidate: impl Fn(&SharedStructure) -> bool) -> Option<u64> {
-        let accepted = |key: &&StructureKey| self.kept.get(*key).is_some_and(|(_, structure)| is_candidate(structure));
+    /// Removes the least recently used value that `is_candidate` accepts, and returns its memory in bytes.
+    fn evict(&mut self, is_candidate: impl Fn(&Kept) -> bool) -> Option<u64> {
+        let accepted = |key: &&CacheKey| self.kept.get(*key).is_some_and(|(_, value)| is_candidate(value));
         let found = *self.by_use.values().find(accepted)?;
-        self.remove(&found).map(|structure| structure.bytes())
+        self.remove(&found).map(|value| value.bytes())
     }
 
-    /// Finds a structure, and makes it the most recently used one.
-    fn find(&mut self, key: &StructureKey) -> Option<SharedStructure> {
+    /// Finds a value, and makes it the most recently used one.
+    fn find(&mut self, key: &CacheKey) -> Option<Kept> {
         let found = self.remove(key)?;
         self.insert(*key, found.clone());
         Some(found)
     }
 }
 
-/// Structures by namespace and digest, within a limit of memory.
+/// Cache of structures by namespace and digest, and of tilesets prepared from them, within a limit of memory.
 #[derive(Debug)]
 pub(crate) struct Structures {
     limit: u64,
     budget: Budget,
     state: Mutex<CacheState>,
-    /// Notified when a request has ended reading.
+    /// Notified when a request has ended making a value.
     ended: Condvar,
 }
 
@@ -173,9 +210,15 @@ impl Structures {
         structures
     }
 
-    /// Returns the structure of a file if it is kept.
-    pub(crate) fn find(&self, namespace: Namespace, digest: Digest) -> Option<SharedStructure> {
-        self.lock().find(&(namespace, digest))
+    /// Returns the structure of a file if it is kept, for a `job` on a tile also as a part of its tileset.
+    pub(crate) fn find(&self, namespace: Namespace, digest: Digest, job: Option<&Job>) -> Option<SharedStructure> {
+        let tileset = job.filter(|job| job.tile.is_some()).map(|job| (namespace, tileset_digest(&digest, job)));
+        let mut state = self.lock();
+        let found = state.find(&(namespace, digest)).or_else(|| state.find(&tileset?));
+        found.map(|kept| match kept {
+            Kept::Structure(structure) => structure,
+            Kept::Tileset(tileset) => tileset.structure().clone(),
+        })
     }
 
     /// Returns the structure of the file with this digest, reading `input` if necessary. Concurrent calls read it once
@@ -204,47 +247,97 @@ impl Structures {
         };
         control.memory.also_held(file.len() as u64);
         let key = (namespace, digest);
-        let mut state = self.lock();
-        loop {
-            if let Some(kept) = state.find(&key) {
-                return hit(kept);
-            }
-            if self.limit == 0 || state.reading.insert(key) {
-                break;
-            }
-            state = self.ended.wait_timeout(state, POLL).unwrap_or_else(PoisonError::into_inner).0;
-            if control.cancel.is_cancelled() {
-                return Err(StructureError::Cancelled);
-            }
-        }
-        drop(state);
-        let _reading = ReadingMark { structures: self, key };
+        let _mark = match self.find_or_begin(key, &control.cancel).ok_or(StructureError::Cancelled)? {
+            Ok(Kept::Structure(kept)) => return hit(kept),
+            Ok(Kept::Tileset(tileset)) => return hit(tileset.structure().clone()),
+            Err(mark) => mark,
+        };
         counter!(STRUCTURE_CACHE_REQUESTS, "result" => "miss").increment(1);
         let reservation = Arc::new(self.budget.reservation());
         reservation.also_held(file.len() as u64);
         let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
         let structure = structure::read_with(file, limits, &charged)?;
         reservation.grow(OVERHEAD)?;
+        let read = self.charged(structure, input, reservation);
+        control.memory.also_held(read.bytes());
+        if read.bytes() <= self.limit {
+            self.keep(key, Kept::Structure(read.clone()));
+        }
+        Ok(read)
+    }
+
+    /// Returns the tileset of a job on the file with this digest, without the tile of the job. Prepares it from `input`
+    /// if necessary; concurrent calls prepare it once. `clock` measures the preparation.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Tileset::new`], and [`OutOfMemory::Limit`] if the tileset is too large for the cache:
+    /// each tile would prepare it again.
+    pub(crate) fn tileset(
+        &self,
+        (namespace, digest): CacheKey,
+        input: &Input,
+        job: &Job,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+        clock: &StageClock<'_>,
+    ) -> Result<SharedTileset, JobError> {
+        let key = (namespace, tileset_digest(&digest, job));
+        let _mark = match self.find_or_begin(key, &control.cancel).ok_or(SurfaceError::Cancelled)? {
+            Ok(Kept::Tileset(kept)) => {
+                control.memory.also_held(kept.bytes());
+                return Ok(kept);
+            }
+            Ok(Kept::Structure(_)) => return Err(JobError::Surface(SurfaceError::Cancelled)),
+            Err(mark) => mark,
+        };
+        let reservation = Arc::new(self.budget.reservation());
+        let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
+        let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
+        let tileset = Tileset::new(read, job, limits, &charged, clock)?;
+        let (needed, limit) = (reservation.bytes(), self.limit);
+        if needed > limit {
+            return Err(SurfaceError::from(OutOfMemory::Limit { needed, limit }).into());
+        }
+        let prepared = self.charged(tileset, input, reservation);
+        control.memory.also_held(needed);
+        self.keep(key, Kept::Tileset(prepared.clone()));
+        Ok(prepared)
+    }
+
+    /// Finds a value, or begins to make it: the caller keeps the mark meanwhile. Waits while another request makes it;
+    /// `None` if this one is cancelled.
+    fn find_or_begin(&self, key: CacheKey, cancel: &CancelToken) -> Option<Result<Kept, MakingMark<'_>>> {
+        let mut state = self.lock();
+        loop {
+            if let Some(kept) = state.find(&key) {
+                return Some(Ok(kept));
+            }
+            if self.limit == 0 || state.making.insert(key) {
+                return Some(Err(MakingMark { structures: self, key }));
+            }
+            state = self.ended.wait_timeout(state, POLL).unwrap_or_else(PoisonError::into_inner).0;
+            if cancel.is_cancelled() {
+                return None;
+            }
+        }
+    }
+
+    /// Charges a value to the budget.
+    fn charged<T>(&self, value: T, input: &Input, reservation: Arc<MemoryReservation>) -> Shared<T> {
         let bytes = reservation.bytes();
-        control.memory.also_held(bytes);
-        let is_kept = bytes <= self.limit;
-        let charge = if is_kept {
+        let charge = if bytes <= self.limit {
             Charge::Kept { _buffers: reservation.to_buffers() }
         } else {
             Charge::Used { _reservation: reservation }
         };
         let (file_bytes, atoms) = (input.file_bytes(), input.atoms());
-        let read = SharedStructure(Arc::new(Charged { structure, file_bytes, atoms, bytes, _charge: charge }));
-        if is_kept {
-            self.keep(key, &read);
-        }
-        Ok(read)
+        Shared(Arc::new(Charged { value, file_bytes, atoms, bytes, _charge: charge }))
     }
 
-    /// Keeps a structure, and evicts others.
-    fn keep(&self, key: StructureKey, kept: &SharedStructure) {
+    /// Keeps a value, and evicts others.
+    fn keep(&self, key: CacheKey, kept: Kept) {
         let mut state = self.lock();
-        state.insert(key, kept.clone());
+        state.insert(key, kept);
         while state.bytes > self.limit && state.evict(|_| true).is_some() {}
         publish(&state);
     }
@@ -255,7 +348,7 @@ impl Structures {
 }
 
 impl Reclaim for Structures {
-    /// Frees structures that no request uses until `bytes` are free, least recently used first.
+    /// Frees values that no request uses until `bytes` are free, least recently used first.
     fn reclaim(&self, bytes: u64) -> bool {
         let mut state = self.lock();
         let mut freed = 0;
@@ -269,17 +362,23 @@ impl Reclaim for Structures {
     }
 }
 
-/// Mark of a structure that a request is reading. Dropping it, even after an error or a panic, lets others read.
-struct ReadingMark<'a> {
+/// Mark of a value that a request is making. Dropping it, even after an error or a panic, lets others make it.
+struct MakingMark<'a> {
     structures: &'a Structures,
-    key: StructureKey,
+    key: CacheKey,
 }
 
-impl Drop for ReadingMark<'_> {
+impl Drop for MakingMark<'_> {
     fn drop(&mut self) {
-        self.structures.lock().reading.remove(&self.key);
+        self.structures.lock().making.remove(&self.key);
         self.structures.ended.notify_all();
     }
+}
+
+/// Returns the digest of a tileset: of its structure file and of the parameters without the tile.
+fn tileset_digest(digest: &Digest, job: &Job) -> Digest {
+    let canonical = params::canonical(&Job { tile: None, ..job.clone() });
+    Digest::of(format!("tileset\n{digest}\n{canonical}").as_bytes())
 }
 
 #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
@@ -399,6 +498,46 @@ mod tests {
     }
 
     #[test]
+    fn a_tileset_is_prepared_once_and_keeps_its_structure() {
+        let budget = Budget::unlimited();
+        let structures = Structures::new(1 << 24, &budget);
+        let (input, digest) = file(20_000);
+        let job = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().job;
+        let [root, child] = ["0/0/0/0", "1/0/0/0"].map(|tile| job(&[("tile", tile), ("select", "all")]));
+        let other = job(&[("tile", "0/0/0/0"), ("select", "all"), ("resolution", "1")]);
+        let get = |job: &Job| {
+            let (limits, clock) = (ReadLimits::default(), StageClock::new(&()));
+            let key = (Namespace::default(), digest);
+            structures.tileset(key, &input, job, &limits, &Control::default(), &clock).unwrap()
+        };
+        let start = Barrier::new(4);
+        let got: Vec<SharedTileset> = std::thread::scope(|scope| {
+            let spawn = |i: usize| {
+                let (start, get, root, child) = (&start, &get, &root, &child);
+                scope.spawn(move || {
+                    start.wait();
+                    get(if i.is_multiple_of(2) { root } else { child })
+                })
+            };
+            let threads: Vec<_> = (0..4).map(spawn).collect();
+            threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+        });
+        assert!(got.iter().all(|tileset| Arc::ptr_eq(&tileset.0, &got[0].0)));
+        assert!(!Arc::ptr_eq(&got[0].0, &get(&other).0), "the control");
+        // A structure that was evicted is found in its tileset, for jobs on its tiles only.
+        let found = |job| structures.find(Namespace::default(), digest, job).map(|found| Arc::as_ptr(&found.0));
+        let structure = found(None);
+        assert!(structure.is_some());
+        structures.lock().remove(&(Namespace::default(), digest));
+        assert_eq!((found(None), found(Some(&Job::default())), found(Some(&child))), (None, None, structure));
+        // Both values are in the budget, and are freed if nothing uses them.
+        drop(got);
+        let bytes = structures.lock().bytes;
+        assert!(bytes > 20_000 * 60, "{bytes}");
+        assert!(structures.reclaim(u64::MAX) && structures.lock().kept.is_empty() && held(&budget) == 0);
+    }
+
+    #[test]
     fn concurrent_requests_read_once_and_a_cancelled_one_does_not_fail_the_others() {
         let budget = Budget::unlimited();
         let structures = Structures::new(1 << 30, &budget);
@@ -423,7 +562,7 @@ mod tests {
         });
         assert!(got.len() >= 6 && got.len() + cancelled.into_inner() == 8);
         assert!(got.iter().all(|kept| Arc::ptr_eq(&kept.0, &got[0].0)));
-        assert!(structures.lock().reading.is_empty());
+        assert!(structures.lock().making.is_empty());
         assert_eq!(held(&budget), structures.lock().bytes);
     }
 }

@@ -10,9 +10,9 @@ use metrics::{counter, histogram};
 
 use super::coalesced_job::QueuedTask;
 use super::pool::WorkerContext;
-use super::{Failure, Finished, JobId, MemoryReservation, OnStart, Outcome};
+use super::{Failure, Finished, JobId, MemoryReservation, OnStart, Outcome, Settings, Task};
 use crate::formats::Pieces;
-use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report};
+use crate::pipeline::{self, Choice, JobError, Product, ProgressSink, Report, StageClock};
 use crate::structure::strict_validator::{self, Diagnostic, Level, MAX_UNREAD_BYTES};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, Control, SurfaceError};
@@ -68,12 +68,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Option<Outcome> {
             } else {
                 (None, None)
             };
-            let limits = &shared.settings.limits;
-            let read = |control: &Control<'_>| {
-                let structures = &shared.settings.structures;
-                structures.get(task.namespace, task.digest, &task.input, &limits.read, control)
-            };
-            let mut product = pipeline::run_with(read, &task.job, limits, &choice, &control, progress.as_ref(), None)
+            let mut product = product(shared, &task, &choice, &control, progress.as_ref())
                 .map_err(|error| explained(shared, file, error, &control))?;
             if let Some(picture) = &task.job.picture {
                 pipeline::draw(&mut product, picture, &shared.settings.renderer, &control, progress.as_ref())?;
@@ -110,6 +105,24 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Option<Outcome> {
     }
     end_span(&span, id, count_outcome(&outcome), Some(&outcome));
     Some(outcome)
+}
+
+/// Computes the mesh of a task, on its structure or on a tileset that is kept in memory.
+fn product(
+    shared: &WorkerContext,
+    task: &Task,
+    choice: &Choice<'_>,
+    control: &Control<'_>,
+    progress: &dyn ProgressSink,
+) -> Result<Product, JobError> {
+    let (Task { namespace, digest, input, job, .. }, Settings { structures, limits, .. }) = (task, &shared.settings);
+    if let Some(address) = job.tile {
+        let clock = StageClock::new(progress);
+        let tileset = structures.tileset((*namespace, *digest), input, job, &limits.read, control, &clock)?;
+        return tileset.product(address, choice, &limits.surface, control, clock, progress);
+    }
+    let read = |control: &Control<'_>| structures.get(*namespace, *digest, input, &limits.read, control);
+    pipeline::run_with(read, job, limits, choice, control, progress, None)
 }
 
 /// Sets attributes and status of the span of a job, and ends it.

@@ -73,6 +73,10 @@ pub fn estimate<S: Deref<Target = Structure>>(
     choice: &Choice<'_>,
     control: &Control<'_>,
 ) -> Result<Estimate, JobError> {
+    if let Some(tile) = job.tile {
+        let (value, expected) = (format!("`{}`", tile.path()), "no value in an estimate".to_owned());
+        return Err(SurfaceError::BadParameter { name: "tile", value, expected }.into());
+    }
     let clock = StageClock::new(&());
     let (structure, selected, spheres) = super::load(read, job, &limits.read, &clock, control)?;
     if let Some(coloring) = job.color.as_ref().filter(|coloring| !matches!(coloring.scheme, Scheme::Vertex(_))) {

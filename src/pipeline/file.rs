@@ -39,6 +39,10 @@ pub enum File<'a> {
 }
 
 impl Product {
+    pub(super) fn new(mesh: Mesh, storage: Storage, report: Report) -> Self {
+        Self { mesh, bounds: None, storage, report, areas: None, pieces: None, picture: None, streamed_bytes: None }
+    }
+
     /// Returns the metadata for a mesh file.
     #[must_use]
     pub fn meta(&self) -> Meta {

@@ -11,6 +11,7 @@ mod cut;
 mod divided;
 #[cfg(feature = "png")]
 mod draw;
+mod error;
 mod estimate;
 mod file;
 mod finest_fit;
@@ -35,8 +36,6 @@ mod work;
 
 use std::ops::Deref;
 
-use thiserror::Error;
-
 pub use areas::{AreaLevel, AtomAreas, ExactReport, Interface};
 pub use auto::AutoBackend;
 pub use cavities::{Cavities, CavityReport, LiningResidue};
@@ -45,6 +44,7 @@ pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
 pub use components::{ComponentReport, VoidReport};
 #[cfg(feature = "png")]
 pub use draw::draw;
+pub use error::JobError;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::{File, Product};
 pub use instances::InstancesReport;
@@ -59,9 +59,9 @@ pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
 
-use crate::formats::{Compress, FormatError, GlbSink, Normals, Packing, Step, Storage, Units};
-use crate::picture::{PictureError, PictureParams};
-use crate::structure::map::MapError;
+use crate::formats::tileset::TileAddress;
+use crate::formats::{Compress, GlbSink, Normals, Packing, Step, Storage, Units};
+use crate::picture::PictureParams;
 use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, Simplify, SinkFailed, Spheres, Stage, SurfaceError,
@@ -73,6 +73,7 @@ use divided::{Division, divided};
 use estimate::MeshPlan;
 use load::{SPHERE_BYTES, load};
 use report::Counts;
+use tileset::Tileset;
 
 /// Number of atom indices that are converted between two checks for cancellation.
 const IDS_PER_CHECK: usize = 1 << 20;
@@ -92,6 +93,8 @@ pub struct Job {
     pub pockets: Option<f64>,
     /// Simplification of the mesh; `None` to keep all triangles.
     pub simplify: Option<Simplify>,
+    /// Tile to mesh instead of the whole structure.
+    pub tile: Option<TileAddress>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -180,61 +183,6 @@ pub struct Choice<'a> {
     pub reason: &'a str,
 }
 
-/// Error of a job.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum JobError {
-    /// Reading or selecting failed.
-    #[error(transparent)]
-    Structure(StructureError),
-    /// Meshing failed.
-    #[error(transparent)]
-    Surface(#[from] SurfaceError),
-    /// Drawing failed.
-    #[error(transparent)]
-    Picture(PictureError),
-    /// The structure or the map lacks the values of the colour scheme.
-    #[error(transparent)]
-    Color(#[from] ColorError),
-    /// Reading the map failed.
-    #[error(transparent)]
-    Map(MapError),
-    /// The mesh cannot be compressed.
-    #[error(transparent)]
-    Format(#[from] FormatError),
-}
-
-impl From<StructureError> for JobError {
-    fn from(error: StructureError) -> Self {
-        match error {
-            // Cancellation and lack of memory are the same errors in all stages.
-            StructureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
-            StructureError::Memory(error) => Self::Surface(error.into()),
-            error => Self::Structure(error),
-        }
-    }
-}
-
-impl From<MapError> for JobError {
-    fn from(error: MapError) -> Self {
-        match error {
-            MapError::Cancelled => Self::Surface(SurfaceError::Cancelled),
-            MapError::Memory(error) => Self::Surface(error.into()),
-            error => Self::Map(error),
-        }
-    }
-}
-
-impl From<PictureError> for JobError {
-    fn from(error: PictureError) -> Self {
-        match error {
-            PictureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
-            PictureError::Memory(error) => Self::Surface(error.into()),
-            PictureError::Device { why } => Self::Surface(SurfaceError::Device { why }),
-            error => Self::Picture(error),
-        }
-    }
-}
-
 /// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh. Reports to
 /// `progress`, not to the observer of `control`. The memory of the product stays added to the meter of `control`.
 ///
@@ -270,6 +218,22 @@ pub fn run_with<S: Deref<Target = Structure>>(
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
     job.check(limits)?;
+    let Some(address) = job.tile else { return run_whole(read, job, limits, choice, control, progress, sink) };
+    let clock = StageClock::new(progress);
+    let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
+    tileset.product(address, choice, &limits.surface, control, clock, progress)
+}
+
+/// Runs a job on the whole structure.
+fn run_whole<S: Deref<Target = Structure>>(
+    read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
+    job: &Job,
+    limits: &JobLimits,
+    choice: &Choice<'_>,
+    control: &Control<'_>,
+    progress: &dyn ProgressSink,
+    sink: Option<&GlbSink<'_>>,
+) -> Result<Product, JobError> {
     let clock = StageClock::new(progress);
     let control = Control { observer: &clock, ..control.clone() };
     let (structure, selected, spheres) = load(read, job, &limits.read, &clock, &control)?;
@@ -339,8 +303,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
-    let mut product =
-        Product { mesh, bounds, storage, report, areas, pieces: None, picture: None, streamed_bytes: None };
+    let mut product = Product { bounds, areas, ..Product::new(mesh, storage, report) };
     product.compress(job, &control, progress)?;
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
         let clock = StageClock::new(progress);

@@ -5,17 +5,19 @@
 
 mod canonical;
 mod choices;
+mod domain;
 mod table;
 mod values;
 
 use thiserror::Error;
 
 pub use canonical::canonical;
-pub use table::{Domain, Parameter, TABLE, usual_range};
+pub use domain::Domain;
+pub use table::{Parameter, TABLE, usual_range};
 use values::ParsedValues;
 
 use super::nearest::nearest;
-use super::{Cavities, Interface, Job};
+use super::{Cavities, Interface, Job, tileset};
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Context, Selection, Split};
@@ -125,6 +127,9 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     check_pockets(&request.job)?;
     check_exact(&request.job)?;
     check_simplify(&request.job)?;
+    if request.job.tile.is_some() {
+        tileset::check(&request.job)?;
+    }
     if let Some(format) = request.format {
         set_format(&mut request.job, format)?;
     }
@@ -245,8 +250,8 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
 /// a format with the nearest atom of each vertex sets `atom_ids`.
 ///
 /// # Errors
-/// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals`, `instances` or a picture parameter that the
-/// format does not support.
+/// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals`, `instances`, `tile` or a picture parameter that
+/// the format does not support.
 pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
         let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::name).collect();
@@ -271,6 +276,9 @@ pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
         return refuse("normals", job.normals.name(), Normals::Smooth.name(), &|f| !f.is_picture());
     }
     job.params.atom_ids |= format.needs_atom_ids();
+    if let Some(tile) = job.tile.filter(|_| format.is_picture()) {
+        return refuse("tile", &tile.path(), "no value", &|f| !f.is_picture());
+    }
     if format.is_picture() {
         job.picture.get_or_insert_default();
         return Ok(());

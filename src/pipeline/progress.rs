@@ -8,13 +8,14 @@ use super::ProgressSink;
 const UNIT: f64 = 1000.0;
 
 /// Stages with their typical shares of the time, in execution order.
-const STAGES: [(&str, f64); 19] = [
+const STAGES: [(&str, f64); 21] = [
     ("read", 0.09),
     ("select", 0.02),
+    ("index", 0.01),
     ("exact", 0.01),
     ("pockets", 0.01),
     ("bin", 0.03),
-    ("field", 0.37),
+    ("field", 0.35),
     ("classify", 0.05),
     ("scan", 0.02),
     ("refine", 0.02),
@@ -23,6 +24,7 @@ const STAGES: [(&str, f64); 19] = [
     ("write", 0.05),
     ("cavities", 0.01),
     ("simplify", 0.01),
+    ("clip", 0.01),
     ("color", 0.01),
     ("measure", 0.04),
     ("draw", 0.03),

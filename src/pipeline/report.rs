@@ -150,8 +150,8 @@ pub struct Report {
     pub triangles: u64,
     /// True if the mesh has no boundary. A surface that `split` and `context=whole` divide is checked before that.
     pub closed: bool,
-    /// Reason why the mesh has a boundary: `cut` (`context=whole`). Absent if `closed` is true, or if a check found a
-    /// defect.
+    /// Reason why the mesh has a boundary: `cut` (`context=whole`, or a tile, which is measured without its skirts).
+    /// Absent if `closed` is true, or if a check found a defect.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub open_reason: Option<&'static str>,
     /// True if all triangles have consistent winding.

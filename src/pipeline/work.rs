@@ -22,6 +22,9 @@ const TRIES: f64 = 1.5;
 /// Work of a pixel of a picture, in atoms: 100 ns on one core. An atom takes 4 µs on two cores.
 const PIXEL: f64 = 0.0125;
 
+/// Atoms around a tile at 0.5 Å. Tiles of other levels have as many grid points.
+const TILE_ATOMS: f64 = 3_000.0;
+
 /// Estimates the work of meshing, without reading, in atoms at 0.5 Å.
 #[must_use]
 pub fn mesh_work(atoms: f64, resolution: f64) -> f64 {
@@ -62,6 +65,9 @@ pub fn estimate_atoms(input: &[u8]) -> f64 {
 /// Estimates the work of a job on a file of about `atoms` atoms, in atoms at 0.5 Å.
 #[must_use]
 pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
+    if job.tile.is_some() {
+        return relative_time(job.params.surface) * mesh_work(atoms.min(TILE_ATOMS), 0.5);
+    }
     let resolution = job.spacing.expected(&job.params, atoms);
     let mesh = if job.spacing.max_triangles().is_some() { search_work } else { mesh_work };
     // Reading does not depend on the spacing.

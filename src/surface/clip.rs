@@ -50,10 +50,9 @@ impl Mesh {
         self.drop_unused_vertices(control).map(drop)
     }
 
-    /// Adds skirts to a clipped mesh with the grid spacing `spacing`, whose box has faces at a distance of `half` from
-    /// the centre. A skirt is a strip of triangles from an edge on a face of the box into the molecule, one spacing
-    /// deep. It hides the gap to an adjacent mesh with another spacing. Lengths are in Å.
-    pub(crate) fn add_skirts(&mut self, half: f64, spacing: f64) {
+    /// Returns the directed edges on the boundary of a clipped mesh with the grid spacing `spacing`. The faces of its
+    /// box are at a distance of `half` from the centre. Lengths are in Å.
+    pub(crate) fn boundary(&self, half: f64, spacing: f64) -> Vec<[u32; 2]> {
         // Vertices that are not on a face are at least 1/1024 of a spacing away from it.
         let near = half - 2e-4 * spacing;
         // Faces on which each vertex lies, as bits.
@@ -69,6 +68,12 @@ impl Mesh {
         let mut boundary: Vec<[u32; 2]> =
             on_face.iter().copied().filter(|[a, b]| !on_face.contains(&[*b, *a])).collect();
         boundary.sort_unstable();
+        boundary
+    }
+
+    /// Adds skirts to a clipped mesh with this boundary. A skirt is a strip of triangles from an edge of the boundary
+    /// into the molecule, one grid spacing (Å) deep. It hides the gap to an adjacent mesh with another spacing.
+    pub(crate) fn add_skirts(&mut self, boundary: &[[u32; 2]], spacing: f64) {
         let mut upper: Vec<u32> = boundary.as_flattened().to_vec();
         upper.sort_unstable();
         upper.dedup();
@@ -90,7 +95,7 @@ impl Mesh {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::{Backend, CpuBackend, SurfaceLimits, SurfaceOptions};
+    use crate::surface::{Backend, CpuBackend, Measures, SurfaceLimits, SurfaceOptions, Validation};
 
     #[test]
     fn skirts_close_the_edges_of_a_clipped_mesh() {
@@ -109,7 +114,15 @@ mod tests {
         };
         let (before, n_vertices, n_triangles) = (open(&mesh), mesh.n_vertices(), mesh.n_triangles());
         assert!(before.len() > 20);
-        mesh.add_skirts(2.0, 0.5);
+        let boundary = mesh.boundary(2.0, 0.5);
+        assert_eq!(boundary.iter().copied().collect::<FxHashSet<_>>(), before);
+        let control = Control::default();
+        let [part, exact] =
+            [Measures::of_part(&mesh, before.len(), &control), Measures::of(&mesh, Validation::Exact, &control)];
+        let (part, exact) = (part.unwrap(), exact.unwrap());
+        assert_eq!((part.euler, part.closed, part.oriented, part.manifold), (exact.euler, false, true, false));
+        assert_eq!((exact.closed, exact.oriented, exact.manifold, part.area), (false, true, false, exact.area));
+        mesh.add_skirts(&boundary, 0.5);
         assert_eq!(mesh.n_triangles(), n_triangles + 2 * before.len());
         // All open edges are now those of the skirts.
         assert!(open(&mesh).iter().all(|edge| edge.iter().any(|v| *v as usize >= n_vertices)));

@@ -101,6 +101,19 @@ impl Measures {
         Ok(Self::new(components, size, topology, validation))
     }
 
+    /// Measures a part of a closed manifold mesh, with `boundary` edges where it was cut. The topology follows from the
+    /// numbers of vertices, triangles and these edges.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    pub(crate) fn of_part(mesh: &Mesh, boundary: usize, control: &Control<'_>) -> Result<Self, SurfaceError> {
+        let _labels = control.reserve(2 * size_of::<u32>() as u64 * mesh.n_vertices() as u64)?;
+        let (components, _) = components_of(mesh, control)?;
+        let (vertices, triangles) = (mesh.n_vertices() as u64, mesh.n_triangles() as u64);
+        let topology = Topology::of_part(triangles, boundary as u64);
+        Ok(Self::new(components, [vertices, triangles], topology, Validation::Checksum))
+    }
+
     /// Returns the measures of a mesh of `triangles` with the result of `validation`.
     ///
     /// # Errors

@@ -19,6 +19,12 @@ pub struct Topology {
 }
 
 impl Topology {
+    /// Returns the topology of a part of a closed manifold, in which `boundary` edges have one triangle.
+    pub(super) const fn of_part(n_triangles: u64, boundary: u64) -> Self {
+        let closed = boundary == 0;
+        Self { edges: (n_triangles * 3).midpoint(boundary), closed, oriented: true, manifold: closed }
+    }
+
     /// Returns the topology of a closed manifold, in which every edge has two triangles.
     pub(super) const fn of_closed(n_triangles: u64) -> Self {
         Self { edges: n_triangles * 3 / 2, closed: true, oriented: true, manifold: true }

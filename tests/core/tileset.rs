@@ -5,12 +5,14 @@ use std::collections::HashMap;
 use std::fmt::Write;
 
 use molmesh::formats::tileset::TileAddress;
-use molmesh::pipeline::tileset::{Tileset, check};
-use molmesh::pipeline::{Choice, JobError, JobLimits, params, run};
-use molmesh::structure::{self, ReadLimits};
+use molmesh::pipeline::tileset::check;
+use molmesh::pipeline::{Choice, JobError, JobLimits, StageClock, params, run};
+use molmesh::structure::{self, ReadLimits, Structure};
 use molmesh::surface::{Control, CpuBackend, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
 
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
+
+type Tileset = molmesh::pipeline::tileset::Tileset<Box<Structure>>;
 
 fn tileset(pairs: &[(&str, &str)]) -> Tileset {
     tileset_of(SAMPLE, pairs)
@@ -20,7 +22,7 @@ fn tileset_of(file: &[u8], pairs: &[(&str, &str)]) -> Tileset {
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     check(&job).unwrap();
     let read = |control: &Control<'_>| structure::read_with(file, &ReadLimits::default(), control).map(Box::new);
-    Tileset::new(read, job, &ReadLimits::default(), &Control::default(), &()).unwrap()
+    Tileset::new(read, &job, &ReadLimits::default(), &Control::default(), &StageClock::new(&())).unwrap()
 }
 
 /// Returns the meshes of all tiles of a level.
@@ -128,7 +130,8 @@ fn coarse_levels_group_atoms_and_keep_the_shape() {
 fn too_many_tiles_are_rejected() {
     let job = |resolution| params::parse([("radius_offset", "10"), ("resolution", resolution)]).unwrap().job;
     let read = |control: &Control<'_>| structure::read_with(SAMPLE, &ReadLimits::default(), control).map(Box::new);
-    let new = |resolution| Tileset::new(read, job(resolution), &ReadLimits::default(), &Control::default(), &());
+    let clock = StageClock::new(&());
+    let new = |resolution| Tileset::new(read, &job(resolution), &ReadLimits::default(), &Control::default(), &clock);
     let Err(JobError::Surface(SurfaceError::TooManyTiles { limit, .. })) = new("0.01") else { panic!("accepted") };
     assert!(new("0.2").is_ok_and(|tileset| (tileset.tiles().len() as u64) < limit));
 }
@@ -143,4 +146,44 @@ fn no_level_misses_atoms_that_are_far_apart() {
             assert!(found.closed && found.components.len() == 2, "{surface} {level}: {}", found.components.len());
         }
     }
+}
+
+#[test]
+fn a_job_can_mesh_one_tile() {
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "" };
+    let pairs = [("resolution", "0.25"), ("atom_ids", "true"), ("color", "chain")];
+    let tileset = tileset(&pairs);
+    let made = |tile: &str| {
+        let job = params::parse(pairs.iter().copied().chain([("tile", tile)])).unwrap().job;
+        run(SAMPLE, &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
+    };
+    let mut triangles = 0;
+    for address in tileset.tiles() {
+        let product = made(&address.path()).unwrap();
+        let tile = tileset.mesh(*address, &backend, &SurfaceLimits::default(), &Control::default()).unwrap();
+        let report = &product.report;
+        assert_eq!(report.resolution, tileset.spacing(address.level));
+        let Some(tile) = tile else {
+            assert_eq!(report.triangles, 0);
+            continue;
+        };
+        // The triangles of the tile come first, then the skirts.
+        let measures = measured(&tile);
+        assert_eq!((report.closed, report.euler, report.area), (measures.closed, measures.euler, measures.area));
+        assert_eq!(report.open_reason, (!measures.closed).then_some("cut"));
+        assert_eq!(report.triangles as usize > tile.n_triangles(), !measures.closed);
+        assert_eq!(
+            product.mesh.triangles.iter().take(tile.n_triangles()).collect::<Vec<_>>(),
+            tile.triangles.iter().collect::<Vec<_>>()
+        );
+        assert_eq!(
+            product.mesh.atom_ids.iter().flatten().take(tile.n_vertices()).collect::<Vec<_>>(),
+            tile.atom_ids.iter().flatten().collect::<Vec<_>>()
+        );
+        triangles += tile.n_triangles() as u64;
+    }
+    assert!(triangles > 100_000, "{triangles}");
+    let Err(JobError::Surface(SurfaceError::BadParameter { name, expected, .. })) = made("9/0/0/0") else { panic!() };
+    assert_eq!((name, &*expected), ("tile", "a tile of the tileset, whose levels are 0 to 2"));
 }

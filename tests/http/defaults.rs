@@ -148,6 +148,7 @@ fn a_default_is_valid_with_every_parameter() {
         &[("pockets", "true"), ("pocket_probe", "5")],
         &[("simplify", "0.1")],
         &[("simplify", "0.2"), ("max_triangles", "20000")],
+        &[("tile", "0/0/0/0")],
         &[("color", "pocket")],
         &[("color", "chain")],
         &[("color", "bfactor"), ("palette", "blue-white-red"), ("color_range", "0,50")],

@@ -52,3 +52,4 @@ mod slow_readers;
 mod spacing;
 mod stop;
 mod store;
+mod tilesets;

@@ -40,6 +40,9 @@ fn archive(dir: &Path, id: &str, bytes: &[u8]) {
     std::fs::write(folder.join(format!("{id}.pdb")), bytes).unwrap();
 }
 
+/// Documents of an entry or a stored structure.
+const DOCUMENTS: [&str; 5] = ["atoms", "colors?scheme=chain", "areas?surface=sas", "tileset.json", "tileset.subtree"];
+
 /// Operations that take a structure.
 const UPLOADS: [&str; 4] = ["/v1/meshes", "/v1/report", "/v1/estimate", "/v1/structures"];
 
@@ -171,16 +174,32 @@ fn surfaces(seen: &Seen, server: &Running) {
     get(&structure, &[("if-none-match", &etag)], 304);
     get(&structure, &[("if-match", "\"other\"")], 412);
     get(&format!("/v1/structures/{ZERO}"), &[], 404);
-    get(&format!("/v1/structures/{ZERO}/atoms"), &[], 404);
-    get("/v1/pdb/9xyz/atoms", &[], 404);
-    get(&format!("/v1/structures/{ZERO}/colors?scheme=chain"), &[], 404);
-    get(&format!("/v1/structures/{ZERO}/areas?surface=sas"), &[], 404);
-    get("/v1/pdb/9xyz/colors?scheme=chain", &[], 404);
-    get("/v1/pdb/9xyz/areas?surface=sas", &[], 404);
+    for document in DOCUMENTS {
+        get(&format!("/v1/structures/{ZERO}/{document}"), &[], 404);
+        get(&format!("/v1/pdb/9xyz/{document}"), &[], 404);
+    }
     get("/v1/pdb/9xyz/report.json", &[], 404);
     get(&format!("/v1/structures/{ZERO}/report.json"), &[], 404);
     get(&format!("/v1/results/{ZERO}.glb"), &[], 404);
     get(&format!("/v1/results/{ZERO}/report.json"), &[], 404);
+}
+
+/// Tilesets of entries and stored structures.
+fn tilesets(seen: &Seen, server: &Running) {
+    let structure = location(&seen.ask(server.addr, "POST", "/v1/structures", &[], SAMPLE));
+    let files = ["tileset.json", "tileset.subtree"];
+    for tileset in
+        [structure.as_str(), "/v1/pdb/4pti"].iter().flat_map(|base| files.map(|file| format!("{base}/{file}")))
+    {
+        let get = |path: &str, headers: &[(&str, &str)], status: u16| {
+            seen.expect(status, server.addr, ("GET", path), headers, b"")
+        };
+        let tag = get(&tileset, &[], 200).header("etag").unwrap().to_owned();
+        get(&tileset, &[("if-none-match", &tag)], 304);
+        get(&tileset, &[("if-match", "\"other\"")], 412);
+        get(&format!("{tileset}?x=1"), &[], 400);
+        get(&format!("{tileset}?chains=Z"), &[], 422);
+    }
 }
 
 /// Jobs that succeed, fail, are cancelled or exceed their deadline.
@@ -241,9 +260,9 @@ fn sizes(seen: &Seen) {
         seen.note("POST", path, &late).unwrap();
     }
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/surface.glb"), &[], b"");
-    seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
-    seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/colors?scheme=chain"), &[], b"");
-    seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/areas?surface=sas"), &[], b"");
+    for document in DOCUMENTS {
+        seen.expect(413, small.addr, ("GET", &format!("/v1/pdb/4pti/{document}")), &[], b"");
+    }
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/report.json"), &[], b"");
     let remote = Remote::saying(status(500));
     let away = fake(Mode::Octahedra, |c| {
@@ -252,9 +271,9 @@ fn sizes(seen: &Seen) {
         c.archive.attempts = 1;
     });
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/surface.glb"), &[], b"");
-    seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/atoms"), &[], b"");
-    seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/colors?scheme=chain"), &[], b"");
-    seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/areas?surface=sas"), &[], b"");
+    for document in DOCUMENTS {
+        seen.expect(424, away.addr, ("GET", &format!("/v1/pdb/9xyz/{document}")), &[], b"");
+    }
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/report.json"), &[], b"");
     let few = fake(Mode::Octahedra, |c| c.limits.labels = 10);
     seen.expect(422, few.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
@@ -293,9 +312,9 @@ fn failures(seen: &Seen) {
     // The request alone exceeds the first limit, and together with its connection the second one.
     for (memory_bytes, status) in [(1_000, 422), (400_000, 503)] {
         let crowded = fake(Mode::Octahedra, |c| c.limits.memory_bytes = memory_bytes);
-        seen.expect(status, crowded.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
-        seen.expect(status, crowded.addr, ("GET", "/v1/pdb/4pti/colors?scheme=chain"), &[], b"");
-        seen.expect(status, crowded.addr, ("GET", "/v1/pdb/4pti/areas?surface=sas"), &[], b"");
+        for document in DOCUMENTS {
+            seen.expect(status, crowded.addr, ("GET", &format!("/v1/pdb/4pti/{document}")), &[], b"");
+        }
         for path in UPLOADS {
             seen.expect(status, crowded.addr, ("POST", path), &[], SAMPLE);
         }
@@ -326,9 +345,9 @@ fn restarts(seen: &Seen) {
     let get = |server: &Running, path: &str, status| seen.expect(status, server.addr, ("GET", path), &[], b"");
     let server = begin(|c| c.limits.inflated_bytes = 1_000);
     get(&server, &structure, 413);
-    get(&server, &format!("{structure}/atoms"), 413);
-    get(&server, &format!("{structure}/colors?scheme=chain"), 413);
-    get(&server, &format!("{structure}/areas?surface=sas"), 413);
+    for document in DOCUMENTS {
+        get(&server, &format!("{structure}/{document}"), 413);
+    }
     get(&server, &format!("{surface}?resolution=2"), 413);
     get(&server, &format!("{structure}/report.json"), 413);
     assert!(server.join());
@@ -341,9 +360,9 @@ fn restarts(seen: &Seen) {
     for (change, status) in tight {
         let server = begin(change);
         get(&server, &structure, status);
-        get(&server, &format!("{structure}/atoms"), status);
-        get(&server, &format!("{structure}/colors?scheme=chain"), status);
-        get(&server, &format!("{structure}/areas?surface=sas"), status);
+        for document in DOCUMENTS {
+            get(&server, &format!("{structure}/{document}"), status);
+        }
         if status == 503 {
             get(&server, &format!("{surface}?resolution=2"), status);
             get(&server, &format!("{structure}/report.json"), status);
@@ -402,6 +421,7 @@ fn the_server_returns_every_documented_status_and_no_other() {
     plain(&seen, &server);
     uploads(&seen, &server);
     surfaces(&seen, &server);
+    tilesets(&seen, &server);
     jobs(&seen);
     sizes(&seen);
     failures(&seen);

@@ -124,6 +124,12 @@ fn mesh_parameters(names: &[&str]) -> impl Iterator<Item = Parameter> {
     names.iter().filter_map(|name| TABLE.iter().find(|parameter| parameter.name == *name)).map(query)
 }
 
+/// Returns the parameters that all tiles of a tileset have in common.
+fn tile_parameters() -> impl Iterator<Item = &'static params::Parameter> {
+    let others = ["format", "check", "tile"];
+    TABLE.iter().filter(move |p| !others.contains(&p.name) && !params::PICTURES.contains(&p.name))
+}
+
 /// Describes a query parameter that is not, or not in this form, one of a mesh.
 fn own(name: &str, required: Required, doc: impl Into<String>, schema: ObjectBuilder) -> Parameter {
     let builder = ParameterBuilder::new().name(name).parameter_in(ParameterIn::Query).required(required);
@@ -182,6 +188,14 @@ parameters!(
         let file = path("file", doc).schema(Some(Ref::from_schema_name(SURFACE_FILE))).build();
         std::iter::once(file).chain(TABLE.iter().filter(|p| p.name != "format").map(query)).collect()
     }
+);
+parameters!(
+    /// Query parameters of a tileset.
+    TilesetParameters: tile_parameters().map(query).collect()
+);
+parameters!(
+    /// Query parameters of a subtree.
+    SubtreeParameters: tile_parameters().map(query).chain(mesh_parameters(&["tile"])).collect()
 );
 parameters!(
     /// Query parameters of the colours of atoms.

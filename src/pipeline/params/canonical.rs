@@ -16,6 +16,7 @@ pub fn canonical(job: &Job) -> String {
         cavities,
         pockets,
         simplify,
+        tile,
         spacing,
         validation,
         compress,
@@ -70,6 +71,7 @@ pub fn canonical(job: &Job) -> String {
         pockets.map(|probe| format!("pockets={probe}")),
         simplify.map(|wanted| format!("simplify={}", wanted.error)),
         simplify.and_then(|wanted| wanted.max_triangles).map(|limit| format!("max_triangles={limit}")),
+        tile.map(|tile| format!("tile={}", tile.path())),
         exact.then(|| "exact=true".to_owned()),
         // Quotes the names, which may contain `&`.
         interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),

@@ -2,58 +2,13 @@
 
 use std::str::FromStr;
 
-use super::ParamError;
 use super::choices::{BLENDS, CAVITIES, COMPRESS, CONTEXTS, FORMATS, NORMALS, PALETTES, SPLITS, STYLES, UNITS, VIEWS};
+use super::{Domain, ParamError};
 use crate::picture::{Background, MAX_SIDE};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::pipeline::{areas, color};
 use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{POCKET_PROBES, Preset, SIMPLIFY_ERRORS, SurfaceKind, Validation};
-
-/// Domain of a parameter.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Domain {
-    /// A number within inclusive bounds, with a unit (may be empty).
-    Number {
-        /// Lowest value.
-        min: f64,
-        /// Highest value.
-        max: f64,
-        /// Unit, such as `Å`.
-        unit: &'static str,
-    },
-    /// An integer within inclusive bounds.
-    Integer {
-        /// Lowest value.
-        min: i64,
-        /// Highest value.
-        max: i64,
-    },
-    /// `true` or `false`.
-    Flag,
-    /// One of these values.
-    Choice(&'static [&'static str]),
-    /// Free text.
-    Text {
-        /// Description of valid values.
-        expected: &'static str,
-    },
-}
-
-impl Domain {
-    /// Describes the valid values.
-    #[must_use]
-    pub fn expected(&self) -> String {
-        match self {
-            Self::Number { min, max, unit: "" } => format!("a number from {min} to {max}"),
-            Self::Number { min, max, unit } => format!("a number from {min} to {max} {unit}"),
-            Self::Integer { min, max } => format!("a whole number from {min} to {max}"),
-            Self::Flag => "true or false".to_owned(),
-            Self::Choice(words) => format!("one of {}", words.join(", ")),
-            Self::Text { expected } => (*expected).to_owned(),
-        }
-    }
-}
 
 /// One parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -317,6 +272,12 @@ pub const TABLE: &[Parameter] = &[
         "absent",
         "Error of a simplification of the mesh: fewer and larger triangles, whose vertices are vertices of the original mesh. A closed manifold mesh remains one. With max_triangles, ends at that number. The report states the measured deviation, which can be somewhat larger than the error.",
     ),
+    Parameter {
+        name: "tile",
+        domain: Domain::Text { expected: "the address of a tile, level/x/y/z" },
+        default: "absent",
+        doc: "Tile of the structure's tileset to mesh, instead of the whole structure. Skirts at its border hide gaps between levels.",
+    },
     Parameter {
         name: "validation",
         domain: Domain::Choice(Validation::NAMES),

@@ -132,10 +132,7 @@ impl ParsedValues {
             "surface" => self.options.surface = Some(SurfaceKind::from_str(text).ok().ok_or_else(bad)?),
             "probe" => self.options.probe = number()?,
             "resolution" => self.options.resolution = number()?,
-            "detail" => {
-                let level = whole(text).filter(|level| *level < DETAILS.len() as u64);
-                self.request.job.spacing = Spacing::Detail(level.and_then(|l| u8::try_from(l).ok()).ok_or_else(bad)?);
-            }
+            "detail" => job.spacing = Spacing::Detail(level(text).ok_or_else(bad)?),
             "max_triangles" => {
                 let allowed = u64::from(MIN_TRIANGLE_LIMIT)..=u64::from(MAX_TRIANGLE_LIMIT);
                 self.max_triangles = Some(whole(text).filter(|n| allowed.contains(n)).ok_or_else(bad)?);
@@ -145,6 +142,7 @@ impl ParsedValues {
             "radius_scale" => self.options.radius_scale = number()?,
             "radius_offset" => self.options.radius_offset = number()?,
             "simplify" => job.simplify = Some(Simplify { error: bounded().ok_or_else(bad)?, max_triangles: None }),
+            "tile" => job.tile = Some(text.parse().ok().ok_or_else(bad)?),
             "cutoff_tolerance" => self.options.cutoff_tolerance = number()?,
             "paper_a" => self.options.paper_a = number()?,
             "paper_b" => self.options.paper_b = number()?,
@@ -209,6 +207,11 @@ fn named<T: Copy>(all: &[T], name: impl Fn(T) -> &'static str, text: &str) -> Op
 
 fn whole(text: &str) -> Option<u64> {
     text.trim().parse().ok()
+}
+
+/// Parses a level of detail.
+fn level(text: &str) -> Option<u8> {
+    whole(text).filter(|level| *level < DETAILS.len() as u64).and_then(|level| u8::try_from(level).ok())
 }
 
 /// Splits a list at commas. Rejects empty items and control characters.

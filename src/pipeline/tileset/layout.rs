@@ -1,11 +1,9 @@
 //! Cube of a tileset: its levels, and the boxes of its tiles.
 
-use crate::formats::tileset::{TileAddress, TilesetBounds};
+use crate::formats::tileset::{MAX_LEVELS, TileAddress, TilesetBounds};
 
 /// Cells of the grid along the edge of a tile. A tile in a protein then has about 40,000 triangles.
 pub(super) const CELLS: f64 = 64.0;
-/// Maximum number of levels: enough for the largest coordinates at the finest spacing.
-pub const MAX_LEVELS: u32 = 24;
 /// Distance between the coarsest spheres and the faces of the cube, in spacings of the root.
 const MARGIN: f64 = 2.0;
 

@@ -9,35 +9,37 @@ mod level;
 mod write;
 
 use std::collections::BTreeSet;
+use std::fmt;
 use std::ops::Deref;
 use std::sync::Arc;
 
-use serde_json::{Map, Value};
-
 use self::layout::Layout;
-pub use self::layout::MAX_LEVELS;
 use self::level::TilesetLevel;
 pub use self::write::{LevelReport, TilesetReport, WriteError};
-use super::color::{ColorBlend, Coloring, MeshColors, Scheme};
+use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, Scheme};
 use super::params::ParamError;
-use super::{Job, JobError, ProgressSink, StageClock, load, to_atom_indices};
+use super::report::Counts;
+use super::{Choice, Job, JobError, Product, ProgressSink, Report, StageClock, load, to_atom_indices};
 use crate::formats::tileset::{TileAddress, TilesetBounds};
-use crate::formats::{CompressedGlb, Meta, Packing, Pieces, Step, Storage};
+use crate::formats::{Compress, Packing, Step, Storage, Units};
 use crate::structure::{Context, ReadLimits, Selected, Split, Structure, StructureError};
 use crate::surface::clip::influence;
 use crate::surface::{
-    Backend, Control, Mesh, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, Validation,
+    Backend, Control, GridStats, Measures, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits,
+    SurfaceParams, Validation,
 };
 
 /// Maximum number of tiles.
 const MAX_TILES: usize = 1_000_000;
 /// Memory of the address of a tile, bytes.
 const TILE_BYTES: u64 = 64;
-/// Spheres between two checks of the cancellation flag.
-const PER_CHECK: usize = 1 << 10;
+/// Spheres or tiles between two checks of the cancellation flag.
+const PER_CHECK: usize = 1 << 14;
 
 /// Levels and tiles of a structure.
-pub struct Tileset {
+pub struct Tileset<S> {
+    structure: S,
+    /// The job without its tile.
     job: Job,
     layout: Layout,
     levels: Vec<TilesetLevel>,
@@ -45,17 +47,12 @@ pub struct Tileset {
     tiles: BTreeSet<TileAddress>,
     selected: Selected,
     colors: Option<MeshColors>,
-    /// PDB id or data block name of the structure.
-    name: Option<String>,
 }
 
-/// File of a tile.
-#[derive(Debug, Clone)]
-pub struct TileFile {
-    /// GLB, compressed with meshopt.
-    pub glb: Vec<u8>,
-    /// Number of triangles, including skirts.
-    pub triangles: u64,
+impl<S> fmt::Debug for Tileset<S> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Tileset").field("layout", &self.layout).finish_non_exhaustive()
+    }
 }
 
 /// Rejects parameters of a job that do not apply to tiles.
@@ -77,6 +74,7 @@ pub fn check(job: &Job) -> Result<(), ParamError> {
         ("exact", job.exact, "false"),
         ("max_triangles", job.max_triangles().is_some(), "no value"),
         ("simplify", job.simplify.is_some(), "no value"),
+        ("units", job.units != Units::Angstrom, "angstrom"),
         ("paper_b", job.params.paper.is_some(), "no value"),
         ("validation", job.validation != Validation::default(), "checksum"),
     ];
@@ -89,55 +87,34 @@ pub fn check(job: &Job) -> Result<(), ParamError> {
     }
 }
 
-impl Tileset {
+impl<S: Deref<Target = Structure>> Tileset<S> {
     /// Prepares the levels of the structure that `read` returns. The grid spacing of `job` is that of the last level.
     ///
     /// # Errors
     /// Returns a [`JobError`] if reading or selecting fails, a colour scheme has no values, or the job is cancelled.
-    pub fn new<S: Deref<Target = Structure>>(
+    pub fn new(
         read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
-        job: Job,
+        job: &Job,
         limits: &ReadLimits,
         control: &Control<'_>,
-        progress: &dyn ProgressSink,
+        clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
-        let clock = StageClock::new(progress);
-        let (structure, selected, spheres) = load(read, &job, limits, &clock, control)?;
-        let color = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, None, control);
-        let colors = job.color.map(color).transpose()?;
-        let name = structure.id.clone();
-        drop(structure);
-        let params = job.params_for(spheres.len());
-        let bounds = spheres.bounds().ok_or(SurfaceError::NoSpheres)?;
-        let layout = Layout::new(bounds, influence(&spheres, &params), params.resolution);
-        let spheres = Arc::new(spheres);
-        let (mut levels, mut tiles) = (Vec::new(), BTreeSet::new());
-        for number in (0..layout.levels).rev() {
-            let level = TilesetLevel::new(&spheres, &params, [layout.spacing(number), layout.side(number)], control)?;
-            let finer = tiles.iter().take_while(|tile: &&TileAddress| tile.level == number + 1);
-            let mut parents: BTreeSet<TileAddress> = finer.filter_map(|tile| tile.parent()).collect();
-            tiles.append(&mut parents);
-            let reach = influence(&level.spheres, &params);
-            for i in 0..level.spheres.len() {
-                if i.is_multiple_of(PER_CHECK) {
-                    control.check()?;
-                }
-                let centre = level.spheres.centre(i);
-                for tile in layout.touched(number, [centre.map(|c| c - reach), centre.map(|c| c + reach)]) {
-                    if !tiles.insert(tile) {
-                        continue;
-                    }
-                    control.memory.grow(TILE_BYTES).map_err(SurfaceError::from)?;
-                    if tiles.len() > MAX_TILES {
-                        let (limit, resolution) = (MAX_TILES as u64, params.resolution);
-                        return Err(SurfaceError::TooManyTiles { limit, resolution }.into());
-                    }
-                }
-            }
-            levels.push(level);
-        }
-        levels.reverse();
-        Ok(Self { job, layout, levels, tiles, selected, colors, name })
+        let job = Job { tile: None, ..job.clone() };
+        let (structure, selected, spheres) = load(read, &job, limits, clock, control)?;
+        clock.time("index", || {
+            let color = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, None, control);
+            let colors = job.color.map(color).transpose()?;
+            let params = job.params_for(spheres.len());
+            let bounds = spheres.bounds().ok_or(SurfaceError::NoSpheres)?;
+            let layout = Layout::new(bounds, influence(&spheres, &params), params.resolution);
+            let (levels, tiles) = layout.index(&Arc::new(spheres), &params, control)?;
+            Ok(Self { structure, job, layout, levels, tiles, selected, colors })
+        })
+    }
+
+    /// Returns the structure.
+    pub const fn structure(&self) -> &S {
+        &self.structure
     }
 
     /// Returns the cube and the levels.
@@ -158,21 +135,48 @@ impl Tileset {
         self.layout.spacing(level)
     }
 
-    /// Meshes a tile and compresses it; `None` if the surface does not pass through it.
+    /// Meshes a tile, adds skirts and encodes it. The mesh is empty if the surface does not pass through the tile. The
+    /// memory of the product stays added to the meter of `control`. Its report includes the times of `clock`.
     ///
     /// # Errors
-    /// Returns the errors of meshing and compression.
-    pub fn tile(
+    /// Returns the errors of meshing and compression, and [`SurfaceError::BadParameter`] for a tile outside the cube.
+    pub fn product(
         &self,
         address: TileAddress,
-        backend: &dyn Backend,
+        choice: &Choice<'_>,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Option<TileFile>, JobError> {
-        // Releases all memory that is counted for the tile. The file is not counted.
-        let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
-        let mesh = self.mesh(address, backend, limits, control)?;
-        mesh.map(|mesh| self.compressed(mesh, address, control)).transpose()
+        clock: StageClock<'_>,
+        progress: &dyn ProgressSink,
+    ) -> Result<Product, JobError> {
+        let control = Control { observer: &clock, ..control.clone() };
+        let (output, color) = self.output(address, choice.backend, limits, &control, &clock)?;
+        let MeshOutput { mut mesh, grid, made_by, .. } = output;
+        let (half, resolution) = (0.5 * self.layout.side(address.level), self.layout.spacing(address.level));
+        let boundary = clock.time("clip", || mesh.boundary(half, resolution));
+        // Without the skirts.
+        let measure = || Measures::of_part(&mesh, boundary.len(), &control);
+        let measures = clock.time(Stage::Measure.name(), measure)?;
+        clock.time("clip", || mesh.add_skirts(&boundary, resolution));
+        // The same step for all tiles of a level.
+        let packing = match self.job.compress {
+            Compress::None => Packing::Full,
+            Compress::Quantize | Compress::Meshopt => Packing::Quantized(Step::covering(half + resolution)),
+        };
+        if let Some(step) = packing.step() {
+            mesh.quantize(step);
+        }
+        let storage = Storage { packing, normals: self.job.normals, units: self.job.units };
+        let (n_vertices, n_triangles, centre) = (mesh.n_vertices(), mesh.n_triangles(), mesh.centre);
+        let counts =
+            Counts { resolution, centre, tries: None, grid, n_vertices, n_triangles, cut: true, made_by, storage };
+        let control = Control { observer: &(), ..control };
+        let times = clock.finish();
+        let mut report = Report::new(&self.structure, &self.selected, &self.job, choice, &counts, &measures, times);
+        report.color = color;
+        let mut product = Product::new(mesh, storage, report);
+        product.compress(&self.job, &control, progress)?;
+        Ok(product)
     }
 
     /// Meshes a tile; `None` if the surface does not pass through it. The mesh has a boundary at the faces of the tile.
@@ -186,8 +190,24 @@ impl Tileset {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Option<Mesh>, JobError> {
-        if !self.tiles.contains(&address) {
-            return Ok(None);
+        let (output, _) = self.output(address, backend, limits, control, &StageClock::new(&()))?;
+        Ok(Some(output.mesh).filter(|mesh| mesh.n_triangles() > 0))
+    }
+
+    /// Meshes a tile and colours it.
+    fn output(
+        &self,
+        address: TileAddress,
+        backend: &dyn Backend,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+        clock: &StageClock<'_>,
+    ) -> Result<(MeshOutput, Option<ColorReport>), JobError> {
+        let levels = self.layout.levels;
+        if !address.is_valid(levels) {
+            let (value, last) = (format!("`{}`", address.path()), levels - 1);
+            let expected = format!("a tile of the tileset, whose levels are 0 to {last}");
+            return Err(SurfaceError::BadParameter { name: "tile", value, expected }.into());
         }
         let level = &self.levels[address.level as usize];
         let (spacing, bounds) = (self.layout.spacing(address.level), self.layout.tile(address));
@@ -198,47 +218,66 @@ impl Tileset {
             ..self.job.params.clone()
         };
         let near = level.near(bounds, influence(&level.spheres, &params) + spacing);
-        if near.is_empty() {
-            return Ok(None);
+        let empty = || Ok((MeshOutput::new(Mesh::default(), GridStats::default()), None));
+        if near.is_empty() || !self.tiles.contains(&address) {
+            return empty();
         }
-        let spheres: Spheres = level.spheres.subset(&near);
-        let mut mesh = match backend.run(&spheres, &params, limits, control) {
-            Err(SurfaceError::NoSurface { .. }) => return Ok(None),
-            output => output?.mesh,
+        let spheres = level.spheres.subset(&near);
+        let mut output = match clock.pass(|| backend.run(&spheres, &params, limits, control)) {
+            Err(SurfaceError::NoSurface { .. }) => return empty(),
+            output => output?,
         };
-        mesh.make_contiguous();
-        for id in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()) {
-            *id = level.row(near[*id as usize]);
-        }
-        mesh.clip(bounds, control)?;
+        let mesh = &mut output.mesh;
+        clock.time("clip", || {
+            mesh.make_contiguous();
+            for id in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()) {
+                *id = level.row(near[*id as usize]);
+            }
+            mesh.clip(bounds, control)
+        })?;
         if mesh.triangles.is_empty() {
-            return Ok(None);
+            return empty();
         }
-        if let Some(colors) = &self.colors {
-            colors.apply(&mut mesh, spacing, None, control)?;
-        }
-        to_atom_indices(&mut mesh, &self.job, &self.selected, control)?;
-        Ok(Some(mesh))
+        let color = |colors: &MeshColors| clock.time("color", || colors.apply(mesh, spacing, None, control));
+        let color = self.colors.as_ref().map(color).transpose()?;
+        to_atom_indices(mesh, &self.job, &self.selected, control)?;
+        Ok((output, color))
     }
+}
 
-    /// Quantizes and compresses the mesh of a tile.
-    fn compressed(&self, mut mesh: Mesh, address: TileAddress, control: &Control<'_>) -> Result<TileFile, JobError> {
-        let (half, spacing) = (0.5 * self.layout.side(address.level), self.layout.spacing(address.level));
-        mesh.add_skirts(half, spacing);
-        // The same step for all tiles of a level.
-        let step = Step::covering(half + spacing);
-        mesh.quantize(step);
-        let storage = Storage { packing: Packing::Quantized(step), normals: self.job.normals, units: self.job.units };
-        let grow = |bytes| {
-            control.check()?;
-            control.memory.grow(bytes).map_err(|error| JobError::from(SurfaceError::from(error)))
-        };
-        let pieces = Pieces::new(&mesh, storage, None, grow, |bytes| control.memory.shrink(bytes))?;
-        let extras = Map::from_iter([("spacing".to_owned(), Value::from(spacing))]);
-        let meta = Meta { name: self.name.clone(), extras };
-        let mut glb = Vec::new();
-        let file = CompressedGlb::new(&mesh, &pieces, &meta)?;
-        file.write(&mut glb).map_err(|_unreachable| SurfaceError::Sink)?;
-        Ok(TileFile { glb, triangles: mesh.n_triangles() as u64 })
+impl Layout {
+    /// Returns the levels, coarsest first, and the tiles that the surface of `spheres` can reach, with their ancestors.
+    fn index(
+        &self,
+        spheres: &Arc<Spheres>,
+        params: &SurfaceParams,
+        control: &Control<'_>,
+    ) -> Result<(Vec<TilesetLevel>, BTreeSet<TileAddress>), JobError> {
+        let (mut levels, mut tiles) = (Vec::new(), BTreeSet::new());
+        for number in (0..self.levels).rev() {
+            let level = TilesetLevel::new(spheres, params, [self.spacing(number), self.side(number)], control)?;
+            let finer = tiles.iter().take_while(|tile: &&TileAddress| tile.level == number + 1);
+            let mut parents: BTreeSet<TileAddress> = finer.filter_map(|tile| tile.parent()).collect();
+            tiles.append(&mut parents);
+            let reach = influence(&level.spheres, params);
+            let centres = (0..level.spheres.len()).map(|i| level.spheres.centre(i));
+            let touched = centres.flat_map(|c| self.touched(number, [c.map(|c| c - reach), c.map(|c| c + reach)]));
+            for (n, tile) in touched.enumerate() {
+                if n.is_multiple_of(PER_CHECK) {
+                    control.check()?;
+                }
+                if !tiles.insert(tile) {
+                    continue;
+                }
+                control.memory.grow(TILE_BYTES).map_err(SurfaceError::from)?;
+                if tiles.len() > MAX_TILES {
+                    let (limit, resolution) = (MAX_TILES as u64, params.resolution);
+                    return Err(SurfaceError::TooManyTiles { limit, resolution }.into());
+                }
+            }
+            levels.push(level);
+        }
+        levels.reverse();
+        Ok((levels, tiles))
     }
 }

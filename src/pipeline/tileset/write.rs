@@ -2,15 +2,19 @@
 
 use std::collections::BTreeSet;
 use std::io;
+use std::ops::Deref;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use serde::Serialize;
 use thiserror::Error;
 
 use super::Tileset;
-use crate::formats::tileset::{TileAddress, subtree, tileset_document};
-use crate::pipeline::{JobError, LeftOutReport, ProgressSink};
-use crate::surface::{Backend, Control, SurfaceError, SurfaceLimits, threads};
+use crate::formats::Format;
+use crate::formats::tileset::{TileAddress, TilesetUris, subtree, tileset_document};
+use crate::pipeline::{Choice, JobError, LeftOutReport, ProgressSink, StageClock};
+use crate::structure::Structure;
+use crate::surface::{Control, Reservation, SurfaceError, SurfaceLimits, threads};
 
 /// Contents of a tileset.
 #[derive(Debug, Clone, Serialize)]
@@ -60,7 +64,7 @@ pub enum WriteError {
     },
 }
 
-impl Tileset {
+impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
     /// Meshes all tiles, in parallel, and passes each file with its path to `write`. `tileset.json` comes last, so that
     /// an incomplete tileset cannot be opened.
     ///
@@ -68,7 +72,7 @@ impl Tileset {
     /// Returns a [`WriteError`] for the first tile that cannot be meshed or written.
     pub fn write(
         &self,
-        backend: &dyn Backend,
+        choice: &Choice<'_>,
         limits: &SurfaceLimits,
         control: &Control<'_>,
         progress: &dyn ProgressSink,
@@ -83,12 +87,19 @@ impl Tileset {
         // Not by parallel iterators: a thread that waits within a tile would begin other tiles, without a limit.
         let made = threads::each(addresses.len(), |i| {
             let address = addresses[i];
-            let tile = self.tile(address, backend, limits, control)?;
+            // Releases all memory that is counted for the tile. The file is not counted.
+            let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+            let tile = self.product(address, choice, limits, control, StageClock::new(&()), &())?;
             let n = done.fetch_add(1, Ordering::Relaxed) + 1;
             progress.progress("tiles", n as f64 / addresses.len() as f64);
-            let Some(tile) = tile else { return Ok(None) };
-            let bytes = store(&format!("{}.glb", address.path()), &tile.glb)?;
-            Ok::<_, WriteError>(Some((address, tile.triangles, bytes)))
+            if tile.report.triangles == 0 {
+                return Ok(None);
+            }
+            let mut glb = Vec::new();
+            let written = tile.file(Format::Glb).map(|file| file.write(&mut glb));
+            written.map_err(JobError::from)?.map_err(|_unreachable| JobError::from(SurfaceError::Sink))?;
+            let bytes = store(&format!("{}.glb", address.path()), &glb)?;
+            Ok::<_, WriteError>(Some((address, tile.report.triangles, bytes)))
         })?;
         let made: Vec<(TileAddress, u64, u64)> = made.into_iter().flatten().collect();
         if made.is_empty() {
@@ -112,8 +123,10 @@ impl Tileset {
             bytes += store(&format!("subtrees/{}.subtree", root.path()), &file)?;
             files += 1;
         }
-        bytes += store("tileset.json", tileset_document(&bounds).to_string().as_bytes())?;
+        let address = "{level}/{x}/{y}/{z}";
+        let uris = TilesetUris { content: format!("{address}.glb"), subtrees: format!("subtrees/{address}.subtree") };
+        bytes += store("tileset.json", tileset_document(&bounds, &uris).to_string().as_bytes())?;
         let (atoms, left_out) = (self.selected.atoms.len() as u64, LeftOutReport::new(&self.selected.left_out));
-        Ok(TilesetReport { id: self.name.clone(), atoms, left_out, levels, files: files + 1, bytes })
+        Ok(TilesetReport { id: self.structure.id.clone(), atoms, left_out, levels, files: files + 1, bytes })
     }
 }

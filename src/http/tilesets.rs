@@ -1,0 +1,205 @@
+//! `…/tileset.json` and `…/tileset.subtree`: 3D Tiles tileset of a structure, whose tiles are meshes with the parameter
+//! `tile`.
+//!
+//! A tileset has no state of its own: its address and those of its tiles name the structure and all parameters.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::body::Body;
+use axum::extract::{FromRequestParts, Query};
+use axum::http::header::{self, HeaderMap};
+use axum::http::request::Parts;
+use axum::response::{IntoResponse, Response};
+
+use super::guard::Caller;
+use super::openapi::meshes::NotModified;
+use super::openapi::parameters::{ConditionHeaders, EntryPath, StructurePath, SubtreeParameters, TilesetParameters};
+use super::openapi::problem_responses;
+use super::openapi::problems::READING;
+use super::parsed_request;
+use super::problem::Problem;
+use super::problem_types::ProblemType;
+use super::source::{Loaded, StructureSource};
+use super::state::{Delivery, Shared};
+use crate::formats::Compress;
+use crate::formats::tileset::{TileAddress, TilesetUris, subtree, tileset_document};
+use crate::jobs::{Failure, SharedTileset};
+use crate::pipeline::params::ParamError;
+use crate::pipeline::{Job, StageClock, params, tileset};
+
+problem_responses!(StructureProblems: [
+    READING,
+    [
+        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
+        ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates, ProblemType::GridTooLarge,
+        ProblemType::TooMuchMemory, ProblemType::MemoryFull,
+        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
+    ],
+]);
+problem_responses!(EntryProblems: [READING, [
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable,
+    ProblemType::PreconditionFailed, ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates,
+    ProblemType::GridTooLarge, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
+    ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
+]]);
+
+/// Get the tileset of a structure
+///
+/// Levels of detail of a large structure, in the format 3D Tiles 1.1. Its tiles are computed when they are requested:
+/// `surface.glb` with the parameter `tile`, compressed with meshopt unless `compress` has another value.
+#[utoipa::path(get, path = "/v1/structures/{digest}/tileset.json", tag = "tilesets", operation_id = "showTileset",
+    params(StructurePath, TilesetParameters, ConditionHeaders),
+    responses(
+        (status = 200, description = "The tileset.", body = serde_json::Value, headers(
+            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
+            ("Cache-Control" = String, description = "Caching rules."),
+        )),
+        NotModified, StructureProblems,
+    ))]
+pub(super) async fn of_structure(request: TilesetRequest) -> Result<Response, Problem> {
+    request.document().await
+}
+
+/// Get the tileset of an archive entry
+///
+/// Levels of detail of a large structure, in the format 3D Tiles 1.1. Its tiles are computed when they are requested:
+/// `surface.glb` with the parameter `tile`, compressed with meshopt unless `compress` has another value.
+#[utoipa::path(get, path = "/v1/pdb/{id}/tileset.json", tag = "tilesets", operation_id = "showEntryTileset",
+    params(EntryPath, TilesetParameters, ConditionHeaders),
+    responses(
+        (status = 200, description = "The tileset.", body = serde_json::Value, headers(
+            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
+            ("Cache-Control" = String, description = "Caching rules."),
+        )),
+        NotModified, EntryProblems,
+    ))]
+pub(super) async fn of_entry(request: TilesetRequest) -> Result<Response, Problem> {
+    request.document().await
+}
+
+/// Get a subtree of the tileset of a structure
+///
+/// Binary file that lists the tiles below `tile`, by default below the root, for clients of `tileset.json`.
+#[utoipa::path(get, path = "/v1/structures/{digest}/tileset.subtree", tag = "tilesets", operation_id = "showSubtree",
+    params(StructurePath, SubtreeParameters, ConditionHeaders),
+    responses(
+        (status = 200, description = "The subtree.", body = Vec<u8>, content_type = "application/octet-stream", headers(
+            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
+            ("Cache-Control" = String, description = "Caching rules."),
+        )),
+        NotModified, StructureProblems,
+    ))]
+pub(super) async fn subtree_of_structure(request: TilesetRequest) -> Result<Response, Problem> {
+    request.subtree().await
+}
+
+/// Get a subtree of the tileset of an archive entry
+///
+/// Binary file that lists the tiles below `tile`, by default below the root, for clients of `tileset.json`.
+#[utoipa::path(get, path = "/v1/pdb/{id}/tileset.subtree", tag = "tilesets", operation_id = "showEntrySubtree",
+    params(EntryPath, SubtreeParameters, ConditionHeaders),
+    responses(
+        (status = 200, description = "The subtree.", body = Vec<u8>, content_type = "application/octet-stream", headers(
+            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
+            ("Cache-Control" = String, description = "Caching rules."),
+        )),
+        NotModified, EntryProblems,
+    ))]
+pub(super) async fn subtree_of_entry(request: TilesetRequest) -> Result<Response, Problem> {
+    request.subtree().await
+}
+
+/// Request for a document of a tileset.
+pub(super) struct TilesetRequest {
+    app: Shared,
+    caller: Caller,
+    source: StructureSource,
+    headers: HeaderMap,
+    /// Parameters of the tiles, without `tile`.
+    pairs: Vec<(String, String)>,
+    job: Job,
+}
+
+impl FromRequestParts<Shared> for TilesetRequest {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, app: &Shared) -> Result<Self, Problem> {
+        let query = Query::from_request_parts(parts, app).await;
+        let mut pairs = parsed_request::pairs(query)?;
+        let (mut request, _) = parsed_request::parse_address(Some("surface.glb"), &pairs)?;
+        if pairs.iter().all(|(name, _)| name != "compress") {
+            request.job.compress = Compress::Meshopt;
+            pairs.push(("compress".to_owned(), request.job.compress.name().to_owned()));
+        }
+        tileset::check(&request.job)?;
+        if request.strict {
+            let expected = "no value for a tileset; POST /v1/report checks a file".to_owned();
+            return Err(ParamError::BadValue { name: "check", value: "`strict`".to_owned(), expected }.into());
+        }
+        app.accepts(&request.job)?;
+        pairs.retain(|(name, _)| name != "tile");
+        let caller = Caller::of(&parts.extensions);
+        let source = StructureSource::from_request_parts(parts, app).await?;
+        Ok(Self { app: Arc::clone(app), caller, source, headers: parts.headers.clone(), pairs, job: request.job })
+    }
+}
+
+impl TilesetRequest {
+    /// Answers with `tileset.json`.
+    async fn document(self) -> Result<Response, Problem> {
+        if let Some(tile) = self.job.tile {
+            let (value, expected) = (format!("`{}`", tile.path()), "no value for tileset.json".to_owned());
+            return Err(ParamError::BadValue { name: "tile", value, expected }.into());
+        }
+        let query = form_urlencoded::Serializer::new(String::new()).extend_pairs(&self.pairs).finish();
+        let tile = format!("tile={{level}}/{{x}}/{{y}}/{{z}}&{query}");
+        // Clients such as 3d-tiles-renderer recognize a subtree by the end of its address.
+        let subtrees = format!("tileset.subtree?{tile}#.subtree");
+        let uris = TilesetUris { content: format!("surface.glb?{tile}"), subtrees };
+        self.answer("application/json", move |tileset| {
+            Ok(tileset_document(&tileset.bounds(), &uris).to_string().into_bytes())
+        })
+        .await
+    }
+
+    /// Answers with the subtree below a tile, by default the root.
+    async fn subtree(self) -> Result<Response, Problem> {
+        let root = self.job.tile.unwrap_or(TileAddress::ROOT);
+        self.answer("application/octet-stream", move |tileset| {
+            let levels = tileset.bounds().subtree_levels();
+            if !root.level.is_multiple_of(levels) || !tileset.tiles().contains(&root) {
+                let (value, expected) = (format!("`{}`", root.path()), "the root of a subtree".to_owned());
+                return Err(ParamError::BadValue { name: "tile", value, expected }.into());
+            }
+            // Tiles that the surface only nearly reaches have an empty file.
+            let is_tile = |tile: TileAddress| tileset.tiles().contains(&tile);
+            Ok(subtree(root, levels, is_tile, is_tile))
+        })
+        .await
+    }
+
+    /// Answers with what `write` makes of the tileset, which is prepared on a blocking thread if necessary.
+    async fn answer(
+        self,
+        media_type: &'static str,
+        write: impl FnOnce(&SharedTileset) -> Result<Vec<u8>, Problem> + Send + 'static,
+    ) -> Result<Response, Problem> {
+        let Self { app, caller, source, headers, job, .. } = self;
+        let variant = format!("{media_type}\n{}", params::canonical(&job));
+        let made = async |loaded: Loaded, delivery: Delivery| {
+            app.admit_work(&caller)?;
+            let Loaded { input, digest, reservation } = loaded;
+            let (shared, payer, key) = (Arc::clone(&app), caller.clone(), (caller.namespace, digest));
+            let made = app.read(caller.client, (reservation, delivery), move |control| {
+                let (start, limits) = (Instant::now(), shared.config.limits.job().read);
+                let clock = StageClock::new(&());
+                let tileset = shared.structures().tileset(key, &input, &job, &limits, control, &clock);
+                shared.charge(&payer, start.elapsed());
+                write(&tileset.map_err(Failure::from)?)
+            });
+            Ok(([(header::CONTENT_TYPE, media_type)], Body::from(made.await??)).into_response())
+        };
+        source.document(&app, &caller, &headers, &variant, made).await
+    }
+}
