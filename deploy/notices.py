@@ -25,7 +25,11 @@ SOURCES = (".rs", ".py", ".toml", ".json", ".go", ".sh", ".c", ".h")
 UNUSED = {"tests", "test", "examples", "benches", ".github"}
 MOST_BYTES = 1 << 20
 # Packages bundled in the page at /. The build of the page checks that the texts are up to date.
-VIEWER = (("three.js", "three.txt"), ("meshoptimizer's decoder", "meshoptimizer.txt"))
+VIEWER = (
+    ("three.js", "three.txt"),
+    ("3d-tiles-renderer", "3d-tiles-renderer.txt"),
+    ("meshoptimizer's decoder", "meshoptimizer.txt"),
+)
 
 
 def cargo(*arguments):

@@ -6,6 +6,7 @@ const here = new URL("./", import.meta.url);
 const dist = new URL(`${process.argv[2] ?? "dist"}/`, here);
 const bundled = [
   ["three.js", "three.txt", "node_modules/three/LICENSE"],
+  ["3d-tiles-renderer", "3d-tiles-renderer.txt", "node_modules/3d-tiles-renderer/LICENSE"],
   ["the decoder of meshoptimizer", "meshoptimizer.txt", "node_modules/meshoptimizer/LICENSE.md"],
 ];
 const texts = bundled.map(([name, kept, theirs]) => {

@@ -121,8 +121,12 @@ async fn list(
     job: Job,
     coloring: Coloring,
 ) -> Result<(Bytes, HeaderValue), Problem> {
-    let list = move |structure: &Structure, limits: &ReadLimits, control: &Control<'_>, _: &MemoryReservation| {
-        let selected = structure::select_with(structure, &job.selection, limits, control)?.atoms;
+    let max_atoms = app.config.limits.job().read.max_atoms;
+    let list = move |structure: &Structure, limits: &ReadLimits, control: &Control<'_>, memory: &MemoryReservation| {
+        // The list has the atoms of the file. Copies in an assembly affect only the range of numbers.
+        let limits = ReadLimits { max_atoms, ..*limits };
+        let selected = structure::select_with(structure, &job.selection, &limits, control)?.atoms;
+        memory.grow(size_of::<u32>() as u64 * selected.len() as u64)?;
         let colors = AtomColors::new(structure, &selected, &coloring).map_err(not_colorable)?;
         let list: Vec<u8> = (0..structure.len()).flat_map(|i| colors.of(i)).collect();
         let mut report = colors.report(&selected);

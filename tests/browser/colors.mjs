@@ -194,6 +194,8 @@ await run({
     }).join("\n");
     await waitForMesh(page, () => drop(page, "cube.pdb", Buffer.from(text)));
     await ready(page);
+    // The surface is shown in tiles.
+    await page.waitForFunction(() => /tiles?, /.test(document.querySelector("#now").textContent) && !document.querySelector("#now").textContent.includes("loading"), null, { timeout: TIMEOUT_MS });
     // Other work would delay the first request.
     await waitForFrames(page);
     const before = surfaces();

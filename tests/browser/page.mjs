@@ -44,7 +44,7 @@ await run({
   "every parameter of the API document has a control": async () => {
     const api = JSON.parse((await fetchBytes("/openapi.json")).bytes);
     const parameter = (p) => (p.$ref ? api.components.parameters[p.$ref.split("/").pop()] : p);
-    const names = (described) => described.paths["/v1/meshes"].post.parameters.map(parameter).filter((p) => p.in === "query" && !["format", "color_offset"].includes(p.name)).map((p) => p.name);
+    const names = (described) => described.paths["/v1/meshes"].post.parameters.map(parameter).filter((p) => p.in === "query" && !["format", "color_offset", "tile"].includes(p.name)).map((p) => p.name);
     const controls = (p) => p.locator("[data-parameter]").evaluateAll((nodes) => nodes.map((n) => n.dataset.parameter).sort());
     assert.ok(names(api).length > 20);
     assert.deepEqual(await controls(page), names(api).sort());
@@ -181,7 +181,7 @@ await run({
 
   "errors show the message of the service and a way to correct them": async () => {
     const problem = page.locator("#problem");
-    await page.locator("#p-resolution").fill("0.05");
+    await page.locator("#p-resolution").fill("0.07");
     await page.locator("#p-resolution").press("Enter");
     await problem.locator("strong").waitFor();
     assert.match(await problem.textContent(), /The grid would be too large.*limit/);

@@ -153,7 +153,7 @@ await run({
 
   "a rejected parameter is reset": async () => {
     await unchanged(page, async () => {
-      await set(page, "resolution", "0.05");
+      await set(page, "resolution", "0.07");
       await problem.locator("strong").waitFor();
       assert.match(await problem.textContent(), /^1CRN: The grid would be too large.*as they were before/s);
     });
@@ -252,12 +252,12 @@ await run({
   },
 
   "without a previous surface a rejected parameter can be corrected": async () => {
-    const other = await open(chromium, { viewport, url: `${SERVICE_URL}/?pdb=1crn&resolution=0.05` });
+    const other = await open(chromium, { viewport, url: `${SERVICE_URL}/?pdb=1crn&resolution=0.07` });
     const rejected = other.locator("#problem");
     await rejected.locator("strong", { hasText: "1CRN: The grid would be too large" }).waitFor();
     assert.ok(!/still|as they were/.test(await rejected.textContent()));
     assert.equal(await other.locator("#structure-name").textContent(), "No surface");
-    assert.equal(await other.locator("#p-resolution").inputValue(), "0.05");
+    assert.equal(await other.locator("#p-resolution").inputValue(), "0.07");
     await waitForMesh(other, () => rejected.getByRole("button", { name: /^Use [\d.]+ Å$/ }).click());
     const now = await described(other);
     assert.equal(now.name, "1CRN");

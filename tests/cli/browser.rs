@@ -100,6 +100,11 @@ fn page_without_webgl_shows_a_message_and_a_picture() {
 }
 
 #[test]
+fn large_surfaces_are_shown_in_tiles() {
+    drive("tiles.mjs", &[], &[]);
+}
+
+#[test]
 fn other_viewers_load_all_glb_variants() {
     drive("variants.mjs", &[], &[]);
 }
@@ -147,10 +152,15 @@ fn notices_cover_the_dependencies_of_the_viewer() {
     let lock: serde_json::Value =
         serde_json::from_str(&std::fs::read_to_string(root.join("web/package-lock.json")).unwrap()).unwrap();
     let notices = std::fs::read_to_string(root.join("deploy/notices.py")).unwrap();
-    for (package, kept) in [("three", "three.txt"), ("meshoptimizer", "meshoptimizer.txt")] {
-        assert_eq!(lock["packages"][format!("node_modules/{package}")]["license"], "MIT", "{package}");
+    let mit = ["MIT", "Permission is hereby granted"];
+    for (package, kept, [license, phrase]) in [
+        ("three", "three.txt", mit),
+        ("meshoptimizer", "meshoptimizer.txt", mit),
+        ("3d-tiles-renderer", "3d-tiles-renderer.txt", ["Apache-2.0", "Apache License"]),
+    ] {
+        assert_eq!(lock["packages"][format!("node_modules/{package}")]["license"], license, "{package}");
         let text = std::fs::read_to_string(root.join("web/licences").join(kept)).unwrap();
-        assert!(text.contains("Permission is hereby granted"), "{kept}");
+        assert!(text.contains(phrase), "{kept}");
         assert!(notices.contains(kept), "{kept}");
     }
 }

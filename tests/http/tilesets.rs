@@ -173,6 +173,18 @@ fn parameters_that_do_not_apply_are_rejected() {
         let problem = server.get(&format!("{structure}/{path}")).problem(400, "bad-parameter");
         assert_eq!(problem["parameter"], parameter, "{path}: {problem}");
     }
+    // The documentation lists none of them.
+    let description = server.get("/openapi.json").json();
+    let resolved = |parameter: &Value| match parameter["$ref"].as_str() {
+        Some(reference) => description.pointer(reference.trim_start_matches('#')).unwrap()["name"].clone(),
+        None => parameter["name"].clone(),
+    };
+    let operation = &description["paths"]["/v1/pdb/{id}/tileset.json"]["get"]["parameters"];
+    let listed: Vec<Value> = operation.as_array().unwrap().iter().map(resolved).collect();
+    assert!(listed.contains(&"resolution".into()) && listed.contains(&"assembly".into()), "{listed:?}");
+    for name in ["split", "simplify", "units", "tile", "width", "format", "validation", "paper_b"] {
+        assert!(!listed.contains(&name.into()), "{name}");
+    }
     let estimate = server.post("/v1/estimate?tile=0/0/0/0", &[], SAMPLE).json();
     assert_eq!((&estimate["parameter"], &estimate["status"]), (&"tile".into(), &400.into()), "{estimate}");
     let unknown = structure.replace(structure.rsplit('/').next().unwrap(), &"0".repeat(64));

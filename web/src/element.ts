@@ -5,9 +5,11 @@ import { Client } from "./api/client";
 import { fetchFile, type Job } from "./api/jobs";
 import { asProblem, Problem } from "./api/problem";
 import { Colors } from "./colors";
+import { fetchTile, type TilesetPaths, tilesetAt } from "./large";
 import { Ligands } from "./ligands";
 import { load } from "./scene/load";
 import { contextOf, transparencyOf } from "./scene/context";
+import type { FetchTile } from "./scene/tiles";
 import { Viewer } from "./scene/viewer";
 import { chooseScheme, fillSchemes, showLegend } from "./ui/legend";
 
@@ -109,7 +111,8 @@ export class MolmeshViewer extends HTMLElement {
     if (!src) return this.arrange("");
     try {
       const progress = ({ status, stage, fraction }: Job) => this.tell("progress", { status, stage, fraction });
-      const reply = await fetchFile(this.client, src, signal, progress, {});
+      const tileset = tilesetAt(src);
+      const reply = await fetchFile(this.client, tileset?.root ?? src, signal, progress, {});
       const loaded = await load(await bytesOf(reply));
       signal.throwIfAborted();
       // The canvas has a size only while it is visible.
@@ -117,11 +120,19 @@ export class MolmeshViewer extends HTMLElement {
       this.paint();
       await this.viewer?.show(loaded, true);
       signal.throwIfAborted();
+      if (tileset) void this.refine(tileset);
       if (this.hasAttribute("turn")) this.viewer?.turn(true);
       this.tell("load", { report: loaded.extras });
     } catch (error) {
       if (!signal.aborted) this.fail(error);
     }
+  }
+
+  /** Shows the tiles of a tileset as the view needs them. */
+  private async refine(tileset: TilesetPaths): Promise<void> {
+    const fetching: FetchTile = (url, signal) => fetchTile(this.client, url, signal);
+    const failed = (error: unknown) => this.report(error);
+    await this.viewer?.refine(tileset.document, fetching, (state) => this.tell("tiles", state), failed);
   }
 
   /** Shows the canvas, or, with the reason `failure`, the fallback. */
@@ -165,14 +176,11 @@ export class MolmeshViewer extends HTMLElement {
     const scheme = this.getAttribute("scheme") ?? "none";
     chooseScheme(this.menu, scheme);
     const { pathname, searchParams, origin } = new URL(this.src, document.baseURI);
-    const structure = /^(.*\/v1\/(?:pdb|structures)\/[^/]+)\/surface\.glb$/.exec(pathname)?.[1];
+    const structure = /^(.*\/v1\/(?:pdb|structures)\/[^/]+)\/(?:surface\.glb|tileset\.json)$/.exec(pathname)?.[1];
     this.menu.hidden = !this.hasAttribute("menu") || !structure;
     if (!structure || !this.hasAttribute("sticks")) this.ligands?.clear();
     if (!structure) return showLegend(this.legend, null);
-    const failed = (error: unknown) => {
-      const { document } = asProblem(error);
-      this.tell("error", { message: document.detail ?? document.title, problem: error instanceof Problem ? document : null });
-    };
+    const failed = (error: unknown) => this.report(error);
     const choices = new Map([...searchParams, ["color", scheme]] as [string, string][]);
     this.colors?.apply(origin + structure, choices).catch(failed);
     if (this.hasAttribute("sticks")) this.ligands?.show(origin + structure, choices).catch(failed);
@@ -184,6 +192,12 @@ export class MolmeshViewer extends HTMLElement {
     this.style.background = this.getAttribute("background") ?? "";
     this.viewer?.setTransparency(transparencyOf(this.getAttribute("transparency")) / 100);
     this.viewer?.theme(this.getAttribute("background") ?? "#ffffff", this.getAttribute("color") ?? "#58ad9d");
+  }
+
+  /** Reports an error that leaves the surface. */
+  private report(error: unknown): void {
+    const { document } = asProblem(error);
+    this.tell("error", { message: document.detail ?? document.title, problem: error instanceof Problem ? document : null });
   }
 
   private fail(error: unknown): void {

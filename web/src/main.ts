@@ -2,7 +2,7 @@
 
 import { Client } from "./api/client";
 import { asProblem, Problem } from "./api/problem";
-import { formatsOf, type OpenApi, parametersOf, schemesOf } from "./api/schema";
+import { formatsOf, type OpenApi, parametersOf, schemesOf, tilesetParametersOf } from "./api/schema";
 import { theme } from "./ui/theme";
 import { Page } from "./page";
 import { $, show } from "./ui/dom";
@@ -20,7 +20,7 @@ async function begin(): Promise<void> {
     ]);
     show($("key-form"), false);
     $("version").textContent = `molmesh ${capabilities.version}, ${capabilities.backends.map((b) => b.name).join(", ")} backend`;
-    await page.start(parametersOf(api), formatsOf(api), schemesOf(api));
+    await page.start(parametersOf(api), formatsOf(api), schemesOf(api), tilesetParametersOf(api));
   } catch (error) {
     const problem = asProblem(error);
     const asksForKey = error instanceof Problem && [401, 403].includes(problem.document.status);

@@ -4,12 +4,13 @@ import type { Client } from "./api/client";
 import { asProblem, Problem } from "./api/problem";
 import type { Legend } from "./api/colors";
 import type { Parameter, Schemes } from "./api/schema";
-import { entry, type Labels, labels, type Source, stored, upload } from "./api/structures";
+import { entry, type Source, stored, upload } from "./api/structures";
 import { Colors } from "./colors";
 import { connect } from "./controls";
 import { Display, type DisplayState } from "./display";
 import { Downloads } from "./downloads";
 import { keyboard } from "./keyboard";
+import { type TilesetPaths, tilesetOf } from "./large";
 import { Picker } from "./picker";
 import { type Delivery, Remesher, type MeshRequest } from "./remesh";
 import { addressOf, type Choices, coarser, curl, currentAddress, drawn, readAddress, SAMPLE, type State, surface, writeAddress } from "./request";
@@ -19,7 +20,8 @@ import { ColourControls } from "./ui/colours";
 import { $, el, number, show } from "./ui/dom";
 import { Form } from "./ui/form";
 import { problem as showProblem } from "./ui/problem";
-import { report, timingsOf } from "./ui/report";
+import { report, storedReport, timingsOf } from "./ui/report";
+import { showTiles } from "./ui/tiles";
 
 /** Time from input to frame, ms, above which a dragged slider shows a coarser preview. */
 const PREVIEW_FROM = 200;
@@ -44,14 +46,20 @@ export class Page {
   private opening: AbortController | null = null;
   /** Structures shown so far, by path, so that returning to one needs no second upload. */
   private readonly visited = new Map<string, Source>();
-  private labelling: AbortController | null = null;
+  /** Names of the parameters that apply to tilesets. */
+  private ofTilesets: ReadonlySet<string> = new Set();
   private facts = 0;
   private readonly busy = new Busy();
 
   constructor(private readonly client: Client) {
-    this.stage = new Stage(client, (turning) => $("turn").setAttribute("aria-pressed", String(turning)), () => this.updateAddress());
+    this.stage = new Stage(client, {
+      turned: (turning) => $("turn").setAttribute("aria-pressed", String(turning)),
+      partsChanged: () => this.updateAddress(),
+      tiles: (state) => showTiles($("now"), state),
+      failed: (error, again) => this.problem(error, () => (this.clear(), again()), this.shown?.source.name),
+    });
     const { viewer } = this.stage;
-    this.picker = viewer && new Picker(viewer, (text) => this.announce(text));
+    this.picker = viewer && new Picker(client, viewer, (text) => this.announce(text));
     this.colors = viewer && new Colors(client, viewer, (legend) => this.colourControls.explain(legend), false);
     this.display = viewer && new Display(client, viewer, {
       changed: () => this.updateAddress(),
@@ -64,6 +72,7 @@ export class Page {
     $("home").addEventListener("click", () => viewer?.reset());
     this.remesher = new Remesher(client, {
       begin: (request) => this.begin(request),
+      tileset: (request) => this.tileset(request),
       progress: (job) => this.busy.follow(job),
       show: (delivery) => this.show(delivery),
       failed: (error, request) => this.failed(error, request),
@@ -73,7 +82,8 @@ export class Page {
   }
 
   /** Builds the form from the OpenAPI document and opens the structure that the address names. */
-  async start(parameters: Parameter[], formats: string[], schemes: Schemes): Promise<void> {
+  async start(parameters: Parameter[], formats: string[], schemes: Schemes, ofTilesets: ReadonlySet<string>): Promise<void> {
+    this.ofTilesets = ofTilesets;
     this.colourControls.fill(schemes);
     const form = new Form($("parameters"), $("picture-fields"), parameters, schemes, (mesh, live) => (mesh ? this.changed(live) : this.displayChanged()));
     this.form = form;
@@ -291,17 +301,23 @@ export class Page {
     this.busy.show("Meshing…", null, request.live ? 600 : undefined);
   }
 
+  /** Returns the tileset of a surface that may be too large for one file. */
+  private tileset({ source, choices }: MeshRequest): TilesetPaths | null {
+    const { form } = this;
+    return !form || !this.stage.viewer || form.coloursVertices(choices) ? null : tilesetOf(source, form.mesh(choices), this.ofTilesets);
+  }
+
   private idle(): void {
     if (!this.opening) this.busy.hide();
   }
 
   /** Shows a received mesh. The page changes in one step, once everything is ready. */
-  private async show({ request, answered, received, bytes, headers, signal }: Delivery): Promise<void> {
+  private async show({ request, answered, received, bytes, headers, tileset, signal }: Delivery): Promise<void> {
     const { form } = this;
     if (!form) return;
     const { source, preview } = request;
     const taken = preview === undefined ? request.choices : coarser(request.choices, preview);
-    const scene = await this.stage.prepare(bytes, source, form.of("png", taken), signal);
+    const scene = await this.stage.prepare(bytes, source, form.of("png", taken), tileset, signal);
     signal.throwIfAborted();
     const { extras } = scene.loaded;
     const previous = this.address;
@@ -312,7 +328,7 @@ export class Page {
     const drawing = this.stage.show(scene, this.shown?.source.path !== source.path, preview !== undefined);
     show($("preview"), preview !== undefined);
     $("preview").textContent = preview === undefined ? "" : `preview at ${number(preview, 2)} Å`;
-    if (preview === undefined) this.commit(request, extras, headers, previous);
+    if (preview === undefined) this.commit(request, extras, headers, tileset, previous);
     const { shown } = this;
     const time = await drawing;
     // Read by web/measure.mjs.
@@ -324,7 +340,7 @@ export class Page {
   }
 
   /** Updates the page to describe the mesh of the request, which is now shown. `address` is that of the one before. */
-  private commit({ source, choices }: MeshRequest, extras: Record<string, unknown>, headers: Headers, address: string): void {
+  private commit({ source, choices }: MeshRequest, extras: Record<string, unknown>, headers: Headers, tileset: TilesetPaths | null, address: string): void {
     const { form, shown: previous } = this;
     if (!form) return;
     const isOther = previous?.source.path !== source.path;
@@ -333,6 +349,7 @@ export class Page {
     const legend = (extras["color"] ?? null) as Legend | null;
     this.shown = { source, choices: form.displayed(choices), legend, resolution: Number(extras["resolution"] ?? 0.5), took: previous?.took ?? 0 };
     source.resent = false;
+    source.atoms ??= Number(extras["atoms_in_file"]) || undefined;
     this.visited.set(source.path, source);
     this.setCaption(source.name, source.summary?.title ?? String(extras["title"] ?? ""));
     document.title = `${source.name} · molmesh`;
@@ -340,45 +357,28 @@ export class Page {
       const chains = source.summary?.chains.map((c) => c.name || "_").slice(0, 12).join(",");
       form.hint("chains", chains ? `all: ${chains}` : "all");
       form.offer("assembly", source.summary?.assemblies.map(({ id, copies }) => [id, copies === null ? id : `${id} (copies: ${copies})`]) ?? []);
-      this.label(source);
+      void this.picker?.follow(source);
     }
     this.paint();
     this.display?.follow(source, this.shown.choices);
-    form.showValues(extras);
+    form.showValues(tileset ? { ...extras, resolution: undefined } : extras);
     report($("report"), extras, timingsOf(headers));
+    show($("coarse"), tileset !== null);
     $("now").textContent = `${Number(extras["triangles"]).toLocaleString("en")} triangles`;
     this.updateAddress(push);
     if (!previous && !this.display?.state.view) this.stage.viewer?.turn(true);
     show($("joined"), choices.get("instances") === "true");
     // After a pause without further meshes.
     clearTimeout(this.facts);
-    this.facts = window.setTimeout(() => this.complete(source, extras, headers), 300);
+    this.facts = window.setTimeout(() => void this.complete(source, extras, headers), 300);
   }
 
-  private complete(source: Source, extras: Record<string, unknown>, headers: Headers): void {
+  private async complete(source: Source, extras: Record<string, unknown>, headers: Headers): Promise<void> {
     const closed = extras["closed"] === true ? "closed" : "not closed";
     this.announce(`Surface of ${source.name}: ${Number(extras["triangles"]).toLocaleString("en")} triangles, area ${number(Number(extras["area"]), 4)} Å², ${closed}.`);
-    const key = /\/v1\/results\/([0-9a-f]{64})\./.exec(headers.get("content-location") ?? "")?.[1];
-    if (!key) return;
     const shown = this.shown;
-    this.client.json<Record<string, unknown>>(`/v1/results/${key}/report.json`).then(
-      (document) => {
-        if (this.shown === shown) report($("report"), document, timingsOf(headers, document));
-      },
-      // A result that is not stored has no report document. The page already shows the report in the file.
-      () => undefined,
-    );
-  }
-
-  private label(source: Source): void {
-    this.labelling?.abort();
-    const abort = (this.labelling = new AbortController());
-    this.picker?.setLabels(null);
-    labels(this.client, source, abort.signal).then(
-      (found: Labels) => abort.signal.aborted || this.picker?.setLabels(found),
-      // Without labels, atoms are shown by number.
-      () => undefined,
-    );
+    const document = await storedReport(this.client, headers);
+    if (document && this.shown === shown) report($("report"), document, timingsOf(headers, document));
   }
 
   private failed(error: unknown, request: MeshRequest): void {

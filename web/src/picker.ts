@@ -1,6 +1,7 @@
 /** Atom selection: under the pointer, pinned by a click, or found by name. */
 
-import { type Atom, type Labels, nameOf } from "./api/structures";
+import type { Client } from "./api/client";
+import { type Atom, type Labels, labels, nameOf, type Source } from "./api/structures";
 import type { Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
 
@@ -8,13 +9,15 @@ import { $, el, show } from "./ui/dom";
 const MAX_HOVER_TRIANGLES = 1_500_000;
 
 export class Picker {
+  /** Labels of the shown structure; null while they are not available. */
   private labels: Labels | null = null;
+  private labelling: AbortController | null = null;
   private pinned: number | null = null;
   private readonly tip = $("tip");
   private readonly colour = $<HTMLSelectElement>("colour");
   private pending: { x: number; y: number } | null = null;
 
-  constructor(private readonly viewer: Viewer, private readonly announce: (text: string) => void) {
+  constructor(private readonly client: Client, private readonly viewer: Viewer, private readonly announce: (text: string) => void) {
     const canvas = viewer.canvas;
     let down = { x: 0, y: 0, moved: true };
     canvas.addEventListener("pointerdown", ({ offsetX: x, offsetY: y }) => {
@@ -36,8 +39,16 @@ export class Picker {
     });
   }
 
-  /** Sets the labels of the shown structure; null while they are not available. */
-  setLabels(labels: Labels | null): void {
+  /** Fetches the labels of the shown structure. Without labels, atoms are shown by number. */
+  async follow(source: Source): Promise<void> {
+    this.labelling?.abort();
+    const { signal } = (this.labelling = new AbortController());
+    this.setLabels(null);
+    const found = await labels(this.client, source, signal).catch(() => null);
+    if (found && !signal.aborted) this.setLabels(found);
+  }
+
+  private setLabels(labels: Labels | null): void {
     this.labels = labels;
     this.pin(null, false);
     this.hover(null);

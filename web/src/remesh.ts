@@ -5,6 +5,7 @@ import type { Client } from "./api/client";
 import { fetchFile, type Progress } from "./api/jobs";
 import type { Source } from "./api/structures";
 import type { DisplayState } from "./display";
+import { isLarge, type TilesetPaths } from "./large";
 import type { Choices } from "./request";
 
 export interface MeshRequest {
@@ -30,6 +31,8 @@ export interface Delivery {
   received: number;
   bytes: ArrayBuffer;
   headers: Headers;
+  /** Tileset of which the mesh is the coarsest tile; null for a whole mesh. */
+  tileset: TilesetPaths | null;
   /** Aborted once a later request supersedes this one, which must not be shown then. */
   signal: AbortSignal;
 }
@@ -37,6 +40,8 @@ export interface Delivery {
 export interface Listener {
   /** Called when a request starts. */
   begin(request: MeshRequest): void;
+  /** Returns the tileset of a surface that may be too large for one file; otherwise null. */
+  tileset(request: MeshRequest): TilesetPaths | null;
   progress: Progress;
   /** Shows a received mesh. Later requests wait until it is shown. */
   show(delivery: Delivery): Promise<void>;
@@ -102,11 +107,18 @@ export class Remesher {
     const { request, abort } = mine;
     const isLatest = () => this.current === mine;
     try {
-      const reply = await fetchFile(this.client, request.path, abort.signal, (job) => isLatest() && this.listener.progress(job));
+      const fetching = (path: string) => fetchFile(this.client, path, abort.signal, (job) => isLatest() && this.listener.progress(job));
+      let tileset = request.preview === undefined ? this.listener.tileset(request) : null;
+      let reply = await fetching(tileset?.root ?? request.path);
+      // The number of atoms is known only now. The service has read them, so the whole surface takes little longer.
+      if (tileset && !isLarge(Number(reply.headers.get("molmesh-atoms")), request.choices)) {
+        tileset = null;
+        reply = await fetching(request.path);
+      }
       const answered = performance.now();
       const bytes = await bytesOf(reply);
       const received = performance.now();
-      if (isLatest()) await this.listener.show({ request, answered, received, bytes, headers: reply.headers, signal: abort.signal });
+      if (isLatest()) await this.listener.show({ request, answered, received, bytes, headers: reply.headers, tileset, signal: abort.signal });
     } catch (error) {
       // A later request is waiting, so this one is superseded already.
       if (isLatest() && !this.next) this.listener.failed(error, request);

@@ -3,10 +3,12 @@
 import type { Client } from "./api/client";
 import { fetchFile } from "./api/jobs";
 import { asProblem } from "./api/problem";
+import { fetchTile, type TilesetPaths } from "./large";
 import { type Choices, surface } from "./request";
 import type { Source } from "./api/structures";
 import { load, type Loaded } from "./scene/load";
 import { contextOf } from "./scene/context";
+import type { FetchTile, TilesState } from "./scene/tiles";
 import { Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
 import { listParts } from "./ui/parts";
@@ -21,8 +23,22 @@ export interface Scene {
   /** Parameters of its picture. */
   choices: Choices;
   loaded: Loaded;
+  /** Tileset that replaces the surface, its coarsest tile, as far as it is loaded; null for a whole surface. */
+  tileset: TilesetPaths | null;
   /** Its picture, or a message with the reason for its absence; null if the viewer draws it. */
   picture: Blob | string | null;
+}
+
+/** Actions of the page. */
+export interface StageActions {
+  /** Called when the rotation starts or stops. */
+  turned(turning: boolean): void;
+  /** Called after parts were shown or hidden. */
+  partsChanged(): void;
+  /** Called in each frame that shows tiles. */
+  tiles(state: TilesState): void;
+  /** Called if a tile cannot be loaded. */
+  failed(error: unknown, again: () => void): void;
 }
 
 export class Stage {
@@ -39,16 +55,16 @@ export class Stage {
   private kept: Scene | null = null;
   private fetching: AbortController | null = null;
 
-  constructor(private readonly client: Client, onTurn: (turning: boolean) => void, private readonly onParts: () => void) {
+  constructor(private readonly client: Client, private readonly actions: StageActions) {
     const gl = contextOf(this.canvas, false);
-    this.viewer = gl && new Viewer(this.canvas, gl, { onTurn, onLost: (lost) => this.onLost(lost) });
+    this.viewer = gl && new Viewer(this.canvas, gl, { onTurn: (turning) => actions.turned(turning), onLost: (lost) => this.onLost(lost) });
     if (!this.viewer) this.explain(ABSENT);
   }
 
   /** Reads a file, and fetches its picture with `choices` if the viewer does not draw. Does not change the display. */
-  async prepare(bytes: ArrayBuffer, source: Source, choices: Choices, signal: AbortSignal): Promise<Scene> {
+  async prepare(bytes: ArrayBuffer, source: Source, choices: Choices, tileset: TilesetPaths | null, signal: AbortSignal): Promise<Scene> {
     const loaded = await load(bytes);
-    return { source, choices, loaded, picture: this.draws ? null : await this.picture(source, choices, signal) };
+    return { source, choices, loaded, tileset, picture: this.draws ? null : await this.picture(source, choices, signal) };
   }
 
   /** Shows a surface at once, and resolves with the time in the frame after it was drawn. */
@@ -56,7 +72,12 @@ export class Stage {
     this.scene = scene;
     this.fetching?.abort();
     const drawn = this.viewer?.show(scene.loaded, fresh) ?? Promise.resolve(performance.now());
-    if (this.viewer) listParts(this.parts, this.viewer, this.onParts);
+    if (this.viewer) listParts(this.parts, this.viewer, () => this.actions.partsChanged());
+    if (scene.tileset) {
+      const { client, actions } = this;
+      const fetching: FetchTile = (url, signal) => fetchTile(client, url, signal);
+      void this.viewer?.refine(scene.tileset.document, fetching, (state) => actions.tiles(state), (error, again) => actions.failed(error, again));
+    }
     if (!preview) this.kept = scene;
     if (!this.draws) this.showPicture(scene);
     return drawn;

@@ -11,7 +11,7 @@ use super::components::pascal_case;
 use crate::formats::Format;
 use crate::http::{area_parameters, atom_parameters, color_parameters};
 use crate::pipeline::params::{self, Domain, TABLE};
-use crate::pipeline::{AreaLevel, areas};
+use crate::pipeline::{AreaLevel, areas, tileset};
 use crate::surface::SurfaceKind;
 
 const DIGEST_PATTERN: &str = "^[0-9a-f]{64}$";
@@ -124,10 +124,10 @@ fn mesh_parameters(names: &[&str]) -> impl Iterator<Item = Parameter> {
     names.iter().filter_map(|name| TABLE.iter().find(|parameter| parameter.name == *name)).map(query)
 }
 
-/// Returns the parameters that all tiles of a tileset have in common.
+/// Returns the parameters that apply to a tileset.
 fn tile_parameters() -> impl Iterator<Item = &'static params::Parameter> {
-    let others = ["format", "check", "tile"];
-    TABLE.iter().filter(move |p| !others.contains(&p.name) && !params::PICTURES.contains(&p.name))
+    let others = || ["format", "check", "tile"].into_iter().chain(params::PICTURES).chain(tileset::NOT_APPLICABLE);
+    TABLE.iter().filter(move |parameter| others().all(|other| other != parameter.name))
 }
 
 /// Describes a query parameter that is not, or not in this form, one of a mesh.

@@ -55,6 +55,14 @@ impl<S> fmt::Debug for Tileset<S> {
     }
 }
 
+/// Parameters that do not apply to tiles.
+#[cfg(feature = "server")]
+#[rustfmt::skip]
+pub(crate) const NOT_APPLICABLE: [&str; 17] = [
+    "split", "instances", "context", "cavities", "pockets", "pocket_probe", "exact", "interface", "max_triangles",
+    "simplify", "units", "paper_a", "paper_b", "paper_c", "validation", "color_blend", "color_offset",
+];
+
 /// Rejects parameters of a job that do not apply to tiles.
 ///
 /// # Errors

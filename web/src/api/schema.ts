@@ -66,11 +66,16 @@ function described(api: OpenApi, id = "createMesh"): Described[] {
 
 /**
  * Returns the parameters of the form in document order. The buttons that download files choose `format`, and the page
- * sends no map, to which `color_offset` applies.
+ * sends no map, to which `color_offset` applies. The viewer chooses tiles.
  */
 export function parametersOf(api: OpenApi): Parameter[] {
-  const isOfForm = ({ name }: Described) => name !== "format" && name !== "color_offset";
+  const isOfForm = ({ name }: Described) => !["format", "color_offset", "tile"].includes(name);
   return described(api).filter(isOfForm).map((parameter) => parameterOf(api, parameter));
+}
+
+/** Returns the names of the parameters that apply to tilesets. */
+export function tilesetParametersOf(api: OpenApi): ReadonlySet<string> {
+  return new Set(described(api, "showTileset").map(({ name }) => name));
 }
 
 /** Returns the output formats, by file name extension. */

@@ -18,6 +18,8 @@ export interface Source {
   /** True for the bundled structure, which the page opens by default. */
   isSample?: boolean;
   summary?: Summary;
+  /** Number of atoms in the file, once it is known. */
+  atoms?: number;
 }
 
 export interface Summary {
@@ -36,14 +38,14 @@ export async function upload(client: Client, blob: Blob, file: string, signal?: 
   const options: RequestInit = { method: "POST", body: blob, headers: { "content-type": "application/octet-stream" } };
   if (signal) options.signal = signal;
   const summary = await client.json<Summary>("/v1/structures", options);
-  return { path: `/v1/structures/${summary.digest}`, name: summary.id ?? file, file, blob, summary };
+  return { path: `/v1/structures/${summary.digest}`, name: summary.id ?? file, file, blob, summary, atoms: summary.atoms };
 }
 
 /** Returns a structure that was uploaded before. */
 export async function stored(client: Client, digest: string, signal: AbortSignal): Promise<Source> {
   const summary = await client.json<Summary>(`/v1/structures/${encodeURIComponent(digest)}`, { signal });
   const name = summary.id ?? "structure";
-  return { path: `/v1/structures/${summary.digest}`, name, file: `${name.toLowerCase()}.cif`, summary };
+  return { path: `/v1/structures/${summary.digest}`, name, file: `${name.toLowerCase()}.cif`, summary, atoms: summary.atoms };
 }
 
 /** Returns an entry of the archive. */

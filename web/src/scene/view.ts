@@ -1,6 +1,7 @@
 /** View of a surface: direction, magnification and centre, independent of the size of the canvas. */
 
 import { MathUtils, type PerspectiveCamera, type Sphere, Vector3 } from "three";
+import type { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
 export interface View {
   /** Direction from the centre of the view to the camera, degrees: about the y axis, from +z to +x. */
@@ -77,4 +78,18 @@ export function viewOfText(text: string): View {
   if (!isView || zoom <= 0) return FRONT;
   const [x = 0, y = 0, z = 0] = shift;
   return { azimuth, elevation, zoom, shift: [x, y, z] };
+}
+
+/**
+ * Sets the limits of distances for a surface of this radius. With `details`, as of tiles, one can come closer, to the
+ * point under the pointer.
+ */
+export function bound(camera: PerspectiveCamera, controls: OrbitControls, radius: number, details: boolean): void {
+  const nearest = radius * (details ? 0.02 : 0.25);
+  controls.zoomToCursor = details;
+  controls.minDistance = nearest;
+  controls.maxDistance = radius * 14;
+  camera.near = nearest * 0.08;
+  camera.far = radius * 18;
+  camera.updateProjectionMatrix();
 }

@@ -1,19 +1,16 @@
 /** Viewer of a surface on a canvas. Draws only when something has changed. */
 
-import { type BufferGeometry, Color, DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, type Vector3, WebGLRenderer } from "three";
+import { type BufferGeometry, type DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, type Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import type { ViewerOptions } from "./context";
-import { type Loaded, unitScale } from "./load";
+import { type Loaded, type Part, unitScale } from "./load";
 import { depthLayer, depthsOnly, SurfaceMaterial } from "./material";
 import { type Hit, pick, placeOf } from "./pick";
-import { FRONT, moved, place, type View, viewOf } from "./view";
-
-/** Duration of the initial rotation, s: one full turn. */
-const TURN = 14;
-/** Maximum device pixels per CSS pixel. More is not visible. */
-const MAX_PIXEL_RATIO = 2;
-/** Frame time, ms, above which the resolution is reduced during motion. */
-const SLOW = 40;
+import { Rotation } from "./rotation";
+import { Sharpness } from "./sharpness";
+import { type Rows, Style } from "./style";
+import type { FetchTile, Tiles, TilesState } from "./tiles";
+import { bound, FRONT, moved, place, type View, viewOf } from "./view";
 
 export class Viewer {
   readonly controls: OrbitControls;
@@ -30,26 +27,23 @@ export class Viewer {
   /** Names of hidden parts. */
   private readonly hidden = new Set<string>();
   private loaded: Loaded | null = null;
-  private colors: { texture: DataTexture; atoms: number } | null = null;
-  /** True if the colours of the file are shown without colours per atom. */
-  private usesFile = true;
-  private haze = new Color("#ffffff");
-  private plain = new Color("#5fb3a1");
-  private marked = { hovered: [-2, -2], pinned: [-2, -2] };
+  private readonly style = new Style();
   private frame = 0;
   private lastFrame = 0;
-  private slowness = 0;
-  /** Remaining time of the rotation, s. */
-  private turnLeft = 0;
-  private settle = 0;
+  private readonly sharpness: Sharpness;
+  private readonly rotation: Rotation;
+  /** Tiles that replace the surface where they are loaded. */
+  private tiles: Tiles | null = null;
+  private onTiles: (state: TilesState) => void = () => undefined;
   private readonly size = new ResizeObserver(() => this.resize());
-  private readonly reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
 
   /** Creates a viewer on `canvas` with the context `gl`. */
   constructor(readonly canvas: HTMLCanvasElement, gl: WebGL2RenderingContext, private readonly options: ViewerOptions = {}) {
     this.renderer = new WebGLRenderer({ canvas, context: gl, antialias: true, alpha: options.transparent ?? false });
     this.renderer.outputColorSpace = SRGBColorSpace;
+    this.sharpness = new Sharpness(this.renderer, () => this.rest());
     this.controls = new OrbitControls(this.camera, canvas);
+    this.rotation = new Rotation(this.controls, options.onTurn);
     this.controls.addEventListener("change", () => this.invalidate());
     this.controls.addEventListener("start", () => this.turn(false));
     canvas.addEventListener("webglcontextlost", () => options.onLost?.(true));
@@ -76,17 +70,57 @@ export class Viewer {
       mesh.matrixAutoUpdate = false;
       mesh.matrix.copy(matrix);
       mesh.frustumCulled = false;
-      mesh.renderOrder = 1;
       mesh.visible = !this.hidden.has(name);
       return mesh;
     });
     this.loaded = loaded;
     this.scene.add(...this.meshes);
-    this.applyStyle();
+    this.restyle();
+    this.dress(this.meshes);
     this.applyTransparency();
     if (fresh || isFirst) this.reset();
     else this.clip();
     return this.drawn();
+  }
+
+  /**
+   * Shows the tileset at `url` in place of the surface, which is its root. Loads the tiles that the view needs, and
+   * calls `changed` in every frame.
+   */
+  async refine(url: string, fetchTile: FetchTile, changed: (state: TilesState) => void, failed: (error: unknown, retry: () => void) => void): Promise<void> {
+    const { loaded } = this;
+    const { Tiles } = await import("./tiles");
+    // Another surface may be shown now.
+    if (this.loaded !== loaded) return;
+    const tiles = new Tiles(url, fetchTile, {
+      loaded: (meshes) => this.dress(meshes),
+      invalidate: () => this.invalidate(),
+      failed: (error) => failed(error, () => tiles.retry()),
+    });
+    [this.tiles, this.onTiles] = [tiles, changed];
+    this.scene.add(tiles.group);
+    this.clip();
+    this.invalidate();
+  }
+
+  /** Prepares meshes of the surface for drawing. */
+  private dress(meshes: Mesh[]): void {
+    const { material, depths } = this;
+    if (!material || !depths) return;
+    for (const mesh of meshes) {
+      mesh.material = material;
+      mesh.renderOrder = 1;
+      mesh.onBeforeRender = this.setDepths;
+      mesh.clear();
+      if (material.transparent) mesh.add(depthLayer(mesh, depths));
+    }
+  }
+
+  /** Returns the visible parts of the surface, or the tiles that replace it. */
+  private get shown(): Pick<Part, "geometry" | "matrix">[] {
+    const tiles = this.tiles?.meshes ?? [];
+    if (tiles.length) return tiles.map(({ geometry, matrixWorld }) => ({ geometry, matrix: matrixWorld }));
+    return (this.loaded?.parts ?? []).filter((_, i) => this.meshes[i]?.visible);
   }
 
   /** Returns the names of the visible parts. */
@@ -119,6 +153,9 @@ export class Viewer {
   }
 
   private release(): void {
+    if (this.tiles) this.scene.remove(this.tiles.group);
+    this.tiles?.dispose();
+    this.tiles = null;
     for (const { geometry } of this.meshes) geometry.dispose();
     this.material?.dispose();
     this.depths?.dispose();
@@ -140,10 +177,7 @@ export class Viewer {
     if (material.transparent === isTransparent && !isTransparent) return;
     material.transparent = isTransparent;
     material.needsUpdate = true;
-    for (const mesh of this.meshes) {
-      mesh.clear();
-      if (isTransparent) mesh.add(depthLayer(mesh, depths));
-    }
+    this.dress([...this.meshes, ...(this.tiles?.all ?? [])]);
   }
 
   /** Shows sticks with coordinates in Å, which stay when another surface is shown; null for none. */
@@ -159,11 +193,11 @@ export class Viewer {
       const material = new SurfaceMaterial(geometry);
       const mesh = new Mesh(geometry, material);
       mesh.frustumCulled = false;
+      mesh.onBeforeRender = this.setDepths;
       this.sticks = { mesh, material };
       this.scene.add(mesh);
     }
-    this.applyStyle();
-    this.invalidate();
+    this.restyle();
   }
 
   /** Resolves with the time in the frame after the next one that is drawn. */
@@ -192,16 +226,12 @@ export class Viewer {
 
   /** Starts or stops the rotation. Unless `byUser`, it turns once, or not at all if reduced motion is preferred. */
   turn(on: boolean, byUser = false): void {
-    const was = this.controls.autoRotate;
-    this.turnLeft = !on || (this.reducedMotion.matches && !byUser) ? 0 : byUser ? Number.POSITIVE_INFINITY : TURN;
-    this.controls.autoRotate = this.isTurning;
-    this.controls.autoRotateSpeed = 60 / TURN;
-    if (was !== this.isTurning) this.options.onTurn?.(this.isTurning);
+    this.rotation.turn(on, byUser);
     this.invalidate();
   }
 
   get isTurning(): boolean {
-    return this.turnLeft > 0;
+    return this.rotation.isTurning;
   }
 
   /** Turns by angles (radians) and zooms by a factor. Used by the keyboard. */
@@ -218,8 +248,7 @@ export class Viewer {
     this.camera.updateMatrixWorld();
     caster.setFromCamera(new Vector2(x, y), this.camera);
     const { ray } = caster;
-    const shown = loaded.parts.filter((_, i) => this.meshes[i]?.visible);
-    const hits = shown.map(({ geometry, matrix }) => pick(geometry, matrix, ray, loaded.twoSided));
+    const hits = this.shown.map(({ geometry, matrix }) => pick(geometry, matrix, ray, loaded.twoSided));
     const distance = ({ point }: Hit) => point.distanceToSquared(ray.origin);
     return hits.reduce((best, hit) => (hit && (!best || distance(hit) < distance(best)) ? hit : best), null);
   }
@@ -227,7 +256,8 @@ export class Viewer {
   /** Turns the surface of the atoms `first` to `last` to the camera. Returns false if they have none. */
   face(first: number, last: number): boolean {
     if (!this.loaded) return false;
-    const places = this.loaded.parts.map(({ geometry, matrix }) => placeOf(geometry, matrix, first, last));
+    const parts = this.tiles ? this.shown : this.loaded.parts;
+    const places = parts.map(({ geometry, matrix }) => placeOf(geometry, matrix, first, last));
     const place = places.find((found) => found !== null);
     if (!place) return false;
     this.turn(false);
@@ -247,40 +277,31 @@ export class Viewer {
   }
 
   /** Marks atoms by first and last row, inclusive; null marks none. */
-  mark(which: "hovered" | "pinned", rows: [number, number] | null): void {
-    const next = rows ?? [-2, -2];
-    if (this.marked[which].every((row, i) => row === next[i])) return;
-    this.marked[which] = next;
-    this.applyStyle();
-    this.invalidate();
+  mark(which: "hovered" | "pinned", rows: Rows | null): void {
+    if (this.style.mark(which, rows)) this.restyle();
   }
 
   /** Sets the colours per atom; null for the colours of the file if `usesFile`, otherwise for one colour. */
   colour(texture: DataTexture | null, atoms: number, usesFile: boolean): void {
-    this.usesFile = usesFile;
-    this.colors?.texture.dispose();
-    this.colors = texture ? { texture, atoms } : null;
+    this.style.colour(texture, atoms, usesFile);
     if (texture) this.renderer.initTexture(texture);
-    this.applyStyle();
-    this.invalidate();
+    this.restyle();
   }
 
   /** Sets the background, and the colour of a surface without atom colours. */
   theme(background: string, plain: string): void {
-    this.haze = new Color(background);
-    this.plain = new Color(plain);
+    this.style.theme(background, plain);
     this.clear();
-    this.applyStyle();
-    this.invalidate();
+    this.restyle();
   }
 
   private clear(): void {
-    if (!this.options.transparent) this.renderer.setClearColor(this.haze, 1);
+    if (!this.options.transparent) this.renderer.setClearColor(this.style.haze, 1);
   }
 
-  /** Returns the number of triangles of all parts. */
+  /** Returns the number of triangles of all parts, or of the tiles that replace them. */
   get triangles(): number {
-    return (this.loaded?.parts ?? []).reduce((sum, { geometry }) => sum + (geometry.getIndex()?.count ?? 0) / 3, 0);
+    return (this.tiles ? this.shown : (this.loaded?.parts ?? [])).reduce((sum, { geometry }) => sum + (geometry.getIndex()?.count ?? 0) / 3, 0);
   }
 
   /** Waits until drawing has finished, since the GPU works asynchronously. For measurements. */
@@ -295,7 +316,7 @@ export class Viewer {
     this.controls.dispose();
     this.release();
     this.showSticks(null);
-    this.colors?.texture.dispose();
+    this.style.dispose();
     this.renderer.dispose();
   }
 
@@ -306,44 +327,35 @@ export class Viewer {
 
   private draw(now: number): void {
     this.frame = 0;
-    const turning = this.isTurning;
-    if (this.controls.autoRotate && !turning) this.turn(false);
     const step = now - this.lastFrame;
     this.lastFrame = now;
-    if (step < 500) this.slowness += 0.3 * (step - this.slowness);
-    if (turning) {
-      const time = Math.min(step / 1000, 0.1, this.turnLeft);
-      this.turnLeft -= time;
-      this.controls.update(time);
-    }
-    // Without a GPU, a lower resolution keeps motion smooth. The full resolution returns at rest.
-    const moving = step < 250;
-    this.sharpen(moving && this.slowness > SLOW ? Math.max(0.5, Math.sqrt(SLOW / this.slowness)) : 1);
+    const turning = this.rotation.frame(step);
+    this.sharpness.frame(step, turning);
+    this.updateTiles();
     this.renderer.render(this.scene, this.camera);
-    clearTimeout(this.settle);
     if (turning) this.invalidate();
-    else if (this.coarse < 1) this.settle = window.setTimeout(() => this.rest(), 200);
   }
 
-  private coarse = 1;
+  /** Selects the tiles of the view. The surface is drawn until the first one is loaded. */
+  private updateTiles(): void {
+    const { tiles } = this;
+    if (!tiles) return;
+    this.camera.updateMatrixWorld();
+    tiles.update(this.camera, this.renderer);
+    const isReplaced = tiles.meshes.length > 0;
+    for (const mesh of this.meshes) mesh.visible = !isReplaced;
+    this.onTiles(tiles.state);
+  }
 
   private rest(): void {
     this.lastFrame = 0;
-    this.slowness = 0;
     this.invalidate();
-  }
-
-  private sharpen(coarse: number): void {
-    const next = Math.round(coarse * 4) / 4;
-    if (next === this.coarse) return;
-    this.coarse = next;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MAX_PIXEL_RATIO) * next);
   }
 
   private resize(): void {
     const { clientWidth, clientHeight } = this.canvas;
     if (!clientWidth || !clientHeight) return;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MAX_PIXEL_RATIO) * this.coarse);
+    this.sharpness.apply();
     this.renderer.setSize(clientWidth, clientHeight, false);
     const before = Math.min(1, this.camera.aspect);
     this.camera.aspect = clientWidth / clientHeight;
@@ -361,40 +373,27 @@ export class Viewer {
 
   /** Sets the near and far planes around the surface. */
   private clip(): void {
-    if (!this.loaded) return;
-    const { radius } = this.loaded.sphere;
-    this.controls.minDistance = radius * 0.25;
-    this.controls.maxDistance = radius * 14;
-    this.camera.near = radius * 0.02;
-    this.camera.far = radius * 18;
-    this.camera.updateProjectionMatrix();
+    if (this.loaded) bound(this.camera, this.controls, this.loaded.sphere.radius, this.tiles !== null);
   }
 
-  /** Applies colours and marks to the surface. */
-  private applyStyle(): void {
-    const { material, loaded, sticks } = this;
+  /** Applies colours and marks to the surface, and draws it. */
+  private restyle(): void {
+    const { material, loaded, sticks, style } = this;
+    this.invalidate();
     if (!material || !loaded) return;
     const scale = unitScale(loaded);
-    const materials = [material, ...(sticks ? [sticks.material] : [])];
-    for (const each of materials) {
-      each.set("haze", this.haze);
-      each.set("unit", 1 / scale);
-    }
+    style.apply(material);
+    for (const each of sticks ? [material, sticks.material] : [material]) style.applyFog(each, scale);
     sticks?.mesh.scale.setScalar(1 / scale);
-    material.set("plain", this.plain);
-    material.set("own", this.usesFile);
-    material.set("hovered", new Vector2(...this.marked.hovered));
-    material.set("pinned", new Vector2(...this.marked.pinned));
-    material.set("atoms", this.colors?.atoms ?? 0);
-    if (this.colors) material.set("palette", this.colors.texture);
-    const prepare = () => {
-      const distance = this.camera.position.distanceTo(this.loaded?.sphere.center ?? this.controls.target);
-      const radius = this.loaded?.sphere.radius ?? 1;
-      for (const each of materials) {
-        each.set("depths", new Vector2(distance - 0.5 * radius, distance + radius));
-        each.uniformsNeedUpdate = true;
-      }
-    };
-    for (const mesh of [...this.meshes, ...(sticks ? [sticks.mesh] : [])]) mesh.onBeforeRender = prepare;
   }
+
+  /** Sets the range of depths with fog, before a mesh is drawn. */
+  private readonly setDepths = (): void => {
+    const { center, radius } = this.loaded?.sphere ?? { center: this.controls.target, radius: 1 };
+    const distance = this.camera.position.distanceTo(center);
+    for (const each of [this.material, this.sticks?.material]) {
+      each?.set("depths", new Vector2(distance - 0.5 * radius, distance + radius));
+      if (each) each.uniformsNeedUpdate = true;
+    }
+  };
 }

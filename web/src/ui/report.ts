@@ -1,5 +1,6 @@
 /** Report of the shown surface, first from the file, later from the service's report. */
 
+import type { Client } from "../api/client";
 import { el, number } from "./dom";
 
 export type Report = Record<string, unknown>;
@@ -36,6 +37,12 @@ export function report(home: HTMLElement, document: Report, timings: [string, nu
     parts.push(details);
   }
   home.replaceChildren(...parts);
+}
+
+/** Fetches the report of a result. Null if the result is not stored; then the page shows the report in the file. */
+export async function storedReport(client: Client, headers: Headers): Promise<Report | null> {
+  const key = /\/v1\/results\/([0-9a-f]{64})\./.exec(headers.get("content-location") ?? "")?.[1];
+  return key ? client.json<Report>(`/v1/results/${key}/report.json`).catch(() => null) : null;
 }
 
 /** Returns the stage times of a report, or of `Server-Timing`, ms. */

@@ -1,0 +1,123 @@
+// Large surfaces in tiles: levels, atoms, colours, limits, and a lost connection.
+import { assert, assertClean, browser, drop, run, start, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
+
+const chromium = await browser();
+const page = await start(chromium);
+const WARNING = /tiles versions at 1.1 or higher have limited support/;
+
+/** Returns a bar of 2,100 × 24 × 24 Å with 44,800 atoms. Its tileset has two levels of subtrees. */
+function bar() {
+  const lines = [];
+  for (let i = 0; i < 700 * 64; i += 1) {
+    const place = [Math.floor(i / 64), (i >> 3) % 8, i % 8].map((c) => (3 * c).toFixed(3).padStart(8)).join("");
+    const [serial, residue] = [(i + 1) % 100_000, (Math.floor(i / 64) % 9_999) + 1];
+    lines.push(`ATOM  ${String(serial).padStart(5)}  CA  ALA A${String(residue).padStart(4)}    ${place}  1.00  0.00           ${i % 2 ? "C" : "N"}`);
+  }
+  return Buffer.from(lines.join("\n"));
+}
+
+const now = () => page.locator("#now").textContent();
+/** Waits until all tiles of the view are loaded, and returns their number, triangles and finest spacing. */
+async function settled() {
+  await page.waitForFunction(
+    () => {
+      const text = document.querySelector("#now").textContent;
+      const isStill = /tiles?, /.test(text) && !text.includes("loading") && window.lastTiles === text;
+      window.lastTiles = text;
+      return isStill;
+    },
+    null,
+    { timeout: TIMEOUT_MS, polling: 1000 },
+  );
+  const [, tiles, triangles, spacing] = /^(\d+) tiles?, ([\d,]+) triangles, ([\d.]+)/.exec(await now());
+  return { tiles: Number(tiles), triangles: Number(triangles.replaceAll(",", "")), spacing: Number(spacing) };
+}
+async function zoom(steps) {
+  const box = await page.locator("#view").boundingBox();
+  await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
+  for (let i = 0; i < steps; i += 1) {
+    await page.mouse.wheel(0, -400);
+    await page.waitForTimeout(50);
+  }
+}
+const tileRequests = () => page.requests.filter((line) => line.includes("surface.glb?") && line.includes("tile="));
+
+await run({
+  "a small surface has no tiles": async () => {
+    assert.match(await now(), /^[\d,]+ triangles/);
+    assert.ok(await page.locator("#coarse").isHidden());
+    assert.deepEqual(page.requests.filter((line) => line.includes("tileset")), []);
+  },
+  "a large one opens in tiles, coarse ones first": async () => {
+    await drop(page, "bar.pdb", bar());
+    const { tiles, triangles, spacing } = await settled();
+    assert.ok(tiles > 1 && triangles > 1000 && spacing > 1, await now());
+    assert.ok(await page.locator("#coarse").isVisible());
+    assert.match(decodeURIComponent(tileRequests()[0]), /tile=0\/0\/0\/0/);
+    assert.ok(page.requests.some((line) => line.includes("/tileset.json?")));
+  },
+  "finer tiles follow the view, from nested subtrees": async () => {
+    const before = await settled();
+    await zoom(25);
+    const after = await settled();
+    assert.ok(after.spacing === 0.5 && before.spacing > 1, `${before.spacing} ${after.spacing}`);
+    assert.ok(after.triangles < 2.6e6 && after.tiles < 300, JSON.stringify(after));
+    const subtrees = page.requests.filter((line) => line.includes("tileset.subtree")).map((line) => /tile=(\d+)/.exec(line)[1]);
+    assert.ok(subtrees.includes("0") && subtrees.includes("4"), subtrees.join());
+  },
+  "atoms of tiles can be picked": async () => {
+    const box = await page.locator("#view").boundingBox();
+    await page.mouse.click(box.x + box.width / 2, box.y + box.height / 2);
+    await page.waitForFunction(() => /ALA/.test(document.querySelector("#picked").textContent), null, { timeout: TIMEOUT_MS });
+  },
+  "colours of atoms need no new tiles": async () => {
+    const before = tileRequests().length;
+    await page.selectOption("#colour", "element");
+    await page.waitForFunction(() => document.querySelector("#legend").textContent.includes("N"), null, { timeout: TIMEOUT_MS });
+    await page.locator("#transparency").fill("40");
+    await settled();
+    assert.equal(tileRequests().length, before);
+  },
+  "a lost connection is reported, and tiles load again": async () => {
+    assertClean(page, WARNING);
+    await page.context().setOffline(true);
+    await page.locator("#home").click();
+    await page.mouse.wheel(0, 400);
+    const box = await page.locator("#view").boundingBox();
+    // A part of the bar that was not in view.
+    await page.mouse.move(box.x + box.width * 0.9, box.y + box.height / 2);
+    for (let i = 0; i < 25; i += 1) {
+      await page.mouse.wheel(0, -400);
+      await page.waitForTimeout(50);
+    }
+    await page.waitForFunction(() => /cannot be reached/.test(document.querySelector("#problem").textContent), null, { timeout: TIMEOUT_MS });
+    await page.context().setOffline(false);
+    await page.locator("#problem button", { hasText: "Try again" }).click();
+    await settled();
+    assert.ok(await page.locator("#problem").isHidden());
+    // The browser has reported every failed request.
+    page.errors.length = 0;
+  },
+  "another surface replaces the tiles": async () => {
+    await page.locator("#sample").click();
+    await page.waitForFunction(() => /^[\d,]+ triangles/.test(document.querySelector("#now").textContent), null, { timeout: TIMEOUT_MS });
+    assert.ok(await page.locator("#coarse").isHidden());
+    assertClean(page);
+  },
+  "the component shows tilesets": async () => {
+    const other = await page.context().newPage();
+    await other.goto(SERVICE_URL);
+    await other.evaluate(async (src) => {
+      await import("/molmesh-viewer.js");
+      const viewer = document.createElement("molmesh-viewer");
+      viewer.style.cssText = "width: 400px; height: 300px";
+      viewer.addEventListener("molmesh-tiles", ({ detail }) => (window.tiles = detail));
+      viewer.addEventListener("molmesh-error", ({ detail }) => (window.failed = detail.message));
+      viewer.src = src;
+      document.body.append(viewer);
+    }, "/v1/pdb/4pti/tileset.json?resolution=0.25&atom_ids=true");
+    await other.waitForFunction(() => window.failed || (window.tiles?.tiles > 0 && !window.tiles.loading), null, { timeout: TIMEOUT_MS });
+    assert.equal(await other.evaluate(() => window.failed ?? null), null);
+    assert.ok((await other.evaluate(() => window.tiles.triangles)) > 1000);
+  },
+});
