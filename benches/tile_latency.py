@@ -3,8 +3,8 @@
 
 Usage: benches/tile_latency.py BINARY STRUCTURE [QUERY] [-- SERVE_OPTION...]
 
-Starts `BINARY serve`, uploads STRUCTURE, and requests 300 random tiles of each level one after the other, then 600 of
-the last level in 6 connections, as a viewer does. Prints one line of JSON for each.
+Starts `BINARY serve`, uploads STRUCTURE, and requests up to 300 random tiles of each level one after the other, then up
+to 600 of the last level in 6 connections, as a viewer does. Prints one line of JSON for each.
 """
 import http.client
 import json
@@ -68,16 +68,17 @@ def summary(label, made):
     names = {name for *_, stage in shown for name in stage}
     medians = {name: round(statistics.median(stage.get(name, 0) for *_, stage in shown), 2) for name in sorted(names)}
     print(json.dumps({
-        "tiles": label, "n": len(shown), "empty": len(made) - len(shown), "median_ms": round(statistics.median(times), 2),
-        "p99_ms": round(times[int(0.99 * (len(times) - 1))], 2), "max_ms": round(times[-1], 2),
+        "tiles": label, "n": len(shown), "empty": len(made) - len(shown),
+        "median_ms": round(statistics.median(times), 2), "p99_ms": round(times[int(0.99 * (len(times) - 1))], 2),
+        "max_ms": round(times[-1], 2),
         "median_kb": round(statistics.median(size for _, size, _ in shown) / 1e3, 1), "stages_ms": medians,
     }), flush=True)
 
 
 def main():
-    own, serve = (sys.argv[1:], []) if "--" not in sys.argv else (
-        sys.argv[1:sys.argv.index("--")], sys.argv[sys.argv.index("--") + 1:])
-    binary, structure, query = own[0], own[1], own[2] if len(own) > 2 else "resolution=0.5"
+    end = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    arguments, serve = sys.argv[1:end], sys.argv[end + 1:]
+    binary, structure, query = [*arguments, "resolution=0.5"][:3]
     with tempfile.TemporaryDirectory() as folder:
         command = [binary, "serve", "--listen", "127.0.0.1:0", "--data-dir", folder, *serve]
         server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -97,8 +98,8 @@ def main():
                 break
             time.sleep(0.2)
         with open(structure, "rb") as file:
-            path = json.loads(client.ask("POST", "/v1/structures", file.read())[1])["digest"]
-        path = f"/v1/structures/{path}"
+            digest = json.loads(client.ask("POST", "/v1/structures", file.read())[1])["digest"]
+        path = f"/v1/structures/{digest}"
         took, document, _ = client.ask("GET", f"{path}/tileset.json?{query}")
         tiling = json.loads(document)["root"]["implicitTiling"]
         print(json.dumps({"first_tileset_ms": round(took, 1), "levels": tiling["availableLevels"]}), flush=True)
@@ -120,13 +121,13 @@ def main():
         rest = fresh[last][:600]
 
         def work():
-            own = Client(port)
+            connection = Client(port)
             while rest:
                 with lock:
                     if not rest:
                         return
                     address = rest.pop()
-                made.append(tile(own, address))
+                made.append(tile(connection, address))
 
         begun = time.perf_counter()
         threads = [threading.Thread(target=work) for _ in range(6)]

@@ -113,6 +113,9 @@ pub(crate) struct MeshArgs {
     /// glb, gltf, ply, ply-text, stl, obj, vtp, vert or face [default: by the extension of the output, glb on stdout]
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
+    /// Tile of the tileset of the structure to mesh, instead of the whole structure
+    #[arg(long, value_name = "LEVEL/X/Y/Z")]
+    pub(crate) tile: Option<String>,
     /// Storage of glb and gltf: none, quantize (12 bytes per vertex instead of 24: 16-bit positions, 8-bit normals), or
     /// meshopt (glb only: quantized and compressed to about a fifth) [default: none]
     #[arg(long, value_name = "METHOD")]
@@ -328,9 +331,6 @@ pub(crate) struct SelectionArgs {
     /// Id of the biological assembly to build [default: asymmetric-unit, the atoms as they are in the file]
     #[arg(long, value_name = "ID")]
     pub(crate) assembly: Option<String>,
-    /// Tile of the tileset of the structure to mesh, instead of the whole structure
-    #[arg(long, value_name = "LEVEL/X/Y/Z")]
-    pub(crate) tile: Option<String>,
     /// Mesh each distinct set of chains of the assembly once and repeat the mesh (glb and gltf only); surfaces of
     /// neighbouring instances are not joined
     #[arg(long)]

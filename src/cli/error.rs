@@ -247,6 +247,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         | SurfaceError::MeshTooLarge { .. }
         | SurfaceError::TooManyTriangles { .. }
         | SurfaceError::TooManyTiles { .. }
+        | SurfaceError::TilesetTooLarge { .. }
         | SurfaceError::DeviceMemory { .. }
         | SurfaceError::Memory(_)
         | SurfaceError::Deadline => code::LIMIT,

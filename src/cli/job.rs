@@ -171,10 +171,12 @@ impl<'a> CommandJob<'a> {
         let tileset = Tileset::new(read, &self.job, &self.limits.read, &control, &clock);
         let tileset = tileset.map_err(|error| self.failure(error))?;
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
-        tileset.write(&choice, &self.limits.surface, &control, &self.progress, write).map_err(|error| match error {
-            WriteError::Job(error) => self.failure(error),
-            WriteError::File { path, source } => {
-                CliError::Output { name: folder.join(path).display().to_string(), source }
+        tileset.write(&self.job, &choice, &self.limits.surface, &control, &self.progress, write).map_err(|error| {
+            match error {
+                WriteError::Job(error) => self.failure(error),
+                WriteError::File { path, source } => {
+                    CliError::Output { name: folder.join(path).display().to_string(), source }
+                }
             }
         })
     }

@@ -11,8 +11,13 @@ use super::error::CliError;
 
 /// Parses the flags of `mesh`.
 pub(super) fn parse_mesh(args: &MeshArgs) -> Result<Request, CliError> {
-    let own =
-        [("format", &args.format), ("compress", &args.compress), ("normals", &args.normals), ("units", &args.units)];
+    let own = [
+        ("format", &args.format),
+        ("tile", &args.tile),
+        ("compress", &args.compress),
+        ("normals", &args.normals),
+        ("units", &args.units),
+    ];
     parse(&own, &args.job)
 }
 
@@ -21,9 +26,6 @@ pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
     let compress = Some("meshopt".to_owned());
     let request = parse(&[("compress", &compress)], &args.job)?;
     tileset::check(&request.job).map_err(|error| refusal(&error))?;
-    if args.job.selection.tile.is_some() {
-        return Err(CliError::usage("`--tile` is for `molmesh mesh`; a tileset has all tiles"));
-    }
     Ok(request)
 }
 
@@ -121,7 +123,6 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("cavities", &surface.cavities),
         ("pocket_probe", &surface.pocket_probe),
         ("simplify", &surface.simplify),
-        ("tile", &atoms.tile),
         ("validation", &args.validation),
         ("interface", &surface.interface),
     ];

@@ -64,7 +64,9 @@ pub enum FormatError {
         limit: u64,
     },
     /// The GLB exceeds the 32-bit length field.
-    #[error("the GLB would take {bytes} bytes, the format's limit is {limit}; use a coarser resolution or PLY")]
+    #[error(
+        "the GLB would take {bytes} bytes, the format's limit is {limit}; use a coarser resolution, PLY or a tileset"
+    )]
     GlbTooLarge {
         /// Length of the file.
         bytes: u64,

@@ -4,10 +4,7 @@
 //! reverses this rotation, so that positions in the tileset are those of the structure. Tile addresses refer to the
 //! rotated axes.
 
-use std::str::FromStr;
-
 use serde_json::{Value, json};
-use thiserror::Error;
 
 use super::GENERATOR;
 
@@ -42,6 +39,16 @@ impl TileAddress {
         format!("{level}/{x}/{y}/{z}")
     }
 
+    /// Parses the path of a tile; `None` for any other text.
+    #[must_use]
+    pub fn parse(text: &str) -> Option<Self> {
+        let numbers: Vec<u32> = text.split('/').map_while(|part| part.parse().ok()).collect();
+        let [level, x, y, z] = numbers[..] else { return None };
+        let address = Self { level, at: [x, y, z] };
+        // Equal tiles have equal paths.
+        (address.is_valid(MAX_LEVELS) && address.path() == text).then_some(address)
+    }
+
     /// Returns true if its level is below `levels` and it lies in the cube of that level.
     pub(crate) fn is_valid(self, levels: u32) -> bool {
         self.level < levels && self.at.iter().all(|c| *c < 1 << self.level)
@@ -52,23 +59,6 @@ impl TileAddress {
         let coordinate = |k: u32| (0..levels).fold(0, |c, bit| c | (index >> (3 * bit + k) & 1) << bit);
         let [x, y, z] = self.at.map(|c| c << levels);
         Self { level: self.level + levels, at: [x | coordinate(0), y | coordinate(1), z | coordinate(2)] }
-    }
-}
-
-/// Error for a text that is not the path of a tile.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
-#[error("the address of a tile is level/x/y/z")]
-pub struct BadAddress;
-
-impl FromStr for TileAddress {
-    type Err = BadAddress;
-
-    fn from_str(text: &str) -> Result<Self, BadAddress> {
-        let numbers: Vec<u32> = text.split('/').map_while(|part| part.parse().ok()).collect();
-        let [level, x, y, z] = numbers[..] else { return Err(BadAddress) };
-        let address = Self { level, at: [x, y, z] };
-        // The canonical text only: equal tiles have equal paths.
-        (address.is_valid(MAX_LEVELS) && address.path() == text).then_some(address).ok_or(BadAddress)
     }
 }
 

@@ -372,6 +372,7 @@ impl From<SurfaceError> for Problem {
                 .with("actual", triangles)
                 .with("resolution", resolution),
             E::TooManyTiles { limit, .. } => Self::new(ProblemType::GridTooLarge, detail).with("limit", limit),
+            E::TilesetTooLarge { limit } => Self::new(ProblemType::TooMuchMemory, detail).with("limit", limit),
             E::TooManyOverlaps { overlaps, limit } => exceeded(ProblemType::TooManyCandidates, limit, overlaps),
             E::NoSurface { isovalue } => match isovalue {
                 Some(isovalue) => {

@@ -57,7 +57,7 @@ fn check_parameters(row: &OperationScope, file: Option<&str>, uri: &Uri) -> Resu
         Parameters::Areas => area_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Tileset | Parameters::Subtree => {
-            Err("a signature opens one address, and a tileset has many; send a key".to_owned())
+            Err("a signature is valid for one URL, and a tileset has many; use a key".to_owned())
         }
         Parameters::Wait => {
             let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;

@@ -31,8 +31,9 @@ use crate::pipeline::{Job, StageClock, params, tileset};
 problem_responses!(StructureProblems: [
     READING,
     [
-        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
-        ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates, ProblemType::GridTooLarge,
+        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure,
+        ProblemType::PreconditionFailed, ProblemType::EmptySelection, ProblemType::TooManyCopies,
+        ProblemType::TooManyCandidates, ProblemType::GridTooLarge,
         ProblemType::TooMuchMemory, ProblemType::MemoryFull,
         ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
     ],
@@ -172,14 +173,14 @@ impl TilesetRequest {
                 let (value, expected) = (format!("`{}`", root.path()), "the root of a subtree".to_owned());
                 return Err(ParamError::BadValue { name: "tile", value, expected }.into());
             }
-            // Tiles that the surface only nearly reaches have an empty file.
+            // A listed tile without a surface is a GLB without a mesh.
             let is_tile = |tile: TileAddress| tileset.tiles().contains(&tile);
             Ok(subtree(root, levels, is_tile, is_tile))
         })
         .await
     }
 
-    /// Answers with what `write` makes of the tileset, which is prepared on a blocking thread if necessary.
+    /// Answers with the output of `write`. Prepares the tileset on a blocking thread if necessary.
     async fn answer(
         self,
         media_type: &'static str,
@@ -196,7 +197,7 @@ impl TilesetRequest {
                 let clock = StageClock::new(&());
                 let tileset = shared.structures().tileset(key, &input, &job, &limits, control, &clock);
                 shared.charge(&payer, start.elapsed());
-                write(&tileset.map_err(Failure::from)?)
+                write(&tileset.map_err(Failure::from)?.0)
             });
             Ok(([(header::CONTENT_TYPE, media_type)], Body::from(made.await??)).into_response())
         };

@@ -16,6 +16,7 @@ mod error;
 #[cfg(feature = "shuttle")]
 mod interleavings;
 mod job_store;
+mod kept;
 mod key;
 mod pool;
 mod queue;
@@ -34,12 +35,13 @@ pub(crate) use crate::memory_budget::{Budget, MemoryReservation};
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};
+pub(crate) use kept::SharedTileset;
 pub(crate) use key::ContentKey;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
 pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
 pub(crate) use results::{REPORT, SaveError, document, is_stored, save};
-pub(crate) use structures::{Input, SharedTileset, Structures};
+pub(crate) use structures::{Input, Structures};
 pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;

@@ -3,8 +3,6 @@
 //! A structure is found by the digest of its file and within its namespace only. It is charged to the memory budget,
 //! which takes the memory back before it rejects anything.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
-use std::ops::Deref;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
@@ -12,102 +10,21 @@ use bytes::Bytes;
 use metrics::{counter, gauge};
 
 use super::MemoryReservation;
-use crate::memory_budget::{Budget, Buffers, Reclaim};
+use super::kept::{CacheKey, CacheState, Charge, Charged, Kept, Shared, SharedColors, SharedStructure, SharedTileset};
+use crate::memory_budget::{Budget, Reclaim};
 use crate::pipeline::tileset::Tileset;
 use crate::pipeline::{Job, JobError, StageClock, estimate_atoms, params};
 use crate::store::{Digest, Namespace};
-use crate::structure::{self, ReadLimits, Structure, StructureError};
+use crate::structure::{self, ReadLimits, StructureError};
 use crate::surface::{CancelToken, Control, MemoryMeter as _, OutOfMemory, SurfaceError};
 use crate::sync::{Condvar, Mutex, MutexGuard};
 use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
-
-/// Namespace, and digest of a file or of a tileset. All other input of the reader is the same for the whole service,
-/// except limits.
-type CacheKey = (Namespace, Digest);
 
 /// Memory of a structure besides its atoms and texts, bytes: its columns are some 40 allocations. Without it, the cache
 /// would take several times its limit for structures of one atom.
 const OVERHEAD: u64 = 4 << 10;
 /// Time between two checks of a request that waits for another one to read its structure.
 const POLL: Duration = Duration::from_millis(20);
-
-/// A structure or a tileset, and the memory that it is charged to.
-#[derive(Debug)]
-struct Charged<T> {
-    value: T,
-    /// Size of the structure file, bytes.
-    file_bytes: usize,
-    /// Number of atoms as estimated from the file, so that estimates of work do not depend on its presence in memory.
-    atoms: f64,
-    /// Memory of the value, bytes.
-    bytes: u64,
-    _charge: Charge,
-}
-
-/// Charge of a value. The metric of the budget counts it only if the value is not kept.
-#[derive(Debug)]
-enum Charge {
-    Kept { _buffers: Buffers },
-    Used { _reservation: Arc<MemoryReservation> },
-}
-
-/// A structure or a tileset that other requests may use as well. Clones share it.
-#[derive(Debug)]
-pub(crate) struct Shared<T>(Arc<Charged<T>>);
-
-/// A structure that other requests may use as well.
-pub(crate) type SharedStructure = Shared<Structure>;
-/// A prepared tileset that other requests may use as well.
-pub(crate) type SharedTileset = Shared<Tileset<SharedStructure>>;
-
-impl<T> Clone for Shared<T> {
-    fn clone(&self) -> Self {
-        Self(Arc::clone(&self.0))
-    }
-}
-
-impl<T> Shared<T> {
-    fn bytes(&self) -> u64 {
-        self.0.bytes
-    }
-
-    /// Returns true if a request uses the value.
-    fn is_used(&self) -> bool {
-        Arc::strong_count(&self.0) > 1
-    }
-}
-
-impl<T> Deref for Shared<T> {
-    type Target = T;
-
-    fn deref(&self) -> &T {
-        &self.0.value
-    }
-}
-
-/// Value of the cache.
-#[derive(Debug, Clone)]
-enum Kept {
-    Structure(SharedStructure),
-    Tileset(SharedTileset),
-}
-
-impl Kept {
-    fn bytes(&self) -> u64 {
-        match self {
-            Self::Structure(kept) => kept.bytes(),
-            Self::Tileset(kept) => kept.bytes(),
-        }
-    }
-
-    /// Returns true if a request uses the value, or a tileset its structure.
-    fn is_used(&self) -> bool {
-        match self {
-            Self::Structure(kept) => kept.is_used(),
-            Self::Tileset(kept) => kept.is_used(),
-        }
-    }
-}
 
 /// Structure of a task or a request.
 #[derive(Debug, Clone)]
@@ -144,52 +61,6 @@ impl Input {
     }
 }
 
-#[derive(Debug, Default)]
-struct CacheState {
-    /// Values, each with the number of its last use.
-    kept: HashMap<CacheKey, (u64, Kept)>,
-    /// Least recently used first.
-    by_use: BTreeMap<u64, CacheKey>,
-    /// Number of uses.
-    uses: u64,
-    /// Memory of all values, bytes.
-    bytes: u64,
-    /// Values that a request is making.
-    making: HashSet<CacheKey>,
-}
-
-impl CacheState {
-    /// Adds a value as the most recently used one.
-    fn insert(&mut self, key: CacheKey, value: Kept) {
-        self.remove(&key);
-        self.uses += 1;
-        self.bytes += value.bytes();
-        self.by_use.insert(self.uses, key);
-        self.kept.insert(key, (self.uses, value));
-    }
-
-    fn remove(&mut self, key: &CacheKey) -> Option<Kept> {
-        let (used, value) = self.kept.remove(key)?;
-        self.by_use.remove(&used);
-        self.bytes -= value.bytes();
-        Some(value)
-    }
-
-    /// Removes the least recently used value that `is_candidate` accepts, and returns its memory in bytes.
-    fn evict(&mut self, is_candidate: impl Fn(&Kept) -> bool) -> Option<u64> {
-        let accepted = |key: &&CacheKey| self.kept.get(*key).is_some_and(|(_, value)| is_candidate(value));
-        let found = *self.by_use.values().find(accepted)?;
-        self.remove(&found).map(|value| value.bytes())
-    }
-
-    /// Finds a value, and makes it the most recently used one.
-    fn find(&mut self, key: &CacheKey) -> Option<Kept> {
-        let found = self.remove(key)?;
-        self.insert(*key, found.clone());
-        Some(found)
-    }
-}
-
 /// Cache of structures by namespace and digest, and of tilesets prepared from them, within a limit of memory.
 #[derive(Debug)]
 pub(crate) struct Structures {
@@ -215,10 +86,11 @@ impl Structures {
         let tileset = job.filter(|job| job.tile.is_some()).map(|job| (namespace, tileset_digest(&digest, job)));
         let mut state = self.lock();
         let found = state.find(&(namespace, digest)).or_else(|| state.find(&tileset?));
-        found.map(|kept| match kept {
-            Kept::Structure(structure) => structure,
-            Kept::Tileset(tileset) => tileset.structure().clone(),
-        })
+        match found? {
+            Kept::Structure(structure) => Some(structure),
+            Kept::Tileset(tileset) => Some(tileset.structure().clone()),
+            Kept::Colors(_) => None,
+        }
     }
 
     /// Returns the structure of the file with this digest, reading `input` if necessary. Concurrent calls read it once
@@ -247,11 +119,10 @@ impl Structures {
         };
         control.memory.also_held(file.len() as u64);
         let key = (namespace, digest);
-        let _mark = match self.find_or_begin(key, &control.cancel).ok_or(StructureError::Cancelled)? {
-            Ok(Kept::Structure(kept)) => return hit(kept),
-            Ok(Kept::Tileset(tileset)) => return hit(tileset.structure().clone()),
-            Err(mark) => mark,
-        };
+        let found = self.find_or_begin(key, &control.cancel).ok_or(StructureError::Cancelled)?;
+        if let Lookup::Kept(Kept::Structure(kept)) = found {
+            return hit(kept);
+        }
         counter!(STRUCTURE_CACHE_REQUESTS, "result" => "miss").increment(1);
         let reservation = Arc::new(self.budget.reservation());
         reservation.also_held(file.len() as u64);
@@ -266,12 +137,12 @@ impl Structures {
         Ok(read)
     }
 
-    /// Returns the tileset of a job on the file with this digest, without the tile of the job. Prepares it from `input`
-    /// if necessary; concurrent calls prepare it once. `clock` measures the preparation.
+    /// Returns the tileset of a job on the file with this digest, and the colours of its atoms. Prepares them from
+    /// `input` if necessary; concurrent calls prepare them once. `clock` measures the preparation.
     ///
     /// # Errors
-    /// Returns the errors of [`Tileset::new`], and [`OutOfMemory::Limit`] if the tileset is too large for the cache:
-    /// each tile would prepare it again.
+    /// Returns the errors of [`Tileset::new`] and [`Tileset::colors`], and [`SurfaceError::TilesetTooLarge`] if one of
+    /// them does not fit into the cache.
     pub(crate) fn tileset(
         &self,
         (namespace, digest): CacheKey,
@@ -280,40 +151,62 @@ impl Structures {
         limits: &ReadLimits,
         control: &Control<'_>,
         clock: &StageClock<'_>,
-    ) -> Result<SharedTileset, JobError> {
+    ) -> Result<(SharedTileset, Option<SharedColors>), JobError> {
         let key = (namespace, tileset_digest(&digest, job));
-        let _mark = match self.find_or_begin(key, &control.cancel).ok_or(SurfaceError::Cancelled)? {
-            Ok(Kept::Tileset(kept)) => {
-                control.memory.also_held(kept.bytes());
-                return Ok(kept);
-            }
-            Ok(Kept::Structure(_)) => return Err(JobError::Surface(SurfaceError::Cancelled)),
-            Err(mark) => mark,
-        };
-        let reservation = Arc::new(self.budget.reservation());
-        let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
         let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
-        let tileset = Tileset::new(read, job, limits, &charged, clock)?;
-        let (needed, limit) = (reservation.bytes(), self.limit);
-        if needed > limit {
-            return Err(SurfaceError::from(OutOfMemory::Limit { needed, limit }).into());
+        let prepare = |control: &Control<'_>| Tileset::new(read, job, limits, control, clock);
+        let as_tileset = |kept: Kept| if let Kept::Tileset(tileset) = kept { Some(tileset) } else { None };
+        let tileset = self.prepared(key, input, control, (Kept::Tileset, as_tileset), prepare)?;
+        let Some(coloring) = job.color else { return Ok((tileset, None)) };
+        let key = (namespace, Digest::of(format!("colors\n{}\n{}", key.1, coloring.canonical()).as_bytes()));
+        let missing = || JobError::Surface(SurfaceError::Cancelled);
+        let prepare = |control: &Control<'_>| tileset.colors(job, control)?.ok_or_else(missing);
+        let as_colors = |kept: Kept| if let Kept::Colors(colors) = kept { Some(colors) } else { None };
+        let colors = self.prepared(key, input, control, (Kept::Colors, as_colors), prepare)?;
+        Ok((tileset, Some(colors)))
+    }
+
+    /// Returns a value that must be kept, and prepares it if necessary.
+    fn prepared<T>(
+        &self,
+        key: CacheKey,
+        input: &Input,
+        control: &Control<'_>,
+        (keep, kept_as): (fn(Shared<T>) -> Kept, impl Fn(Kept) -> Option<Shared<T>>),
+        prepare: impl FnOnce(&Control<'_>) -> Result<T, JobError>,
+    ) -> Result<Shared<T>, JobError> {
+        let found = self.find_or_begin(key, &control.cancel).ok_or(SurfaceError::Cancelled)?;
+        if let Lookup::Kept(kept) = &found
+            && let Some(kept) = kept_as(kept.clone())
+        {
+            control.memory.also_held(kept.bytes());
+            return Ok(kept);
         }
-        let prepared = self.charged(tileset, input, reservation);
-        control.memory.also_held(needed);
-        self.keep(key, Kept::Tileset(prepared.clone()));
-        Ok(prepared)
+        let limit = self.limit;
+        let reservation = Arc::new(self.budget.part(limit).reservation());
+        let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
+        let value = prepare(&charged).map_err(|error| match error {
+            JobError::Surface(SurfaceError::Memory(
+                OutOfMemory::Limit { limit: of, .. } | OutOfMemory::Budget { limit: of, .. },
+            )) if of == limit => SurfaceError::TilesetTooLarge { limit }.into(),
+            error => error,
+        })?;
+        let shared = self.charged(value, input, reservation);
+        control.memory.also_held(shared.bytes());
+        self.keep(key, keep(shared.clone()));
+        Ok(shared)
     }
 
     /// Finds a value, or begins to make it: the caller keeps the mark meanwhile. Waits while another request makes it;
     /// `None` if this one is cancelled.
-    fn find_or_begin(&self, key: CacheKey, cancel: &CancelToken) -> Option<Result<Kept, MakingMark<'_>>> {
+    fn find_or_begin(&self, key: CacheKey, cancel: &CancelToken) -> Option<Lookup<'_>> {
         let mut state = self.lock();
         loop {
             if let Some(kept) = state.find(&key) {
-                return Some(Ok(kept));
+                return Some(Lookup::Kept(kept));
             }
             if self.limit == 0 || state.making.insert(key) {
-                return Some(Err(MakingMark { structures: self, key }));
+                return Some(Lookup::Missing { _mark: MakingMark { structures: self, key } });
             }
             state = self.ended.wait_timeout(state, POLL).unwrap_or_else(PoisonError::into_inner).0;
             if cancel.is_cancelled() {
@@ -362,6 +255,15 @@ impl Reclaim for Structures {
     }
 }
 
+/// Result of a search for a value.
+enum Lookup<'a> {
+    Kept(Kept),
+    /// The caller makes the value, and keeps the mark meanwhile.
+    Missing {
+        _mark: MakingMark<'a>,
+    },
+}
+
 /// Mark of a value that a request is making. Dropping it, even after an error or a panic, lets others make it.
 struct MakingMark<'a> {
     structures: &'a Structures,
@@ -375,9 +277,12 @@ impl Drop for MakingMark<'_> {
     }
 }
 
-/// Returns the digest of a tileset: of its structure file and of the parameters without the tile.
+/// Returns the digest of a tileset: of its structure file and of the parameters that affect the index.
 fn tileset_digest(digest: &Digest, job: &Job) -> Digest {
-    let canonical = params::canonical(&Job { tile: None, ..job.clone() });
+    let Job { compress, normals, .. } = Job::default();
+    let mut job = Job { tile: None, color: None, compress, normals, ..job.clone() };
+    job.params.atom_ids = false;
+    let canonical = params::canonical(&job);
     Digest::of(format!("tileset\n{digest}\n{canonical}").as_bytes())
 }
 
@@ -508,7 +413,7 @@ mod tests {
         let get = |job: &Job| {
             let (limits, clock) = (ReadLimits::default(), StageClock::new(&()));
             let key = (Namespace::default(), digest);
-            structures.tileset(key, &input, job, &limits, &Control::default(), &clock).unwrap()
+            structures.tileset(key, &input, job, &limits, &Control::default(), &clock).unwrap().0
         };
         let start = Barrier::new(4);
         let got: Vec<SharedTileset> = std::thread::scope(|scope| {

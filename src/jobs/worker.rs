@@ -116,10 +116,10 @@ fn product(
     progress: &dyn ProgressSink,
 ) -> Result<Product, JobError> {
     let (Task { namespace, digest, input, job, .. }, Settings { structures, limits, .. }) = (task, &shared.settings);
-    if let Some(address) = job.tile {
+    if job.tile.is_some() {
         let clock = StageClock::new(progress);
-        let tileset = structures.tileset((*namespace, *digest), input, job, &limits.read, control, &clock)?;
-        return tileset.product(address, choice, &limits.surface, control, clock, progress);
+        let (tileset, colors) = structures.tileset((*namespace, *digest), input, job, &limits.read, control, &clock)?;
+        return tileset.product((job, colors.as_deref()), choice, &limits.surface, control, clock, progress);
     }
     let read = |control: &Control<'_>| structures.get(*namespace, *digest, input, &limits.read, control);
     pipeline::run_with(read, job, limits, choice, control, progress, None)

@@ -218,10 +218,13 @@ pub fn run_with<S: Deref<Target = Structure>>(
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
     job.check(limits)?;
-    let Some(address) = job.tile else { return run_whole(read, job, limits, choice, control, progress, sink) };
+    if job.tile.is_none() {
+        return run_whole(read, job, limits, choice, control, progress, sink);
+    }
     let clock = StageClock::new(progress);
     let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
-    tileset.product(address, choice, &limits.surface, control, clock, progress)
+    let colors = tileset.colors(job, control)?;
+    tileset.product((job, colors.as_ref()), choice, &limits.surface, control, clock, progress)
 }
 
 /// Runs a job on the whole structure.

@@ -32,22 +32,22 @@ impl Mesh {
     /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub(crate) fn clip(&mut self, [low, high]: [[f64; 3]; 2], control: &Control<'_>) -> Result<(), SurfaceError> {
         self.make_contiguous();
-        let centre: [f64; 3] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
-        let shift: [f64; 3] = std::array::from_fn(|k| self.centre[k] - centre[k]);
-        let moved = |p: [f32; 3]| std::array::from_fn(|k| to_f32(f64::from(p[k]) + shift[k]));
-        self.positions = self.positions.iter().map(|p| moved(*p)).collect();
-        self.centre = centre;
-        control.check()?;
         let inside = |triangle: &&[u32; 3]| {
             let corners = triangle.map(|v| self.positions[v as usize]);
             (0..3).all(|k| {
-                let middle = centre[k] + corners.iter().map(|p| f64::from(p[k])).sum::<f64>() / 3.0;
+                let middle = self.centre[k] + corners.iter().map(|p| f64::from(p[k])).sum::<f64>() / 3.0;
                 (low[k]..high[k]).contains(&middle)
             })
         };
         let kept: Column<[u32; 3]> = self.triangles.iter().filter(inside).copied().collect();
         self.triangles = kept;
-        self.drop_unused_vertices(control).map(drop)
+        self.drop_unused_vertices(control)?;
+        let centre: [f64; 3] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
+        for position in self.positions.iter_mut() {
+            *position = std::array::from_fn(|k| to_f32(f64::from(position[k]) + self.centre[k] - centre[k]));
+        }
+        self.centre = centre;
+        Ok(())
     }
 
     /// Returns the directed edges on the boundary of a clipped mesh with the grid spacing `spacing`. The faces of its

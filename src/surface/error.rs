@@ -143,6 +143,12 @@ pub enum SurfaceError {
         /// Spacing of the last level, Å.
         resolution: f64,
     },
+    /// The index of a tileset is too large to be kept, and each tile would need it again.
+    #[error("the index of the tileset has more than {limit} bytes, the limit of the cache of structures")]
+    TilesetTooLarge {
+        /// Bytes allowed.
+        limit: u64,
+    },
     /// The sink of the mesh failed. It keeps the cause.
     #[error("the mesh sink failed")]
     Sink,

@@ -164,8 +164,9 @@ impl Measures {
         components.sort_by(|a, b| b.area.total_cmp(&a.area));
         let Topology { edges, closed, oriented, manifold } = topology;
         Self {
-            area: components.iter().map(|c| c.area).sum(),
-            volume: components.iter().map(|c| c.volume).sum(),
+            // An empty sum is −0.
+            area: components.iter().map(|c| c.area).sum::<f64>() + 0.0,
+            volume: components.iter().map(|c| c.volume).sum::<f64>() + 0.0,
             euler: (vertices + faces).cast_signed() - edges.cast_signed(),
             closed,
             oriented,

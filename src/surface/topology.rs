@@ -27,7 +27,7 @@ impl Topology {
 
     /// Returns the topology of a closed manifold, in which every edge has two triangles.
     pub(super) const fn of_closed(n_triangles: u64) -> Self {
-        Self { edges: n_triangles * 3 / 2, closed: true, oriented: true, manifold: true }
+        Self::of_part(n_triangles, 0)
     }
 
     /// Returns the topology of two meshes without a common edge.

@@ -3,35 +3,55 @@
 
 use std::collections::HashMap;
 use std::fmt::Write;
+use std::ops::Deref;
 
 use molmesh::formats::tileset::TileAddress;
-use molmesh::pipeline::tileset::check;
-use molmesh::pipeline::{Choice, JobError, JobLimits, StageClock, params, run};
+use molmesh::pipeline::tileset::{Tileset, check};
+use molmesh::pipeline::{Choice, Job, JobError, JobLimits, StageClock, params, run};
 use molmesh::structure::{self, ReadLimits, Structure};
 use molmesh::surface::{Control, CpuBackend, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
 
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 
-type Tileset = molmesh::pipeline::tileset::Tileset<Box<Structure>>;
+/// Tileset with its job.
+struct Prepared {
+    tileset: Tileset<Box<Structure>>,
+    job: Job,
+}
 
-fn tileset(pairs: &[(&str, &str)]) -> Tileset {
+impl Prepared {
+    fn mesh(&self, tile: TileAddress) -> Option<Mesh> {
+        let (backend, job) = (CpuBackend::new(Some(2)).unwrap(), Job { tile: Some(tile), ..self.job.clone() });
+        let colors = self.tileset.colors(&job, &Control::default()).unwrap();
+        let limits = SurfaceLimits::default();
+        self.tileset.mesh((&job, colors.as_ref()), &backend, &limits, &Control::default()).unwrap()
+    }
+}
+
+impl Deref for Prepared {
+    type Target = Tileset<Box<Structure>>;
+
+    fn deref(&self) -> &Self::Target {
+        &self.tileset
+    }
+}
+
+fn tileset(pairs: &[(&str, &str)]) -> Prepared {
     tileset_of(SAMPLE, pairs)
 }
 
-fn tileset_of(file: &[u8], pairs: &[(&str, &str)]) -> Tileset {
+fn tileset_of(file: &[u8], pairs: &[(&str, &str)]) -> Prepared {
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     check(&job).unwrap();
     let read = |control: &Control<'_>| structure::read_with(file, &ReadLimits::default(), control).map(Box::new);
-    Tileset::new(read, &job, &ReadLimits::default(), &Control::default(), &StageClock::new(&())).unwrap()
+    let tileset = Tileset::new(read, &job, &ReadLimits::default(), &Control::default(), &StageClock::new(&())).unwrap();
+    Prepared { tileset, job }
 }
 
 /// Returns the meshes of all tiles of a level.
-fn meshes(tileset: &Tileset, level: u32) -> Vec<Mesh> {
-    let backend = CpuBackend::new(Some(2)).unwrap();
+fn meshes(tileset: &Prepared, level: u32) -> Vec<Mesh> {
     let tiles = tileset.tiles().iter().filter(|tile| tile.level == level);
-    let mesh =
-        |tile: &TileAddress| tileset.mesh(*tile, &backend, &SurfaceLimits::default(), &Control::default()).unwrap();
-    tiles.filter_map(mesh).collect()
+    tiles.filter_map(|tile| tileset.mesh(*tile)).collect()
 }
 
 /// Joins meshes. Vertices that are at most 2e-5 Å apart become one.
@@ -138,8 +158,10 @@ fn too_many_tiles_are_rejected() {
 
 #[test]
 fn no_level_misses_atoms_that_are_far_apart() {
-    let text = "2\n\nC 1.3 2.7 3.1\nC 2000.7 33.3 77.7\n";
-    for surface in ["gaussian", "vdw", "ses"] {
+    let near = "2\n\nC 1.3 2.7 3.1\nC 2000.7 33.3 77.7\n";
+    // Coordinates at the limit.
+    let far = "2\n\nC 99900 0 0\nN -99900 0 0\n";
+    for (text, surface) in [(near, "gaussian"), (near, "vdw"), (near, "ses"), (far, "gaussian")] {
         let tileset = tileset_of(text.as_bytes(), &[("surface", surface), ("select", "all")]);
         for level in 0..tileset.bounds().levels {
             let found = measured(&welded(&meshes(&tileset, level)));
@@ -161,7 +183,7 @@ fn a_job_can_mesh_one_tile() {
     let mut triangles = 0;
     for address in tileset.tiles() {
         let product = made(&address.path()).unwrap();
-        let tile = tileset.mesh(*address, &backend, &SurfaceLimits::default(), &Control::default()).unwrap();
+        let tile = tileset.mesh(*address);
         let report = &product.report;
         assert_eq!(report.resolution, tileset.spacing(address.level));
         let Some(tile) = tile else {

@@ -5,11 +5,10 @@ import { Client } from "./api/client";
 import { fetchFile, type Job } from "./api/jobs";
 import { asProblem, Problem } from "./api/problem";
 import { Colors } from "./colors";
-import { fetchTile, type TilesetPaths, tilesetAt } from "./large";
+import { tileFetcher, type TilesetPaths, tilesetAt } from "./large";
 import { Ligands } from "./ligands";
 import { load } from "./scene/load";
 import { contextOf, transparencyOf } from "./scene/context";
-import type { FetchTile } from "./scene/tiles";
 import { Viewer } from "./scene/viewer";
 import { chooseScheme, fillSchemes, showLegend } from "./ui/legend";
 
@@ -130,9 +129,8 @@ export class MolmeshViewer extends HTMLElement {
 
   /** Shows the tiles of a tileset as the view needs them. */
   private async refine(tileset: TilesetPaths): Promise<void> {
-    const fetching: FetchTile = (url, signal) => fetchTile(this.client, url, signal);
     const failed = (error: unknown) => this.report(error);
-    await this.viewer?.refine(tileset.document, fetching, (state) => this.tell("tiles", state), failed);
+    await this.viewer?.refine(tileset.document, tileFetcher(this.client), (state) => this.tell("tiles", state), failed);
   }
 
   /** Shows the canvas, or, with the reason `failure`, the fallback. */
@@ -194,7 +192,7 @@ export class MolmeshViewer extends HTMLElement {
     this.viewer?.theme(this.getAttribute("background") ?? "#ffffff", this.getAttribute("color") ?? "#58ad9d");
   }
 
-  /** Reports an error that leaves the surface. */
+  /** Reports an error; the surface stays visible. */
   private report(error: unknown): void {
     const { document } = asProblem(error);
     this.tell("error", { message: document.detail ?? document.title, problem: error instanceof Problem ? document : null });

@@ -4,9 +4,10 @@ import type { Client } from "./api/client";
 import { asProblem } from "./api/problem";
 import type { Source } from "./api/structures";
 import { type Choices, query, surface } from "./request";
+import type { FetchTile } from "./scene/tiles";
 
 /** Number of triangles above which a surface is shown in tiles. */
-const MAX_TRIANGLES = 3e6;
+const MAX_FILE_TRIANGLES = 3e6;
 /** Approximate number of triangles per atom at 0.5 Å. */
 const TRIANGLES_PER_ATOM = 100;
 /** Attempts to fetch a tile from a busy server, and the pause before the second one, ms. Later pauses are longer. */
@@ -24,7 +25,7 @@ export interface TilesetPaths {
  * is not among `applicable`, those of tilesets. `detail` limits the number of triangles.
  */
 export function tilesetOf(source: Source, choices: Choices, applicable: ReadonlySet<string>): TilesetPaths | null {
-  const applies = [...choices.keys()].every((name) => applicable.has(name) && name !== "detail");
+  const applies = [...choices.keys()].every((name) => applicable.has(name) && name !== "detail") && choices.get("model") !== "all";
   // The decoder of tiles needs WebAssembly.
   if (!applies || typeof WebAssembly === "undefined") return null;
   if (source.atoms !== undefined && !choices.has("assembly") && !isLarge(source.atoms, choices)) return null;
@@ -47,17 +48,19 @@ export function tilesetAt(url: string): TilesetPaths | null {
 /** Returns true if the surface of so many atoms is shown in tiles. */
 export function isLarge(atoms: number, choices: Choices): boolean {
   const spacing = Number(choices.get("resolution") ?? 0.5);
-  return TRIANGLES_PER_ATOM * atoms * (0.5 / spacing) ** 2 > MAX_TRIANGLES;
+  return TRIANGLES_PER_ATOM * atoms * (0.5 / spacing) ** 2 > MAX_FILE_TRIANGLES;
 }
 
-/** Fetches a tile. Tries again while the server is busy. */
-export async function fetchTile(client: Client, url: string, signal: AbortSignal): Promise<Response> {
-  for (let attempt = 1; ; attempt += 1) {
-    try {
-      return await client.ask(url, { signal });
-    } catch (error) {
-      if (signal.aborted || asProblem(error).document.status !== 503 || attempt === ATTEMPTS) throw error;
-      await new Promise((resolve) => setTimeout(resolve, PAUSE * attempt));
+/** Returns a function that fetches a tile, and tries again while the server is busy. */
+export function tileFetcher(client: Client): FetchTile {
+  return async (url, signal) => {
+    for (let attempt = 1; ; attempt += 1) {
+      try {
+        return await client.ask(url, { signal });
+      } catch (error) {
+        if (signal.aborted || asProblem(error).document.status !== 503 || attempt === ATTEMPTS) throw error;
+        await new Promise((resolve) => setTimeout(resolve, PAUSE * attempt));
+      }
     }
-  }
+  };
 }

@@ -3,12 +3,12 @@
 import type { Client } from "./api/client";
 import { fetchFile } from "./api/jobs";
 import { asProblem } from "./api/problem";
-import { fetchTile, type TilesetPaths } from "./large";
+import { tileFetcher, type TilesetPaths } from "./large";
 import { type Choices, surface } from "./request";
 import type { Source } from "./api/structures";
 import { load, type Loaded } from "./scene/load";
 import { contextOf } from "./scene/context";
-import type { FetchTile, TilesState } from "./scene/tiles";
+import type { TilesState } from "./scene/tiles";
 import { Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
 import { listParts } from "./ui/parts";
@@ -23,7 +23,7 @@ export interface Scene {
   /** Parameters of its picture. */
   choices: Choices;
   loaded: Loaded;
-  /** Tileset that replaces the surface, its coarsest tile, as far as it is loaded; null for a whole surface. */
+  /** Tileset whose coarsest tile is `loaded`; null for a whole surface. */
   tileset: TilesetPaths | null;
   /** Its picture, or a message with the reason for its absence; null if the viewer draws it. */
   picture: Blob | string | null;
@@ -75,8 +75,7 @@ export class Stage {
     if (this.viewer) listParts(this.parts, this.viewer, () => this.actions.partsChanged());
     if (scene.tileset) {
       const { client, actions } = this;
-      const fetching: FetchTile = (url, signal) => fetchTile(client, url, signal);
-      void this.viewer?.refine(scene.tileset.document, fetching, (state) => actions.tiles(state), (error, again) => actions.failed(error, again));
+      void this.viewer?.refine(scene.tileset.document, tileFetcher(client), (state) => actions.tiles(state), (error, again) => actions.failed(error, again));
     }
     if (!preview) this.kept = scene;
     if (!this.draws) this.showPicture(scene);

@@ -4,6 +4,7 @@ use std::str::FromStr;
 
 use super::table::flag;
 use super::{Domain, ParamError, Parameter, Request, unknown};
+use crate::formats::tileset::TileAddress;
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::{Background, MAX_SIDE, PictureParams, Style, View};
 use crate::pipeline::color::{ColorBlend, Coloring, Palette, Scheme};
@@ -142,7 +143,7 @@ impl ParsedValues {
             "radius_scale" => self.options.radius_scale = number()?,
             "radius_offset" => self.options.radius_offset = number()?,
             "simplify" => job.simplify = Some(Simplify { error: bounded().ok_or_else(bad)?, max_triangles: None }),
-            "tile" => job.tile = Some(text.parse().ok().ok_or_else(bad)?),
+            "tile" => job.tile = Some(TileAddress::parse(text).ok_or_else(bad)?),
             "cutoff_tolerance" => self.options.cutoff_tolerance = number()?,
             "paper_a" => self.options.paper_a = number()?,
             "paper_b" => self.options.paper_b = number()?,

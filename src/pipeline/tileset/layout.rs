@@ -57,8 +57,9 @@ impl Layout {
         [0.0, 1.0].map(|end| std::array::from_fn(|k| self.low[k] + side * (along[k] + end)))
     }
 
-    /// Returns the tiles of a level that a box from `low` to `high`, Å, touches.
-    pub(super) fn touched(&self, level: u32, [low, high]: [[f64; 3]; 2]) -> impl Iterator<Item = TileAddress> {
+    /// Returns the lowest and the highest coordinates, along the axes of the structure, of the tiles of a level that a
+    /// box from `low` to `high`, Å, touches.
+    pub(super) fn touched(&self, level: u32, [low, high]: [[f64; 3]; 2]) -> [[u32; 3]; 2] {
         let (side, last) = (self.side(level), (1_u32 << level) - 1);
         #[expect(
             clippy::cast_possible_truncation,
@@ -66,7 +67,13 @@ impl Layout {
             reason = "clamped to the tiles of the level"
         )]
         let tile = |c: f64, k: usize| ((c - self.low[k]) / side).floor().clamp(0.0, f64::from(last)) as u32;
-        let [x, y, z] = [0, 1, 2].map(|k| tile(low[k], k)..=tile(high[k], k));
+        [low, high].map(|corner| std::array::from_fn(|k| tile(corner[k], k)))
+    }
+
+    /// Returns the tiles of a level between these coordinates, inclusive.
+    pub(super) fn between(level: u32, [low, high]: [[u32; 3]; 2]) -> impl Iterator<Item = TileAddress> {
+        let last = (1_u32 << level) - 1;
+        let [x, y, z] = [0, 1, 2].map(|k| low[k]..=high[k]);
         let columns = z.flat_map(move |z| y.clone().map(move |y| [y, z]));
         columns.flat_map(move |[y, z]| x.clone().map(move |x| TileAddress { level, at: [x, last - z, y] }))
     }
@@ -93,12 +100,14 @@ mod tests {
                 "{low:?} {high:?}"
             );
             for level in 0..layout.levels.min(4) {
-                let all: Vec<TileAddress> = layout.touched(level, [low, high.map(|c| c - 1e-6)]).collect();
+                let touched =
+                    |bounds| Layout::between(level, layout.touched(level, bounds)).collect::<Vec<TileAddress>>();
+                let all = touched([low, high.map(|c| c - 1e-6)]);
                 assert_eq!(all.len(), 8_usize.pow(level));
                 for tile in all {
                     let [from, to] = layout.tile(tile);
                     let inner = [from.map(|c| c + 1e-6), to.map(|c| c - 1e-6)];
-                    assert_eq!(layout.touched(level, inner).collect::<Vec<_>>(), [tile]);
+                    assert_eq!(touched(inner), [tile]);
                     if let Some(parent) = tile.parent() {
                         let [low, high] = layout.tile(parent);
                         assert!((0..3).all(|k| low[k] <= from[k] && to[k] <= high[k]), "{tile:?} in {parent:?}");

@@ -39,14 +39,20 @@ const PER_CHECK: usize = 1 << 14;
 /// Levels and tiles of a structure.
 pub struct Tileset<S> {
     structure: S,
-    /// The job without its tile.
-    job: Job,
     layout: Layout,
     levels: Vec<TilesetLevel>,
     /// Tiles that the surface can reach, and their ancestors.
     tiles: BTreeSet<TileAddress>,
     selected: Selected,
-    colors: Option<MeshColors>,
+}
+
+/// Colours of the atoms of a tileset.
+pub struct TilesetColors(MeshColors);
+
+impl fmt::Debug for TilesetColors {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("TilesetColors").finish_non_exhaustive()
+    }
 }
 
 impl<S> fmt::Debug for Tileset<S> {
@@ -99,7 +105,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
     /// Prepares the levels of the structure that `read` returns. The grid spacing of `job` is that of the last level.
     ///
     /// # Errors
-    /// Returns a [`JobError`] if reading or selecting fails, a colour scheme has no values, or the job is cancelled.
+    /// Returns a [`JobError`] if reading or selecting fails, there are too many tiles, or the job is cancelled.
     pub fn new(
         read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
         job: &Job,
@@ -107,17 +113,23 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
-        let job = Job { tile: None, ..job.clone() };
-        let (structure, selected, spheres) = load(read, &job, limits, clock, control)?;
+        let (structure, selected, spheres) = load(read, job, limits, clock, control)?;
         clock.time("index", || {
-            let color = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, None, control);
-            let colors = job.color.map(color).transpose()?;
             let params = job.params_for(spheres.len());
             let bounds = spheres.bounds().ok_or(SurfaceError::NoSpheres)?;
             let layout = Layout::new(bounds, influence(&spheres, &params), params.resolution);
             let (levels, tiles) = layout.index(&Arc::new(spheres), &params, control)?;
-            Ok(Self { structure, job, layout, levels, tiles, selected, colors })
+            Ok(Self { structure, layout, levels, tiles, selected })
         })
+    }
+
+    /// Prepares the colours of a job; `None` without colours.
+    ///
+    /// # Errors
+    /// Returns [`JobError::Color`] if the colour scheme has no values, and the errors of memory.
+    pub fn colors(&self, job: &Job, control: &Control<'_>) -> Result<Option<TilesetColors>, JobError> {
+        let color = |coloring| MeshColors::new(&self.structure, &self.selected.atoms, coloring, None, control);
+        Ok(job.color.map(color).transpose()?.map(TilesetColors))
     }
 
     /// Returns the structure.
@@ -143,14 +155,16 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         self.layout.spacing(level)
     }
 
-    /// Meshes a tile, adds skirts and encodes it. The mesh is empty if the surface does not pass through the tile. The
-    /// memory of the product stays added to the meter of `control`. Its report includes the times of `clock`.
+    /// Meshes the tile of `job`, or the root without one, adds skirts and encodes it. The mesh is empty if the surface
+    /// does not pass through the tile. The memory of the product stays added to the meter of `control`. Its report
+    /// includes the times of `clock`. `job` differs from that of [`Self::new`] in tile, colours and encoding at most;
+    /// `colors` are those of [`Self::colors`].
     ///
     /// # Errors
     /// Returns the errors of meshing and compression, and [`SurfaceError::BadParameter`] for a tile outside the cube.
     pub fn product(
         &self,
-        address: TileAddress,
+        (job, colors): (&Job, Option<&TilesetColors>),
         choice: &Choice<'_>,
         limits: &SurfaceLimits,
         control: &Control<'_>,
@@ -158,8 +172,9 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         progress: &dyn ProgressSink,
     ) -> Result<Product, JobError> {
         let control = Control { observer: &clock, ..control.clone() };
-        let (output, color) = self.output(address, choice.backend, limits, &control, &clock)?;
+        let (output, color) = self.output((job, colors), choice.backend, limits, &control, &clock)?;
         let MeshOutput { mut mesh, grid, made_by, .. } = output;
+        let address = job.tile.unwrap_or(TileAddress::ROOT);
         let (half, resolution) = (0.5 * self.layout.side(address.level), self.layout.spacing(address.level));
         let boundary = clock.time("clip", || mesh.boundary(half, resolution));
         // Without the skirts.
@@ -167,51 +182,52 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         let measures = clock.time(Stage::Measure.name(), measure)?;
         clock.time("clip", || mesh.add_skirts(&boundary, resolution));
         // The same step for all tiles of a level.
-        let packing = match self.job.compress {
+        let packing = match job.compress {
             Compress::None => Packing::Full,
             Compress::Quantize | Compress::Meshopt => Packing::Quantized(Step::covering(half + resolution)),
         };
         if let Some(step) = packing.step() {
             mesh.quantize(step);
         }
-        let storage = Storage { packing, normals: self.job.normals, units: self.job.units };
+        let storage = Storage { packing, normals: job.normals, units: job.units };
         let (n_vertices, n_triangles, centre) = (mesh.n_vertices(), mesh.n_triangles(), mesh.centre);
         let counts =
             Counts { resolution, centre, tries: None, grid, n_vertices, n_triangles, cut: true, made_by, storage };
         let control = Control { observer: &(), ..control };
         let times = clock.finish();
-        let mut report = Report::new(&self.structure, &self.selected, &self.job, choice, &counts, &measures, times);
+        let mut report = Report::new(&self.structure, &self.selected, job, choice, &counts, &measures, times);
         report.color = color;
         let mut product = Product::new(mesh, storage, report);
-        product.compress(&self.job, &control, progress)?;
+        product.compress(job, &control, progress)?;
         Ok(product)
     }
 
-    /// Meshes a tile; `None` if the surface does not pass through it. The mesh has a boundary at the faces of the tile.
+    /// Meshes the tile of `job`, as [`Self::product`] does, without skirts and encoding; `None` if the surface does not
+    /// pass through it. The mesh has a boundary at the faces of the tile.
     ///
     /// # Errors
     /// Returns the errors of meshing.
     pub fn mesh(
         &self,
-        address: TileAddress,
+        (job, colors): (&Job, Option<&TilesetColors>),
         backend: &dyn Backend,
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Option<Mesh>, JobError> {
-        let (output, _) = self.output(address, backend, limits, control, &StageClock::new(&()))?;
+        let (output, _) = self.output((job, colors), backend, limits, control, &StageClock::new(&()))?;
         Ok(Some(output.mesh).filter(|mesh| mesh.n_triangles() > 0))
     }
 
     /// Meshes a tile and colours it.
     fn output(
         &self,
-        address: TileAddress,
+        (job, colors): (&Job, Option<&TilesetColors>),
         backend: &dyn Backend,
         limits: &SurfaceLimits,
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<(MeshOutput, Option<ColorReport>), JobError> {
-        let levels = self.layout.levels;
+        let (address, levels) = (job.tile.unwrap_or(TileAddress::ROOT), self.layout.levels);
         if !address.is_valid(levels) {
             let (value, last) = (format!("`{}`", address.path()), levels - 1);
             let expected = format!("a tile of the tileset, whose levels are 0 to {last}");
@@ -219,12 +235,8 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         }
         let level = &self.levels[address.level as usize];
         let (spacing, bounds) = (self.layout.spacing(address.level), self.layout.tile(address));
-        let params = SurfaceParams {
-            resolution: spacing,
-            atom_ids: self.job.needs_atoms(),
-            quantize: None,
-            ..self.job.params.clone()
-        };
+        let params =
+            SurfaceParams { resolution: spacing, atom_ids: job.needs_atoms(), quantize: None, ..job.params.clone() };
         let near = level.near(bounds, influence(&level.spheres, &params) + spacing);
         let empty = || Ok((MeshOutput::new(Mesh::default(), GridStats::default()), None));
         if near.is_empty() || !self.tiles.contains(&address) {
@@ -246,9 +258,9 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         if mesh.triangles.is_empty() {
             return empty();
         }
-        let color = |colors: &MeshColors| clock.time("color", || colors.apply(mesh, spacing, None, control));
-        let color = self.colors.as_ref().map(color).transpose()?;
-        to_atom_indices(mesh, &self.job, &self.selected, control)?;
+        let color = |colors: &TilesetColors| clock.time("color", || colors.0.apply(mesh, spacing, None, control));
+        let color = colors.map(color).transpose()?;
+        to_atom_indices(mesh, job, &self.selected, control)?;
         Ok((output, color))
     }
 }
@@ -261,16 +273,20 @@ impl Layout {
         params: &SurfaceParams,
         control: &Control<'_>,
     ) -> Result<(Vec<TilesetLevel>, BTreeSet<TileAddress>), JobError> {
-        let (mut levels, mut tiles) = (Vec::new(), BTreeSet::new());
+        let (mut levels, mut tiles) = (Vec::<TilesetLevel>::new(), BTreeSet::new());
         for number in (0..self.levels).rev() {
-            let level = TilesetLevel::new(spheres, params, [self.spacing(number), self.side(number)], control)?;
+            let finer = levels.iter().rev().find(|level| !level.is_grouped());
+            let level = TilesetLevel::new(spheres, params, [self.spacing(number), self.side(number)], finer, control)?;
             let finer = tiles.iter().take_while(|tile: &&TileAddress| tile.level == number + 1);
             let mut parents: BTreeSet<TileAddress> = finer.filter_map(|tile| tile.parent()).collect();
             tiles.append(&mut parents);
             let reach = influence(&level.spheres, params);
             let centres = (0..level.spheres.len()).map(|i| level.spheres.centre(i));
-            let touched = centres.flat_map(|c| self.touched(number, [c.map(|c| c - reach), c.map(|c| c + reach)]));
-            for (n, tile) in touched.enumerate() {
+            let ranges = centres.map(|c| self.touched(number, [c.map(|c| c - reach), c.map(|c| c + reach)]));
+            // Successive atoms mostly touch the same tiles.
+            let mut last = None;
+            let new = ranges.filter(|range| last.replace(*range) != Some(*range));
+            for (n, tile) in new.flat_map(|range| Layout::between(number, range)).enumerate() {
                 if n.is_multiple_of(PER_CHECK) {
                     control.check()?;
                 }

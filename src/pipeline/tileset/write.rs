@@ -12,7 +12,7 @@ use thiserror::Error;
 use super::Tileset;
 use crate::formats::Format;
 use crate::formats::tileset::{TileAddress, TilesetUris, subtree, tileset_document};
-use crate::pipeline::{Choice, JobError, LeftOutReport, ProgressSink, StageClock};
+use crate::pipeline::{Choice, Job, JobError, LeftOutReport, ProgressSink, StageClock};
 use crate::structure::Structure;
 use crate::surface::{Control, Reservation, SurfaceError, SurfaceLimits, threads};
 
@@ -72,6 +72,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
     /// Returns a [`WriteError`] for the first tile that cannot be meshed or written.
     pub fn write(
         &self,
+        job: &Job,
         choice: &Choice<'_>,
         limits: &SurfaceLimits,
         control: &Control<'_>,
@@ -82,6 +83,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
             write(path, bytes).map_err(|source| WriteError::File { path: path.to_owned(), source })?;
             Ok::<_, WriteError>(bytes.len() as u64)
         };
+        let colors = self.colors(job, control)?;
         let addresses: Vec<TileAddress> = self.tiles.iter().copied().collect();
         let done = AtomicUsize::new(0);
         // Not by parallel iterators: a thread that waits within a tile would begin other tiles, without a limit.
@@ -89,7 +91,8 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
             let address = addresses[i];
             // Releases all memory that is counted for the tile. The file is not counted.
             let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
-            let tile = self.product(address, choice, limits, control, StageClock::new(&()), &())?;
+            let job = Job { tile: Some(address), ..job.clone() };
+            let tile = self.product((&job, colors.as_ref()), choice, limits, control, StageClock::new(&()), &())?;
             let n = done.fetch_add(1, Ordering::Relaxed) + 1;
             progress.progress("tiles", n as f64 / addresses.len() as f64);
             if tile.report.triangles == 0 {
@@ -103,7 +106,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
         })?;
         let made: Vec<(TileAddress, u64, u64)> = made.into_iter().flatten().collect();
         if made.is_empty() {
-            return Err(JobError::from(SurfaceError::NoSurface { isovalue: self.job.params.level() }).into());
+            return Err(JobError::from(SurfaceError::NoSurface { isovalue: job.params.level() }).into());
         }
         let level = |level| LevelReport { spacing: self.spacing(level), ..LevelReport::default() };
         let mut levels: Vec<LevelReport> = (0..self.layout.levels).map(level).collect();

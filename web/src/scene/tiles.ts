@@ -7,10 +7,10 @@ import type { Tile } from "3d-tiles-renderer/core";
 import { TilesRenderer } from "3d-tiles-renderer/three";
 import { ImplicitTilingPlugin } from "3d-tiles-renderer/core/plugins";
 
-/** Lowest grid spacing on the screen, in pixels, above which finer tiles replace a tile. */
+/** Minimum error target: grid spacing on the screen, in pixels, above which finer tiles replace a tile. */
 const MIN_ERROR = 4;
-/** Maximum number of visible triangles. Above it, the grid spacing on the screen grows by the factor `COARSER`. */
-const MAX_TRIANGLES = 2e6;
+/** Maximum number of visible triangles. Above it, the error target grows by the factor `COARSER`. */
+const MAX_VISIBLE_TRIANGLES = 2e6;
 const COARSER = 1.25;
 /** Limits of the memory of tiles, bytes. Above the second one, tiles out of view are removed down to the first. */
 const MEMORY = [120e6, 180e6] as const;
@@ -119,9 +119,9 @@ export class Tiles {
   private balance(): void {
     const { renderer, triangles } = this;
     const before = renderer.errorTarget;
-    if (triangles > MAX_TRIANGLES) renderer.errorTarget *= COARSER;
+    if (triangles > MAX_VISIBLE_TRIANGLES) renderer.errorTarget *= COARSER;
     // A level has about four times the triangles of the one before.
-    else if (triangles < MAX_TRIANGLES / 4 && !this.loading) renderer.errorTarget = Math.max(MIN_ERROR, before / COARSER);
+    else if (triangles < MAX_VISIBLE_TRIANGLES / 4 && !this.loading) renderer.errorTarget = Math.max(MIN_ERROR, before / COARSER);
     if (renderer.errorTarget !== before) this.listener.invalidate();
   }
 

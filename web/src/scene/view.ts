@@ -81,8 +81,8 @@ export function viewOfText(text: string): View {
 }
 
 /**
- * Sets the limits of distances for a surface of this radius. With `details`, as of tiles, one can come closer, to the
- * point under the pointer.
+ * Sets the limits of distances for a surface of this radius. With `details` (tiles), the camera can come closer and
+ * zooms to the pointer.
  */
 export function bound(camera: PerspectiveCamera, controls: OrbitControls, radius: number, details: boolean): void {
   const nearest = radius * (details ? 0.02 : 0.25);

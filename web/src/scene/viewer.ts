@@ -76,7 +76,7 @@ export class Viewer {
     this.loaded = loaded;
     this.scene.add(...this.meshes);
     this.restyle();
-    this.dress(this.meshes);
+    this.prepareMeshes(this.meshes);
     this.applyTransparency();
     if (fresh || isFirst) this.reset();
     else this.clip();
@@ -93,7 +93,7 @@ export class Viewer {
     // Another surface may be shown now.
     if (this.loaded !== loaded) return;
     const tiles = new Tiles(url, fetchTile, {
-      loaded: (meshes) => this.dress(meshes),
+      loaded: (meshes) => this.prepareMeshes(meshes),
       invalidate: () => this.invalidate(),
       failed: (error) => failed(error, () => tiles.retry()),
     });
@@ -104,7 +104,7 @@ export class Viewer {
   }
 
   /** Prepares meshes of the surface for drawing. */
-  private dress(meshes: Mesh[]): void {
+  private prepareMeshes(meshes: Mesh[]): void {
     const { material, depths } = this;
     if (!material || !depths) return;
     for (const mesh of meshes) {
@@ -177,7 +177,7 @@ export class Viewer {
     if (material.transparent === isTransparent && !isTransparent) return;
     material.transparent = isTransparent;
     material.needsUpdate = true;
-    this.dress([...this.meshes, ...(this.tiles?.all ?? [])]);
+    this.prepareMeshes([...this.meshes, ...(this.tiles?.all ?? [])]);
   }
 
   /** Shows sticks with coordinates in Å, which stay when another surface is shown; null for none. */
@@ -344,7 +344,7 @@ export class Viewer {
     tiles.update(this.camera, this.renderer);
     const isReplaced = tiles.meshes.length > 0;
     for (const mesh of this.meshes) mesh.visible = !isReplaced;
-    this.onTiles(tiles.state);
+    if (isReplaced) this.onTiles(tiles.state);
   }
 
   private rest(): void {

@@ -1,0 +1,144 @@
+//! Values of the cache of structures: structures, tilesets and their colours, each charged to the memory budget.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::ops::Deref;
+use std::sync::Arc;
+
+use super::MemoryReservation;
+use crate::memory_budget::Buffers;
+use crate::pipeline::tileset::{Tileset, TilesetColors};
+use crate::store::{Digest, Namespace};
+use crate::structure::Structure;
+
+/// Namespace, and digest of a file or of a tileset. All other input of the reader is the same for the whole service,
+/// except limits.
+pub(super) type CacheKey = (Namespace, Digest);
+
+/// A structure or a tileset, and the memory that it is charged to.
+#[derive(Debug)]
+pub(super) struct Charged<T> {
+    pub(super) value: T,
+    /// Size of the structure file, bytes.
+    pub(super) file_bytes: usize,
+    /// Number of atoms as estimated from the file, so that estimates of work do not depend on its presence in memory.
+    pub(super) atoms: f64,
+    /// Memory of the value, bytes.
+    pub(super) bytes: u64,
+    pub(super) _charge: Charge,
+}
+
+/// Charge of a value. The metric of the budget counts it only if the value is not kept.
+#[derive(Debug)]
+pub(super) enum Charge {
+    Kept { _buffers: Buffers },
+    Used { _reservation: Arc<MemoryReservation> },
+}
+
+/// A structure or a tileset that other requests may use as well. Clones share it.
+#[derive(Debug)]
+pub(crate) struct Shared<T>(pub(super) Arc<Charged<T>>);
+
+/// A structure that other requests may use as well.
+pub(crate) type SharedStructure = Shared<Structure>;
+/// A prepared tileset that other requests may use as well.
+pub(crate) type SharedTileset = Shared<Tileset<SharedStructure>>;
+/// Colours of a tileset that other requests may use as well.
+pub(crate) type SharedColors = Shared<TilesetColors>;
+
+impl<T> Clone for Shared<T> {
+    fn clone(&self) -> Self {
+        Self(Arc::clone(&self.0))
+    }
+}
+
+impl<T> Shared<T> {
+    pub(super) fn bytes(&self) -> u64 {
+        self.0.bytes
+    }
+
+    /// Returns true if a request uses the value.
+    pub(super) fn is_used(&self) -> bool {
+        Arc::strong_count(&self.0) > 1
+    }
+}
+
+impl<T> Deref for Shared<T> {
+    type Target = T;
+
+    fn deref(&self) -> &T {
+        &self.0.value
+    }
+}
+
+/// Value of the cache.
+#[derive(Debug, Clone)]
+pub(super) enum Kept {
+    Structure(SharedStructure),
+    Tileset(SharedTileset),
+    Colors(SharedColors),
+}
+
+impl Kept {
+    pub(super) fn bytes(&self) -> u64 {
+        match self {
+            Self::Structure(kept) => kept.bytes(),
+            Self::Tileset(kept) => kept.bytes(),
+            Self::Colors(kept) => kept.bytes(),
+        }
+    }
+
+    /// Returns true if a request uses the value, or a cached tileset uses the structure.
+    pub(super) fn is_used(&self) -> bool {
+        match self {
+            Self::Structure(kept) => kept.is_used(),
+            Self::Tileset(kept) => kept.is_used(),
+            Self::Colors(kept) => kept.is_used(),
+        }
+    }
+}
+
+#[derive(Debug, Default)]
+pub(super) struct CacheState {
+    /// Values, each with the number of its last use.
+    pub(super) kept: HashMap<CacheKey, (u64, Kept)>,
+    /// Least recently used first.
+    pub(super) by_use: BTreeMap<u64, CacheKey>,
+    /// Number of uses.
+    pub(super) uses: u64,
+    /// Memory of all values, bytes.
+    pub(super) bytes: u64,
+    /// Values that a request is making.
+    pub(super) making: HashSet<CacheKey>,
+}
+
+impl CacheState {
+    /// Adds a value as the most recently used one.
+    pub(super) fn insert(&mut self, key: CacheKey, value: Kept) {
+        self.remove(&key);
+        self.uses += 1;
+        self.bytes += value.bytes();
+        self.by_use.insert(self.uses, key);
+        self.kept.insert(key, (self.uses, value));
+    }
+
+    pub(super) fn remove(&mut self, key: &CacheKey) -> Option<Kept> {
+        let (used, value) = self.kept.remove(key)?;
+        self.by_use.remove(&used);
+        self.bytes -= value.bytes();
+        Some(value)
+    }
+
+    /// Removes the least recently used value that `is_candidate` accepts, and returns its memory in bytes.
+    pub(super) fn evict(&mut self, is_candidate: impl Fn(&Kept) -> bool) -> Option<u64> {
+        let accepted = |key: &&CacheKey| self.kept.get(*key).is_some_and(|(_, value)| is_candidate(value));
+        let found = *self.by_use.values().find(accepted)?;
+        self.remove(&found).map(|value| value.bytes())
+    }
+
+    /// Finds a value, and makes it the most recently used one.
+    pub(super) fn find(&mut self, key: &CacheKey) -> Option<Kept> {
+        let found = self.remove(key)?;
+        self.insert(*key, found.clone());
+        Some(found)
+    }
+}
