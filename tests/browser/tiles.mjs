@@ -104,6 +104,16 @@ await run({
     assert.ok(await page.locator("#coarse").isHidden());
     assertClean(page);
   },
+  "without an index, the page requests one file": async () => {
+    const problem = { type: "/problems/too-much-memory", title: "The request needs too much memory", status: 422 };
+    const refuse = (route) => route.fulfill({ status: 422, contentType: "application/problem+json", body: JSON.stringify(problem) });
+    const other = await start(chromium, { url: `${SERVICE_URL}/?pdb=1crn`, before: (p) => p.route(/[?&]tile=/, refuse) });
+    assert.match(await other.locator("#now").textContent(), /^[\d,]+ triangles/);
+    assert.ok(other.requests.some((line) => line.includes("tile=")), "no tile was requested");
+    assert.ok(await other.locator("#problem").isHidden());
+    await other.context().close();
+  },
+
   "the component shows tilesets": async () => {
     const other = await page.context().newPage();
     await other.goto(SERVICE_URL);

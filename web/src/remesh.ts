@@ -3,6 +3,7 @@
 import { bytesOf } from "./api/bytes";
 import type { Client } from "./api/client";
 import { fetchFile, type Progress } from "./api/jobs";
+import { Problem } from "./api/problem";
 import type { Source } from "./api/structures";
 import type { DisplayState } from "./display";
 import { isLarge, type TilesetPaths } from "./large";
@@ -109,9 +110,9 @@ export class Remesher {
     try {
       const fetching = (path: string) => fetchFile(this.client, path, abort.signal, (job) => isLatest() && this.listener.progress(job));
       let tileset = request.preview === undefined ? this.listener.tileset(request) : null;
-      let reply = await fetching(tileset?.root ?? request.path);
+      let reply = tileset && (await fetching(tileset.root).catch(withoutTiles));
       // The number of atoms is known only now. The service has read them, so the whole surface takes little longer.
-      if (tileset && !isLarge(Number(reply.headers.get("molmesh-atoms")), request.choices)) {
+      if (!reply || !isLarge(Number(reply.headers.get("molmesh-atoms")), request.choices)) {
         tileset = null;
         reply = await fetching(request.path);
       }
@@ -128,4 +129,10 @@ export class Remesher {
     if (this.next) this.supersede();
     else this.listener.idle();
   }
+}
+
+/** Returns null for the error of a service that cannot keep the index of a tileset. Throws any other error. */
+function withoutTiles(error: unknown): null {
+  if (error instanceof Problem && error.is("too-much-memory")) return null;
+  throw error;
 }
