@@ -131,7 +131,8 @@ fn finish(app: &App, request: &mut Request, headers: &HeaderMap) -> Result<Forma
 fn format_of(file: &str) -> Result<Format, Problem> {
     let format = |ext| Format::ALL.into_iter().find(|format| format.name() == ext);
     file.strip_prefix("surface.").and_then(format).ok_or_else(|| {
-        let available: Vec<String> = Format::ALL.iter().map(|f| format!("surface.{}", f.name())).collect();
+        let surfaces = Format::ALL.iter().map(|f| format!("surface.{}", f.name()));
+        let available: Vec<String> = surfaces.chain(["tileset.json".to_owned()]).collect();
         let detail = format!("a structure has no `{file}`; it has {}", available.join(", "));
         Problem::new(ProblemType::NotFound, detail).with("available", available)
     })

@@ -172,6 +172,10 @@ fn parameters_that_do_not_apply_are_rejected() {
     ] {
         let problem = server.get(&format!("{structure}/{path}")).problem(400, "bad-parameter");
         assert_eq!(problem["parameter"], parameter, "{path}: {problem}");
+        // The value is that of the address.
+        let given = path.split(&format!("{parameter}=")).nth(1).map(|rest| rest.split('&').next().unwrap());
+        let value = problem["value"].as_str().unwrap_or(given.unwrap_or_default());
+        assert!(given.is_none_or(|given| value == given), "{path}: {problem}");
     }
     // The documentation lists none of them.
     let description = server.get("/openapi.json").json();

@@ -75,27 +75,28 @@ pub(crate) const NOT_APPLICABLE: [&str; 17] = [
 /// Returns [`ParamError::BadValue`].
 pub fn check(job: &Job) -> Result<(), ParamError> {
     let selection = &job.selection;
+    let when = |is_refused: bool, value: &str| is_refused.then(|| value.to_owned());
     let of_vertices = |color: &Coloring| matches!(color.scheme, Scheme::Vertex(_));
     let refused = [
-        ("split", job.split != Split::None && job.split != Split::Model, "none"),
-        ("model", job.split == Split::Model, "one model"),
-        ("instances", selection.instances, "false"),
-        ("context", selection.context != Context::Selection, "selection"),
-        ("cavities", job.cavities.is_some(), "no value"),
-        ("color", job.color.as_ref().is_some_and(of_vertices), "a scheme that colours atoms"),
-        ("color_blend", job.color.is_some_and(|color| color.blend == ColorBlend::Smooth), "nearest"),
-        ("pockets", job.pockets.is_some(), "false"),
-        ("exact", job.exact, "false"),
-        ("max_triangles", job.max_triangles().is_some(), "no value"),
-        ("simplify", job.simplify.is_some(), "no value"),
-        ("units", job.units != Units::Angstrom, "angstrom"),
-        ("paper_b", job.params.paper.is_some(), "no value"),
-        ("validation", job.validation != Validation::default(), "checksum"),
+        ("split", when(job.split != Split::None && job.split != Split::Model, job.split.name()), "none"),
+        ("model", when(job.split == Split::Model, "all"), "one model"),
+        ("instances", when(selection.instances, "true"), "false"),
+        ("context", when(selection.context != Context::Selection, selection.context.name()), "selection"),
+        ("cavities", job.cavities.map(|cavities| cavities.name().to_owned()), "no value"),
+        ("color", job.color.filter(of_vertices).map(|color| color.scheme.to_string()), "a scheme that colours atoms"),
+        ("color_blend", when(job.color.is_some_and(|color| color.blend == ColorBlend::Smooth), "smooth"), "nearest"),
+        ("pockets", when(job.pockets.is_some(), "true"), "false"),
+        ("exact", when(job.exact, "true"), "false"),
+        ("max_triangles", job.max_triangles().map(|limit| limit.to_string()), "no value"),
+        ("simplify", job.simplify.map(|wanted| wanted.error.to_string()), "no value"),
+        ("units", when(job.units != Units::Angstrom, job.units.name()), "angstrom"),
+        ("paper_b", when(job.params.paper.is_some(), "a raw constant"), "no value"),
+        ("validation", when(job.validation != Validation::default(), job.validation.name()), "checksum"),
     ];
-    match refused.into_iter().find(|(_, is_refused, _)| *is_refused) {
-        Some((name, _, expected)) => {
+    match refused.into_iter().find_map(|(name, value, expected)| Some((name, value?, expected))) {
+        Some((name, value, expected)) => {
             let expected = format!("{expected} for a tileset, whose tiles are computed independently");
-            Err(ParamError::BadValue { name, value: "the value".to_owned(), expected })
+            Err(ParamError::bad_value(name, &value, expected))
         }
         None => Ok(()),
     }
