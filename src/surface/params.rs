@@ -251,11 +251,11 @@ impl SurfaceParams {
         Mesh::bytes_for(n_vertices, n_triangles, self.quantize.is_some())
     }
 
-    /// Returns true if scale and offset leave the smallest radius usable.
+    /// Checks that scale and offset leave the smallest radius usable.
     ///
     /// # Errors
     /// [`SurfaceError::BadParameter`] names `radius_offset`.
-    pub(super) fn check_radius(&self, smallest: f32) -> Result<(), SurfaceError> {
+    pub(crate) fn check_radius(&self, smallest: f32) -> Result<(), SurfaceError> {
         if f64::from(smallest) * self.radius_scale + self.radius_offset < MIN_RADIUS {
             let expected =
                 format!("an offset that leaves every radius at {MIN_RADIUS} Å or more; the smallest is {smallest} Å");

@@ -96,7 +96,7 @@ impl Spheres {
     }
 
     /// The smallest and the largest radius, Å.
-    pub(super) fn radius_range(&self) -> (f32, f32) {
+    pub(crate) fn radius_range(&self) -> (f32, f32) {
         let parts = self.r.par_chunks(PART).map(|part| range(part, (f32::MAX, 0.0)));
         parts.reduce(|| (f32::MAX, 0.0), |a, b| (a.0.min(b.0), a.1.max(b.1)))
     }

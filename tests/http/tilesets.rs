@@ -155,6 +155,7 @@ fn parameters_that_do_not_apply_are_rejected() {
         ("tileset.json?simplify=0.1", "simplify"),
         ("tileset.json?units=nanometer", "units"),
         ("tileset.json?color=depth", "color"),
+        ("tileset.json?radius_offset=-5", "radius_offset"),
         ("tileset.json?check=strict", "check"),
         ("tileset.json?width=100", "width"),
         ("tileset.json?format=stl", "format"),

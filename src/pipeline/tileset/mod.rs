@@ -117,6 +117,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         let (structure, selected, spheres) = load(read, job, limits, clock, control)?;
         clock.time("index", || {
             let params = job.params_for(spheres.len());
+            params.check_radius(spheres.radius_range().0)?;
             let bounds = spheres.bounds().ok_or(SurfaceError::NoSpheres)?;
             let layout = Layout::new(bounds, influence(&spheres, &params), params.resolution);
             let (levels, tiles) = layout.index(&Arc::new(spheres), &params, control)?;
