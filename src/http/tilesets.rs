@@ -1,7 +1,7 @@
 //! `…/tileset.json` and `…/tileset.subtree`: 3D Tiles tileset of a structure, whose tiles are meshes with the parameter
 //! `tile`.
 //!
-//! A tileset has no state of its own: its address and those of its tiles name the structure and all parameters.
+//! A tileset has no state of its own: its URL and those of its tiles name the structure and all parameters.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -33,16 +33,15 @@ problem_responses!(StructureProblems: [
     [
         ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure,
         ProblemType::PreconditionFailed, ProblemType::EmptySelection, ProblemType::TooManyCopies,
-        ProblemType::TooManyCandidates, ProblemType::GridTooLarge,
-        ProblemType::TooMuchMemory, ProblemType::MemoryFull,
+        ProblemType::TooManyCandidates, ProblemType::GridTooLarge, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
         ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
     ],
 ]);
 problem_responses!(EntryProblems: [READING, [
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable,
-    ProblemType::PreconditionFailed, ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates,
-    ProblemType::GridTooLarge, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
-    ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge,
+    ProblemType::ArchiveUnavailable, ProblemType::PreconditionFailed, ProblemType::EmptySelection,
+    ProblemType::TooManyCopies, ProblemType::TooManyCandidates, ProblemType::GridTooLarge,
+    ProblemType::TooMuchMemory, ProblemType::MemoryFull, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
 ]]);
 
 /// Get the tileset of a structure
@@ -155,7 +154,7 @@ impl TilesetRequest {
         }
         let query = form_urlencoded::Serializer::new(String::new()).extend_pairs(&self.pairs).finish();
         let tile = format!("tile={{level}}/{{x}}/{{y}}/{{z}}&{query}");
-        // Clients such as 3d-tiles-renderer recognize a subtree by the end of its address.
+        // Clients such as 3d-tiles-renderer recognize a subtree by the end of its URL.
         let subtrees = format!("tileset.subtree?{tile}#.subtree");
         let uris = TilesetUris { content: format!("surface.glb?{tile}"), subtrees };
         self.answer("application/json", move |tileset| {

@@ -159,8 +159,7 @@ impl Structures {
         let tileset = self.prepared(key, input, control, (Kept::Tileset, as_tileset), prepare)?;
         let Some(coloring) = job.color else { return Ok((tileset, None)) };
         let key = (namespace, Digest::of(format!("colors\n{}\n{}", key.1, coloring.canonical()).as_bytes()));
-        let missing = || JobError::Surface(SurfaceError::Cancelled);
-        let prepare = |control: &Control<'_>| tileset.colors(job, control)?.ok_or_else(missing);
+        let prepare = |control: &Control<'_>| tileset.colors(coloring, control);
         let as_colors = |kept: Kept| if let Kept::Colors(colors) = kept { Some(colors) } else { None };
         let colors = self.prepared(key, input, control, (Kept::Colors, as_colors), prepare)?;
         Ok((tileset, Some(colors)))

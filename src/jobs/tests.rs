@@ -367,3 +367,18 @@ async fn versions_of_states_continue_after_a_restart() {
     assert!(versions.is_sorted_by(|a, b| a < b), "{versions:?}");
     assert_eq!(DurableJob::new(next.record()).view().version, *versions.last().unwrap(), "no event follows the last");
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn tiles_do_not_change_the_estimated_duration_of_jobs() {
+    let fixture = Fixture::new(1, Duration::ZERO).await;
+    let pool = &fixture.jobs.0.pool;
+    let run = async |job: &[(&str, &str)]| {
+        let job = params::parse(job.iter().copied()).unwrap().job;
+        let mut ticket = pool.submit(Task { job, ..task("a", "2") }, MAX_WAIT, None).unwrap();
+        assert!(ticket.wait().await.is_ok());
+        pool.seconds(1.0)
+    };
+    let before = pool.seconds(1.0);
+    assert!((run(&[("resolution", "2"), ("tile", "0/0/0/0")]).await - before).abs() < f64::EPSILON);
+    assert!((run(&[("resolution", "2")]).await - before).abs() > f64::EPSILON, "the control");
+}

@@ -21,15 +21,16 @@ use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_
 /// Runs jobs until the queue is closed and empty.
 pub(super) fn work(shared: &WorkerContext) {
     while let Some(entry) = shared.queue.pop() {
-        let (id, client) = (entry.id, entry.task.rank.client);
+        let (id, client, is_tile) = (entry.id, entry.task.rank.client, entry.task.job.tile.is_some());
         let start = Instant::now();
         let outcome = run(shared, entry);
         if let Some(meter) = &shared.settings.meter {
             meter(client, start.elapsed());
         }
         shared.publish_devices();
-        // Only successful jobs count in the duration estimate.
-        let time = matches!(outcome, Some(Ok(_))).then(|| start.elapsed());
+        // Only successful jobs count in the duration estimate. The time of a tile says little about other jobs: the
+        // first one prepares the tileset, and others have no surface.
+        let time = (matches!(outcome, Some(Ok(_))) && !is_tile).then(|| start.elapsed());
         shared.queue.done(id, outcome, time);
     }
 }

@@ -223,7 +223,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     }
     let clock = StageClock::new(progress);
     let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
-    let colors = tileset.colors(job, control)?;
+    let colors = job.color.map(|coloring| tileset.colors(coloring, control)).transpose()?;
     tileset.product((job, colors.as_ref()), choice, &limits.surface, control, clock, progress)
 }
 

@@ -22,7 +22,8 @@ struct Prepared {
 impl Prepared {
     fn mesh(&self, tile: TileAddress) -> Option<Mesh> {
         let (backend, job) = (CpuBackend::new(Some(2)).unwrap(), Job { tile: Some(tile), ..self.job.clone() });
-        let colors = self.tileset.colors(&job, &Control::default()).unwrap();
+        let color = |coloring| self.tileset.colors(coloring, &Control::default()).unwrap();
+        let colors = job.color.map(color);
         let limits = SurfaceLimits::default();
         self.tileset.mesh((&job, colors.as_ref()), &backend, &limits, &Control::default()).unwrap()
     }

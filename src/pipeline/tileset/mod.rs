@@ -125,13 +125,12 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         })
     }
 
-    /// Prepares the colours of a job; `None` without colours.
+    /// Prepares the colours of the atoms.
     ///
     /// # Errors
     /// Returns [`JobError::Color`] if the colour scheme has no values, and the errors of memory.
-    pub fn colors(&self, job: &Job, control: &Control<'_>) -> Result<Option<TilesetColors>, JobError> {
-        let color = |coloring| MeshColors::new(&self.structure, &self.selected.atoms, coloring, None, control);
-        Ok(job.color.map(color).transpose()?.map(TilesetColors))
+    pub fn colors(&self, coloring: Coloring, control: &Control<'_>) -> Result<TilesetColors, JobError> {
+        MeshColors::new(&self.structure, &self.selected.atoms, coloring, None, control).map(TilesetColors)
     }
 
     /// Returns the structure.

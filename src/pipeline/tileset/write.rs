@@ -83,7 +83,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
             write(path, bytes).map_err(|source| WriteError::File { path: path.to_owned(), source })?;
             Ok::<_, WriteError>(bytes.len() as u64)
         };
-        let colors = self.colors(job, control)?;
+        let colors = job.color.map(|coloring| self.colors(coloring, control)).transpose()?;
         let addresses: Vec<TileAddress> = self.tiles.iter().copied().collect();
         let done = AtomicUsize::new(0);
         // Not by parallel iterators: a thread that waits within a tile would begin other tiles, without a limit.

@@ -85,7 +85,7 @@ export class Viewer {
 
   /**
    * Shows the tileset at `url` in place of the surface, which is its root. Loads the tiles that the view needs, and
-   * calls `changed` in every frame.
+   * calls `changed` in every frame that shows tiles.
    */
   async refine(url: string, fetchTile: FetchTile, changed: (state: TilesState) => void, failed: (error: unknown, retry: () => void) => void): Promise<void> {
     const { loaded } = this;
