@@ -468,7 +468,7 @@ const MEDIA_TYPES: [&str; 10] = [
     "model/x-msms-face",
     "image/png",
 ];
-const FILES: [&str; 10] = [
+const FILES: [&str; 11] = [
     "surface.glb",
     "surface.gltf",
     "surface.ply",
@@ -479,6 +479,7 @@ const FILES: [&str; 10] = [
     "surface.vert",
     "surface.face",
     "surface.png",
+    "tileset.json",
 ];
 
 fn http() -> Vec<Row> {
