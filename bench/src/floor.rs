@@ -54,7 +54,7 @@ impl Work {
             }
             Stage::Emit => (300.0 * surface + 12.0 * triangles, 0.0),
             Stage::Measure => ((64.0 + 32.0 + 68.0) * surface + 4.0 * vertices, 0.0),
-            Stage::Write => (0.0, 0.0),
+            Stage::Write | Stage::Improve => (0.0, 0.0),
         };
         Self { bytes, fmas }
     }

@@ -263,6 +263,9 @@ pub(crate) struct SurfaceArgs {
     /// Simplify the mesh: fewer, larger triangles, with this error in Å
     #[arg(long, value_name = "Å")]
     pub(crate) simplify: Option<String>,
+    /// Quality of the triangles: standard, or high (few small angles; takes several times as long)
+    #[arg(long, value_name = "NAME")]
+    pub(crate) quality: Option<String>,
     /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)
     #[arg(long)]
     pub(crate) atom_ids: bool,

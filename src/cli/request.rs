@@ -123,6 +123,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("cavities", &surface.cavities),
         ("pocket_probe", &surface.pocket_probe),
         ("simplify", &surface.simplify),
+        ("quality", &surface.quality),
         ("validation", &args.validation),
         ("interface", &surface.interface),
     ];
@@ -192,6 +193,7 @@ mod tests {
             let value = match parameter.name {
                 "atom_ids" | "check" | "pockets" => vec![flag.as_str()],
                 "validation" => vec![&flag, "exact"],
+                "quality" => vec![&flag, "high"],
                 "cavities" => vec![&flag, "drop"],
                 "tile" => vec![&flag, "1/0/1/0"],
                 "pocket_probe" => vec![&flag, "5", "--pockets"],

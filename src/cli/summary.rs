@@ -2,6 +2,7 @@
 
 use molmesh::pipeline::{
     CavityReport, ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport, PocketReport, Report,
+    SimplificationReport, TriangleReport,
 };
 use molmesh::surface::Validation;
 
@@ -86,10 +87,11 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     if let Some(found) = report.pockets {
         page.row("pockets", &pockets(found, report.pocket_list.as_deref().unwrap_or_default()));
     }
-    if let Some(found) = report.simplification {
-        let [most, mean] = [found.max_deviation, found.mean_deviation];
-        let before = grouped(found.triangles_before);
-        page.row("simplified", &format!("from {before} triangles, deviation up to {most:.3} Å, mean {mean:.4} Å"));
+    if let Some(found) = &report.simplification {
+        page.row("simplified", &simplified(found));
+    }
+    if let Some(shapes) = &report.triangle_shapes {
+        page.row("angles", &angles(shapes));
     }
     page.row("area", &format!("{} Å²", decimal(report.area)));
     if let Some(volume) = report.volume {
@@ -109,6 +111,16 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     }
     timings(&mut page, report);
     page.finish()
+}
+
+fn simplified(found: &SimplificationReport) -> String {
+    let [most, mean] = [found.max_deviation, found.mean_deviation];
+    format!("from {} triangles, deviation up to {most:.3} Å, mean {mean:.4} Å", grouped(found.triangles_before))
+}
+
+fn angles(shapes: &TriangleReport) -> String {
+    let [all, most, median] = [shapes.smallest_angle, shapes.angle_1_percent, shapes.angle_median];
+    format!("at least {all:.1}°, {most:.1}° in 99 % of the triangles, median {median:.1}°")
 }
 
 /// Formats exact areas and volume.
@@ -370,6 +382,7 @@ mod tests {
             cavities: Some(2),
             cavity_list: None,
             pockets: Some(0),
+            triangle_shapes: None,
             simplification: None,
             pocket_list: None,
             component_list: Vec::new(),

@@ -9,9 +9,9 @@ use std::sync::Arc;
 
 use super::color::{AtomColors, Scheme};
 use super::cut::Cut;
-use super::divided::{Division, divided};
 use super::finest_fit::with_finest_fit;
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
+use super::job_backend::{Division, of_job};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
 use super::{parts, work};
 use crate::formats::Compress;
@@ -19,9 +19,10 @@ use crate::structure::{AtomPart, Structure, StructureError};
 use crate::surface::cpu::{LATTICE_BYTES, check_work, scan};
 use crate::surface::lattice::{Lattice, slightly_coarser};
 use crate::surface::params::MAX_RESOLUTION;
-use crate::surface::simplify::{TRIANGLE_BYTES, check_error};
+use crate::surface::simplify::{self, check_error};
 use crate::surface::{
-    Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
+    Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, TriangleQuality,
+    candidates, improve,
 };
 
 /// Estimated size of a job.
@@ -85,7 +86,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
     let parts = selected.parts(&structure, job.split, &limits.read, control)?;
     let cut = Cut::of(&selected, parts.as_deref(), None, job.validation, control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
-    let backend = divided(choice.backend, division);
+    let backend = of_job(choice.backend, division, job.quality);
     let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
     let mut params = job.params_for(spheres.len());
     let mut refused = None;
@@ -159,9 +160,10 @@ pub(super) fn check_memory(
     control: &Control<'_>,
 ) -> Result<(), SurfaceError> {
     let (memory, params) = (&control.memory, plan.params);
+    let processing = if job.simplify.is_some() { simplify::TRIANGLE_BYTES } else { 0 }
+        .max(if job.quality == TriangleQuality::High { improve::TRIANGLE_BYTES } else { 0 });
     // A vertex has two triangles.
-    let simplification = 2 * TRIANGLE_BYTES * u64::from(job.simplify.is_some());
-    let per_vertex = job.attribute_bytes() + simplification;
+    let per_vertex = job.attribute_bytes() + 2 * processing;
     let attributes =
         |vertices: u64| vertices.saturating_mul(per_vertex).saturating_add(plan.compressed_bytes(vertices));
     let vertices = n_vertices(plan.spheres.area(params), params.resolution);

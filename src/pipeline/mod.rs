@@ -8,7 +8,6 @@ pub mod color;
 mod components;
 pub mod cost;
 mod cut;
-mod divided;
 #[cfg(feature = "png")]
 mod draw;
 mod error;
@@ -19,6 +18,7 @@ mod fit;
 mod host_cores;
 mod instances;
 pub mod integer;
+mod job_backend;
 mod left_out;
 mod limits;
 mod load;
@@ -29,6 +29,7 @@ mod parts;
 mod pockets;
 mod progress;
 mod report;
+mod shapes;
 mod simplify;
 pub mod spacing;
 pub mod tileset;
@@ -55,6 +56,7 @@ pub use parts::PartReport;
 pub use pockets::PocketReport;
 pub use progress::Tracker;
 pub use report::{AssemblyReport, PictureReport, Quantization, Report, file_arithmetic};
+pub use shapes::TriangleReport;
 pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
@@ -65,12 +67,12 @@ use crate::picture::PictureParams;
 use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, Simplify, SinkFailed, Spheres, Stage, SurfaceError,
-    SurfaceParams, Validation, lattice,
+    SurfaceParams, TriangleQuality, Validation, lattice,
 };
 use color::{MeshColors, Scheme};
 use cut::Cut;
-use divided::{Division, divided};
 use estimate::MeshPlan;
+use job_backend::{Division, of_job};
 use load::{SPHERE_BYTES, load};
 use report::Counts;
 use tileset::Tileset;
@@ -93,6 +95,8 @@ pub struct Job {
     pub pockets: Option<f64>,
     /// Simplification of the mesh; `None` to keep all triangles.
     pub simplify: Option<Simplify>,
+    /// Quality of the triangles.
+    pub quality: TriangleQuality,
     /// Tile to mesh instead of the whole structure.
     pub tile: Option<TileAddress>,
     /// Choice of the grid spacing.
@@ -139,8 +143,8 @@ impl Job {
     }
 
     /// Returns true if the mesh can be written while it is computed. Atom ids, colours, the exact validation, a limit
-    /// on triangles, parts, cuts, instances, removed components, compression, simplification and pictures need the
-    /// whole mesh in memory.
+    /// on triangles, parts, cuts, instances, removed components, compression, simplification, improved triangles and
+    /// pictures need the whole mesh in memory.
     fn can_stream(&self) -> bool {
         !self.params.atom_ids
             && self.color.is_none()
@@ -148,6 +152,7 @@ impl Job {
             && self.spacing.max_triangles().is_none()
             && self.compress != Compress::Meshopt
             && self.simplify.is_none()
+            && self.quality == TriangleQuality::Standard
             && self.split == Split::None
             && self.selection.context == Context::Selection
             && !self.selection.instances
@@ -251,7 +256,7 @@ fn run_whole<S: Deref<Target = Structure>>(
     let parts = pockets::parts(of_pockets, &structure, &selected, job.split, &limits.read, &control)?;
     let cut = Cut::of(&selected, parts.as_deref(), of_pockets, job.validation, &control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
-    let backend = divided(choice.backend, division);
+    let backend = of_job(choice.backend, division, job.quality);
     let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
@@ -295,12 +300,15 @@ fn run_whole<S: Deref<Target = Structure>>(
         Some(measures) if cut.is_some() || measures.validation == job.validation => measures,
         found => clock.time(Stage::Measure.name(), || measures_of(&mut mesh, found, job.validation, &control))?,
     };
+    let shapes = (job.quality == TriangleQuality::High)
+        .then(|| clock.time(Stage::Measure.name(), || TriangleReport::new(&mesh)));
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     // The report takes the times of the clock, which observes nothing later.
     let control = Control { observer: &(), ..control };
     let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     (report.color, report.exact, report.simplification) = (color, exact, simplification);
+    report.triangle_shapes = shapes;
     report.set_cavities(cavities.as_ref(), &structure, &selected);
     report.set_pockets(pockets.as_ref(), &structure, &selected);
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);

@@ -22,7 +22,7 @@ use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Context, Selection, Split};
 use crate::surface::pockets::SPACING as POCKET_SPACING;
-use crate::surface::{Simplify, SurfaceError, SurfaceParams};
+use crate::surface::{Simplify, SurfaceError, SurfaceParams, TriangleQuality};
 
 /// Errors of parsing parameters.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -199,11 +199,12 @@ fn divided_by(split: Split, Selection { context, instances, .. }: &Selection) ->
     }
 }
 
-/// Rejects the simplification of one surface that is divided into parts. Vertices on borders are stored once per part,
-/// so the check for common edges would not find those of two parts.
+/// Rejects the simplification of improved triangles, and of one surface that is divided into parts: vertices on borders
+/// are stored once per part, so the check for common edges would not find those of two parts.
 fn check_simplify(job: &Job) -> Result<(), ParamError> {
     let Some(Simplify { error, .. }) = job.simplify else { return Ok(()) };
     let expected = match (job.split, job.selection.context) {
+        _ if job.quality == TriangleQuality::High => "no value with quality=high, whose triangles it would replace",
         (Split::Pocket, _) => "no value with split=pocket, which divides one surface",
         (split, Context::Whole) if split != Split::None => {
             "no value with split and context=whole, which divide one surface"

@@ -8,20 +8,21 @@ use super::ProgressSink;
 const UNIT: f64 = 1000.0;
 
 /// Stages with their typical shares of the time, in execution order.
-const STAGES: [(&str, f64); 21] = [
+const STAGES: [(&str, f64); 22] = [
     ("read", 0.09),
     ("select", 0.02),
     ("index", 0.01),
     ("exact", 0.01),
     ("pockets", 0.01),
     ("bin", 0.03),
-    ("field", 0.35),
+    ("field", 0.30),
     ("classify", 0.05),
     ("scan", 0.02),
     ("refine", 0.02),
     ("interpolate", 0.08),
     ("emit", 0.10),
     ("write", 0.05),
+    ("improve", 0.05),
     ("cavities", 0.01),
     ("simplify", 0.01),
     ("clip", 0.01),

@@ -11,6 +11,7 @@ use super::instances::InstancesReport;
 use super::left_out::LeftOutReport;
 use super::parts::PartReport;
 use super::pockets::PocketReport;
+use super::shapes::TriangleReport;
 use super::simplify::SimplificationReport;
 use super::{Choice, Job, StageClock};
 use crate::formats::{Storage, Units};
@@ -186,6 +187,9 @@ pub struct Report {
     /// Pockets with the largest volumes, at most 100; absent without `pockets`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pocket_list: Option<Vec<PocketReport>>,
+    /// Shapes of the triangles; absent without `quality=high`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub triangle_shapes: Option<TriangleReport>,
     /// Simplification of the mesh; absent without `simplify`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub simplification: Option<SimplificationReport>,
@@ -315,6 +319,7 @@ impl Report {
             cavity_list: None,
             pockets: None,
             pocket_list: None,
+            triangle_shapes: None,
             simplification: None,
             component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
             parts: Vec::new(),
@@ -369,12 +374,13 @@ impl Report {
 }
 
 /// Fields of the report that mesh files do not contain. The last digits of `exact` depend on mathematical libraries.
-const EXCLUDED_EXTRAS: [&str; 10] = [
+const EXCLUDED_EXTRAS: [&str; 11] = [
     "timings_ms",
     "device",
     "backend_reason",
     "fallback",
     "exact",
+    "triangle_shapes",
     "left_out",
     "warnings",
     "void_list",

@@ -28,11 +28,13 @@ pub enum Stage {
     Measure,
     /// Writing finished parts of the mesh to a sink.
     Write,
+    /// Improvement of triangles on request, on the CPU.
+    Improve,
 }
 
 impl Stage {
     /// Every stage, in the order in which they run.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Bin,
         Self::Field,
         Self::Classify,
@@ -42,6 +44,7 @@ impl Stage {
         Self::Emit,
         Self::Measure,
         Self::Write,
+        Self::Improve,
     ];
 
     /// The stage's name, as shaders, reports and `Server-Timing` spell it.
@@ -57,6 +60,7 @@ impl Stage {
             Self::Emit => "emit",
             Self::Write => "write",
             Self::Measure => "measure",
+            Self::Improve => "improve",
         }
     }
 }

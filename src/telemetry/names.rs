@@ -60,7 +60,7 @@ metrics! {
     /// Time of each stage of a job.
     STAGE_DURATION = "molmesh_job_stage_duration_seconds", Histogram,
         stage: "queue|check|read|select|exact|pockets|bin|field|classify|scan|refine|interpolate|emit|write|\
-                cavities|simplify|index|clip|measure|roundtrip|color|draw|png|encode";
+                improve|cavities|simplify|index|clip|measure|roundtrip|color|draw|png|encode";
     /// Results of synchronous requests that were not stored.
     RESULTS_NOT_STORED = "molmesh_results_not_stored_total", Counter, reason: "busy|failed";
     /// Jobs waiting in the queue.

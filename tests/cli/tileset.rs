@@ -115,6 +115,7 @@ fn a_folder_with_files_and_parameters_of_whole_meshes_are_rejected() {
         &["--split", "chain"][..],
         &["--cavities", "keep"],
         &["--simplify", "0.1"],
+        &["--quality", "high"],
         &["--max-triangles", "1000"],
         &["--color", "depth"],
         &["--color", "element", "--color-blend", "smooth"],

@@ -284,25 +284,27 @@ fn jobs_of_ten_seconds_end_soon_after_cancellation_at_any_time() {
 }
 
 #[test]
-fn simplifications_end_soon_after_cancellation_at_any_time() {
+fn simplifications_and_improvements_end_soon_after_cancellation_at_any_time() {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
-    let (input, job) = (lattice(12), job(&[("resolution", "0.5"), ("simplify", "0.1")]));
-    let run = |control: &Control<'_>, progress: &dyn ProgressSink| {
-        pipeline::run(&input, &job, &JobLimits::default(), &choice, control, progress, None)
-    };
-    let whole = run(&Control::default(), &()).unwrap().report.timings_ms["simplify"].as_f64().unwrap();
-    let time = Duration::from_secs_f64(whole / 1e3);
-    for part in [0.0, 0.2, 0.4, 0.6, 0.8] {
-        assert_in_time("simplify", || {
-            let at = CancelIn { delay: time.mul_f64(part), ..CancelIn::new("simplify") };
-            let stopped = run(&at.control(), &at);
-            let late = at.time();
-            // The last part may be over already.
-            let cancelled = matches!(stopped, Err(JobError::Surface(SurfaceError::Cancelled)));
-            assert!(cancelled || (part > 0.3 && stopped.is_ok()), "simplify after {part} of {time:?}");
-            late
-        });
+    for (stage, parameter) in [("simplify", ("simplify", "0.1")), ("improve", ("quality", "high"))] {
+        let (input, job) = (lattice(12), job(&[("resolution", "0.5"), parameter]));
+        let run = |control: &Control<'_>, progress: &dyn ProgressSink| {
+            pipeline::run(&input, &job, &JobLimits::default(), &choice, control, progress, None)
+        };
+        let whole = run(&Control::default(), &()).unwrap().report.timings_ms[stage].as_f64().unwrap();
+        let time = Duration::from_secs_f64(whole / 1e3);
+        for part in [0.0, 0.2, 0.4, 0.6, 0.8] {
+            assert_in_time(stage, || {
+                let at = CancelIn { delay: time.mul_f64(part), ..CancelIn::new(stage) };
+                let stopped = run(&at.control(), &at);
+                let late = at.time();
+                // The last part may be over already.
+                let cancelled = matches!(stopped, Err(JobError::Surface(SurfaceError::Cancelled)));
+                assert!(cancelled || (part > 0.3 && stopped.is_ok()), "{stage} after {part} of {time:?}");
+                late
+            });
+        }
     }
 }
 
@@ -366,7 +368,7 @@ fn backends_end_soon_after_cancellation_in_any_stage() {
     let structure = structure::read(&lattice(24), &ReadLimits::default()).unwrap();
     let spheres: Spheres = structure::select(&structure, &Selection::default()).unwrap().spheres(&structure).unwrap();
     let backend = CpuBackend::new(Some(2)).unwrap();
-    for stage in Stage::ALL.into_iter().filter(|stage| *stage != Stage::Measure) {
+    for stage in Stage::ALL.into_iter().filter(|stage| ![Stage::Measure, Stage::Improve].contains(stage)) {
         // The CPU refines isosurfaces while it interpolates.
         let surface = if stage == Stage::Refine { SurfaceKind::Ses } else { SurfaceKind::default() };
         let params = SurfaceParams { surface, resolution: 0.4, ..SurfaceParams::default() };

@@ -30,6 +30,7 @@ mod maps;
 mod peers;
 mod picture;
 mod pockets;
+mod quality;
 mod real_structures;
 mod simplify;
 mod spacing;

@@ -255,6 +255,7 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         &[("split", "residue-group")],
         &[("atom_ids", "true")],
         &[("validation", "exact")],
+        &[("quality", "high")],
         &[("compress", "quantize")],
         &[("compress", "meshopt")],
         &[("normals", "none")],

@@ -118,6 +118,7 @@ fn read(pairs: &[(&str, &str)], format: Format) -> Result<String, ParamError> {
 }
 
 #[test]
+#[expect(clippy::too_many_lines, reason = "a request per line")]
 fn a_default_is_valid_with_every_parameter() {
     let (_server, description) = server();
     let defaults = query(&description, "post", "/v1/meshes", None);
@@ -147,6 +148,7 @@ fn a_default_is_valid_with_every_parameter() {
         &[("cavities", "drop"), ("surface", "ses")],
         &[("pockets", "true"), ("pocket_probe", "5")],
         &[("simplify", "0.1")],
+        &[("quality", "high")],
         &[("simplify", "0.2"), ("max_triangles", "20000")],
         &[("tile", "0/0/0/0")],
         &[("color", "pocket")],

@@ -153,6 +153,7 @@ fn parameters_that_do_not_apply_are_rejected() {
         ("tileset.json?split=chain", "split"),
         ("tileset.json?tile=0/0/0/0", "tile"),
         ("tileset.json?simplify=0.1", "simplify"),
+        ("tileset.json?quality=high", "quality"),
         ("tileset.json?units=nanometer", "units"),
         ("tileset.json?color=depth", "color"),
         ("tileset.json?radius_offset=-5", "radius_offset"),

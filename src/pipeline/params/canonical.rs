@@ -2,7 +2,7 @@
 
 use crate::pipeline::{Coloring, Job, PictureParams, Spacing};
 use crate::structure::{Context, Selection, Split};
-use crate::surface::{PaperParams, SurfaceParams};
+use crate::surface::{PaperParams, SurfaceParams, TriangleQuality};
 
 /// Returns all parameters of a job as one line of text, which is equal for equal jobs only. It is part of the content
 /// key.
@@ -16,6 +16,7 @@ pub fn canonical(job: &Job) -> String {
         cavities,
         pockets,
         simplify,
+        quality,
         tile,
         spacing,
         validation,
@@ -71,6 +72,7 @@ pub fn canonical(job: &Job) -> String {
         pockets.map(|probe| format!("pockets={probe}")),
         simplify.map(|wanted| format!("simplify={}", wanted.error)),
         simplify.and_then(|wanted| wanted.max_triangles).map(|limit| format!("max_triangles={limit}")),
+        (*quality != TriangleQuality::Standard).then(|| format!("quality={}", quality.name())),
         tile.map(|tile| format!("tile={}", tile.path())),
         exact.then(|| "exact=true".to_owned()),
         // Quotes the names, which may contain `&`.

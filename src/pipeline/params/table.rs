@@ -8,7 +8,7 @@ use crate::picture::{Background, MAX_SIDE};
 use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::pipeline::{areas, color};
 use crate::surface::params::{MAX_PROBE, MAX_RESOLUTION, MIN_RESOLUTION};
-use crate::surface::{POCKET_PROBES, Preset, SIMPLIFY_ERRORS, SurfaceKind, Validation};
+use crate::surface::{POCKET_PROBES, Preset, SIMPLIFY_ERRORS, SurfaceKind, TriangleQuality, Validation};
 
 /// One parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -277,6 +277,12 @@ pub const TABLE: &[Parameter] = &[
         domain: Domain::Text { expected: "the address of a tile, level/x/y/z" },
         default: "absent",
         doc: "Tile of the structure's tileset to mesh, instead of the whole structure. Skirts at its border hide gaps between levels.",
+    },
+    Parameter {
+        name: "quality",
+        domain: Domain::Choice(TriangleQuality::NAMES),
+        default: "standard",
+        doc: "Quality of the triangles: high improves those of marching cubes, so that few have small angles. Not with simplify.",
     },
     Parameter {
         name: "validation",

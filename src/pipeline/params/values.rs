@@ -11,7 +11,9 @@ use crate::pipeline::color::{ColorBlend, Coloring, Palette, Scheme};
 use crate::pipeline::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::pipeline::{Cavities, Spacing};
 use crate::structure::{Context, ModelChoice, Selection, Split};
-use crate::surface::{DEFAULT_POCKET_PROBE, Preset, Simplify, SurfaceKind, SurfaceOptions, Validation};
+use crate::surface::{
+    DEFAULT_POCKET_PROBE, Preset, Simplify, SurfaceKind, SurfaceOptions, TriangleQuality, Validation,
+};
 
 /// Default of `color_offset`: the radius of a water molecule, Å.
 const DEFAULT_COLOR_OFFSET: f64 = 1.4;
@@ -182,6 +184,7 @@ impl ParsedValues {
             "pockets" => self.pockets = flag(text).ok_or_else(bad)?,
             "pocket_probe" => self.pocket_probe = Some(bounded().ok_or_else(bad)?),
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
+            "quality" => self.request.job.quality = TriangleQuality::from_str(text).ok().ok_or_else(bad)?,
             "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
             "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
             "format" => self.request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),

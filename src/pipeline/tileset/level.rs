@@ -30,12 +30,13 @@ pub(super) struct TilesetLevel {
     pub(super) spheres: Arc<Spheres>,
     /// Atom that represents each sphere, as a row of the selected atoms; `None` if sphere and row are the same.
     rows: Option<Vec<u32>>,
-    buckets: Buckets,
+    /// Buckets of the spheres. Levels whose spheres are the atoms share them.
+    buckets: Arc<Buckets>,
 }
 
 /// Spheres by the cube that contains their centres.
 #[derive(Debug)]
-struct Buckets {
+pub(super) struct Buckets {
     /// Edge length of the cubes, Å.
     side: f64,
     numbers: FxHashMap<[i64; 3], u32>,
@@ -45,8 +46,11 @@ struct Buckets {
 }
 
 impl Buckets {
-    /// Sorts spheres by counting, without memory besides the result.
-    fn new(spheres: &Spheres, side: f64, control: &Control<'_>) -> Result<Self, SurfaceError> {
+    /// Sorts spheres into cubes with the edge length `side`, Å. Sorts by counting, without memory besides the result.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    pub(super) fn new(spheres: &Spheres, side: f64, control: &Control<'_>) -> Result<Self, SurfaceError> {
         control.memory.grow(INDEX_BYTES * spheres.len() as u64)?;
         let mut numbers = FxHashMap::default();
         let mut starts: Vec<u32> = Vec::new();
@@ -93,9 +97,14 @@ impl Buckets {
         &self.order[self.starts[number] as usize..self.starts[number + 1] as usize]
     }
 
-    /// Returns the spheres of each bucket.
-    fn all(&self) -> impl Iterator<Item = &[u32]> {
-        (0..self.starts.len() - 1).map(|number| self.of(number))
+    /// Returns the numbers of the buckets by the cell of a grid, sorted. Cells are unions of buckets, or a bucket is a
+    /// union of cells.
+    fn by_cell(&self, spacing: f64) -> Vec<([i64; 3], u32)> {
+        let middle = |at: &[i64; 3]| at.map(|c| (c as f64 + 0.5) * self.side);
+        let cell = |at: &[i64; 3]| cube(middle(at), spacing.max(self.side));
+        let mut cells: Vec<_> = self.numbers.iter().map(|(at, number)| (cell(at), *number)).collect();
+        cells.sort_unstable();
+        cells
     }
 
     /// Returns the spheres in a cube.
@@ -106,32 +115,23 @@ impl Buckets {
 
 impl TilesetLevel {
     /// Prepares a level with the grid spacing `spacing` and tiles with the edge length `side`, Å. A coarse level has
-    /// one sphere for all atoms in a cell of its grid, with their total volume. `finer` is the coarsest level without
-    /// groups, if there is one.
+    /// one sphere for all atoms in a cell of its grid, with their total volume. `buckets` are those of the atoms.
     ///
     /// # Errors
     /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`], [`SurfaceError::BadParameter`] for the radii.
     pub(super) fn new(
         atoms: &Arc<Spheres>,
+        buckets: &Arc<Buckets>,
         params: &SurfaceParams,
         [spacing, side]: [f64; 2],
-        finer: Option<&Self>,
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
-        let (spheres, rows) = if spacing <= GROUP_ABOVE {
-            (Arc::clone(atoms), None)
-        } else {
-            let buckets = finer.map(|level| &level.buckets).filter(|buckets| buckets.side >= spacing);
-            let (spheres, rows) = grouped(atoms, buckets, params, spacing, control)?;
-            (Arc::new(spheres), Some(rows))
-        };
-        let buckets = Buckets::new(&spheres, side, control)?;
-        Ok(Self { spheres, rows, buckets })
-    }
-
-    /// Returns true if the spheres are groups of atoms.
-    pub(super) const fn is_grouped(&self) -> bool {
-        self.rows.is_some()
+        if spacing <= GROUP_ABOVE {
+            return Ok(Self { spheres: Arc::clone(atoms), rows: None, buckets: Arc::clone(buckets) });
+        }
+        let (spheres, rows) = grouped(atoms, buckets, params, spacing, control)?;
+        let buckets = Arc::new(Buckets::new(&spheres, side, control)?);
+        Ok(Self { spheres: Arc::new(spheres), rows: Some(rows), buckets })
     }
 
     /// Returns the spheres whose centres are at most `margin` away from a box along each axis, ascending. Lengths are
@@ -169,11 +169,11 @@ fn grid_point(c: f64, spacing: f64) -> f64 {
 }
 
 /// Returns a sphere for the atoms in each cell of a grid, Å: at the mean of their centres, with their total volume. A
-/// small sphere lies at the nearest grid point instead. Also returns the atom nearest to this mean. Each cell lies in
-/// one of `buckets`, which limit the memory of sorting.
+/// small sphere lies at the nearest grid point instead. Also returns the atom nearest to this mean. `buckets` limit the
+/// memory of sorting.
 fn grouped(
     atoms: &Spheres,
-    buckets: Option<&Buckets>,
+    buckets: &Buckets,
     params: &SurfaceParams,
     spacing: f64,
     control: &Control<'_>,
@@ -181,14 +181,14 @@ fn grouped(
     let effective = |radius: f32| f64::from(radius) * params.radius_scale + params.radius_offset;
     #[expect(clippy::cast_possible_truncation, reason = "radii have single precision")]
     let given = |effective: f64| ((effective - params.radius_offset) / params.radius_scale) as f32;
-    let everything: Vec<u32> = if buckets.is_none() { (0_u32..).take(atoms.len()).collect() } else { Vec::new() };
-    let runs: Vec<&[u32]> = buckets.map_or_else(|| vec![&everything[..]], |buckets| buckets.all().collect());
     let [mut x, mut y, mut z] = [const { Vec::new() }; 3];
     let (mut radii, mut rows) = (Vec::new(), Vec::new());
-    for run in runs {
+    for run in buckets.by_cell(spacing).chunk_by(|a, b| a.0 == b.0) {
         control.check()?;
-        let _sorting = control.reserve(SORT_BYTES * run.len() as u64)?;
-        let mut keys: Vec<_> = run.iter().map(|i| (cube(atoms.centre(*i as usize), spacing), *i as usize)).collect();
+        let run = run.iter().map(|(_, number)| buckets.of(*number as usize));
+        let _sorting = control.reserve(SORT_BYTES * run.clone().map(<[u32]>::len).sum::<usize>() as u64)?;
+        let key = |i: &u32| (cube(atoms.centre(*i as usize), spacing), *i as usize);
+        let mut keys: Vec<_> = run.flatten().map(key).collect();
         keys.sort_unstable();
         let before = rows.len();
         for group in keys.chunk_by(|a, b| a.0 == b.0) {

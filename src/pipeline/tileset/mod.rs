@@ -14,7 +14,7 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use self::layout::Layout;
-use self::level::TilesetLevel;
+use self::level::{Buckets, TilesetLevel};
 pub use self::write::{LevelReport, TilesetReport, WriteError};
 use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, Scheme};
 use super::params::ParamError;
@@ -26,7 +26,7 @@ use crate::structure::{Context, ReadLimits, Selected, Split, Structure, Structur
 use crate::surface::clip::influence;
 use crate::surface::{
     Backend, Control, GridStats, Measures, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits,
-    SurfaceParams, Validation,
+    SurfaceParams, TriangleQuality, Validation,
 };
 
 /// Maximum number of tiles.
@@ -64,9 +64,9 @@ impl<S> fmt::Debug for Tileset<S> {
 /// Parameters that do not apply to tiles.
 #[cfg(feature = "server")]
 #[rustfmt::skip]
-pub(crate) const NOT_APPLICABLE: [&str; 17] = [
+pub(crate) const NOT_APPLICABLE: [&str; 18] = [
     "split", "instances", "context", "cavities", "pockets", "pocket_probe", "exact", "interface", "max_triangles",
-    "simplify", "units", "paper_a", "paper_b", "paper_c", "validation", "color_blend", "color_offset",
+    "simplify", "quality", "units", "paper_a", "paper_b", "paper_c", "validation", "color_blend", "color_offset",
 ];
 
 /// Rejects parameters of a job that do not apply to tiles.
@@ -89,6 +89,7 @@ pub fn check(job: &Job) -> Result<(), ParamError> {
         ("exact", when(job.exact, "true"), "false"),
         ("max_triangles", job.max_triangles().map(|limit| limit.to_string()), "no value"),
         ("simplify", job.simplify.map(|wanted| wanted.error.to_string()), "no value"),
+        ("quality", when(job.quality != TriangleQuality::Standard, job.quality.name()), "standard"),
         ("units", when(job.units != Units::Angstrom, job.units.name()), "angstrom"),
         ("paper_b", when(job.params.paper.is_some(), "a raw constant"), "no value"),
         ("validation", when(job.validation != Validation::default(), job.validation.name()), "checksum"),
@@ -274,10 +275,11 @@ impl Layout {
         params: &SurfaceParams,
         control: &Control<'_>,
     ) -> Result<(Vec<TilesetLevel>, BTreeSet<TileAddress>), JobError> {
-        let (mut levels, mut tiles) = (Vec::<TilesetLevel>::new(), BTreeSet::new());
+        let (mut levels, mut tiles) = (Vec::new(), BTreeSet::new());
+        let buckets = Arc::new(Buckets::new(spheres, self.side(self.levels - 1), control)?);
         for number in (0..self.levels).rev() {
-            let finer = levels.iter().rev().find(|level| !level.is_grouped());
-            let level = TilesetLevel::new(spheres, params, [self.spacing(number), self.side(number)], finer, control)?;
+            let lengths = [self.spacing(number), self.side(number)];
+            let level = TilesetLevel::new(spheres, &buckets, params, lengths, control)?;
             let finer = tiles.iter().take_while(|tile: &&TileAddress| tile.level == number + 1);
             let mut parents: BTreeSet<TileAddress> = finer.filter_map(|tile| tile.parent()).collect();
             tiles.append(&mut parents);

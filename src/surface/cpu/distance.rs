@@ -101,7 +101,12 @@ impl DistanceField {
 
     /// Returns the bounding spheres of the arcs.
     pub(super) fn bounds(&self) -> Option<&Lattice> {
-        self.boundary.as_ref().map(|boundary| &boundary.bounds)
+        self.boundary().map(|(bounds, _)| bounds)
+    }
+
+    /// Returns the bounding spheres of the arcs and their tiles.
+    pub(super) fn boundary(&self) -> Option<(&Lattice, &Tiles)> {
+        self.boundary.as_ref().map(|boundary| (&boundary.bounds, &boundary.tiles))
     }
 
     /// Finds the arcs near every brick in `layers` of a tile, and in the layer beyond, as [`Bricks::fill`] finds atoms.

@@ -19,6 +19,7 @@ mod first_pass;
 mod interpolate;
 mod measure;
 mod neighbours;
+pub(super) mod points;
 mod refine;
 pub(crate) mod scan;
 mod sheets;

@@ -1,4 +1,5 @@
-//! Backend that divides its meshes: into parts with meshes of their own, or by the atoms nearest to their triangles.
+//! Backend of a job: improves the triangles of the meshes of another backend if the job requests it, and divides the
+//! meshes: into parts with meshes of their own, or by the atoms nearest to their triangles.
 
 use std::ops::Deref;
 use std::sync::Arc;
@@ -7,9 +8,10 @@ use super::cut::Cut;
 use super::parts::{self, Run};
 use super::work::mesh_work;
 use crate::structure::AtomPart;
+use crate::surface::improve::improve;
 use crate::surface::{
-    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Reservation, Spheres, SurfaceError, SurfaceKind,
-    SurfaceLimits, SurfaceParams,
+    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Reservation, Spheres, Stage, SurfaceError, SurfaceKind,
+    SurfaceLimits, SurfaceParams, TriangleQuality,
 };
 
 /// Division of a mesh.
@@ -44,13 +46,17 @@ impl<'a> Division<'a> {
     }
 }
 
-/// Returns `backend` or, with a `division`, a backend that divides the meshes of `backend`.
-pub(super) fn divided<'a>(backend: &'a dyn Backend, division: Option<Division<'a>>) -> AnyBackend<'a> {
+/// Returns `backend` or, if the job has a division or a high quality, a backend that processes the meshes of `backend`.
+pub(super) fn of_job<'a>(
+    backend: &'a dyn Backend,
+    division: Option<Division<'a>>,
+    quality: TriangleQuality,
+) -> AnyBackend<'a> {
     let inner = AnyBackend::Borrowed(backend);
-    match division {
-        Some(division) => AnyBackend::Owned(Box::new(DividedBackend { inner, division })),
-        None => inner,
+    if division.is_none() && quality == TriangleQuality::Standard {
+        return inner;
     }
+    AnyBackend::Owned(Box::new(JobBackend { inner, division, quality }))
 }
 
 /// Borrowed or owned backend.
@@ -70,24 +76,37 @@ impl<'a> Deref for AnyBackend<'a> {
     }
 }
 
-/// Backend that divides the meshes of another backend.
-struct DividedBackend<'a> {
+/// Backend that processes the meshes of another backend.
+struct JobBackend<'a> {
     /// The chosen backend, or the one that it assigned to the job.
     inner: AnyBackend<'a>,
-    division: Division<'a>,
+    division: Option<Division<'a>>,
+    quality: TriangleQuality,
 }
 
-impl DividedBackend<'_> {
+impl JobBackend<'_> {
+    /// Returns a mesh that is not divided.
+    fn whole(&self, run: &Run<'_>, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
+        let mut output = self.inner.run(run.spheres, run.single, run.limits, control)?;
+        if self.quality == TriangleQuality::High {
+            let improved = || improve(&mut output.mesh, run.spheres, run.single, run.limits, control);
+            control.span(Stage::Improve, improved)?;
+            (output.measures, output.bounds) = (None, None);
+        }
+        Ok(output)
+    }
+
     /// Meshes each of `parts` and joins the meshes. Limits apply to all parts together, before quantizing.
     fn join(&self, parts: &[AtomPart], run: &Run<'_>, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
         let work = parts.iter().map(|part| mesh_work(part.rows.len() as f64, run.params.resolution)).sum();
         let assigned = self.inner.for_job(run.params.surface, work);
-        let backend = assigned.as_deref().unwrap_or(&*self.inner);
+        let inner = AnyBackend::Borrowed(assigned.as_deref().unwrap_or(&*self.inner));
+        let backend = JobBackend { inner, division: None, quality: self.quality };
         // The content key names one backend. If it fails after some parts, the fallback meshes all parts again.
         for _attempt in 0..2 {
             let memory = Arc::new(Reservation::new(&control.memory));
             let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-            if let Some(output) = parts::join(parts, backend, run, &metered)? {
+            if let Some(output) = parts::join(parts, &backend, run, &metered)? {
                 memory.keep();
                 return Ok(output);
             }
@@ -101,8 +120,10 @@ impl DividedBackend<'_> {
         let memory = Arc::new(Reservation::new(&control.memory));
         let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
         let atom_ids = run.params.atom_ids || cut.needs_atom_ids();
-        let with_atoms = SurfaceParams { atom_ids, ..run.params.clone() };
-        let whole = self.inner.run(run.spheres, &with_atoms, run.limits, &metered)?;
+        // Improvement needs vertices that are not rounded.
+        let quantize = run.params.quantize.filter(|_| self.quality == TriangleQuality::Standard);
+        let with_atoms = SurfaceParams { atom_ids, quantize, ..run.params.clone() };
+        let whole = self.whole(&Run { single: &with_atoms, ..*run }, &metered)?;
         let mut output = cut.apply(whole, run, control)?;
         if !run.params.atom_ids {
             output.mesh.atom_ids = None;
@@ -111,7 +132,7 @@ impl DividedBackend<'_> {
     }
 }
 
-impl Backend for DividedBackend<'_> {
+impl Backend for JobBackend<'_> {
     fn name(&self) -> &'static str {
         self.inner.name()
     }
@@ -138,7 +159,7 @@ impl Backend for DividedBackend<'_> {
 
     fn for_job(&self, surface: SurfaceKind, work: f64) -> Option<Box<dyn Backend + '_>> {
         let inner = AnyBackend::Owned(self.inner.for_job(surface, work)?);
-        Some(Box::new(DividedBackend { inner, division: self.division }))
+        Some(Box::new(JobBackend { inner, division: self.division, quality: self.quality }))
     }
 
     fn write(
@@ -151,8 +172,9 @@ impl Backend for DividedBackend<'_> {
     ) -> Result<MeshOutput, SurfaceError> {
         let run = Run { spheres, params, single: &SurfaceParams { quantize: None, ..params.clone() }, limits };
         let output = match self.division {
-            Division::Parts(parts) => self.join(parts, &run, control),
-            Division::Cut(cut) => self.cut(cut, &run, control),
+            Some(Division::Parts(parts)) => self.join(parts, &run, control),
+            Some(Division::Cut(cut)) => self.cut(cut, &run, control),
+            None => self.whole(&run, control),
         };
         output?.deliver(params, control, sink)
     }

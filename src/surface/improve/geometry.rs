@@ -1,0 +1,56 @@
+//! Vectors and triangles in single precision; signs of volumes in double precision.
+
+/// Position or vector, Å.
+pub(super) type Vector = [f32; 3];
+/// Corners of a triangle, Å.
+pub(super) type Corners = [Vector; 3];
+
+pub(super) fn sub(a: Vector, b: Vector) -> Vector {
+    std::array::from_fn(|k| a[k] - b[k])
+}
+
+pub(super) fn dot(a: Vector, b: Vector) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+pub(super) fn cross(a: Vector, b: Vector) -> Vector {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+pub(super) fn length(a: Vector) -> f32 {
+    dot(a, a).sqrt()
+}
+
+/// Returns the normal of a triangle, twice as long as its area.
+pub(super) fn area_vector([a, b, c]: Corners) -> Vector {
+    cross(sub(b, a), sub(c, a))
+}
+
+/// Returns the tangent of the smallest angle of a triangle; 0 for a degenerate one.
+pub(super) fn tan_smallest_angle([a, b, c]: Corners) -> f32 {
+    let (u, v, w) = (sub(b, a), sub(c, b), sub(a, c));
+    let [uu, vv, ww] = [dot(u, u), dot(v, v), dot(w, w)];
+    // The smallest angle is opposite to the shortest edge. The product of the other two edges and its cosine is half of
+    // the sum of their squares less that of the shortest edge.
+    let shortest = uu.min(vv).min(ww);
+    let cosine = 0.5 * (uu + vv + ww) - shortest;
+    if cosine > 0.0 { length(cross(u, w)) / cosine } else { 0.0 }
+}
+
+/// Returns six times the signed volume of a tetrahedron.
+fn volume6([a, b, c]: &Corners, d: Vector) -> f64 {
+    let from = |p: &Vector| -> [f64; 3] { std::array::from_fn(|k| f64::from(p[k]) - f64::from(d[k])) };
+    let [a, b, c] = [from(a), from(b), from(c)];
+    a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+}
+
+/// Returns true if a line segment crosses a triangle. Both must not have a common point on the boundary of the
+/// triangle.
+pub(super) fn segment_crosses(from: Vector, to: Vector, triangle: &Corners) -> bool {
+    let [a, b, c] = *triangle;
+    if volume6(triangle, from) * volume6(triangle, to) >= 0.0 {
+        return false;
+    }
+    let around = [[a, b], [b, c], [c, a]].map(|[p, q]| volume6(&[p, q, from], to) > 0.0);
+    around == [true; 3] || around == [false; 3]
+}
