@@ -160,8 +160,11 @@ pub(super) fn check_memory(
     control: &Control<'_>,
 ) -> Result<(), SurfaceError> {
     let (memory, params) = (&control.memory, plan.params);
-    let processing = if job.simplify.is_some() { simplify::TRIANGLE_BYTES } else { 0 }
-        .max(if job.quality == TriangleQuality::High { improve::TRIANGLE_BYTES } else { 0 });
+    let processing = match (job.simplify, job.quality) {
+        (Some(_), _) => simplify::TRIANGLE_BYTES,
+        (None, TriangleQuality::High) => improve::TRIANGLE_BYTES,
+        (None, TriangleQuality::Standard) => 0,
+    };
     // A vertex has two triangles.
     let per_vertex = job.attribute_bytes() + 2 * processing;
     let attributes =

@@ -373,7 +373,8 @@ impl Report {
     }
 }
 
-/// Fields of the report that mesh files do not contain. The last digits of `exact` depend on mathematical libraries.
+/// Fields of the report that mesh files do not contain. The last digits of `exact` and `triangle_shapes` depend on
+/// mathematical libraries.
 const EXCLUDED_EXTRAS: [&str; 11] = [
     "timings_ms",
     "device",

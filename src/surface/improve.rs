@@ -5,14 +5,13 @@
 //! Kobbelt, A Remeshing Approach to Multiresolution Modeling, SGP 2004).
 //!
 //! Space is divided into cubes. The vertices in the interior of a cube are free; the others stay, with the triangles
-//! between them. The triangles of two cubes that change have no common point, so cubes are independent. Each pass
-//! shifts the cubes; every vertex is free in at least one pass. Each operation keeps a closed manifold. After them, the
-//! triangles of a cube are searched for intersections; if there are any, the cube is improved again without the
-//! vertices of the intersecting triangles.
+//! between them. Triangles that change in one cube share no point with those that change in another, so cubes are
+//! independent. Each pass shifts the cubes; every vertex is free in at least one pass. Each operation keeps a closed
+//! manifold. After them, the triangles of a cube are searched for intersections; if there are any, the cube is improved
+//! again without the vertices of the intersecting triangles.
 
-mod crossings;
 mod cube;
-mod geometry;
+mod intersections;
 mod patch;
 mod shapes;
 
@@ -24,7 +23,6 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use rayon::prelude::*;
 
 use self::cube::{CubeMesh, CubeResult, MovedVertex};
-use self::geometry::Vector;
 pub use self::shapes::TriangleShapes;
 use super::control::{Control, Stage};
 use super::cpu::points::PointField;
@@ -35,17 +33,18 @@ use super::memory::Reservation;
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
+use super::triangle::Vector;
 
 /// Edge length of a cube, spacings.
 const SIDE: i32 = 24;
 /// Shift of the cubes in each pass, spacings.
 const SHIFTS: [i32; 4] = [0, 12, 6, 18];
-/// Distance of free vertices from the walls of their cube, spacings: more than the longest edge. It is at most an
-/// eighth of [`SIDE`], so no vertex is near a wall in all passes.
+/// Distance of free vertices from the walls of their cube, spacings: more than the longest edge. It is less than an
+/// eighth of [`SIDE`], so along each axis, a vertex is near a wall in at most one of the four passes. It is free in one.
 const MARGIN: i32 = 2;
 /// Distance from a cube within which triangles with a vertex there may intersect triangles that change, spacings.
 const AROUND: i32 = 1;
-/// Memory per triangle of the mesh, bytes: its cubes, and the patches that are open.
+/// Memory per triangle of the mesh, bytes: the list of cubes, the results of all cubes, and open patches.
 pub(crate) const TRIANGLE_BYTES: u64 = 96;
 
 /// Quality of the triangles of a mesh.
@@ -60,8 +59,8 @@ pub enum TriangleQuality {
 
 named!(TriangleQuality, "quality", Standard => "standard", High => "high");
 
-/// Cube: its position in edge lengths.
-type Cube = [i32; 3];
+/// Position of a cube, in edge lengths.
+type CubeIndex = [i32; 3];
 
 /// Improves `mesh`, the closed mesh of `spheres`. `params` are those of the mesh, which is not quantized.
 ///
@@ -80,14 +79,14 @@ pub(crate) fn improve(
     let of_field = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
     let field = PointField::new(spheres, params, limits, &of_field)?;
     for (pass, shift) in SHIFTS.into_iter().enumerate() {
-        let space = Space { field: &field, spacing: params.resolution, shift };
-        let by_cube = space.by_cube(mesh, control)?;
-        let cubes: Vec<&[(Cube, u32)]> = by_cube.chunk_by(|a, b| a.0 == b.0).collect();
+        let division = Cubes { field: &field, spacing: params.resolution, shift };
+        let by_cube = division.by_cube(mesh, control)?;
+        let cubes: Vec<&[(CubeIndex, u32)]> = by_cube.chunk_by(|a, b| a.0 == b.0).collect();
         let done = AtomicUsize::new(pass * cubes.len());
-        let improved = |entries: &&[(Cube, u32)]| {
+        let improved = |entries: &&[(CubeIndex, u32)]| {
             let n_done = done.fetch_add(1, Ordering::Relaxed);
             control.observer.progress(Stage::Improve, n_done, SHIFTS.len() * cubes.len());
-            CubeMesh::new(&space, mesh, entries).improved(control)
+            CubeMesh::new(&division, mesh, entries).improved(control)
         };
         let results = cubes.par_iter().map(improved).collect::<Result<Vec<_>, SurfaceError>>()?;
         apply(mesh, results);
@@ -99,9 +98,9 @@ pub(crate) fn improve(
 /// Writes the changes of all cubes to the mesh.
 fn apply(mesh: &mut Mesh, results: Vec<CubeResult>) {
     const REMOVED: [u32; 3] = [u32::MAX; 3];
-    for CubeResult { slots, triangles, vertices } in results {
-        for (slot, triangle) in slots.into_iter().zip(triangles) {
-            mesh.triangles[slot as usize] = triangle.unwrap_or(REMOVED);
+    for CubeResult { numbers, triangles, vertices } in results {
+        for (number, triangle) in numbers.into_iter().zip(triangles) {
+            mesh.triangles[number as usize] = triangle.unwrap_or(REMOVED);
         }
         for MovedVertex { number, position, normal, sphere } in vertices {
             mesh.positions[number as usize] = position;
@@ -115,8 +114,8 @@ fn apply(mesh: &mut Mesh, results: Vec<CubeResult>) {
     mesh.triangles = kept.into();
 }
 
-/// Division of space into cubes.
-struct Space<'a> {
+/// Division of space into cubes, in one pass.
+struct Cubes<'a> {
     field: &'a PointField,
     /// Grid spacing, Å.
     spacing: f64,
@@ -124,7 +123,7 @@ struct Space<'a> {
     shift: i32,
 }
 
-impl Space<'_> {
+impl Cubes<'_> {
     /// Returns a position in spacings from a grid point.
     fn to_spacings(&self, position: Vector, origin: [i32; 3]) -> Vector {
         let centre = self.field.centre();
@@ -138,12 +137,12 @@ impl Space<'_> {
     }
 
     /// Returns the grid points at the ends of a cube.
-    fn ends(&self, cube: Cube) -> [[i32; 3]; 2] {
+    fn ends(&self, cube: CubeIndex) -> [[i32; 3]; 2] {
         [0, 1].map(|end| cube.map(|c| (c + end) * SIDE - self.shift))
     }
 
-    /// Returns the cubes that a vertex belongs to, with those that it is near.
-    fn cubes_of(&self, position: Vector) -> impl Iterator<Item = Cube> {
+    /// Returns the cubes that contain a vertex or are within [`AROUND`] of it.
+    fn cubes_of(&self, position: Vector) -> impl Iterator<Item = CubeIndex> {
         let point = self.to_spacings(position, [0; 3]);
         let along = |k: usize, margin: i32| {
             let c = f64::from(point[k]) + f64::from(self.shift + margin);
@@ -160,16 +159,17 @@ impl Space<'_> {
     }
 
     /// Returns each triangle with each cube that it belongs to or is near, sorted.
-    fn by_cube(&self, mesh: &Mesh, control: &Control<'_>) -> Result<Vec<(Cube, u32)>, SurfaceError> {
+    fn by_cube(&self, mesh: &Mesh, control: &Control<'_>) -> Result<Vec<(CubeIndex, u32)>, SurfaceError> {
         control.check()?;
         let entries = |(i, row): (usize, &[u32; 3])| {
-            let mut cubes: Vec<Cube> = row.iter().flat_map(|v| self.cubes_of(mesh.positions[*v as usize])).collect();
+            let mut cubes: Vec<CubeIndex> =
+                row.iter().flat_map(|v| self.cubes_of(mesh.positions[*v as usize])).collect();
             cubes.sort_unstable();
             cubes.dedup();
             cubes.into_iter().map(move |cube| (cube, to_u32(i)))
         };
         let rows: &[[u32; 3]] = &mesh.triangles;
-        let mut sorted: Vec<(Cube, u32)> = rows.par_iter().enumerate().flat_map_iter(entries).collect();
+        let mut sorted: Vec<(CubeIndex, u32)> = rows.par_iter().enumerate().flat_map_iter(entries).collect();
         super::checked_sort::sort(&mut sorted, Ord::cmp, control)?;
         Ok(sorted)
     }

@@ -37,6 +37,7 @@ pub mod spheres;
 mod sums;
 pub(crate) mod threads;
 pub mod topology;
+mod triangle;
 mod union_find;
 
 pub use backend::{Backend, BackendIdentity, GridStats, MeshOutput, StreamedMesh};

@@ -23,13 +23,14 @@ use rustc_hash::FxHashSet;
 pub use self::deviation::Deviation;
 use self::deviation::{Distances, centroid};
 use self::fans::{BoundaryFans, topology};
-use self::grid::{Corners, TriangleGrid};
+use self::grid::TriangleGrid;
 use super::control::Control;
 use super::error::SurfaceError;
 use super::lattice::{to_i32, to_u32};
 use super::measure::Component;
 use super::mesh::{Mesh, PartRange, bounds_of};
 use super::params::bad;
+use super::triangle::Corners;
 use super::union_find::UnionFind;
 
 /// Smallest and largest value of the parameter `simplify`, Å.

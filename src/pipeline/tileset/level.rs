@@ -97,8 +97,8 @@ impl Buckets {
         &self.order[self.starts[number] as usize..self.starts[number + 1] as usize]
     }
 
-    /// Returns the numbers of the buckets by the cell of a grid, sorted. Cells are unions of buckets, or a bucket is a
-    /// union of cells.
+    /// Returns each bucket with its cell of a grid, sorted by cell. A cell is a union of buckets; cells smaller than a
+    /// bucket are joined up to its size.
     fn by_cell(&self, spacing: f64) -> Vec<([i64; 3], u32)> {
         let middle = |at: &[i64; 3]| at.map(|c| (c as f64 + 0.5) * self.side);
         let cell = |at: &[i64; 3]| cube(middle(at), spacing.max(self.side));

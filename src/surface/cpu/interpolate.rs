@@ -311,7 +311,14 @@ fn sum_candidates<const FMA: bool>(
 }
 
 dispatched! {
-pub(super) fn sums(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3], density: &mut [f32]) {
+/// Adds −∇F and F of the candidates to the sums of each vertex, each up to a common factor.
+pub(super) fn sums(
+    c: &Constants,
+    around: &mut BrickAtoms,
+    p: &[Vec<f32>; 3],
+    n: &mut [Vec<f32>; 3],
+    density: &mut [f32],
+) {
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
         // One copy of the loop per kernel.
         let of = |kernel| Constants { kernel, ..*c };

@@ -1,4 +1,4 @@
-//! Field of a run at points near the surface, wherever they lie: depth, normal and nearest sphere.
+//! Field of a run at any point near the surface: depth, normal and nearest sphere.
 
 use super::bin::Tiles;
 use super::brick_atoms::{BrickAtoms, nearest_atoms};
@@ -16,7 +16,7 @@ use crate::surface::spheres::Spheres;
 /// Margin for rounding in the selection of spheres, spacings.
 const MARGIN: f64 = 0.01;
 
-/// Field of a run, for [`NearbyField`].
+/// Field of a run, prepared for evaluation at any point.
 pub(in crate::surface) struct PointField {
     lattice: Lattice,
     field: Field,
@@ -27,7 +27,7 @@ pub(in crate::surface) struct PointField {
 
 /// Spheres and arcs that affect a box.
 #[derive(Default)]
-pub(in crate::surface) struct NearbyField {
+pub(in crate::surface) struct NearbySpheres {
     /// Grid point to which coordinates are relative.
     origin: [i32; 3],
     candidates: Vec<u32>,
@@ -38,9 +38,9 @@ pub(in crate::surface) struct NearbyField {
 /// Field at a point.
 #[derive(Debug, Clone, Copy, Default)]
 pub(in crate::surface) struct PointSample {
-    /// Distance to the surface to first order, positive inside, spacings. Not finite where the gradient vanishes.
+    /// Distance to the surface to first order, positive inside, spacings.
     pub(in crate::surface) depth: f32,
-    /// Outward unit normal of the level set.
+    /// Outward unit normal of the level set. Not finite where the gradient vanishes.
     pub(in crate::surface) normal: [f32; 3],
 }
 
@@ -70,8 +70,8 @@ impl PointField {
     }
 
     /// Returns the spheres and arcs that affect the box between two grid points.
-    pub(in crate::surface) fn near(&self, [low, high]: [[i32; 3]; 2]) -> NearbyField {
-        let mut near = NearbyField { origin: low, ..NearbyField::default() };
+    pub(in crate::surface) fn near(&self, [low, high]: [[i32; 3]; 2]) -> NearbySpheres {
+        let mut near = NearbySpheres { origin: low, ..NearbySpheres::default() };
         near.candidates = reaching(&self.lattice, &self.tiles, [low, high]);
         match &self.field {
             Field::Density(_) => near.atoms.fill(&self.lattice.atoms, &near.candidates, low),
@@ -86,10 +86,10 @@ impl PointField {
 
     /// Evaluates the field at `points`, in spacings relative to the origin of `near`. Points that follow each other
     /// should be close together.
-    pub(in crate::surface) fn evaluate(&self, near: &mut NearbyField, points: &[[f32; 3]]) -> Vec<PointSample> {
+    pub(in crate::surface) fn evaluate(&self, near: &mut NearbySpheres, points: &[[f32; 3]]) -> Vec<PointSample> {
         let mut samples = Vec::with_capacity(points.len());
         for chunk in points.chunks(LANES) {
-            let lanes: Lanes = std::array::from_fn(|k| std::array::from_fn(|i| chunk[i.min(chunk.len() - 1)][k]));
+            let lanes = lanes(chunk);
             match &self.field {
                 Field::Density(constants) => {
                     let p = lanes.map(|lane| lane.to_vec());
@@ -118,10 +118,10 @@ impl PointField {
     }
 
     /// Returns the nearest sphere of each point, in the caller's numbering.
-    pub(in crate::surface) fn nearest_spheres(&self, near: &mut NearbyField, points: &[[f32; 3]]) -> Vec<u32> {
+    pub(in crate::surface) fn nearest_spheres(&self, near: &mut NearbySpheres, points: &[[f32; 3]]) -> Vec<u32> {
         let mut ids = vec![0; points.len()];
         for (ids, chunk) in ids.chunks_mut(LANES).zip(points.chunks(LANES)) {
-            let lanes: Lanes = std::array::from_fn(|k| std::array::from_fn(|i| chunk[i.min(chunk.len() - 1)][k]));
+            let lanes = lanes(chunk);
             match &self.field {
                 Field::Density(constants) => {
                     let (atoms, p) = (&self.lattice.atoms, lanes.map(|lane| lane.to_vec()));
@@ -144,6 +144,16 @@ impl PointSample {
         let length = outward.iter().map(|c| c * c).sum::<f32>().sqrt();
         Self { depth: depth(length), normal: outward.map(|c| c / length) }
     }
+
+    /// Returns false where the gradient vanishes.
+    pub(in crate::surface) fn is_finite(&self) -> bool {
+        self.depth.is_finite() && self.normal.iter().all(|c| c.is_finite())
+    }
+}
+
+/// Returns the coordinates of a chunk of points. Unused lanes repeat the last point.
+fn lanes(chunk: &[[f32; 3]]) -> Lanes {
+    std::array::from_fn(|k| std::array::from_fn(|i| chunk[i.min(chunk.len() - 1)][k]))
 }
 
 /// Returns the atoms of `lattice` that reach the box between two grid points, ascending.

@@ -1,14 +1,14 @@
 //! Triangles of a cube, with their surroundings, and their improvement.
 
-use super::crossings::crossings;
-use super::geometry::Vector;
+use super::intersections::intersections;
 use super::patch::Patch;
-use super::{Cube, MARGIN, SIDE, Space};
+use super::{CubeIndex, Cubes, MARGIN, SIDE};
 use crate::surface::control::Control;
-use crate::surface::cpu::points::NearbyField;
+use crate::surface::cpu::points::NearbySpheres;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{to_f32, to_u32};
 use crate::surface::mesh::Mesh;
+use crate::surface::triangle::Vector;
 
 /// Number of rounds of collapses, flips and moves.
 const ROUNDS: usize = 3;
@@ -24,9 +24,9 @@ const TOLERANCE: f32 = 2e-3;
 /// Changes of a cube, in the numbers of the mesh.
 #[derive(Default)]
 pub(super) struct CubeResult {
-    /// Triangles that may have changed, ascending.
-    pub(super) slots: Vec<u32>,
-    /// New triangles of these slots; `None` for removed ones.
+    /// Numbers of the triangles that may have changed, ascending.
+    pub(super) numbers: Vec<u32>,
+    /// These triangles; `None` for removed ones.
     pub(super) triangles: Vec<Option<[u32; 3]>>,
     pub(super) vertices: Vec<MovedVertex>,
 }
@@ -42,7 +42,7 @@ pub(super) struct MovedVertex {
 
 /// Triangles of a cube, with vertex numbers of their own.
 pub(super) struct CubeMesh<'a> {
-    space: &'a Space<'a>,
+    cubes: &'a Cubes<'a>,
     mesh: &'a Mesh,
     /// Grid points at the ends of the cube.
     ends: [[i32; 3]; 2],
@@ -55,25 +55,25 @@ pub(super) struct CubeMesh<'a> {
     /// Triangles with a free vertex, then the others.
     triangles: Vec<[u32; 3]>,
     /// Numbers in the mesh of the triangles with a free vertex.
-    slots: Vec<u32>,
+    numbers: Vec<u32>,
 }
 
 impl<'a> CubeMesh<'a> {
-    /// Collects the triangles of a cube from the entries of [`Space::by_cube`].
-    pub(super) fn new(space: &'a Space<'a>, mesh: &'a Mesh, entries: &[(Cube, u32)]) -> Self {
-        let ends = space.ends(entries[0].0);
+    /// Collects the triangles of a cube from the entries of [`Cubes::by_cube`].
+    pub(super) fn new(cubes: &'a Cubes<'a>, mesh: &'a Mesh, entries: &[(CubeIndex, u32)]) -> Self {
+        let ends = cubes.ends(entries[0].0);
         let rows = || entries.iter().map(|(_, i)| mesh.triangles[*i as usize]);
         let mut vertices: Vec<u32> = rows().flatten().collect();
         vertices.sort_unstable();
         vertices.dedup();
         let points: Vec<Vector> = vertices.iter().map(|v| mesh.positions[*v as usize]).collect();
-        let free: Vec<bool> = points.iter().map(|p| is_inside(space.to_spacings(*p, ends[0]))).collect();
+        let free: Vec<bool> = points.iter().map(|p| is_inside(cubes.to_spacings(*p, ends[0]))).collect();
         let number = |v| to_u32(vertices.partition_point(|other| *other < v));
         let rows = rows().map(|row| row.map(number)).zip(entries);
         let (own, context): (Vec<_>, Vec<_>) = rows.partition(|(row, _)| row.iter().any(|v| free[*v as usize]));
-        let slots = own.iter().map(|(_, (_, slot))| *slot).collect();
+        let numbers = own.iter().map(|(_, (_, number))| *number).collect();
         let triangles = own.into_iter().chain(context).map(|(row, _)| row).collect();
-        Self { space, mesh, ends, vertices, points, free, triangles, slots }
+        Self { cubes, mesh, ends, vertices, points, free, triangles, numbers }
     }
 
     /// Improves the cube. If all attempts fail, it stays unchanged.
@@ -81,10 +81,10 @@ impl<'a> CubeMesh<'a> {
     /// # Errors
     /// [`SurfaceError::Cancelled`].
     pub(super) fn improved(mut self, control: &Control<'_>) -> Result<CubeResult, SurfaceError> {
-        if self.slots.is_empty() {
+        if self.numbers.is_empty() {
             return Ok(CubeResult::default());
         }
-        let mut near = self.space.field.near(self.ends);
+        let mut near = self.cubes.field.near(self.ends);
         for _attempt in 0..ATTEMPTS {
             let mut patch = self.patch();
             for _ in 0..ROUNDS {
@@ -110,28 +110,28 @@ impl<'a> CubeMesh<'a> {
 
     fn patch(&self) -> Patch {
         let normals = self.vertices.iter().map(|v| self.mesh.normals[*v as usize]).collect();
-        let (triangles, spacing) = (self.triangles.clone(), to_f32(self.space.spacing));
-        Patch::new(self.points.clone(), normals, self.free.clone(), triangles, self.slots.len(), spacing)
+        let (triangles, spacing) = (self.triangles.clone(), to_f32(self.cubes.spacing));
+        Patch::new(self.points.clone(), normals, self.free.clone(), triangles, self.numbers.len(), spacing)
     }
 
     /// Moves the free vertices.
-    fn smooth(&self, patch: &mut Patch, near: &mut NearbyField) {
-        let (space, origin) = (self.space, self.ends[0]);
+    fn smooth(&self, patch: &mut Patch, near: &mut NearbySpheres) {
+        let (cubes, origin) = (self.cubes, self.ends[0]);
         let (vertices, targets) = patch.smoothed();
-        let mut points: Vec<Vector> = targets.into_iter().map(|p| space.to_spacings(p, origin)).collect();
-        let mut samples = space.field.evaluate(near, &points);
+        let mut points: Vec<Vector> = targets.into_iter().map(|p| cubes.to_spacings(p, origin)).collect();
+        let mut samples = cubes.field.evaluate(near, &points);
         for _ in 0..NEWTON_STEPS {
             for (point, sample) in points.iter_mut().zip(&samples) {
-                let step = sample.depth.clamp(-MAX_STEP, MAX_STEP);
-                if step.is_finite() {
+                if sample.is_finite() {
+                    let step = sample.depth.clamp(-MAX_STEP, MAX_STEP);
                     *point = std::array::from_fn(|k| point[k] + step * sample.normal[k]);
                 }
             }
-            samples = space.field.evaluate(near, &points);
+            samples = cubes.field.evaluate(near, &points);
         }
         for ((v, point), sample) in vertices.into_iter().zip(points).zip(samples) {
-            if sample.depth.abs() <= TOLERANCE && is_inside(point) {
-                patch.move_vertex(v, space.position(point, origin), sample.normal);
+            if sample.is_finite() && sample.depth.abs() <= TOLERANCE && is_inside(point) {
+                patch.move_vertex(v, cubes.position(point, origin), sample.normal);
             }
         }
     }
@@ -139,23 +139,23 @@ impl<'a> CubeMesh<'a> {
     /// Returns the vertices of triangles that intersect and were changed.
     fn intersecting(&self, patch: &Patch) -> Vec<u32> {
         let kept = patch.triangles.iter().enumerate().filter_map(|(i, row)| Some((i, (*row)?)));
-        let (numbers, rows): (Vec<usize>, Vec<[u32; 3]>) = kept.unzip();
+        let (indices, rows): (Vec<usize>, Vec<[u32; 3]>) = kept.unzip();
         let is_changed = |(i, row): (&usize, &[u32; 3])| {
             *row != self.triangles[*i] || row.iter().any(|v| patch.is_moved[*v as usize])
         };
-        let changed: Vec<bool> = numbers.iter().zip(&rows).map(is_changed).collect();
-        let pairs = crossings(&patch.points, &rows, &changed, to_f32(self.space.spacing));
+        let changed: Vec<bool> = indices.iter().zip(&rows).map(is_changed).collect();
+        let pairs = intersections(&patch.points, &rows, &changed, to_f32(self.cubes.spacing));
         let of_pairs = pairs.into_iter().flatten().filter(|i| changed[*i]);
-        of_pairs.flat_map(|i| rows[i].into_iter().chain(self.triangles[numbers[i]])).collect()
+        of_pairs.flat_map(|i| rows[i].into_iter().chain(self.triangles[indices[i]])).collect()
     }
 
     /// Returns the changes of a patch.
-    fn result(self, patch: &Patch, near: &mut NearbyField) -> CubeResult {
-        let (space, origin) = (self.space, self.ends[0]);
+    fn result(self, patch: &Patch, near: &mut NearbySpheres) -> CubeResult {
+        let (cubes, origin) = (self.cubes, self.ends[0]);
         let moved: Vec<usize> = (0..self.points.len()).filter(|v| patch.is_moved[*v]).collect();
         let spheres = self.mesh.atom_ids.as_ref().map(|_| {
-            let points: Vec<Vector> = moved.iter().map(|v| space.to_spacings(patch.points[*v], origin)).collect();
-            space.field.nearest_spheres(near, &points)
+            let points: Vec<Vector> = moved.iter().map(|v| cubes.to_spacings(patch.points[*v], origin)).collect();
+            cubes.field.nearest_spheres(near, &points)
         });
         let of_vertex = |(i, v): (usize, &usize)| MovedVertex {
             number: self.vertices[*v],
@@ -165,8 +165,8 @@ impl<'a> CubeMesh<'a> {
         };
         let vertices = moved.iter().enumerate().map(of_vertex).collect();
         let in_mesh = |row: &Option<[u32; 3]>| row.map(|row| row.map(|v| self.vertices[v as usize]));
-        let triangles = patch.triangles[..self.slots.len()].iter().map(in_mesh).collect();
-        CubeResult { slots: self.slots, triangles, vertices }
+        let triangles = patch.triangles[..self.numbers.len()].iter().map(in_mesh).collect();
+        CubeResult { numbers: self.numbers, triangles, vertices }
     }
 }
 

@@ -1,13 +1,13 @@
 //! Patch: the triangles of a cube, with the operations that improve their shapes.
 
-use super::geometry::{Corners, Vector, area_vector, dot, length, sub, tan_smallest_angle};
 use crate::surface::lattice::to_u32;
+use crate::surface::triangle::{Corners, Vector, area_vector, dot, length, sub, tan_smallest_angle};
 
 /// Smallest angle, as a tangent, at which a triangle needs no improvement: 35°.
 const GOOD: f32 = 0.7;
-/// Smallest angle, as a tangent, that a move may leave in a triangle, unless it improves the worst one: 30°.
+/// Smallest angle, as a tangent, that a collapse or a move may leave where it does not improve the smallest one: 30°.
 const FAIR: f32 = 0.577;
-/// Length of edges that are always collapsed if possible, spacings.
+/// Length below which an edge is a candidate for a collapse, spacings.
 const SHORT: f32 = 0.5;
 /// Maximum length of new edges, spacings. The edges of marching cubes are at most √3 spacings long.
 const LONG: f32 = 1.5;
@@ -68,15 +68,15 @@ impl Patch {
         self.fan(v).map(move |row| after(row, v))
     }
 
-    /// Returns the smallest angle of triangles, as a tangent, and the smallest cosine between a triangle and the normals
-    /// of its vertices.
-    fn quality(&self, rows: impl Iterator<Item = [u32; 3]>) -> Quality {
-        rows.fold(Quality { angle: f32::INFINITY, cosine: 1.0 }, |worst, row| {
+    /// Returns the smallest angle of triangles, as a tangent, and the smallest cosine between a triangle and the
+    /// normals of its vertices.
+    fn worst(&self, rows: impl Iterator<Item = [u32; 3]>) -> Worst {
+        rows.fold(Worst { angle: f32::INFINITY, cosine: 1.0 }, |worst, row| {
             let corners = self.corners(row);
             let normal = area_vector(corners);
             let along = row.map(|v| dot(normal, self.normals[v as usize])).into_iter().fold(f32::INFINITY, f32::min);
             let cosine = along / length(normal).max(f32::MIN_POSITIVE);
-            Quality { angle: worst.angle.min(tan_smallest_angle(corners)), cosine: worst.cosine.min(cosine) }
+            Worst { angle: worst.angle.min(tan_smallest_angle(corners)), cosine: worst.cosine.min(cosine) }
         })
     }
 
@@ -84,7 +84,8 @@ impl Patch {
         length(sub(self.points[a as usize], self.points[b as usize]))
     }
 
-    /// Collapses short edges, and edges of triangles with small angles where that improves the worst angle.
+    /// Collapses short edges, and edges of triangles with small angles. The smallest angle around the removed vertex must
+    /// improve or remain fair.
     pub(super) fn collapse(&mut self) {
         let mut edges = Vec::new();
         for row in self.triangles[..self.n_own].iter().flatten() {
@@ -93,11 +94,12 @@ impl Patch {
                 let (a, b) = (row[k], row[(k + 1) % 3]);
                 let length = self.distance(a, b);
                 if length < SHORT * self.spacing || bad {
-                    edges.push((length, a, b));
+                    edges.push((length, a.min(b), a.max(b)));
                 }
             }
         }
         edges.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+        edges.dedup();
         for (_, a, b) in edges {
             let best =
                 [(a, b), (b, a)].into_iter().filter_map(|(from, to)| Some((self.collapsed(from, to)?, from, to)));
@@ -129,9 +131,9 @@ impl Patch {
         if !adjacent || common != 2 {
             return None;
         }
-        let before = self.quality(self.fan(from));
+        let before = self.worst(self.fan(from));
         let moved = self.fan(from).filter(|row| !row.contains(&to)).map(|row| renamed(row, from, to));
-        let after = self.quality(moved);
+        let after = self.worst(moved);
         (after.is_permitted_after(before) && (after.angle > before.angle || after.angle > FAIR)).then_some(after.angle)
     }
 
@@ -172,8 +174,10 @@ impl Patch {
         let Some(row) = self.triangles[other as usize] else { return };
         let d = after(row, a);
         let keeps_fans = [a, b].iter().all(|v| self.around[*v as usize].len() > 3);
-        if other as usize >= self.n_own
-            || ![a, b, c, d].iter().any(|v| self.free[*v as usize])
+        // A triangle with a free vertex may change.
+        let is_free = |row: [u32; 3]| row.iter().any(|v| self.free[*v as usize]);
+        if !is_free([a, b, c])
+            || !is_free(row)
             || !keeps_fans
             || self.distance(c, d) > LONG * self.spacing
             || self.neighbours(c).any(|v| v == d)
@@ -181,7 +185,7 @@ impl Patch {
             return;
         }
         let (old, new) = ([[a, b, c], row], [[c, a, d], [d, b, c]]);
-        let (before, after) = (self.quality(old.into_iter()), self.quality(new.into_iter()));
+        let (before, after) = (self.worst(old.into_iter()), self.worst(new.into_iter()));
         if before.angle < GOOD && after.angle > before.angle && after.is_permitted_after(before) {
             self.triangles[t] = Some(new[0]);
             self.triangles[other as usize] = Some(new[1]);
@@ -193,8 +197,8 @@ impl Patch {
         }
     }
 
-    /// Returns the free vertices around which the smallest angle is not good, and a better position for each: the mean of
-    /// the centroids of its triangles by area, in the tangent plane.
+    /// Returns the free vertices around which the smallest angle is not good, and a better position for each: the mean
+    /// of the centroids of its triangles, weighted by area, in the tangent plane.
     pub(super) fn smoothed(&self) -> (Vec<u32>, Vec<Vector>) {
         let free = (0_u32..).zip(&self.free).filter(|(_, free)| **free).map(|(v, _)| v);
         let is_bad = |row: [u32; 3]| tan_smallest_angle(self.corners(row)) < GOOD;
@@ -217,12 +221,12 @@ impl Patch {
         std::array::from_fn(|k| p[k] + (step[k] - along * normal[k]))
     }
 
-    /// Moves a vertex if the triangles around it do not become worse.
+    /// Moves a vertex if the smallest angle around it improves or remains fair.
     pub(super) fn move_vertex(&mut self, v: u32, position: Vector, normal: Vector) {
-        let before = self.quality(self.fan(v));
+        let before = self.worst(self.fan(v));
         let old = (self.points[v as usize], self.normals[v as usize]);
         (self.points[v as usize], self.normals[v as usize]) = (position, normal);
-        let after = self.quality(self.fan(v));
+        let after = self.worst(self.fan(v));
         let too_long = self.neighbours(v).any(|other| self.distance(v, other) > LONG * self.spacing);
         let worse = after.angle < before.angle && after.angle < FAIR;
         if worse || too_long || !after.is_permitted_after(before) {
@@ -233,16 +237,16 @@ impl Patch {
     }
 }
 
-/// Quality of triangles.
+/// Worst of triangles.
 #[derive(Clone, Copy)]
-struct Quality {
+struct Worst {
     /// Tangent of the smallest angle.
     angle: f32,
     /// Smallest cosine between a triangle and the normals of its vertices.
     cosine: f32,
 }
 
-impl Quality {
+impl Worst {
     /// Returns true if no triangle is turned away from the surface, or at most as far as `before`.
     fn is_permitted_after(self, before: Self) -> bool {
         self.cosine >= FLAT || (self.cosine >= before.cosine && self.cosine > 0.0)

@@ -2,9 +2,9 @@
 
 use rayon::prelude::*;
 
-use super::geometry::{Corners, Vector, area_vector, length, sub, tan_smallest_angle};
 use crate::surface::lattice::to_u64;
 use crate::surface::mesh::Mesh;
+use crate::surface::triangle::{Corners, Vector, area_vector, length, sub, tan_smallest_angle};
 
 /// Upper ends of the classes of aspect ratios; the last class has none.
 pub(super) const ASPECT_ENDS: [f64; 7] = [1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0];

@@ -2,10 +2,11 @@
 
 use rayon::prelude::*;
 
-use super::grid::{Corners, TriangleGrid};
+use super::grid::TriangleGrid;
 use super::{Cube, CubeSide, Triangles, TrianglesByCube};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
+use crate::surface::triangle::Corners;
 
 /// Maximum number of cubes with samples.
 const CUBES: usize = 1000;

@@ -1,7 +1,6 @@
 //! Distances of points from the nearest of many triangles, which a uniform grid of cells finds.
 
-/// Triangle: its corners, Å.
-pub(super) type Corners = [[f32; 3]; 3];
+use crate::surface::triangle::{Corners, dot, floor, sub};
 
 /// Largest number of cells per axis.
 const MAX_CELLS: f32 = 64.0;
@@ -100,19 +99,6 @@ impl TriangleGrid {
             radius = if nearest2.is_finite() { 1.01 * nearest2.sqrt() } else { 4.0 * radius };
         }
     }
-}
-
-#[expect(clippy::cast_possible_truncation, reason = "casts saturate, and cells outside the grid are skipped")]
-fn floor(value: f32) -> i32 {
-    value.floor().clamp(-1e9, 1e9) as i32
-}
-
-fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn sub(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
-    std::array::from_fn(|k| a[k] - b[k])
 }
 
 /// Returns the squared distance of a point from the bounding box of a triangle.

@@ -1,4 +1,4 @@
-//! Vectors and triangles in single precision; signs of volumes in double precision.
+//! Vectors and triangles in single precision, and their intersections, with signs of volumes in double precision.
 
 /// Position or vector, Å.
 pub(super) type Vector = [f32; 3];
@@ -44,13 +44,20 @@ fn volume6([a, b, c]: &Corners, d: Vector) -> f64 {
     a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
 }
 
-/// Returns true if a line segment crosses a triangle. Both must not have a common point on the boundary of the
-/// triangle.
-pub(super) fn segment_crosses(from: Vector, to: Vector, triangle: &Corners) -> bool {
+/// Returns true if a line segment passes through a triangle. One that only touches its plane or its boundary does not.
+pub(super) fn segment_intersects(from: Vector, to: Vector, triangle: &Corners) -> bool {
     let [a, b, c] = *triangle;
     if volume6(triangle, from) * volume6(triangle, to) >= 0.0 {
         return false;
     }
     let around = [[a, b], [b, c], [c, a]].map(|[p, q]| volume6(&[p, q, from], to) > 0.0);
     around == [true; 3] || around == [false; 3]
+}
+
+/// Rounds down to a whole number.
+#[expect(clippy::cast_possible_truncation, reason = "casts saturate, and callers limit the number of cells")]
+pub(super) fn floor(value: f32) -> i32 {
+    // The library's function is slow without vector extensions.
+    let towards_zero = value as i32;
+    towards_zero.saturating_sub(i32::from(value < towards_zero as f32))
 }
