@@ -86,7 +86,8 @@ pub fn estimate<S: Deref<Target = Structure>>(
     let parts = selected.parts(&structure, job.split, &limits.read, control)?;
     let cut = Cut::of(&selected, parts.as_deref(), None, job.validation, control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
-    let backend = of_job(choice.backend, division, job.quality);
+    // Improved meshes would take far longer than the estimate needs.
+    let backend = of_job(choice.backend, division, TriangleQuality::Standard);
     let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
     let mut params = job.params_for(spheres.len());
     let mut refused = None;

@@ -256,14 +256,16 @@ fn run_whole<S: Deref<Target = Structure>>(
     let parts = pockets::parts(of_pockets, &structure, &selected, job.split, &limits.read, &control)?;
     let cut = Cut::of(&selected, parts.as_deref(), of_pockets, job.validation, &control)?;
     let division = Division::of(parts.as_deref(), cut.as_ref());
-    let backend = of_job(choice.backend, division, job.quality);
-    let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
+    let [backend, planner] =
+        [job.quality, TriangleQuality::Standard].map(|quality| of_job(choice.backend, division, quality));
+    let [choice, planner, undivided] =
+        [&*backend, &*planner, choice.backend].map(|backend| Choice { backend, ..*choice });
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (mut output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
-        let fitted = fit::mesh(&spheres, job, limit, &limits.surface, choice, &clock, &control).map_err(|error| {
+        let fitted = fit::mesh(&spheres, job, limit, &limits.surface, &choice, &clock, &control).map_err(|error| {
             let plan = MeshPlan::new(&spheres, division, &params, job, limits);
-            finest_fit::with_finest_fit(error, &plan, plan.choice(undivided, choice), &control)
+            finest_fit::with_finest_fit(error, &plan, plan.choice(&undivided, &planner), &control)
         })?;
         params.resolution = fitted.resolution;
         let storage = storage(job, &mut params, &spheres);
@@ -275,12 +277,12 @@ fn run_whole<S: Deref<Target = Structure>>(
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
         let plan = MeshPlan::new(&spheres, division, &params, job, limits);
-        let choice = plan.choice(undivided, choice);
-        let checked = if sink.is_none() { estimate::check_memory(&plan, job, choice, &control) } else { Ok(()) };
+        let planner = plan.choice(&undivided, &planner);
+        let checked = if sink.is_none() { estimate::check_memory(&plan, job, planner, &control) } else { Ok(()) };
         let meshed = simplify::params_of_input(job, &params)?;
         let write = |()| clock.pass(|| backend.write(&spheres, &meshed, &limits.surface, &control, sink));
         let written = checked.and_then(write);
-        (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, choice, &control))?, None, storage)
+        (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, planner, &control))?, None, storage)
     };
     let search = |mode| {
         clock.time("cavities", || cavities::search(mode, &spheres, &params, &limits.surface, &mut output, &control))
@@ -306,7 +308,7 @@ fn run_whole<S: Deref<Target = Structure>>(
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     // The report takes the times of the clock, which observes nothing later.
     let control = Control { observer: &(), ..control };
-    let mut report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
+    let mut report = Report::new(&structure, &selected, job, &choice, &counts, &measures, clock.finish());
     (report.color, report.exact, report.simplification) = (color, exact, simplification);
     report.triangle_shapes = shapes;
     report.set_cavities(cavities.as_ref(), &structure, &selected);

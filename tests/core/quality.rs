@@ -5,7 +5,8 @@ use std::collections::HashMap;
 
 use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError};
-use molmesh::pipeline::{Choice, JobLimits, Product, run};
+use molmesh::pipeline::{Choice, JobLimits, Product, estimate, run};
+use molmesh::structure;
 use molmesh::surface::reference::Density;
 use molmesh::surface::{Control, CpuBackend, Measures, Mesh, SurfaceParams, TriangleShapes, Validation};
 
@@ -126,8 +127,8 @@ fn control_intersections_and_angles_are_detected() {
 
 #[test]
 fn vertices_stay_on_the_surface() {
-    let structure = molmesh::structure::read(SAMPLE, &Default::default()).unwrap();
-    let selected = molmesh::structure::select(&structure, &Default::default()).unwrap();
+    let structure = structure::read(SAMPLE, &Default::default()).unwrap();
+    let selected = structure::select(&structure, &Default::default()).unwrap();
     let spheres = selected.spheres(&structure).unwrap();
     for surface in ["gaussian", "soft-object", "inverse-square"] {
         let pairs = [("surface", surface), ("resolution", "0.8"), ("quality", "high"), ("atom_ids", "true")];
@@ -208,6 +209,20 @@ fn improved_meshes_do_not_depend_on_the_number_of_threads() {
     let pairs = [("quality", "high"), ("resolution", "0.6"), ("atom_ids", "true")];
     let meshes = [1, 3].map(|threads| meshed(CHAINS, &pairs, threads).mesh);
     assert!(meshes[0] == meshes[1]);
+}
+
+#[test]
+fn estimates_state_the_mesh_before_its_improvement() {
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let (choice, control) = (Choice { backend: &backend, reason: "" }, Control::default());
+    let estimates = ["standard", "high"].map(|quality| {
+        let job = params::parse([("quality", quality), ("resolution", "0.5")]).unwrap().job;
+        let read = |control: &Control<'_>| structure::read_with(CHAINS, &Default::default(), control).map(Box::new);
+        let estimate = estimate(read, &job, &JobLimits::default(), &choice, &control).unwrap();
+        (estimate.work(&job).unwrap(), estimate.mesh.unwrap())
+    });
+    assert_eq!(estimates[0].1, estimates[1].1);
+    assert!(estimates[1].0 > 10.0 * estimates[0].0, "{estimates:?}");
 }
 
 #[test]
