@@ -40,7 +40,8 @@ const SIDE: i32 = 24;
 /// Shift of the cubes in each pass, spacings.
 const SHIFTS: [i32; 4] = [0, 12, 6, 18];
 /// Distance of free vertices from the walls of their cube, spacings: more than the longest edge. It is less than an
-/// eighth of [`SIDE`], so along each axis, a vertex is near a wall in at most one of the four passes. It is free in one.
+/// eighth of [`SIDE`], so along each axis, a vertex is near a wall in at most one of the four passes: it is free in
+/// one.
 const MARGIN: i32 = 2;
 /// Distance from a cube within which triangles with a vertex there may intersect triangles that change, spacings.
 const AROUND: i32 = 1;

@@ -84,8 +84,8 @@ impl Patch {
         length(sub(self.points[a as usize], self.points[b as usize]))
     }
 
-    /// Collapses short edges, and edges of triangles with small angles. The smallest angle around the removed vertex must
-    /// improve or remain fair.
+    /// Collapses short edges, and edges of triangles with small angles. The smallest angle around the removed vertex
+    /// must improve or remain fair.
     pub(super) fn collapse(&mut self) {
         let mut edges = Vec::new();
         for row in self.triangles[..self.n_own].iter().flatten() {
