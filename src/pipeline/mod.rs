@@ -258,14 +258,13 @@ fn run_whole<S: Deref<Target = Structure>>(
     let division = Division::of(parts.as_deref(), cut.as_ref());
     let [backend, planner] =
         [job.quality, TriangleQuality::Standard].map(|quality| of_job(choice.backend, division, quality));
-    let [choice, planner, undivided] =
-        [&*backend, &*planner, choice.backend].map(|backend| Choice { backend, ..*choice });
+    let [choice, planner, whole] = [&*backend, &*planner, choice.backend].map(|backend| Choice { backend, ..*choice });
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (mut output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
         let fitted = fit::mesh(&spheres, job, limit, &limits.surface, &choice, &clock, &control).map_err(|error| {
             let plan = MeshPlan::new(&spheres, division, &params, job, limits);
-            finest_fit::with_finest_fit(error, &plan, plan.choice(&undivided, &planner), &control)
+            finest_fit::with_finest_fit(error, &plan, plan.choice(&whole, &planner), &control)
         })?;
         params.resolution = fitted.resolution;
         let storage = storage(job, &mut params, &spheres);
@@ -277,7 +276,7 @@ fn run_whole<S: Deref<Target = Structure>>(
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
         let plan = MeshPlan::new(&spheres, division, &params, job, limits);
-        let planner = plan.choice(&undivided, &planner);
+        let planner = plan.choice(&whole, &planner);
         let checked = if sink.is_none() { estimate::check_memory(&plan, job, planner, &control) } else { Ok(()) };
         let meshed = simplify::params_of_input(job, &params)?;
         let write = |()| clock.pass(|| backend.write(&spheres, &meshed, &limits.surface, &control, sink));
@@ -302,15 +301,14 @@ fn run_whole<S: Deref<Target = Structure>>(
         Some(measures) if cut.is_some() || measures.validation == job.validation => measures,
         found => clock.time(Stage::Measure.name(), || measures_of(&mut mesh, found, job.validation, &control))?,
     };
-    let shapes = (job.quality == TriangleQuality::High)
-        .then(|| clock.time(Stage::Measure.name(), || TriangleReport::new(&mesh)));
+    let shapes = TriangleReport::of_job(job, &mesh, &clock);
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     // The report takes the times of the clock, which observes nothing later.
     let control = Control { observer: &(), ..control };
     let mut report = Report::new(&structure, &selected, job, &choice, &counts, &measures, clock.finish());
-    (report.color, report.exact, report.simplification) = (color, exact, simplification);
-    report.triangle_shapes = shapes;
+    (report.color, report.exact, report.simplification, report.triangle_shapes) =
+        (color, exact, simplification, shapes);
     report.set_cavities(cavities.as_ref(), &structure, &selected);
     report.set_pockets(pockets.as_ref(), &structure, &selected);
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);

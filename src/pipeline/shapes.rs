@@ -2,7 +2,8 @@
 
 use serde::Serialize;
 
-use crate::surface::{Mesh, TriangleShapes};
+use super::{Job, StageClock};
+use crate::surface::{Mesh, Stage, TriangleQuality, TriangleShapes};
 
 /// Shapes of the triangles.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -24,7 +25,13 @@ pub struct TriangleReport {
 }
 
 impl TriangleReport {
-    pub(super) fn new(mesh: &Mesh) -> Self {
+    /// Returns the report of a mesh if the job improves triangles.
+    pub(super) fn of_job(job: &Job, mesh: &Mesh, clock: &StageClock<'_>) -> Option<Self> {
+        let is_improved = job.quality == TriangleQuality::High;
+        is_improved.then(|| clock.time(Stage::Measure.name(), || Self::new(mesh)))
+    }
+
+    fn new(mesh: &Mesh) -> Self {
         let shapes = TriangleShapes::of(mesh);
         let rounded = |angle: f64| (angle * 1e3).round() / 1e3;
         Self {

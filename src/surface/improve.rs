@@ -54,7 +54,7 @@ pub enum TriangleQuality {
     /// Triangles of marching cubes.
     #[default]
     Standard,
-    /// Triangles with few small angles, by [`improve`].
+    /// Triangles with few small angles.
     High,
 }
 
