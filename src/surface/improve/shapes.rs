@@ -24,7 +24,7 @@ pub struct TriangleShapes {
     pub smallest_angle: f64,
     /// Numbers of triangles by class of smallest angles, in tenths of a degree.
     fine: Vec<u64>,
-    /// Numbers of triangles by class of aspect ratios: up to each of [`ASPECT_ENDS`], and above.
+    /// Numbers of triangles by aspect ratio: up to 1.25, 1.5, 2, 3, 5, 10, 100, and above.
     pub aspects: [u64; ASPECT_ENDS.len() + 1],
 }
 
