@@ -263,7 +263,7 @@ pub(crate) struct SurfaceArgs {
     /// Simplify the mesh: fewer, larger triangles, with this error in Å
     #[arg(long, value_name = "Å")]
     pub(crate) simplify: Option<String>,
-    /// Quality of the triangles: standard, or high (few small angles; about 100 times as long as meshing)
+    /// Quality of the triangles: standard, or high (few small angles; takes 10 to 50 times as long as meshing)
     #[arg(long, value_name = "NAME")]
     pub(crate) quality: Option<String>,
     /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)

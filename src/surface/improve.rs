@@ -75,10 +75,11 @@ pub(crate) fn improve(
     control: &Control<'_>,
 ) -> Result<(), SurfaceError> {
     mesh.make_contiguous();
-    let _memory = control.reserve(TRIANGLE_BYTES * mesh.n_triangles() as u64)?;
+    let _patches = control.reserve(TRIANGLE_BYTES * mesh.n_triangles() as u64)?;
+    // The memory of the field ends with this function.
     let memory = Arc::new(Reservation::new(&control.memory));
-    let of_field = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-    let field = PointField::new(spheres, params, limits, &of_field)?;
+    let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
+    let field = PointField::new(spheres, params, limits, &metered)?;
     for (pass, shift) in SHIFTS.into_iter().enumerate() {
         let division = Cubes { field: &field, spacing: params.resolution, shift };
         let by_cube = division.by_cube(mesh, control)?;

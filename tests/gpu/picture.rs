@@ -18,7 +18,9 @@ fn gpu(fallback: bool) -> Option<GpuRenderer> {
     if found.selected().next().is_none() {
         return tools::skip(&format!("no software Vulkan; install mesa-vulkan-drivers ({found:?})"));
     }
-    Some(GpuRenderer::start(&found, &PoolSettings::default(), fallback.then_some(CpuRenderer)).unwrap())
+    // Tests that run beside this one delay a software device.
+    let settings = PoolSettings { hang_timeout: Duration::from_mins(10), ..PoolSettings::default() };
+    Some(GpuRenderer::start(&found, &settings, fallback.then_some(CpuRenderer)).unwrap())
 }
 
 fn params(style: Style, view: View) -> PictureParams {
@@ -93,8 +95,6 @@ fn pictures_end_soon_after_cancellation() {
     let Some(gpu) = gpu(false) else { return };
     let large = PictureParams { width: 2800, height: 2800, ..params(Style::Surface, View::Front) };
     let mesh = Arc::new(balls());
-    // The first picture measures the device, so that the time limit of the large one suits a loaded machine.
-    of(&gpu, &mesh, &params(Style::Surface, View::Front));
     let begun = Instant::now();
     gpu.render(&mesh, &large, &Control::default()).unwrap();
     let whole = begun.elapsed();
@@ -116,7 +116,7 @@ fn pictures_end_soon_after_cancellation() {
     for (stopped, ended) in [first, second] {
         assert_eq!(stopped, Err(PictureError::Cancelled));
         let time = ended.saturating_duration_since(cancelled);
-        assert!(time < Duration::from_millis(500), "{time:?} of {whole:?}");
+        assert!(time < Duration::from_millis(500).max(whole / 4), "{time:?} of {whole:?}");
     }
     let small = params(Style::Surface, View::Front);
     assert_eq!(differences(&of(&CpuRenderer, &mesh, &small), &of(&gpu, &mesh, &small)).0, 0, "the device still works");

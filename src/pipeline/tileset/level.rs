@@ -10,6 +10,8 @@ use crate::surface::{Control, Spheres, SurfaceError, SurfaceParams};
 /// Spacing above which atoms are grouped, Å: a coarser grid misses single atoms, and all atoms would be too many for
 /// its few cells.
 const GROUP_ABOVE: f64 = 2.5;
+/// Minimum edge length of the buckets of the atoms, Å: with smaller ones, tiles of coarse levels would look up many.
+pub(super) const MIN_BUCKET: f64 = 32.0;
 /// Radius below which a group of atoms moves to a grid point, in spacings. Groups in the interior of a protein have
 /// about 0.65.
 const SMALL: f64 = 0.5;

@@ -14,7 +14,7 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use self::layout::Layout;
-use self::level::{Buckets, TilesetLevel};
+use self::level::{Buckets, MIN_BUCKET, TilesetLevel};
 pub use self::write::{LevelReport, TilesetReport, WriteError};
 use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, Scheme};
 use super::params::ParamError;
@@ -276,7 +276,11 @@ impl Layout {
         control: &Control<'_>,
     ) -> Result<(Vec<TilesetLevel>, BTreeSet<TileAddress>), JobError> {
         let (mut levels, mut tiles) = (Vec::new(), BTreeSet::new());
-        let buckets = Arc::new(Buckets::new(spheres, self.side(self.levels - 1), control)?);
+        let mut side = self.side(self.levels - 1);
+        while side < MIN_BUCKET {
+            side *= 2.0;
+        }
+        let buckets = Arc::new(Buckets::new(spheres, side, control)?);
         for number in (0..self.levels).rev() {
             let lengths = [self.spacing(number), self.side(number)];
             let level = TilesetLevel::new(spheres, &buckets, params, lengths, control)?;

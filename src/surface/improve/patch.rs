@@ -237,7 +237,7 @@ impl Patch {
     }
 }
 
-/// Worst of triangles.
+/// Worst shape of several triangles.
 #[derive(Clone, Copy)]
 struct Worst {
     /// Tangent of the smallest angle.
