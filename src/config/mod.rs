@@ -5,6 +5,7 @@
 
 mod access;
 mod archive;
+mod broker;
 mod devices;
 mod error;
 mod hosts;
@@ -30,6 +31,7 @@ use serde::{Deserialize, Serialize};
 
 pub use access::{AccessConfig, Origins};
 pub use archive::ArchiveConfig;
+pub use broker::BrokerConfig;
 pub use devices::DevicesConfig;
 pub use error::ConfigError;
 pub use hosts::Hosts;
@@ -55,6 +57,8 @@ pub struct Config {
     pub limits: LimitsConfig,
     /// Worker pool.
     pub jobs: JobsConfig,
+    /// Dispatch of asynchronous jobs.
+    pub broker: BrokerConfig,
     /// GPUs.
     pub devices: DevicesConfig,
     /// Structures by PDB id.

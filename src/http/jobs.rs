@@ -68,7 +68,7 @@ pub(super) struct JobDocument {
     fraction: f64,
     /// Current stage; null unless the job is running.
     #[schema(required)]
-    stage: Option<&'static str>,
+    stage: Option<String>,
     /// Number of times the job was started.
     attempts: u32,
     /// Time of acceptance.
@@ -301,7 +301,7 @@ pub(super) fn document(view: &JobView) -> JobDocument {
         status: record.status,
         progress,
         fraction: view.fraction,
-        stage: view.stage,
+        stage: view.stage.as_deref().map(str::to_owned),
         attempts: record.attempts,
         created: rfc3339(record.created_ms),
         started: record.started_ms.map(rfc3339),

@@ -21,15 +21,18 @@ use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::client_shares::ClientShares;
 use crate::config::Config;
-use crate::jobs::{Budget, Client, EndError, JobStore, Pool, Settings, Structures};
+use crate::jobs::{Budget, Client, EndError, JobStore, MemoryBroker, Pool, Settings, Structures};
 use crate::picture::SelectedRenderer;
 use crate::single_flight::SingleFlight;
-use crate::store::{FolderLock, LockError, Store, StoreError};
+use crate::store::{FolderLock, LockError, Secret, Store, StoreError};
 use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, Recorder, TelemetryError, Traces};
 
 /// Interval of metrics upkeep.
 const UPKEEP: Duration = Duration::from_secs(5);
+
+/// Interval at which jobs that the broker has lost are dispatched again.
+const RECONCILE: Duration = Duration::from_mins(1);
 
 /// Number of results whose headers are cached, about 2 KB each.
 const CACHED_HEADERS: usize = 1024;
@@ -140,14 +143,7 @@ impl Server {
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
-        let describe = |error: &EndError| Problem::from(error.clone()).record("");
-        let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
-        let job_store = JobStore::new(store.clone(), Arc::clone(&pool), jobs, output_bytes, secret, describe);
-        // The inputs of open jobs are pinned before a request can evict them.
-        let recovered = job_store.recover().await?;
-        if recovered > 0 {
-            tracing::info!(jobs = recovered, "resumed jobs of an earlier process");
-        }
+        let job_store = start_jobs(&config, &store, &pool, secret).await?;
         ::metrics::gauge!(telemetry::MEMORY_LIMIT).set(config.limits.memory_bytes as f64);
         let archive = Archive::new(&config, pool.settings().budget.clone());
         let capabilities = capabilities::document(&config, &pool, &found);
@@ -214,6 +210,7 @@ impl Server {
         background.spawn(key_reload::run(Arc::clone(&self.app.access)));
         let app = Arc::clone(&self.app);
         background.spawn_blocking(move || warm_up(&app));
+        background.spawn(reconcile(self.app.job_store.clone()));
         background.spawn(sweep(self.app.store.clone(), Duration::from_millis(self.app.config.store.sweep_ms)));
         let (router, budget) = (router::router(&self.app), self.app.pool.settings().budget.clone());
         let serving = accept::serve(self.listener, router, Arc::clone(&config), budget, stopped.clone());
@@ -235,6 +232,21 @@ impl Server {
     }
 }
 
+/// Creates the job store, dispatches the unfinished jobs of earlier processes, and starts to claim jobs.
+async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Secret) -> Result<JobStore, ServeError> {
+    let describe = |error: &EndError| Problem::from(error.clone()).record("");
+    let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
+    let broker = (Arc::new(MemoryBroker::new(config.broker.queue)) as _, config.broker.queue);
+    let job_store = JobStore::new(store.clone(), Arc::clone(pool), broker, jobs, output_bytes, secret, describe);
+    // The inputs of open jobs are pinned before a request can evict them.
+    let recovered = job_store.reconcile().await?;
+    if recovered > 0 {
+        tracing::info!(jobs = recovered, "dispatched jobs of an earlier process");
+    }
+    job_store.start_claiming();
+    Ok(job_store)
+}
+
 /// Shuts the service down in the phases that `orders` requests. Returns true if every request was finished.
 async fn wind_down(
     app: &Shared,
@@ -252,6 +264,7 @@ async fn wind_down(
     let end = tokio::time::Instant::now() + Duration::from_millis(app.config.server.drain_timeout_ms);
     // Only orders received from here on count as new.
     orders.borrow_and_update();
+    app.job_store.stop_claiming();
     app.pool.leave();
     stop.send_replace(Stop::Drain);
     let cut = async {
@@ -288,6 +301,18 @@ async fn publish(app: Shared, recorder: Option<Recorder>) {
         app.pool.publish();
         key_reload::publish_clients(&app.access);
         recorder.iter().for_each(Recorder::run_upkeep);
+    }
+}
+
+/// Dispatches jobs that the broker has lost, at regular intervals.
+async fn reconcile(jobs: JobStore) {
+    loop {
+        tokio::time::sleep(RECONCILE).await;
+        match jobs.reconcile().await {
+            Ok(0) => {}
+            Ok(dispatched) => tracing::warn!(jobs = dispatched, "dispatched jobs that the broker did not have"),
+            Err(error) => tracing::warn!(%error, "the records of jobs were not read"),
+        }
     }
 }
 

@@ -1,29 +1,32 @@
 //! Durable jobs: the record is in the store before the client gets its id, and unfinished jobs are resumed after
 //! a restart.
 //!
-//! A job is accepted in three steps: store the input and its map, store the record, answer. Results are named by their
+//! A job is accepted in four steps: store the input and its map, store the record, dispatch the job, answer. From the
+//! second step on it is durable: unfinished jobs that no broker holds are dispatched again. Results are named by their
 //! contents, so computing one twice is harmless; a crash costs time and never loses a job.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
-use metrics::counter;
 use serde_json::Value;
-use tokio::sync::{Semaphore, oneshot, watch};
+use tokio::sync::{Semaphore, watch};
 use tracing::Instrument as _;
 
-use super::durable_job::{DurableJob, Runner};
+use super::broker::{Broker, Dispatch};
+use super::durable_job::DurableJob;
+use super::open_jobs::OpenJobs;
 use super::record::{JobId, JobRecord, Requester, Status, now_ms};
 use super::retry::retry;
-use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, results};
+use super::runner::Runner;
+use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Refusal, SaveError, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::single_flight::SingleFlight;
 use crate::store::{Digest, Namespace, Pin, Secret, Store, StoreError};
 use crate::sync::{Handle, timeout};
-use crate::telemetry::JOBS_RECOVERED;
 
 /// Number of ended jobs that are held in memory; older ones are read from the store. A record takes up to 64 KiB, the
 /// size of a request without its structure.
@@ -56,7 +59,7 @@ pub(crate) struct JobView {
     /// Record of the job.
     pub(crate) record: JobRecord,
     /// Running stage.
-    pub(crate) stage: Option<&'static str>,
+    pub(crate) stage: Option<Cow<'static, str>>,
     /// Finished fraction, from 0 to 1.
     pub(crate) fraction: f64,
     /// Number of this state: the time of the change, ms since 1970. Grows with every change, even across restarts.
@@ -76,21 +79,36 @@ pub(crate) struct JobStore(pub(super) Arc<JobStoreState>);
 pub(super) struct JobStoreState {
     pub(super) store: Store,
     pub(super) pool: Arc<Pool>,
+    pub(super) broker: Arc<dyn Broker>,
+    /// Maximum number of queued jobs.
+    max_queued: usize,
     pub(super) config: JobsConfig,
     /// Maximum size of a result, bytes.
     pub(super) output_bytes: u64,
     pub(super) describe: DescribeError,
     /// Secret that derives job ids from idempotency keys.
     secret: Secret,
-    jobs: Mutex<HashMap<JobId, Arc<DurableJob>>>,
+    /// Jobs that run in this process, are watched, or have ended recently.
+    jobs: Mutex<JobMap>,
+    /// Unfinished jobs that this process knows of.
+    pub(super) open: OpenJobs,
     /// Permits to write the record of a begun or ended job.
     pub(super) writes: Semaphore,
-    /// Permits to load the input of a job and to submit it, one per worker.
-    pub(super) loads: Semaphore,
+    /// Permits to claim a job, one per worker.
+    pub(super) slots: Arc<Semaphore>,
     /// Results that are being stored: jobs that shared work store its result once.
     pub(super) saves: SingleFlight<ContentKey, Result<(), SaveError>>,
     /// Number of jobs with a runner.
-    pub(super) open: watch::Sender<usize>,
+    pub(super) running: watch::Sender<usize>,
+    /// True once no more jobs are claimed.
+    pub(super) stopping: watch::Sender<bool>,
+}
+
+/// Jobs by id.
+pub(super) struct JobMap {
+    pub(super) jobs: HashMap<JobId, Arc<DurableJob>>,
+    /// Number of jobs at which ended ones are removed.
+    trim_at: usize,
 }
 
 impl JobStoreState {
@@ -104,50 +122,56 @@ impl JobStoreState {
         Duration::from_millis(self.config.save_retry_ms)
     }
 
-    pub(super) fn lock(&self) -> MutexGuard<'_, HashMap<JobId, Arc<DurableJob>>> {
+    pub(super) fn lock(&self) -> MutexGuard<'_, JobMap> {
         self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Adds a job to the map, unless there is one with this id, and returns the job in the map.
     pub(super) fn insert(&self, id: &JobId, job: &Arc<DurableJob>) -> Arc<DurableJob> {
-        let mut jobs = self.lock();
-        let inserted = Arc::clone(jobs.entry(id.clone()).or_insert_with(|| Arc::clone(job)));
-        let n_ended = jobs.len().saturating_sub(*self.open.borrow());
+        let mut map = self.lock();
+        let inserted = Arc::clone(map.jobs.entry(id.clone()).or_insert_with(|| Arc::clone(job)));
         // Slack of 10 %, so that not every insertion sorts.
-        if n_ended > MAX_ENDED + MAX_ENDED / 10 {
-            let mut ended: Vec<_> = jobs.values().filter_map(|job| job.ended()).collect();
+        if map.jobs.len() > map.trim_at {
+            let mut ended: Vec<_> = map.jobs.values().filter_map(|job| job.ended()).collect();
             ended.sort_unstable();
-            for (_, id) in ended.iter().take(n_ended - MAX_ENDED) {
-                jobs.remove(id);
+            for (_, id) in ended.iter().take(ended.len().saturating_sub(MAX_ENDED)) {
+                map.jobs.remove(id);
             }
+            map.trim_at = MAX_ENDED / 10 + map.jobs.len().max(MAX_ENDED);
         }
         inserted
     }
 }
 
 impl JobStore {
-    /// Creates an empty job store over `store`, whose jobs run on `pool`. `secret` is the secret of the store.
+    /// Creates an empty job store over `store`, whose jobs are dispatched by `broker` and run on `pool`. `secret` is the
+    /// secret of the store.
     pub(crate) fn new(
         store: Store,
         pool: Arc<Pool>,
+        (broker, max_queued): (Arc<dyn Broker>, usize),
         config: JobsConfig,
         output_bytes: u64,
         secret: Secret,
         describe: DescribeError,
     ) -> Self {
-        let loads = Semaphore::new(pool.settings().workers);
+        let slots = Arc::new(Semaphore::new(pool.settings().workers));
         Self(Arc::new(JobStoreState {
             store,
             pool,
+            broker,
+            max_queued,
             config,
             output_bytes,
             describe,
             secret,
-            jobs: Mutex::default(),
+            jobs: Mutex::new(JobMap { jobs: HashMap::new(), trim_at: MAX_ENDED + MAX_ENDED / 10 }),
+            open: OpenJobs::default(),
             writes: Semaphore::new(CONCURRENT_WRITES),
-            loads,
+            slots,
             saves: SingleFlight::default(),
-            open: watch::channel(0).0,
+            running: watch::channel(0).0,
+            stopping: watch::channel(false).0,
         }))
     }
 
@@ -188,49 +212,59 @@ impl JobStore {
             Some(_) => None,
             None => self.stored_result(&spec.task, spec.format).await?,
         };
-        // The job gets its queue slot before its record: without a slot it could not run soon. A job with a stored
-        // result needs none.
-        let job = Arc::new(DurableJob::new(record));
-        let digest = spec.task.digest;
-        let map = spec.map.as_ref().map(|(digest, _)| *digest);
-        let pin = inner.pin(&id, [digest].into_iter().chain(map), namespace)?;
-        let (recorded, wait_for_record) = oneshot::channel();
-        let ticket = if ticket.is_some() || stored.is_some() {
-            ticket
-        } else {
-            let on_start = self.on_start(&job, Some(wait_for_record));
-            let task = Task { id: Some(id.clone()), ..spec.task };
-            let ticket = inner.pool.submit(task, inner.allowed(), Some(on_start))?;
-            if ticket.joined_running {
-                job.begin();
-            }
-            Some(ticket)
-        };
+        let is_dispatched = ticket.is_none() && stored.is_none();
+        if is_dispatched && inner.broker.queued() >= inner.max_queued {
+            return Err(self.queue_full(&spec.task).into());
+        }
+        let (digest, map) = (spec.task.digest, spec.map.as_ref().map(|(digest, _)| *digest));
+        // A client that gets an id finds its job, even if the store is over its capacity.
+        let pins = inner.pins(&id, [digest].into_iter().chain(map), namespace)?;
         let reservation = inner.admit(&id).await?;
         inner.store.put_input(&digest, namespace, spec.file).await?;
         if let Some((digest, bytes)) = spec.map {
             inner.store.put_input(&digest, namespace, bytes).await?;
         }
-        if !inner.write_new(&job.record()).await?
+        if !inner.write_new(&record).await?
             && let Some(view) = self.view(&id, namespace).await?
         {
             // A concurrent request with the same key stored its record first.
-            return existing(&job.record(), view);
+            return existing(&record, view);
         }
         drop(reservation);
-        // Releases the worker that waits in `on_start`; no worker does if the job was joined while it ran.
-        _ = recorded.send(());
-        let inserted = inner.insert(&id, &job);
-        // Otherwise a request for the job has resumed it from its record; it shares the same work.
-        if Arc::ptr_eq(&inserted, &job) {
-            self.spawn(Runner { job, ticket, pin, digest, earlier_attempts: 0 });
-            if stored.is_some() {
-                // The client gets the end at once, unless the store fails.
-                let mut watched = inserted.state.subscribe();
-                drop(timeout(STORED_WAIT, watched.wait_for(|view| view.record.status.is_final())).await);
-            }
+        let dispatch = Dispatch::of(&record);
+        inner.open.insert(dispatch.clone(), pins);
+        if is_dispatched {
+            self.dispatch(&dispatch).await;
+            let known = self.known(&id, namespace);
+            return Ok(known.map_or_else(|| DurableJob::new(record).view(), |job| job.view()));
         }
-        Ok(inserted.view())
+        let job = self.insert_open(record);
+        // Otherwise the job was dispatched from its record and runs already.
+        if job.own() {
+            self.spawn(Runner { job: Arc::clone(&job), digest, ticket, claim: None, slot: None });
+        }
+        if stored.is_some() {
+            // The client gets the end at once, unless the store fails.
+            let mut watched = job.state.subscribe();
+            drop(timeout(STORED_WAIT, watched.wait_for(|view| view.record.status.is_final())).await);
+        }
+        Ok(job.view())
+    }
+
+    /// Dispatches an accepted job. If that fails, [`Self::reconcile`] dispatches it later.
+    pub(super) async fn dispatch(&self, dispatch: &Dispatch) {
+        if let Err(error) = self.0.broker.dispatch(dispatch).await {
+            tracing::warn!(job_id = %dispatch.id, %error, "a job is dispatched later");
+        }
+    }
+
+    /// Returns the error of a task for which the broker has no free slot.
+    fn queue_full(&self, task: &Task) -> Refusal {
+        let (waiting, limit, pool) = (self.0.broker.queued(), self.0.max_queued, &self.0.pool);
+        // As if the jobs ahead took as long as this one.
+        let ahead = pool.expected(&task.input, &task.job) * waiting as f64 / pool.settings().workers as f64;
+        let wait = pool.estimated_wait() + Duration::try_from_secs_f64(ahead).unwrap_or(Duration::MAX);
+        Refusal::QueueFull { waiting, limit, wait }
     }
 
     /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
@@ -248,7 +282,7 @@ impl JobStore {
 
     /// Returns a job in memory, if it is of the namespace.
     fn known(&self, id: &JobId, namespace: Namespace) -> Option<Arc<DurableJob>> {
-        self.0.lock().get(id).filter(|job| job.state.borrow().record.namespace == namespace).cloned()
+        self.0.lock().jobs.get(id).filter(|job| job.state.borrow().record.namespace == namespace).cloned()
     }
 
     /// Watches the state of a job; `None` if the namespace has no such job.
@@ -266,7 +300,7 @@ impl JobStore {
             // The job began during the read. Its end may be on record and not be visible to others yet.
             Some(job) => job,
             None if record.status.is_final() => Arc::new(DurableJob::new(record)),
-            None => self.resume(record).await?,
+            None => self.insert_open(record),
         };
         Ok(Some(job.state.subscribe()))
     }
@@ -279,13 +313,18 @@ impl JobStore {
     /// Cancels a job unless it has ended, and returns its final state; `None` if the namespace has no such job. The job
     /// is cancelled even if the store fails.
     pub(crate) async fn dismiss(&self, id: &JobId, namespace: Namespace) -> Result<Option<JobView>, StoreError> {
+        if self.watch(id, namespace).await?.is_none() {
+            return Ok(None);
+        }
         let Some(job) = self.known(id, namespace) else { return self.view(id, namespace).await };
         if job.end(Status::Dismissed, |_| {}) {
             job.dismissed.notify_one();
             let (inner, ended) = (Arc::clone(&self.0), Arc::clone(&job));
             let write = async move {
                 let written = inner.write_job(&ended).await;
-                ended.publish_end();
+                if written.is_err() {
+                    ended.publish_end(ended.record());
+                }
                 written
             };
             // The write ends even if the client leaves.
@@ -298,40 +337,11 @@ impl JobStore {
         Ok(Some(job.view()))
     }
 
-    /// Resumes a job from its record, unless it runs already.
-    pub(super) async fn resume(&self, record: JobRecord) -> Result<Arc<DurableJob>, StoreError> {
-        let (id, input, earlier_attempts) = (record.id.clone(), record.input.parse::<Digest>(), record.attempts);
-        let map = record.map.as_deref().map(str::parse::<Digest>).transpose();
-        let fresh = Arc::new(DurableJob::new(record));
-        let known = self.0.lock().get(&id).cloned();
-        if let Some(known) = known {
-            return Ok(known);
-        }
-        let (Ok(digest), Ok(map)) = (input, map) else {
-            let why = "its input or its map has no valid digest".to_owned();
-            self.finish(&fresh, Err(EndError::Lost { why })).await;
-            return Ok(fresh);
-        };
-        let pin = self.0.pin(&id, [digest].into_iter().chain(map), fresh.record().namespace)?;
-        let job = self.0.insert(&id, &fresh);
-        if Arc::ptr_eq(&job, &fresh) {
-            counter!(JOBS_RECOVERED).increment(1);
-            self.spawn(Runner { job: fresh, ticket: None, pin, digest, earlier_attempts });
-        }
-        Ok(job)
-    }
-
     /// Returns the work that records an attempt before the worker starts it, so that a job that crashes the process is
-    /// detected. It first waits for a message on `recorded`, sent once the job itself is on record.
-    pub(super) fn on_start(&self, job: &Arc<DurableJob>, recorded: Option<oneshot::Receiver<()>>) -> OnStart {
+    /// detected.
+    pub(super) fn on_start(&self, job: &Arc<DurableJob>) -> OnStart {
         let (jobs, job) = (self.clone(), Arc::clone(job));
         OnStart::new(async move {
-            // The sender is dropped if the job could not be recorded; the work is cancelled then.
-            if let Some(recorded) = recorded
-                && recorded.await.is_err()
-            {
-                return;
-            }
             if job.begin()
                 && let Err(error) = jobs.0.write_job(&job).await
             {
@@ -365,7 +375,7 @@ impl JobStore {
         // Without the record a restart runs the job again: wasted work, but nothing is lost.
         if let Err(error) = retry(&id, self.0.retry_time(), StoreError::is_temporary, write).await {
             tracing::error!(job_id = %id, %error, "cannot record the end of a job");
-            job.publish_end();
+            job.publish_end(job.record());
         }
     }
 }

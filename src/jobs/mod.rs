@@ -7,6 +7,8 @@
 //! `queue` holds `coalesced_job`s: identical requests share one. `job_store` keeps `durable_job`s, whose `records`
 //! survive the process.
 
+mod broker;
+mod claims;
 mod coalesced_job;
 mod cost;
 mod devices;
@@ -18,6 +20,7 @@ mod interleavings;
 mod job_store;
 mod kept;
 mod key;
+mod open_jobs;
 mod pool;
 mod queue;
 mod rank;
@@ -25,6 +28,7 @@ mod record;
 mod records;
 mod results;
 mod retry;
+mod runner;
 mod structures;
 #[cfg(test)]
 mod tests;
@@ -32,6 +36,7 @@ mod ticket;
 mod worker;
 
 pub(crate) use crate::memory_budget::{Budget, MemoryReservation};
+pub(crate) use broker::MemoryBroker;
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};

@@ -158,6 +158,10 @@ impl Queue {
             // The next process runs the job. Without a sender the ticket ends as stopped.
             return Ok(Some(self.ticket(id, None, Arc::default(), job_span(task, now), (allowed, 0.0))));
         }
+        // A broker has queued durable jobs; no more are claimed than there are workers.
+        if task.rank.batch {
+            return Ok(None);
+        }
         let wait = self.wait(state, now);
         // A job of a free worker counts as running before the worker has woken up.
         if state.jobs.len() >= self.limit + self.workers {

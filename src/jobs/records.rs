@@ -2,31 +2,34 @@
 //!
 //! The record of an open job is `ID.json`. At its end, the record `ID.ended.json` is written, then the other one is
 //! removed, so that one of them exists at any time. If both exist, the job has ended. The end of a job is thus known
-//! from the name, and a start reads the records of open jobs only.
+//! from the name, and a start reads the records of open jobs only. The record of an end is never replaced.
 
 use std::sync::Arc;
 
 use bytes::Bytes;
 use futures_util::{StreamExt as _, stream};
+use metrics::counter;
 use thiserror::Error;
 
+use super::broker::{Dispatch, JobEvent};
+use super::claims::input_of;
 use super::durable_job::DurableJob;
 use super::job_store::{JobStore, JobStoreState};
 use super::rank::{Client, Rank};
 use super::record::{JobId, JobRecord};
-use super::{Input, Task};
+use super::{EndError, Input, Task};
 use crate::formats::Format;
 use crate::pipeline::MapFile;
 use crate::store::{BadDigest, Digest, Folder, Name, Namespace, Pin, RecordCaps, RecordReservation, StoreError};
 use crate::surface::OutOfMemory;
-use crate::telemetry::shorten;
+use crate::telemetry::{JOBS_RECOVERED, shorten};
 
-/// Concurrent reads of records at startup.
-const RECOVERY_READS: usize = 64;
+/// Concurrent reads of records.
+const CONCURRENT_READS: usize = 64;
 
 impl JobStoreState {
     /// Protects the inputs (structure and map) and the record of an unfinished job from eviction.
-    pub(super) fn pin(
+    pub(super) fn pins(
         &self,
         id: &JobId,
         inputs: impl IntoIterator<Item = Digest>,
@@ -42,19 +45,18 @@ impl JobStoreState {
         let caps = RecordCaps { total: self.config.records, per_client: self.config.records_per_client };
         let (reservation, removed) = self.store.admit_record(&Name::job(id.as_str())?, caps).await?;
         for id in removed.iter().filter_map(|name| name.stem().parse().ok()) {
-            self.lock().remove(&id);
+            self.lock().jobs.remove(&id);
         }
         Ok(reservation)
     }
 
-    /// Writes a record to the store.
-    pub(super) async fn write(&self, record: &JobRecord) -> Result<(), StoreError> {
-        let (id, bytes) = (record.id.as_str(), record.to_bytes());
-        if !record.status.is_final() {
-            return self.store.put(&Name::job(id)?, bytes).await;
-        }
-        self.store.put(&Name::ended_job(id)?, bytes).await?;
-        self.store.delete(&Name::job(id)?).await
+    /// Adds the job of an open record to the open jobs, with pins of its inputs. Returns the digest of its input.
+    pub(super) fn track(&self, record: &JobRecord) -> Result<Digest, EndError> {
+        let (input, map) = input_of(record)?;
+        let pins = self.pins(&record.id, [input].into_iter().chain(map), record.namespace);
+        let pins = pins.map_err(|error| EndError::Lost { why: error.to_string() })?;
+        self.open.insert(Dispatch::of(record), pins);
+        Ok(input)
     }
 
     /// Writes the latest record of a job, and makes its end visible. Writers of one job take turns, so the last write
@@ -64,11 +66,26 @@ impl JobStoreState {
         // The semaphore is never closed.
         let _permit = self.writes.acquire().await;
         let record = job.record();
-        self.write(&record).await?;
-        if record.status.is_final() {
-            job.publish_end();
+        if !record.status.is_final() {
+            return self.store.put(&Name::job(record.id.as_str())?, record.to_bytes()).await;
         }
+        let id = record.id.clone();
+        job.publish_end(self.write_end(record).await?);
+        self.open.remove(&id);
+        self.broker.publish(&id, JobEvent::Ended);
         Ok(())
+    }
+
+    /// Writes the record of an end, unless an end is on record, and returns the record in the store.
+    pub(super) async fn write_end(&self, record: JobRecord) -> Result<JobRecord, StoreError> {
+        let (open, ended) = (Name::job(record.id.as_str())?, Name::ended_job(record.id.as_str())?);
+        let end = if self.store.put_new(&ended, record.to_bytes()).await? {
+            record
+        } else {
+            self.read_document(&ended).await?.unwrap_or(record)
+        };
+        self.store.delete(&open).await?;
+        Ok(end)
     }
 
     /// Writes the record of a new, open job. Returns false if there is a job with its id, open or ended.
@@ -108,9 +125,16 @@ impl JobStoreState {
         Err(StoreError::Quarantined { name: name.to_string() })
     }
 
-    /// Reads the records of open jobs, in the order of their acceptance. Removes those of jobs that have ended.
-    async fn read_open(&self) -> Result<Vec<JobRecord>, StoreError> {
+    /// Reads the records of open jobs that this process does not know yet, in the order of their acceptance. Removes
+    /// those of jobs that have ended. Forgets jobs that are not on record any more.
+    async fn read_unknown(&self) -> Result<Vec<JobRecord>, StoreError> {
+        let mut known = self.open.ids();
         let (ended, open): (Vec<_>, Vec<_>) = self.store.names(Folder::Jobs).into_iter().partition(Name::is_ended_job);
+        let is_new = |name: &Name| name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id));
+        let open: Vec<_> = open.into_iter().filter(is_new).collect();
+        for gone in &known {
+            self.open.remove(gone);
+        }
         let read = |name: Name| {
             let ended = &ended;
             async move {
@@ -120,7 +144,7 @@ impl JobStoreState {
                 self.read_document(&name).await
             }
         };
-        let mut reads = stream::iter(open).map(read).buffer_unordered(RECOVERY_READS);
+        let mut reads = stream::iter(open).map(read).buffer_unordered(CONCURRENT_READS);
         let mut records = Vec::new();
         while let Some(read) = reads.next().await {
             match read {
@@ -129,6 +153,7 @@ impl JobStoreState {
                 Err(error) => return Err(error),
             }
         }
+        drop(reads);
         records.sort_by_key(|record| (record.created_ms, record.id.clone()));
         Ok(records)
     }
@@ -187,16 +212,33 @@ impl JobStore {
         Ok(())
     }
 
-    /// Resumes the unfinished jobs of earlier processes and returns their number.
-    pub(crate) async fn recover(&self) -> Result<usize, StoreError> {
-        let before = self.0.lock().len();
-        for record in self.0.read_open().await? {
+    /// Dispatches the unfinished jobs that neither the broker nor this process has, such as those of an earlier process,
+    /// and returns their number.
+    pub(crate) async fn reconcile(&self) -> Result<usize, StoreError> {
+        let inner = &self.0;
+        for record in inner.read_unknown().await? {
             if record.status.is_final() {
-                self.0.write(&record).await?;
-            } else {
-                self.resume(record).await?;
+                inner.write_end(record).await?;
+            } else if let Err(error) = inner.track(&record) {
+                let job = self.insert_open(record);
+                self.finish(&job, Err(error)).await;
             }
         }
-        Ok(self.0.lock().len() - before)
+        let mut dispatched = 0;
+        for dispatch in inner.open.all() {
+            if inner.lock().jobs.get(&dispatch.id).is_some_and(|job| job.is_owned()) {
+                continue;
+            }
+            match inner.broker.dispatch(&dispatch).await {
+                Ok(true) => dispatched += 1,
+                Ok(false) => {}
+                Err(error) => {
+                    tracing::warn!(%error, "some jobs are dispatched later");
+                    break;
+                }
+            }
+        }
+        counter!(JOBS_RECOVERED).increment(dispatched as u64);
+        Ok(dispatched)
     }
 }

@@ -18,8 +18,8 @@ use super::durable_job::DurableJob;
 use super::rank::{Client, DEFAULT_URGENCY, Rank};
 use super::record::{JobRecord, Requester, now_ms};
 use super::{
-    AcceptError, Budget, EndError, Input, JobId, JobSpec, JobStore, JobView, OnStart, Pool, Settings, Status,
-    Structures, Task,
+    AcceptError, Budget, EndError, Input, JobId, JobSpec, JobStore, JobView, MemoryBroker, OnStart, Pool, Settings,
+    Status, Structures, Task,
 };
 use crate::config::JobsConfig;
 use crate::formats::Format;
@@ -39,6 +39,7 @@ struct Fixture {
     faults: Arc<Faults>,
     store: Store,
     jobs: JobStore,
+    broker: MemoryBroker,
     dir: TempDir,
 }
 
@@ -68,7 +69,17 @@ impl Fixture {
         };
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
-        Self { faults, jobs: JobStore::new(store.clone(), pool, config, 1 << 30, [0; 32], describe), store, dir }
+        let broker = MemoryBroker::new(1000);
+        let dispatch = (Arc::new(broker.clone()) as _, 1000);
+        let jobs = JobStore::new(store.clone(), pool, dispatch, config, 1 << 30, [0; 32], describe);
+        jobs.start_claiming();
+        Self { faults, store, jobs, broker, dir }
+    }
+
+    /// Waits until every job has ended.
+    async fn all_ended(&self) {
+        until("the end of all jobs", || async { self.broker.is_empty() }).await;
+        self.jobs.all_recorded().await;
     }
 
     async fn accept(&self) -> Result<JobView, AcceptError> {
@@ -108,7 +119,7 @@ impl Fixture {
             result: None,
             problem: None,
         };
-        self.jobs.0.write(&record).await.unwrap();
+        self.store.put(&Name::job(record.id.as_str()).unwrap(), record.to_bytes()).await.unwrap();
         self.store.put_new(&Name::input(&digest), input).await.unwrap();
         record.id
     }
@@ -171,7 +182,7 @@ async fn a_failing_store_ends_no_job() {
     let fixture = Fixture::new(1, MAX_WAIT).await;
     let id = fixture.store_record().await;
     fixture.faults.silence(Some(Folder::Inputs));
-    assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
+    assert_eq!(fixture.jobs.reconcile().await.unwrap(), 1);
     let mut seen = fixture.watch(&id).await;
     // More failures than attempts: a failed read of the input is not an attempt.
     fixture.until_timed_out(3).await;
@@ -184,7 +195,7 @@ async fn a_failing_store_ends_no_job() {
     let other = Bytes::from_static(b"another input");
     let id = fixture.store_record_with(other.clone()).await;
     fixture.store.delete(&Name::input(&Digest::of(&other))).await.unwrap();
-    assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
+    assert_eq!(fixture.jobs.reconcile().await.unwrap(), 1);
     let mut seen = fixture.watch(&id).await;
     ended(&mut seen).await;
     is(&seen, |record| record.status, &Status::Failed);
@@ -223,11 +234,13 @@ async fn a_result_that_is_never_stored_is_computed_for_every_attempt() {
     fixture.jobs = JobStore::new(
         fixture.store.clone(),
         Arc::clone(&fixture.jobs.0.pool),
+        (Arc::new(MemoryBroker::new(8)), 8),
         fixture.jobs.0.config.clone(),
         100,
         [0; 32],
         fixture.jobs.0.describe,
     );
+    fixture.jobs.start_claiming();
     let id = fixture.accept().await.unwrap().record.id;
     let mut seen = fixture.watch(&id).await;
     ended(&mut seen).await;
@@ -253,7 +266,7 @@ async fn the_end_of_a_job_is_recorded_once_the_store_works_again() {
     ended(&mut seen).await;
     is(&seen, |record| record.status, &Status::Successful);
     assert_eq!(fixture.on_record(&id).await, seen.borrow().record);
-    fixture.jobs.all_recorded().await;
+    fixture.all_ended().await;
     expire().await;
     assert_eq!(fixture.store.usage(Folder::Results).objects, 0, "control: an unused result expires");
 }
@@ -267,7 +280,7 @@ async fn no_job_is_accepted_without_a_record() {
         assert!(matches!(refused, Err(AcceptError::Store(StoreError::Failed { .. }))), "{refused:?}");
     }
     fixture.faults.silence(None);
-    assert_eq!((fixture.store.usage(Folder::Jobs).objects, fixture.jobs.recover().await.unwrap()), (0, 0));
+    assert_eq!((fixture.store.usage(Folder::Jobs).objects, fixture.jobs.reconcile().await.unwrap()), (0, 0));
     fixture.accept().await.unwrap();
 }
 
@@ -276,7 +289,7 @@ async fn a_dismissed_job_does_not_start() {
     let fixture = Fixture::new(1, MAX_WAIT).await;
     let id = fixture.store_record().await;
     let job = Arc::new(DurableJob::new(fixture.on_record(&id).await));
-    let on_start = fixture.jobs.on_start(&job, None);
+    let on_start = fixture.jobs.on_start(&job);
     assert!(job.end(Status::Dismissed, |_| {}));
     fixture.jobs.0.write_job(&job).await.unwrap();
     // The worker has already taken the job.
@@ -319,7 +332,7 @@ async fn records_that_cannot_be_read_go_into_quarantine() {
     let refused = fixture.jobs.view(&id(&names[0]), Namespace::default()).await;
     assert!(matches!(refused, Err(StoreError::Quarantined { .. })), "{refused:?}");
     assert_eq!(fixture.store.quarantined().await.unwrap(), 1);
-    assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
+    assert_eq!(fixture.jobs.reconcile().await.unwrap(), 1);
     ended(&mut fixture.watch(&good).await).await;
     assert_eq!(fixture.store.quarantined().await.unwrap(), 3);
     let folder = fixture.dir.path().join("store/quarantine");
@@ -340,7 +353,7 @@ async fn recovered_inputs_are_pinned() {
     let id = fixture.store_record().await;
     // The job cannot start, so only the recovery protects its input.
     fixture.faults.silence(Some(Folder::Inputs));
-    assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
+    assert_eq!(fixture.jobs.reconcile().await.unwrap(), 1);
     fixture.store.sweep(SystemTime::now() + Duration::from_hours(10_000)).await;
     fixture.faults.silence(None);
     let mut seen = fixture.watch(&id).await;
@@ -362,7 +375,7 @@ async fn versions_of_states_continue_after_a_restart() {
     let next = DurableJob::new(job.record());
     versions.push(next.view().version);
     assert!(next.end(Status::Failed, |_| {}));
-    next.publish_end();
+    next.publish_end(next.record());
     versions.push(next.view().version);
     assert!(versions.is_sorted_by(|a, b| a < b), "{versions:?}");
     assert_eq!(DurableJob::new(next.record()).view().version, *versions.last().unwrap(), "no event follows the last");

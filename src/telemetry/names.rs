@@ -53,7 +53,9 @@ metrics! {
     JOBS_FINISHED = "molmesh_jobs_finished_total", Counter, outcome: "successful|failed|dismissed|panicked";
     /// Asynchronous jobs that have not ended.
     JOBS_OPEN = "molmesh_jobs_open", Gauge;
-    /// Asynchronous jobs of earlier processes that were resumed.
+    /// Asynchronous jobs that wait for a worker.
+    BROKER_QUEUED = "molmesh_broker_jobs_queued", Gauge;
+    /// Unfinished asynchronous jobs that were dispatched again, such as those of an earlier process.
     JOBS_RECOVERED = "molmesh_jobs_recovered_total", Counter;
     /// Jobs that a fallback backend ran instead of the selected one.
     JOBS_FALLBACK = "molmesh_jobs_fallback_total", Counter;
@@ -63,7 +65,7 @@ metrics! {
                 improve|cavities|simplify|index|clip|measure|roundtrip|color|draw|png|encode";
     /// Results of synchronous requests that were not stored.
     RESULTS_NOT_STORED = "molmesh_results_not_stored_total", Counter, reason: "busy|failed";
-    /// Jobs waiting in the queue.
+    /// Interactive and claimed jobs that wait in the queue of the pool.
     QUEUE_DEPTH = "molmesh_queue_depth", Gauge;
     /// Time for which the oldest job in the queue has waited.
     QUEUE_AGE = "molmesh_queue_oldest_age_seconds", Gauge;

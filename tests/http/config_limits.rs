@@ -83,6 +83,7 @@ const ROWS: &[Row] = &[
         "too-many-jobs",
         "src/jobs/tests/records::records_are_limited_in_total_and_for_each_client",
     ),
+    ("broker.queue", "queue-full", "http/limits::a_full_broker_rejects_jobs_with_retry_after"),
     ("devices.jobs", "molmesh_device_jobs", "http/devices::devices_are_listed_with_their_reasons"),
     ("devices.batch", "molmesh_device_shared_submissions_total", "gpu/pool::small_jobs_share_a_submission"),
     (

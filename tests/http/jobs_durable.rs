@@ -435,7 +435,8 @@ fn a_store_that_becomes_read_only_is_reported_and_used_again_when_it_recovers() 
     };
     let upload = |n: usize| request("POST", "/v1/structures", "", &sample(n)).0;
     let ready = || request("GET", "/readyz", "", b"");
-    assert_eq!((upload(1), ready().0), (201, 200));
+    wait_for("the first mesh", || ready().0 == 200);
+    assert_eq!(upload(1), 201);
     // The upload may still be renamed or synced.
     wait_for("no file is open", || remount("remount,ro"));
     let later = "prefer: respond-async\r\n";

@@ -425,6 +425,26 @@ fn a_full_queue_rejects_with_retry_after() {
 }
 
 #[test]
+fn a_full_broker_rejects_jobs_with_retry_after() {
+    let backend = Fake::new(Mode::Slow(Duration::from_millis(600)));
+    let server = start(Arc::clone(&backend) as _, |c| (c.jobs.workers, c.broker.queue) = (1, 2));
+    let asynchronous = [("prefer", "respond-async")];
+    let submit = |n| server.post("/v1/meshes", &asynchronous, &sample(n));
+    assert_eq!(submit(0).status, 202);
+    wait_for("one job to run", || backend.started.load(Ordering::SeqCst) == 1);
+    for n in 1..3 {
+        assert_eq!(submit(n).status, 202);
+    }
+    assert!((server.metric("molmesh_broker_jobs_queued", &[]) - 2.0).abs() < 0.1);
+    let refused = submit(9);
+    let problem = refused.problem(503, "queue-full");
+    assert_eq!((&problem["limit"], &problem["actual"]), (&2.into(), &2.into()));
+    assert!(refused.header("retry-after").unwrap().parse::<u64>().unwrap() >= 1);
+    assert_eq!(server.post("/v1/meshes", &[], &sample(10)).status, 200, "an interactive request needs no slot");
+    wait_for("a slot to become free", || submit(9).status == 202);
+}
+
+#[test]
 fn the_deadline_includes_queueing_and_stops_the_job() {
     let backend = Fake::new(Mode::Slow(Duration::from_secs(30)));
     let server = start(Arc::clone(&backend) as _, |c| {
@@ -681,6 +701,7 @@ fn reading_counts_against_the_memory_limit() {
     let body = compressed_atoms(100_000);
     assert!(body.len() < 2_000_000, "{}", body.len());
     for path in ["/v1/meshes", "/v1/structures", "/v1/estimate", "/v1/meshes?check=strict"] {
+        wait_for("the memory to be returned", || server.metric("molmesh_memory_held_bytes", &[]) == 0.0);
         let refused = server.post(path, &[], &body);
         let problem = refused.problem(422, "too-much-memory");
         assert_eq!(problem["limit"], 8_000_000, "{path}");

@@ -17,8 +17,8 @@ use shuttle::scheduler::RandomScheduler;
 use super::super::coalesced_job::QueuedTask;
 use super::super::queue::Queue;
 use super::super::{
-    Budget, ContentKey, EndError, Failure, JobId, JobRecord, JobSpec, JobStore, JobView, OnStart, Pool, REPORT,
-    Settings, Status, Structures, results,
+    Budget, ContentKey, EndError, Failure, JobId, JobRecord, JobSpec, JobStore, JobView, MemoryBroker, OnStart, Pool,
+    REPORT, Settings, Status, Structures, results,
 };
 use super::task;
 use crate::config::JobsConfig;
@@ -45,6 +45,7 @@ const ATTEMPTS: u32 = 3;
 struct Fixture {
     jobs: JobStore,
     queue: Arc<Queue>,
+    broker: MemoryBroker,
     store: Store,
     objects: Arc<InMemory>,
     /// Ends that clients have seen.
@@ -70,8 +71,11 @@ impl Fixture {
         let queue = Arc::clone(&pool.shared.queue);
         let config = JobsConfig { attempts: ATTEMPTS, ..JobsConfig::default() };
         let describe = |error: &EndError| Value::String(error.to_string());
-        let jobs = JobStore::new(store.clone(), pool, config, 1 << 20, [0; 32], describe);
-        Self { jobs, queue, store, objects, ends: Arc::default() }
+        let broker = MemoryBroker::new(8);
+        let dispatch = (Arc::new(broker.clone()) as _, 8);
+        let jobs = JobStore::new(store.clone(), pool, dispatch, config, 1 << 20, [0; 32], describe);
+        jobs.start_claiming();
+        Self { jobs, queue, broker, store, objects, ends: Arc::default() }
     }
 
     /// Creates or joins the job.
@@ -134,7 +138,11 @@ impl Fixture {
 
     /// Waits for the end of all work and checks the final state. Returns its status.
     fn check(&self, workers: Vec<JoinHandle<()>>) -> Status {
+        while !self.broker.is_empty() {
+            thread::yield_now();
+        }
         block_on(self.jobs.all_recorded());
+        self.jobs.stop_claiming();
         self.queue.close();
         for worker in workers {
             worker.join().unwrap();
@@ -196,9 +204,9 @@ impl Client<'_> {
 
     /// Cancels the job in the wrong order: its end is visible before it is on record.
     fn cancels_without_record(&mut self) {
-        let Some(job) = self.fixture.jobs.0.lock().get(&id()).cloned() else { return };
+        let Some(job) = self.fixture.jobs.0.lock().jobs.get(&id()).cloned() else { return };
         if job.end(Status::Dismissed, |_| {}) {
-            job.publish_end();
+            job.publish_end(job.record());
             job.dismissed.notify_one();
             block_on(self.fixture.jobs.0.write_job(&job)).unwrap();
         }

@@ -22,7 +22,7 @@ async fn record_attempts(n: usize, writes: usize, slow: Duration) -> (Duration, 
         let id = fixture.store_record().await;
         jobs.push(Arc::new(DurableJob::new(fixture.on_record(&id).await)));
     }
-    let on_start = jobs.iter().map(|job| fixture.jobs.on_start(job, None)).collect();
+    let on_start = jobs.iter().map(|job| fixture.jobs.on_start(job)).collect();
     fixture.faults.slow_ms.store(slow.as_millis().try_into().unwrap(), Ordering::SeqCst);
     let begun = Instant::now();
     tokio::task::spawn_blocking(|| OnStart::run_all(on_start)).await.unwrap();
@@ -58,13 +58,13 @@ async fn joined_jobs_are_recovered_within_the_memory_budget() {
     // Without memory for the input, every job waits.
     let reservation = budget.reservation();
     reservation.grow(8 * input.len() as u64 - 1).unwrap();
-    assert_eq!(fixture.jobs.recover().await.unwrap(), JOBS);
+    assert_eq!(fixture.jobs.reconcile().await.unwrap(), JOBS);
     tokio::time::sleep(Duration::from_millis(300)).await;
     assert_eq!(fixture.faults.input_reads.load(Ordering::SeqCst), 0, "memory is reserved before it is used");
     drop(reservation);
     let begun = Instant::now();
     let mut most = 0;
-    while *fixture.jobs.0.open.borrow() > 0 {
+    while !fixture.broker.is_empty() {
         assert!(begun.elapsed() < MAX_WAIT, "the jobs do not end");
         most = most.max(budget.used());
         tokio::time::sleep(Duration::from_millis(1)).await;
@@ -72,7 +72,8 @@ async fn joined_jobs_are_recovered_within_the_memory_budget() {
     assert!(most <= 8 * input.len() as u64, "{most} bytes were held");
     for id in &ids {
         let record = fixture.on_record(id).await;
-        assert_eq!((record.status, record.attempts), (Status::Successful, 1), "{record:?}");
+        // Those that are claimed after the first one has ended find its result.
+        assert!(record.status == Status::Successful && record.attempts <= 1, "{record:?}");
     }
     let reads = fixture.faults.input_reads.load(Ordering::SeqCst);
     assert!((1..=2).contains(&reads), "the input was loaded {reads} times");
@@ -84,7 +85,7 @@ async fn a_recovered_job_whose_input_never_fits_fails() {
     let budget = Budget::new(SAMPLE.len() as u64 - 1);
     let fixture = Fixture::open_within(tempfile::tempdir().unwrap(), JobsConfig::default(), budget).await;
     let id = fixture.store_record().await;
-    assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
+    assert_eq!(fixture.jobs.reconcile().await.unwrap(), 1);
     let mut seen = fixture.watch(&id).await;
     ended(&mut seen).await;
     is(&seen, |record| record.status, &Status::Failed);

@@ -31,7 +31,7 @@ async fn records_are_limited_in_total_and_for_each_client() {
         assert_eq!((l, k), (limit, key), "the request would join the work of the others");
     }
     fixture.faults.silence(None);
-    fixture.jobs.all_recorded().await;
+    fixture.all_ended().await;
     // In the order of their use.
     for id in &open {
         assert_eq!(fixture.on_record(id).await.status, Status::Successful);
@@ -60,7 +60,7 @@ async fn few_ended_jobs_stay_in_memory() {
     insert(record.clone());
     let ended = |n: u64| JobRecord { id: new_id(), status: Status::Successful, finished_ms: Some(n), ..record.clone() };
     let ids: Vec<JobId> = (0..3 * MAX_ENDED as u64).map(|n| insert(ended(n))).collect();
-    let jobs = fixture.jobs.0.lock();
+    let jobs = &fixture.jobs.0.lock().jobs;
     let n = jobs.len();
     assert!((MAX_ENDED..=MAX_ENDED + MAX_ENDED / 10 + 1).contains(&n), "{n}");
     assert!(jobs.contains_key(&open), "open jobs stay");
@@ -80,13 +80,13 @@ async fn a_start_reads_the_records_of_open_jobs_only() {
     write(&half_ended);
     (1..ENDED).for_each(|_| write(&new_id()));
     let fixture = Fixture::open(fixture.dir, config).await;
-    assert_eq!(fixture.jobs.recover().await.unwrap(), open.len());
+    assert_eq!(fixture.jobs.reconcile().await.unwrap(), open.len());
     assert_eq!(fixture.faults.job_reads.load(Ordering::SeqCst), open.len());
     assert!(!folder.join(format!("{}.json", half_ended.as_str())).exists());
     for id in &open {
         ended(&mut fixture.watch(id).await).await;
     }
-    fixture.jobs.all_recorded().await;
+    fixture.all_ended().await;
     let count = || fixture.store.usage(Folder::Jobs).objects;
     assert_eq!(count(), ENDED as u64 + 2);
     // The names alone identify the client: its ended records are removed down to the cap.
@@ -101,9 +101,9 @@ async fn a_record_of_an_ended_job_prevents_another_one() {
     let open = fixture.on_record(&id).await;
     let ended = JobRecord { status: Status::Dismissed, finished_ms: Some(now_ms()), ..open.clone() };
     assert!(!fixture.jobs.0.write_new(&open).await.unwrap(), "the job is open");
-    fixture.jobs.0.write(&ended).await.unwrap();
+    fixture.jobs.0.write_end(ended.clone()).await.unwrap();
     assert!(!fixture.jobs.0.write_new(&open).await.unwrap(), "the job has ended");
-    assert_eq!((fixture.on_record(&id).await, fixture.jobs.recover().await.unwrap()), (ended, 0));
+    assert_eq!((fixture.on_record(&id).await, fixture.jobs.reconcile().await.unwrap()), (ended, 0));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -118,7 +118,7 @@ async fn occasional_errors_of_the_store_end_no_job() {
             Err(error) => panic!("{error:?}"),
         }
     }
-    fixture.jobs.all_recorded().await;
+    fixture.all_ended().await;
     assert!(accepted.len() < 30 && accepted.len() >= 5, "{} jobs are accepted", accepted.len());
     fixture.faults.error_every.store(0, Ordering::SeqCst);
     for id in &accepted {

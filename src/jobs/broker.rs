@@ -1,0 +1,138 @@
+//! Dispatch of asynchronous jobs to workers, within a process or between the nodes of a cluster.
+//!
+//! The store is the truth: a broker holds only ids, and a broker that loses them loses no job, since every node
+//! dispatches unfinished jobs again ([`JobStore::reconcile`](super::JobStore::reconcile)). A job may therefore be
+//! claimed twice; results are named by their contents, and the first end on record counts.
+//!
+//! Clients take turns. Of the jobs of one client, the most urgent runs first, then the oldest.
+
+mod memory;
+
+use std::borrow::Cow;
+use std::fmt;
+use std::time::Duration;
+
+use futures_util::future::BoxFuture;
+use futures_util::stream::BoxStream;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+pub(crate) use memory::MemoryBroker;
+
+use super::rank::Client;
+use super::record::{JobId, JobRecord};
+
+/// Job as its broker sees it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Dispatch {
+    /// Id of the job.
+    pub(crate) id: JobId,
+    /// Client, for fair queueing.
+    pub(crate) client: Client,
+    /// Urgency among the jobs of the client, from 0 (first) to 7 (last).
+    pub(crate) urgency: u8,
+}
+
+impl Dispatch {
+    /// Returns the dispatch of the job of a record.
+    pub(crate) fn of(record: &JobRecord) -> Self {
+        Self { id: record.id.clone(), client: Client(record.client), urgency: record.urgency }
+    }
+}
+
+/// State of a job that the node which runs it publishes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum JobEvent {
+    /// The job runs.
+    Running {
+        /// Number of attempts.
+        attempts: u32,
+        /// Stage.
+        stage: Cow<'static, str>,
+        /// Finished fraction, from 0 to 1.
+        fraction: f64,
+    },
+    /// The end of the job is on record.
+    Ended,
+}
+
+/// Error of a job that was not dispatched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+pub(crate) enum DispatchError {
+    /// The queue is full.
+    #[error("the queue is full")]
+    Full,
+}
+
+/// Dispatches jobs to workers.
+pub(crate) trait Broker: Send + Sync {
+    /// Queues a job. Returns false if it is queued or claimed already.
+    fn dispatch<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>>;
+
+    /// Waits for a job and claims it. Cancel safe.
+    fn claim(&self) -> BoxFuture<'_, Claim>;
+
+    /// Publishes the state of a job to its followers. An event may be lost.
+    fn publish(&self, id: &JobId, event: JobEvent);
+
+    /// Returns the events of a job that are published from now on.
+    fn events(&self, id: &JobId) -> BoxStream<'static, JobEvent>;
+
+    /// Returns the number of queued jobs.
+    fn queued(&self) -> usize;
+}
+
+/// Ends of a claim that an implementation provides.
+pub(crate) trait Lease: Send + Sync {
+    /// Removes the job from the queue.
+    fn done(self: Box<Self>) -> BoxFuture<'static, ()>;
+
+    /// Returns the job to the queue. It can be claimed again after `delay`.
+    fn release(self: Box<Self>, delay: Duration);
+}
+
+/// Claimed job. No other worker gets the job until the claim is dropped, or until its node has stopped. A claim that is
+/// dropped returns the job to the queue.
+#[must_use = "dropping the claim returns the job to the queue"]
+pub(crate) struct Claim {
+    /// Id of the job.
+    pub(crate) id: JobId,
+    /// Number of claims of the job since it was dispatched, this one included.
+    pub(crate) deliveries: u32,
+    lease: Option<Box<dyn Lease>>,
+}
+
+impl fmt::Debug for Claim {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Claim").field("id", &self.id).field("deliveries", &self.deliveries).finish_non_exhaustive()
+    }
+}
+
+impl Claim {
+    fn new(id: JobId, deliveries: u32, lease: impl Lease + 'static) -> Self {
+        Self { id, deliveries, lease: Some(Box::new(lease)) }
+    }
+
+    /// Removes the job from the queue.
+    pub(crate) async fn done(mut self) {
+        if let Some(lease) = self.lease.take() {
+            lease.done().await;
+        }
+    }
+
+    /// Returns the job to the queue. It can be claimed again after `delay`.
+    pub(crate) fn release(mut self, delay: Duration) {
+        if let Some(lease) = self.lease.take() {
+            lease.release(delay);
+        }
+    }
+}
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        if let Some(lease) = self.lease.take() {
+            lease.release(Duration::ZERO);
+        }
+    }
+}

@@ -1,0 +1,210 @@
+//! Broker within a process. A new process dispatches the unfinished jobs of the store again.
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::sync::{Arc, PoisonError};
+use std::time::Duration;
+
+use futures_util::future::BoxFuture;
+use futures_util::stream::{self, BoxStream, StreamExt as _};
+use metrics::gauge;
+use tokio::sync::{Notify, broadcast};
+
+use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, Lease};
+use crate::jobs::rank::Client;
+use crate::jobs::record::JobId;
+use crate::sync::{Handle, Mutex, MutexGuard, sleep};
+use crate::telemetry::BROKER_QUEUED;
+
+/// Number of events that a slow follower may miss before it skips some.
+const EVENTS: usize = 256;
+
+/// Position of a job among those of its client: urgency, then order of dispatch.
+type Place = (u8, u64);
+
+/// State of a job that the broker holds.
+#[derive(Debug, Clone, Copy)]
+struct HeldJob {
+    client: Client,
+    place: Place,
+    deliveries: u32,
+}
+
+#[derive(Debug, Default)]
+struct BrokerState {
+    /// Queued jobs of each client. No client has none.
+    queued: HashMap<Client, BTreeMap<Place, JobId>>,
+    /// Clients with queued jobs, in the order of their turns.
+    turns: VecDeque<Client>,
+    /// All jobs that are queued, delayed or claimed.
+    held: HashMap<JobId, HeldJob>,
+    next: u64,
+    /// Number of queued jobs.
+    waiting: usize,
+}
+
+impl BrokerState {
+    fn enqueue(&mut self, id: JobId, job: HeldJob) {
+        let jobs = self.queued.entry(job.client).or_default();
+        if jobs.is_empty() {
+            self.turns.push_back(job.client);
+        }
+        jobs.insert(job.place, id);
+        self.count(self.waiting + 1);
+    }
+
+    /// Takes the first job of the client whose turn it is.
+    fn take(&mut self) -> Option<(JobId, u32)> {
+        let client = self.turns.pop_front()?;
+        let jobs = self.queued.get_mut(&client)?;
+        let (_, id) = jobs.pop_first()?;
+        if jobs.is_empty() {
+            self.queued.remove(&client);
+        } else {
+            self.turns.push_back(client);
+        }
+        self.count(self.waiting - 1);
+        let job = self.held.get_mut(&id)?;
+        job.deliveries += 1;
+        Some((id, job.deliveries))
+    }
+
+    fn count(&mut self, waiting: usize) {
+        self.waiting = waiting;
+        gauge!(BROKER_QUEUED).set(u32::try_from(waiting).unwrap_or(u32::MAX));
+    }
+}
+
+struct BrokerShared {
+    state: Mutex<BrokerState>,
+    filled: Notify,
+    events: broadcast::Sender<(JobId, JobEvent)>,
+    limit: usize,
+}
+
+impl BrokerShared {
+    fn lock(&self) -> MutexGuard<'_, BrokerState> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes the next job. Passes the notification on if further jobs are queued: two notifications without a waiter
+    /// count as one.
+    fn take(&self) -> Option<(JobId, u32)> {
+        let mut state = self.lock();
+        let taken = state.take();
+        if taken.is_some() && state.waiting > 0 {
+            self.filled.notify_one();
+        }
+        taken
+    }
+
+    fn requeue(&self, id: JobId) {
+        let mut state = self.lock();
+        if let Some(job) = state.held.get(&id).copied() {
+            state.enqueue(id, job);
+            drop(state);
+            self.filled.notify_one();
+        }
+    }
+}
+
+/// Broker within a process. Clones share one queue.
+#[derive(Clone)]
+pub(crate) struct MemoryBroker(Arc<BrokerShared>);
+
+impl MemoryBroker {
+    /// Creates an empty broker that queues at most `limit` jobs.
+    pub(crate) fn new(limit: usize) -> Self {
+        let (events, _) = broadcast::channel(EVENTS);
+        Self(Arc::new(BrokerShared { state: Mutex::default(), filled: Notify::new(), events, limit }))
+    }
+
+    /// Returns true if no job is queued or claimed.
+    #[cfg(test)]
+    pub(crate) fn is_empty(&self) -> bool {
+        self.0.lock().held.is_empty()
+    }
+}
+
+/// Claim of a job of a [`MemoryBroker`]. It lasts as long as the process.
+struct MemoryLease {
+    broker: Arc<BrokerShared>,
+    id: JobId,
+}
+
+impl Lease for MemoryLease {
+    fn done(self: Box<Self>) -> BoxFuture<'static, ()> {
+        self.broker.lock().held.remove(&self.id);
+        Box::pin(std::future::ready(()))
+    }
+
+    fn release(self: Box<Self>, delay: Duration) {
+        let Self { broker, id } = *self;
+        if delay.is_zero() {
+            broker.requeue(id);
+            return;
+        }
+        Handle::current().spawn(async move {
+            sleep(delay).await;
+            broker.requeue(id);
+        });
+    }
+}
+
+impl Broker for MemoryBroker {
+    fn dispatch<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>> {
+        let mut state = self.0.lock();
+        let queued = if state.held.contains_key(&job.id) {
+            Ok(false)
+        } else if state.waiting >= self.0.limit {
+            Err(DispatchError::Full)
+        } else {
+            let place = (job.urgency, state.next);
+            state.next += 1;
+            let held = HeldJob { client: job.client, place, deliveries: 0 };
+            state.held.insert(job.id.clone(), held);
+            state.enqueue(job.id.clone(), held);
+            Ok(true)
+        };
+        drop(state);
+        if queued == Ok(true) {
+            self.0.filled.notify_one();
+        }
+        Box::pin(std::future::ready(queued))
+    }
+
+    fn claim(&self) -> BoxFuture<'_, Claim> {
+        Box::pin(async {
+            loop {
+                let filled = self.0.filled.notified();
+                if let Some((id, deliveries)) = self.0.take() {
+                    let lease = MemoryLease { broker: Arc::clone(&self.0), id: id.clone() };
+                    return Claim::new(id, deliveries, lease);
+                }
+                filled.await;
+            }
+        })
+    }
+
+    fn publish(&self, id: &JobId, event: JobEvent) {
+        // Without followers there is no receiver.
+        drop(self.0.events.send((id.clone(), event)));
+    }
+
+    fn events(&self, id: &JobId) -> BoxStream<'static, JobEvent> {
+        let (receiver, id) = (self.0.events.subscribe(), id.clone());
+        let next = |(mut receiver, id): (broadcast::Receiver<(JobId, JobEvent)>, JobId)| async move {
+            loop {
+                match receiver.recv().await {
+                    Ok((of, event)) if of == id => return Some((event, (receiver, id))),
+                    Ok(_) | Err(broadcast::error::RecvError::Lagged(_)) => {}
+                    Err(broadcast::error::RecvError::Closed) => return None,
+                }
+            }
+        };
+        stream::unfold((receiver, id), next).boxed()
+    }
+
+    fn queued(&self) -> usize {
+        self.0.lock().waiting
+    }
+}

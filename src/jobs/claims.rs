@@ -1,0 +1,178 @@
+//! Claims of jobs from the broker, and the state of jobs that run in other processes.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures_util::StreamExt as _;
+use tokio::sync::OwnedSemaphorePermit;
+
+use super::EndError;
+use super::broker::{Claim, JobEvent};
+use super::durable_job::DurableJob;
+use super::job_store::JobStore;
+use super::record::JobRecord;
+use super::retry;
+use super::runner::Runner;
+use crate::store::{Digest, StoreError};
+use crate::sync::{Handle, sleep};
+
+/// Interval at which the record of a followed job is read. Events arrive sooner, but may be lost.
+const POLL: Duration = Duration::from_secs(5);
+/// Number of such intervals without any watcher after which a job is not followed any more.
+const MAX_UNWATCHED: usize = 6;
+/// Time after which a job that runs in this process already may be claimed again.
+const DUPLICATE: Duration = Duration::from_secs(5);
+
+impl JobStore {
+    /// Starts to claim and run jobs.
+    pub(crate) fn start_claiming(&self) {
+        Handle::current().spawn(self.clone().claim_jobs());
+    }
+
+    /// Claims no more jobs.
+    pub(crate) fn stop_claiming(&self) {
+        self.0.stopping.send_replace(true);
+    }
+
+    async fn claim_jobs(self) {
+        let mut stopping = self.0.stopping.subscribe();
+        loop {
+            let next = async {
+                // The semaphore is never closed.
+                let slot = Arc::clone(&self.0.slots).acquire_owned().await.ok()?;
+                Some((self.0.broker.claim().await, slot))
+            };
+            let claimed = tokio::select! {
+                claimed = next => claimed,
+                _ = stopping.wait_for(|stops| *stops) => None,
+            };
+            let Some((claim, slot)) = claimed else { return };
+            let jobs = self.clone();
+            Handle::current().spawn(async move { jobs.run_claimed(claim, slot).await });
+        }
+    }
+
+    /// Runs a claimed job unless it has ended or runs in this process already.
+    async fn run_claimed(&self, claim: Claim, slot: OwnedSemaphorePermit) {
+        let Some(record) = self.record_of(&claim).await else {
+            claim.done().await;
+            return;
+        };
+        let job = self.insert_open(record.clone());
+        if job.ended().is_some() {
+            claim.done().await;
+            return;
+        }
+        if !job.own() {
+            claim.release(DUPLICATE);
+            return;
+        }
+        job.adopt(record.clone());
+        match self.0.track(&record) {
+            Ok(digest) => self.spawn(Runner { job, digest, ticket: None, claim: Some(claim), slot: Some(slot) }),
+            Err(error) => {
+                self.finish(&job, Err(error)).await;
+                job.disown();
+                claim.done().await;
+            }
+        }
+    }
+
+    /// Reads the record of a claimed job. Waits while the store fails. `None` if no such job is open.
+    async fn record_of(&self, claim: &Claim) -> Option<JobRecord> {
+        let mut pause = retry::FIRST_PAUSE;
+        loop {
+            match self.0.read(&claim.id).await {
+                Ok(record) => return record.filter(|record| !record.status.is_final()),
+                Err(StoreError::Quarantined { .. }) => return None,
+                Err(error) => tracing::warn!(job_id = %claim.id, %error, "a claimed job waits for the store"),
+            }
+            sleep(pause).await;
+            pause = (pause * 2).min(retry::MAX_PAUSE);
+        }
+    }
+
+    /// Adds an unfinished job to the map, unless it is there, and returns the job in the map.
+    pub(super) fn insert_open(&self, record: JobRecord) -> Arc<DurableJob> {
+        let (id, fresh) = (record.id.clone(), Arc::new(DurableJob::new(record)));
+        let job = self.0.insert(&id, &fresh);
+        if Arc::ptr_eq(&job, &fresh) {
+            Handle::current().spawn(self.clone().follow(fresh));
+        }
+        job
+    }
+
+    /// Updates the state of a job until it has ended or nobody watches it any more: the job may run, or be dismissed,
+    /// in another process.
+    async fn follow(self, job: Arc<DurableJob>) {
+        let id = job.id();
+        let mut events = self.0.broker.events(&id);
+        let mut ended = job.state.subscribe();
+        let mut unwatched = 0;
+        // The job may have ended since its record was read.
+        let mut stale = !job.is_owned();
+        loop {
+            if stale && self.refresh(&job).await {
+                return;
+            }
+            stale = tokio::select! {
+                Some(event) = events.next() => match event {
+                    JobEvent::Ended => true,
+                    JobEvent::Running { attempts, stage, fraction } => {
+                        if !job.is_owned() {
+                            job.publish_stage(attempts, stage, fraction);
+                        }
+                        false
+                    }
+                },
+                _ = ended.wait_for(|view| view.record.status.is_final()) => return,
+                () = sleep(POLL) => {
+                    // One receiver is that of this function.
+                    unwatched = if job.state.receiver_count() > 1 || job.is_owned() { 0 } else { unwatched + 1 };
+                    !job.is_owned()
+                }
+            };
+            if unwatched > MAX_UNWATCHED {
+                self.0.lock().jobs.remove(&id);
+                return;
+            }
+        }
+    }
+
+    /// Reads the record of a job that may have changed in another process. Returns true if the job has ended or is gone.
+    async fn refresh(&self, job: &Arc<DurableJob>) -> bool {
+        let id = job.id();
+        match self.0.read(&id).await {
+            Ok(Some(record)) if record.status.is_final() => {
+                job.publish_end(record);
+                self.0.open.remove(&id);
+                // Stops the runner if there is one.
+                job.dismissed.notify_one();
+                true
+            }
+            Ok(Some(record)) => {
+                if !job.is_owned() {
+                    job.adopt(record);
+                }
+                false
+            }
+            Ok(None) => {
+                self.0.lock().jobs.remove(&id);
+                true
+            }
+            Err(error) => {
+                tracing::debug!(job_id = %id, %error, "the record of a followed job was not read");
+                false
+            }
+        }
+    }
+}
+
+/// Returns the digest of the input of a record.
+pub(super) fn input_of(record: &JobRecord) -> Result<(Digest, Option<Digest>), EndError> {
+    let map = record.map.as_deref().map(str::parse::<Digest>).transpose();
+    match (record.input.parse::<Digest>(), map) {
+        (Ok(input), Ok(map)) => Ok((input, map)),
+        _ => Err(EndError::Lost { why: "its input or its map has no valid digest".to_owned() }),
+    }
+}

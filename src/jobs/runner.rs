@@ -1,0 +1,292 @@
+//! Run of a durable job, from its claim to its end or to its return to the queue.
+
+use std::borrow::Cow;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use tokio::sync::OwnedSemaphorePermit;
+use tracing::Instrument as _;
+
+use super::broker::{Claim, Dispatch, JobEvent};
+use super::durable_job::DurableJob;
+use super::job_store::JobStore;
+use super::record::JobRecord;
+use super::records::LoadError;
+use super::results::{self, SaveError};
+use super::retry::{self, retry};
+use super::{ContentKey, EndError, Failure, Finished, Refusal, Ticket};
+use crate::pipeline::JobError;
+use crate::store::{Digest, Pin, StoreError};
+use crate::surface::{OutOfMemory, SurfaceError};
+use crate::sync::{Handle, sleep};
+use crate::telemetry::{SpanKind, TraceSpan};
+
+/// Interval at which the progress of a running job is published.
+const TICK: Duration = Duration::from_millis(100);
+/// Pause between two attempts to get memory for an input.
+const PAUSE: Duration = Duration::from_millis(500);
+/// Upper limit of the pause after an attempt that lacked memory. Each attempt repeats the work.
+const MAX_MEMORY_PAUSE: Duration = Duration::from_mins(1);
+
+/// State of the task that runs a durable job.
+pub(super) struct Runner {
+    /// The job, which this runner owns.
+    pub(super) job: Arc<DurableJob>,
+    /// SHA-256 of the input.
+    pub(super) digest: Digest,
+    /// Ticket of queued or running work; `None` for a claimed job.
+    pub(super) ticket: Option<Ticket>,
+    /// Claim of the job; `None` for a job whose work had begun before its acceptance.
+    pub(super) claim: Option<Claim>,
+    /// Permit of the job for a worker. A job that joins the work of another one needs none.
+    pub(super) slot: Option<OwnedSemaphorePermit>,
+}
+
+/// Result of one attempt to run a job.
+enum Attempt {
+    /// The job has ended: key of the result with its pin, or the error.
+    Ended(Result<(String, Pin), EndError>),
+    /// The work needed more memory than was left.
+    OutOfMemory(OutOfMemory),
+    /// The store fails; it is retried with growing pauses.
+    StoreFailed,
+    /// The service stops; another process runs the job.
+    Left,
+}
+
+/// Returns the pause before the claim that follows `deliveries` claims that lacked memory.
+fn memory_pause(deliveries: u32) -> Duration {
+    let doublings = deliveries.saturating_sub(1).min(16);
+    (retry::FIRST_PAUSE * (1 << doublings)).min(MAX_MEMORY_PAUSE)
+}
+
+impl JobStore {
+    /// Runs a job in a task of its own, traced under the request that created it.
+    pub(super) fn spawn(&self, runner: Runner) {
+        let record = runner.job.record();
+        let log = record.requester.parent(&self.0.pool.settings().tracer).log_span(Some(record.id.as_str()));
+        self.0.running.send_modify(|running| *running += 1);
+        let jobs = self.clone();
+        let run = async move {
+            runner.run(&jobs).await;
+            jobs.0.running.send_modify(|running| *running -= 1);
+        };
+        Handle::current().spawn(run.instrument(log));
+    }
+
+    /// Waits until no job of this process runs any more: each has ended or is left to another process, and its record
+    /// is written. The pool must be drained.
+    pub(crate) async fn all_recorded(&self) {
+        drop(self.0.running.subscribe().wait_for(|running| *running == 0).await);
+    }
+}
+
+impl Runner {
+    async fn run(self, jobs: &JobStore) {
+        let Self { job, digest, mut ticket, claim, mut slot } = self;
+        let (mut pause, earlier) = (retry::FIRST_PAUSE, job.record().attempts - u32::from(ticket.is_some()));
+        let mut counted = earlier;
+        // The time after which another worker may claim the job, or `None` once it has ended.
+        let delay = loop {
+            let attempt = attempt(jobs, &job, (&mut ticket, &mut slot), digest);
+            let attempt = tokio::select! {
+                attempt = attempt => attempt,
+                // Dropping the ticket stops the work.
+                () = job.dismissed.notified() => break None,
+            };
+            match attempt {
+                Attempt::Ended(ending) => {
+                    if ending.is_err() && jobs.is_superseded(&job).await {
+                        tracing::warn!(job_id = %job.id(), "another worker runs a later attempt of a job that failed");
+                    } else {
+                        jobs.finish(&job, ending).await;
+                    }
+                    break None;
+                }
+                Attempt::OutOfMemory(error) => {
+                    let deliveries = claim.as_ref().map_or(0, |claim| claim.deliveries);
+                    let waited: Duration = (1..deliveries).map(memory_pause).sum();
+                    let never_fits = matches!(error, OutOfMemory::Limit { .. });
+                    if never_fits || waited >= jobs.0.allowed() {
+                        jobs.finish(&job, Err(EndError::Job(error.into()))).await;
+                        break None;
+                    }
+                    tracing::info!(job_id = %job.id(), %error, "a job waits for memory");
+                    jobs.return_to_queue(&job, counted).await;
+                    break Some(memory_pause(deliveries));
+                }
+                Attempt::StoreFailed => {
+                    counted = job.record().attempts;
+                    sleep(pause).await;
+                    pause = (pause * 2).min(retry::MAX_PAUSE);
+                }
+                Attempt::Left => {
+                    jobs.return_to_queue(&job, counted).await;
+                    break Some(Duration::ZERO);
+                }
+            }
+        };
+        job.disown();
+        match (delay, claim) {
+            (None, Some(claim)) => claim.done().await,
+            (Some(delay), Some(claim)) => claim.release(delay),
+            (None, None) => {}
+            (Some(_), None) => jobs.dispatch(&Dispatch::of(&job.record())).await,
+        }
+    }
+}
+
+async fn attempt(
+    jobs: &JobStore,
+    job: &Arc<DurableJob>,
+    (ticket, slot): (&mut Option<Ticket>, &mut Option<OwnedSemaphorePermit>),
+    digest: Digest,
+) -> Attempt {
+    let record = job.record();
+    let mut ticket = match ticket.take() {
+        Some(ticket) => ticket,
+        None => match submit(jobs, job, &record, digest).await {
+            Ok(ticket) => ticket,
+            Err(attempt) => return attempt,
+        },
+    };
+    if ticket.is_shared {
+        drop(slot.take());
+    }
+    let outcome = loop {
+        tokio::select! {
+            outcome = ticket.wait() => break outcome,
+            () = sleep(TICK) => {
+                if let Some((stage, fraction)) = ticket.progress.now() {
+                    jobs.publish_stage(job, stage, fraction);
+                }
+            }
+        }
+    };
+    match outcome {
+        Ok(finished) => {
+            jobs.publish_stage(job, "encode", 0.95);
+            match save(jobs, &record, finished).await {
+                // The mesh is not held for ever. It is computed again while attempts are left.
+                Err(EndError::Save { error, .. })
+                    if error.is_temporary() && job.record().attempts < jobs.0.config.attempts =>
+                {
+                    tracing::warn!(job_id = %record.id, %error, "a result was not stored; computing it again");
+                    Attempt::StoreFailed
+                }
+                ending => Attempt::Ended(ending),
+            }
+        }
+        // Work with a ticket is cancelled only when the service stops.
+        Err(Failure::Stopped | Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => Attempt::Left,
+        Err(Failure::Memory(error)) => Attempt::OutOfMemory(error),
+        Err(Failure::Waited { limit, .. }) => Attempt::Ended(Err(Failure::Deadline { limit }.into())),
+        Err(failure) => Attempt::Ended(Err(failure.into())),
+    }
+}
+
+/// Submits a claimed job to the pool. Waits while memory for its input is short.
+async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &JobRecord, digest: Digest) -> Result<Ticket, Attempt> {
+    if record.attempts >= jobs.0.config.attempts {
+        return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
+    }
+    let ticket = loop {
+        if let Some(ticket) = join_or_load(jobs, job, record, digest).await? {
+            break ticket;
+        }
+        sleep(PAUSE).await;
+    };
+    if ticket.joined_running && job.begin() {
+        jobs.0.write_job(job).await.map_err(|error| store_failed(record, &error))?;
+    }
+    Ok(ticket)
+}
+
+fn store_failed(record: &JobRecord, error: &StoreError) -> Attempt {
+    tracing::warn!(job_id = %record.id, %error, "a job waits for the store");
+    Attempt::StoreFailed
+}
+
+/// Joins an identical job. Otherwise submits the job with its input. `None` if memory for the input is short.
+async fn join_or_load(
+    jobs: &JobStore,
+    job: &Arc<DurableJob>,
+    record: &JobRecord,
+    digest: Digest,
+) -> Result<Option<Ticket>, Attempt> {
+    let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
+    // The pool refuses a claimed job only while it stops.
+    let refused = |_: Refusal| Attempt::Left;
+    let (mut task, format) = jobs.task_of(record, digest).map_err(lost)?;
+    let (pool, mut on_start) = (&jobs.0.pool, Some(jobs.on_start(job)));
+    if let Some(ticket) = pool.join(&task, jobs.0.allowed(), &mut on_start).map_err(refused)? {
+        return Ok(Some(ticket));
+    }
+    // An earlier process may have ended between storing the result and updating the record.
+    let stored = jobs.stored_result(&task, format).await.map_err(|error| store_failed(record, &error))?;
+    if let Some(stored) = stored {
+        return Err(Attempt::Ended(Ok(stored)));
+    }
+    match jobs.load_input(&mut task).await {
+        Ok(()) => pool.submit(task, jobs.0.allowed(), on_start).map(Some).map_err(refused),
+        Err(error @ (LoadError::Removed | LoadError::Store(StoreError::Damaged { .. }))) => {
+            Err(lost(error.to_string()))
+        }
+        Err(LoadError::Memory(error @ OutOfMemory::Limit { .. })) => {
+            Err(Attempt::Ended(Err(EndError::Job(error.into()))))
+        }
+        Err(LoadError::Memory(_)) => Ok(None),
+        Err(LoadError::Store(error)) => Err(store_failed(record, &error)),
+    }
+}
+
+/// Stores the result and returns its key, with its pin.
+async fn save(jobs: &JobStore, record: &JobRecord, finished: Arc<Finished>) -> Result<(String, Pin), EndError> {
+    let lost = |why| EndError::Lost { why };
+    let (request, format) = record.request().map_err(lost)?;
+    let report = &finished.product.report;
+    let (resolution, digest) = (report.resolution, finished.digest);
+    let key = ContentKey::new(&digest, &request.job, format, &report.file_arithmetic(), record.namespace);
+    let parent = record.requester.parent(&jobs.0.pool.settings().tracer);
+    let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
+    let failed = |error| EndError::Save { error, resolution };
+    let pin = jobs.0.store.pin(&key.name(format.name()).map_err(|error| failed(error.into()))?);
+    let start = || {
+        let (store, finished, limit) = (jobs.0.store.clone(), Arc::clone(&finished), jobs.0.output_bytes);
+        async move { results::save(&store, finished, format, &key, limit).await.map(drop) }
+    };
+    let save = async || {
+        let saved = jobs.0.saves.run(&key, start).recv().await;
+        saved.unwrap_or_else(|| Err(SaveError::Other("the encoder panicked".to_owned())))
+    };
+    retry(&record.id, jobs.0.retry_time(), SaveError::is_temporary, save).await.map_err(failed)?;
+    span.end();
+    Ok((key.to_string(), pin))
+}
+
+impl JobStore {
+    /// Publishes the stage and the finished fraction of a running job here and to other processes.
+    fn publish_stage(&self, job: &DurableJob, stage: &'static str, fraction: f64) {
+        let attempts = job.record().attempts;
+        if job.publish_stage(attempts, Cow::Borrowed(stage), fraction) {
+            self.0.broker.publish(&job.id(), JobEvent::Running { attempts, stage: Cow::Borrowed(stage), fraction });
+        }
+    }
+
+    /// Marks a job as accepted again, with `attempts` attempts, and writes the record. An attempt does not count if the
+    /// service stopped it or if memory was short.
+    async fn return_to_queue(&self, job: &DurableJob, attempts: u32) {
+        if !self.is_superseded(job).await
+            && job.return_to_queue(attempts)
+            && let Err(error) = self.0.write_job(job).await
+        {
+            tracing::warn!(job_id = %job.id(), %error, "an interrupted attempt is counted");
+        }
+    }
+
+    /// Returns true if another process has begun a later attempt of a job, because the claim of this one had expired.
+    async fn is_superseded(&self, job: &DurableJob) -> bool {
+        let own = job.record();
+        matches!(self.0.read(&own.id).await, Ok(Some(stored)) if stored.attempts > own.attempts)
+    }
+}
