@@ -57,6 +57,7 @@ pub(super) fn load(args: &ServeArgs) -> Result<Loaded, CliError> {
         ("server.listen", args.listen.clone()),
         ("server.metrics_listen", args.metrics_listen.clone()),
         ("server.data_dir", args.data_dir.as_ref().map(path)),
+        ("server.role", args.role.clone()),
         ("devices.use", args.devices.clone()),
         ("archive.dir", args.archive.as_ref().map(path)),
         ("log.format", log),

@@ -10,8 +10,9 @@ pub struct JobsConfig {
     /// Number of concurrent jobs. Default 2: the backend uses all cores for one job, and a second one fills them while
     /// the first reads its file or measures its mesh. GPUs run more: see `devices.jobs`.
     pub workers: usize,
-    /// Number of queued interactive requests. Default 64: at a typical 0.1 s per job on two workers the last one waits three seconds; a
-    /// longer queue would only delay refusals. Further requests get a 503 with an estimated `Retry-After`.
+    /// Number of queued interactive requests. Default 64: at a typical 0.1 s per job on two workers the last one waits
+    /// three seconds; a longer queue would only delay refusals. Further requests get a 503 with an estimated
+    /// `Retry-After`.
     pub queue: usize,
     /// Number of concurrent requests for meshes, from the submission of the job to the last byte of the response.
     /// Default 256: each one holds a thread while its mesh is written, and some threads must stay free to read files.
@@ -19,8 +20,8 @@ pub struct JobsConfig {
     /// Time from acceptance to the finished mesh, ms, time in the queue included; also the longest wait for `Prefer:
     /// wait=`. Default 60,000: proxies commonly cut an exchange after a minute.
     pub deadline_ms: u64,
-    /// Time from the claim of an asynchronous job by a worker to its result, ms. Default 3,600,000: no connection is held
-    /// for it.
+    /// Time from the claim of an asynchronous job by a worker to its result, ms. Default 3,600,000: no connection is
+    /// held for it.
     pub batch_deadline_ms: u64,
     /// Maximum time that an asynchronous job yields to interactive requests, ms. Default 10,000: interactive requests
     /// come first, but asynchronous jobs must make progress under constant load.

@@ -42,7 +42,7 @@ pub use log::{LogConfig, LogFormat};
 pub use memory::{AvailableMemory, OwnedMemory};
 pub use proxies::{ForwardedHeader, Proxies};
 pub use schema::schema;
-pub use server::ServerConfig;
+pub use server::{Role, ServerConfig};
 pub use store::{Secret, StoreConfig};
 pub use telemetry::{SecretHeaders, TelemetryConfig};
 pub use template::{Template, Templates};

@@ -5,7 +5,8 @@ use std::io::Read;
 use std::path::Path;
 
 /// Keys whose values are secret. For each there is a key with the suffix `_file`.
-pub(super) const SECRETS: [&str; 3] = ["store.secret_access_key", "access.signing_secret", "telemetry.secret_headers"];
+pub(super) const SECRETS: [&str; 4] =
+    ["broker.password", "store.secret_access_key", "access.signing_secret", "telemetry.secret_headers"];
 
 /// Maximum size of a secret, bytes: keys and tokens have a few hundred.
 const MAX_BYTES: u64 = 64 << 10;

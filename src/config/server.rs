@@ -8,6 +8,19 @@ use serde::{Deserialize, Serialize};
 
 use super::{ForwardedHeader, Hosts, Proxies, list, telemetry};
 
+/// Work of a node of a cluster.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// Requests and asynchronous jobs.
+    #[default]
+    All,
+    /// Requests.
+    Api,
+    /// Asynchronous jobs.
+    Worker,
+}
+
 /// Listeners and limits of connections.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
@@ -15,6 +28,9 @@ pub struct ServerConfig {
     /// Address of the service. Default 127.0.0.1:8080: the service is not exposed unless configured. Port 0 selects a
     /// free port.
     pub listen: SocketAddr,
+    /// Work of this node: `all`, `api` (answers requests, claims no asynchronous jobs) or `worker` (claims asynchronous
+    /// jobs, answers only probes and `/version`). Default `all`. The others need `broker.url`.
+    pub role: Role,
     /// Host names by which clients reach the service, without ports, besides the names of the loopback addresses.
     /// Default `none`: a service that listens on a loopback address answers requests for any other name with a 421, so
     /// that a web page cannot reach it through its own host name. With a list, this applies to every address.
@@ -81,6 +97,7 @@ pub struct ServerConfig {
 impl Default for ServerConfig {
     fn default() -> Self {
         Self {
+            role: Role::default(),
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8080)),
             hosts: None,
             metrics_listen: None,

@@ -11,8 +11,8 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct StoreConfig {
-    /// Location of the store: `s3://bucket` or `s3://bucket/prefix`. Default `none`: the folder `store` in
-    /// `server.data_dir`.
+    /// Location of the store: `s3://bucket`, `s3://bucket/prefix`, or with `broker.url` a folder that all nodes share,
+    /// such as `file:///shared/store`. Default `none`: the folder `store` in `server.data_dir`.
     pub url: Option<String>,
     /// URL of an S3-compatible service, such as `https://minio.example:9000`. Default `none`: `AWS_ENDPOINT_URL`, else
     /// AWS in the region.

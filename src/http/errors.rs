@@ -15,9 +15,7 @@ use crate::pipeline::JobError;
 use crate::pipeline::color::{self, ColorError};
 use crate::pipeline::params::ParamError;
 use crate::store::StoreError;
-use crate::structure::map::MapError;
-use crate::structure::strict_validator::Diagnostic;
-use crate::structure::{Split, StructureError};
+use crate::structure::{Split, StructureError, map::MapError, strict_validator::Diagnostic};
 use crate::surface::params::MAX_RESOLUTION;
 use crate::surface::{OutOfMemory, SurfaceError};
 
@@ -133,11 +131,13 @@ impl From<Refusal> for Problem {
                 .with("limit", u64::try_from(allowed.as_millis()).unwrap_or(u64::MAX))
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait.saturating_sub(allowed)),
-            Refusal::Draining => {
-                Self::new(ProblemType::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1))
-            }
+            Refusal::Draining => shutting_down(error.to_string()),
         }
     }
+}
+
+fn shutting_down(detail: String) -> Problem {
+    Problem::new(ProblemType::ShuttingDown, detail).retry_after(Duration::from_secs(1))
 }
 
 impl From<Failure> for Problem {
@@ -161,9 +161,7 @@ impl From<Failure> for Problem {
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait),
             Failure::Memory(error) => error.into(),
-            Failure::Stopped => {
-                Self::new(ProblemType::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1))
-            }
+            Failure::Stopped => shutting_down(error.to_string()),
             Failure::Panicked { .. } => Self::internal(error),
         }
     }
@@ -179,10 +177,7 @@ impl From<EndError> for Problem {
             }
             EndError::Save { error: SaveError::Store(error), .. } => error.into(),
             EndError::Save { error: SaveError::Other(error), .. } => Self::internal(error),
-            EndError::Poison { attempts } => {
-                Self::new(ProblemType::JobAbandoned, error.to_string()).with("actual", attempts)
-            }
-            EndError::Lost { .. } => Self::new(ProblemType::JobAbandoned, error.to_string()),
+            EndError::Poison { .. } | EndError::Lost { .. } => Self::new(ProblemType::JobAbandoned, error.to_string()),
         }
     }
 }
@@ -191,6 +186,9 @@ impl From<AcceptError> for Problem {
     fn from(error: AcceptError) -> Self {
         match error {
             AcceptError::Refused(refusal) => refusal.into(),
+            AcceptError::BrokerDown => {
+                Self::new(ProblemType::BrokerFailed, error.to_string()).retry_after(Duration::from_secs(5))
+            }
             AcceptError::Store(error) => error.into(),
             AcceptError::OtherRequest => {
                 Self::new(ProblemType::OtherRequest, error.to_string()).with("parameter", "Idempotency-Key")
@@ -374,12 +372,12 @@ impl From<SurfaceError> for Problem {
             E::TooManyTiles { limit, .. } => Self::new(ProblemType::GridTooLarge, detail).with("limit", limit),
             E::TilesetTooLarge { limit } => Self::new(ProblemType::TooMuchMemory, detail).with("limit", limit),
             E::TooManyOverlaps { overlaps, limit } => exceeded(ProblemType::TooManyCandidates, limit, overlaps),
-            E::NoSurface { isovalue } => match isovalue {
-                Some(isovalue) => {
-                    Self::new(ProblemType::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
-                }
-                None => Self::new(ProblemType::NoSurface, detail).with("parameter", "resolution"),
-            },
+            E::NoSurface { isovalue: Some(isovalue) } => {
+                Self::new(ProblemType::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
+            }
+            E::NoSurface { isovalue: None } => {
+                Self::new(ProblemType::NoSurface, detail).with("parameter", "resolution")
+            }
             E::NoCavity { .. } => Self::new(ProblemType::NoSurface, detail).with("parameter", "cavities"),
             E::NoPatch => Self::new(ProblemType::NoSurface, detail).with("parameter", "context"),
             E::DeviceMemory { needed, available, .. } => {

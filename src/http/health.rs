@@ -52,7 +52,7 @@ pub(super) struct ReadyDocument {
 /// Readiness check.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReadinessCheck {
-    /// Name of the check: `accepting`, `devices`, `store` or `records`.
+    /// Name of the check: `accepting`, `devices`, `store`, `broker` or `records`.
     name: &'static str,
     /// True if the check passed.
     ok: bool,
@@ -75,12 +75,12 @@ problem_responses!(ReadyProblems: [[ProblemType::NotReady]]);
 /// Check that the service is ready for requests
 ///
 /// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts
-/// jobs, can write and read the store, and has no unreadable job record in quarantine. The response does not depend on
-/// the load.
+/// jobs, can write and read the store, can dispatch jobs, and has no unreadable job record in quarantine. The response
+/// does not depend on the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
     responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyProblems))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {
-    let checks = [accepting(&app), devices(&app), store(&app).await, records(&app).await];
+    let checks = [accepting(&app), devices(&app), store(&app).await, broker(&app), records(&app).await];
     let failing = checks.iter().find(|check| !check.ok).map(|check| check.detail.clone());
     match failing {
         None => {
@@ -126,6 +126,14 @@ async fn store(app: &Shared) -> ReadinessCheck {
         Some(why) => Err(format!("the store does not work: {why}")),
     };
     ReadinessCheck::new("store", found)
+}
+
+fn broker(app: &Shared) -> ReadinessCheck {
+    let found = match app.job_store.broker_down() {
+        None => Ok("jobs can be dispatched".to_owned()),
+        Some(why) => Err(format!("jobs cannot be dispatched: {why}")),
+    };
+    ReadinessCheck::new("broker", found)
 }
 
 async fn records(app: &Shared) -> ReadinessCheck {

@@ -14,16 +14,22 @@ use super::{
     api_document, areas, atoms, capabilities, colors, estimate, events, guard, health, jobs, meshes, middleware,
     negotiate, page, pdb, problems, results, scopes, structures, tilesets,
 };
+use crate::config::Role;
 
 /// Margin of the backstop timeout over the sum of the regular timeouts.
 const MARGIN: Duration = Duration::from_secs(10);
+
+/// Paths that a worker of a cluster answers.
+const OF_WORKERS: [&str; 3] = ["/livez", "/readyz", "/version"];
 
 /// Builds the router with its middleware.
 pub(super) fn router(app: &Shared) -> Router {
     let longest = Duration::from_millis(app.config.jobs.deadline_ms).max(Duration::from_secs(jobs::MAX_WAIT_S));
     let input = Duration::from_millis(app.config.server.body_timeout_ms.max(app.config.archive.timeout_ms));
     let timeout = input + longest + MARGIN;
-    let router = routes().into_iter().fold(Router::new(), |router, (path, methods)| router.route(path, methods));
+    let is_worker = app.config.server.role == Role::Worker;
+    let routes = routes().into_iter().filter(|(path, _)| !is_worker || OF_WORKERS.contains(path));
+    let router = routes.fold(Router::new(), |router, (path, methods)| router.route(path, methods));
     let router = router.layer(from_fn(negotiate::relabel)).layer(from_fn(reject_parameters));
     let router = router.with_state(Arc::clone(app));
     middleware::apply(router, timeout, app)

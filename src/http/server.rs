@@ -20,8 +20,8 @@ use super::{accept, capabilities, key_reload, metrics, results, router};
 use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::client_shares::ClientShares;
-use crate::config::Config;
-use crate::jobs::{Budget, Client, EndError, JobStore, MemoryBroker, Pool, Settings, Structures};
+use crate::config::{Config, Role};
+use crate::jobs::{Broker, Budget, Client, EndError, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Structures};
 use crate::picture::SelectedRenderer;
 use crate::single_flight::SingleFlight;
 use crate::store::{FolderLock, LockError, Secret, Store, StoreError};
@@ -62,6 +62,12 @@ pub enum ServeError {
     /// The data folder is in use or cannot be locked.
     #[error(transparent)]
     Lock(#[from] LockError),
+    /// The settings of a cluster contradict each other.
+    #[error("{0}")]
+    Cluster(&'static str),
+    /// The address or the credentials of the broker are malformed.
+    #[error("cannot use the broker (broker.url): {0}")]
+    Broker(String),
     /// The store cannot be opened.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -110,6 +116,7 @@ impl Server {
     /// [`ServeError`].
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
         let Chosen { backend, reason, renderer, devices: found } = chosen;
+        check_cluster(&config)?;
         let access = Arc::new(Access::open(&config)?);
         if access.sites().lacks_origins() {
             tracing::warn!("pages of other origins are rejected: set access.cors_origins to their origins, or to none");
@@ -140,7 +147,11 @@ impl Server {
             })),
             tracer: traces.tracer(),
         };
-        let store = Store::open(&config.store, &config.server.data_dir).await?;
+        let store = if config.broker.url.is_some() {
+            Store::open_shared(&config.store, &config.server.data_dir).await?
+        } else {
+            Store::open(&config.store, &config.server.data_dir).await?
+        };
         let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
         let job_store = start_jobs(&config, &store, &pool, secret).await?;
@@ -236,15 +247,33 @@ impl Server {
 async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Secret) -> Result<JobStore, ServeError> {
     let describe = |error: &EndError| Problem::from(error.clone()).record("");
     let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
-    let broker = (Arc::new(MemoryBroker::new(config.broker.queue)) as _, config.broker.queue);
+    let broker: Arc<dyn Broker> = match &config.broker.url {
+        Some(url) => Arc::new(NatsBroker::connect(&config.broker, url).await.map_err(ServeError::Broker)?),
+        None => Arc::new(MemoryBroker::new(config.broker.queue)),
+    };
+    let broker = (broker, config.broker.queue);
     let job_store = JobStore::new(store.clone(), Arc::clone(pool), broker, jobs, output_bytes, secret, describe);
     // The inputs of open jobs are pinned before a request can evict them.
     let recovered = job_store.reconcile().await?;
     if recovered > 0 {
         tracing::info!(jobs = recovered, "dispatched jobs of an earlier process");
     }
-    job_store.start_claiming();
+    if config.server.role != Role::Api {
+        job_store.start_claiming();
+    }
     Ok(job_store)
+}
+
+/// Rejects settings that only a cluster has.
+fn check_cluster(config: &Config) -> Result<(), ServeError> {
+    let is_folder = config.store.url.as_deref().is_some_and(|url| url.starts_with("file://"));
+    let why = match (&config.broker.url, &config.store.url) {
+        (None, _) if config.server.role != Role::All => "server.role needs broker.url: a node alone has every role",
+        (None, _) if is_folder => "a folder in store.url needs broker.url: without it, set server.data_dir",
+        (Some(_), None) => "broker.url needs store.url: the nodes of a cluster share one store",
+        _ => return Ok(()),
+    };
+    Err(ServeError::Cluster(why))
 }
 
 /// Shuts the service down in the phases that `orders` requests. Returns true if every request was finished.

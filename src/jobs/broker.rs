@@ -2,11 +2,14 @@
 //!
 //! The store is the truth: a broker holds only ids, and a broker that loses them loses no job, since every node
 //! dispatches unfinished jobs again ([`JobStore::reconcile`](super::JobStore::reconcile)). A job may therefore be
-//! claimed twice; results are named by their contents, and the first end on record counts.
+//! run twice; results are named by their contents, and the first end on record counts.
 //!
 //! Clients take turns. Of the jobs of one client, the most urgent runs first, then the oldest.
 
 mod memory;
+mod nats;
+#[cfg(test)]
+pub(crate) mod tests;
 
 use std::borrow::Cow;
 use std::fmt;
@@ -18,6 +21,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 pub(crate) use memory::MemoryBroker;
+pub(crate) use nats::NatsBroker;
 
 use super::rank::Client;
 use super::record::{JobId, JobRecord};
@@ -58,11 +62,14 @@ pub(crate) enum JobEvent {
 }
 
 /// Error of a job that was not dispatched.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub(crate) enum DispatchError {
     /// The queue is full.
     #[error("the queue is full")]
     Full,
+    /// The broker does not answer.
+    #[error("{why}")]
+    Unavailable { why: String },
 }
 
 /// Dispatches jobs to workers.
@@ -77,10 +84,13 @@ pub(crate) trait Broker: Send + Sync {
     fn publish(&self, id: &JobId, event: JobEvent);
 
     /// Returns the events of a job that are published from now on.
-    fn events(&self, id: &JobId) -> BoxStream<'static, JobEvent>;
+    fn events(&self, id: &JobId) -> BoxFuture<'_, BoxStream<'static, JobEvent>>;
 
     /// Returns the number of queued jobs.
     fn queued(&self) -> usize;
+
+    /// Returns the reason for which no job can be dispatched now, if there is one.
+    fn down(&self) -> Option<String>;
 }
 
 /// Ends of a claim that an implementation provides.

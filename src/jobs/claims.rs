@@ -106,7 +106,7 @@ impl JobStore {
     /// in another process.
     async fn follow(self, job: Arc<DurableJob>) {
         let id = job.id();
-        let mut events = self.0.broker.events(&id);
+        let mut events = self.0.broker.events(&id).await;
         let mut ended = job.state.subscribe();
         let mut unwatched = 0;
         // The job may have ended since its record was read.
@@ -139,7 +139,8 @@ impl JobStore {
         }
     }
 
-    /// Reads the record of a job that may have changed in another process. Returns true if the job has ended or is gone.
+    /// Reads the record of a job that may have changed in another process. Returns true if the job has ended or is
+    /// gone.
     async fn refresh(&self, job: &Arc<DurableJob>) -> bool {
         let id = job.id();
         match self.0.read(&id).await {

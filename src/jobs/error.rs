@@ -88,6 +88,9 @@ pub(crate) enum AcceptError {
     /// The queue refused the task.
     #[error(transparent)]
     Refused(#[from] Refusal),
+    /// No job can be dispatched now.
+    #[error("the queue of jobs does not respond")]
+    BrokerDown,
     /// Input or record could not be stored.
     #[error(transparent)]
     Store(#[from] StoreError),

@@ -144,8 +144,8 @@ impl JobStoreState {
 }
 
 impl JobStore {
-    /// Creates an empty job store over `store`, whose jobs are dispatched by `broker` and run on `pool`. `secret` is the
-    /// secret of the store.
+    /// Creates an empty job store over `store`, whose jobs are dispatched by `broker` and run on `pool`. `secret` is
+    /// the secret of the store.
     pub(crate) fn new(
         store: Store,
         pool: Arc<Pool>,
@@ -213,6 +213,11 @@ impl JobStore {
             None => self.stored_result(&spec.task, spec.format).await?,
         };
         let is_dispatched = ticket.is_none() && stored.is_none();
+        if let Some(why) = inner.broker.down().filter(|_| is_dispatched) {
+            // Clients do not get the reason, which may contain an address.
+            tracing::warn!(why, "a job was rejected, because it cannot be dispatched");
+            return Err(AcceptError::BrokerDown);
+        }
         if is_dispatched && inner.broker.queued() >= inner.max_queued {
             return Err(self.queue_full(&spec.task).into());
         }
@@ -249,6 +254,11 @@ impl JobStore {
             drop(timeout(STORED_WAIT, watched.wait_for(|view| view.record.status.is_final())).await);
         }
         Ok(job.view())
+    }
+
+    /// Returns the reason for which no job can be dispatched now, if there is one.
+    pub(crate) fn broker_down(&self) -> Option<String> {
+        self.0.broker.down()
     }
 
     /// Dispatches an accepted job. If that fails, [`Self::reconcile`] dispatches it later.

@@ -36,7 +36,7 @@ mod ticket;
 mod worker;
 
 pub(crate) use crate::memory_budget::{Budget, MemoryReservation};
-pub(crate) use broker::MemoryBroker;
+pub(crate) use broker::{Broker, MemoryBroker, NatsBroker};
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};

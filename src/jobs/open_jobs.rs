@@ -21,17 +21,17 @@ struct OpenJob {
 }
 
 #[derive(Default)]
-struct Table {
+struct OpenJobTable {
     jobs: HashMap<JobId, OpenJob>,
     next: u64,
 }
 
 /// Unfinished jobs by id.
 #[derive(Default)]
-pub(super) struct OpenJobs(Mutex<Table>);
+pub(super) struct OpenJobs(Mutex<OpenJobTable>);
 
 impl OpenJobs {
-    fn lock(&self) -> MutexGuard<'_, Table> {
+    fn lock(&self) -> MutexGuard<'_, OpenJobTable> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -69,6 +69,6 @@ impl OpenJobs {
     }
 }
 
-fn publish(open: &Table) {
+fn publish(open: &OpenJobTable) {
     gauge!(JOBS_OPEN).set(u32::try_from(open.jobs.len()).unwrap_or(u32::MAX));
 }

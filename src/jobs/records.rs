@@ -20,7 +20,7 @@ use super::record::{JobId, JobRecord};
 use super::{EndError, Input, Task};
 use crate::formats::Format;
 use crate::pipeline::MapFile;
-use crate::store::{BadDigest, Digest, Folder, Name, Namespace, Pin, RecordCaps, RecordReservation, StoreError};
+use crate::store::{BadDigest, Digest, Name, Namespace, Pin, RecordCaps, RecordReservation, StoreError};
 use crate::surface::OutOfMemory;
 use crate::telemetry::{JOBS_RECOVERED, shorten};
 
@@ -129,7 +129,7 @@ impl JobStoreState {
     /// those of jobs that have ended. Forgets jobs that are not on record any more.
     async fn read_unknown(&self) -> Result<Vec<JobRecord>, StoreError> {
         let mut known = self.open.ids();
-        let (ended, open): (Vec<_>, Vec<_>) = self.store.names(Folder::Jobs).into_iter().partition(Name::is_ended_job);
+        let (ended, open): (Vec<_>, Vec<_>) = self.store.job_records().await?.into_iter().partition(Name::is_ended_job);
         let is_new = |name: &Name| name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id));
         let open: Vec<_> = open.into_iter().filter(is_new).collect();
         for gone in &known {
@@ -212,8 +212,8 @@ impl JobStore {
         Ok(())
     }
 
-    /// Dispatches the unfinished jobs that neither the broker nor this process has, such as those of an earlier process,
-    /// and returns their number.
+    /// Dispatches the unfinished jobs that neither the broker nor this process has, such as those of an earlier
+    /// process, and returns their number.
     pub(crate) async fn reconcile(&self) -> Result<usize, StoreError> {
         let inner = &self.0;
         for record in inner.read_unknown().await? {

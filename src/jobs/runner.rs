@@ -285,7 +285,7 @@ impl JobStore {
     }
 
     /// Returns true if another process has begun a later attempt of a job, because the claim of this one had expired.
-    async fn is_superseded(&self, job: &DurableJob) -> bool {
+    pub(super) async fn is_superseded(&self, job: &DurableJob) -> bool {
         let own = job.record();
         matches!(self.0.read(&own.id).await, Ok(Some(stored)) if stored.attempts > own.attempts)
     }

@@ -1,5 +1,6 @@
 //! Durable jobs on a store that fails on command.
 
+mod cluster;
 mod joined;
 mod records;
 

@@ -33,6 +33,9 @@ const FILE_PART: usize = 1 << 20;
 /// Folder of the objects of [`Backend::check`].
 const CHECK: &str = "check";
 
+/// Begin of the URL of a folder.
+const FOLDER_URL: &str = "file://";
+
 /// Returns the folder of a store in `data_dir`.
 fn folder_of(data_dir: &FilePath) -> PathBuf {
     data_dir.join("store")
@@ -63,14 +66,16 @@ impl Backend {
     /// Opens the configured store. The default is a folder in `data_dir`.
     pub(super) async fn open(config: &StoreConfig, data_dir: &FilePath) -> Result<Self, StoreError> {
         let limit = Duration::from_millis(config.timeout_ms);
-        if let Some(url) = &config.url {
+        let shared = config.url.as_deref().and_then(|url| url.strip_prefix(FOLDER_URL));
+        if let Some(url) = config.url.as_ref().filter(|_| shared.is_none()) {
             let failed = |reason| StoreError::Open { key: "store.url", location: url.clone(), reason };
             let (objects, bucket) = s3::connect(config, url).map_err(failed)?;
             let location = url.trim_end_matches('/').to_owned();
             return Ok(Self { objects, kind: StorageKind::S3(bucket), location, limit });
         }
-        let root = folder_of(data_dir);
-        if let Some(target) = link_of(data_dir) {
+        let root = shared.map_or_else(|| folder_of(data_dir), PathBuf::from);
+        let key = if shared.is_some() { "store.url" } else { "server.data_dir" };
+        if let Some(target) = link_of(data_dir).filter(|_| shared.is_none()) {
             let (store, target) = (root.display(), target.display());
             tracing::warn!(%store, %target, "the folder of the store is a symbolic link; objects are removed at its target");
         }
@@ -87,7 +92,7 @@ impl Backend {
             LocalFileSystem::new_with_prefix(&folder).map(|files| files.with_fsync(true)).map_err(|e| e.to_string())
         });
         let opened = opened.await.unwrap_or_else(|e| Err(e.to_string()));
-        let failed = |reason| StoreError::Open { key: "server.data_dir", location: location.clone(), reason };
+        let failed = |reason| StoreError::Open { key, location: location.clone(), reason };
         Ok(Self { objects: Arc::new(opened.map_err(failed)?), kind: StorageKind::Local(root), location, limit })
     }
 

@@ -71,6 +71,12 @@ impl Store {
     pub async fn sweep(&self, now: SystemTime) -> Swept {
         let mut swept = Swept::default();
         let mut cleared = self.0.last_cleanup.lock().await;
+        if self.0.is_shared
+            && let Err(error) = self.refresh().await
+        {
+            tracing::warn!(%error, "the store was not swept, because it cannot be listed");
+            return swept;
+        }
         let expired = self.index().expired(now, |folder| self.ttl(folder));
         (swept.expired, swept.bytes) = self.remove_all(&expired, "ttl", &mut swept.failed).await;
         // The capacity may have been lowered, or other processes may have written.
@@ -97,7 +103,7 @@ impl Store {
         swept
     }
 
-    fn ttl(&self, folder: Folder) -> Duration {
+    pub(super) fn ttl(&self, folder: Folder) -> Duration {
         match folder {
             Folder::Inputs => Duration::from_millis(self.0.config.input_ttl_ms),
             Folder::Jobs => Duration::from_millis(self.0.config.job_ttl_ms),
@@ -198,6 +204,9 @@ impl Store {
         self.run_to_completion(async move {
             let Some(first) = candidate.names.first() else { return Ok(false) };
             let _lock = store.write_lock(first).lock().await;
+            if store.0.is_shared && store.was_written(&candidate).await? {
+                return Ok(false);
+            }
             let begun = store.index().begin_removal(&candidate);
             if begun {
                 let removed = join_all(candidate.names.iter().map(|name| store.remove(name))).await;

@@ -241,6 +241,6 @@ pub(crate) async fn open_faulty(dir: &std::path::Path, config: StoreConfig) -> (
     let (root, faults) = (dir.join("store"), Arc::new(Faults::default()));
     let files = LocalFileSystem::new_with_prefix(&root).unwrap();
     let objects = Arc::new(Faulty { files, faults: Arc::clone(&faults) });
-    let store = Store::open_backend(Backend::over(objects, root, &config), &config).await.unwrap();
+    let store = Store::open_backend(Backend::over(objects, root, &config), &config, false).await.unwrap();
     (faults, store)
 }

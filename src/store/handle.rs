@@ -41,6 +41,8 @@ pub struct Store(pub(super) Arc<StoreState>);
 pub(super) struct StoreState {
     pub(super) backend: Backend,
     pub(super) config: StoreConfig,
+    /// True if other nodes write to the store and remove from it.
+    pub(super) is_shared: bool,
     index: Mutex<Index>,
     pub(super) memory: Memory,
     /// Results that this process has written or checked, as they were then.
@@ -69,11 +71,15 @@ impl Store {
     /// Returns [`StoreError::Open`] if it cannot be written and read.
     pub async fn open(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
         let backend = Backend::open(config, data_dir).await?;
-        Self::open_backend(backend, config).await
+        Self::open_backend(backend, config, false).await
     }
 
     /// Opens a store over `backend`; see [`open`](Self::open).
-    pub(super) async fn open_backend(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
+    pub(super) async fn open_backend(
+        backend: Backend,
+        config: &StoreConfig,
+        is_shared: bool,
+    ) -> Result<Self, StoreError> {
         backend.check().await.map_err(|e| backend.open_error(&e))?;
         let clock = Clock::start();
         let now = clock.now();
@@ -86,6 +92,7 @@ impl Store {
             }
         };
         let mut index = Index::default();
+        index.keeps_inputs = is_shared;
         for folder in Folder::ALL {
             for (name, meta) in backend.list(folder).await.map_err(|e| backend.open_error(&e))? {
                 index.commit(&name, meta.size, meta.modified);
@@ -96,6 +103,7 @@ impl Store {
         tracing::info!(location = backend.location(), inputs, jobs, results, cleared, "store opened");
         let store = Self(Arc::new(StoreState {
             backend,
+            is_shared,
             index: Mutex::new(index),
             memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
             intact: Cache::new(results::INTACT_RESULTS),
@@ -124,11 +132,10 @@ impl Store {
     /// # Errors
     /// Returns a [`StoreError`]. Nothing has changed then.
     pub async fn put_new(&self, name: &Name, bytes: Bytes) -> Result<bool, StoreError> {
-        if self.head(name).await?.is_some() {
-            self.touch(name, self.now());
-            return Ok(false);
-        }
-        self.write(name, bytes, true).await
+        let Some(meta) = self.head(name).await? else { return self.write(name, bytes, true).await };
+        self.touch(name, self.now());
+        self.renew(name, meta, bytes).await?;
+        Ok(false)
     }
 
     /// Reads all bytes of an object. Results in memory need no disk access and no other thread. For large objects, use
@@ -241,11 +248,6 @@ impl Store {
     /// Returns a [`StoreError`].
     pub async fn list(&self, folder: Folder) -> Result<Vec<(Name, Meta)>, StoreError> {
         self.0.backend.list(folder).await
-    }
-
-    /// Returns the names of the objects of a folder in the index, in name order.
-    pub(crate) fn names(&self, folder: Folder) -> Vec<Name> {
-        self.index().names(folder)
     }
 
     /// Returns the time for [`touch`](Self::touch) and [`sweep`](Self::sweep). It does not follow jumps of the system

@@ -38,6 +38,13 @@ pub(super) struct EvictionCandidate {
     used: Vec<Use>,
 }
 
+impl EvictionCandidate {
+    /// Returns the objects with the times of their last uses.
+    pub(super) fn uses(&self) -> impl Iterator<Item = (&Name, SystemTime)> {
+        self.names.iter().zip(self.used.iter().map(|(used, _)| *used))
+    }
+}
+
 /// Reason for a failed reservation.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum ReserveError {
@@ -63,6 +70,8 @@ pub(super) struct Index {
     reserved: u64,
     count: u64,
     removals: u64,
+    /// True if inputs are never evicted for space: another node may be about to read them.
+    pub(super) keeps_inputs: bool,
 }
 
 impl Index {
@@ -245,7 +254,7 @@ impl Index {
     /// Returns the least recently used objects, of at least `missing` bytes and objects if there are so many.
     pub(super) fn oldest(&self, mut missing: Usage) -> Vec<EvictionCandidate> {
         let mut chosen = Vec::new();
-        let mut candidates = self.candidates(self.by_use.values().filter(|name| name.folder().is_capped()));
+        let mut candidates = self.candidates(self.by_use.values().filter(|name| self.is_evictable(name)));
         while missing.bytes > 0 || missing.objects > 0 {
             let Some(candidate) = candidates.next() else { break };
             missing.bytes = missing.bytes.saturating_sub(candidate.bytes);
@@ -254,6 +263,10 @@ impl Index {
         }
         drop(candidates);
         chosen
+    }
+
+    fn is_evictable(&self, name: &Name) -> bool {
+        name.folder().is_capped() && !(self.keeps_inputs && name.folder() == Folder::Inputs)
     }
 
     /// Returns what counts against the capacity: objects on disk, and reserved bytes.

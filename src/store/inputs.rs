@@ -44,7 +44,7 @@ impl Store {
             && let Some((meta, stream)) = self.read(&name, None).await?
         {
             if holds(meta, stream, &bytes).await? {
-                return Ok(false);
+                return if self.0.is_shared { self.put_new(&name, bytes).await } else { Ok(false) };
             }
             match self.remove_damaged(&name, digest).await {
                 Ok(_) | Err(StoreError::Damaged { .. }) => {}

@@ -89,7 +89,7 @@ pub(crate) async fn open_bytes(max_bytes: u64) -> (Store, Arc<InMemory>) {
     let config = StoreConfig { max_bytes, memory_object_bytes: 1, ..StoreConfig::default() };
     let objects = Arc::new(InMemory::new());
     let backend = Backend::over(Arc::new(Yielding(Arc::clone(&objects))), PathBuf::from("/nonexistent"), &config);
-    (Store::open_backend(backend, &config).await.unwrap(), objects)
+    (Store::open_backend(backend, &config, false).await.unwrap(), objects)
 }
 
 /// Checks that the index agrees with the objects, and that no reservation is left.

@@ -4,7 +4,7 @@
 //! `clock.rs` gives the times of use, `memory.rs` caches small results, `eviction.rs` frees space, `upload.rs` writes
 //! objects, large ones in parts, and `writer.rs` accepts data from blocking threads. `inputs.rs` checks the digests of
 //! structure files, `records.rs` limits the number of job records, `quarantine.rs` keeps what is damaged, and `lock.rs`
-//! protects the data folder against a second service.
+//! protects the data folder against a second service. `shared.rs` is for stores that several nodes use.
 //!
 //! A write or removal reserves space first and then holds the lock of the name (`Store::write_lock`), so it never waits
 //! for space under a lock. Reads take no lock. Their results enter index and cache only if the name has not changed.
@@ -32,6 +32,7 @@ mod records;
 mod results;
 mod s3;
 mod secret;
+mod shared;
 mod stale;
 mod stream;
 #[cfg(test)]

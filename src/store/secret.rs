@@ -25,8 +25,8 @@ pub(super) fn in_folder(root: &FilePath) -> io::Result<Secret> {
         Err(error) => return Err(error),
     }
     let fresh = random()?;
-    // The name appears with the complete content. A staged file of a process that died is overwritten.
-    let staged = root.join(format!(".{NAME}.tmp"));
+    // The name appears with the complete content. Of processes that create it at once, one succeeds.
+    let staged = root.join(format!(".{NAME}.{}.tmp", std::process::id()));
     let mut options = OpenOptions::new();
     options.write(true).create(true).truncate(true);
     #[cfg(unix)]
@@ -34,7 +34,12 @@ pub(super) fn in_folder(root: &FilePath) -> io::Result<Secret> {
     let mut file = options.open(&staged)?;
     file.write_all(&fresh)?;
     file.sync_all()?;
-    std::fs::rename(&staged, &path)?;
+    let linked = std::fs::hard_link(&staged, &path);
+    std::fs::remove_file(&staged)?;
+    match linked {
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => return secret(&std::fs::read(&path)?),
+        linked => linked?,
+    }
     #[cfg(unix)]
     File::open(root)?.sync_all()?;
     Ok(fresh)

@@ -53,8 +53,12 @@ metrics! {
     JOBS_FINISHED = "molmesh_jobs_finished_total", Counter, outcome: "successful|failed|dismissed|panicked";
     /// Asynchronous jobs that have not ended.
     JOBS_OPEN = "molmesh_jobs_open", Gauge;
-    /// Asynchronous jobs that wait for a worker.
+    /// Asynchronous jobs that wait for a worker; with `broker.url`, jobs that wait or run on any node.
     BROKER_QUEUED = "molmesh_broker_jobs_queued", Gauge;
+    /// 1 while the NATS server answers, else 0.
+    BROKER_UP = "molmesh_broker_up", Gauge;
+    /// Claims of jobs whose earlier claim expired or was returned.
+    BROKER_REDELIVERIES = "molmesh_broker_redeliveries_total", Counter;
     /// Unfinished asynchronous jobs that were dispatched again, such as those of an earlier process.
     JOBS_RECOVERED = "molmesh_jobs_recovered_total", Counter;
     /// Jobs that a fallback backend ran instead of the selected one.

@@ -174,6 +174,7 @@ const LAYERS: &[Layer] = &[
             ("memory_budget", Any),
             ("store", Any),
             ("sync", Any),
+            ("tls", Any),
         ],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap"],
     },

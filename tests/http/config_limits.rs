@@ -83,6 +83,12 @@ const ROWS: &[Row] = &[
         "too-many-jobs",
         "src/jobs/tests/records::records_are_limited_in_total_and_for_each_client",
     ),
+    ("broker.replicas", "molmesh_broker_up", "src/jobs/broker/tests::a_stream_that_cannot_be_created_is_reported"),
+    (
+        "broker.lease_ms",
+        "molmesh_broker_redeliveries_total",
+        "http/cluster::a_job_of_a_killed_worker_runs_again_on_another_one",
+    ),
     ("broker.queue", "queue-full", "http/limits::a_full_broker_rejects_jobs_with_retry_after"),
     ("devices.jobs", "molmesh_device_jobs", "http/devices::devices_are_listed_with_their_reasons"),
     ("devices.batch", "molmesh_device_shared_submissions_total", "gpu/pool::small_jobs_share_a_submission"),

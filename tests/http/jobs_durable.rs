@@ -52,7 +52,7 @@ impl Process {
     }
 
     /// Kills the process (`kill -9`).
-    fn kill(mut self) {
+    pub(crate) fn kill(mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }

@@ -12,6 +12,8 @@ mod bcif_support;
 mod cli_support;
 #[path = "../http_support/mod.rs"]
 mod http_support;
+#[path = "../../src/jobs/broker/nats_server.rs"]
+mod nats;
 #[path = "../openapi_support/mod.rs"]
 mod openapi_support;
 #[path = "../store_support/mod.rs"]
@@ -24,6 +26,7 @@ mod api;
 mod archive_http;
 mod auto;
 mod bad_input;
+mod cluster;
 mod config;
 mod config_limits;
 mod config_schema;

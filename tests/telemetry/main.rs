@@ -8,6 +8,8 @@ mod archive_support;
 mod http_support;
 #[path = "../metrics_support/mod.rs"]
 mod metrics_support;
+#[path = "../../src/jobs/broker/nats_server.rs"]
+mod nats;
 #[path = "../tools/mod.rs"]
 mod tools;
 #[path = "../trace_support/mod.rs"]

@@ -4,6 +4,7 @@
 use crate::archive_support;
 use crate::http_support;
 use crate::metrics_support;
+use crate::nats;
 use crate::tools;
 use crate::trace_support;
 
@@ -37,6 +38,9 @@ const ROWS: &[Row] = &[
     (t::JOBS_SUBMITTED, &["mode=\"sync\"", "dedup=\"no\""], meshes),
     (t::JOBS_FINISHED, &["outcome=\"successful\""], meshes),
     (t::JOBS_OPEN, &[], held),
+    (t::BROKER_QUEUED, &[], held),
+    (t::BROKER_UP, &[], cluster),
+    (t::BROKER_REDELIVERIES, &[], cluster),
     (t::JOBS_RECOVERED, &[], restart),
     (t::RECORDS_QUARANTINED, &[], damaged_record),
     (t::JOBS_FALLBACK, &[], devices),
@@ -106,6 +110,7 @@ fn held(look: &dyn Fn()) {
         let later = [("prefer", "respond-async")];
         assert_eq!(server.post("/v1/meshes", &later, &sample(2)).status, 202);
         assert_eq!(server.post("/v1/meshes", &later, &sample(3)).status, 202);
+        // A worker claims one job; the other one waits in the broker.
         look();
         backend.set(Mode::Octahedra);
         assert_eq!(running.join().unwrap().status, 200);
@@ -147,6 +152,25 @@ fn restart(look: &dyn Fn()) {
     wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
     let _drained = server.join();
     let _server = start(Fake::new(Mode::Octahedra), keep);
+    look();
+}
+
+/// Job that moves to another node.
+fn cluster(look: &dyn Fn()) {
+    let Some(program) = nats::programs().pop() else { return };
+    let (queue, folder) = (nats::NatsServer::start(&program), tempfile::tempdir().unwrap());
+    let shared = |config: &mut molmesh::config::Config| {
+        config.broker.url = Some(queue.address().to_owned());
+        config.store.url = Some(format!("file://{}", folder.path().display()));
+        config.server.drain_timeout_ms = 1;
+    };
+    let backend = Fake::new(Mode::Held);
+    let server = start(Arc::clone(&backend) as _, shared);
+    let later = [("prefer", "respond-async")];
+    wait_for("a job", || server.post("/v1/meshes", &later, SAMPLE).status == 202);
+    wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
+    let _drained = server.join();
+    let _server = start(Fake::new(Mode::Octahedra), shared);
     look();
 }
 

@@ -1,7 +1,8 @@
 #!/bin/sh
 # Installs what the tests need: Mesa's software Vulkan, Chromium and strace into the system, if they are missing, and
-# promtool, Python and Node packages into target/test-tools. Prints one line per step. Without root, skips what needs
-# it and names it at the end; the tests that need it are then skipped too. SKIPPED=FILE collects these names.
+# promtool, a NATS server, Python and Node packages into target/test-tools. Prints one line per step. Without root,
+# skips what needs it and names it at the end; the tests that need it are then skipped too. SKIPPED=FILE collects these
+# names.
 
 set -eu
 
@@ -10,7 +11,7 @@ root=$(CDPATH='' cd -- "$here/../.." && pwd)
 tools=$root/target/test-tools
 python=${PYTHON:-python3}
 versions="Python 3.11 or later and Node 20.19 or later"
-steps=6
+steps=7
 step=0
 skipped=
 
@@ -92,12 +93,12 @@ browser() {
     return 1
 }
 
-# Extracts promtool from Debian's package of Prometheus. Installing the package would start a server.
-promtool() {
+# Extracts the program at path $2 from Debian's package $1. Installing the package would start a server.
+from_debian() {
     command -v apt-get >/dev/null 2>&1 && command -v dpkg-deb >/dev/null 2>&1 || return 1
     folder=$(mktemp -d)
-    (cd "$folder" && apt_get_fresh "" download prometheus &&
-        dpkg-deb --fsys-tarfile prometheus_*.deb | tar -x ./usr/bin/promtool && mv usr/bin/promtool "$tools/promtool") ||
+    (cd "$folder" && apt_get_fresh "" download "$1" && dpkg-deb --fsys-tarfile "$1"_*.deb | tar -x "./$2" &&
+        mv "$2" "$tools/") ||
         { rm -rf "$folder" && return 1; }
     rm -rf "$folder"
 }
@@ -123,10 +124,19 @@ if [ -x "$tools/promtool" ]; then
     say "promtool is installed"
 else
     say "extracting promtool from Debian's package of Prometheus"
-    promtool || skip "promtool cannot be had from apt-get; put it into target/test-tools by hand"
+    from_debian prometheus usr/bin/promtool || skip "promtool cannot be had from apt-get; put it into target/test-tools by hand"
 fi
 
 step=5
+if [ -x "$tools/nats-server" ]; then
+    say "a NATS server is installed"
+else
+    say "extracting the oldest supported NATS server from Debian's package"
+    from_debian nats-server usr/sbin/nats-server ||
+        skip "a NATS server cannot be had from apt-get; put it into target/test-tools by hand"
+fi
+
+step=6
 stamp=$(digest "$("$python" -VV) $root" "$here/requirements.txt")
 if [ "$(cat "$tools/venv/.stamp" 2>/dev/null)" = "$stamp" ]; then
     say "the Python packages are installed"
@@ -139,7 +149,7 @@ else
     echo "$stamp" >"$tools/venv/.stamp"
 fi
 
-step=6
+step=7
 stamp=$(digest "$(node --version)" "$here/package.json" "$here/package-lock.json")
 if [ "$(cat "$tools/node/.stamp" 2>/dev/null)" = "$stamp" ]; then
     say "the Node packages are installed"

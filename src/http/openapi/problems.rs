@@ -75,6 +75,7 @@ pub(in crate::http) const SUBMITTING: &[ProblemType] = &[
     ProblemType::ShareExceeded,
     ProblemType::StoreFull,
     ProblemType::StoreFailed,
+    ProblemType::BrokerFailed,
 ];
 
 /// Declares a type for `responses(…)` with the problems of one operation:

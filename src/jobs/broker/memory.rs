@@ -190,7 +190,7 @@ impl Broker for MemoryBroker {
         drop(self.0.events.send((id.clone(), event)));
     }
 
-    fn events(&self, id: &JobId) -> BoxStream<'static, JobEvent> {
+    fn events(&self, id: &JobId) -> BoxFuture<'_, BoxStream<'static, JobEvent>> {
         let (receiver, id) = (self.0.events.subscribe(), id.clone());
         let next = |(mut receiver, id): (broadcast::Receiver<(JobId, JobEvent)>, JobId)| async move {
             loop {
@@ -201,10 +201,14 @@ impl Broker for MemoryBroker {
                 }
             }
         };
-        stream::unfold((receiver, id), next).boxed()
+        Box::pin(std::future::ready(stream::unfold((receiver, id), next).boxed()))
     }
 
     fn queued(&self) -> usize {
         self.0.lock().waiting
+    }
+
+    fn down(&self) -> Option<String> {
+        None
     }
 }

@@ -1,0 +1,319 @@
+//! Conformance tests of brokers: the same for every implementation.
+
+#[path = "nats_server.rs"]
+pub(crate) mod server;
+
+use std::collections::BTreeSet;
+use std::future::Future;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use futures_util::StreamExt as _;
+use tokio::runtime::Runtime;
+
+use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, MemoryBroker, NatsBroker};
+use crate::config::BrokerConfig;
+use crate::jobs::rank::{Client, DEFAULT_URGENCY};
+use crate::jobs::record::JobId;
+use server::NatsServer;
+
+/// Maximum time of a step of a test.
+const MAX_WAIT: Duration = Duration::from_secs(20);
+/// Time in which a job that may be claimed is claimed.
+const SOON: Duration = Duration::from_secs(5);
+/// Lease of claims.
+const LEASE: Duration = Duration::from_secs(2);
+/// Maximum number of jobs.
+const LIMIT: usize = 40;
+
+/// Broker that several nodes share.
+enum Shared {
+    Memory(MemoryBroker),
+    Nats(NatsServer),
+}
+
+impl Shared {
+    /// Connects a node.
+    async fn node(&self) -> Arc<dyn Broker> {
+        match self {
+            Self::Memory(broker) => Arc::new(broker.clone()),
+            Self::Nats(server) => Arc::new(nats(server).await),
+        }
+    }
+
+    /// Runs `work` on a node that crashes afterwards, without a word to the broker. A broker within a process crashes
+    /// with it, so there only the claims end.
+    async fn crash<F: Future<Output = Claim>>(&self, work: impl FnOnce(Arc<dyn Broker>) -> F + Send + 'static) {
+        match self {
+            Self::Memory(broker) => drop(work(Arc::new(broker.clone())).await),
+            Self::Nats(server) => {
+                let server = server.address().to_owned();
+                let crash = move || {
+                    let runtime = Runtime::new().unwrap();
+                    let broker = runtime.block_on(async { Arc::new(connect(&server).await) });
+                    let claim = runtime.block_on(work(broker));
+                    // Nobody extends or returns the claim.
+                    runtime.shutdown_background();
+                    std::mem::forget(claim);
+                };
+                tokio::task::spawn_blocking(crash).await.unwrap();
+            }
+        }
+    }
+}
+
+/// Connects to a server and waits until it answers.
+async fn connect(address: &str) -> NatsBroker {
+    let lease_ms = u64::try_from(LEASE.as_millis()).unwrap();
+    let config = BrokerConfig { lease_ms, queue: LIMIT, ..BrokerConfig::default() };
+    let broker = NatsBroker::connect(&config, address).await.unwrap();
+    let begun = Instant::now();
+    while let Some(why) = broker.down() {
+        assert!(begun.elapsed() < MAX_WAIT, "{why}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    broker
+}
+
+pub(crate) async fn nats(server: &NatsServer) -> NatsBroker {
+    connect(server.address()).await
+}
+
+/// Runs a test on every broker: within the process, and on every installed version of NATS.
+async fn with_all<F: Future<Output = ()>>(test: impl Fn(Arc<Shared>) -> F) {
+    test(Arc::new(Shared::Memory(MemoryBroker::new(LIMIT)))).await;
+    for program in server::programs() {
+        println!("{}", program.display());
+        test(Arc::new(Shared::Nats(NatsServer::start(&program)))).await;
+    }
+}
+
+fn job(client: u64, urgency: u8) -> Dispatch {
+    Dispatch { id: JobId::random(&[0; 32], client).unwrap(), client: Client(client), urgency }
+}
+
+/// Claims a job that must be available.
+async fn claim(broker: &Arc<dyn Broker>) -> Claim {
+    tokio::time::timeout(SOON, broker.claim()).await.expect("a job is available")
+}
+
+/// Checks that no job is available for `time`.
+async fn none_within(broker: &Arc<dyn Broker>, time: Duration) {
+    if let Ok(claim) = tokio::time::timeout(time, broker.claim()).await {
+        panic!("claimed {claim:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn jobs_of_a_client_follow_urgency_then_age() {
+    with_all(|shared| async move {
+        let broker = shared.node().await;
+        let jobs = [(DEFAULT_URGENCY, 2), (7, 5), (0, 0), (DEFAULT_URGENCY, 3), (7, 6), (0, 1), (DEFAULT_URGENCY, 4)];
+        let mut expected = Vec::new();
+        for (urgency, place) in jobs {
+            let job = job(1, urgency);
+            assert_eq!(broker.dispatch(&job).await, Ok(true));
+            expected.push((place, job.id));
+        }
+        expected.sort();
+        for (_, id) in expected {
+            let claimed = claim(&broker).await;
+            assert_eq!((&claimed.id, claimed.deliveries), (&id, 1));
+            claimed.done().await;
+        }
+        none_within(&broker, Duration::from_millis(300)).await;
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_with_many_jobs_delays_others_by_one_job() {
+    with_all(|shared| async move {
+        let broker = shared.node().await;
+        for _ in 0..20 {
+            assert_eq!(broker.dispatch(&job(1, 0)).await, Ok(true));
+        }
+        let modest = [job(2, 7), job(3, 7)];
+        for job in &modest {
+            assert_eq!(broker.dispatch(job).await, Ok(true));
+        }
+        let mut first = Vec::new();
+        for _ in 0..3 {
+            let claimed = claim(&broker).await;
+            first.push(claimed.id.clone());
+            claimed.done().await;
+        }
+        assert!(modest.iter().all(|job| first.contains(&job.id)), "{first:?}");
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_is_queued_once_until_it_is_done() {
+    with_all(|shared| async move {
+        let (a, b) = (shared.node().await, shared.node().await);
+        let job = job(1, DEFAULT_URGENCY);
+        assert_eq!(a.dispatch(&job).await, Ok(true));
+        assert_eq!((b.dispatch(&job).await, a.dispatch(&job).await), (Ok(false), Ok(false)), "it is queued");
+        let claimed = claim(&b).await;
+        assert_eq!(a.dispatch(&job).await, Ok(false), "it is claimed");
+        none_within(&a, Duration::from_millis(300)).await;
+        claimed.done().await;
+        assert_eq!(a.dispatch(&job).await, Ok(true), "it is done");
+        claim(&b).await.done().await;
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_full_queue_rejects_jobs() {
+    with_all(|shared| async move {
+        let broker = shared.node().await;
+        for _ in 0..LIMIT {
+            assert_eq!(broker.dispatch(&job(1, DEFAULT_URGENCY)).await, Ok(true));
+        }
+        let more = job(2, DEFAULT_URGENCY);
+        assert_eq!(broker.dispatch(&more).await, Err(DispatchError::Full));
+        let begun = Instant::now();
+        while broker.queued() < LIMIT {
+            assert!(begun.elapsed() < SOON, "{} jobs are counted", broker.queued());
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        claim(&broker).await.done().await;
+        assert_eq!(broker.dispatch(&more).await, Ok(true), "there is a free slot");
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_returned_job_is_claimed_again_after_its_delay() {
+    with_all(|shared| async move {
+        let broker = shared.node().await;
+        let job = job(1, DEFAULT_URGENCY);
+        assert_eq!(broker.dispatch(&job).await, Ok(true));
+        drop(claim(&broker).await);
+        let claimed = claim(&broker).await;
+        assert_eq!((&claimed.id, claimed.deliveries), (&job.id, 2));
+        claimed.release(Duration::from_millis(700));
+        none_within(&broker, Duration::from_millis(300)).await;
+        let claimed = claim(&broker).await;
+        assert_eq!((&claimed.id, claimed.deliveries), (&job.id, 3));
+        claimed.done().await;
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_of_a_crashed_node_is_claimed_again() {
+    with_all(|shared| async move {
+        let broker = shared.node().await;
+        let job = job(1, DEFAULT_URGENCY);
+        assert_eq!(broker.dispatch(&job).await, Ok(true));
+        let begun = Instant::now();
+        shared.crash(|broker| async move { broker.claim().await }).await;
+        let claimed = tokio::time::timeout(LEASE + SOON, broker.claim()).await.expect("the lease expires");
+        println!("claimed again after {:?}", begun.elapsed());
+        assert_eq!((&claimed.id, claimed.deliveries), (&job.id, 2));
+        // A claim of a running node lasts longer than a lease.
+        none_within(&broker, LEASE * 2).await;
+        claimed.done().await;
+        none_within(&broker, LEASE + SOON / 5).await;
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn nodes_share_the_jobs() {
+    with_all(|shared| async move {
+        let nodes = [shared.node().await, shared.node().await, shared.node().await];
+        let work = |broker: Arc<dyn Broker>| async move {
+            let mut claimed = Vec::new();
+            while let Ok(claim) = tokio::time::timeout(Duration::from_secs(2), broker.claim()).await {
+                claimed.push(claim.id.clone());
+                tokio::time::sleep(Duration::from_millis(10)).await;
+                claim.done().await;
+            }
+            claimed
+        };
+        // The nodes wait before there are jobs.
+        let workers = nodes.clone().map(|node| tokio::spawn(work(node)));
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        let mut expected = BTreeSet::new();
+        for n in 0..30 {
+            let job = job(n % 5, DEFAULT_URGENCY);
+            assert_eq!(nodes[0].dispatch(&job).await, Ok(true));
+            expected.insert(job.id);
+        }
+        let mut all = Vec::new();
+        for worker in workers {
+            let claimed = worker.await.unwrap();
+            assert!(claimed.len() >= 3, "a node claimed only {}", claimed.len());
+            all.extend(claimed);
+        }
+        assert_eq!(all.len(), expected.len(), "no job is claimed twice");
+        assert_eq!(all.into_iter().collect::<BTreeSet<_>>(), expected);
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn followers_get_the_events_of_their_job() {
+    with_all(|shared| async move {
+        let (a, b) = (shared.node().await, shared.node().await);
+        let (job, other) = (job(1, 3), job(1, 3));
+        let mut events = b.events(&job.id).await;
+        // A subscription takes effect after a round trip.
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        let running = JobEvent::Running { attempts: 2, stage: "field".into(), fraction: 0.25 };
+        a.publish(&other.id, JobEvent::Ended);
+        a.publish(&job.id, running.clone());
+        let mut next = async || tokio::time::timeout(SOON, events.next()).await.expect("an event");
+        assert_eq!(next().await, Some(running));
+        a.publish(&job.id, JobEvent::Ended);
+        assert_eq!(next().await, Some(JobEvent::Ended));
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stream_that_cannot_be_created_is_reported() {
+    for program in server::programs() {
+        let server = NatsServer::start(&program);
+        let config = BrokerConfig { replicas: 3, ..BrokerConfig::default() };
+        let broker = NatsBroker::connect(&config, server.address()).await.unwrap();
+        let begun = Instant::now();
+        while !broker.down().is_some_and(|why| why.contains("replicas")) {
+            assert!(begun.elapsed() < SOON, "{:?}", broker.down());
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_broker_that_comes_back_is_used_again() {
+    for program in server::programs() {
+        let mut server = NatsServer::start(&program);
+        let broker: Arc<dyn Broker> = Arc::new(nats(&server).await);
+        let queued = job(1, DEFAULT_URGENCY);
+        assert_eq!(broker.dispatch(&queued).await, Ok(true));
+        for keeps_data in [true, false] {
+            server.stop(keeps_data);
+            let begun = Instant::now();
+            while broker.down().is_none() {
+                assert!(begun.elapsed() < SOON, "the stop is not noticed");
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+            server.restart();
+            let begun = Instant::now();
+            while let Some(why) = broker.down() {
+                assert!(begun.elapsed() < SOON, "{why}");
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+            // Without its data the broker has lost the job.
+            assert_eq!(broker.dispatch(&queued).await, Ok(!keeps_data));
+            let claimed = claim(&broker).await;
+            assert_eq!(claimed.id, queued.id);
+            claimed.release(Duration::ZERO);
+        }
+    }
+}

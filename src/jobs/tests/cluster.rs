@@ -1,0 +1,211 @@
+//! Job stores of several nodes over one store and one broker, within the process and on NATS.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use serde_json::Value;
+use tempfile::TempDir;
+
+use super::{MAX_WAIT, SAMPLE, ended, is, task, until};
+use crate::config::{JobsConfig, StoreConfig};
+use crate::formats::Format;
+use crate::jobs::broker::tests::{nats, server};
+use crate::jobs::{
+    Broker, Budget, EndError, JobId, JobSpec, JobStore, MemoryBroker, Pool, Settings, Status, Structures,
+};
+use crate::picture::SelectedRenderer;
+use crate::pipeline::JobLimits;
+use crate::store::{Folder, Namespace, Store};
+use crate::surface::ReferenceBackend;
+use crate::telemetry::Tracer;
+
+/// Node of a cluster.
+struct Node {
+    jobs: JobStore,
+    store: Store,
+}
+
+/// Starts a node over the shared folder `shared`. It does not claim jobs yet.
+async fn node(shared: &Path, broker: Arc<dyn Broker>) -> Node {
+    let url = Some(format!("file://{}", shared.display()));
+    let store = Store::open_shared(&StoreConfig { url, ..StoreConfig::default() }, shared).await.unwrap();
+    let budget = Budget::new(1 << 30);
+    let settings = Settings {
+        workers: 1,
+        queue: 8,
+        batch_max_delay: Duration::from_secs(10),
+        limits: JobLimits::default(),
+        structures: Structures::new(1 << 20, &budget),
+        budget,
+        renderer: SelectedRenderer::cpu("a test"),
+        meter: None,
+        tracer: Tracer::default(),
+    };
+    let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
+    let describe = |error: &EndError| Value::String(format!("{error:?}"));
+    let secret = store.secret().await.unwrap();
+    let jobs = JobStore::new(store.clone(), pool, (broker, 1000), JobsConfig::default(), 1 << 30, secret, describe);
+    Node { jobs, store }
+}
+
+impl Node {
+    /// Accepts a job with a grid spacing.
+    async fn accept(&self, resolution: &str, key: Option<&str>) -> JobId {
+        let spec = JobSpec {
+            task: task("a", resolution),
+            file: Bytes::from_static(SAMPLE),
+            map: None,
+            parameters: vec![("resolution".to_owned(), resolution.to_owned())],
+            format: Format::Stl,
+            idempotency_key: key.map(str::to_owned),
+        };
+        self.jobs.accept(spec, None).await.unwrap().record.id
+    }
+
+    async fn watch(&self, id: &JobId) -> tokio::sync::watch::Receiver<crate::jobs::JobView> {
+        self.jobs.watch(id, Namespace::default()).await.unwrap().unwrap()
+    }
+}
+
+/// Runs a test with two nodes: on a broker within the process, and on every installed version of NATS.
+async fn with_all<F: Future<Output = ()>>(test: impl Fn(Node, Node) -> F) {
+    let run = async |a: Arc<dyn Broker>, b: Arc<dyn Broker>| {
+        let shared: TempDir = tempfile::tempdir().unwrap();
+        test(node(shared.path(), a).await, node(shared.path(), b).await).await;
+    };
+    let broker = MemoryBroker::new(1000);
+    run(Arc::new(broker.clone()), Arc::new(broker)).await;
+    for program in server::programs() {
+        println!("{}", program.display());
+        let server = server::NatsServer::start(&program);
+        run(Arc::new(nats(&server).await), Arc::new(nats(&server).await)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_runs_on_another_node_and_its_state_is_seen_on_both() {
+    with_all(|a, b| async move {
+        let id = a.accept("2", None).await;
+        let mut seen = a.watch(&id).await;
+        is(&seen, |record| record.status, &Status::Accepted);
+        b.jobs.start_claiming();
+        ended(&mut seen).await;
+        is(&seen, |record| (record.status, record.attempts), &(Status::Successful, 1));
+        let on_b = b.jobs.view(&id, Namespace::default()).await.unwrap().unwrap();
+        assert_eq!(seen.borrow().record, on_b.record);
+        assert_eq!(
+            seen.borrow().version,
+            on_b.version,
+            "a client that reconnects to the other node gets no event twice"
+        );
+        assert_eq!(a.store.list(Folder::Results).await.unwrap().len(), 2);
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_running_job_is_cancelled_from_another_node() {
+    with_all(|a, b| async move {
+        b.jobs.start_claiming();
+        // Takes seconds.
+        let id = a.accept("0.2", None).await;
+        let mut seen = a.watch(&id).await;
+        let running = seen.wait_for(|view| view.record.status == Status::Running && view.stage.is_some());
+        tokio::time::timeout(MAX_WAIT, running).await.expect("the job runs").unwrap();
+        let dismissed = a.jobs.dismiss(&id, Namespace::default()).await.unwrap().unwrap();
+        assert_eq!(dismissed.record.status, Status::Dismissed);
+        tokio::time::timeout(Duration::from_secs(20), b.jobs.all_recorded()).await.expect("the worker stops");
+        let on_b = b.jobs.view(&id, Namespace::default()).await.unwrap().unwrap();
+        assert_eq!(on_b.record, dismissed.record);
+        // The worker is free again.
+        let next = a.accept("2", None).await;
+        ended(&mut a.watch(&next).await).await;
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_idempotency_key_makes_one_job_on_all_nodes() {
+    with_all(|a, b| async move {
+        let (one, other) = tokio::join!(a.accept("2", Some("key")), b.accept("2", Some("key")));
+        assert_eq!(one, other);
+        b.jobs.start_claiming();
+        ended(&mut a.watch(&one).await).await;
+        assert_eq!(b.accept("2.0", Some("key")).await, one);
+        assert_eq!(a.store.list(Folder::Jobs).await.unwrap().len(), 1);
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn jobs_that_the_broker_has_lost_are_dispatched_again() {
+    for program in server::programs() {
+        let mut server = server::NatsServer::start(&program);
+        let shared = tempfile::tempdir().unwrap();
+        let connect = async || Arc::new(nats(&server).await);
+        let (broker, other) = (connect().await, connect().await);
+        let (a, b) = (node(shared.path(), broker.clone() as _).await, node(shared.path(), other as _).await);
+        let mut ids = Vec::new();
+        for resolution in ["2", "2.1", "2.2"] {
+            ids.push(a.accept(resolution, None).await);
+        }
+        assert_eq!((a.jobs.reconcile().await.unwrap(), b.jobs.reconcile().await.unwrap()), (0, 0), "none is lost");
+        server.stop(false);
+        server.restart();
+        until("the broker", || async { broker.down().is_none() && broker.queued() == 0 }).await;
+        assert_eq!((b.jobs.reconcile().await.unwrap(), a.jobs.reconcile().await.unwrap()), (3, 0));
+        b.jobs.start_claiming();
+        for id in &ids {
+            let mut seen = a.watch(id).await;
+            ended(&mut seen).await;
+            is(&seen, |record| record.status, &Status::Successful);
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_that_runs_twice_has_one_end() {
+    for _ in 0..5 {
+        let shared = tempfile::tempdir().unwrap();
+        // Neither broker knows of the other, as after the expiry of a claim whose worker still runs.
+        let brokers = [(); 2].map(|()| Arc::new(MemoryBroker::new(10)));
+        let a = node(shared.path(), brokers[0].clone() as _).await;
+        let b = node(shared.path(), brokers[1].clone() as _).await;
+        let id = a.accept("2", None).await;
+        assert_eq!(b.jobs.reconcile().await.unwrap(), 1);
+        a.jobs.start_claiming();
+        b.jobs.start_claiming();
+        let (mut on_a, mut on_b) = (a.watch(&id).await, b.watch(&id).await);
+        ended(&mut on_a).await;
+        ended(&mut on_b).await;
+        assert_eq!(on_a.borrow().record, on_b.borrow().record);
+        until("both workers", || async { brokers.iter().all(|broker| broker.is_empty()) }).await;
+        let records = a.store.list(Folder::Jobs).await.unwrap();
+        assert_eq!(records.len(), 1, "{records:?}");
+        assert_eq!(a.store.list(Folder::Results).await.unwrap().len(), 2);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_failure_of_an_earlier_attempt_does_not_count() {
+    let shared = tempfile::tempdir().unwrap();
+    let brokers = [(); 2].map(|()| Arc::new(MemoryBroker::new(10)));
+    let a = node(shared.path(), brokers[0].clone() as _).await;
+    let b = node(shared.path(), brokers[1].clone() as _).await;
+    let id = a.accept("2", None).await;
+    // The input cannot be read for now: the attempt fails for good as soon as it is read.
+    let input = a.store.list(Folder::Inputs).await.unwrap().remove(0).0;
+    a.store.delete(&input).await.unwrap();
+    // Another node has begun attempt 2 meanwhile.
+    let mut record = b.jobs.0.read(&id).await.unwrap().unwrap();
+    record.attempts = 2;
+    record.status = Status::Running;
+    let job = a.jobs.insert_open(a.jobs.0.read(&id).await.unwrap().unwrap());
+    b.store.put(&crate::store::Name::job(id.as_str()).unwrap(), record.to_bytes()).await.unwrap();
+    assert!(a.jobs.is_superseded(&job).await);
+    // Control: the same attempt is not superseded.
+    job.adopt(record);
+    assert!(!a.jobs.is_superseded(&job).await);
+}
