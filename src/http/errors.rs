@@ -131,13 +131,9 @@ impl From<Refusal> for Problem {
                 .with("limit", u64::try_from(allowed.as_millis()).unwrap_or(u64::MAX))
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait.saturating_sub(allowed)),
-            Refusal::Draining => shutting_down(error.to_string()),
+            Refusal::Draining => Self::shutting_down(error.to_string()),
         }
     }
-}
-
-fn shutting_down(detail: String) -> Problem {
-    Problem::new(ProblemType::ShuttingDown, detail).retry_after(Duration::from_secs(1))
 }
 
 impl From<Failure> for Problem {
@@ -161,7 +157,7 @@ impl From<Failure> for Problem {
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait),
             Failure::Memory(error) => error.into(),
-            Failure::Stopped => shutting_down(error.to_string()),
+            Failure::Stopped => Self::shutting_down(error.to_string()),
             Failure::Panicked { .. } => Self::internal(error),
         }
     }
@@ -177,7 +173,10 @@ impl From<EndError> for Problem {
             }
             EndError::Save { error: SaveError::Store(error), .. } => error.into(),
             EndError::Save { error: SaveError::Other(error), .. } => Self::internal(error),
-            EndError::Poison { .. } | EndError::Lost { .. } => Self::new(ProblemType::JobAbandoned, error.to_string()),
+            EndError::Poison { attempts } => {
+                Self::new(ProblemType::JobAbandoned, error.to_string()).with("actual", attempts)
+            }
+            EndError::Lost { .. } => Self::new(ProblemType::JobAbandoned, error.to_string()),
         }
     }
 }

@@ -24,21 +24,21 @@ use super::source::{self, Loaded, StructureSource};
 use super::state::Shared;
 use super::timing::Timing;
 use super::{conditional, delivery, jobs, results};
-use crate::jobs::{ContentKey, Failure, Input, JobSpec, Refusal, Task, Ticket};
+use crate::jobs::{ContentKey, Failure, Input, JobSpec, JobView, Refusal, Task, Ticket};
 use crate::store::Digest;
 use crate::telemetry::{SpanParent, TraceSpan};
 
 /// Request for a mesh or its report.
 pub(super) struct MeshRequest {
-    app: Shared,
-    method: Method,
+    pub(super) app: Shared,
+    pub(super) method: Method,
     /// Conditions and the range of a GET request; empty for an upload.
-    headers: HeaderMap,
-    parsed: ParsedRequest,
-    preferences: RequestPreferences,
+    pub(super) headers: HeaderMap,
+    pub(super) parsed: ParsedRequest,
+    pub(super) preferences: RequestPreferences,
     /// `Cache-Control` of the response; `None` if it belongs to this request alone.
     cache: Option<HeaderValue>,
-    timing: Timing,
+    pub(super) timing: Timing,
 }
 
 /// Reads a GET request: the path names the structure and ends in `surface.{ext}` (`{file}`) or in `report.json`.
@@ -146,7 +146,7 @@ impl MeshRequest {
         Ok(Some(self.with_cache_control(response)))
     }
 
-    fn with_cache_control(&self, mut response: Response) -> Response {
+    pub(super) fn with_cache_control(&self, mut response: Response) -> Response {
         if let Some(cache) = &self.cache {
             response.headers_mut().insert(header::CACHE_CONTROL, cache.clone());
         }
@@ -165,6 +165,9 @@ impl MeshRequest {
         app.admit_work(&self.preferences.caller)?;
         if self.is_answered_with_job() {
             return self.accept(loaded, None).await;
+        }
+        if self.is_transferred() {
+            return self.transfer(loaded).await;
         }
         let report = self.parsed.report;
         let permit = app.delivery(self.preferences.caller.client)?;
@@ -238,27 +241,39 @@ impl MeshRequest {
     }
 
     /// Accepts a durable job and answers with its address.
-    async fn accept(self, mut loaded: Loaded, mut ticket: Option<Ticket>) -> Result<Response, Problem> {
-        if loaded.input.file().is_none() {
-            let digest = loaded.digest;
-            loaded = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
-            // The archive may have another file of the entry now.
-            ticket = ticket.filter(|_| loaded.digest == digest);
-        }
-        let Input::File(file) = loaded.input.clone() else { return Err(Problem::internal("a file was not loaded")) };
-        let task = self.task(&loaded);
-        let Self { app, parsed: ParsedRequest { request, pairs, map, format, .. }, preferences, .. } = self;
-        let spec = JobSpec { task, file, map, parameters: pairs, format, idempotency_key: preferences.idempotency_key };
-        let job_store = app.job_store.clone();
-        // A client that disconnects now does not interrupt the acceptance.
-        let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());
-        let view = accepted.await.map_err(Problem::internal)??;
-        let duration = Duration::from_secs_f64(app.pool.expected(&loaded.input, &request.job));
+    async fn accept(self, mut loaded: Loaded, ticket: Option<Ticket>) -> Result<Response, Problem> {
+        let view = self.record(&mut loaded, ticket).await?;
+        let Self { app, parsed, preferences, .. } = self;
+        let duration = Duration::from_secs_f64(app.pool.expected(&loaded.input, &parsed.request.job));
         let mut response = jobs::accepted(&view, app.pool.estimated_wait() + duration);
         if preferences.respond_async {
             response.headers_mut().insert(PREFERENCE_APPLIED, HeaderValue::from_static("respond-async"));
         }
         Ok(response)
+    }
+
+    /// Accepts a durable job. `ticket` belongs to work that is queued or running already.
+    pub(super) async fn record(&self, loaded: &mut Loaded, mut ticket: Option<Ticket>) -> Result<JobView, Problem> {
+        if loaded.input.file().is_none() {
+            let digest = loaded.digest;
+            *loaded = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
+            // The archive may have another file of the entry now.
+            ticket = ticket.filter(|_| loaded.digest == digest);
+        }
+        let Input::File(file) = loaded.input.clone() else { return Err(Problem::internal("a file was not loaded")) };
+        let ParsedRequest { pairs, map, format, .. } = &self.parsed;
+        let spec = JobSpec {
+            task: self.task(loaded),
+            file,
+            map: map.clone(),
+            parameters: pairs.clone(),
+            format: *format,
+            idempotency_key: self.preferences.idempotency_key.clone(),
+        };
+        let job_store = self.app.job_store.clone();
+        // A client that disconnects now does not interrupt the acceptance.
+        let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());
+        Ok(accepted.await.map_err(Problem::internal)??)
     }
 
     fn refused(&self, refusal: Refusal) -> Problem {
@@ -267,7 +282,7 @@ impl MeshRequest {
         if is_late { self.advise(problem) } else { problem }
     }
 
-    fn failed(&self, failure: Failure) -> Problem {
+    pub(super) fn failed(&self, failure: Failure) -> Problem {
         let problem = self.parsed.declared.explain(failure);
         if problem.is(ProblemType::Deadline) { self.advise(problem) } else { problem }
     }

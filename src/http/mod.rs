@@ -15,6 +15,7 @@ mod socket;
 mod store_health;
 mod tilesets;
 mod timing;
+mod transfer;
 
 mod stop;
 

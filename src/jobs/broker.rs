@@ -25,6 +25,7 @@ pub(crate) use nats::NatsBroker;
 
 use super::rank::Client;
 use super::record::{JobId, JobRecord};
+use crate::store::Digest;
 
 /// Job as its broker sees it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -80,6 +81,10 @@ pub(crate) trait Broker: Send + Sync {
     /// Waits for a job and claims it. Cancel safe.
     fn claim(&self) -> BoxFuture<'_, Claim>;
 
+    /// Locks work that one node at a time does. `None` if another run has the lock. If the broker does not answer, the
+    /// work is not locked: doing it twice costs time only.
+    fn lock<'a>(&'a self, work: &'a Digest) -> BoxFuture<'a, Option<WorkLock>>;
+
     /// Publishes the state of a job to its followers. An event may be lost.
     fn publish(&self, id: &JobId, event: JobEvent);
 
@@ -91,6 +96,25 @@ pub(crate) trait Broker: Send + Sync {
 
     /// Returns the reason for which no job can be dispatched now, if there is one.
     fn down(&self) -> Option<String>;
+}
+
+/// Lock of some work, until it is dropped.
+#[must_use = "dropping the lock releases the work"]
+pub(crate) struct WorkLock(Option<Box<dyn FnOnce() + Send + Sync>>);
+
+impl WorkLock {
+    /// Creates a lock that `release` ends.
+    fn new(release: impl FnOnce() + Send + Sync + 'static) -> Self {
+        Self(Some(Box::new(release)))
+    }
+}
+
+impl Drop for WorkLock {
+    fn drop(&mut self) {
+        if let Some(release) = self.0.take() {
+            release();
+        }
+    }
 }
 
 /// Ends of a claim that an implementation provides.

@@ -1,4 +1,4 @@
-//! Claims of jobs from the broker, and the state of jobs that run in other processes.
+//! Dispatch and claims of jobs, and the state of jobs that run in other processes.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,13 +6,13 @@ use std::time::Duration;
 use futures_util::StreamExt as _;
 use tokio::sync::OwnedSemaphorePermit;
 
-use super::EndError;
-use super::broker::{Claim, JobEvent};
+use super::broker::{Claim, Dispatch, JobEvent};
 use super::durable_job::DurableJob;
 use super::job_store::JobStore;
 use super::record::JobRecord;
 use super::retry;
 use super::runner::Runner;
+use super::{EndError, Refusal, Task};
 use crate::store::{Digest, StoreError};
 use crate::sync::{Handle, sleep};
 
@@ -24,6 +24,27 @@ const MAX_UNWATCHED: usize = 6;
 const DUPLICATE: Duration = Duration::from_secs(5);
 
 impl JobStore {
+    /// Returns the reason for which no job can be dispatched now, if there is one.
+    pub(crate) fn broker_down(&self) -> Option<String> {
+        self.0.broker.down()
+    }
+
+    /// Dispatches an accepted job. If that fails, [`Self::reconcile`] dispatches it later.
+    pub(super) async fn dispatch(&self, dispatch: &Dispatch) {
+        if let Err(error) = self.0.broker.dispatch(dispatch).await {
+            tracing::warn!(job_id = %dispatch.id, %error, "a job is dispatched later");
+        }
+    }
+
+    /// Returns the error of a task for which the broker has no free slot.
+    pub(super) fn queue_full(&self, task: &Task) -> Refusal {
+        let (waiting, limit, pool) = (self.0.broker.queued(), self.0.max_queued, &self.0.pool);
+        // As if the jobs ahead took as long as this one.
+        let ahead = pool.expected(&task.input, &task.job) * waiting as f64 / pool.settings().workers as f64;
+        let wait = pool.estimated_wait() + Duration::try_from_secs_f64(ahead).unwrap_or(Duration::MAX);
+        Refusal::QueueFull { waiting, limit, wait }
+    }
+
     /// Starts to claim and run jobs.
     pub(crate) fn start_claiming(&self) {
         Handle::current().spawn(self.clone().claim_jobs());

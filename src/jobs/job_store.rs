@@ -21,11 +21,11 @@ use super::open_jobs::OpenJobs;
 use super::record::{JobId, JobRecord, Requester, Status, now_ms};
 use super::retry::retry;
 use super::runner::Runner;
-use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Refusal, SaveError, Task, Ticket, results};
+use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::single_flight::SingleFlight;
-use crate::store::{Digest, Namespace, Pin, Secret, Store, StoreError};
+use crate::store::{Digest, Name, Namespace, Pin, Secret, Store, StoreError};
 use crate::sync::{Handle, timeout};
 
 /// Number of ended jobs that are held in memory; older ones are read from the store. A record takes up to 64 KiB, the
@@ -81,7 +81,7 @@ pub(super) struct JobStoreState {
     pub(super) pool: Arc<Pool>,
     pub(super) broker: Arc<dyn Broker>,
     /// Maximum number of queued jobs.
-    max_queued: usize,
+    pub(super) max_queued: usize,
     pub(super) config: JobsConfig,
     /// Maximum size of a result, bytes.
     pub(super) output_bytes: u64,
@@ -256,27 +256,6 @@ impl JobStore {
         Ok(job.view())
     }
 
-    /// Returns the reason for which no job can be dispatched now, if there is one.
-    pub(crate) fn broker_down(&self) -> Option<String> {
-        self.0.broker.down()
-    }
-
-    /// Dispatches an accepted job. If that fails, [`Self::reconcile`] dispatches it later.
-    pub(super) async fn dispatch(&self, dispatch: &Dispatch) {
-        if let Err(error) = self.0.broker.dispatch(dispatch).await {
-            tracing::warn!(job_id = %dispatch.id, %error, "a job is dispatched later");
-        }
-    }
-
-    /// Returns the error of a task for which the broker has no free slot.
-    fn queue_full(&self, task: &Task) -> Refusal {
-        let (waiting, limit, pool) = (self.0.broker.queued(), self.0.max_queued, &self.0.pool);
-        // As if the jobs ahead took as long as this one.
-        let ahead = pool.expected(&task.input, &task.job) * waiting as f64 / pool.settings().workers as f64;
-        let wait = pool.estimated_wait() + Duration::try_from_secs_f64(ahead).unwrap_or(Duration::MAX);
-        Refusal::QueueFull { waiting, limit, wait }
-    }
-
     /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
     pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<(String, Pin)>, StoreError> {
         let arithmetics = if task.strict { Vec::new() } else { self.0.pool.file_arithmetics(&task.job) };
@@ -345,6 +324,12 @@ impl JobStore {
         // Another end may have been decided, but not be on record yet. The job holds the sender.
         drop(job.state.subscribe().wait_for(|view| view.record.status.is_final()).await);
         Ok(Some(job.view()))
+    }
+
+    /// Removes the record of an ended job that no client knows.
+    pub(crate) async fn forget(&self, id: &JobId) -> Result<(), StoreError> {
+        self.0.lock().jobs.remove(id);
+        self.0.store.delete(&Name::ended_job(id.as_str())?).await
     }
 
     /// Returns the work that records an attempt before the worker starts it, so that a job that crashes the process is

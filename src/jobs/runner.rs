@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use tokio::sync::OwnedSemaphorePermit;
 use tracing::Instrument as _;
 
-use super::broker::{Claim, Dispatch, JobEvent};
+use super::broker::{Claim, Dispatch, JobEvent, WorkLock};
+use super::coalesced_job::work_key;
 use super::durable_job::DurableJob;
 use super::job_store::JobStore;
 use super::record::JobRecord;
@@ -25,6 +26,8 @@ use crate::telemetry::{SpanKind, TraceSpan};
 const TICK: Duration = Duration::from_millis(100);
 /// Pause between two attempts to get memory for an input.
 const PAUSE: Duration = Duration::from_millis(500);
+/// Time after which a job whose work another node does is claimed again.
+const ELSEWHERE: Duration = Duration::from_millis(500);
 /// Upper limit of the pause after an attempt that lacked memory. Each attempt repeats the work.
 const MAX_MEMORY_PAUSE: Duration = Duration::from_mins(1);
 
@@ -42,6 +45,9 @@ pub(super) struct Runner {
     pub(super) slot: Option<OwnedSemaphorePermit>,
 }
 
+/// Ticket of submitted work, and its lock unless another job has it.
+type Work = (Ticket, Option<WorkLock>);
+
 /// Result of one attempt to run a job.
 enum Attempt {
     /// The job has ended: key of the result with its pin, or the error.
@@ -50,6 +56,8 @@ enum Attempt {
     OutOfMemory(OutOfMemory),
     /// The store fails; it is retried with growing pauses.
     StoreFailed,
+    /// Another node does the same work; its result will be found.
+    Elsewhere,
     /// The service stops; another process runs the job.
     Left,
 }
@@ -120,6 +128,7 @@ impl Runner {
                     sleep(pause).await;
                     pause = (pause * 2).min(retry::MAX_PAUSE);
                 }
+                Attempt::Elsewhere => break Some(ELSEWHERE),
                 Attempt::Left => {
                     jobs.return_to_queue(&job, counted).await;
                     break Some(Duration::ZERO);
@@ -143,16 +152,18 @@ async fn attempt(
     digest: Digest,
 ) -> Attempt {
     let record = job.record();
-    let mut ticket = match ticket.take() {
-        Some(ticket) => ticket,
+    let (mut ticket, lock) = match ticket.take() {
+        Some(ticket) => (ticket, None),
         None => match submit(jobs, job, &record, digest).await {
-            Ok(ticket) => ticket,
+            Ok(submitted) => submitted,
             Err(attempt) => return attempt,
         },
     };
     if ticket.is_shared {
         drop(slot.take());
     }
+    // Until the result is stored.
+    let _lock = lock;
     let outcome = loop {
         tokio::select! {
             outcome = ticket.wait() => break outcome,
@@ -186,20 +197,20 @@ async fn attempt(
 }
 
 /// Submits a claimed job to the pool. Waits while memory for its input is short.
-async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &JobRecord, digest: Digest) -> Result<Ticket, Attempt> {
+async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &JobRecord, digest: Digest) -> Result<Work, Attempt> {
     if record.attempts >= jobs.0.config.attempts {
         return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
     }
-    let ticket = loop {
-        if let Some(ticket) = join_or_load(jobs, job, record, digest).await? {
-            break ticket;
+    let (ticket, lock) = loop {
+        if let Some(work) = join_or_load(jobs, job, record, digest).await? {
+            break work;
         }
         sleep(PAUSE).await;
     };
     if ticket.joined_running && job.begin() {
         jobs.0.write_job(job).await.map_err(|error| store_failed(record, &error))?;
     }
-    Ok(ticket)
+    Ok((ticket, lock))
 }
 
 fn store_failed(record: &JobRecord, error: &StoreError) -> Attempt {
@@ -213,22 +224,26 @@ async fn join_or_load(
     job: &Arc<DurableJob>,
     record: &JobRecord,
     digest: Digest,
-) -> Result<Option<Ticket>, Attempt> {
+) -> Result<Option<Work>, Attempt> {
     let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
     // The pool refuses a claimed job only while it stops.
     let refused = |_: Refusal| Attempt::Left;
     let (mut task, format) = jobs.task_of(record, digest).map_err(lost)?;
     let (pool, mut on_start) = (&jobs.0.pool, Some(jobs.on_start(job)));
     if let Some(ticket) = pool.join(&task, jobs.0.allowed(), &mut on_start).map_err(refused)? {
-        return Ok(Some(ticket));
+        return Ok(Some((ticket, None)));
     }
+    let lock = jobs.0.broker.lock(&work_key(&task)).await.ok_or(Attempt::Elsewhere)?;
     // An earlier process may have ended between storing the result and updating the record.
     let stored = jobs.stored_result(&task, format).await.map_err(|error| store_failed(record, &error))?;
     if let Some(stored) = stored {
         return Err(Attempt::Ended(Ok(stored)));
     }
     match jobs.load_input(&mut task).await {
-        Ok(()) => pool.submit(task, jobs.0.allowed(), on_start).map(Some).map_err(refused),
+        Ok(()) => {
+            let ticket = pool.submit(task, jobs.0.allowed(), on_start).map_err(refused)?;
+            Ok(Some((ticket, Some(lock))))
+        }
         Err(error @ (LoadError::Removed | LoadError::Store(StoreError::Damaged { .. }))) => {
             Err(lost(error.to_string()))
         }

@@ -205,3 +205,45 @@ fn settings_of_a_cluster_that_contradict_each_other_are_rejected() {
         assert!(output.status.code() == Some(2) && message.contains(why), "{message}");
     }
 }
+
+#[test]
+fn synchronous_requests_are_computed_by_workers() {
+    for program in nats::programs() {
+        let cluster = Cluster::start(&program);
+        let (api, worker) = (cluster.node("a", "api"), cluster.node("w", "worker"));
+        let path = "/v1/meshes?format=stl&resolution=1";
+        let reply = send(api.addr, "POST", path, &[], SAMPLE);
+        assert_eq!(reply.status, 200, "{}", reply.text());
+        let timing = reply.header("server-timing").unwrap();
+        assert!(timing.contains("transfer;dur="), "{timing}");
+        assert!(reply.header("etag").is_some() && reply.header("molmesh-triangles").is_some(), "{:?}", reply.headers);
+        // The second request finds the result in the store.
+        let again = send(api.addr, "POST", path, &[], SAMPLE);
+        assert!(again.header("server-timing").unwrap().contains("hit"));
+        assert!(again.status == 200 && again.body == reply.body);
+        // Errors are those of the node itself. No record remains.
+        send(api.addr, "POST", "/v1/meshes", &[], b"REMARK no atoms\n").problem(422, "no-atoms");
+        send(api.addr, "POST", "/v1/meshes?isovalue=1000", &[], SAMPLE).problem(422, "no-surface");
+        let records = cluster.folder.path().join("store/jobs");
+        wait_for("the records to be removed", || std::fs::read_dir(&records).unwrap().next().is_none());
+        // A client that disconnects stops the work.
+        let long = "/v1/meshes?format=stl&resolution=0.1&quality=high";
+        let mut client = TcpStream::connect(api.addr).unwrap();
+        let head = format!("POST {long} HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
+        client.write_all(&[head.as_bytes(), SAMPLE].concat()).unwrap();
+        let names = || -> Vec<String> {
+            let all = std::fs::read_dir(&records).unwrap();
+            all.map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned()).collect()
+        };
+        wait_for("the job", || !names().is_empty());
+        drop(client);
+        wait_for("the end of the job", || names().iter().all(|name| name.ends_with(".ended.json")));
+        // Without the queue the node computes the mesh itself.
+        let mut cluster = cluster;
+        cluster.nats.stop(true);
+        wait_for("the loss is noticed", || get(api.addr, "/readyz").status == 503);
+        let reply = send(api.addr, "POST", path, &[], &sample(1));
+        assert!(reply.status == 200 && !reply.header("server-timing").unwrap().contains("transfer"));
+        kill_all([api, worker]);
+    }
+}

@@ -1,6 +1,6 @@
 //! Broker within a process. A new process dispatches the unfinished jobs of the store again.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
@@ -9,9 +9,10 @@ use futures_util::stream::{self, BoxStream, StreamExt as _};
 use metrics::gauge;
 use tokio::sync::{Notify, broadcast};
 
-use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, Lease};
+use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, Lease, WorkLock};
 use crate::jobs::rank::Client;
 use crate::jobs::record::JobId;
+use crate::store::Digest;
 use crate::sync::{Handle, Mutex, MutexGuard, sleep};
 use crate::telemetry::BROKER_QUEUED;
 
@@ -37,6 +38,8 @@ struct BrokerState {
     turns: VecDeque<Client>,
     /// All jobs that are queued, delayed or claimed.
     held: HashMap<JobId, HeldJob>,
+    /// Work that is being done.
+    locked: HashSet<Digest>,
     next: u64,
     /// Number of queued jobs.
     waiting: usize,
@@ -183,6 +186,17 @@ impl Broker for MemoryBroker {
                 filled.await;
             }
         })
+    }
+
+    fn lock<'a>(&'a self, work: &'a Digest) -> BoxFuture<'a, Option<WorkLock>> {
+        let (broker, work) = (Arc::clone(&self.0), *work);
+        let is_free = broker.lock().locked.insert(work);
+        let lock = is_free.then(|| {
+            WorkLock::new(move || {
+                broker.lock().locked.remove(&work);
+            })
+        });
+        Box::pin(std::future::ready(lock))
     }
 
     fn publish(&self, id: &JobId, event: JobEvent) {

@@ -7,6 +7,9 @@
 //!
 //! Uses only what servers from version 2.9 on offer.
 
+mod lease;
+mod lock;
+
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -14,7 +17,7 @@ use std::time::Duration;
 use async_nats::connection::State;
 use async_nats::jetstream::consumer::{AckPolicy, Consumer, pull};
 use async_nats::jetstream::context::PublishErrorKind;
-use async_nats::jetstream::message::{AckKind, Acker, PublishMessage};
+use async_nats::jetstream::message::{AckKind, PublishMessage};
 use async_nats::jetstream::stream::{Config as StreamConfig, DiscardPolicy, RetentionPolicy};
 use async_nats::jetstream::{Context, ContextBuilder};
 use async_nats::{Client as Connection, ConnectOptions, Event, Subscriber};
@@ -22,12 +25,14 @@ use futures_util::future::BoxFuture;
 use futures_util::stream::{self, BoxStream, StreamExt as _};
 use metrics::{counter, gauge};
 use tokio::sync::Mutex as AsyncMutex;
-use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
-use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, Lease};
+use lease::NatsLease;
+
+use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, WorkLock};
 use crate::config::BrokerConfig;
 use crate::jobs::record::JobId;
+use crate::store::Digest;
 use crate::telemetry::{BROKER_QUEUED, BROKER_REDELIVERIES, BROKER_UP};
 
 /// Number of lanes. Clients share them by the remainder of their numbers.
@@ -174,6 +179,7 @@ impl NatsState {
             ..StreamConfig::default()
         };
         let info = self.context.create_or_update_stream(config).await.map_err(|error| error.to_string())?;
+        self.context.create_or_update_stream(self.lock_stream()).await.map_err(|error| error.to_string())?;
         let mut queues = Vec::new();
         for lane in 0..LANES {
             for class in 0..CLASSES {
@@ -278,50 +284,7 @@ impl NatsState {
             drop(acker.ack_with(AckKind::Term).await);
             return Ok(None);
         };
-        let acker = Arc::new(acker);
-        let (extended, interval) = (Arc::clone(&acker), Duration::from_millis(self.config.lease_ms / 3));
-        let extend = tokio::spawn(async move {
-            loop {
-                sleep(interval).await;
-                if let Err(error) = extended.ack_with(AckKind::Progress).await {
-                    tracing::debug!(%error, "the claim of a job was not extended");
-                }
-            }
-        });
-        Ok(Some(Claim::new(id, deliveries, NatsLease { acker, extend: extend.abort_handle() })))
-    }
-}
-
-/// Claim of a message, which is extended until the lease is dropped.
-struct NatsLease {
-    acker: Arc<Acker>,
-    extend: AbortHandle,
-}
-
-impl Drop for NatsLease {
-    fn drop(&mut self) {
-        self.extend.abort();
-    }
-}
-
-impl Lease for NatsLease {
-    fn done(self: Box<Self>) -> BoxFuture<'static, ()> {
-        Box::pin(async move {
-            // A job whose message stays is claimed once more, and found ended.
-            if let Err(error) = self.acker.double_ack().await {
-                tracing::debug!(%error, "the end of a claim was not acknowledged");
-            }
-        })
-    }
-
-    fn release(self: Box<Self>, delay: Duration) {
-        // Claims may be dropped after the end of the runtime.
-        let Ok(runtime) = tokio::runtime::Handle::try_current() else { return };
-        runtime.spawn(async move {
-            if let Err(error) = self.acker.ack_with(AckKind::Nak(Some(delay))).await {
-                tracing::debug!(%error, "a job returns to the queue when its claim expires");
-            }
-        });
+        Ok(Some(Claim::new(id, deliveries, NatsLease::start(acker, Duration::from_millis(self.config.lease_ms / 3)))))
     }
 }
 
@@ -352,6 +315,10 @@ impl Broker for NatsBroker {
                 }
             }
         })
+    }
+
+    fn lock<'a>(&'a self, work: &'a Digest) -> BoxFuture<'a, Option<WorkLock>> {
+        Box::pin(self.0.lock_work(work))
     }
 
     fn publish(&self, id: &JobId, event: JobEvent) {

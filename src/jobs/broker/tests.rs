@@ -15,6 +15,7 @@ use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, MemoryBroker, Nats
 use crate::config::BrokerConfig;
 use crate::jobs::rank::{Client, DEFAULT_URGENCY};
 use crate::jobs::record::JobId;
+use crate::store::Digest;
 use server::NatsServer;
 
 /// Maximum time of a step of a test.
@@ -271,6 +272,26 @@ async fn followers_get_the_events_of_their_job() {
         assert_eq!(next().await, Some(running));
         a.publish(&job.id, JobEvent::Ended);
         assert_eq!(next().await, Some(JobEvent::Ended));
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn work_is_locked_by_one_run_at_a_time() {
+    with_all(|shared| async move {
+        let (a, b) = (shared.node().await, shared.node().await);
+        let [work, other] = [b"work", b"else"].map(|name| Digest::of(name));
+        let lock = a.lock(&work).await.expect("the work is free");
+        // The lock of a running node lasts longer than a lease.
+        tokio::time::sleep(LEASE * 3 / 2).await;
+        assert!(a.lock(&work).await.is_none() && b.lock(&work).await.is_none());
+        assert!(b.lock(&other).await.is_some());
+        drop(lock);
+        let begun = Instant::now();
+        while b.lock(&work).await.is_none() {
+            assert!(begun.elapsed() < LEASE / 2, "the lock is not released");
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
     })
     .await;
 }
