@@ -128,4 +128,5 @@ def main():
         sys.exit(f"errors occurred with seed {args.seed}: see above")
 
 
-main()
+if __name__ == "__main__":
+    main()

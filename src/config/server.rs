@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{ForwardedHeader, Hosts, Proxies, list, telemetry};
 
-/// Work of a node of a cluster.
+/// Role of a node of a cluster.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
@@ -28,7 +28,7 @@ pub struct ServerConfig {
     /// Address of the service. Default 127.0.0.1:8080: the service is not exposed unless configured. Port 0 selects a
     /// free port.
     pub listen: SocketAddr,
-    /// Work of this node: `all`, `api` (answers requests, claims no asynchronous jobs) or `worker` (claims asynchronous
+    /// Role of this node: `all`, `api` (answers requests, claims no asynchronous jobs) or `worker` (claims asynchronous
     /// jobs, answers only probes and `/version`). Default `all`. The others need `broker.url`.
     pub role: Role,
     /// Host names by which clients reach the service, without ports, besides the names of the loopback addresses.

@@ -24,7 +24,7 @@ use super::source::{self, Loaded, StructureSource};
 use super::state::Shared;
 use super::timing::Timing;
 use super::{conditional, delivery, jobs, results};
-use crate::jobs::{ContentKey, Failure, Input, JobSpec, JobView, Refusal, Task, Ticket};
+use crate::jobs::{ContentKey, Failure, Input, JobSpec, Refusal, Task, Ticket};
 use crate::store::Digest;
 use crate::telemetry::{SpanParent, TraceSpan};
 
@@ -240,10 +240,17 @@ impl MeshRequest {
         }
     }
 
-    /// Accepts a durable job and answers with its address.
-    async fn accept(self, mut loaded: Loaded, ticket: Option<Ticket>) -> Result<Response, Problem> {
-        let view = self.record(&mut loaded, ticket).await?;
+    /// Accepts a durable job and answers with its address. `ticket` belongs to work that is queued or running already.
+    async fn accept(self, mut loaded: Loaded, mut ticket: Option<Ticket>) -> Result<Response, Problem> {
+        let digest = loaded.digest;
+        let spec = self.job_spec(&mut loaded).await?;
+        // The archive may have another file of the entry now.
+        ticket = ticket.filter(|_| loaded.digest == digest);
         let Self { app, parsed, preferences, .. } = self;
+        let job_store = app.job_store.clone();
+        // A client that disconnects now does not interrupt the acceptance.
+        let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());
+        let view = accepted.await.map_err(Problem::internal)??;
         let duration = Duration::from_secs_f64(app.pool.expected(&loaded.input, &parsed.request.job));
         let mut response = jobs::accepted(&view, app.pool.estimated_wait() + duration);
         if preferences.respond_async {
@@ -252,28 +259,21 @@ impl MeshRequest {
         Ok(response)
     }
 
-    /// Accepts a durable job. `ticket` belongs to work that is queued or running already.
-    pub(super) async fn record(&self, loaded: &mut Loaded, mut ticket: Option<Ticket>) -> Result<JobView, Problem> {
+    /// Returns the durable job of the request. Loads the file of the structure if it is not in memory.
+    pub(super) async fn job_spec(&self, loaded: &mut Loaded) -> Result<JobSpec, Problem> {
         if loaded.input.file().is_none() {
-            let digest = loaded.digest;
             *loaded = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
-            // The archive may have another file of the entry now.
-            ticket = ticket.filter(|_| loaded.digest == digest);
         }
         let Input::File(file) = loaded.input.clone() else { return Err(Problem::internal("a file was not loaded")) };
         let ParsedRequest { pairs, map, format, .. } = &self.parsed;
-        let spec = JobSpec {
+        Ok(JobSpec {
             task: self.task(loaded),
             file,
             map: map.clone(),
             parameters: pairs.clone(),
             format: *format,
             idempotency_key: self.preferences.idempotency_key.clone(),
-        };
-        let job_store = self.app.job_store.clone();
-        // A client that disconnects now does not interrupt the acceptance.
-        let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());
-        Ok(accepted.await.map_err(Problem::internal)??)
+        })
     }
 
     fn refused(&self, refusal: Refusal) -> Problem {

@@ -15,7 +15,7 @@ use super::source::Loaded;
 use super::timing::SERVER_TIMING;
 use super::{delivery, results};
 use crate::config::Role;
-use crate::jobs::{ContentKey, Failure, JobId, JobStore, Status};
+use crate::jobs::{AcceptError, ContentKey, Failure, JobId, JobStore, Status};
 use crate::store::Namespace;
 use crate::telemetry::JOBS_TRANSFERRED;
 
@@ -46,7 +46,7 @@ impl Drop for EndOnDrop {
 
 impl MeshRequest {
     /// Returns true if other nodes compute the mesh: this node only answers requests, or its queue is long. Strict
-    /// checks and reports stay, because they are no files that the store has.
+    /// checks and reports stay, because the store does not hold their results.
     pub(super) fn is_transferred(&self) -> bool {
         let Self { app, parsed, preferences, method, .. } = self;
         let (broker, is_busy) = (&app.config.broker, || {
@@ -55,7 +55,7 @@ impl MeshRequest {
         });
         let is_file = !parsed.report && !parsed.request.strict && !parsed.declared.is_structure();
         let is_plain = preferences.wait.is_none() && *method != Method::HEAD;
-        broker.url.is_some() && is_file && is_plain && is_busy() && app.job_store.broker_down().is_none()
+        broker.url.is_some() && is_file && is_plain && is_busy() && app.job_store.can_dispatch()
     }
 
     /// Waits until a worker of the cluster has stored the mesh, and returns it.
@@ -64,13 +64,18 @@ impl MeshRequest {
         self.preferences.rank.urgency = 0;
         self.preferences.idempotency_key = None;
         let permit = self.app.delivery(self.preferences.caller.client)?;
-        let view = self.record(&mut loaded, None).await?;
+        let (spec, jobs) = (self.job_spec(&mut loaded).await?, self.app.job_store.clone());
         drop(loaded);
+        let accept = async move {
+            let record = jobs.accept(spec, None).await?.record;
+            Ok::<_, AcceptError>(EndOnDrop { jobs, id: record.id, namespace: record.namespace })
+        };
+        // If the client disconnects now, the job ends as soon as it is accepted.
+        let end = tokio::spawn(accept.in_current_span()).await.map_err(Problem::internal)??;
         counter!(JOBS_TRANSFERRED).increment(1);
-        let (jobs, id, namespace) = (self.app.job_store.clone(), view.record.id, view.record.namespace);
-        let _end = EndOnDrop { jobs: jobs.clone(), id: id.clone(), namespace };
+        let (jobs, id, namespace) = (&end.jobs, &end.id, end.namespace);
         let lost = || Problem::internal("the record of a transferred request was lost");
-        let mut watched = jobs.watch(&id, namespace).await?.ok_or_else(lost)?;
+        let mut watched = jobs.watch(id, namespace).await?.ok_or_else(lost)?;
         let limit = Duration::from_millis(self.app.config.jobs.deadline_ms);
         let ended = tokio::time::timeout(limit, watched.wait_for(|view| view.record.status.is_final())).await;
         let ended = ended.map_err(|_elapsed| self.failed(Failure::Deadline { limit }))?;

@@ -1,6 +1,6 @@
 //! Dispatch of asynchronous jobs to workers, within a process or between the nodes of a cluster.
 //!
-//! The store is the truth: a broker holds only ids, and a broker that loses them loses no job, since every node
+//! The store is authoritative: a broker holds only ids, and a broker that loses them loses no job, since every node
 //! dispatches unfinished jobs again ([`JobStore::reconcile`](super::JobStore::reconcile)). A job may therefore be
 //! run twice; results are named by their contents, and the first end on record counts.
 //!
@@ -27,7 +27,7 @@ use super::rank::Client;
 use super::record::{JobId, JobRecord};
 use crate::store::Digest;
 
-/// Job as its broker sees it.
+/// Queue entry of a job.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Dispatch {
     /// Id of the job.
@@ -78,7 +78,8 @@ pub(crate) trait Broker: Send + Sync {
     /// Queues a job. Returns false if it is queued or claimed already.
     fn dispatch<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>>;
 
-    /// Waits for a job and claims it. Cancel safe.
+    /// Waits for a job and claims it. If the future is dropped, a job that it has claimed can be claimed again after
+    /// its lease.
     fn claim(&self) -> BoxFuture<'_, Claim>;
 
     /// Locks work that one node at a time does. `None` if another run has the lock. If the broker does not answer, the
@@ -117,13 +118,16 @@ impl Drop for WorkLock {
     }
 }
 
-/// Ends of a claim that an implementation provides.
+/// Ways to end a claim.
 pub(crate) trait Lease: Send + Sync {
     /// Removes the job from the queue.
     fn done(self: Box<Self>) -> BoxFuture<'static, ()>;
 
     /// Returns the job to the queue. It can be claimed again after `delay`.
     fn release(self: Box<Self>, delay: Duration);
+
+    /// Ends the claim after another worker has claimed the job.
+    fn abandon(self: Box<Self>);
 }
 
 /// Claimed job. No other worker gets the job until the claim is dropped, or until its node has stopped. A claim that is
@@ -133,19 +137,26 @@ pub(crate) struct Claim {
     /// Id of the job.
     pub(crate) id: JobId,
     /// Number of claims of the job since it was dispatched, this one included.
-    pub(crate) deliveries: u32,
+    pub(crate) claims: u32,
     lease: Option<Box<dyn Lease>>,
 }
 
 impl fmt::Debug for Claim {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Claim").field("id", &self.id).field("deliveries", &self.deliveries).finish_non_exhaustive()
+        f.debug_struct("Claim").field("id", &self.id).field("claims", &self.claims).finish_non_exhaustive()
     }
 }
 
 impl Claim {
-    fn new(id: JobId, deliveries: u32, lease: impl Lease + 'static) -> Self {
-        Self { id, deliveries, lease: Some(Box::new(lease)) }
+    fn new(id: JobId, claims: u32, lease: impl Lease + 'static) -> Self {
+        Self { id, claims, lease: Some(Box::new(lease)) }
+    }
+
+    /// Leaves the job to another worker that has claimed it meanwhile.
+    pub(crate) fn abandon(mut self) {
+        if let Some(lease) = self.lease.take() {
+            lease.abandon();
+        }
     }
 
     /// Removes the job from the queue.

@@ -24,6 +24,11 @@ const MAX_UNWATCHED: usize = 6;
 const DUPLICATE: Duration = Duration::from_secs(5);
 
 impl JobStore {
+    /// Returns true if a job can be dispatched now.
+    pub(crate) fn can_dispatch(&self) -> bool {
+        self.0.broker.down().is_none() && self.0.broker.queued() < self.0.max_queued
+    }
+
     /// Returns the reason for which no job can be dispatched now, if there is one.
     pub(crate) fn broker_down(&self) -> Option<String> {
         self.0.broker.down()
@@ -36,7 +41,7 @@ impl JobStore {
         }
     }
 
-    /// Returns the error of a task for which the broker has no free slot.
+    /// Returns the refusal of a task when the queue of jobs is full.
     pub(super) fn queue_full(&self, task: &Task) -> Refusal {
         let (waiting, limit, pool) = (self.0.broker.queued(), self.0.max_queued, &self.0.pool);
         // As if the jobs ahead took as long as this one.
@@ -81,10 +86,14 @@ impl JobStore {
         };
         let job = self.insert_open(record.clone());
         if job.ended().is_some() {
-            claim.done().await;
+            // Its end could not be written before.
+            match self.0.write_job(&job).await {
+                Ok(()) => claim.done().await,
+                Err(_logged) => claim.release(DUPLICATE),
+            }
             return;
         }
-        if !job.own() {
+        if !self.0.try_own(&job) {
             claim.release(DUPLICATE);
             return;
         }
@@ -93,7 +102,7 @@ impl JobStore {
             Ok(digest) => self.spawn(Runner { job, digest, ticket: None, claim: Some(claim), slot: Some(slot) }),
             Err(error) => {
                 self.finish(&job, Err(error)).await;
-                job.disown();
+                job.release();
                 claim.done().await;
             }
         }
@@ -131,7 +140,7 @@ impl JobStore {
         let mut ended = job.state.subscribe();
         let mut unwatched = 0;
         // The job may have ended since its record was read.
-        let mut stale = !job.is_owned();
+        let mut stale = true;
         loop {
             if stale && self.refresh(&job).await {
                 return;
@@ -148,13 +157,13 @@ impl JobStore {
                 },
                 _ = ended.wait_for(|view| view.record.status.is_final()) => return,
                 () = sleep(POLL) => {
-                    // One receiver is that of this function.
-                    unwatched = if job.state.receiver_count() > 1 || job.is_owned() { 0 } else { unwatched + 1 };
-                    !job.is_owned()
+                    unwatched = if is_unused(&job) { unwatched + 1 } else { 0 };
+                    true
                 }
             };
-            if unwatched > MAX_UNWATCHED {
-                self.0.lock().jobs.remove(&id);
+            let mut map = self.0.lock();
+            if unwatched > MAX_UNWATCHED && is_unused(&job) {
+                map.jobs.remove(&id);
                 return;
             }
         }
@@ -188,6 +197,11 @@ impl JobStore {
             }
         }
     }
+}
+
+/// Returns true if only the task that follows a job uses it.
+fn is_unused(job: &DurableJob) -> bool {
+    job.state.receiver_count() <= 1 && !job.is_owned()
 }
 
 /// Returns the digest of the input of a record.

@@ -30,12 +30,12 @@ impl DurableJob {
     }
 
     /// Makes the caller the runner of the job. Returns false if it has one in this process.
-    pub(super) fn own(&self) -> bool {
+    pub(super) fn try_own(&self) -> bool {
         !self.owned.swap(true, Ordering::AcqRel)
     }
 
     /// Ends the ownership of the runner.
-    pub(super) fn disown(&self) {
+    pub(super) fn release(&self) {
         self.owned.store(false, Ordering::Release);
     }
 
@@ -88,13 +88,15 @@ impl DurableJob {
         })
     }
 
-    /// Marks the job as accepted again, with `attempts` attempts. Returns true if that changed the record.
-    pub(super) fn return_to_queue(&self, attempts: u32) -> bool {
+    /// Marks the job as accepted again, with `attempts` attempts, and `memory_waits` more that lacked memory. Returns
+    /// true if that changed the record.
+    pub(super) fn return_to_queue(&self, attempts: u32, memory_waits: u32) -> bool {
         self.update(|view, _| {
-            if view.record.attempts == attempts && view.record.started_ms.is_none() {
+            if view.record.attempts == attempts && view.record.started_ms.is_none() && memory_waits == 0 {
                 return false;
             }
             view.record.attempts = attempts;
+            view.record.memory_waits += memory_waits;
             view.record.status = Status::Accepted;
             view.record.started_ms = None;
             view.stage = None;
@@ -140,6 +142,9 @@ impl DurableJob {
     pub(super) fn adopt(&self, record: JobRecord) {
         self.update(|view, _| {
             let changed = view.record != record;
+            if record.status == Status::Accepted {
+                view.stage = None;
+            }
             view.record = record;
             changed
         });

@@ -126,6 +126,12 @@ impl JobStoreState {
         self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Makes the caller the runner of a job. Returns false if the job has one, or is not in the map any more.
+    pub(super) fn try_own(&self, job: &Arc<DurableJob>) -> bool {
+        let map = self.lock();
+        map.jobs.get(&job.id()).is_some_and(|known| Arc::ptr_eq(known, job)) && job.try_own()
+    }
+
     /// Adds a job to the map, unless there is one with this id, and returns the job in the map.
     pub(super) fn insert(&self, id: &JobId, job: &Arc<DurableJob>) -> Arc<DurableJob> {
         let mut map = self.lock();
@@ -195,6 +201,7 @@ impl JobStore {
             urgency: spec.task.rank.urgency,
             status: Status::Accepted,
             attempts: u32::from(ticket.is_some()),
+            memory_waits: 0,
             created_ms: now_ms(),
             started_ms: None,
             finished_ms: None,
@@ -245,7 +252,7 @@ impl JobStore {
         }
         let job = self.insert_open(record);
         // Otherwise the job was dispatched from its record and runs already.
-        if job.own() {
+        if inner.try_own(&job) {
             self.spawn(Runner { job: Arc::clone(&job), digest, ticket, claim: None, slot: None });
         }
         if stored.is_some() {
@@ -274,24 +281,32 @@ impl JobStore {
         self.0.lock().jobs.get(id).filter(|job| job.state.borrow().record.namespace == namespace).cloned()
     }
 
+    /// Watches a job in memory, if it is of the namespace. The job stays in memory while it is watched.
+    fn watch_known(&self, id: &JobId, namespace: Namespace) -> Option<watch::Receiver<JobView>> {
+        let map = self.0.lock();
+        let job = map.jobs.get(id).filter(|job| job.state.borrow().record.namespace == namespace)?;
+        Some(job.state.subscribe())
+    }
+
     /// Watches the state of a job; `None` if the namespace has no such job.
     pub(crate) async fn watch(
         &self,
         id: &JobId,
         namespace: Namespace,
     ) -> Result<Option<watch::Receiver<JobView>>, StoreError> {
-        if let Some(job) = self.known(id, namespace) {
-            return Ok(Some(job.state.subscribe()));
+        if let Some(watched) = self.watch_known(id, namespace) {
+            return Ok(Some(watched));
         }
         let record = self.0.read(id).await?.filter(|record| record.namespace == namespace);
         let Some(record) = record else { return Ok(None) };
-        let job = match self.known(id, namespace) {
+        if let Some(watched) = self.watch_known(id, namespace) {
             // The job began during the read. Its end may be on record and not be visible to others yet.
-            Some(job) => job,
-            None if record.status.is_final() => Arc::new(DurableJob::new(record)),
-            None => self.insert_open(record),
-        };
-        Ok(Some(job.state.subscribe()))
+            return Ok(Some(watched));
+        }
+        if record.status.is_final() {
+            return Ok(Some(DurableJob::new(record).state.subscribe()));
+        }
+        Ok(Some(self.insert_open(record).state.subscribe()))
     }
 
     /// Returns the present state of a job; `None` if the namespace has no such job.

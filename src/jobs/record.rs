@@ -142,6 +142,9 @@ pub(crate) struct JobRecord {
     pub(crate) status: Status,
     /// Number of attempts to run the job.
     pub(crate) attempts: u32,
+    /// Number of attempts that ended for lack of memory. They do not count as attempts.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub(crate) memory_waits: u32,
     /// Time of acceptance, ms since 1970.
     pub(crate) created_ms: u64,
     /// Start of the last attempt, ms since 1970.
@@ -155,6 +158,11 @@ pub(crate) struct JobRecord {
     /// Request that created the job.
     #[serde(default)]
     pub(crate) requester: Requester,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde calls")]
+fn is_zero(n: &u32) -> bool {
+    *n == 0
 }
 
 /// Id and W3C trace context of the request that created a job.
@@ -305,6 +313,7 @@ mod tests {
             urgency: 3,
             status: Status::Accepted,
             attempts: 1,
+            memory_waits: 0,
             created_ms: 1,
             started_ms: None,
             finished_ms: None,

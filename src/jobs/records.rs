@@ -130,21 +130,20 @@ impl JobStoreState {
     async fn read_unknown(&self) -> Result<Vec<JobRecord>, StoreError> {
         let mut known = self.open.ids();
         let (ended, open): (Vec<_>, Vec<_>) = self.store.job_records().await?.into_iter().partition(Name::is_ended_job);
-        let is_new = |name: &Name| name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id));
-        let open: Vec<_> = open.into_iter().filter(is_new).collect();
+        let has_ended = |name: &Name| Ok::<_, StoreError>(ended.binary_search(&Name::ended_job(name.stem())?).is_ok());
+        let mut unknown = Vec::new();
+        for name in open {
+            if has_ended(&name)? {
+                self.store.delete(&name).await?;
+            } else if name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id)) {
+                unknown.push(name);
+            }
+        }
         for gone in &known {
             self.open.remove(gone);
         }
-        let read = |name: Name| {
-            let ended = &ended;
-            async move {
-                if ended.binary_search(&Name::ended_job(name.stem())?).is_ok() {
-                    return self.store.delete(&name).await.map(|()| None);
-                }
-                self.read_document(&name).await
-            }
-        };
-        let mut reads = stream::iter(open).map(read).buffer_unordered(CONCURRENT_READS);
+        let read = |name: Name| async move { self.read_document(&name).await };
+        let mut reads = stream::iter(unknown).map(read).buffer_unordered(CONCURRENT_READS);
         let mut records = Vec::new();
         while let Some(read) = reads.next().await {
             match read {

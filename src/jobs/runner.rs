@@ -27,7 +27,7 @@ const TICK: Duration = Duration::from_millis(100);
 /// Pause between two attempts to get memory for an input.
 const PAUSE: Duration = Duration::from_millis(500);
 /// Time after which a job whose work another node does is claimed again.
-const ELSEWHERE: Duration = Duration::from_millis(500);
+const LOCKED_DELAY: Duration = Duration::from_millis(500);
 /// Upper limit of the pause after an attempt that lacked memory. Each attempt repeats the work.
 const MAX_MEMORY_PAUSE: Duration = Duration::from_mins(1);
 
@@ -48,6 +48,16 @@ pub(super) struct Runner {
 /// Ticket of submitted work, and its lock unless another job has it.
 type Work = (Ticket, Option<WorkLock>);
 
+/// End of the run of a job.
+enum RunEnd {
+    /// The job has ended.
+    Done,
+    /// Another worker has claimed the job.
+    Superseded,
+    /// The job returns to the queue, and can be claimed after this time.
+    Return(Duration),
+}
+
 /// Result of one attempt to run a job.
 enum Attempt {
     /// The job has ended: key of the result with its pin, or the error.
@@ -57,15 +67,27 @@ enum Attempt {
     /// The store fails; it is retried with growing pauses.
     StoreFailed,
     /// Another node does the same work; its result will be found.
-    Elsewhere,
+    Locked,
     /// The service stops; another process runs the job.
-    Left,
+    Stopped,
 }
 
-/// Returns the pause before the claim that follows `deliveries` claims that lacked memory.
-fn memory_pause(deliveries: u32) -> Duration {
-    let doublings = deliveries.saturating_sub(1).min(16);
-    (retry::FIRST_PAUSE * (1 << doublings)).min(MAX_MEMORY_PAUSE)
+/// Returns the pause after an attempt that lacked memory, of which there were `earlier` before.
+fn memory_pause(earlier: u32) -> Duration {
+    (retry::FIRST_PAUSE * (1 << earlier.min(16))).min(MAX_MEMORY_PAUSE)
+}
+
+/// Marks a job as running in this process until it is dropped.
+struct RunningJob {
+    jobs: JobStore,
+    job: Arc<DurableJob>,
+}
+
+impl Drop for RunningJob {
+    fn drop(&mut self) {
+        self.job.release();
+        self.jobs.0.running.send_modify(|running| *running -= 1);
+    }
 }
 
 impl JobStore {
@@ -74,10 +96,10 @@ impl JobStore {
         let record = runner.job.record();
         let log = record.requester.parent(&self.0.pool.settings().tracer).log_span(Some(record.id.as_str()));
         self.0.running.send_modify(|running| *running += 1);
-        let jobs = self.clone();
+        let running = RunningJob { jobs: self.clone(), job: Arc::clone(&runner.job) };
         let run = async move {
-            runner.run(&jobs).await;
-            jobs.0.running.send_modify(|running| *running -= 1);
+            runner.run(&running.jobs).await;
+            drop(running);
         };
         Handle::current().spawn(run.instrument(log));
     }
@@ -92,55 +114,55 @@ impl JobStore {
 impl Runner {
     async fn run(self, jobs: &JobStore) {
         let Self { job, digest, mut ticket, claim, mut slot } = self;
-        let (mut pause, earlier) = (retry::FIRST_PAUSE, job.record().attempts - u32::from(ticket.is_some()));
-        let mut counted = earlier;
-        // The time after which another worker may claim the job, or `None` once it has ended.
-        let delay = loop {
+        let mut pause = retry::FIRST_PAUSE;
+        let mut counted = job.record().attempts - u32::from(ticket.is_some());
+        let end = loop {
             let attempt = attempt(jobs, &job, (&mut ticket, &mut slot), digest);
             let attempt = tokio::select! {
                 attempt = attempt => attempt,
                 // Dropping the ticket stops the work.
-                () = job.dismissed.notified() => break None,
+                () = job.dismissed.notified() => break RunEnd::Done,
             };
             match attempt {
                 Attempt::Ended(ending) => {
                     if ending.is_err() && jobs.is_superseded(&job).await {
                         tracing::warn!(job_id = %job.id(), "another worker runs a later attempt of a job that failed");
-                    } else {
-                        jobs.finish(&job, ending).await;
+                        break RunEnd::Superseded;
                     }
-                    break None;
+                    jobs.finish(&job, ending).await;
+                    break RunEnd::Done;
                 }
                 Attempt::OutOfMemory(error) => {
-                    let deliveries = claim.as_ref().map_or(0, |claim| claim.deliveries);
-                    let waited: Duration = (1..deliveries).map(memory_pause).sum();
+                    let waits = job.record().memory_waits;
+                    let waited: Duration = (0..waits).map(memory_pause).sum();
                     let never_fits = matches!(error, OutOfMemory::Limit { .. });
                     if never_fits || waited >= jobs.0.allowed() {
                         jobs.finish(&job, Err(EndError::Job(error.into()))).await;
-                        break None;
+                        break RunEnd::Done;
                     }
                     tracing::info!(job_id = %job.id(), %error, "a job waits for memory");
-                    jobs.return_to_queue(&job, counted).await;
-                    break Some(memory_pause(deliveries));
+                    jobs.return_to_queue(&job, counted, 1).await;
+                    break RunEnd::Return(memory_pause(waits));
                 }
                 Attempt::StoreFailed => {
                     counted = job.record().attempts;
                     sleep(pause).await;
                     pause = (pause * 2).min(retry::MAX_PAUSE);
                 }
-                Attempt::Elsewhere => break Some(ELSEWHERE),
-                Attempt::Left => {
-                    jobs.return_to_queue(&job, counted).await;
-                    break Some(Duration::ZERO);
+                Attempt::Locked => break RunEnd::Return(LOCKED_DELAY),
+                Attempt::Stopped => {
+                    jobs.return_to_queue(&job, counted, 0).await;
+                    break RunEnd::Return(Duration::ZERO);
                 }
             }
         };
-        job.disown();
-        match (delay, claim) {
-            (None, Some(claim)) => claim.done().await,
-            (Some(delay), Some(claim)) => claim.release(delay),
-            (None, None) => {}
-            (Some(_), None) => jobs.dispatch(&Dispatch::of(&job.record())).await,
+        job.release();
+        match (end, claim) {
+            (RunEnd::Done, Some(claim)) => claim.done().await,
+            (RunEnd::Superseded, Some(claim)) => claim.abandon(),
+            (RunEnd::Return(delay), Some(claim)) => claim.release(delay),
+            (RunEnd::Done | RunEnd::Superseded, None) => {}
+            (RunEnd::Return(_), None) => jobs.dispatch(&Dispatch::of(&job.record())).await,
         }
     }
 }
@@ -153,7 +175,8 @@ async fn attempt(
 ) -> Attempt {
     let record = job.record();
     let (mut ticket, lock) = match ticket.take() {
-        Some(ticket) => (ticket, None),
+        // Other nodes may find the record and dispatch the job.
+        Some(ticket) => (ticket, jobs.lock_work(&record, digest).await),
         None => match submit(jobs, job, &record, digest).await {
             Ok(submitted) => submitted,
             Err(attempt) => return attempt,
@@ -189,7 +212,9 @@ async fn attempt(
             }
         }
         // Work with a ticket is cancelled only when the service stops.
-        Err(Failure::Stopped | Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => Attempt::Left,
+        Err(Failure::Stopped | Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => {
+            Attempt::Stopped
+        }
         Err(Failure::Memory(error)) => Attempt::OutOfMemory(error),
         Err(Failure::Waited { limit, .. }) => Attempt::Ended(Err(Failure::Deadline { limit }.into())),
         Err(failure) => Attempt::Ended(Err(failure.into())),
@@ -227,13 +252,13 @@ async fn join_or_load(
 ) -> Result<Option<Work>, Attempt> {
     let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
     // The pool refuses a claimed job only while it stops.
-    let refused = |_: Refusal| Attempt::Left;
+    let refused = |_: Refusal| Attempt::Stopped;
     let (mut task, format) = jobs.task_of(record, digest).map_err(lost)?;
     let (pool, mut on_start) = (&jobs.0.pool, Some(jobs.on_start(job)));
     if let Some(ticket) = pool.join(&task, jobs.0.allowed(), &mut on_start).map_err(refused)? {
         return Ok(Some((ticket, None)));
     }
-    let lock = jobs.0.broker.lock(&work_key(&task)).await.ok_or(Attempt::Elsewhere)?;
+    let lock = jobs.0.broker.lock(&work_key(&task)).await.ok_or(Attempt::Locked)?;
     // An earlier process may have ended between storing the result and updating the record.
     let stored = jobs.stored_result(&task, format).await.map_err(|error| store_failed(record, &error))?;
     if let Some(stored) = stored {
@@ -288,11 +313,11 @@ impl JobStore {
         }
     }
 
-    /// Marks a job as accepted again, with `attempts` attempts, and writes the record. An attempt does not count if the
-    /// service stopped it or if memory was short.
-    async fn return_to_queue(&self, job: &DurableJob, attempts: u32) {
+    /// Marks a job as accepted again, with `attempts` attempts and `memory_waits` more that lacked memory, and writes
+    /// the record. An attempt does not count if the service stopped it or if memory was short.
+    async fn return_to_queue(&self, job: &DurableJob, attempts: u32, memory_waits: u32) {
         if !self.is_superseded(job).await
-            && job.return_to_queue(attempts)
+            && job.return_to_queue(attempts, memory_waits)
             && let Err(error) = self.0.write_job(job).await
         {
             tracing::warn!(job_id = %job.id(), %error, "an interrupted attempt is counted");
@@ -303,5 +328,11 @@ impl JobStore {
     pub(super) async fn is_superseded(&self, job: &DurableJob) -> bool {
         let own = job.record();
         matches!(self.0.read(&own.id).await, Ok(Some(stored)) if stored.attempts > own.attempts)
+    }
+
+    /// Locks the work of a job that runs already. `None` if another node does the same work.
+    async fn lock_work(&self, record: &JobRecord, digest: Digest) -> Option<WorkLock> {
+        let (task, _) = self.task_of(record, digest).ok()?;
+        self.0.broker.lock(&work_key(&task)).await
     }
 }

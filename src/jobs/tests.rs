@@ -114,6 +114,7 @@ impl Fixture {
             status: Status::Accepted,
             requester: Requester::default(),
             attempts: 0,
+            memory_waits: 0,
             created_ms: now_ms(),
             started_ms: None,
             finished_ms: None,

@@ -4,7 +4,6 @@ use std::future::Future;
 use std::io;
 use std::path::{Path as FilePath, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
@@ -33,7 +32,7 @@ const FILE_PART: usize = 1 << 20;
 /// Folder of the objects of [`Backend::check`].
 const CHECK: &str = "check";
 
-/// Begin of the URL of a folder.
+/// URL prefix of a folder.
 const FOLDER_URL: &str = "file://";
 
 /// Returns the folder of a store in `data_dir`.
@@ -235,9 +234,8 @@ impl Backend {
 
     /// Writes, reads and removes a small object.
     pub(super) async fn check(&self) -> Result<(), StoreError> {
-        static COUNT: AtomicU64 = AtomicU64::new(0);
-        // The name is unique per process, because processes may share a store.
-        let file = format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        // Nodes that share a store may have the same process id.
+        let file = secret::unique().map_err(|e| self.fail("check", CHECK, &e))?;
         let path = Path::from_iter([CHECK, &file]);
         let fail = |e: object_store::Error| self.fail("check", path.as_ref(), &e);
         let written = Bytes::from(file.into_bytes());

@@ -26,7 +26,7 @@ pub(super) fn in_folder(root: &FilePath) -> io::Result<Secret> {
     }
     let fresh = random()?;
     // The name appears with the complete content. Of processes that create it at once, one succeeds.
-    let staged = root.join(format!(".{NAME}.{}.tmp", std::process::id()));
+    let staged = root.join(format!(".{NAME}.{}.tmp", unique()?));
     let mut options = OpenOptions::new();
     options.write(true).create(true).truncate(true);
     #[cfg(unix)]
@@ -43,6 +43,12 @@ pub(super) fn in_folder(root: &FilePath) -> io::Result<Secret> {
     #[cfg(unix)]
     File::open(root)?.sync_all()?;
     Ok(fresh)
+}
+
+/// Returns 16 random hexadecimal digits, for names that no other process chooses.
+pub(super) fn unique() -> io::Result<String> {
+    let [a, b, c, d, e, f, g, h, ..] = random()?;
+    Ok(format!("{:016x}", u64::from_be_bytes([a, b, c, d, e, f, g, h])))
 }
 
 /// Reads the secret in a bucket, or creates it. Processes that create it at once get the same one.

@@ -3,13 +3,15 @@
 
 use crate::cli_support;
 use crate::deploy_support;
+use crate::tools;
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use deploy_support::{Recipe, at, bytes, kinds, only, read, root, sections, strings, under, yaml};
-use molmesh::config::{Config, load};
+use molmesh::config::{Config, Role, load};
 use serde_json::{Value, json};
 
 /// User id of the service in a container.
@@ -201,6 +203,73 @@ fn compose_matches_the_image() {
     let secret = compose["secrets"]["configuration"]["file"].as_str().unwrap();
     let default = secret.trim_end_matches('}').rsplit_once(":-").unwrap().1;
     assert_eq!(Path::new("deploy").join(default), Path::new("deploy/./container/molmesh.toml"));
+}
+
+#[test]
+fn compose_of_a_cluster_sets_existing_keys() {
+    let Some(found) = yaml(&["deploy/compose.cluster.yaml"]) else { return };
+    assert_eq!(found[0].errors, [""; 0]);
+    let services = found[0].documents[0]["services"].as_object().unwrap();
+    let mut roles = Vec::new();
+    for (name, service) in services.iter().filter(|(name, _)| *name != "nats") {
+        let environment = service["environment"].as_object().unwrap();
+        let set = environment.iter().map(|(key, value)| (key.clone(), value.as_str().unwrap().to_owned()));
+        // Variables of Compose have their values when it starts.
+        let environment = set.filter(|(_, value)| !value.starts_with("${"));
+        let config = load(None, environment, &[]).unwrap().config;
+        assert_eq!(config.broker.url.as_deref(), Some("nats://nats:4222"), "{name}");
+        let folder = config.store.url.unwrap();
+        let volume = service["volumes"][0].as_str().unwrap().split(':').nth(1).unwrap();
+        assert!(folder.starts_with(&format!("file://{volume}/")), "{name}: {folder} is not in the volume {volume}");
+        roles.push(config.server.role);
+    }
+    assert_eq!(roles, [Role::Api, Role::Worker]);
+}
+
+/// Renders the Helm chart with `settings`. Returns the documents, or the message of the error.
+fn chart(settings: &[&str]) -> Option<Result<String, String>> {
+    let program = root().join("target/test-tools/venv/bin/helm");
+    if !program.exists() {
+        return tools::skip("helm is missing; run tests/tools/setup.sh");
+    }
+    let mut command = Command::new(program);
+    command.args(["template", "surfaces"]).arg(root().join("deploy/helm/molmesh"));
+    let output = command.args(settings.iter().flat_map(|set| ["--set", set])).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    Some(if output.status.success() { Ok(text(output.stdout)) } else { Err(text(output.stderr)) })
+}
+
+#[test]
+fn the_chart_renders_valid_manifests() {
+    let shared = ["broker.url=nats://nats:4222", "store.url=s3://meshes"];
+    let Some(rendered) = chart(&shared) else { return };
+    let folder = cli_support::Folder::new();
+    let keda = chart(&[&shared[..], &["keda.enabled=true", "broker.secret=nats"]].concat()).unwrap();
+    let files = [rendered, keda].map(Result::unwrap);
+    let files = [folder.file("chart.yaml", &files[0]), folder.file("keda.yaml", &files[1])];
+    let Some(found) = yaml(&files) else { return };
+    assert_eq!(found[0].errors, [""; 0]);
+    // The schema of Kubernetes lacks the kinds of KEDA.
+    assert_eq!(found[1].errors, ["no such kind: keda.sh/v1alpha1 ScaledObject"]);
+    let kinds = |n: usize| -> BTreeSet<&str> {
+        found[n].documents.iter().map(|document| document["kind"].as_str().unwrap()).collect()
+    };
+    for kind in ["Deployment", "Service", "HorizontalPodAutoscaler", "PodDisruptionBudget", "NetworkPolicy"] {
+        assert!(kinds(0).contains(kind), "no {kind}");
+    }
+    assert!(kinds(1).contains("ScaledObject"));
+    let scaled = found[1].documents.iter().find(|document| document["kind"] == "ScaledObject").unwrap();
+    assert_eq!(scaled["spec"]["triggers"].as_array().unwrap().len(), 24, "one trigger for each queue");
+    // The configuration of the pods is valid.
+    let map = found[0].documents.iter().find(|document| document["kind"] == "ConfigMap").unwrap();
+    let file = folder.file("molmesh.toml", map["data"]["molmesh.toml"].as_str().unwrap());
+    let config = load(Some(&file), [], &[]).unwrap().config;
+    assert_eq!((config.broker.url.as_deref(), config.broker.replicas), (Some("nats://nats:4222"), 3));
+    assert!(config.access.keys_file.is_some());
+    // Control: without a queue or a store nothing is rendered.
+    for (setting, missing) in [(shared[0], "store.url is required"), (shared[1], "broker.url is required")] {
+        assert!(chart(&[setting]).unwrap().unwrap_err().contains(missing));
+    }
 }
 
 /// Returns the memory that a configuration allows, bytes.

@@ -25,7 +25,7 @@ pub(crate) struct ServeArgs {
     /// Data folder of the service
     #[arg(long, value_name = "DIR")]
     pub(crate) data_dir: Option<PathBuf>,
-    /// Work of this node of a cluster: all, api or worker [default: all]
+    /// Role of this node of a cluster: all, api or worker [default: all]
     #[arg(long, value_name = "ROLE")]
     pub(crate) role: Option<String>,
     /// Folder of structure files, flat or in the `divided` layout of the wwPDB

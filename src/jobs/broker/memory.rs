@@ -27,7 +27,7 @@ type Place = (u8, u64);
 struct HeldJob {
     client: Client,
     place: Place,
-    deliveries: u32,
+    claims: u32,
 }
 
 #[derive(Debug, Default)]
@@ -67,8 +67,8 @@ impl BrokerState {
         }
         self.count(self.waiting - 1);
         let job = self.held.get_mut(&id)?;
-        job.deliveries += 1;
-        Some((id, job.deliveries))
+        job.claims += 1;
+        Some((id, job.claims))
     }
 
     fn count(&mut self, waiting: usize) {
@@ -140,6 +140,10 @@ impl Lease for MemoryLease {
         Box::pin(std::future::ready(()))
     }
 
+    fn abandon(self: Box<Self>) {
+        self.broker.lock().held.remove(&self.id);
+    }
+
     fn release(self: Box<Self>, delay: Duration) {
         let Self { broker, id } = *self;
         if delay.is_zero() {
@@ -163,7 +167,7 @@ impl Broker for MemoryBroker {
         } else {
             let place = (job.urgency, state.next);
             state.next += 1;
-            let held = HeldJob { client: job.client, place, deliveries: 0 };
+            let held = HeldJob { client: job.client, place, claims: 0 };
             state.held.insert(job.id.clone(), held);
             state.enqueue(job.id.clone(), held);
             Ok(true)
@@ -179,9 +183,9 @@ impl Broker for MemoryBroker {
         Box::pin(async {
             loop {
                 let filled = self.0.filled.notified();
-                if let Some((id, deliveries)) = self.0.take() {
+                if let Some((id, claims)) = self.0.take() {
                     let lease = MemoryLease { broker: Arc::clone(&self.0), id: id.clone() };
-                    return Claim::new(id, deliveries, lease);
+                    return Claim::new(id, claims, lease);
                 }
                 filled.await;
             }

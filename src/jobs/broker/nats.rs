@@ -46,7 +46,7 @@ const REQUEST: Duration = Duration::from_secs(5);
 /// Interval at which the server is asked for the number of jobs, and idle workers look for jobs.
 const POLL: Duration = Duration::from_secs(1);
 
-/// Message of the queue of a lane and a class.
+/// Consumer of one lane and class.
 type Queue = Consumer<pull::Config>;
 
 /// State of the search for jobs.
@@ -55,8 +55,8 @@ struct JobSearch {
     filled: [bool; LANES * CLASSES],
     /// Lane whose turn it is.
     turn: usize,
-    /// Notifications of new jobs, of which each idle node gets its share.
-    news: Option<Subscriber>,
+    /// Announcements of new jobs. Each idle node gets its share.
+    announcements: Option<Subscriber>,
 }
 
 struct NatsState {
@@ -113,7 +113,7 @@ impl NatsBroker {
             context,
             config: config.clone(),
             queues: Mutex::new(None),
-            search: AsyncMutex::new(JobSearch { filled: [true; LANES * CLASSES], turn: 0, news: None }),
+            search: AsyncMutex::new(JobSearch { filled: [true; LANES * CLASSES], turn: 0, announcements: None }),
             queued: AtomicUsize::new(0),
             losses,
             checked: AtomicUsize::new(usize::MAX),
@@ -129,9 +129,10 @@ async fn watch(broker: std::sync::Weak<NatsState>) {
     loop {
         let Some(state) = broker.upgrade() else { return };
         let losses = state.losses.load(Ordering::Acquire);
-        let asked = timeout(REQUEST, state.look()).await.unwrap_or_else(|_elapsed| Err("no answer".to_owned()));
+        let asked =
+            timeout(REQUEST, state.check_streams()).await.unwrap_or_else(|_elapsed| Err("no answer".to_owned()));
         gauge!(BROKER_UP).set(f64::from(u8::from(asked.is_ok())));
-        state.set_down(asked.err());
+        state.set_unavailable(asked.err());
         state.checked.store(losses, Ordering::Release);
         drop(state);
         sleep(POLL).await;
@@ -143,7 +144,7 @@ impl NatsState {
         format!("{}-jobs", self.config.prefix)
     }
 
-    fn set_down(&self, why: Option<String>) {
+    fn set_unavailable(&self, why: Option<String>) {
         let mut down = self.down.lock().unwrap_or_else(PoisonError::into_inner);
         match (&*down, &why) {
             (None, Some(why)) => tracing::warn!(why, "the broker does not answer"),
@@ -153,11 +154,12 @@ impl NatsState {
         *down = why;
     }
 
-    /// Updates the number of jobs. Creates stream and queues if they are missing.
-    async fn look(&self) -> Result<(), String> {
+    /// Updates the number of jobs. Creates streams and consumers if they are missing.
+    async fn check_streams(&self) -> Result<(), String> {
         let found = self.context.get_stream(self.stream()).await;
+        let has_locks = self.context.get_stream(self.locks()).await.is_ok();
         let jobs = match found {
-            Ok(stream) if self.queues().is_some() => stream.cached_info().state.messages,
+            Ok(stream) if self.queues().is_some() && has_locks => stream.cached_info().state.messages,
             _ => self.create().await?,
         };
         let jobs = usize::try_from(jobs).unwrap_or(usize::MAX);
@@ -220,19 +222,19 @@ impl NatsState {
         loop {
             let queues = self.queues().ok_or("the stream does not exist yet")?;
             if let Some(claim) = self.scan(search, &queues).await? {
-                search.news = None;
+                search.announcements = None;
                 return Ok(claim);
             }
-            let Some(news) = &mut search.news else {
+            let Some(announcements) = &mut search.announcements else {
                 // Jobs that are dispatched from now on are announced; earlier ones are found by another search.
                 let all = format!("{}.jobs.>", self.config.prefix);
-                let news = self.connection.queue_subscribe(all, "idle".to_owned()).await;
-                search.news = Some(news.map_err(|error| error.to_string())?);
+                let announcements = self.connection.queue_subscribe(all, "idle".to_owned()).await;
+                search.announcements = Some(announcements.map_err(|error| error.to_string())?);
                 self.connection.flush().await.map_err(|error| error.to_string())?;
                 search.filled.fill(true);
                 continue;
             };
-            match timeout(POLL, news.next()).await {
+            match timeout(POLL, announcements.next()).await {
                 Ok(Some(message)) => {
                     let mut parts = message.subject.as_str().rsplit('.').skip(1);
                     let mut number = || parts.next()?.parse::<usize>().ok();
@@ -242,7 +244,7 @@ impl NatsState {
                         *filled = true;
                     }
                 }
-                Ok(None) => search.news = None,
+                Ok(None) => search.announcements = None,
                 Err(_elapsed) => search.filled.fill(true),
             }
         }
@@ -273,8 +275,8 @@ impl NatsState {
         let fetched =
             timeout(REQUEST, fetched).await.map_err(|_elapsed| "no answer to a request for jobs".to_owned())??;
         let Some(message) = fetched else { return Ok(None) };
-        let deliveries = message.info().map_or(1, |info| u32::try_from(info.delivered).unwrap_or(1));
-        if deliveries > 1 {
+        let claims = message.info().map_or(1, |info| u32::try_from(info.delivered).unwrap_or(1));
+        if claims > 1 {
             counter!(BROKER_REDELIVERIES).increment(1);
         }
         let (message, acker) = message.split();
@@ -284,7 +286,7 @@ impl NatsState {
             drop(acker.ack_with(AckKind::Term).await);
             return Ok(None);
         };
-        Ok(Some(Claim::new(id, deliveries, NatsLease::start(acker, Duration::from_millis(self.config.lease_ms / 3)))))
+        Ok(Some(Claim::new(id, claims, NatsLease::start(acker, Duration::from_millis(self.config.lease_ms / 3)))))
     }
 }
 

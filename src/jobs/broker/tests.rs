@@ -119,7 +119,7 @@ async fn jobs_of_a_client_follow_urgency_then_age() {
         expected.sort();
         for (_, id) in expected {
             let claimed = claim(&broker).await;
-            assert_eq!((&claimed.id, claimed.deliveries), (&id, 1));
+            assert_eq!((&claimed.id, claimed.claims), (&id, 1));
             claimed.done().await;
         }
         none_within(&broker, Duration::from_millis(300)).await;
@@ -194,11 +194,11 @@ async fn a_returned_job_is_claimed_again_after_its_delay() {
         assert_eq!(broker.dispatch(&job).await, Ok(true));
         drop(claim(&broker).await);
         let claimed = claim(&broker).await;
-        assert_eq!((&claimed.id, claimed.deliveries), (&job.id, 2));
+        assert_eq!((&claimed.id, claimed.claims), (&job.id, 2));
         claimed.release(Duration::from_millis(700));
         none_within(&broker, Duration::from_millis(300)).await;
         let claimed = claim(&broker).await;
-        assert_eq!((&claimed.id, claimed.deliveries), (&job.id, 3));
+        assert_eq!((&claimed.id, claimed.claims), (&job.id, 3));
         claimed.done().await;
     })
     .await;
@@ -214,7 +214,7 @@ async fn a_job_of_a_crashed_node_is_claimed_again() {
         shared.crash(|broker| async move { broker.claim().await }).await;
         let claimed = tokio::time::timeout(LEASE + SOON, broker.claim()).await.expect("the lease expires");
         println!("claimed again after {:?}", begun.elapsed());
-        assert_eq!((&claimed.id, claimed.deliveries), (&job.id, 2));
+        assert_eq!((&claimed.id, claimed.claims), (&job.id, 2));
         // A claim of a running node lasts longer than a lease.
         none_within(&broker, LEASE * 2).await;
         claimed.done().await;
@@ -294,6 +294,58 @@ async fn work_is_locked_by_one_run_at_a_time() {
         }
     })
     .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn jobs_are_dispatched_and_claimed_concurrently() {
+    // With `MOLMESH_DISPATCHES=20000` and `--no-capture` it prints the rates of a long run.
+    let n: usize = std::env::var("MOLMESH_DISPATCHES").map_or(1000, |n| n.parse().unwrap());
+    for program in server::programs() {
+        let server = NatsServer::start(&program);
+        let config = BrokerConfig { queue: n, ..BrokerConfig::default() };
+        let connect = async || Arc::new(NatsBroker::connect(&config, server.address()).await.unwrap());
+        let nodes = [connect().await, connect().await, connect().await];
+        while nodes.iter().any(|node| node.down().is_some()) {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        let jobs: Vec<_> = (0..n as u64).map(|n| job(n % 100, DEFAULT_URGENCY)).collect();
+        let mut times = Vec::new();
+        for job in &jobs[..n / 10] {
+            let begun = Instant::now();
+            assert_eq!(nodes[0].dispatch(job).await, Ok(true));
+            times.push(begun.elapsed());
+        }
+        times.sort_unstable();
+        let begun = Instant::now();
+        let dispatch = |job: Dispatch| async {
+            let job = job;
+            assert_eq!(nodes[0].dispatch(&job).await, Ok(true));
+        };
+        futures_util::stream::iter(jobs[n / 10..].iter().cloned()).for_each_concurrent(64, dispatch).await;
+        let rate = (n - n / 10) as f64 / begun.elapsed().as_secs_f64();
+        let claimed = Arc::new(std::sync::atomic::AtomicUsize::new(0));
+        let begun = Instant::now();
+        let workers = nodes.map(|node| {
+            let claimed = Arc::clone(&claimed);
+            tokio::spawn(async move {
+                while claimed.fetch_add(1, std::sync::atomic::Ordering::Relaxed) < n {
+                    let claim = node.claim().await;
+                    // The job itself takes no time.
+                    tokio::spawn(claim.done());
+                }
+            })
+        });
+        for worker in workers {
+            worker.await.unwrap();
+        }
+        let claims = n as f64 / begun.elapsed().as_secs_f64();
+        println!(
+            "{}: dispatch p50 {:?}, p99 {:?}; {rate:.0} dispatches per s from one node; {claims:.0} claims per s by three",
+            program.display(),
+            times[times.len() / 2],
+            times[times.len() * 99 / 100]
+        );
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -50,6 +50,10 @@ impl Lease for NatsLease {
         })
     }
 
+    fn abandon(self: Box<Self>) {
+        // Acknowledging would remove the message of the other claim.
+    }
+
     fn release(self: Box<Self>, delay: Duration) {
         // Claims may be dropped after the end of the runtime.
         let Ok(runtime) = Handle::try_current() else { return };

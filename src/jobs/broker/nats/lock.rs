@@ -24,7 +24,7 @@ async fn write(context: &Context, subject: &str, last: u64) -> Result<u64, Publi
 
 impl NatsState {
     /// Returns the name of the stream of locks.
-    fn locks(&self) -> String {
+    pub(super) fn locks(&self) -> String {
         format!("{}-work", self.config.prefix)
     }
 
