@@ -36,10 +36,10 @@ def main():
     print(f"seed {args.seed}", flush=True)
     dice = random.Random(args.seed)
     expected = Expected(args.binary, args.structures)
-    # A job may be started at every kill, so attempts are not limited.
+    # A job may be started at every kill, so attempts are not limited. No record of an ended job is removed.
     cluster = Cluster(
         args.binary, args.nats, args.port, ["api", "api", "worker", "worker"],
-        ["broker.lease_ms=2000", "jobs.attempts=100000"],
+        ["broker.lease_ms=2000", "jobs.attempts=100000", "jobs.records_per_client=100000"],
     )
     cluster.start()
     apis = enumerate(cluster.of_role("api"))

@@ -1,5 +1,6 @@
 //! Interleavings of requests, workers and shutdown.
 
+mod broker;
 mod durable;
 
 use std::sync::Arc;

@@ -1,0 +1,116 @@
+//! Interleavings of nodes that dispatch, claim, return and finish jobs of one broker.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use shuttle::future::block_on;
+use shuttle::rand::{Rng as _, thread_rng};
+use tokio::sync::watch;
+
+use super::SCHEDULES;
+use crate::jobs::broker::{Broker, Claim, Dispatch, MemoryBroker};
+use crate::jobs::rank::Client;
+use crate::jobs::record::JobId;
+use crate::store::Digest;
+use crate::sync::thread;
+
+/// Number of jobs.
+const JOBS: u64 = 3;
+
+/// Runs and ends of each job.
+type Ledger = std::sync::Mutex<BTreeMap<JobId, (u32, u32)>>;
+
+fn change(ledger: &Ledger, id: &JobId, change: impl FnOnce(&mut (u32, u32))) {
+    change(ledger.lock().unwrap().entry(id.clone()).or_default());
+}
+
+/// Runs a claimed job, which ends or returns to the queue. `returns_early` returns it before its run has ended.
+fn run(broker: &MemoryBroker, claim: Claim, ledger: &Ledger, returns_early: bool) {
+    let id = claim.id.clone();
+    change(ledger, &id, |(runs, _)| {
+        *runs += 1;
+        assert_eq!(*runs, 1, "two workers run a job");
+    });
+    if returns_early {
+        claim.release(Duration::ZERO);
+        thread::yield_now();
+        change(ledger, &id, |(runs, _)| *runs -= 1);
+        return;
+    }
+    let lock = block_on(broker.lock(&Digest::of(id.as_str().as_bytes())));
+    assert!(lock.is_some(), "two workers do the same work");
+    thread::yield_now();
+    drop(lock);
+    let ends = thread_rng().gen_range(0..3) > 0;
+    change(ledger, &id, |(runs, ended)| {
+        *runs -= 1;
+        *ended += u32::from(ends);
+    });
+    if ends {
+        block_on(claim.done());
+    } else {
+        claim.release(Duration::ZERO);
+    }
+}
+
+/// Explores schedules of two nodes that dispatch the same jobs, and two workers.
+fn explore(returns_early: bool) {
+    let model = move || {
+        let (broker, ledger) = (MemoryBroker::new(8), Arc::<Ledger>::default());
+        let job = |n: u64| JobId::from_key(&[0; 32], crate::store::Namespace::default(), n, "k");
+        let jobs: Vec<_> = (0..JOBS).map(|n| Dispatch { id: job(n), client: Client(n % 2), urgency: 3 }).collect();
+        let node = || {
+            let (broker, jobs) = (broker.clone(), jobs.clone());
+            thread::spawn(move || {
+                jobs.iter().filter(|job| block_on(broker.dispatch(job)).unwrap()).map(|job| job.id.clone()).collect()
+            })
+        };
+        let nodes: Vec<thread::JoinHandle<Vec<JobId>>> = vec![node(), node()];
+        let stop = watch::Sender::new(false);
+        let worker = || {
+            let (broker, ledger, mut stop) = (broker.clone(), Arc::clone(&ledger), stop.subscribe());
+            thread::spawn(move || {
+                loop {
+                    let next = async {
+                        tokio::select! {
+                            claim = broker.claim() => Some(claim),
+                            _ = stop.wait_for(|stops| *stops) => None,
+                        }
+                    };
+                    let Some(claim) = block_on(next) else { return };
+                    run(&broker, claim, &ledger, returns_early);
+                }
+            })
+        };
+        let workers = [worker(), worker()];
+        let mut dispatched: Vec<JobId> = nodes.into_iter().flat_map(|node| node.join().unwrap()).collect();
+        while !broker.is_empty() {
+            thread::yield_now();
+        }
+        stop.send_replace(true);
+        for worker in workers {
+            worker.join().unwrap();
+        }
+        dispatched.sort();
+        let ledger = ledger.lock().unwrap().clone();
+        for id in &dispatched {
+            let times = dispatched.iter().filter(|other| *other == id).count();
+            // A job that has ended may be dispatched again by a node that does not know it.
+            assert_eq!(ledger[id], (0, u32::try_from(times).unwrap()), "a dispatched job ends once");
+        }
+        assert_eq!(ledger.len() as u64, JOBS);
+    };
+    shuttle::check_random(model, SCHEDULES);
+}
+
+#[test]
+fn every_dispatched_job_ends_once_and_runs_on_one_worker_at_a_time() {
+    explore(false);
+}
+
+#[test]
+#[should_panic(expected = "two workers run a job")]
+fn a_job_that_is_returned_before_its_run_has_ended_is_detected() {
+    explore(true);
+}
