@@ -3,10 +3,11 @@
 
     python3 benches/load/cluster_simulation.py --jobs-per-second 1000 --seconds-per-job 0.5
 
-Jobs arrive at random (Poisson) and take a random time (log-normal, as structures differ in size). Workers claim them one
-after another from one broker, which serves a limited number of claims per second; dead workers lose their jobs for one
-lease. The constants below were measured with the scripts and tests that their comments name. The script prints the
-smallest number of workers whose 99th percentile of the waiting time stays below a limit, and the load on queue and store.
+Jobs arrive at random (Poisson) and take a random time (log-normal, as structures differ in size). Workers claim them
+one after another from one broker, which serves a limited number of claims per second. A job of a worker that fails runs
+again after the lease. The constants below were measured with the scripts and tests that their comments name. The script
+prints the smallest number of workers for which the 99th percentile of the waiting time stays below a limit, and the
+load on queue and store.
 """
 
 import argparse
@@ -14,7 +15,7 @@ import heapq
 import math
 import random
 
-# Claims per second of one NATS server (`MOLMESH_DISPATCHES=20000 cargo nextest run --no-capture dispatched_and_claimed`).
+# Claims per second of one NATS server (test `jobs_are_dispatched_and_claimed_concurrently`).
 CLAIMS_PER_SECOND = 6000
 # Requests of one job to an S3 store (`benches/load/store_requests.py`).
 WRITES_PER_JOB, READS_PER_JOB = 6, 20

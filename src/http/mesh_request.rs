@@ -166,7 +166,7 @@ impl MeshRequest {
         if self.is_answered_with_job() {
             return self.accept(loaded, None).await;
         }
-        if self.is_transferred() {
+        if self.is_transferred().await {
             return self.transfer(loaded).await;
         }
         let report = self.parsed.report;

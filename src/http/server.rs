@@ -24,7 +24,7 @@ use crate::config::{Config, Role};
 use crate::jobs::{Broker, Budget, Client, EndError, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Structures};
 use crate::picture::SelectedRenderer;
 use crate::single_flight::SingleFlight;
-use crate::store::{FolderLock, LockError, Secret, Store, StoreError};
+use crate::store::{Digest, FolderLock, LockError, Secret, Store, StoreError, derive};
 use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, Recorder, TelemetryError, Traces};
 
@@ -248,7 +248,11 @@ async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Se
     let describe = |error: &EndError| Problem::from(error.clone()).record("");
     let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
     let broker: Arc<dyn Broker> = match &config.broker.url {
-        Some(url) => Arc::new(NatsBroker::connect(&config.broker, url).await.map_err(ServeError::Broker)?),
+        Some(url) => {
+            // Identifies the store without revealing its secret.
+            let id = Digest::of(&derive(&secret, "store")).to_string();
+            Arc::new(NatsBroker::connect(&config.broker, url, &id).await.map_err(ServeError::Broker)?)
+        }
         None => Arc::new(MemoryBroker::new(config.broker.queue)),
     };
     let broker = (broker, config.broker.queue);
@@ -264,13 +268,25 @@ async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Se
     Ok(job_store)
 }
 
-/// Rejects settings that only a cluster has.
+/// Shortest `broker.lease_ms`: workers extend their claims three times in it.
+const MIN_LEASE_MS: u64 = 1000;
+
+/// Rejects settings of a cluster that are wrong or incomplete.
 fn check_cluster(config: &Config) -> Result<(), ServeError> {
-    let is_folder = config.store.url.as_deref().is_some_and(|url| url.starts_with("file://"));
-    let why = match (&config.broker.url, &config.store.url) {
+    let (broker, url) = (&config.broker, config.store.url.as_deref());
+    let folder = url.and_then(|url| url.strip_prefix("file://"));
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
+    let why = match (&broker.url, url) {
         (None, _) if config.server.role != Role::All => "server.role needs broker.url: a node alone has every role",
-        (None, _) if is_folder => "a folder in store.url needs broker.url: without it, set server.data_dir",
+        (None, _) if folder.is_some() => "a folder in store.url needs broker.url: without it, set server.data_dir",
+        (None, _) => return Ok(()),
         (Some(_), None) => "broker.url needs store.url: the nodes of a cluster share one store",
+        _ if folder.is_some_and(|path| !path.starts_with('/')) => "store.url: expected file:///absolute/path",
+        _ if broker.prefix.is_empty() || !broker.prefix.chars().all(is_plain) => {
+            "broker.prefix: expected letters, digits, `-` and `_`"
+        }
+        _ if broker.lease_ms < MIN_LEASE_MS => "broker.lease_ms: expected 1000 or more",
+        _ if broker.user.is_some() != broker.password.is_some() => "broker.user and broker.password belong together",
         _ => return Ok(()),
     };
     Err(ServeError::Cluster(why))

@@ -47,7 +47,7 @@ impl Drop for EndOnDrop {
 impl MeshRequest {
     /// Returns true if other nodes compute the mesh: this node only answers requests, or its queue is long. Strict
     /// checks and reports stay, because the store does not hold their results.
-    pub(super) fn is_transferred(&self) -> bool {
+    pub(super) async fn is_transferred(&self) -> bool {
         let Self { app, parsed, preferences, method, .. } = self;
         let (broker, is_busy) = (&app.config.broker, || {
             let limit = Duration::from_millis(app.config.broker.transfer_wait_ms);
@@ -55,7 +55,7 @@ impl MeshRequest {
         });
         let is_file = !parsed.report && !parsed.request.strict && !parsed.declared.is_structure();
         let is_plain = preferences.wait.is_none() && *method != Method::HEAD;
-        broker.url.is_some() && is_file && is_plain && is_busy() && app.job_store.can_dispatch()
+        broker.url.is_some() && is_file && is_plain && is_busy() && app.job_store.has_workers().await
     }
 
     /// Waits until a worker of the cluster has stored the mesh, and returns it.

@@ -53,6 +53,8 @@ pub(crate) enum JobEvent {
     Running {
         /// Number of attempts.
         attempts: u32,
+        /// Start of the attempt, ms since 1970.
+        started_ms: Option<u64>,
         /// Stage.
         stage: Cow<'static, str>,
         /// Finished fraction, from 0 to 1.
@@ -91,6 +93,9 @@ pub(crate) trait Broker: Send + Sync {
 
     /// Returns the events of a job that are published from now on.
     fn events(&self, id: &JobId) -> BoxFuture<'_, BoxStream<'static, JobEvent>>;
+
+    /// Returns true if a worker claims jobs.
+    fn has_workers(&self) -> BoxFuture<'_, bool>;
 
     /// Returns the number of queued jobs.
     fn queued(&self) -> usize;

@@ -25,8 +25,13 @@ const DUPLICATE: Duration = Duration::from_secs(5);
 
 impl JobStore {
     /// Returns true if a job can be dispatched now.
-    pub(crate) fn can_dispatch(&self) -> bool {
+    fn can_dispatch(&self) -> bool {
         self.0.broker.down().is_none() && self.0.broker.queued() < self.0.max_queued
+    }
+
+    /// Returns true if a job that is dispatched now finds a worker.
+    pub(crate) async fn has_workers(&self) -> bool {
+        self.can_dispatch() && self.0.broker.has_workers().await
     }
 
     /// Returns the reason for which no job can be dispatched now, if there is one.
@@ -148,10 +153,15 @@ impl JobStore {
             stale = tokio::select! {
                 Some(event) = events.next() => match event {
                     JobEvent::Ended => true,
-                    JobEvent::Running { attempts, stage, fraction } => {
-                        if !job.is_owned() {
-                            job.publish_stage(attempts, stage, fraction);
+                    JobEvent::Running { attempts, .. } if job.is_owned() => {
+                        if attempts > job.record().attempts {
+                            tracing::warn!(job_id = %id, "another worker runs a later attempt of a job");
+                            job.stop.notify_one();
                         }
+                        false
+                    }
+                    JobEvent::Running { attempts, started_ms, stage, fraction } => {
+                        job.publish_stage((attempts, started_ms), stage, fraction);
                         false
                     }
                 },
@@ -178,7 +188,7 @@ impl JobStore {
                 job.publish_end(record);
                 self.0.open.remove(&id);
                 // Stops the runner if there is one.
-                job.dismissed.notify_one();
+                job.stop.notify_one();
                 true
             }
             Ok(Some(record)) => {

@@ -11,8 +11,8 @@ use super::record::{JobId, JobRecord, Status, now_ms};
 /// A job whose record is in the store.
 pub(super) struct DurableJob {
     pub(super) state: watch::Sender<JobView>,
-    /// Signals the runner to stop the work.
-    pub(super) dismissed: Notify,
+    /// Signals the runner to stop the work: the job has ended, or a later attempt runs in another process.
+    pub(super) stop: Notify,
     /// Held while the record is written.
     pub(super) writing: tokio::sync::Mutex<()>,
     /// True while a [`Runner`](super::runner::Runner) of this process runs the job.
@@ -25,8 +25,8 @@ impl DurableJob {
         // Later than every version of an earlier process, unless the job has ended.
         let version = record.finished_ms.unwrap_or_else(now_ms);
         let (state, _) = watch::channel(JobView { record, stage: None, fraction, version, end: None });
-        let (dismissed, writing) = (Notify::new(), tokio::sync::Mutex::default());
-        Self { state, dismissed, writing, owned: AtomicBool::new(false) }
+        let (stop, writing) = (Notify::new(), tokio::sync::Mutex::default());
+        Self { state, stop, writing, owned: AtomicBool::new(false) }
     }
 
     /// Makes the caller the runner of the job. Returns false if it has one in this process.
@@ -104,6 +104,12 @@ impl DurableJob {
         })
     }
 
+    /// Returns true if the end of the job is decided.
+    pub(super) fn is_decided(&self) -> bool {
+        let view = self.state.borrow();
+        view.end.is_some() || view.record.status.is_final()
+    }
+
     /// Decides the end of the job: sets `status` and applies `change` to the record. Returns false if the end was
     /// decided before. [`Self::publish_end`] makes it visible.
     pub(super) fn end(&self, status: Status, change: impl FnOnce(&mut JobRecord)) -> bool {
@@ -152,7 +158,12 @@ impl DurableJob {
 
     /// Publishes the stage and the finished fraction of attempt `attempts` if they have advanced. Returns true if they
     /// have.
-    pub(super) fn publish_stage(&self, attempts: u32, stage: Cow<'static, str>, fraction: f64) -> bool {
+    pub(super) fn publish_stage(
+        &self,
+        (attempts, started_ms): (u32, Option<u64>),
+        stage: Cow<'static, str>,
+        fraction: f64,
+    ) -> bool {
         self.update(|view, now| {
             let begins = view.record.status == Status::Accepted || view.record.attempts < attempts;
             if !begins && view.stage.as_ref() == Some(&stage) && fraction <= view.fraction + 0.004 {
@@ -161,7 +172,7 @@ impl DurableJob {
             if begins {
                 view.record.attempts = view.record.attempts.max(attempts);
                 view.record.status = Status::Running;
-                view.record.started_ms = Some(now);
+                view.record.started_ms = started_ms.or(Some(now));
             }
             view.stage = Some(stage);
             view.fraction = view.fraction.max(fraction);

@@ -121,7 +121,7 @@ impl Runner {
             let attempt = tokio::select! {
                 attempt = attempt => attempt,
                 // Dropping the ticket stops the work.
-                () = job.dismissed.notified() => break RunEnd::Done,
+                () = job.stop.notified() => break if job.is_decided() { RunEnd::Done } else { RunEnd::Superseded },
             };
             match attempt {
                 Attempt::Ended(ending) => {
@@ -307,9 +307,10 @@ async fn save(jobs: &JobStore, record: &JobRecord, finished: Arc<Finished>) -> R
 impl JobStore {
     /// Publishes the stage and the finished fraction of a running job here and to other processes.
     fn publish_stage(&self, job: &DurableJob, stage: &'static str, fraction: f64) {
-        let attempts = job.record().attempts;
-        if job.publish_stage(attempts, Cow::Borrowed(stage), fraction) {
-            self.0.broker.publish(&job.id(), JobEvent::Running { attempts, stage: Cow::Borrowed(stage), fraction });
+        let JobRecord { attempts, started_ms, .. } = job.record();
+        if job.publish_stage((attempts, started_ms), Cow::Borrowed(stage), fraction) {
+            let event = JobEvent::Running { attempts, started_ms, stage: Cow::Borrowed(stage), fraction };
+            self.0.broker.publish(&job.id(), event);
         }
     }
 

@@ -4,6 +4,7 @@ use std::future::Future;
 use std::io;
 use std::path::{Path as FilePath, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
@@ -57,6 +58,8 @@ pub(super) struct Backend {
     kind: StorageKind,
     /// Folder, or URL without credentials, for messages.
     location: String,
+    /// True once the folder has a secret, without which it is another folder, such as that below a lost mount.
+    has_secret: AtomicBool,
     /// Time limit of an operation of a folder. The client of S3 has time limits of its own.
     limit: Duration,
 }
@@ -70,7 +73,13 @@ impl Backend {
             let failed = |reason| StoreError::Open { key: "store.url", location: url.clone(), reason };
             let (objects, bucket) = s3::connect(config, url).map_err(failed)?;
             let location = url.trim_end_matches('/').to_owned();
-            return Ok(Self { objects, kind: StorageKind::S3(bucket), location, limit });
+            return Ok(Self {
+                objects,
+                kind: StorageKind::S3(bucket),
+                location,
+                limit,
+                has_secret: AtomicBool::new(false),
+            });
         }
         let root = shared.map_or_else(|| folder_of(data_dir), PathBuf::from);
         let key = if shared.is_some() { "store.url" } else { "server.data_dir" };
@@ -92,14 +101,20 @@ impl Backend {
         });
         let opened = opened.await.unwrap_or_else(|e| Err(e.to_string()));
         let failed = |reason| StoreError::Open { key, location: location.clone(), reason };
-        Ok(Self { objects: Arc::new(opened.map_err(failed)?), kind: StorageKind::Local(root), location, limit })
+        Ok(Self {
+            objects: Arc::new(opened.map_err(failed)?),
+            kind: StorageKind::Local(root),
+            location,
+            limit,
+            has_secret: AtomicBool::new(false),
+        })
     }
 
     /// Creates a backend over a folder with injected behaviour, for tests.
     #[cfg(test)]
     pub(super) fn over(objects: Arc<dyn ObjectStore>, root: PathBuf, config: &StoreConfig) -> Self {
         let (location, limit) = (root.display().to_string(), Duration::from_millis(config.timeout_ms));
-        Self { objects, kind: StorageKind::Local(root), location, limit }
+        Self { objects, kind: StorageKind::Local(root), location, limit, has_secret: AtomicBool::new(false) }
     }
 
     /// Returns the location, for messages.
@@ -165,6 +180,7 @@ impl Backend {
 
     /// Writes an object. With `new`, returns false and changes nothing if the object exists.
     pub(super) async fn put(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
+        self.check_folder().await?;
         let mode = if new { PutMode::Create } else { PutMode::Overwrite };
         match self.timed(self.objects.put_opts(&name.path(), bytes.into(), mode.into())).await {
             Ok(_) => Ok(true),
@@ -234,6 +250,7 @@ impl Backend {
 
     /// Writes, reads and removes a small object.
     pub(super) async fn check(&self) -> Result<(), StoreError> {
+        self.check_folder().await?;
         // Nodes that share a store may have the same process id.
         let file = secret::unique().map_err(|e| self.fail("check", CHECK, &e))?;
         let path = Path::from_iter([CHECK, &file]);
@@ -262,7 +279,20 @@ impl Backend {
                 secret::in_bucket(self.objects.as_ref()).await.map_err(|e| self.fail("secret", "secret", &e))
             }
         };
+        self.has_secret.store(outcome.is_ok(), Ordering::Release);
         outcome.map_err(|error| self.open_error(&error))
+    }
+
+    /// Checks that the folder of the store is still there: a write would create it again, and its objects would be lost
+    /// when the right folder returns.
+    pub(super) async fn check_folder(&self) -> Result<(), StoreError> {
+        let StorageKind::Local(root) = &self.kind else { return Ok(()) };
+        if !self.has_secret.load(Ordering::Acquire) {
+            return Ok(());
+        }
+        let root = root.clone();
+        let found = move || secret::is_in_folder(&root);
+        self.blocking("folder", "", found).await
     }
 
     /// Returns the free bytes of the disk, 0 if unknown; `None` on S3.

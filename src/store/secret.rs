@@ -45,6 +45,16 @@ pub(super) fn in_folder(root: &FilePath) -> io::Result<Secret> {
     Ok(fresh)
 }
 
+/// Fails if the folder `root` has no secret. Blocks.
+pub(super) fn is_in_folder(root: &FilePath) -> io::Result<()> {
+    match root.join(NAME).symlink_metadata() {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            Err(io::Error::other("the folder of the store is missing, or another folder is in its place"))
+        }
+        found => found.map(|_| ()),
+    }
+}
+
 /// Returns 16 random hexadecimal digits, for names that no other process chooses.
 pub(super) fn unique() -> io::Result<String> {
     let [a, b, c, d, e, f, g, h, ..] = random()?;

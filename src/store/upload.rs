@@ -23,6 +23,7 @@ impl ObjectUpload {
     /// Starts an upload. The backend of a folder creates the staged file on the calling thread.
     pub(super) async fn begin(store: &Store, name: &Name) -> Result<Self, StoreError> {
         let backend = &store.0.backend;
+        backend.check_folder().await?;
         let begun = backend.timed(backend.objects().put_multipart(&name.path())).await;
         let begun = begun.map_err(backend.fail_at("put", name))?;
         let parts = WriteMultipart::new_with_chunk_size(begun, backend.part_size());

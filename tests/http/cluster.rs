@@ -196,6 +196,10 @@ fn settings_of_a_cluster_that_contradict_each_other_are_rejected() {
         (&["server.role=worker"][..], "server.role needs broker.url"),
         (&["store.url=file:///tmp/x"], "a folder in store.url needs broker.url"),
         (&["broker.url=nats://127.0.0.1:1"], "broker.url needs store.url"),
+        (&["broker.url=nats://127.0.0.1:1", "store.url=file://tmp/x"], "expected file:///absolute/path"),
+        (&["broker.url=nats://127.0.0.1:1", "store.url=s3://m", "broker.prefix=a.b"], "broker.prefix: expected"),
+        (&["broker.url=nats://127.0.0.1:1", "store.url=s3://m", "broker.lease_ms=1"], "broker.lease_ms: expected"),
+        (&["broker.url=nats://127.0.0.1:1", "store.url=s3://m", "broker.user=u"], "belong together"),
     ] {
         let folder = tempfile::tempdir().unwrap();
         let mut program = Command::new(env!("CARGO_BIN_EXE_molmesh"));
@@ -246,4 +250,25 @@ fn synchronous_requests_are_computed_by_workers() {
         assert!(reply.status == 200 && !reply.header("server-timing").unwrap().contains("transfer"));
         kill_all([api, worker]);
     }
+}
+
+#[test]
+fn a_folder_of_the_store_that_vanishes_is_not_created_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let node = Process::spawn(Command::new(env!("CARGO_BIN_EXE_molmesh")), folder.path());
+    wait_for("the node to be ready", || get(node.addr, "/readyz").status == 200);
+    let (store, away) = (folder.path().join("store"), folder.path().join("away"));
+    let known = submit(node.addr, "/v1/meshes?format=stl&resolution=1", SAMPLE);
+    successful(node.addr, &known);
+    std::fs::rename(&store, &away).unwrap();
+    for n in 0..3 {
+        let refused = send(node.addr, "POST", "/v1/meshes?format=stl&resolution=1", &[ASYNCHRONOUS], &sample(n));
+        refused.problem(503, "store-failed");
+    }
+    assert_eq!(send(node.addr, "POST", "/v1/meshes?format=stl&resolution=1", &[], &sample(9)).status, 200);
+    assert!(!store.exists());
+    std::fs::rename(&away, &store).unwrap();
+    successful(node.addr, &submit(node.addr, "/v1/meshes?format=stl&resolution=1", &sample(4)));
+    assert_eq!(get(node.addr, &known).json()["status"], "successful");
+    node.kill();
 }

@@ -83,7 +83,11 @@ const ROWS: &[Row] = &[
         "too-many-jobs",
         "src/jobs/tests/records::records_are_limited_in_total_and_for_each_client",
     ),
-    ("broker.replicas", "molmesh_broker_up", "src/jobs/broker/tests::a_stream_that_cannot_be_created_is_reported"),
+    (
+        "broker.replicas",
+        "molmesh_broker_up",
+        "src/jobs/broker/tests/nats_only::a_stream_that_cannot_be_created_is_reported",
+    ),
     (
         "broker.lease_ms",
         "molmesh_broker_redeliveries_total",

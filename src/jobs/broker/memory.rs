@@ -222,6 +222,10 @@ impl Broker for MemoryBroker {
         Box::pin(std::future::ready(stream::unfold((receiver, id), next).boxed()))
     }
 
+    fn has_workers(&self) -> BoxFuture<'_, bool> {
+        Box::pin(std::future::ready(true))
+    }
+
     fn queued(&self) -> usize {
         self.0.lock().waiting
     }

@@ -9,31 +9,34 @@
 
 mod lease;
 mod lock;
+mod search;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Duration;
 
 use async_nats::connection::State;
 use async_nats::jetstream::consumer::{AckPolicy, Consumer, pull};
 use async_nats::jetstream::context::PublishErrorKind;
-use async_nats::jetstream::message::{AckKind, PublishMessage};
+use async_nats::jetstream::message::PublishMessage;
 use async_nats::jetstream::stream::{Config as StreamConfig, DiscardPolicy, RetentionPolicy};
 use async_nats::jetstream::{Context, ContextBuilder};
-use async_nats::{Client as Connection, ConnectOptions, Event, Subscriber};
+use async_nats::{Client as Connection, ConnectOptions, Event};
+use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use futures_util::stream::{self, BoxStream, StreamExt as _};
-use metrics::{counter, gauge};
+use metrics::gauge;
 use tokio::sync::Mutex as AsyncMutex;
+use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
-use lease::NatsLease;
+use search::JobSearch;
 
 use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, WorkLock};
 use crate::config::BrokerConfig;
 use crate::jobs::record::JobId;
 use crate::store::Digest;
-use crate::telemetry::{BROKER_QUEUED, BROKER_REDELIVERIES, BROKER_UP};
+use crate::telemetry::{BROKER_QUEUED, BROKER_UP};
 
 /// Number of lanes. Clients share them by the remainder of their numbers.
 const LANES: usize = 8;
@@ -49,20 +52,16 @@ const POLL: Duration = Duration::from_secs(1);
 /// Consumer of one lane and class.
 type Queue = Consumer<pull::Config>;
 
-/// State of the search for jobs.
-struct JobSearch {
-    /// Queues that may have jobs.
-    filled: [bool; LANES * CLASSES],
-    /// Lane whose turn it is.
-    turn: usize,
-    /// Announcements of new jobs. Each idle node gets its share.
-    announcements: Option<Subscriber>,
-}
-
 struct NatsState {
     connection: Connection,
     context: Context,
     config: BrokerConfig,
+    /// Identity of the store that all nodes share.
+    store: String,
+    /// Last error of the connection.
+    failure: Arc<Mutex<Option<String>>>,
+    /// Task that answers other nodes that look for a worker.
+    responder: OnceLock<AbortHandle>,
     /// Queues by lane and class; `None` until they exist.
     queues: Mutex<Option<Arc<[Queue]>>>,
     search: AsyncMutex<JobSearch>,
@@ -76,28 +75,44 @@ struct NatsState {
     down: Mutex<Option<String>>,
 }
 
+impl Drop for NatsState {
+    fn drop(&mut self) {
+        if let Some(responder) = self.responder.get() {
+            responder.abort();
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// Broker over NATS. Clones share one connection.
 #[derive(Clone)]
 pub(crate) struct NatsBroker(Arc<NatsState>);
 
 impl NatsBroker {
-    /// Connects to the server of the configuration. Does not wait until it answers.
+    /// Connects to the server of the configuration. Does not wait until it answers. `store` identifies the store of the
+    /// nodes.
     ///
     /// # Errors
     /// Returns the reason if an address or the credentials are malformed.
-    pub(crate) async fn connect(config: &BrokerConfig, url: &str) -> Result<Self, String> {
+    pub(crate) async fn connect(config: &BrokerConfig, url: &str, store: &str) -> Result<Self, String> {
         crate::tls::install_provider();
-        let losses = Arc::new(AtomicUsize::new(0));
-        let counted = Arc::clone(&losses);
+        let (losses, failure) = (Arc::new(AtomicUsize::new(0)), Arc::new(Mutex::new(None)));
+        let (counted, failed) = (Arc::clone(&losses), Arc::clone(&failure));
         let mut options = ConnectOptions::new()
             .name("molmesh")
             .retry_on_initial_connect()
             .connection_timeout(REQUEST)
             .ping_interval(REQUEST)
             .event_callback(move |event| {
-                // What was known of the server may have changed.
-                if event == Event::Disconnected {
-                    counted.fetch_add(1, Ordering::AcqRel);
+                match event {
+                    // What was known of the server may have changed.
+                    Event::Disconnected => drop(counted.fetch_add(1, Ordering::AcqRel)),
+                    Event::ClientError(error) => *lock(&failed) = Some(error.to_string()),
+                    Event::ServerError(error) => *lock(&failed) = Some(error.to_string()),
+                    _ => {}
                 }
                 std::future::ready(())
             })
@@ -112,8 +127,11 @@ impl NatsBroker {
             connection,
             context,
             config: config.clone(),
+            store: store.to_owned(),
+            failure,
+            responder: OnceLock::new(),
             queues: Mutex::new(None),
-            search: AsyncMutex::new(JobSearch { filled: [true; LANES * CLASSES], turn: 0, announcements: None }),
+            search: AsyncMutex::new(JobSearch::default()),
             queued: AtomicUsize::new(0),
             losses,
             checked: AtomicUsize::new(usize::MAX),
@@ -144,8 +162,34 @@ impl NatsState {
         format!("{}-jobs", self.config.prefix)
     }
 
+    /// Returns the description of the stream, which names the store of its jobs.
+    fn description(&self) -> String {
+        format!("jobs of the store {}", self.store)
+    }
+
+    /// Returns the subject on which nodes look for a worker.
+    fn worker_subject(&self) -> String {
+        format!("{}.worker", self.config.prefix)
+    }
+
+    /// Answers nodes that look for a worker.
+    fn respond(&self) {
+        self.responder.get_or_init(|| {
+            let (connection, subject) = (self.connection.clone(), self.worker_subject());
+            let respond = async move {
+                let Ok(mut asked) = connection.queue_subscribe(subject, "workers".to_owned()).await else { return };
+                while let Some(request) = asked.next().await {
+                    if let Some(reply) = request.reply {
+                        drop(connection.publish(reply, Bytes::new()).await);
+                    }
+                }
+            };
+            tokio::spawn(respond).abort_handle()
+        });
+    }
+
     fn set_unavailable(&self, why: Option<String>) {
-        let mut down = self.down.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut down = lock(&self.down);
         match (&*down, &why) {
             (None, Some(why)) => tracing::warn!(why, "the broker does not answer"),
             (Some(_), None) => tracing::info!("the broker answers"),
@@ -158,6 +202,14 @@ impl NatsState {
     async fn check_streams(&self) -> Result<(), String> {
         let found = self.context.get_stream(self.stream()).await;
         let has_locks = self.context.get_stream(self.locks()).await.is_ok();
+        let used_by =
+            found.as_ref().ok().map(|stream| stream.cached_info().config.description.clone().unwrap_or_default());
+        if used_by.as_ref().is_some_and(|other| *other != self.description()) {
+            // Its jobs are not in the store of this node.
+            *lock(&self.queues) = None;
+            let stream = self.stream();
+            return Err(format!("the stream {stream} is that of another store: check store.url and broker.prefix"));
+        }
         let jobs = match found {
             Ok(stream) if self.queues().is_some() && has_locks => stream.cached_info().state.messages,
             _ => self.create().await?,
@@ -172,6 +224,7 @@ impl NatsState {
     async fn create(&self) -> Result<u64, String> {
         let config = StreamConfig {
             name: self.stream(),
+            description: Some(self.description()),
             subjects: vec![format!("{}.jobs.>", self.config.prefix)],
             retention: RetentionPolicy::WorkQueue,
             discard: DiscardPolicy::New,
@@ -197,12 +250,12 @@ impl NatsState {
                 queues.push(queue.map_err(|error| error.to_string())?);
             }
         }
-        *self.queues.lock().unwrap_or_else(PoisonError::into_inner) = Some(queues.into());
+        *lock(&self.queues) = Some(queues.into());
         Ok(info.state.messages)
     }
 
     fn queues(&self) -> Option<Arc<[Queue]>> {
-        self.queues.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        lock(&self.queues).clone()
     }
 
     fn subject_of(&self, job: &Dispatch) -> String {
@@ -214,80 +267,6 @@ impl NatsState {
     fn events_of(&self, id: &JobId) -> String {
         format!("{}.events.{}", self.config.prefix, id.as_str())
     }
-
-    /// Waits for a job and claims it, or returns an error of the server.
-    async fn next(&self) -> Result<Claim, String> {
-        let mut search = self.search.lock().await;
-        let search = &mut *search;
-        loop {
-            let queues = self.queues().ok_or("the stream does not exist yet")?;
-            if let Some(claim) = self.scan(search, &queues).await? {
-                search.announcements = None;
-                return Ok(claim);
-            }
-            let Some(announcements) = &mut search.announcements else {
-                // Jobs that are dispatched from now on are announced; earlier ones are found by another search.
-                let all = format!("{}.jobs.>", self.config.prefix);
-                let announcements = self.connection.queue_subscribe(all, "idle".to_owned()).await;
-                search.announcements = Some(announcements.map_err(|error| error.to_string())?);
-                self.connection.flush().await.map_err(|error| error.to_string())?;
-                search.filled.fill(true);
-                continue;
-            };
-            match timeout(POLL, announcements.next()).await {
-                Ok(Some(message)) => {
-                    let mut parts = message.subject.as_str().rsplit('.').skip(1);
-                    let mut number = || parts.next()?.parse::<usize>().ok();
-                    if let Some((class, lane)) = number().zip(number())
-                        && let Some(filled) = search.filled.get_mut(lane * CLASSES + class)
-                    {
-                        *filled = true;
-                    }
-                }
-                Ok(None) => search.announcements = None,
-                Err(_elapsed) => search.filled.fill(true),
-            }
-        }
-    }
-
-    /// Claims the first job of the lane whose turn it is, or of the next lane that has any.
-    async fn scan(&self, search: &mut JobSearch, queues: &[Queue]) -> Result<Option<Claim>, String> {
-        for step in 0..LANES {
-            let lane = (search.turn + step) % LANES;
-            let of_lane = search.filled.iter_mut().zip(queues).skip(lane * CLASSES).take(CLASSES);
-            for (filled, queue) in of_lane.filter(|(filled, _)| **filled) {
-                if let Some(claim) = self.fetch(queue).await? {
-                    search.turn = lane + 1;
-                    return Ok(Some(claim));
-                }
-                *filled = false;
-            }
-        }
-        Ok(None)
-    }
-
-    /// Claims the first job of a queue.
-    async fn fetch(&self, queue: &Queue) -> Result<Option<Claim>, String> {
-        let fetched = async {
-            let mut messages = queue.fetch().max_messages(1).messages().await.map_err(|error| error.to_string())?;
-            messages.next().await.transpose().map_err(|error| error.to_string())
-        };
-        let fetched =
-            timeout(REQUEST, fetched).await.map_err(|_elapsed| "no answer to a request for jobs".to_owned())??;
-        let Some(message) = fetched else { return Ok(None) };
-        let claims = message.info().map_or(1, |info| u32::try_from(info.delivered).unwrap_or(1));
-        if claims > 1 {
-            counter!(BROKER_REDELIVERIES).increment(1);
-        }
-        let (message, acker) = message.split();
-        let id = message.subject.as_str().rsplit('.').next().and_then(|id| id.parse().ok());
-        let Some(id) = id else {
-            // A message of another program.
-            drop(acker.ack_with(AckKind::Term).await);
-            return Ok(None);
-        };
-        Ok(Some(Claim::new(id, claims, NatsLease::start(acker, Duration::from_millis(self.config.lease_ms / 3)))))
-    }
 }
 
 impl Broker for NatsBroker {
@@ -297,15 +276,22 @@ impl Broker for NatsBroker {
             let failed = |error: &dyn std::fmt::Display| DispatchError::Unavailable { why: error.to_string() };
             let sent = self.0.context.send_publish(self.0.subject_of(job), message).await;
             match sent.map_err(|error| failed(&error))?.await {
-                Ok(_) => Ok(true),
+                Ok(_) => {
+                    self.0.queued.fetch_add(1, Ordering::Relaxed);
+                    Ok(true)
+                }
                 Err(error) if error.kind() == PublishErrorKind::WrongLastSequence => Ok(false),
-                Err(error) if error.to_string().contains("maximum messages exceeded") => Err(DispatchError::Full),
+                Err(error) if error.to_string().contains("maximum messages exceeded") => {
+                    self.0.queued.fetch_max(self.0.config.queue, Ordering::Relaxed);
+                    Err(DispatchError::Full)
+                }
                 Err(error) => Err(failed(&error)),
             }
         })
     }
 
     fn claim(&self) -> BoxFuture<'_, Claim> {
+        self.0.respond();
         Box::pin(async {
             loop {
                 match self.0.next().await {
@@ -348,17 +334,25 @@ impl Broker for NatsBroker {
         })
     }
 
+    fn has_workers(&self) -> BoxFuture<'_, bool> {
+        Box::pin(async {
+            let asked = timeout(POLL, self.0.connection.request(self.0.worker_subject(), Bytes::new())).await;
+            asked.is_ok_and(|answer| answer.is_ok())
+        })
+    }
+
     fn queued(&self) -> usize {
         self.0.queued.load(Ordering::Relaxed)
     }
 
     fn down(&self) -> Option<String> {
         if self.0.connection.connection_state() != State::Connected {
-            return Some("the broker is not connected".to_owned());
+            let failure = lock(&self.0.failure).clone().unwrap_or_else(|| "connecting".to_owned());
+            return Some(format!("not connected: {failure}"));
         }
         if self.0.checked.load(Ordering::Acquire) != self.0.losses.load(Ordering::Acquire) {
             return Some("the broker is being asked for its queue".to_owned());
         }
-        self.0.down.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        lock(&self.0.down).clone()
     }
 }

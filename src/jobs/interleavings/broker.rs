@@ -19,23 +19,23 @@ use crate::sync::thread;
 const JOBS: u64 = 3;
 
 /// Runs and ends of each job.
-type Ledger = std::sync::Mutex<BTreeMap<JobId, (u32, u32)>>;
+type RunCounts = std::sync::Mutex<BTreeMap<JobId, (u32, u32)>>;
 
-fn change(ledger: &Ledger, id: &JobId, change: impl FnOnce(&mut (u32, u32))) {
-    change(ledger.lock().unwrap().entry(id.clone()).or_default());
+fn change(counts: &RunCounts, id: &JobId, change: impl FnOnce(&mut (u32, u32))) {
+    change(counts.lock().unwrap().entry(id.clone()).or_default());
 }
 
 /// Runs a claimed job, which ends or returns to the queue. `returns_early` returns it before its run has ended.
-fn run(broker: &MemoryBroker, claim: Claim, ledger: &Ledger, returns_early: bool) {
+fn run(broker: &MemoryBroker, claim: Claim, counts: &RunCounts, returns_early: bool) {
     let id = claim.id.clone();
-    change(ledger, &id, |(runs, _)| {
+    change(counts, &id, |(runs, _)| {
         *runs += 1;
         assert_eq!(*runs, 1, "two workers run a job");
     });
     if returns_early {
         claim.release(Duration::ZERO);
         thread::yield_now();
-        change(ledger, &id, |(runs, _)| *runs -= 1);
+        change(counts, &id, |(runs, _)| *runs -= 1);
         return;
     }
     let lock = block_on(broker.lock(&Digest::of(id.as_str().as_bytes())));
@@ -43,7 +43,7 @@ fn run(broker: &MemoryBroker, claim: Claim, ledger: &Ledger, returns_early: bool
     thread::yield_now();
     drop(lock);
     let ends = thread_rng().gen_range(0..3) > 0;
-    change(ledger, &id, |(runs, ended)| {
+    change(counts, &id, |(runs, ended)| {
         *runs -= 1;
         *ended += u32::from(ends);
     });
@@ -57,7 +57,7 @@ fn run(broker: &MemoryBroker, claim: Claim, ledger: &Ledger, returns_early: bool
 /// Explores schedules of two nodes that dispatch the same jobs, and two workers.
 fn explore(returns_early: bool) {
     let model = move || {
-        let (broker, ledger) = (MemoryBroker::new(8), Arc::<Ledger>::default());
+        let (broker, counts) = (MemoryBroker::new(8), Arc::<RunCounts>::default());
         let job = |n: u64| JobId::from_key(&[0; 32], crate::store::Namespace::default(), n, "k");
         let jobs: Vec<_> = (0..JOBS).map(|n| Dispatch { id: job(n), client: Client(n % 2), urgency: 3 }).collect();
         let node = || {
@@ -69,7 +69,7 @@ fn explore(returns_early: bool) {
         let nodes: Vec<thread::JoinHandle<Vec<JobId>>> = vec![node(), node()];
         let stop = watch::Sender::new(false);
         let worker = || {
-            let (broker, ledger, mut stop) = (broker.clone(), Arc::clone(&ledger), stop.subscribe());
+            let (broker, counts, mut stop) = (broker.clone(), Arc::clone(&counts), stop.subscribe());
             thread::spawn(move || {
                 loop {
                     let next = async {
@@ -79,7 +79,7 @@ fn explore(returns_early: bool) {
                         }
                     };
                     let Some(claim) = block_on(next) else { return };
-                    run(&broker, claim, &ledger, returns_early);
+                    run(&broker, claim, &counts, returns_early);
                 }
             })
         };
@@ -93,13 +93,13 @@ fn explore(returns_early: bool) {
             worker.join().unwrap();
         }
         dispatched.sort();
-        let ledger = ledger.lock().unwrap().clone();
+        let counts = counts.lock().unwrap().clone();
         for id in &dispatched {
             let times = dispatched.iter().filter(|other| *other == id).count();
             // A job that has ended may be dispatched again by a node that does not know it.
-            assert_eq!(ledger[id], (0, u32::try_from(times).unwrap()), "a dispatched job ends once");
+            assert_eq!(counts[id], (0, u32::try_from(times).unwrap()), "a dispatched job ends once");
         }
-        assert_eq!(ledger.len() as u64, JOBS);
+        assert_eq!(counts.len() as u64, JOBS);
     };
     shuttle::check_random(model, SCHEDULES);
 }

@@ -1,0 +1,121 @@
+//! Search for the next job among the consumers of all lanes.
+
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use async_nats::Subscriber;
+use async_nats::jetstream::message::AckKind;
+use futures_util::StreamExt as _;
+use metrics::counter;
+use tokio::time::{sleep, timeout};
+
+use super::lease::NatsLease;
+use super::{CLASSES, LANES, NatsState, POLL, Queue, REQUEST};
+use crate::jobs::broker::Claim;
+use crate::telemetry::BROKER_REDELIVERIES;
+
+/// Number of searches after an announcement whose job is not found, and the pause before the first one, which doubles.
+const RETRIES: u32 = 5;
+const FIRST_RETRY: Duration = Duration::from_millis(2);
+
+/// State of the search for jobs.
+pub(super) struct JobSearch {
+    /// Queues that may have jobs.
+    filled: [bool; LANES * CLASSES],
+    /// Lane whose turn it is.
+    turn: usize,
+    /// Announcements of new jobs. Each idle node gets its share.
+    announcements: Option<Subscriber>,
+}
+
+impl Default for JobSearch {
+    fn default() -> Self {
+        Self { filled: [true; LANES * CLASSES], turn: 0, announcements: None }
+    }
+}
+
+impl NatsState {
+    /// Waits for a job and claims it, or returns an error of the server.
+    pub(super) async fn next(&self) -> Result<Claim, String> {
+        let mut search = self.search.lock().await;
+        let search = &mut *search;
+        let mut retries = 0;
+        loop {
+            let queues = self.queues().ok_or("the stream does not exist yet")?;
+            let before = search.filled;
+            if let Some(claim) = self.scan(search, &queues).await? {
+                search.announcements = None;
+                return Ok(claim);
+            }
+            if retries > 0 {
+                // An announcement may arrive before its job is in the stream.
+                sleep(FIRST_RETRY * (1 << (RETRIES - retries))).await;
+                (retries, search.filled) = (retries - 1, before);
+                continue;
+            }
+            let Some(announcements) = &mut search.announcements else {
+                // Jobs that are dispatched from now on are announced; earlier ones are found by another search.
+                let all = format!("{}.jobs.>", self.config.prefix);
+                let announcements = self.connection.queue_subscribe(all, "idle".to_owned()).await;
+                search.announcements = Some(announcements.map_err(|error| error.to_string())?);
+                self.connection.flush().await.map_err(|error| error.to_string())?;
+                search.filled.fill(true);
+                continue;
+            };
+            match timeout(POLL, announcements.next()).await {
+                Ok(Some(message)) => {
+                    let mut parts = message.subject.as_str().rsplit('.').skip(1);
+                    let mut number = || parts.next()?.parse::<usize>().ok();
+                    if let Some((class, lane)) = number().zip(number())
+                        && let Some(filled) = search.filled.get_mut(lane * CLASSES + class)
+                    {
+                        *filled = true;
+                        retries = RETRIES;
+                    }
+                }
+                Ok(None) => search.announcements = None,
+                // A job of a stopped worker returns without an announcement.
+                Err(_elapsed) => search.filled.fill(self.queued.load(Ordering::Relaxed) > 0),
+            }
+        }
+    }
+
+    /// Claims the first job of the lane whose turn it is, or of the next lane that has any.
+    async fn scan(&self, search: &mut JobSearch, queues: &[Queue]) -> Result<Option<Claim>, String> {
+        for step in 0..LANES {
+            let lane = (search.turn + step) % LANES;
+            let of_lane = search.filled.iter_mut().zip(queues).skip(lane * CLASSES).take(CLASSES);
+            for (filled, queue) in of_lane.filter(|(filled, _)| **filled) {
+                if let Some(claim) = self.fetch(queue).await? {
+                    search.turn = lane + 1;
+                    return Ok(Some(claim));
+                }
+                *filled = false;
+            }
+        }
+        Ok(None)
+    }
+
+    /// Claims the first job of a queue.
+    async fn fetch(&self, queue: &Queue) -> Result<Option<Claim>, String> {
+        let fetched = async {
+            let mut messages = queue.fetch().max_messages(1).messages().await.map_err(|error| error.to_string())?;
+            messages.next().await.transpose().map_err(|error| error.to_string())
+        };
+        let fetched =
+            timeout(REQUEST, fetched).await.map_err(|_elapsed| "no answer to a request for jobs".to_owned())??;
+        let Some(message) = fetched else { return Ok(None) };
+        let claims = message.info().map_or(1, |info| u32::try_from(info.delivered).unwrap_or(1));
+        if claims > 1 {
+            counter!(BROKER_REDELIVERIES).increment(1);
+        }
+        let (message, acker) = message.split();
+        let id = message.subject.as_str().rsplit('.').next().and_then(|id| id.parse().ok());
+        let Some(id) = id else {
+            // A message of another program.
+            drop(acker.ack_with(AckKind::Term).await);
+            return Ok(None);
+        };
+        Ok(Some(Claim::new(id, claims, NatsLease::start(acker, Duration::from_millis(self.config.lease_ms / 3)))))
+    }
+}

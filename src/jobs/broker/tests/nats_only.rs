@@ -1,0 +1,129 @@
+//! Tests of what only a broker with a server has.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use futures_util::StreamExt as _;
+
+use super::super::{Broker, Dispatch, NatsBroker};
+use super::server::{self, NatsServer};
+use super::{SOON, claim, job, nats, none_within};
+use crate::config::BrokerConfig;
+use crate::jobs::rank::DEFAULT_URGENCY;
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn jobs_are_dispatched_and_claimed_concurrently() {
+    // With `MOLMESH_DISPATCHES=20000` and `--no-capture` it prints the rates of a long run.
+    let n: usize = std::env::var("MOLMESH_DISPATCHES").map_or(1000, |n| n.parse().unwrap());
+    for program in server::programs() {
+        let server = NatsServer::start(&program);
+        let config = BrokerConfig { queue: n, ..BrokerConfig::default() };
+        let connect = async || Arc::new(NatsBroker::connect(&config, server.address(), "a").await.unwrap());
+        let nodes = [connect().await, connect().await, connect().await];
+        while nodes.iter().any(|node| node.down().is_some()) {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        let jobs: Vec<_> = (0..n as u64).map(|n| job(n % 100, DEFAULT_URGENCY)).collect();
+        let mut times = Vec::new();
+        for job in &jobs[..n / 10] {
+            let begun = Instant::now();
+            assert_eq!(nodes[0].dispatch(job).await, Ok(true));
+            times.push(begun.elapsed());
+        }
+        times.sort_unstable();
+        let begun = Instant::now();
+        let dispatch = |job: Dispatch| async {
+            let job = job;
+            assert_eq!(nodes[0].dispatch(&job).await, Ok(true));
+        };
+        futures_util::stream::iter(jobs[n / 10..].iter().cloned()).for_each_concurrent(64, dispatch).await;
+        let rate = (n - n / 10) as f64 / begun.elapsed().as_secs_f64();
+        let claimed = Arc::new(std::sync::atomic::AtomicUsize::new(0));
+        let begun = Instant::now();
+        let workers = nodes.map(|node| {
+            let claimed = Arc::clone(&claimed);
+            tokio::spawn(async move {
+                while claimed.fetch_add(1, std::sync::atomic::Ordering::Relaxed) < n {
+                    let claim = node.claim().await;
+                    // The job itself takes no time.
+                    tokio::spawn(claim.done());
+                }
+            })
+        });
+        for worker in workers {
+            worker.await.unwrap();
+        }
+        let claims = n as f64 / begun.elapsed().as_secs_f64();
+        println!(
+            "{}: dispatch p50 {:?}, p99 {:?}; {rate:.0} dispatches per s from one node; {claims:.0} claims per s by three",
+            program.display(),
+            times[times.len() / 2],
+            times[times.len() * 99 / 100]
+        );
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_node_with_another_store_gets_no_jobs() {
+    for program in server::programs() {
+        let server = NatsServer::start(&program);
+        let broker: Arc<dyn Broker> = Arc::new(nats(&server).await);
+        assert!(!broker.has_workers().await);
+        assert_eq!(broker.dispatch(&job(1, DEFAULT_URGENCY)).await, Ok(true));
+        let other = NatsBroker::connect(&BrokerConfig::default(), server.address(), "b").await.unwrap();
+        let begun = Instant::now();
+        while !other.down().is_some_and(|why| why.contains("another store")) {
+            assert!(begun.elapsed() < SOON, "{:?}", other.down());
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        none_within(&(Arc::new(other) as _), SOON / 2).await;
+        // Control: a node with the same store gets the job, and is found.
+        let same: Arc<dyn Broker> = Arc::new(nats(&server).await);
+        let claimed = claim(&same).await;
+        assert!(broker.has_workers().await);
+        claimed.done().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stream_that_cannot_be_created_is_reported() {
+    for program in server::programs() {
+        let server = NatsServer::start(&program);
+        let config = BrokerConfig { replicas: 3, ..BrokerConfig::default() };
+        let broker = NatsBroker::connect(&config, server.address(), "a").await.unwrap();
+        let begun = Instant::now();
+        while !broker.down().is_some_and(|why| why.contains("replicas")) {
+            assert!(begun.elapsed() < SOON, "{:?}", broker.down());
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_broker_that_comes_back_is_used_again() {
+    for program in server::programs() {
+        let mut server = NatsServer::start(&program);
+        let broker: Arc<dyn Broker> = Arc::new(nats(&server).await);
+        let queued = job(1, DEFAULT_URGENCY);
+        assert_eq!(broker.dispatch(&queued).await, Ok(true));
+        for keeps_data in [true, false] {
+            server.stop(keeps_data);
+            let begun = Instant::now();
+            while broker.down().is_none() {
+                assert!(begun.elapsed() < SOON, "the stop is not noticed");
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+            server.restart();
+            let begun = Instant::now();
+            while let Some(why) = broker.down() {
+                assert!(begun.elapsed() < SOON, "{why}");
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+            // Without its data the broker has lost the job.
+            assert_eq!(broker.dispatch(&queued).await, Ok(!keeps_data));
+            let claimed = claim(&broker).await;
+            assert_eq!(claimed.id, queued.id);
+            claimed.release(Duration::ZERO);
+        }
+    }
+}
