@@ -187,8 +187,13 @@ impl JobStore {
             Ok(Some(record)) if record.status.is_final() => {
                 job.publish_end(record);
                 self.0.open.remove(&id);
-                // Stops the runner if there is one.
-                job.stop.notify_one();
+                if job.is_owned() {
+                    job.stop.notify_one();
+                    // Removes the open record, which the runner may have written after the end of the job.
+                    if let Err(error) = self.0.write_job(job).await {
+                        tracing::debug!(job_id = %id, %error, "the open record of an ended job is removed later");
+                    }
+                }
                 true
             }
             Ok(Some(record)) => {
