@@ -196,7 +196,16 @@ impl Backend {
         range: Option<std::ops::Range<u64>>,
     ) -> Result<Option<GetResult>, StoreError> {
         let options = GetOptions { range: range.map(GetRange::Bounded), ..GetOptions::default() };
-        found(self.timed(self.objects.get_opts(&name.path(), options)).await).map_err(self.fail_at("get", name))
+        let read = found(self.timed(self.objects.get_opts(&name.path(), options)).await);
+        self.or_missing(read.map_err(self.fail_at("get", name))?).await
+    }
+
+    /// Returns what was found. Fails if nothing was found because the folder of the store is missing.
+    async fn or_missing<T>(&self, found: Option<T>) -> Result<Option<T>, StoreError> {
+        if found.is_none() {
+            self.check_folder().await?;
+        }
+        Ok(found)
     }
 
     /// Reads all bytes of an object.
@@ -229,7 +238,7 @@ impl Backend {
 
     pub(super) async fn head(&self, name: &Name) -> Result<Option<Meta>, StoreError> {
         let found = found(self.timed(self.objects.head(&name.path())).await).map_err(self.fail_at("head", name))?;
-        Ok(found.as_ref().map(Meta::from))
+        Ok(self.or_missing(found).await?.as_ref().map(Meta::from))
     }
 
     /// Removes an object. Succeeds if it does not exist.

@@ -266,6 +266,9 @@ fn a_folder_of_the_store_that_vanishes_is_not_created_again() {
         refused.problem(503, "store-failed");
     }
     assert_eq!(send(node.addr, "POST", "/v1/meshes?format=stl&resolution=1", &[], &sample(9)).status, 200);
+    // A structure of the store is not missing, it cannot be read.
+    let digest = molmesh::store::Digest::of(b"unknown");
+    get(node.addr, &format!("/v1/structures/{digest}")).problem(503, "store-failed");
     assert!(!store.exists());
     std::fs::rename(&away, &store).unwrap();
     successful(node.addr, &submit(node.addr, "/v1/meshes?format=stl&resolution=1", &sample(4)));
