@@ -5,7 +5,10 @@ use std::path::PathBuf;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::Secret;
+use super::{Config, Role, Secret};
+
+/// Shortest `broker.lease_ms`: workers extend their claims three times in it.
+const MIN_LEASE_MS: u64 = 1000;
 
 /// Dispatch of asynchronous jobs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -54,5 +57,30 @@ impl Default for BrokerConfig {
             transfer_wait_ms: 1000,
             queue: 10_000,
         }
+    }
+}
+
+impl Config {
+    /// Checks the settings of a cluster, and returns the fault.
+    pub(crate) fn check_cluster(&self) -> Result<(), &'static str> {
+        let (broker, url) = (&self.broker, self.store.url.as_deref());
+        let folder = url.and_then(|url| url.strip_prefix("file://"));
+        let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
+        let why = match (&broker.url, url) {
+            (None, _) if self.server.role != Role::All => "server.role needs broker.url: a node alone has every role",
+            (None, _) if folder.is_some() => "a folder in store.url needs broker.url: without it, set server.data_dir",
+            (None, _) => return Ok(()),
+            (Some(_), None) => "broker.url needs store.url: the nodes of a cluster share one store",
+            _ if folder.is_some_and(|path| !path.starts_with('/')) => "store.url: expected file:///absolute/path",
+            _ if broker.prefix.is_empty() || !broker.prefix.chars().all(is_plain) => {
+                "broker.prefix: expected letters, digits, `-` and `_`"
+            }
+            _ if broker.lease_ms < MIN_LEASE_MS => "broker.lease_ms: expected 1000 or more",
+            _ if broker.user.is_some() != broker.password.is_some() => {
+                "broker.user and broker.password belong together"
+            }
+            _ => return Ok(()),
+        };
+        Err(why)
     }
 }

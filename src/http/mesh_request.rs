@@ -217,7 +217,7 @@ impl MeshRequest {
         conditional::check_match(&headers, &delivery::etag(&key))?;
         let mut response = delivery::mesh(&app, Arc::clone(&finished), format, &key, timing, permit).await?;
         let answered = response.headers_mut();
-        if is_stored && results::will_be_stored(&app, &key, format, answered).await? {
+        if is_stored && results::will_be_stored(&app, &key, format, answered).await {
             answered.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, format.name())));
         }
         if let Some(cache) = cache {

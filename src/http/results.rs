@@ -237,20 +237,16 @@ async fn wait_for_save(app: &App, key: &ContentKey) {
 
 /// Returns true if a result that is being stored will be found at its address. `headers` are those of its response.
 /// Waits until it is stored only if the space may not suffice.
-pub(super) async fn will_be_stored(
-    app: &App,
-    key: &ContentKey,
-    format: Format,
-    headers: &HeaderMap,
-) -> Result<bool, Problem> {
+pub(super) async fn will_be_stored(app: &App, key: &ContentKey, format: Format, headers: &HeaderMap) -> bool {
     let bytes = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
     if let Some(bytes) = bytes
         && app.store.has_space(bytes).await
     {
-        return Ok(true);
+        return true;
     }
     wait_for_save(app, key).await;
-    Ok(jobs::is_stored(&app.store, format, key).await?)
+    // The store has logged its error. The mesh is sent without its address.
+    jobs::is_stored(&app.store, format, key).await.unwrap_or(false)
 }
 
 /// Waits until no result is being stored. No new results may be computed by then.

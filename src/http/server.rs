@@ -31,6 +31,8 @@ use crate::telemetry::{self, Recorder, TelemetryError, Traces};
 /// Interval of metrics upkeep.
 const UPKEEP: Duration = Duration::from_secs(5);
 
+/// Interval at which the state of the broker is read.
+const BROKER_CHECK: Duration = Duration::from_secs(1);
 /// Interval at which jobs that the broker has lost are dispatched again.
 const RECONCILE: Duration = Duration::from_mins(1);
 
@@ -116,7 +118,7 @@ impl Server {
     /// [`ServeError`].
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
         let Chosen { backend, reason, renderer, devices: found } = chosen;
-        check_cluster(&config)?;
+        config.check_cluster().map_err(ServeError::Cluster)?;
         let access = Arc::new(Access::open(&config)?);
         if access.sites().lacks_origins() {
             tracing::warn!("pages of other origins are rejected: set access.cors_origins to their origins, or to none");
@@ -268,30 +270,6 @@ async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Se
     Ok(job_store)
 }
 
-/// Shortest `broker.lease_ms`: workers extend their claims three times in it.
-const MIN_LEASE_MS: u64 = 1000;
-
-/// Rejects settings of a cluster that are wrong or incomplete.
-fn check_cluster(config: &Config) -> Result<(), ServeError> {
-    let (broker, url) = (&config.broker, config.store.url.as_deref());
-    let folder = url.and_then(|url| url.strip_prefix("file://"));
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
-    let why = match (&broker.url, url) {
-        (None, _) if config.server.role != Role::All => "server.role needs broker.url: a node alone has every role",
-        (None, _) if folder.is_some() => "a folder in store.url needs broker.url: without it, set server.data_dir",
-        (None, _) => return Ok(()),
-        (Some(_), None) => "broker.url needs store.url: the nodes of a cluster share one store",
-        _ if folder.is_some_and(|path| !path.starts_with('/')) => "store.url: expected file:///absolute/path",
-        _ if broker.prefix.is_empty() || !broker.prefix.chars().all(is_plain) => {
-            "broker.prefix: expected letters, digits, `-` and `_`"
-        }
-        _ if broker.lease_ms < MIN_LEASE_MS => "broker.lease_ms: expected 1000 or more",
-        _ if broker.user.is_some() != broker.password.is_some() => "broker.user and broker.password belong together",
-        _ => return Ok(()),
-    };
-    Err(ServeError::Cluster(why))
-}
-
 /// Shuts the service down in the phases that `orders` requests. Returns true if every request was finished.
 async fn wind_down(
     app: &Shared,
@@ -352,11 +330,18 @@ async fn publish(app: Shared, recorder: Option<Recorder>) {
 /// Dispatches jobs that the broker has lost, at regular intervals.
 async fn reconcile(jobs: JobStore) {
     loop {
-        tokio::time::sleep(RECONCILE).await;
+        // A broker that was away may have lost jobs.
+        while jobs.broker_down().is_some() {
+            tokio::time::sleep(BROKER_CHECK).await;
+        }
         match jobs.reconcile().await {
             Ok(0) => {}
             Ok(dispatched) => tracing::warn!(jobs = dispatched, "dispatched jobs that the broker did not have"),
             Err(error) => tracing::warn!(%error, "the records of jobs were not read"),
+        }
+        let end = tokio::time::Instant::now() + RECONCILE;
+        while tokio::time::Instant::now() < end && jobs.broker_down().is_none() {
+            tokio::time::sleep(BROKER_CHECK).await;
         }
     }
 }

@@ -94,7 +94,10 @@ pub(crate) trait Broker: Send + Sync {
     /// Returns the events of a job that are published from now on.
     fn events(&self, id: &JobId) -> BoxFuture<'_, BoxStream<'static, JobEvent>>;
 
-    /// Returns true if a worker claims jobs.
+    /// Tells other nodes that this node claims no more jobs.
+    fn stop(&self);
+
+    /// Returns true if a node that claims jobs answers.
     fn has_workers(&self) -> BoxFuture<'_, bool>;
 
     /// Returns the number of queued jobs.
@@ -135,8 +138,8 @@ pub(crate) trait Lease: Send + Sync {
     fn abandon(self: Box<Self>);
 }
 
-/// Claimed job. No other worker gets the job until the claim is dropped, or until its node has stopped. A claim that is
-/// dropped returns the job to the queue.
+/// Claimed job. No other worker gets the job until the claim ends, or until its node has not extended it for a lease. A
+/// claim that is dropped returns the job to the queue.
 #[must_use = "dropping the claim returns the job to the queue"]
 pub(crate) struct Claim {
     /// Id of the job.

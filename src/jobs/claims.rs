@@ -9,7 +9,7 @@ use tokio::sync::OwnedSemaphorePermit;
 use super::broker::{Claim, Dispatch, JobEvent};
 use super::durable_job::DurableJob;
 use super::job_store::JobStore;
-use super::record::JobRecord;
+use super::record::{JobRecord, Status};
 use super::retry;
 use super::runner::Runner;
 use super::{EndError, Refusal, Task};
@@ -63,6 +63,7 @@ impl JobStore {
     /// Claims no more jobs.
     pub(crate) fn stop_claiming(&self) {
         self.0.stopping.send_replace(true);
+        self.0.broker.stop();
     }
 
     async fn claim_jobs(self) {
@@ -154,9 +155,11 @@ impl JobStore {
                 Some(event) = events.next() => match event {
                     JobEvent::Ended => true,
                     JobEvent::Running { attempts, .. } if job.is_owned() => {
-                        if attempts > job.record().attempts {
+                        // An attempt that returned to the queue does not count any more.
+                        let own = job.record();
+                        if own.status == Status::Running && attempts > own.attempts {
                             tracing::warn!(job_id = %id, "another worker runs a later attempt of a job");
-                            job.stop.notify_one();
+                            job.stop().notify_one();
                         }
                         false
                     }
@@ -188,7 +191,7 @@ impl JobStore {
                 job.publish_end(record);
                 self.0.open.remove(&id);
                 if job.is_owned() {
-                    job.stop.notify_one();
+                    job.stop().notify_one();
                     // Removes the open record, which the runner may have written after the end of the job.
                     if let Err(error) = self.0.write_job(job).await {
                         tracing::debug!(job_id = %id, %error, "the open record of an ended job is removed later");

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use tokio::sync::{Notify, watch};
 
@@ -12,7 +13,7 @@ use super::record::{JobId, JobRecord, Status, now_ms};
 pub(super) struct DurableJob {
     pub(super) state: watch::Sender<JobView>,
     /// Signals the runner to stop the work: the job has ended, or a later attempt runs in another process.
-    pub(super) stop: Notify,
+    stop: Mutex<Arc<Notify>>,
     /// Held while the record is written.
     pub(super) writing: tokio::sync::Mutex<()>,
     /// True while a [`Runner`](super::runner::Runner) of this process runs the job.
@@ -25,13 +26,23 @@ impl DurableJob {
         // Later than every version of an earlier process, unless the job has ended.
         let version = record.finished_ms.unwrap_or_else(now_ms);
         let (state, _) = watch::channel(JobView { record, stage: None, fraction, version, end: None });
-        let (stop, writing) = (Notify::new(), tokio::sync::Mutex::default());
+        let (stop, writing) = (Mutex::default(), tokio::sync::Mutex::default());
         Self { state, stop, writing, owned: AtomicBool::new(false) }
     }
 
     /// Makes the caller the runner of the job. Returns false if it has one in this process.
     pub(super) fn try_own(&self) -> bool {
-        !self.owned.swap(true, Ordering::AcqRel)
+        let is_new = !self.owned.swap(true, Ordering::AcqRel);
+        if is_new {
+            // A signal to an earlier runner does not stop this one.
+            *self.stop.lock().unwrap_or_else(PoisonError::into_inner) = Arc::default();
+        }
+        is_new
+    }
+
+    /// Returns the signal to stop the work of the present runner.
+    pub(super) fn stop(&self) -> Arc<Notify> {
+        Arc::clone(&self.stop.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// Ends the ownership of the runner.

@@ -322,7 +322,7 @@ impl JobStore {
         }
         let Some(job) = self.known(id, namespace) else { return self.view(id, namespace).await };
         if job.end(Status::Dismissed, |_| {}) {
-            job.stop.notify_one();
+            job.stop().notify_one();
             let (inner, ended) = (Arc::clone(&self.0), Arc::clone(&job));
             let write = async move {
                 let written = inner.write_job(&ended).await;

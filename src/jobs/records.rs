@@ -224,6 +224,9 @@ impl JobStore {
             }
         }
         let mut dispatched = 0;
+        if inner.broker.down().is_some() {
+            return Ok(0);
+        }
         for dispatch in inner.open.all() {
             if inner.lock().jobs.get(&dispatch.id).is_some_and(|job| job.is_owned()) {
                 continue;

@@ -114,14 +114,14 @@ impl JobStore {
 impl Runner {
     async fn run(self, jobs: &JobStore) {
         let Self { job, digest, mut ticket, claim, mut slot } = self;
-        let mut pause = retry::FIRST_PAUSE;
+        let (mut pause, stop) = (retry::FIRST_PAUSE, job.stop());
         let mut counted = job.record().attempts - u32::from(ticket.is_some());
         let end = loop {
             let attempt = attempt(jobs, &job, (&mut ticket, &mut slot), digest);
             let attempt = tokio::select! {
                 attempt = attempt => attempt,
                 // Dropping the ticket stops the work.
-                () = job.stop.notified() => break if job.is_decided() { RunEnd::Done } else { RunEnd::Superseded },
+                () = stop.notified() => break if job.is_decided() { RunEnd::Done } else { RunEnd::Superseded },
             };
             match attempt {
                 Attempt::Ended(ending) => {
@@ -141,8 +141,7 @@ impl Runner {
                         break RunEnd::Done;
                     }
                     tracing::info!(job_id = %job.id(), %error, "a job waits for memory");
-                    jobs.return_to_queue(&job, counted, 1).await;
-                    break RunEnd::Return(memory_pause(waits));
+                    break jobs.return_to_queue(&job, (counted, 1), memory_pause(waits)).await;
                 }
                 Attempt::StoreFailed => {
                     counted = job.record().attempts;
@@ -150,10 +149,7 @@ impl Runner {
                     pause = (pause * 2).min(retry::MAX_PAUSE);
                 }
                 Attempt::Locked => break RunEnd::Return(LOCKED_DELAY),
-                Attempt::Stopped => {
-                    jobs.return_to_queue(&job, counted, 0).await;
-                    break RunEnd::Return(Duration::ZERO);
-                }
+                Attempt::Stopped => break jobs.return_to_queue(&job, (counted, 0), Duration::ZERO).await,
             }
         };
         job.release();
@@ -223,17 +219,17 @@ async fn attempt(
 
 /// Submits a claimed job to the pool. Waits while memory for its input is short.
 async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &JobRecord, digest: Digest) -> Result<Work, Attempt> {
-    if record.attempts >= jobs.0.config.attempts {
-        return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
-    }
     let (ticket, lock) = loop {
         if let Some(work) = join_or_load(jobs, job, record, digest).await? {
             break work;
         }
         sleep(PAUSE).await;
     };
-    if ticket.joined_running && job.begin() {
-        jobs.0.write_job(job).await.map_err(|error| store_failed(record, &error))?;
+    if ticket.joined_running
+        && job.begin()
+        && let Err(error) = jobs.0.write_job(job).await
+    {
+        tracing::error!(job_id = %job.id(), %error, "cannot record an attempt to run a job");
     }
     Ok((ticket, lock))
 }
@@ -259,6 +255,10 @@ async fn join_or_load(
         return Ok(Some((ticket, None)));
     }
     let lock = jobs.0.broker.lock(&work_key(&task)).await.ok_or(Attempt::Locked)?;
+    // Without the lock, the last attempt may still run on another node.
+    if record.attempts >= jobs.0.config.attempts {
+        return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
+    }
     // An earlier process may have ended between storing the result and updating the record.
     let stored = jobs.stored_result(&task, format).await.map_err(|error| store_failed(record, &error))?;
     if let Some(stored) = stored {
@@ -315,14 +315,18 @@ impl JobStore {
     }
 
     /// Marks a job as accepted again, with `attempts` attempts and `memory_waits` more that lacked memory, and writes
-    /// the record. An attempt does not count if the service stopped it or if memory was short.
-    async fn return_to_queue(&self, job: &DurableJob, attempts: u32, memory_waits: u32) {
-        if !self.is_superseded(job).await
-            && job.return_to_queue(attempts, memory_waits)
+    /// the record. An attempt does not count if the service stopped it or if memory was short. The job can be claimed
+    /// again after `delay`, unless another worker has claimed it already.
+    async fn return_to_queue(&self, job: &DurableJob, (attempts, memory_waits): (u32, u32), delay: Duration) -> RunEnd {
+        if self.is_superseded(job).await {
+            return RunEnd::Superseded;
+        }
+        if job.return_to_queue(attempts, memory_waits)
             && let Err(error) = self.0.write_job(job).await
         {
             tracing::warn!(job_id = %job.id(), %error, "an interrupted attempt is counted");
         }
+        RunEnd::Return(delay)
     }
 
     /// Returns true if another process has begun a later attempt of a job, because the claim of this one had expired.

@@ -248,6 +248,7 @@ impl Backend {
 
     /// Lists the objects of a folder in name order. Ignores files with other names.
     pub(super) async fn list(&self, folder: Folder) -> Result<Vec<(Name, Meta)>, StoreError> {
+        self.check_folder().await?;
         let listed = self.objects.list(Some(&Path::from(folder.as_str())));
         let parsed = |meta: ObjectMeta| Some((Name::from_path(meta.location.as_ref())?, Meta::from(&meta)));
         let fail = |e| self.fail("list", folder.as_str(), &e);

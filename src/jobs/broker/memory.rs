@@ -222,6 +222,8 @@ impl Broker for MemoryBroker {
         Box::pin(std::future::ready(stream::unfold((receiver, id), next).boxed()))
     }
 
+    fn stop(&self) {}
+
     fn has_workers(&self) -> BoxFuture<'_, bool> {
         Box::pin(std::future::ready(true))
     }

@@ -173,13 +173,14 @@ impl NatsState {
     }
 
     /// Answers nodes that look for a worker.
-    fn respond(&self) {
+    fn respond(self: &Arc<Self>) {
         self.responder.get_or_init(|| {
-            let (connection, subject) = (self.connection.clone(), self.worker_subject());
+            let (connection, subject, state) = (self.connection.clone(), self.worker_subject(), Arc::downgrade(self));
             let respond = async move {
                 let Ok(mut asked) = connection.queue_subscribe(subject, "workers".to_owned()).await else { return };
                 while let Some(request) = asked.next().await {
-                    if let Some(reply) = request.reply {
+                    let claims = state.upgrade().is_some_and(|state| state.queues().is_some());
+                    if let Some(reply) = request.reply.filter(|_| claims) {
                         drop(connection.publish(reply, Bytes::new()).await);
                     }
                 }
@@ -332,6 +333,12 @@ impl Broker for NatsBroker {
                 }
             }
         })
+    }
+
+    fn stop(&self) {
+        if let Some(responder) = self.0.responder.get() {
+            responder.abort();
+        }
     }
 
     fn has_workers(&self) -> BoxFuture<'_, bool> {

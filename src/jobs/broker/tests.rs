@@ -151,6 +151,35 @@ async fn a_client_with_many_jobs_delays_others_by_one_job() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_client_that_comes_later_gets_its_turn() {
+    with_all(|shared| async move {
+        let broker = shared.node().await;
+        for _ in 0..30 {
+            assert_eq!(broker.dispatch(&job(1, DEFAULT_URGENCY)).await, Ok(true));
+        }
+        // The other queues are known to be empty now.
+        for _ in 0..3 {
+            claim(&broker).await.done().await;
+        }
+        let later = job(2, 0);
+        assert_eq!(broker.dispatch(&later).await, Ok(true));
+        let mut jobs_before = 0;
+        loop {
+            let claimed = claim(&broker).await;
+            let is_later = claimed.id == later.id;
+            claimed.done().await;
+            if is_later {
+                break;
+            }
+            jobs_before += 1;
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+        assert!(jobs_before <= 15, "{jobs_before} jobs of the other client came first");
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_is_queued_once_until_it_is_done() {
     with_all(|shared| async move {
         let (a, b) = (shared.node().await, shared.node().await);

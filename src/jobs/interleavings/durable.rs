@@ -207,7 +207,7 @@ impl Client<'_> {
         let Some(job) = self.fixture.jobs.0.lock().jobs.get(&id()).cloned() else { return };
         if job.end(Status::Dismissed, |_| {}) {
             job.publish_end(job.record());
-            job.stop.notify_one();
+            job.stop().notify_one();
             block_on(self.fixture.jobs.0.write_job(&job)).unwrap();
         }
     }

@@ -13,7 +13,7 @@ use crate::config::{JobsConfig, StoreConfig};
 use crate::formats::Format;
 use crate::jobs::broker::tests::{nats, server};
 use crate::jobs::{
-    Broker, Budget, EndError, JobId, JobSpec, JobStore, MemoryBroker, Pool, Settings, Status, Structures,
+    Broker, Budget, EndError, JobId, JobSpec, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Status, Structures,
 };
 use crate::picture::SelectedRenderer;
 use crate::pipeline::JobLimits;
@@ -146,7 +146,7 @@ async fn jobs_that_the_broker_has_lost_are_dispatched_again() {
         let shared = tempfile::tempdir().unwrap();
         let connect = async || Arc::new(nats(&server).await);
         let (broker, other) = (connect().await, connect().await);
-        let (a, b) = (node(shared.path(), broker.clone() as _).await, node(shared.path(), other as _).await);
+        let (a, b) = (node(shared.path(), broker.clone() as _).await, node(shared.path(), other.clone() as _).await);
         let mut ids = Vec::new();
         for resolution in ["2", "2.1", "2.2"] {
             ids.push(a.accept(resolution, None).await);
@@ -154,7 +154,8 @@ async fn jobs_that_the_broker_has_lost_are_dispatched_again() {
         assert_eq!((a.jobs.reconcile().await.unwrap(), b.jobs.reconcile().await.unwrap()), (0, 0), "none is lost");
         server.stop(false);
         server.restart();
-        until("the broker", || async { broker.down().is_none() && broker.queued() == 0 }).await;
+        let is_back = |broker: &NatsBroker| broker.down().is_none() && broker.queued() == 0;
+        until("the broker", || async { is_back(&broker) && is_back(&other) }).await;
         assert_eq!((b.jobs.reconcile().await.unwrap(), a.jobs.reconcile().await.unwrap()), (3, 0));
         b.jobs.start_claiming();
         for id in &ids {

@@ -42,6 +42,9 @@ spec:
       imagePullPolicy: {{ .root.Values.image.pullPolicy }}
       env:
         - { name: MOLMESH__SERVER__ROLE, value: {{ .role }} }
+        {{- range $name, $value := .root.Values.environment }}
+        - { name: {{ $name }}, value: {{ $value | quote }} }
+        {{- end }}
         {{- with .jobs }}
         - { name: MOLMESH__JOBS__WORKERS, value: {{ . | quote }} }
         {{- end }}
@@ -70,9 +73,9 @@ spec:
         capabilities: { drop: [ALL] }
       resources:
         {{- toYaml .resources | nindent 8 }}
-      # Ready after the first mesh. A GPU builds its pipelines before that.
+      # A worker is ready after its first mesh. A GPU builds its pipelines before that.
       startupProbe:
-        httpGet: { path: /readyz, port: http }
+        httpGet: { path: {{ if eq .role "api" }}/livez{{ else }}/readyz{{ end }}, port: http }
         periodSeconds: 1
         timeoutSeconds: 2
         failureThreshold: 120

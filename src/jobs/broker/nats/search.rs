@@ -1,7 +1,7 @@
 //! Search for the next job among the consumers of all lanes.
 
 use std::sync::atomic::Ordering;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use async_nats::Subscriber;
 use async_nats::jetstream::message::AckKind;
@@ -14,14 +14,16 @@ use super::{CLASSES, LANES, NatsState, POLL, Queue, REQUEST};
 use crate::jobs::broker::Claim;
 use crate::telemetry::BROKER_REDELIVERIES;
 
+/// Time for which a queue without jobs is not asked again, so that a busy worker asks each queue once a second.
+const EMPTY: Duration = Duration::from_secs(1);
 /// Number of searches after an announcement whose job is not found, and the pause before the first one, which doubles.
 const RETRIES: u32 = 5;
 const FIRST_RETRY: Duration = Duration::from_millis(2);
 
 /// State of the search for jobs.
 pub(super) struct JobSearch {
-    /// Queues that may have jobs.
-    filled: [bool; LANES * CLASSES],
+    /// Time until which each queue is assumed to be empty.
+    empty_until: [Instant; LANES * CLASSES],
     /// Lane whose turn it is.
     turn: usize,
     /// Announcements of new jobs. Each idle node gets its share.
@@ -30,7 +32,7 @@ pub(super) struct JobSearch {
 
 impl Default for JobSearch {
     fn default() -> Self {
-        Self { filled: [true; LANES * CLASSES], turn: 0, announcements: None }
+        Self { empty_until: [Instant::now(); LANES * CLASSES], turn: 0, announcements: None }
     }
 }
 
@@ -42,7 +44,7 @@ impl NatsState {
         let mut retries = 0;
         loop {
             let queues = self.queues().ok_or("the stream does not exist yet")?;
-            let before = search.filled;
+            let before = search.empty_until;
             if let Some(claim) = self.scan(search, &queues).await? {
                 search.announcements = None;
                 return Ok(claim);
@@ -50,7 +52,7 @@ impl NatsState {
             if retries > 0 {
                 // An announcement may arrive before its job is in the stream.
                 sleep(FIRST_RETRY * (1 << (RETRIES - retries))).await;
-                (retries, search.filled) = (retries - 1, before);
+                (retries, search.empty_until) = (retries - 1, before);
                 continue;
             }
             let Some(announcements) = &mut search.announcements else {
@@ -59,23 +61,28 @@ impl NatsState {
                 let announcements = self.connection.queue_subscribe(all, "idle".to_owned()).await;
                 search.announcements = Some(announcements.map_err(|error| error.to_string())?);
                 self.connection.flush().await.map_err(|error| error.to_string())?;
-                search.filled.fill(true);
+                search.empty_until = [Instant::now(); LANES * CLASSES];
                 continue;
             };
-            match timeout(POLL, announcements.next()).await {
-                Ok(Some(message)) => {
-                    let mut parts = message.subject.as_str().rsplit('.').skip(1);
-                    let mut number = || parts.next()?.parse::<usize>().ok();
-                    if let Some((class, lane)) = number().zip(number())
-                        && let Some(filled) = search.filled.get_mut(lane * CLASSES + class)
-                    {
-                        *filled = true;
-                        retries = RETRIES;
-                    }
+            let announced = loop {
+                match timeout(POLL, announcements.next()).await {
+                    Ok(announced) => break announced,
+                    // A job of a stopped worker returns without an announcement.
+                    Err(_elapsed) if self.queued.load(Ordering::Relaxed) > 0 => break None,
+                    Err(_elapsed) => {}
                 }
-                Ok(None) => search.announcements = None,
-                // A job of a stopped worker returns without an announcement.
-                Err(_elapsed) => search.filled.fill(self.queued.load(Ordering::Relaxed) > 0),
+            };
+            let Some(message) = announced else {
+                search.announcements = None;
+                continue;
+            };
+            let mut parts = message.subject.as_str().rsplit('.').skip(1);
+            let mut number = || parts.next()?.parse::<usize>().ok();
+            if let Some((class, lane)) = number().zip(number())
+                && let Some(until) = search.empty_until.get_mut(lane * CLASSES + class)
+            {
+                *until = Instant::now();
+                retries = RETRIES;
             }
         }
     }
@@ -84,13 +91,13 @@ impl NatsState {
     async fn scan(&self, search: &mut JobSearch, queues: &[Queue]) -> Result<Option<Claim>, String> {
         for step in 0..LANES {
             let lane = (search.turn + step) % LANES;
-            let of_lane = search.filled.iter_mut().zip(queues).skip(lane * CLASSES).take(CLASSES);
-            for (filled, queue) in of_lane.filter(|(filled, _)| **filled) {
+            let of_lane = search.empty_until.iter_mut().zip(queues).skip(lane * CLASSES).take(CLASSES);
+            for (until, queue) in of_lane.filter(|(until, _)| **until <= Instant::now()) {
                 if let Some(claim) = self.fetch(queue).await? {
                     search.turn = lane + 1;
                     return Ok(Some(claim));
                 }
-                *filled = false;
+                *until = Instant::now() + EMPTY;
             }
         }
         Ok(None)
