@@ -37,6 +37,9 @@ class Network:
         self.names = [f"mmw{n}" for n in range(number)]
         for n, name in enumerate(self.names):
             host, inside = NETWORK.format(n, 1), NETWORK.format(n, 2)
+            # What an interrupted run has left.
+            run("ip", "link", "del", f"{name}h", check=False)
+            run("ip", "netns", "del", name, check=False)
             run("ip", "netns", "add", name)
             run("ip", "link", "add", f"{name}h", "type", "veth", "peer", "name", f"{name}i", "netns", name)
             run("ip", "addr", "add", f"{host}/24", "dev", f"{name}h")
