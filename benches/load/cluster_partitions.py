@@ -37,7 +37,7 @@ class Network:
         self.names = [f"mmw{n}" for n in range(number)]
         for n, name in enumerate(self.names):
             host, inside = NETWORK.format(n, 1), NETWORK.format(n, 2)
-            # What an interrupted run has left.
+            # Remains of an interrupted run.
             run("ip", "link", "del", f"{name}h", check=False)
             run("ip", "netns", "del", name, check=False)
             run("ip", "netns", "add", name)
