@@ -262,8 +262,12 @@ fn a_damaged_structure_is_neither_used_nor_kept_by_another_upload() {
         assert_eq!(server.post("/v1/structures", &[], SAMPLE).status, 201);
         assert_eq!(std::fs::read(&stored).unwrap(), SAMPLE);
         std::fs::write(&stored, damaged).unwrap();
-        assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE).status, 202);
+        let accepted = server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE);
+        assert_eq!(accepted.status, 202);
         assert_eq!(std::fs::read(&stored).unwrap(), SAMPLE);
+        // The worker reads the file as well.
+        let job = accepted.header("location").unwrap();
+        assert_eq!(server.get(&format!("{job}?wait=20")).json()["status"], "successful");
         assert!((verified() - 3.0 * (n as f64 + 1.0)).abs() < 0.5);
     }
     // Undamaged, it is not written again, and the service remains ready.
