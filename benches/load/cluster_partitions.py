@@ -146,19 +146,13 @@ def attack(cluster, network, expected, dice, args):
     stop, go_on = (lambda: queue.send_signal(signal.SIGSTOP)), (lambda: queue.send_signal(signal.SIGCONT))
     good &= away("NATS", port, structure, key, stop, go_on)
     hidden = cluster.store + ".away"
-    hide, show = (lambda: os.rename(cluster.store, hidden)), (lambda: restore(cluster.store, hidden))
+    hide, show = (lambda: os.rename(cluster.store, hidden)), (lambda: os.rename(hidden, cluster.store))
     good &= away("the store", port, structure, key, hide, show)
     clients.finish()
     deadline = time.monotonic() + FINISH_TIMEOUT
     ends = collections.Counter(outcome(port, job, mesh, deadline) for job, mesh in clients.jobs.items())
     print(f"{len(clients.jobs)} accepted jobs: {dict(ends)}")
     return good and set(ends) == {"successful"}
-
-
-def restore(folder, hidden):
-    """Puts the folder of the store back. The service may have created parts of it meanwhile."""
-    subprocess.run(["rm", "-rf", folder], check=True)
-    os.rename(hidden, folder)
 
 
 if __name__ == "__main__":

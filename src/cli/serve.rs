@@ -62,7 +62,6 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
             match error {
                 // Keys and secrets are part of the configuration.
                 ServeError::Access(error) => CliError::usage(error.to_string()),
-                ServeError::Cluster(why) => CliError::usage(why.to_owned()),
                 ServeError::Lock(error @ LockError::Held { .. }) => CliError::InUse(error.to_string()),
                 error => CliError::Service(error.to_string()),
             }

@@ -36,7 +36,8 @@ pub struct BrokerConfig {
     /// their claims three times in this time.
     pub lease_ms: u64,
     /// Estimated time in the queue of a node above which other nodes compute the meshes of its synchronous requests,
-    /// ms. Default 1,000: a transfer takes some 20 ms. Nodes with the role `api` transfer all such requests.
+    /// ms. Default 1,000: a transfer also writes input, record and result. Nodes with the role `api` transfer all such
+    /// requests.
     pub transfer_wait_ms: u64,
     /// Number of asynchronous jobs that wait for a worker; with `url`, of jobs that wait or run. Default 10,000: at 0.1
     /// s per job on two workers the last one waits for eight minutes. Further requests for jobs get a 503 with an
@@ -62,7 +63,7 @@ impl Default for BrokerConfig {
 
 impl Config {
     /// Checks the settings of a cluster, and returns the fault.
-    pub(crate) fn check_cluster(&self) -> Result<(), &'static str> {
+    pub(super) fn check_cluster(&self) -> Result<(), &'static str> {
         let (broker, url) = (&self.broker, self.store.url.as_deref());
         let folder = url.and_then(|url| url.strip_prefix("file://"));
         let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);

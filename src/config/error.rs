@@ -55,6 +55,9 @@ pub enum ConfigError {
         /// Layer that set the key.
         source_layer: ConfigSource,
     },
+    /// Settings of a cluster contradict each other or are incomplete.
+    #[error("{0}")]
+    Contradiction(&'static str),
     /// A value has the wrong type or is out of range.
     #[error("{source_layer}: `{key}` is {value}; expected {expected}")]
     BadValue {

@@ -141,6 +141,7 @@ pub fn load(
         tree.set(key, &Value::String(value.clone()), &ConfigSource::Flag)?;
     }
     let mut warnings = tree.read_secrets()?;
+    tree.config.check_cluster().map_err(ConfigError::Contradiction)?;
     warnings.extend(others.iter().filter_map(|(name, _)| tree.misspelt(name)));
     Ok(Loaded { config: tree.config, warnings, sources: tree.sources })
 }

@@ -64,9 +64,6 @@ pub enum ServeError {
     /// The data folder is in use or cannot be locked.
     #[error(transparent)]
     Lock(#[from] LockError),
-    /// The settings of a cluster contradict each other.
-    #[error("{0}")]
-    Cluster(&'static str),
     /// The address or the credentials of the broker are malformed.
     #[error("cannot use the broker (broker.url): {0}")]
     Broker(String),
@@ -118,7 +115,6 @@ impl Server {
     /// [`ServeError`].
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
         let Chosen { backend, reason, renderer, devices: found } = chosen;
-        config.check_cluster().map_err(ServeError::Cluster)?;
         let access = Arc::new(Access::open(&config)?);
         if access.sites().lacks_origins() {
             tracing::warn!("pages of other origins are rejected: set access.cors_origins to their origins, or to none");

@@ -49,13 +49,11 @@ impl MeshRequest {
     /// checks and reports stay, because the store does not hold their results.
     pub(super) async fn is_transferred(&self) -> bool {
         let Self { app, parsed, preferences, method, .. } = self;
-        let (broker, is_busy) = (&app.config.broker, || {
-            let limit = Duration::from_millis(app.config.broker.transfer_wait_ms);
-            app.config.server.role == Role::Api || app.pool.estimated_wait() > limit
-        });
+        let limit = Duration::from_millis(app.config.broker.transfer_wait_ms);
+        let is_busy = || app.config.server.role == Role::Api || app.pool.estimated_wait() > limit;
         let is_file = !parsed.report && !parsed.request.strict && !parsed.declared.is_structure();
         let is_plain = preferences.wait.is_none() && *method != Method::HEAD;
-        broker.url.is_some() && is_file && is_plain && is_busy() && app.job_store.has_workers().await
+        app.config.broker.url.is_some() && is_file && is_plain && is_busy() && app.job_store.has_workers().await
     }
 
     /// Waits until a worker of the cluster has stored the mesh, and returns it.

@@ -45,7 +45,7 @@ impl Dispatch {
     }
 }
 
-/// State of a job that the node which runs it publishes.
+/// News of a job, published by the node that runs or cancels it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum JobEvent {
@@ -144,20 +144,18 @@ pub(crate) trait Lease: Send + Sync {
 pub(crate) struct Claim {
     /// Id of the job.
     pub(crate) id: JobId,
-    /// Number of claims of the job since it was dispatched, this one included.
-    pub(crate) claims: u32,
     lease: Option<Box<dyn Lease>>,
 }
 
 impl fmt::Debug for Claim {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Claim").field("id", &self.id).field("claims", &self.claims).finish_non_exhaustive()
+        f.debug_struct("Claim").field("id", &self.id).finish_non_exhaustive()
     }
 }
 
 impl Claim {
-    fn new(id: JobId, claims: u32, lease: impl Lease + 'static) -> Self {
-        Self { id, claims, lease: Some(Box::new(lease)) }
+    fn new(id: JobId, lease: impl Lease + 'static) -> Self {
+        Self { id, lease: Some(Box::new(lease)) }
     }
 
     /// Leaves the job to another worker that has claimed it meanwhile.

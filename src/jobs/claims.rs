@@ -95,7 +95,10 @@ impl JobStore {
             // Its end could not be written before.
             match self.0.write_job(&job).await {
                 Ok(()) => claim.done().await,
-                Err(_logged) => claim.release(DUPLICATE),
+                Err(error) => {
+                    tracing::error!(job_id = %job.id(), %error, "cannot record the end of a job");
+                    claim.release(DUPLICATE);
+                }
             }
             return;
         }
@@ -138,8 +141,8 @@ impl JobStore {
         job
     }
 
-    /// Updates the state of a job until it has ended or nobody watches it any more: the job may run, or be dismissed,
-    /// in another process.
+    /// Updates the state of a job until it has ended or has no watcher any more: the job may run, or be dismissed, in
+    /// another process.
     async fn follow(self, job: Arc<DurableJob>) {
         let id = job.id();
         let mut events = self.0.broker.events(&id).await;

@@ -229,7 +229,7 @@ impl JobStore {
             return Err(self.queue_full(&spec.task).into());
         }
         let (digest, map) = (spec.task.digest, spec.map.as_ref().map(|(digest, _)| *digest));
-        // A client that gets an id finds its job, even if the store is over its capacity.
+        // Nothing of the job is evicted meanwhile.
         let pins = inner.pins(&id, [digest].into_iter().chain(map), namespace)?;
         let reservation = inner.admit(&id).await?;
         inner.store.put_input(&digest, namespace, spec.file).await?;

@@ -37,6 +37,24 @@ pub(crate) struct Settings {
     pub(crate) tracer: Tracer,
 }
 
+#[cfg(test)]
+impl Settings {
+    /// Returns settings for tests: CPU pictures and a small cache of structures.
+    pub(super) fn of_test(workers: usize, budget: Budget) -> Self {
+        Self {
+            workers,
+            queue: 8,
+            batch_max_delay: Duration::from_secs(10),
+            limits: JobLimits::default(),
+            structures: Structures::new(1 << 20, &budget),
+            budget,
+            renderer: SelectedRenderer::cpu("a test"),
+            meter: None,
+            tracer: Tracer::default(),
+        }
+    }
+}
+
 /// Callback with the time that a worker spent on a job of a client, successful or not. A shared job is charged to its
 /// first client. The callback precedes the outcome.
 pub(crate) type UsageRecorder = Arc<dyn Fn(Client, Duration) + Send + Sync>;

@@ -20,16 +20,15 @@ use super::rank::{Client, DEFAULT_URGENCY, Rank};
 use super::record::{JobRecord, Requester, now_ms};
 use super::{
     AcceptError, Budget, EndError, Input, JobId, JobSpec, JobStore, JobView, MemoryBroker, OnStart, Pool, Settings,
-    Status, Structures, Task,
+    Status, Task,
 };
 use crate::config::JobsConfig;
 use crate::formats::Format;
-use crate::picture::SelectedRenderer;
-use crate::pipeline::{JobLimits, params};
+use crate::pipeline::params;
 use crate::store::faulty::{Faults, faulty_in};
 use crate::store::{Digest, Folder, Name, Namespace, Store, StoreError};
 use crate::surface::ReferenceBackend;
-use crate::telemetry::{SpanParent, Tracer};
+use crate::telemetry::SpanParent;
 
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 /// Maximum time of a step of a test.
@@ -57,17 +56,7 @@ impl Fixture {
 
     async fn open_within(dir: TempDir, config: JobsConfig, budget: Budget) -> Self {
         let (faults, store) = faulty_in(dir.path(), 1 << 30).await;
-        let settings = Settings {
-            workers: 1,
-            queue: 8,
-            batch_max_delay: Duration::from_secs(10),
-            limits: JobLimits::default(),
-            structures: Structures::new(1 << 20, &budget),
-            budget,
-            renderer: SelectedRenderer::cpu("a test"),
-            meter: None,
-            tracer: Tracer::default(),
-        };
+        let settings = Settings::of_test(1, budget);
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
         let broker = MemoryBroker::new(1000);

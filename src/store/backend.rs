@@ -58,6 +58,8 @@ pub(super) struct Backend {
     kind: StorageKind,
     /// Folder, or URL without credentials, for messages.
     location: String,
+    /// Configuration key of the location.
+    key: &'static str,
     /// True once the folder has a secret, without which it is another folder, such as that below a lost mount.
     has_secret: AtomicBool,
     /// Time limit of an operation of a folder. The client of S3 has time limits of its own.
@@ -73,13 +75,7 @@ impl Backend {
             let failed = |reason| StoreError::Open { key: "store.url", location: url.clone(), reason };
             let (objects, bucket) = s3::connect(config, url).map_err(failed)?;
             let location = url.trim_end_matches('/').to_owned();
-            return Ok(Self {
-                objects,
-                kind: StorageKind::S3(bucket),
-                location,
-                limit,
-                has_secret: AtomicBool::new(false),
-            });
+            return Ok(Self::new(objects, StorageKind::S3(bucket), ("store.url", location), limit));
         }
         let root = shared.map_or_else(|| folder_of(data_dir), PathBuf::from);
         let key = if shared.is_some() { "store.url" } else { "server.data_dir" };
@@ -101,20 +97,24 @@ impl Backend {
         });
         let opened = opened.await.unwrap_or_else(|e| Err(e.to_string()));
         let failed = |reason| StoreError::Open { key, location: location.clone(), reason };
-        Ok(Self {
-            objects: Arc::new(opened.map_err(failed)?),
-            kind: StorageKind::Local(root),
-            location,
-            limit,
-            has_secret: AtomicBool::new(false),
-        })
+        let objects = Arc::new(opened.map_err(failed)?);
+        Ok(Self::new(objects, StorageKind::Local(root), (key, location), limit))
+    }
+
+    fn new(
+        objects: Arc<dyn ObjectStore>,
+        kind: StorageKind,
+        (key, location): (&'static str, String),
+        limit: Duration,
+    ) -> Self {
+        Self { objects, kind, location, key, has_secret: AtomicBool::new(false), limit }
     }
 
     /// Creates a backend over a folder with injected behaviour, for tests.
     #[cfg(test)]
     pub(super) fn over(objects: Arc<dyn ObjectStore>, root: PathBuf, config: &StoreConfig) -> Self {
         let (location, limit) = (root.display().to_string(), Duration::from_millis(config.timeout_ms));
-        Self { objects, kind: StorageKind::Local(root), location, limit, has_secret: AtomicBool::new(false) }
+        Self::new(objects, StorageKind::Local(root), ("server.data_dir", location), limit)
     }
 
     /// Returns the location, for messages.
@@ -124,8 +124,7 @@ impl Backend {
 
     /// Converts an error to [`StoreError::Open`], with the configuration key of the location.
     pub(super) fn open_error(&self, error: &StoreError) -> StoreError {
-        let key = if self.is_local() { "server.data_dir" } else { "store.url" };
-        StoreError::Open { key, location: self.location.clone(), reason: error.to_string() }
+        StoreError::Open { key: self.key, location: self.location.clone(), reason: error.to_string() }
     }
 
     pub(super) fn is_local(&self) -> bool {

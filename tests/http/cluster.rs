@@ -175,7 +175,7 @@ fn a_cluster_recovers_from_the_loss_of_its_queue() {
             let refused = send(api.addr, "POST", "/v1/meshes?format=stl", &[ASYNCHRONOUS], &sample(1));
             refused.problem(503, "broker-failed");
             assert!(refused.header("retry-after").unwrap().parse::<u64>().unwrap() >= 1);
-            // What needs no queue goes on.
+            // Other requests are answered.
             assert!(!result(api.addr, &known).is_empty());
             assert_eq!(send(api.addr, "POST", "/v1/meshes?format=stl", &[], &sample(2)).status, 200);
             cluster.nats.restart();

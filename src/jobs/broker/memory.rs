@@ -27,7 +27,6 @@ type Place = (u8, u64);
 struct HeldJob {
     client: Client,
     place: Place,
-    claims: u32,
 }
 
 #[derive(Debug, Default)]
@@ -56,7 +55,7 @@ impl BrokerState {
     }
 
     /// Takes the first job of the client whose turn it is.
-    fn take(&mut self) -> Option<(JobId, u32)> {
+    fn take(&mut self) -> Option<JobId> {
         let client = self.turns.pop_front()?;
         let jobs = self.queued.get_mut(&client)?;
         let (_, id) = jobs.pop_first()?;
@@ -66,9 +65,7 @@ impl BrokerState {
             self.turns.push_back(client);
         }
         self.count(self.waiting - 1);
-        let job = self.held.get_mut(&id)?;
-        job.claims += 1;
-        Some((id, job.claims))
+        Some(id)
     }
 
     fn count(&mut self, waiting: usize) {
@@ -91,7 +88,7 @@ impl BrokerShared {
 
     /// Takes the next job. Passes the notification on if further jobs are queued: two notifications without a waiter
     /// count as one.
-    fn take(&self) -> Option<(JobId, u32)> {
+    fn take(&self) -> Option<JobId> {
         let mut state = self.lock();
         let taken = state.take();
         if taken.is_some() && state.waiting > 0 {
@@ -167,7 +164,7 @@ impl Broker for MemoryBroker {
         } else {
             let place = (job.urgency, state.next);
             state.next += 1;
-            let held = HeldJob { client: job.client, place, claims: 0 };
+            let held = HeldJob { client: job.client, place };
             state.held.insert(job.id.clone(), held);
             state.enqueue(job.id.clone(), held);
             Ok(true)
@@ -183,9 +180,9 @@ impl Broker for MemoryBroker {
         Box::pin(async {
             loop {
                 let filled = self.0.filled.notified();
-                if let Some((id, claims)) = self.0.take() {
+                if let Some(id) = self.0.take() {
                     let lease = MemoryLease { broker: Arc::clone(&self.0), id: id.clone() };
-                    return Claim::new(id, claims, lease);
+                    return Claim::new(id, lease);
                 }
                 filled.await;
             }

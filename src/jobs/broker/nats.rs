@@ -108,7 +108,7 @@ impl NatsBroker {
             .ping_interval(REQUEST)
             .event_callback(move |event| {
                 match event {
-                    // What was known of the server may have changed.
+                    // The server may have lost its streams.
                     Event::Disconnected => drop(counted.fetch_add(1, Ordering::AcqRel)),
                     Event::ClientError(error) => *lock(&failed) = Some(error.to_string()),
                     Event::ServerError(error) => *lock(&failed) = Some(error.to_string()),

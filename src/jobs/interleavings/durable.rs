@@ -18,18 +18,15 @@ use super::super::coalesced_job::QueuedTask;
 use super::super::queue::Queue;
 use super::super::{
     Budget, ContentKey, EndError, Failure, JobId, JobRecord, JobSpec, JobStore, JobView, MemoryBroker, OnStart, Pool,
-    REPORT, Settings, Status, Structures, results,
+    REPORT, Settings, Status, results,
 };
 use super::task;
 use crate::config::JobsConfig;
 use crate::formats::Format;
-use crate::picture::SelectedRenderer;
-use crate::pipeline::JobLimits;
 use crate::store::interleavings::open_bytes;
 use crate::store::{Hasher, Name, Namespace, Store};
 use crate::surface::{OutOfMemory, ReferenceBackend};
 use crate::sync::thread::{self, JoinHandle};
-use crate::telemetry::Tracer;
 
 /// Number of schedules of a test. Each has a hundred times the steps of a test of the queue.
 const SCHEDULES: usize = 3000;
@@ -56,17 +53,7 @@ impl Fixture {
     fn new() -> Self {
         let (store, objects) = block_on(open_bytes(1 << 20));
         let budget = Budget::new(1 << 30);
-        let settings = Settings {
-            workers: 2,
-            queue: 8,
-            batch_max_delay: Duration::ZERO,
-            limits: JobLimits::default(),
-            structures: Structures::new(1 << 20, &budget),
-            budget,
-            renderer: SelectedRenderer::cpu("a test"),
-            meter: None,
-            tracer: Tracer::default(),
-        };
+        let settings = Settings { batch_max_delay: Duration::ZERO, ..Settings::of_test(2, budget) };
         let pool = Arc::new(Pool::without_workers(settings, Arc::new(ReferenceBackend), "a test".to_owned()));
         let queue = Arc::clone(&pool.shared.queue);
         let config = JobsConfig { attempts: ATTEMPTS, ..JobsConfig::default() };

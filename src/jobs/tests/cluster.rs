@@ -13,13 +13,10 @@ use crate::config::{JobsConfig, StoreConfig};
 use crate::formats::Format;
 use crate::jobs::broker::tests::{nats, server};
 use crate::jobs::{
-    Broker, Budget, EndError, JobId, JobSpec, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Status, Structures,
+    Broker, Budget, EndError, JobId, JobSpec, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Status,
 };
-use crate::picture::SelectedRenderer;
-use crate::pipeline::JobLimits;
 use crate::store::{Folder, Namespace, Store};
 use crate::surface::ReferenceBackend;
-use crate::telemetry::Tracer;
 
 /// Node of a cluster.
 struct Node {
@@ -32,17 +29,7 @@ async fn node(shared: &Path, broker: Arc<dyn Broker>) -> Node {
     let url = Some(format!("file://{}", shared.display()));
     let store = Store::open_shared(&StoreConfig { url, ..StoreConfig::default() }, shared).await.unwrap();
     let budget = Budget::new(1 << 30);
-    let settings = Settings {
-        workers: 1,
-        queue: 8,
-        batch_max_delay: Duration::from_secs(10),
-        limits: JobLimits::default(),
-        structures: Structures::new(1 << 20, &budget),
-        budget,
-        renderer: SelectedRenderer::cpu("a test"),
-        meter: None,
-        tracer: Tracer::default(),
-    };
+    let settings = Settings::of_test(1, budget);
     let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
     let describe = |error: &EndError| Value::String(format!("{error:?}"));
     let secret = store.secret().await.unwrap();
@@ -190,23 +177,18 @@ async fn a_job_that_runs_twice_has_one_end() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_failure_of_an_earlier_attempt_does_not_count() {
+async fn a_later_attempt_of_another_node_supersedes_an_earlier_one() {
     let shared = tempfile::tempdir().unwrap();
     let brokers = [(); 2].map(|()| Arc::new(MemoryBroker::new(10)));
     let a = node(shared.path(), brokers[0].clone() as _).await;
     let b = node(shared.path(), brokers[1].clone() as _).await;
     let id = a.accept("2", None).await;
-    // The input cannot be read for now: the attempt fails for good as soon as it is read.
-    let input = a.store.list(Folder::Inputs).await.unwrap().remove(0).0;
-    a.store.delete(&input).await.unwrap();
-    // Another node has begun attempt 2 meanwhile.
     let mut record = b.jobs.0.read(&id).await.unwrap().unwrap();
-    record.attempts = 2;
-    record.status = Status::Running;
-    let job = a.jobs.insert_open(a.jobs.0.read(&id).await.unwrap().unwrap());
+    let job = a.jobs.insert_open(record.clone());
+    assert!(!a.jobs.is_superseded(&job).await, "control: there is no other attempt");
+    (record.attempts, record.status) = (2, Status::Running);
     b.store.put(&crate::store::Name::job(id.as_str()).unwrap(), record.to_bytes()).await.unwrap();
     assert!(a.jobs.is_superseded(&job).await);
-    // Control: the same attempt is not superseded.
     job.adopt(record);
-    assert!(!a.jobs.is_superseded(&job).await);
+    assert!(!a.jobs.is_superseded(&job).await, "control: the same attempt");
 }

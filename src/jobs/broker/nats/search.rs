@@ -66,15 +66,19 @@ impl NatsState {
             };
             let announced = loop {
                 match timeout(POLL, announcements.next()).await {
-                    Ok(announced) => break announced,
+                    Ok(announced) => break Some(announced),
                     // A job of a stopped worker returns without an announcement.
                     Err(_elapsed) if self.queued.load(Ordering::Relaxed) > 0 => break None,
                     Err(_elapsed) => {}
                 }
             };
-            let Some(message) = announced else {
-                search.announcements = None;
-                continue;
+            let message = match announced {
+                None => continue,
+                Some(None) => {
+                    search.announcements = None;
+                    continue;
+                }
+                Some(Some(message)) => message,
             };
             let mut parts = message.subject.as_str().rsplit('.').skip(1);
             let mut number = || parts.next()?.parse::<usize>().ok();
@@ -112,8 +116,7 @@ impl NatsState {
         let fetched =
             timeout(REQUEST, fetched).await.map_err(|_elapsed| "no answer to a request for jobs".to_owned())??;
         let Some(message) = fetched else { return Ok(None) };
-        let claims = message.info().map_or(1, |info| u32::try_from(info.delivered).unwrap_or(1));
-        if claims > 1 {
+        if message.info().is_ok_and(|info| info.delivered > 1) {
             counter!(BROKER_REDELIVERIES).increment(1);
         }
         let (message, acker) = message.split();
@@ -123,6 +126,6 @@ impl NatsState {
             drop(acker.ack_with(AckKind::Term).await);
             return Ok(None);
         };
-        Ok(Some(Claim::new(id, claims, NatsLease::start(acker, Duration::from_millis(self.config.lease_ms / 3)))))
+        Ok(Some(Claim::new(id, NatsLease::start(acker, Duration::from_millis(self.config.lease_ms / 3)))))
     }
 }
