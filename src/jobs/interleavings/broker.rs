@@ -21,17 +21,19 @@ const JOBS: u64 = 3;
 /// Runs and ends of each job.
 type RunCounts = std::sync::Mutex<BTreeMap<JobId, (u32, u32)>>;
 
-fn change(counts: &RunCounts, id: &JobId, change: impl FnOnce(&mut (u32, u32))) {
-    change(counts.lock().unwrap().entry(id.clone()).or_default());
+/// Changes the counts of a job and returns them. Assertions follow outside the lock: a poisoned one would hide them.
+fn change(counts: &RunCounts, id: &JobId, change: impl FnOnce(&mut (u32, u32))) -> (u32, u32) {
+    let mut counts = counts.lock().unwrap();
+    let of_job = counts.entry(id.clone()).or_default();
+    change(of_job);
+    *of_job
 }
 
 /// Runs a claimed job, which ends or returns to the queue. `returns_early` returns it before its run has ended.
 fn run(broker: &MemoryBroker, claim: Claim, counts: &RunCounts, returns_early: bool) {
     let id = claim.id.clone();
-    change(counts, &id, |(runs, _)| {
-        *runs += 1;
-        assert_eq!(*runs, 1, "two workers run a job");
-    });
+    let (runs, _) = change(counts, &id, |(runs, _)| *runs += 1);
+    assert_eq!(runs, 1, "two workers run a job");
     if returns_early {
         claim.release(Duration::ZERO);
         thread::yield_now();
