@@ -338,6 +338,9 @@ pub(crate) struct SelectionArgs {
     /// neighbouring instances are not joined
     #[arg(long)]
     pub(crate) instances: bool,
+    /// Mesh one unit of the assembly, by its number in the order of --instances, where it is in the file
+    #[arg(long, value_name = "NUMBER")]
+    pub(crate) unit: Option<String>,
     /// Atoms whose surface is made: selection (the selected atoms alone), or whole (all polymer chains and the selected
     /// atoms; only the triangles nearest to selected atoms are kept, and the mesh is open) [default: selection]
     #[arg(long, value_name = "CONTEXT")]

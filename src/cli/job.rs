@@ -8,10 +8,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
-use molmesh::pipeline::tileset::{Tileset, TilesetReport, WriteError};
-use molmesh::pipeline::{
-    self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report, StageClock,
-};
+use molmesh::pipeline::tileset::{self, TilesetReport, WriteError};
+use molmesh::pipeline::{self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, SurfaceError};
@@ -166,17 +164,12 @@ impl<'a> CommandJob<'a> {
         write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
     ) -> Result<TilesetReport, CliError> {
         let read = |control: &Control<'_>| structure::read_with(&self.input, &self.limits.read, control).map(Box::new);
-        let control = self.control();
-        let clock = StageClock::new(&self.progress);
-        let tileset = Tileset::new(read, &self.job, &self.limits.read, &control, &clock);
-        let tileset = tileset.map_err(|error| self.failure(error))?;
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
-        tileset.write(&self.job, &choice, &self.limits.surface, &control, &self.progress, write).map_err(|error| {
-            match error {
-                WriteError::Job(error) => self.failure(error),
-                WriteError::File { path, source } => {
-                    CliError::Output { name: folder.join(path).display().to_string(), source }
-                }
+        let written = tileset::write(read, &self.job, &choice, &self.limits, &self.control(), &self.progress, write);
+        written.map_err(|error| match error {
+            WriteError::Job(error) => self.failure(error),
+            WriteError::File { path, source } => {
+                CliError::Output { name: folder.join(path).display().to_string(), source }
             }
         })
     }

@@ -1,8 +1,8 @@
 //! Summary of a report, as text of at most one screen.
 
 use molmesh::pipeline::{
-    CavityReport, ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport, PocketReport, Report,
-    SimplificationReport, TriangleReport,
+    AssemblyReport, CavityReport, ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport,
+    PocketReport, Report, SimplificationReport, TriangleReport,
 };
 use molmesh::surface::Validation;
 
@@ -44,7 +44,7 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
         page.row("selected", &format!("{} atoms; the mesh is cut out of the surface of all atoms", grouped(selected)));
     }
     if let Some(assembly) = &report.assembly {
-        page.row("assembly", &format!("{} of {} copies", assembly.id, grouped(assembly.copies)));
+        page.row("assembly", &assembled(assembly));
     }
     if let Some(instances) = &report.instances {
         page.row("instances", &repeated(report, instances));
@@ -154,6 +154,14 @@ fn surface(report: &Report) -> String {
     let isovalue = report.isovalue.map(|level| format!(", isovalue {level}")).unwrap_or_default();
     let probe = report.probe.map(|radius| format!(", probe {radius} Å")).unwrap_or_default();
     format!("{}, {} Å{from}{isovalue}{smoothness}{probe}{preset}", report.surface, report.resolution)
+}
+
+/// Formats the assembly, or its unit.
+fn assembled(AssemblyReport { id, copies, unit }: &AssemblyReport) -> String {
+    match unit {
+        Some(unit) => format!("unit {unit} of {id}, not copied"),
+        None => format!("{id} of {} copies", grouped(*copies)),
+    }
 }
 
 /// Formats the sums over all instances.

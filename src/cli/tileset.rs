@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use molmesh::formats::tileset::MAX_LEVELS;
 use molmesh::pipeline::params::Request;
-use molmesh::pipeline::tileset::TilesetReport;
+use molmesh::pipeline::tileset::{LevelReport, TilesetReport, unit_folder};
 use serde_json::Value;
 
 use super::args::{ReportStyle, TilesetArgs};
@@ -90,6 +90,7 @@ impl Drop for Folder {
         // The command already fails with another error, so errors are ignored. Files of others remain.
         let mut names: Vec<String> = (0..MAX_LEVELS).map(|level| level.to_string()).collect();
         names.push("subtrees".to_owned());
+        names.extend((1..).map(unit_folder).take_while(|name| self.path.join(name).exists()));
         for name in names {
             drop(fs::remove_dir_all(self.path.join(name)));
         }
@@ -100,18 +101,28 @@ impl Drop for Folder {
     }
 }
 
+/// Adds a row for each level.
+fn add_levels(page: &mut Page, levels: &[LevelReport]) {
+    for (number, LevelReport { spacing, tiles, triangles, bytes, .. }) in levels.iter().enumerate() {
+        let megabytes = *bytes as f64 / 1e6;
+        page.row(
+            &format!("level {number}"),
+            &format!("{spacing} Å: {tiles} tiles, {triangles} triangles, {megabytes:.1} MB"),
+        );
+    }
+}
+
 /// Formats the report as text.
 fn text(report: &TilesetReport, findings: Option<&[String]>, folder: &Path, seconds: f64, style: Style) -> String {
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &format!("{} atoms", report.atoms));
     if report.left_out.total > 0 {
         page.row("left out", &summary::left_out(&report.left_out));
     }
-    for (number, level) in report.levels.iter().enumerate() {
-        let megabytes = level.bytes as f64 / 1e6;
-        page.row(
-            &format!("level {number}"),
-            &format!("{} Å: {} tiles, {} triangles, {megabytes:.1} MB", level.spacing, level.tiles, level.triangles),
-        );
+    add_levels(&mut page, &report.levels);
+    for (number, unit) in report.units.iter().enumerate() {
+        let counts = format!("{}: {} atoms, {} instances", unit.name, unit.atoms, unit.instances);
+        page.row(&format!("unit {}", number + 1), &counts);
+        add_levels(&mut page, &unit.levels);
     }
     if let Some(findings) = findings {
         summary::add_findings(&mut page, findings);

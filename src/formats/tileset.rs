@@ -10,6 +10,8 @@ use super::GENERATOR;
 
 /// Maximum number of levels: enough for the largest coordinates at the finest spacing.
 pub const MAX_LEVELS: u32 = 24;
+/// Transform of the root, by columns: its inverse rotates y up to z up, as clients do with glTF.
+const AXES: [i32; 16] = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1];
 /// Maximum number of levels of a subtree: its bits then have at most 42 KB.
 const MAX_SUBTREE_LEVELS: u32 = 6;
 
@@ -103,7 +105,7 @@ pub fn tileset_document(bounds: &TilesetBounds, uris: &TilesetUris) -> Value {
         // Error of showing nothing.
         "geometricError": side,
         "root": {
-            "transform": [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1],
+            "transform": AXES,
             "boundingVolume": { "box": [x, -z, y, half, 0, 0, 0, half, 0, 0, 0, half] },
             "geometricError": error,
             "refine": "REPLACE",
@@ -114,6 +116,59 @@ pub fn tileset_document(bounds: &TilesetBounds, uris: &TilesetUris) -> Value {
                 "subtreeLevels": bounds.subtree_levels(),
                 "subtrees": { "uri": uris.subtrees },
             },
+        },
+    })
+}
+
+/// Tileset of a unit that another tileset repeats.
+#[derive(Debug, Clone)]
+pub struct RepeatedTileset {
+    /// URI of its `tileset.json`.
+    pub uri: String,
+    /// Bounds in the coordinates of the unit.
+    pub bounds: TilesetBounds,
+    /// Placements: rows of matrices with the translation in Å in the last column.
+    pub placements: Vec<[[f64; 4]; 3]>,
+}
+
+/// Returns the `tileset.json` of an assembly: the mesh at `root`, which the tilesets of the units at all placements
+/// replace. There is at least one placement.
+#[must_use]
+pub fn assembly_document(root: &str, units: &[RepeatedTileset]) -> Value {
+    let (mut children, mut corners) = (Vec::new(), [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]]);
+    for RepeatedTileset { uri, bounds: TilesetBounds { centre: [x, y, z], side, error, .. }, placements } in units {
+        let half = 0.5 * side;
+        for rows in placements {
+            for (k, [a, b, c, t]) in rows.iter().enumerate() {
+                let (middle, reach) = (a * x + b * y + c * z + t, half * (a.abs() + b.abs() + c.abs()));
+                corners[0][k] = corners[0][k].min(middle - reach);
+                corners[1][k] = corners[1][k].max(middle + reach);
+            }
+            // Relative to the axes of the root.
+            let rows = [rows[0], rows[2].map(|v| -v), rows[1]];
+            let column = |k: usize| rows.map(|row| row[k]).into_iter().chain([f64::from(u8::from(k == 3))]);
+            children.push(json!({
+                "transform": (0..4).flat_map(column).collect::<Vec<f64>>(),
+                "boundingVolume": { "box": [x, y, z, half, 0, 0, 0, half, 0, 0, 0, half] },
+                "geometricError": error,
+                "content": { "uri": uri },
+            }));
+        }
+    }
+    let [low, high] = corners;
+    let [x, y, z] = [0, 1, 2].map(|k| 0.5 * (low[k] + high[k]));
+    let [a, b, c] = [0, 1, 2].map(|k| 0.5 * (high[k] - low[k]));
+    json!({
+        "asset": { "version": "1.1", "generator": GENERATOR },
+        // Error of showing nothing.
+        "geometricError": 2.0 * a.max(b).max(c),
+        "root": {
+            "transform": AXES,
+            "boundingVolume": { "box": [x, -z, y, a, 0, 0, 0, c, 0, 0, 0, b] },
+            "geometricError": units.iter().fold(0.0, |most: f64, unit| most.max(unit.bounds.error)),
+            "refine": "REPLACE",
+            "content": { "uri": root },
+            "children": children,
         },
     })
 }

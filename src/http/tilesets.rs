@@ -23,10 +23,18 @@ use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
 use crate::formats::Compress;
-use crate::formats::tileset::{TileAddress, TilesetUris, subtree, tileset_document};
-use crate::jobs::{Failure, SharedTileset};
+use crate::formats::tileset::{
+    RepeatedTileset, TileAddress, TilesetUris, assembly_document, subtree, tileset_document,
+};
+use crate::jobs::{CacheKey, Failure, Input, SharedTileset};
 use crate::pipeline::params::ParamError;
-use crate::pipeline::{Job, StageClock, params, tileset};
+use crate::pipeline::tileset::UnitTileset;
+use crate::pipeline::{Job, JobError, StageClock, params, tileset};
+use crate::structure::ReadLimits;
+use crate::surface::{Control, SurfaceError};
+
+/// Memory of a placement in the document of an assembly, bytes.
+const PLACEMENT_BYTES: u64 = 4096;
 
 problem_responses!(StructureProblems: [
     READING,
@@ -152,13 +160,39 @@ impl TilesetRequest {
             let (value, expected) = (format!("`{}`", tile.path()), "no value for tileset.json".to_owned());
             return Err(ParamError::BadValue { name: "tile", value, expected }.into());
         }
-        let query = form_urlencoded::Serializer::new(String::new()).extend_pairs(&self.pairs).finish();
+        if self.job.selection.instances {
+            return self.assembly().await;
+        }
+        let query = query(&self.pairs);
         let tile = format!("tile={{level}}/{{x}}/{{y}}/{{z}}&{query}");
         // Clients such as 3d-tiles-renderer recognize a subtree by the end of its URL.
         let subtrees = format!("tileset.subtree?{tile}#.subtree");
         let uris = TilesetUris { content: format!("surface.glb?{tile}"), subtrees };
-        self.answer("application/json", move |tileset| {
-            Ok(tileset_document(&tileset.bounds(), &uris).to_string().into_bytes())
+        self.answer("application/json", move |prepared| {
+            Ok(tileset_document(&prepared.tileset()?.bounds(), &uris).to_string().into_bytes())
+        })
+        .await
+    }
+
+    /// Answers with the `tileset.json` of an assembly that repeats the tilesets of its units.
+    async fn assembly(mut self) -> Result<Response, Problem> {
+        let pairs = std::mem::take(&mut self.pairs);
+        self.answer("application/json", move |prepared| {
+            let units = prepared.units()?;
+            let instances: usize = units.iter().map(|unit| unit.operators.len()).sum();
+            let memory = prepared.control.reserve(PLACEMENT_BYTES * instances as u64);
+            let _memory = memory.map_err(|error| Failure::from(JobError::from(SurfaceError::from(error))))?;
+            let own = || pairs.iter().filter(|(name, _)| name != "instances").cloned();
+            let uri = |number: usize| {
+                let unit = ("unit".to_owned(), number.to_string());
+                format!("tileset.json?{}", query(&own().chain([unit]).collect::<Vec<_>>()))
+            };
+            let resolution = tileset::job_of_assembly(prepared.job, &units).params.resolution;
+            let spacing = ("resolution".to_owned(), resolution.to_string());
+            let coarse = pairs.iter().filter(|(name, _)| !params::SPACINGS.contains(&&**name)).cloned();
+            let root = format!("surface.glb?{}", query(&coarse.chain([spacing]).collect::<Vec<_>>()));
+            let repeated: Vec<RepeatedTileset> = units.iter().zip(1..).map(|(unit, n)| unit.repeated(uri(n))).collect();
+            Ok(assembly_document(&root, &repeated).to_string().into_bytes())
         })
         .await
     }
@@ -166,7 +200,12 @@ impl TilesetRequest {
     /// Answers with the subtree below a tile, by default the root.
     async fn subtree(self) -> Result<Response, Problem> {
         let root = self.job.tile.unwrap_or(TileAddress::ROOT);
-        self.answer("application/octet-stream", move |tileset| {
+        if self.job.selection.instances {
+            let expected = "false for a subtree, which belongs to one unit".to_owned();
+            return Err(ParamError::BadValue { name: "instances", value: "`true`".to_owned(), expected }.into());
+        }
+        self.answer("application/octet-stream", move |prepared| {
+            let tileset = prepared.tileset()?;
             let levels = tileset.bounds().subtree_levels();
             if !root.level.is_multiple_of(levels) || !tileset.tiles().contains(&root) {
                 let (value, expected) = (format!("`{}`", root.path()), "the root of a subtree".to_owned());
@@ -183,7 +222,7 @@ impl TilesetRequest {
     async fn answer(
         self,
         media_type: &'static str,
-        write: impl FnOnce(&SharedTileset) -> Result<Vec<u8>, Problem> + Send + 'static,
+        write: impl FnOnce(&Preparation<'_>) -> Result<Vec<u8>, Problem> + Send + 'static,
     ) -> Result<Response, Problem> {
         let Self { app, caller, source, headers, job, .. } = self;
         let variant = format!("{media_type}\n{}", params::canonical(&job));
@@ -193,13 +232,44 @@ impl TilesetRequest {
             let (shared, payer, key) = (Arc::clone(&app), caller.clone(), (caller.namespace, digest));
             let made = app.read(caller.client, (reservation, delivery), move |control| {
                 let (start, limits) = (Instant::now(), shared.config.limits.job().read);
-                let clock = StageClock::new(&());
-                let tileset = shared.structures().tileset(key, &input, &job, &limits, control, &clock);
+                let written = write(&Preparation { app: &shared, key, input: &input, job: &job, limits, control });
                 shared.charge(&payer, start.elapsed());
-                write(&tileset.map_err(Failure::from)?.0)
+                written
             });
             Ok(([(header::CONTENT_TYPE, media_type)], Body::from(made.await??)).into_response())
         };
         source.document(&app, &caller, &headers, &variant, made).await
     }
+}
+
+/// Structure and parameters of a document.
+struct Preparation<'a> {
+    app: &'a Shared,
+    key: CacheKey,
+    input: &'a Input,
+    job: &'a Job,
+    limits: ReadLimits,
+    control: &'a Control<'a>,
+}
+
+impl Preparation<'_> {
+    /// Returns the tileset, and prepares it if necessary.
+    fn tileset(&self) -> Result<SharedTileset, Problem> {
+        let Self { app, key, input, job, limits, control } = self;
+        let prepared = app.structures().tileset(*key, input, job, limits, control, &StageClock::new(&()));
+        Ok(prepared.map_err(Failure::from)?.0)
+    }
+
+    /// Returns the units of the assembly.
+    fn units(&self) -> Result<Vec<UnitTileset>, Problem> {
+        let Self { app, key: (namespace, digest), input, job, limits, control } = self;
+        let read = |control: &Control<'_>| app.structures().get(*namespace, *digest, input, limits, control);
+        let units = tileset::units(read, job, limits, control, &StageClock::new(&()));
+        Ok(units.map_err(Failure::from)?.1)
+    }
+}
+
+/// Returns the query of a URL.
+fn query(pairs: &[(String, String)]) -> String {
+    form_urlencoded::Serializer::new(String::new()).extend_pairs(pairs).finish()
 }

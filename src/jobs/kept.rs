@@ -12,7 +12,7 @@ use crate::structure::Structure;
 
 /// Namespace, and digest of a file or of a tileset. All other input of the reader is the same for the whole service,
 /// except limits.
-pub(super) type CacheKey = (Namespace, Digest);
+pub(crate) type CacheKey = (Namespace, Digest);
 
 /// A structure or a tileset, and the memory that it is charged to.
 #[derive(Debug)]

@@ -1,13 +1,37 @@
 //! Instances of the units of an assembly: each unit is meshed once, and the file repeats its mesh.
 
+use std::num::NonZeroU32;
+
 use serde::Serialize;
 
-use crate::structure::Unit;
+use crate::structure::{Selected, Selection, Unit};
 use crate::surface::lattice::to_f32;
 use crate::surface::{Control, Mesh, PartRange, Placements, SurfaceError};
 
 /// Memory of a placement, bytes.
 const PLACEMENT_BYTES: u64 = 28;
+
+/// Biological assembly.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct AssemblyReport {
+    /// Id in the file.
+    pub id: String,
+    /// Number of copies of chains, or of instances; 1 for one unit.
+    pub copies: u64,
+    /// Number of the unit that is meshed (`unit`); absent for all units.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub unit: Option<u32>,
+}
+
+impl AssemblyReport {
+    /// Returns the report of the assembly of `selection`; `None` for the asymmetric unit.
+    pub(super) fn new(selection: &Selection, selected: &Selected) -> Option<Self> {
+        let unit = selection.unit.map(NonZeroU32::get);
+        let copies = if unit.is_some() { 1 } else { selected.n_copies() };
+        Some(Self { id: selection.assembly.clone()?, copies, unit })
+    }
+}
 
 /// Instances of the units of an assembly.
 #[derive(Debug, Clone, Serialize)]

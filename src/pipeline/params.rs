@@ -136,10 +136,17 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     Ok(request)
 }
 
-/// Rejects instances without an assembly, and with a surface that is divided or joined otherwise.
+/// Rejects a unit without an assembly, and instances without one, with one unit, or with a surface that is divided or
+/// joined otherwise.
 fn check_instances(job: &Job) -> Result<(), ParamError> {
-    let Selection { assembly, context, instances, .. } = &job.selection;
+    let Selection { assembly, context, instances, unit, .. } = &job.selection;
+    if let (None, Some(unit)) = (assembly, unit) {
+        let expected = "no value for the asymmetric unit, or a value of assembly".to_owned();
+        return Err(ParamError::BadValue { name: "unit", value: format!("`{unit}`"), expected });
+    }
     let expected = match (assembly, context, job.split) {
+        _ if unit.is_some() => "false with a value of unit".to_owned(),
+        _ if job.tile.is_some() => "false for a tile, which belongs to one unit".to_owned(),
         (None, ..) => "false for the asymmetric unit, or a value of assembly".to_owned(),
         (_, Context::Whole, _) => format!("false with context={}, which makes one surface", context.name()),
         (.., split) if split != Split::None => format!("false with split={}", split.name()),

@@ -7,7 +7,7 @@ use super::areas::ExactReport;
 use super::cavities::CavityReport;
 use super::color::ColorReport;
 use super::components::{ComponentReport, VoidReport};
-use super::instances::InstancesReport;
+use super::instances::{AssemblyReport, InstancesReport};
 use super::left_out::LeftOutReport;
 use super::parts::PartReport;
 use super::pockets::PocketReport;
@@ -17,16 +17,6 @@ use super::{Choice, Job, StageClock};
 use crate::formats::{Storage, Units};
 use crate::structure::{Selected, Structure};
 use crate::surface::{BackendIdentity, Component, GridStats, Measures, SurfaceKind, Validation};
-
-/// Biological assembly.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
-pub struct AssemblyReport {
-    /// Id in the file.
-    pub id: String,
-    /// Number of copies of chains, or of instances.
-    pub copies: u64,
-}
 
 /// Quantization of the vertices in the file.
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -280,7 +270,7 @@ impl Report {
             atoms_in_file: structure.len() as u64,
             model: selected.model,
             models: None,
-            assembly: job.selection.assembly.clone().map(|id| AssemblyReport { id, copies: selected.n_copies() }),
+            assembly: AssemblyReport::new(&job.selection, selected),
             instances: None,
             left_out: LeftOutReport::new(&selected.left_out),
             warnings: structure.warnings.clone(),

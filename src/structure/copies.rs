@@ -1,6 +1,7 @@
 //! Copies of the selected atoms that form an assembly, and its distinct units.
 
 use std::collections::HashMap;
+use std::num::NonZeroU32;
 use std::ops::Range;
 
 use indexmap::IndexMap;
@@ -42,6 +43,9 @@ const MAX_NAME: usize = 40;
 
 /// Rule that applies, with the rows of each of its chains.
 type AppliedRule<'s> = (&'s Generator, Vec<Range<usize>>);
+
+/// Rows of the chains of a unit, with the rules that place it.
+type UnitRules<'s> = IndexMap<Vec<Range<usize>>, Vec<&'s Generator>>;
 
 /// Rule of an assembly with its chains.
 struct RuleChains<'s> {
@@ -154,15 +158,11 @@ impl<'s> Assembly<'s> {
     ) -> Result<Selected, StructureError> {
         let mut atoms = selected.atoms;
         let _sorting = self.sort(&mut atoms, control)?;
-        let (rules, counts) = self.rules(&atoms, limits)?;
-        let mut placed: IndexMap<Vec<Range<usize>>, Vec<&Generator>> = IndexMap::new();
-        for (generator, rows) in rules {
-            placed.entry(rows).or_default().push(generator);
-        }
+        let (placed, n_instances) = self.rules_by_unit(&atoms, limits)?;
         let n_atoms = placed.keys().map(|rows| n_rows(rows)).fold(0, u64::saturating_add);
         let capacity = self.check_atoms(n_atoms, limits)?;
         let of_instance = (size_of::<Operator>() + size_of::<[f64; 4]>()) as u64;
-        control.memory.grow(4 * n_atoms + of_instance * counts.iter().sum::<u64>())?;
+        control.memory.grow(4 * n_atoms + of_instance * n_instances)?;
         let (mut all, mut units) = (Vec::with_capacity(capacity), Vec::new());
         for (rows, generators) in placed {
             check(control)?;
@@ -183,6 +183,45 @@ impl<'s> Assembly<'s> {
             units.push(Unit { name: self.unit_name(&atoms, &rows), rows: first..all.len(), operators, rotations });
         }
         Ok(Selected { atoms: all, units, ..selected })
+    }
+
+    /// Restricts the assembly to one of the units that [`Self::units`] would return for `atoms`, without operators.
+    /// `number` counts from 1.
+    ///
+    /// # Errors
+    /// Returns [`StructureError::NotFound`] if the assembly has fewer units, and the errors of [`Self::units`].
+    pub(super) fn only_unit(
+        mut self,
+        number: NonZeroU32,
+        mut atoms: Vec<u32>,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+    ) -> Result<Self, StructureError> {
+        let _sorting = self.sort(&mut atoms, control)?;
+        let (placed, _) = self.rules_by_unit(&atoms, limits)?;
+        let Some((rows, _)) = placed.get_index(number.get() as usize - 1) else {
+            return Err(StructureError::NotFound {
+                what: "unit",
+                requested: number.to_string(),
+                available: format!("units 1 to {} of assembly {} with selected atoms", placed.len(), self.shown()),
+            });
+        };
+        self.covered.fill(false);
+        for rows in rows {
+            self.covered[self.column.id(atoms[rows.start] as usize) as usize] = true;
+        }
+        Ok(self)
+    }
+
+    /// Returns the distinct units that have some of `atoms`, which are sorted by chain, and the number of instances of
+    /// all units.
+    fn rules_by_unit(&self, atoms: &[u32], limits: &ReadLimits) -> Result<(UnitRules<'s>, u64), StructureError> {
+        let (rules, counts) = self.rules(atoms, limits)?;
+        let mut placed = UnitRules::new();
+        for (generator, rows) in rules {
+            placed.entry(rows).or_default().push(generator);
+        }
+        Ok((placed, counts.iter().sum()))
     }
 
     /// Returns the author names of the chains of a unit.

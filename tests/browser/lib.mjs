@@ -176,6 +176,33 @@ export function silhouette({ width, height, data }) {
   return { pixels, share: pixels / (width * height), brightness: pixels ? sum / pixels : 0, background: luminance(data, 4 * 2) };
 }
 
+/** Returns the mask of the surface in a picture: true for pixels that differ from the background, without a frame. */
+export function maskOf({ width, height, data }) {
+  const frame = 16;
+  const differs = (i, j) => [0, 1, 2].some((c) => Math.abs(data[i + c] - data[j + c]) > 6);
+  const isInside = (x, y) => Math.min(x, y, width - 1 - x, height - 1 - y) >= frame;
+  const background = 4 * (frame * width + frame);
+  return Array.from({ length: width * height }, (_, i) => isInside(i % width, Math.floor(i / width)) && differs(4 * i, background));
+}
+
+/** Returns the silhouette as 48 × 48 cells of its bounding box: silhouettes of other sizes have the same cells. */
+function cellsOf(picture) {
+  const n = 48;
+  const mask = maskOf(picture);
+  const points = mask.flatMap((set, i) => (set ? [[i % picture.width, Math.floor(i / picture.width)]] : []));
+  assert.ok(points.length > 1000, "the picture is empty");
+  const [low, high] = [Math.min, Math.max].map((end) => [0, 1].map((k) => points.reduce((found, p) => end(found, p[k]), points[0][k])));
+  const at = (t, k) => Math.round(low[k] + ((t + 0.5) / n) * (high[k] - low[k]));
+  return Array.from({ length: n * n }, (_, i) => mask[at(Math.floor(i / n), 1) * picture.width + at(i % n, 0)]);
+}
+
+/** Returns the share of the cells of two silhouettes that belong to one of them only. */
+export function difference(a, b) {
+  const [one, other] = [cellsOf(a), cellsOf(b)];
+  const count = (holds) => one.filter((set, i) => holds(set, other[i])).length;
+  return count((x, y) => x !== y) / count((x, y) => x || y);
+}
+
 /** Reads JSON, bounds and sizes of a GLB without a library. */
 export function glb(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);

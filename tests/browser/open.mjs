@@ -2,8 +2,8 @@
 import { readFileSync } from "node:fs";
 import path from "node:path";
 import {
-  assert, assertClean, browser, drop, fetchUncompressed, inverted, open, plainColor, run, silhouette, stablePicture, start, waitForMesh, ROOT,
-  SERVICE_URL, TIMEOUT_MS,
+  assert, assertClean, browser, difference, drop, fetchUncompressed, inverted, maskOf, open, plainColor, run, silhouette, stablePicture, start,
+  waitForMesh, ROOT, SERVICE_URL, TIMEOUT_MS,
 } from "./lib.mjs";
 
 const chromium = await browser();
@@ -38,37 +38,10 @@ function oneSided(bytes) {
   return copy;
 }
 
-/** Returns the mask of the surface in a picture: true for pixels that differ from the background, without a frame. */
-function maskOf({ width, height, data }) {
-  const frame = 16;
-  const differs = (i, j) => [0, 1, 2].some((c) => Math.abs(data[i + c] - data[j + c]) > 6);
-  const isInside = (x, y) => Math.min(x, y, width - 1 - x, height - 1 - y) >= frame;
-  const background = 4 * (frame * width + frame);
-  return Array.from({ length: width * height }, (_, i) => isInside(i % width, Math.floor(i / width)) && differs(4 * i, background));
-}
-
 /** Returns the mean luminance of the pixels in `mask`. */
 function luminance({ data }, mask) {
   const values = mask.flatMap((set, i) => (set ? [0.2126 * data[4 * i] + 0.7152 * data[4 * i + 1] + 0.0722 * data[4 * i + 2]] : []));
   return values.reduce((sum, value) => sum + value, 0) / values.length / 255;
-}
-
-/** Returns the silhouette as 48 × 48 cells of its bounding box: silhouettes of other sizes have the same cells. */
-function cellsOf(picture) {
-  const n = 48;
-  const mask = maskOf(picture);
-  const points = mask.flatMap((set, i) => (set ? [[i % picture.width, Math.floor(i / picture.width)]] : []));
-  assert.ok(points.length > 5000, "the picture is empty");
-  const [low, high] = [Math.min, Math.max].map((end) => [0, 1].map((k) => points.reduce((found, p) => end(found, p[k]), points[0][k])));
-  const at = (t, k) => Math.round(low[k] + ((t + 0.5) / n) * (high[k] - low[k]));
-  return Array.from({ length: n * n }, (_, i) => mask[at(Math.floor(i / n), 1) * picture.width + at(i % n, 0)]);
-}
-
-/** Returns the share of the cells of two silhouettes that belong to one of them only. */
-function difference(a, b) {
-  const [one, other] = [cellsOf(a), cellsOf(b)];
-  const count = (holds) => one.filter((set, i) => holds(set, other[i])).length;
-  return count((x, y) => x !== y) / count((x, y) => x || y);
 }
 
 await run({

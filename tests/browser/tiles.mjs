@@ -1,5 +1,5 @@
 // Large surfaces in tiles: levels, atoms, colours, limits, and a lost connection.
-import { assert, assertClean, browser, drop, run, start, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
+import { assert, assertClean, browser, difference, drop, run, stablePicture, start, waitForMesh, SERVICE_URL, TIMEOUT_MS } from "./lib.mjs";
 
 const chromium = await browser();
 const page = await start(chromium);
@@ -16,10 +16,10 @@ function bar() {
   return Buffer.from(lines.join("\n"));
 }
 
-const now = () => page.locator("#now").textContent();
+const now = (of = page) => of.locator("#now").textContent();
 /** Waits until all tiles of the view are loaded, and returns their number, triangles and finest spacing. */
-async function settled() {
-  await page.waitForFunction(
+async function settled(of = page) {
+  await of.waitForFunction(
     () => {
       const text = document.querySelector("#now").textContent;
       const isStill = /tiles?, /.test(text) && !text.includes("loading") && window.lastTiles === text;
@@ -29,7 +29,7 @@ async function settled() {
     null,
     { timeout: TIMEOUT_MS, polling: 1000 },
   );
-  const [, tiles, triangles, spacing] = /^(\d+) tiles?, ([\d,]+) triangles, ([\d.]+)/.exec(await now());
+  const [, tiles, triangles, spacing] = /^(\d+) tiles?, ([\d,]+) triangles, ([\d.]+)/.exec(await now(of));
   return { tiles: Number(tiles), triangles: Number(triangles.replaceAll(",", "")), spacing: Number(spacing) };
 }
 async function zoom(steps) {
@@ -47,6 +47,32 @@ await run({
     assert.match(await now(), /^[\d,]+ triangles/);
     assert.ok(await page.locator("#coarse").isHidden());
     assert.deepEqual(page.requests.filter((line) => line.includes("tileset")), []);
+  },
+  "instances of a large unit are tiles, each in its place": async () => {
+    // As in the file, 300 Å away, and turned by a quarter.
+    const operators = [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], [[1, 0, 0, 0], [0, 1, 0, 300], [0, 0, 1, 0]], [[0, -1, 0, 900], [1, 0, 0, 0], [0, 0, 1, 0]]];
+    const line = (row, k, serial) =>
+      `REMARK 350   BIOMT${k + 1} ${String(serial + 1).padStart(3)}${row.slice(0, 3).map((v) => v.toFixed(6).padStart(10)).join("")}${row[3].toFixed(5).padStart(15)}`;
+    const rules = operators.flatMap((rows, serial) => rows.map((row, k) => line(row, k, serial)));
+    const header = ["REMARK 350 BIOMOLECULE: 1", "REMARK 350 APPLY THE FOLLOWING TO CHAINS: A", ...rules, ""].join("\n");
+    const own = await start(chromium);
+    await waitForMesh(own, () => drop(own, "bars.pdb", Buffer.concat([Buffer.from(header), bar()])));
+    const structure = new URL(own.url()).searchParams.get("structure");
+    const shown = async (pairs) => {
+      await own.goto(`${SERVICE_URL}/?structure=${structure}&camera=20,10,1&resolution=0.5${pairs}`);
+      const state = await settled(own);
+      return { ...state, picture: await stablePicture(own) };
+    };
+    const instances = await shown("&assembly=1&instances=true");
+    const wanted = (text) => own.requests.map(decodeURIComponent).filter((line) => line.includes(text));
+    assert.ok(instances.tiles >= 3, await now(own));
+    assert.ok(wanted("tileset.json?").some((line) => line.includes("unit=1")), "the tileset of the unit");
+    assert.ok(wanted("tile=0/0/0/0").length > 0 && wanted("instances=true").some((line) => line.includes("resolution=4")));
+    const [joined, unit] = [await shown("&assembly=1"), await shown("")];
+    const [same, other] = [joined, unit].map(({ picture }) => difference(instances.picture, picture));
+    assert.ok(same < 0.2 && other > 0.5, `${same} and ${other} of the silhouette differ from those of the assembly and of one copy`);
+    assertClean(own, WARNING);
+    await own.context().close();
   },
   "a large one opens in tiles, coarse ones first": async () => {
     await drop(page, "bar.pdb", bar());

@@ -82,6 +82,73 @@ fn a_tileset_has_the_files_that_its_documents_list() {
     }
 }
 
+/// Returns an assembly of two units, the sample at two placements and its first 300 atoms as chain B at a third one.
+fn assembly() -> String {
+    let placed = |serial: usize, shift: f64| {
+        (1..4).map(move |k| {
+            let row: [f64; 3] = std::array::from_fn(|i| f64::from(u8::from(i + 1 == k)));
+            format!("REMARK 350   BIOMT{k} {serial:>3}{:>10.6}{:>10.6}{:>10.6}{shift:>15.5}\n", row[0], row[1], row[2])
+        })
+    };
+    let mut text = "REMARK 350 BIOMOLECULE: 2\nREMARK 350 APPLY THE FOLLOWING TO CHAINS: A\n".to_owned();
+    text.extend(placed(1, 0.0).chain(placed(2, 50.0)));
+    text.push_str("REMARK 350 APPLY THE FOLLOWING TO CHAINS: B\n");
+    text.extend(placed(3, -75.5));
+    let sample = include_str!("../../samples/4pti.pdb");
+    let atoms = || sample.lines().filter(|line| line.starts_with("ATOM"));
+    text.extend(atoms().map(|line| format!("{line}\n")));
+    text.extend(atoms().take(300).map(|line| format!("{}B{}\n", &line[..21], &line[22..])));
+    text
+}
+
+#[test]
+fn a_tileset_of_instances_repeats_the_tilesets_of_units() {
+    let folder = Folder::new();
+    let (input, output) = (folder.path("assembly.pdb"), folder.path("tiles"));
+    fs::write(&input, assembly()).unwrap();
+    let run = |more: &[&str]| {
+        let all = ["--assembly", "2", "--instances", "--resolution", "0.5"];
+        molmesh().arg("tileset").arg(&input).arg("-o").arg(&output).args(all).args(more).output().unwrap()
+    };
+    let made = run(&["--report", "json"]);
+    assert_code(&made, 0);
+    let report: Value = serde_json::from_str(&stdout(&made)).unwrap();
+    let units = report["units"].as_array().unwrap();
+    let facts = |name: &str| units.iter().map(|unit| unit[name].clone()).collect::<Vec<_>>();
+    assert_eq!((facts("name"), facts("atoms")), (vec!["A".into(), "B".into()], vec![454.into(), 300.into()]));
+    assert_eq!((facts("instances"), &report["levels"]), (vec![2.into(), 1.into()], &Value::Array(Vec::new())));
+    let documents = files(&output, "json");
+    assert_eq!(documents, ["tileset.json", "unit-1/tileset.json", "unit-2/tileset.json"].map(PathBuf::from));
+    let glbs = files(&output, "glb");
+    let root = json_of(&fs::read(output.join("0/0/0/0.glb")).unwrap());
+    assert!(root["extensionsUsed"].as_array().unwrap().contains(&"EXT_mesh_gpu_instancing".into()));
+    let all = [documents, glbs.clone(), files(&output, "subtree")].concat();
+    assert_eq!(report["files"], all.len());
+    let bytes: u64 = all.iter().map(|path| fs::metadata(output.join(path)).unwrap().len()).sum();
+    assert_eq!(report["bytes"], bytes);
+    // Every instance contains every tile of its unit.
+    let Some(walked) = tools::walk_tileset(&[output.join("tileset.json")]) else { return };
+    let tools::WalkedTileset { error: None, tiles } = &walked[0] else { panic!("{:?}", walked[0].error) };
+    for (unit, instances) in [("unit-1", 2), ("unit-2", 1)] {
+        let own: Vec<&PathBuf> = glbs.iter().filter(|path| path.starts_with(unit)).collect();
+        assert!(own.len() > 2, "{own:?}");
+        for path in own {
+            let n = tiles.iter().filter(|tile| tile.content.as_ref().is_some_and(|content| path.ends_with(content)));
+            assert!(n.count() >= instances, "{path:?}");
+        }
+    }
+    let contents = tiles.iter().filter(|tile| tile.content.is_some()).count();
+    let of_unit = |unit: &str| glbs.iter().filter(|path| path.starts_with(unit)).count();
+    assert_eq!(contents, 2 * of_unit("unit-1") + of_unit("unit-2"));
+    // The text names the units; a command that fails removes their folders.
+    fs::remove_dir_all(&output).unwrap();
+    let text = run(&[]);
+    assert!(stderr(&text).contains("A: 454 atoms, 2 instances"), "{}", stderr(&text));
+    fs::remove_dir_all(&output).unwrap();
+    assert_ne!(run(&["--max-grid-points", "100000"]).status.code(), Some(0));
+    assert!(!output.exists());
+}
+
 #[test]
 fn a_command_that_fails_removes_its_files() {
     let folder = Folder::new();

@@ -1,6 +1,8 @@
 //! Instances of the units of an assembly: placements, rejected requests, sums and other readers.
 #![allow(clippy::pedantic, clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
+use std::num::NonZeroU32;
+
 use molmesh::formats::{Encoder, Format, FormatError};
 use molmesh::pipeline::params;
 use molmesh::pipeline::{Choice, JobError, JobLimits, Product, run};
@@ -208,6 +210,51 @@ fn units_are_meshed_once_and_sums_count_every_instance() {
         chain.parts.iter().map(|part| (part.name.as_str(), part.instances)).collect::<Vec<_>>(),
         [("B", Some(2))]
     );
+}
+
+#[test]
+fn one_unit_is_meshed_where_it_is_in_the_file() {
+    let [one, two, three] = OPERATORS;
+    let text = with_rules(&[("A", &[one]), ("A, B", &[two, three]), ("B", &[three])]);
+    let structure = read(text.as_bytes(), &ReadLimits::default()).unwrap();
+    let selected = |instances: bool, unit: Option<u32>| {
+        let unit = unit.and_then(NonZeroU32::new);
+        let selection = Selection { assembly: Some("1".into()), instances, unit, ..Selection::default() };
+        select(&structure, &selection)
+    };
+    let all = selected(true, None).unwrap();
+    assert_eq!(all.units.iter().map(|unit| unit.name.as_str()).collect::<Vec<_>>(), ["A", "A,B", "B"]);
+    let total = structure.len() as u64;
+    for (number, unit) in (1..).zip(&all.units) {
+        let own = selected(false, Some(number)).unwrap();
+        let mut expected = all.atoms[unit.rows.clone()].to_vec();
+        expected.sort_unstable();
+        assert_eq!((&own.atoms, own.copies.len(), own.units.len()), (&expected, 0, 0), "{number}");
+        assert_eq!(own.atoms.len() as u64 + own.left_out.total(), total);
+    }
+    let missing = selected(false, Some(4)).unwrap_err().to_string();
+    assert!(missing.contains("unit 4") && missing.contains("units 1 to 3 of assembly 1"), "{missing}");
+    // The number counts the units that have selected atoms.
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "" };
+    let pairs = [("assembly", "1"), ("unit", "2"), ("chains", "B"), ("resolution", "1.2")];
+    let job = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().job;
+    let run = |job| run(text.as_bytes(), &job, &JobLimits::default(), &choice, &Control::default(), &(), None);
+    assert!(run(job(&pairs)).unwrap_err().to_string().contains("units 1 to 1"));
+    let report = run(job(&[("assembly", "1"), ("unit", "1"), ("chains", "B"), ("resolution", "1.2")])).unwrap().report;
+    let alone = run(job(&[("chains", "B"), ("resolution", "1.2")])).unwrap().report;
+    assert_eq!((report.triangles, report.area.to_bits()), (alone.triangles, alone.area.to_bits()));
+    let assembly = report.assembly.unwrap();
+    assert_eq!((assembly.copies, assembly.unit, alone.assembly.is_none()), (1, Some(1), true));
+    for (pairs, reason) in [
+        (&[("unit", "1")][..], "no value for the asymmetric unit"),
+        (&[("unit", "0"), ("assembly", "1")], "a whole number from 1"),
+        (&[("unit", "1"), ("assembly", "1"), ("instances", "true")], "false with a value of unit"),
+        (&[("tile", "0/0/0/0"), ("assembly", "1"), ("instances", "true")], "false for a tile"),
+    ] {
+        let error = params::parse(pairs.iter().copied()).unwrap_err().to_string();
+        assert!(error.contains(reason), "{pairs:?}: {error}");
+    }
 }
 
 #[test]

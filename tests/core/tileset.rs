@@ -5,11 +5,14 @@ use std::collections::HashMap;
 use std::fmt::Write;
 use std::ops::Deref;
 
-use molmesh::formats::tileset::TileAddress;
-use molmesh::pipeline::tileset::{Tileset, check};
+use molmesh::formats::tileset::{TileAddress, assembly_document};
+use molmesh::pipeline::tileset::{Tileset, check, units};
 use molmesh::pipeline::{Choice, Job, JobError, JobLimits, StageClock, params, run};
 use molmesh::structure::{self, ReadLimits, Structure};
 use molmesh::surface::{Control, CpuBackend, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
+use serde_json::Value;
+
+use crate::instances::{OPERATORS, with_rules};
 
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 
@@ -155,6 +158,65 @@ fn too_many_tiles_are_rejected() {
     let new = |resolution| Tileset::new(read, &job(resolution), &ReadLimits::default(), &Control::default(), &clock);
     let Err(JobError::Surface(SurfaceError::TooManyTiles { limit, .. })) = new("0.01") else { panic!("accepted") };
     assert!(new("0.2").is_ok_and(|tileset| (tileset.tiles().len() as u64) < limit));
+}
+
+#[test]
+fn an_assembly_repeats_the_tilesets_of_its_units() {
+    let [one, two, three] = OPERATORS;
+    let text = with_rules(&[("A", &[one]), ("A, B", &[two, three])]);
+    let pairs = [("assembly", "1"), ("resolution", "1"), ("instances", "true")];
+    let job = params::parse(pairs).unwrap().job;
+    check(&job).unwrap();
+    let read =
+        |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
+    let clock = StageClock::new(&());
+    let (_, units) = units(read, &job, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "" };
+    let whole = run(text.as_bytes(), &job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
+    let parts = whole.report.parts;
+    assert_eq!((units.len(), parts.len()), (2, 2));
+    let mut repeated = Vec::new();
+    for (index, (unit, part)) in units.iter().zip(&parts).enumerate() {
+        assert_eq!(
+            (&unit.name, unit.atoms, unit.operators.len() as u64),
+            (&part.name, part.atoms, part.instances.unwrap())
+        );
+        let number = (index + 1).to_string();
+        let tileset = tileset_of(text.as_bytes(), &[("assembly", "1"), ("resolution", "1"), ("unit", &number)]);
+        assert_eq!(tileset.bounds(), unit.bounds);
+        // The tiles of the last level join to the mesh of the unit.
+        let joined = measured(&welded(&meshes(&tileset, unit.bounds.levels - 1)));
+        assert!(joined.closed && (joined.area / part.area - 1.0).abs() < 1e-6, "{} {}", joined.area, part.area);
+        repeated.push(unit.repeated(number));
+    }
+    let document = assembly_document("root.glb", &repeated);
+    let root = &document["root"];
+    let children = root["children"].as_array().unwrap();
+    let numbers = |value: &Value| value.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect::<Vec<f64>>();
+    let around = numbers(&root["boundingVolume"]["box"]);
+    for (child, (uri, m)) in children.iter().zip([("1", one), ("2", two), ("2", three)]) {
+        assert_eq!(child["content"]["uri"], uri);
+        assert!(child["geometricError"].as_f64() <= root["geometricError"].as_f64());
+        let (columns, bounds) = (numbers(&child["transform"]), numbers(&child["boundingVolume"]["box"]));
+        let stored = |k: usize| [columns[k], columns[4 + k], columns[8 + k], columns[12 + k]];
+        // The axes of the root are x, -z and y of the structure.
+        let row = |k: usize| [stored(0), stored(2), stored(1).map(|v| -v)][k];
+        assert_eq!([row(0), row(1), row(2)].concat(), m);
+        assert_eq!(stored(3), [0.0, 0.0, 0.0, 1.0]);
+        // All corners of the instance lie in the box of the root.
+        for corner in 0..8 {
+            let p: [f64; 3] =
+                std::array::from_fn(|k| bounds[k] + bounds[3] * if corner >> k & 1 == 1 { 1.0 } else { -1.0 });
+            for k in 0..3 {
+                let [a, b, c, t] = row(k);
+                let at = a * p[0] + b * p[1] + c * p[2] + t;
+                let (middle, half) = [(around[0], around[3]), (around[2], around[11]), (-around[1], around[7])][k];
+                assert!((at - middle).abs() <= half + 1e-9, "{uri} {corner} {k}: {at} {around:?}");
+            }
+        }
+    }
+    assert_eq!(children.len(), 3);
 }
 
 #[test]

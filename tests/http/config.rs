@@ -250,6 +250,7 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         &[("assembly", "1")],
         &[("context", "whole")],
         &[("instances", "true"), ("assembly", "1")],
+        &[("unit", "1"), ("assembly", "1")],
         &[("split", "chain")],
         &[("split", "entity")],
         &[("split", "residue-group")],

@@ -163,6 +163,7 @@ fn a_default_is_valid_with_every_parameter() {
         &[("assembly", "1")],
         &[("context", "whole")],
         &[("instances", "true"), ("assembly", "1")],
+        &[("unit", "1"), ("assembly", "1")],
         &[("split", "chain")],
         &[("validation", "exact")],
         &[("check", "strict")],

@@ -108,6 +108,49 @@ fn a_client_finds_all_tiles_of_a_tileset() {
 }
 
 #[test]
+fn the_tileset_of_an_assembly_links_to_those_of_its_units() {
+    let server = server();
+    let mut text = "REMARK 350 BIOMOLECULE: 1\nREMARK 350 APPLY THE FOLLOWING TO CHAINS: A\n".to_owned();
+    for (k, row) in
+        ["  0.000000 -1.000000  0.000000", "  1.000000  0.000000  0.000000", "  0.000000  0.000000  1.000000"]
+            .into_iter()
+            .enumerate()
+    {
+        text += &format!("REMARK 350   BIOMT{} {:>3}{row}{:>15.5}\n", k + 1, 1, 12.5);
+    }
+    let atoms = std::str::from_utf8(SAMPLE).unwrap().lines().filter(|line| line.starts_with("ATOM"));
+    text.extend(atoms.map(|line| format!("{line}\n")));
+    let structure = server.post("/v1/structures", &[], text.as_bytes()).header("location").unwrap().to_owned();
+    let query = "assembly=1&resolution=1&color=element&instances=true";
+    let document = get(&server, &format!("{structure}/tileset.json?{query}")).json();
+    let children = document["root"]["children"].as_array().unwrap();
+    assert_eq!(children.len(), 1);
+    // The rows are x, -z and y of the operator.
+    let columns = [0.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 12.5, -12.5, 12.5, 1.0];
+    let numbers: Vec<f64> = children[0]["transform"].as_array().unwrap().iter().filter_map(Value::as_f64).collect();
+    assert_eq!(numbers, columns);
+    let root = document["root"]["content"]["uri"].as_str().unwrap();
+    let whole = get(&server, &format!("{structure}/{root}"));
+    assert_eq!(whole.header("molmesh-resolution").unwrap().parse().ok(), document["root"]["geometricError"].as_f64());
+    assert!(json_of(&whole.body)["extensionsRequired"].as_array().unwrap().contains(&"EXT_mesh_gpu_instancing".into()));
+    let uri = children[0]["content"]["uri"].as_str().unwrap();
+    assert!(uri.starts_with("tileset.json?") && uri.contains("unit=1") && !uri.contains("instances"), "{uri}");
+    let unit = get(&server, &format!("{structure}/{uri}")).json();
+    assert_eq!(unit["root"]["geometricError"], children[0]["geometricError"]);
+    let tile = get(&server, &format!("{structure}/{}", filled(&unit["root"]["content"]["uri"], [0; 4])));
+    // The mesh is that of the atoms in the file.
+    let plain =
+        get(&server, &format!("{structure}/surface.glb?tile=0/0/0/0&resolution=1&color=element&compress=meshopt"));
+    assert_eq!(tile.header("molmesh-triangles"), plain.header("molmesh-triangles"));
+    for path in ["tileset.subtree?assembly=1&instances=true", "surface.glb?tile=0/0/0/0&assembly=1&instances=true"] {
+        let problem = server.get(&format!("{structure}/{path}")).problem(400, "bad-parameter");
+        assert_eq!(problem["parameter"], "instances", "{problem}");
+    }
+    let missing = server.get(&format!("{structure}/tileset.json?assembly=1&unit=2")).problem(422, "empty-selection");
+    assert!(missing["detail"].as_str().unwrap().contains("units 1 to 1"), "{missing}");
+}
+
+#[test]
 fn tiles_are_stored_and_documents_are_cacheable() {
     let server = server();
     let structure = uploaded(&server);

@@ -15,11 +15,12 @@ const { ResourceResolvers, TilesetTraverser } = createRequire(tools)('3d-tiles-t
 async function walk(file) {
   const folder = dirname(file);
   const tiles = [];
-  const traverser = new TilesetTraverser(folder, ResourceResolvers.createFileResourceResolver(folder), { depthFirst: false });
+  const options = { depthFirst: false, traverseExternalTilesets: true };
+  const traverser = new TilesetTraverser(folder, ResourceResolvers.createFileResourceResolver(folder), options);
   await traverser.traverse(JSON.parse(readFileSync(file)), async (tile) => {
-    // The first tile is the description of all others.
-    if (tile.level > 0) {
-      const [content] = tile.getFinalContents();
+    const [content] = tile.getFinalContents();
+    // The root of a tileset describes all others. Tiles of an assembly refer to the tilesets of its units.
+    if (tile.level > 0 && !/\.json$|\{/.test(content?.uri)) {
       tiles.push({ level: tile.level - 1, content: content?.uri, box: tile.asFinalTile().boundingVolume.box });
     }
     return true;

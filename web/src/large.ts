@@ -10,11 +10,14 @@ import type { FetchTile } from "./scene/tiles";
 const MAX_FILE_TRIANGLES = 3e6;
 /** Approximate number of triangles per atom at 0.5 Å. */
 const TRIANGLES_PER_ATOM = 100;
+/** Parameters of the coarsest tile, and of the mesh of an assembly whose tiles belong to its units. */
+const ROOT = { tile: "0/0/0/0" };
+const COARSE_ASSEMBLY = { resolution: "4" };
 /** Attempts to fetch a tile from a busy server, and the pause before the second one, ms. Later pauses are longer. */
 const ATTEMPTS = 5;
 const PAUSE = 500;
 
-/** Paths of a tileset and of its coarsest tile. */
+/** Paths of a tileset and of its coarsest mesh. */
 export interface TilesetPaths {
   document: string;
   root: string;
@@ -28,9 +31,12 @@ export function tilesetOf(source: Source, choices: Choices, applicable: Readonly
   const applies = [...choices.keys()].every((name) => applicable.has(name) && name !== "detail") && choices.get("model") !== "all";
   // The decoder of tiles needs WebAssembly.
   if (!applies || typeof WebAssembly === "undefined") return null;
-  if (source.atoms !== undefined && !choices.has("assembly") && !isLarge(source.atoms, choices)) return null;
+  const repeats = choices.get("instances") === "true";
+  // Copies of an assembly have more atoms than the file.
+  if (source.atoms !== undefined && (repeats || !choices.has("assembly")) && !isLarge(source.atoms, choices)) return null;
   const more = { atom_ids: "true", compress: choices.get("compress") ?? "meshopt" };
-  return { document: `${source.path}/tileset.json${query(choices, more)}`, root: surface(source, "glb", choices, { ...more, tile: "0/0/0/0" }) };
+  const coarsest = repeats ? COARSE_ASSEMBLY : ROOT;
+  return { document: `${source.path}/tileset.json${query(choices, more)}`, root: surface(source, "glb", choices, { ...more, ...coarsest }) };
 }
 
 /** Returns the paths of the tileset at `url`, of a service or a folder; null for another address. */
@@ -39,7 +45,8 @@ export function tilesetAt(url: string): TilesetPaths | null {
   if (!root.pathname.endsWith("/tileset.json")) return null;
   if (/\/v1\/(pdb|structures)\/[^/]+\/tileset\.json$/.test(root.pathname)) {
     root.pathname = root.pathname.replace(/tileset\.json$/, "surface.glb");
-    root.searchParams.set("tile", "0/0/0/0");
+    const coarsest = root.searchParams.get("instances") === "true" ? COARSE_ASSEMBLY : ROOT;
+    for (const [name, value] of Object.entries(coarsest)) root.searchParams.set(name, value);
     if (!root.searchParams.has("compress")) root.searchParams.set("compress", "meshopt");
   } else root.pathname = root.pathname.replace(/tileset\.json$/, "0/0/0/0.glb");
   return { document: new URL(url, document.baseURI).href, root: root.href };

@@ -131,8 +131,11 @@ export class Remesher {
   }
 }
 
-/** Returns null for the error of a service that cannot keep the index of a tileset. Throws any other error. */
+/**
+ * Returns null for the error of a service that cannot keep the index of a tileset, or of a coarse mesh that misses the
+ * surface. Throws any other error.
+ */
 function withoutTiles(error: unknown): null {
-  if (error instanceof Problem && error.is("too-much-memory")) return null;
+  if (error instanceof Problem && error.is("too-much-memory", "no-surface")) return null;
   throw error;
 }

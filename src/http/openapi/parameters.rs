@@ -195,7 +195,10 @@ parameters!(
 );
 parameters!(
     /// Query parameters of a subtree.
-    SubtreeParameters: tile_parameters().map(query).chain(mesh_parameters(&["tile"])).collect()
+    SubtreeParameters: {
+        let own = tile_parameters().filter(|parameter| parameter.name != "instances");
+        own.map(query).chain(mesh_parameters(&["tile"])).collect()
+    }
 );
 parameters!(
     /// Query parameters of the colours of atoms.

@@ -29,7 +29,7 @@ pub fn canonical(job: &Job) -> String {
         exact,
         interface,
     } = job;
-    let Selection { model, chains, atoms, altloc, assembly, context, instances } = selection;
+    let Selection { model, chains, atoms, altloc, assembly, context, instances, unit } = selection;
     let SurfaceParams {
         surface,
         probe,
@@ -78,6 +78,7 @@ pub fn canonical(job: &Job) -> String {
         // Quotes the names, which may contain `&`.
         interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),
         instances.then(|| "instances=true".to_owned()),
+        unit.map(|unit| format!("unit={unit}")),
         (*context != Context::Selection).then(|| format!("context={}", context.name())),
         paper_params.as_ref().map(paper),
         color.as_ref().map(Coloring::canonical),

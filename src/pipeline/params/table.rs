@@ -237,6 +237,12 @@ pub const TABLE: &[Parameter] = &[
         "Meshes each distinct set of chains of the assembly once and repeats the mesh by rotations and translations (EXT_mesh_gpu_instancing); glb and gltf only. Surfaces of neighbouring instances are not joined.",
     ),
     Parameter {
+        name: "unit",
+        domain: Domain::Integer { min: 1, max: 1_000_000 },
+        default: "absent",
+        doc: "Number of a unit of the assembly, in the order of instances: meshes its chains alone, where they are in the file.",
+    },
+    Parameter {
         name: "context",
         domain: Domain::Choice(CONTEXTS),
         default: "selection",

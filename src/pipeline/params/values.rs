@@ -1,5 +1,6 @@
 //! Values of the parameters of one request.
 
+use std::num::NonZeroU32;
 use std::str::FromStr;
 
 use super::table::flag;
@@ -178,6 +179,7 @@ impl ParsedValues {
                     id.map(|id| (id != parameter.default).then(|| id.to_owned())).ok_or_else(bad)?;
             }
             "instances" => self.selection.instances = flag(text).ok_or_else(bad)?,
+            "unit" => self.selection.unit = Some(number_of_unit(parameter, text).ok_or_else(bad)?),
             "context" => self.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
             "split" => self.request.job.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
             "cavities" => job.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?),
@@ -216,6 +218,12 @@ fn whole(text: &str) -> Option<u64> {
 /// Parses a level of detail.
 fn level(text: &str) -> Option<u8> {
     whole(text).filter(|level| *level < DETAILS.len() as u64).and_then(|level| u8::try_from(level).ok())
+}
+
+/// Parses the number of a unit.
+fn number_of_unit(parameter: &Parameter, text: &str) -> Option<NonZeroU32> {
+    let Domain::Integer { max, .. } = parameter.domain else { return None };
+    NonZeroU32::new(u32::try_from(whole(text)?).ok()?).filter(|number| i64::from(number.get()) <= max)
 }
 
 /// Splits a list at commas. Rejects empty items and control characters.

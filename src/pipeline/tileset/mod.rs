@@ -6,6 +6,7 @@
 
 mod layout;
 mod level;
+mod units;
 mod write;
 
 use std::collections::BTreeSet;
@@ -15,7 +16,8 @@ use std::sync::Arc;
 
 use self::layout::Layout;
 use self::level::{Buckets, MIN_BUCKET, TilesetLevel};
-pub use self::write::{LevelReport, TilesetReport, WriteError};
+pub use self::units::{UnitTileset, job_of_assembly, job_of_unit, units};
+pub use self::write::{LevelReport, TilesetReport, UnitReport, WriteError, unit_folder, write};
 use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, Scheme};
 use super::params::ParamError;
 use super::report::Counts;
@@ -64,8 +66,8 @@ impl<S> fmt::Debug for Tileset<S> {
 /// Parameters that do not apply to tiles.
 #[cfg(feature = "server")]
 #[rustfmt::skip]
-pub(crate) const NOT_APPLICABLE: [&str; 18] = [
-    "split", "instances", "context", "cavities", "pockets", "pocket_probe", "exact", "interface", "max_triangles",
+pub(crate) const NOT_APPLICABLE: [&str; 17] = [
+    "split", "context", "cavities", "pockets", "pocket_probe", "exact", "interface", "max_triangles",
     "simplify", "quality", "units", "paper_a", "paper_b", "paper_c", "validation", "color_blend", "color_offset",
 ];
 
@@ -80,7 +82,6 @@ pub fn check(job: &Job) -> Result<(), ParamError> {
     let refused = [
         ("split", when(job.split != Split::None && job.split != Split::Model, job.split.name()), "none"),
         ("model", when(job.split == Split::Model, "all"), "one model"),
-        ("instances", when(selection.instances, "true"), "false"),
         ("context", when(selection.context != Context::Selection, selection.context.name()), "selection"),
         ("cavities", job.cavities.map(|cavities| cavities.name().to_owned()), "no value"),
         ("color", job.color.filter(of_vertices).map(|color| color.scheme.to_string()), "a scheme that colours atoms"),
@@ -118,9 +119,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         let (structure, selected, spheres) = load(read, job, limits, clock, control)?;
         clock.time("index", || {
             let params = job.params_for(spheres.len());
-            params.check_radius(spheres.radius_range().0)?;
-            let bounds = spheres.bounds().ok_or(SurfaceError::NoSpheres)?;
-            let layout = Layout::new(bounds, influence(&spheres, &params), params.resolution);
+            let layout = Layout::of(&spheres, &params)?;
             let (levels, tiles) = layout.index(&Arc::new(spheres), &params, control)?;
             Ok(Self { structure, layout, levels, tiles, selected })
         })
@@ -268,6 +267,13 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
 }
 
 impl Layout {
+    /// Returns the layout of the surface of `spheres`.
+    fn of(spheres: &Spheres, params: &SurfaceParams) -> Result<Self, SurfaceError> {
+        params.check_radius(spheres.radius_range().0)?;
+        let bounds = spheres.bounds().ok_or(SurfaceError::NoSpheres)?;
+        Ok(Self::new(bounds, influence(spheres, params), params.resolution))
+    }
+
     /// Returns the levels, coarsest first, and the tiles that the surface of `spheres` can reach, with their ancestors.
     fn index(
         &self,

@@ -9,15 +9,15 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use serde::Serialize;
 use thiserror::Error;
 
-use super::Tileset;
+use super::{Tileset, UnitTileset, job_of_assembly, job_of_unit, units};
 use crate::formats::Format;
-use crate::formats::tileset::{TileAddress, TilesetUris, subtree, tileset_document};
-use crate::pipeline::{Choice, Job, JobError, LeftOutReport, ProgressSink, StageClock};
-use crate::structure::Structure;
+use crate::formats::tileset::{TileAddress, TilesetUris, assembly_document, subtree, tileset_document};
+use crate::pipeline::{Choice, Job, JobError, JobLimits, LeftOutReport, Product, ProgressSink, StageClock, run_with};
+use crate::structure::{Structure, StructureError};
 use crate::surface::{Control, Reservation, SurfaceError, SurfaceLimits, threads};
 
 /// Contents of a tileset.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Default, Serialize)]
 pub struct TilesetReport {
     /// PDB id or data block name; null if the file has none.
     pub id: Option<String>,
@@ -25,12 +25,28 @@ pub struct TilesetReport {
     pub atoms: u64,
     /// Atoms of the selected models that are not meshed.
     pub left_out: LeftOutReport,
-    /// Levels, coarsest first.
+    /// Levels, coarsest first; empty with `instances`.
     pub levels: Vec<LevelReport>,
+    /// Units of the assembly with `instances`; otherwise empty.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub units: Vec<UnitReport>,
     /// Number of files.
     pub files: u64,
     /// Size of all files, bytes.
     pub bytes: u64,
+}
+
+/// Tileset of a unit.
+#[derive(Debug, Clone, Serialize)]
+pub struct UnitReport {
+    /// Author names of its chains.
+    pub name: String,
+    /// Number of atoms.
+    pub atoms: u64,
+    /// Number of instances.
+    pub instances: u64,
+    /// Levels, coarsest first.
+    pub levels: Vec<LevelReport>,
 }
 
 /// Contents of a level.
@@ -64,13 +80,92 @@ pub enum WriteError {
     },
 }
 
+/// Meshes all tiles of the structure that `read` returns, in parallel, and passes each file with its path to `write`.
+/// With `instances`, writes the tileset of each unit into a folder `unit-NUMBER`. `tileset.json` comes last, so that an
+/// incomplete tileset cannot be opened.
+///
+/// # Errors
+/// Returns a [`WriteError`] if the structure cannot be read, or for the first tile that cannot be meshed or written.
+pub fn write<S: Deref<Target = Structure> + Sync>(
+    read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
+    job: &Job,
+    choice: &Choice<'_>,
+    limits: &JobLimits,
+    control: &Control<'_>,
+    progress: &dyn ProgressSink,
+    write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
+) -> Result<TilesetReport, WriteError> {
+    let clock = StageClock::new(progress);
+    if !job.selection.instances {
+        let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
+        return tileset.write(job, choice, &limits.surface, control, progress, write);
+    }
+    let (structure, units) = units(read, job, &limits.read, control, &clock)?;
+    let (mut all, mut repeated) = (TilesetReport::default(), Vec::new());
+    for (index, unit) in units.iter().enumerate() {
+        // Releases all memory that is counted for the unit.
+        let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+        let (job, folder) = (job_of_unit(job, index), unit_folder(index + 1));
+        let tileset = Tileset::new(|_| Ok(&*structure), &job, &limits.read, control, &clock)?;
+        let in_folder = |path: &str, bytes: &[u8]| write(&format!("{folder}/{path}"), bytes);
+        let part = Part { sink: progress, first: index, count: units.len() };
+        let report = tileset.write(&job, choice, &limits.surface, control, &part, in_folder)?;
+        let UnitTileset { name, atoms, operators, .. } = unit;
+        let (name, instances, levels) = (name.clone(), operators.len() as u64, report.levels);
+        all.units.push(UnitReport { name, atoms: *atoms, instances, levels });
+        all.atoms += atoms;
+        all.files += report.files;
+        all.bytes += report.bytes;
+        repeated.push(unit.repeated(format!("{folder}/tileset.json")));
+    }
+    let root = format!("{}.glb", TileAddress::ROOT.path());
+    let assembly = job_of_assembly(job, &units);
+    let product = run_with(|_| Ok(&*structure), &assembly, limits, choice, control, &(), None)?;
+    all.bytes += stored(&write, &root, &glb_of(&product)?)?;
+    all.files += 1;
+    let document = assembly_document(&root, &repeated).to_string();
+    all.bytes += stored(&write, "tileset.json", document.as_bytes())?;
+    all.files += 1;
+    all.id.clone_from(&structure.id);
+    Ok(all)
+}
+
+/// Returns the folder of the tileset of a unit, numbered from 1.
+#[must_use]
+pub fn unit_folder(number: usize) -> String {
+    format!("unit-{number}")
+}
+
+/// Passes a file to `write`. Returns its size, bytes.
+fn stored(write: &impl Fn(&str, &[u8]) -> io::Result<()>, path: &str, bytes: &[u8]) -> Result<u64, WriteError> {
+    write(path, bytes).map_err(|source| WriteError::File { path: path.to_owned(), source })?;
+    Ok(bytes.len() as u64)
+}
+
+/// Returns the GLB of a product.
+fn glb_of(product: &Product) -> Result<Vec<u8>, JobError> {
+    let mut glb = Vec::new();
+    let written = product.file(Format::Glb).map(|file| file.write(&mut glb));
+    written?.map_err(|_unreachable| SurfaceError::Sink)?;
+    Ok(glb)
+}
+
+/// Progress of one of several tilesets, as a part of the progress of all.
+struct Part<'a> {
+    sink: &'a dyn ProgressSink,
+    first: usize,
+    count: usize,
+}
+
+impl ProgressSink for Part<'_> {
+    fn progress(&self, stage: &'static str, fraction: f64) {
+        self.sink.progress(stage, (self.first as f64 + fraction) / self.count as f64);
+    }
+}
+
 impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
-    /// Meshes all tiles, in parallel, and passes each file with its path to `write`. `tileset.json` comes last, so that
-    /// an incomplete tileset cannot be opened.
-    ///
-    /// # Errors
-    /// Returns a [`WriteError`] for the first tile that cannot be meshed or written.
-    pub fn write(
+    /// Meshes all tiles and passes each file with its path to `write`.
+    fn write(
         &self,
         job: &Job,
         choice: &Choice<'_>,
@@ -79,10 +174,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
         progress: &dyn ProgressSink,
         write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
     ) -> Result<TilesetReport, WriteError> {
-        let store = |path: &str, bytes: &[u8]| {
-            write(path, bytes).map_err(|source| WriteError::File { path: path.to_owned(), source })?;
-            Ok::<_, WriteError>(bytes.len() as u64)
-        };
+        let store = |path: &str, bytes: &[u8]| stored(&write, path, bytes);
         let colors = job.color.map(|coloring| self.colors(coloring, control)).transpose()?;
         let addresses: Vec<TileAddress> = self.tiles.iter().copied().collect();
         let done = AtomicUsize::new(0);
@@ -98,10 +190,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
             if tile.report.triangles == 0 {
                 return Ok(None);
             }
-            let mut glb = Vec::new();
-            let written = tile.file(Format::Glb).map(|file| file.write(&mut glb));
-            written.map_err(JobError::from)?.map_err(|_unreachable| JobError::from(SurfaceError::Sink))?;
-            let bytes = store(&format!("{}.glb", address.path()), &glb)?;
+            let bytes = store(&format!("{}.glb", address.path()), &glb_of(&tile)?)?;
             Ok::<_, WriteError>(Some((address, tile.report.triangles, bytes)))
         })?;
         let made: Vec<(TileAddress, u64, u64)> = made.into_iter().flatten().collect();
@@ -130,6 +219,14 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
         let uris = TilesetUris { content: format!("{address}.glb"), subtrees: format!("subtrees/{address}.subtree") };
         bytes += store("tileset.json", tileset_document(&bounds, &uris).to_string().as_bytes())?;
         let (atoms, left_out) = (self.selected.atoms.len() as u64, LeftOutReport::new(&self.selected.left_out));
-        Ok(TilesetReport { id: self.structure.id.clone(), atoms, left_out, levels, files: files + 1, bytes })
+        Ok(TilesetReport {
+            id: self.structure.id.clone(),
+            atoms,
+            left_out,
+            levels,
+            units: Vec::new(),
+            files: files + 1,
+            bytes,
+        })
     }
 }

@@ -9,6 +9,7 @@ mod parse;
 mod selected;
 
 use std::collections::HashSet;
+use std::num::NonZeroU32;
 use std::ops::Range;
 
 pub use context::Context;
@@ -76,6 +77,9 @@ pub struct Selection {
     pub context: Context,
     /// True to mesh the distinct units of the assembly instead of all copies.
     pub instances: bool,
+    /// Number of the unit of the assembly to mesh without its operators, from 1 in the order of
+    /// [`Selected::units`]; all copies by default.
+    pub unit: Option<NonZeroU32>,
 }
 
 /// Number of atoms that a task selects or copies, and minimum number that a task moves: about 0.1 ms of work.
@@ -104,7 +108,7 @@ pub fn select_with(
     limits: &ReadLimits,
     control: &Control<'_>,
 ) -> Result<Selected, StructureError> {
-    let assembly = selection.assembly.as_deref().map(|id| Assembly::find(structure, id)).transpose()?;
+    let mut assembly = selection.assembly.as_deref().map(|id| Assembly::find(structure, id)).transpose()?;
     let models = models(structure, selection)?;
     let chains = match &selection.chains {
         Some(names) => Some(chains(structure, names.iter().map(String::as_str), "chain")?),
@@ -132,17 +136,14 @@ pub fn select_with(
         Context::Selection => None,
         Context::Whole => Some(evaluation.marks(&Expression::default().condition)?),
     };
-    let rules = Rules {
-        structure,
-        models,
-        chains,
-        assembly: assembly.as_ref(),
-        marks,
-        hydrogens: *hydrogens,
-        context,
-        alternatives,
-    };
-    let Found { atoms, mut left_out, residues } = rules.find(control)?;
+    let rules = Rules { structure, models, chains, marks, hydrogens: *hydrogens, context, alternatives };
+    let mut found = rules.find(assembly.as_ref(), control)?;
+    if let (Some(whole), Some(number)) = (assembly.take_if(|_| selection.unit.is_some()), selection.unit) {
+        // Atoms of other units are those of other chains.
+        let unit = whole.only_unit(number, found.atoms, limits, control)?;
+        found = rules.find(Some(&unit), control)?;
+    }
+    let Found { atoms, mut left_out, residues } = found;
     let first = structure.model.first().copied().unwrap_or(1);
     let model = if let Models::One(model) = models { model } else { first };
     let marks = rules.marks(&atoms, control)?;
@@ -165,7 +166,6 @@ struct Rules<'a> {
     models: Models,
     /// True for selected chains, by id.
     chains: Option<Vec<bool>>,
-    assembly: Option<&'a Assembly<'a>>,
     marks: Marks,
     hydrogens: bool,
     /// With [`Context::Whole`], marks of the atoms of the default selection, with their hydrogens.
@@ -209,12 +209,12 @@ impl Rules<'_> {
         Ok(Some(marks))
     }
 
-    /// Finds the atoms to mesh, in parallel.
-    fn find(&self, control: &Control<'_>) -> Result<Found, StructureError> {
+    /// Finds the atoms to mesh, those of `assembly` or of the asymmetric unit, in parallel.
+    fn find(&self, assembly: Option<&Assembly<'_>>, control: &Control<'_>) -> Result<Found, StructureError> {
         let n = self.structure.len();
         let range = |first| first..n.min(first + ATOMS_PER_TASK);
         let mut ranges: Vec<Range<usize>> = (0..n).step_by(ATOMS_PER_TASK).map(range).collect();
-        let parts = pieces::map(&mut ranges, |range| check(control).map(|()| self.find_in(range.clone())));
+        let parts = pieces::map(&mut ranges, |range| check(control).map(|()| self.find_in(range.clone(), assembly)));
         let mut found = Found::default();
         for part in parts {
             let Found { atoms, left_out, residues } = part?;
@@ -225,8 +225,8 @@ impl Rules<'_> {
         Ok(found)
     }
 
-    fn find_in(&self, range: Range<usize>) -> Found {
-        let Self { structure, assembly, .. } = self;
+    fn find_in(&self, range: Range<usize>, assembly: Option<&Assembly<'_>>) -> Found {
+        let structure = self.structure;
         let Found { mut atoms, mut left_out, mut residues } = Found::default();
         for i in range {
             if !self.models.contains(structure.model[i]) {

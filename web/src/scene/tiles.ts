@@ -1,6 +1,6 @@
 /** Tiles of a tileset: loads those that the view needs, coarse ones first, within a limit of memory. */
 
-import { type Material, type Mesh, type Object3D, type PerspectiveCamera, Vector2, type WebGLRenderer } from "three";
+import { type InstancedMesh, type Material, Mesh, type Object3D, type PerspectiveCamera, Vector2, type WebGLRenderer } from "three";
 import { MeshoptDecoder } from "three/examples/jsm/libs/meshopt_decoder.module.js";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 import type { Tile } from "3d-tiles-renderer/core";
@@ -58,6 +58,7 @@ export class Tiles {
     [tiles.lruCache.minBytesSize, tiles.lruCache.maxBytesSize] = MEMORY;
     tiles.downloadQueue.maxJobsPerOrigin = REQUESTS;
     tiles.addEventListener("load-model", ({ scene, tile }) => {
+      meshesOf(scene).forEach(expand);
       const meshes = meshesOf(scene);
       this.loaded.set(tile, meshes);
       for (const { material } of meshes) (material as Material).dispose();
@@ -148,4 +149,20 @@ function meshesOf(object: Object3D): Mesh[] {
     if ((child as Mesh).isMesh && !(child.parent as Mesh | null)?.isMesh) meshes.push(child as Mesh);
   });
   return meshes;
+}
+
+/** Replaces a mesh with instances by one mesh for each instance, because surfaces are picked and drawn one by one. */
+function expand(mesh: Mesh): void {
+  const instanced = mesh as InstancedMesh;
+  if (!instanced.isInstancedMesh) return;
+  instanced.updateMatrix();
+  for (let i = 0; i < instanced.count; i += 1) {
+    const one = new Mesh(instanced.geometry, instanced.material);
+    instanced.getMatrixAt(i, one.matrix);
+    one.matrix.premultiply(instanced.matrix);
+    one.matrixAutoUpdate = false;
+    one.userData = instanced.userData;
+    instanced.parent?.add(one);
+  }
+  instanced.removeFromParent();
 }
