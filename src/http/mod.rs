@@ -56,6 +56,7 @@ mod delivery;
 mod openapi;
 
 mod jobs;
+mod reconcile;
 mod results;
 
 mod mesh_request;
@@ -93,6 +94,7 @@ mod router;
 mod server;
 
 pub use page::has_viewer;
+pub use reconcile::{LostJob, Reconciled, reconcile};
 pub use server::{Chosen, ServeError, Server};
 pub use signing::check_signable;
 pub use stop::{Stop, shutdown_signals};

@@ -36,12 +36,15 @@ pub(crate) struct Dispatch {
     pub(crate) client: Client,
     /// Urgency among the jobs of the client, from 0 (first) to 7 (last).
     pub(crate) urgency: u8,
+    /// True for a job that workers with a GPU should run.
+    pub(crate) suits_gpu: bool,
 }
 
 impl Dispatch {
     /// Returns the dispatch of the job of a record.
     pub(crate) fn of(record: &JobRecord) -> Self {
-        Self { id: record.id.clone(), client: Client(record.client), urgency: record.urgency }
+        let JobRecord { id, client, urgency, suits_gpu, .. } = record;
+        Self { id: id.clone(), client: Client(*client), urgency: *urgency, suits_gpu: *suits_gpu }
     }
 }
 
@@ -80,9 +83,12 @@ pub(crate) trait Broker: Send + Sync {
     /// Queues a job. Returns false if it is queued or claimed already.
     fn dispatch<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>>;
 
-    /// Waits for a job and claims it. If the future is dropped, a job that it has claimed can be claimed again after
-    /// its lease.
-    fn claim(&self) -> BoxFuture<'_, Claim>;
+    /// Returns true if a job is queued or claimed.
+    fn holds<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>>;
+
+    /// Waits for a job and claims it: first one that suits a GPU if `prefers_gpu`, else first one that does not. If the
+    /// future is dropped, a job that it has claimed can be claimed again after its lease.
+    fn claim(&self, prefers_gpu: bool) -> BoxFuture<'_, Claim>;
 
     /// Locks work that one node at a time does. `None` if another run has the lock. If the broker does not answer, the
     /// work is not locked: doing it twice costs time only.

@@ -68,11 +68,12 @@ impl JobStore {
 
     async fn claim_jobs(self) {
         let mut stopping = self.0.stopping.subscribe();
+        let has_gpu = !self.0.pool.backend().devices().is_empty();
         loop {
             let next = async {
                 // The semaphore is never closed.
                 let slot = Arc::clone(&self.0.slots).acquire_owned().await.ok()?;
-                Some((self.0.broker.claim().await, slot))
+                Some((self.0.broker.claim(has_gpu).await, slot))
             };
             let claimed = tokio::select! {
                 claimed = next => claimed,

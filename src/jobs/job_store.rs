@@ -24,6 +24,7 @@ use super::runner::Runner;
 use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
+use crate::pipeline::suits_gpu;
 use crate::single_flight::SingleFlight;
 use crate::store::{Digest, Name, Namespace, Pin, Secret, Store, StoreError};
 use crate::sync::{Handle, timeout};
@@ -199,6 +200,7 @@ impl JobStore {
             format: spec.format.name().to_owned(),
             client,
             urgency: spec.task.rank.urgency,
+            suits_gpu: suits_gpu(spec.task.input.atoms(), &spec.task.job),
             status: Status::Accepted,
             attempts: u32::from(ticket.is_some()),
             memory_waits: 0,

@@ -36,7 +36,7 @@ mod ticket;
 mod worker;
 
 pub(crate) use crate::memory_budget::{Budget, MemoryReservation};
-pub(crate) use broker::{Broker, MemoryBroker, NatsBroker};
+pub(crate) use broker::{Broker, Dispatch, DispatchError, MemoryBroker, NatsBroker};
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};
@@ -45,6 +45,7 @@ pub(crate) use key::ContentKey;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
 pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
+pub(crate) use records::unfinished_jobs;
 pub(crate) use results::{REPORT, SaveError, document, is_stored, save};
 pub(crate) use structures::{Input, Structures};
 pub(crate) use ticket::Ticket;

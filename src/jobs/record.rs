@@ -138,6 +138,9 @@ pub(crate) struct JobRecord {
     pub(crate) client: u64,
     /// Urgency among the jobs of the client.
     pub(crate) urgency: u8,
+    /// True for a job that workers with a GPU should run.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub(crate) suits_gpu: bool,
     /// Status at the last write.
     pub(crate) status: Status,
     /// Number of attempts to run the job.
@@ -311,6 +314,7 @@ mod tests {
             format: "glb".to_owned(),
             client: u64::MAX,
             urgency: 3,
+            suits_gpu: false,
             status: Status::Accepted,
             attempts: 1,
             memory_waits: 0,

@@ -20,7 +20,7 @@ use super::record::{JobId, JobRecord};
 use super::{EndError, Input, Task};
 use crate::formats::Format;
 use crate::pipeline::MapFile;
-use crate::store::{BadDigest, Digest, Name, Namespace, Pin, RecordCaps, RecordReservation, StoreError};
+use crate::store::{BadDigest, Digest, Name, Namespace, Pin, RecordCaps, RecordReservation, Store, StoreError};
 use crate::surface::OutOfMemory;
 use crate::telemetry::{JOBS_RECOVERED, shorten};
 
@@ -129,21 +129,16 @@ impl JobStoreState {
     /// those of jobs that have ended. Forgets jobs that are not on record any more.
     async fn read_unknown(&self) -> Result<Vec<JobRecord>, StoreError> {
         let mut known = self.open.ids();
-        let (ended, open): (Vec<_>, Vec<_>) = self.store.job_records().await?.into_iter().partition(Name::is_ended_job);
-        let has_ended = |name: &Name| Ok::<_, StoreError>(ended.binary_search(&Name::ended_job(name.stem())?).is_ok());
-        let mut unknown = Vec::new();
-        for name in open {
-            if has_ended(&name)? {
-                self.store.delete(&name).await?;
-            } else if name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id)) {
-                unknown.push(name);
-            }
+        let OpenNames { mut open, ended } = OpenNames::of(&self.store).await?;
+        for name in ended {
+            self.store.delete(&name).await?;
         }
+        open.retain(|name| name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id)));
         for gone in &known {
             self.open.remove(gone);
         }
         let read = |name: Name| async move { self.read_document(&name).await };
-        let mut reads = stream::iter(unknown).map(read).buffer_unordered(CONCURRENT_READS);
+        let mut reads = stream::iter(open).map(read).buffer_unordered(CONCURRENT_READS);
         let mut records = Vec::new();
         while let Some(read) = reads.next().await {
             match read {
@@ -156,6 +151,44 @@ impl JobStoreState {
         records.sort_by_key(|record| (record.created_ms, record.id.clone()));
         Ok(records)
     }
+}
+
+/// Names of the records of open jobs in a store.
+struct OpenNames {
+    /// Records of unfinished jobs.
+    open: Vec<Name>,
+    /// Records of jobs that have ended, which a crash has left behind.
+    ended: Vec<Name>,
+}
+
+impl OpenNames {
+    async fn of(store: &Store) -> Result<Self, StoreError> {
+        let (ends, all): (Vec<_>, Vec<_>) = store.job_records().await?.into_iter().partition(Name::is_ended_job);
+        let (mut open, mut ended) = (Vec::new(), Vec::new());
+        for name in all {
+            let has_ended = ends.binary_search(&Name::ended_job(name.stem())?).is_ok();
+            if has_ended { &mut ended } else { &mut open }.push(name);
+        }
+        Ok(Self { open, ended })
+    }
+}
+
+/// Reads the records of all unfinished jobs of a store, in the order of their acceptance. Changes nothing. Returns them
+/// and the number of records that cannot be parsed, which the next node that reads them moves into quarantine.
+pub(crate) async fn unfinished_jobs(store: &Store) -> Result<(Vec<JobRecord>, usize), StoreError> {
+    let read = |name: Name| async move { store.get(&name).await };
+    let mut reads = stream::iter(OpenNames::of(store).await?.open).map(read).buffer_unordered(CONCURRENT_READS);
+    let (mut records, mut unreadable) = (Vec::new(), 0);
+    while let Some(read) = reads.next().await {
+        match read?.map(|stored| JobRecord::from_bytes(&stored.bytes)) {
+            Some(Ok(record)) => records.push(record),
+            Some(Err(_)) => unreadable += 1,
+            // The job has ended meanwhile.
+            None => {}
+        }
+    }
+    records.sort_by_key(|record| (record.created_ms, record.id.clone()));
+    Ok((records, unreadable))
 }
 
 /// Error of [`JobStore::load_input`].

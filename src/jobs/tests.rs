@@ -100,6 +100,7 @@ impl Fixture {
             format: "stl".to_owned(),
             client: 1,
             urgency: DEFAULT_URGENCY,
+            suits_gpu: false,
             status: Status::Accepted,
             requester: Requester::default(),
             attempts: 0,

@@ -59,6 +59,8 @@ pub use report::{PictureReport, Quantization, Report, file_arithmetic};
 pub use shapes::TriangleReport;
 pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
+#[cfg(feature = "server")]
+pub(crate) use work::suits_gpu;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
 
 use crate::formats::tileset::TileAddress;

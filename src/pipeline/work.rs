@@ -81,6 +81,20 @@ pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
         + drawing(job)
 }
 
+/// Minimum work of a surface that a GPU should compute, in atoms at 0.5 Å: about 40 ms on two cores. A GPU needs some
+/// milliseconds for any job.
+#[cfg(feature = "server")]
+const MIN_GPU_WORK: f64 = 10_000.0;
+
+/// Returns true if a machine with a GPU would finish a job on a file of about `atoms` atoms much earlier than one
+/// without: if the surface takes most of its time, and not little.
+#[cfg(feature = "server")]
+pub(crate) fn suits_gpu(atoms: f64, job: &Job) -> bool {
+    let resolution = job.spacing.expected(&job.params, atoms);
+    let surface = relative_time(job.params.surface) * mesh_work(atoms, resolution);
+    job.tile.is_none() && surface >= MIN_GPU_WORK && 2.0 * surface >= estimate_work(atoms, job)
+}
+
 /// Work of a job besides its atoms and its grid, in atoms: about 1 ms.
 const OVERHEAD: f64 = 250.0;
 /// Work per pair of an atom and a brick, per grid point and per vertex, in atoms.
@@ -161,6 +175,19 @@ mod tests {
 
     fn estimate_work(input: &[u8], job: &Job) -> f64 {
         super::estimate_work(estimate_atoms(input), job)
+    }
+
+    #[cfg(feature = "server")]
+    #[test]
+    fn large_surfaces_suit_a_gpu() {
+        let suits =
+            |atoms: f64, pairs: &[(&str, &str)]| suits_gpu(atoms, &params::parse(pairs.iter().copied()).unwrap().job);
+        assert!(suits(60_000.0, &[]) && suits(2_000.0, &[("surface", "ses")]) && !suits(2_000.0, &[]));
+        // Most of the time is spent on the CPU.
+        assert!(
+            !suits(60_000.0, &[("resolution", "2")]) && !suits(60_000.0, &[("cavities", "keep"), ("surface", "sas")])
+        );
+        assert!(!suits(60_000.0, &[("tile", "0/0/0/0")]));
     }
 
     #[test]

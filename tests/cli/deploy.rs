@@ -245,8 +245,20 @@ fn the_chart_renders_valid_manifests() {
     let Some(rendered) = chart(&shared) else { return };
     let folder = cli_support::Folder::new();
     let keda = chart(&[&shared[..], &["keda.enabled=true", "broker.secret=nats"]].concat()).unwrap();
-    let files = [rendered, keda].map(Result::unwrap);
-    let files = [folder.file("chart.yaml", &files[0]), folder.file("keda.yaml", &files[1])];
+    let gpu = [
+        "keda.enabled=true",
+        "workers[0].name=cpu",
+        "workers[1].name=gpu",
+        "workers[1].gpu=true",
+        "workers[0].minReplicas=1",
+        "workers[0].maxReplicas=2",
+        "workers[1].minReplicas=1",
+        "workers[1].maxReplicas=2",
+    ];
+    let gpu = chart(&[&shared[..], &gpu].concat()).unwrap();
+    let files = [rendered, keda, gpu].map(Result::unwrap);
+    let names = ["chart.yaml", "keda.yaml", "gpu.yaml"];
+    let files: Vec<_> = names.iter().zip(&files).map(|(name, text)| folder.file(name, text)).collect();
     let Some(found) = yaml(&files) else { return };
     assert_eq!(found[0].errors, [""; 0]);
     // The schema of Kubernetes lacks the kinds of KEDA.
@@ -258,8 +270,16 @@ fn the_chart_renders_valid_manifests() {
         assert!(kinds(0).contains(kind), "no {kind}");
     }
     assert!(kinds(1).contains("ScaledObject"));
-    let scaled = found[1].documents.iter().find(|document| document["kind"] == "ScaledObject").unwrap();
-    assert_eq!(scaled["spec"]["triggers"].as_array().unwrap().len(), 24, "one trigger for each queue");
+    let triggers = |n: usize| {
+        let scaled = found[n].documents.iter().filter(|document| document["kind"] == "ScaledObject");
+        scaled.map(|scaled| scaled["spec"]["triggers"].as_array().unwrap().clone()).collect::<Vec<_>>()
+    };
+    assert_eq!(triggers(1).iter().map(Vec::len).collect::<Vec<_>>(), [48], "one trigger for each queue");
+    let [cpu, gpu] = &triggers(2)[..] else { panic!("two kinds of workers") };
+    let of = |triggers: &[Value], class: &str| {
+        triggers.iter().all(|trigger| class.contains(&trigger["metadata"]["consumer"].as_str().unwrap()[7..]))
+    };
+    assert!(cpu.len() == 24 && gpu.len() == 24 && of(cpu, "024") && of(gpu, "135"));
     // The configuration of the pods is valid.
     let map = found[0].documents.iter().find(|document| document["kind"] == "ConfigMap").unwrap();
     let file = folder.file("molmesh.toml", map["data"]["molmesh.toml"].as_str().unwrap());

@@ -31,6 +31,13 @@ impl Cluster {
 
     /// Starts a node, whose own data are in the folder `name`.
     fn node(&self, name: &str, role: &str) -> Process {
+        let node = Process::spawn(self.command(role), &self.folder.path().join(name));
+        wait_for("the node to be ready", || get(node.addr, "/readyz").status == 200);
+        node
+    }
+
+    /// Returns a command with the configuration of a node.
+    fn command(&self, role: &str) -> Command {
         let mut program = Command::new(env!("CARGO_BIN_EXE_molmesh"));
         program
             .env("MOLMESH__BROKER__URL", self.nats.address())
@@ -38,9 +45,7 @@ impl Cluster {
             .env("MOLMESH__STORE__URL", format!("file://{}", self.folder.path().join("store").display()))
             .env("MOLMESH__STORE__CHECK_INTERVAL_MS", "200")
             .env("MOLMESH__SERVER__ROLE", role);
-        let node = Process::spawn(program, &self.folder.path().join(name));
-        wait_for("the node to be ready", || get(node.addr, "/readyz").status == 200);
-        node
+        program
     }
 }
 
@@ -187,6 +192,42 @@ fn a_cluster_recovers_from_the_loss_of_its_queue() {
             successful(api.addr, &submit(api.addr, "/v1/meshes?format=stl&resolution=1", &sample(4)));
         }
         kill_all([api, worker]);
+    }
+}
+
+#[test]
+fn the_command_reconcile_finds_and_dispatches_lost_jobs() {
+    for program in nats::programs() {
+        let mut cluster = Cluster::start(&program);
+        let reconcile = |cluster: &Cluster, more: &[&str]| {
+            let mut command = cluster.command("all");
+            let output = command.args(["reconcile", "--report", "json"]).args(more).output().unwrap();
+            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            serde_json::from_slice::<Value>(&output.stdout).unwrap()
+        };
+        let counts = |found: &Value| (found["unfinished"].clone(), found["lost"].as_array().unwrap().len());
+        let api = cluster.node("a", "api");
+        let job = submit(api.addr, "/v1/meshes?format=stl&resolution=1", SAMPLE);
+        assert_eq!(counts(&reconcile(&cluster, &["--dry-run"])), (1.into(), 0), "it is queued");
+        api.kill();
+        cluster.nats.stop(false);
+        cluster.nats.restart();
+        for _ in 0..2 {
+            let found = reconcile(&cluster, &["--dry-run"]);
+            assert_eq!((counts(&found), &found["dispatched"]), ((1.into(), 1), &0.into()));
+            let lost = &found["lost"][0];
+            let id = lost["id"].as_str().unwrap().trim_end_matches('…');
+            assert!(id.len() == 8 && job.rsplit('/').next().unwrap().starts_with(id), "{lost}");
+            assert_eq!(lost["status"], "accepted");
+        }
+        let found = reconcile(&cluster, &[]);
+        assert_eq!((counts(&found), &found["dispatched"]), ((1.into(), 1), &1.into()));
+        assert_eq!(counts(&reconcile(&cluster, &["--dry-run"])), (1.into(), 0));
+        // Without its broker, the command fails.
+        cluster.nats.stop(true);
+        let failed = cluster.command("all").arg("reconcile").output().unwrap();
+        let text = String::from_utf8_lossy(&failed.stderr);
+        assert!(failed.status.code() == Some(1) && text.contains("broker.url"), "{text}");
     }
 }
 

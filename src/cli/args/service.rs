@@ -68,9 +68,9 @@ pub(crate) enum LogStyle {
     Json,
 }
 
-/// Values of `doctor --report`.
+/// Values of `--report` of `doctor` and `reconcile`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum DoctorStyle {
+pub(crate) enum SurveyStyle {
     /// Text
     Text,
     /// JSON
@@ -83,7 +83,7 @@ pub(crate) enum DoctorStyle {
 pub(crate) struct DoctorArgs {
     /// Format of the report on stdout
     #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
-    pub(crate) report: DoctorStyle,
+    pub(crate) report: SurveyStyle,
     /// Measure the CPU and the GPU for `--backend auto` of later commands, and store the result in the cache folder
     /// (`$XDG_CACHE_HOME` or `~/.cache`)
     #[arg(long)]
@@ -93,6 +93,23 @@ pub(crate) struct DoctorArgs {
     pub(crate) timeout: f64,
     #[command(flatten)]
     pub(crate) serve: ServeArgs,
+}
+
+// `molmesh reconcile`.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct ReconcileArgs {
+    /// List the lost jobs without dispatching them
+    #[arg(long)]
+    pub(crate) dry_run: bool,
+    /// Format of the report on stdout
+    #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
+    pub(crate) report: SurveyStyle,
+    /// Configuration file (TOML) of the nodes
+    #[arg(long, value_name = "FILE", env = "MOLMESH_CONFIG", hide_env_values = true)]
+    pub(crate) config: Option<PathBuf>,
+    /// Set one value of the configuration, such as `broker.url=nats://host:4222`; may be repeated
+    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    pub(crate) set: Vec<String>,
 }
 
 // `molmesh config`.

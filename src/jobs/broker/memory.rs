@@ -176,7 +176,12 @@ impl Broker for MemoryBroker {
         Box::pin(std::future::ready(queued))
     }
 
-    fn claim(&self) -> BoxFuture<'_, Claim> {
+    fn holds<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>> {
+        Box::pin(std::future::ready(Ok(self.0.lock().held.contains_key(&job.id))))
+    }
+
+    fn claim(&self, _prefers_gpu: bool) -> BoxFuture<'_, Claim> {
+        // All workers of a process have the same devices.
         Box::pin(async {
             loop {
                 let filled = self.0.filled.notified();

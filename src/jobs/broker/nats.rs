@@ -3,7 +3,8 @@
 //! Queued and claimed jobs are the messages of a stream with one subject per job, `PREFIX.jobs.LANE.CLASS.ID`: the
 //! stream rejects a second message with a subject, and an acknowledged message is removed. Each client belongs to a
 //! lane, by its number. Lanes take turns, so a client with many jobs delays those of other lanes by one job only.
-//! Within a lane, a class of higher urgency precedes the others. Events of jobs are plain messages, which may be lost.
+//! Within a lane, a class of higher urgency precedes the others. The number of a class is even, or odd for jobs that
+//! suit a GPU: a worker first looks for those that suit it. Events of jobs are plain messages, which may be lost.
 //!
 //! Uses only what servers from version 2.9 on offer.
 
@@ -19,7 +20,7 @@ use async_nats::connection::State;
 use async_nats::jetstream::consumer::{AckPolicy, Consumer, pull};
 use async_nats::jetstream::context::PublishErrorKind;
 use async_nats::jetstream::message::PublishMessage;
-use async_nats::jetstream::stream::{Config as StreamConfig, DiscardPolicy, RetentionPolicy};
+use async_nats::jetstream::stream::{Config as StreamConfig, DiscardPolicy, LastRawMessageErrorKind, RetentionPolicy};
 use async_nats::jetstream::{Context, ContextBuilder};
 use async_nats::{Client as Connection, ConnectOptions, Event};
 use bytes::Bytes;
@@ -42,8 +43,10 @@ use crate::telemetry::{BROKER_QUEUED, BROKER_UP};
 const LANES: usize = 8;
 /// Most urgent class of each urgency from 0 to 7: urgent, normal, background.
 const CLASS: [usize; 8] = [0, 0, 0, 1, 2, 2, 2, 2];
-/// Number of classes.
+/// Number of classes. Each has a queue of jobs that suit a GPU, behind that of the others.
 const CLASSES: usize = 3;
+/// Number of queues.
+const QUEUES: usize = LANES * CLASSES * 2;
 /// Time limit of a request to the server.
 const REQUEST: Duration = Duration::from_secs(5);
 /// Interval at which the server is asked for the number of jobs, and idle workers look for jobs.
@@ -238,7 +241,7 @@ impl NatsState {
         self.context.create_or_update_stream(self.lock_stream()).await.map_err(|error| error.to_string())?;
         let mut queues = Vec::new();
         for lane in 0..LANES {
-            for class in 0..CLASSES {
+            for class in 0..CLASSES * 2 {
                 let config = pull::Config {
                     durable_name: Some(format!("lane-{lane}-{class}")),
                     filter_subject: format!("{}.jobs.{lane}.{class}.*", self.config.prefix),
@@ -261,7 +264,7 @@ impl NatsState {
 
     fn subject_of(&self, job: &Dispatch) -> String {
         let lane = job.client.0 % LANES as u64;
-        let class = CLASS[usize::from(job.urgency.min(7))];
+        let class = 2 * CLASS[usize::from(job.urgency.min(7))] + usize::from(job.suits_gpu);
         format!("{}.jobs.{lane}.{class}.{}", self.config.prefix, job.id.as_str())
     }
 
@@ -291,11 +294,23 @@ impl Broker for NatsBroker {
         })
     }
 
-    fn claim(&self) -> BoxFuture<'_, Claim> {
+    fn holds<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>> {
+        Box::pin(async move {
+            let failed = |error: &dyn std::fmt::Display| DispatchError::Unavailable { why: error.to_string() };
+            let stream = self.0.context.get_stream_no_info(self.0.stream()).await.map_err(|error| failed(&error))?;
+            match stream.get_last_raw_message_by_subject(&self.0.subject_of(job)).await {
+                Ok(_) => Ok(true),
+                Err(error) if error.kind() == LastRawMessageErrorKind::NoMessageFound => Ok(false),
+                Err(error) => Err(failed(&error)),
+            }
+        })
+    }
+
+    fn claim(&self, prefers_gpu: bool) -> BoxFuture<'_, Claim> {
         self.0.respond();
-        Box::pin(async {
+        Box::pin(async move {
             loop {
-                match self.0.next().await {
+                match self.0.next(prefers_gpu).await {
                     Ok(claim) => return claim,
                     Err(why) => {
                         tracing::debug!(why, "no job was claimed");

@@ -91,17 +91,17 @@ async fn with_all<F: Future<Output = ()>>(test: impl Fn(Arc<Shared>) -> F) {
 }
 
 fn job(client: u64, urgency: u8) -> Dispatch {
-    Dispatch { id: JobId::random(&[0; 32], client).unwrap(), client: Client(client), urgency }
+    Dispatch { id: JobId::random(&[0; 32], client).unwrap(), client: Client(client), urgency, suits_gpu: false }
 }
 
 /// Claims a job that must be available.
 async fn claim(broker: &Arc<dyn Broker>) -> Claim {
-    tokio::time::timeout(SOON, broker.claim()).await.expect("a job is available")
+    tokio::time::timeout(SOON, broker.claim(false)).await.expect("a job is available")
 }
 
 /// Checks that no job is available for `time`.
 async fn none_within(broker: &Arc<dyn Broker>, time: Duration) {
-    if let Ok(claim) = tokio::time::timeout(time, broker.claim()).await {
+    if let Ok(claim) = tokio::time::timeout(time, broker.claim(false)).await {
         panic!("claimed {claim:?}");
     }
 }
@@ -184,12 +184,14 @@ async fn a_job_is_queued_once_until_it_is_done() {
     with_all(|shared| async move {
         let (a, b) = (shared.node().await, shared.node().await);
         let job = job(1, DEFAULT_URGENCY);
-        assert_eq!(a.dispatch(&job).await, Ok(true));
+        assert_eq!((a.holds(&job).await, a.dispatch(&job).await), (Ok(false), Ok(true)));
         assert_eq!((b.dispatch(&job).await, a.dispatch(&job).await), (Ok(false), Ok(false)), "it is queued");
+        assert_eq!(b.holds(&job).await, Ok(true));
         let claimed = claim(&b).await;
-        assert_eq!(a.dispatch(&job).await, Ok(false), "it is claimed");
+        assert_eq!((a.dispatch(&job).await, a.holds(&job).await), (Ok(false), Ok(true)), "it is claimed");
         none_within(&a, Duration::from_millis(300)).await;
         claimed.done().await;
+        assert_eq!(a.holds(&job).await, Ok(false));
         assert_eq!(a.dispatch(&job).await, Ok(true), "it is done");
         claim(&b).await.done().await;
     })
@@ -241,8 +243,8 @@ async fn a_job_of_a_crashed_node_is_claimed_again() {
         let job = job(1, DEFAULT_URGENCY);
         assert_eq!(broker.dispatch(&job).await, Ok(true));
         let begun = Instant::now();
-        shared.crash(|broker| async move { broker.claim().await }).await;
-        let claimed = tokio::time::timeout(LEASE + SOON, broker.claim()).await.expect("the lease expires");
+        shared.crash(|broker| async move { broker.claim(false).await }).await;
+        let claimed = tokio::time::timeout(LEASE + SOON, broker.claim(false)).await.expect("the lease expires");
         println!("claimed again after {:?}", begun.elapsed());
         assert_eq!(claimed.id, job.id);
         // A claim of a running node lasts longer than a lease.
@@ -259,7 +261,7 @@ async fn nodes_share_the_jobs() {
         let nodes = [shared.node().await, shared.node().await, shared.node().await];
         let work = |broker: Arc<dyn Broker>| async move {
             let mut claimed = Vec::new();
-            while let Ok(claim) = tokio::time::timeout(Duration::from_secs(2), broker.claim()).await {
+            while let Ok(claim) = tokio::time::timeout(Duration::from_secs(2), broker.claim(false)).await {
                 claimed.push(claim.id.clone());
                 tokio::time::sleep(Duration::from_millis(10)).await;
                 claim.done().await;

@@ -61,7 +61,8 @@ fn explore(returns_early: bool) {
     let model = move || {
         let (broker, counts) = (MemoryBroker::new(8), Arc::<RunCounts>::default());
         let job = |n: u64| JobId::from_key(&[0; 32], crate::store::Namespace::default(), n, "k");
-        let jobs: Vec<_> = (0..JOBS).map(|n| Dispatch { id: job(n), client: Client(n % 2), urgency: 3 }).collect();
+        let jobs: Vec<_> =
+            (0..JOBS).map(|n| Dispatch { id: job(n), client: Client(n % 2), urgency: 3, suits_gpu: false }).collect();
         let node = || {
             let (broker, jobs) = (broker.clone(), jobs.clone());
             thread::spawn(move || {
@@ -76,7 +77,7 @@ fn explore(returns_early: bool) {
                 loop {
                     let next = async {
                         tokio::select! {
-                            claim = broker.claim() => Some(claim),
+                            claim = broker.claim(false) => Some(claim),
                             _ = stop.wait_for(|stops| *stops) => None,
                         }
                     };

@@ -10,7 +10,7 @@ use metrics::counter;
 use tokio::time::{sleep, timeout};
 
 use super::lease::NatsLease;
-use super::{CLASSES, LANES, NatsState, POLL, Queue, REQUEST};
+use super::{CLASSES, LANES, NatsState, POLL, QUEUES, Queue, REQUEST};
 use crate::jobs::broker::Claim;
 use crate::telemetry::BROKER_REDELIVERIES;
 
@@ -20,10 +20,18 @@ const EMPTY: Duration = Duration::from_secs(1);
 const RETRIES: u32 = 5;
 const FIRST_RETRY: Duration = Duration::from_millis(2);
 
+/// Time for which idle workers leave a new job to those that it suits.
+const PRECEDENCE: Duration = Duration::from_millis(20);
+
+/// Returns true if the jobs of a class suit a GPU.
+const fn suits_gpu(class: usize) -> bool {
+    class % 2 == 1
+}
+
 /// State of the search for jobs.
 pub(super) struct JobSearch {
     /// Time until which each queue is assumed to be empty.
-    empty_until: [Instant; LANES * CLASSES],
+    empty_until: [Instant; QUEUES],
     /// Lane whose turn it is.
     turn: usize,
     /// Announcements of new jobs. Each idle node gets its share.
@@ -32,20 +40,20 @@ pub(super) struct JobSearch {
 
 impl Default for JobSearch {
     fn default() -> Self {
-        Self { empty_until: [Instant::now(); LANES * CLASSES], turn: 0, announcements: None }
+        Self { empty_until: [Instant::now(); QUEUES], turn: 0, announcements: None }
     }
 }
 
 impl NatsState {
     /// Waits for a job and claims it, or returns an error of the server.
-    pub(super) async fn next(&self) -> Result<Claim, String> {
+    pub(super) async fn next(&self, prefers_gpu: bool) -> Result<Claim, String> {
         let mut search = self.search.lock().await;
         let search = &mut *search;
         let mut retries = 0;
         loop {
             let queues = self.queues().ok_or("the stream does not exist yet")?;
             let before = search.empty_until;
-            if let Some(claim) = self.scan(search, &queues).await? {
+            if let Some(claim) = self.scan(search, &queues, prefers_gpu).await? {
                 search.announcements = None;
                 return Ok(claim);
             }
@@ -58,10 +66,11 @@ impl NatsState {
             let Some(announcements) = &mut search.announcements else {
                 // Jobs that are dispatched from now on are announced; earlier ones are found by another search.
                 let all = format!("{}.jobs.>", self.config.prefix);
-                let announcements = self.connection.queue_subscribe(all, "idle".to_owned()).await;
+                let group = if prefers_gpu { "idle-gpu" } else { "idle" };
+                let announcements = self.connection.queue_subscribe(all, group.to_owned()).await;
                 search.announcements = Some(announcements.map_err(|error| error.to_string())?);
                 self.connection.flush().await.map_err(|error| error.to_string())?;
-                search.empty_until = [Instant::now(); LANES * CLASSES];
+                search.empty_until = [Instant::now(); QUEUES];
                 continue;
             };
             let announced = loop {
@@ -83,25 +92,31 @@ impl NatsState {
             let mut parts = message.subject.as_str().rsplit('.').skip(1);
             let mut number = || parts.next()?.parse::<usize>().ok();
             if let Some((class, lane)) = number().zip(number())
-                && let Some(until) = search.empty_until.get_mut(lane * CLASSES + class)
+                && let Some(until) = search.empty_until.get_mut(lane * CLASSES * 2 + class)
             {
                 *until = Instant::now();
                 retries = RETRIES;
+                if suits_gpu(class) != prefers_gpu {
+                    sleep(PRECEDENCE).await;
+                }
             }
         }
     }
 
     /// Claims the first job of the lane whose turn it is, or of the next lane that has any.
-    async fn scan(&self, search: &mut JobSearch, queues: &[Queue]) -> Result<Option<Claim>, String> {
+    async fn scan(&self, search: &mut JobSearch, queues: &[Queue], prefers_gpu: bool) -> Result<Option<Claim>, String> {
         for step in 0..LANES {
             let lane = (search.turn + step) % LANES;
-            let of_lane = search.empty_until.iter_mut().zip(queues).skip(lane * CLASSES).take(CLASSES);
-            for (until, queue) in of_lane.filter(|(until, _)| **until <= Instant::now()) {
-                if let Some(claim) = self.fetch(queue).await? {
+            let numbers = (0..CLASSES * 2).map(|class| lane * CLASSES * 2 + (class ^ usize::from(prefers_gpu)));
+            for number in numbers {
+                if search.empty_until[number] > Instant::now() {
+                    continue;
+                }
+                if let Some(claim) = self.fetch(&queues[number]).await? {
                     search.turn = lane + 1;
                     return Ok(Some(claim));
                 }
-                *until = Instant::now() + EMPTY;
+                search.empty_until[number] = Instant::now() + EMPTY;
             }
         }
         Ok(None)

@@ -44,7 +44,7 @@ async fn jobs_are_dispatched_and_claimed_concurrently() {
             let claimed = Arc::clone(&claimed);
             tokio::spawn(async move {
                 while claimed.fetch_add(1, std::sync::atomic::Ordering::Relaxed) < n {
-                    let claim = node.claim().await;
+                    let claim = node.claim(false).await;
                     // The job itself takes no time.
                     tokio::spawn(claim.done());
                 }
@@ -125,5 +125,46 @@ async fn a_broker_that_comes_back_is_used_again() {
             assert_eq!(claimed.id, queued.id);
             claimed.release(Duration::ZERO);
         }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn workers_claim_what_suits_them_first() {
+    for program in server::programs() {
+        let server = NatsServer::start(&program);
+        let [gpu, cpu] = [nats(&server).await, nats(&server).await].map(Arc::new);
+        let of = |suits_gpu: bool, urgency: u8| Dispatch { suits_gpu, ..job(1, urgency) };
+        // Queued jobs: those that suit the worker first, but not before more urgent ones.
+        let jobs = [of(false, 3), of(true, 3), of(false, 3), of(true, 3), of(false, 0)];
+        for job in &jobs {
+            assert_eq!(cpu.dispatch(job).await, Ok(true));
+        }
+        for (number, prefers_gpu) in [(4, true), (1, true), (0, false), (3, true), (2, true)] {
+            let claimed = tokio::time::timeout(SOON, cpu.claim(prefers_gpu)).await.expect("a job is available");
+            assert_eq!(claimed.id, jobs[number].id, "{number}");
+            claimed.done().await;
+        }
+        // New jobs: an idle worker that they suit precedes the others.
+        for n in 0..10 {
+            let job = of(n % 2 == 0, 3);
+            let [on_gpu, on_cpu] = [(&gpu, true), (&cpu, false)].map(|(broker, prefers_gpu)| {
+                let broker = Arc::clone(broker);
+                tokio::spawn(async move { broker.claim(prefers_gpu).await })
+            });
+            // Both look for jobs.
+            tokio::time::sleep(Duration::from_millis(300)).await;
+            assert_eq!(cpu.dispatch(&job).await, Ok(true));
+            let (taker, idle) = if job.suits_gpu { (on_gpu, on_cpu) } else { (on_cpu, on_gpu) };
+            let claimed = tokio::time::timeout(SOON, taker).await.expect("the worker that it suits").unwrap();
+            assert_eq!(claimed.id, job.id);
+            claimed.done().await;
+            idle.abort();
+        }
+        // A worker takes what does not suit it if nothing else waits.
+        let other = of(true, 3);
+        assert_eq!(cpu.dispatch(&other).await, Ok(true));
+        let claimed = tokio::time::timeout(SOON, cpu.claim(false)).await.expect("a job is available");
+        assert_eq!(claimed.id, other.id);
+        claimed.done().await;
     }
 }
