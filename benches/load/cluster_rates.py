@@ -17,12 +17,12 @@ from cluster import Cluster
 from mixed import Server, fetch, folder
 
 
-def accept(port, structure, number):
+def accept(port, structure, number, resolution):
     """Submits jobs on one connection. Returns their addresses and the times to accept them, s."""
     connection, jobs, times = http.client.HTTPConnection("127.0.0.1", port), [], []
     for n in range(number):
         begun = time.perf_counter()
-        connection.request("POST", f"/v1/meshes?resolution=1&isovalue={1 + n / 1e5:.5f}&format=stl", structure, {"prefer": "respond-async"})
+        connection.request("POST", f"/v1/meshes?resolution={resolution}&isovalue={1 + n / 1e5:.5f}&format=stl", structure, {"prefer": "respond-async"})
         response = connection.getresponse()
         response.read()
         times.append(time.perf_counter() - begun)
@@ -40,8 +40,8 @@ def rate(port, jobs):
     return len(jobs) / (time.perf_counter() - begun)
 
 
-def report(what, port, structure, number):
-    jobs, times = accept(port, structure, number)
+def report(what, port, structure, args):
+    jobs, times = accept(port, structure, args.jobs, args.resolution)
     times.sort()
     done = rate(port, jobs)
     ms = [1e3 * times[len(times) * percent // 100] for percent in (50, 99)]
@@ -63,6 +63,7 @@ def main():
     parser.add_argument("nats")
     parser.add_argument("structure")
     parser.add_argument("--jobs", type=int, default=400)
+    parser.add_argument("--resolution", default="1", help="grid spacing of the jobs, A")
     parser.add_argument("--port", type=int, default=18900)
     args = parser.parse_args()
     os.environ["RAYON_NUM_THREADS"] = "1"
@@ -70,12 +71,12 @@ def main():
         structure = file.read()
     alone = Server(args.binary, folder(), args.port, ["--backend", "cpu", "--set", "jobs.workers=1"])
     alone.start()
-    report("a service alone", args.port, structure, args.jobs)
+    report("a service alone", args.port, structure, args)
     alone.stop()
     for workers in (1, 2, 3):
         cluster = Cluster(args.binary, args.nats, args.port + 100 * workers, ["api"] + workers * ["worker"], ["jobs.workers=1"])
         cluster.start()
-        report(f"{workers} workers", cluster.of_role("api")[0].port, structure, args.jobs)
+        report(f"{workers} workers", cluster.of_role("api")[0].port, structure, args)
         cluster.stop()
 
 

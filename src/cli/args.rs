@@ -20,7 +20,7 @@ pub(crate) use keys::{KeyCommand, NewKeyArgs, SignArgs, SigningKeyArgs};
 pub(crate) use render::{PictureArgs, RenderArgs};
 #[cfg(feature = "server")]
 pub(crate) use service::{
-    ConfigCommand, ConfigStyle, DoctorArgs, HealthcheckArgs, LogStyle, PrintArgs, ReconcileArgs, ServeArgs, SurveyStyle,
+    ConfigCommand, ConfigStyle, DoctorArgs, HealthcheckArgs, LogStyle, PrintArgs, ReconcileArgs, ServeArgs, TextOrJson,
 };
 
 const MESH_EXAMPLES: &str = "\
@@ -341,7 +341,7 @@ pub(crate) struct SelectionArgs {
     /// neighbouring instances are not joined
     #[arg(long)]
     pub(crate) instances: bool,
-    /// Mesh one unit of the assembly, by its number in the order of --instances, where it is in the file
+    /// Mesh one unit of the assembly, where it is in the file; NUMBER counts the parts of a report with --instances
     #[arg(long, value_name = "NUMBER")]
     pub(crate) unit: Option<String>,
     /// Atoms whose surface is made: selection (the selected atoms alone), or whole (all polymer chains and the selected

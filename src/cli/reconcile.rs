@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use molmesh::http::{Reconciled, reconcile};
 
-use super::args::{ReconcileArgs, SurveyStyle};
+use super::args::{ReconcileArgs, TextOrJson};
 use super::error::CliError;
 use super::page::Page;
 use super::style::Style;
@@ -17,28 +17,27 @@ const MAX_LISTED: usize = 20;
 /// Runs the command.
 pub(super) fn run(args: &ReconcileArgs) -> Result<(), CliError> {
     let config = super::config::load_with(args.config.as_deref(), &args.set, [])?.config;
-    if config.broker.url.is_none() {
-        return Err(CliError::Usage {
-            message: "the configuration has no broker.url".to_owned(),
-            hint: Some("a service without a broker dispatches the jobs of its store when it starts".to_owned()),
-        });
-    }
+    let url = config.broker.url.as_deref().ok_or_else(|| CliError::Usage {
+        message: "the configuration has no broker.url".to_owned(),
+        hint: Some("a service without a broker dispatches the jobs of its store when it starts".to_owned()),
+    })?;
     let failed = |e: std::io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().map_err(failed)?;
-    let found = runtime.block_on(reconcile(&config, args.dry_run, WAIT));
+    let found = runtime.block_on(reconcile(&config, url, args.dry_run, WAIT));
     let found = found.map_err(|error| CliError::Service(error.to_string()))?;
     super::print(&match args.report {
-        SurveyStyle::Text => text(&found, args.dry_run),
-        SurveyStyle::Json => {
+        TextOrJson::Text => text(&found, args.dry_run),
+        TextOrJson::Json => {
             let document = serde_json::to_value(&found).map_err(|error| CliError::Internal(error.to_string()))?;
             super::config::pretty(&document)
         }
-    })
+    })?;
+    found.error.map_or(Ok(()), |error| Err(CliError::Service(format!("not all jobs were examined: {error}"))))
 }
 
 /// Formats the result as text.
 fn text(found: &Reconciled, dry_run: bool) -> String {
-    let Reconciled { unfinished, dispatched, unreadable, lost } = found;
+    let Reconciled { unfinished, dispatched, unreadable, lost, error: _ } = found;
     let mut page = Page::new(Style::stdout(), "jobs", &format!("{unfinished} unfinished on record"));
     let state = if dry_run { "not dispatched (--dry-run)".to_owned() } else { format!("{dispatched} dispatched") };
     page.row("lost", &format!("{} without a message in the broker, {state}", lost.len()));
@@ -49,7 +48,10 @@ fn text(found: &Reconciled, dry_run: bool) -> String {
         page.row("", &format!("and {} others", lost.len() - MAX_LISTED));
     }
     if *unreadable > 0 {
-        page.row("unreadable", &format!("{unreadable} records, which the next node moves into quarantine"));
+        page.row(
+            "unreadable",
+            &format!("{unreadable} records; the next node that reads them moves them into quarantine"),
+        );
     }
     page.finish()
 }

@@ -159,7 +159,7 @@ fn surface(report: &Report) -> String {
 /// Formats the assembly, or its unit.
 fn assembled(AssemblyReport { id, copies, unit }: &AssemblyReport) -> String {
     match unit {
-        Some(unit) => format!("unit {unit} of {id}, not copied"),
+        Some(unit) => format!("{id}, unit {unit} only, without operators"),
         None => format!("{id} of {} copies", grouped(*copies)),
     }
 }

@@ -53,8 +53,8 @@ pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
 /// Folder of a tileset. Dropping it before it is complete removes its files.
 struct Folder {
     path: PathBuf,
-    /// True if the command created the folder.
-    is_new: bool,
+    /// Folders that the command created, innermost first: this one and those that contain it.
+    created: Vec<PathBuf>,
     complete: bool,
 }
 
@@ -65,13 +65,14 @@ impl Folder {
             return Err(CliError::usage("a tileset has several files and cannot be written to stdout"));
         }
         let failed = |source| CliError::Output { name: path.display().to_string(), source };
-        let is_new = !path.exists();
+        let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
+        let created = path.ancestors().take_while(is_missing).map(Path::to_owned).collect();
         fs::create_dir_all(path).map_err(failed)?;
         if fs::read_dir(path).map_err(failed)?.next().is_some() {
             let message = format!("`{}` is not empty", path.display());
             return Err(CliError::Usage { message, hint: Some("name another folder with -o".to_owned()) });
         }
-        Ok(Self { path: path.to_owned(), is_new, complete: false })
+        Ok(Self { path: path.to_owned(), created, complete: false })
     }
 
     /// Writes a file, whose path is relative to the folder.
@@ -95,8 +96,8 @@ impl Drop for Folder {
             drop(fs::remove_dir_all(self.path.join(name)));
         }
         drop(fs::remove_file(self.path.join("tileset.json")));
-        if self.is_new {
-            drop(fs::remove_dir(&self.path));
+        for folder in &self.created {
+            drop(fs::remove_dir(folder));
         }
     }
 }

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::server::{ServeError, connect_broker};
 use crate::config::Config;
-use crate::jobs::{Broker as _, Dispatch, DispatchError, rfc3339, unfinished_jobs};
+use crate::jobs::{Broker as _, Dispatch, DispatchError, JobRecord, NatsBroker, rfc3339, unfinished_jobs};
 use crate::store::Store;
 
 /// Interval at which the broker is asked whether it answers.
@@ -23,12 +23,14 @@ pub struct Reconciled {
     pub unreadable: usize,
     /// Unfinished jobs that the broker did not have, oldest first.
     pub lost: Vec<LostJob>,
+    /// Error of the broker, after which no further job was examined; null without one.
+    pub error: Option<String>,
 }
 
 /// Unfinished job that the broker did not have.
 #[derive(Debug, Clone, Serialize)]
 pub struct LostJob {
-    /// Beginning of the id, as in the log.
+    /// Id of the job.
     pub id: String,
     /// Status at the last write: `accepted` or `running`.
     pub status: &'static str,
@@ -36,19 +38,16 @@ pub struct LostJob {
     pub created: String,
 }
 
-/// Dispatches the unfinished jobs of the store that the broker does not have. A dry run only lists them. Waits at most
-/// `limit` for the broker. A job that is being accepted or has just ended may be listed as well; to dispatch it is
-/// harmless.
+/// Dispatches the unfinished jobs of the store that the broker at `url` does not have. A dry run only lists them. Waits
+/// at most `limit` for the broker. Creates neither store nor streams. A job that is being accepted or has just ended
+/// may be listed as well; dispatching it again is harmless.
 ///
 /// # Errors
-/// Returns a [`ServeError`] if `broker.url` is not set, or the store or the broker cannot be used.
-pub async fn reconcile(config: &Config, dry_run: bool, limit: Duration) -> Result<Reconciled, ServeError> {
-    let Some(url) = &config.broker.url else {
-        let why = "it is not set; a service without a broker dispatches the jobs of its store when it starts";
-        return Err(ServeError::Broker(why.to_owned()));
-    };
-    let store = Store::open_shared(&config.store, &config.server.data_dir).await?;
-    let broker = connect_broker(config, url, &store.secret().await?).await?;
+/// Returns a [`ServeError`] if the store or the broker cannot be used. After a later error of the broker, the result
+/// contains it.
+pub async fn reconcile(config: &Config, url: &str, dry_run: bool, limit: Duration) -> Result<Reconciled, ServeError> {
+    let store = Store::open_existing(&config.store, &config.server.data_dir).await?;
+    let broker = connect_broker(config, url, &store.secret().await?, false).await?;
     let end = tokio::time::Instant::now() + limit;
     while let Some(why) = broker.down() {
         if tokio::time::Instant::now() >= end {
@@ -57,17 +56,28 @@ pub async fn reconcile(config: &Config, dry_run: bool, limit: Duration) -> Resul
         tokio::time::sleep(CHECK).await;
     }
     let (records, unreadable) = unfinished_jobs(&store).await?;
-    let mut result = Reconciled { unfinished: records.len(), dispatched: 0, unreadable, lost: Vec::new() };
+    let mut result = Reconciled { unfinished: records.len(), dispatched: 0, unreadable, lost: Vec::new(), error: None };
     for record in records {
-        let (dispatch, failed) = (Dispatch::of(&record), |error: DispatchError| ServeError::Broker(error.to_string()));
-        if broker.holds(&dispatch).await.map_err(failed)? {
-            continue;
+        if let Err(error) = result.examine(&record, &broker, dry_run).await {
+            result.error = Some(error.to_string());
+            break;
         }
-        if !dry_run {
-            result.dispatched += usize::from(broker.dispatch(&dispatch).await.map_err(failed)?);
-        }
-        let (id, created) = (record.id.to_string(), rfc3339(record.created_ms));
-        result.lost.push(LostJob { id, status: record.status.name(), created });
     }
     Ok(result)
+}
+
+impl Reconciled {
+    /// Lists a job if the broker does not have it, and dispatches it unless in a dry run.
+    async fn examine(&mut self, record: &JobRecord, broker: &NatsBroker, dry_run: bool) -> Result<(), DispatchError> {
+        let dispatch = Dispatch::of(record);
+        if broker.holds(&dispatch).await? {
+            return Ok(());
+        }
+        let (id, created) = (record.id.as_str().to_owned(), rfc3339(record.created_ms));
+        self.lost.push(LostJob { id, status: record.status.name(), created });
+        if !dry_run {
+            self.dispatched += usize::from(broker.dispatch(&dispatch).await?);
+        }
+        Ok(())
+    }
 }

@@ -246,7 +246,7 @@ async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Se
     let describe = |error: &EndError| Problem::from(error.clone()).record("");
     let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
     let broker: Arc<dyn Broker> = match &config.broker.url {
-        Some(url) => Arc::new(connect_broker(config, url, &secret).await?),
+        Some(url) => Arc::new(connect_broker(config, url, &secret, true).await?),
         None => Arc::new(MemoryBroker::new(config.broker.queue)),
     };
     let broker = (broker, config.broker.queue);
@@ -262,11 +262,16 @@ async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Se
     Ok(job_store)
 }
 
-/// Connects to the broker of the nodes that share the store with this secret.
-pub(super) async fn connect_broker(config: &Config, url: &str, secret: &Secret) -> Result<NatsBroker, ServeError> {
+/// Connects to the broker of the nodes that share the store with this secret. With `creates`, creates what is missing.
+pub(super) async fn connect_broker(
+    config: &Config,
+    url: &str,
+    secret: &Secret,
+    creates: bool,
+) -> Result<NatsBroker, ServeError> {
     // Identifies the store without revealing its secret.
     let id = Digest::of(&derive(secret, "store")).to_string();
-    NatsBroker::connect(&config.broker, url, &id).await.map_err(ServeError::Broker)
+    NatsBroker::connect(&config.broker, url, &id, creates).await.map_err(ServeError::Broker)
 }
 
 /// Shuts the service down in the phases that `orders` requests. Returns true if every request was finished.

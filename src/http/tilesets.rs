@@ -23,18 +23,16 @@ use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
 use crate::formats::Compress;
-use crate::formats::tileset::{
-    RepeatedTileset, TileAddress, TilesetUris, assembly_document, subtree, tileset_document,
-};
-use crate::jobs::{CacheKey, Failure, Input, SharedTileset};
+use crate::formats::tileset::{TileAddress, TilesetUris, assembly_document, subtree, tileset_document};
+use crate::jobs::{CacheKey, Failure, Input, SharedStructure, SharedTileset};
 use crate::pipeline::params::ParamError;
-use crate::pipeline::tileset::UnitTileset;
+use crate::pipeline::tileset::AssemblyTileset;
 use crate::pipeline::{Job, JobError, StageClock, params, tileset};
 use crate::structure::ReadLimits;
 use crate::surface::{Control, SurfaceError};
 
-/// Memory of a placement in the document of an assembly, bytes.
-const PLACEMENT_BYTES: u64 = 4096;
+/// Memory of an instance in the document of an assembly, bytes.
+const DOCUMENT_BYTES: u64 = 4096;
 
 problem_responses!(StructureProblems: [
     READING,
@@ -163,7 +161,7 @@ impl TilesetRequest {
         if self.job.selection.instances {
             return self.assembly().await;
         }
-        let query = query(&self.pairs);
+        let query = query(&self.pairs, None);
         let tile = format!("tile={{level}}/{{x}}/{{y}}/{{z}}&{query}");
         // Clients such as 3d-tiles-renderer recognize a subtree by the end of its URL.
         let subtrees = format!("tileset.subtree?{tile}#.subtree");
@@ -178,20 +176,18 @@ impl TilesetRequest {
     async fn assembly(mut self) -> Result<Response, Problem> {
         let pairs = std::mem::take(&mut self.pairs);
         self.answer("application/json", move |prepared| {
-            let units = prepared.units()?;
-            let instances: usize = units.iter().map(|unit| unit.operators.len()).sum();
-            let memory = prepared.control.reserve(PLACEMENT_BYTES * instances as u64);
+            let assembly = prepared.assembly()?;
+            let instances: usize = assembly.units().iter().map(|unit| unit.operators.len()).sum();
+            let memory = prepared.control.reserve(DOCUMENT_BYTES * instances as u64);
             let _memory = memory.map_err(|error| Failure::from(JobError::from(SurfaceError::from(error))))?;
-            let own = || pairs.iter().filter(|(name, _)| name != "instances").cloned();
-            let uri = |number: usize| {
-                let unit = ("unit".to_owned(), number.to_string());
-                format!("tileset.json?{}", query(&own().chain([unit]).collect::<Vec<_>>()))
-            };
-            let resolution = tileset::job_of_assembly(prepared.job, &units).params.resolution;
-            let spacing = ("resolution".to_owned(), resolution.to_string());
-            let coarse = pairs.iter().filter(|(name, _)| !params::SPACINGS.contains(&&**name)).cloned();
-            let root = format!("surface.glb?{}", query(&coarse.chain([spacing]).collect::<Vec<_>>()));
-            let repeated: Vec<RepeatedTileset> = units.iter().zip(1..).map(|(unit, n)| unit.repeated(uri(n))).collect();
+            let range = assembly.color_range().map(|[low, high]| ("color_range".to_owned(), format!("{low},{high}")));
+            let is_given = pairs.iter().any(|(name, _)| name == "color_range");
+            let range: Vec<(String, String)> = range.filter(|_| !is_given).into_iter().collect();
+            let repeated = assembly.repeated(|number| {
+                let own = pairs.iter().filter(|(name, _)| name != "instances");
+                format!("tileset.json?{}", query(own.chain(&range), Some(("unit", number.to_string()))))
+            });
+            let root = format!("surface.glb?{}", query(&pairs, Some(("tile", TileAddress::ROOT.path()))));
             Ok(assembly_document(&root, &repeated).to_string().into_bytes())
         })
         .await
@@ -260,16 +256,17 @@ impl Preparation<'_> {
         Ok(prepared.map_err(Failure::from)?.0)
     }
 
-    /// Returns the units of the assembly.
-    fn units(&self) -> Result<Vec<UnitTileset>, Problem> {
+    /// Returns the tileset of the assembly.
+    fn assembly(&self) -> Result<AssemblyTileset<SharedStructure>, Problem> {
         let Self { app, key: (namespace, digest), input, job, limits, control } = self;
         let read = |control: &Control<'_>| app.structures().get(*namespace, *digest, input, limits, control);
-        let units = tileset::units(read, job, limits, control, &StageClock::new(&()));
-        Ok(units.map_err(Failure::from)?.1)
+        let assembly = AssemblyTileset::new(read, job, limits, control, &StageClock::new(&()));
+        Ok(assembly.map_err(Failure::from)?)
     }
 }
 
 /// Returns the query of a URL.
-fn query(pairs: &[(String, String)]) -> String {
-    form_urlencoded::Serializer::new(String::new()).extend_pairs(pairs).finish()
+fn query<'a>(pairs: impl IntoIterator<Item = &'a (String, String)>, more: Option<(&str, String)>) -> String {
+    let mut query = form_urlencoded::Serializer::new(String::new());
+    query.extend_pairs(pairs).extend_pairs(more).finish()
 }

@@ -40,7 +40,7 @@ pub(crate) use broker::{Broker, Dispatch, DispatchError, MemoryBroker, NatsBroke
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};
-pub(crate) use kept::{CacheKey, SharedTileset};
+pub(crate) use kept::{CacheKey, SharedStructure, SharedTileset};
 pub(crate) use key::ContentKey;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};

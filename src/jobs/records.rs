@@ -129,16 +129,16 @@ impl JobStoreState {
     /// those of jobs that have ended. Forgets jobs that are not on record any more.
     async fn read_unknown(&self) -> Result<Vec<JobRecord>, StoreError> {
         let mut known = self.open.ids();
-        let OpenNames { mut open, ended } = OpenNames::of(&self.store).await?;
+        let RecordNames { mut unfinished, ended } = RecordNames::of(&self.store).await?;
         for name in ended {
             self.store.delete(&name).await?;
         }
-        open.retain(|name| name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id)));
+        unfinished.retain(|name| name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id)));
         for gone in &known {
             self.open.remove(gone);
         }
         let read = |name: Name| async move { self.read_document(&name).await };
-        let mut reads = stream::iter(open).map(read).buffer_unordered(CONCURRENT_READS);
+        let mut reads = stream::iter(unfinished).map(read).buffer_unordered(CONCURRENT_READS);
         let mut records = Vec::new();
         while let Some(read) = reads.next().await {
             match read {
@@ -153,23 +153,23 @@ impl JobStoreState {
     }
 }
 
-/// Names of the records of open jobs in a store.
-struct OpenNames {
+/// Names of the records in a store that are not those of ends.
+struct RecordNames {
     /// Records of unfinished jobs.
-    open: Vec<Name>,
+    unfinished: Vec<Name>,
     /// Records of jobs that have ended, which a crash has left behind.
     ended: Vec<Name>,
 }
 
-impl OpenNames {
+impl RecordNames {
     async fn of(store: &Store) -> Result<Self, StoreError> {
-        let (ends, all): (Vec<_>, Vec<_>) = store.job_records().await?.into_iter().partition(Name::is_ended_job);
-        let (mut open, mut ended) = (Vec::new(), Vec::new());
-        for name in all {
+        let (ends, others): (Vec<_>, Vec<_>) = store.job_records().await?.into_iter().partition(Name::is_ended_job);
+        let (mut unfinished, mut ended) = (Vec::new(), Vec::new());
+        for name in others {
             let has_ended = ends.binary_search(&Name::ended_job(name.stem())?).is_ok();
-            if has_ended { &mut ended } else { &mut open }.push(name);
+            if has_ended { &mut ended } else { &mut unfinished }.push(name);
         }
-        Ok(Self { open, ended })
+        Ok(Self { unfinished, ended })
     }
 }
 
@@ -177,7 +177,7 @@ impl OpenNames {
 /// and the number of records that cannot be parsed, which the next node that reads them moves into quarantine.
 pub(crate) async fn unfinished_jobs(store: &Store) -> Result<(Vec<JobRecord>, usize), StoreError> {
     let read = |name: Name| async move { store.get(&name).await };
-    let mut reads = stream::iter(OpenNames::of(store).await?.open).map(read).buffer_unordered(CONCURRENT_READS);
+    let mut reads = stream::iter(RecordNames::of(store).await?.unfinished).map(read).buffer_unordered(CONCURRENT_READS);
     let (mut records, mut unreadable) = (Vec::new(), 0);
     while let Some(read) = reads.next().await {
         match read?.map(|stored| JobRecord::from_bytes(&stored.bytes)) {

@@ -117,7 +117,7 @@ fn product(
     progress: &dyn ProgressSink,
 ) -> Result<Product, JobError> {
     let (Task { namespace, digest, input, job, .. }, Settings { structures, limits, .. }) = (task, &shared.settings);
-    if job.tile.is_some() {
+    if job.tile.is_some() && !job.selection.instances {
         let clock = StageClock::new(progress);
         let (tileset, colors) = structures.tileset((*namespace, *digest), input, job, &limits.read, control, &clock)?;
         return tileset.product((job, colors.as_deref()), choice, &limits.surface, control, clock, progress);

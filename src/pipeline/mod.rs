@@ -77,7 +77,7 @@ use estimate::MeshPlan;
 use job_backend::{Division, of_job};
 use load::{SPHERE_BYTES, load};
 use report::Counts;
-use tileset::Tileset;
+use tileset::{AssemblyTileset, Tileset};
 
 /// Number of atom indices that are converted between two checks for cancellation.
 const IDS_PER_CHECK: usize = 1 << 20;
@@ -229,6 +229,10 @@ pub fn run_with<S: Deref<Target = Structure>>(
         return run_whole(read, job, limits, choice, control, progress, sink);
     }
     let clock = StageClock::new(progress);
+    if job.selection.instances {
+        return AssemblyTileset::new(read, job, &limits.read, control, &clock)?
+            .root(job, limits, choice, control, clock);
+    }
     let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
     let colors = job.color.map(|coloring| tileset.colors(coloring, control)).transpose()?;
     tileset.product((job, colors.as_ref()), choice, &limits.surface, control, clock, progress)
@@ -245,8 +249,23 @@ fn run_whole<S: Deref<Target = Structure>>(
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
     let clock = StageClock::new(progress);
+    let loaded = load(read, job, &limits.read, &clock, &Control { observer: &clock, ..control.clone() })?;
+    run_loaded(loaded, job, limits, choice, control, clock, progress, sink)
+}
+
+/// Runs a job on selected spheres of a structure.
+#[expect(clippy::too_many_arguments, reason = "those of `run_with`, and what was loaded")]
+fn run_loaded<S: Deref<Target = Structure>>(
+    (structure, selected, spheres): (S, Selected, Spheres),
+    job: &Job,
+    limits: &JobLimits,
+    choice: &Choice<'_>,
+    control: &Control<'_>,
+    clock: StageClock<'_>,
+    progress: &dyn ProgressSink,
+    sink: Option<&GlbSink<'_>>,
+) -> Result<Product, JobError> {
     let control = Control { observer: &clock, ..control.clone() };
-    let (structure, selected, spheres) = load(read, job, &limits.read, &clock, &control)?;
     let read_map = |file: &MapFile| clock.time("read", || file.read(&limits.map, &control));
     let map = job.map.as_ref().map(read_map).transpose()?;
     let prepare = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, map, &control);

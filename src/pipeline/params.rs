@@ -18,6 +18,7 @@ use values::ParsedValues;
 
 use super::nearest::nearest;
 use super::{Cavities, Interface, Job, tileset};
+use crate::formats::tileset::TileAddress;
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::PictureParams;
 use crate::structure::{BadExpression, Context, Selection, Split};
@@ -140,13 +141,20 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
 /// joined otherwise.
 fn check_instances(job: &Job) -> Result<(), ParamError> {
     let Selection { assembly, context, instances, unit, .. } = &job.selection;
-    if let (None, Some(unit)) = (assembly, unit) {
-        let expected = "no value for the asymmetric unit, or a value of assembly".to_owned();
+    let unfit = match (assembly, context) {
+        (None, _) => Some("the asymmetric unit, or a value of assembly".to_owned()),
+        (_, Context::Whole) => Some(format!("context={}", context.name())),
+        _ => None,
+    };
+    if let (Some(unfit), Some(unit)) = (unfit, unit) {
+        let expected = format!("no value with {unfit}");
         return Err(ParamError::BadValue { name: "unit", value: format!("`{unit}`"), expected });
     }
     let expected = match (assembly, context, job.split) {
         _ if unit.is_some() => "false with a value of unit".to_owned(),
-        _ if job.tile.is_some() => "false for a tile, which belongs to one unit".to_owned(),
+        _ if job.tile.is_some_and(|tile| tile != TileAddress::ROOT) => {
+            "false for a tile other than the root, which belongs to one unit".to_owned()
+        }
         (None, ..) => "false for the asymmetric unit, or a value of assembly".to_owned(),
         (_, Context::Whole, _) => format!("false with context={}, which makes one surface", context.name()),
         (.., split) if split != Split::None => format!("false with split={}", split.name()),

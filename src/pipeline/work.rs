@@ -86,8 +86,8 @@ pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
 #[cfg(feature = "server")]
 const MIN_GPU_WORK: f64 = 10_000.0;
 
-/// Returns true if a machine with a GPU would finish a job on a file of about `atoms` atoms much earlier than one
-/// without: if the surface takes most of its time, and not little.
+/// Returns true if a GPU would make a job on a file of about `atoms` atoms much faster: its surface takes most of the
+/// time, and at least [`MIN_GPU_WORK`]. Tiles are too small.
 #[cfg(feature = "server")]
 pub(crate) fn suits_gpu(atoms: f64, job: &Job) -> bool {
     let resolution = job.spacing.expected(&job.params, atoms);

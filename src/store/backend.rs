@@ -3,8 +3,7 @@
 use std::future::Future;
 use std::io;
 use std::path::{Path as FilePath, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
@@ -34,7 +33,7 @@ const FILE_PART: usize = 1 << 20;
 const CHECK: &str = "check";
 
 /// URL prefix of a folder.
-const FOLDER_URL: &str = "file://";
+pub(super) const FOLDER_URL: &str = "file://";
 
 /// Returns the folder of a store in `data_dir`.
 fn folder_of(data_dir: &FilePath) -> PathBuf {
@@ -60,8 +59,8 @@ pub(super) struct Backend {
     location: String,
     /// Configuration key of the location.
     key: &'static str,
-    /// True once the folder has a secret, without which it is another folder, such as that below a lost mount.
-    has_secret: AtomicBool,
+    /// Secret of the folder once it is known. A folder without it is another one, such as that below a lost mount.
+    secret: OnceLock<Secret>,
     /// Time limit of an operation of a folder. The client of S3 has time limits of its own.
     limit: Duration,
 }
@@ -107,7 +106,7 @@ impl Backend {
         (key, location): (&'static str, String),
         limit: Duration,
     ) -> Self {
-        Self { objects, kind, location, key, has_secret: AtomicBool::new(false), limit }
+        Self { objects, kind, location, key, secret: OnceLock::new(), limit }
     }
 
     /// Creates a backend over a folder with injected behaviour, for tests.
@@ -288,19 +287,30 @@ impl Backend {
                 secret::in_bucket(self.objects.as_ref()).await.map_err(|e| self.fail("secret", "secret", &e))
             }
         };
-        self.has_secret.store(outcome.is_ok(), Ordering::Release);
+        if let Ok(secret) = &outcome {
+            self.secret.get_or_init(|| *secret);
+        }
         outcome.map_err(|error| self.open_error(&error))
+    }
+
+    /// Returns true if a bucket has a secret, and for every folder.
+    pub(super) async fn has_secret(&self) -> Result<bool, StoreError> {
+        if self.is_local() {
+            return Ok(true);
+        }
+        match secret::is_in_bucket(self.objects.as_ref()).await {
+            Err(object_store::Error::NotFound { .. }) => Ok(false),
+            found => found.map(|()| true).map_err(|error| self.open_error(&self.fail("secret", "secret", &error))),
+        }
     }
 
     /// Checks that the folder of the store is still there: a write would create it again, and its objects would be lost
     /// when the right folder returns.
     pub(super) async fn check_folder(&self) -> Result<(), StoreError> {
         let StorageKind::Local(root) = &self.kind else { return Ok(()) };
-        if !self.has_secret.load(Ordering::Acquire) {
-            return Ok(());
-        }
+        let Some(secret) = self.secret.get().copied() else { return Ok(()) };
         let root = root.clone();
-        let found = move || secret::is_in_folder(&root);
+        let found = move || secret::is_in_folder(&root, Some(&secret));
         self.blocking("folder", "", found).await
     }
 

@@ -3,18 +3,20 @@
 //! The index is updated from a list of the store before anything is removed. Inputs are not evicted for space, because
 //! another node may be about to read them, and their age is that of their last write.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::backend::Backend;
+use super::backend::{Backend, FOLDER_URL};
 use super::error::StoreError;
 use super::handle::Store;
 use super::index::EvictionCandidate;
 use super::name::{Folder, Name};
 use super::object::Meta;
+use super::secret;
 use crate::config::StoreConfig;
+use crate::sync::spawn_blocking;
 
 /// Number of objects that are updated in the index under one lock.
 const REFRESHED: usize = 1000;
@@ -28,6 +30,26 @@ impl Store {
     /// As for [`open`](Self::open).
     pub(crate) async fn open_shared(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
         let backend = Backend::open(config, data_dir).await?;
+        Self::open_backend(backend, config, true).await
+    }
+
+    /// Opens the store of a cluster as [`open_shared`](Self::open_shared) does, and creates nothing if there is none.
+    ///
+    /// # Errors
+    /// As for [`open`](Self::open); [`StoreError::Open`] if there is no store.
+    pub(crate) async fn open_existing(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
+        let location = config.url.clone().unwrap_or_default();
+        let root = location.strip_prefix(FOLDER_URL).map(PathBuf::from);
+        let missing = || StoreError::Open { key: "store.url", location, reason: "no store of a service".to_owned() };
+        if let Some(root) = root
+            && !matches!(spawn_blocking(move || secret::is_in_folder(&root, None)).await, Ok(Ok(())))
+        {
+            return Err(missing());
+        }
+        let backend = Backend::open(config, data_dir).await?;
+        if !backend.has_secret().await? {
+            return Err(missing());
+        }
         Self::open_backend(backend, config, true).await
     }
 

@@ -185,32 +185,29 @@ impl<'s> Assembly<'s> {
         Ok(Selected { atoms: all, units, ..selected })
     }
 
-    /// Restricts the assembly to one of the units that [`Self::units`] would return for `atoms`, without operators.
-    /// `number` counts from 1.
+    /// Returns those of `atoms` that belong to one of the units that [`Self::units`] would return for them, in file
+    /// order. `number` counts from 1.
     ///
     /// # Errors
     /// Returns [`StructureError::NotFound`] if the assembly has fewer units, and the errors of [`Self::units`].
-    pub(super) fn only_unit(
-        mut self,
+    pub(super) fn unit(
+        self,
         number: NonZeroU32,
         mut atoms: Vec<u32>,
         limits: &ReadLimits,
         control: &Control<'_>,
-    ) -> Result<Self, StructureError> {
+    ) -> Result<Vec<u32>, StructureError> {
         let _sorting = self.sort(&mut atoms, control)?;
         let (placed, _) = self.rules_by_unit(&atoms, limits)?;
         let Some((rows, _)) = placed.get_index(number.get() as usize - 1) else {
-            return Err(StructureError::NotFound {
-                what: "unit",
-                requested: number.to_string(),
-                available: format!("units 1 to {} of assembly {} with selected atoms", placed.len(), self.shown()),
-            });
+            let (n, id) = (placed.len(), self.shown());
+            let available = if n == 1 { "one unit".to_owned() } else { format!("the units 1 to {n}") };
+            let available = format!("{available} in assembly {id} with the selected atoms");
+            return Err(StructureError::NotFound { what: "unit", requested: number.to_string(), available });
         };
-        self.covered.fill(false);
-        for rows in rows {
-            self.covered[self.column.id(atoms[rows.start] as usize) as usize] = true;
-        }
-        Ok(self)
+        let mut unit: Vec<u32> = rows.iter().flat_map(|rows| &atoms[rows.clone()]).copied().collect();
+        unit.sort_unstable();
+        Ok(unit)
     }
 
     /// Returns the distinct units that have some of `atoms`, which are sorted by chain, and the number of instances of

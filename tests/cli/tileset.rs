@@ -97,6 +97,8 @@ fn assembly() -> String {
     let sample = include_str!("../../samples/4pti.pdb");
     let atoms = || sample.lines().filter(|line| line.starts_with("ATOM"));
     text.extend(atoms().map(|line| format!("{line}\n")));
+    text.push_str("HETATM 9001 NA    NA A 901     200.300 -81.700   3.100  1.00 20.00          NA\n");
+    text.push_str("HETATM 9002 NA    NA A 902    -600.100  77.300  51.900  1.00 20.00          NA\n");
     text.extend(atoms().take(300).map(|line| format!("{}B{}\n", &line[..21], &line[22..])));
     text
 }
@@ -104,7 +106,7 @@ fn assembly() -> String {
 #[test]
 fn a_tileset_of_instances_repeats_the_tilesets_of_units() {
     let folder = Folder::new();
-    let (input, output) = (folder.path("assembly.pdb"), folder.path("tiles"));
+    let (input, output) = (folder.path("assembly.pdb"), folder.path("new/tiles"));
     fs::write(&input, assembly()).unwrap();
     let run = |more: &[&str]| {
         let all = ["--assembly", "2", "--instances", "--resolution", "0.5"];
@@ -144,9 +146,14 @@ fn a_tileset_of_instances_repeats_the_tilesets_of_units() {
     fs::remove_dir_all(&output).unwrap();
     let text = run(&[]);
     assert!(stderr(&text).contains("A: 454 atoms, 2 instances"), "{}", stderr(&text));
-    fs::remove_dir_all(&output).unwrap();
+    fs::remove_dir_all(folder.path("new")).unwrap();
     assert_ne!(run(&["--max-grid-points", "100000"]).status.code(), Some(0));
-    assert!(!output.exists());
+    assert!(!folder.path("new").exists());
+    // Two sodium ions far apart: no grid point of a coarse mesh lies in one of them.
+    let ions = run(&["--select", "ion", "--report", "json"]);
+    assert_code(&ions, 0);
+    let report: Value = serde_json::from_str(&stdout(&ions)).unwrap();
+    assert_eq!((&report["atoms"], &report["left_out"]["total"]), (&2.into(), &754.into()));
 }
 
 #[test]

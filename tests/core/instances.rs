@@ -233,24 +233,34 @@ fn one_unit_is_meshed_where_it_is_in_the_file() {
         assert_eq!(own.atoms.len() as u64 + own.left_out.total(), total);
     }
     let missing = selected(false, Some(4)).unwrap_err().to_string();
-    assert!(missing.contains("unit 4") && missing.contains("units 1 to 3 of assembly 1"), "{missing}");
+    assert!(missing.contains("unit 4") && missing.contains("the units 1 to 3 in assembly 1"), "{missing}");
+    // Atoms that the selection leaves out are not those of other units, also if they have chains of their own.
+    let file = include_bytes!("../structures/1pfe.cif.gz");
+    let structure = read(file, &ReadLimits::default()).unwrap();
+    let left_out = |instances, unit| {
+        let selection = Selection { assembly: Some("1".into()), instances, unit, ..Selection::default() };
+        select(&structure, &selection).unwrap().left_out
+    };
+    assert_eq!(left_out(true, None), left_out(false, NonZeroU32::new(1)));
+    assert!(!left_out(true, None).kinds.is_empty());
     // The number counts the units that have selected atoms.
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
     let pairs = [("assembly", "1"), ("unit", "2"), ("chains", "B"), ("resolution", "1.2")];
     let job = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().job;
     let run = |job| run(text.as_bytes(), &job, &JobLimits::default(), &choice, &Control::default(), &(), None);
-    assert!(run(job(&pairs)).unwrap_err().to_string().contains("units 1 to 1"));
+    assert!(run(job(&pairs)).unwrap_err().to_string().contains("one unit"));
     let report = run(job(&[("assembly", "1"), ("unit", "1"), ("chains", "B"), ("resolution", "1.2")])).unwrap().report;
     let alone = run(job(&[("chains", "B"), ("resolution", "1.2")])).unwrap().report;
     assert_eq!((report.triangles, report.area.to_bits()), (alone.triangles, alone.area.to_bits()));
     let assembly = report.assembly.unwrap();
     assert_eq!((assembly.copies, assembly.unit, alone.assembly.is_none()), (1, Some(1), true));
     for (pairs, reason) in [
-        (&[("unit", "1")][..], "no value for the asymmetric unit"),
+        (&[("unit", "1")][..], "no value with the asymmetric unit"),
+        (&[("unit", "1"), ("assembly", "1"), ("context", "whole")], "no value with context=whole"),
         (&[("unit", "0"), ("assembly", "1")], "a whole number from 1"),
         (&[("unit", "1"), ("assembly", "1"), ("instances", "true")], "false with a value of unit"),
-        (&[("tile", "0/0/0/0"), ("assembly", "1"), ("instances", "true")], "false for a tile"),
+        (&[("tile", "1/0/0/0"), ("assembly", "1"), ("instances", "true")], "false for a tile"),
     ] {
         let error = params::parse(pairs.iter().copied()).unwrap_err().to_string();
         assert!(error.contains(reason), "{pairs:?}: {error}");

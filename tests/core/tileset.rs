@@ -6,7 +6,7 @@ use std::fmt::Write;
 use std::ops::Deref;
 
 use molmesh::formats::tileset::{TileAddress, assembly_document};
-use molmesh::pipeline::tileset::{Tileset, check, units};
+use molmesh::pipeline::tileset::{AssemblyTileset, Tileset, check};
 use molmesh::pipeline::{Choice, Job, JobError, JobLimits, StageClock, params, run};
 use molmesh::structure::{self, ReadLimits, Structure};
 use molmesh::surface::{Control, CpuBackend, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
@@ -170,26 +170,29 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
     let read =
         |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
-    let (_, units) = units(read, &job, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    let assembly = AssemblyTileset::new(read, &job, &ReadLimits::default(), &Control::default(), &clock).unwrap();
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let whole = run(text.as_bytes(), &job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
-    let parts = whole.report.parts;
-    assert_eq!((units.len(), parts.len()), (2, 2));
-    let mut repeated = Vec::new();
-    for (index, (unit, part)) in units.iter().zip(&parts).enumerate() {
-        assert_eq!(
-            (&unit.name, unit.atoms, unit.operators.len() as u64),
-            (&part.name, part.atoms, part.instances.unwrap())
-        );
-        let number = (index + 1).to_string();
-        let tileset = tileset_of(text.as_bytes(), &[("assembly", "1"), ("resolution", "1"), ("unit", &number)]);
-        assert_eq!(tileset.bounds(), unit.bounds);
+    let (limits, control) = (JobLimits::default(), Control::default());
+    let whole = run(text.as_bytes(), &job, &limits, &choice, &control, &(), None).unwrap();
+    let parts = &whole.report.parts;
+    assert_eq!((assembly.units().len(), parts.len()), (2, 2));
+    let repeated = assembly.repeated(|number| number.to_string());
+    for (number, (tileset, part)) in (1..).zip(repeated.iter().zip(parts)) {
+        assert_eq!(tileset.placements.len() as u64, part.instances.unwrap());
+        let number = number.to_string();
+        let own = tileset_of(text.as_bytes(), &[("assembly", "1"), ("resolution", "1"), ("unit", &number)]);
+        assert_eq!(own.bounds(), tileset.bounds);
         // The tiles of the last level join to the mesh of the unit.
-        let joined = measured(&welded(&meshes(&tileset, unit.bounds.levels - 1)));
+        let joined = measured(&welded(&meshes(&own, own.bounds().levels - 1)));
         assert!(joined.closed && (joined.area / part.area - 1.0).abs() < 1e-6, "{} {}", joined.area, part.area);
-        repeated.push(unit.repeated(number));
     }
+    // The root is the coarse mesh of all instances.
+    let root = assembly.root(&job, &limits, &choice, &control, StageClock::new(&())).unwrap().report;
+    assert_eq!((root.atoms, root.instances.as_ref().unwrap().count), (whole.report.atoms, 3));
+    assert_eq!(root.instances.unwrap().atoms_sum, whole.report.instances.unwrap().atoms_sum);
+    assert_eq!(root.parts.iter().map(|part| part.atoms).collect::<Vec<_>>(), [454, 908]);
+    assert!(root.closed && root.resolution == repeated.iter().map(|unit| unit.bounds.error).fold(0.0, f64::max));
     let document = assembly_document("root.glb", &repeated);
     let root = &document["root"];
     let children = root["children"].as_array().unwrap();
@@ -217,6 +220,29 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
         }
     }
     assert_eq!(children.len(), 3);
+}
+
+#[test]
+fn units_have_the_colours_and_the_small_parts_of_the_assembly() {
+    // Atoms 2,000 Å apart with other B-factors, each of which is a unit.
+    let atom = |chain: char, x: f64, b: f64| {
+        format!("HETATM    1 NA    NA {chain}   1    {x:8.3}{:8.3}{:8.3}  1.00{b:6.2}          NA\n", 3.3, 7.7)
+    };
+    let mut text = with_rules(&[("A", &OPERATORS[..1]), ("B", &OPERATORS[..1])]);
+    text.truncate(text.find("ATOM").unwrap());
+    text += &(atom('A', 0.3, 5.0) + &atom('A', 2000.7, 25.0) + &atom('B', 50.1, 90.0));
+    let pairs = [("assembly", "1"), ("instances", "true"), ("select", "all"), ("color", "bfactor")];
+    let job = params::parse(pairs).unwrap().job;
+    let read =
+        |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
+    let clock = StageClock::new(&());
+    let assembly = AssemblyTileset::new(read, &job, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    assert_eq!(assembly.color_range(), Some([5.0, 90.0]));
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let choice = Choice { backend: &backend, reason: "" };
+    let root = assembly.root(&job, &JobLimits::default(), &choice, &Control::default(), clock).unwrap().report;
+    assert!(root.resolution > 8.0, "{}", root.resolution);
+    assert_eq!((root.components, root.color.unwrap().range), (3, Some([5.0, 90.0])));
 }
 
 #[test]

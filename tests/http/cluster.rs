@@ -53,6 +53,16 @@ fn get(addr: SocketAddr, path: &str) -> Reply {
     send(addr, "GET", path, &[], b"")
 }
 
+/// Removes all messages of the queue.
+fn purge(nats: &NatsServer) {
+    let mut server = TcpStream::connect(nats.address().trim_start_matches("nats://")).unwrap();
+    server.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+    let purge = "CONNECT {\"verbose\":false}\r\nSUB purged 1\r\nPUB $JS.API.STREAM.PURGE.molmesh-jobs purged 0\r\n\r\n";
+    server.write_all(purge.as_bytes()).unwrap();
+    let answer = BufReader::new(server).lines().map(Result::unwrap).find(|line| line.contains("purged\":"));
+    assert!(answer.is_some_and(|answer| answer.contains("\"success\":true")));
+}
+
 fn kill_all<const N: usize>(nodes: [Process; N]) {
     for node in nodes {
         node.kill();
@@ -210,24 +220,30 @@ fn the_command_reconcile_finds_and_dispatches_lost_jobs() {
         let job = submit(api.addr, "/v1/meshes?format=stl&resolution=1", SAMPLE);
         assert_eq!(counts(&reconcile(&cluster, &["--dry-run"])), (1.into(), 0), "it is queued");
         api.kill();
-        cluster.nats.stop(false);
-        cluster.nats.restart();
+        purge(&cluster.nats);
         for _ in 0..2 {
             let found = reconcile(&cluster, &["--dry-run"]);
             assert_eq!((counts(&found), &found["dispatched"]), ((1.into(), 1), &0.into()));
             let lost = &found["lost"][0];
-            let id = lost["id"].as_str().unwrap().trim_end_matches('…');
-            assert!(id.len() == 8 && job.rsplit('/').next().unwrap().starts_with(id), "{lost}");
-            assert_eq!(lost["status"], "accepted");
+            assert_eq!((lost["id"].as_str(), lost["status"].as_str()), (job.rsplit('/').next(), Some("accepted")));
         }
         let found = reconcile(&cluster, &[]);
         assert_eq!((counts(&found), &found["dispatched"]), ((1.into(), 1), &1.into()));
         assert_eq!(counts(&reconcile(&cluster, &["--dry-run"])), (1.into(), 0));
-        // Without its broker, the command fails.
+        // It creates nothing, and fails without store, stream or broker.
+        let fails = |cluster: &Cluster, more: &[&str], reason: &str| {
+            let failed = cluster.command("all").arg("reconcile").args(more).output().unwrap();
+            let text = String::from_utf8_lossy(&failed.stderr);
+            assert!(failed.status.code() == Some(1) && text.contains(reason), "{text}");
+        };
+        let missing = cluster.folder.path().join("missing");
+        fails(&cluster, &["--set", &format!("store.url=file://{}", missing.display())], "no store of a service");
+        assert!(!missing.exists());
+        for _ in 0..2 {
+            fails(&cluster, &["--set", "broker.prefix=other"], "the stream other-jobs");
+        }
         cluster.nats.stop(true);
-        let failed = cluster.command("all").arg("reconcile").output().unwrap();
-        let text = String::from_utf8_lossy(&failed.stderr);
-        assert!(failed.status.code() == Some(1) && text.contains("broker.url"), "{text}");
+        fails(&cluster, &[], "broker.url");
     }
 }
 

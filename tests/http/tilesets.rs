@@ -142,12 +142,18 @@ fn the_tileset_of_an_assembly_links_to_those_of_its_units() {
     let plain =
         get(&server, &format!("{structure}/surface.glb?tile=0/0/0/0&resolution=1&color=element&compress=meshopt"));
     assert_eq!(tile.header("molmesh-triangles"), plain.header("molmesh-triangles"));
-    for path in ["tileset.subtree?assembly=1&instances=true", "surface.glb?tile=0/0/0/0&assembly=1&instances=true"] {
+    for path in ["tileset.subtree?assembly=1&instances=true", "surface.glb?tile=1/0/0/0&assembly=1&instances=true"] {
         let problem = server.get(&format!("{structure}/{path}")).problem(400, "bad-parameter");
         assert_eq!(problem["parameter"], "instances", "{problem}");
     }
+    // Root and units have one range of colours.
+    let coloured = get(&server, &format!("{structure}/tileset.json?assembly=1&instances=true&color=bfactor")).json();
+    let uri = coloured["root"]["children"][0]["content"]["uri"].as_str().unwrap();
+    let report = get(&server, &format!("{structure}/report.json?assembly=1&color=bfactor")).json();
+    let [low, high] = [0, 1].map(|end| report["color"]["range"][end].as_f64().unwrap());
+    assert!(low < high && uri.contains(&format!("color_range={low}%2C{high}&")), "{uri}: {low} {high}");
     let missing = server.get(&format!("{structure}/tileset.json?assembly=1&unit=2")).problem(422, "empty-selection");
-    assert!(missing["detail"].as_str().unwrap().contains("units 1 to 1"), "{missing}");
+    assert!(missing["detail"].as_str().unwrap().contains("one unit in assembly 1"), "{missing}");
 }
 
 #[test]

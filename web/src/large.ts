@@ -10,9 +10,6 @@ import type { FetchTile } from "./scene/tiles";
 const MAX_FILE_TRIANGLES = 3e6;
 /** Approximate number of triangles per atom at 0.5 Å. */
 const TRIANGLES_PER_ATOM = 100;
-/** Parameters of the coarsest tile, and of the mesh of an assembly whose tiles belong to its units. */
-const ROOT = { tile: "0/0/0/0" };
-const COARSE_ASSEMBLY = { resolution: "4" };
 /** Attempts to fetch a tile from a busy server, and the pause before the second one, ms. Later pauses are longer. */
 const ATTEMPTS = 5;
 const PAUSE = 500;
@@ -35,8 +32,7 @@ export function tilesetOf(source: Source, choices: Choices, applicable: Readonly
   // Copies of an assembly have more atoms than the file.
   if (source.atoms !== undefined && (repeats || !choices.has("assembly")) && !isLarge(source.atoms, choices)) return null;
   const more = { atom_ids: "true", compress: choices.get("compress") ?? "meshopt" };
-  const coarsest = repeats ? COARSE_ASSEMBLY : ROOT;
-  return { document: `${source.path}/tileset.json${query(choices, more)}`, root: surface(source, "glb", choices, { ...more, ...coarsest }) };
+  return { document: `${source.path}/tileset.json${query(choices, more)}`, root: surface(source, "glb", choices, { ...more, tile: "0/0/0/0" }) };
 }
 
 /** Returns the paths of the tileset at `url`, of a service or a folder; null for another address. */
@@ -45,8 +41,7 @@ export function tilesetAt(url: string): TilesetPaths | null {
   if (!root.pathname.endsWith("/tileset.json")) return null;
   if (/\/v1\/(pdb|structures)\/[^/]+\/tileset\.json$/.test(root.pathname)) {
     root.pathname = root.pathname.replace(/tileset\.json$/, "surface.glb");
-    const coarsest = root.searchParams.get("instances") === "true" ? COARSE_ASSEMBLY : ROOT;
-    for (const [name, value] of Object.entries(coarsest)) root.searchParams.set(name, value);
+    root.searchParams.set("tile", "0/0/0/0");
     if (!root.searchParams.has("compress")) root.searchParams.set("compress", "meshopt");
   } else root.pathname = root.pathname.replace(/tileset\.json$/, "0/0/0/0.glb");
   return { document: new URL(url, document.baseURI).href, root: root.href };

@@ -70,7 +70,7 @@ pub(crate) enum LogStyle {
 
 /// Values of `--report` of `doctor` and `reconcile`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum SurveyStyle {
+pub(crate) enum TextOrJson {
     /// Text
     Text,
     /// JSON
@@ -83,7 +83,7 @@ pub(crate) enum SurveyStyle {
 pub(crate) struct DoctorArgs {
     /// Format of the report on stdout
     #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
-    pub(crate) report: SurveyStyle,
+    pub(crate) report: TextOrJson,
     /// Measure the CPU and the GPU for `--backend auto` of later commands, and store the result in the cache folder
     /// (`$XDG_CACHE_HOME` or `~/.cache`)
     #[arg(long)]
@@ -103,7 +103,7 @@ pub(crate) struct ReconcileArgs {
     pub(crate) dry_run: bool,
     /// Format of the report on stdout
     #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
-    pub(crate) report: SurveyStyle,
+    pub(crate) report: TextOrJson,
     /// Configuration file (TOML) of the nodes
     #[arg(long, value_name = "FILE", env = "MOLMESH_CONFIG", hide_env_values = true)]
     pub(crate) config: Option<PathBuf>,

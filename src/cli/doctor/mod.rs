@@ -13,7 +13,7 @@ use molmesh::config::{Config, Loaded};
 use molmesh::surface::FoundDevice;
 use serde_json::{Value, json};
 
-use super::args::{DoctorArgs, SurveyStyle};
+use super::args::{DoctorArgs, TextOrJson};
 use super::backend::{self, BackendRequest, SelectedBackend};
 use super::error::CliError;
 use super::style::Style;
@@ -38,8 +38,8 @@ pub(super) fn run(args: &DoctorArgs) -> Result<(), CliError> {
     let loaded = super::config::load(&args.serve)?;
     let findings = examine(args, loaded, limit)?;
     super::print(&match args.report {
-        SurveyStyle::Text => page::text(&findings, Style::stdout()),
-        SurveyStyle::Json => super::config::pretty(&findings.document()),
+        TextOrJson::Text => page::text(&findings, Style::stdout()),
+        TextOrJson::Json => super::config::pretty(&findings.document()),
     })?;
     let failed: Vec<_> = findings.checks.iter().filter(|c| c.state == CheckResult::Failed).map(|c| c.name).collect();
     if failed.is_empty() {

@@ -3,8 +3,9 @@
 //! Queued and claimed jobs are the messages of a stream with one subject per job, `PREFIX.jobs.LANE.CLASS.ID`: the
 //! stream rejects a second message with a subject, and an acknowledged message is removed. Each client belongs to a
 //! lane, by its number. Lanes take turns, so a client with many jobs delays those of other lanes by one job only.
-//! Within a lane, a class of higher urgency precedes the others. The number of a class is even, or odd for jobs that
-//! suit a GPU: a worker first looks for those that suit it. Events of jobs are plain messages, which may be lost.
+//! Within a lane, jobs of a higher level of urgency precede the others. Each level has two classes, with an even number
+//! for jobs that suit a CPU and an odd one for those that suit a GPU: three of four claims first look for those that
+//! suit the worker. Events of jobs are plain messages, which may be lost.
 //!
 //! Uses only what servers from version 2.9 on offer.
 
@@ -41,12 +42,12 @@ use crate::telemetry::{BROKER_QUEUED, BROKER_UP};
 
 /// Number of lanes. Clients share them by the remainder of their numbers.
 const LANES: usize = 8;
-/// Most urgent class of each urgency from 0 to 7: urgent, normal, background.
-const CLASS: [usize; 8] = [0, 0, 0, 1, 2, 2, 2, 2];
-/// Number of classes. Each has a queue of jobs that suit a GPU, behind that of the others.
-const CLASSES: usize = 3;
+/// Level of each urgency from 0 to 7: urgent, normal, background.
+const LEVEL: [usize; 8] = [0, 0, 0, 1, 2, 2, 2, 2];
+/// Number of classes: each level has a class of jobs that suit a CPU, and one of jobs that suit a GPU.
+const CLASSES: usize = 6;
 /// Number of queues.
-const QUEUES: usize = LANES * CLASSES * 2;
+const QUEUES: usize = LANES * CLASSES;
 /// Time limit of a request to the server.
 const REQUEST: Duration = Duration::from_secs(5);
 /// Interval at which the server is asked for the number of jobs, and idle workers look for jobs.
@@ -61,6 +62,8 @@ struct NatsState {
     config: BrokerConfig,
     /// Identity of the store that all nodes share.
     store: String,
+    /// True to create streams and queues that are missing.
+    creates: bool,
     /// Last error of the connection.
     failure: Arc<Mutex<Option<String>>>,
     /// Task that answers other nodes that look for a worker.
@@ -96,11 +99,11 @@ pub(crate) struct NatsBroker(Arc<NatsState>);
 
 impl NatsBroker {
     /// Connects to the server of the configuration. Does not wait until it answers. `store` identifies the store of the
-    /// nodes.
+    /// nodes. Without `creates`, streams and queues must exist, and their settings remain.
     ///
     /// # Errors
     /// Returns the reason if an address or the credentials are malformed.
-    pub(crate) async fn connect(config: &BrokerConfig, url: &str, store: &str) -> Result<Self, String> {
+    pub(crate) async fn connect(config: &BrokerConfig, url: &str, store: &str, creates: bool) -> Result<Self, String> {
         crate::tls::install_provider();
         let (losses, failure) = (Arc::new(AtomicUsize::new(0)), Arc::new(Mutex::new(None)));
         let (counted, failed) = (Arc::clone(&losses), Arc::clone(&failure));
@@ -131,6 +134,7 @@ impl NatsBroker {
             context,
             config: config.clone(),
             store: store.to_owned(),
+            creates,
             failure,
             responder: OnceLock::new(),
             queues: Mutex::new(None),
@@ -158,6 +162,12 @@ async fn watch(broker: std::sync::Weak<NatsState>) {
         drop(state);
         sleep(POLL).await;
     }
+}
+
+/// Returns the lane and the class of a job.
+fn lane_and_class(job: &Dispatch) -> (usize, usize) {
+    let lane = usize::try_from(job.client.0 % LANES as u64).unwrap_or_default();
+    (lane, 2 * LEVEL[usize::from(job.urgency.min(7))] + usize::from(job.suits_gpu))
 }
 
 impl NatsState {
@@ -215,7 +225,10 @@ impl NatsState {
             return Err(format!("the stream {stream} is that of another store: check store.url and broker.prefix"));
         }
         let jobs = match found {
-            Ok(stream) if self.queues().is_some() && has_locks => stream.cached_info().state.messages,
+            Ok(stream) if !self.creates || (self.queues().is_some() && has_locks) => {
+                stream.cached_info().state.messages
+            }
+            Err(error) if !self.creates => return Err(format!("the stream {}: {error}", self.stream())),
             _ => self.create().await?,
         };
         let jobs = usize::try_from(jobs).unwrap_or(usize::MAX);
@@ -241,7 +254,7 @@ impl NatsState {
         self.context.create_or_update_stream(self.lock_stream()).await.map_err(|error| error.to_string())?;
         let mut queues = Vec::new();
         for lane in 0..LANES {
-            for class in 0..CLASSES * 2 {
+            for class in 0..CLASSES {
                 let config = pull::Config {
                     durable_name: Some(format!("lane-{lane}-{class}")),
                     filter_subject: format!("{}.jobs.{lane}.{class}.*", self.config.prefix),
@@ -263,8 +276,7 @@ impl NatsState {
     }
 
     fn subject_of(&self, job: &Dispatch) -> String {
-        let lane = job.client.0 % LANES as u64;
-        let class = 2 * CLASS[usize::from(job.urgency.min(7))] + usize::from(job.suits_gpu);
+        let (lane, class) = lane_and_class(job);
         format!("{}.jobs.{lane}.{class}.{}", self.config.prefix, job.id.as_str())
     }
 
@@ -282,6 +294,7 @@ impl Broker for NatsBroker {
             match sent.map_err(|error| failed(&error))?.await {
                 Ok(_) => {
                     self.0.queued.fetch_add(1, Ordering::Relaxed);
+                    self.0.announce(job).await;
                     Ok(true)
                 }
                 Err(error) if error.kind() == PublishErrorKind::WrongLastSequence => Ok(false),

@@ -68,7 +68,7 @@ impl Shared {
 async fn connect(address: &str) -> NatsBroker {
     let lease_ms = u64::try_from(LEASE.as_millis()).unwrap();
     let config = BrokerConfig { lease_ms, queue: LIMIT, ..BrokerConfig::default() };
-    let broker = NatsBroker::connect(&config, address, "a").await.unwrap();
+    let broker = NatsBroker::connect(&config, address, "a", true).await.unwrap();
     let begun = Instant::now();
     while let Some(why) = broker.down() {
         assert!(begun.elapsed() < MAX_WAIT, "{why}");

@@ -248,6 +248,11 @@ impl<'a> AtomColors<'a> {
         }
     }
 
+    /// Returns the range of the values that are coloured.
+    pub(crate) const fn range(&self) -> [f64; 2] {
+        self.range
+    }
+
     /// Returns the scheme, the range and the legend of the `selected` atoms.
     #[must_use]
     pub fn report(&self, selected: &[u32]) -> ColorReport {

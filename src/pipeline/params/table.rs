@@ -240,7 +240,7 @@ pub const TABLE: &[Parameter] = &[
         name: "unit",
         domain: Domain::Integer { min: 1, max: 1_000_000 },
         default: "absent",
-        doc: "Number of a unit of the assembly, in the order of instances: meshes its chains alone, where they are in the file.",
+        doc: "Number of a unit of the assembly in the parts of a report with instances=true, from 1; only units with selected atoms count. Meshes this unit alone, where it is in the file.",
     },
     Parameter {
         name: "context",

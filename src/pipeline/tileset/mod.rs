@@ -16,7 +16,7 @@ use std::sync::Arc;
 
 use self::layout::Layout;
 use self::level::{Buckets, MIN_BUCKET, TilesetLevel};
-pub use self::units::{UnitTileset, job_of_assembly, job_of_unit, units};
+pub use self::units::AssemblyTileset;
 pub use self::write::{LevelReport, TilesetReport, UnitReport, WriteError, unit_folder, write};
 use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, Scheme};
 use super::params::ParamError;

@@ -1,80 +1,158 @@
-//! Units of an assembly with `instances=true`: each has its own tileset, which the tileset of the assembly repeats.
+//! Tileset of an assembly with `instances=true`. Each unit has its own tileset, which that of the assembly repeats.
 
 use std::num::NonZeroU32;
 use std::ops::Deref;
+use std::sync::Arc;
 
-use super::layout::Layout;
+use super::layout::{CELLS, Layout};
+use super::level::{Buckets, TilesetLevel};
 use crate::formats::tileset::{RepeatedTileset, TilesetBounds};
-use crate::pipeline::{Job, JobError, SPHERE_BYTES, Spacing, StageClock, load};
-use crate::structure::{Operator, ReadLimits, Selection, Structure, StructureError, Unit};
-use crate::surface::{Control, SurfaceError, SurfaceParams};
+use crate::pipeline::color::{AtomColors, Coloring, Scheme};
+use crate::pipeline::{Choice, Job, JobError, JobLimits, Product, SPHERE_BYTES, Spacing, StageClock, load, run_loaded};
+use crate::structure::{ReadLimits, Selected, Selection, Structure, StructureError, Unit};
+use crate::surface::{Control, Spheres, SurfaceError, SurfaceParams};
 
-/// Maximum grid spacing of the mesh of the whole assembly, Å. A coarser grid could miss the surface.
-const MAX_ASSEMBLY_SPACING: f64 = 4.0;
-
-/// Unit of an assembly, and the bounds of its tileset.
-#[derive(Debug, Clone)]
-pub struct UnitTileset {
-    /// Author names of its chains.
-    pub name: String,
-    /// Number of atoms.
-    pub atoms: u64,
-    /// Operators that place its instances.
-    pub operators: Vec<Operator>,
-    /// Bounds of its tileset, in the coordinates of the structure.
-    pub bounds: TilesetBounds,
+/// Tileset of an assembly.
+pub struct AssemblyTileset<S> {
+    structure: S,
+    selected: Selected,
+    spheres: Spheres,
+    /// Bounds of the tileset of each unit, in the coordinates of the structure.
+    bounds: Vec<TilesetBounds>,
+    /// Range of the values that are coloured, for all units; `None` if it does not depend on the atoms.
+    color_range: Option<[f64; 2]>,
 }
 
-impl UnitTileset {
-    /// Returns the tileset at `uri` with all placements.
+impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
+    /// Prepares the units of the structure that `read` returns. `job` has `instances`.
+    ///
+    /// # Errors
+    /// Returns a [`JobError`] if reading or selecting fails, or the job is cancelled.
+    pub fn new(
+        read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
+        job: &Job,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+        clock: &StageClock<'_>,
+    ) -> Result<Self, JobError> {
+        let (structure, selected, spheres) = load(read, job, limits, clock, control)?;
+        let bounds = |unit: &Unit| {
+            control.check()?;
+            let _spheres = control.reserve((SPHERE_BYTES + 4) * unit.rows.len() as u64)?;
+            let own = spheres.subset(&rows_of(unit));
+            Ok(Layout::of(&own, &job.params_for(own.len()))?.bounds())
+        };
+        let bounds = selected.units.iter().map(bounds).collect::<Result<_, SurfaceError>>()?;
+        let by_atoms = |coloring: &Coloring| matches!(coloring.scheme, Scheme::BFactor | Scheme::Occupancy);
+        let range = |coloring| Ok::<_, JobError>(AtomColors::new(&structure, &selected.atoms, coloring)?.range());
+        // A range without extent cannot be requested, and is the same for all units.
+        let range = job.color.as_ref().filter(|coloring| by_atoms(coloring)).map(range).transpose()?;
+        let color_range = range.filter(|[low, high]| low < high);
+        Ok(Self { structure, selected, spheres, bounds, color_range })
+    }
+
+    /// Returns the structure.
+    pub const fn structure(&self) -> &S {
+        &self.structure
+    }
+
+    /// Returns the units.
     #[must_use]
-    pub fn repeated(&self, uri: String) -> RepeatedTileset {
-        RepeatedTileset {
-            uri,
-            bounds: self.bounds,
-            placements: self.operators.iter().map(|operator| operator.0).collect(),
+    pub fn units(&self) -> &[Unit] {
+        &self.selected.units
+    }
+
+    /// Returns the range of the values that are coloured, if it depends on the atoms: the same for root and units.
+    #[must_use]
+    pub const fn color_range(&self) -> Option<[f64; 2]> {
+        self.color_range
+    }
+
+    /// Returns the tilesets of the units with all placements. `uri` returns the URI of the tileset of a unit, numbered
+    /// from 1.
+    pub fn repeated(&self, uri: impl Fn(usize) -> String) -> Vec<RepeatedTileset> {
+        let units = self.selected.units.iter().zip(&self.bounds).enumerate();
+        let repeated = |(index, (unit, bounds)): (usize, (&Unit, &TilesetBounds))| {
+            let placements = unit.operators.iter().map(|operator| operator.0).collect();
+            RepeatedTileset { uri: uri(index + 1), bounds: *bounds, placements }
+        };
+        units.map(repeated).collect()
+    }
+
+    /// Returns the job of the tileset of a unit, numbered from 1.
+    pub(super) fn job_of_unit(&self, job: &Job, number: usize) -> Job {
+        let unit = u32::try_from(number).ok().and_then(NonZeroU32::new);
+        let selection = Selection { instances: false, unit, ..job.selection.clone() };
+        self.colored(Job { selection, ..job.clone() })
+    }
+
+    /// Sets the range of the colours.
+    fn colored(&self, mut job: Job) -> Job {
+        if let Some(coloring) = &mut job.color {
+            coloring.range = coloring.range.or(self.color_range);
         }
+        job
+    }
+
+    /// Meshes the root: all instances at the coarsest grid spacing of the units. Atoms are grouped as in coarse tiles.
+    ///
+    /// # Errors
+    /// Returns the errors of meshing and compression.
+    pub fn root(
+        &self,
+        job: &Job,
+        limits: &JobLimits,
+        choice: &Choice<'_>,
+        control: &Control<'_>,
+        clock: StageClock<'_>,
+    ) -> Result<Product, JobError> {
+        let spacing = self.bounds.iter().fold(0.0_f64, |most, bounds| most.max(bounds.error));
+        let (selected, spheres) = clock.time("index", || self.grouped(job, spacing, control))?;
+        let params = SurfaceParams { resolution: spacing, ..job.params.clone() };
+        let coarse = self.colored(Job { params, spacing: Spacing::Given, tile: None, ..job.clone() });
+        let loaded = (&*self.structure, selected, spheres);
+        let mut product = run_loaded(loaded, &coarse, limits, choice, control, clock, &(), None)?;
+        // The groups represent all atoms.
+        let report = &mut product.report;
+        report.atoms = self.selected.atoms.len() as u64;
+        for (part, unit) in report.parts.iter_mut().zip(&self.selected.units) {
+            part.atoms = unit.rows.len() as u64;
+        }
+        if let Some(instances) = &mut report.instances {
+            let atoms = |unit: &Unit| (unit.rows.len() * unit.operators.len()) as u64;
+            instances.atoms_sum = self.selected.units.iter().map(atoms).sum();
+        }
+        Ok(product)
+    }
+
+    /// Returns the spheres of all units on a grid with this spacing, Å, with the atoms that represent them.
+    fn grouped(&self, job: &Job, spacing: f64, control: &Control<'_>) -> Result<(Selected, Spheres), SurfaceError> {
+        let [mut x, mut y, mut z] = [const { Vec::new() }; 3];
+        let (mut radii, mut atoms, mut units) = (Vec::new(), Vec::new(), Vec::new());
+        for unit in &self.selected.units {
+            let rows = rows_of(unit);
+            let _spheres = control.reserve((SPHERE_BYTES + 4) * rows.len() as u64)?;
+            let own = Arc::new(self.spheres.subset(&rows));
+            let buckets = Arc::new(Buckets::new(&own, CELLS * spacing, control)?);
+            let params = job.params_for(own.len());
+            let level = TilesetLevel::new(&own, &buckets, &params, [spacing, CELLS * spacing], control)?;
+            control.memory.grow((SPHERE_BYTES + 4) * level.spheres.len() as u64)?;
+            let first = atoms.len();
+            for (number, sphere) in (0..level.spheres.len()).zip(0_u32..) {
+                let centre = level.spheres.centre(number);
+                x.push(centre[0]);
+                y.push(centre[1]);
+                z.push(centre[2]);
+                radii.push(level.spheres.radius(number));
+                atoms.push(self.selected.atoms[rows[level.row(sphere) as usize] as usize]);
+            }
+            units.push(Unit { rows: first..atoms.len(), ..unit.clone() });
+        }
+        Ok((Selected { atoms, units, ..self.selected.clone() }, Spheres::new(x, y, z, radii)?))
     }
 }
 
-/// Returns the structure that `read` returns and the units of its assembly with the bounds of their tilesets. `job` has
-/// `instances`.
-///
-/// # Errors
-/// Returns a [`JobError`] if reading or selecting fails, or the job is cancelled.
-pub fn units<S: Deref<Target = Structure>>(
-    read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
-    job: &Job,
-    limits: &ReadLimits,
-    control: &Control<'_>,
-    clock: &StageClock<'_>,
-) -> Result<(S, Vec<UnitTileset>), JobError> {
-    let (structure, selected, spheres) = load(read, job, limits, clock, control)?;
-    let placed = |Unit { name, rows, operators, .. }: Unit| -> Result<UnitTileset, JobError> {
-        control.check()?;
-        let _spheres = control.reserve((SPHERE_BYTES + 4) * rows.len() as u64).map_err(SurfaceError::from)?;
-        // The reader limits the number of atoms, so rows have 32 bits.
-        let rows: Vec<u32> = rows.map(|row| u32::try_from(row).unwrap_or(u32::MAX)).collect();
-        let own = spheres.subset(&rows);
-        let bounds = Layout::of(&own, &job.params_for(own.len()))?.bounds();
-        Ok(UnitTileset { name, atoms: rows.len() as u64, operators, bounds })
-    };
-    let units = selected.units.into_iter().map(placed).collect::<Result<Vec<UnitTileset>, JobError>>()?;
-    Ok((structure, units))
-}
-
-/// Returns the job of the mesh of the whole assembly that is shown from afar: a coarse mesh with `instances`.
-#[must_use]
-pub fn job_of_assembly(job: &Job, units: &[UnitTileset]) -> Job {
-    let coarsest = units.iter().fold(0.0_f64, |most, unit| most.max(unit.bounds.error));
-    let resolution = coarsest.min(MAX_ASSEMBLY_SPACING);
-    let params = SurfaceParams { resolution, ..job.params.clone() };
-    Job { params, spacing: Spacing::Given, ..job.clone() }
-}
-
-/// Returns the job of the tileset of a unit. `index` counts from 0.
-#[must_use]
-pub fn job_of_unit(job: &Job, index: usize) -> Job {
-    let unit = u32::try_from(index + 1).ok().and_then(NonZeroU32::new);
-    Job { selection: Selection { instances: false, unit, ..job.selection.clone() }, ..job.clone() }
+/// Returns the rows of a unit. The reader limits the number of atoms, so they have 32 bits.
+fn rows_of(unit: &Unit) -> Vec<u32> {
+    unit.rows.clone().map(|row| u32::try_from(row).unwrap_or(u32::MAX)).collect()
 }

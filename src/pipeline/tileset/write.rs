@@ -9,11 +9,11 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use serde::Serialize;
 use thiserror::Error;
 
-use super::{Tileset, UnitTileset, job_of_assembly, job_of_unit, units};
+use super::{AssemblyTileset, Tileset};
 use crate::formats::Format;
 use crate::formats::tileset::{TileAddress, TilesetUris, assembly_document, subtree, tileset_document};
-use crate::pipeline::{Choice, Job, JobError, JobLimits, LeftOutReport, Product, ProgressSink, StageClock, run_with};
-use crate::structure::{Structure, StructureError};
+use crate::pipeline::{Choice, Job, JobError, JobLimits, LeftOutReport, Product, ProgressSink, StageClock};
+use crate::structure::{Structure, StructureError, Unit};
 use crate::surface::{Control, Reservation, SurfaceError, SurfaceLimits, threads};
 
 /// Contents of a tileset.
@@ -96,37 +96,39 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
     write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
 ) -> Result<TilesetReport, WriteError> {
     let clock = StageClock::new(progress);
+    let store = |path: &str, bytes: &[u8]| {
+        write(path, bytes).map_err(|source| WriteError::File { path: path.to_owned(), source })?;
+        Ok(bytes.len() as u64)
+    };
     if !job.selection.instances {
         let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
-        return tileset.write(job, choice, &limits.surface, control, progress, write);
+        return tileset.write(job, choice, &limits.surface, control, progress, store);
     }
-    let (structure, units) = units(read, job, &limits.read, control, &clock)?;
-    let (mut all, mut repeated) = (TilesetReport::default(), Vec::new());
-    for (index, unit) in units.iter().enumerate() {
+    let assembly = AssemblyTileset::new(read, job, &limits.read, control, &clock)?;
+    let units = assembly.units();
+    let mut all = TilesetReport::default();
+    for (number, Unit { name, rows, operators, .. }) in (1..).zip(units) {
         // Releases all memory that is counted for the unit.
         let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
-        let (job, folder) = (job_of_unit(job, index), unit_folder(index + 1));
-        let tileset = Tileset::new(|_| Ok(&*structure), &job, &limits.read, control, &clock)?;
-        let in_folder = |path: &str, bytes: &[u8]| write(&format!("{folder}/{path}"), bytes);
-        let part = Part { sink: progress, first: index, count: units.len() };
+        let (job, structure) = (assembly.job_of_unit(job, number), &**assembly.structure());
+        let tileset = Tileset::new(|_| Ok(structure), &job, &limits.read, control, &clock)?;
+        let part = Part { sink: progress, index: number - 1, count: units.len() };
+        let in_folder = |path: &str, bytes: &[u8]| store(&format!("{}/{path}", unit_folder(number)), bytes);
         let report = tileset.write(&job, choice, &limits.surface, control, &part, in_folder)?;
-        let UnitTileset { name, atoms, operators, .. } = unit;
-        let (name, instances, levels) = (name.clone(), operators.len() as u64, report.levels);
-        all.units.push(UnitReport { name, atoms: *atoms, instances, levels });
+        let (name, atoms, instances) = (name.clone(), rows.len() as u64, operators.len() as u64);
+        all.units.push(UnitReport { name, atoms, instances, levels: report.levels });
         all.atoms += atoms;
         all.files += report.files;
         all.bytes += report.bytes;
-        repeated.push(unit.repeated(format!("{folder}/tileset.json")));
     }
     let root = format!("{}.glb", TileAddress::ROOT.path());
-    let assembly = job_of_assembly(job, &units);
-    let product = run_with(|_| Ok(&*structure), &assembly, limits, choice, control, &(), None)?;
-    all.bytes += stored(&write, &root, &glb_of(&product)?)?;
-    all.files += 1;
+    let product = assembly.root(job, limits, choice, control, StageClock::new(&()))?;
+    all.bytes += store(&root, &glb_of(&product)?)?;
+    let repeated = assembly.repeated(|number| format!("{}/tileset.json", unit_folder(number)));
     let document = assembly_document(&root, &repeated).to_string();
-    all.bytes += stored(&write, "tileset.json", document.as_bytes())?;
-    all.files += 1;
-    all.id.clone_from(&structure.id);
+    all.bytes += store("tileset.json", document.as_bytes())?;
+    all.files += 2;
+    (all.id, all.left_out) = (assembly.structure().id.clone(), product.report.left_out);
     Ok(all)
 }
 
@@ -134,12 +136,6 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
 #[must_use]
 pub fn unit_folder(number: usize) -> String {
     format!("unit-{number}")
-}
-
-/// Passes a file to `write`. Returns its size, bytes.
-fn stored(write: &impl Fn(&str, &[u8]) -> io::Result<()>, path: &str, bytes: &[u8]) -> Result<u64, WriteError> {
-    write(path, bytes).map_err(|source| WriteError::File { path: path.to_owned(), source })?;
-    Ok(bytes.len() as u64)
 }
 
 /// Returns the GLB of a product.
@@ -153,18 +149,18 @@ fn glb_of(product: &Product) -> Result<Vec<u8>, JobError> {
 /// Progress of one of several tilesets, as a part of the progress of all.
 struct Part<'a> {
     sink: &'a dyn ProgressSink,
-    first: usize,
+    index: usize,
     count: usize,
 }
 
 impl ProgressSink for Part<'_> {
     fn progress(&self, stage: &'static str, fraction: f64) {
-        self.sink.progress(stage, (self.first as f64 + fraction) / self.count as f64);
+        self.sink.progress(stage, (self.index as f64 + fraction) / self.count as f64);
     }
 }
 
 impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
-    /// Meshes all tiles and passes each file with its path to `write`.
+    /// Meshes all tiles and passes each file with its path to `store`, which returns its size, bytes.
     fn write(
         &self,
         job: &Job,
@@ -172,9 +168,8 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
         limits: &SurfaceLimits,
         control: &Control<'_>,
         progress: &dyn ProgressSink,
-        write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
+        store: impl Fn(&str, &[u8]) -> Result<u64, WriteError> + Sync,
     ) -> Result<TilesetReport, WriteError> {
-        let store = |path: &str, bytes: &[u8]| stored(&write, path, bytes);
         let colors = job.color.map(|coloring| self.colors(coloring, control)).transpose()?;
         let addresses: Vec<TileAddress> = self.tiles.iter().copied().collect();
         let done = AtomicUsize::new(0);

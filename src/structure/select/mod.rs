@@ -138,10 +138,12 @@ pub fn select_with(
     };
     let rules = Rules { structure, models, chains, marks, hydrogens: *hydrogens, context, alternatives };
     let mut found = rules.find(assembly.as_ref(), control)?;
-    if let (Some(whole), Some(number)) = (assembly.take_if(|_| selection.unit.is_some()), selection.unit) {
-        // Atoms of other units are those of other chains.
-        let unit = whole.only_unit(number, found.atoms, limits, control)?;
-        found = rules.find(Some(&unit), control)?;
+    if let Some(number) = selection.unit
+        && let Some(assembly) = assembly.take()
+    {
+        let before = found.atoms.len();
+        found.atoms = assembly.unit(number, found.atoms, limits, control)?;
+        found.left_out.other_chains += (before - found.atoms.len()) as u64;
     }
     let Found { atoms, mut left_out, residues } = found;
     let first = structure.model.first().copied().unwrap_or(1);
@@ -209,7 +211,7 @@ impl Rules<'_> {
         Ok(Some(marks))
     }
 
-    /// Finds the atoms to mesh, those of `assembly` or of the asymmetric unit, in parallel.
+    /// Finds the atoms to mesh, of the chains of `assembly` if there is one, in parallel.
     fn find(&self, assembly: Option<&Assembly<'_>>, control: &Control<'_>) -> Result<Found, StructureError> {
         let n = self.structure.len();
         let range = |first| first..n.min(first + ATOMS_PER_TASK);

@@ -68,19 +68,19 @@ function partsOf(group: Group): Pick<Loaded, "parts" | "twoSided"> {
     twoSided ||= (mesh.material as Material).side === DoubleSide;
     // The pieces of a part are children of an object that has its name.
     const name = String(mesh.userData["name"] ?? mesh.parent?.userData["name"] ?? mesh.name);
-    for (const matrix of transformsOf(mesh)) parts.push({ name, geometry: mesh.geometry, matrix });
+    for (const matrix of transformsOf(mesh, mesh.matrixWorld)) parts.push({ name, geometry: mesh.geometry, matrix });
   });
   return { parts, twoSided };
 }
 
-/** Returns the transforms of a mesh to file units: one, or one for each of its instances. */
-function transformsOf(mesh: Mesh): Matrix4[] {
+/** Returns the transforms of a mesh that `own` precedes: one, or one for each of its instances. */
+export function transformsOf(mesh: Mesh, own: Matrix4): Matrix4[] {
   const instanced = mesh as InstancedMesh;
-  if (!instanced.isInstancedMesh) return [mesh.matrixWorld.clone()];
+  if (!instanced.isInstancedMesh) return [own.clone()];
   return Array.from({ length: instanced.count }, (_, i) => {
     const matrix = new Matrix4();
     instanced.getMatrixAt(i, matrix);
-    return matrix.premultiply(mesh.matrixWorld);
+    return matrix.premultiply(own);
   });
 }
 

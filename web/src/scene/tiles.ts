@@ -6,6 +6,7 @@ import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 import type { Tile } from "3d-tiles-renderer/core";
 import { TilesRenderer } from "3d-tiles-renderer/three";
 import { ImplicitTilingPlugin } from "3d-tiles-renderer/core/plugins";
+import { transformsOf } from "./load";
 
 /** Minimum error target: grid spacing on the screen, in pixels, above which finer tiles replace a tile. */
 const MIN_ERROR = 4;
@@ -153,16 +154,14 @@ function meshesOf(object: Object3D): Mesh[] {
 
 /** Replaces a mesh with instances by one mesh for each instance, because surfaces are picked and drawn one by one. */
 function expand(mesh: Mesh): void {
-  const instanced = mesh as InstancedMesh;
-  if (!instanced.isInstancedMesh) return;
-  instanced.updateMatrix();
-  for (let i = 0; i < instanced.count; i += 1) {
-    const one = new Mesh(instanced.geometry, instanced.material);
-    instanced.getMatrixAt(i, one.matrix);
-    one.matrix.premultiply(instanced.matrix);
+  if (!(mesh as InstancedMesh).isInstancedMesh) return;
+  mesh.updateMatrix();
+  for (const matrix of transformsOf(mesh, mesh.matrix)) {
+    const one = new Mesh(mesh.geometry, mesh.material);
+    one.matrix.copy(matrix);
     one.matrixAutoUpdate = false;
-    one.userData = instanced.userData;
-    instanced.parent?.add(one);
+    one.userData = mesh.userData;
+    mesh.parent?.add(one);
   }
-  instanced.removeFromParent();
+  mesh.removeFromParent();
 }

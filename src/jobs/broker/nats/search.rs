@@ -3,30 +3,23 @@
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use async_nats::Subscriber;
 use async_nats::jetstream::message::AckKind;
+use async_nats::{Client as Connection, Subscriber};
 use futures_util::StreamExt as _;
 use metrics::counter;
-use tokio::time::{sleep, timeout};
+use tokio::time::timeout;
 
 use super::lease::NatsLease;
-use super::{CLASSES, LANES, NatsState, POLL, QUEUES, Queue, REQUEST};
-use crate::jobs::broker::Claim;
+use super::{CLASSES, LANES, NatsState, POLL, QUEUES, Queue, REQUEST, lane_and_class};
+use crate::jobs::broker::{Claim, Dispatch};
 use crate::telemetry::BROKER_REDELIVERIES;
 
 /// Time for which a queue without jobs is not asked again, so that a busy worker asks each queue once a second.
 const EMPTY: Duration = Duration::from_secs(1);
-/// Number of searches after an announcement whose job is not found, and the pause before the first one, which doubles.
-const RETRIES: u32 = 5;
-const FIRST_RETRY: Duration = Duration::from_millis(2);
-
-/// Time for which idle workers leave a new job to those that it suits.
-const PRECEDENCE: Duration = Duration::from_millis(20);
-
-/// Returns true if the jobs of a class suit a GPU.
-const fn suits_gpu(class: usize) -> bool {
-    class % 2 == 1
-}
+/// Time that an idle worker waits before it claims a new job that suits the other kind of workers.
+const PRECEDENCE: Duration = Duration::from_millis(5);
+/// Every fourth claim prefers jobs that suit the other kind of workers, so that they are not delayed without end.
+const OTHER_KIND: usize = 4;
 
 /// State of the search for jobs.
 pub(super) struct JobSearch {
@@ -34,70 +27,87 @@ pub(super) struct JobSearch {
     empty_until: [Instant; QUEUES],
     /// Lane whose turn it is.
     turn: usize,
+    /// Number of claims.
+    claims: usize,
     /// Announcements of new jobs. Each idle node gets its share.
     announcements: Option<Subscriber>,
 }
 
 impl Default for JobSearch {
     fn default() -> Self {
-        Self { empty_until: [Instant::now(); QUEUES], turn: 0, announcements: None }
+        Self { empty_until: [Instant::now(); QUEUES], turn: 0, claims: 0, announcements: None }
+    }
+}
+
+/// Passes the announcements on that arrive until this node is unsubscribed: it is not idle any more.
+async fn pass_on(mut announcements: Subscriber, connection: Connection) {
+    drop(announcements.drain().await);
+    while let Some(message) = announcements.next().await {
+        drop(connection.publish(message.subject, message.payload).await);
     }
 }
 
 impl NatsState {
+    /// Returns the subject of announcements, whose content is the number of a queue with a new job.
+    fn announcement(&self) -> String {
+        format!("{}.new", self.config.prefix)
+    }
+
+    /// Tells an idle node of each kind that there is a new job.
+    pub(super) async fn announce(&self, job: &Dispatch) {
+        let (lane, class) = lane_and_class(job);
+        let queue = (lane * CLASSES + class).to_string();
+        // Idle nodes also look for jobs at intervals.
+        drop(self.connection.publish(self.announcement(), queue.into()).await);
+    }
+
     /// Waits for a job and claims it, or returns an error of the server.
     pub(super) async fn next(&self, prefers_gpu: bool) -> Result<Claim, String> {
         let mut search = self.search.lock().await;
         let search = &mut *search;
-        let mut retries = 0;
+        // Time of the search for an announced job of the other kind.
+        let mut due: Option<Instant> = None;
         loop {
             let queues = self.queues().ok_or("the stream does not exist yet")?;
-            let before = search.empty_until;
-            if let Some(claim) = self.scan(search, &queues, prefers_gpu).await? {
-                search.announcements = None;
+            let prefers = prefers_gpu ^ (search.claims % OTHER_KIND == OTHER_KIND - 1);
+            if let Some(claim) = self.scan(search, &queues, prefers).await? {
+                if let Some(announcements) = search.announcements.take() {
+                    tokio::spawn(pass_on(announcements, self.connection.clone()));
+                }
+                search.claims += 1;
                 return Ok(claim);
-            }
-            if retries > 0 {
-                // An announcement may arrive before its job is in the stream.
-                sleep(FIRST_RETRY * (1 << (RETRIES - retries))).await;
-                (retries, search.empty_until) = (retries - 1, before);
-                continue;
             }
             let Some(announcements) = &mut search.announcements else {
                 // Jobs that are dispatched from now on are announced; earlier ones are found by another search.
-                let all = format!("{}.jobs.>", self.config.prefix);
                 let group = if prefers_gpu { "idle-gpu" } else { "idle" };
-                let announcements = self.connection.queue_subscribe(all, group.to_owned()).await;
+                let announcements = self.connection.queue_subscribe(self.announcement(), group.to_owned()).await;
                 search.announcements = Some(announcements.map_err(|error| error.to_string())?);
                 self.connection.flush().await.map_err(|error| error.to_string())?;
                 search.empty_until = [Instant::now(); QUEUES];
                 continue;
             };
-            let announced = loop {
-                match timeout(POLL, announcements.next()).await {
-                    Ok(announced) => break Some(announced),
+            loop {
+                let wait = due.map_or(POLL, |due| due.saturating_duration_since(Instant::now()));
+                match timeout(wait, announcements.next()).await {
+                    Ok(Some(message)) => {
+                        let queue = std::str::from_utf8(&message.payload).ok().and_then(|text| text.parse().ok());
+                        let Some(until) = queue.and_then(|queue: usize| search.empty_until.get_mut(queue)) else {
+                            continue;
+                        };
+                        *until = Instant::now();
+                        if queue.is_some_and(|queue| queue % 2 == usize::from(prefers_gpu)) {
+                            break;
+                        }
+                        *until += PRECEDENCE;
+                        due = due.or(Some(*until));
+                    }
+                    Ok(None) => {
+                        search.announcements = None;
+                        break;
+                    }
                     // A job of a stopped worker returns without an announcement.
-                    Err(_elapsed) if self.queued.load(Ordering::Relaxed) > 0 => break None,
+                    Err(_elapsed) if due.take().is_some() || self.queued.load(Ordering::Relaxed) > 0 => break,
                     Err(_elapsed) => {}
-                }
-            };
-            let message = match announced {
-                None => continue,
-                Some(None) => {
-                    search.announcements = None;
-                    continue;
-                }
-                Some(Some(message)) => message,
-            };
-            let mut parts = message.subject.as_str().rsplit('.').skip(1);
-            let mut number = || parts.next()?.parse::<usize>().ok();
-            if let Some((class, lane)) = number().zip(number())
-                && let Some(until) = search.empty_until.get_mut(lane * CLASSES * 2 + class)
-            {
-                *until = Instant::now();
-                retries = RETRIES;
-                if suits_gpu(class) != prefers_gpu {
-                    sleep(PRECEDENCE).await;
                 }
             }
         }
@@ -107,7 +117,7 @@ impl NatsState {
     async fn scan(&self, search: &mut JobSearch, queues: &[Queue], prefers_gpu: bool) -> Result<Option<Claim>, String> {
         for step in 0..LANES {
             let lane = (search.turn + step) % LANES;
-            let numbers = (0..CLASSES * 2).map(|class| lane * CLASSES * 2 + (class ^ usize::from(prefers_gpu)));
+            let numbers = (0..CLASSES).map(|class| lane * CLASSES + (class ^ usize::from(prefers_gpu)));
             for number in numbers {
                 if search.empty_until[number] > Instant::now() {
                     continue;
