@@ -32,7 +32,7 @@ pub(super) fn run(args: &ReconcileArgs) -> Result<(), CliError> {
             super::config::pretty(&document)
         }
     })?;
-    found.error.map_or(Ok(()), |error| Err(CliError::Service(format!("not all jobs were examined: {error}"))))
+    found.error.map_or(Ok(()), |error| Err(CliError::Service(format!("stopped after an error of the broker: {error}"))))
 }
 
 /// Formats the result as text.

@@ -142,18 +142,17 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
 fn check_instances(job: &Job) -> Result<(), ParamError> {
     let Selection { assembly, context, instances, unit, .. } = &job.selection;
     let unfit = match (assembly, context) {
-        (None, _) => Some("the asymmetric unit, or a value of assembly".to_owned()),
-        (_, Context::Whole) => Some(format!("context={}", context.name())),
+        (None, _) => Some("no value without assembly".to_owned()),
+        (_, Context::Whole) => Some(format!("no value with context={}", context.name())),
         _ => None,
     };
     if let (Some(unfit), Some(unit)) = (unfit, unit) {
-        let expected = format!("no value with {unfit}");
-        return Err(ParamError::BadValue { name: "unit", value: format!("`{unit}`"), expected });
+        return Err(ParamError::BadValue { name: "unit", value: format!("`{unit}`"), expected: unfit });
     }
     let expected = match (assembly, context, job.split) {
         _ if unit.is_some() => "false with a value of unit".to_owned(),
         _ if job.tile.is_some_and(|tile| tile != TileAddress::ROOT) => {
-            "false for a tile other than the root, which belongs to one unit".to_owned()
+            "false for a tile below the root: it belongs to one unit".to_owned()
         }
         (None, ..) => "false for the asymmetric unit, or a value of assembly".to_owned(),
         (_, Context::Whole, _) => format!("false with context={}, which makes one surface", context.name()),

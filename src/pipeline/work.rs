@@ -66,7 +66,9 @@ pub fn estimate_atoms(input: &[u8]) -> f64 {
 #[must_use]
 pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
     if job.tile.is_some() {
-        return relative_time(job.params.surface) * mesh_work(atoms.min(TILE_ATOMS), 0.5);
+        // The root of an assembly is not kept in memory.
+        let reading = if job.selection.instances { 0.3 * (atoms + MIN_WORK) } else { 0.0 };
+        return reading + relative_time(job.params.surface) * mesh_work(atoms.min(TILE_ATOMS), 0.5);
     }
     let resolution = job.spacing.expected(&job.params, atoms);
     let mesh = if job.spacing.max_triangles().is_some() { search_work } else { mesh_work };

@@ -293,7 +293,7 @@ impl Backend {
         outcome.map_err(|error| self.open_error(&error))
     }
 
-    /// Returns true if a bucket has a secret, and for every folder.
+    /// Returns true if the bucket has a secret; always true for a folder.
     pub(super) async fn has_secret(&self) -> Result<bool, StoreError> {
         if self.is_local() {
             return Ok(true);

@@ -16,7 +16,7 @@ use super::name::{Folder, Name};
 use super::object::Meta;
 use super::secret;
 use crate::config::StoreConfig;
-use crate::sync::spawn_blocking;
+use crate::sync::{spawn_blocking, timeout};
 
 /// Number of objects that are updated in the index under one lock.
 const REFRESHED: usize = 1000;
@@ -40,15 +40,16 @@ impl Store {
     pub(crate) async fn open_existing(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
         let location = config.url.clone().unwrap_or_default();
         let root = location.strip_prefix(FOLDER_URL).map(PathBuf::from);
-        let missing = || StoreError::Open { key: "store.url", location, reason: "no store of a service".to_owned() };
-        if let Some(root) = root
-            && !matches!(spawn_blocking(move || secret::is_in_folder(&root, None)).await, Ok(Ok(())))
-        {
-            return Err(missing());
+        let failed = |reason: String| StoreError::Open { key: "store.url", location: location.clone(), reason };
+        if let Some(root) = root {
+            let found = spawn_blocking(move || secret::is_in_folder(&root, None));
+            let found = timeout(Duration::from_millis(config.timeout_ms), found).await;
+            let found = found.map_err(|_elapsed| failed("the folder does not answer".to_owned()))?;
+            found.map_err(|error| failed(error.to_string()))?.map_err(|error| failed(error.to_string()))?;
         }
         let backend = Backend::open(config, data_dir).await?;
         if !backend.has_secret().await? {
-            return Err(missing());
+            return Err(failed("it is not the store of a service".to_owned()));
         }
         Self::open_backend(backend, config, true).await
     }

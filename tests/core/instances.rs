@@ -256,7 +256,7 @@ fn one_unit_is_meshed_where_it_is_in_the_file() {
     let assembly = report.assembly.unwrap();
     assert_eq!((assembly.copies, assembly.unit, alone.assembly.is_none()), (1, Some(1), true));
     for (pairs, reason) in [
-        (&[("unit", "1")][..], "no value with the asymmetric unit"),
+        (&[("unit", "1")][..], "no value without assembly"),
         (&[("unit", "1"), ("assembly", "1"), ("context", "whole")], "no value with context=whole"),
         (&[("unit", "0"), ("assembly", "1")], "a whole number from 1"),
         (&[("unit", "1"), ("assembly", "1"), ("instances", "true")], "false with a value of unit"),

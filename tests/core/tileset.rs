@@ -188,7 +188,7 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
         assert!(joined.closed && (joined.area / part.area - 1.0).abs() < 1e-6, "{} {}", joined.area, part.area);
     }
     // The root is the coarse mesh of all instances.
-    let root = assembly.root(&job, &limits, &choice, &control, StageClock::new(&())).unwrap().report;
+    let root = assembly.root(&job, &limits, &choice, &control, StageClock::new(&()), &()).unwrap().report;
     assert_eq!((root.atoms, root.instances.as_ref().unwrap().count), (whole.report.atoms, 3));
     assert_eq!(root.instances.unwrap().atoms_sum, whole.report.instances.unwrap().atoms_sum);
     assert_eq!(root.parts.iter().map(|part| part.atoms).collect::<Vec<_>>(), [454, 908]);
@@ -240,7 +240,7 @@ fn units_have_the_colours_and_the_small_parts_of_the_assembly() {
     assert_eq!(assembly.color_range(), Some([5.0, 90.0]));
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let root = assembly.root(&job, &JobLimits::default(), &choice, &Control::default(), clock).unwrap().report;
+    let root = assembly.root(&job, &JobLimits::default(), &choice, &Control::default(), clock, &()).unwrap().report;
     assert!(root.resolution > 8.0, "{}", root.resolution);
     assert_eq!((root.components, root.color.unwrap().range), (3, Some([5.0, 90.0])));
 }

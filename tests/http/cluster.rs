@@ -237,7 +237,11 @@ fn the_command_reconcile_finds_and_dispatches_lost_jobs() {
             assert!(failed.status.code() == Some(1) && text.contains(reason), "{text}");
         };
         let missing = cluster.folder.path().join("missing");
-        fails(&cluster, &["--set", &format!("store.url=file://{}", missing.display())], "no store of a service");
+        fails(
+            &cluster,
+            &["--set", &format!("store.url=file://{}", missing.display())],
+            "the folder of the store is missing",
+        );
         assert!(!missing.exists());
         for _ in 0..2 {
             fails(&cluster, &["--set", "broker.prefix=other"], "the stream other-jobs");

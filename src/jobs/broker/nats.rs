@@ -367,6 +367,8 @@ impl Broker for NatsBroker {
         if let Some(responder) = self.0.responder.get() {
             responder.abort();
         }
+        let state = Arc::clone(&self.0);
+        tokio::spawn(async move { state.end_search().await });
     }
 
     fn has_workers(&self) -> BoxFuture<'_, bool> {

@@ -5,12 +5,14 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use super::layout::{CELLS, Layout};
-use super::level::{Buckets, TilesetLevel};
+use super::level::{Buckets, MIN_BUCKET, TilesetLevel};
 use crate::formats::tileset::{RepeatedTileset, TilesetBounds};
 use crate::pipeline::color::{AtomColors, Coloring, Scheme};
-use crate::pipeline::{Choice, Job, JobError, JobLimits, Product, SPHERE_BYTES, Spacing, StageClock, load, run_loaded};
+use crate::pipeline::{
+    Choice, Job, JobError, JobLimits, Product, ProgressSink, SPHERE_BYTES, Spacing, StageClock, load, run_loaded,
+};
 use crate::structure::{ReadLimits, Selected, Selection, Structure, StructureError, Unit};
-use crate::surface::{Control, Spheres, SurfaceError, SurfaceParams};
+use crate::surface::{Control, Reservation, Spheres, SurfaceError, SurfaceParams};
 
 /// Tileset of an assembly.
 pub struct AssemblyTileset<S> {
@@ -105,16 +107,22 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         choice: &Choice<'_>,
         control: &Control<'_>,
         clock: StageClock<'_>,
+        progress: &dyn ProgressSink,
     ) -> Result<Product, JobError> {
         let spacing = self.bounds.iter().fold(0.0_f64, |most, bounds| most.max(bounds.error));
         let (selected, spheres) = clock.time("index", || self.grouped(job, spacing, control))?;
         let params = SurfaceParams { resolution: spacing, ..job.params.clone() };
         let coarse = self.colored(Job { params, spacing: Spacing::Given, tile: None, ..job.clone() });
         let loaded = (&*self.structure, selected, spheres);
-        let mut product = run_loaded(loaded, &coarse, limits, choice, control, clock, &(), None)?;
+        let mut product = run_loaded(loaded, &coarse, limits, choice, control, clock, progress, None)?;
         // The groups represent all atoms.
         let report = &mut product.report;
         report.atoms = self.selected.atoms.len() as u64;
+        (report.resolution_from, report.detail) = (job.spacing.parameter(), job.spacing.detail());
+        if let (Some(color), Some(coloring)) = (&mut report.color, &coarse.color) {
+            let all = &self.selected.atoms;
+            color.legend = AtomColors::new(&self.structure, all, coloring)?.report(all).legend;
+        }
         for (part, unit) in report.parts.iter_mut().zip(&self.selected.units) {
             part.atoms = unit.rows.len() as u64;
         }
@@ -129,13 +137,19 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
     fn grouped(&self, job: &Job, spacing: f64, control: &Control<'_>) -> Result<(Selected, Spheres), SurfaceError> {
         let [mut x, mut y, mut z] = [const { Vec::new() }; 3];
         let (mut radii, mut atoms, mut units) = (Vec::new(), Vec::new(), Vec::new());
+        let mut side = CELLS * spacing;
+        while side >= 2.0 * MIN_BUCKET {
+            side *= 0.5;
+        }
         for unit in &self.selected.units {
+            // Releases the memory of the index of the unit.
+            let of_unit = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
             let rows = rows_of(unit);
-            let _spheres = control.reserve((SPHERE_BYTES + 4) * rows.len() as u64)?;
+            of_unit.memory.grow((SPHERE_BYTES + 4) * rows.len() as u64)?;
             let own = Arc::new(self.spheres.subset(&rows));
-            let buckets = Arc::new(Buckets::new(&own, CELLS * spacing, control)?);
+            let buckets = Arc::new(Buckets::new(&own, side, of_unit)?);
             let params = job.params_for(own.len());
-            let level = TilesetLevel::new(&own, &buckets, &params, [spacing, CELLS * spacing], control)?;
+            let level = TilesetLevel::new(&own, &buckets, &params, [spacing, CELLS * spacing], of_unit)?;
             control.memory.grow((SPHERE_BYTES + 4) * level.spheres.len() as u64)?;
             let first = atoms.len();
             for (number, sphere) in (0..level.spheres.len()).zip(0_u32..) {
@@ -148,7 +162,10 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
             }
             units.push(Unit { rows: first..atoms.len(), ..unit.clone() });
         }
-        Ok((Selected { atoms, units, ..self.selected.clone() }, Spheres::new(x, y, z, radii)?))
+        let Selected { n_distinct, model, ref left_out, .. } = self.selected;
+        let left_out = left_out.clone();
+        let selected = Selected { atoms, marks: None, copies: Vec::new(), units, n_distinct, model, left_out };
+        Ok((selected, Spheres::new(x, y, z, radii)?))
     }
 }
 

@@ -139,6 +139,7 @@ pub fn select_with(
     let rules = Rules { structure, models, chains, marks, hydrogens: *hydrogens, context, alternatives };
     let mut found = rules.find(assembly.as_ref(), control)?;
     if let Some(number) = selection.unit
+        && !found.atoms.is_empty()
         && let Some(assembly) = assembly.take()
     {
         let before = found.atoms.len();

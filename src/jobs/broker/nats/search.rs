@@ -18,7 +18,7 @@ use crate::telemetry::BROKER_REDELIVERIES;
 const EMPTY: Duration = Duration::from_secs(1);
 /// Time that an idle worker waits before it claims a new job that suits the other kind of workers.
 const PRECEDENCE: Duration = Duration::from_millis(5);
-/// Every fourth claim prefers jobs that suit the other kind of workers, so that they are not delayed without end.
+/// Every fourth claim from a lane prefers jobs that suit the other kind of workers, so that none starves.
 const OTHER_KIND: usize = 4;
 
 /// State of the search for jobs.
@@ -27,19 +27,19 @@ pub(super) struct JobSearch {
     empty_until: [Instant; QUEUES],
     /// Lane whose turn it is.
     turn: usize,
-    /// Number of claims.
-    claims: usize,
+    /// Number of claims from each lane.
+    claims: [usize; LANES],
     /// Announcements of new jobs. Each idle node gets its share.
     announcements: Option<Subscriber>,
 }
 
 impl Default for JobSearch {
     fn default() -> Self {
-        Self { empty_until: [Instant::now(); QUEUES], turn: 0, claims: 0, announcements: None }
+        Self { empty_until: [Instant::now(); QUEUES], turn: 0, claims: [0; LANES], announcements: None }
     }
 }
 
-/// Passes the announcements on that arrive until this node is unsubscribed: it is not idle any more.
+/// Republishes the announcements that arrive before the subscription ends: this node is no longer idle.
 async fn pass_on(mut announcements: Subscriber, connection: Connection) {
     drop(announcements.drain().await);
     while let Some(message) = announcements.next().await {
@@ -61,6 +61,18 @@ impl NatsState {
         drop(self.connection.publish(self.announcement(), queue.into()).await);
     }
 
+    /// Ends the subscription to announcements, which idle nodes have.
+    fn leave(&self, search: &mut JobSearch) {
+        if let Some(announcements) = search.announcements.take() {
+            tokio::spawn(pass_on(announcements, self.connection.clone()));
+        }
+    }
+
+    /// Ends the search for jobs.
+    pub(super) async fn end_search(&self) {
+        self.leave(&mut *self.search.lock().await);
+    }
+
     /// Waits for a job and claims it, or returns an error of the server.
     pub(super) async fn next(&self, prefers_gpu: bool) -> Result<Claim, String> {
         let mut search = self.search.lock().await;
@@ -69,12 +81,8 @@ impl NatsState {
         let mut due: Option<Instant> = None;
         loop {
             let queues = self.queues().ok_or("the stream does not exist yet")?;
-            let prefers = prefers_gpu ^ (search.claims % OTHER_KIND == OTHER_KIND - 1);
-            if let Some(claim) = self.scan(search, &queues, prefers).await? {
-                if let Some(announcements) = search.announcements.take() {
-                    tokio::spawn(pass_on(announcements, self.connection.clone()));
-                }
-                search.claims += 1;
+            if let Some(claim) = self.scan(search, &queues, prefers_gpu).await? {
+                self.leave(search);
                 return Ok(claim);
             }
             let Some(announcements) = &mut search.announcements else {
@@ -94,12 +102,11 @@ impl NatsState {
                         let Some(until) = queue.and_then(|queue: usize| search.empty_until.get_mut(queue)) else {
                             continue;
                         };
-                        *until = Instant::now();
                         if queue.is_some_and(|queue| queue % 2 == usize::from(prefers_gpu)) {
+                            *until = Instant::now();
                             break;
                         }
-                        *until += PRECEDENCE;
-                        due = due.or(Some(*until));
+                        *until = *due.get_or_insert_with(|| Instant::now() + PRECEDENCE);
                     }
                     Ok(None) => {
                         search.announcements = None;
@@ -117,13 +124,15 @@ impl NatsState {
     async fn scan(&self, search: &mut JobSearch, queues: &[Queue], prefers_gpu: bool) -> Result<Option<Claim>, String> {
         for step in 0..LANES {
             let lane = (search.turn + step) % LANES;
-            let numbers = (0..CLASSES).map(|class| lane * CLASSES + (class ^ usize::from(prefers_gpu)));
-            for number in numbers {
+            let prefers_gpu = prefers_gpu ^ (search.claims[lane] % OTHER_KIND == OTHER_KIND - 1);
+            for class in 0..CLASSES {
+                let number = lane * CLASSES + (class ^ usize::from(prefers_gpu));
                 if search.empty_until[number] > Instant::now() {
                     continue;
                 }
                 if let Some(claim) = self.fetch(&queues[number]).await? {
                     search.turn = lane + 1;
+                    search.claims[lane] += 1;
                     return Ok(Some(claim));
                 }
                 search.empty_until[number] = Instant::now() + EMPTY;
