@@ -70,7 +70,8 @@ await run({
     assert.ok(wanted("tile=0/0/0/0").some((line) => line.includes("instances=true")), "the root");
     const [joined, unit] = [await shown("&assembly=1"), await shown("")];
     const [same, other] = [joined, unit].map(({ picture }) => difference(instances.picture, picture));
-    assert.ok(same < 0.2 && other > 0.5, `${same} and ${other} of the silhouette differ from those of the assembly and of one copy`);
+    // The bars are thin, and thicker in coarser tiles. A bar in another place would make half of the cells differ.
+    assert.ok(same < 0.4 && other > 0.8, `${same} and ${other} of the silhouette differ from those of the assembly and of one copy`);
     assertClean(own, WARNING);
     await own.context().close();
   },

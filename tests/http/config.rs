@@ -195,13 +195,15 @@ fn the_table_and_the_core_agree_on_every_range() {
     for parameter in TABLE {
         let Domain::Integer { min, max } = parameter.domain else { continue };
         integers += 1;
-        let give = |value: i64| parse([(parameter.name, value.to_string())]);
+        // A unit is that of an assembly.
+        let assembly = (parameter.name == "unit").then(|| ("assembly", "1".to_owned()));
+        let give = |value: i64| parse(assembly.clone().into_iter().chain([(parameter.name, value.to_string())]));
         for (good, bad) in [(min, min - 1), (max, max + 1)] {
             give(good).unwrap_or_else(|e| panic!("{e}"));
             assert!(matches!(give(bad), Err(ParamError::BadValue { .. })), "{} {bad}", parameter.name);
         }
     }
-    assert_eq!(integers, 4);
+    assert_eq!(integers, 5);
     // The ranges of the paper depend on the kernel: the table contains their union.
     let hull = |name: &str| TABLE.iter().find(|p| p.name == name).unwrap().domain;
     for (kernel, a, b) in [("gaussian", [1e-3, 100.0], [1e-2, 1e6]), ("soft-object", [1e-2, 1e6], [0.1, 50.0])] {
