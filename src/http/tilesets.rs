@@ -181,8 +181,6 @@ impl TilesetRequest {
             let memory = prepared.control.reserve(DOCUMENT_BYTES * instances as u64);
             let _memory = memory.map_err(|error| Failure::from(JobError::from(SurfaceError::from(error))))?;
             let range = assembly.color_range().map(|[low, high]| ("color_range".to_owned(), format!("{low},{high}")));
-            let is_given = pairs.iter().any(|(name, _)| name == "color_range");
-            let range: Vec<(String, String)> = range.filter(|_| !is_given).into_iter().collect();
             let repeated = assembly.repeated(|number| {
                 let own = pairs.iter().filter(|(name, _)| name != "instances");
                 format!("tileset.json?{}", query(own.chain(&range), Some(("unit", number.to_string()))))

@@ -231,7 +231,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
     let clock = StageClock::new(progress);
     if job.selection.instances {
         let assembly = AssemblyTileset::new(read, job, &limits.read, control, &clock)?;
-        return assembly.root(job, limits, choice, control, clock, progress);
+        return assembly.root(job, limits, choice, control, progress);
     }
     let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
     let colors = job.color.map(|coloring| tileset.colors(coloring, control)).transpose()?;

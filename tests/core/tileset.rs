@@ -188,7 +188,7 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
         assert!(joined.closed && (joined.area / part.area - 1.0).abs() < 1e-6, "{} {}", joined.area, part.area);
     }
     // The root is the coarse mesh of all instances.
-    let root = assembly.root(&job, &limits, &choice, &control, StageClock::new(&()), &()).unwrap().report;
+    let root = assembly.root(&job, &limits, &choice, &control, &()).unwrap().report;
     assert_eq!((root.atoms, root.instances.as_ref().unwrap().count), (whole.report.atoms, 3));
     assert_eq!(root.instances.unwrap().atoms_sum, whole.report.instances.unwrap().atoms_sum);
     assert_eq!(root.parts.iter().map(|part| part.atoms).collect::<Vec<_>>(), [454, 908]);
@@ -240,9 +240,25 @@ fn units_have_the_colours_and_the_small_parts_of_the_assembly() {
     assert_eq!(assembly.color_range(), Some([5.0, 90.0]));
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let root = assembly.root(&job, &JobLimits::default(), &choice, &Control::default(), clock, &()).unwrap().report;
+    let root = assembly.root(&job, &JobLimits::default(), &choice, &Control::default(), &()).unwrap().report;
     assert!(root.resolution > 8.0, "{}", root.resolution);
     assert_eq!((root.components, root.color.unwrap().range), (3, Some([5.0, 90.0])));
+    // Each atom lies between the grid points of the roots, which do not group atoms.
+    let mut text = with_rules(&[("A", &OPERATORS[..1])]);
+    text.truncate(text.find("ATOM").unwrap());
+    text += &[0.5, 40.5]
+        .map(|x| format!("HETATM    1 MG    MG A   1    {x:8.3}{:8.3}{:8.3}  1.00  5.00          MG\n", 0.5, 0.5))
+        .concat();
+    let pairs =
+        [("assembly", "1"), ("instances", "true"), ("select", "all"), ("surface", "vdw"), ("radius_scale", "0.4")];
+    let job = params::parse(pairs).unwrap().job;
+    let read =
+        |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
+    let clock = StageClock::new(&());
+    let assembly = AssemblyTileset::new(read, &job, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    let coarsest = assembly.repeated(|_| String::new())[0].bounds.error;
+    let root = assembly.root(&job, &JobLimits::default(), &choice, &Control::default(), &()).unwrap().report;
+    assert_eq!((root.components, coarsest / root.resolution), (2, 2.0));
 }
 
 #[test]

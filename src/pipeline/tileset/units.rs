@@ -21,7 +21,7 @@ pub struct AssemblyTileset<S> {
     spheres: Spheres,
     /// Bounds of the tileset of each unit, in the coordinates of the structure.
     bounds: Vec<TilesetBounds>,
-    /// Range of the values that are coloured, for all units; `None` if it does not depend on the atoms.
+    /// Range of the colours for all units, if the request has none and the atoms determine it.
     color_range: Option<[f64; 2]>,
 }
 
@@ -45,10 +45,12 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
             Ok(Layout::of(&own, &job.params_for(own.len()))?.bounds())
         };
         let bounds = selected.units.iter().map(bounds).collect::<Result<_, SurfaceError>>()?;
-        let by_atoms = |coloring: &Coloring| matches!(coloring.scheme, Scheme::BFactor | Scheme::Occupancy);
+        let needs_range = |coloring: &&Coloring| {
+            coloring.range.is_none() && matches!(coloring.scheme, Scheme::BFactor | Scheme::Occupancy)
+        };
         let range = |coloring| Ok::<_, JobError>(AtomColors::new(&structure, &selected.atoms, coloring)?.range());
+        let range = job.color.as_ref().filter(needs_range).map(range).transpose()?;
         // A range without extent cannot be requested, and is the same for all units.
-        let range = job.color.as_ref().filter(|coloring| by_atoms(coloring)).map(range).transpose()?;
         let color_range = range.filter(|[low, high]| low < high);
         Ok(Self { structure, selected, spheres, bounds, color_range })
     }
@@ -64,7 +66,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         &self.selected.units
     }
 
-    /// Returns the range of the values that are coloured, if it depends on the atoms: the same for root and units.
+    /// Returns the range of the colours for root and units, if the request has none and the atoms determine it.
     #[must_use]
     pub const fn color_range(&self) -> Option<[f64; 2]> {
         self.color_range
@@ -96,7 +98,8 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         job
     }
 
-    /// Meshes the root: all instances at the coarsest grid spacing of the units. Atoms are grouped as in coarse tiles.
+    /// Meshes the root: all instances at the coarsest grid spacing of the units, or at the next level at which the grid
+    /// does not miss the surface. Atoms are grouped as in coarse tiles.
     ///
     /// # Errors
     /// Returns the errors of meshing and compression.
@@ -106,10 +109,32 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         limits: &JobLimits,
         choice: &Choice<'_>,
         control: &Control<'_>,
-        clock: StageClock<'_>,
         progress: &dyn ProgressSink,
     ) -> Result<Product, JobError> {
-        let spacing = self.bounds.iter().fold(0.0_f64, |most, bounds| most.max(bounds.error));
+        let coarsest = self.bounds.iter().fold(0.0_f64, |most, bounds| most.max(bounds.error));
+        let levels = self.bounds.iter().map(|bounds| bounds.levels).max().unwrap_or(1);
+        let mut level = 0;
+        loop {
+            let spacing = coarsest / f64::from(1_u32 << level);
+            level += 1;
+            match self.root_at(spacing, job, limits, choice, control, progress) {
+                Err(JobError::Surface(SurfaceError::NoSurface { .. })) if level < levels => {}
+                made => return made,
+            }
+        }
+    }
+
+    /// Meshes the root with a grid spacing, Å.
+    fn root_at(
+        &self,
+        spacing: f64,
+        job: &Job,
+        limits: &JobLimits,
+        choice: &Choice<'_>,
+        control: &Control<'_>,
+        progress: &dyn ProgressSink,
+    ) -> Result<Product, JobError> {
+        let clock = StageClock::new(progress);
         let (selected, spheres) = clock.time("index", || self.grouped(job, spacing, control))?;
         let params = SurfaceParams { resolution: spacing, ..job.params.clone() };
         let coarse = self.colored(Job { params, spacing: Spacing::Given, tile: None, ..job.clone() });

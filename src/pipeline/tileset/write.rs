@@ -122,7 +122,7 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
         all.bytes += report.bytes;
     }
     let root = format!("{}.glb", TileAddress::ROOT.path());
-    let product = assembly.root(job, limits, choice, control, StageClock::new(&()), &())?;
+    let product = assembly.root(job, limits, choice, control, &())?;
     all.bytes += store(&root, &glb_of(&product)?)?;
     let repeated = assembly.repeated(|number| format!("{}/tileset.json", unit_folder(number)));
     let document = assembly_document(&root, &repeated).to_string();

@@ -102,6 +102,7 @@ impl NatsState {
                         let Some(until) = queue.and_then(|queue: usize| search.empty_until.get_mut(queue)) else {
                             continue;
                         };
+                        // As the numbers of classes, those of queues are odd for jobs that suit a GPU.
                         if queue.is_some_and(|queue| queue % 2 == usize::from(prefers_gpu)) {
                             *until = Instant::now();
                             break;

@@ -178,3 +178,27 @@ async fn workers_first_claim_jobs_that_suit_them() {
         claimed.done().await;
     }
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn idle_nodes_share_jobs_that_are_dispatched_at_once() {
+    for program in server::programs() {
+        let server = NatsServer::start(&program);
+        let nodes = [nats(&server).await, nats(&server).await].map(Arc::new);
+        let mut late = 0;
+        for _ in 0..20 {
+            let claims = nodes.clone().map(|node| tokio::spawn(async move { node.claim(false).await }));
+            // Both look for jobs.
+            tokio::time::sleep(Duration::from_millis(300)).await;
+            let begun = Instant::now();
+            for _ in 0..2 {
+                assert_eq!(nodes[0].dispatch(&job(1, DEFAULT_URGENCY)).await, Ok(true));
+            }
+            for claim in claims {
+                tokio::time::timeout(SOON, claim).await.expect("a job for each node").unwrap().done().await;
+            }
+            // A node without an announcement finds its job at an interval of a second.
+            late += usize::from(begun.elapsed() > Duration::from_millis(400));
+        }
+        assert!(late < 5, "{late} of 20 times, a node missed the announcement");
+    }
+}
