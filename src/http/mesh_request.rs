@@ -237,6 +237,7 @@ impl MeshRequest {
             reservation: Some(Arc::clone(&loaded.reservation)),
             parent: SpanParent::current(),
             id: None,
+            partitions: None,
         }
     }
 

@@ -249,7 +249,8 @@ async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Se
         Some(url) => Arc::new(connect_broker(config, url, &secret, true).await?),
         None => Arc::new(MemoryBroker::new(config.broker.queue)),
     };
-    let broker = (broker, config.broker.queue);
+    let partition_time = config.broker.url.as_ref().and(config.broker.partition_time());
+    let broker = (broker, config.broker.queue, partition_time);
     let job_store = JobStore::new(store.clone(), Arc::clone(pool), broker, jobs, output_bytes, secret, describe);
     // The inputs of open jobs are pinned before a request can evict them.
     let recovered = job_store.reconcile().await?;

@@ -15,34 +15,8 @@ use super::source::Loaded;
 use super::timing::SERVER_TIMING;
 use super::{delivery, results};
 use crate::config::Role;
-use crate::jobs::{AcceptError, ContentKey, Failure, JobId, JobStore, Status};
-use crate::store::Namespace;
+use crate::jobs::{AcceptError, ContentKey, Failure, OwnedJob, Status};
 use crate::telemetry::JOBS_TRANSFERRED;
-
-/// Ends a job when its request ends: cancels it, or removes its record if it has ended. The record of a cancelled job
-/// stays until it expires, because a worker may have read that the job is open.
-struct EndOnDrop {
-    jobs: JobStore,
-    id: JobId,
-    namespace: Namespace,
-}
-
-impl Drop for EndOnDrop {
-    fn drop(&mut self) {
-        let (jobs, id, namespace) = (self.jobs.clone(), self.id.clone(), self.namespace);
-        let end = async move {
-            let ended = match jobs.dismiss(&id, namespace).await {
-                Ok(Some(view)) if view.record.status != Status::Dismissed => jobs.forget(&id).await,
-                Ok(_) => Ok(()),
-                Err(error) => Err(error),
-            };
-            if let Err(error) = ended {
-                tracing::debug!(job_id = %id, %error, "the record of a transferred request expires later");
-            }
-        };
-        tokio::spawn(end.in_current_span());
-    }
-}
 
 impl MeshRequest {
     /// Returns true if other nodes compute the mesh: this node only answers requests, or its queue is long. Strict
@@ -65,15 +39,15 @@ impl MeshRequest {
         let (spec, jobs) = (self.job_spec(&mut loaded).await?, self.app.job_store.clone());
         drop(loaded);
         let accept = async move {
-            let record = jobs.accept(spec, None).await?.record;
-            Ok::<_, AcceptError>(EndOnDrop { jobs, id: record.id, namespace: record.namespace })
+            let view = jobs.accept(spec, None).await?;
+            Ok::<_, AcceptError>(OwnedJob::new(jobs, &view))
         };
         // If the client disconnects now, the job ends as soon as it is accepted.
-        let end = tokio::spawn(accept.in_current_span()).await.map_err(Problem::internal)??;
+        let job = tokio::spawn(accept.in_current_span()).await.map_err(Problem::internal)??;
         counter!(JOBS_TRANSFERRED).increment(1);
-        let (jobs, id, namespace) = (&end.jobs, &end.id, end.namespace);
+        let namespace = self.preferences.caller.namespace;
         let lost = || Problem::internal("the record of a transferred request was lost");
-        let mut watched = jobs.watch(id, namespace).await?.ok_or_else(lost)?;
+        let mut watched = job.watch().await?.ok_or_else(lost)?;
         let limit = Duration::from_millis(self.app.config.jobs.deadline_ms);
         let ended = tokio::time::timeout(limit, watched.wait_for(|view| view.record.status.is_final())).await;
         let ended = ended.map_err(|_elapsed| self.failed(Failure::Deadline { limit }))?;

@@ -27,6 +27,7 @@ use crate::formats::Format;
 use crate::pipeline::suits_gpu;
 use crate::single_flight::SingleFlight;
 use crate::store::{Digest, Name, Namespace, Pin, Secret, Store, StoreError};
+use crate::surface::MeshPartition;
 use crate::sync::{Handle, timeout};
 
 /// Number of ended jobs that are held in memory; older ones are read from the store. A record takes up to 64 KiB, the
@@ -83,6 +84,8 @@ pub(super) struct JobStoreState {
     pub(super) broker: Arc<dyn Broker>,
     /// Maximum number of queued jobs.
     pub(super) max_queued: usize,
+    /// Expected time of the partitions into which workers divide a mesh; `None` if they do not.
+    pub(super) partition_time: Option<Duration>,
     pub(super) config: JobsConfig,
     /// Maximum size of a result, bytes.
     pub(super) output_bytes: u64,
@@ -156,7 +159,7 @@ impl JobStore {
     pub(crate) fn new(
         store: Store,
         pool: Arc<Pool>,
-        (broker, max_queued): (Arc<dyn Broker>, usize),
+        (broker, max_queued, partition_time): (Arc<dyn Broker>, usize, Option<Duration>),
         config: JobsConfig,
         output_bytes: u64,
         secret: Secret,
@@ -168,6 +171,7 @@ impl JobStore {
             pool,
             broker,
             max_queued,
+            partition_time,
             config,
             output_bytes,
             describe,
@@ -198,6 +202,7 @@ impl JobStore {
             map: spec.map.as_ref().map(|(digest, _)| digest.to_string()),
             parameters: spec.parameters,
             format: spec.format.name().to_owned(),
+            partition: spec.task.job.partition.map(|MeshPartition { index, count }| [index, count]),
             client,
             urgency: spec.task.rank.urgency,
             suits_gpu: suits_gpu(spec.task.input.atoms(), &spec.task.job),

@@ -21,6 +21,8 @@ mod job_store;
 mod kept;
 mod key;
 mod open_jobs;
+mod owned_job;
+mod partitions;
 mod pool;
 mod queue;
 mod rank;
@@ -42,6 +44,7 @@ pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};
 pub(crate) use kept::{CacheKey, SharedStructure, SharedTileset};
 pub(crate) use key::ContentKey;
+pub(crate) use owned_job::OwnedJob;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
 pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
@@ -55,6 +58,7 @@ use std::sync::Arc;
 use crate::pipeline::{Job, Product};
 use crate::store::{Digest, Namespace};
 use crate::structure::strict_validator::Diagnostic;
+use crate::surface::PartitionSource;
 use crate::telemetry::SpanParent;
 
 /// Work for the pool.
@@ -78,6 +82,16 @@ pub(crate) struct Task {
     pub(crate) parent: SpanParent,
     /// Id of the durable job; `None` for an interactive request.
     pub(crate) id: Option<JobId>,
+    /// Partitions of the mesh that other workers may compute; `None` if this process computes all of it.
+    pub(crate) partitions: Option<Arc<dyn PartitionSource>>,
+}
+
+impl Task {
+    /// Returns true if the time that the task takes tells how long others take. The first tile prepares the tileset,
+    /// others have no surface; other processes compute partitions.
+    fn is_typical(&self) -> bool {
+        self.job.tile.is_none() && self.job.partition.is_none() && self.partitions.is_none()
+    }
 }
 
 /// Result of a job.

@@ -60,7 +60,7 @@ impl Fixture {
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
         let broker = MemoryBroker::new(1000);
-        let dispatch = (Arc::new(broker.clone()) as _, 1000);
+        let dispatch = (Arc::new(broker.clone()) as _, 1000, None);
         let jobs = JobStore::new(store.clone(), pool, dispatch, config, 1 << 30, [0; 32], describe);
         jobs.start_claiming();
         Self { faults, store, jobs, broker, dir }
@@ -98,6 +98,7 @@ impl Fixture {
             map: None,
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),
+            partition: None,
             client: 1,
             urgency: DEFAULT_URGENCY,
             suits_gpu: false,
@@ -143,6 +144,7 @@ fn task(client: &str, resolution: &str) -> Task {
         reservation: None,
         parent: SpanParent::default(),
         id: None,
+        partitions: None,
     }
 }
 
@@ -226,7 +228,7 @@ async fn a_result_that_is_never_stored_is_computed_for_every_attempt() {
     fixture.jobs = JobStore::new(
         fixture.store.clone(),
         Arc::clone(&fixture.jobs.0.pool),
-        (Arc::new(MemoryBroker::new(8)), 8),
+        (Arc::new(MemoryBroker::new(8)), 8, None),
         fixture.jobs.0.config.clone(),
         100,
         [0; 32],

@@ -21,16 +21,15 @@ use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_
 /// Runs jobs until the queue is closed and empty.
 pub(super) fn work(shared: &WorkerContext) {
     while let Some(entry) = shared.queue.pop() {
-        let (id, client, is_tile) = (entry.id, entry.task.rank.client, entry.task.job.tile.is_some());
+        let (id, client, is_typical) = (entry.id, entry.task.rank.client, entry.task.is_typical());
         let start = Instant::now();
         let outcome = run(shared, entry);
         if let Some(meter) = &shared.settings.meter {
             meter(client, start.elapsed());
         }
         shared.publish_devices();
-        // Only successful jobs count in the duration estimate. The time of a tile says little about other jobs: the
-        // first one prepares the tileset, and others have no surface.
-        let time = (matches!(outcome, Some(Ok(_))) && !is_tile).then(|| start.elapsed());
+        // Only successful jobs count in the duration estimate.
+        let time = (matches!(outcome, Some(Ok(_))) && is_typical).then(|| start.elapsed());
         shared.queue.done(id, outcome, time);
     }
 }
@@ -55,6 +54,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Option<Outcome> {
         let control = Control {
             cancel: cancel.clone(),
             memory: Arc::<MemoryReservation>::clone(&reservation),
+            partitions: task.partitions.clone(),
             ..Control::default()
         };
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
@@ -202,8 +202,8 @@ fn count(report: &Report) {
 }
 
 /// Memory use of a product, bytes.
-fn bytes_of(Product { mesh, pieces, picture, .. }: &Product) -> u64 {
-    let drawn = picture.as_ref().map_or(0, Vec::len) as u64 + pieces.as_ref().map_or(0, Pieces::bytes);
+fn bytes_of(Product { mesh, pieces, bytes, .. }: &Product) -> u64 {
+    let drawn = bytes.as_ref().map_or(0, Vec::len) as u64 + pieces.as_ref().map_or(0, Pieces::bytes);
     let optional = mesh.atom_ids.as_ref().map_or(0, Column::len) + mesh.colors.as_ref().map_or(0, Column::len);
     mesh.bytes() + 4 * optional as u64 + drawn
 }

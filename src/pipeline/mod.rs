@@ -25,6 +25,7 @@ mod load;
 mod map_file;
 pub mod nearest;
 pub mod params;
+mod partition;
 mod parts;
 mod pockets;
 mod progress;
@@ -52,6 +53,8 @@ pub use instances::{AssemblyReport, InstancesReport};
 pub use left_out::{KindCount, LeftOutReport, ResidueCount};
 pub use limits::JobLimits;
 pub use map_file::MapFile;
+#[cfg(feature = "server")]
+pub(crate) use partition::is_divisible;
 pub use parts::PartReport;
 pub use pockets::PocketReport;
 pub use progress::Tracker;
@@ -59,17 +62,17 @@ pub use report::{PictureReport, Quantization, Report, file_arithmetic};
 pub use shapes::TriangleReport;
 pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
-#[cfg(feature = "server")]
-pub(crate) use work::suits_gpu;
 pub use work::{estimate_atoms, estimate_work, mesh_work};
+#[cfg(feature = "server")]
+pub(crate) use work::{suits_gpu, surface_work};
 
 use crate::formats::tileset::TileAddress;
 use crate::formats::{Compress, GlbSink, Normals, Packing, Step, Storage, Units};
 use crate::picture::PictureParams;
 use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
-    Backend, Control, Measures, Mesh, MeshOutput, MeshSink, Simplify, SinkFailed, Spheres, Stage, SurfaceError,
-    SurfaceParams, TriangleQuality, Validation, lattice,
+    Backend, Control, Measures, Mesh, MeshOutput, MeshPartition, MeshSink, Simplify, SinkFailed, Spheres, Stage,
+    SurfaceError, SurfaceParams, TriangleQuality, Validation, lattice,
 };
 use color::{MeshColors, Scheme};
 use cut::Cut;
@@ -101,6 +104,8 @@ pub struct Job {
     pub quality: TriangleQuality,
     /// Tile to mesh instead of the whole structure.
     pub tile: Option<TileAddress>,
+    /// Partition to compute instead of the whole mesh.
+    pub partition: Option<MeshPartition>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -250,6 +255,9 @@ fn run_whole<S: Deref<Target = Structure>>(
 ) -> Result<Product, JobError> {
     let clock = StageClock::new(progress);
     let loaded = load(read, job, &limits.read, &clock, &Control { observer: &clock, ..control.clone() })?;
+    if let Some(partition) = job.partition {
+        return partition::run(loaded, job, partition, limits, choice.reason, control, clock);
+    }
     run_loaded(loaded, job, limits, choice, control, clock, progress, sink)
 }
 

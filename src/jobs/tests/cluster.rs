@@ -15,8 +15,8 @@ use crate::jobs::broker::tests::{nats, server};
 use crate::jobs::{
     Broker, Budget, EndError, JobId, JobSpec, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Status,
 };
-use crate::store::{Folder, Namespace, Store};
-use crate::surface::ReferenceBackend;
+use crate::store::{Folder, Name, Namespace, Store};
+use crate::surface::{Backend, CpuBackend, ReferenceBackend};
 
 /// Node of a cluster.
 struct Node {
@@ -26,14 +26,25 @@ struct Node {
 
 /// Starts a node over the shared folder `shared`. It does not claim jobs yet.
 async fn node(shared: &Path, broker: Arc<dyn Broker>) -> Node {
+    node_with(shared, broker, Arc::new(ReferenceBackend), None).await
+}
+
+/// Starts a node with a backend, which divides meshes into partitions of a time.
+async fn node_with(
+    shared: &Path,
+    broker: Arc<dyn Broker>,
+    backend: Arc<dyn Backend>,
+    partition_time: Option<Duration>,
+) -> Node {
     let url = Some(format!("file://{}", shared.display()));
     let store = Store::open_shared(&StoreConfig { url, ..StoreConfig::default() }, shared).await.unwrap();
     let budget = Budget::new(1 << 30);
     let settings = Settings::of_test(1, budget);
-    let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
+    let pool = Arc::new(Pool::start(settings, backend, "a test".to_owned()).unwrap());
     let describe = |error: &EndError| Value::String(format!("{error:?}"));
     let secret = store.secret().await.unwrap();
-    let jobs = JobStore::new(store.clone(), pool, (broker, 1000), JobsConfig::default(), 1 << 30, secret, describe);
+    let broker = (broker, 1000, partition_time);
+    let jobs = JobStore::new(store.clone(), pool, broker, JobsConfig::default(), 1 << 30, secret, describe);
     Node { jobs, store }
 }
 
@@ -191,4 +202,46 @@ async fn a_later_attempt_of_another_node_supersedes_an_earlier_one() {
     assert!(a.jobs.is_superseded(&job).await);
     job.adopt(record);
     assert!(!a.jobs.is_superseded(&job).await, "control: the same attempt");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn workers_share_a_mesh_and_it_has_the_bytes_of_one_worker() {
+    let backend = || Arc::new(CpuBackend::new(Some(1)).unwrap());
+    // Returns the mesh and the number of stored objects: two for the mesh, two for each partition of another worker.
+    let run = async |broker: [Arc<dyn Broker>; 2], time: Option<Duration>, workers: usize| {
+        let shared = tempfile::tempdir().unwrap();
+        let [a, b] = broker.map(|broker| node_with(shared.path(), broker, backend(), time));
+        let nodes = [a.await, b.await];
+        nodes[..workers].iter().for_each(|node| node.jobs.start_claiming());
+        let id = nodes[0].accept("0.25", None).await;
+        let mut seen = nodes[0].watch(&id).await;
+        ended(&mut seen).await;
+        let record = seen.borrow().record.clone();
+        assert_eq!(record.status, Status::Successful, "{:?}", record.problem);
+        let name = Name::result(&record.result.unwrap(), "stl").unwrap();
+        let mesh = nodes[1].store.get(&name).await.unwrap().unwrap().bytes;
+        // The records of partitions are removed, or their jobs are cancelled.
+        for node in &nodes {
+            tokio::time::timeout(MAX_WAIT, node.jobs.all_recorded()).await.expect("no job runs any more");
+        }
+        (mesh, nodes[0].store.list(Folder::Results).await.unwrap().len())
+    };
+    let in_process = || {
+        let broker = MemoryBroker::new(1000);
+        [Arc::new(broker.clone()) as Arc<dyn Broker>, Arc::new(broker)]
+    };
+    let (whole, objects) = run(in_process(), None, 2).await;
+    assert_eq!(objects, 2);
+    let soon = Some(Duration::from_micros(200));
+    // A single worker computes all partitions itself.
+    assert_eq!(run(in_process(), soon, 1).await, (whole.clone(), 2));
+    let shared_by = async |broker| {
+        let (mesh, objects) = run(broker, soon, 2).await;
+        assert!(mesh == whole && objects > 2, "{objects} objects");
+    };
+    shared_by(in_process()).await;
+    for program in server::programs() {
+        let server = server::NatsServer::start(&program);
+        shared_by([Arc::new(nats(&server).await), Arc::new(nats(&server).await)]).await;
+    }
 }

@@ -1,5 +1,7 @@
 //! Signed distance from points of a brick to the boundary of a union of spheres.
 
+use bytemuck::{Pod, Zeroable};
+
 use super::{Arc, SphereUnion};
 use crate::surface::lattice::LatticeAtom;
 use crate::surface::simd::{LANES, dispatched, extent};
@@ -33,7 +35,8 @@ pub(in crate::surface) struct BrickUnion {
 
 /// Part of the boundary: a face, stored as the number of its sphere, or an arc with its ends, stored as its number with
 /// the highest bit set.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+#[repr(transparent)]
 pub(in crate::surface) struct Feature(u32);
 
 /// Marks an arc in [`Feature`].
