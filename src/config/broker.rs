@@ -40,8 +40,8 @@ pub struct BrokerConfig {
     /// ms. Default 1,000: a transfer also writes input, record and result. Nodes with the role `api` transfer all such
     /// requests.
     pub transfer_wait_ms: u64,
-    /// Expected time of the partitions into which the workers of a cluster divide a large mesh, ms. Default 10,000: each
-    /// partition reads the structure again and passes the store. 0: each mesh is computed by one worker.
+    /// Expected time of the partitions of a large mesh that the workers of a cluster share, ms. Default 2,000: each
+    /// helper reads the structure again, and each partition passes the store. 0: one worker computes each mesh.
     pub partition_ms: u64,
     /// Number of asynchronous jobs that wait for a worker; with `url`, of jobs that wait or run. Default 10,000: at 0.1
     /// s per job on two workers the last one waits for eight minutes. Further requests for jobs get a 503 with an
@@ -60,7 +60,7 @@ impl Default for BrokerConfig {
             replicas: 1,
             lease_ms: 30_000,
             transfer_wait_ms: 1000,
-            partition_ms: 10_000,
+            partition_ms: 2000,
             queue: 10_000,
         }
     }

@@ -274,6 +274,7 @@ impl MeshRequest {
             parameters: pairs.clone(),
             format: *format,
             idempotency_key: self.preferences.idempotency_key.clone(),
+            helper: None,
         })
     }
 

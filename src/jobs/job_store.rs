@@ -6,7 +6,7 @@
 //! contents, so computing one twice is harmless; a crash costs time and never loses a job.
 
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -18,7 +18,7 @@ use tracing::Instrument as _;
 use super::broker::{Broker, Dispatch};
 use super::durable_job::DurableJob;
 use super::open_jobs::OpenJobs;
-use super::record::{JobId, JobRecord, Requester, Status, now_ms};
+use super::record::{Helper, JobId, JobRecord, Requester, Status, now_ms};
 use super::retry::retry;
 use super::runner::Runner;
 use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, results};
@@ -27,7 +27,6 @@ use crate::formats::Format;
 use crate::pipeline::suits_gpu;
 use crate::single_flight::SingleFlight;
 use crate::store::{Digest, Name, Namespace, Pin, Secret, Store, StoreError};
-use crate::surface::MeshPartition;
 use crate::sync::{Handle, timeout};
 
 /// Number of ended jobs that are held in memory; older ones are read from the store. A record takes up to 64 KiB, the
@@ -53,6 +52,8 @@ pub(crate) struct JobSpec {
     pub(crate) format: Format,
     /// Idempotency key of the request.
     pub(crate) idempotency_key: Option<String>,
+    /// Helper of another job, if the task is one.
+    pub(crate) helper: Option<Helper>,
 }
 
 /// State of a job that its watchers see.
@@ -102,6 +103,8 @@ pub(super) struct JobStoreState {
     pub(super) slots: Arc<Semaphore>,
     /// Results that are being stored: jobs that shared work store its result once.
     pub(super) saves: SingleFlight<ContentKey, Result<(), SaveError>>,
+    /// Meshes whose partitions this process computes.
+    pub(super) shared_meshes: Mutex<HashSet<ContentKey>>,
     /// Number of jobs with a runner.
     pub(super) running: watch::Sender<usize>,
     /// True once no more jobs are claimed.
@@ -181,6 +184,7 @@ impl JobStore {
             writes: Semaphore::new(CONCURRENT_WRITES),
             slots,
             saves: SingleFlight::default(),
+            shared_meshes: Mutex::default(),
             running: watch::channel(0).0,
             stopping: watch::channel(false).0,
         }))
@@ -202,7 +206,7 @@ impl JobStore {
             map: spec.map.as_ref().map(|(digest, _)| digest.to_string()),
             parameters: spec.parameters,
             format: spec.format.name().to_owned(),
-            partition: spec.task.job.partition.map(|MeshPartition { index, count }| [index, count]),
+            helper: spec.helper,
             client,
             urgency: spec.task.rank.urgency,
             suits_gpu: suits_gpu(spec.task.input.atoms(), &spec.task.job),

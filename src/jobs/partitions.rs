@@ -1,26 +1,26 @@
-//! Partitions of a large mesh, which the workers of a cluster compute as jobs of which no client knows.
+//! Partitions of a large mesh, which the workers of a cluster share.
 //!
-//! The worker that writes the mesh dispatches the partitions when it knows the number of spheres. It then computes those
-//! that no other worker has begun, one at a time, and joins the results of the others from the store. Locks of the
-//! broker prevent that two workers compute one partition. Results are named by their contents, so that a second attempt
-//! finds the results of the first one.
+//! The worker that writes the mesh dispatches helpers, jobs of which no client knows, when it knows the number of
+//! spheres. It and its helpers lock, compute and release one partition after another. Helpers put their results into the
+//! store; the writer joins them, and computes what no helper has begun or finished. Results are named by their contents,
+//! so a second attempt finds the results of the first one.
 
+use std::collections::VecDeque;
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
+use futures_util::TryStreamExt as _;
 use metrics::counter;
 use tokio::sync::watch;
 
 use super::broker::WorkLock;
-use super::coalesced_job::work_key;
 use super::job_store::JobStore;
-use super::record::JobRecord;
+use super::record::{Helper, JobRecord};
 use super::records::LoadError;
-use super::{ContentKey, Input, JobSpec, JobView, OwnedJob, Status, Task, results};
-use crate::formats::Format;
-use crate::pipeline::{is_divisible, surface_work};
+use super::{ContentKey, Input, JobSpec, JobView, OwnedJob, Status, Task};
+use crate::pipeline::{Job, is_divisible, surface_work};
 use crate::store::Digest;
 use crate::surface::{Control, PartitionSource, PartitionStep, SurfaceError, SurfaceParams};
 use crate::sync::{Handle, sleep};
@@ -28,18 +28,26 @@ use crate::telemetry::PARTITIONS;
 
 /// Maximum number of partitions of a mesh.
 const MAX_PARTITIONS: u32 = 64;
-/// Interval at which the states of partitions that other workers compute are read.
+/// Number of helpers of a job, more than there are partitions for some: a process that works on the mesh already ends
+/// another helper at once.
+const HELPERS: u32 = 16;
+/// Interval at which the writer looks for partitions that its helpers have finished.
 const POLL: Duration = Duration::from_millis(50);
+/// File name extension of the results of a partition.
+const EXTENSION: &str = "partition";
+/// Length of a digest as text, bytes.
+const DIGEST_BYTES: usize = 64;
 
-/// Partitions of the mesh of a task.
+/// Partitions of the mesh of a job.
 struct Partitions {
     jobs: JobStore,
     runtime: Handle,
-    /// Record of the job that writes the mesh.
+    /// Record of the job, or of the helper.
     record: JobRecord,
     file: Bytes,
     digest: Digest,
-    format: Format,
+    /// Key of the mesh.
+    key: ContentKey,
     /// Expected time of a partition.
     time: Duration,
     state: Mutex<State>,
@@ -48,22 +56,16 @@ struct Partitions {
 #[derive(Default)]
 struct State {
     begun: bool,
+    /// True if this mesh is one of [`JobStoreState::shared_meshes`](super::job_store::JobStoreState::shared_meshes)
+    /// because of these partitions.
+    is_listed: bool,
+    count: u32,
     /// Partitions without a step.
-    open: Vec<OpenPartition>,
-    /// Partition that this process computes, and its lock.
-    own: Option<(OpenPartition, Option<WorkLock>)>,
-}
-
-/// Partition that is dispatched as a job.
-struct OpenPartition {
-    index: u32,
-    /// Cancels the job when the partition is finished.
-    _job: OwnedJob,
-    state: watch::Receiver<JobView>,
-    /// Identity of the work of the job.
-    work: Digest,
-    /// Key of the result.
-    key: ContentKey,
+    open: VecDeque<u32>,
+    /// Lock of the partition that this process computes.
+    lock: Option<WorkLock>,
+    /// Helpers of the writer, which end with it.
+    helpers: Vec<(OwnedJob, watch::Receiver<JobView>)>,
 }
 
 impl fmt::Debug for Partitions {
@@ -75,15 +77,13 @@ impl fmt::Debug for Partitions {
 impl JobStore {
     /// Returns the source of the partitions of a task with its input; `None` if its mesh cannot be divided, or if this
     /// process does not share its jobs.
-    pub(super) fn partitions_of(
-        &self,
-        record: &JobRecord,
-        task: &Task,
-        format: Format,
-    ) -> Option<Arc<dyn PartitionSource>> {
+    pub(super) fn partitions_of(&self, record: &JobRecord, task: &Task) -> Option<Arc<dyn PartitionSource>> {
         let (time, file) = (self.0.partition_time?, task.input.file()?);
+        let (_, format) = record.request().ok()?;
+        let mesh = Job { helper: None, ..task.job.clone() };
         // Partitions are computed on the CPU.
-        if self.0.pool.backend().name() != "cpu" || !is_divisible(&task.job) {
+        let backend = self.0.pool.backend();
+        if backend.name() != "cpu" || !is_divisible(&mesh) {
             return None;
         }
         Some(Arc::new(Partitions {
@@ -92,78 +92,99 @@ impl JobStore {
             record: record.clone(),
             file: file.clone(),
             digest: task.digest,
-            format,
+            key: ContentKey::new(&task.digest, &mesh, format, &backend.arithmetic(), task.namespace),
             time,
             state: Mutex::default(),
         }))
     }
 }
 
+impl Drop for Partitions {
+    fn drop(&mut self) {
+        if self.lock().is_listed {
+            lock(&self.jobs.0.shared_meshes).remove(&self.key);
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 impl Partitions {
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
-    /// Dispatches the partitions.
-    async fn dispatch(&self, count: u32) -> Result<Vec<OpenPartition>, String> {
-        let (jobs, arithmetic) = (&self.jobs, self.jobs.0.pool.backend().arithmetic());
-        let mut open = Vec::new();
-        for index in 0..count {
-            let record = JobRecord { partition: Some([index, count]), ..self.record.clone() };
+    /// Returns the number of partitions of a mesh; `None` if one worker computes it.
+    fn count(&self, spheres: usize, params: &SurfaceParams) -> Option<u32> {
+        let seconds = self.jobs.0.pool.seconds(surface_work(spheres as f64, params));
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
+        let count = (seconds / self.time.as_secs_f64()).clamp(0.0, f64::from(MAX_PARTITIONS)) as u32;
+        (count > 1 && self.runtime.block_on(self.jobs.has_workers())).then_some(count)
+    }
+
+    /// Dispatches helpers, which share the work with this process.
+    async fn dispatch(&self, partitions: u32) -> Result<Vec<(OwnedJob, watch::Receiver<JobView>)>, String> {
+        let (jobs, mut dispatched) = (&self.jobs, Vec::new());
+        for number in 0..HELPERS {
+            let helper = Some(Helper { number, partitions });
+            let record = JobRecord { helper, ..self.record.clone() };
             let (task, format) = jobs.task_of(&record, self.digest)?;
             let task = Task { input: Input::File(self.file.clone()), id: None, ..task };
-            let key = ContentKey::new(&self.digest, &task.job, format, &arithmetic, task.namespace);
-            let (work, file, parameters) = (work_key(&task), self.file.clone(), record.parameters);
-            let spec = JobSpec { task, file, map: None, parameters, format, idempotency_key: None };
+            let (file, parameters) = (self.file.clone(), record.parameters);
+            let spec = JobSpec { task, file, map: None, parameters, format, idempotency_key: None, helper };
             let view = jobs.accept(spec, None).await.map_err(|error| error.to_string())?;
             let job = OwnedJob::new(jobs.clone(), &view);
             let state = job.watch().await.map_err(|error| error.to_string())?.ok_or("its record was lost")?;
-            open.push(OpenPartition { index, _job: job, state, work, key });
+            dispatched.push((job, state));
         }
-        Ok(open)
+        Ok(dispatched)
     }
 
-    /// Returns the result of a partition; `None` if it is not in the store.
-    fn result(&self, partition: &OpenPartition, control: &Control<'_>) -> Result<Option<Vec<u8>>, SurfaceError> {
-        let load = results::load(&self.jobs.0.store, self.format, &partition.key, control);
-        match self.runtime.block_on(load) {
-            Err(LoadError::Memory(error)) => Err(error.into()),
-            Err(error) => {
-                tracing::warn!(%error, "the result of a partition is computed again");
-                Ok(None)
-            }
-            Ok(bytes) => Ok(bytes),
+    /// Reads the results of a partition, whose last bytes are their digest; `None` if they are not stored or damaged.
+    async fn stored(&self, key: &ContentKey, control: &Control<'_>) -> Result<Option<Vec<u8>>, LoadError> {
+        let Some((meta, mut body)) = self.jobs.0.store.read(&key.name(EXTENSION)?, None).await? else {
+            return Ok(None);
+        };
+        let _space = control.reserve(meta.size)?;
+        let mut bytes = Vec::with_capacity(usize::try_from(meta.size).unwrap_or_default());
+        while let Some(piece) = body.try_next().await? {
+            bytes.extend_from_slice(&piece);
         }
+        let digest = bytes.len().checked_sub(DIGEST_BYTES).map(|end| bytes.split_off(end));
+        Ok((digest.as_deref() == Some(Digest::of(&bytes).to_string().as_bytes())).then_some(bytes))
     }
 
-    /// Returns the next step that needs no wait.
+    /// Locks the next partition that needs a step. Returns its results if this process joins them and they are stored.
     fn step(&self, state: &mut State, control: &Control<'_>) -> Result<Option<PartitionStep>, SurfaceError> {
-        let status = |partition: &OpenPartition| partition.state.borrow().record.status;
-        if let Some(at) = state.open.iter().position(|partition| status(partition) == Status::Successful) {
-            let partition = state.open.remove(at);
-            let (index, bytes) = (partition.index, self.result(&partition, control)?);
-            state.own = Some((partition, None));
-            return Ok(Some(bytes.map_or(PartitionStep::Compute(index), |bytes| PartitionStep::Join(index, bytes))));
-        }
-        for at in 0..state.open.len() {
-            let lock = match status(&state.open[at]) {
-                Status::Running | Status::Successful => continue,
-                Status::Failed | Status::Dismissed => None,
-                Status::Accepted => match self.runtime.block_on(self.jobs.0.broker.lock(&state.open[at].work)) {
-                    Some(lock) => Some(lock),
-                    None => continue,
-                },
+        for _ in 0..state.open.len() {
+            let Some(index) = state.open.pop_front() else { break };
+            let key = self.key.of_partition(index, state.count);
+            let Some(lock) = self.runtime.block_on(self.jobs.0.broker.lock(&key.work())) else {
+                state.open.push_back(index);
+                continue;
             };
-            if status(&state.open[at]) == Status::Successful {
-                // Another worker has finished it meanwhile.
-                return self.step(state, control);
+            state.lock = Some(lock);
+            match self.runtime.block_on(self.stored(&key, control)) {
+                Ok(None) => return Ok(Some(PartitionStep::Compute(index))),
+                Ok(Some(bytes)) if self.record.helper.is_none() => return Ok(Some(PartitionStep::Join(index, bytes))),
+                // The writer joins it.
+                Ok(Some(_)) => self.release(state),
+                Err(LoadError::Memory(error)) => return Err(error.into()),
+                Err(error) => {
+                    tracing::warn!(%error, "a partition is computed again");
+                    return Ok(Some(PartitionStep::Compute(index)));
+                }
             }
-            let partition = state.open.remove(at);
-            let index = partition.index;
-            state.own = Some((partition, lock));
-            return Ok(Some(PartitionStep::Compute(index)));
         }
         Ok(None)
+    }
+
+    /// Releases the lock of a partition. The broker needs the runtime for this.
+    fn release(&self, state: &mut State) {
+        let lock = state.lock.take();
+        self.runtime.block_on(async { drop(lock) });
     }
 }
 
@@ -173,23 +194,29 @@ impl PartitionSource for Partitions {
         if std::mem::replace(&mut state.begun, true) {
             return None;
         }
-        let seconds = self.jobs.0.pool.seconds(surface_work(spheres as f64, params));
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-        let count = (seconds / self.time.as_secs_f64()).clamp(0.0, f64::from(MAX_PARTITIONS)) as u32;
-        if count < 2 || !self.runtime.block_on(self.jobs.has_workers()) {
+        let (count, first) = if let Some(Helper { number, partitions }) = self.record.helper {
+            // The writer and its helpers begin at different partitions.
+            (partitions, partitions * (number + 1) / (HELPERS + 1))
+        } else {
+            (self.count(spheres, params)?, 0)
+        };
+        if self.record.helper.is_none() {
+            match self.runtime.block_on(self.dispatch(count)) {
+                Ok(helpers) => state.helpers = helpers,
+                Err(error) => {
+                    tracing::warn!(error, "a worker computes a large mesh without helpers");
+                    return None;
+                }
+            }
+            tracing::debug!(partitions = count, "workers share a mesh");
+        }
+        state.is_listed = lock(&self.jobs.0.shared_meshes).insert(self.key);
+        if self.record.helper.is_some() && !state.is_listed {
+            // Another job of this process uses the same processor.
             return None;
         }
-        match self.runtime.block_on(self.dispatch(count)) {
-            Ok(open) => {
-                tracing::info!(partitions = count, "workers share a mesh");
-                state.open = open;
-                Some(count)
-            }
-            Err(error) => {
-                tracing::warn!(error, "one worker computes a large mesh, because its partitions were not accepted");
-                None
-            }
-        }
+        (state.count, state.open) = (count, (first..count).chain(0..first).collect());
+        Some(count)
     }
 
     fn next(&self, control: &Control<'_>) -> Result<Option<PartitionStep>, SurfaceError> {
@@ -199,15 +226,32 @@ impl PartitionSource for Partitions {
             if let Some(step) = self.step(&mut state, control)? {
                 return Ok(Some(step));
             }
+            if self.record.helper.is_some() {
+                return Ok(None);
+            }
+            // Nothing is left for helpers that have not begun.
+            state.helpers.retain(|(_, view)| view.borrow().record.status != Status::Accepted);
             self.runtime.block_on(async { sleep(POLL).await });
         }
         Ok(None)
     }
 
+    fn publish(&self, index: u32, mut results: Vec<u8>) {
+        let (store, key) = (&self.jobs.0.store, self.key.of_partition(index, self.lock().count));
+        let digest = Digest::of(&results).to_string();
+        results.extend_from_slice(digest.as_bytes());
+        let put = async { store.put(&key.name(EXTENSION)?, results.into()).await };
+        if let Err(error) = self.runtime.block_on(put) {
+            tracing::warn!(%error, "the results of a partition were not stored, so it is computed again");
+        }
+    }
+
     fn finished(&self, index: u32, is_joined: bool) {
         let computed = if is_joined { "elsewhere" } else { "here" };
-        counter!(PARTITIONS, "computed" => computed).increment(1);
+        if self.record.helper.is_none() {
+            counter!(PARTITIONS, "computed" => computed).increment(1);
+        }
         tracing::debug!(index, computed, "a partition is finished");
-        self.lock().own = None;
+        self.release(&mut self.lock());
     }
 }

@@ -12,7 +12,6 @@ use thiserror::Error;
 use crate::formats::Format;
 use crate::pipeline::{MapFile, params};
 use crate::store::{Namespace, OWNER_DIGITS, Secret, derive};
-use crate::surface::MeshPartition;
 use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, traceparent, tracestate};
 
 /// Error of a text that is not a job id.
@@ -135,9 +134,9 @@ pub(crate) struct JobRecord {
     pub(crate) parameters: Vec<(String, String)>,
     /// Mesh format, as a file name extension.
     pub(crate) format: String,
-    /// Number of the partition to compute instead of the whole mesh, and number of partitions.
+    /// Helper of another job, which computes partitions of its mesh.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) partition: Option<[u32; 2]>,
+    pub(crate) helper: Option<Helper>,
     /// Number of the client, for fair queueing after a restart.
     pub(crate) client: u64,
     /// Urgency among the jobs of the client.
@@ -165,6 +164,15 @@ pub(crate) struct JobRecord {
     /// Request that created the job.
     #[serde(default)]
     pub(crate) requester: Requester,
+}
+
+/// Helper of a job: another worker, which computes partitions of its mesh.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Helper {
+    /// Number of the helper, from 0.
+    pub(crate) number: u32,
+    /// Number of partitions.
+    pub(crate) partitions: u32,
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde calls")]
@@ -253,7 +261,7 @@ impl JobRecord {
         let format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
         params::set_format(&mut request.job, format).map_err(|e| e.to_string())?;
         request.job.map = self.map.clone().map(MapFile::not_loaded);
-        request.job.partition = self.partition.map(|[index, count]| MeshPartition { index, count });
+        request.job.helper = self.helper.map(|helper| helper.number);
         Ok((request, format))
     }
 
@@ -317,7 +325,7 @@ mod tests {
             map: None,
             parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect(),
             format: "glb".to_owned(),
-            partition: None,
+            helper: None,
             client: u64::MAX,
             urgency: 3,
             suits_gpu: false,

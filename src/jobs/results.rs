@@ -4,15 +4,12 @@ use std::io::{self, Write};
 use std::sync::Arc;
 
 use bytes::Bytes;
-use futures_util::TryStreamExt as _;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use super::records::LoadError;
 use super::{ContentKey, Finished};
 use crate::formats::{Format, FormatError};
 use crate::store::{Digest, Hasher, Pin, Store, StoreError};
-use crate::surface::Control;
 
 /// File name extension of a report.
 pub(crate) const REPORT: &str = "json";
@@ -112,25 +109,6 @@ pub(crate) async fn is_stored(store: &Store, format: Format, key: &ContentKey) -
     }
     let Some((_, sums)) = store.peek(&report).await?.as_ref().and_then(split) else { return Ok(false) };
     store.is_intact(&mesh, sums.mesh_bytes, &sums.mesh_sha256).await
-}
-
-/// Reads the whole file of a result within the memory of `control`; `None` if it is not stored or damaged.
-pub(super) async fn load(
-    store: &Store,
-    format: Format,
-    key: &ContentKey,
-    control: &Control<'_>,
-) -> Result<Option<Vec<u8>>, LoadError> {
-    let (name, report) = (key.name(format.name())?, key.name(REPORT)?);
-    let Some((_, sums)) = store.peek(&report).await?.as_ref().and_then(split) else { return Ok(None) };
-    let Some((meta, mut body)) = store.read(&name, None).await? else { return Ok(None) };
-    let _space = control.reserve(meta.size)?;
-    let mut bytes = Vec::with_capacity(usize::try_from(meta.size).unwrap_or_default());
-    while let Some(piece) = body.try_next().await? {
-        bytes.extend_from_slice(&piece);
-    }
-    let is_intact = (bytes.len() as u64, Digest::of(&bytes)) == (sums.mesh_bytes, sums.mesh_sha256);
-    Ok(is_intact.then_some(bytes))
 }
 
 /// Writer that hashes what it writes.

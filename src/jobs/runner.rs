@@ -266,7 +266,7 @@ async fn join_or_load(
     }
     match jobs.load_input(&mut task).await {
         Ok(()) => {
-            task.partitions = jobs.partitions_of(record, &task, format);
+            task.partitions = jobs.partitions_of(record, &task);
             let ticket = pool.submit(task, jobs.0.allowed(), on_start).map_err(refused)?;
             Ok(Some((ticket, Some(lock))))
         }

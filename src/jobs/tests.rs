@@ -79,7 +79,8 @@ impl Fixture {
     async fn accept_from(&self, client: &str) -> Result<JobView, AcceptError> {
         let parameters = vec![("resolution".to_owned(), "2".to_owned())];
         let (task, file) = (task(client, "2"), Bytes::from_static(SAMPLE));
-        let spec = JobSpec { task, file, map: None, parameters, format: Format::Stl, idempotency_key: None };
+        let spec =
+            JobSpec { task, file, map: None, parameters, format: Format::Stl, idempotency_key: None, helper: None };
         self.jobs.accept(spec, None).await
     }
 
@@ -98,7 +99,7 @@ impl Fixture {
             map: None,
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),
-            partition: None,
+            helper: None,
             client: 1,
             urgency: DEFAULT_URGENCY,
             suits_gpu: false,

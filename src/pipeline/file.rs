@@ -21,7 +21,7 @@ pub struct Product {
     pub areas: Option<AtomAreas>,
     /// Compressed form of the mesh, for [`Compress::Meshopt`]. The columns of `mesh` are empty then.
     pub pieces: Option<Pieces>,
-    /// PNG of the mesh, if one was drawn, or the results of a partition. The mesh is empty then.
+    /// PNG of the mesh, if one was drawn, or the empty file of a helper. The mesh is empty then.
     pub bytes: Option<Vec<u8>>,
     /// Length of the GLB, bytes, if the mesh was streamed into a sink. The columns of `mesh` are empty then.
     pub streamed_bytes: Option<u64>,
@@ -34,7 +34,7 @@ pub enum File<'a> {
     Mesh(Encoder<'a>),
     /// GLB of a compressed mesh.
     Compressed(CompressedGlb<'a>),
-    /// PNG of a picture, or the results of a partition.
+    /// PNG of a picture, or the empty file of a helper.
     Bytes(&'a [u8]),
 }
 

@@ -15,6 +15,7 @@ mod estimate;
 mod file;
 mod finest_fit;
 mod fit;
+mod helper;
 mod host_cores;
 mod instances;
 pub mod integer;
@@ -25,7 +26,6 @@ mod load;
 mod map_file;
 pub mod nearest;
 pub mod params;
-mod partition;
 mod parts;
 mod pockets;
 mod progress;
@@ -49,12 +49,12 @@ pub use draw::draw;
 pub use error::JobError;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::{File, Product};
+#[cfg(feature = "server")]
+pub(crate) use helper::is_divisible;
 pub use instances::{AssemblyReport, InstancesReport};
 pub use left_out::{KindCount, LeftOutReport, ResidueCount};
 pub use limits::JobLimits;
 pub use map_file::MapFile;
-#[cfg(feature = "server")]
-pub(crate) use partition::is_divisible;
 pub use parts::PartReport;
 pub use pockets::PocketReport;
 pub use progress::Tracker;
@@ -71,8 +71,8 @@ use crate::formats::{Compress, GlbSink, Normals, Packing, Step, Storage, Units};
 use crate::picture::PictureParams;
 use crate::structure::{self, Context, Selected, Selection, Split, Structure, StructureError};
 use crate::surface::{
-    Backend, Control, Measures, Mesh, MeshOutput, MeshPartition, MeshSink, Simplify, SinkFailed, Spheres, Stage,
-    SurfaceError, SurfaceParams, TriangleQuality, Validation, lattice,
+    Backend, Control, Measures, Mesh, MeshOutput, MeshSink, Simplify, SinkFailed, Spheres, Stage, SurfaceError,
+    SurfaceParams, TriangleQuality, Validation, lattice,
 };
 use color::{MeshColors, Scheme};
 use cut::Cut;
@@ -104,8 +104,8 @@ pub struct Job {
     pub quality: TriangleQuality,
     /// Tile to mesh instead of the whole structure.
     pub tile: Option<TileAddress>,
-    /// Partition to compute instead of the whole mesh.
-    pub partition: Option<MeshPartition>,
+    /// Number of a helper, which computes partitions of the mesh for another process; `None` for the mesh itself.
+    pub helper: Option<u32>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -255,8 +255,8 @@ fn run_whole<S: Deref<Target = Structure>>(
 ) -> Result<Product, JobError> {
     let clock = StageClock::new(progress);
     let loaded = load(read, job, &limits.read, &clock, &Control { observer: &clock, ..control.clone() })?;
-    if let Some(partition) = job.partition {
-        return partition::run(loaded, job, partition, limits, choice.reason, control, clock);
+    if job.helper.is_some() {
+        return helper::run(loaded, job, limits, choice.reason, control, clock);
     }
     run_loaded(loaded, job, limits, choice, control, clock, progress, sink)
 }

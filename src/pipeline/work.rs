@@ -4,7 +4,7 @@ use super::Job;
 use super::color::{Scheme, VertexProperty};
 #[cfg(feature = "server")]
 use crate::surface::SurfaceParams;
-use crate::surface::{MeshPartition, SurfaceKind, TriangleQuality};
+use crate::surface::{SurfaceKind, TriangleQuality};
 
 /// Approximate bytes of text per atom. A line of a PDB file has 81, a line of an mmCIF file 90 to 110.
 const BYTES_PER_ATOM: f64 = 90.0;
@@ -73,10 +73,6 @@ pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
         return reading + relative_time(job.params.surface) * mesh_work(atoms.min(TILE_ATOMS), 0.5);
     }
     let resolution = job.spacing.expected(&job.params, atoms);
-    if let Some(MeshPartition { count, .. }) = job.partition {
-        let surface = relative_time(job.params.surface) * mesh_work(atoms, resolution);
-        return 0.3 * (atoms + MIN_WORK) + surface / f64::from(count);
-    }
     let mesh = if job.spacing.max_triangles().is_some() { search_work } else { mesh_work };
     // Reading does not depend on the spacing.
     0.3 * (atoms + MIN_WORK)
@@ -106,10 +102,7 @@ const MIN_GPU_WORK: f64 = 10_000.0;
 pub(crate) fn suits_gpu(atoms: f64, job: &Job) -> bool {
     let resolution = job.spacing.expected(&job.params, atoms);
     let surface = relative_time(job.params.surface) * mesh_work(atoms, resolution);
-    job.tile.is_none()
-        && job.partition.is_none()
-        && surface >= MIN_GPU_WORK
-        && 2.0 * surface >= estimate_work(atoms, job)
+    job.tile.is_none() && job.helper.is_none() && surface >= MIN_GPU_WORK && 2.0 * surface >= estimate_work(atoms, job)
 }
 
 /// Work of a job besides its atoms and its grid, in atoms: about 1 ms.

@@ -8,7 +8,7 @@ use super::error::SurfaceError;
 use super::params::SurfaceParams;
 
 /// One of several partitions of a mesh with about the same number of atoms.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MeshPartition {
     /// Number of the partition, from 0.
     pub index: u32,
@@ -16,7 +16,7 @@ pub struct MeshPartition {
     pub count: u32,
 }
 
-/// Next step of the run that joins the partitions of a mesh.
+/// Next step of a process that works on a mesh.
 #[derive(Debug)]
 pub enum PartitionStep {
     /// Computes the partition with this number.
@@ -31,11 +31,15 @@ pub trait PartitionSource: Debug + Send + Sync {
     /// all of it, or if a run has begun before.
     fn begin(&self, spheres: usize, params: &SurfaceParams) -> Option<u32>;
 
-    /// Waits for the next step; `None` once there has been one for each partition.
+    /// Waits for the next step. Returns `None` once there has been one for each partition or, in a process that only
+    /// computes partitions, once others work on the rest.
     ///
     /// # Errors
     /// [`SurfaceError::Cancelled`] and [`SurfaceError::Memory`].
     fn next(&self, control: &Control<'_>) -> Result<Option<PartitionStep>, SurfaceError>;
+
+    /// Passes the results of a partition that this process has computed to the process that joins them.
+    fn publish(&self, index: u32, results: Vec<u8>);
 
     /// Notes that a partition is finished: computed by this process, or joined. This process computes a partition
     /// whose results cannot be joined.

@@ -74,6 +74,7 @@ impl Fixture {
             parameters: Vec::new(),
             format: Format::Glb,
             idempotency_key: Some(KEY.to_owned()),
+            helper: None,
         };
         let mut client = Client { fixture: self, ended: false };
         client.sees(&block_on(self.jobs.accept(spec, None)).unwrap());

@@ -2,7 +2,7 @@
 
 use crate::pipeline::{Coloring, Job, PictureParams, Spacing};
 use crate::structure::{Context, Selection, Split};
-use crate::surface::{MeshPartition, PaperParams, SurfaceParams, TriangleQuality};
+use crate::surface::{PaperParams, SurfaceParams, TriangleQuality};
 
 /// Returns all parameters of a job as one line of text, which is equal for equal jobs only. It is part of the content
 /// key.
@@ -18,7 +18,7 @@ pub fn canonical(job: &Job) -> String {
         simplify,
         quality,
         tile,
-        partition,
+        helper,
         spacing,
         validation,
         compress,
@@ -75,7 +75,7 @@ pub fn canonical(job: &Job) -> String {
         simplify.and_then(|wanted| wanted.max_triangles).map(|limit| format!("max_triangles={limit}")),
         (*quality != TriangleQuality::Standard).then(|| format!("quality={}", quality.name())),
         tile.map(|tile| format!("tile={}", tile.path())),
-        partition.map(|MeshPartition { index, count }| format!("partition={index}/{count}")),
+        helper.map(|number| format!("helper={number}")),
         exact.then(|| "exact=true".to_owned()),
         // Quotes the names, which may contain `&`.
         interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),

@@ -5,6 +5,7 @@
 
 use std::hash::Hasher as _;
 use std::ops::Range;
+use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
 use rustc_hash::FxHasher;
@@ -16,6 +17,7 @@ use super::{CpuBackend, FirstPass, NO_BRICK, RunContext, Tile};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK_POINTS, Lattice, to_u32};
+use crate::surface::memory::Reservation;
 use crate::surface::params::{SurfaceLimits, SurfaceParams};
 use crate::surface::partitions::{MeshPartition, PartitionSource, PartitionStep};
 use crate::surface::spheres::Spheres;
@@ -61,48 +63,64 @@ struct TileHeader {
 }
 
 impl CpuBackend {
-    /// Runs the first pass over the tiles of a partition. The run that joins the partitions needs the same spheres,
+    /// Computes partitions of a mesh that another process joins, until none is left. That process has the same spheres,
     /// parameters, release and arithmetic.
     ///
     /// # Errors
-    /// Those of [`Backend::write`](crate::surface::Backend::write); of the limits, those that the partition exceeds.
-    pub fn partition(
+    /// Those of [`Backend::write`](crate::surface::Backend::write); of the limits, those that the partitions exceed.
+    pub fn help(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-        partition: MeshPartition,
-    ) -> Result<Vec<u8>, SurfaceError> {
+    ) -> Result<(), SurfaceError> {
         self.install(|free_threads| {
             let context = RunContext { params, limits, control, free_threads };
+            let Some((source, count)) = source(spheres.len(), context) else { return Ok(()) };
             let first = FirstPass::new(super::place(spheres, context)?, context)?;
-            let pass = first.pass(context);
-            let tiles = pass.tiles.of_partition(partition);
-            let found = evaluate(&pass, &tiles)?;
-            let header = PartitionHeader {
-                magic: MAGIC,
-                lattice: hash(pass.lattice),
-                partition: [partition.index, partition.count, to_u32(tiles.start), to_u32(tiles.len())],
-                counts: pass.counters.counts(),
-            };
-            let length = found.iter().map(|(_, tile)| size_of::<TileHeader>() as u64 + tile.found.bytes()).sum::<u64>();
-            control.memory.grow(length)?;
-            let mut bytes =
-                Vec::with_capacity(usize::try_from(length).unwrap_or_default() + size_of::<PartitionHeader>());
-            bytes.extend_from_slice(bytemuck::bytes_of(&header));
-            found.iter().for_each(|(t, tile)| encode(to_u32(*t), &tile.found, &mut bytes));
-            Ok(bytes)
+            while let Some(step) = source.next(control)? {
+                let (PartitionStep::Compute(index) | PartitionStep::Join(index, _)) = step;
+                // Releases the memory of the partition.
+                let memory = Arc::new(Reservation::new(&control.memory));
+                let control = &Control { memory, ..control.clone() };
+                let results = results(&first, RunContext { control, ..context }, MeshPartition { index, count })?;
+                source.publish(index, results);
+                source.finished(index, false);
+            }
+            Ok(())
         })
     }
 }
 
+/// Returns the source of partitions of a run, and their number.
+fn source(spheres: usize, context: RunContext<'_>) -> Option<(&dyn PartitionSource, u32)> {
+    let source = context.control.partitions.as_deref()?;
+    Some((source, source.begin(spheres, context.params)?))
+}
+
+/// Returns the results of a partition.
+fn results(first: &FirstPass, context: RunContext<'_>, partition: MeshPartition) -> Result<Vec<u8>, SurfaceError> {
+    let pass = first.pass(context);
+    let tiles = pass.tiles.of_partition(partition);
+    let found = evaluate(&pass, &tiles)?;
+    let header = PartitionHeader {
+        magic: MAGIC,
+        lattice: hash(pass.lattice),
+        partition: [partition.index, partition.count, to_u32(tiles.start), to_u32(tiles.len())],
+        counts: pass.counters.counts(),
+    };
+    let of_tiles = found.iter().map(|(_, tile)| size_of::<TileHeader>() as u64 + tile.found.bytes()).sum::<u64>();
+    context.control.memory.grow(of_tiles)?;
+    let mut bytes = Vec::with_capacity(size_of::<PartitionHeader>() + usize::try_from(of_tiles).unwrap_or_default());
+    bytes.extend_from_slice(bytemuck::bytes_of(&header));
+    found.iter().for_each(|(t, tile)| encode(to_u32(*t), &tile.found, &mut bytes));
+    Ok(bytes)
+}
+
 /// Evaluates all tiles that the surface reaches, in order: in partitions if the run has a source of them.
 pub(super) fn evaluate_all(pass: &Pass<'_>) -> Result<Vec<Tile>, SurfaceError> {
-    let RunContext { params, control, .. } = pass.context;
-    let begin = |source: &dyn PartitionSource| source.begin(pass.lattice.atoms.len(), params);
-    let partitions = control.partitions.as_deref().and_then(|source| Some((source, begin(source)?)));
-    let mut found = match partitions {
+    let mut found = match source(pass.lattice.atoms.len(), pass.context) {
         None => evaluate(pass, &(0..pass.tiles.len()))?,
         Some((source, count)) => join(pass, source, count)?,
     };
@@ -255,8 +273,20 @@ mod tests {
     struct Steps {
         steps: Mutex<Vec<PartitionStep>>,
         count: u32,
+        published: Mutex<Vec<Vec<u8>>>,
         begun: AtomicUsize,
         joined: AtomicUsize,
+    }
+
+    impl Steps {
+        fn new(count: u32, steps: Vec<PartitionStep>) -> Arc<Self> {
+            let [begun, joined] = [0, 0].map(AtomicUsize::new);
+            Arc::new(Self { steps: Mutex::new(steps), count, published: Mutex::default(), begun, joined })
+        }
+
+        fn control(self: &Arc<Self>) -> Control<'static> {
+            Control { partitions: Some(Arc::<Self>::clone(self)), ..Control::default() }
+        }
     }
 
     impl PartitionSource for Steps {
@@ -266,6 +296,10 @@ mod tests {
 
         fn next(&self, _: &Control<'_>) -> Result<Option<PartitionStep>, SurfaceError> {
             Ok(self.steps.lock().unwrap().pop())
+        }
+
+        fn publish(&self, _: u32, results: Vec<u8>) {
+            self.published.lock().unwrap().push(results);
         }
 
         fn finished(&self, _: u32, is_joined: bool) {
@@ -282,16 +316,17 @@ mod tests {
 
     /// Meshes `spheres` with the partitions that `steps` yields, last one first. Also returns the number of joined ones.
     fn mesh(spheres: &Spheres, params: &SurfaceParams, count: u32, steps: Vec<PartitionStep>) -> (MeshOutput, usize) {
-        let [begun, joined] = [0, 0].map(AtomicUsize::new);
-        let source = Arc::new(Steps { steps: Mutex::new(steps), count, begun, joined });
-        let control = Control { partitions: Some(Arc::<Steps>::clone(&source)), ..Control::default() };
-        let output = CpuBackend::default().run(spheres, params, &SurfaceLimits::default(), &control).unwrap();
+        let source = Steps::new(count, steps);
+        let limits = SurfaceLimits::default();
+        let output = CpuBackend::default().run(spheres, params, &limits, &source.control()).unwrap();
         (output, source.joined.load(Ordering::SeqCst))
     }
 
     fn partition(spheres: &Spheres, params: &SurfaceParams, index: u32, count: u32) -> Vec<u8> {
         let (backend, limits) = (CpuBackend::new(Some(1)).unwrap(), SurfaceLimits::default());
-        backend.partition(spheres, params, &limits, &Control::default(), MeshPartition { index, count }).unwrap()
+        let source = Steps::new(count, vec![PartitionStep::Compute(index)]);
+        backend.help(spheres, params, &limits, &source.control()).unwrap();
+        source.published.lock().unwrap().pop().unwrap()
     }
 
     fn described(output: &MeshOutput) -> String {
@@ -364,10 +399,7 @@ mod tests {
             let limits = SurfaceLimits { max_grid_points, ..most };
             let steps =
                 (0..4).map(|index| PartitionStep::Join(index, partition(&spheres, &params, index, 4))).collect();
-            let [begun, joined] = [0, 0].map(AtomicUsize::new);
-            let source = Steps { steps: Mutex::new(steps), count: 4, begun, joined };
-            let control = Control { partitions: Some(Arc::new(source)), ..Control::default() };
-            let found = CpuBackend::default().run(&spheres, &params, &limits, &control);
+            let found = CpuBackend::default().run(&spheres, &params, &limits, &Steps::new(4, steps).control());
             assert_eq!(found.is_ok(), fits, "{found:?}");
         }
     }

@@ -1,11 +1,11 @@
-//! Partition of a job's mesh, which another process joins with the others.
+//! Helper of a job: computes partitions of its mesh, which another process joins.
 
 use std::ops::Deref;
 
 use super::report::Counts;
 use super::{Choice, Job, JobError, JobLimits, Product, Report, StageClock, storage};
 use crate::structure::{Selected, Structure};
-use crate::surface::{Backend as _, Control, CpuBackend, GridStats, Measures, Mesh, MeshPartition, Spheres};
+use crate::surface::{Backend as _, Control, CpuBackend, GridStats, Measures, Mesh, Spheres};
 
 /// Returns true if a job meshes one surface with a spacing that does not depend on the mesh, so that its mesh can be
 /// divided into partitions.
@@ -17,17 +17,16 @@ pub(crate) fn is_divisible(job: &Job) -> bool {
         && job.selection.context == Context::Selection
         && !job.selection.instances
         && job.tile.is_none()
-        && job.partition.is_none()
+        && job.helper.is_none()
         && job.spacing.max_triangles().is_none()
         && job.map.is_none()
         && job.picture.is_none()
 }
 
-/// Computes a partition on the CPU. The mesh of the product is empty.
+/// Computes partitions on the CPU until none is left. The product is an empty file.
 pub(super) fn run<S: Deref<Target = Structure>>(
     (structure, selected, spheres): (S, Selected, Spheres),
     job: &Job,
-    partition: MeshPartition,
     limits: &JobLimits,
     reason: &str,
     control: &Control<'_>,
@@ -37,8 +36,7 @@ pub(super) fn run<S: Deref<Target = Structure>>(
     let control = Control { observer: &clock, ..control.clone() };
     let mut params = job.params_for(spheres.len());
     let storage = storage(job, &mut params, &spheres);
-    let compute = || backend.partition(&spheres, &params, &limits.surface, &control, partition);
-    let bytes = clock.pass(compute)?;
+    clock.pass(|| backend.help(&spheres, &params, &limits.surface, &control))?;
     let mesh = Mesh::default();
     let measures = Measures::of_part(&mesh, 0, &control)?;
     let counts = Counts {
@@ -56,5 +54,5 @@ pub(super) fn run<S: Deref<Target = Structure>>(
     // The report takes the times of the clock.
     drop(control);
     let report = Report::new(&structure, &selected, job, &choice, &counts, &measures, clock.finish());
-    Ok(Product { bytes: Some(bytes), ..Product::new(mesh, storage, report) })
+    Ok(Product { bytes: Some(Vec::new()), ..Product::new(mesh, storage, report) })
 }
