@@ -59,8 +59,8 @@ metrics! {
     BROKER_UP = "molmesh_broker_up", Gauge;
     /// Synchronous requests whose meshes other nodes computed.
     JOBS_TRANSFERRED = "molmesh_jobs_transferred_total", Counter;
-    /// Partitions of meshes that this node wrote, by `computed`: `here` or `elsewhere`.
-    PARTITIONS = "molmesh_partitions_total", Counter;
+    /// Partitions of the shared meshes that this node wrote, computed by it or by helpers on other nodes.
+    PARTITIONS = "molmesh_partitions_total", Counter, computed: "here|elsewhere";
     /// Claims of jobs whose earlier claim expired or was returned.
     BROKER_REDELIVERIES = "molmesh_broker_redeliveries_total", Counter;
     /// Unfinished asynchronous jobs that were dispatched again, such as those of an earlier process.

@@ -315,9 +315,10 @@ impl FirstPass {
 
 fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
     let RunContext { params, limits, control, .. } = context;
+    let source = partitions::source(lattice.atoms.len(), context);
     let first = FirstPass::new(lattice, context)?;
     let pass = first.pass(context);
-    let mut done = partitions::evaluate_all(&pass)?;
+    let mut done = partitions::evaluate_all(&pass, source)?;
     let counts = pass.counters.counts();
     control.check()?;
     let totals = control.span(Stage::Scan, || scan::scan(&mut done, params, limits))?;

@@ -93,8 +93,9 @@ impl CpuBackend {
     }
 }
 
-/// Returns the source of partitions of a run, and their number.
-fn source(spheres: usize, context: RunContext<'_>) -> Option<(&dyn PartitionSource, u32)> {
+/// Returns the source of partitions of a run, and their number. Called before the first pass is prepared, so that helpers
+/// prepare it at the same time.
+pub(super) fn source(spheres: usize, context: RunContext<'_>) -> Option<(&dyn PartitionSource, u32)> {
     let source = context.control.partitions.as_deref()?;
     Some((source, source.begin(spheres, context.params)?))
 }
@@ -118,9 +119,12 @@ fn results(first: &FirstPass, context: RunContext<'_>, partition: MeshPartition)
     Ok(bytes)
 }
 
-/// Evaluates all tiles that the surface reaches, in order: in partitions if the run has a source of them.
-pub(super) fn evaluate_all(pass: &Pass<'_>) -> Result<Vec<Tile>, SurfaceError> {
-    let mut found = match source(pass.lattice.atoms.len(), pass.context) {
+/// Evaluates all tiles that the surface reaches, in order: in partitions if there is a source of them.
+pub(super) fn evaluate_all(
+    pass: &Pass<'_>,
+    source: Option<(&dyn PartitionSource, u32)>,
+) -> Result<Vec<Tile>, SurfaceError> {
+    let mut found = match source {
         None => evaluate(pass, &(0..pass.tiles.len()))?,
         Some((source, count)) => join(pass, source, count)?,
     };
