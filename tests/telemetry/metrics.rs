@@ -181,7 +181,7 @@ fn cluster(look: &dyn Fn()) {
     let folder = tempfile::tempdir().unwrap();
     let alone = start(Arc::new(CpuBackend::default()), |config| {
         shared(config);
-        config.broker.prefix = "alone".to_owned();
+        "alone".clone_into(&mut config.broker.prefix);
         config.broker.partition_ms = 1;
         config.store.url = Some(format!("file://{}", folder.path().display()));
     });

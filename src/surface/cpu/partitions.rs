@@ -115,7 +115,9 @@ fn results(first: &FirstPass, context: RunContext<'_>, partition: MeshPartition)
     context.control.memory.grow(of_tiles)?;
     let mut bytes = Vec::with_capacity(size_of::<PartitionHeader>() + usize::try_from(of_tiles).unwrap_or_default());
     bytes.extend_from_slice(bytemuck::bytes_of(&header));
-    found.iter().for_each(|(t, tile)| encode(to_u32(*t), &tile.found, &mut bytes));
+    for (t, tile) in &found {
+        encode(to_u32(*t), &tile.found, &mut bytes);
+    }
     Ok(bytes)
 }
 
@@ -205,7 +207,9 @@ fn encode(tile: u32, found: &ClassifiedBricks, bytes: &mut Vec<u8>) {
         bytemuck::cast_slice(spheres),
         bytemuck::cast_slice(sheets),
     ];
-    lists.into_iter().for_each(|list| bytes.extend_from_slice(list));
+    for list in lists {
+        bytes.extend_from_slice(list);
+    }
 }
 
 /// Takes `n` records from the beginning of `bytes`. `None` if there are fewer.
@@ -275,7 +279,7 @@ mod tests {
     /// Source whose steps are given.
     #[derive(Debug)]
     struct Steps {
-        steps: Mutex<Vec<PartitionStep>>,
+        left: Mutex<Vec<PartitionStep>>,
         count: u32,
         published: Mutex<Vec<Vec<u8>>>,
         begun: AtomicUsize,
@@ -285,7 +289,7 @@ mod tests {
     impl Steps {
         fn new(count: u32, steps: Vec<PartitionStep>) -> Arc<Self> {
             let [begun, joined] = [0, 0].map(AtomicUsize::new);
-            Arc::new(Self { steps: Mutex::new(steps), count, published: Mutex::default(), begun, joined })
+            Arc::new(Self { left: Mutex::new(steps), count, published: Mutex::default(), begun, joined })
         }
 
         fn control(self: &Arc<Self>) -> Control<'static> {
@@ -299,7 +303,7 @@ mod tests {
         }
 
         fn next(&self, _: &Control<'_>) -> Result<Option<PartitionStep>, SurfaceError> {
-            Ok(self.steps.lock().unwrap().pop())
+            Ok(self.left.lock().unwrap().pop())
         }
 
         fn publish(&self, _: u32, results: Vec<u8>) {
