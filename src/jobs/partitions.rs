@@ -62,8 +62,9 @@ struct State {
     count: u32,
     /// Partitions without a step.
     open: VecDeque<u32>,
-    /// Lock of the partition that this process computes.
-    lock: Option<WorkLock>,
+    /// Locks of partitions: of the writer, those that it has begun, so that no helper computes them again; of a helper,
+    /// that which it computes.
+    locks: Vec<WorkLock>,
     /// Helpers of the writer, which end with it.
     helpers: Vec<(OwnedJob, watch::Receiver<JobView>)>,
 }
@@ -101,7 +102,9 @@ impl JobStore {
 
 impl Drop for Partitions {
     fn drop(&mut self) {
-        if self.lock().is_listed {
+        let mut state = self.lock();
+        self.release(&mut state);
+        if state.is_listed {
             lock(&self.jobs.0.shared_meshes).remove(&self.key);
         }
     }
@@ -165,7 +168,7 @@ impl Partitions {
                 state.open.push_back(index);
                 continue;
             };
-            state.lock = Some(lock);
+            state.locks.push(lock);
             match self.runtime.block_on(self.stored(&key, control)) {
                 Ok(None) => return Ok(Some(PartitionStep::Compute(index))),
                 Ok(Some(bytes)) if self.record.helper.is_none() => return Ok(Some(PartitionStep::Join(index, bytes))),
@@ -181,10 +184,12 @@ impl Partitions {
         Ok(None)
     }
 
-    /// Releases the lock of a partition. The broker needs the runtime for this.
+    /// Releases the locks. The broker needs the runtime for this.
     fn release(&self, state: &mut State) {
-        let lock = state.lock.take();
-        self.runtime.block_on(async { drop(lock) });
+        let locks = std::mem::take(&mut state.locks);
+        if !locks.is_empty() {
+            self.runtime.block_on(async { drop(locks) });
+        }
     }
 }
 
@@ -248,10 +253,11 @@ impl PartitionSource for Partitions {
 
     fn finished(&self, index: u32, is_joined: bool) {
         let computed = if is_joined { "elsewhere" } else { "here" };
-        if self.record.helper.is_none() {
+        tracing::debug!(index, computed, "a partition is finished");
+        if self.record.helper.is_some() {
+            self.release(&mut self.lock());
+        } else {
             counter!(PARTITIONS, "computed" => computed).increment(1);
         }
-        tracing::debug!(index, computed, "a partition is finished");
-        self.release(&mut self.lock());
     }
 }

@@ -292,6 +292,10 @@ async fn save(jobs: &JobStore, record: &JobRecord, finished: Arc<Finished>) -> R
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
     let failed = |error| EndError::Save { error, resolution };
     let pin = jobs.0.store.pin(&key.name(format.name()).map_err(|error| failed(error.into()))?);
+    if record.helper.is_some() {
+        // Its partitions are stored.
+        return Ok((key.to_string(), pin));
+    }
     let start = || {
         let (store, finished, limit) = (jobs.0.store.clone(), Arc::clone(&finished), jobs.0.output_bytes);
         async move { results::save(&store, finished, format, &key, limit).await.map(drop) }

@@ -202,8 +202,8 @@ fn count(report: &Report) {
 }
 
 /// Memory use of a product, bytes.
-fn bytes_of(Product { mesh, pieces, bytes, .. }: &Product) -> u64 {
-    let drawn = bytes.as_ref().map_or(0, Vec::len) as u64 + pieces.as_ref().map_or(0, Pieces::bytes);
+fn bytes_of(Product { mesh, pieces, picture, .. }: &Product) -> u64 {
+    let drawn = picture.as_ref().map_or(0, Vec::len) as u64 + pieces.as_ref().map_or(0, Pieces::bytes);
     let optional = mesh.atom_ids.as_ref().map_or(0, Column::len) + mesh.colors.as_ref().map_or(0, Column::len);
     mesh.bytes() + 4 * optional as u64 + drawn
 }

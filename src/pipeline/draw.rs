@@ -33,7 +33,7 @@ pub fn draw(
     for (stage, ms) in clock.finish() {
         Report::add_timing(&mut product.report, stage, ms);
     }
-    product.bytes = Some(bytes);
+    product.picture = Some(bytes);
     Ok(())
 }
 

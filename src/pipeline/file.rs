@@ -21,8 +21,8 @@ pub struct Product {
     pub areas: Option<AtomAreas>,
     /// Compressed form of the mesh, for [`Compress::Meshopt`]. The columns of `mesh` are empty then.
     pub pieces: Option<Pieces>,
-    /// PNG of the mesh, if one was drawn, or the empty file of a helper. The mesh is empty then.
-    pub bytes: Option<Vec<u8>>,
+    /// PNG of the mesh, if one was drawn. The mesh is empty then.
+    pub picture: Option<Vec<u8>>,
     /// Length of the GLB, bytes, if the mesh was streamed into a sink. The columns of `mesh` are empty then.
     pub streamed_bytes: Option<u64>,
 }
@@ -34,13 +34,13 @@ pub enum File<'a> {
     Mesh(Encoder<'a>),
     /// GLB of a compressed mesh.
     Compressed(CompressedGlb<'a>),
-    /// PNG of a picture, or the empty file of a helper.
-    Bytes(&'a [u8]),
+    /// PNG of a picture.
+    Picture(&'a [u8]),
 }
 
 impl Product {
     pub(super) fn new(mesh: Mesh, storage: Storage, report: Report) -> Self {
-        Self { mesh, bounds: None, storage, report, areas: None, pieces: None, bytes: None, streamed_bytes: None }
+        Self { mesh, bounds: None, storage, report, areas: None, pieces: None, picture: None, streamed_bytes: None }
     }
 
     /// Returns the metadata for a mesh file.
@@ -55,8 +55,8 @@ impl Product {
     /// Returns a [`FormatError`]; [`FormatError::NotAMeshFormat`] for a picture that was not drawn.
     pub fn file(&self, format: Format) -> Result<File<'_>, FormatError> {
         let (mesh, meta) = (&self.mesh, self.meta());
-        match (&self.bytes, &self.pieces) {
-            (Some(bytes), _) => Ok(File::Bytes(bytes)),
+        match (&self.picture, &self.pieces) {
+            (Some(picture), _) if format.is_picture() => Ok(File::Picture(picture)),
             (_, Some(pieces)) if format == Format::Glb => {
                 Ok(File::Compressed(CompressedGlb::new(mesh, pieces, &meta)?))
             }
@@ -96,7 +96,7 @@ impl File<'_> {
         match self {
             Self::Mesh(encoder) => encoder.encoded_len(),
             Self::Compressed(file) => Some(file.encoded_len()),
-            Self::Bytes(bytes) => Some(bytes.len() as u64),
+            Self::Picture(bytes) => Some(bytes.len() as u64),
         }
     }
 
@@ -106,7 +106,7 @@ impl File<'_> {
         match self {
             Self::Mesh(encoder) => encoder.encoded_len_bound(),
             Self::Compressed(file) => file.encoded_len(),
-            Self::Bytes(bytes) => bytes.len() as u64,
+            Self::Picture(bytes) => bytes.len() as u64,
         }
     }
 
@@ -118,7 +118,7 @@ impl File<'_> {
         match self {
             Self::Mesh(encoder) => encoder.write(out),
             Self::Compressed(file) => file.write(out),
-            Self::Bytes(bytes) => out.write_all(bytes).and_then(|()| out.flush()),
+            Self::Picture(bytes) => out.write_all(bytes).and_then(|()| out.flush()),
         }
     }
 }

@@ -23,7 +23,7 @@ pub(crate) fn is_divisible(job: &Job) -> bool {
         && job.picture.is_none()
 }
 
-/// Computes partitions on the CPU until none is left. The product is an empty file.
+/// Computes partitions on the CPU until none is left. The mesh of the product is empty.
 pub(super) fn run<S: Deref<Target = Structure>>(
     (structure, selected, spheres): (S, Selected, Spheres),
     job: &Job,
@@ -54,5 +54,5 @@ pub(super) fn run<S: Deref<Target = Structure>>(
     // The report takes the times of the clock.
     drop(control);
     let report = Report::new(&structure, &selected, job, &choice, &counts, &measures, clock.finish());
-    Ok(Product { bytes: Some(Vec::new()), ..Product::new(mesh, storage, report) })
+    Ok(Product::new(mesh, storage, report))
 }
