@@ -6,6 +6,7 @@ mod keys;
 mod render;
 #[cfg(feature = "server")]
 mod service;
+mod tileset;
 
 use std::path::PathBuf;
 
@@ -22,17 +23,13 @@ pub(crate) use render::{PictureArgs, RenderArgs};
 pub(crate) use service::{
     ConfigCommand, ConfigStyle, DoctorArgs, HealthcheckArgs, LogStyle, PrintArgs, ReconcileArgs, ServeArgs, TextOrJson,
 };
+pub(crate) use tileset::TilesetArgs;
 
 const MESH_EXAMPLES: &str = "\
 Examples:
   molmesh mesh 4pti.pdb -o 4pti.glb
   molmesh mesh 1gbt.cif.gz -o - --format ply --resolution 0.3 > 1gbt.ply
   curl -sS --fail-with-body http://127.0.0.1:8080/sample.pdb | molmesh mesh - -o 4pti.stl --report json";
-
-const TILESET_EXAMPLES: &str = "\
-Examples:
-  molmesh tileset 2btv.pdb.gz --assembly 1 --color chain -o 2btv-tiles
-  molmesh tileset 4pti.pdb --resolution 0.25 -o 4pti-tiles --report json";
 
 /// Watertight molecular-surface meshes from PDB, mmCIF, BinaryCIF, PQR and XYZ files.
 #[derive(Debug, Parser)]
@@ -138,19 +135,6 @@ pub(crate) struct MeshArgs {
     /// Rows of the table of areas: atom, residue or chain [default: residue]
     #[arg(long, value_name = "LEVEL")]
     pub(crate) areas_by: Option<String>,
-    #[command(flatten)]
-    pub(crate) job: JobArgs,
-}
-
-// `molmesh tileset`.
-#[derive(Debug, ClapArgs)]
-#[command(after_help = format!("{TILESET_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
-pub(crate) struct TilesetArgs {
-    /// Structure file: PDB, mmCIF, BinaryCIF, PQR or XYZ, optionally compressed with gzip or zstd; `-` is stdin
-    pub(crate) input: PathBuf,
-    /// Folder of the tileset, which must not exist or be empty; the file to open is `tileset.json` in it
-    #[arg(short, long)]
-    pub(crate) output: PathBuf,
     #[command(flatten)]
     pub(crate) job: JobArgs,
 }

@@ -148,6 +148,7 @@ impl CliError {
             Self::Usage { .. } => code::USAGE,
             Self::Input { .. } => code::INPUT,
             Self::InputTooLarge { .. } => code::LIMIT,
+            Self::Job { source: JobError::Scratch { .. }, .. } => code::OUTPUT,
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
             Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
@@ -213,6 +214,7 @@ impl CliError {
 
 fn structure_code(error: &StructureError) -> i32 {
     match error {
+        StructureError::Input { .. } => code::INPUT,
         StructureError::InflatedTooLarge { .. }
         | StructureError::TooManyAtoms { .. }
         | StructureError::TooManyDuplicates { .. }

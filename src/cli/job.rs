@@ -1,16 +1,17 @@
 //! Job of the commands `mesh` and `render`: reads one structure, and writes one file and one report.
 
-use std::cell::OnceCell;
+use std::cell::{Cell, OnceCell};
 use std::fs::File;
 use std::io::{self, Read, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
-use molmesh::pipeline::tileset::{self, TilesetReport, WriteError};
+use molmesh::pipeline::tileset::{self, StructureStream, TilesetReport, WriteError};
 use molmesh::pipeline::{self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
+use molmesh::structure::stream::BLOCK_BYTES;
 use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, SurfaceError};
 use serde_json::{Value, json};
@@ -82,19 +83,21 @@ impl<'a> CommandJob<'a> {
             output.refuse_terminal(format)?;
             Ok(output)
         };
-        Self::prepare_for(purpose, job, strict, path, args, open)
+        Self::prepare_for(purpose, job, strict, (path, None), args, open)
     }
 
-    /// Prepares a job whose output `open` opens. Cheap steps come first: flags, output, input, backend.
+    /// Prepares a job whose output `open` opens. Cheap steps come first: flags, output, input, backend. The input is read
+    /// later if its estimated number of atoms is given.
     pub(super) fn prepare_for<T>(
         purpose: Purpose,
         mut job: Job,
         strict: bool,
-        path: &'a Path,
+        (path, streamed): (&'a Path, Option<f64>),
         args: &'a JobArgs,
         open: impl FnOnce(&CancelToken) -> Result<T, CliError>,
     ) -> Result<(Self, T), CliError> {
-        let limits = request::limits(&args.limits);
+        let limits =
+            if streamed.is_some() { request::limits_of_stream(&args.limits) } else { request::limits(&args.limits) };
         let mut requested = BackendRequest::for_command(args, purpose);
         backend::check(&requested)?;
         if let Some(n) = args.threads {
@@ -114,12 +117,14 @@ impl<'a> CommandJob<'a> {
             return Err(CliError::usage(message));
         }
         let output = open(&cancel)?;
-        let input = read(path, limits.read.max_inflated_bytes)?;
+        let input =
+            if streamed.is_some() { Vec::new() } else { read(path, limits.read.max_inflated_bytes)? };
         if let Some(map) = map {
             // The command line makes no content keys.
             job.map = Some(MapFile::new(String::new(), read(map, limits.map.max_inflated_bytes)?));
         }
-        requested.work = Some(pipeline::estimate_work(pipeline::estimate_atoms(&input), &job));
+        let atoms = streamed.unwrap_or_else(|| pipeline::estimate_atoms(&input));
+        requested.work = Some(pipeline::estimate_work(atoms, &job));
         let selected = backend::select(&requested)?;
         let progress = Progress::new(!args.quiet);
         let findings = if strict { Some(check(path, &input, &limits)?) } else { None };
@@ -166,12 +171,39 @@ impl<'a> CommandJob<'a> {
         let read = |control: &Control<'_>| structure::read_with(&self.input, &self.limits.read, control).map(Box::new);
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
         let written = tileset::write(read, &self.job, &choice, &self.limits, &self.control(), &self.progress, write);
-        written.map_err(|error| match error {
-            WriteError::Job(error) => self.failure(error),
+        written.map_err(|error| self.write_failure(folder, self.path, error))
+    }
+
+    /// Meshes all tiles of a tileset of a structure that is read as a stream from the files of `inputs`.
+    pub(super) fn write_streamed_tileset(
+        &self,
+        inputs: &[PathBuf],
+        files: Vec<Box<dyn Read + Send>>,
+        scratch: File,
+        folder: &Path,
+        write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
+    ) -> Result<TilesetReport, CliError> {
+        let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
+        let current = Cell::new(0);
+        let stream = StructureStream { files, scratch, block_bytes: BLOCK_BYTES, began: &|number| current.set(number) };
+        let (control, sink) = (self.control(), &self.progress);
+        let written = tileset::write_stream(stream, &self.job, &choice, &self.limits, &control, sink, write);
+        written.map_err(|error| self.write_failure(folder, inputs.get(current.get()).map_or(self.path, |p| p), error))
+    }
+
+    /// Converts the error of a tileset. `folder` and `input` are for messages.
+    fn write_failure(&self, folder: &Path, input: &Path, error: WriteError) -> CliError {
+        match error {
+            WriteError::Job(error) => match self.failure(error) {
+                CliError::Job { strict_finding, source, .. } => {
+                    CliError::Job { name: name_of(input), strict_finding, source }
+                }
+                error => error,
+            },
             WriteError::File { path, source } => {
                 CliError::Output { name: folder.join(path).display().to_string(), source }
             }
-        })
+        }
     }
 
     /// Draws the picture of a product.
@@ -255,7 +287,7 @@ fn take(source: impl Read, capacity: u64, limit: u64) -> io::Result<Vec<u8>> {
 }
 
 /// Returns the name of the input in messages.
-fn name_of(input: &Path) -> String {
+pub(super) fn name_of(input: &Path) -> String {
     if is_stdio(input) { "stdin".to_owned() } else { input.display().to_string() }
 }
 

@@ -26,6 +26,15 @@ pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
     let compress = Some("meshopt".to_owned());
     let request = parse(&[("compress", &compress)], &args.job)?;
     tileset::check(&request.job).map_err(|error| refusal(&error))?;
+    if args.scratch.is_some() {
+        tileset::check_stream(&request.job).map_err(|error| refusal(&error))?;
+        if request.strict {
+            return Err(CliError::usage("`--check` reads the whole file; leave it out with `--scratch`"));
+        }
+    } else if args.inputs.len() > 1 {
+        let hint = "name a folder for an index of their atoms with --scratch".to_owned();
+        return Err(CliError::Usage { message: "several files cannot be read into memory".to_owned(), hint: Some(hint) });
+    }
     Ok(request)
 }
 
@@ -88,6 +97,14 @@ pub(super) fn limits(args: &LimitArgs) -> JobLimits {
     set(&mut limits.surface.max_candidates, args.max_candidates);
     set(&mut limits.read.max_distances, args.max_candidates.map(|pairs| pairs.saturating_mul(DISTANCES_PER_PAIR)));
     set(&mut limits.surface.max_mesh_bytes, args.max_mesh_bytes);
+    limits
+}
+
+/// Returns the limits of a structure that is read as a stream, changed by the flags. Its atoms are not in memory.
+pub(super) fn limits_of_stream(args: &LimitArgs) -> JobLimits {
+    let mut limits = limits(args);
+    limits.read.max_atoms = args.max_atoms.unwrap_or_else(|| u32::MAX.into());
+    limits.read.max_inflated_bytes = args.max_input_bytes.unwrap_or(1 << 40);
     limits
 }
 

@@ -1,9 +1,9 @@
 //! `molmesh tileset`: meshes one structure into the files of a tileset.
 
-use std::fs;
-use std::io::{self, Write as _};
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Write as _};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use molmesh::formats::tileset::MAX_LEVELS;
 use molmesh::pipeline::params::Request;
@@ -13,19 +13,31 @@ use serde_json::Value;
 use super::args::{ReportStyle, TilesetArgs};
 use super::backend::Purpose;
 use super::error::CliError;
-use super::job::{CommandJob, finding_lines, findings_json};
+use super::job::{CommandJob, finding_lines, findings_json, name_of};
 use super::output::is_stdio;
 use super::page::Page;
 use super::style::Style;
-use super::{request, summary};
+use super::{interrupt, request, summary};
+
+/// Bytes of an atom in a text file.
+const BYTES_PER_ATOM: f64 = 60.0;
 
 /// Runs the command.
 pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
     let Request { job, strict, .. } = request::parse_tileset(args)?;
     let start = Instant::now();
+    let input = args.inputs.first().map_or(Path::new("-"), PathBuf::as_path);
+    let scratch = args.scratch.as_deref().map(|scratch| StreamFiles::open(&args.inputs, scratch)).transpose()?;
     let open = |_: &_| Folder::create(&args.output);
-    let (job, mut folder) = CommandJob::prepare_for(Purpose::Mesh, job, strict, &args.input, &args.job, open)?;
-    let report = job.write_tileset(&folder.path, |path, bytes| folder.write(path, bytes))?;
+    let input = (input, scratch.as_ref().map(|files| files.atoms));
+    let (job, mut folder) = CommandJob::prepare_for(Purpose::Mesh, job, strict, input, &args.job, open)?;
+    let write = |path: &str, bytes: &[u8]| folder.write(path, bytes);
+    let report = match scratch {
+        Some(StreamFiles { inputs, scratch, .. }) => {
+            job.write_streamed_tileset(&args.inputs, inputs, scratch.create()?, &folder.path, write)?
+        }
+        None => job.write_tileset(&folder.path, write)?,
+    };
     folder.complete = true;
     let findings = job.findings.clone();
     // Ends the progress bar.
@@ -47,6 +59,62 @@ pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
             }
             super::print(&format!("{value:#}\n"))
         }
+    }
+}
+
+/// Files that are read as a stream.
+struct StreamFiles {
+    inputs: Vec<Box<dyn Read + Send>>,
+    /// Estimated number of atoms.
+    atoms: f64,
+    scratch: ScratchFile,
+}
+
+impl StreamFiles {
+    /// Opens the inputs.
+    fn open(paths: &[PathBuf], folder: &Path) -> Result<Self, CliError> {
+        if paths.iter().filter(|path| is_stdio(path)).count() > 1 {
+            return Err(CliError::usage("only one of several files can be read from stdin"));
+        }
+        let (mut inputs, mut bytes) = (Vec::<Box<dyn Read + Send>>::new(), 0);
+        for path in paths {
+            if is_stdio(path) {
+                inputs.push(Box::new(io::stdin()));
+                continue;
+            }
+            let failed = |source| CliError::Input { name: name_of(path), source };
+            let file = File::open(path).map_err(failed)?;
+            bytes += file.metadata().map_err(failed)?.len();
+            inputs.push(Box::new(file));
+        }
+        // The time makes the name unique if processes share an id, as in containers with a common volume.
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
+        let path = folder.join(format!(".molmesh-{}-{now:x}.part", std::process::id()));
+        Ok(Self { inputs, atoms: bytes as f64 / BYTES_PER_ATOM, scratch: ScratchFile { path } })
+    }
+}
+
+/// Temporary file, which is removed when this is dropped or the command is interrupted.
+struct ScratchFile {
+    path: PathBuf,
+}
+
+impl ScratchFile {
+    /// Creates the file. Unix systems remove its name at once, and its contents when it is closed.
+    fn create(&self) -> Result<File, CliError> {
+        // Registered before the file exists, so that no interrupt can come in between.
+        interrupt::stage(&self.path);
+        let created = OpenOptions::new().read(true).write(true).create_new(true).open(&self.path);
+        if cfg!(unix) {
+            interrupt::discard(&self.path);
+        }
+        created.map_err(|source| CliError::Output { name: self.path.display().to_string(), source })
+    }
+}
+
+impl Drop for ScratchFile {
+    fn drop(&mut self) {
+        interrupt::discard(&self.path);
     }
 }
 

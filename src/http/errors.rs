@@ -144,6 +144,7 @@ impl From<Failure> for Problem {
             Failure::Job { error: JobError::Picture(error), .. } => error.into(),
             Failure::Job { error: JobError::Color(error), .. } => error.into(),
             Failure::Job { error: JobError::Map(error), .. } => error.into(),
+            Failure::Job { error: error @ JobError::Scratch { .. }, .. } => Self::internal(error),
             // Compression rejects no mesh for its size, so no resolution is suggested.
             Failure::Job { error: JobError::Format(error), .. } => format_problem(&error, 0.0),
             Failure::Check { ref diagnostics } => {
@@ -236,6 +237,7 @@ impl From<StructureError> for Problem {
         use StructureError as E;
         let detail = error.to_string();
         match error {
+            E::Input { .. } | E::NotAStream { .. } => Self::new(ProblemType::UnreadableStructure, detail),
             E::UnknownFormat { found } => Self::new(ProblemType::UnreadableStructure, detail).with("found", found),
             E::Syntax { line, column, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)
                 .with("line", line)

@@ -27,6 +27,12 @@ pub enum JobError {
     /// Reading the map failed.
     #[error(transparent)]
     Map(MapError),
+    /// The index of atoms on disk failed.
+    #[error("cannot use the index of atoms in the folder of `--scratch`: {reason}")]
+    Scratch {
+        /// Message of the system.
+        reason: String,
+    },
     /// The mesh cannot be compressed.
     #[error(transparent)]
     Format(#[from] FormatError),

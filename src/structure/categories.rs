@@ -165,6 +165,11 @@ impl Categories {
         Ok(())
     }
 
+    /// Returns true if the item with this index describes entities, and true if it describes helices or strands.
+    pub(super) fn describes(item_ix: usize) -> [bool; 2] {
+        [0, 2].map(|of| group(item_ix) == of)
+    }
+
     /// Removes the values of the group to which the item with index `item_ix` belongs. Returns the name of these data.
     pub(super) fn forget(&mut self, item_ix: usize) -> &'static str {
         let values = self.values.iter_mut().enumerate();

@@ -38,6 +38,20 @@ pub enum StructureError {
         /// The expected content.
         expected: String,
     },
+    /// The input failed.
+    #[error("cannot read the file: {reason}")]
+    Input {
+        /// Message of the system.
+        reason: String,
+    },
+    /// The file cannot be read as a stream.
+    #[error("cannot read the file as a stream: found {found}, expected {expected}; without `--scratch`, it can be read")]
+    NotAStream {
+        /// The content found there.
+        found: String,
+        /// The expected content.
+        expected: &'static str,
+    },
     /// Compressed data is broken.
     #[error("cannot decompress {encoding}: {reason}")]
     Decompress {

@@ -14,7 +14,7 @@ const GZIP: &[u8] = b"\x1f\x8b";
 const ZSTD: &[u8] = b"\x28\xb5\x2f\xfd";
 /// Maximum zstd window, bytes. The sender chooses the window, so it must be bounded. 32 MiB covers all levels of the
 /// usual tools except `--ultra --long`.
-const MAX_ZSTD_WINDOW: u64 = 32 << 20;
+pub(super) const MAX_ZSTD_WINDOW: u64 = 32 << 20;
 
 /// Returns the name of the compression whose magic number the bytes begin with, if it is supported.
 pub(super) fn encoding(bytes: &[u8]) -> Option<&'static str> {
@@ -166,7 +166,7 @@ fn append(
 }
 
 /// Returns true for a skippable frame, which zstd allows between data frames.
-fn skippable_frame(bytes: &[u8]) -> bool {
+pub(super) fn skippable_frame(bytes: &[u8]) -> bool {
     matches!(bytes, [0x50..=0x5F, 0x2A, 0x4D, 0x18, ..])
 }
 

@@ -6,8 +6,9 @@
 //! residues.
 
 use std::collections::{HashMap, HashSet};
+use std::sync::atomic::Ordering;
 
-use super::atoms::{Columns, Slices, Tables};
+use super::atoms::{Columns, Slices, Structure, Tables};
 use super::categories::{Categories, Entity};
 use super::chemistry::TextClasses;
 use super::contents::Kind;
@@ -65,7 +66,7 @@ pub(super) fn assign(
     reading: &Reading<'_>,
 ) -> Result<(), StructureError> {
     let solvent = Solvent::new(tables);
-    let declared = Declared::new(columns, tables, sequence, &solvent);
+    let declared = Declared::new(columns, tables, sequence, &solvent, reading);
     let joints: Vec<Option<Joint>> = tables.name.texts().map(Joint::of).collect();
     let texts = TextClasses::new(tables, sequence);
     let bytes = usize::try_from(Columns::bytes(columns.len())).unwrap_or(usize::MAX);
@@ -151,15 +152,37 @@ struct Declared<'a> {
 }
 
 impl<'a> Declared<'a> {
-    fn new(columns: &Columns, tables: &'a Tables, sequence: &'a Sequence, solvent: &Solvent) -> Self {
+    fn new(
+        columns: &Columns,
+        tables: &'a Tables,
+        sequence: &'a Sequence,
+        solvent: &Solvent,
+        reading: &Reading<'_>,
+    ) -> Self {
         let is_polymer = |chain| Some(*sequence.entities.get(chain)? == Entity::Polymer);
         let chains = tables.label_chain.texts().map(is_polymer).collect();
-        Self { chains, numbered: has_sequence_numbers(columns, solvent), tables, sequence }
+        let mut declared = Self { chains, numbered: false, tables, sequence };
+        let found = declared.sequence_numbers(columns, solvent);
+        // The other blocks are not known. [`HeteroBlocks::agree`] checks them.
+        declared.numbered = reading.is_block || are_numbered(found);
+        reading.hetero.store(found, Ordering::Relaxed);
+        declared
     }
 
     /// Returns true for polymers if the entity of the chain is known.
     fn of_entity(&self, label_chain: u32) -> Option<bool> {
         self.chains.get(label_chain as usize).copied().flatten()
+    }
+
+    /// Returns the findings on the HETATM records.
+    fn sequence_numbers(&self, columns: &Columns, solvent: &Solvent) -> u8 {
+        let found = |i: usize| match columns.kind[i] {
+            Kind::Polymer if solvent.has(columns.residue[i]) => SOLVENT,
+            Kind::Polymer if self.of_entity(columns.label_chain[i]).is_none() => OPEN,
+            Kind::Polymer => 0,
+            _ => WITHOUT,
+        };
+        (0..columns.len()).filter(|&i| columns.hetero[i]).fold(0, |all, i| all | found(i))
     }
 
     /// Returns true if a record lists the residue name for the chain.
@@ -181,18 +204,54 @@ impl<'a> Declared<'a> {
     }
 }
 
+/// HETATM records without `label_seq_id`, those of water and ions with one, and others with one whose entity is unknown.
+const WITHOUT: u8 = 1;
+const SOLVENT: u8 = 2;
+const OPEN: u8 = 4;
+
 /// Returns true if `label_seq_id` distinguishes polymers from other residues. Some programs write it for every atom,
 /// even for water.
-fn has_sequence_numbers(columns: &Columns, solvent: &Solvent) -> bool {
-    let mut without = false;
-    for i in (0..columns.len()).filter(|&i| columns.hetero[i]) {
-        if columns.kind[i] != Kind::Polymer {
-            without = true;
-        } else if solvent.has(columns.residue[i]) {
-            return false;
-        }
+const fn are_numbered(found: u8) -> bool {
+    found & (WITHOUT | SOLVENT) == WITHOUT
+}
+
+/// Findings on the HETATM records of consecutive blocks of a file.
+#[derive(Debug, Default)]
+pub(super) struct HeteroBlocks(u8);
+
+impl HeteroBlocks {
+    /// Adds the findings of a block.
+    pub(super) fn add(&mut self, reading: &Reading<'_>) {
+        self.0 |= reading.hetero.load(Ordering::Relaxed);
     }
-    without
+
+    /// Returns true if sequence numbers distinguish polymers, as the blocks assume, or no record depends on it.
+    pub(super) const fn agree(&self) -> bool {
+        self.0 & OPEN == 0 || are_numbered(self.0)
+    }
+}
+
+/// Returns the last row before which a file can be divided: the kinds and alternative locations of the rows before and
+/// after it do not depend on each other. Returns `None` without such a row.
+pub(super) fn last_division(structure: &Structure) -> Option<usize> {
+    (1..structure.len()).rev().find(|&i| divides(structure, i))
+}
+
+fn divides(s: &Structure, i: usize) -> bool {
+    let before = i - 1;
+    // A Drude particle follows its atom.
+    if s.name.get(i).starts_with('D') {
+        return false;
+    }
+    if s.chain.id(i) != s.chain.id(before) || s.model[i] != s.model[before] {
+        return true;
+    }
+    // Names of one number and code are alternatives.
+    if (s.residue_number[i], s.insertion_code[i]) == (s.residue_number[before], s.insertion_code[before]) {
+        return false;
+    }
+    let both = |of: fn(&str) -> bool| of(s.residue.get(before)) && of(s.residue.get(i));
+    both(residue::is_water) || (both(residue::is_polymer) && !s.hetero[before] && !s.hetero[i])
 }
 
 /// Backbone atoms that join the residues of a chain.

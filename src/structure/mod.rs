@@ -19,6 +19,7 @@ mod chemistry;
 mod cif;
 pub mod contents;
 mod copies;
+mod decoder;
 mod duplicates;
 pub mod element;
 pub mod error;
@@ -41,6 +42,7 @@ pub mod select;
 mod sites;
 mod sniff;
 pub mod split;
+pub mod stream;
 #[cfg(feature = "strict")]
 mod strict_cost;
 #[cfg(feature = "strict")]
@@ -60,7 +62,7 @@ pub use copies::{PlacedCopy, Unit};
 pub use error::StructureError;
 pub use kind_set::KindSet;
 pub use read::{ReadLimits, read, read_with};
-pub use select::{BadExpression, Context, Expression, LeftOut, ModelChoice, Selected, Selection, select, select_with};
+pub use select::{BadExpression, Context, Expression, LeftOut, ModelChoice, Selected, SelectedBlocks, Selection, select, select_with};
 pub use split::{AtomPart, Split};
 pub use survey::{Survey, survey};
 pub use texts::TextColumn;

@@ -1,6 +1,7 @@
 //! Entry point of the readers, and their limits.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicU8;
 
 use super::atoms::{SourceFormat, Structure};
 use super::error::StructureError;
@@ -64,11 +65,21 @@ pub(super) struct Reading<'a> {
     pub(super) text: Reservation,
     /// Number of pieces to read; `None` to choose it by size.
     pieces: Option<usize>,
+    /// True for a block of a file.
+    pub(super) is_block: bool,
+    /// Findings on HETATM records.
+    pub(super) hetero: AtomicU8,
 }
 
 impl<'a> Reading<'a> {
     pub(super) fn new(limits: &'a ReadLimits, control: &'a Control<'a>) -> Self {
-        Self { limits, control, text: Reservation::new(&control.memory), pieces: None }
+        let text = Reservation::new(&control.memory);
+        Self { limits, control, text, pieces: None, is_block: false, hetero: AtomicU8::new(0) }
+    }
+
+    /// Begins to read a block of a file.
+    pub(super) fn of_block(limits: &'a ReadLimits, control: &'a Control<'a>) -> Self {
+        Self { is_block: true, ..Self::new(limits, control) }
     }
 
     /// Returns the number of pieces for a text of this size.
@@ -141,7 +152,7 @@ fn of_bytes(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureE
     of_text(without_mark(&plain), reading)
 }
 
-fn of_text(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
+pub(super) fn of_text(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     match sniff::sniff(text)? {
         SourceFormat::Pdb => pdb::read(text, reading),
         SourceFormat::Mmcif => mmcif::read(text, reading),

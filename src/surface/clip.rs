@@ -13,8 +13,13 @@ use super::spheres::Spheres;
 
 /// Returns a distance, Å: spheres whose centres are farther away from a point do not affect the surface there.
 pub(crate) fn influence(spheres: &Spheres, params: &SurfaceParams) -> f64 {
+    influence_of(spheres.radius_range().1, params)
+}
+
+/// Returns the distance of [`influence`] for spheres whose largest radius is `radius`, Å.
+pub(crate) fn influence_of(radius: f32, params: &SurfaceParams) -> f64 {
     let shape = Shape::new(params);
-    let length = shape.length(effective_radius(spheres.radius_range().1, params));
+    let length = shape.length(effective_radius(radius, params));
     match shape {
         Shape::Density(_) => shape.reach(length),
         // The nearest point of the boundary is at most the radius of the probe away, and so is each sphere that could

@@ -3,6 +3,7 @@
 
 mod blend;
 mod depth;
+mod of_blocks;
 mod of_map;
 mod of_mesh;
 mod palette;
@@ -18,6 +19,7 @@ use serde::Serialize;
 use thiserror::Error;
 
 pub use blend::ColorBlend;
+pub(super) use of_blocks::BlockColors;
 pub(super) use of_mesh::MeshColors;
 pub use palette::Palette;
 pub use scheme::{EXPECTED, Hydrophobicity, Scheme};
@@ -26,6 +28,7 @@ pub use vertex::VertexProperty;
 use crate::structure::annotations::{Confidences, SecondaryRanges};
 use crate::structure::{Structure, element};
 use crate::surface::Column;
+use of_blocks::{number, without_entities};
 use palette::Rgb;
 use tables::{OTHER, PLDDT};
 
@@ -147,7 +150,7 @@ pub struct AtomColors<'a> {
     scheme: Scheme,
     palette: Palette,
     range: [f64; 2],
-    /// Colours by residue name, or of entities by `label_chain`.
+    /// Colours by residue name, by chain, or of entities by `label_chain`.
     colors: Vec<Rgb>,
     /// Values by residue name.
     values: Vec<Option<f64>>,
@@ -165,6 +168,22 @@ impl<'a> AtomColors<'a> {
     /// # Errors
     /// Returns a [`ColorError`] if the file lacks the values of the scheme, or the scheme is of vertices.
     pub fn new(structure: &'a Structure, selected: &[u32], coloring: &Coloring) -> Result<Self, ColorError> {
+        let mut names = IndexSet::new();
+        let colors = Self::numbered(structure, selected, coloring, &mut names)?;
+        if coloring.scheme == Scheme::Entity && names.is_empty() {
+            return Err(without_entities());
+        }
+        Ok(colors)
+    }
+
+    /// Prepares the colours as [`Self::new`] does. Chains or entities have the numbers of their names in `names`, which
+    /// are in order of first appearance; adds those of this structure.
+    fn numbered(
+        structure: &'a Structure,
+        selected: &[u32],
+        coloring: &Coloring,
+        names: &mut IndexSet<String>,
+    ) -> Result<Self, ColorError> {
         let Coloring { scheme, palette, range, .. } = *coloring;
         let fail = |why: String| ColorError { scheme: scheme.to_string(), why };
         if matches!(scheme, Scheme::Vertex(_)) {
@@ -180,9 +199,14 @@ impl<'a> AtomColors<'a> {
         };
         let colors = match scheme {
             Scheme::Residue => residues().map(tables::residue).collect(),
-            Scheme::Entity => entities(structure).ok_or_else(|| {
-                fail("the file does not assign chains to entities; only mmCIF and BinaryCIF files can".to_owned())
-            })?,
+            Scheme::Chain => structure.chain.texts().map(|name| tables::category(number(names, name))).collect(),
+            Scheme::Entity => {
+                let color = |name: &String| match name.as_str() {
+                    "" => OTHER,
+                    name => tables::category(number(names, name)),
+                };
+                structure.entities.iter().map(color).collect()
+            }
             _ => Vec::new(),
         };
         let secondary = (scheme == Scheme::SecondaryStructure).then(|| SecondaryRanges::of(structure)).flatten();
@@ -218,7 +242,7 @@ impl<'a> AtomColors<'a> {
             // Rejected by [`Self::new`].
             Scheme::Vertex(_) => OTHER,
             Scheme::Element => tables::element(structure.element[i]),
-            Scheme::Chain => tables::category(structure.chain.id(i)),
+            Scheme::Chain => self.colors[structure.chain.id(i) as usize],
             Scheme::Entity => self.colors[structure.label_chain.id(i) as usize],
             Scheme::Residue => self.colors[structure.residue.id(i) as usize],
             Scheme::BFactor => self.scaled(f64::from(structure.b_factor[i])),
@@ -335,18 +359,6 @@ fn stops(palette: Palette, range: [f64; 2], round: impl Fn(f64) -> f64) -> Vec<L
 
 fn entry(label: String, color: Rgb) -> LegendEntry {
     LegendEntry { label, color: format!("#{color:06x}") }
-}
-
-/// Returns the colour of the entity of each `label_chain`; `None` if none is known.
-fn entities(structure: &Structure) -> Option<Vec<Rgb>> {
-    // Entities are numbered in order of first appearance.
-    let mut names: IndexSet<&str> = IndexSet::new();
-    let colors = structure.entities.iter().map(|name| match name.as_str() {
-        "" => OTHER,
-        name => tables::category(u32::try_from(names.insert_full(name).0).unwrap_or(0)),
-    });
-    let colors = colors.collect();
-    (!names.is_empty()).then_some(colors)
 }
 
 /// Returns the class of a pLDDT from 0 to 100.

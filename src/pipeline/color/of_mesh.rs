@@ -67,6 +67,27 @@ impl MeshColors {
         Ok(Self { coloring, source })
     }
 
+    /// Creates the colours of atoms that are given later, by [`Self::of_tile`].
+    pub(in super::super) const fn of_report(coloring: Coloring, report: ColorReport) -> Self {
+        Self { coloring, source: ColorSource::Atoms { of_spheres: Vec::new(), report } }
+    }
+
+    /// Returns the colour of a sphere; opaque black if it is not known.
+    pub(in super::super) fn of_sphere(&self, sphere: u32) -> [u8; 4] {
+        match &self.source {
+            ColorSource::Atoms { of_spheres, .. } => of_spheres.get(sphere as usize).copied(),
+            _ => None,
+        }
+        .unwrap_or([0, 0, 0, u8::MAX])
+    }
+
+    /// Returns the colours of the spheres of a tile, with the report of all; `None` for colours of vertices.
+    pub(in super::super) fn of_tile(&self, of_spheres: Vec<[u8; 4]>) -> Option<Self> {
+        let ColorSource::Atoms { report, .. } = &self.source else { return None };
+        let source = ColorSource::Atoms { of_spheres, report: report.clone() };
+        Some(Self { coloring: self.coloring, source })
+    }
+
     /// Sets the colours of the vertices. `resolution` is the grid spacing, Å; `pockets` are those of the scheme
     /// `pocket`. Returns the report.
     ///

@@ -9,7 +9,7 @@ use crate::surface::{Control, Spheres, SurfaceError, SurfaceParams};
 
 /// Spacing above which atoms are grouped, Å: a coarser grid misses single atoms, and all atoms would be too many for
 /// its few cells.
-const GROUP_ABOVE: f64 = 2.5;
+pub(super) const GROUP_ABOVE: f64 = 2.5;
 /// Minimum edge length of the buckets of the atoms, Å: with smaller ones, tiles of coarse levels would look up many.
 pub(super) const MIN_BUCKET: f64 = 32.0;
 /// Radius below which a group of atoms moves to a grid point, in spacings. Groups in the interior of a protein have
@@ -102,8 +102,7 @@ impl Buckets {
     /// Returns each bucket with its cell of a grid, sorted by cell. A cell is a union of buckets; cells smaller than a
     /// bucket are joined up to its size.
     fn by_cell(&self, spacing: f64) -> Vec<([i64; 3], u32)> {
-        let middle = |at: &[i64; 3]| at.map(|c| (c as f64 + 0.5) * self.side);
-        let cell = |at: &[i64; 3]| cube(middle(at), spacing.max(self.side));
+        let cell = |at: &[i64; 3]| grid_cell(*at, self.side, spacing);
         let mut cells: Vec<_> = self.numbers.iter().map(|(at, number)| (cell(at), *number)).collect();
         cells.sort_unstable();
         cells
@@ -160,8 +159,14 @@ impl TilesetLevel {
 
 /// Returns the cube of edge length `side`, Å, that contains a point.
 #[expect(clippy::cast_possible_truncation, reason = "coordinates are limited")]
-fn cube(c: [f64; 3], side: f64) -> [i64; 3] {
+pub(super) fn cube(c: [f64; 3], side: f64) -> [i64; 3] {
     c.map(|c| (c / side).floor() as i64)
+}
+
+/// Returns the cell of a grid that contains a cube of edge length `side`. Cells smaller than a cube are joined up to its
+/// size. Lengths are in Å.
+pub(super) fn grid_cell(at: [i64; 3], side: f64, spacing: f64) -> [i64; 3] {
+    cube(at.map(|c| (c as f64 + 0.5) * side), spacing.max(side))
 }
 
 /// Returns the nearest coordinate of the grid that a sphere can have, Å.
@@ -180,9 +185,6 @@ fn grouped(
     spacing: f64,
     control: &Control<'_>,
 ) -> Result<(Spheres, Vec<u32>), SurfaceError> {
-    let effective = |radius: f32| f64::from(radius) * params.radius_scale + params.radius_offset;
-    #[expect(clippy::cast_possible_truncation, reason = "radii have single precision")]
-    let given = |effective: f64| ((effective - params.radius_offset) / params.radius_scale) as f32;
     let [mut x, mut y, mut z] = [const { Vec::new() }; 3];
     let (mut radii, mut rows) = (Vec::new(), Vec::new());
     for run in buckets.by_cell(spacing).chunk_by(|a, b| a.0 == b.0) {
@@ -194,22 +196,35 @@ fn grouped(
         keys.sort_unstable();
         let before = rows.len();
         for group in keys.chunk_by(|a, b| a.0 == b.0) {
-            let centres = group.iter().map(|(_, i)| atoms.centre(*i));
-            let mean: [f64; 3] =
-                std::array::from_fn(|k| centres.clone().map(|c| c[k]).sum::<f64>() / group.len() as f64);
-            let distance2 = |i: usize| (0..3).map(|k| (atoms.centre(i)[k] - mean[k]).powi(2)).sum::<f64>();
-            let nearest = group.iter().map(|(_, i)| *i).min_by(|a, b| distance2(*a).total_cmp(&distance2(*b)));
-            let cubes = group.iter().map(|(_, i)| effective(atoms.radius(*i)).powi(3)).sum::<f64>();
-            let radius = cubes.cbrt();
-            // The grid would miss a small sphere between its points.
-            let centre = if radius < SMALL * spacing { mean.map(|c| grid_point(c, spacing)) } else { mean };
+            let sphere = |i: usize| (atoms.centre(group[i].1), atoms.radius(group[i].1));
+            let (centre, radius, nearest) = group_of(group.len(), sphere, params, spacing);
             x.push(centre[0]);
             y.push(centre[1]);
             z.push(centre[2]);
-            radii.push(given(radius));
-            rows.push(u32::try_from(nearest.unwrap_or_default()).unwrap_or(u32::MAX));
+            radii.push(radius);
+            rows.push(u32::try_from(group[nearest].1).unwrap_or(u32::MAX));
         }
         control.memory.grow(GROUP_BYTES * (rows.len() - before) as u64)?;
     }
     Ok((Spheres::new(x, y, z, radii)?, rows))
+}
+
+/// Returns centre and radius, Å, of the sphere of a group of `n` atoms, and the number of the atom nearest to the mean of
+/// their centres. `atom` returns centre and radius of each.
+pub(super) fn group_of(
+    n: usize,
+    atom: impl Fn(usize) -> ([f64; 3], f32),
+    params: &SurfaceParams,
+    spacing: f64,
+) -> ([f64; 3], f32, usize) {
+    let effective = |radius: f32| f64::from(radius) * params.radius_scale + params.radius_offset;
+    #[expect(clippy::cast_possible_truncation, reason = "radii have single precision")]
+    let given = |effective: f64| ((effective - params.radius_offset) / params.radius_scale) as f32;
+    let mean: [f64; 3] = std::array::from_fn(|k| (0..n).map(|i| atom(i).0[k]).sum::<f64>() / n as f64);
+    let distance2 = |i: usize| (0..3).map(|k| (atom(i).0[k] - mean[k]).powi(2)).sum::<f64>();
+    let nearest = (0..n).min_by(|a, b| distance2(*a).total_cmp(&distance2(*b)));
+    let radius = (0..n).map(|i| effective(atom(i).1).powi(3)).sum::<f64>().cbrt();
+    // The grid would miss a small sphere between its points.
+    let centre = if radius < SMALL * spacing { mean.map(|c| grid_point(c, spacing)) } else { mean };
+    (centre, given(radius), nearest.unwrap_or_default())
 }

@@ -6,6 +6,9 @@
 
 mod layout;
 mod level;
+mod source;
+mod stored;
+mod stream;
 mod units;
 mod write;
 
@@ -16,16 +19,18 @@ use std::sync::Arc;
 
 use self::layout::Layout;
 use self::level::{Buckets, MIN_BUCKET, TilesetLevel};
+use self::source::{LevelSource, NearSpheres, Streamed};
+pub use self::stream::{StructureStream, check_stream};
 pub use self::units::AssemblyTileset;
-pub use self::write::{LevelReport, TilesetReport, UnitReport, WriteError, unit_folder, write};
+pub use self::write::{LevelReport, TilesetReport, UnitReport, WriteError, unit_folder, write, write_stream};
 use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, Scheme};
 use super::params::ParamError;
 use super::report::Counts;
-use super::{Choice, Job, JobError, Product, ProgressSink, Report, StageClock, load, to_atom_indices};
+use super::{Choice, Job, JobError, Product, ProgressSink, Report, StageClock, load};
 use crate::formats::tileset::{TileAddress, TilesetBounds};
 use crate::formats::{Compress, Packing, Step, Storage, Units};
 use crate::structure::{Context, ReadLimits, Selected, Split, Structure, StructureError};
-use crate::surface::clip::influence;
+use crate::surface::clip::{influence, influence_of};
 use crate::surface::{
     Backend, Control, GridStats, Measures, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, TriangleQuality, Validation,
@@ -42,10 +47,12 @@ const PER_CHECK: usize = 1 << 14;
 pub struct Tileset<S> {
     structure: S,
     layout: Layout,
-    levels: Vec<TilesetLevel>,
+    levels: Vec<LevelSource>,
     /// Tiles that the surface can reach, and their ancestors.
     tiles: BTreeSet<TileAddress>,
     selected: Selected,
+    /// Values of a structure that is not in memory.
+    streamed: Option<Streamed>,
 }
 
 /// Colours of the atoms of a tileset.
@@ -121,7 +128,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
             let params = job.params_for(spheres.len());
             let layout = Layout::of(&spheres, &params)?;
             let (levels, tiles) = layout.index(&Arc::new(spheres), &params, control)?;
-            Ok(Self { structure, layout, levels, tiles, selected })
+            Ok(Self { structure, layout, levels, tiles, selected, streamed: None })
         })
     }
 
@@ -130,6 +137,9 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
     /// # Errors
     /// Returns [`JobError::Color`] if the colour scheme has no values, and the errors of memory.
     pub fn colors(&self, coloring: Coloring, control: &Control<'_>) -> Result<TilesetColors, JobError> {
+        if let Some((coloring, report)) = self.streamed.as_ref().and_then(|streamed| streamed.colors.clone()) {
+            return Ok(TilesetColors(MeshColors::of_report(coloring, report)));
+        }
         MeshColors::new(&self.structure, &self.selected.atoms, coloring, None, control).map(TilesetColors)
     }
 
@@ -198,6 +208,9 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         let times = clock.finish();
         let mut report = Report::new(&self.structure, &self.selected, job, choice, &counts, &measures, times);
         report.color = color;
+        if let Some(Streamed { n_atoms, atoms_in_file, radii, .. }) = &self.streamed {
+            (report.atoms, report.atoms_in_file, report.radii) = (*n_atoms, *atoms_in_file, radii);
+        }
         let mut product = Product::new(mesh, storage, report);
         product.compress(job, &control, progress)?;
         Ok(product)
@@ -238,12 +251,15 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         let (spacing, bounds) = (self.layout.spacing(address.level), self.layout.tile(address));
         let params =
             SurfaceParams { resolution: spacing, atom_ids: job.needs_atoms(), quantize: None, ..job.params.clone() };
-        let near = level.near(bounds, influence(&level.spheres, &params) + spacing);
         let empty = || Ok((MeshOutput::new(Mesh::default(), GridStats::default()), None));
-        if near.is_empty() || !self.tiles.contains(&address) {
+        if !self.tiles.contains(&address) {
             return empty();
         }
-        let spheres = level.spheres.subset(&near);
+        let margin = influence_of(level.largest(), &params) + spacing;
+        let NearSpheres { spheres, atoms, colors } = level.near(&self.selected, bounds, margin, colors, control)?;
+        if spheres.is_empty() {
+            return empty();
+        }
         let mut output = match clock.pass(|| backend.run(&spheres, &params, limits, control)) {
             Err(SurfaceError::NoSurface { .. }) => return empty(),
             output => output?,
@@ -251,18 +267,25 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         let mesh = &mut output.mesh;
         clock.time("clip", || {
             mesh.make_contiguous();
-            for id in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()) {
-                *id = level.row(near[*id as usize]);
-            }
             mesh.clip(bounds, control)
         })?;
         if mesh.triangles.is_empty() {
             return empty();
         }
-        let color = |colors: &TilesetColors| clock.time("color", || colors.0.apply(mesh, spacing, None, control));
+        let color = |colors: MeshColors| clock.time("color", || colors.apply(mesh, spacing, None, control));
         let color = colors.map(color).transpose()?;
-        to_atom_indices(mesh, job, &self.selected, control)?;
+        if !job.params.atom_ids {
+            mesh.atom_ids = None;
+        }
+        for id in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()) {
+            *id = atoms[*id as usize];
+        }
         Ok((output, color))
+    }
+
+    /// Returns the number of meshed atoms.
+    fn n_atoms(&self) -> u64 {
+        self.streamed.as_ref().map_or(self.selected.atoms.len() as u64, |streamed| streamed.n_atoms)
     }
 }
 
@@ -280,7 +303,7 @@ impl Layout {
         spheres: &Arc<Spheres>,
         params: &SurfaceParams,
         control: &Control<'_>,
-    ) -> Result<(Vec<TilesetLevel>, BTreeSet<TileAddress>), JobError> {
+    ) -> Result<(Vec<LevelSource>, BTreeSet<TileAddress>), JobError> {
         let (mut levels, mut tiles) = (Vec::new(), BTreeSet::new());
         let mut side = self.side(self.levels - 1);
         while side < MIN_BUCKET {
@@ -290,31 +313,50 @@ impl Layout {
         for number in (0..self.levels).rev() {
             let lengths = [self.spacing(number), self.side(number)];
             let level = TilesetLevel::new(spheres, &buckets, params, lengths, control)?;
-            let finer = tiles.iter().take_while(|tile: &&TileAddress| tile.level == number + 1);
-            let mut parents: BTreeSet<TileAddress> = finer.filter_map(|tile| tile.parent()).collect();
-            tiles.append(&mut parents);
+            Self::add_parents(number, &mut tiles);
             let reach = influence(&level.spheres, params);
             let centres = (0..level.spheres.len()).map(|i| level.spheres.centre(i));
-            let ranges = centres.map(|c| self.touched(number, [c.map(|c| c - reach), c.map(|c| c + reach)]));
-            // Successive atoms mostly touch the same tiles.
-            let mut last = None;
-            let new = ranges.filter(|range| last.replace(*range) != Some(*range));
-            for (n, tile) in new.flat_map(|range| Layout::between(number, range)).enumerate() {
-                if n.is_multiple_of(PER_CHECK) {
-                    control.check()?;
-                }
-                if !tiles.insert(tile) {
-                    continue;
-                }
-                control.memory.grow(TILE_BYTES).map_err(SurfaceError::from)?;
-                if tiles.len() > MAX_TILES {
-                    let (limit, resolution) = (MAX_TILES as u64, params.resolution);
-                    return Err(SurfaceError::TooManyTiles { limit, resolution }.into());
-                }
-            }
-            levels.push(level);
+            self.add_tiles(number, centres, reach, params, &mut tiles, control)?;
+            levels.push(LevelSource::Memory(level));
         }
         levels.reverse();
         Ok((levels, tiles))
+    }
+
+    /// Adds the parents of the tiles of the next level.
+    fn add_parents(number: u32, tiles: &mut BTreeSet<TileAddress>) {
+        let finer = tiles.iter().take_while(|tile: &&TileAddress| tile.level == number + 1);
+        let mut parents: BTreeSet<TileAddress> = finer.filter_map(|tile| tile.parent()).collect();
+        tiles.append(&mut parents);
+    }
+
+    /// Adds the tiles of a level that a sphere of radius `reach`, Å, around one of the centres touches.
+    fn add_tiles(
+        &self,
+        number: u32,
+        centres: impl Iterator<Item = [f64; 3]>,
+        reach: f64,
+        params: &SurfaceParams,
+        tiles: &mut BTreeSet<TileAddress>,
+        control: &Control<'_>,
+    ) -> Result<(), JobError> {
+        let ranges = centres.map(|c| self.touched(number, [c.map(|c| c - reach), c.map(|c| c + reach)]));
+        // Successive atoms mostly touch the same tiles.
+        let mut last = None;
+        let new = ranges.filter(|range| last.replace(*range) != Some(*range));
+        for (n, tile) in new.flat_map(|range| Self::between(number, range)).enumerate() {
+            if n.is_multiple_of(PER_CHECK) {
+                control.check()?;
+            }
+            if !tiles.insert(tile) {
+                continue;
+            }
+            control.memory.grow(TILE_BYTES).map_err(SurfaceError::from)?;
+            if tiles.len() > MAX_TILES {
+                let (limit, resolution) = (MAX_TILES as u64, params.resolution);
+                return Err(SurfaceError::TooManyTiles { limit, resolution }.into());
+            }
+        }
+        Ok(())
     }
 }

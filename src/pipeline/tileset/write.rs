@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use serde::Serialize;
 use thiserror::Error;
 
-use super::{AssemblyTileset, Tileset};
+use super::{AssemblyTileset, StructureStream, Tileset};
 use crate::formats::Format;
 use crate::formats::tileset::{TileAddress, TilesetUris, assembly_document, subtree, tileset_document};
 use crate::pipeline::{Choice, Job, JobError, JobLimits, LeftOutReport, Product, ProgressSink, StageClock};
@@ -96,10 +96,7 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
     write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
 ) -> Result<TilesetReport, WriteError> {
     let clock = StageClock::new(progress);
-    let store = |path: &str, bytes: &[u8]| {
-        write(path, bytes).map_err(|source| WriteError::File { path: path.to_owned(), source })?;
-        Ok(bytes.len() as u64)
-    };
+    let store = |path: &str, bytes: &[u8]| store(&write, path, bytes);
     if !job.selection.instances {
         let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
         return tileset.write(job, choice, &limits.surface, control, progress, store);
@@ -130,6 +127,31 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
     all.files += 2;
     (all.id, all.left_out) = (assembly.structure().id.clone(), product.report.left_out);
     Ok(all)
+}
+
+/// Writes all files of a tileset as [`write`] does, of a structure that is read as a stream. The job has no assembly.
+///
+/// # Errors
+/// Returns the errors of [`write`], and [`JobError::Scratch`].
+pub fn write_stream(
+    stream: StructureStream<'_>,
+    job: &Job,
+    choice: &Choice<'_>,
+    limits: &JobLimits,
+    control: &Control<'_>,
+    progress: &dyn ProgressSink,
+    write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
+) -> Result<TilesetReport, WriteError> {
+    let clock = StageClock::new(progress);
+    let tileset = Tileset::of_stream(stream, job, &limits.read, control, &clock)?;
+    let store = |path: &str, bytes: &[u8]| store(&write, path, bytes);
+    tileset.write(job, choice, &limits.surface, control, progress, store)
+}
+
+/// Passes a file to `write`. Returns its size, bytes.
+fn store(write: impl Fn(&str, &[u8]) -> io::Result<()>, path: &str, bytes: &[u8]) -> Result<u64, WriteError> {
+    write(path, bytes).map_err(|source| WriteError::File { path: path.to_owned(), source })?;
+    Ok(bytes.len() as u64)
 }
 
 /// Returns the folder of the tileset of a unit, numbered from 1.
@@ -213,7 +235,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
         let address = "{level}/{x}/{y}/{z}";
         let uris = TilesetUris { content: format!("{address}.glb"), subtrees: format!("subtrees/{address}.subtree") };
         bytes += store("tileset.json", tileset_document(&bounds, &uris).to_string().as_bytes())?;
-        let (atoms, left_out) = (self.selected.atoms.len() as u64, LeftOutReport::new(&self.selected.left_out));
+        let (atoms, left_out) = (self.n_atoms(), LeftOutReport::new(&self.selected.left_out));
         Ok(TilesetReport {
             id: self.structure.id.clone(),
             atoms,

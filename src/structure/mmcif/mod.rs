@@ -51,6 +51,38 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
     }
 }
 
+/// Returns the offset of the first value of the `atom_site` loop that [`read`] reads. Returns `None` if the text has no
+/// such loop, or ends before it.
+pub(super) fn first_row(text: &[u8]) -> Option<usize> {
+    let (mut tokens, mut tags, mut in_loop, mut in_frame) = (Tokenizer::new(text), Vec::new(), false, false);
+    loop {
+        let token = tokens.next().ok()?;
+        match token.kind {
+            TokenKind::End => return None,
+            TokenKind::Loop => {
+                tags.clear();
+                in_loop = true;
+                continue;
+            }
+            TokenKind::Tag if in_loop => {
+                tags.push((token.start, token.end));
+                continue;
+            }
+            // One atom.
+            TokenKind::Tag if !in_frame && row::has_prefix(&text[token.start..token.end]) => return None,
+            TokenKind::Value if in_loop && !in_frame => {
+                let of_atoms = tags.first().is_some_and(|&(start, end)| row::has_prefix(&text[start..end]));
+                if of_atoms && row::layout(text, &tags).ok()?.missing().is_none() {
+                    return Some(token.start);
+                }
+            }
+            TokenKind::Save => in_frame = token.end - token.start > b"save_".len(),
+            _ => {}
+        }
+        in_loop = false;
+    }
+}
+
 /// Values of a data block that have been read so far.
 #[derive(Debug, Default)]
 struct TextBlock {

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::expression::Condition;
-use super::{SELECTED_CHAIN, chains, near};
+use super::{SELECTED_CHAIN, chains, known_chains, near};
 use crate::structure::altloc::ATOMS_PER_CHECK;
 use crate::structure::read::check;
 use crate::structure::{Structure, StructureError, TextColumn};
@@ -23,6 +23,8 @@ pub(super) struct Evaluation<'a> {
     pub(super) distances: near::TestCount,
     /// Atoms that can be meshed; `within` and `byres` ignore the others. `None` if no condition depends on other atoms.
     pub(super) usable: Option<Marks>,
+    /// True to reject chains that the structure lacks.
+    pub(super) is_whole: bool,
 }
 
 impl Evaluation<'_> {
@@ -46,7 +48,9 @@ impl Evaluation<'_> {
         match condition {
             Condition::Kinds(set) => self.each(|i| set.has(s.kind[i])),
             Condition::Chains(names) => {
-                self.texts(&s.chain, &chains(s, names.iter().map(String::as_str), SELECTED_CHAIN)?)
+                let names = names.iter().map(String::as_str);
+                let marks = if self.is_whole { chains(s, names, SELECTED_CHAIN)? } else { known_chains(s, names) };
+                self.texts(&s.chain, &marks)
             }
             Condition::Residues(ranges) => {
                 // The atoms of a residue are consecutive.

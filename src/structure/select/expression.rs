@@ -19,6 +19,13 @@ pub struct Expression {
     pub(super) hydrogens: bool,
 }
 
+impl Expression {
+    /// Returns true if an atom is selected by its distance from others.
+    pub(crate) fn has_within(&self) -> bool {
+        self.condition.has_within()
+    }
+}
+
 impl Default for Expression {
     fn default() -> Self {
         Self { condition: Condition::Kinds(KindSet::POLYMER), hydrogens: false }
@@ -143,6 +150,10 @@ impl Condition {
             Self::And(parts) | Self::Or(parts) => parts.iter().collect(),
             _ => Vec::new(),
         }
+    }
+
+    fn has_within(&self) -> bool {
+        matches!(self, Self::Within(..)) || self.parts().into_iter().any(Self::has_within)
     }
 
     /// Returns true if the result for an atom depends on other atoms.

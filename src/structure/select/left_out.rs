@@ -43,11 +43,7 @@ impl LeftOut {
     }
 
     /// Sets the counts of kinds and residue names.
-    pub(super) fn name_residues(&mut self, structure: &Structure, tally: Tally) {
-        let counts = tally.finish();
-        let texts: Vec<&str> = structure.residue.texts().collect();
-        let mut names: Vec<(&str, Kind, u64)> =
-            counts.into_iter().map(|((residue, kind), n)| (texts[residue as usize], kind, n)).collect();
+    pub(super) fn name_residues(&mut self, mut names: Vec<(&str, Kind, u64)>) {
         names.sort_unstable_by(|(a, i, m), (b, j, n)| n.cmp(m).then(a.cmp(b)).then(i.cmp(j)));
         let mut kinds: BTreeMap<Kind, u64> = BTreeMap::new();
         for (_, kind, n) in &names {
@@ -89,6 +85,12 @@ impl Tally {
         if self.pending > 0 {
             *self.counts.entry(self.latest).or_default() += std::mem::take(&mut self.pending);
         }
+    }
+
+    /// Returns the counts with the names of the residues.
+    pub(super) fn named(self, structure: &Structure) -> Vec<(&str, Kind, u64)> {
+        let texts: Vec<&str> = structure.residue.texts().collect();
+        self.finish().into_iter().map(|((residue, kind), n)| (texts[residue as usize], kind, n)).collect()
     }
 
     fn finish(mut self) -> HashMap<(u32, Kind), u64> {

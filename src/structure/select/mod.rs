@@ -6,6 +6,7 @@ mod expression;
 mod left_out;
 mod near;
 mod parse;
+mod part;
 mod selected;
 
 use std::collections::HashSet;
@@ -18,6 +19,7 @@ pub use expression::Expression;
 pub use left_out::LeftOut;
 use left_out::Tally;
 pub use parse::{BadExpression, MAX_DEPTH, MAX_DISTANCE, MAX_WITHIN};
+pub use part::SelectedBlocks;
 pub use selected::Selected;
 
 use super::altloc::Alternatives;
@@ -109,35 +111,8 @@ pub fn select_with(
     control: &Control<'_>,
 ) -> Result<Selected, StructureError> {
     let mut assembly = selection.assembly.as_deref().map(|id| Assembly::find(structure, id)).transpose()?;
-    let models = models(structure, selection)?;
-    let chains = match &selection.chains {
-        Some(names) => Some(chains(structure, names.iter().map(String::as_str), "chain")?),
-        None => None,
-    };
-    let wanted = alternative(structure, selection, models)?;
-    let alternatives = Alternatives::choose(structure, models, wanted, control)?;
-    let Expression { condition, hydrogens } = &selection.atoms;
-    let mut names = Vec::new();
-    condition.chains(&mut names);
-    // Fails for chains that do not exist.
-    self::chains(structure, names, SELECTED_CHAIN)?;
-    let distances = near::TestCount::new(limits);
-    let mut evaluation = Evaluation { structure, control, distances, usable: None };
-    if condition.depends_on_others() {
-        evaluation.usable = Some(evaluation.each(|i| {
-            models.contains(structure.model[i])
-                && structure.kind[i] != Kind::VirtualSite
-                && (*hydrogens || !structure.is_hydrogen(i))
-                && alternatives.keeps(structure, i)
-        })?);
-    }
-    let marks = evaluation.marks(condition)?;
-    let context = match selection.context {
-        Context::Selection => None,
-        Context::Whole => Some(evaluation.marks(&Expression::default().condition)?),
-    };
-    let rules = Rules { structure, models, chains, marks, hydrogens: *hydrogens, context, alternatives };
-    let mut found = rules.find(assembly.as_ref(), control)?;
+    let rules = Rules::new(structure, selection, true, limits, control)?;
+    let mut found = rules.find(structure.len(), assembly.as_ref(), control)?;
     if let Some(number) = selection.unit
         && !found.atoms.is_empty()
         && let Some(assembly) = assembly.take()
@@ -148,12 +123,12 @@ pub fn select_with(
     }
     let Found { atoms, mut left_out, residues } = found;
     let first = structure.model.first().copied().unwrap_or(1);
-    let model = if let Models::One(model) = models { model } else { first };
+    let model = if let Models::One(model) = rules.models { model } else { first };
     let marks = rules.marks(&atoms, control)?;
     if !marks.as_ref().map_or(!atoms.is_empty(), |marks| marks.contains(&true)) {
         return Err(StructureError::EmptySelection { holds: holds(structure, selection, model) });
     }
-    left_out.name_residues(structure, residues);
+    left_out.name_residues(residues.named(structure));
     let selected =
         Selected { n_distinct: atoms.len(), atoms, marks, copies: Vec::new(), units: Vec::new(), model, left_out };
     match assembly {
@@ -184,7 +159,55 @@ struct Found {
     residues: Tally,
 }
 
-impl Rules<'_> {
+impl<'a> Rules<'a> {
+    /// Prepares the selection of atoms of a structure, or of a part of one unless `is_whole`. A part may lack the
+    /// model, the chains and the alternative location that are requested.
+    fn new(
+        structure: &'a Structure,
+        selection: &Selection,
+        is_whole: bool,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+    ) -> Result<Self, StructureError> {
+        let models = match selection.model {
+            ModelChoice::Number(number) if !is_whole => Models::One(number),
+            _ => models(structure, selection)?,
+        };
+        let of_names = |names: &Vec<String>| {
+            let names = names.iter().map(String::as_str);
+            if is_whole { chains(structure, names, "chain") } else { Ok(known_chains(structure, names)) }
+        };
+        let chains = selection.chains.as_ref().map(of_names).transpose()?;
+        let wanted = match selection.altloc {
+            Some(letter) if !is_whole => u8::try_from(letter).ok(),
+            _ => alternative(structure, selection, models)?,
+        };
+        let alternatives = Alternatives::choose(structure, models, wanted, control)?;
+        let Expression { condition, hydrogens } = &selection.atoms;
+        if is_whole {
+            let mut names = Vec::new();
+            condition.chains(&mut names);
+            // Fails for chains that do not exist.
+            self::chains(structure, names, SELECTED_CHAIN)?;
+        }
+        let distances = near::TestCount::new(limits);
+        let mut evaluation = Evaluation { structure, control, distances, usable: None, is_whole };
+        if condition.depends_on_others() {
+            evaluation.usable = Some(evaluation.each(|i| {
+                models.contains(structure.model[i])
+                    && structure.kind[i] != Kind::VirtualSite
+                    && (*hydrogens || !structure.is_hydrogen(i))
+                    && alternatives.keeps(structure, i)
+            })?);
+        }
+        let marks = evaluation.marks(condition)?;
+        let context = match selection.context {
+            Context::Selection => None,
+            Context::Whole => Some(evaluation.marks(&Expression::default().condition)?),
+        };
+        Ok(Self { structure, models, chains, marks, hydrogens: *hydrogens, context, alternatives })
+    }
+
     /// Returns true if atom `i` belongs to a selected chain.
     fn has_chain(&self, i: usize) -> bool {
         self.chains.as_ref().is_none_or(|chains| chains[self.structure.chain.id(i) as usize])
@@ -212,9 +235,8 @@ impl Rules<'_> {
         Ok(Some(marks))
     }
 
-    /// Finds the atoms to mesh, of the chains of `assembly` if there is one, in parallel.
-    fn find(&self, assembly: Option<&Assembly<'_>>, control: &Control<'_>) -> Result<Found, StructureError> {
-        let n = self.structure.len();
+    /// Finds the atoms to mesh among the first `n`, of the chains of `assembly` if there is one, in parallel.
+    fn find(&self, n: usize, assembly: Option<&Assembly<'_>>, control: &Control<'_>) -> Result<Found, StructureError> {
         let range = |first| first..n.min(first + ATOMS_PER_TASK);
         let mut ranges: Vec<Range<usize>> = (0..n).step_by(ATOMS_PER_TASK).map(range).collect();
         let parts = pieces::map(&mut ranges, |range| check(control).map(|()| self.find_in(range.clone(), assembly)));
@@ -279,19 +301,25 @@ pub(crate) fn chains<'a>(
     what: &'static str,
 ) -> Result<Vec<bool>, StructureError> {
     let known: HashSet<&str> = structure.chain.texts().collect();
-    let mut names: HashSet<&str> = HashSet::new();
-    for requested in requested {
-        let name = if requested == "_" && !known.contains("_") { "" } else { requested };
-        if !known.contains(name) {
-            return Err(StructureError::NotFound {
-                what,
-                requested: format!("`{}`", requested.chars().take(40).collect::<String>()),
-                available: Contents::of(structure, None).chain_list(),
-            });
-        }
-        names.insert(name);
+    let requested: Vec<&str> = requested.into_iter().collect();
+    let is_known = |name: &str| known.contains(name) || name == "_" && known.contains("");
+    if let Some(unknown) = requested.iter().find(|name| !is_known(name)) {
+        return Err(StructureError::NotFound {
+            what,
+            requested: format!("`{}`", unknown.chars().take(40).collect::<String>()),
+            available: Contents::of(structure, None).chain_list(),
+        });
     }
-    Ok(structure.chain.texts().map(|text| names.contains(text)).collect())
+    Ok(known_chains(structure, requested))
+}
+
+/// Returns, for each text of the chain column, true if it is one of `requested`, as [`chains`] does. Ignores chains that
+/// do not exist.
+fn known_chains<'a>(structure: &'a Structure, requested: impl IntoIterator<Item = &'a str>) -> Vec<bool> {
+    let has_underscore = structure.chain.texts().any(|text| text == "_");
+    let name = |requested| if requested == "_" && !has_underscore { "" } else { requested };
+    let names: HashSet<&str> = requested.into_iter().map(name).collect();
+    structure.chain.texts().map(|text| names.contains(text)).collect()
 }
 
 fn alternative(structure: &Structure, selection: &Selection, models: Models) -> Result<Option<u8>, StructureError> {

@@ -1,0 +1,152 @@
+//! Selection of the atoms of consecutive blocks of a structure.
+
+use std::collections::{HashMap, HashSet};
+
+use super::{LeftOut, ModelChoice, Rules, SELECTED_CHAIN, Selected, Selection};
+use crate::structure::contents::Kind;
+use crate::structure::error::StructureError;
+use crate::structure::read::{ReadLimits, check};
+use crate::structure::stream::Block;
+use crate::structure::text::list;
+use crate::surface::Control;
+
+/// Model, chain, number and insertion code of a residue.
+type ResidueId = (i32, String, i32, u8);
+
+/// Atoms selected so far. Errors of a whole structure, such as a missing chain, are found at the end.
+#[derive(Debug, Default)]
+pub struct SelectedBlocks {
+    /// Number of selected atoms.
+    pub n_selected: u64,
+    /// Number of atoms.
+    pub n_atoms: u64,
+    left_out: LeftOut,
+    residues: HashMap<(String, Kind), u64>,
+    chains: HashSet<String>,
+    models: HashSet<i32>,
+    altlocs: HashSet<u8>,
+    /// Residues of the file with alternative locations, with the number of their block.
+    alternatives: HashMap<ResidueId, usize>,
+    n_blocks: usize,
+    first_model: Option<i32>,
+}
+
+impl SelectedBlocks {
+    /// Begins a file. Residues of different files are different residues.
+    pub fn begin_file(&mut self) {
+        self.alternatives.clear();
+    }
+
+    /// Selects atoms of the next block. Returns their indices, ascending.
+    ///
+    /// # Errors
+    /// Returns [`StructureError::TooManyAtoms`], [`StructureError::NotAStream`] and the errors of memory and
+    /// cancellation.
+    pub fn add(
+        &mut self,
+        block: &Block,
+        selection: &Selection,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+    ) -> Result<Vec<u32>, StructureError> {
+        let s = &block.structure;
+        self.n_atoms += block.len as u64;
+        // Indices of atoms have 32 bits.
+        let limit = limits.max_atoms.min(u64::from(u32::MAX));
+        if self.n_atoms > limit {
+            return Err(StructureError::TooManyAtoms { limit });
+        }
+        let first_model = *self.first_model.get_or_insert_with(|| s.model.first().copied().unwrap_or(1));
+        let model = match selection.model {
+            ModelChoice::First => ModelChoice::Number(first_model),
+            model => model,
+        };
+        let selection = Selection { model, ..selection.clone() };
+        let rules = Rules::new(s, &selection, false, limits, control)?;
+        self.note(block, &rules)?;
+        let found = rules.find(block.len, None, control)?;
+        check(control)?;
+        self.left_out.add(&found.left_out);
+        for (name, kind, n) in found.residues.named(s) {
+            *self.residues.entry((name.to_owned(), kind)).or_default() += n;
+        }
+        self.n_selected += found.atoms.len() as u64;
+        Ok(found.atoms)
+    }
+
+    /// Notes chains, models and alternative locations of a block.
+    fn note(&mut self, block: &Block, rules: &Rules<'_>) -> Result<(), StructureError> {
+        let s = &block.structure;
+        for name in s.chain.texts() {
+            if !self.chains.contains(name) {
+                self.chains.insert(name.to_owned());
+            }
+        }
+        self.n_blocks += 1;
+        for i in 0..block.len {
+            if self.models.len() < 100 {
+                self.models.insert(s.model[i]);
+            }
+            if s.altloc[i] == 0 || !rules.models.contains(s.model[i]) {
+                continue;
+            }
+            self.altlocs.insert(s.altloc[i]);
+            let residue = (s.model[i], s.chain.get(i).to_owned(), s.residue_number[i], s.insertion_code[i]);
+            if *self.alternatives.entry(residue).or_insert(self.n_blocks) != self.n_blocks {
+                let (chain, number) = (s.chain.get(i), s.residue_number[i]);
+                return Err(StructureError::NotAStream {
+                    found: format!("alternative locations of residue {number} of chain `{chain}` in several places"),
+                    expected: "residues with different numbers",
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Ends the selection.
+    ///
+    /// # Errors
+    /// Returns [`StructureError::EmptySelection`], [`StructureError::NotFound`] for a model, chain or alternative
+    /// location that does not exist, and [`StructureError::NotAStream`].
+    pub fn finish(mut self, selection: &Selection) -> Result<Selected, StructureError> {
+        let missing = |what, requested: String, mut available: Vec<String>| {
+            available.sort_unstable();
+            let n = available.len();
+            Err(StructureError::NotFound { what, requested, available: list(available, n) })
+        };
+        let mut names = Vec::new();
+        selection.atoms.condition.chains(&mut names);
+        let of_expression = names.into_iter().map(|name| (SELECTED_CHAIN, name));
+        for (what, name) in selection.chains.iter().flatten().map(|name| ("chain", name.as_str())).chain(of_expression) {
+            if name == "_" && ["", "_"].iter().all(|name| self.chains.contains(*name)) {
+                let expected = "one of the two, or a chain by its name";
+                return Err(StructureError::NotAStream { found: "a chain `_` and a blank chain".to_owned(), expected });
+            }
+            if !self.chains.contains(name) && !(name == "_" && self.chains.contains("")) {
+                let known = self.chains.iter().map(|name| format!("`{name}`")).collect();
+                return missing(what, format!("`{}`", name.chars().take(40).collect::<String>()), known);
+            }
+        }
+        let model = match selection.model {
+            ModelChoice::Number(number) if !self.models.contains(&number) => {
+                return missing("model", number.to_string(), self.models.iter().map(i32::to_string).collect());
+            }
+            ModelChoice::Number(number) => number,
+            ModelChoice::First | ModelChoice::All => self.first_model.unwrap_or(1),
+        };
+        if let Some(letter) = selection.altloc
+            && !u8::try_from(letter).is_ok_and(|letter| self.altlocs.contains(&letter))
+        {
+            let known = self.altlocs.iter().map(|letter| char::from(*letter).to_string()).collect();
+            return missing("alternative location", format!("`{letter}`"), known);
+        }
+        if self.n_selected == 0 {
+            let holds = format!("{} was requested; the files have {} atoms", selection.atoms, self.n_atoms);
+            return Err(StructureError::EmptySelection { holds });
+        }
+        let counts = self.residues.iter().map(|((name, kind), n)| (name.as_str(), *kind, *n)).collect();
+        self.left_out.name_residues(counts);
+        let (marks, copies, units) = (None, Vec::new(), Vec::new());
+        Ok(Selected { atoms: Vec::new(), marks, copies, units, n_distinct: 0, model, left_out: self.left_out })
+    }
+}

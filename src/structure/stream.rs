@@ -1,0 +1,431 @@
+//! Reads a structure file in blocks, so that the memory depends on a block and not on the file.
+//!
+//! A block is a number of rows of the `atom_site` loop of an mmCIF file, with everything before the first row. It ends
+//! where the residues before and after do not depend on each other. Files of other formats are one block.
+
+use std::io::Read;
+
+use super::annotations::Annotations;
+use super::assembly::Assemblies;
+use super::atoms::{SourceFormat, Structure};
+use super::categories::Categories;
+use super::decoder::Decoder;
+use super::error::StructureError;
+use super::kinds::{self, HeteroBlocks};
+use super::read::{ReadLimits, Reading, check, of_text, without_mark};
+use super::texts::TextColumn;
+use super::{duplicates, mmcif, sniff};
+use crate::surface::{Control, MemoryMeter as _, Reservation};
+
+/// Bytes of the rows of a block: about 270,000 atoms.
+pub const BLOCK_BYTES: usize = 16 << 20;
+/// Bytes that are read at a time.
+const STEP: usize = 1 << 20;
+/// First words of a line after the last row, besides tags.
+const WORDS: [&[u8]; 5] = [b"loop_", b"data_", b"save_", b"global_", b"stop_"];
+
+/// Some atoms of a structure.
+#[derive(Debug)]
+pub struct Block {
+    /// The atoms, followed by the first ones of the next block.
+    pub structure: Structure,
+    /// Number of atoms of this block.
+    pub len: usize,
+}
+
+impl Block {
+    /// Takes the structure without its atoms: format, id and title.
+    pub fn take_description(&mut self) -> Structure {
+        let s = &mut self.structure;
+        Structure {
+            format: s.format,
+            id: s.id.take(),
+            title: s.title.take(),
+            x: Vec::new(),
+            y: Vec::new(),
+            z: Vec::new(),
+            element: Vec::new(),
+            name: TextColumn::default(),
+            residue: TextColumn::default(),
+            chain: TextColumn::default(),
+            label_chain: TextColumn::default(),
+            entities: Vec::new(),
+            residue_number: Vec::new(),
+            insertion_code: Vec::new(),
+            altloc: Vec::new(),
+            occupancy: Vec::new(),
+            b_factor: Vec::new(),
+            radius: Vec::new(),
+            model: Vec::new(),
+            hetero: Vec::new(),
+            kind: Vec::new(),
+            assemblies: Assemblies::default(),
+            annotations: Annotations::default(),
+            warnings: Vec::new(),
+        }
+    }
+}
+
+/// Rejects atoms of one model of which more than allowed have the same position. `centre` returns the position of an
+/// atom below `n`, Å.
+///
+/// # Errors
+/// Returns [`StructureError::TooManyDuplicates`] and the errors of memory and cancellation.
+pub fn check_positions(
+    n: usize,
+    centre: impl Fn(usize) -> [f64; 3],
+    limits: &ReadLimits,
+    control: &Control<'_>,
+) -> Result<(), StructureError> {
+    duplicates::check(n, |i| (1, centre(i)), &Reading::new(limits, control))
+}
+
+/// Blocks of a file, in file order.
+pub struct Blocks<'a> {
+    input: Decoder<'a>,
+    limits: ReadLimits,
+    /// Text before the first row, and rows that are not in a block yet.
+    text: Vec<u8>,
+    memory: Reservation,
+    /// Length of the text before the first row; `None` to read the file as one block.
+    head: Option<usize>,
+    /// Bytes of the rows of a block.
+    block_bytes: usize,
+    /// Decompressed bytes so far.
+    inflated: u64,
+    /// Number of lines in the blocks so far.
+    lines: u64,
+    /// True at the end of the input.
+    at_end: bool,
+    finished: bool,
+    hetero: HeteroBlocks,
+    /// True to reject helices and strands after the atoms.
+    needs_secondary: bool,
+}
+
+impl<'a> Blocks<'a> {
+    /// Begins to read a file in blocks of about `block_bytes`. With `needs_secondary`, helices and strands must precede
+    /// the atoms.
+    ///
+    /// # Errors
+    /// Returns the errors of reading.
+    pub fn new(
+        input: Box<dyn Read + Send + 'a>,
+        block_bytes: usize,
+        needs_secondary: bool,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+    ) -> Result<Self, StructureError> {
+        let mut blocks = Self {
+            input: Decoder::new(input)?,
+            limits: *limits,
+            text: Vec::new(),
+            memory: Reservation::new(&control.memory),
+            head: None,
+            block_bytes,
+            inflated: 0,
+            lines: 0,
+            at_end: false,
+            finished: false,
+            hetero: HeteroBlocks::default(),
+            needs_secondary,
+        };
+        let mut size = STEP;
+        loop {
+            blocks.fill(size, control)?;
+            let text = without_mark(&blocks.text);
+            if sniff::sniff(text)? == SourceFormat::Mmcif {
+                blocks.head = mmcif::first_row(text).map(|first| blocks.text.len() - text.len() + first);
+                if blocks.head.is_none() && !blocks.at_end {
+                    size *= 2;
+                    continue;
+                }
+            }
+            break;
+        }
+        if let Some(head) = &mut blocks.head {
+            let line = memchr::memrchr(b'\n', &blocks.text[..*head]).map_or(0, |i| i + 1);
+            if !blocks.text[line..*head].iter().all(u8::is_ascii_whitespace) {
+                return Err(not_lines("a row on the line of the last item"));
+            }
+            *head = line;
+        }
+        Ok(blocks)
+    }
+
+    /// Returns the next block; `None` at the end. The memory of its structure stays added to the meter of `control`.
+    ///
+    /// # Errors
+    /// Returns the errors of [`super::read_with`], and [`StructureError::NotAStream`] if the whole file would give other
+    /// atoms.
+    pub fn next(&mut self, control: &Control<'_>) -> Result<Option<Block>, StructureError> {
+        if self.finished {
+            return Ok(None);
+        }
+        let Some(head) = self.head else {
+            self.finished = true;
+            self.fill(usize::MAX, control)?;
+            let reading = Reading::new(&self.limits, control);
+            let structure = of_text(without_mark(&self.text), &reading)?;
+            return Ok(Some(Block { len: structure.len(), structure }));
+        };
+        let mut size = self.block_bytes;
+        loop {
+            check(control)?;
+            self.fill(head.saturating_add(size), control)?;
+            let most = self.text.len().min(head.saturating_add(size));
+            let rows_end = end_of_rows(&self.text[head..most]).map(|end| head + end);
+            let is_last = rows_end.is_some() || (self.at_end && most == self.text.len());
+            let whole_lines = || memchr::memrchr(b'\n', &self.text[head..most]).map_or(head, |i| head + i + 1);
+            let end = rows_end.unwrap_or_else(|| if is_last { most } else { whole_lines() });
+            let n_rows = rows(&self.text[head..end]).count();
+            if n_rows == 0 && is_last {
+                self.finished = true;
+                self.end(end, control)?;
+                return Ok(None);
+            }
+            if n_rows == 0 {
+                size = size.saturating_mul(2);
+                continue;
+            }
+            let is_whole = is_last && self.lines == 0;
+            let reading =
+                if is_whole { Reading::new(&self.limits, control) } else { Reading::of_block(&self.limits, control) };
+            let structure = mmcif::read(without_mark(&self.text[..end]), &reading).map_err(|e| self.moved(e, head))?;
+            if structure.len() != n_rows && !is_whole {
+                return Err(not_lines(&format!("{} rows in {n_rows} lines", structure.len())));
+            }
+            let len = if is_last { Some(structure.len()) } else { kinds::last_division(&structure) };
+            let Some(len) = len else {
+                // All residues depend on each other.
+                size = size.saturating_mul(2);
+                continue;
+            };
+            if !is_whole {
+                self.hetero.add(&reading);
+            }
+            let used = rows(&self.text[head..end]).nth(len).map_or(end, |(start, _)| head + start);
+            self.lines += memchr::memchr_iter(b'\n', &self.text[head..used]).count() as u64;
+            if is_last {
+                self.finished = true;
+                self.end(end, control)?;
+            } else {
+                self.text.drain(head..used);
+            }
+            return Ok(Some(Block { structure, len }));
+        }
+    }
+
+    /// Reads until the text has `size` bytes, or the input ends.
+    fn fill(&mut self, size: usize, control: &Control<'_>) -> Result<(), StructureError> {
+        while !self.at_end && self.text.len() < size {
+            check(control)?;
+            let old = self.text.capacity();
+            if self.text.len() + STEP > old {
+                // Doubles, because the size of the input is unknown.
+                let new = (2 * old).max(self.text.len() + STEP);
+                self.memory.grow(new as u64)?;
+                self.text.reserve_exact(new - self.text.len());
+                self.memory.shrink(old as u64);
+            }
+            let n = self.input.read(STEP as u64, &mut self.text)?;
+            self.count(n)?;
+        }
+        Ok(())
+    }
+
+    /// Counts decompressed bytes.
+    fn count(&mut self, n: u64) -> Result<(), StructureError> {
+        self.at_end = n < STEP as u64;
+        self.inflated += n;
+        let limit = self.limits.max_inflated_bytes;
+        if self.inflated > limit { Err(StructureError::InflatedTooLarge { limit }) } else { Ok(()) }
+    }
+
+    /// Reads the rest of the data block, from `end` of the text on, and rejects categories that change the atoms.
+    fn end(&mut self, end: usize, control: &Control<'_>) -> Result<(), StructureError> {
+        if !self.hetero.agree() {
+            let found = "HETATM records with `label_seq_id` of chains whose entity is unknown, and none without, or water with";
+            return Err(not_a_stream(found, "the categories `entity` and `struct_asym` before the atoms"));
+        }
+        self.text.drain(..end);
+        loop {
+            check(control)?;
+            let whole = if self.at_end { self.text.len() } else { memchr::memrchr(b'\n', &self.text).map_or(0, |i| i + 1) };
+            for line in self.text[..whole].split(|&b| b == b'\n').map(<[u8]>::trim_ascii_start) {
+                if begins(line, b"data_") {
+                    return Ok(());
+                }
+                if let Some(tag) = line.strip_prefix(b"_") {
+                    self.check_tag(tag.split(u8::is_ascii_whitespace).next().unwrap_or_default())?;
+                }
+            }
+            if self.at_end {
+                return Ok(());
+            }
+            self.text.drain(..whole);
+            self.fill(self.text.len() + 1, control)?;
+        }
+    }
+
+    /// Rejects a tag after the atoms, without its underscore, that changes them.
+    fn check_tag(&self, tag: &[u8]) -> Result<(), StructureError> {
+        let Some([entities, secondary]) = Categories::find(tag).map(Categories::describes) else { return Ok(()) };
+        if entities || (secondary && self.needs_secondary) {
+            let found = format!("`_{}` after the atoms", String::from_utf8_lossy(tag));
+            return Err(not_a_stream(&found, "entities, chains, helices and strands before the atoms"));
+        }
+        Ok(())
+    }
+
+    /// Converts the line of an error from that of the text to that of the file.
+    fn moved(&self, mut error: StructureError, head: usize) -> StructureError {
+        if let StructureError::Syntax { line, .. } = &mut error
+            && *line > memchr::memchr_iter(b'\n', &self.text[..head]).count() as u64
+        {
+            *line += self.lines;
+        }
+        error
+    }
+}
+
+fn not_a_stream(found: &str, expected: &'static str) -> StructureError {
+    StructureError::NotAStream { found: found.to_owned(), expected }
+}
+
+fn not_lines(found: &str) -> StructureError {
+    not_a_stream(found, "one line for each row of `atom_site`")
+}
+
+/// Returns true if a line begins with a word, in any letter case.
+fn begins(line: &[u8], word: &[u8]) -> bool {
+    line.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word))
+}
+
+/// Returns start and end of the lines that are neither blank nor comments.
+fn rows(text: &[u8]) -> impl Iterator<Item = (usize, usize)> {
+    let mut start = 0;
+    let lines = std::iter::from_fn(move || {
+        let from = start;
+        let rest = text.get(from..).filter(|rest| !rest.is_empty())?;
+        start = memchr::memchr(b'\n', rest).map_or(text.len(), |i| from + i + 1);
+        Some((from, start))
+    });
+    lines.filter(|&(start, end)| !matches!(text[start..end].trim_ascii_start().first(), None | Some(b'#')))
+}
+
+/// Returns the start of the line after the last row, if the text contains it. This line contains an underscore, which
+/// few rows do.
+fn end_of_rows(text: &[u8]) -> Option<usize> {
+    memchr::memchr_iter(b'_', text).find_map(|at| {
+        let start = memchr::memrchr(b'\n', &text[..at]).map_or(0, |i| i + 1);
+        let line = text[start..].trim_ascii_start();
+        (line.starts_with(b"_") || WORDS.iter().any(|word| begins(line, word))).then_some(start)
+    })
+}
+
+#[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
+mod tests {
+    use super::*;
+    use crate::structure::{Kind, read};
+
+    const HEAD: &str = "data_x\n_entry.id 1ABC\nloop_\n_atom_site.group_PDB\n_atom_site.type_symbol\n\
+                        _atom_site.label_atom_id\n_atom_site.auth_comp_id\n_atom_site.auth_asym_id\n\
+                        _atom_site.auth_seq_id\n_atom_site.label_seq_id\n_atom_site.Cartn_x\n_atom_site.Cartn_y\n\
+                        _atom_site.Cartn_z\n";
+
+    type Row = (String, String, i32, Kind, [f64; 3]);
+
+    fn of(structure: &Structure, len: usize) -> Vec<Row> {
+        let s = structure;
+        let row = |i: usize| {
+            (s.chain.get(i).to_owned(), s.name.get(i).to_owned(), s.residue_number[i], s.kind[i], [s.x[i], s.y[i], s.z[i]])
+        };
+        (0..len).map(row).collect()
+    }
+
+    /// Reads a text in blocks of `size` bytes. Returns all atoms and the number of blocks.
+    fn blocks(text: &str, size: usize) -> Result<(Vec<Row>, usize), StructureError> {
+        let (control, limits) = (Control::default(), ReadLimits::default());
+        let mut blocks = Blocks::new(Box::new(text.as_bytes()), size, false, &limits, &control)?;
+        let (mut found, mut n) = (Vec::new(), 0);
+        while let Some(block) = blocks.next(&control)? {
+            found.extend(of(&block.structure, block.len));
+            n += 1;
+        }
+        Ok((found, n))
+    }
+
+    fn whole(text: &str) -> Vec<Row> {
+        let structure = read(text.as_bytes(), &ReadLimits::default()).unwrap();
+        of(&structure, structure.len())
+    }
+
+    fn row(record: &str, name: &str, residue: &str, chain: &str, number: i32, sequence: &str) -> String {
+        format!("{record} C {name} {residue} {chain} {number} {sequence} {}.5 1 {}\n", number, name.len())
+    }
+
+    /// Returns 200 residues: amino acids, modified ones that bonds join to them, and water.
+    fn rows_of(chain: &str, sequence: bool) -> String {
+        let residue = |i: i32| {
+            let sequence = if sequence { i.to_string() } else { ".".to_owned() };
+            let (record, name) = if i % 7 == 3 { ("HETATM", "XYZ") } else { ("ATOM", ["ALA", "GLY"][i as usize % 2]) };
+            ["N", "C"].map(|atom| row(record, atom, name, chain, i, &sequence)).concat()
+        };
+        let water = |i: i32| row("HETATM", "O", "HOH", chain, i, ".");
+        (0..150).map(residue).chain((150..200).map(water)).collect()
+    }
+
+    #[test]
+    fn blocks_have_the_atoms_of_the_file() {
+        for chains in [&["A"][..], &["A", "B", "A", "'C d'"]] {
+            for sequence in [true, false] {
+                let rows: String = chains.iter().map(|chain| rows_of(chain, sequence)).collect();
+                let text = format!("{HEAD}{rows}# end\nloop_\n_x.y\n1\ndata_other\n_entity.id 1\n");
+                let expected = whole(&text);
+                assert!(expected.iter().any(|row| row.3 == Kind::Protein) && expected.iter().any(|r| r.3 == Kind::Water));
+                for size in [1, 100, 1000, 5000] {
+                    let (found, n) = blocks(&text, size).unwrap();
+                    assert!(found == expected, "{chains:?} {sequence} {size}");
+                    assert!(n > 1, "{n}");
+                }
+                assert_eq!(blocks(&text, BLOCK_BYTES), Ok((expected, 1)));
+            }
+        }
+    }
+
+    /// Negative control: residues depend on those before, so blocks of any rows give other kinds.
+    #[test]
+    fn kinds_depend_on_adjacent_residues() {
+        let text = HEAD.to_owned() + &rows_of("A", false);
+        let kinds = |rows: &[Row]| rows.iter().map(|row| row.3).collect::<Vec<_>>();
+        let apart: Vec<Row> = rows_of("A", false).lines().flat_map(|line| whole(&format!("{HEAD}{line}\n"))).collect();
+        assert_ne!(kinds(&apart), kinds(&whole(&text)));
+    }
+
+    #[test]
+    fn files_that_blocks_would_change_are_rejected() {
+        let rows = rows_of("A", true);
+        let entities = format!("{HEAD}{rows}loop_\n_entity.id\n_entity.type\n1 polymer\n");
+        let same_line = format!("{}1 2 3\n", "data_x\nloop_\n_atom_site.Cartn_x\n_atom_site.Cartn_y\n_atom_site.Cartn_z ");
+        let two_lines = HEAD.to_owned() + &rows.replace(" 1 ", "\n1 ");
+        // The last rows have sequence numbers of water, so those of all others have no meaning.
+        let water = HEAD.to_owned() + &rows + &row("HETATM", "O", "HOH", "W", 1, "1");
+        for text in [entities, same_line, two_lines, water] {
+            let found = blocks(&text, 1000).unwrap_err();
+            assert!(matches!(found, StructureError::NotAStream { .. }), "{found}");
+            assert!(!whole(&text).is_empty());
+        }
+    }
+
+    #[test]
+    fn faults_have_the_line_of_the_file() {
+        let text = HEAD.to_owned() + &rows_of("A", true) + &row("ATOM", "C", "ALA", "B", 1, "x").replace("1.5", "y");
+        let expected = read(text.as_bytes(), &ReadLimits::default()).unwrap_err();
+        assert!(matches!(expected, StructureError::Syntax { line: 363.., .. }), "{expected}");
+        for size in [1, 1000, 1 << 20] {
+            assert_eq!(blocks(&text, size).unwrap_err(), expected);
+        }
+    }
+}
