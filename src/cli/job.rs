@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use molmesh::formats::{Format, GlbSink};
 use molmesh::pipeline::tileset::{self, StructureStream, TilesetReport, WriteError};
 use molmesh::pipeline::{self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
-use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::stream::BLOCK_BYTES;
+use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, SurfaceError};
 use serde_json::{Value, json};
@@ -117,8 +117,7 @@ impl<'a> CommandJob<'a> {
             return Err(CliError::usage(message));
         }
         let output = open(&cancel)?;
-        let input =
-            if streamed.is_some() { Vec::new() } else { read(path, limits.read.max_inflated_bytes)? };
+        let input = if streamed.is_some() { Vec::new() } else { read(path, limits.read.max_inflated_bytes)? };
         if let Some(map) = map {
             // The command line makes no content keys.
             job.map = Some(MapFile::new(String::new(), read(map, limits.map.max_inflated_bytes)?));

@@ -33,7 +33,10 @@ pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
         }
     } else if args.inputs.len() > 1 {
         let hint = "name a folder for an index of their atoms with --scratch".to_owned();
-        return Err(CliError::Usage { message: "several files cannot be read into memory".to_owned(), hint: Some(hint) });
+        return Err(CliError::Usage {
+            message: "several files cannot be read into memory".to_owned(),
+            hint: Some(hint),
+        });
     }
     Ok(request)
 }

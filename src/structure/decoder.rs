@@ -69,7 +69,8 @@ impl<'a> Decoder<'a> {
 }
 
 fn failure(error: &io::Error) -> StructureError {
-    StructureError::Input { reason: error.to_string() }
+    let text = error.to_string();
+    StructureError::Input { reason: text.split(" (os error").next().unwrap_or(&text).to_owned() }
 }
 
 fn broken(encoding: &'static str, reason: String) -> StructureError {

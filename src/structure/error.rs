@@ -45,7 +45,9 @@ pub enum StructureError {
         reason: String,
     },
     /// The file cannot be read as a stream.
-    #[error("cannot read the file as a stream: found {found}, expected {expected}; without `--scratch`, it can be read")]
+    #[error(
+        "cannot read the file as a stream: found {found}, expected {expected}; without `--scratch`, it can be read"
+    )]
     NotAStream {
         /// The content found there.
         found: String,

@@ -62,7 +62,9 @@ pub use copies::{PlacedCopy, Unit};
 pub use error::StructureError;
 pub use kind_set::KindSet;
 pub use read::{ReadLimits, read, read_with};
-pub use select::{BadExpression, Context, Expression, LeftOut, ModelChoice, Selected, SelectedBlocks, Selection, select, select_with};
+pub use select::{
+    BadExpression, Context, Expression, LeftOut, ModelChoice, Selected, SelectedBlocks, Selection, select, select_with,
+};
 pub use split::{AtomPart, Split};
 pub use survey::{Survey, survey};
 pub use texts::TextColumn;

@@ -245,13 +245,15 @@ impl<'a> Blocks<'a> {
     /// Reads the rest of the data block, from `end` of the text on, and rejects categories that change the atoms.
     fn end(&mut self, end: usize, control: &Control<'_>) -> Result<(), StructureError> {
         if !self.hetero.agree() {
-            let found = "HETATM records with `label_seq_id` of chains whose entity is unknown, and none without, or water with";
+            let found =
+                "HETATM records with `label_seq_id` of chains whose entity is unknown, and none without, or water with";
             return Err(not_a_stream(found, "the categories `entity` and `struct_asym` before the atoms"));
         }
         self.text.drain(..end);
         loop {
             check(control)?;
-            let whole = if self.at_end { self.text.len() } else { memchr::memrchr(b'\n', &self.text).map_or(0, |i| i + 1) };
+            let whole =
+                if self.at_end { self.text.len() } else { memchr::memrchr(b'\n', &self.text).map_or(0, |i| i + 1) };
             for line in self.text[..whole].split(|&b| b == b'\n').map(<[u8]>::trim_ascii_start) {
                 if begins(line, b"data_") {
                     return Ok(());
@@ -340,7 +342,13 @@ mod tests {
     fn of(structure: &Structure, len: usize) -> Vec<Row> {
         let s = structure;
         let row = |i: usize| {
-            (s.chain.get(i).to_owned(), s.name.get(i).to_owned(), s.residue_number[i], s.kind[i], [s.x[i], s.y[i], s.z[i]])
+            (
+                s.chain.get(i).to_owned(),
+                s.name.get(i).to_owned(),
+                s.residue_number[i],
+                s.kind[i],
+                [s.x[i], s.y[i], s.z[i]],
+            )
         };
         (0..len).map(row).collect()
     }
@@ -384,7 +392,9 @@ mod tests {
                 let rows: String = chains.iter().map(|chain| rows_of(chain, sequence)).collect();
                 let text = format!("{HEAD}{rows}# end\nloop_\n_x.y\n1\ndata_other\n_entity.id 1\n");
                 let expected = whole(&text);
-                assert!(expected.iter().any(|row| row.3 == Kind::Protein) && expected.iter().any(|r| r.3 == Kind::Water));
+                assert!(
+                    expected.iter().any(|row| row.3 == Kind::Protein) && expected.iter().any(|r| r.3 == Kind::Water)
+                );
                 for size in [1, 100, 1000, 5000] {
                     let (found, n) = blocks(&text, size).unwrap();
                     assert!(found == expected, "{chains:?} {sequence} {size}");
@@ -408,7 +418,8 @@ mod tests {
     fn files_that_blocks_would_change_are_rejected() {
         let rows = rows_of("A", true);
         let entities = format!("{HEAD}{rows}loop_\n_entity.id\n_entity.type\n1 polymer\n");
-        let same_line = format!("{}1 2 3\n", "data_x\nloop_\n_atom_site.Cartn_x\n_atom_site.Cartn_y\n_atom_site.Cartn_z ");
+        let same_line =
+            format!("{}1 2 3\n", "data_x\nloop_\n_atom_site.Cartn_x\n_atom_site.Cartn_y\n_atom_site.Cartn_z ");
         let two_lines = HEAD.to_owned() + &rows.replace(" 1 ", "\n1 ");
         // The last rows have sequence numbers of water, so those of all others have no meaning.
         let water = HEAD.to_owned() + &rows + &row("HETATM", "O", "HOH", "W", 1, "1");

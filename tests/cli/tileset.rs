@@ -203,3 +203,98 @@ fn a_folder_with_files_and_parameters_of_whole_meshes_are_rejected() {
         assert!(!output.join("tileset.json").exists());
     }
 }
+
+/// Returns the paths and contents of all files of a tileset.
+fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let paths = ["glb", "subtree", "json"].into_iter().flat_map(|kind| files(folder, kind));
+    paths.map(|path| (path.clone(), fs::read(folder.join(path)).unwrap())).collect()
+}
+
+/// Runs `molmesh tileset` on several files with an index on disk.
+fn streamed(inputs: &[&Path], output: &Path, scratch: &Path, more: &[&str]) -> Output {
+    molmesh()
+        .arg("tileset")
+        .args(inputs)
+        .arg("-o")
+        .arg(output)
+        .arg("--scratch")
+        .arg(scratch)
+        .args(more)
+        .output()
+        .unwrap()
+}
+
+/// Includes a negative control: the files of another structure.
+#[test]
+fn an_index_on_disk_gives_the_same_files_and_is_removed() {
+    let folder = Folder::new();
+    let [scratch, memory, disk] = ["scratch", "memory", "disk"].map(|name| folder.path(name));
+    fs::create_dir(&scratch).unwrap();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples");
+    let more = ["--resolution", "0.5", "--color", "chain", "--atom-ids", "--report", "json"];
+    let mut all = Vec::new();
+    for name in ["4pti.pdb", "1crn.cif"] {
+        let input = root.join(name);
+        let made = molmesh().arg("tileset").arg(&input).arg("-o").arg(&memory).args(more).output().unwrap();
+        assert_code(&made, 0);
+        let streamed = streamed(&[&input], &disk, &scratch, &more);
+        assert_code(&streamed, 0);
+        assert_eq!(stdout(&streamed), stdout(&made));
+        assert!(contents(&disk) == contents(&memory), "{name}");
+        assert_eq!(fs::read_dir(&scratch).unwrap().count(), 0);
+        all.push(contents(&memory));
+        for folder in [&memory, &disk] {
+            fs::remove_dir_all(folder).unwrap();
+        }
+    }
+    assert!(all[0] != all[1]);
+    // Two files are one structure.
+    let text = fs::read_to_string(root.join("1crn.cif")).unwrap();
+    let rows: Vec<&str> = text.lines().filter(|line| line.starts_with("ATOM")).collect();
+    let (head, _) = text.split_once(rows[0]).unwrap();
+    let file = |name: &str, rows: &[&str]| folder.file(name, format!("{head}{}\n", rows.join("\n")));
+    let parts = [file("1.cif", &rows[..100]), file("2.cif", &rows[100..])];
+    assert_code(&streamed(&[&parts[0], &parts[1]], &disk, &scratch, &more), 0);
+    assert!(contents(&disk) == all[1]);
+}
+
+#[test]
+fn files_and_parameters_that_cannot_be_streamed_are_rejected() {
+    let folder = Folder::new();
+    let (scratch, output) = (folder.path("scratch"), folder.path("tiles"));
+    fs::create_dir(&scratch).unwrap();
+    let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/4pti.pdb");
+    let run = |more: &[&str]| streamed(&[&sample], &output, &scratch, more);
+    for (more, expected) in [
+        (&["--select", "polymer and within 5 of water"][..], "`select`"),
+        (&["--assembly", "1"], "`assembly`"),
+        (&["--assembly", "1", "--instances"], "`assembly`"),
+        (&["--detail", "3"], "`detail`"),
+        (&["--color", "bfactor"], "`color_range`"),
+        (&["--color", "plddt"], "`color`"),
+        (&["--check"], "--check"),
+    ] {
+        let refused = run(more);
+        assert_code(&refused, 2);
+        let text = stderr(&refused);
+        assert!(text.contains(expected) && text.contains("--scratch"), "{more:?}: {text}");
+    }
+    assert_code(&run(&["--chains", "Q"]), 4);
+    assert_code(&run(&["--max-atoms", "100"]), 5);
+    assert_code(&run(&["--isovalue", "1000"]), 2);
+    let missing = folder.path("missing.cif");
+    let missing = streamed(&[&sample, &missing], &output, &scratch, &[]);
+    assert_code(&missing, 3);
+    assert!(stderr(&missing).contains("missing.cif"), "{}", stderr(&missing));
+    // The message names the file at fault.
+    let broken = folder.file("broken.cif", "data_x\n");
+    let broken = streamed(&[&sample, &broken], &output, &scratch, &[]);
+    assert_code(&broken, 4);
+    assert!(stderr(&broken).contains("broken.cif"), "{}", stderr(&broken));
+    assert_code(&streamed(&[&sample], &output, &folder.path("none"), &[]), 7);
+    let several = molmesh().arg("tileset").args([&sample, &sample]).arg("-o").arg(&output).output().unwrap();
+    assert_code(&several, 2);
+    assert!(stderr(&several).contains("--scratch"), "{}", stderr(&several));
+    assert!(!output.exists());
+    assert_eq!(fs::read_dir(&scratch).unwrap().count(), 0);
+}

@@ -23,7 +23,7 @@ pub(crate) struct TilesetArgs {
     /// Folder of the tileset, which must not exist or be empty; the file to open is `tileset.json` in it
     #[arg(short, long)]
     pub(crate) output: PathBuf,
-    /// Folder for a temporary index of the atoms, for structures larger than memory: about 65 bytes per atom. mmCIF files
+    /// Folder for a temporary index of the atoms, for structures larger than memory: 48 bytes per atom and more. mmCIF files
     /// are read in blocks, files of other formats one at a time. Raises the limits of atoms to 4294967295 and of each
     /// input to 1TiB, unless they are given
     #[arg(long, value_name = "FOLDER")]

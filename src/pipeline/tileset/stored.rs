@@ -80,6 +80,8 @@ pub(super) struct SphereIndex {
     /// Edge length of the cubes, Å.
     side: f64,
     numbers: FxHashMap<[i64; 3], usize>,
+    /// Latest cube and its number. Successive atoms mostly lie in one cube.
+    latest: ([i64; 3], usize),
     cubes: Vec<StoredCube>,
     n_buffered: usize,
     /// Bytes of spheres in memory before they are written.
@@ -106,6 +108,7 @@ impl SphereIndex {
             file: Arc::clone(file),
             side,
             numbers: FxHashMap::default(),
+            latest: ([i64::MIN; 3], 0),
             cubes: Vec::new(),
             n_buffered: 0,
             buffer_bytes,
@@ -123,13 +126,16 @@ impl SphereIndex {
             std::array::from_fn(|k| self.bounds[0][k].min(c[k])),
             std::array::from_fn(|k| self.bounds[1][k].max(c[k])),
         ];
-        let next = self.cubes.len();
-        let number = *self.numbers.entry(cube(c, self.side)).or_insert(next);
-        if number == next {
-            self.memory.grow(CUBE_BYTES).map_err(SurfaceError::from)?;
-            self.cubes.push(StoredCube::default());
+        let at = cube(c, self.side);
+        if at != self.latest.0 {
+            let next = self.cubes.len();
+            self.latest = (at, *self.numbers.entry(at).or_insert(next));
+            if self.latest.1 == next {
+                self.memory.grow(CUBE_BYTES).map_err(SurfaceError::from)?;
+                self.cubes.push(StoredCube::default());
+            }
         }
-        self.cubes[number].buffer.push(sphere);
+        self.cubes[self.latest.1].buffer.push(sphere);
         self.n_buffered += 1;
         if self.n_buffered * size_of::<StoredSphere>() >= self.buffer_bytes { self.flush() } else { Ok(()) }
     }

@@ -6,11 +6,11 @@ use std::fs::File;
 use std::io::Read;
 use std::sync::Arc;
 
+use super::Tileset;
 use super::layout::{CELLS, Layout};
 use super::level::{GROUP_ABOVE, MIN_BUCKET, cube, group_of};
-use super::stored::{SphereFile, SphereIndex, StoredSphere};
-use super::Tileset;
 use super::source::{LevelSource, Streamed};
+use super::stored::{SphereFile, SphereIndex, StoredSphere};
 use crate::formats::tileset::TileAddress;
 use crate::pipeline::color::{BlockColors, Scheme};
 use crate::pipeline::load::SPHERE_BYTES;
@@ -268,8 +268,20 @@ mod tests {
     const HEAD: &str = "data_x\n_struct.title 'Several copies'\nloop_\n_entity.id\n_entity.type\n1 polymer\n2 water\n\
                         loop_\n_struct_asym.id\n_struct_asym.entity_id\n";
     const ITEMS: [&str; 15] = [
-        "group_PDB", "type_symbol", "label_atom_id", "label_alt_id", "label_comp_id", "label_asym_id", "auth_asym_id",
-        "auth_seq_id", "label_seq_id", "Cartn_x", "Cartn_y", "Cartn_z", "occupancy", "B_iso_or_equiv",
+        "group_PDB",
+        "type_symbol",
+        "label_atom_id",
+        "label_alt_id",
+        "label_comp_id",
+        "label_asym_id",
+        "auth_asym_id",
+        "auth_seq_id",
+        "label_seq_id",
+        "Cartn_x",
+        "Cartn_y",
+        "Cartn_z",
+        "occupancy",
+        "B_iso_or_equiv",
         "pdbx_PDB_model_num",
     ];
 

@@ -83,10 +83,8 @@ impl SelectedBlocks {
             }
         }
         self.n_blocks += 1;
+        self.models.extend(s.model[..block.len].chunk_by(|a, b| a == b).map(|run| run[0]));
         for i in 0..block.len {
-            if self.models.len() < 100 {
-                self.models.insert(s.model[i]);
-            }
             if s.altloc[i] == 0 || !rules.models.contains(s.model[i]) {
                 continue;
             }
@@ -117,12 +115,14 @@ impl SelectedBlocks {
         let mut names = Vec::new();
         selection.atoms.condition.chains(&mut names);
         let of_expression = names.into_iter().map(|name| (SELECTED_CHAIN, name));
-        for (what, name) in selection.chains.iter().flatten().map(|name| ("chain", name.as_str())).chain(of_expression) {
+        for (what, name) in selection.chains.iter().flatten().map(|name| ("chain", name.as_str())).chain(of_expression)
+        {
             if name == "_" && ["", "_"].iter().all(|name| self.chains.contains(*name)) {
                 let expected = "one of the two, or a chain by its name";
                 return Err(StructureError::NotAStream { found: "a chain `_` and a blank chain".to_owned(), expected });
             }
-            if !self.chains.contains(name) && !(name == "_" && self.chains.contains("")) {
+            let is_known = self.chains.contains(name) || (name == "_" && self.chains.contains(""));
+            if !is_known {
                 let known = self.chains.iter().map(|name| format!("`{name}`")).collect();
                 return missing(what, format!("`{}`", name.chars().take(40).collect::<String>()), known);
             }
