@@ -86,8 +86,8 @@ impl<'a> CommandJob<'a> {
         Self::prepare_for(purpose, job, strict, (path, None), args, open)
     }
 
-    /// Prepares a job whose output `open` opens. Cheap steps come first: flags, output, input, backend. The input is read
-    /// later if its estimated number of atoms is given.
+    /// Prepares a job whose output `open` opens. Cheap steps come first: flags, output, input, backend. The input is
+    /// read later if its estimated number of atoms is given.
     pub(super) fn prepare_for<T>(
         purpose: Purpose,
         mut job: Job,

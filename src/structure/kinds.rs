@@ -204,7 +204,8 @@ impl<'a> Declared<'a> {
     }
 }
 
-/// HETATM records without `label_seq_id`, those of water and ions with one, and others with one whose entity is unknown.
+/// HETATM records without `label_seq_id`, those of water and ions with one, and others with one whose entity is
+/// unknown.
 const WITHOUT: u8 = 1;
 const SOLVENT: u8 = 2;
 const OPEN: u8 = 4;

@@ -156,8 +156,8 @@ impl<'a> Blocks<'a> {
     /// Returns the next block; `None` at the end. The memory of its structure stays added to the meter of `control`.
     ///
     /// # Errors
-    /// Returns the errors of [`super::read_with`], and [`StructureError::NotAStream`] if the whole file would give other
-    /// atoms.
+    /// Returns the errors of [`super::read_with`], and [`StructureError::NotAStream`] if the whole file would give
+    /// other atoms.
     pub fn next(&mut self, control: &Control<'_>) -> Result<Option<Block>, StructureError> {
         if self.finished {
             return Ok(None);

@@ -16,16 +16,16 @@ Examples:
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{TILESET_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct TilesetArgs {
-    /// Structure file: PDB, mmCIF, BinaryCIF, PQR or XYZ, optionally compressed with gzip or zstd; `-` is stdin. Several
-    /// files form one structure, with --scratch
+    /// Structure file: PDB, mmCIF, BinaryCIF, PQR or XYZ, optionally compressed with gzip or zstd; `-` is stdin.
+    /// Several files form one structure, with --scratch
     #[arg(required = true, value_name = "INPUT")]
     pub(crate) inputs: Vec<PathBuf>,
     /// Folder of the tileset, which must not exist or be empty; the file to open is `tileset.json` in it
     #[arg(short, long)]
     pub(crate) output: PathBuf,
-    /// Folder for a temporary index of the atoms, for structures larger than memory: 48 bytes per atom and more. mmCIF files
-    /// are read in blocks, files of other formats one at a time. Raises the limits of atoms to 4294967295 and of each
-    /// input to 1TiB, unless they are given
+    /// Folder for a temporary index of the atoms, for structures larger than memory: 48 bytes per atom and more. mmCIF
+    /// files are read in blocks, files of other formats one at a time. Raises the limits of atoms to 4294967295 and of
+    /// each input to 1TiB, unless they are given
     #[arg(long, value_name = "FOLDER")]
     pub(crate) scratch: Option<PathBuf>,
     #[command(flatten)]

@@ -163,8 +163,8 @@ pub(super) fn cube(c: [f64; 3], side: f64) -> [i64; 3] {
     c.map(|c| (c / side).floor() as i64)
 }
 
-/// Returns the cell of a grid that contains a cube of edge length `side`. Cells smaller than a cube are joined up to its
-/// size. Lengths are in Å.
+/// Returns the cell of a grid that contains a cube of edge length `side`. Cells smaller than a cube are joined up to
+/// its size. Lengths are in Å.
 pub(super) fn grid_cell(at: [i64; 3], side: f64, spacing: f64) -> [i64; 3] {
     cube(at.map(|c| (c as f64 + 0.5) * side), spacing.max(side))
 }
@@ -209,8 +209,8 @@ fn grouped(
     Ok((Spheres::new(x, y, z, radii)?, rows))
 }
 
-/// Returns centre and radius, Å, of the sphere of a group of `n` atoms, and the number of the atom nearest to the mean of
-/// their centres. `atom` returns centre and radius of each.
+/// Returns centre and radius, Å, of the sphere of a group of `n` atoms, and the number of the atom nearest to the mean
+/// of their centres. `atom` returns centre and radius of each.
 pub(super) fn group_of(
     n: usize,
     atom: impl Fn(usize) -> ([f64; 3], f32),

@@ -42,8 +42,8 @@ impl LevelSource {
         }
     }
 
-    /// Returns the spheres whose centres are at most `margin` away from a box along each axis, in the order of the level.
-    /// Lengths are in Å. `selected` are the atoms of the tileset.
+    /// Returns the spheres whose centres are at most `margin` away from a box along each axis, in the order of the
+    /// level. Lengths are in Å. `selected` are the atoms of the tileset.
     pub(super) fn near(
         &self,
         selected: &Selected,

@@ -94,7 +94,8 @@ pub(super) struct SphereIndex {
 }
 
 impl SphereIndex {
-    /// Creates an empty index with cubes of the edge length `side`, Å. Writes spheres when `buffer_bytes` are in memory.
+    /// Creates an empty index with cubes of the edge length `side`, Å. Writes spheres when `buffer_bytes` are in
+    /// memory.
     pub(super) fn new(
         file: &Arc<SphereFile>,
         side: f64,

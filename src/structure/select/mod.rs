@@ -313,8 +313,8 @@ pub(crate) fn chains<'a>(
     Ok(known_chains(structure, requested))
 }
 
-/// Returns, for each text of the chain column, true if it is one of `requested`, as [`chains`] does. Ignores chains that
-/// do not exist.
+/// Returns, for each text of the chain column, true if it is one of `requested`, as [`chains`] does. Ignores chains
+/// that do not exist.
 fn known_chains<'a>(structure: &'a Structure, requested: impl IntoIterator<Item = &'a str>) -> Vec<bool> {
     let has_underscore = structure.chain.texts().any(|text| text == "_");
     let name = |requested| if requested == "_" && !has_underscore { "" } else { requested };
