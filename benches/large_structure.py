@@ -73,7 +73,8 @@ def main():
             file.write("data_CELL\n#\nloop_\n" + "".join(f"_atom_site.{item}\n" for item in ITEMS))
             for copy in range(copies * number // args.files, copies * (number + 1) // args.files):
                 chain = chain_name(copy)
-                x, y, z = ((c - along / 2) * args.lattice for c in (copy // along**2, copy // along % along, copy % along))
+                at = (copy // along**2, copy // along % along, copy % along)
+                x, y, z = ((c - along / 2) * args.lattice for c in at)
                 rows = zip(heads, sequence, turned[numbers.randrange(64)])
                 file.writelines(
                     f"{head}{chain} {seq} {x + a:.3f} {y + b:.3f} {z + c:.3f} 1.00 20.00 {chain}\n"

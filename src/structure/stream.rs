@@ -330,7 +330,7 @@ fn end_of_rows(text: &[u8]) -> Option<usize> {
 #[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
-    use crate::structure::{Kind, read};
+    use crate::structure::{Kind, SelectedBlocks, Selection, read, select};
 
     const HEAD: &str = "data_x\n_entry.id 1ABC\nloop_\n_atom_site.group_PDB\n_atom_site.type_symbol\n\
                         _atom_site.label_atom_id\n_atom_site.auth_comp_id\n_atom_site.auth_asym_id\n\
@@ -403,6 +403,40 @@ mod tests {
                 assert_eq!(blocks(&text, BLOCK_BYTES), Ok((expected, 1)));
             }
         }
+    }
+
+    #[test]
+    fn blocks_of_real_files_give_the_same_selection() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+        let folders = ["samples", "tests/structures"];
+        let entries = folders.iter().flat_map(|folder| std::fs::read_dir(root.join(folder)).unwrap());
+        let paths: Vec<_> = entries.map(|entry| entry.unwrap().path()).filter(|path| path.is_file()).collect();
+        let (control, limits) = (Control::default(), ReadLimits::default());
+        let mut n_blocks = 0;
+        for path in paths {
+            let bytes = std::fs::read(&path).unwrap();
+            let Ok(structure) = read(&bytes, &limits) else { continue };
+            for atoms in ["polymer", "all", "byres elem P or resn HOH"] {
+                let selection = Selection { atoms: atoms.parse().unwrap(), ..Selection::default() };
+                let Ok(expected) = select(&structure, &selection) else { continue };
+                for size in [10_000, 200_000] {
+                    let mut blocks = Blocks::new(Box::new(&bytes[..]), size, true, &limits, &control).unwrap();
+                    let (mut selected, mut found) = (SelectedBlocks::default(), Vec::new());
+                    while let Some(block) = blocks.next(&control).unwrap() {
+                        let first = u32::try_from(selected.n_atoms).unwrap();
+                        let atoms = selected.add(&block, &selection, &limits, &control).unwrap();
+                        found.extend(atoms.into_iter().map(|i| first + i));
+                        n_blocks += 1;
+                    }
+                    let n_atoms = selected.n_atoms;
+                    let ended = selected.finish(&selection).unwrap();
+                    assert!(found == expected.atoms, "{} {atoms} {size}", path.display());
+                    assert_eq!((ended.left_out, ended.model), (expected.left_out.clone(), expected.model));
+                    assert_eq!(n_atoms, structure.len() as u64);
+                }
+            }
+        }
+        assert!(n_blocks > 30, "{n_blocks}");
     }
 
     /// Negative control: residues depend on those before, so blocks of any rows give other kinds.
