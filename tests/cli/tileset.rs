@@ -291,6 +291,10 @@ fn files_and_parameters_that_cannot_be_streamed_are_rejected() {
     let broken = streamed(&[&sample, &broken], &output, &scratch, &[]);
     assert_code(&broken, 4);
     assert!(stderr(&broken).contains("broken.cif"), "{}", stderr(&broken));
+    let other = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/1crn.cif");
+    let without = streamed(&[&other, &sample], &output, &scratch, &["--color", "entity"]);
+    assert_code(&without, 4);
+    assert!(stderr(&without).contains("4pti.pdb: parameter `color`"), "{}", stderr(&without));
     assert_code(&streamed(&[&sample], &output, &folder.path("none"), &[]), 7);
     let several = molmesh().arg("tileset").args([&sample, &sample]).arg("-o").arg(&output).output().unwrap();
     assert_code(&several, 2);

@@ -200,6 +200,7 @@ impl<'a> AtomColors<'a> {
         let colors = match scheme {
             Scheme::Residue => residues().map(tables::residue).collect(),
             Scheme::Chain => structure.chain.texts().map(|name| tables::category(number(names, name))).collect(),
+            Scheme::Entity if structure.label_chain.is_empty() => return Err(without_entities()),
             Scheme::Entity => {
                 let color = |name: &String| match name.as_str() {
                     "" => OTHER,
