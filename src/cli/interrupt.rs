@@ -17,7 +17,7 @@ fn staged() -> MutexGuard<'static, Vec<PathBuf>> {
     STAGED.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Registers a file that is removed unless [`commit`] renames it.
+/// Registers a file, or a folder that may be empty, which is removed unless [`commit`] renames it or [`keep`] keeps it.
 pub(crate) fn stage(path: &Path) {
     staged().push(path.to_owned());
 }
@@ -37,6 +37,11 @@ pub(crate) fn commit(files: &[(&Path, &Path)]) -> Result<(), (usize, io::Error)>
     Ok(())
 }
 
+/// Keeps a staged folder.
+pub(crate) fn keep(path: &Path) {
+    staged().retain(|known| known != path);
+}
+
 /// Removes a staged file, if it is still staged.
 pub(crate) fn discard(path: &Path) {
     let mut staged = staged();
@@ -53,6 +58,8 @@ fn discard_all() {
 fn remove(path: &Path) {
     // The file may be gone already, and an error here must not hide the original one.
     drop(fs::remove_file(path));
+    // Only if it is an empty folder.
+    drop(fs::remove_dir(path));
 }
 
 /// Cancels `token` on SIGINT and SIGTERM. Half a second later (the job may be waiting for stdin) or on a second signal,

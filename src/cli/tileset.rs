@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use molmesh::formats::tileset::MAX_LEVELS;
+use molmesh::pipeline::BYTES_PER_ATOM;
 use molmesh::pipeline::params::Request;
 use molmesh::pipeline::tileset::{LevelReport, TilesetReport, unit_folder};
 use serde_json::Value;
@@ -18,9 +19,6 @@ use super::output::is_stdio;
 use super::page::Page;
 use super::style::Style;
 use super::{interrupt, request, summary};
-
-/// Bytes of an atom in a text file.
-const BYTES_PER_ATOM: f64 = 60.0;
 
 /// Runs the command.
 pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
@@ -134,7 +132,9 @@ impl Folder {
         }
         let failed = |source| CliError::Output { name: path.display().to_string(), source };
         let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
-        let created = path.ancestors().take_while(is_missing).map(Path::to_owned).collect();
+        let created: Vec<PathBuf> = path.ancestors().take_while(is_missing).map(Path::to_owned).collect();
+        // An interrupt may come while the command waits for its input.
+        created.iter().for_each(|folder| interrupt::stage(folder));
         fs::create_dir_all(path).map_err(failed)?;
         if fs::read_dir(path).map_err(failed)?.next().is_some() {
             let message = format!("`{}` is not empty", path.display());
@@ -153,6 +153,7 @@ impl Folder {
 
 impl Drop for Folder {
     fn drop(&mut self) {
+        self.created.iter().for_each(|folder| interrupt::keep(folder));
         if self.complete {
             return;
         }

@@ -40,8 +40,8 @@ pub struct BrokerConfig {
     /// ms. Default 1,000: a transfer also writes input, record and result. Nodes with the role `api` transfer all such
     /// requests.
     pub transfer_wait_ms: u64,
-    /// Expected time of the partitions of a large mesh that the workers of a cluster share, ms. Default 2,000: each
-    /// helper reads the structure again, and each partition passes the store. 0: one worker computes each mesh.
+    /// Target time of one partition of a mesh that the workers of a cluster share, ms. Default 2,000: each helper reads
+    /// the structure again, and each partition passes the store. 0: one worker computes each mesh.
     pub partition_ms: u64,
     /// Number of asynchronous jobs that wait for a worker; with `url`, of jobs that wait or run. Default 10,000: at 0.1
     /// s per job on two workers the last one waits for eight minutes. Further requests for jobs get a 503 with an

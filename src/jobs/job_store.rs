@@ -19,6 +19,7 @@ use super::broker::{Broker, Dispatch};
 use super::durable_job::DurableJob;
 use super::open_jobs::OpenJobs;
 use super::record::{Helper, JobId, JobRecord, Requester, Status, now_ms};
+use super::records::existing;
 use super::retry::retry;
 use super::runner::Runner;
 use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, results};
@@ -26,7 +27,7 @@ use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::pipeline::suits_gpu;
 use crate::single_flight::SingleFlight;
-use crate::store::{Digest, Name, Namespace, Pin, Secret, Store, StoreError};
+use crate::store::{Digest, Namespace, Pin, Secret, Store, StoreError};
 use crate::sync::{Handle, timeout};
 
 /// Number of ended jobs that are held in memory; older ones are read from the store. A record takes up to 64 KiB, the
@@ -197,7 +198,9 @@ impl JobStore {
         let (client, namespace) = (spec.task.rank.client.0, spec.task.namespace);
         let id = match &spec.idempotency_key {
             Some(key) => JobId::from_key(&inner.secret, namespace, client, key),
-            None => JobId::random(&inner.secret, client).map_err(AcceptError::Random)?,
+            // Helpers neither displace the records of the client nor count towards its limit.
+            None => JobId::random(&inner.secret, if spec.helper.is_some() { !client } else { client })
+                .map_err(AcceptError::Random)?,
         };
         let record = JobRecord {
             id: id.clone(),
@@ -352,12 +355,6 @@ impl JobStore {
         Ok(Some(job.view()))
     }
 
-    /// Removes the record of an ended job that no client knows.
-    pub(crate) async fn forget(&self, id: &JobId) -> Result<(), StoreError> {
-        self.0.lock().jobs.remove(id);
-        self.0.store.delete(&Name::ended_job(id.as_str())?).await
-    }
-
     /// Returns the work that records an attempt before the worker starts it, so that a job that crashes the process is
     /// detected.
     pub(super) fn on_start(&self, job: &Arc<DurableJob>) -> OnStart {
@@ -399,9 +396,4 @@ impl JobStore {
             job.publish_end(job.record());
         }
     }
-}
-
-/// Returns the job that has the idempotency key of `record`, if both requests are the same.
-fn existing(record: &JobRecord, view: JobView) -> Result<JobView, AcceptError> {
-    if record.is_same_request(&view.record) { Ok(view) } else { Err(AcceptError::OtherRequest) }
 }

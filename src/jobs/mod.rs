@@ -90,7 +90,7 @@ impl Task {
     /// Returns true if the time that the task takes tells how long others take. The first tile prepares the tileset,
     /// others have no surface; helpers compute partitions only.
     fn is_typical(&self) -> bool {
-        self.job.tile.is_none() && self.job.helper.is_none() && self.partitions.is_none()
+        self.job.tile.is_none() && self.job.helper.is_none()
     }
 }
 

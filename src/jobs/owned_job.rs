@@ -4,7 +4,7 @@ use tokio::sync::watch;
 use tracing::Instrument as _;
 
 use super::{JobId, JobStore, JobView, Status};
-use crate::store::{Namespace, StoreError};
+use crate::store::{Name, Namespace, StoreError};
 use crate::sync::Handle;
 
 /// Job that is cancelled when its owner drops it, or whose record is then removed if it has ended. The record of a
@@ -34,7 +34,7 @@ impl Drop for OwnedJob {
         let (jobs, id, namespace) = (self.jobs.clone(), self.id.clone(), self.namespace);
         let end = async move {
             let ended = match jobs.dismiss(&id, namespace).await {
-                Ok(Some(view)) if view.record.status != Status::Dismissed => jobs.forget(&id).await,
+                Ok(Some(view)) if view.record.status != Status::Dismissed => forget(&jobs, &id).await,
                 Ok(_) => Ok(()),
                 Err(error) => Err(error),
             };
@@ -44,4 +44,10 @@ impl Drop for OwnedJob {
         };
         self.runtime.spawn(end.in_current_span());
     }
+}
+
+/// Removes the record of an ended job.
+async fn forget(jobs: &JobStore, id: &JobId) -> Result<(), StoreError> {
+    jobs.0.lock().jobs.remove(id);
+    jobs.0.store.delete(&Name::ended_job(id.as_str())?).await
 }

@@ -1,9 +1,9 @@
 //! Partitions of a large mesh, which the workers of a cluster share.
 //!
 //! The worker that writes the mesh dispatches helpers, jobs of which no client knows, when it knows the number of
-//! spheres. It and its helpers lock, compute and release one partition after another. Helpers put their results into the
-//! store; the writer joins them, and computes what no helper has begun or finished. Results are named by their contents,
-//! so a second attempt finds the results of the first one.
+//! spheres. It and its helpers lock, compute and release one partition after another. Helpers put their results into
+//! the store; the writer joins them, and computes what no helper has begun or finished. Results are named by their
+//! contents, so a second attempt finds the results of the first one.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -20,16 +20,16 @@ use super::job_store::JobStore;
 use super::record::{Helper, JobRecord};
 use super::records::LoadError;
 use super::{ContentKey, Input, JobSpec, JobView, OwnedJob, Status, Task};
+use crate::formats::Format;
 use crate::pipeline::{Job, is_divisible, surface_work};
-use crate::store::Digest;
+use crate::store::{Digest, Namespace, Pin};
 use crate::surface::{Control, PartitionSource, PartitionStep, SurfaceError, SurfaceParams};
 use crate::sync::{Handle, sleep};
 use crate::telemetry::PARTITIONS;
 
 /// Maximum number of partitions of a mesh.
 const MAX_PARTITIONS: u32 = 64;
-/// Number of helpers of a job, more than there are partitions for some: a process that works on the mesh already ends
-/// another helper at once.
+/// Number of helpers of a job. Surplus ones end on nodes that work on the mesh already.
 const HELPERS: u32 = 16;
 /// Interval at which the writer looks for partitions that its helpers have finished.
 const POLL: Duration = Duration::from_millis(50);
@@ -48,6 +48,7 @@ struct Partitions {
     digest: Digest,
     /// Key of the mesh.
     key: ContentKey,
+    format: Format,
     /// Expected time of a partition.
     time: Duration,
     state: Mutex<State>,
@@ -62,6 +63,10 @@ struct State {
     count: u32,
     /// Partitions without a step.
     open: VecDeque<u32>,
+    /// True while results of a helper are joined.
+    is_joining: bool,
+    /// Partitions whose results were joined.
+    joined: Vec<u32>,
     /// Locks of partitions: of the writer, those that it has begun, so that no helper computes them again; of a helper,
     /// that which it computes.
     locks: Vec<WorkLock>,
@@ -76,24 +81,60 @@ impl fmt::Debug for Partitions {
 }
 
 impl JobStore {
+    /// Returns the key of the mesh of a task; `None` if the mesh cannot be divided, or if this process does not share
+    /// its jobs.
+    fn key_of_mesh(&self, task: &Task, format: Format) -> Option<ContentKey> {
+        let (backend, mesh) = (self.0.pool.backend(), Job { helper: None, ..task.job.clone() });
+        // Partitions are computed on the CPU.
+        let can_divide = self.0.partition_time.is_some() && backend.name() == "cpu" && is_divisible(&mesh);
+        let key = || ContentKey::new(&task.digest, &mesh, format, &backend.arithmetic(), task.namespace);
+        can_divide.then(key)
+    }
+
+    /// Returns true if a helper can compute partitions here: this node has the release and the arithmetic of the
+    /// writer, and no other job of this process, which has the same processor, works on the mesh.
+    pub(super) fn can_help(&self, helper: &Helper, task: &Task, format: Format) -> bool {
+        let key = self.key_of_mesh(task, format);
+        key.is_some_and(|key| key.to_string() == helper.mesh && !lock(&self.0.shared_meshes).contains(&key))
+    }
+
+    /// Returns the end of a helper, whose results are its partitions: the key of the mesh, pinned.
+    pub(super) fn end_of_helper(
+        &self,
+        helper: &Helper,
+        format: Format,
+        namespace: Namespace,
+    ) -> Result<(String, Pin), String> {
+        let key = ContentKey::parse(&helper.mesh, namespace).map_err(|error| error.to_string())?;
+        let name = key.name(format.name()).map_err(|error| error.to_string())?;
+        Ok((helper.mesh.clone(), self.0.store.pin(&name)))
+    }
+
+    /// Returns the end of a helper whose mesh is stored; `None` if it is not, or if the store fails.
+    pub(super) async fn needless_helper(&self, record: &JobRecord, format: Format) -> Option<(String, Pin)> {
+        let helper = record.helper.as_ref()?;
+        let key = ContentKey::parse(&helper.mesh, record.namespace).ok()?;
+        self.0.store.head(&key.name(format.name()).ok()?).await.ok()??;
+        self.end_of_helper(helper, format, record.namespace).ok()
+    }
+
     /// Returns the source of the partitions of a task with its input; `None` if its mesh cannot be divided, or if this
     /// process does not share its jobs.
-    pub(super) fn partitions_of(&self, record: &JobRecord, task: &Task) -> Option<Arc<dyn PartitionSource>> {
-        let (time, file) = (self.0.partition_time?, task.input.file()?);
-        let (_, format) = record.request().ok()?;
-        let mesh = Job { helper: None, ..task.job.clone() };
-        // Partitions are computed on the CPU.
-        let backend = self.0.pool.backend();
-        if backend.name() != "cpu" || !is_divisible(&mesh) {
-            return None;
-        }
+    pub(super) fn partitions_of(
+        &self,
+        record: &JobRecord,
+        task: &Task,
+        format: Format,
+    ) -> Option<Arc<dyn PartitionSource>> {
+        let (key, time, file) = (self.key_of_mesh(task, format)?, self.0.partition_time?, task.input.file()?);
         Some(Arc::new(Partitions {
             jobs: self.clone(),
             runtime: Handle::current(),
             record: record.clone(),
             file: file.clone(),
             digest: task.digest,
-            key: ContentKey::new(&task.digest, &mesh, format, &backend.arithmetic(), task.namespace),
+            key,
+            format,
             time,
             state: Mutex::default(),
         }))
@@ -106,6 +147,15 @@ impl Drop for Partitions {
         self.release(&mut state);
         if state.is_listed {
             lock(&self.jobs.0.shared_meshes).remove(&self.key);
+        }
+        let names = state.joined.iter().map(|index| self.key.of_partition(*index, state.count).name(EXTENSION));
+        for name in names.flatten() {
+            let store = self.jobs.0.store.clone();
+            self.runtime.spawn(async move {
+                if let Err(error) = store.delete(&name).await {
+                    tracing::debug!(%error, "the results of a partition are removed later");
+                }
+            });
         }
     }
 }
@@ -127,22 +177,36 @@ impl Partitions {
         (count > 1 && self.runtime.block_on(self.jobs.has_workers())).then_some(count)
     }
 
-    /// Dispatches helpers, which share the work with this process.
-    async fn dispatch(&self, partitions: u32) -> Result<Vec<(OwnedJob, watch::Receiver<JobView>)>, String> {
-        let (jobs, mut dispatched) = (&self.jobs, Vec::new());
+    /// Dispatches helpers, which share the work with this process. They may be fewer than wanted.
+    async fn dispatch(&self, partitions: u32) -> Vec<(OwnedJob, watch::Receiver<JobView>)> {
+        let mut helpers = Vec::new();
         for number in 0..HELPERS {
-            let helper = Some(Helper { number, partitions });
-            let record = JobRecord { helper, ..self.record.clone() };
-            let (task, format) = jobs.task_of(&record, self.digest)?;
-            let task = Task { input: Input::File(self.file.clone()), id: None, ..task };
-            let (file, parameters) = (self.file.clone(), record.parameters);
-            let spec = JobSpec { task, file, map: None, parameters, format, idempotency_key: None, helper };
-            let view = jobs.accept(spec, None).await.map_err(|error| error.to_string())?;
-            let job = OwnedJob::new(jobs.clone(), &view);
-            let state = job.watch().await.map_err(|error| error.to_string())?.ok_or("its record was lost")?;
-            dispatched.push((job, state));
+            match self.dispatch_helper(number, partitions).await {
+                Ok(helper) => helpers.push(helper),
+                Err(error) => {
+                    tracing::warn!(error, helpers = number, "a large mesh has fewer helpers");
+                    break;
+                }
+            }
         }
-        Ok(dispatched)
+        helpers
+    }
+
+    async fn dispatch_helper(
+        &self,
+        number: u32,
+        partitions: u32,
+    ) -> Result<(OwnedJob, watch::Receiver<JobView>), String> {
+        let (jobs, helper) = (&self.jobs, Some(Helper { number, partitions, mesh: self.key.to_string() }));
+        let record = JobRecord { helper: helper.clone(), ..self.record.clone() };
+        let (task, format) = jobs.task_of(&record, self.digest)?;
+        let task = Task { input: Input::File(self.file.clone()), id: None, ..task };
+        let (file, parameters) = (self.file.clone(), record.parameters);
+        let spec = JobSpec { task, file, map: None, parameters, format, idempotency_key: None, helper };
+        let view = jobs.accept(spec, None).await.map_err(|error| error.to_string())?;
+        let job = OwnedJob::new(jobs.clone(), &view);
+        let state = job.watch().await.map_err(|error| error.to_string())?.ok_or("its record was lost")?;
+        Ok((job, state))
     }
 
     /// Reads the results of a partition, whose last bytes are their digest; `None` if they are not stored or damaged.
@@ -156,7 +220,11 @@ impl Partitions {
             bytes.extend_from_slice(&piece);
         }
         let digest = bytes.len().checked_sub(DIGEST_BYTES).map(|end| bytes.split_off(end));
-        Ok((digest.as_deref() == Some(Digest::of(&bytes).to_string().as_bytes())).then_some(bytes))
+        let is_intact = digest.as_deref() == Some(Digest::of(&bytes).to_string().as_bytes());
+        if !is_intact {
+            tracing::warn!(%key, "the results of a partition are damaged, so it is computed again");
+        }
+        Ok(is_intact.then_some(bytes))
     }
 
     /// Locks the next partition that needs a step. Returns its results if this process joins them and they are stored.
@@ -171,7 +239,10 @@ impl Partitions {
             state.locks.push(lock);
             match self.runtime.block_on(self.stored(&key, control)) {
                 Ok(None) => return Ok(Some(PartitionStep::Compute(index))),
-                Ok(Some(bytes)) if self.record.helper.is_none() => return Ok(Some(PartitionStep::Join(index, bytes))),
+                Ok(Some(bytes)) if self.record.helper.is_none() => {
+                    state.is_joining = true;
+                    return Ok(Some(PartitionStep::Join(index, bytes)));
+                }
                 // The writer joins it.
                 Ok(Some(_)) => self.release(state),
                 Err(LoadError::Memory(error)) => return Err(error.into()),
@@ -194,31 +265,30 @@ impl Partitions {
 }
 
 impl PartitionSource for Partitions {
+    fn is_divided(&self) -> bool {
+        self.lock().count > 0
+    }
+
     fn begin(&self, spheres: usize, params: &SurfaceParams) -> Option<u32> {
         let mut state = self.lock();
         if std::mem::replace(&mut state.begun, true) {
             return None;
         }
-        let (count, first) = if let Some(Helper { number, partitions }) = self.record.helper {
+        let (count, first) = match &self.record.helper {
             // The writer and its helpers begin at different partitions.
-            (partitions, partitions * (number + 1) / (HELPERS + 1))
-        } else {
-            (self.count(spheres, params)?, 0)
+            Some(Helper { number, partitions, .. }) => (*partitions, partitions * (number + 1) / (HELPERS + 1)),
+            None => (self.count(spheres, params)?, 0),
         };
-        if self.record.helper.is_none() {
-            match self.runtime.block_on(self.dispatch(count)) {
-                Ok(helpers) => state.helpers = helpers,
-                Err(error) => {
-                    tracing::warn!(error, "a worker computes a large mesh without helpers");
-                    return None;
-                }
-            }
-            tracing::debug!(partitions = count, "workers share a mesh");
-        }
         state.is_listed = lock(&self.jobs.0.shared_meshes).insert(self.key);
         if self.record.helper.is_some() && !state.is_listed {
-            // Another job of this process uses the same processor.
             return None;
+        }
+        if self.record.helper.is_none() {
+            state.helpers = self.runtime.block_on(self.dispatch(count));
+            if state.helpers.is_empty() {
+                return None;
+            }
+            tracing::debug!(partitions = count, "workers share a mesh");
         }
         (state.count, state.open) = (count, (first..count).chain(0..first).collect());
         Some(count)
@@ -228,6 +298,10 @@ impl PartitionSource for Partitions {
         let mut state = self.lock();
         while !state.open.is_empty() {
             control.check()?;
+            // Another attempt of the writer may have finished the mesh.
+            if self.runtime.block_on(self.jobs.needless_helper(&self.record, self.format)).is_some() {
+                return Ok(None);
+            }
             if let Some(step) = self.step(&mut state, control)? {
                 return Ok(Some(step));
             }
@@ -244,6 +318,8 @@ impl PartitionSource for Partitions {
     fn publish(&self, index: u32, mut results: Vec<u8>) {
         let (store, key) = (&self.jobs.0.store, self.key.of_partition(index, self.lock().count));
         let digest = Digest::of(&results).to_string();
+        // Otherwise the capacity would double.
+        results.reserve_exact(DIGEST_BYTES);
         results.extend_from_slice(digest.as_bytes());
         let put = async { store.put(&key.name(EXTENSION)?, results.into()).await };
         if let Err(error) = self.runtime.block_on(put) {
@@ -254,8 +330,15 @@ impl PartitionSource for Partitions {
     fn finished(&self, index: u32, is_joined: bool) {
         let computed = if is_joined { "elsewhere" } else { "here" };
         tracing::debug!(index, computed, "a partition is finished");
+        let mut state = self.lock();
+        if std::mem::take(&mut state.is_joining) && !is_joined {
+            tracing::warn!(index, "the results of a partition did not match, so it was computed again");
+        }
+        if is_joined {
+            state.joined.push(index);
+        }
         if self.record.helper.is_some() {
-            self.release(&mut self.lock());
+            self.release(&mut state);
         } else {
             counter!(PARTITIONS, "computed" => computed).increment(1);
         }

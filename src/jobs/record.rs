@@ -167,12 +167,14 @@ pub(crate) struct JobRecord {
 }
 
 /// Helper of a job: another worker, which computes partitions of its mesh.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Helper {
     /// Number of the helper, from 0.
     pub(crate) number: u32,
     /// Number of partitions.
     pub(crate) partitions: u32,
+    /// Key of the mesh, with the release and the arithmetic of the worker that joins the partitions.
+    pub(crate) mesh: String,
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde calls")]
@@ -261,7 +263,7 @@ impl JobRecord {
         let format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
         params::set_format(&mut request.job, format).map_err(|e| e.to_string())?;
         request.job.map = self.map.clone().map(MapFile::not_loaded);
-        request.job.helper = self.helper.map(|helper| helper.number);
+        request.job.helper = self.helper.as_ref().map(|helper| helper.number);
         Ok((request, format))
     }
 

@@ -17,7 +17,7 @@ use super::durable_job::DurableJob;
 use super::job_store::{JobStore, JobStoreState};
 use super::rank::{Client, Rank};
 use super::record::{JobId, JobRecord};
-use super::{EndError, Input, Task};
+use super::{AcceptError, EndError, Input, JobView, Task};
 use crate::formats::Format;
 use crate::pipeline::MapFile;
 use crate::store::{BadDigest, Digest, Name, Namespace, Pin, RecordCaps, RecordReservation, Store, StoreError};
@@ -189,6 +189,11 @@ pub(crate) async fn unfinished_jobs(store: &Store) -> Result<(Vec<JobRecord>, us
     }
     records.sort_by_key(|record| (record.created_ms, record.id.clone()));
     Ok((records, unreadable))
+}
+
+/// Returns the job that has the idempotency key of `record`, if both requests are the same.
+pub(super) fn existing(record: &JobRecord, view: JobView) -> Result<JobView, AcceptError> {
+    if record.is_same_request(&view.record) { Ok(view) } else { Err(AcceptError::OtherRequest) }
 }
 
 /// Error of [`JobStore::load_input`].

@@ -22,8 +22,11 @@ use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_
 pub(super) fn work(shared: &WorkerContext) {
     while let Some(entry) = shared.queue.pop() {
         let (id, client, is_typical) = (entry.id, entry.task.rank.client, entry.task.is_typical());
+        let partitions = entry.task.partitions.clone();
         let start = Instant::now();
         let outcome = run(shared, entry);
+        // Helpers have computed a part of a divided mesh.
+        let is_typical = is_typical && !partitions.is_some_and(|partitions| partitions.is_divided());
         if let Some(meter) = &shared.settings.meter {
             meter(client, start.elapsed());
         }

@@ -62,7 +62,7 @@ pub use report::{PictureReport, Quantization, Report, file_arithmetic};
 pub use shapes::TriangleReport;
 pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
-pub use work::{estimate_atoms, estimate_work, mesh_work};
+pub use work::{BYTES_PER_ATOM, estimate_atoms, estimate_work, mesh_work};
 #[cfg(feature = "server")]
 pub(crate) use work::{suits_gpu, surface_work};
 

@@ -356,9 +356,8 @@ impl Report {
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
-        for field in EXCLUDED_EXTRAS {
-            map.remove(field);
-        }
+        // Keeps the order of the other fields.
+        map.retain(|field, _| !EXCLUDED_EXTRAS.contains(&field.as_str()));
         map
     }
 }

@@ -7,7 +7,7 @@ use crate::surface::SurfaceParams;
 use crate::surface::{SurfaceKind, TriangleQuality};
 
 /// Approximate bytes of text per atom. A line of a PDB file has 81, a line of an mmCIF file 90 to 110.
-const BYTES_PER_ATOM: f64 = 90.0;
+pub const BYTES_PER_ATOM: f64 = 90.0;
 /// Approximate compression ratio of structure files.
 const COMPRESSION: f64 = 4.0;
 /// Approximate ratio of the sizes of atoms in text and in BinaryCIF. It does not apply to compressed input, whose

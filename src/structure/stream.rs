@@ -4,11 +4,13 @@
 //! where the residues before and after do not depend on each other. Files of other formats are one block.
 
 use std::io::Read;
+use std::sync::Arc;
 
 use super::annotations::Annotations;
 use super::assembly::Assemblies;
 use super::atoms::{SourceFormat, Structure};
 use super::categories::Categories;
+use super::cif::{TokenKind, Tokenizer};
 use super::decoder::Decoder;
 use super::error::StructureError;
 use super::kinds::{self, HeteroBlocks};
@@ -101,6 +103,7 @@ pub struct Blocks<'a> {
     hetero: HeteroBlocks,
     /// True to reject helices and strands after the atoms.
     needs_secondary: bool,
+    tags: TagsAfterAtoms,
 }
 
 impl<'a> Blocks<'a> {
@@ -129,6 +132,7 @@ impl<'a> Blocks<'a> {
             finished: false,
             hetero: HeteroBlocks::default(),
             needs_secondary,
+            tags: TagsAfterAtoms::default(),
         };
         let mut size = STEP;
         loop {
@@ -189,9 +193,13 @@ impl<'a> Blocks<'a> {
                 continue;
             }
             let is_whole = is_last && self.lines == 0;
+            let memory = Arc::new(Reservation::new(&control.memory));
+            let of_attempt = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
+            let (limits, of_attempt) = (&self.limits, &of_attempt);
             let reading =
-                if is_whole { Reading::new(&self.limits, control) } else { Reading::of_block(&self.limits, control) };
-            let structure = mmcif::read(without_mark(&self.text[..end]), &reading).map_err(|e| self.moved(e, head))?;
+                if is_whole { Reading::new(limits, of_attempt) } else { Reading::of_block(limits, of_attempt) };
+            let structure = mmcif::read(without_mark(&self.text[..end]), &reading)
+                .map_err(|error| if is_last { self.moved(error, head) } else { self.of_block(error, head, end) })?;
             if structure.len() != n_rows && !is_whole {
                 return Err(not_lines(&format!("{} rows in {n_rows} lines", structure.len())));
             }
@@ -204,6 +212,7 @@ impl<'a> Blocks<'a> {
             if !is_whole {
                 self.hetero.add(&reading);
             }
+            memory.keep();
             let used = rows(&self.text[head..end]).nth(len).map_or(end, |(start, _)| head + start);
             self.lines += memchr::memchr_iter(b'\n', &self.text[head..used]).count() as u64;
             if is_last {
@@ -254,12 +263,9 @@ impl<'a> Blocks<'a> {
             check(control)?;
             let whole =
                 if self.at_end { self.text.len() } else { memchr::memrchr(b'\n', &self.text).map_or(0, |i| i + 1) };
-            for line in self.text[..whole].split(|&b| b == b'\n').map(<[u8]>::trim_ascii_start) {
-                if begins(line, b"data_") {
+            for line in self.text[..whole].split_inclusive(|&b| b == b'\n') {
+                if self.tags.is_last(line, self.needs_secondary)? {
                     return Ok(());
-                }
-                if let Some(tag) = line.strip_prefix(b"_") {
-                    self.check_tag(tag.split(u8::is_ascii_whitespace).next().unwrap_or_default())?;
                 }
             }
             if self.at_end {
@@ -270,14 +276,13 @@ impl<'a> Blocks<'a> {
         }
     }
 
-    /// Rejects a tag after the atoms, without its underscore, that changes them.
-    fn check_tag(&self, tag: &[u8]) -> Result<(), StructureError> {
-        let Some([entities, secondary]) = Categories::find(tag).map(Categories::describes) else { return Ok(()) };
-        if entities || (secondary && self.needs_secondary) {
-            let found = format!("`_{}` after the atoms", String::from_utf8_lossy(tag));
-            return Err(not_a_stream(&found, "entities, chains, helices and strands before the atoms"));
+    /// Converts the error of a block that more rows follow. A row that does not end within the block has several lines.
+    fn of_block(&self, error: StructureError, head: usize, end: usize) -> StructureError {
+        let n_lines = memchr::memchr_iter(b'\n', &self.text[..end]).count() as u64;
+        match error {
+            StructureError::Syntax { line, .. } if line > n_lines => not_lines("a row of several lines"),
+            error => self.moved(error, head),
         }
-        Ok(())
     }
 
     /// Converts the line of an error from that of the text to that of the file.
@@ -289,6 +294,47 @@ impl<'a> Blocks<'a> {
         }
         error
     }
+}
+
+/// Scanner of the lines after the atoms.
+#[derive(Default)]
+struct TagsAfterAtoms {
+    in_text_field: bool,
+}
+
+impl TagsAfterAtoms {
+    /// Returns true if a line begins the next data block. Rejects tags that change the atoms.
+    fn is_last(&mut self, line: &[u8], needs_secondary: bool) -> Result<bool, StructureError> {
+        let delimits = line.first() == Some(&b';');
+        let is_value = self.in_text_field != delimits;
+        self.in_text_field = is_value;
+        if is_value {
+            return Ok(false);
+        }
+        // Behind the semicolon that ends a text field.
+        let text = &line[usize::from(delimits)..];
+        let mut tokens = Tokenizer::new(text);
+        // The values after the atoms are not read, so faults of theirs do not matter.
+        while let Ok(token) = tokens.next() {
+            match token.kind {
+                TokenKind::End => break,
+                TokenKind::Data => return Ok(true),
+                TokenKind::Tag => check_tag(&text[token.start + 1..token.end], needs_secondary)?,
+                _ => {}
+            }
+        }
+        Ok(false)
+    }
+}
+
+/// Rejects a tag after the atoms, without its underscore, that changes them.
+fn check_tag(tag: &[u8], needs_secondary: bool) -> Result<(), StructureError> {
+    let Some([entities, secondary]) = Categories::find(tag).map(Categories::describes) else { return Ok(()) };
+    if entities || (secondary && needs_secondary) {
+        let found = format!("`_{}` after the atoms", String::from_utf8_lossy(tag));
+        return Err(not_a_stream(&found, "entities, chains, helices and strands before the atoms"));
+    }
+    Ok(())
 }
 
 fn not_a_stream(found: &str, expected: &'static str) -> StructureError {
@@ -421,7 +467,7 @@ mod tests {
                 let Ok(expected) = select(&structure, &selection) else { continue };
                 for size in [10_000, 200_000] {
                     let mut blocks = Blocks::new(Box::new(&bytes[..]), size, true, &limits, &control).unwrap();
-                    let (mut selected, mut found) = (SelectedBlocks::default(), Vec::new());
+                    let (mut selected, mut found) = (SelectedBlocks::new(&control), Vec::new());
                     while let Some(block) = blocks.next(&control).unwrap() {
                         let first = u32::try_from(selected.n_atoms).unwrap();
                         let atoms = selected.add(&block, &selection, &limits, &control).unwrap();
@@ -455,13 +501,23 @@ mod tests {
         let same_line =
             format!("{}1 2 3\n", "data_x\nloop_\n_atom_site.Cartn_x\n_atom_site.Cartn_y\n_atom_site.Cartn_z ");
         let two_lines = HEAD.to_owned() + &rows.replace(" 1 ", "\n1 ");
+        let one_line = format!("{HEAD}{rows}loop_ _entity.id _entity.type 1 polymer\n");
+        // The tags follow a text field with lines that look like a data block and a text field.
+        let behind_text = format!("{HEAD}{rows}_x.y\n;a\ndata_b\n ;\n;\nloop_\n_entity.id\n_entity.type\n1 polymer\n");
         // The last rows have sequence numbers of water, so those of all others have no meaning.
         let water = HEAD.to_owned() + &rows + &row("HETATM", "O", "HOH", "W", 1, "1");
-        for text in [entities, same_line, two_lines, water] {
+        for text in [entities, same_line, two_lines.clone(), one_line, behind_text, water] {
             let found = blocks(&text, 1000).unwrap_err();
             assert!(matches!(found, StructureError::NotAStream { .. }), "{found}");
             assert!(!whole(&text).is_empty());
         }
+        for size in 1000..1100 {
+            let found = blocks(&two_lines, size).unwrap_err();
+            assert!(matches!(found, StructureError::NotAStream { .. }), "{size}: {found}");
+        }
+        // Controls: values that look like tags.
+        let values = format!("{HEAD}{rows}_x.y\n;a\n_entity.id 1\n;\n_x.z '_entity.id 1' # _entity.id\n");
+        assert_eq!(blocks(&values, 1000).unwrap().0, whole(&values));
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! Partitions of a mesh that several processes compute: each runs the first pass over some tiles of the grid, and one of
-//! them joins the results and writes the mesh.
+//! Partitions of a mesh that several processes compute: each runs the first pass over some tiles of the grid, and one
+//! of them joins the results and writes the mesh.
 
 use std::fmt::Debug;
 
@@ -27,8 +27,11 @@ pub enum PartitionStep {
 
 /// Source of the partitions of one mesh.
 pub trait PartitionSource: Debug + Send + Sync {
-    /// Divides the mesh of this number of spheres, and returns the number of partitions; `None` if this process computes
-    /// all of it, or if a run has begun before.
+    /// Returns true if a run has divided the mesh.
+    fn is_divided(&self) -> bool;
+
+    /// Divides the mesh of this number of spheres, and returns the number of partitions; `None` if this process
+    /// computes all of it, or if a run has begun before.
     fn begin(&self, spheres: usize, params: &SurfaceParams) -> Option<u32>;
 
     /// Waits for the next step. Returns `None` once there has been one for each partition or, in a process that only

@@ -60,7 +60,7 @@ metrics! {
     /// Synchronous requests whose meshes other nodes computed.
     JOBS_TRANSFERRED = "molmesh_jobs_transferred_total", Counter;
     /// Partitions of the shared meshes that this node wrote, computed by it or by helpers on other nodes.
-    PARTITIONS = "molmesh_partitions_total", Counter, computed: "here|elsewhere";
+    PARTITIONS = "molmesh_mesh_partitions_total", Counter, computed: "here|elsewhere";
     /// Claims of jobs whose earlier claim expired or was returned.
     BROKER_REDELIVERIES = "molmesh_broker_redeliveries_total", Counter;
     /// Unfinished asynchronous jobs that were dispatched again, such as those of an earlier process.

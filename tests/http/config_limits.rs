@@ -100,7 +100,7 @@ const ROWS: &[Row] = &[
     ),
     (
         "broker.partition_ms",
-        "molmesh_partitions_total",
+        "molmesh_mesh_partitions_total",
         "http/cluster::a_mesh_that_workers_share_survives_the_loss_of_any_of_them",
     ),
     ("broker.queue", "queue-full", "http/limits::a_full_broker_rejects_jobs_with_retry_after"),

@@ -208,7 +208,7 @@ async fn a_later_attempt_of_another_node_supersedes_an_earlier_one() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn workers_share_a_mesh_and_it_has_the_bytes_of_one_worker() {
     let backend = || Arc::new(CpuBackend::new(Some(1)).unwrap());
-    // Returns the mesh and the number of partitions that helpers have stored.
+    // Returns the mesh and the largest number of partitions in the store.
     let run = async |broker: [Arc<dyn Broker>; 2], time: Option<Duration>, workers: usize| {
         let shared = tempfile::tempdir().unwrap();
         let [a, b] = broker.map(|broker| node_with(shared.path(), broker, backend(), time));
@@ -216,6 +216,13 @@ async fn workers_share_a_mesh_and_it_has_the_bytes_of_one_worker() {
         nodes[..workers].iter().for_each(|node| node.jobs.start_claiming());
         let id = nodes[0].accept("0.25", None).await;
         let mut seen = nodes[0].watch(&id).await;
+        let mut partitions = 0;
+        while !seen.borrow().record.status.is_final() {
+            let stored = nodes[0].store.list(Folder::Results).await.unwrap();
+            let found = stored.iter().filter(|(name, _)| name.to_string().ends_with(".partition")).count();
+            partitions = found.max(partitions);
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
         ended(&mut seen).await;
         let record = seen.borrow().record.clone();
         assert_eq!(record.status, Status::Successful, "{:?}", record.problem);
@@ -225,8 +232,7 @@ async fn workers_share_a_mesh_and_it_has_the_bytes_of_one_worker() {
         for node in &nodes {
             tokio::time::timeout(MAX_WAIT, node.jobs.all_recorded()).await.expect("no job runs any more");
         }
-        let stored = nodes[0].store.list(Folder::Results).await.unwrap();
-        (mesh, stored.iter().filter(|(name, _)| name.to_string().ends_with(".partition")).count())
+        (mesh, partitions)
     };
     let in_process = || {
         let broker = MemoryBroker::new(1000);

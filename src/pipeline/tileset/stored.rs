@@ -26,7 +26,8 @@ pub(super) struct StoredSphere {
     /// Atom of the structure, or the atom that represents a group.
     pub(super) atom: u32,
     pub(super) color: [u8; 4],
-    pub(super) unused: u32,
+    /// Makes the size a multiple of the alignment.
+    pub(super) padding: u32,
 }
 
 /// File of spheres.

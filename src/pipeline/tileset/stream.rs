@@ -103,7 +103,7 @@ impl BlockReader<'_> {
             let atom = u32::try_from(order).unwrap_or(u32::MAX);
             let (centre, radius) = (spheres.centre(row), spheres.radius(row));
             let color = colors.as_ref().map_or([0; 4], |colors| colors[row]);
-            self.index.push(StoredSphere { centre, order, radius, atom, color, unused: 0 })?;
+            self.index.push(StoredSphere { centre, order, radius, atom, color, padding: 0 })?;
         }
         if self.head.is_none() {
             let radii = block.structure.radii_name();
@@ -134,7 +134,7 @@ impl Tileset<Box<Structure>> {
         }
         let buffer = BUFFERED_BLOCKS * stream.block_bytes;
         let index = SphereIndex::new(&file, side, buffer, control)?;
-        let (selected, colors) = (SelectedBlocks::default(), job.color.map(BlockColors::new));
+        let (selected, colors) = (SelectedBlocks::new(control), job.color.map(BlockColors::new));
         let mut reader = BlockReader { job, limits, selected, colors, index, head: None };
         let needs_secondary = job.color.is_some_and(|color| color.scheme == Scheme::SecondaryStructure);
         for (number, input) in stream.files.into_iter().enumerate() {

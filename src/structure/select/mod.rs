@@ -1,25 +1,25 @@
 //! Selection of the atoms to mesh: an expression, chains, a model and alternative locations.
 
+mod blocks;
 mod context;
 mod evaluate;
 mod expression;
 mod left_out;
 mod near;
 mod parse;
-mod part;
 mod selected;
 
 use std::collections::HashSet;
 use std::num::NonZeroU32;
 use std::ops::Range;
 
+pub use blocks::SelectedBlocks;
 pub use context::Context;
 use evaluate::{Evaluation, Marks};
 pub use expression::Expression;
 pub use left_out::LeftOut;
 use left_out::Tally;
 pub use parse::{BadExpression, MAX_DEPTH, MAX_DISTANCE, MAX_WITHIN};
-pub use part::SelectedBlocks;
 pub use selected::Selected;
 
 use super::altloc::Alternatives;
@@ -160,7 +160,7 @@ struct Found {
 }
 
 impl<'a> Rules<'a> {
-    /// Prepares the selection of atoms of a structure, or of a part of one unless `is_whole`. A part may lack the
+    /// Prepares the selection of atoms of a structure, or of a block of one unless `is_whole`. A block may lack the
     /// model, the chains and the alternative location that are requested.
     fn new(
         structure: &'a Structure,

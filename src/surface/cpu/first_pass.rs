@@ -140,8 +140,8 @@ impl Pass<'_> {
         Ok(tile)
     }
 
-    /// Adds the counts of a partition that another process computed: of the pass, of its vertices and triangles, and its
-    /// number of slabs.
+    /// Adds the counts of a partition that another process computed: of the pass, of its vertices and triangles, and
+    /// its number of slabs.
     ///
     /// # Errors
     /// Returns the error of the first limit that is exceeded.

@@ -93,8 +93,8 @@ impl CpuBackend {
     }
 }
 
-/// Returns the source of partitions of a run, and their number. Called before the first pass is prepared, so that helpers
-/// prepare it at the same time.
+/// Returns the source of partitions of a run, and their number. Called before the first pass is prepared, so that
+/// helpers prepare it at the same time.
 pub(super) fn source(spheres: usize, context: RunContext<'_>) -> Option<(&dyn PartitionSource, u32)> {
     let source = context.control.partitions.as_deref()?;
     Some((source, source.begin(spheres, context.params)?))
@@ -153,20 +153,24 @@ fn join(pass: &Pass<'_>, source: &dyn PartitionSource, count: u32) -> Result<Vec
         };
         let partition = MeshPartition { index, count };
         let tiles = pass.tiles.of_partition(partition);
+        // The bytes, and the lists with the same records.
         let _bytes = control.reserve(bytes.len() as u64)?;
+        let memory = bytes.len() as u64 + TILE_BYTES * tiles.len() as u64;
+        control.memory.grow(memory)?;
         let decoded = decode(&bytes, pass, lattice, partition, &tiles);
         let is_joined = decoded.is_some();
         match decoded {
             Some((counts, joined)) => {
-                let memory = joined.iter().map(|(_, tile)| TILE_BYTES + tile.found.bytes()).sum();
-                control.memory.grow(memory)?;
                 let vertices = joined.iter().map(|(_, tile)| u64::from(tile.found.vertices)).sum();
                 let triangles = joined.iter().map(|(_, tile)| u64::from(tile.found.triangles)).sum();
                 let slabs = pass.slabs.iter().filter(|slab| tiles.contains(&slab.tile)).count();
                 pass.add(&counts, [vertices, triangles], slabs)?;
                 found.extend(joined);
             }
-            None => found.extend(evaluate(pass, &tiles)?),
+            None => {
+                control.memory.shrink(memory);
+                found.extend(evaluate(pass, &tiles)?);
+            }
         }
         source.finished(index, is_joined);
     }
@@ -298,6 +302,10 @@ mod tests {
     }
 
     impl PartitionSource for Steps {
+        fn is_divided(&self) -> bool {
+            self.begun.load(Ordering::SeqCst) > 0
+        }
+
         fn begin(&self, _: usize, _: &SurfaceParams) -> Option<u32> {
             (self.begun.fetch_add(1, Ordering::SeqCst) == 0).then_some(self.count)
         }
@@ -322,7 +330,8 @@ mod tests {
         Spheres::new(column(0.37), column(1.13), column(2.71), vec![1.6; n]).unwrap()
     }
 
-    /// Meshes `spheres` with the partitions that `steps` yields, last one first. Also returns the number of joined ones.
+    /// Meshes `spheres` with the partitions that `steps` yields, last one first. Also returns the number of joined
+    /// ones.
     fn mesh(spheres: &Spheres, params: &SurfaceParams, count: u32, steps: Vec<PartitionStep>) -> (MeshOutput, usize) {
         let source = Steps::new(count, steps);
         let limits = SurfaceLimits::default();

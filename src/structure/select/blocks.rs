@@ -8,13 +8,13 @@ use crate::structure::error::StructureError;
 use crate::structure::read::{ReadLimits, check};
 use crate::structure::stream::Block;
 use crate::structure::text::list;
-use crate::surface::Control;
+use crate::surface::{Control, MemoryMeter as _, Reservation};
 
 /// Model, chain, number and insertion code of a residue.
 type ResidueId = (i32, String, i32, u8);
 
 /// Atoms selected so far. Errors of a whole structure, such as a missing chain, are found at the end.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct SelectedBlocks {
     /// Number of selected atoms.
     pub n_selected: u64,
@@ -29,12 +29,36 @@ pub struct SelectedBlocks {
     alternatives: HashMap<ResidueId, usize>,
     n_blocks: usize,
     first_model: Option<i32>,
+    /// Memory of `alternatives`.
+    memory: Reservation,
 }
 
+/// Memory of a residue with alternative locations, bytes.
+const ALTERNATIVE_BYTES: u64 = 2 * (size_of::<(ResidueId, usize)>() as u64) + 16;
+
 impl SelectedBlocks {
+    /// Creates an empty selection.
+    #[must_use]
+    pub fn new(control: &Control<'_>) -> Self {
+        Self {
+            n_selected: 0,
+            n_atoms: 0,
+            left_out: LeftOut::default(),
+            residues: HashMap::new(),
+            chains: HashSet::new(),
+            models: HashSet::new(),
+            altlocs: HashSet::new(),
+            alternatives: HashMap::new(),
+            n_blocks: 0,
+            first_model: None,
+            memory: Reservation::new(&control.memory),
+        }
+    }
+
     /// Begins a file. Residues of different files are different residues.
     pub fn begin_file(&mut self) {
-        self.alternatives.clear();
+        self.memory.shrink(ALTERNATIVE_BYTES * self.alternatives.len() as u64);
+        self.alternatives = HashMap::new();
     }
 
     /// Selects atoms of the next block. Returns their indices, ascending.
@@ -90,7 +114,12 @@ impl SelectedBlocks {
             }
             self.altlocs.insert(s.altloc[i]);
             let residue = (s.model[i], s.chain.get(i).to_owned(), s.residue_number[i], s.insertion_code[i]);
-            if *self.alternatives.entry(residue).or_insert(self.n_blocks) != self.n_blocks {
+            let n_known = self.alternatives.len();
+            let block_of_residue = *self.alternatives.entry(residue).or_insert(self.n_blocks);
+            if self.alternatives.len() > n_known {
+                self.memory.grow(ALTERNATIVE_BYTES)?;
+            }
+            if block_of_residue != self.n_blocks {
                 let (chain, number) = (s.chain.get(i), s.residue_number[i]);
                 return Err(StructureError::NotAStream {
                     found: format!("alternative locations of residue {number} of chain `{chain}` in several places"),
@@ -110,7 +139,8 @@ impl SelectedBlocks {
         let missing = |what, requested: String, mut available: Vec<String>| {
             available.sort_unstable();
             let n = available.len();
-            Err(StructureError::NotFound { what, requested, available: list(available, n) })
+            let available = if n == 0 { "none".to_owned() } else { list(available, n) };
+            Err(StructureError::NotFound { what, requested, available })
         };
         let mut names = Vec::new();
         selection.atoms.condition.chains(&mut names);
