@@ -134,7 +134,9 @@ impl Folder {
         let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
         let created: Vec<PathBuf> = path.ancestors().take_while(is_missing).map(Path::to_owned).collect();
         // An interrupt may come while the command waits for its input.
-        created.iter().for_each(|folder| interrupt::stage(folder));
+        for folder in &created {
+            interrupt::stage(folder);
+        }
         fs::create_dir_all(path).map_err(failed)?;
         if fs::read_dir(path).map_err(failed)?.next().is_some() {
             let message = format!("`{}` is not empty", path.display());
@@ -153,7 +155,9 @@ impl Folder {
 
 impl Drop for Folder {
     fn drop(&mut self) {
-        self.created.iter().for_each(|folder| interrupt::keep(folder));
+        for folder in &self.created {
+            interrupt::keep(folder);
+        }
         if self.complete {
             return;
         }

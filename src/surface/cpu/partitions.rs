@@ -159,18 +159,15 @@ fn join(pass: &Pass<'_>, source: &dyn PartitionSource, count: u32) -> Result<Vec
         control.memory.grow(memory)?;
         let decoded = decode(&bytes, pass, lattice, partition, &tiles);
         let is_joined = decoded.is_some();
-        match decoded {
-            Some((counts, joined)) => {
-                let vertices = joined.iter().map(|(_, tile)| u64::from(tile.found.vertices)).sum();
-                let triangles = joined.iter().map(|(_, tile)| u64::from(tile.found.triangles)).sum();
-                let slabs = pass.slabs.iter().filter(|slab| tiles.contains(&slab.tile)).count();
-                pass.add(&counts, [vertices, triangles], slabs)?;
-                found.extend(joined);
-            }
-            None => {
-                control.memory.shrink(memory);
-                found.extend(evaluate(pass, &tiles)?);
-            }
+        if let Some((counts, joined)) = decoded {
+            let vertices = joined.iter().map(|(_, tile)| u64::from(tile.found.vertices)).sum();
+            let triangles = joined.iter().map(|(_, tile)| u64::from(tile.found.triangles)).sum();
+            let slabs = pass.slabs.iter().filter(|slab| tiles.contains(&slab.tile)).count();
+            pass.add(&counts, [vertices, triangles], slabs)?;
+            found.extend(joined);
+        } else {
+            control.memory.shrink(memory);
+            found.extend(evaluate(pass, &tiles)?);
         }
         source.finished(index, is_joined);
     }
