@@ -129,10 +129,10 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
     Ok(all)
 }
 
-/// Writes all files of a tileset as [`write`] does, of a structure that is read as a stream. The job has no assembly.
+/// Writes all files of a tileset as [`write()`] does, of a structure that is read as a stream. The job has no assembly.
 ///
 /// # Errors
-/// Returns the errors of [`write`], and [`JobError::Scratch`].
+/// Returns the errors of [`write()`], and [`JobError::Scratch`].
 pub fn write_stream(
     stream: StructureStream<'_>,
     job: &Job,
