@@ -217,7 +217,9 @@ fn encode(tile: u32, found: &ClassifiedBricks, bytes: &mut Vec<u8>) {
 fn take<T: Pod>(bytes: &mut &[u8], n: u32) -> Option<Vec<T>> {
     let (list, rest) = bytes.split_at_checked(size_of::<T>() * n as usize)?;
     *bytes = rest;
-    Some(bytemuck::pod_collect_to_vec(list))
+    let mut records = vec![T::zeroed(); n as usize];
+    bytemuck::cast_slice_mut::<T, u8>(&mut records).copy_from_slice(list);
+    Some(records)
 }
 
 /// Reads the results of a partition. `None` if they belong to another partition or lattice.
