@@ -27,7 +27,7 @@ pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
     let request = parse(&[("compress", &compress)], &args.job)?;
     tileset::check(&request.job).map_err(|error| refusal(&error))?;
     if args.scratch.is_some() {
-        tileset::check_stream(&request.job).map_err(|error| refusal(&error))?;
+        tileset::check_stream(&request.job, args.inputs.len()).map_err(|error| refusal(&error))?;
         if request.strict {
             return Err(CliError::usage("`--check` reads the whole file; leave it out with `--scratch`"));
         }

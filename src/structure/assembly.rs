@@ -139,7 +139,7 @@ impl Assemblies {
     }
 
     /// Returns the memory of the tables, bytes.
-    pub(super) fn bytes(&self) -> u64 {
+    pub(crate) fn bytes(&self) -> u64 {
         let texts = |g: &Generator| g.assembly.len() + g.expression.len() + g.chains.len() + size_of::<Generator>();
         let generators: usize = self.generators.iter().map(texts).sum();
         // Hash tables are at most seven eighths full and double in size.

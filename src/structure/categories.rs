@@ -170,6 +170,12 @@ impl Categories {
         [0, 2].map(|of| group(item_ix) == of)
     }
 
+    /// Returns true if a tag, without its underscore, belongs to a category that describes assemblies.
+    pub(super) fn is_assembly(tag: &[u8]) -> bool {
+        let category = tag.split(|&b| b == b'.').next().unwrap_or(tag);
+        [GENERATOR, OPERATOR].iter().any(|name| category.eq_ignore_ascii_case(name.as_bytes()))
+    }
+
     /// Removes the values of the group to which the item with index `item_ix` belongs. Returns the name of these data.
     pub(super) fn forget(&mut self, item_ix: usize) -> &'static str {
         let values = self.values.iter_mut().enumerate();

@@ -6,7 +6,7 @@ use std::ops::Range;
 
 use indexmap::IndexMap;
 
-use super::assembly::{BadExpression, Generator, Operator};
+use super::assembly::{Assemblies, BadExpression, Generator, Operator};
 use super::atoms::Structure;
 use super::contents::shown;
 use super::error::StructureError;
@@ -54,35 +54,65 @@ struct RuleChains<'s> {
     chains: Vec<u32>,
 }
 
-/// Assembly that a selection names.
-pub(super) struct Assembly<'s> {
-    structure: &'s Structure,
+/// Rules of an assembly for the chains of a file.
+pub(crate) struct AssemblyRules<'s> {
+    assemblies: &'s Assemblies,
     id: &'s str,
-    /// Column of the chain names that the assemblies of this file use.
-    column: &'s TextColumn,
     parts: Vec<RuleChains<'s>>,
     /// True for chains of the assembly, by id.
     covered: Vec<bool>,
 }
 
-impl<'s> Assembly<'s> {
-    /// Finds an assembly of the file.
+/// Operators that place the chains of an assembly.
+#[derive(Debug)]
+pub(crate) struct Placements {
+    /// Operator of each copy, in the order of the file: by rule and operator.
+    pub(crate) operators: Vec<Operator>,
+    /// Numbers of the chains that each rule copies, ascending, with its copies.
+    pub(crate) rules: Vec<(Vec<u32>, Range<usize>)>,
+}
+
+impl Placements {
+    /// Returns the numbers of the chains in the order of the assembly.
+    pub(crate) fn chains(&self) -> Vec<u32> {
+        self.rules.iter().flat_map(|(chains, _)| chains).copied().collect()
+    }
+
+    /// Returns the copies of each chain, by its number.
+    pub(crate) fn copies_by_chain(&self) -> Vec<Vec<Range<usize>>> {
+        let n = self.chains().into_iter().max().map_or(0, |last| last as usize + 1);
+        let mut by_chain = vec![Vec::new(); n];
+        for (chains, copies) in &self.rules {
+            for chain in chains {
+                by_chain[*chain as usize].push(copies.clone());
+            }
+        }
+        by_chain
+    }
+
+    /// Returns the copies without their atoms.
+    pub(crate) fn copies(&self) -> Vec<PlacedCopy> {
+        self.operators.iter().map(|operator| PlacedCopy { rows: 0..0, operator: *operator }).collect()
+    }
+}
+
+impl<'s> AssemblyRules<'s> {
+    /// Finds an assembly among those of a file. `names` are the names of its chains by number.
     ///
     /// # Errors
     /// Returns [`StructureError::NotFound`] if the file has none with this id, [`StructureError::BadAssembly`] if it
     /// has no atoms of any of its chains.
-    pub(super) fn find(structure: &'s Structure, id: &'s str) -> Result<Self, StructureError> {
-        let column = if structure.label_chain.is_empty() { &structure.chain } else { &structure.label_chain };
-        let ids: HashMap<&str, u32> = column.texts().zip(0..).collect();
+    pub(crate) fn find(assemblies: &'s Assemblies, names: &[&str], id: &'s str) -> Result<Self, StructureError> {
+        let ids: HashMap<&str, u32> = names.iter().copied().zip(0..).collect();
         let part = |generator: &'s Generator| {
             let mut chains: Vec<u32> = generator.chains().filter_map(|name| ids.get(name).copied()).collect();
             chains.sort_unstable();
             chains.dedup();
             RuleChains { generator, chains }
         };
-        let parts: Vec<RuleChains<'s>> = structure.assemblies.generators(id).map(part).collect();
+        let parts: Vec<RuleChains<'s>> = assemblies.generators(id).map(part).collect();
         if parts.is_empty() {
-            let known = structure.assemblies.list(0);
+            let known = assemblies.list(0);
             let n = known.len();
             let names = list(known.into_iter().map(|(id, _)| id.to_owned()), n);
             return Err(StructureError::NotFound {
@@ -91,7 +121,7 @@ impl<'s> Assembly<'s> {
                 available: if n == 0 { "no assemblies".to_owned() } else { format!("the assemblies {names}") },
             });
         }
-        let mut covered = vec![false; column.texts().len()];
+        let mut covered = vec![false; names.len()];
         parts.iter().flat_map(|part| &part.chains).for_each(|&chain| covered[chain as usize] = true);
         if !covered.contains(&true) {
             let named: Vec<String> = parts.iter().flat_map(|part| part.generator.chains()).map(shown).collect();
@@ -99,16 +129,112 @@ impl<'s> Assembly<'s> {
             return Err(StructureError::BadAssembly {
                 id: id.chars().take(40).collect(),
                 found: format!("chains without atoms: {}", list(named, n)),
-                expected: format!("chains of the file: {}", list(column.texts().map(shown), column.texts().len())),
+                expected: format!("chains of the file: {}", list(names.iter().copied().map(shown), names.len())),
             });
         }
-        Ok(Self { structure, id, column, parts, covered })
+        Ok(Self { assemblies, id, parts, covered })
+    }
+
+    /// Returns true if the assembly contains the chain with this number.
+    pub(crate) fn covers(&self, chain: usize) -> bool {
+        self.covered[chain]
+    }
+
+    /// Returns the placements of chains with these numbers of selected atoms.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Assembly::copy`].
+    pub(crate) fn placements(
+        &self,
+        n_atoms: &[u64],
+        limits: &ReadLimits,
+        control: &Control<'_>,
+    ) -> Result<Placements, StructureError> {
+        let has_atoms = |chain: u32| n_atoms[chain as usize] > 0;
+        let (rules, counts) = self.applied(has_atoms, limits)?;
+        let of_rule = |(rule, copies): (&&RuleChains<'_>, &u64)| {
+            copies.saturating_mul(rule.chains.iter().map(|chain| n_atoms[*chain as usize]).sum())
+        };
+        self.check_atoms(rules.iter().zip(&counts).map(of_rule).fold(0, u64::saturating_add), limits)?;
+        control.memory.grow(size_of::<PlacedCopy>() as u64 * counts.iter().sum::<u64>())?;
+        let mut placements = Placements { operators: Vec::new(), rules: Vec::new() };
+        for rule in rules {
+            check(control)?;
+            let first = placements.operators.len();
+            placements.operators.append(&mut self.expand(rule.generator)?);
+            let chains = rule.chains.iter().copied().filter(|chain| has_atoms(*chain)).collect();
+            placements.rules.push((chains, first..placements.operators.len()));
+        }
+        Ok(placements)
+    }
+
+    /// Returns the rules of which some chain has atoms, and their numbers of copies.
+    fn applied(
+        &self,
+        has_atoms: impl Fn(u32) -> bool,
+        limits: &ReadLimits,
+    ) -> Result<(Vec<&RuleChains<'s>>, Vec<u64>), StructureError> {
+        let (mut rules, mut counts) = (Vec::new(), Vec::new());
+        let mut n_copies = 0_u64;
+        for rule in self.parts.iter().filter(|rule| rule.chains.iter().any(|chain| has_atoms(*chain))) {
+            let count = self.assemblies.count(&rule.generator.expression, limits.max_copies);
+            counts.push(count.map_err(|bad| self.bad(bad))?);
+            n_copies = n_copies.saturating_add(counts.last().copied().unwrap_or_default());
+            if n_copies > limits.max_copies {
+                return Err(StructureError::TooManyCopies { id: self.shown(), limit: limits.max_copies });
+            }
+            rules.push(rule);
+        }
+        Ok((rules, counts))
+    }
+
+    /// Checks the number of atoms to mesh, and returns it.
+    fn check_atoms(&self, atoms: u64, limits: &ReadLimits) -> Result<usize, StructureError> {
+        let n = usize::try_from(atoms).unwrap_or(usize::MAX);
+        if n <= limits.max_rows() {
+            return Ok(n);
+        }
+        Err(StructureError::AssemblyTooLarge { id: self.shown(), atoms, limit: limits.max_atoms })
+    }
+
+    /// Returns the operators of a rule.
+    fn expand(&self, generator: &Generator) -> Result<Vec<Operator>, StructureError> {
+        self.assemblies.expand(&generator.expression).map_err(|bad| self.bad(bad))
+    }
+
+    fn bad(&self, BadExpression { found, expected }: BadExpression) -> StructureError {
+        StructureError::BadAssembly { id: self.shown(), found, expected }
+    }
+
+    /// Returns the id, shortened for a message.
+    fn shown(&self) -> String {
+        self.id.chars().take(40).collect()
+    }
+}
+
+/// Assembly that a selection names.
+pub(super) struct Assembly<'s> {
+    structure: &'s Structure,
+    /// Column of the chain names that the assemblies of this file use.
+    column: &'s TextColumn,
+    rules: AssemblyRules<'s>,
+}
+
+impl<'s> Assembly<'s> {
+    /// Finds an assembly of the file.
+    ///
+    /// # Errors
+    /// Returns the errors of [`AssemblyRules::find`].
+    pub(super) fn find(structure: &'s Structure, id: &'s str) -> Result<Self, StructureError> {
+        let column = structure.assembly_chains();
+        let rules = AssemblyRules::find(&structure.assemblies, &column.texts().collect::<Vec<_>>(), id)?;
+        Ok(Self { structure, column, rules })
     }
 
     /// Returns true if the assembly contains the chain of atom `i`.
     #[inline]
     pub(super) fn covers(&self, i: usize) -> bool {
-        self.covered[self.column.id(i) as usize]
+        self.rules.covers(self.column.id(i) as usize)
     }
 
     /// Replaces the selected atoms by their copies, in the order of the file: by rule, operator, chain and atom.
@@ -125,15 +251,15 @@ impl<'s> Assembly<'s> {
     ) -> Result<Selected, StructureError> {
         let mut atoms = selected.atoms;
         let _sorting = self.sort(&mut atoms, control)?;
-        let (rules, counts) = self.rules(&atoms, limits)?;
+        let (rules, counts) = self.applied(&atoms, limits)?;
         let n_copies: u64 = counts.iter().sum();
         let of_rule = |((_, rows), copies): (&AppliedRule<'_>, &u64)| copies.saturating_mul(n_rows(rows));
         let n_atoms = rules.iter().zip(&counts).map(of_rule).fold(0, u64::saturating_add);
-        let capacity = self.check_atoms(n_atoms, limits)?;
+        let capacity = self.rules.check_atoms(n_atoms, limits)?;
         control.memory.grow(4 * n_atoms + size_of::<PlacedCopy>() as u64 * n_copies)?;
         let (mut all, mut copies) = (Vec::with_capacity(capacity), Vec::new());
         for (generator, rows) in rules {
-            for operator in self.expand(generator)? {
+            for operator in self.rules.expand(generator)? {
                 check(control)?;
                 let first = all.len();
                 for rows in &rows {
@@ -160,7 +286,7 @@ impl<'s> Assembly<'s> {
         let _sorting = self.sort(&mut atoms, control)?;
         let (placed, n_instances) = self.rules_by_unit(&atoms, limits)?;
         let n_atoms = placed.keys().map(|rows| n_rows(rows)).fold(0, u64::saturating_add);
-        let capacity = self.check_atoms(n_atoms, limits)?;
+        let capacity = self.rules.check_atoms(n_atoms, limits)?;
         let of_instance = (size_of::<Operator>() + size_of::<[f64; 4]>()) as u64;
         control.memory.grow(4 * n_atoms + of_instance * n_instances)?;
         let (mut all, mut units) = (Vec::with_capacity(capacity), Vec::new());
@@ -172,11 +298,11 @@ impl<'s> Assembly<'s> {
             }
             let mut operators = Vec::new();
             for generator in generators {
-                operators.append(&mut self.expand(generator)?);
+                operators.append(&mut self.rules.expand(generator)?);
             }
             let rotations: Option<Vec<[f64; 4]>> = operators.iter().map(Operator::rotation).collect();
             let rotations = rotations.ok_or_else(|| StructureError::BadAssembly {
-                id: self.shown(),
+                id: self.rules.shown(),
                 found: "an operator that is not a rotation and a translation".to_owned(),
                 expected: "rotations and translations only, for `instances`".to_owned(),
             })?;
@@ -200,7 +326,7 @@ impl<'s> Assembly<'s> {
         let _sorting = self.sort(&mut atoms, control)?;
         let (placed, _) = self.rules_by_unit(&atoms, limits)?;
         let Some((rows, _)) = placed.get_index(number.get() as usize - 1) else {
-            let (n, id) = (placed.len(), self.shown());
+            let (n, id) = (placed.len(), self.rules.shown());
             let available = if n == 1 { "one unit".to_owned() } else { format!("the units 1 to {n}") };
             let available = format!("{available} in assembly {id} with the selected atoms");
             return Err(StructureError::NotFound { what: "unit", requested: number.to_string(), available });
@@ -213,7 +339,7 @@ impl<'s> Assembly<'s> {
     /// Returns the distinct units that have some of `atoms`, which are sorted by chain, and the number of instances of
     /// all units.
     fn rules_by_unit(&self, atoms: &[u32], limits: &ReadLimits) -> Result<(UnitRules<'s>, u64), StructureError> {
-        let (rules, counts) = self.rules(atoms, limits)?;
+        let (rules, counts) = self.applied(atoms, limits)?;
         let mut placed = UnitRules::new();
         for (generator, rows) in rules {
             placed.entry(rows).or_default().push(generator);
@@ -238,59 +364,25 @@ impl<'s> Assembly<'s> {
     }
 
     /// Returns the rules that apply to `atoms`, which are sorted by chain, and their numbers of copies.
-    fn rules(&self, atoms: &[u32], limits: &ReadLimits) -> Result<(Vec<AppliedRule<'s>>, Vec<u64>), StructureError> {
+    fn applied(&self, atoms: &[u32], limits: &ReadLimits) -> Result<(Vec<AppliedRule<'s>>, Vec<u64>), StructureError> {
         let rows = self.rows_of_chains(atoms);
-        let (mut rules, mut counts) = (Vec::new(), Vec::new());
-        let mut n_copies = 0_u64;
-        for RuleChains { generator, chains } in &self.parts {
-            let rows = chains.iter().map(|&chain| rows[chain as usize].clone());
-            let rows: Vec<Range<usize>> = rows.filter(|rows| !rows.is_empty()).collect();
-            if rows.is_empty() {
-                continue;
-            }
-            let count = self.structure.assemblies.count(&generator.expression, limits.max_copies);
-            counts.push(count.map_err(|bad| self.bad(bad))?);
-            n_copies = n_copies.saturating_add(counts.last().copied().unwrap_or_default());
-            if n_copies > limits.max_copies {
-                return Err(StructureError::TooManyCopies { id: self.shown(), limit: limits.max_copies });
-            }
-            rules.push((*generator, rows));
-        }
-        Ok((rules, counts))
-    }
-
-    /// Checks the number of atoms to mesh, and returns it.
-    fn check_atoms(&self, atoms: u64, limits: &ReadLimits) -> Result<usize, StructureError> {
-        let n = usize::try_from(atoms).unwrap_or(usize::MAX);
-        if n <= limits.max_rows() {
-            return Ok(n);
-        }
-        Err(StructureError::AssemblyTooLarge { id: self.shown(), atoms, limit: limits.max_atoms })
-    }
-
-    /// Returns the operators of a rule.
-    fn expand(&self, generator: &Generator) -> Result<Vec<Operator>, StructureError> {
-        self.structure.assemblies.expand(&generator.expression).map_err(|bad| self.bad(bad))
-    }
-
-    fn bad(&self, BadExpression { found, expected }: BadExpression) -> StructureError {
-        StructureError::BadAssembly { id: self.shown(), found, expected }
+        let (rules, counts) = self.rules.applied(|chain| !rows[chain as usize].is_empty(), limits)?;
+        let of_rule = |rule: &RuleChains<'s>| {
+            let rows = rule.chains.iter().map(|&chain| rows[chain as usize].clone());
+            (rule.generator, rows.filter(|rows| !rows.is_empty()).collect())
+        };
+        Ok((rules.into_iter().map(of_rule).collect(), counts))
     }
 
     /// Returns the rows of each chain in `atoms`, which are sorted by chain.
     fn rows_of_chains(&self, atoms: &[u32]) -> Vec<Range<usize>> {
-        let mut rows = vec![0..0; self.covered.len()];
+        let mut rows = vec![0..0; self.column.texts().len()];
         let mut first = 0;
         for chain in atoms.chunk_by(|&a, &b| self.column.id(a as usize) == self.column.id(b as usize)) {
             rows[self.column.id(chain[0] as usize) as usize] = first..first + chain.len();
             first += chain.len();
         }
         rows
-    }
-
-    /// Returns the id, shortened for a message.
-    fn shown(&self) -> String {
-        self.id.chars().take(40).collect()
     }
 }
 

@@ -58,12 +58,14 @@ pub use archive::{Archive, ArchiveError, EntryId, Opened, Stamp};
 pub use assembly::{Assemblies, Operator};
 pub use atoms::{SourceFormat, Structure};
 pub use contents::{Contents, Kind};
+pub(crate) use copies::{AssemblyRules, Placements};
 pub use copies::{PlacedCopy, Unit};
 pub use error::StructureError;
 pub use kind_set::KindSet;
 pub use read::{ReadLimits, read, read_with};
 pub use select::{
-    BadExpression, Context, Expression, LeftOut, ModelChoice, Selected, SelectedBlocks, Selection, select, select_with,
+    BadExpression, Context, Expression, LeftOut, ModelChoice, Selected, SelectedBlocks, SelectedOfBlock, Selection,
+    select, select_with,
 };
 pub use split::{AtomPart, Split};
 pub use survey::{Survey, survey};

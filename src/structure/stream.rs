@@ -104,6 +104,8 @@ pub struct Blocks<'a> {
     /// True to reject helices and strands after the atoms.
     needs_secondary: bool,
     tags: TagsAfterAtoms,
+    /// Assemblies of the file, after the last block.
+    assemblies: Assemblies,
 }
 
 impl<'a> Blocks<'a> {
@@ -133,6 +135,7 @@ impl<'a> Blocks<'a> {
             hetero: HeteroBlocks::default(),
             needs_secondary,
             tags: TagsAfterAtoms::default(),
+            assemblies: Assemblies::default(),
         };
         let mut size = STEP;
         loop {
@@ -170,7 +173,8 @@ impl<'a> Blocks<'a> {
             self.finished = true;
             self.fill(usize::MAX, control)?;
             let reading = Reading::new(&self.limits, control);
-            let structure = of_text(without_mark(&self.text), &reading)?;
+            let mut structure = of_text(without_mark(&self.text), &reading)?;
+            self.assemblies = std::mem::take(&mut structure.assemblies);
             return Ok(Some(Block { len: structure.len(), structure }));
         };
         let mut size = self.block_bytes;
@@ -225,6 +229,11 @@ impl<'a> Blocks<'a> {
         }
     }
 
+    /// Takes the assemblies of the file, after the last block. The caller charges their memory.
+    pub fn take_assemblies(&mut self) -> Assemblies {
+        std::mem::take(&mut self.assemblies)
+    }
+
     /// Reads until the text has `size` bytes, or the input ends.
     fn fill(&mut self, size: usize, control: &Control<'_>) -> Result<(), StructureError> {
         while !self.at_end && self.text.len() < size {
@@ -258,22 +267,30 @@ impl<'a> Blocks<'a> {
                 "HETATM records with `label_seq_id` of chains whose entity is unknown, and none without, or water with";
             return Err(not_a_stream(found, "the categories `entity` and `struct_asym` before the atoms"));
         }
-        self.text.drain(..end);
-        loop {
+        let head = self.head.unwrap_or(0);
+        self.text.drain(head..end);
+        self.memory.grow(head as u64)?;
+        self.tags.assemblies = self.text[..head].to_vec();
+        // Ends the loop of the atoms, which has no rows here.
+        self.tags.assemblies.extend_from_slice(b"\nsave_\n");
+        self.text.drain(..head);
+        let mut is_last = false;
+        while !is_last {
             check(control)?;
             let whole =
                 if self.at_end { self.text.len() } else { memchr::memrchr(b'\n', &self.text).map_or(0, |i| i + 1) };
+            let kept = self.tags.assemblies.len();
             for line in self.text[..whole].split_inclusive(|&b| b == b'\n') {
-                if self.tags.is_last(line, self.needs_secondary)? {
-                    return Ok(());
-                }
+                is_last = is_last || self.tags.is_last(line, self.needs_secondary)?;
             }
-            if self.at_end {
-                return Ok(());
-            }
+            self.memory.grow((self.tags.assemblies.len() - kept) as u64)?;
+            is_last |= self.at_end;
             self.text.drain(..whole);
             self.fill(self.text.len() + 1, control)?;
         }
+        let reading = Reading::new(&self.limits, control);
+        self.assemblies = mmcif::assemblies(without_mark(&self.tags.assemblies), &reading)?;
+        Ok(())
     }
 
     /// Converts the error of a block that more rows follow. A row that does not end within the block has several lines.
@@ -300,6 +317,12 @@ impl<'a> Blocks<'a> {
 #[derive(Default)]
 struct TagsAfterAtoms {
     in_text_field: bool,
+    /// Text before the atoms, and the categories after them that describe assemblies.
+    assemblies: Vec<u8>,
+    /// True in such a category.
+    in_assemblies: bool,
+    /// True after `loop_`.
+    begins_loop: bool,
 }
 
 impl TagsAfterAtoms {
@@ -308,20 +331,40 @@ impl TagsAfterAtoms {
         let delimits = line.first() == Some(&b';');
         let is_value = self.in_text_field != delimits;
         self.in_text_field = is_value;
+        if self.in_assemblies && (is_value || delimits) {
+            self.assemblies.extend_from_slice(if is_value { line } else { b";" });
+        }
         if is_value {
             return Ok(false);
         }
         // Behind the semicolon that ends a text field.
         let text = &line[usize::from(delimits)..];
         let mut tokens = Tokenizer::new(text);
-        // The values after the atoms are not read, so faults of theirs do not matter.
+        // The other values after the atoms are not read, so faults of theirs do not matter.
         while let Ok(token) = tokens.next() {
+            let word = &text[token.start..token.end];
             match token.kind {
                 TokenKind::End => break,
                 TokenKind::Data => return Ok(true),
-                TokenKind::Tag => check_tag(&text[token.start + 1..token.end], needs_secondary)?,
-                _ => {}
+                TokenKind::Tag => {
+                    check_tag(&word[1..], needs_secondary)?;
+                    self.in_assemblies = Categories::is_assembly(&word[1..]);
+                    if self.in_assemblies && self.begins_loop {
+                        self.assemblies.extend_from_slice(b" loop_");
+                    }
+                }
+                TokenKind::Value => {}
+                _ => self.in_assemblies = false,
             }
+            self.begins_loop = token.kind == TokenKind::Loop;
+            if self.in_assemblies {
+                // No value begins a line, because a semicolon there would begin a text field.
+                self.assemblies.push(b' ');
+                self.assemblies.extend_from_slice(word);
+            }
+        }
+        if self.in_assemblies {
+            self.assemblies.push(b'\n');
         }
         Ok(false)
     }
@@ -470,12 +513,12 @@ mod tests {
                     let (mut selected, mut found) = (SelectedBlocks::new(&control), Vec::new());
                     while let Some(block) = blocks.next(&control).unwrap() {
                         let first = u32::try_from(selected.n_atoms).unwrap();
-                        let atoms = selected.add(&block, &selection, &limits, &control).unwrap();
-                        found.extend(atoms.into_iter().map(|i| first + i));
+                        let of_block = selected.add(&block, &selection, &limits, &control).unwrap();
+                        found.extend(of_block.atoms.into_iter().map(|i| first + i));
                         n_blocks += 1;
                     }
                     let n_atoms = selected.n_atoms;
-                    let ended = selected.finish(&selection).unwrap();
+                    let ended = selected.finish(&selection, None).unwrap();
                     assert!(found == expected.atoms, "{} {atoms} {size}", path.display());
                     assert_eq!((ended.left_out, ended.model), (expected.left_out.clone(), expected.model));
                     assert_eq!(n_atoms, structure.len() as u64);

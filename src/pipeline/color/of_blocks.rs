@@ -2,8 +2,10 @@
 
 use indexmap::IndexSet;
 
-use super::{AtomColors, ColorError, ColorReport, Coloring, MAX_ENTRIES, Scheme};
+use super::{AtomColors, ColorError, ColorReport, Coloring, LegendEntry, MAX_ENTRIES, Scheme};
+use crate::pipeline::JobError;
 use crate::structure::Structure;
+use crate::surface::{Control, MemoryMeter as _, Reservation, SurfaceError};
 
 /// Colours of the blocks so far.
 pub(in super::super) struct BlockColors {
@@ -11,48 +13,75 @@ pub(in super::super) struct BlockColors {
     /// Names of chains or entities, in order of first appearance.
     names: IndexSet<String>,
     report: Option<ColorReport>,
+    /// Categories of each group of atoms, in order of first appearance.
+    legends: Vec<Vec<LegendEntry>>,
+    memory: Reservation,
 }
 
+/// Memory of a category, bytes.
+const ENTRY_BYTES: u64 = 2 * (size_of::<LegendEntry>() as u64) + 32;
+
 impl BlockColors {
-    pub(in super::super) fn new(coloring: Coloring) -> Self {
-        Self { coloring, names: IndexSet::new(), report: None }
+    pub(in super::super) fn new(coloring: Coloring, control: &Control<'_>) -> Self {
+        let memory = Reservation::new(&control.memory);
+        Self { coloring, names: IndexSet::new(), report: None, legends: Vec::new(), memory }
     }
 
-    /// Returns the colours of the `selected` atoms of the next block.
+    /// Returns the colours of the `selected` atoms of the next block. `groups` are the numbers of their groups.
     ///
     /// # Errors
-    /// Returns [`ColorError`] if the values of the scheme are missing.
+    /// Returns [`ColorError`] if the values of the scheme are missing, and the errors of memory.
     pub(in super::super) fn add(
         &mut self,
         structure: &Structure,
         selected: &[u32],
-    ) -> Result<Vec<[u8; 4]>, ColorError> {
+        groups: &[u32],
+    ) -> Result<Vec<[u8; 4]>, JobError> {
         let colors = AtomColors::numbered(structure, selected, &self.coloring, &mut self.names)?;
-        let new = colors.report(selected);
-        match &mut self.report {
-            None => self.report = Some(new),
-            Some(report) => {
-                for entry in new.legend {
-                    let is_known = report.legend.iter().any(|known| known.label == entry.label);
-                    if !is_known && report.legend.len() < MAX_ENTRIES {
-                        report.legend.push(entry);
-                    }
-                }
+        let mut first = 0;
+        for run in groups.chunk_by(|a, b| a == b) {
+            let group = run[0] as usize;
+            if self.legends.len() <= group {
+                self.memory.grow(ENTRY_BYTES * (group + 1 - self.legends.len()) as u64).map_err(SurfaceError::from)?;
+                self.legends.resize(group + 1, Vec::new());
             }
+            let mut report = colors.report(&selected[first..first + run.len()]);
+            let n_known = self.legends[group].len();
+            add_new(&mut self.legends[group], std::mem::take(&mut report.legend));
+            let n_new = (self.legends[group].len() - n_known) as u64;
+            self.memory.grow(ENTRY_BYTES * n_new).map_err(SurfaceError::from)?;
+            self.report = Some(report);
+            first += run.len();
         }
         Ok(selected.iter().map(|&i| colors.of(i as usize)).collect())
     }
 
-    /// Returns the report of all blocks.
+    /// Returns the report of all blocks. The legend has the categories in the order of `groups`.
     ///
     /// # Errors
     /// Returns [`ColorError`] if no block has an entity.
-    pub(in super::super) fn finish(self) -> Result<(Coloring, ColorReport), ColorError> {
+    pub(in super::super) fn finish(
+        mut self,
+        groups: impl Iterator<Item = u32>,
+    ) -> Result<(Coloring, ColorReport), ColorError> {
         match self.report {
-            Some(report) if self.coloring.scheme != Scheme::Entity || !self.names.is_empty() => {
+            Some(mut report) if self.coloring.scheme != Scheme::Entity || !self.names.is_empty() => {
+                for group in groups {
+                    let legend = self.legends.get_mut(group as usize).map(std::mem::take);
+                    add_new(&mut report.legend, legend.unwrap_or_default());
+                }
                 Ok((self.coloring, report))
             }
             _ => Err(without_entities()),
+        }
+    }
+}
+
+/// Adds the entries to a legend that it lacks.
+fn add_new(legend: &mut Vec<LegendEntry>, entries: Vec<LegendEntry>) {
+    for entry in entries {
+        if legend.len() < MAX_ENTRIES && legend.iter().all(|known| known.label != entry.label) {
+            legend.push(entry);
         }
     }
 }

@@ -20,7 +20,7 @@ const RUN_BYTES: u64 = 16;
 #[repr(C)]
 pub(super) struct StoredSphere {
     pub(super) centre: [f64; 3],
-    /// Order of the spheres of a level.
+    /// Order of the spheres of a level, before that of their atoms.
     pub(super) order: u64,
     pub(super) radius: f32,
     /// Atom of the structure, or the atom that represents a group.
@@ -28,6 +28,13 @@ pub(super) struct StoredSphere {
     pub(super) color: [u8; 4],
     /// Makes the size a multiple of the alignment.
     pub(super) padding: u32,
+}
+
+impl StoredSphere {
+    /// Returns the key that sorts the spheres of a level.
+    pub(super) const fn key(&self) -> (u64, u32) {
+        (self.order, self.atom)
+    }
 }
 
 /// File of spheres.
@@ -67,6 +74,55 @@ fn failure(error: &io::Error) -> JobError {
     JobError::Scratch { reason: error.to_string() }
 }
 
+/// Spheres in a file, in the order in which they were added.
+#[derive(Debug)]
+pub(super) struct SphereList {
+    file: Arc<SphereFile>,
+    /// Offsets and lengths of the parts in the file.
+    runs: Vec<(u64, u32)>,
+    buffer: Vec<StoredSphere>,
+    memory: Reservation,
+}
+
+/// Number of spheres in a part of a list.
+const RUN: usize = 1 << 14;
+
+impl SphereList {
+    /// Creates an empty list.
+    pub(super) fn new(file: &Arc<SphereFile>, control: &Control<'_>) -> Result<Self, JobError> {
+        let memory = control.reserve((RUN * size_of::<StoredSphere>()) as u64).map_err(SurfaceError::from)?;
+        Ok(Self { file: Arc::clone(file), runs: Vec::new(), buffer: Vec::with_capacity(RUN), memory })
+    }
+
+    /// Adds a sphere.
+    pub(super) fn push(&mut self, sphere: StoredSphere) -> Result<(), JobError> {
+        self.buffer.push(sphere);
+        if self.buffer.len() < RUN { Ok(()) } else { self.flush() }
+    }
+
+    fn flush(&mut self) -> Result<(), JobError> {
+        self.memory.grow(RUN_BYTES).map_err(SurfaceError::from)?;
+        let length = u32::try_from(self.buffer.len()).unwrap_or(u32::MAX);
+        self.runs.push((self.file.append(&self.buffer)?, length));
+        self.buffer.clear();
+        Ok(())
+    }
+
+    /// Calls `visit` with the spheres, in parts.
+    pub(super) fn each_run(
+        mut self,
+        mut visit: impl FnMut(&[StoredSphere]) -> Result<(), JobError>,
+    ) -> Result<(), JobError> {
+        self.flush()?;
+        for (offset, length) in self.runs {
+            self.buffer.resize(length as usize, StoredSphere::default());
+            self.file.read(offset, &mut self.buffer)?;
+            visit(&self.buffer)?;
+        }
+        Ok(())
+    }
+}
+
 /// Spheres in a cube: runs in the file, as offset and length, and those that are not written yet.
 #[derive(Debug, Default)]
 struct StoredCube {
@@ -85,6 +141,8 @@ pub(super) struct SphereIndex {
     latest: ([i64; 3], usize),
     cubes: Vec<StoredCube>,
     n_buffered: usize,
+    /// Number of spheres.
+    pub(super) len: u64,
     /// Bytes of spheres in memory before they are written.
     buffer_bytes: usize,
     /// Smallest and largest radius, Å.
@@ -113,6 +171,7 @@ impl SphereIndex {
             latest: ([i64::MIN; 3], 0),
             cubes: Vec::new(),
             n_buffered: 0,
+            len: 0,
             buffer_bytes,
             radii: [f32::MAX, 0.0],
             bounds: [[f64::MAX; 3], [f64::MIN; 3]],
@@ -139,6 +198,7 @@ impl SphereIndex {
         }
         self.cubes[self.latest.1].buffer.push(sphere);
         self.n_buffered += 1;
+        self.len += 1;
         if self.n_buffered * size_of::<StoredSphere>() >= self.buffer_bytes { self.flush() } else { Ok(()) }
     }
 
@@ -200,7 +260,7 @@ impl SphereIndex {
         let cubes: Vec<usize> = cubes.filter_map(|cube| self.numbers.get(&cube).copied()).collect();
         let (mut found, memory) = self.read(&cubes, control)?;
         found.retain(|sphere| (0..3).all(|k| (low[k]..=high[k]).contains(&sphere.centre[k])));
-        found.sort_unstable_by_key(|sphere| sphere.order);
+        found.sort_unstable_by_key(StoredSphere::key);
         Ok((found, memory))
     }
 

@@ -10,21 +10,21 @@ use super::Tileset;
 use super::layout::{CELLS, Layout};
 use super::level::{GROUP_ABOVE, MIN_BUCKET, cube, group_of};
 use super::source::{LevelSource, Streamed};
-use super::stored::{SphereFile, SphereIndex, StoredSphere};
+use super::stored::{SphereFile, SphereIndex, SphereList, StoredSphere};
 use crate::formats::tileset::TileAddress;
 use crate::pipeline::color::{BlockColors, Scheme};
 use crate::pipeline::load::SPHERE_BYTES;
 use crate::pipeline::params::ParamError;
 use crate::pipeline::{Job, JobError, StageClock};
 use crate::structure::stream::{Block, Blocks, check_positions};
-use crate::structure::{ReadLimits, SelectedBlocks, Structure};
+use crate::structure::{Assemblies, AssemblyRules, Placements, ReadLimits, SelectedBlocks, SelectedOfBlock, Structure};
 use crate::surface::clip::influence_of;
 use crate::surface::{Control, Reservation, Spheres, SurfaceError, SurfaceParams};
 
 /// Buffer of the index, in blocks.
 const BUFFERED_BLOCKS: usize = 4;
 /// Memory of selecting and colouring an atom of a block, bytes.
-const SELECT_BYTES: u64 = 16 + SPHERE_BYTES;
+const SELECT_BYTES: u64 = 20 + SPHERE_BYTES;
 /// Memory of an atom while it is grouped, bytes.
 const SORT_BYTES: u64 = 40;
 /// Number of coordinates of groups along an axis, a power of two: spacings are above 2.5 Å.
@@ -42,18 +42,19 @@ pub struct StructureStream<'a> {
     pub began: &'a dyn Fn(usize),
 }
 
-/// Rejects parameters of a job that need the whole structure in memory.
+/// Rejects parameters of a job that need the whole structure in memory, or do not apply to several files.
 ///
 /// # Errors
 /// Returns [`ParamError::BadValue`].
-pub fn check_stream(job: &Job) -> Result<(), ParamError> {
+pub fn check_stream(job: &Job, n_files: usize) -> Result<(), ParamError> {
     let selection = &job.selection;
     let of_range = |scheme| matches!(scheme, Scheme::BFactor | Scheme::Occupancy);
     let when = |is_refused: bool, value: String| is_refused.then_some(value);
     let color = job.color.map(|color| (color.scheme, color.range.is_some()));
     let refused = [
         ("select", when(selection.atoms.has_within(), selection.atoms.to_string()), "an expression without `within`"),
-        ("assembly", selection.assembly.clone(), "no value"),
+        ("assembly", selection.assembly.clone().filter(|_| n_files > 1), "no value for several files, or one file"),
+        ("instances", when(selection.instances, "true".to_owned()), "false"),
         ("detail", job.spacing.detail().map(|level| level.to_string()), "a `resolution` instead"),
         (
             "color",
@@ -75,35 +76,76 @@ pub fn check_stream(job: &Job) -> Result<(), ParamError> {
     }
 }
 
-/// Blocks that are added to the index.
+/// Spheres of the blocks so far.
+enum ReadSpheres {
+    /// Index of all spheres.
+    Index(SphereIndex),
+    /// Atoms of the file in which an assembly is found, with the number of their chain as their order.
+    Distinct(SphereList),
+}
+
+/// Reader of the blocks of a stream.
 struct BlockReader<'a> {
     job: &'a Job,
     limits: &'a ReadLimits,
     selected: SelectedBlocks,
     colors: Option<BlockColors>,
-    index: SphereIndex,
+    spheres: ReadSpheres,
     /// Description of the first file, without its atoms, and the source of its radii.
     head: Option<(Structure, &'static str)>,
+    /// Assemblies of the latest file.
+    assemblies: Assemblies,
 }
 
 impl BlockReader<'_> {
+    /// Adds the atoms of a file. Reads blocks of about `block_bytes`.
+    fn read(
+        &mut self,
+        input: Box<dyn Read + Send + '_>,
+        block_bytes: usize,
+        control: &Control<'_>,
+        clock: &StageClock<'_>,
+    ) -> Result<(), JobError> {
+        self.selected.begin_file();
+        let needs_secondary = self.job.color.is_some_and(|color| color.scheme == Scheme::SecondaryStructure);
+        let open = || Blocks::new(input, block_bytes, needs_secondary, self.limits, control);
+        let mut blocks = clock.time("read", open)?;
+        loop {
+            // Releases the memory of the block.
+            let of_block = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+            let Some(mut block) = clock.time("read", || blocks.next(&of_block))? else { break };
+            clock.time("select", || self.add(&mut block, &of_block))?;
+        }
+        self.assemblies = blocks.take_assemblies();
+        control.memory.grow(self.assemblies.bytes()).map_err(SurfaceError::from)?;
+        Ok(())
+    }
+
     /// Adds the atoms of a block.
     fn add(&mut self, block: &mut Block, control: &Control<'_>) -> Result<(), JobError> {
         control.memory.grow(SELECT_BYTES * block.len as u64).map_err(SurfaceError::from)?;
         let first = self.selected.n_atoms;
-        let atoms = self.selected.add(block, &self.job.selection, self.limits, control)?;
+        let SelectedOfBlock { atoms, mut chains } =
+            self.selected.add(block, &self.job.selection, self.limits, control)?;
+        if matches!(self.spheres, ReadSpheres::Index(_)) {
+            // The order of the atoms is that of the file.
+            chains.fill(0);
+        }
         let structure = &block.structure;
-        let colors = self.colors.as_mut().map(|colors| colors.add(structure, &atoms)).transpose()?;
+        let colors = self.colors.as_mut().map(|colors| colors.add(structure, &atoms, &chains)).transpose()?;
         let column = |column: &[f64]| atoms.iter().map(|&i| column[i as usize]).collect();
         let radii = atoms.iter().map(|&i| structure.vdw_radius(i as usize)).collect();
         let spheres = Spheres::new(column(&structure.x), column(&structure.y), column(&structure.z), radii)?;
         for (row, i) in atoms.iter().enumerate() {
-            let order = first + u64::from(*i);
             // The number of atoms is limited to 32 bits.
-            let atom = u32::try_from(order).unwrap_or(u32::MAX);
-            let (centre, radius) = (spheres.centre(row), spheres.radius(row));
+            let atom = u32::try_from(first + u64::from(*i)).unwrap_or(u32::MAX);
+            let (centre, radius, order) = (spheres.centre(row), spheres.radius(row), chains[row].into());
             let color = colors.as_ref().map_or([0; 4], |colors| colors[row]);
-            self.index.push(StoredSphere { centre, order, radius, atom, color, padding: 0 })?;
+            let sphere = StoredSphere { centre, order, radius, atom, color, padding: 0 };
+            match &mut self.spheres {
+                ReadSpheres::Index(index) => index.push(sphere)?,
+                ReadSpheres::Distinct(list) => list.push(sphere)?,
+            }
         }
         if self.head.is_none() {
             let radii = block.structure.radii_name();
@@ -133,37 +175,77 @@ impl Tileset<Box<Structure>> {
             side *= 0.5;
         }
         let buffer = BUFFERED_BLOCKS * stream.block_bytes;
-        let index = SphereIndex::new(&file, side, buffer, control)?;
-        let (selected, colors) = (SelectedBlocks::new(control), job.color.map(BlockColors::new));
-        let mut reader = BlockReader { job, limits, selected, colors, index, head: None };
-        let needs_secondary = job.color.is_some_and(|color| color.scheme == Scheme::SecondaryStructure);
+        let new_index = || SphereIndex::new(&file, side, buffer, control);
+        let is_assembly = job.selection.assembly.is_some();
+        let spheres = if is_assembly {
+            ReadSpheres::Distinct(SphereList::new(&file, control)?)
+        } else {
+            ReadSpheres::Index(new_index()?)
+        };
+        let (selected, colors) =
+            (SelectedBlocks::new(control), job.color.map(|coloring| BlockColors::new(coloring, control)));
+        let assemblies = Assemblies::default();
+        let mut reader = BlockReader { job, limits, selected, colors, spheres, head: None, assemblies };
         for (number, input) in stream.files.into_iter().enumerate() {
             (stream.began)(number);
-            reader.selected.begin_file();
-            let open = || Blocks::new(input, stream.block_bytes, needs_secondary, limits, control);
-            let mut blocks = clock.time("read", open)?;
-            loop {
-                // Releases the memory of the block.
-                let of_block = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
-                let Some(mut block) = clock.time("read", || blocks.next(&of_block))? else { break };
-                clock.time("select", || reader.add(&mut block, &of_block))?;
-            }
+            reader.read(input, stream.block_bytes, control, clock)?;
         }
-        let BlockReader { selected, colors, index, head, .. } = reader;
-        let (n_atoms, atoms_in_file) = (selected.n_selected, selected.n_atoms);
-        let selected = selected.finish(&job.selection)?;
-        let colors = colors.map(BlockColors::finish).transpose()?;
+        let BlockReader { selected, colors, spheres, head, assemblies, .. } = reader;
+        let atoms_in_file = selected.n_atoms;
+        let assembly = match &job.selection.assembly {
+            Some(id) => Some(AssemblyRules::find(&assemblies, &selected.chain_names(), id)?),
+            None => None,
+        };
+        let n_of_chains = selected.n_of_chains();
+        let mut selected = selected.finish(&job.selection, assembly.as_ref())?;
+        let placements = assembly.map(|assembly| assembly.placements(&n_of_chains, limits, control)).transpose()?;
+        let groups = placements.as_ref().map_or_else(|| vec![0], Placements::chains);
+        let colors = colors.map(|colors| colors.finish(groups.into_iter())).transpose()?;
         let Some((structure, radii)) = head else { return Err(SurfaceError::NoSpheres.into()) };
         clock.time("index", || {
+            let index = match (spheres, &placements) {
+                (ReadSpheres::Index(index), _) => index,
+                (ReadSpheres::Distinct(list), placements) => {
+                    let mut index = new_index()?;
+                    if let Some(placements) = placements {
+                        place(list, placements, &mut index)?;
+                        selected.copies = placements.copies();
+                    }
+                    index
+                }
+            };
             let index = Arc::new(index.finish()?);
             check_duplicates(&index, limits, control)?;
             params.check_radius(index.radii[0])?;
             let layout = Layout::new(index.bounds, influence_of(index.radii[1], &params), params.resolution);
             let (levels, tiles) = layout.index_of(&index, &file, buffer, &params, control)?;
-            let streamed = Some(Streamed { n_atoms, atoms_in_file, radii, colors });
+            let streamed = Some(Streamed { n_atoms: index.len, atoms_in_file, radii, colors });
             Ok(Self { structure: Box::new(structure), layout, levels, tiles, selected, streamed })
         })
     }
+}
+
+/// Adds the copies of atoms that form an assembly to an index. Their order is that of the copies, then of the chains.
+fn place(list: SphereList, placements: &Placements, index: &mut SphereIndex) -> Result<(), JobError> {
+    let by_chain = placements.copies_by_chain();
+    list.each_run(|spheres| {
+        for chain in spheres.chunk_by(|a, b| a.order == b.order) {
+            let number = chain[0].order;
+            for copy in by_chain.get(number as usize).into_iter().flatten().cloned().flatten() {
+                let operator = &placements.operators[copy];
+                let moved: Vec<[f64; 3]> = chain.iter().map(|sphere| operator.apply(sphere.centre)).collect();
+                let column = |k: usize| moved.iter().map(|at| at[k]).collect();
+                // Rejects coordinates out of range.
+                let radii = chain.iter().map(|sphere| sphere.radius).collect();
+                let moved = Spheres::new(column(0), column(1), column(2), radii)?;
+                for (row, sphere) in chain.iter().enumerate() {
+                    let order = (copy as u64) << 32 | number;
+                    index.push(StoredSphere { centre: moved.centre(row), order, ..*sphere })?;
+                }
+            }
+        }
+        Ok(())
+    })
 }
 
 /// Returns the edge length, Å, of the cubes that determine the order of groups of atoms in memory.
@@ -208,7 +290,7 @@ fn grouped(
         let (mut spheres, _memory) = atoms.read(&cubes, control)?;
         let cell = |sphere: &StoredSphere| cube(sphere.centre, spacing);
         let _sorting = control.reserve(SORT_BYTES * spheres.len() as u64).map_err(SurfaceError::from)?;
-        spheres.sort_by_cached_key(|sphere| (cell(sphere), sphere.order));
+        spheres.sort_by_cached_key(|sphere| (cell(sphere), sphere.key()));
         for group in spheres.chunk_by(|a, b| cell(a) == cell(b)) {
             let atom = |i: usize| (group[i].centre, group[i].radius);
             let (centre, radius, nearest) = group_of(group.len(), atom, params, spacing);
@@ -340,7 +422,7 @@ mod tests {
 
     /// Returns the files of the tileset of a stream.
     fn streamed(texts: &[&str], block_bytes: usize, job: &Job) -> Result<Written, String> {
-        check_stream(job).map_err(|error| error.to_string())?;
+        check_stream(job, texts.len()).map_err(|error| error.to_string())?;
         let (files, limits, control) = (Mutex::default(), JobLimits::default(), Control::default());
         let store = |path: &str, bytes: &[u8]| {
             let files: &Mutex<BTreeMap<_, _>> = &files;
@@ -406,6 +488,98 @@ mod tests {
         assert_ne!(found.0, expected.0);
     }
 
+    /// Categories of an assembly whose rules have another order than the chains of [`copies`].
+    const ASSEMBLY: &str = "loop_\n_pdbx_struct_assembly.id\n_pdbx_struct_assembly.details\n1 'a_b'\nloop_\n\
+        _pdbx_struct_assembly_gen.assembly_id\n_pdbx_struct_assembly_gen.details\n\
+        _pdbx_struct_assembly_gen.oper_expression\n_pdbx_struct_assembly_gen.asym_id_list\n\
+        1 .\n;(1-3)\n;\n Z0,A0w\n2 . 1 A0\n1 '; x' 'P,2'\n;B0,Z0,\nB0w,none\n;\n";
+    const OPERATORS: &str = "loop_\n_pdbx_struct_oper_list.id\n";
+
+    /// Returns the rows of translations 1 to 3, and of `P`, a turn about z.
+    fn operators() -> String {
+        let mut text = OPERATORS.to_owned();
+        for row in 1..4 {
+            (1..4).for_each(|k| writeln!(text, "_pdbx_struct_oper_list.matrix[{row}][{k}]").unwrap());
+            writeln!(text, "_pdbx_struct_oper_list.vector[{row}]").unwrap();
+        }
+        (1..4).for_each(|n| writeln!(text, "{n} 1 0 0 {} 0 1 0 0 0 0 1 {n}", 70 * n - 70).unwrap());
+        text + "P 0 -1 0 0 1 0 0 50 0 0 1 -90.5\n"
+    }
+
+    #[test]
+    fn an_assembly_may_precede_or_follow_the_atoms() {
+        let (head, rows) = copies(6);
+        // The second chain begins before the first one.
+        let second = (rows.len() - 1) / 6;
+        let (before, after) = rows.split_at(second + 200);
+        let rows: Vec<String> = after[..200].iter().chain(before).chain(&after[200..]).cloned().collect();
+        let (atoms, rest) = (rows.concat(), "_x.y 'a' # _entity.id\n_x.z 2\n");
+        let (name, head) = head.split_at("data_x\n".len());
+        let texts = [
+            format!("{name}{ASSEMBLY}{}{head}{atoms}{rest}", operators()),
+            format!("{name}{}{head}{atoms}{rest}{ASSEMBLY}_x.zz 2\n", operators()),
+            format!("{name}{head}{atoms}{rest}{ASSEMBLY}{}#\ndata_y\n{ASSEMBLY}", operators()),
+        ];
+        let all = [("assembly", "1"), ("select", "all")];
+        for (query, n_atoms) in [
+            (&[("resolution", "2"), ("color", "chain"), ("atom_ids", "true")][..], 5 * 454),
+            (&[("resolution", "3"), ("color", "entity")], 5 * 454),
+            (&[("resolution", "1.5"), ("color", "residue"), ("chains", "A0,B0")], 0),
+        ] {
+            let query: Vec<(&str, &str)> = all.iter().chain(query).copied().collect();
+            let job = job(&query);
+            for text in &texts {
+                let expected = in_memory(text, &job);
+                assert!(expected.1.levels.len() > 1 && expected.1.atoms > n_atoms, "{}", expected.1.atoms);
+                for block_bytes in [3000, 20_000, 1 << 24] {
+                    let found = streamed(&[text], block_bytes, &job).unwrap();
+                    assert_same(&found, &expected, &format!("{query:?} {block_bytes}"));
+                }
+            }
+        }
+        // Negative controls: one operator, and the rules twice.
+        let single = streamed(&[&texts[0]], 3000, &job(&[("assembly", "2"), ("resolution", "2")])).unwrap();
+        assert!(single.1.atoms < 500, "{}", single.1.atoms);
+        let other = texts[2].replace("data_y", "");
+        let query = job(&[("assembly", "1"), ("resolution", "2")]);
+        assert_ne!(in_memory(&other, &query).1.atoms, in_memory(&texts[2], &query).1.atoms);
+        assert_same(&streamed(&[&other], 3000, &query).unwrap(), &in_memory(&other, &query), "two tables");
+    }
+
+    #[test]
+    fn assemblies_are_limited_and_missing_ones_rejected() {
+        let (head, rows) = copies(3);
+        let text = head + &rows.concat() + ASSEMBLY + &operators();
+        let of = |id: &str, limits: &ReadLimits| {
+            let job = job(&[("assembly", id), ("resolution", "2")]);
+            let stream = StructureStream {
+                files: vec![Box::new(text.as_bytes())],
+                scratch: tempfile::tempfile().unwrap(),
+                block_bytes: 5000,
+                began: &|_| {},
+            };
+            let made = Tileset::of_stream(stream, &job, limits, &Control::default(), &StageClock::new(&()));
+            let expected = crate::structure::select_with(
+                &read(text.as_bytes(), limits).unwrap(),
+                &job.selection,
+                limits,
+                &Control::default(),
+            );
+            (made.map(|made| made.n_atoms()).map_err(|error| error.to_string()), expected.map(|all| all.atoms.len()))
+        };
+        let limits = ReadLimits::default();
+        let n = of("1", &limits).1.unwrap() as u64;
+        assert_eq!(of("1", &limits).0, Ok(n));
+        for (id, limits) in [
+            ("3", limits),
+            ("1", ReadLimits { max_copies: 4, ..limits }),
+            ("1", ReadLimits { max_atoms: n - 1, ..limits }),
+        ] {
+            let (found, expected) = of(id, &limits);
+            assert_eq!(found.unwrap_err(), expected.unwrap_err().to_string());
+        }
+    }
+
     #[test]
     fn what_needs_the_whole_structure_is_rejected() {
         let (head, rows) = copies(2);
@@ -413,7 +587,8 @@ mod tests {
         let of = |query: &[(&str, &str)]| streamed(&[&text], 3000, &job(query)).unwrap_err();
         for (query, expected) in [
             (&[("select", "within 5 of water")][..], "`select`"),
-            (&[("assembly", "1")], "`assembly`"),
+            (&[("assembly", "1"), ("instances", "true")], "`instances`"),
+            (&[("assembly", "1")], "no assemblies"),
             (&[("detail", "2")], "`detail`"),
             (&[("color", "bfactor")], "`color_range`"),
             (&[("color", "plddt")], "`bfactor`"),

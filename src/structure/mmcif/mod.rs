@@ -8,6 +8,7 @@ mod row;
 mod rows;
 
 use self::rows::TableRows;
+use super::assembly::Assemblies;
 use super::atom_site::{Layout, Passed};
 use super::atoms::{SourceFields, SourceFormat, Structure};
 use super::categories::Categories;
@@ -48,6 +49,18 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         Ok(()) => reader.finish(),
         Err(StopReason::Fault(fault)) => Err(fault.locate(text)),
         Err(StopReason::Error(error)) => Err(*error),
+    }
+}
+
+/// Reads the assemblies of the last data block of a text, up to the first syntax error.
+///
+/// # Errors
+/// Returns the errors of memory and cancellation.
+pub(super) fn assemblies(text: &[u8], reading: &Reading<'_>) -> Result<Assemblies, StructureError> {
+    let mut reader = Reader::new(text, reading);
+    match reader.run() {
+        Err(StopReason::Error(error)) => Err(*error),
+        _ => Ok(reader.block.categories.assemblies()),
     }
 }
 

@@ -2,10 +2,13 @@
 
 use std::collections::{HashMap, HashSet};
 
+use indexmap::IndexMap;
+
 use super::{LeftOut, ModelChoice, Rules, SELECTED_CHAIN, Selected, Selection};
 use crate::structure::contents::Kind;
+use crate::structure::copies::AssemblyRules;
 use crate::structure::error::StructureError;
-use crate::structure::read::{ReadLimits, check};
+use crate::structure::read::ReadLimits;
 use crate::structure::stream::Block;
 use crate::structure::text::list;
 use crate::surface::{Control, MemoryMeter as _, Reservation};
@@ -13,15 +16,30 @@ use crate::surface::{Control, MemoryMeter as _, Reservation};
 /// Model, chain, number and insertion code of a residue.
 type ResidueId = (i32, String, i32, u8);
 
+/// Selected atoms of a block.
+#[derive(Debug)]
+pub struct SelectedOfBlock {
+    /// Indices of the atoms in the block, ascending.
+    pub atoms: Vec<u32>,
+    /// Number of the chain of each atom among those of all blocks, as assemblies name them, in order of appearance.
+    pub chains: Vec<u32>,
+}
+
+/// Counts of the atoms of a chain.
+#[derive(Debug, Default)]
+struct ChainCounts {
+    n_selected: u64,
+    left_out: LeftOut,
+    residues: HashMap<(String, Kind), u64>,
+}
+
 /// Atoms selected so far. Errors of a whole structure, such as a missing chain, are found at the end.
 #[derive(Debug)]
 pub struct SelectedBlocks {
-    /// Number of selected atoms.
-    pub n_selected: u64,
     /// Number of atoms.
     pub n_atoms: u64,
-    left_out: LeftOut,
-    residues: HashMap<(String, Kind), u64>,
+    /// Counts by the chain names that assemblies use.
+    by_chain: IndexMap<String, ChainCounts>,
     chains: HashSet<String>,
     models: HashSet<i32>,
     altlocs: HashSet<u8>,
@@ -31,8 +49,13 @@ pub struct SelectedBlocks {
     first_model: Option<i32>,
     /// Memory of `alternatives`.
     memory: Reservation,
+    /// Memory of `by_chain`.
+    chain_memory: Reservation,
 }
 
+/// Memory of the counts of a chain, and of those of a residue name, bytes.
+const CHAIN_BYTES: u64 = 3 * (size_of::<(String, ChainCounts)>() as u64) + 16;
+const NAME_BYTES: u64 = 2 * (size_of::<((String, Kind), u64)>() as u64) + 16;
 /// Memory of a residue with alternative locations, bytes.
 const ALTERNATIVE_BYTES: u64 = 2 * (size_of::<(ResidueId, usize)>() as u64) + 16;
 
@@ -41,10 +64,8 @@ impl SelectedBlocks {
     #[must_use]
     pub fn new(control: &Control<'_>) -> Self {
         Self {
-            n_selected: 0,
             n_atoms: 0,
-            left_out: LeftOut::default(),
-            residues: HashMap::new(),
+            by_chain: IndexMap::new(),
             chains: HashSet::new(),
             models: HashSet::new(),
             altlocs: HashSet::new(),
@@ -52,6 +73,7 @@ impl SelectedBlocks {
             n_blocks: 0,
             first_model: None,
             memory: Reservation::new(&control.memory),
+            chain_memory: Reservation::new(&control.memory),
         }
     }
 
@@ -61,7 +83,7 @@ impl SelectedBlocks {
         self.alternatives = HashMap::new();
     }
 
-    /// Selects atoms of the next block. Returns their indices, ascending.
+    /// Selects atoms of the next block. An assembly is ignored.
     ///
     /// # Errors
     /// Returns [`StructureError::TooManyAtoms`], [`StructureError::NotAStream`] and the errors of memory and
@@ -72,7 +94,7 @@ impl SelectedBlocks {
         selection: &Selection,
         limits: &ReadLimits,
         control: &Control<'_>,
-    ) -> Result<Vec<u32>, StructureError> {
+    ) -> Result<SelectedOfBlock, StructureError> {
         let s = &block.structure;
         self.n_atoms += block.len as u64;
         // Indices of atoms have 32 bits.
@@ -88,14 +110,47 @@ impl SelectedBlocks {
         let selection = Selection { model, ..selection.clone() };
         let rules = Rules::new(s, &selection, false, limits, control)?;
         self.note(block, &rules)?;
-        let found = rules.find(block.len, None, control)?;
-        check(control)?;
-        self.left_out.add(&found.left_out);
-        for (name, kind, n) in found.residues.named(s) {
-            *self.residues.entry((name.to_owned(), kind)).or_default() += n;
+        let column = s.assembly_chains();
+        let numbers = column.texts().map(|name| self.number(name)).collect::<Result<Vec<u32>, _>>()?;
+        let mut selected = SelectedOfBlock { atoms: Vec::new(), chains: Vec::new() };
+        for (chain, found) in rules.find_by_chain(block.len, column, control)? {
+            let number = numbers[chain as usize];
+            let counts = &mut self.by_chain[number as usize];
+            counts.n_selected += found.atoms.len() as u64;
+            counts.left_out.add(&found.left_out);
+            for (name, kind, n) in found.residues.named(s) {
+                let n_known = counts.residues.len();
+                *counts.residues.entry((name.to_owned(), kind)).or_default() += n;
+                self.chain_memory.grow(NAME_BYTES * (counts.residues.len() - n_known) as u64)?;
+            }
+            selected.chains.resize(selected.chains.len() + found.atoms.len(), number);
+            selected.atoms.extend_from_slice(&found.atoms);
         }
-        self.n_selected += found.atoms.len() as u64;
-        Ok(found.atoms)
+        Ok(selected)
+    }
+
+    /// Returns the number of a chain.
+    fn number(&mut self, name: &str) -> Result<u32, StructureError> {
+        let known = self.by_chain.get_index_of(name);
+        let number = known.map_or_else(
+            || {
+                self.chain_memory.grow(CHAIN_BYTES + name.len() as u64)?;
+                Ok::<_, StructureError>(self.by_chain.insert_full(name.to_owned(), ChainCounts::default()).0)
+            },
+            Ok,
+        )?;
+        // There are at most as many chains as atoms.
+        Ok(u32::try_from(number).unwrap_or(u32::MAX))
+    }
+
+    /// Returns the names of the chains by number.
+    pub(crate) fn chain_names(&self) -> Vec<&str> {
+        self.by_chain.keys().map(String::as_str).collect()
+    }
+
+    /// Returns the number of selected atoms of each chain.
+    pub(crate) fn n_of_chains(&self) -> Vec<u64> {
+        self.by_chain.values().map(|counts| counts.n_selected).collect()
     }
 
     /// Notes chains, models and alternative locations of a block.
@@ -130,12 +185,16 @@ impl SelectedBlocks {
         Ok(())
     }
 
-    /// Ends the selection.
+    /// Ends the selection of the chains of an `assembly`, or of all.
     ///
     /// # Errors
     /// Returns [`StructureError::EmptySelection`], [`StructureError::NotFound`] for a model, chain or alternative
     /// location that does not exist, and [`StructureError::NotAStream`].
-    pub fn finish(mut self, selection: &Selection) -> Result<Selected, StructureError> {
+    pub(crate) fn finish(
+        mut self,
+        selection: &Selection,
+        assembly: Option<&AssemblyRules<'_>>,
+    ) -> Result<Selected, StructureError> {
         let missing = |what, requested: String, mut available: Vec<String>| {
             available.sort_unstable();
             let n = available.len();
@@ -170,13 +229,27 @@ impl SelectedBlocks {
             let known = self.altlocs.iter().map(|letter| char::from(*letter).to_string()).collect();
             return missing("alternative location", format!("`{letter}`"), known);
         }
-        if self.n_selected == 0 {
+        let (mut n_selected, mut left_out, mut residues) = (0, LeftOut::default(), HashMap::new());
+        for (number, counts) in std::mem::take(&mut self.by_chain).into_values().enumerate() {
+            let of_names: u64 = counts.residues.values().sum();
+            if assembly.is_some_and(|assembly| !assembly.covers(number)) {
+                left_out.other_chains += counts.n_selected + counts.left_out.total() + of_names;
+                continue;
+            }
+            n_selected += counts.n_selected;
+            left_out.add(&counts.left_out);
+            for (key, n) in counts.residues {
+                *residues.entry(key).or_default() += n;
+            }
+        }
+        if n_selected == 0 {
             let holds = format!("{} was requested; the files have {} atoms", selection.atoms, self.n_atoms);
             return Err(StructureError::EmptySelection { holds });
         }
-        let counts = self.residues.iter().map(|((name, kind), n)| (name.as_str(), *kind, *n)).collect();
-        self.left_out.name_residues(counts);
+        let counts = residues.iter().map(|((name, kind), n)| (name.as_str(), *kind, *n)).collect();
+        left_out.name_residues(counts);
         let (marks, copies, units) = (None, Vec::new(), Vec::new());
-        Ok(Selected { atoms: Vec::new(), marks, copies, units, n_distinct: 0, model, left_out: self.left_out })
+        let n_distinct = usize::try_from(n_selected).unwrap_or(usize::MAX);
+        Ok(Selected { atoms: Vec::new(), marks, copies, units, n_distinct, model, left_out })
     }
 }

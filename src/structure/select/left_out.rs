@@ -89,8 +89,12 @@ impl Tally {
 
     /// Returns the counts with the names of the residues.
     pub(super) fn named(self, structure: &Structure) -> Vec<(&str, Kind, u64)> {
+        let counts = self.finish();
+        if counts.is_empty() {
+            return Vec::new();
+        }
         let texts: Vec<&str> = structure.residue.texts().collect();
-        self.finish().into_iter().map(|((residue, kind), n)| (texts[residue as usize], kind, n)).collect()
+        counts.into_iter().map(|((residue, kind), n)| (texts[residue as usize], kind, n)).collect()
     }
 
     fn finish(mut self) -> HashMap<(u32, Kind), u64> {

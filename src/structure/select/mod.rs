@@ -13,7 +13,7 @@ use std::collections::HashSet;
 use std::num::NonZeroU32;
 use std::ops::Range;
 
-pub use blocks::SelectedBlocks;
+pub use blocks::{SelectedBlocks, SelectedOfBlock};
 pub use context::Context;
 use evaluate::{Evaluation, Marks};
 pub use expression::Expression;
@@ -30,6 +30,7 @@ use super::error::StructureError;
 use super::pieces;
 use super::read::{ReadLimits, check};
 use super::text::list;
+use super::texts::TextColumn;
 use crate::surface::Control;
 
 /// Models of a file.
@@ -248,6 +249,26 @@ impl<'a> Rules<'a> {
             found.residues.append(residues);
         }
         Ok(found)
+    }
+
+    /// Finds the atoms to mesh among the first `n`, in parallel: in file order by runs of atoms of one of the `chains`.
+    fn find_by_chain(
+        &self,
+        n: usize,
+        chains: &TextColumn,
+        control: &Control<'_>,
+    ) -> Result<Vec<(u32, Found)>, StructureError> {
+        let runs = chains.ids()[..n].chunk_by(|a, b| a == b).flat_map(|run| run.chunks(ATOMS_PER_TASK));
+        let mut first = 0;
+        let range = |run: &[u32]| {
+            first += run.len();
+            (run[0], first - run.len()..first)
+        };
+        let mut ranges: Vec<(u32, Range<usize>)> = runs.map(range).collect();
+        let find = |(chain, range): &mut (u32, Range<usize>)| {
+            check(control).map(|()| (*chain, self.find_in(range.clone(), None)))
+        };
+        pieces::map(&mut ranges, find).into_iter().collect()
     }
 
     fn find_in(&self, range: Range<usize>, assembly: Option<&Assembly<'_>>) -> Found {
