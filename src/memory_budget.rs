@@ -9,7 +9,7 @@ use bytes::{Bytes, BytesMut};
 use metrics::gauge;
 
 use crate::surface::{MemoryMeter, OutOfMemory};
-use crate::telemetry::{MEMORY_HELD, MEMORY_USED};
+use crate::telemetry::{MEMORY_HELD, MEMORY_USED, SCRATCH_BYTES};
 
 /// Owner of memory that it can free when the budget is exceeded.
 pub(crate) trait Reclaim: Debug + Send + Sync {
@@ -25,13 +25,30 @@ pub struct Budget {
     /// Budget of which this one is a part.
     whole: Option<Arc<Self>>,
     reclaim: Arc<OnceLock<Weak<dyn Reclaim>>>,
+    gauges: Gauges,
+}
+
+/// Names of the metrics of a budget.
+#[derive(Debug, Clone, Copy)]
+struct Gauges {
+    /// Bytes in use.
+    used: &'static str,
+    /// Bytes that requests reserve.
+    held: Option<&'static str>,
 }
 
 impl Budget {
     /// Creates a budget of `limit` bytes.
     #[must_use]
     pub fn new(limit: u64) -> Self {
-        Self { limit, held: Arc::default(), reclaim: Arc::default(), whole: None }
+        let gauges = Gauges { used: MEMORY_USED, held: Some(MEMORY_HELD) };
+        Self { limit, held: Arc::default(), reclaim: Arc::default(), whole: None, gauges }
+    }
+
+    /// Creates a budget of `limit` bytes of temporary files.
+    #[must_use]
+    pub fn of_disk(limit: u64) -> Self {
+        Self { gauges: Gauges { used: SCRATCH_BYTES, held: None }, ..Self::new(limit) }
     }
 
     /// Creates a budget of `limit` bytes that is a part of this one: its reservations count in both.
@@ -45,7 +62,7 @@ impl Budget {
         self.held.fetch_add(bytes, Ordering::Relaxed);
         match &self.whole {
             Some(whole) => whole.add(bytes),
-            None => publish(MEMORY_USED, bytes, 1.0),
+            None => publish(self.gauges.used, bytes, 1.0),
         }
     }
 
@@ -59,7 +76,7 @@ impl Budget {
         self.held.fetch_sub(bytes, Ordering::Relaxed);
         match &self.whole {
             Some(whole) => whole.subtract(bytes),
-            None => publish(MEMORY_USED, bytes, -1.0),
+            None => publish(self.gauges.used, bytes, -1.0),
         }
     }
 
@@ -97,7 +114,7 @@ impl Budget {
             reclaimed = self.reclaim.get().and_then(Weak::upgrade).is_some_and(|owner| owner.reclaim(missing));
         }
         let Some(whole) = &self.whole else {
-            publish(MEMORY_USED, bytes, 1.0);
+            publish(self.gauges.used, bytes, 1.0);
             return Ok(());
         };
         let taken = whole.take(bytes);
@@ -113,6 +130,13 @@ impl Budget {
     pub fn buffers(&self, bytes: u64) -> Buffers {
         self.add(bytes);
         Buffers { budget: self.clone(), bytes }
+    }
+
+    /// Changes the gauge of the bytes that requests reserve.
+    fn publish_held(&self, bytes: u64, sign: f64) {
+        if let Some(gauge) = self.gauges.held {
+            publish(gauge, bytes, sign);
+        }
     }
 
     /// Creates a reservation of 0 bytes.
@@ -152,7 +176,7 @@ impl MemoryReservation {
     pub fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
         self.budget.take(bytes).map_err(|error| self.check(bytes).err().unwrap_or(error))?;
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
-        publish(MEMORY_HELD, bytes, 1.0);
+        self.budget.publish_held(bytes, 1.0);
         Ok(())
     }
 
@@ -187,14 +211,14 @@ impl MemoryReservation {
     pub fn force(&self, bytes: u64) {
         self.budget.add(bytes);
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
-        publish(MEMORY_HELD, bytes, 1.0);
+        self.budget.publish_held(bytes, 1.0);
     }
 
     /// Subtracts `bytes` of freed memory.
     pub fn shrink(&self, bytes: u64) {
         self.budget.subtract(bytes);
         self.bytes.fetch_sub(bytes, Ordering::Relaxed);
-        publish(MEMORY_HELD, bytes, -1.0);
+        self.budget.publish_held(bytes, -1.0);
     }
 
     /// Sets the reservation to `bytes` regardless of the limit, for memory that remains of a finished job.
@@ -207,7 +231,7 @@ impl MemoryReservation {
     /// Converts the reservation, for memory that no request uses. The reservation then has 0 bytes.
     pub(crate) fn to_buffers(&self) -> Buffers {
         let bytes = self.bytes.swap(0, Ordering::Relaxed);
-        publish(MEMORY_HELD, bytes, -1.0);
+        self.budget.publish_held(bytes, -1.0);
         Buffers { budget: self.budget.clone(), bytes }
     }
 

@@ -148,7 +148,10 @@ impl CliError {
             Self::Usage { .. } => code::USAGE,
             Self::Input { .. } => code::INPUT,
             Self::InputTooLarge { .. } => code::LIMIT,
-            Self::Job { source: JobError::Scratch { .. }, .. } => code::OUTPUT,
+            Self::Job {
+                source: JobError::Scratch { .. } | JobError::ScratchTooSmall { .. } | JobError::ScratchFull { .. },
+                ..
+            } => code::OUTPUT,
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
             Self::Job { source: JobError::Picture(error), .. } => picture_code(error),

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
-use molmesh::pipeline::tileset::{self, StructureStream, TilesetReport, WriteError};
+use molmesh::pipeline::tileset::{self, ScratchFile, StreamSource, StructureStream, TilesetReport, WriteError};
 use molmesh::pipeline::{self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
 use molmesh::structure::stream::BLOCK_BYTES;
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
@@ -178,13 +178,16 @@ impl<'a> CommandJob<'a> {
         &self,
         inputs: &[PathBuf],
         files: Vec<Box<dyn Read + Send>>,
-        scratch: File,
+        file: File,
         folder: &Path,
         write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
     ) -> Result<TilesetReport, CliError> {
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
         let current = Cell::new(0);
-        let stream = StructureStream { files, scratch, block_bytes: BLOCK_BYTES, began: &|number| current.set(number) };
+        let scratch = ScratchFile { file, meter: Arc::new(()) };
+        let source = StreamSource::Files(files);
+        let stream =
+            StructureStream { source, scratch, block_bytes: BLOCK_BYTES, began: &|number| current.set(number) };
         let (control, sink) = (self.control(), &self.progress);
         let written = tileset::write_stream(stream, &self.job, &choice, &self.limits, &control, sink, write);
         written.map_err(|error| self.write_failure(folder, inputs.get(current.get()).map_or(self.path, |p| p), error))

@@ -1,9 +1,9 @@
 //! `molmesh tileset`: meshes one structure into the files of a tileset.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{self, Read, Write as _};
 use std::path::{Path, PathBuf};
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::Instant;
 
 use molmesh::formats::tileset::MAX_LEVELS;
 use molmesh::pipeline::BYTES_PER_ATOM;
@@ -32,7 +32,7 @@ pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
     let write = |path: &str, bytes: &[u8]| folder.write(path, bytes);
     let report = match scratch {
         Some(StreamFiles { inputs, scratch, .. }) => {
-            job.write_streamed_tileset(&args.inputs, inputs, scratch.create()?, &folder.path, write)?
+            job.write_streamed_tileset(&args.inputs, inputs, scratch, &folder.path, write)?
         }
         None => job.write_tileset(&folder.path, write)?,
     };
@@ -65,7 +65,8 @@ struct StreamFiles {
     inputs: Vec<Box<dyn Read + Send>>,
     /// Estimated number of atoms.
     atoms: f64,
-    scratch: ScratchFile,
+    /// File without a name, so that the system removes it in any case.
+    scratch: File,
 }
 
 impl StreamFiles {
@@ -85,34 +86,9 @@ impl StreamFiles {
             bytes += file.metadata().map_err(failed)?.len();
             inputs.push(Box::new(file));
         }
-        // The time makes the name unique if processes share an id, as in containers with a common volume.
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
-        let path = folder.join(format!(".molmesh-{}-{now:x}.part", std::process::id()));
-        Ok(Self { inputs, atoms: bytes as f64 / BYTES_PER_ATOM, scratch: ScratchFile { path } })
-    }
-}
-
-/// Temporary file, which is removed when this is dropped or the command is interrupted.
-struct ScratchFile {
-    path: PathBuf,
-}
-
-impl ScratchFile {
-    /// Creates the file. Unix systems remove its name at once, and its contents when it is closed.
-    fn create(&self) -> Result<File, CliError> {
-        // Registered before the file exists, so that no interrupt can come in between.
-        interrupt::stage(&self.path);
-        let created = OpenOptions::new().read(true).write(true).create_new(true).open(&self.path);
-        if cfg!(unix) {
-            interrupt::discard(&self.path);
-        }
-        created.map_err(|source| CliError::Output { name: self.path.display().to_string(), source })
-    }
-}
-
-impl Drop for ScratchFile {
-    fn drop(&mut self) {
-        interrupt::discard(&self.path);
+        let failed = |source| CliError::Output { name: folder.display().to_string(), source };
+        let scratch = tempfile::tempfile_in(folder).map_err(failed)?;
+        Ok(Self { inputs, atoms: bytes as f64 / BYTES_PER_ATOM, scratch })
     }
 }
 

@@ -115,5 +115,5 @@ async fn answer(
         let (text, ()) = listing.await?;
         Ok(([(header::CONTENT_TYPE, "text/csv")], Body::from(text)).into_response())
     };
-    source.document(app, caller, headers, &canonical, write).await
+    source.document(app, caller, headers, &canonical, None, write).await
 }

@@ -156,7 +156,7 @@ async fn answer(
     let positions = atom_parameters::parse(&parsed_request::pairs(query)?)?;
     let variant = positions.as_ref().map_or_else(String::new, |positions| positions.canonical.clone());
     let write = async |loaded, delivery| list(app, caller, loaded, delivery, positions).await;
-    source.document(app, caller, headers, &variant, write).await
+    source.document(app, caller, headers, &variant, None, write).await
 }
 
 async fn list(

@@ -110,7 +110,7 @@ async fn answer(
             [(header::CONTENT_TYPE, HeaderValue::from_static("application/octet-stream")), (LEGEND, legend)];
         Ok((described, part_of(&colors, headers, &etag)?).into_response())
     };
-    source.document(app, caller, headers, &variant, write).await
+    source.document(app, caller, headers, &variant, None, write).await
 }
 
 /// Lists the colours of the atoms, with their legend.

@@ -145,6 +145,12 @@ impl From<Failure> for Problem {
             Failure::Job { error: JobError::Color(error), .. } => error.into(),
             Failure::Job { error: JobError::Map(error), .. } => error.into(),
             Failure::Job { error: error @ JobError::Scratch { .. }, .. } => Self::internal(error),
+            Failure::Job { error: error @ JobError::ScratchFull { limit }, .. } => {
+                Self::new(ProblemType::MemoryFull, error.to_string()).with("limit", limit)
+            }
+            Failure::Job { error: error @ JobError::ScratchTooSmall { limit }, .. } => {
+                Self::new(ProblemType::TooMuchMemory, error.to_string()).with("limit", limit)
+            }
             // Compression rejects no mesh for its size, so no resolution is suggested.
             Failure::Job { error: JobError::Format(error), .. } => format_problem(&error, 0.0),
             Failure::Check { ref diagnostics } => {

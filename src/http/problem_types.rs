@@ -184,7 +184,7 @@ pub(super) const PROBLEM_TYPES: &[ProblemEntry] = &[
     row(ProblemType::DeviceMemory, "device-memory", S::UNPROCESSABLE_ENTITY, true, "The device has too little memory",
         "At this resolution the surface needs more memory than the device has (`limit` bytes), even in parts. `suggested_resolution` is a grid spacing in Å that fits, if there is one."),
     row(ProblemType::TooMuchMemory, "too-much-memory", S::UNPROCESSABLE_ENTITY, true, "The request needs too much memory",
-        "The request alone needs at least `actual` bytes of memory at once, more than the `limit` bytes that the service may use. Use a coarser resolution, a smaller picture or fewer atoms, or ask the operator to raise limits.memory_bytes. An uploaded body may use half of that memory, the index of a tileset limits.structure_cache_bytes."),
+        "The request alone needs at least `actual` bytes of memory at once, more than the `limit` bytes that the service may use. Use a coarser resolution, a smaller picture or fewer atoms, or ask the operator to raise limits.memory_bytes. An uploaded body may use half of that memory, the index of a tileset limits.structure_cache_bytes, or limits.scratch_bytes on disk."),
     row(ProblemType::NoSurface, "no-surface", S::UNPROCESSABLE_ENTITY, false, "There is no surface",
         "The density does not reach `isovalue` at any grid point, or no grid point lies inside the spheres. Use a lower isovalue or a finer resolution. Or no triangle is nearest to a selected atom (`context=whole`), or no component of the mesh encloses a cavity (`cavities=only`)."),
     row(ProblemType::OtherRequest, "other-request", S::UNPROCESSABLE_ENTITY, false, "The idempotency key belongs to another request",

@@ -21,7 +21,9 @@ use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::client_shares::ClientShares;
 use crate::config::{Config, Role};
-use crate::jobs::{Broker, Budget, Client, EndError, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Structures};
+use crate::jobs::{
+    Broker, Budget, Client, EndError, JobStore, MemoryBroker, NatsBroker, Pool, ScratchSpace, Settings, Structures,
+};
 use crate::picture::SelectedRenderer;
 use crate::single_flight::SingleFlight;
 use crate::store::{Digest, FolderLock, LockError, Secret, Store, StoreError, derive};
@@ -131,12 +133,14 @@ impl Server {
         }
         let traces = Traces::start(&config.telemetry)?;
         let budget = Budget::new(config.limits.memory_bytes);
+        let scratch_bytes = config.limits.scratch_bytes;
+        let scratch = (scratch_bytes > 0).then(|| ScratchSpace::new(&config.server.data_dir, scratch_bytes));
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
             batch_max_delay: Duration::from_millis(config.jobs.batch_max_delay_ms),
             limits: config.limits.job(),
-            structures: Structures::new(config.limits.structure_cache_bytes, &budget),
+            structures: Structures::new(config.limits.structure_cache_bytes, &budget, scratch),
             budget,
             renderer,
             meter: Some(Arc::new({

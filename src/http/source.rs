@@ -107,8 +107,8 @@ impl StructureSource {
         }
     }
 
-    /// Returns the structure in memory if there is one, for a `job` on a tile also as a part of its tileset, or the
-    /// file. `digest` is the one that [`Self::digest`] returned for this caller, which has checked that the structure
+    /// Returns the structure in memory if there is one, for a `job` on a tile also as a part of its tileset, the tileset
+    /// if its atoms are on disk, or the file. `digest` is the one that [`Self::digest`] returned for this caller, which has checked that the structure
     /// exists.
     pub(super) async fn find(
         &self,
@@ -119,12 +119,12 @@ impl StructureSource {
     ) -> Result<Loaded, Problem> {
         let namespace = caller.namespace;
         match (self, app.structures().find(namespace, *digest, job)) {
-            (Self::Stored(_) | Self::Entry(_), Some(kept)) => {
+            (Self::Stored(_) | Self::Entry(_), Some(input)) => {
                 if let Self::Stored(_) = self {
                     app.store.touch(&Name::input(digest).within(namespace), app.store.now());
                 }
                 let reservation = Arc::new(app.pool.settings().budget.reservation());
-                Ok(Loaded { input: Input::Kept(kept), digest: *digest, reservation })
+                Ok(Loaded { input, digest: *digest, reservation })
             }
             _ => self.load(app, caller).await,
         }
@@ -154,7 +154,7 @@ impl StructureSource {
     }
 
     /// Returns a response with the document that `write` makes of the structure, or 304 if the client has it. `write`
-    /// holds the delivery slot of the request until its work has stopped. The `ETag` is that of
+    /// holds the delivery slot of the request until its work has stopped. `job` is that of [`Self::find`]. The `ETag` is that of
     /// [`etag`] with `variant`, the parameters of the document.
     pub(super) async fn document<F>(
         self,
@@ -162,6 +162,7 @@ impl StructureSource {
         caller: &Caller,
         headers: &HeaderMap,
         variant: &str,
+        job: Option<&Job>,
         write: impl FnOnce(Loaded, Delivery) -> F,
     ) -> Result<Response, Problem>
     where
@@ -174,7 +175,7 @@ impl StructureSource {
             return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
         }
         let delivery = app.delivery(caller.client)?;
-        let loaded = self.find(app, caller, &digest, None).await?;
+        let loaded = self.find(app, caller, &digest, job).await?;
         let validators = self::validators(&loaded.digest, variant)?;
         Ok((validators, write(loaded, delivery).await?).into_response())
     }

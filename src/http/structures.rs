@@ -198,7 +198,7 @@ pub(super) async fn show(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let write = async |loaded, delivery| Ok(Json(summarize(&app, &caller, loaded, delivery).await?).into_response());
-    source.document(&app, &caller, &headers, "", write).await
+    source.document(&app, &caller, &headers, "", None, write).await
 }
 
 /// Mesh an uploaded structure

@@ -220,6 +220,8 @@ impl TilesetRequest {
     ) -> Result<Response, Problem> {
         let Self { app, caller, source, headers, job, .. } = self;
         let variant = format!("{media_type}\n{}", params::canonical(&job));
+        // A tile of the tileset, which may be prepared.
+        let of_tile = Job { tile: Some(TileAddress::ROOT), ..job.clone() };
         let made = async |loaded: Loaded, delivery: Delivery| {
             app.admit_work(&caller)?;
             let Loaded { input, digest, reservation } = loaded;
@@ -232,7 +234,7 @@ impl TilesetRequest {
             });
             Ok(([(header::CONTENT_TYPE, media_type)], Body::from(made.await??)).into_response())
         };
-        source.document(&app, &caller, &headers, &variant, made).await
+        source.document(&app, &caller, &headers, &variant, Some(&of_tile), made).await
     }
 }
 

@@ -87,6 +87,11 @@ impl Kept {
         }
     }
 
+    /// Returns true for a tileset with its atoms on disk.
+    pub(super) fn is_streamed(&self) -> bool {
+        matches!(self, Self::Tileset(tileset) if tileset.is_streamed())
+    }
+
     /// Returns true if a request uses the value, or a cached tileset uses the structure.
     pub(super) fn is_used(&self) -> bool {
         match self {

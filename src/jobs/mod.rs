@@ -31,6 +31,7 @@ mod records;
 mod results;
 mod retry;
 mod runner;
+mod scratch;
 mod structures;
 #[cfg(test)]
 mod tests;
@@ -50,6 +51,7 @@ pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
 pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
 pub(crate) use records::unfinished_jobs;
 pub(crate) use results::{REPORT, SaveError, document, is_stored, save};
+pub(crate) use scratch::ScratchSpace;
 pub(crate) use structures::{Input, Structures};
 pub(crate) use ticket::Ticket;
 

@@ -46,7 +46,7 @@ impl Settings {
             queue: 8,
             batch_max_delay: Duration::from_secs(10),
             limits: JobLimits::default(),
-            structures: Structures::new(1 << 20, &budget),
+            structures: Structures::new(1 << 20, &budget, None),
             budget,
             renderer: SelectedRenderer::cpu("a test"),
             meter: None,

@@ -9,12 +9,13 @@ use std::time::Duration;
 use bytes::Bytes;
 use metrics::{counter, gauge};
 
-use super::MemoryReservation;
 use super::kept::{CacheKey, CacheState, Charge, Charged, Kept, Shared, SharedColors, SharedStructure, SharedTileset};
+use super::{MemoryReservation, ScratchSpace};
 use crate::memory_budget::{Budget, Reclaim};
-use crate::pipeline::tileset::Tileset;
+use crate::pipeline::tileset::{self, StreamSource, StructureStream, Tileset};
 use crate::pipeline::{Job, JobError, StageClock, estimate_atoms, params};
 use crate::store::{Digest, Namespace};
+use crate::structure::stream::BLOCK_BYTES;
 use crate::structure::{self, ReadLimits, StructureError};
 use crate::surface::{CancelToken, Control, MemoryMeter as _, OutOfMemory, SurfaceError};
 use crate::sync::{Condvar, Mutex, MutexGuard};
@@ -23,6 +24,10 @@ use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
 /// Memory of a structure besides its atoms and texts, bytes: its columns are some 40 allocations. Without it, the cache
 /// would take several times its limit for structures of one atom.
 const OVERHEAD: u64 = 4 << 10;
+/// Memory of the atoms of a tileset and of their index, bytes per atom.
+const BYTES_PER_ATOM: f64 = 110.0;
+/// Size of the cache in blocks of a file that is read as a stream. The buffers of the index take a quarter of it.
+const BLOCKS: u64 = 32;
 /// Time between two checks of a request that waits for another one to read its structure.
 const POLL: Duration = Duration::from_millis(20);
 
@@ -33,6 +38,8 @@ pub(crate) enum Input {
     File(Bytes),
     /// Structure in memory, whose file need not be loaded.
     Kept(SharedStructure),
+    /// Tileset with its atoms on disk, for jobs on its tiles.
+    Tileset(SharedTileset),
 }
 
 impl Input {
@@ -40,7 +47,7 @@ impl Input {
     pub(crate) fn file(&self) -> Option<&Bytes> {
         match self {
             Self::File(file) => Some(file),
-            Self::Kept(_) => None,
+            Self::Kept(_) | Self::Tileset(_) => None,
         }
     }
 
@@ -49,6 +56,7 @@ impl Input {
         match self {
             Self::File(file) => file.len(),
             Self::Kept(kept) => kept.0.file_bytes,
+            Self::Tileset(kept) => kept.0.file_bytes,
         }
     }
 
@@ -57,6 +65,7 @@ impl Input {
         match self {
             Self::File(file) => estimate_atoms(file),
             Self::Kept(kept) => kept.0.atoms,
+            Self::Tileset(kept) => kept.0.atoms,
         }
     }
 }
@@ -66,29 +75,37 @@ impl Input {
 pub(crate) struct Structures {
     limit: u64,
     budget: Budget,
+    /// Disk space for tilesets whose index would exceed the limit.
+    scratch: Option<Arc<ScratchSpace>>,
     state: Mutex<CacheState>,
     /// Notified when a request has ended making a value.
     ended: Condvar,
 }
 
 impl Structures {
-    /// Keeps at most `limit` bytes, charged to `budget`.
-    pub(crate) fn new(limit: u64, budget: &Budget) -> Arc<Self> {
+    /// Keeps at most `limit` bytes, charged to `budget`, and indexes of tilesets that are larger in `scratch`.
+    pub(crate) fn new(limit: u64, budget: &Budget, scratch: Option<Arc<ScratchSpace>>) -> Arc<Self> {
         let (state, ended) = (Mutex::default(), Condvar::default());
-        let structures = Arc::new(Self { limit, budget: budget.clone(), state, ended });
+        let structures = Arc::new(Self { limit, budget: budget.clone(), scratch, state, ended });
+        if let Some(scratch) = &structures.scratch {
+            scratch.evict_from(Arc::downgrade(&structures));
+        }
         let owner: Arc<dyn Reclaim> = Arc::<Self>::clone(&structures);
         budget.reclaim_from(Arc::downgrade(&owner));
         structures
     }
 
-    /// Returns the structure of a file if it is kept, for a `job` on a tile also as a part of its tileset.
-    pub(crate) fn find(&self, namespace: Namespace, digest: Digest, job: Option<&Job>) -> Option<SharedStructure> {
-        let tileset = job.filter(|job| job.tile.is_some()).map(|job| (namespace, tileset_digest(&digest, job)));
+    /// Returns the structure of a file if it is kept, for a `job` on a tile also as a part of its tileset, or this
+    /// tileset.
+    pub(crate) fn find(&self, namespace: Namespace, digest: Digest, job: Option<&Job>) -> Option<Input> {
+        let job = job.filter(|job| job.tile.is_some());
+        let tilesets = job.map(|job| [tileset_digest(&digest, job), streamed_digest(&digest, job)]);
         let mut state = self.lock();
-        let found = state.find(&(namespace, digest)).or_else(|| state.find(&tileset?));
-        match found? {
-            Kept::Structure(structure) => Some(structure),
-            Kept::Tileset(tileset) => Some(tileset.structure().clone()),
+        let mut digests = std::iter::once(digest).chain(tilesets.into_iter().flatten());
+        match digests.find_map(|digest| state.find(&(namespace, digest)))? {
+            Kept::Structure(structure) => Some(Input::Kept(structure)),
+            Kept::Tileset(tileset) if tileset.is_streamed() => Some(Input::Tileset(tileset)),
+            Kept::Tileset(tileset) => Some(Input::Kept(tileset.structure().clone())),
             Kept::Colors(_) => None,
         }
     }
@@ -116,6 +133,8 @@ impl Structures {
         let file = match input {
             Input::File(file) => file,
             Input::Kept(kept) => return hit(kept.clone()),
+            // Has no atoms. Only jobs on tiles have such an input, and they do not read the structure.
+            Input::Tileset(tileset) => return hit(tileset.structure().clone()),
         };
         control.memory.also_held(file.len() as u64);
         let key = (namespace, digest);
@@ -138,11 +157,12 @@ impl Structures {
     }
 
     /// Returns the tileset of a job on the file with this digest, and the colours of its atoms. Prepares them from
-    /// `input` if necessary; concurrent calls prepare them once. `clock` measures the preparation.
+    /// `input` if necessary; concurrent calls prepare them once. `clock` measures the preparation. A tileset that does
+    /// not fit into the cache has its atoms on disk, if the parameters allow it.
     ///
     /// # Errors
-    /// Returns the errors of [`Tileset::new`] and [`Tileset::colors`], and [`SurfaceError::TilesetTooLarge`] if one of
-    /// them does not fit into the cache.
+    /// Returns the errors of [`Tileset::new`], [`Tileset::of_stream`] and [`Tileset::colors`], and
+    /// [`SurfaceError::TilesetTooLarge`] if one of them does not fit into the cache.
     pub(crate) fn tileset(
         &self,
         (namespace, digest): CacheKey,
@@ -152,17 +172,65 @@ impl Structures {
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<(SharedTileset, Option<SharedColors>), JobError> {
-        let key = (namespace, tileset_digest(&digest, job));
-        let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
-        let prepare = |control: &Control<'_>| Tileset::new(read, job, limits, control, clock);
         let as_tileset = |kept: Kept| if let Kept::Tileset(tileset) = kept { Some(tileset) } else { None };
-        let tileset = self.prepared(key, input, control, (Kept::Tileset, as_tileset), prepare)?;
+        let [of_memory, of_disk] = [tileset_digest(&digest, job), streamed_digest(&digest, job)];
+        let in_memory = || {
+            let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
+            let prepare = |control: &Control<'_>| Tileset::new(read, job, limits, control, clock);
+            self.prepared((namespace, of_memory), input, control, (Kept::Tileset, as_tileset), prepare)
+        };
+        let on_disk = |scratch: &ScratchSpace| {
+            let prepare = |control: &Control<'_>| self.streamed(scratch, input, job, limits, control, clock);
+            self.prepared((namespace, of_disk), input, control, (Kept::Tileset, as_tileset), prepare)
+        };
+        let tileset = match (input, &self.scratch) {
+            (Input::Tileset(tileset), _) => tileset.clone(),
+            (_, Some(scratch)) if tileset::check_stream(job, 1).is_ok() => {
+                let is_large = input.atoms() * BYTES_PER_ATOM > self.limit as f64;
+                match if is_large { None } else { Some(in_memory()) } {
+                    None | Some(Err(JobError::Surface(SurfaceError::TilesetTooLarge { .. }))) => on_disk(scratch)?,
+                    Some(made) => made?,
+                }
+            }
+            _ => in_memory()?,
+        };
+        let of_tileset = if tileset.is_streamed() { of_disk } else { of_memory };
         let Some(coloring) = job.color else { return Ok((tileset, None)) };
-        let key = (namespace, Digest::of(format!("colors\n{}\n{}", key.1, coloring.canonical()).as_bytes()));
+        let key = (namespace, Digest::of(format!("colors\n{of_tileset}\n{}", coloring.canonical()).as_bytes()));
         let prepare = |control: &Control<'_>| tileset.colors(coloring, control);
         let as_colors = |kept: Kept| if let Kept::Colors(colors) = kept { Some(colors) } else { None };
         let colors = self.prepared(key, input, control, (Kept::Colors, as_colors), prepare)?;
         Ok((tileset, Some(colors)))
+    }
+
+    /// Prepares a tileset with its atoms in a temporary file.
+    fn streamed(
+        &self,
+        scratch: &ScratchSpace,
+        input: &Input,
+        job: &Job,
+        limits: &ReadLimits,
+        control: &Control<'_>,
+        clock: &StageClock<'_>,
+    ) -> Result<Tileset<SharedStructure>, JobError> {
+        let source = match input {
+            Input::File(file) => {
+                control.memory.also_held(file.len() as u64);
+                StreamSource::Files(vec![Box::new(&file[..])])
+            }
+            // The atoms fit into memory, but not all copies of an assembly.
+            Input::Kept(structure) => {
+                control.memory.grow(structure.bytes()).map_err(SurfaceError::from)?;
+                StreamSource::Structure(structure)
+            }
+            // Without atoms. The caller has returned this tileset.
+            Input::Tileset(tileset) => StreamSource::Structure(tileset.structure()),
+        };
+        let block_bytes = usize::try_from(self.limit / BLOCKS).unwrap_or(usize::MAX).min(BLOCK_BYTES);
+        let stream = StructureStream { source, scratch: scratch.file()?, block_bytes, began: &|_| {} };
+        let tileset = Tileset::of_stream(stream, job, limits, control, clock)?;
+        let reservation = Arc::new(self.budget.reservation());
+        Ok(tileset.with_structure(|structure| self.charged(*structure, input, reservation)))
     }
 
     /// Returns a value that must be kept, and prepares it if necessary.
@@ -234,6 +302,15 @@ impl Structures {
         publish(&state);
     }
 
+    /// Evicts the least recently used tileset with its atoms on disk that no request uses. Returns true if there was
+    /// one.
+    pub(super) fn evict_streamed(&self) -> bool {
+        let mut state = self.lock();
+        let evicted = state.evict(|kept| kept.is_streamed() && !kept.is_used());
+        publish(&state);
+        evicted.is_some()
+    }
+
     fn lock(&self) -> MutexGuard<'_, CacheState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -274,6 +351,12 @@ impl Drop for MakingMark<'_> {
         self.structures.lock().making.remove(&self.key);
         self.structures.ended.notify_all();
     }
+}
+
+/// Returns the digest of a tileset with its atoms on disk, whose index has the colours.
+fn streamed_digest(digest: &Digest, job: &Job) -> Digest {
+    let color = job.color.map(|coloring| coloring.canonical());
+    Digest::of(format!("on disk\n{}\n{color:?}", tileset_digest(digest, job)).as_bytes())
 }
 
 /// Returns the digest of a tileset: of its structure file and of the parameters that affect the index.
@@ -324,7 +407,7 @@ mod tests {
     }
 
     fn size(file: &File) -> u64 {
-        get(&Structures::new(0, &Budget::unlimited()), file).bytes()
+        get(&Structures::new(0, &Budget::unlimited(), None), file).bytes()
     }
 
     fn held(budget: &Budget) -> u64 {
@@ -333,7 +416,7 @@ mod tests {
 
     #[test]
     fn a_structure_is_read_once_within_its_namespace() {
-        let structures = Structures::new(1 << 20, &Budget::unlimited());
+        let structures = Structures::new(1 << 20, &Budget::unlimited(), None);
         let file = file(10);
         let first = get(&structures, &file);
         assert!(Arc::ptr_eq(&first.0, &get(&structures, &file).0));
@@ -351,7 +434,7 @@ mod tests {
         let files = [file(100), file(101), file(102), file(100_000)];
         let budget = Budget::unlimited();
         let limit = size(&files[0]) + size(&files[2]);
-        let structures = Structures::new(limit, &budget);
+        let structures = Structures::new(limit, &budget, None);
         for i in [0, 1, 0, 2, 3] {
             get(&structures, &files[i]);
             assert!(structures.lock().bytes <= limit);
@@ -362,7 +445,7 @@ mod tests {
     #[test]
     fn small_structures_are_charged_for_their_allocations() {
         // 400 structures of one atom and some texts.
-        let structures = Structures::new(400 * (OVERHEAD + 1000), &Budget::unlimited());
+        let structures = Structures::new(400 * (OVERHEAD + 1000), &Budget::unlimited(), None);
         for i in 0..1000_u32 {
             get(&structures, &(file(1).0, Digest::of(&i.to_le_bytes())));
         }
@@ -376,7 +459,7 @@ mod tests {
     fn memory_is_given_back_before_anything_is_rejected() {
         let files = [file(1000), file(1001), file(1002)];
         let budget = Budget::new(1 << 20);
-        let structures = Structures::new(1 << 20, &budget);
+        let structures = Structures::new(1 << 20, &budget, None);
         let in_use = get(&structures, &files[0]);
         for i in [1, 2] {
             get(&structures, &files[i]);
@@ -404,7 +487,7 @@ mod tests {
     #[test]
     fn a_tileset_is_prepared_once_and_keeps_its_structure() {
         let budget = Budget::unlimited();
-        let structures = Structures::new(1 << 24, &budget);
+        let structures = Structures::new(1 << 24, &budget, None);
         let (input, digest) = file(20_000);
         let job = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().job;
         let [root, child] = ["0/0/0/0", "1/0/0/0"].map(|tile| job(&[("tile", tile), ("select", "all")]));
@@ -429,7 +512,10 @@ mod tests {
         assert!(got.iter().all(|tileset| Arc::ptr_eq(&tileset.0, &got[0].0)));
         assert!(!Arc::ptr_eq(&got[0].0, &get(&other).0), "the control");
         // A structure that was evicted is found in its tileset, for jobs on its tiles only.
-        let found = |job| structures.find(Namespace::default(), digest, job).map(|found| Arc::as_ptr(&found.0));
+        let found = |job| match structures.find(Namespace::default(), digest, job) {
+            Some(Input::Kept(found)) => Some(Arc::as_ptr(&found.0)),
+            _ => None,
+        };
         let structure = found(None);
         assert!(structure.is_some());
         structures.lock().remove(&(Namespace::default(), digest));
@@ -444,7 +530,7 @@ mod tests {
     #[test]
     fn concurrent_requests_read_once_and_a_cancelled_one_does_not_fail_the_others() {
         let budget = Budget::unlimited();
-        let structures = Structures::new(1 << 30, &budget);
+        let structures = Structures::new(1 << 30, &budget, None);
         let file = file(50_000);
         let (start, cancelled) = (Barrier::new(8), AtomicUsize::new(0));
         let got: Vec<SharedStructure> = std::thread::scope(|scope| {

@@ -46,7 +46,7 @@ pub enum StructureError {
     },
     /// The file cannot be read as a stream.
     #[error(
-        "cannot read the file as a stream: found {found}, expected {expected}; without `--scratch`, it can be read"
+        "cannot read the file as a stream: found {found}, expected {expected}; it can be read if it fits into memory"
     )]
     NotAStream {
         /// The content found there.

@@ -56,6 +56,7 @@ const ROWS: &[Row] = &[
         "molmesh_structure_cache_requests_total",
         "src/jobs/structures::the_limit_is_respected_and_the_least_recently_used_structure_is_evicted",
     ),
+    ("limits.scratch_bytes", "molmesh_scratch_bytes", "http/tilesets::a_tileset_larger_than_the_cache_is_on_disk"),
     ("limits.picture_side", "picture-too-large", "http/pictures::pictures_are_limited_before_any_work"),
     ("jobs.workers", "molmesh_queue_depth", "http/limits::a_full_queue_rejects_with_retry_after"),
     ("jobs.queue", "queue-full", "http/limits::a_full_queue_rejects_with_retry_after"),

@@ -264,7 +264,11 @@ fn a_tileset_of_an_entry_is_that_of_its_file() {
 
 #[test]
 fn a_tileset_larger_than_the_cache_is_rejected() {
-    let fake = |bytes| start(Fake::new(Mode::Octahedra), move |c| c.limits.structure_cache_bytes = bytes);
+    let fake = |bytes| {
+        start(Fake::new(Mode::Octahedra), move |c| {
+            (c.limits.structure_cache_bytes, c.limits.scratch_bytes) = (bytes, 0);
+        })
+    };
     for (bytes, fits) in [(0, false), (10_000, false), (1 << 20, true)] {
         let server = fake(bytes);
         let structure = uploaded(&server);
@@ -278,6 +282,82 @@ fn a_tileset_larger_than_the_cache_is_rejected() {
                 assert!(problem["detail"].as_str().unwrap().contains("the cache of structures"), "{problem}");
             }
         }
+    }
+}
+
+/// Returns an mmCIF file of `n` atoms on a lattice, in chains of 1,000, with an assembly of `copies`.
+fn lattice(n: usize, copies: usize) -> String {
+    let mut text = "data_x\nloop_\n".to_owned();
+    for item in ["type_symbol", "label_atom_id", "label_comp_id", "label_asym_id", "label_seq_id"] {
+        text += &format!("_atom_site.{item}\n");
+    }
+    text += "_atom_site.Cartn_x\n_atom_site.Cartn_y\n_atom_site.Cartn_z\n";
+    for i in 0..n {
+        let [x, y, z] = [i % 50, i / 50 % 50, i / 2500].map(|c| 2 * c);
+        text += &format!("C CA ALA A{} {} {x}.125 {y}.25 {z}.5\n", i / 1000, i % 1000 + 1);
+    }
+    let chains: Vec<String> = (0..n.div_ceil(1000)).map(|chain| format!("A{chain}")).collect();
+    text += &format!(
+        "_pdbx_struct_assembly_gen.assembly_id 1\n_pdbx_struct_assembly_gen.oper_expression '1-{copies}'\n\
+         _pdbx_struct_assembly_gen.asym_id_list {}\nloop_\n_pdbx_struct_oper_list.id\n",
+        chains.join(",")
+    );
+    for row in 1..4 {
+        (1..4).for_each(|k| text += &format!("_pdbx_struct_oper_list.matrix[{row}][{k}]\n"));
+        text += &format!("_pdbx_struct_oper_list.vector[{row}]\n");
+    }
+    (1..=copies).for_each(|copy| text += &format!("{copy} 1 0 0 {} 0 1 0 0 0 0 1 0\n", 100 * copy));
+    text
+}
+
+#[test]
+fn a_tileset_larger_than_the_cache_is_on_disk() {
+    const CACHE: u64 = 8 << 20;
+    let started = |cache: u64, scratch: u64| {
+        start(Arc::new(CpuBackend::new(Some(2)).unwrap()), move |c| {
+            (c.limits.structure_cache_bytes, c.limits.scratch_bytes) = (cache, scratch);
+        })
+    };
+    let upload = |server: &Running, text: &str| {
+        server.post("/v1/structures", &[], text.as_bytes()).header("location").unwrap().to_owned()
+    };
+    let disk = |server: &Running| server.metric("molmesh_scratch_bytes", &[]);
+    let (in_memory, on_disk) = (started(512 << 20, 1 << 30), started(CACHE, 1 << 30));
+    // The second file is small, and its assembly is as large as the first.
+    for (text, query) in [(lattice(200_000, 1), ""), (lattice(2000, 100), "&assembly=1")] {
+        let before = disk(&on_disk);
+        let structures = [&in_memory, &on_disk].map(|server| upload(server, &text));
+        let query = format!("select=all&resolution=1.5&compress=meshopt{query}");
+        for path in
+            ["tileset.json?", "tileset.subtree?tile=0/0/0/0&", "surface.glb?tile=0/0/0/0&", "surface.glb?tile=1/0/0/0&"]
+        {
+            let [expected, found] = [(&in_memory, 0), (&on_disk, 1)]
+                .map(|(server, i)| get(server, &format!("{}/{path}{query}", structures[i])));
+            assert!(expected.body.len() > 100 && found.body == expected.body, "{path}{query}");
+        }
+        let used = disk(&on_disk) - before;
+        assert!(used >= 48.0 * 200_000.0, "{used}");
+        // From now on, a request that loads the file finds it damaged.
+        let stored = on_disk.dir.path().join("store/inputs").join(structures[1].rsplit('/').next().unwrap());
+        fs::write(stored, vec![b' '; text.len()]).unwrap();
+        get(&on_disk, &format!("{}/surface.glb?tile=1/0/1/0&{query}", structures[1]));
+        get(&on_disk, &format!("{}/tileset.subtree?{query}", structures[1]));
+    }
+    // An index that does not fit beside another one replaces it, and one that never fits is rejected.
+    let text = lattice(200_000, 1);
+    let narrow = started(CACHE, 18_000_000);
+    let (structure, before) = (upload(&narrow, &text), disk(&narrow));
+    for color in ["element", "chain", "element"] {
+        get(&narrow, &format!("{structure}/tileset.json?select=all&resolution=4&color={color}"));
+        assert!((9_600_000.0..18_000_000.0).contains(&(disk(&narrow) - before)), "{}", disk(&narrow));
+    }
+    drop((on_disk, narrow));
+    for (scratch, place) in [(1_000_000, "disk space"), (0, "the cache of structures")] {
+        let server = started(CACHE, scratch);
+        let path = format!("{}/tileset.json?select=all&resolution=4", upload(&server, &text));
+        let problem = server.get(&path).problem(422, "too-much-memory");
+        assert_eq!(problem["limit"], if scratch == 0 { CACHE } else { scratch }, "{problem}");
+        assert!(problem["detail"].as_str().unwrap().contains(place), "{problem}");
     }
 }
 

@@ -20,7 +20,8 @@ use std::sync::Arc;
 use self::layout::Layout;
 use self::level::{Buckets, MIN_BUCKET, TilesetLevel};
 use self::source::{LevelSource, NearSpheres, Streamed};
-pub use self::stream::{StructureStream, check_stream};
+pub use self::stored::ScratchFile;
+pub use self::stream::{StreamSource, StructureStream, check_stream};
 pub use self::units::AssemblyTileset;
 pub use self::write::{LevelReport, TilesetReport, UnitReport, WriteError, unit_folder, write, write_stream};
 use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, Scheme};
@@ -141,6 +142,17 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
             return Ok(TilesetColors(MeshColors::of_report(coloring, report)));
         }
         MeshColors::new(&self.structure, &self.selected.atoms, coloring, None, control).map(TilesetColors)
+    }
+
+    /// Replaces the structure by an equal one.
+    pub(crate) fn with_structure<T>(self, structure: impl FnOnce(S) -> T) -> Tileset<T> {
+        let Self { structure: own, layout, levels, tiles, selected, streamed } = self;
+        Tileset { structure: structure(own), layout, levels, tiles, selected, streamed }
+    }
+
+    /// Returns true if the atoms are in a file and not in the structure.
+    pub(crate) const fn is_streamed(&self) -> bool {
+        self.streamed.is_some()
     }
 
     /// Returns the structure.

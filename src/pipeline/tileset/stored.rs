@@ -9,7 +9,7 @@ use rustc_hash::FxHashMap;
 
 use super::level::{cube, grid_cell};
 use crate::pipeline::JobError;
-use crate::surface::{Control, MemoryMeter as _, Reservation, SurfaceError};
+use crate::surface::{Control, MemoryMeter, OutOfMemory, Reservation, SurfaceError};
 
 /// Memory of a cube, and of a part of it in the file, bytes.
 const CUBE_BYTES: u64 = 128;
@@ -37,21 +37,36 @@ impl StoredSphere {
     }
 }
 
+/// Temporary file.
+#[derive(Debug)]
+pub struct ScratchFile {
+    /// Empty file that can be read and written.
+    pub file: File,
+    /// Counter of the bytes in the file.
+    pub meter: Arc<dyn MemoryMeter>,
+}
+
 /// File of spheres.
 #[derive(Debug)]
 pub(super) struct SphereFile {
     /// File and its length.
     file: Mutex<(File, u64)>,
+    bytes: Reservation,
 }
 
 impl SphereFile {
-    /// Takes an empty file that can be read and written.
-    pub(super) const fn new(file: File) -> Self {
-        Self { file: Mutex::new((file, 0)) }
+    /// Takes an empty file.
+    pub(super) fn new(ScratchFile { file, meter }: ScratchFile) -> Self {
+        Self { file: Mutex::new((file, 0)), bytes: Reservation::new(&meter) }
     }
 
     /// Writes spheres at the end. Returns their offset, bytes.
     fn append(&self, spheres: &[StoredSphere]) -> Result<u64, JobError> {
+        self.bytes.grow(size_of_val(spheres) as u64).map_err(|error| match error {
+            OutOfMemory::Limit { limit, .. } => JobError::ScratchTooSmall { limit },
+            OutOfMemory::Budget { limit, .. } => JobError::ScratchFull { limit },
+            error @ OutOfMemory::System { .. } => SurfaceError::from(error).into(),
+        })?;
         let mut guard = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         let (file, length) = &mut *guard;
         let bytes: &[u8] = bytemuck::must_cast_slice(spheres);

@@ -2,7 +2,6 @@
 //! a block of a file, not on the structure.
 
 use std::collections::BTreeSet;
-use std::fs::File;
 use std::io::Read;
 use std::sync::Arc;
 
@@ -10,7 +9,7 @@ use super::Tileset;
 use super::layout::{CELLS, Layout};
 use super::level::{GROUP_ABOVE, MIN_BUCKET, cube, group_of};
 use super::source::{LevelSource, Streamed};
-use super::stored::{SphereFile, SphereIndex, SphereList, StoredSphere};
+use super::stored::{ScratchFile, SphereFile, SphereIndex, SphereList, StoredSphere};
 use crate::formats::tileset::TileAddress;
 use crate::pipeline::color::{BlockColors, Scheme};
 use crate::pipeline::load::SPHERE_BYTES;
@@ -30,12 +29,20 @@ const SORT_BYTES: u64 = 40;
 /// Number of coordinates of groups along an axis, a power of two: spacings are above 2.5 Å.
 const MAX_CELLS: u64 = 1 << 18;
 
-/// Files that form one structure.
+/// Atoms of a structure.
+pub enum StreamSource<'a> {
+    /// Contents of the files that form one structure, in order.
+    Files(Vec<Box<dyn Read + Send + 'a>>),
+    /// Structure in memory, whose assembly need not fit. It is copied.
+    Structure(&'a Structure),
+}
+
+/// Structure that is indexed on disk.
 pub struct StructureStream<'a> {
-    /// Contents of the files, in order.
-    pub files: Vec<Box<dyn Read + Send + 'a>>,
-    /// Empty file for the index, which can be read and written.
-    pub scratch: File,
+    /// Source of the atoms.
+    pub source: StreamSource<'a>,
+    /// File for the index.
+    pub scratch: ScratchFile,
     /// Bytes of a block of text.
     pub block_bytes: usize,
     /// Called with the number of each file before it is read.
@@ -161,7 +168,7 @@ impl Tileset<Box<Structure>> {
     /// # Errors
     /// Returns a [`JobError`] if reading or selecting fails, there are too many tiles, the index cannot be written, or
     /// the job is cancelled.
-    pub(super) fn of_stream(
+    pub fn of_stream(
         stream: StructureStream<'_>,
         job: &Job,
         limits: &ReadLimits,
@@ -186,9 +193,18 @@ impl Tileset<Box<Structure>> {
             (SelectedBlocks::new(control), job.color.map(|coloring| BlockColors::new(coloring, control)));
         let assemblies = Assemblies::default();
         let mut reader = BlockReader { job, limits, selected, colors, spheres, head: None, assemblies };
-        for (number, input) in stream.files.into_iter().enumerate() {
-            (stream.began)(number);
-            reader.read(input, stream.block_bytes, control, clock)?;
+        match stream.source {
+            StreamSource::Files(files) => {
+                for (number, input) in files.into_iter().enumerate() {
+                    (stream.began)(number);
+                    reader.read(input, stream.block_bytes, control, clock)?;
+                }
+            }
+            StreamSource::Structure(structure) => {
+                let mut block = Block { len: structure.len(), structure: structure.clone() };
+                reader.assemblies = std::mem::take(&mut block.structure.assemblies);
+                clock.time("select", || reader.add(&mut block, control))?;
+            }
         }
         let BlockReader { selected, colors, spheres, head, assemblies, .. } = reader;
         let atoms_in_file = selected.n_atoms;
@@ -231,7 +247,8 @@ fn place(list: SphereList, placements: &Placements, index: &mut SphereIndex) -> 
     list.each_run(|spheres| {
         for chain in spheres.chunk_by(|a, b| a.order == b.order) {
             let number = chain[0].order;
-            for copy in by_chain.get(number as usize).into_iter().flatten().cloned().flatten() {
+            let copies = usize::try_from(number).ok().and_then(|number| by_chain.get(number));
+            for copy in copies.into_iter().flatten().cloned().flatten() {
                 let operator = &placements.operators[copy];
                 let moved: Vec<[f64; 3]> = chain.iter().map(|sphere| operator.apply(sphere.centre)).collect();
                 let column = |k: usize| moved.iter().map(|at| at[k]).collect();
@@ -420,6 +437,10 @@ mod tests {
         (files.into_inner().unwrap(), report)
     }
 
+    fn scratch() -> ScratchFile {
+        ScratchFile { file: tempfile::tempfile().unwrap(), meter: Arc::new(()) }
+    }
+
     /// Returns the files of the tileset of a stream.
     fn streamed(texts: &[&str], block_bytes: usize, job: &Job) -> Result<Written, String> {
         check_stream(job, texts.len()).map_err(|error| error.to_string())?;
@@ -430,8 +451,8 @@ mod tests {
             Ok(())
         };
         let inputs = texts.iter().map(|text| Box::new(text.as_bytes()) as Box<dyn Read + Send>).collect();
-        let scratch = tempfile::tempfile().unwrap();
-        let stream = StructureStream { files: inputs, scratch, block_bytes, began: &|_| {} };
+        let stream =
+            StructureStream { source: StreamSource::Files(inputs), scratch: scratch(), block_bytes, began: &|_| {} };
         let written = write_stream(stream, job, &choice(&CpuBackend::default()), &limits, &control, &(), store);
         let report = written.map_err(|error| error.to_string())?;
         Ok((files.into_inner().unwrap(), report))
@@ -553,8 +574,8 @@ mod tests {
         let of = |id: &str, limits: &ReadLimits| {
             let job = job(&[("assembly", id), ("resolution", "2")]);
             let stream = StructureStream {
-                files: vec![Box::new(text.as_bytes())],
-                scratch: tempfile::tempfile().unwrap(),
+                source: StreamSource::Files(vec![Box::new(text.as_bytes())]),
+                scratch: scratch(),
                 block_bytes: 5000,
                 began: &|_| {},
             };

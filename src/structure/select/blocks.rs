@@ -1,6 +1,6 @@
 //! Selection of the atoms of consecutive blocks of a structure.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use indexmap::IndexMap;
 
@@ -30,7 +30,7 @@ pub struct SelectedOfBlock {
 struct ChainCounts {
     n_selected: u64,
     left_out: LeftOut,
-    residues: HashMap<(String, Kind), u64>,
+    residues: BTreeMap<(String, Kind), u64>,
 }
 
 /// Atoms selected so far. Errors of a whole structure, such as a missing chain, are found at the end.
@@ -229,7 +229,7 @@ impl SelectedBlocks {
             let known = self.altlocs.iter().map(|letter| char::from(*letter).to_string()).collect();
             return missing("alternative location", format!("`{letter}`"), known);
         }
-        let (mut n_selected, mut left_out, mut residues) = (0, LeftOut::default(), HashMap::new());
+        let (mut n_selected, mut left_out, mut residues) = (0, LeftOut::default(), BTreeMap::new());
         for (number, counts) in std::mem::take(&mut self.by_chain).into_values().enumerate() {
             let of_names: u64 = counts.residues.values().sum();
             if assembly.is_some_and(|assembly| !assembly.covers(number)) {
