@@ -407,7 +407,8 @@ fn pod_matches_the_image_and_its_configuration() {
     let memory = container["resources"]["limits"]["memory"].as_str().unwrap();
     assert!(bytes(memory) >= budget(&config), "{memory} of memory for {} bytes", budget(&config));
     let volume = storage["spec"]["resources"]["requests"]["storage"].as_str().unwrap();
-    assert!(bytes(volume) > config.store.max_bytes + config.archive.cache_bytes, "{volume} on the volume");
+    let files = config.store.max_bytes + config.archive.cache_bytes + config.limits.scratch_bytes;
+    assert!(bytes(volume) > files, "{volume} on the volume");
     // Paths of the probes exist.
     let described = read("openapi.yaml");
     for (probe, path) in [("startupProbe", "/readyz"), ("readinessProbe", "/readyz"), ("livenessProbe", "/livez")] {
@@ -442,7 +443,8 @@ fn scaled_pods_fit_their_ephemeral_storage() {
     assert!(environment.iter().all(|(name, _)| name.starts_with("MOLMESH__")));
     let config = load(Some(&root().join(CONFIGURATIONS[1])), environment, &[]).unwrap().config;
     let volume = bytes(pod["volumes"][0]["emptyDir"]["sizeLimit"].as_str().unwrap());
-    assert!(volume > config.store.max_bytes + config.archive.cache_bytes, "{volume} bytes on the volume");
+    let files = config.store.max_bytes + config.archive.cache_bytes + config.limits.scratch_bytes;
+    assert!(volume > files, "{volume} bytes on the volume");
     let ephemeral = bytes(pod["containers"][0]["resources"]["limits"]["ephemeral-storage"].as_str().unwrap());
     assert!(ephemeral > volume, "{ephemeral} bytes of ephemeral storage for {volume}");
     assert_eq!(autoscaler["spec"]["scaleTargetRef"]["name"], patch["metadata"]["name"]);

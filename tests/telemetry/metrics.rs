@@ -68,6 +68,7 @@ const ROWS: &[Row] = &[
     (t::CACHE_REQUESTS, &["tier=\"memory\"", "result=\"hit\""], meshes),
     (t::STRUCTURE_CACHE_REQUESTS, &["result=\"miss\""], meshes),
     (t::STRUCTURE_CACHE_BYTES, &[], meshes),
+    (t::SCRATCH_BYTES, &[], tileset_on_disk),
     (t::STORE_BYTES, &["folder=\"results\""], meshes),
     (t::STORE_OBJECTS, &["folder=\"results\""], meshes),
     (t::STORE_REMOVED, &["reason=\"cap\""], full_store),
@@ -94,6 +95,19 @@ fn meshes(look: &dyn Fn()) {
     let ask = || server.post("/v1/meshes", &[], SAMPLE);
     assert_eq!(ask().status, 200);
     wait_for("the result is cached", || ask().header("server-timing").unwrap().contains("hit"));
+    look();
+}
+
+/// Tileset that does not fit into the cache of structures.
+fn tileset_on_disk(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |config| config.limits.structure_cache_bytes = 6 << 20);
+    let items = ["type_symbol", "label_atom_id", "label_comp_id", "label_seq_id", "Cartn_x", "Cartn_y", "Cartn_z"];
+    let mut text = "data_x\nloop_\n".to_owned();
+    items.iter().for_each(|item| text += &format!("_atom_site.{item}\n"));
+    (0..200_000).for_each(|i| text += &format!("C CA ALA {i} {} {} {}\n", i % 60, i / 60 % 60, i / 3600));
+    let stored = server.post("/v1/structures", &[], text.as_bytes());
+    let tileset = server.get(&format!("{}/tileset.json?resolution=2", stored.header("location").unwrap()));
+    assert_eq!(tileset.status, 200);
     look();
 }
 

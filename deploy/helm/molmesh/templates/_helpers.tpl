@@ -100,9 +100,9 @@ spec:
         - { name: tmp, mountPath: /tmp }
         - { name: keys, mountPath: /etc/molmesh-keys, readOnly: true }
   volumes:
-    # Copies of archive entries.
+    # Copies of archive entries, and temporary files within limits.scratch_bytes.
     - name: data
-      emptyDir: { sizeLimit: 4Gi }
+      emptyDir: { sizeLimit: 9Gi }
     - name: configuration
       configMap: { name: {{ .root.Release.Name }} }
     - name: tmp
