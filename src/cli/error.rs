@@ -148,10 +148,6 @@ impl CliError {
             Self::Usage { .. } => code::USAGE,
             Self::Input { .. } => code::INPUT,
             Self::InputTooLarge { .. } => code::LIMIT,
-            Self::Job {
-                source: JobError::Scratch { .. } | JobError::ScratchTooSmall { .. } | JobError::ScratchFull { .. },
-                ..
-            } => code::OUTPUT,
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
             Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
@@ -218,6 +214,9 @@ impl CliError {
 fn structure_code(error: &StructureError) -> i32 {
     match error {
         StructureError::Input { .. } => code::INPUT,
+        StructureError::Scratch { .. }
+        | StructureError::ScratchTooSmall { .. }
+        | StructureError::ScratchFull { .. } => code::OUTPUT,
         StructureError::InflatedTooLarge { .. }
         | StructureError::TooManyAtoms { .. }
         | StructureError::TooManyDuplicates { .. }

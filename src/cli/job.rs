@@ -8,9 +8,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
-use molmesh::pipeline::tileset::{self, ScratchFile, StreamSource, StructureStream, TilesetReport, WriteError};
+use molmesh::pipeline::tileset::{self, StreamSource, StructureStream, TilesetReport, WriteError};
 use molmesh::pipeline::{self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
-use molmesh::structure::stream::BLOCK_BYTES;
+use molmesh::structure::stream::{BLOCK_BYTES, ScratchFile};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, SurfaceError};

@@ -144,13 +144,6 @@ impl From<Failure> for Problem {
             Failure::Job { error: JobError::Picture(error), .. } => error.into(),
             Failure::Job { error: JobError::Color(error), .. } => error.into(),
             Failure::Job { error: JobError::Map(error), .. } => error.into(),
-            Failure::Job { error: error @ JobError::Scratch { .. }, .. } => Self::internal(error),
-            Failure::Job { error: error @ JobError::ScratchFull { limit }, .. } => {
-                Self::new(ProblemType::MemoryFull, error.to_string()).with("limit", limit)
-            }
-            Failure::Job { error: error @ JobError::ScratchTooSmall { limit }, .. } => {
-                Self::new(ProblemType::TooMuchMemory, error.to_string()).with("limit", limit)
-            }
             // Compression rejects no mesh for its size, so no resolution is suggested.
             Failure::Job { error: JobError::Format(error), .. } => format_problem(&error, 0.0),
             Failure::Check { ref diagnostics } => {
@@ -243,6 +236,9 @@ impl From<StructureError> for Problem {
         use StructureError as E;
         let detail = error.to_string();
         match error {
+            E::Scratch { .. } => Self::internal(detail),
+            E::ScratchTooSmall { limit } => Self::new(ProblemType::TooMuchMemory, detail).with("limit", limit),
+            E::ScratchFull { limit } => Self::new(ProblemType::MemoryFull, detail).with("limit", limit),
             E::Input { .. } | E::NotAStream { .. } => Self::new(ProblemType::UnreadableStructure, detail),
             E::UnknownFormat { found } => Self::new(ProblemType::UnreadableStructure, detail).with("found", found),
             E::Syntax { line, column, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)
@@ -397,8 +393,7 @@ impl From<SurfaceError> for Problem {
             E::Deadline => Self::new(ProblemType::Deadline, detail),
             E::Memory(error) => error.into(),
             E::Cancelled => Self::from(Failure::Stopped),
-            // Responses are not written to a sink.
-            E::Sink => Self::internal(detail),
+            E::Sink => Self::internal(detail), // Responses are not written to a sink.
         }
     }
 }

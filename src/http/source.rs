@@ -107,9 +107,9 @@ impl StructureSource {
         }
     }
 
-    /// Returns the structure in memory if there is one, for a `job` on a tile also as a part of its tileset, the tileset
-    /// if its atoms are on disk, or the file. `digest` is the one that [`Self::digest`] returned for this caller, which has checked that the structure
-    /// exists.
+    /// Returns the structure in memory if there is one, for a `job` on a tile also as a part of its tileset, the
+    /// tileset if its atoms are on disk, or the file. `digest` is the one that [`Self::digest`] returned for this
+    /// caller, which has checked that the structure exists.
     pub(super) async fn find(
         &self,
         app: &Shared,
@@ -154,8 +154,8 @@ impl StructureSource {
     }
 
     /// Returns a response with the document that `write` makes of the structure, or 304 if the client has it. `write`
-    /// holds the delivery slot of the request until its work has stopped. `job` is that of [`Self::find`]. The `ETag` is that of
-    /// [`etag`] with `variant`, the parameters of the document.
+    /// holds the delivery slot of the request until its work has stopped. `job` is that of [`Self::find`]. The `ETag`
+    /// is that of [`etag`] with `variant`, the parameters of the document.
     pub(super) async fn document<F>(
         self,
         app: &Shared,

@@ -5,8 +5,8 @@ use std::sync::{Arc, OnceLock, Weak};
 
 use super::Structures;
 use crate::memory_budget::{Budget, Reclaim};
-use crate::pipeline::JobError;
-use crate::pipeline::tileset::ScratchFile;
+use crate::structure::StructureError;
+use crate::structure::stream::ScratchFile;
 
 /// Folder for temporary files, within a limit of their size.
 #[derive(Debug)]
@@ -35,10 +35,10 @@ impl ScratchSpace {
     /// Creates a file. It has no name, so that the system removes it when it is closed, also after a crash.
     ///
     /// # Errors
-    /// Returns [`JobError::Scratch`].
-    pub(super) fn file(&self) -> Result<ScratchFile, JobError> {
+    /// Returns [`StructureError::Scratch`].
+    pub(super) fn file(&self) -> Result<ScratchFile, StructureError> {
         let file = tempfile::tempfile_in(&self.folder);
-        let file = file.map_err(|error| JobError::Scratch { reason: error.to_string() })?;
+        let file = file.map_err(|error| StructureError::Scratch { reason: error.to_string() })?;
         Ok(ScratchFile { file, meter: Arc::new(self.budget.reservation()) })
     }
 }

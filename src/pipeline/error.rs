@@ -27,24 +27,6 @@ pub enum JobError {
     /// Reading the map failed.
     #[error(transparent)]
     Map(MapError),
-    /// The index of atoms on disk failed.
-    #[error("cannot use the temporary file of the index of atoms: {reason}")]
-    Scratch {
-        /// Message of the system.
-        reason: String,
-    },
-    /// The index of a tileset needs more disk space than allowed.
-    #[error("the index of the tileset needs more than {limit} bytes of disk space, the limit of temporary files")]
-    ScratchTooSmall {
-        /// Size of the disk space, bytes.
-        limit: u64,
-    },
-    /// The indexes of other tilesets use the disk space.
-    #[error("the indexes of other tilesets are in use and take most of the {limit} bytes of disk space for them")]
-    ScratchFull {
-        /// Size of the disk space, bytes.
-        limit: u64,
-    },
     /// The mesh cannot be compressed.
     #[error(transparent)]
     Format(#[from] FormatError),

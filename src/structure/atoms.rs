@@ -108,11 +108,6 @@ impl Structure {
         self.element.is_empty()
     }
 
-    /// Returns the column of the chain names that the assemblies of this file use.
-    pub(crate) fn assembly_chains(&self) -> &TextColumn {
-        if self.label_chain.is_empty() { &self.chain } else { &self.label_chain }
-    }
-
     /// Returns the van der Waals radius of atom `i`, Å: the radius in the file or, without one, of the element.
     #[must_use]
     pub fn vdw_radius(&self, i: usize) -> f32 {
@@ -160,7 +155,7 @@ pub(super) struct Atom {
 }
 
 /// Fields of a structure that are not columns.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct SourceFields {
     pub(super) format: SourceFormat,
     pub(super) id: Option<String>,

@@ -54,6 +54,11 @@ struct RuleChains<'s> {
     chains: Vec<u32>,
 }
 
+/// Returns the column of the chain names that the assemblies of a file use.
+pub(super) fn chain_column(structure: &Structure) -> &TextColumn {
+    if structure.label_chain.is_empty() { &structure.chain } else { &structure.label_chain }
+}
+
 /// Rules of an assembly for the chains of a file.
 pub(crate) struct AssemblyRules<'s> {
     assemblies: &'s Assemblies,
@@ -226,7 +231,7 @@ impl<'s> Assembly<'s> {
     /// # Errors
     /// Returns the errors of [`AssemblyRules::find`].
     pub(super) fn find(structure: &'s Structure, id: &'s str) -> Result<Self, StructureError> {
-        let column = structure.assembly_chains();
+        let column = chain_column(structure);
         let rules = AssemblyRules::find(&structure.assemblies, &column.texts().collect::<Vec<_>>(), id)?;
         Ok(Self { structure, column, rules })
     }

@@ -44,6 +44,24 @@ pub enum StructureError {
         /// Message of the system.
         reason: String,
     },
+    /// The temporary file failed.
+    #[error("cannot use the temporary file of the index of atoms: {reason}")]
+    Scratch {
+        /// Message of the system.
+        reason: String,
+    },
+    /// The temporary file would exceed its limit.
+    #[error("the index of the atoms needs more than {limit} bytes of disk space, the limit of temporary files")]
+    ScratchTooSmall {
+        /// Size of the disk space, bytes.
+        limit: u64,
+    },
+    /// Other temporary files use the disk space.
+    #[error("the indexes of other structures are in use and take most of the {limit} bytes of disk space for them")]
+    ScratchFull {
+        /// Size of the disk space, bytes.
+        limit: u64,
+    },
     /// The file cannot be read as a stream.
     #[error(
         "cannot read the file as a stream: found {found}, expected {expected}; it can be read if it fits into memory"

@@ -17,7 +17,7 @@ use super::read::Reading;
 use super::{pieces, residue, sites};
 
 /// Sequence information of a file, by chain.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Sequence {
     /// Chains and residue names of SEQRES and MODRES records, standard residues excepted.
     pub(super) listed: HashSet<Listed>,
@@ -226,9 +226,15 @@ impl HeteroBlocks {
         self.0 |= reading.hetero.load(Ordering::Relaxed);
     }
 
-    /// Returns true if sequence numbers distinguish polymers, as the blocks assume, or no record depends on it.
-    pub(super) const fn agree(&self) -> bool {
-        self.0 & OPEN == 0 || are_numbered(self.0)
+    /// Rejects records whose sequence numbers do not distinguish polymers, as the blocks assume. `expected` describes a
+    /// file of known entities.
+    pub(super) fn check(&self, expected: &'static str) -> Result<(), StructureError> {
+        if self.0 & OPEN == 0 || are_numbered(self.0) {
+            return Ok(());
+        }
+        let found =
+            "HETATM records with `label_seq_id` of chains whose entity is unknown, and none without, or water with";
+        Err(StructureError::NotAStream { found: found.to_owned(), expected })
     }
 }
 

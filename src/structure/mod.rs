@@ -42,6 +42,7 @@ pub mod select;
 mod sites;
 mod sniff;
 pub mod split;
+mod stored;
 pub mod stream;
 #[cfg(feature = "strict")]
 mod strict_cost;

@@ -1,16 +1,19 @@
 //! Reads a structure file in blocks, so that the memory depends on a block and not on the file.
 //!
-//! A block is a number of rows of the `atom_site` loop of an mmCIF file, with everything before the first row. It ends
-//! where the residues before and after do not depend on each other. Files of other formats are one block.
+//! A block is a number of rows of `atom_site`, with everything before the first row of an mmCIF file, or all other
+//! categories of a BinaryCIF file. It ends where the residues before and after do not depend on each other. Files of
+//! other formats are one block.
+
+mod lines;
 
 use std::io::Read;
 use std::sync::Arc;
 
+use self::lines::{TagsAfterAtoms, end_of_rows, rows};
 use super::annotations::Annotations;
 use super::assembly::Assemblies;
 use super::atoms::{SourceFormat, Structure};
-use super::categories::Categories;
-use super::cif::{TokenKind, Tokenizer};
+use super::bcif::{self, RowStream, Skeleton};
 use super::decoder::Decoder;
 use super::error::StructureError;
 use super::kinds::{self, HeteroBlocks};
@@ -19,12 +22,16 @@ use super::texts::TextColumn;
 use super::{duplicates, mmcif, sniff};
 use crate::surface::{Control, MemoryMeter as _, Reservation};
 
+pub use super::stored::{ScratchFile, StoredBytes};
+
 /// Bytes of the rows of a block: about 270,000 atoms.
 pub const BLOCK_BYTES: usize = 16 << 20;
 /// Bytes that are read at a time.
 const STEP: usize = 1 << 20;
-/// First words of a line after the last row, besides tags.
-const WORDS: [&[u8]; 5] = [b"loop_", b"data_", b"save_", b"global_", b"stop_"];
+/// Bytes of a block for each row of a BinaryCIF file.
+const ROW_BYTES: usize = 60;
+/// Part of a block from which on byte strings of a BinaryCIF file are in the temporary file: 64 KiB.
+const MOVED_PART: usize = 256;
 
 /// Some atoms of a structure.
 #[derive(Debug)]
@@ -82,6 +89,13 @@ pub fn check_positions(
     duplicates::check(n, |i| (1, centre(i)), &Reading::new(limits, control))
 }
 
+/// Content of a BinaryCIF file.
+enum Binary {
+    /// File that is one block.
+    Whole(Skeleton),
+    Rows(Box<RowStream>),
+}
+
 /// Blocks of a file, in file order.
 pub struct Blocks<'a> {
     input: Decoder<'a>,
@@ -91,6 +105,8 @@ pub struct Blocks<'a> {
     memory: Reservation,
     /// Length of the text before the first row; `None` to read the file as one block.
     head: Option<usize>,
+    /// Content of a BinaryCIF file.
+    binary: Option<Binary>,
     /// Bytes of the rows of a block.
     block_bytes: usize,
     /// Decompressed bytes so far.
@@ -109,8 +125,8 @@ pub struct Blocks<'a> {
 }
 
 impl<'a> Blocks<'a> {
-    /// Begins to read a file in blocks of about `block_bytes`. With `needs_secondary`, helices and strands must precede
-    /// the atoms.
+    /// Begins to read a file in blocks of about `block_bytes`. With `needs_secondary`, helices and strands of an mmCIF
+    /// file must precede the atoms. Large columns of a BinaryCIF file are moved to `stored`.
     ///
     /// # Errors
     /// Returns the errors of reading.
@@ -118,6 +134,7 @@ impl<'a> Blocks<'a> {
         input: Box<dyn Read + Send + 'a>,
         block_bytes: usize,
         needs_secondary: bool,
+        stored: &Arc<StoredBytes>,
         limits: &ReadLimits,
         control: &Control<'_>,
     ) -> Result<Self, StructureError> {
@@ -127,6 +144,7 @@ impl<'a> Blocks<'a> {
             text: Vec::new(),
             memory: Reservation::new(&control.memory),
             head: None,
+            binary: None,
             block_bytes,
             inflated: 0,
             lines: 0,
@@ -141,12 +159,16 @@ impl<'a> Blocks<'a> {
         loop {
             blocks.fill(size, control)?;
             let text = without_mark(&blocks.text);
-            if sniff::sniff(text)? == SourceFormat::Mmcif {
-                blocks.head = mmcif::first_row(text).map(|first| blocks.text.len() - text.len() + first);
-                if blocks.head.is_none() && !blocks.at_end {
-                    size *= 2;
-                    continue;
+            match sniff::sniff(text)? {
+                SourceFormat::Mmcif => {
+                    blocks.head = mmcif::first_row(text).map(|first| blocks.text.len() - text.len() + first);
+                    if blocks.head.is_none() && !blocks.at_end {
+                        size *= 2;
+                        continue;
+                    }
                 }
+                SourceFormat::BinaryCif => blocks.binary = Some(blocks.open_binary(stored, control)?),
+                _ => {}
             }
             break;
         }
@@ -160,6 +182,23 @@ impl<'a> Blocks<'a> {
         Ok(blocks)
     }
 
+    /// Reads a BinaryCIF file.
+    fn open_binary(&mut self, stored: &Arc<StoredBytes>, control: &Control<'_>) -> Result<Binary, StructureError> {
+        let mut skeleton = Skeleton::new(stored, (self.block_bytes / MOVED_PART) as u64, control);
+        skeleton.add(without_mark(&self.text))?;
+        while !self.at_end {
+            self.text.clear();
+            self.fill(1, control)?;
+            skeleton.add(&self.text)?;
+        }
+        let rows = (self.block_bytes / ROW_BYTES).max(1);
+        let Some(mut opened) = RowStream::open(&skeleton, rows, &self.limits, control)? else {
+            return Ok(Binary::Whole(skeleton));
+        };
+        self.assemblies = opened.take_assemblies();
+        Ok(Binary::Rows(Box::new(opened)))
+    }
+
     /// Returns the next block; `None` at the end. The memory of its structure stays added to the meter of `control`.
     ///
     /// # Errors
@@ -169,11 +208,17 @@ impl<'a> Blocks<'a> {
         if self.finished {
             return Ok(None);
         }
+        if let Some(Binary::Rows(rows)) = &mut self.binary {
+            return rows.next(&self.limits, control);
+        }
         let Some(head) = self.head else {
             self.finished = true;
             self.fill(usize::MAX, control)?;
             let reading = Reading::new(&self.limits, control);
-            let mut structure = of_text(without_mark(&self.text), &reading)?;
+            let mut structure = match &self.binary {
+                Some(Binary::Whole(skeleton)) => bcif::read_skeleton(skeleton, &reading)?,
+                _ => of_text(without_mark(&self.text), &reading)?,
+            };
             self.assemblies = std::mem::take(&mut structure.assemblies);
             return Ok(Some(Block { len: structure.len(), structure }));
         };
@@ -262,11 +307,7 @@ impl<'a> Blocks<'a> {
 
     /// Reads the rest of the data block, from `end` of the text on, and rejects categories that change the atoms.
     fn end(&mut self, end: usize, control: &Control<'_>) -> Result<(), StructureError> {
-        if !self.hetero.agree() {
-            let found =
-                "HETATM records with `label_seq_id` of chains whose entity is unknown, and none without, or water with";
-            return Err(not_a_stream(found, "the categories `entity` and `struct_asym` before the atoms"));
-        }
+        self.hetero.check("the categories `entity` and `struct_asym` before the atoms")?;
         let head = self.head.unwrap_or(0);
         self.text.drain(head..end);
         self.memory.grow(head as u64)?;
@@ -313,106 +354,12 @@ impl<'a> Blocks<'a> {
     }
 }
 
-/// Scanner of the lines after the atoms.
-#[derive(Default)]
-struct TagsAfterAtoms {
-    in_text_field: bool,
-    /// Text before the atoms, and the categories after them that describe assemblies.
-    assemblies: Vec<u8>,
-    /// True in such a category.
-    in_assemblies: bool,
-    /// True after `loop_`.
-    begins_loop: bool,
-}
-
-impl TagsAfterAtoms {
-    /// Returns true if a line begins the next data block. Rejects tags that change the atoms.
-    fn is_last(&mut self, line: &[u8], needs_secondary: bool) -> Result<bool, StructureError> {
-        let delimits = line.first() == Some(&b';');
-        let is_value = self.in_text_field != delimits;
-        self.in_text_field = is_value;
-        if self.in_assemblies && (is_value || delimits) {
-            self.assemblies.extend_from_slice(if is_value { line } else { b";" });
-        }
-        if is_value {
-            return Ok(false);
-        }
-        // Behind the semicolon that ends a text field.
-        let text = &line[usize::from(delimits)..];
-        let mut tokens = Tokenizer::new(text);
-        // The other values after the atoms are not read, so faults of theirs do not matter.
-        while let Ok(token) = tokens.next() {
-            let word = &text[token.start..token.end];
-            match token.kind {
-                TokenKind::End => break,
-                TokenKind::Data => return Ok(true),
-                TokenKind::Tag => {
-                    check_tag(&word[1..], needs_secondary)?;
-                    self.in_assemblies = Categories::is_assembly(&word[1..]);
-                    if self.in_assemblies && self.begins_loop {
-                        self.assemblies.extend_from_slice(b" loop_");
-                    }
-                }
-                TokenKind::Value => {}
-                _ => self.in_assemblies = false,
-            }
-            self.begins_loop = token.kind == TokenKind::Loop;
-            if self.in_assemblies {
-                // No value begins a line, because a semicolon there would begin a text field.
-                self.assemblies.push(b' ');
-                self.assemblies.extend_from_slice(word);
-            }
-        }
-        if self.in_assemblies {
-            self.assemblies.push(b'\n');
-        }
-        Ok(false)
-    }
-}
-
-/// Rejects a tag after the atoms, without its underscore, that changes them.
-fn check_tag(tag: &[u8], needs_secondary: bool) -> Result<(), StructureError> {
-    let Some([entities, secondary]) = Categories::find(tag).map(Categories::describes) else { return Ok(()) };
-    if entities || (secondary && needs_secondary) {
-        let found = format!("`_{}` after the atoms", String::from_utf8_lossy(tag));
-        return Err(not_a_stream(&found, "entities, chains, helices and strands before the atoms"));
-    }
-    Ok(())
-}
-
 fn not_a_stream(found: &str, expected: &'static str) -> StructureError {
     StructureError::NotAStream { found: found.to_owned(), expected }
 }
 
 fn not_lines(found: &str) -> StructureError {
     not_a_stream(found, "one line for each row of `atom_site`")
-}
-
-/// Returns true if a line begins with a word, in any letter case.
-fn begins(line: &[u8], word: &[u8]) -> bool {
-    line.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word))
-}
-
-/// Returns start and end of the lines that are neither blank nor comments.
-fn rows(text: &[u8]) -> impl Iterator<Item = (usize, usize)> {
-    let mut start = 0;
-    let lines = std::iter::from_fn(move || {
-        let from = start;
-        let rest = text.get(from..).filter(|rest| !rest.is_empty())?;
-        start = memchr::memchr(b'\n', rest).map_or(text.len(), |i| from + i + 1);
-        Some((from, start))
-    });
-    lines.filter(|&(start, end)| !matches!(text[start..end].trim_ascii_start().first(), None | Some(b'#')))
-}
-
-/// Returns the start of the line after the last row, if the text contains it. This line contains an underscore, which
-/// few rows do.
-fn end_of_rows(text: &[u8]) -> Option<usize> {
-    memchr::memchr_iter(b'_', text).find_map(|at| {
-        let start = memchr::memrchr(b'\n', &text[..at]).map_or(0, |i| i + 1);
-        let line = text[start..].trim_ascii_start();
-        (line.starts_with(b"_") || WORDS.iter().any(|word| begins(line, word))).then_some(start)
-    })
 }
 
 #[cfg(test)]
@@ -425,6 +372,10 @@ mod tests {
                         _atom_site.label_atom_id\n_atom_site.auth_comp_id\n_atom_site.auth_asym_id\n\
                         _atom_site.auth_seq_id\n_atom_site.label_seq_id\n_atom_site.Cartn_x\n_atom_site.Cartn_y\n\
                         _atom_site.Cartn_z\n";
+
+    fn stored() -> Arc<StoredBytes> {
+        Arc::new(StoredBytes::new(ScratchFile { file: tempfile::tempfile().unwrap(), meter: Arc::new(()) }))
+    }
 
     type Row = (String, String, i32, Kind, [f64; 3]);
 
@@ -445,7 +396,7 @@ mod tests {
     /// Reads a text in blocks of `size` bytes. Returns all atoms and the number of blocks.
     fn blocks(text: &str, size: usize) -> Result<(Vec<Row>, usize), StructureError> {
         let (control, limits) = (Control::default(), ReadLimits::default());
-        let mut blocks = Blocks::new(Box::new(text.as_bytes()), size, false, &limits, &control)?;
+        let mut blocks = Blocks::new(Box::new(text.as_bytes()), size, false, &stored(), &limits, &control)?;
         let (mut found, mut n) = (Vec::new(), 0);
         while let Some(block) = blocks.next(&control)? {
             found.extend(of(&block.structure, block.len));
@@ -509,7 +460,8 @@ mod tests {
                 let selection = Selection { atoms: atoms.parse().unwrap(), ..Selection::default() };
                 let Ok(expected) = select(&structure, &selection) else { continue };
                 for size in [10_000, 200_000] {
-                    let mut blocks = Blocks::new(Box::new(&bytes[..]), size, true, &limits, &control).unwrap();
+                    let mut blocks =
+                        Blocks::new(Box::new(&bytes[..]), size, true, &stored(), &limits, &control).unwrap();
                     let (mut selected, mut found) = (SelectedBlocks::new(&control), Vec::new());
                     while let Some(block) = blocks.next(&control).unwrap() {
                         let first = u32::try_from(selected.n_atoms).unwrap();

@@ -232,12 +232,13 @@ fn an_index_on_disk_gives_the_same_files_and_is_removed() {
     fs::create_dir(&scratch).unwrap();
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples");
     let more = ["--resolution", "0.5", "--color", "chain", "--atom-ids", "--report", "json"];
+    let of_assembly = [&more[..], &["--assembly", "1"]].concat();
     let mut all = Vec::new();
-    for name in ["4pti.pdb", "1crn.cif"] {
+    for (name, more) in [("4pti.pdb", &of_assembly[..]), ("1crn.cif", &of_assembly), ("1crn.cif", &more)] {
         let input = root.join(name);
         let made = molmesh().arg("tileset").arg(&input).arg("-o").arg(&memory).args(more).output().unwrap();
         assert_code(&made, 0);
-        let streamed = streamed(&[&input], &disk, &scratch, &more);
+        let streamed = streamed(&[&input], &disk, &scratch, more);
         assert_code(&streamed, 0);
         assert_eq!(stdout(&streamed), stdout(&made));
         assert!(contents(&disk) == contents(&memory), "{name}");
@@ -255,7 +256,7 @@ fn an_index_on_disk_gives_the_same_files_and_is_removed() {
     let file = |name: &str, rows: &[&str]| folder.file(name, format!("{head}{}\n", rows.join("\n")));
     let parts = [file("1.cif", &rows[..100]), file("2.cif", &rows[100..])];
     assert_code(&streamed(&[&parts[0], &parts[1]], &disk, &scratch, &more), 0);
-    assert!(contents(&disk) == all[1]);
+    assert!(contents(&disk) == all[2]);
 }
 
 #[test]
@@ -267,8 +268,7 @@ fn files_and_parameters_that_cannot_be_streamed_are_rejected() {
     let run = |more: &[&str]| streamed(&[&sample], &output, &scratch, more);
     for (more, expected) in [
         (&["--select", "polymer and within 5 of water"][..], "`select`"),
-        (&["--assembly", "1"], "`assembly`"),
-        (&["--assembly", "1", "--instances"], "`assembly`"),
+        (&["--assembly", "1", "--instances"], "`instances`"),
         (&["--detail", "3"], "`detail`"),
         (&["--color", "bfactor"], "`color_range`"),
         (&["--color", "plddt"], "`color`"),
@@ -279,6 +279,10 @@ fn files_and_parameters_that_cannot_be_streamed_are_rejected() {
         let text = stderr(&refused);
         assert!(text.contains(expected) && text.contains("--scratch"), "{more:?}: {text}");
     }
+    let several = streamed(&[&sample, &sample], &output, &scratch, &["--assembly", "1"]);
+    assert_code(&several, 2);
+    assert!(stderr(&several).contains("`assembly`"), "{}", stderr(&several));
+    assert_code(&run(&["--assembly", "9"]), 4);
     assert_code(&run(&["--chains", "Q"]), 4);
     assert_code(&run(&["--max-atoms", "100"]), 5);
     assert_code(&run(&["--isovalue", "1000"]), 2);

@@ -11,6 +11,7 @@ mod tools;
 
 mod architecture;
 mod bcif_oracles;
+mod bcif_stream;
 mod cancellation;
 mod cavities;
 mod cut;

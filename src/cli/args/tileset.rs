@@ -24,8 +24,8 @@ pub(crate) struct TilesetArgs {
     #[arg(short, long)]
     pub(crate) output: PathBuf,
     /// Folder for a temporary index of the atoms, for structures larger than memory: 48 bytes per atom and more. mmCIF
-    /// files are read in blocks, files of other formats one at a time. Raises the limits of atoms to 4294967295 and of
-    /// each input to 1TiB, unless they are given
+    /// and BinaryCIF files are read in blocks, files of other formats one at a time. Raises the limits of atoms to
+    /// 4294967295 and of each input to 1TiB, unless they are given
     #[arg(long, value_name = "FOLDER")]
     pub(crate) scratch: Option<PathBuf>,
     #[command(flatten)]

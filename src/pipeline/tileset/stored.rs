@@ -1,15 +1,14 @@
 //! Index of spheres in a file: sorted by cube, so that tiles read the spheres near them.
 
-use std::fs::File;
-use std::io::{self, Read as _, Seek as _, SeekFrom, Write as _};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
 use rustc_hash::FxHashMap;
 
 use super::level::{cube, grid_cell};
 use crate::pipeline::JobError;
-use crate::surface::{Control, MemoryMeter, OutOfMemory, Reservation, SurfaceError};
+use crate::structure::stream::StoredBytes;
+use crate::surface::{Control, MemoryMeter as _, Reservation, SurfaceError};
 
 /// Memory of a cube, and of a part of it in the file, bytes.
 const CUBE_BYTES: u64 = 128;
@@ -37,62 +36,18 @@ impl StoredSphere {
     }
 }
 
-/// Temporary file.
-#[derive(Debug)]
-pub struct ScratchFile {
-    /// Empty file that can be read and written.
-    pub file: File,
-    /// Counter of the bytes in the file.
-    pub meter: Arc<dyn MemoryMeter>,
-}
-
-/// File of spheres.
-#[derive(Debug)]
-pub(super) struct SphereFile {
-    /// File and its length.
-    file: Mutex<(File, u64)>,
-    bytes: Reservation,
-}
-
-impl SphereFile {
-    /// Takes an empty file.
-    pub(super) fn new(ScratchFile { file, meter }: ScratchFile) -> Self {
-        Self { file: Mutex::new((file, 0)), bytes: Reservation::new(&meter) }
-    }
-
-    /// Writes spheres at the end. Returns their offset, bytes.
-    fn append(&self, spheres: &[StoredSphere]) -> Result<u64, JobError> {
-        self.bytes.grow(size_of_val(spheres) as u64).map_err(|error| match error {
-            OutOfMemory::Limit { limit, .. } => JobError::ScratchTooSmall { limit },
-            OutOfMemory::Budget { limit, .. } => JobError::ScratchFull { limit },
-            error @ OutOfMemory::System { .. } => SurfaceError::from(error).into(),
-        })?;
-        let mut guard = self.file.lock().unwrap_or_else(PoisonError::into_inner);
-        let (file, length) = &mut *guard;
-        let bytes: &[u8] = bytemuck::must_cast_slice(spheres);
-        let offset = *length;
-        file.seek(SeekFrom::Start(offset)).and_then(|_| file.write_all(bytes)).map_err(|error| failure(&error))?;
-        *length += bytes.len() as u64;
-        Ok(offset)
-    }
-
-    /// Reads spheres from an offset on.
-    fn read(&self, offset: u64, spheres: &mut [StoredSphere]) -> Result<(), JobError> {
-        let mut guard = self.file.lock().unwrap_or_else(PoisonError::into_inner);
-        let file = &mut guard.0;
-        let bytes: &mut [u8] = bytemuck::must_cast_slice_mut(spheres);
-        file.seek(SeekFrom::Start(offset)).and_then(|_| file.read_exact(bytes)).map_err(|error| failure(&error))
-    }
-}
-
-fn failure(error: &io::Error) -> JobError {
-    JobError::Scratch { reason: error.to_string() }
+/// Writes spheres at the end of a file. Returns their offset, bytes.
+fn append(file: &StoredBytes, spheres: &[StoredSphere]) -> Result<u64, JobError> {
+    let bytes: &[u8] = bytemuck::must_cast_slice(spheres);
+    let offset = file.reserve(bytes.len() as u64);
+    file.write(offset, bytes)?;
+    Ok(offset)
 }
 
 /// Spheres in a file, in the order in which they were added.
 #[derive(Debug)]
 pub(super) struct SphereList {
-    file: Arc<SphereFile>,
+    file: Arc<StoredBytes>,
     /// Offsets and lengths of the parts in the file.
     runs: Vec<(u64, u32)>,
     buffer: Vec<StoredSphere>,
@@ -104,7 +59,7 @@ const RUN: usize = 1 << 14;
 
 impl SphereList {
     /// Creates an empty list.
-    pub(super) fn new(file: &Arc<SphereFile>, control: &Control<'_>) -> Result<Self, JobError> {
+    pub(super) fn new(file: &Arc<StoredBytes>, control: &Control<'_>) -> Result<Self, JobError> {
         let memory = control.reserve((RUN * size_of::<StoredSphere>()) as u64).map_err(SurfaceError::from)?;
         Ok(Self { file: Arc::clone(file), runs: Vec::new(), buffer: Vec::with_capacity(RUN), memory })
     }
@@ -118,7 +73,7 @@ impl SphereList {
     fn flush(&mut self) -> Result<(), JobError> {
         self.memory.grow(RUN_BYTES).map_err(SurfaceError::from)?;
         let length = u32::try_from(self.buffer.len()).unwrap_or(u32::MAX);
-        self.runs.push((self.file.append(&self.buffer)?, length));
+        self.runs.push((append(&self.file, &self.buffer)?, length));
         self.buffer.clear();
         Ok(())
     }
@@ -131,7 +86,7 @@ impl SphereList {
         self.flush()?;
         for (offset, length) in self.runs {
             self.buffer.resize(length as usize, StoredSphere::default());
-            self.file.read(offset, &mut self.buffer)?;
+            self.file.read(offset, bytemuck::must_cast_slice_mut(&mut self.buffer))?;
             visit(&self.buffer)?;
         }
         Ok(())
@@ -148,7 +103,7 @@ struct StoredCube {
 /// Spheres by the cube that contains their centres.
 #[derive(Debug)]
 pub(super) struct SphereIndex {
-    file: Arc<SphereFile>,
+    file: Arc<StoredBytes>,
     /// Edge length of the cubes, Å.
     side: f64,
     numbers: FxHashMap<[i64; 3], usize>,
@@ -171,7 +126,7 @@ impl SphereIndex {
     /// Creates an empty index with cubes of the edge length `side`, Å. Writes spheres when `buffer_bytes` are in
     /// memory.
     pub(super) fn new(
-        file: &Arc<SphereFile>,
+        file: &Arc<StoredBytes>,
         side: f64,
         buffer_bytes: usize,
         control: &Control<'_>,
@@ -221,7 +176,7 @@ impl SphereIndex {
     fn flush(&mut self) -> Result<(), JobError> {
         for cube in self.cubes.iter_mut().filter(|cube| !cube.buffer.is_empty()) {
             let buffer = std::mem::take(&mut cube.buffer);
-            let offset = self.file.append(&buffer)?;
+            let offset = append(&self.file, &buffer)?;
             self.memory.grow(RUN_BYTES).map_err(SurfaceError::from)?;
             cube.runs.push((offset, u32::try_from(buffer.len()).unwrap_or(u32::MAX)));
         }
@@ -254,7 +209,7 @@ impl SphereIndex {
         let mut rest = &mut spheres[..];
         for (offset, length) in cubes.iter().flat_map(|number| &self.cubes[*number].runs) {
             let (run, others) = rest.split_at_mut(*length as usize);
-            self.file.read(*offset, run)?;
+            self.file.read(*offset, bytemuck::must_cast_slice_mut(run))?;
             rest = others;
         }
         Ok((spheres, memory))

@@ -9,13 +9,13 @@ use super::Tileset;
 use super::layout::{CELLS, Layout};
 use super::level::{GROUP_ABOVE, MIN_BUCKET, cube, group_of};
 use super::source::{LevelSource, Streamed};
-use super::stored::{ScratchFile, SphereFile, SphereIndex, SphereList, StoredSphere};
+use super::stored::{SphereIndex, SphereList, StoredSphere};
 use crate::formats::tileset::TileAddress;
 use crate::pipeline::color::{BlockColors, Scheme};
 use crate::pipeline::load::SPHERE_BYTES;
 use crate::pipeline::params::ParamError;
 use crate::pipeline::{Job, JobError, StageClock};
-use crate::structure::stream::{Block, Blocks, check_positions};
+use crate::structure::stream::{Block, Blocks, ScratchFile, StoredBytes, check_positions};
 use crate::structure::{Assemblies, AssemblyRules, Placements, ReadLimits, SelectedBlocks, SelectedOfBlock, Structure};
 use crate::surface::clip::influence_of;
 use crate::surface::{Control, Reservation, Spheres, SurfaceError, SurfaceParams};
@@ -41,7 +41,7 @@ pub enum StreamSource<'a> {
 pub struct StructureStream<'a> {
     /// Source of the atoms.
     pub source: StreamSource<'a>,
-    /// File for the index.
+    /// File for the index and for large columns of BinaryCIF.
     pub scratch: ScratchFile,
     /// Bytes of a block of text.
     pub block_bytes: usize,
@@ -108,14 +108,14 @@ impl BlockReader<'_> {
     /// Adds the atoms of a file. Reads blocks of about `block_bytes`.
     fn read(
         &mut self,
-        input: Box<dyn Read + Send + '_>,
-        block_bytes: usize,
+        (input, block_bytes): (Box<dyn Read + Send + '_>, usize),
+        file: &Arc<StoredBytes>,
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<(), JobError> {
         self.selected.begin_file();
         let needs_secondary = self.job.color.is_some_and(|color| color.scheme == Scheme::SecondaryStructure);
-        let open = || Blocks::new(input, block_bytes, needs_secondary, self.limits, control);
+        let open = || Blocks::new(input, block_bytes, needs_secondary, file, self.limits, control);
         let mut blocks = clock.time("read", open)?;
         loop {
             // Releases the memory of the block.
@@ -176,7 +176,7 @@ impl Tileset<Box<Structure>> {
         clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
         let params = SurfaceParams { atom_ids: job.needs_atoms(), ..job.params.clone() };
-        let file = Arc::new(SphereFile::new(stream.scratch));
+        let file = Arc::new(StoredBytes::new(stream.scratch));
         let mut side = order_side(params.resolution);
         while side >= 2.0 * MIN_BUCKET {
             side *= 0.5;
@@ -197,7 +197,7 @@ impl Tileset<Box<Structure>> {
             StreamSource::Files(files) => {
                 for (number, input) in files.into_iter().enumerate() {
                     (stream.began)(number);
-                    reader.read(input, stream.block_bytes, control, clock)?;
+                    reader.read((input, stream.block_bytes), &file, control, clock)?;
                 }
             }
             StreamSource::Structure(structure) => {
@@ -323,7 +323,7 @@ impl Layout {
     fn index_of(
         &self,
         atoms: &Arc<SphereIndex>,
-        file: &Arc<SphereFile>,
+        file: &Arc<StoredBytes>,
         buffer: usize,
         params: &SurfaceParams,
         control: &Control<'_>,

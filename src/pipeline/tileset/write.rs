@@ -132,7 +132,7 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
 /// Writes all files of a tileset as [`write()`] does, of a structure that is read as a stream. The job has no assembly.
 ///
 /// # Errors
-/// Returns the errors of [`write()`], and [`JobError::Scratch`].
+/// Returns the errors of [`write()`], and those of the temporary file.
 pub fn write_stream(
     stream: StructureStream<'_>,
     job: &Job,

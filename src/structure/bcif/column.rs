@@ -1,37 +1,63 @@
-//! Columns of a category: values, and the rows without a value.
+//! Decoded columns of a category: values, and the rows without a value.
 
 use std::borrow::Cow;
-
-use super::super::text::decode;
-use super::decode::Values;
-use super::encoding::{Chain, Strings};
-use super::fault::Fault;
-use super::msgpack::{Cursor, PackToken};
-
-/// An undecoded column.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Raw<'a> {
-    pub(super) name: &'a [u8],
-    data: Cursor<'a>,
-    mask: Option<Cursor<'a>>,
-}
 
 /// Texts by row.
 #[derive(Debug)]
 pub(super) struct Texts<'a> {
     pub(super) joined: Cow<'a, [u8]>,
     /// Start of each text in `joined`, followed by the end of the last one.
-    offsets: Vec<u32>,
+    pub(super) offsets: Vec<u32>,
     /// Text id by row; negative if there is none.
-    ids: Vec<i32>,
+    pub(super) ids: Vec<i32>,
+    /// True if the texts are converted integers.
+    pub(super) are_written: bool,
 }
 
 impl Texts<'_> {
+    /// Creates a column without rows for converted integers.
+    pub(super) fn written() -> Self {
+        Self { joined: Cow::Owned(Vec::new()), offsets: vec![0], ids: Vec::new(), are_written: true }
+    }
+
     /// Returns the range in `joined` of the text of a row.
     #[inline]
     pub(super) fn range(&self, row: usize) -> Option<(usize, usize)> {
         let id = usize::try_from(self.ids[row]).ok()?;
         Some((self.offsets[id] as usize, self.offsets[id + 1] as usize))
+    }
+
+    /// Adds rows of integers, converted to texts, one for each run of equal values.
+    pub(super) fn write(&mut self, values: &[i32]) {
+        let joined = self.joined.to_mut();
+        let mut id = i32::try_from(self.offsets.len()).unwrap_or(i32::MAX) - 2;
+        for (i, value) in values.iter().enumerate() {
+            if i == 0 || values[i - 1] != *value {
+                joined.extend_from_slice(itoa::Buffer::new().format(*value).as_bytes());
+                self.offsets.push(u32::try_from(joined.len()).unwrap_or(u32::MAX));
+                id += 1;
+            }
+            self.ids.push(id);
+        }
+    }
+
+    /// Removes the first `n` rows. Texts of a dictionary remain.
+    fn remove(&mut self, n: usize) {
+        self.ids.drain(..n);
+        if !self.are_written {
+            return;
+        }
+        let first = self.ids.first().copied();
+        let n_texts = first.map_or(self.offsets.len() - 1, |id| usize::try_from(id).unwrap_or(0));
+        let start = self.offsets[n_texts];
+        self.joined.to_mut().drain(..start as usize);
+        self.offsets.drain(..n_texts);
+        for offset in &mut self.offsets {
+            *offset -= start;
+        }
+        for id in &mut self.ids {
+            *id -= first.unwrap_or(0);
+        }
     }
 }
 
@@ -48,7 +74,7 @@ pub(super) enum Cells<'a> {
 pub(super) struct DecodedColumn<'a> {
     pub(super) cells: Cells<'a>,
     /// By row: true if there is no value.
-    mask: Option<Vec<bool>>,
+    pub(super) mask: Option<Vec<bool>>,
 }
 
 impl DecodedColumn<'_> {
@@ -76,150 +102,50 @@ impl DecodedColumn<'_> {
 
     /// Returns true if some row has no value.
     pub(super) fn has_nulls(&self) -> bool {
-        self.mask.is_some() || matches!(&self.cells, Cells::Text(texts) if texts.ids.iter().any(|&id| id < 0))
+        self.mask.as_ref().is_some_and(|mask| mask.contains(&true))
+            || matches!(&self.cells, Cells::Text(texts) if texts.ids.iter().any(|&id| id < 0))
     }
-}
 
-/// Limits of decoding.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct DecodeLimits {
-    /// Number of rows in the category.
-    pub(super) rows: usize,
-    /// Maximum number of distinct texts in a column.
-    pub(super) texts: usize,
-}
+    /// Reserves capacity for `n` more rows.
+    pub(super) fn reserve(&mut self, n: usize) {
+        match &mut self.cells {
+            Cells::Int(values) => values.reserve(n),
+            Cells::Real(values) => values.reserve(n),
+            Cells::Text(texts) => texts.ids.reserve(n),
+        }
+        if let Some(mask) = &mut self.mask {
+            mask.reserve(n);
+        }
+    }
 
-impl<'a> Raw<'a> {
-    pub(super) fn read(at: &mut Cursor<'a>) -> Result<Self, Box<Fault>> {
-        let (mut name, mut data, mut mask) = (None, None, None);
-        at.map(|key, value| {
-            let mut head = *value;
-            match key {
-                b"name" => name = Some(value.text()?),
-                b"data" => data = Some(*value),
-                b"mask" if head.next()? != PackToken::Nil => mask = Some(*value),
-                _ => {}
+    /// Removes the first `n` rows.
+    pub(super) fn remove(&mut self, n: usize) {
+        match &mut self.cells {
+            Cells::Int(values) => drop(values.drain(..n)),
+            Cells::Real(values) => drop(values.drain(..n)),
+            Cells::Text(texts) => texts.remove(n),
+        }
+        if let Some(mask) = &mut self.mask {
+            mask.drain(..n);
+        }
+    }
+
+    /// Copies the texts of the file.
+    pub(super) fn into_owned(self) -> DecodedColumn<'static> {
+        let cells = match self.cells {
+            Cells::Int(values) => Cells::Int(values),
+            Cells::Real(values) => Cells::Real(values),
+            Cells::Text(Texts { joined, offsets, ids, are_written }) => {
+                let joined = Cow::Owned(joined.into_owned());
+                Cells::Text(Texts { joined, offsets, ids, are_written })
             }
-            Ok(())
-        })?;
-        let name = name.ok_or_else(|| Fault::new("a column without a name", "`name`"))?;
-        let data = data.ok_or_else(|| Fault::new("nothing", "`data`").within(decode(name)))?;
-        Ok(Self { name, data, mask })
-    }
-
-    /// Decodes the column. If `texts` is true, integers are converted to texts.
-    pub(super) fn load(&self, bounds: DecodeLimits, texts: bool) -> Result<DecodedColumn<'a>, Box<Fault>> {
-        self.decode(bounds, texts).map_err(|fault| fault.within(decode(self.name)))
-    }
-
-    fn decode(&self, bounds: DecodeLimits, texts: bool) -> Result<DecodedColumn<'a>, Box<Fault>> {
-        let mask = self.mask.map(|mask| nulls(mask, bounds.rows).map_err(|f| f.within("mask"))).transpose()?.flatten();
-        let (data, chain) = encoded(self.data)?;
-        if let Some(strings) = chain.strings() {
-            let cells = Cells::Text(strings.read(data, bounds).map_err(|f| f.within("StringArray"))?);
-            return Ok(DecodedColumn { cells, mask });
-        }
-        let values = chain.decode(data, max_values(bounds.rows))?;
-        whole_column(values.len(), bounds.rows)?;
-        let cells = match values {
-            Values::Int(values) if texts => Cells::Text(written_out(&values)),
-            Values::Int(values) => Cells::Int(values),
-            Values::Real(_) if texts => return Err(Fault::new("real numbers", "texts")),
-            Values::Real(values) => Cells::Real(values),
         };
-        Ok(DecodedColumn { cells, mask })
-    }
-}
-
-/// Returns the maximum number of values in an intermediate step of decoding `n` values. Run-length pairs take two.
-const fn max_values(n: usize) -> usize {
-    n.saturating_add(1).saturating_mul(2)
-}
-
-fn whole_column(found: usize, rows: usize) -> Result<(), Box<Fault>> {
-    if found == rows { Ok(()) } else { Err(Fault::new(format!("{found} values"), format!("{rows}, as rowCount says"))) }
-}
-
-/// Reads encoded data and its chain of encodings.
-fn encoded(at: Cursor<'_>) -> Result<(&[u8], Chain<'_>), Box<Fault>> {
-    let data = at.required("data", Cursor::bytes)?;
-    let chain = at.required("encoding", |value| Ok(*value))?;
-    Ok((data, Chain::read(chain)?))
-}
-
-/// Decodes a mask of rows without a value: 1 is `.`, 2 is `?`. Returns `None` if all rows have a value.
-fn nulls(mask: Cursor<'_>, rows: usize) -> Result<Option<Vec<bool>>, Box<Fault>> {
-    let (data, chain) = encoded(mask)?;
-    let values = chain.decode(data, max_values(rows))?.ints()?;
-    whole_column(values.len(), rows)?;
-    if let Some(odd) = values.iter().find(|value| !(0..=2).contains(*value)) {
-        return Err(Fault::new(odd.to_string(), "0 (a value), 1 (.) or 2 (?)"));
-    }
-    let nulls: Vec<bool> = values.iter().map(|&value| value != 0).collect();
-    Ok(nulls.contains(&true).then_some(nulls))
-}
-
-impl<'a> Strings<'a> {
-    fn read(&self, data: &'a [u8], bounds: DecodeLimits) -> Result<Texts<'a>, Box<Fault>> {
-        let chain = |at, what| Chain::read(at).map_err(|f: Box<Fault>| f.within(what));
-        let offset_chain = chain(self.offset_chain, "offsetEncoding")?;
-        let offsets = offset_chain.decode(self.offsets, max_values(bounds.texts)).and_then(Values::ints);
-        let offsets = offsets.and_then(|o| self.byte_offsets(o)).map_err(|f| f.within("offsets"))?;
-        let ids = chain(self.data_chain, "dataEncoding")?.decode(data, max_values(bounds.rows)).and_then(Values::ints);
-        let ids = ids.map_err(|f| f.within("data"))?;
-        whole_column(ids.len(), bounds.rows)?;
-        let n = offsets.len().saturating_sub(1);
-        if let Some(&odd) = ids.iter().find(|&&id| usize::try_from(id).map_or(id != -1, |id| id >= n)) {
-            return Err(Fault::new(format!("text {odd}"), format!("-1 (none) or one of the {n} that are there")));
-        }
-        Ok(Texts { joined: Cow::Borrowed(self.joined), offsets, ids })
+        DecodedColumn { cells, mask: self.mask }
     }
 
-    /// Checks that the offsets are ascending, and converts them from UTF-16 code units, which the reference
-    /// implementation writes, to bytes.
-    fn byte_offsets(&self, offsets: Vec<i32>) -> Result<Vec<u32>, Box<Fault>> {
-        let text = if self.joined.is_ascii() { None } else { std::str::from_utf8(self.joined).ok() };
-        let mut characters = text.map(str::chars);
-        let (mut units, mut bytes) = (0_usize, 0_usize);
-        let mut byte_offset = |offset: i32| {
-            let offset = usize::try_from(offset).ok()?;
-            let Some(characters) = &mut characters else {
-                bytes = offset;
-                return (offset <= self.joined.len()).then_some(offset);
-            };
-            while units < offset {
-                let next = characters.next()?;
-                units += next.len_utf16();
-                bytes += next.len_utf8();
-            }
-            (units == offset).then_some(bytes)
-        };
-        let mut last = 0;
-        let mut out = Vec::with_capacity(offsets.len());
-        for offset in offsets {
-            let at = byte_offset(offset).filter(|_| offset >= last).and_then(|at| u32::try_from(at).ok());
-            let Some(at) = at else {
-                let expected = format!("one from {last} to the end of {} bytes", self.joined.len());
-                return Err(Fault::new(format!("offset {offset}"), expected));
-            };
-            out.push(at);
-            last = offset;
-        }
-        Ok(out)
+    /// Returns the memory of the texts, bytes.
+    pub(super) fn text_bytes(&self) -> u64 {
+        let Cells::Text(texts) = &self.cells else { return 0 };
+        (texts.joined.len() + size_of::<u32>() * texts.offsets.len()) as u64
     }
-}
-
-/// Converts integers to texts, one for each run of equal values.
-fn written_out(values: &[i32]) -> Texts<'static> {
-    let (mut joined, mut offsets, mut ids) = (Vec::new(), vec![0], Vec::with_capacity(values.len()));
-    let mut id = -1;
-    for (i, value) in values.iter().enumerate() {
-        if i == 0 || values[i - 1] != *value {
-            joined.extend_from_slice(itoa::Buffer::new().format(*value).as_bytes());
-            offsets.push(u32::try_from(joined.len()).unwrap_or(u32::MAX));
-            id += 1;
-        }
-        ids.push(id);
-    }
-    Texts { joined: Cow::Owned(joined), offsets, ids }
 }

@@ -1,10 +1,11 @@
-//! Declarations of BinaryCIF encodings. [`super::decode`] applies them.
+//! Declarations of BinaryCIF encodings. [`mod@super::decode`] applies them.
 //!
 //! Specification: <https://github.com/molstar/BinaryCIF/blob/master/encoding.md>.
 
 use super::super::text::quote;
 use super::fault::Fault;
 use super::msgpack::Cursor;
+use super::payload::Payload;
 
 /// Maximum length of a chain of encodings. Useful chains have at most five.
 const MAX_CHAIN: usize = 8;
@@ -37,6 +38,10 @@ impl Number {
         })
     }
 
+    pub(super) const fn is_real(self) -> bool {
+        matches!(self, Self::Float32 | Self::Float64)
+    }
+
     pub(super) const fn size(self) -> usize {
         match self {
             Self::Int8 | Self::Uint8 => 1,
@@ -65,7 +70,7 @@ pub(super) enum Encoding<'a> {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Strings<'a> {
     pub(super) joined: &'a [u8],
-    pub(super) offsets: &'a [u8],
+    pub(super) offsets: Payload<'a>,
     pub(super) offset_chain: Cursor<'a>,
     pub(super) data_chain: Cursor<'a>,
 }

@@ -3,17 +3,26 @@
 //!
 //! Specification: <https://github.com/molstar/BinaryCIF>, version 0.3.
 //!
-//! Only the required columns are decoded. Declared lengths are not trusted: they must agree with the number of bytes,
-//! the rows of the category and the limits before memory is allocated.
+//! Only the required columns are decoded. Declared lengths are not trusted: rows are within the limits before memory is
+//! allocated, and columns must have as many values.
 
 mod column;
+mod column_stream;
 mod decode;
 mod encoding;
 mod fault;
 mod msgpack;
+mod payload;
+mod row_stream;
 mod rows;
+mod skeleton;
+mod steps;
 
-use self::column::{DecodeLimits, DecodedColumn, Raw};
+pub(super) use self::row_stream::RowStream;
+pub(super) use self::skeleton::Skeleton;
+
+use self::column::DecodedColumn;
+use self::column_stream::{DecodeLimits, Raw};
 use self::fault::Fault;
 use self::msgpack::Cursor;
 use super::atom_site::{Layout, Passed};
@@ -33,9 +42,21 @@ const MAX_UNUSED_TEXTS: usize = 1 << 20;
 
 /// Reads the first data block that has atoms with coordinates.
 pub(super) fn read(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
+    first_block(Cursor::new(bytes), |block, passed| block.structure(reading, passed))
+}
+
+/// Reads a file whose large byte strings are in the temporary file, as [`read`] does.
+pub(super) fn read_skeleton(skeleton: &Skeleton, reading: &Reading<'_>) -> Result<Structure, StructureError> {
+    first_block(Cursor::of_skeleton(skeleton), |block, passed| block.structure(reading, passed))
+}
+
+/// Applies `read` to the data blocks until it returns a value.
+fn first_block<T>(
+    mut file: Cursor<'_>,
+    read: impl Fn(&BinaryBlock<'_>, &mut Passed) -> Result<Option<T>, StructureError>,
+) -> Result<T, StructureError> {
     let mut passed = Passed::default();
     let (mut found, mut last, mut any) = (None, None, false);
-    let mut file = Cursor::new(bytes);
     let frame = file.map(|key, value| {
         if key != b"dataBlocks" {
             return Ok(());
@@ -46,7 +67,7 @@ pub(super) fn read(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, Str
             if found.is_none() {
                 passed.block();
                 let block = BinaryBlock::read(at, &mut passed)?;
-                found = block.structure(reading, &mut passed).transpose();
+                found = read(&block, &mut passed).transpose();
                 last = block.name;
             }
             Ok(())
@@ -54,7 +75,7 @@ pub(super) fn read(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, Str
     });
     frame.map_err(|fault| fault.within("BinaryCIF"))?;
     match found {
-        Some(structure) => structure,
+        Some(value) => value,
         None if any => Err(passed.no_atoms("BinaryCIF", last)),
         None => Err(Fault::new("nothing", "`dataBlocks`").within("BinaryCIF").into()),
     }
@@ -182,28 +203,65 @@ impl<'a> BinaryBlock<'a> {
 
     /// Returns the structure, if the block has atoms with coordinates.
     fn structure(&self, reading: &Reading<'_>, passed: &mut Passed) -> Result<Option<Structure>, StructureError> {
-        let (categories, unread) = self.categories(reading)?;
-        let Some((columns, tables, warnings)) = self.atoms(categories.entities_are_known(), reading, passed)? else {
+        let Some(site) = self.site(reading, passed)? else { return Ok(None) };
+        let (SiteColumns { raw, layout, bounds, location }, mut source) = self.source(site, reading)?;
+        reading.text.grow(rows::window_bytes(&layout, bounds.rows))?;
+        let memory = reading.reserve(Columns::bytes(bounds.rows))?;
+        let atoms = rows::read(&raw, layout, bounds, reading)?;
+        let (columns, tables, warnings) = atoms.map_err(|fault| fault.within(&location))?;
+        memory.keep();
+        let replaced = warnings.messages(|fault| fault.within(&location).into());
+        source.warnings.splice(..0, replaced);
+        columns.finish(tables, source, reading).map(Some)
+    }
+
+    /// Returns the columns of the atoms, if the block has some with coordinates.
+    fn site(&self, reading: &Reading<'_>, passed: &mut Passed) -> Result<Option<SiteColumns<'a>>, StructureError> {
+        let limits = reading.limits;
+        let Some(category) = self.category("atom_site").filter(|category| category.rows > 0) else { return Ok(None) };
+        let bounds = category.bounds(limits).ok_or(StructureError::TooManyAtoms { limit: limits.max_atoms })?;
+        let location = category.location();
+        let raw = category.columns().map_err(|fault| fault.within(&location))?;
+        let layout = layout(&raw).map_err(|fault| fault.within(&location))?;
+        if let Some(missing) = layout.missing() {
+            passed.lacking(missing);
             return Ok(None);
-        };
+        }
+        Ok(Some(SiteColumns { raw, layout, bounds, location }))
+    }
+
+    /// Returns the columns to decode, and the fields of the structure besides its atoms.
+    fn source(
+        &self,
+        mut site: SiteColumns<'a>,
+        reading: &Reading<'_>,
+    ) -> Result<(SiteColumns<'a>, SourceFields), StructureError> {
+        let (categories, warnings) = self.categories(reading)?;
+        if categories.entities_are_known() {
+            // The column is not needed.
+            site.layout = site.layout.without_sequence_numbers();
+        }
+        // Decoded data counts as decompressed data, because a few bytes of run-length encoding may expand to many.
+        let limit = reading.limits.max_inflated_bytes;
+        if rows::decoded_bytes(&site.layout, site.bounds.rows) > limit {
+            return Err(StructureError::InflatedTooLarge { limit });
+        }
         let value = |category, item, max| -> Result<Option<String>, StructureError> {
             let Some(category) = self.category(category) else { return Ok(None) };
             Ok(category.value(item, max, reading.limits).map_err(|f| f.within(category.location()))?)
         };
         let entry = value("entry", "id", 80)?;
-        let title = value("struct", "title", MAX_TITLE)?;
-        let location = self.category("atom_site").map(Category::location).unwrap_or_default();
         let source = SourceFields {
             format: SourceFormat::BinaryCif,
             id: entry.or_else(|| self.name.clone()),
-            title,
+            title: value("struct", "title", MAX_TITLE)?,
             sequence: Sequence::of(&categories),
             annotations: categories.annotations(),
             assemblies: categories.assemblies(),
             radii: Vec::new(),
-            warnings: warnings.messages(|fault| fault.within(&location).into()).into_iter().chain(unread).collect(),
+            warnings,
         };
-        columns.finish(tables, source, reading).map(Some)
+        Ok((site, source))
     }
 
     /// Returns entities and assemblies, and a warning for those that cannot be read.
@@ -222,6 +280,9 @@ impl<'a> BinaryBlock<'a> {
                 }
                 Err(fault) => {
                     let error = StructureError::from(fault.within(category.location()));
+                    if matches!(error, StructureError::Scratch { .. }) {
+                        return Err(error);
+                    }
                     let what = known.forget(item_ix);
                     unread.push(format!("{error}; {what} are unknown"));
                     // The other items of the same group are useless without this one.
@@ -231,38 +292,14 @@ impl<'a> BinaryBlock<'a> {
         }
         Ok((known, unread))
     }
+}
 
-    /// Returns the atoms, if the block has some with coordinates.
-    fn atoms(
-        &self,
-        entities: bool,
-        reading: &Reading<'_>,
-        passed: &mut Passed,
-    ) -> Result<Option<rows::Atoms>, StructureError> {
-        let limits = reading.limits;
-        let Some(category) = self.category("atom_site").filter(|category| category.rows > 0) else { return Ok(None) };
-        let bounds = category.bounds(limits).ok_or(StructureError::TooManyAtoms { limit: limits.max_atoms })?;
-        let within = |fault: Box<Fault>| fault.within(category.location());
-        let raw = category.columns().map_err(within)?;
-        let layout = layout(&raw).map_err(within)?;
-        if let Some(missing) = layout.missing() {
-            passed.lacking(missing);
-            return Ok(None);
-        }
-        // The column is not needed if entities are known.
-        let layout = if entities { layout.without_sequence_numbers() } else { layout };
-        // Decoded data counts as decompressed data, because a few bytes of run-length encoding may expand to many.
-        let decoded = rows::decoded_bytes(&layout, bounds.rows);
-        if decoded > limits.max_inflated_bytes {
-            return Err(StructureError::InflatedTooLarge { limit: limits.max_inflated_bytes });
-        }
-        // A step of decoding holds its input and its output.
-        reading.text.grow(2 * decoded)?;
-        let memory = reading.reserve(Columns::bytes(bounds.rows))?;
-        let atoms = rows::read(&raw, layout, bounds, reading)?.map_err(within)?;
-        memory.keep();
-        Ok(Some(atoms))
-    }
+/// Undecoded columns of the atoms of a block.
+struct SiteColumns<'a> {
+    raw: Vec<Raw<'a>>,
+    layout: Layout,
+    bounds: DecodeLimits,
+    location: String,
 }
 
 /// Finds the items among the columns.

@@ -5,6 +5,8 @@
 
 use super::super::text::quote;
 use super::fault::Fault;
+use super::payload::Payload;
+use super::skeleton::{Cut, Skeleton};
 
 /// A value, or the head of a container.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -16,6 +18,8 @@ pub(super) enum PackToken<'a> {
     /// A text. UTF-8 is not checked.
     Text(&'a [u8]),
     Bytes(&'a [u8]),
+    /// Bytes in the temporary file.
+    Stored(Cut),
     /// Number of values that follow.
     Array(u32),
     /// Number of key-value pairs that follow.
@@ -33,6 +37,7 @@ impl PackToken<'_> {
             Self::Real(value) => value.to_string(),
             Self::Text(text) => format!("the text {}", quote(text)),
             Self::Bytes(bytes) => format!("{} bytes", bytes.len()),
+            Self::Stored(cut) => format!("{} bytes", cut.len),
             Self::Array(n) => format!("an array of {n}"),
             Self::Map(n) => format!("a map of {n}"),
             Self::Extension => "an extension".to_owned(),
@@ -45,11 +50,18 @@ impl PackToken<'_> {
 pub(super) struct Cursor<'a> {
     bytes: &'a [u8],
     at: usize,
+    /// Source of `bytes`, if large byte strings are in the temporary file.
+    skeleton: Option<&'a Skeleton>,
 }
 
 impl<'a> Cursor<'a> {
     pub(super) fn new(bytes: &'a [u8]) -> Self {
-        Self { bytes, at: 0 }
+        Self { bytes, at: 0, skeleton: None }
+    }
+
+    /// Begins to read a file whose large byte strings are in the temporary file.
+    pub(super) fn of_skeleton(skeleton: &'a Skeleton) -> Self {
+        Self { bytes: &skeleton.bytes, at: 0, skeleton: Some(skeleton) }
     }
 
     /// Returns the next value or container head. The values of a container follow.
@@ -64,12 +76,12 @@ impl<'a> Cursor<'a> {
             0xC0 => PackToken::Nil,
             0xC1 => {
                 let fault = Fault::new("c1, which no value begins with", "a MessagePack value");
-                return Err(fault.within(format_args!("byte {start}")));
+                return Err(fault.within(format_args!("byte {}", self.offset(start))));
             }
             0xC2 | 0xC3 => PackToken::Bool(first == 0xC3),
             0xC4..=0xC6 => {
                 let n = self.length(first - 0xC4)?;
-                PackToken::Bytes(self.slice(n)?)
+                self.payload(n)?
             }
             0xC7..=0xC9 => {
                 let n = self.length(first - 0xC7)?;
@@ -188,10 +200,13 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    pub(super) fn bytes(&mut self) -> Result<&'a [u8], Box<Fault>> {
-        match self.next()? {
-            PackToken::Bytes(bytes) => Ok(bytes),
-            other => Err(Fault::new(other.words(), "bytes")),
+    pub(super) fn bytes(&mut self) -> Result<Payload<'a>, Box<Fault>> {
+        match (self.next()?, self.skeleton) {
+            (PackToken::Bytes(bytes), _) => Ok(Payload::Bytes(bytes)),
+            (PackToken::Stored(Cut { offset, len, .. }), Some(Skeleton { file, .. })) => {
+                Ok(Payload::Stored { file, offset, len })
+            }
+            (other, _) => Err(Fault::new(other.words(), "bytes")),
         }
     }
 
@@ -250,6 +265,29 @@ impl<'a> Cursor<'a> {
         Ok(found)
     }
 
+    /// Reads a byte string of `len` bytes.
+    fn payload(&mut self, len: u32) -> Result<PackToken<'a>, Box<Fault>> {
+        match self.skeleton.and_then(|skeleton| skeleton.cut_at(self.at)) {
+            None => self.slice(len).map(PackToken::Bytes),
+            Some(cut) if cut.len == u64::from(len) => {
+                self.at += 1;
+                Ok(PackToken::Stored(cut))
+            }
+            // The file ends within the byte string.
+            Some(_) => Err(self.end(len as usize)),
+        }
+    }
+
+    /// Returns the offset in the file of a position.
+    fn offset(&self, at: usize) -> u64 {
+        self.skeleton.map_or(at as u64, |skeleton| skeleton.offset(at))
+    }
+
+    /// Returns the number of bytes to the end of the file.
+    fn left(&self) -> u64 {
+        self.offset(self.bytes.len()).saturating_sub(self.offset(self.at))
+    }
+
     fn extension(&mut self, len: u32) -> Result<PackToken<'a>, Box<Fault>> {
         let [_kind] = self.take()?;
         self.slice(len)?;
@@ -263,15 +301,15 @@ impl<'a> Cursor<'a> {
             PackToken::Map(n) => 2 * n as usize,
             _ => 0,
         };
-        if least > self.bytes.len() - self.at { Err(self.end(least)) } else { Ok(head) }
+        if least as u64 > self.left() { Err(self.end(least)) } else { Ok(head) }
     }
 
     #[cold]
     #[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
     fn end(&self, wanted: usize) -> Box<Fault> {
-        let left = self.bytes.len() - self.at.min(self.bytes.len());
+        let left = self.left();
         Fault::new(format!("the end of the file after {left} bytes"), format!("{wanted} bytes or more"))
-            .within(format_args!("byte {}", self.at))
+            .within(format_args!("byte {}", self.offset(self.at)))
     }
 }
 

@@ -8,7 +8,8 @@ use super::super::pieces;
 use super::super::read::Reading;
 use super::super::text::{decode, quote};
 use super::super::warnings::Warnings;
-use super::column::{Cells, DecodeLimits, DecodedColumn, Raw};
+use super::column::{Cells, DecodedColumn};
+use super::column_stream::{DecodeLimits, Raw};
 use super::fault::Fault;
 
 /// Bytes of text that take as long to read as a row.
@@ -16,10 +17,15 @@ const BYTES_PER_ROW: usize = 80;
 /// Rows between two checks of the cancellation flag and charges of memory: a few milliseconds.
 const ROWS_PER_CHECK: usize = 1 << 14;
 
-/// Columns of `atom_site` in file order. Only the required ones are decoded.
-struct Table<'a> {
-    raw: &'a [Raw<'a>],
-    columns: Vec<Option<DecodedColumn<'a>>>,
+/// Rows of `atom_site`, with the columns in file order. Only the required ones are decoded.
+#[derive(Debug)]
+pub(super) struct Table<'a> {
+    pub(super) names: Vec<String>,
+    pub(super) columns: Vec<Option<DecodedColumn<'a>>>,
+    /// Number of rows of the file before these.
+    pub(super) first: usize,
+    /// Number of rows.
+    pub(super) len: usize,
 }
 
 /// A row of the table.
@@ -77,8 +83,8 @@ impl atom_site::AtomRow for BinaryRow<'_> {
                 .range(self.index)
                 .map_or_else(|| "nothing".to_owned(), |(start, end)| quote(&texts.joined[start..end])),
         };
-        let name = self.table.raw.get(column).map_or_else(Default::default, |raw| decode(raw.name));
-        Fault::new(found, expected).within(format_args!("{name}, row {}", self.index + 1))
+        let name = self.table.names.get(column).map_or("", String::as_str);
+        Fault::new(found, expected).within(format_args!("{name}, row {}", self.table.first + self.index + 1))
     }
 }
 
@@ -97,6 +103,12 @@ pub(super) fn decoded_bytes(layout: &Layout, rows: usize) -> u64 {
     row as u64 * rows as u64
 }
 
+/// Returns an upper bound for the memory (bytes) of `rows` decoded rows. A mask takes a byte for each value, a quarter
+/// of the smallest value.
+pub(super) fn window_bytes(layout: &Layout, rows: usize) -> u64 {
+    decoded_bytes(layout, rows) / 4 * 5
+}
+
 /// Atoms, their string tables, and warnings about replaced values.
 pub(super) type Atoms = (Columns, Tables, Warnings<Box<Fault>>);
 
@@ -104,24 +116,53 @@ pub(super) type Atoms = (Columns, Tables, Warnings<Box<Fault>>);
 ///
 /// # Errors
 /// Returns the errors of cancellation and memory.
-pub(super) fn read(
-    raw: &[Raw<'_>],
+pub(super) fn read<'a>(
+    raw: &[Raw<'a>],
     layout: Layout,
     bounds: DecodeLimits,
     reading: &Reading<'_>,
 ) -> Result<Result<Atoms, Box<Fault>>, StructureError> {
-    let n_pieces = reading.n_pieces(BYTES_PER_ROW * bounds.rows);
-    let table = match load(raw, &layout, bounds, n_pieces > 1) {
-        Ok(columns) => Table { raw, columns },
-        Err(fault) => return Ok(Err(fault)),
+    let load = |raw: &Raw<'a>, texts: bool| {
+        let column = raw.load(bounds, texts)?;
+        let has_nulls = column.has_nulls();
+        Ok((column, has_nulls))
     };
-    check_samples(&table, layout, bounds, reading)?;
-    let mut columns = Columns::zeroed(bounds.rows);
+    match load_pairs(raw, &layout, n_pieces(bounds.rows, reading) > 1, load) {
+        Ok(columns) => {
+            let table = Table { names: names(raw), columns, first: 0, len: bounds.rows };
+            check_samples(&table, layout, reading)?;
+            convert(&table, layout, reading)
+        }
+        Err(fault) => Ok(Err(fault)),
+    }
+}
+
+/// Returns the names of columns.
+pub(super) fn names(raw: &[Raw<'_>]) -> Vec<String> {
+    raw.iter().map(|raw| decode(raw.name).into_owned()).collect()
+}
+
+/// Returns the number of pieces for a number of rows.
+pub(super) fn n_pieces(rows: usize, reading: &Reading<'_>) -> usize {
+    reading.n_pieces(BYTES_PER_ROW * rows)
+}
+
+/// Converts rows to atoms. Returns the first fault in file order.
+///
+/// # Errors
+/// Returns the errors of cancellation and memory.
+pub(super) fn convert(
+    table: &Table<'_>,
+    layout: Layout,
+    reading: &Reading<'_>,
+) -> Result<Result<Atoms, Box<Fault>>, StructureError> {
+    let n_pieces = n_pieces(table.len, reading);
+    let mut columns = Columns::zeroed(table.len);
     let mut rest = columns.slices();
     let mut parts = Vec::with_capacity(n_pieces);
-    let size = bounds.rows.div_ceil(n_pieces);
-    for first in (0..bounds.rows).step_by(size) {
-        let n = size.min(bounds.rows - first);
+    let size = table.len.div_ceil(n_pieces);
+    for first in (0..table.len).step_by(size) {
+        let n = size.min(table.len - first);
         let (slices, others) = rest.split(n);
         parts.push((first..first + n, (slices, AtomSite::new(layout))));
         rest = others;
@@ -134,7 +175,7 @@ pub(super) fn read(
                 reading.hold_texts(site.tables.n_texts() - n_texts)?;
                 n_texts = site.tables.n_texts();
             }
-            match site.atom(&BinaryRow { table: &table, index }) {
+            match site.atom(&BinaryRow { table, index }) {
                 Ok(atom) => slices.put(&atom),
                 Err(fault) => return Ok(Err(fault)),
             };
@@ -160,16 +201,11 @@ const N_SAMPLES: usize = 8;
 
 /// Rejects a file if samples of its rows contain too many atoms at the same position. Does not depend on the number of
 /// threads. Ignores other errors, which the conversion of all rows reports.
-fn check_samples(
-    table: &Table<'_>,
-    layout: Layout,
-    bounds: DecodeLimits,
-    reading: &Reading<'_>,
-) -> Result<(), StructureError> {
-    if bounds.rows < SAMPLED_FROM {
+fn check_samples(table: &Table<'_>, layout: Layout, reading: &Reading<'_>) -> Result<(), StructureError> {
+    if table.len < SAMPLED_FROM {
         return Ok(());
     }
-    for first in (0..bounds.rows - SAMPLE).step_by(bounds.rows / N_SAMPLES) {
+    for first in (0..table.len - SAMPLE).step_by(table.len / N_SAMPLES) {
         reading.check()?;
         let _memory = reading.reserve(Columns::bytes(SAMPLE))?;
         let (mut columns, mut site) = (Columns::zeroed(SAMPLE), AtomSite::new(layout));
@@ -185,30 +221,27 @@ fn check_samples(
     Ok(())
 }
 
-/// A column and its fallback, if required.
-type ColumnPair<'a> = [Option<DecodedColumn<'a>>; 2];
-
-/// Decodes columns, in parallel if requested. The second of a pair is required only if the first has rows without a
-/// value.
-fn load<'a>(
+/// Reads the columns of the layout, in parallel if requested. The second of a pair is required only if the first has
+/// rows without a value. `load` returns a column, read as texts if its second argument is true, and true if it has such
+/// rows.
+pub(super) fn load_pairs<'a, T: Send, E: Send>(
     raw: &[Raw<'a>],
     layout: &Layout,
-    bounds: DecodeLimits,
     parallel: bool,
-) -> Result<Vec<Option<DecodedColumn<'a>>>, Box<Fault>> {
+    load: impl Fn(&Raw<'a>, bool) -> Result<(T, bool), E> + Sync,
+) -> Result<Vec<Option<T>>, E> {
     let texts = layout.texts().map(|pair| (pair, true));
     let numbers = layout.numbers().map(|pair| (pair, false));
     let mut wanted: Vec<_> = texts.into_iter().chain(numbers).collect();
-    let load = |&mut ([first, second], texts): &mut ([usize; 2], bool)| -> Result<ColumnPair<'a>, Box<Fault>> {
-        let load = |column: usize| raw.get(column).map(|raw| raw.load(bounds, texts)).transpose();
-        let (first, mut fallback) = (load(first)?, None);
-        if first.as_ref().is_some_and(DecodedColumn::has_nulls) {
-            fallback = load(second)?;
-        }
-        Ok([first, fallback])
+    let load = |&mut ([first, second], texts): &mut ([usize; 2], bool)| -> Result<[Option<T>; 2], E> {
+        let load = |column: usize| raw.get(column).map(|raw| load(raw, texts)).transpose();
+        Ok(match load(first)? {
+            Some((first, true)) => [Some(first), load(second)?.map(|(second, _)| second)],
+            first => [first.map(|(first, _)| first), None],
+        })
     };
     let loaded = if parallel { pieces::map(&mut wanted, load) } else { wanted.iter_mut().map(load).collect() };
-    let mut columns: Vec<Option<DecodedColumn<'a>>> = Vec::new();
+    let mut columns: Vec<Option<T>> = Vec::new();
     columns.resize_with(raw.len(), || None);
     for ((indices, _), pair) in wanted.into_iter().zip(loaded) {
         for (index, column) in indices.into_iter().zip(pair?) {

@@ -6,7 +6,7 @@ use indexmap::IndexMap;
 
 use super::{LeftOut, ModelChoice, Rules, SELECTED_CHAIN, Selected, Selection};
 use crate::structure::contents::Kind;
-use crate::structure::copies::AssemblyRules;
+use crate::structure::copies::{AssemblyRules, chain_column};
 use crate::structure::error::StructureError;
 use crate::structure::read::ReadLimits;
 use crate::structure::stream::Block;
@@ -110,7 +110,7 @@ impl SelectedBlocks {
         let selection = Selection { model, ..selection.clone() };
         let rules = Rules::new(s, &selection, false, limits, control)?;
         self.note(block, &rules)?;
-        let column = s.assembly_chains();
+        let column = chain_column(s);
         let numbers = column.texts().map(|name| self.number(name)).collect::<Result<Vec<u32>, _>>()?;
         let mut selected = SelectedOfBlock { atoms: Vec::new(), chains: Vec::new() };
         for (chain, found) in rules.find_by_chain(block.len, column, control)? {
