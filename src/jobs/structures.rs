@@ -25,7 +25,7 @@ use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
 /// would take several times its limit for structures of one atom.
 const OVERHEAD: u64 = 4 << 10;
 /// Memory of the atoms of a tileset and of their index, bytes per atom.
-const BYTES_PER_ATOM: f64 = 110.0;
+const BYTES_PER_ATOM: u64 = 110;
 /// Size of the cache in blocks of a file that is read as a stream. The buffers of the index take a quarter of it.
 const BLOCKS: u64 = 32;
 /// Time between two checks of a request that waits for another one to read its structure.
@@ -174,7 +174,7 @@ impl Structures {
     ) -> Result<(SharedTileset, Option<SharedColors>), JobError> {
         let as_tileset = |kept: Kept| if let Kept::Tileset(tileset) = kept { Some(tileset) } else { None };
         let [of_memory, of_disk] = [tileset_digest(&digest, job), streamed_digest(&digest, job)];
-        let in_memory = || {
+        let in_memory = |limits: &ReadLimits| {
             let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
             let prepare = |control: &Control<'_>| Tileset::new(read, job, limits, control, clock);
             self.prepared((namespace, of_memory), input, control, (Kept::Tileset, as_tileset), prepare)
@@ -186,13 +186,22 @@ impl Structures {
         let tileset = match (input, &self.scratch) {
             (Input::Tileset(tileset), _) => tileset.clone(),
             (_, Some(scratch)) if tileset::check_stream(job, 1).is_ok() => {
-                let is_large = input.atoms() * BYTES_PER_ATOM > self.limit as f64;
-                match if is_large { None } else { Some(in_memory()) } {
-                    None | Some(Err(JobError::Surface(SurfaceError::TilesetTooLarge { .. }))) => on_disk(scratch)?,
-                    Some(made) => made?,
+                // Reading ends early if the atoms do not fit.
+                let max_atoms = match input {
+                    Input::File(_) => limits.max_atoms.min(self.limit / BYTES_PER_ATOM),
+                    _ => limits.max_atoms,
+                };
+                match in_memory(&ReadLimits { max_atoms, ..*limits }) {
+                    Err(
+                        JobError::Surface(SurfaceError::TilesetTooLarge { .. })
+                        | JobError::Structure(
+                            StructureError::TooManyAtoms { .. } | StructureError::AssemblyTooLarge { .. },
+                        ),
+                    ) => on_disk(scratch)?,
+                    made => made?,
                 }
             }
-            _ => in_memory()?,
+            _ => in_memory(limits)?,
         };
         let of_tileset = if tileset.is_streamed() { of_disk } else { of_memory };
         let Some(coloring) = job.color else { return Ok((tileset, None)) };

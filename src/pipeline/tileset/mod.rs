@@ -144,12 +144,14 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
     }
 
     /// Replaces the structure by an equal one.
+    #[cfg(feature = "server")]
     pub(crate) fn with_structure<T>(self, structure: impl FnOnce(S) -> T) -> Tileset<T> {
         let Self { structure: own, layout, levels, tiles, selected, streamed } = self;
         Tileset { structure: structure(own), layout, levels, tiles, selected, streamed }
     }
 
     /// Returns true if the atoms are in a file and not in the structure.
+    #[cfg(feature = "server")]
     pub(crate) const fn is_streamed(&self) -> bool {
         self.streamed.is_some()
     }
