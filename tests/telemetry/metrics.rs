@@ -102,9 +102,10 @@ fn meshes(look: &dyn Fn()) {
 fn tileset_on_disk(look: &dyn Fn()) {
     let server = start(Fake::new(Mode::Octahedra), |config| config.limits.structure_cache_bytes = 6 << 20);
     let items = ["type_symbol", "label_atom_id", "label_comp_id", "label_seq_id", "Cartn_x", "Cartn_y", "Cartn_z"];
-    let mut text = "data_x\nloop_\n".to_owned();
-    items.iter().for_each(|item| text += &format!("_atom_site.{item}\n"));
-    (0..200_000).for_each(|i| text += &format!("C CA ALA {i} {} {} {}\n", i % 60, i / 60 % 60, i / 3600));
+    let tags: String = items.map(|item| format!("_atom_site.{item}\n")).concat();
+    let row = |i: i32| format!("C CA ALA {i} {} {} {}\n", i % 60, i / 60 % 60, i / 3600);
+    let rows: Vec<String> = (0..200_000).map(row).collect();
+    let text = format!("data_x\nloop_\n{tags}{}", rows.concat());
     let stored = server.post("/v1/structures", &[], text.as_bytes());
     let tileset = server.get(&format!("{}/tileset.json?resolution=2", stored.header("location").unwrap()));
     assert_eq!(tileset.status, 200);
