@@ -28,6 +28,8 @@ const OVERHEAD: u64 = 4 << 10;
 const BYTES_PER_ATOM: u64 = 110;
 /// Size of the cache in blocks of a file that is read as a stream. The buffers of the index take a quarter of it.
 const BLOCKS: u64 = 32;
+/// Minimum size of a block, bytes.
+const MIN_BLOCK: usize = 256 << 10;
 /// Time between two checks of a request that waits for another one to read its structure.
 const POLL: Duration = Duration::from_millis(20);
 
@@ -177,15 +179,18 @@ impl Structures {
         let in_memory = |limits: &ReadLimits| {
             let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
             let prepare = |control: &Control<'_>| Tileset::new(read, job, limits, control, clock);
-            self.prepared((namespace, of_memory), input, control, (Kept::Tileset, as_tileset), prepare)
+            let (key, budget) = ((namespace, of_memory), self.budget.part(self.limit));
+            self.prepared(key, input, control, &budget, (Kept::Tileset, as_tileset), prepare)
         };
         let on_disk = |scratch: &ScratchSpace| {
             let prepare = |control: &Control<'_>| self.streamed(scratch, input, job, limits, control, clock);
-            self.prepared((namespace, of_disk), input, control, (Kept::Tileset, as_tileset), prepare)
+            // Only what remains must fit into the cache, not the memory of reading and sorting.
+            let key = (namespace, of_disk);
+            self.prepared(key, input, control, &self.budget, (Kept::Tileset, as_tileset), prepare)
         };
         let tileset = match (input, &self.scratch) {
             (Input::Tileset(tileset), _) => tileset.clone(),
-            (_, Some(scratch)) if tileset::check_stream(job, 1).is_ok() => {
+            (_, Some(scratch)) if self.limit > 0 && tileset::check_stream(job, 1).is_ok() => {
                 // Reading ends early if the atoms do not fit.
                 let max_atoms = match input {
                     Input::File(_) => limits.max_atoms.min(self.limit / BYTES_PER_ATOM),
@@ -208,7 +213,8 @@ impl Structures {
         let key = (namespace, Digest::of(format!("colors\n{of_tileset}\n{}", coloring.canonical()).as_bytes()));
         let prepare = |control: &Control<'_>| tileset.colors(coloring, control);
         let as_colors = |kept: Kept| if let Kept::Colors(colors) = kept { Some(colors) } else { None };
-        let colors = self.prepared(key, input, control, (Kept::Colors, as_colors), prepare)?;
+        let budget = self.budget.part(self.limit);
+        let colors = self.prepared(key, input, control, &budget, (Kept::Colors, as_colors), prepare)?;
         Ok((tileset, Some(colors)))
     }
 
@@ -235,19 +241,20 @@ impl Structures {
             // Without atoms. The caller has returned this tileset.
             Input::Tileset(tileset) => StreamSource::Structure(tileset.structure()),
         };
-        let block_bytes = usize::try_from(self.limit / BLOCKS).unwrap_or(usize::MAX).min(BLOCK_BYTES);
+        let block_bytes = usize::try_from(self.limit / BLOCKS).unwrap_or(usize::MAX).clamp(MIN_BLOCK, BLOCK_BYTES);
         let stream = StructureStream { source, scratch: scratch.file()?, block_bytes, began: &|_| {} };
         let tileset = Tileset::of_stream(stream, job, limits, control, clock)?;
         let reservation = Arc::new(self.budget.reservation());
         Ok(tileset.with_structure(|structure| self.charged(*structure, input, reservation)))
     }
 
-    /// Returns a value that must be kept, and prepares it if necessary.
+    /// Returns a value that must be kept, and prepares it with memory of `budget` if necessary.
     fn prepared<T>(
         &self,
         key: CacheKey,
         input: &Input,
         control: &Control<'_>,
+        budget: &Budget,
         (keep, kept_as): (fn(Shared<T>) -> Kept, impl Fn(Kept) -> Option<Shared<T>>),
         prepare: impl FnOnce(&Control<'_>) -> Result<T, JobError>,
     ) -> Result<Shared<T>, JobError> {
@@ -259,7 +266,7 @@ impl Structures {
             return Ok(kept);
         }
         let limit = self.limit;
-        let reservation = Arc::new(self.budget.part(limit).reservation());
+        let reservation = Arc::new(budget.reservation());
         let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
         let value = prepare(&charged).map_err(|error| match error {
             JobError::Surface(SurfaceError::Memory(
@@ -267,6 +274,9 @@ impl Structures {
             )) if of == limit => SurfaceError::TilesetTooLarge { limit }.into(),
             error => error,
         })?;
+        if reservation.bytes() > limit {
+            return Err(SurfaceError::TilesetTooLarge { limit }.into());
+        }
         let shared = self.charged(value, input, reservation);
         control.memory.also_held(shared.bytes());
         self.keep(key, keep(shared.clone()));
