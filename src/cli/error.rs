@@ -214,9 +214,7 @@ impl CliError {
 fn structure_code(error: &StructureError) -> i32 {
     match error {
         StructureError::Input { .. } => code::INPUT,
-        StructureError::Scratch { .. }
-        | StructureError::ScratchTooSmall { .. }
-        | StructureError::ScratchFull { .. } => code::OUTPUT,
+        StructureError::Scratch { .. } | StructureError::DiskSpace(_) => code::OUTPUT,
         StructureError::InflatedTooLarge { .. }
         | StructureError::TooManyAtoms { .. }
         | StructureError::TooManyDuplicates { .. }

@@ -237,8 +237,7 @@ impl From<StructureError> for Problem {
         let detail = error.to_string();
         match error {
             E::Scratch { .. } => Self::internal(detail),
-            E::ScratchTooSmall { limit } => Self::new(ProblemType::TooMuchMemory, detail).with("limit", limit),
-            E::ScratchFull { limit } => Self::new(ProblemType::MemoryFull, detail).with("limit", limit),
+            E::DiskSpace(error) => Self::from(error).detailed(detail),
             E::Input { .. } | E::NotAStream { .. } => Self::new(ProblemType::UnreadableStructure, detail),
             E::UnknownFormat { found } => Self::new(ProblemType::UnreadableStructure, detail).with("found", found),
             E::Syntax { line, column, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)

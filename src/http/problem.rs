@@ -37,6 +37,11 @@ impl Problem {
         Self { kind, detail: detail.into(), members: Map::new(), retry_after_s: None, header: None }
     }
 
+    /// Replaces the explanation of this occurrence.
+    pub(super) fn detailed(self, detail: String) -> Self {
+        Self { detail, ..self }
+    }
+
     /// Creates the problem of a request or a job that the end of the service cuts off.
     pub(super) fn shutting_down(detail: String) -> Self {
         Self::new(ProblemType::ShuttingDown, detail).retry_after(Duration::from_secs(1))

@@ -208,7 +208,7 @@ pub(super) const PROBLEM_TYPES: &[ProblemEntry] = &[
     row(ProblemType::TooManyJobs, "too-many-jobs", S::SERVICE_UNAVAILABLE, true, "Too many asynchronous jobs are open",
         "The server keeps records of at most `limit` asynchronous jobs, in total or for one client, and none of these jobs has ended. Wait for the end of a job, or cancel one. Retry after `Retry-After` seconds."),
     row(ProblemType::MemoryFull, "memory-full", S::SERVICE_UNAVAILABLE, true, "The memory limit is reached",
-        "Requests and jobs use all memory reserved for them: `limit` bytes, of which `actual` are in use. Retry after `Retry-After` seconds."),
+        "Requests and jobs use all memory reserved for them, or indexes of tilesets all disk space: `limit` bytes, of which `actual` are in use. Retry after `Retry-After` seconds."),
     row(ProblemType::StoreFull, "store-full", S::SERVICE_UNAVAILABLE, true, "The store is full",
         "The store uses all space reserved for it (`limit` bytes), and no object may be removed now; without `limit`, its disk is full. Retry after `Retry-After` seconds."),
     row(ProblemType::StoreFailed, "store-failed", S::SERVICE_UNAVAILABLE, false, "The store is unavailable",

@@ -220,7 +220,7 @@ impl TilesetRequest {
     ) -> Result<Response, Problem> {
         let Self { app, caller, source, headers, job, .. } = self;
         let variant = format!("{media_type}\n{}", params::canonical(&job));
-        // A tile of the tileset, which may be prepared.
+        // Finds the tileset in the cache, as jobs on its tiles do.
         let of_tile = Job { tile: Some(TileAddress::ROOT), ..job.clone() };
         let made = async |loaded: Loaded, delivery: Delivery| {
             app.admit_work(&caller)?;

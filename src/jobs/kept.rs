@@ -7,6 +7,7 @@ use std::sync::Arc;
 use super::MemoryReservation;
 use crate::memory_budget::Buffers;
 use crate::pipeline::tileset::{Tileset, TilesetColors};
+use crate::pipeline::{Job, params};
 use crate::store::{Digest, Namespace};
 use crate::structure::Structure;
 
@@ -133,11 +134,11 @@ impl CacheState {
         Some(value)
     }
 
-    /// Removes the least recently used value that `is_candidate` accepts, and returns its memory in bytes.
-    pub(super) fn evict(&mut self, is_candidate: impl Fn(&Kept) -> bool) -> Option<u64> {
+    /// Removes the least recently used value that `is_candidate` accepts, and returns it.
+    pub(super) fn evict(&mut self, is_candidate: impl Fn(&Kept) -> bool) -> Option<Kept> {
         let accepted = |key: &&CacheKey| self.kept.get(*key).is_some_and(|(_, value)| is_candidate(value));
         let found = *self.by_use.values().find(accepted)?;
-        self.remove(&found).map(|value| value.bytes())
+        self.remove(&found)
     }
 
     /// Finds a value, and makes it the most recently used one.
@@ -146,4 +147,19 @@ impl CacheState {
         self.insert(*key, found.clone());
         Some(found)
     }
+}
+
+/// Returns the digest of a tileset with its atoms on disk, whose index has the colours.
+pub(super) fn streamed_digest(digest: &Digest, job: &Job) -> Digest {
+    let color = job.color.map(|coloring| coloring.canonical());
+    Digest::of(format!("on disk\n{}\n{color:?}", tileset_digest(digest, job)).as_bytes())
+}
+
+/// Returns the digest of a tileset: of its structure file and of the parameters that affect the index.
+pub(super) fn tileset_digest(digest: &Digest, job: &Job) -> Digest {
+    let Job { compress, normals, .. } = Job::default();
+    let mut job = Job { tile: None, color: None, compress, normals, ..job.clone() };
+    job.params.atom_ids = false;
+    let canonical = params::canonical(&job);
+    Digest::of(format!("tileset\n{digest}\n{canonical}").as_bytes())
 }

@@ -9,15 +9,18 @@ use std::time::Duration;
 use bytes::Bytes;
 use metrics::{counter, gauge};
 
-use super::kept::{CacheKey, CacheState, Charge, Charged, Kept, Shared, SharedColors, SharedStructure, SharedTileset};
+use super::kept::{
+    CacheKey, CacheState, Charge, Charged, Kept, Shared, SharedColors, SharedStructure, SharedTileset, streamed_digest,
+    tileset_digest,
+};
 use super::{MemoryReservation, ScratchSpace};
 use crate::memory_budget::{Budget, Reclaim};
 use crate::pipeline::tileset::{self, StreamSource, StructureStream, Tileset};
-use crate::pipeline::{Job, JobError, StageClock, estimate_atoms, params};
+use crate::pipeline::{Job, JobError, StageClock, estimate_atoms};
 use crate::store::{Digest, Namespace};
 use crate::structure::stream::BLOCK_BYTES;
 use crate::structure::{self, ReadLimits, StructureError};
-use crate::surface::{CancelToken, Control, MemoryMeter as _, OutOfMemory, SurfaceError};
+use crate::surface::{CancelToken, Control, MemoryMeter as _, OutOfMemory, Reservation, SurfaceError};
 use crate::sync::{Condvar, Mutex, MutexGuard};
 use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
 
@@ -103,7 +106,7 @@ impl Structures {
         let job = job.filter(|job| job.tile.is_some());
         let tilesets = job.map(|job| [tileset_digest(&digest, job), streamed_digest(&digest, job)]);
         let mut state = self.lock();
-        let mut digests = std::iter::once(digest).chain(tilesets.into_iter().flatten());
+        let mut digests = tilesets.into_iter().flatten().chain([digest]);
         match digests.find_map(|digest| state.find(&(namespace, digest)))? {
             Kept::Structure(structure) => Some(Input::Kept(structure)),
             Kept::Tileset(tileset) if tileset.is_streamed() => Some(Input::Tileset(tileset)),
@@ -191,12 +194,10 @@ impl Structures {
         let tileset = match (input, &self.scratch) {
             (Input::Tileset(tileset), _) => tileset.clone(),
             (_, Some(scratch)) if self.limit > 0 && tileset::check_stream(job, 1).is_ok() => {
-                // Reading ends early if the atoms do not fit.
-                let max_atoms = match input {
-                    Input::File(_) => limits.max_atoms.min(self.limit / BYTES_PER_ATOM),
-                    _ => limits.max_atoms,
-                };
-                match in_memory(&ReadLimits { max_atoms, ..*limits }) {
+                // Reading, or copying for an assembly, ends early if the atoms do not fit.
+                let max_atoms = limits.max_atoms.min(self.limit / BYTES_PER_ATOM);
+                let found = self.lock().find(&(namespace, of_disk)).and_then(as_tileset);
+                match found.map_or_else(|| in_memory(&ReadLimits { max_atoms, ..*limits }), Ok) {
                     Err(
                         JobError::Surface(SurfaceError::TilesetTooLarge { .. })
                         | JobError::Structure(
@@ -228,6 +229,8 @@ impl Structures {
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<Tileset<SharedStructure>, JobError> {
+        // The copy of a structure in memory.
+        let copy = Reservation::new(&control.memory);
         let source = match input {
             Input::File(file) => {
                 control.memory.also_held(file.len() as u64);
@@ -235,15 +238,16 @@ impl Structures {
             }
             // The atoms fit into memory, but not all copies of an assembly.
             Input::Kept(structure) => {
-                control.memory.grow(structure.bytes()).map_err(SurfaceError::from)?;
+                copy.grow(structure.bytes()).map_err(SurfaceError::from)?;
                 StreamSource::Structure(structure)
             }
-            // Without atoms. The caller has returned this tileset.
-            Input::Tileset(tileset) => StreamSource::Structure(tileset.structure()),
+            // Has no atoms. The caller returns this tileset itself.
+            Input::Tileset(_) => return Err(SurfaceError::NoSpheres.into()),
         };
         let block_bytes = usize::try_from(self.limit / BLOCKS).unwrap_or(usize::MAX).clamp(MIN_BLOCK, BLOCK_BYTES);
         let stream = StructureStream { source, scratch: scratch.file()?, block_bytes, began: &|_| {} };
         let tileset = Tileset::of_stream(stream, job, limits, control, clock)?;
+        drop(copy);
         let reservation = Arc::new(self.budget.reservation());
         Ok(tileset.with_structure(|structure| self.charged(*structure, input, reservation)))
     }
@@ -317,8 +321,15 @@ impl Structures {
     fn keep(&self, key: CacheKey, kept: Kept) {
         let mut state = self.lock();
         state.insert(key, kept);
-        while state.bytes > self.limit && state.evict(|_| true).is_some() {}
+        let mut evicted = Vec::new();
+        while state.bytes > self.limit
+            && let Some(kept) = state.evict(|_| true)
+        {
+            evicted.push(kept);
+        }
         publish(&state);
+        // Closing a large file takes time, which must not delay other requests.
+        drop(state);
     }
 
     /// Evicts the least recently used tileset with its atoms on disk that no request uses. Returns true if there was
@@ -327,6 +338,7 @@ impl Structures {
         let mut state = self.lock();
         let evicted = state.evict(|kept| kept.is_streamed() && !kept.is_used());
         publish(&state);
+        drop(state);
         evicted.is_some()
     }
 
@@ -339,13 +351,15 @@ impl Reclaim for Structures {
     /// Frees values that no request uses until `bytes` are free, least recently used first.
     fn reclaim(&self, bytes: u64) -> bool {
         let mut state = self.lock();
-        let mut freed = 0;
+        let (mut freed, mut evicted) = (0, Vec::new());
         while freed < bytes
-            && let Some(more) = state.evict(|kept| !kept.is_used())
+            && let Some(kept) = state.evict(|kept| !kept.is_used())
         {
-            freed += more;
+            freed += kept.bytes();
+            evicted.push(kept);
         }
         publish(&state);
+        drop(state);
         freed > 0
     }
 }
@@ -372,21 +386,6 @@ impl Drop for MakingMark<'_> {
     }
 }
 
-/// Returns the digest of a tileset with its atoms on disk, whose index has the colours.
-fn streamed_digest(digest: &Digest, job: &Job) -> Digest {
-    let color = job.color.map(|coloring| coloring.canonical());
-    Digest::of(format!("on disk\n{}\n{color:?}", tileset_digest(digest, job)).as_bytes())
-}
-
-/// Returns the digest of a tileset: of its structure file and of the parameters that affect the index.
-fn tileset_digest(digest: &Digest, job: &Job) -> Digest {
-    let Job { compress, normals, .. } = Job::default();
-    let mut job = Job { tile: None, color: None, compress, normals, ..job.clone() };
-    job.params.atom_ids = false;
-    let canonical = params::canonical(&job);
-    Digest::of(format!("tileset\n{digest}\n{canonical}").as_bytes())
-}
-
 #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
 fn publish(state: &CacheState) {
     gauge!(STRUCTURE_CACHE_BYTES).set(state.bytes as f64);
@@ -399,6 +398,7 @@ mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use super::*;
+    use crate::pipeline::params;
     use crate::surface::CancelToken;
 
     type File = (Input, Digest);

@@ -50,18 +50,9 @@ pub enum StructureError {
         /// Message of the system.
         reason: String,
     },
-    /// The temporary file would exceed its limit.
-    #[error("the index of the atoms needs more than {limit} bytes of disk space, the limit of temporary files")]
-    ScratchTooSmall {
-        /// Size of the disk space, bytes.
-        limit: u64,
-    },
-    /// Other temporary files use the disk space.
-    #[error("the indexes of other structures are in use and take most of the {limit} bytes of disk space for them")]
-    ScratchFull {
-        /// Size of the disk space, bytes.
-        limit: u64,
-    },
+    /// Temporary files would exceed their limit.
+    #[error("{}", disk_space(.0))]
+    DiskSpace(OutOfMemory),
     /// The file cannot be read as a stream.
     #[error(
         "cannot read the file as a stream: found {found}, expected {expected}; it can be read if it fits into memory"
@@ -184,4 +175,17 @@ pub enum StructureError {
         /// The available values.
         available: String,
     },
+}
+
+/// Describes that the limit of temporary files is reached.
+fn disk_space(error: &OutOfMemory) -> String {
+    match error {
+        OutOfMemory::Limit { needed, limit } => {
+            format!("the index of the atoms needs at least {needed} bytes of disk space and the limit is {limit}")
+        }
+        OutOfMemory::Budget { held, limit, .. } => {
+            format!("other indexes of atoms are in use and take {held} of {limit} bytes of disk space")
+        }
+        OutOfMemory::System { .. } => error.to_string(),
+    }
 }

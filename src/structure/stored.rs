@@ -5,7 +5,7 @@ use std::io::{Read as _, Seek as _, SeekFrom, Write as _};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::error::StructureError;
-use crate::surface::{MemoryMeter, OutOfMemory, Reservation};
+use crate::surface::{MemoryMeter, Reservation};
 
 /// Temporary file.
 #[derive(Debug)]
@@ -42,13 +42,9 @@ impl StoredBytes {
     /// Writes bytes at a reserved offset, once, and adds them to the meter.
     ///
     /// # Errors
-    /// Returns [`StructureError::Scratch`], [`StructureError::ScratchTooSmall`] and [`StructureError::ScratchFull`].
+    /// Returns [`StructureError::Scratch`] and [`StructureError::DiskSpace`].
     pub fn write(&self, offset: u64, bytes: &[u8]) -> Result<(), StructureError> {
-        self.bytes.grow(bytes.len() as u64).map_err(|error| match error {
-            OutOfMemory::Limit { limit, .. } => StructureError::ScratchTooSmall { limit },
-            OutOfMemory::Budget { limit, .. } => StructureError::ScratchFull { limit },
-            OutOfMemory::System { .. } => error.into(),
-        })?;
+        self.bytes.grow(bytes.len() as u64).map_err(StructureError::DiskSpace)?;
         self.at(offset, |file| file.write_all(bytes))
     }
 

@@ -30,7 +30,7 @@ pub const BLOCK_BYTES: usize = 16 << 20;
 const STEP: usize = 1 << 20;
 /// Bytes of a block for each row of a BinaryCIF file.
 const ROW_BYTES: usize = 60;
-/// Part of a block from which on byte strings of a BinaryCIF file are in the temporary file: 64 KiB.
+/// Size of a block relative to the smallest byte string that is moved to the temporary file: 64 KiB of 16 MiB.
 const MOVED_PART: usize = 256;
 
 /// Some atoms of a structure.

@@ -341,7 +341,10 @@ fn a_tileset_larger_than_the_cache_is_on_disk() {
         // From now on, a request that loads the file finds it damaged.
         let stored = on_disk.dir.path().join("store/inputs").join(structures[1].rsplit('/').next().unwrap());
         fs::write(stored, vec![b' '; text.len()]).unwrap();
-        get(&on_disk, &format!("{}/surface.glb?tile=1/0/1/0&{query}", structures[1]));
+        let tile = get(&on_disk, &format!("{}/surface.glb?tile=1/0/1/0&{query}", structures[1]));
+        // Neither the index nor an attempt in memory is repeated.
+        let times = tile.header("server-timing").unwrap();
+        assert!(!["read;dur", "select;dur", "index;dur"].iter().any(|stage| times.contains(stage)), "{times}");
         get(&on_disk, &format!("{}/tileset.subtree?{query}", structures[1]));
     }
     // An index that does not fit beside another one replaces it, and one that never fits is rejected.

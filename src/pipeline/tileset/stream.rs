@@ -203,7 +203,8 @@ impl Tileset<Box<Structure>> {
             StreamSource::Structure(structure) => {
                 let mut block = Block { len: structure.len(), structure: structure.clone() };
                 reader.assemblies = std::mem::take(&mut block.structure.assemblies);
-                clock.time("select", || reader.add(&mut block, control))?;
+                let of_block = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+                clock.time("select", || reader.add(&mut block, &of_block))?;
             }
         }
         let BlockReader { selected, colors, spheres, head, assemblies, .. } = reader;
@@ -221,14 +222,14 @@ impl Tileset<Box<Structure>> {
         clock.time("index", || {
             let index = match (spheres, &placements) {
                 (ReadSpheres::Index(index), _) => index,
-                (ReadSpheres::Distinct(list), placements) => {
+                (ReadSpheres::Distinct(list), Some(placements)) => {
                     let mut index = new_index()?;
-                    if let Some(placements) = placements {
-                        place(list, placements, &mut index)?;
-                        selected.copies = placements.copies();
-                    }
+                    place(list, placements, &mut index)?;
+                    selected.copies = placements.copies();
                     index
                 }
+                // Atoms are listed for an assembly only.
+                (ReadSpheres::Distinct(_), None) => return Err(SurfaceError::NoSpheres.into()),
             };
             let index = Arc::new(index.finish()?);
             check_duplicates(&index, limits, control)?;

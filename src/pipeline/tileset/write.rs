@@ -129,7 +129,8 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
     Ok(all)
 }
 
-/// Writes all files of a tileset as [`write()`] does, of a structure that is read as a stream. The job has no assembly.
+/// Writes all files of a tileset as [`write()`] does, of a structure that is read as a stream. The job has no
+/// `instances`.
 ///
 /// # Errors
 /// Returns the errors of [`write()`], and those of the temporary file.

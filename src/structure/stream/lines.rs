@@ -35,8 +35,10 @@ impl TagsAfterAtoms {
         // Behind the semicolon that ends a text field.
         let text = &line[usize::from(delimits)..];
         let mut tokens = Tokenizer::new(text);
+        let mut end = 0;
         // The other values after the atoms are not read, so faults of theirs do not matter.
         while let Ok(token) = tokens.next() {
+            end = token.end;
             let word = &text[token.start..token.end];
             match token.kind {
                 TokenKind::End => break,
@@ -59,6 +61,8 @@ impl TagsAfterAtoms {
             }
         }
         if self.in_assemblies {
+            // Text with a fault, at which reading in memory ends as well; otherwise blanks or a comment.
+            self.assemblies.extend_from_slice(&text[end..]);
             self.assemblies.push(b'\n');
         }
         Ok(false)
