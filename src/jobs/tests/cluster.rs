@@ -243,13 +243,17 @@ async fn workers_share_a_mesh_and_it_has_the_bytes_of_one_worker() {
     let soon = Some(Duration::from_micros(200));
     // A single worker computes all partitions itself.
     assert_eq!(run(in_process(), soon, 1).await, (whole.clone(), 0));
-    let shared_by = async |broker| {
-        let (mesh, partitions) = run(broker, soon, 2).await;
-        assert!(mesh == whole && partitions > 0);
-    };
-    shared_by(in_process()).await;
+    // On a busy machine, the second worker may come too late to share a mesh.
+    let mut attempts = 0;
+    while attempts < 10 {
+        let (mesh, partitions) = run(in_process(), soon, 2).await;
+        assert!(mesh == whole);
+        attempts = if partitions > 0 { break } else { attempts + 1 };
+    }
+    assert!(attempts < 10);
     for program in server::programs() {
         let server = server::NatsServer::start(&program);
-        shared_by([Arc::new(nats(&server).await), Arc::new(nats(&server).await)]).await;
+        let (mesh, partitions) = run([Arc::new(nats(&server).await), Arc::new(nats(&server).await)], soon, 2).await;
+        assert!(mesh == whole && partitions > 0);
     }
 }
