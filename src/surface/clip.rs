@@ -1,5 +1,6 @@
 //! Part of a mesh within a box of grid cells.
 
+use rayon::prelude::*;
 use rustc_hash::FxHashSet;
 
 use super::column::Column;
@@ -10,6 +11,9 @@ use super::lattice::{effective_radius, to_f32, to_u32};
 use super::mesh::Mesh;
 use super::params::SurfaceParams;
 use super::spheres::Spheres;
+
+/// Triangles that one task tests.
+const TESTED: usize = 1 << 14;
 
 /// Returns a distance, Å: spheres whose centres are farther away from a point do not affect the surface there.
 pub(crate) fn influence(spheres: &Spheres, params: &SurfaceParams) -> f64 {
@@ -37,15 +41,16 @@ impl Mesh {
     /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub(crate) fn clip(&mut self, [low, high]: [[f64; 3]; 2], control: &Control<'_>) -> Result<(), SurfaceError> {
         self.make_contiguous();
+        let positions = &self.positions[..];
         let inside = |triangle: &&[u32; 3]| {
-            let corners = triangle.map(|v| self.positions[v as usize]);
+            let corners = triangle.map(|v| positions[v as usize]);
             (0..3).all(|k| {
                 let middle = self.centre[k] + corners.iter().map(|p| f64::from(p[k])).sum::<f64>() / 3.0;
                 (low[k]..high[k]).contains(&middle)
             })
         };
-        let kept: Column<[u32; 3]> = self.triangles.iter().filter(inside).copied().collect();
-        self.triangles = kept;
+        let kept = |some: &[[u32; 3]]| some.iter().filter(inside).copied().collect::<Column<_>>();
+        self.triangles = Column::from_chunks(self.triangles.par_chunks(TESTED).map(kept).collect());
         self.drop_unused_vertices(control)?;
         let centre: [f64; 3] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
         for position in self.positions.iter_mut() {
@@ -85,7 +90,7 @@ impl Mesh {
         let n = self.n_vertices();
         let lower = |v: u32| to_u32(n + upper.partition_point(|other| *other < v));
         let strips = boundary.iter().flat_map(|[a, b]| [[*b, *a, lower(*a)], [*b, lower(*a), lower(*b)]]);
-        self.triangles = self.triangles.iter().copied().chain(strips).collect();
+        self.triangles.append(strips.collect());
         self.take_vertices(&(0..to_u32(n)).chain(upper.iter().copied()).collect::<Vec<_>>());
         for v in n..self.n_vertices() {
             let normal = self.normals[v];

@@ -196,10 +196,11 @@ pub(super) fn components_of(mesh: &Mesh, control: &Control<'_>) -> Result<(Vec<C
     for component in &of_vertex {
         components[*component as usize].vertices += 1;
     }
+    let position = mesh.relative_positions();
     for chunk in mesh.triangles.chunks(TRIANGLES_PER_CHECK) {
         control.check()?;
         for triangle in chunk {
-            let corners = triangle.map(|v| mesh.position(v as usize).map(f64::from));
+            let corners = triangle.map(|v| position(v as usize).map(f64::from));
             components[of_vertex[triangle[0] as usize] as usize].add(corners);
         }
     }

@@ -172,10 +172,17 @@ impl Mesh {
     /// Panics if there is no such vertex.
     #[must_use]
     pub fn position(&self, i: usize) -> [f32; 3] {
-        match &self.quantized {
-            None => self.positions[i],
-            Some(Quantized { step, positions, .. }) => {
-                let [x, y, z, _] = positions[i];
+        self.relative_positions()(i)
+    }
+
+    /// Returns the function [`Self::position`]. Loops use it, because access to a column as a slice takes time.
+    pub(crate) fn relative_positions(&self) -> impl Fn(usize) -> [f32; 3] + Sync {
+        let quantized = self.quantized.as_ref().map(|quantized| (quantized.step, &quantized.positions[..]));
+        let positions = &self.positions[..];
+        move |i| match quantized {
+            None => positions[i],
+            Some((step, rows)) => {
+                let [x, y, z, _] = rows[i];
                 step.decoded([x, y, z])
             }
         }
@@ -196,12 +203,13 @@ impl Mesh {
         if self.quantized.as_ref().is_some_and(|quantized| quantized.step == step) {
             return false;
         }
-        let rows = |i: usize| self.position(i);
-        let n = self.n_vertices();
-        let mut rounded = Quantized::zeroed(step, n);
-        rounded.positions.par_chunks_mut(ROWS).enumerate().for_each(|(chunk, out)| {
-            out.iter_mut().zip(chunk * ROWS..).for_each(|(out, i)| *out = position_row(step, rows(i)));
-        });
+        let mut rounded = Quantized::zeroed(step, self.n_vertices());
+        {
+            let position = self.relative_positions();
+            rounded.positions.par_chunks_mut(ROWS).enumerate().for_each(|(chunk, out)| {
+                out.iter_mut().zip(chunk * ROWS..).for_each(|(out, i)| *out = position_row(step, position(i)));
+            });
+        }
         if let Some(quantized) = self.quantized.take() {
             // Another step: normals have none.
             rounded.normals = quantized.normals;

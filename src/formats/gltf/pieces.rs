@@ -255,26 +255,36 @@ impl<'a> Source<'a> {
 
     fn compress(&self, part: usize, numbering: &Numbering, layout: BufferLayout) -> Result<Piece, FormatError> {
         let Numbering { vertices, triangles } = numbering;
-        let mut streams = Streams { n_vertices: vertices.len(), ..Streams::default() };
-        let positions = gathered(self.positions, vertices);
-        let [low, high] = bounds(&positions);
-        streams.attribute(&positions, None)?;
-        drop(positions);
-        if let Some(normals) = self.normals {
-            let rows = gathered(normals, vertices).into_iter().map(|row| row.map(|v| f32::from(v) / 127.0));
-            let rows: Vec<[f32; 4]> = rows.collect();
-            streams.attribute(&meshopt::encode_filter_oct::<i8>(&rows, NORMAL_BITS), Some("OCTAHEDRAL"))?;
-        }
-        if let Some(colors) = self.colors {
-            let bytes = written(ColumnRows::Colors(&gathered(colors, vertices)), &layout)?;
-            streams.attribute(bytes.as_chunks::<8>().0, None)?;
-        }
-        if let Some(atoms) = self.atoms {
-            let bytes = written(ColumnRows::Atoms(&gathered(atoms, vertices)), &layout)?;
-            streams.attribute(bytes.as_chunks::<4>().0, None)?;
-        }
-        streams.indices(triangles, layout.indices.0)?;
-        let Streams { all: streams, mut data, .. } = streams;
+        // In parallel, because a small mesh is one piece.
+        let (shape, rest) = rayon::join(
+            || {
+                let mut streams = Streams::default();
+                let positions = gathered(self.positions, vertices);
+                streams.attribute(&positions, None)?;
+                if let Some(normals) = self.normals {
+                    let rows = gathered(normals, vertices).into_iter().map(|row| row.map(|v| f32::from(v) / 127.0));
+                    let rows: Vec<[f32; 4]> = rows.collect();
+                    streams.attribute(&meshopt::encode_filter_oct::<i8>(&rows, NORMAL_BITS), Some("OCTAHEDRAL"))?;
+                }
+                Ok::<_, FormatError>((bounds(&positions), streams))
+            },
+            || {
+                let mut streams = Streams::default();
+                if let Some(colors) = self.colors {
+                    let bytes = written(ColumnRows::Colors(&gathered(colors, vertices)), &layout)?;
+                    streams.attribute(bytes.as_chunks::<8>().0, None)?;
+                }
+                if let Some(atoms) = self.atoms {
+                    let bytes = written(ColumnRows::Atoms(&gathered(atoms, vertices)), &layout)?;
+                    streams.attribute(bytes.as_chunks::<4>().0, None)?;
+                }
+                streams.indices(triangles, vertices.len(), layout.indices.0)?;
+                Ok::<_, FormatError>(streams)
+            },
+        );
+        let ([low, high], mut streams) = shape?;
+        streams.append(&rest?);
+        let Streams { all: streams, mut data } = streams;
         data.shrink_to_fit();
         let (n_vertices, n_triangles) = (vertices.len() as u64, triangles.len() as u64);
         let bounds = [self.step.decoded(low), self.step.decoded(high)];
@@ -285,7 +295,6 @@ impl<'a> Source<'a> {
 /// Streams of a piece.
 #[derive(Default)]
 struct Streams {
-    n_vertices: usize,
     all: Vec<Stream>,
     data: Vec<u8>,
 }
@@ -299,10 +308,10 @@ impl Streams {
     }
 
     /// Adds the indices.
-    fn indices(&mut self, triangles: &[[u32; 3]], index_type: IndexType) -> Result<(), FormatError> {
+    fn indices(&mut self, triangles: &[[u32; 3]], n_vertices: usize, index: IndexType) -> Result<(), FormatError> {
         let indices = triangles.as_flattened();
-        let encoded = meshopt::encode_index_buffer(indices, self.n_vertices).map_err(failed)?;
-        self.add(&encoded, index_type.bytes(), indices.len(), "TRIANGLES", None);
+        let encoded = meshopt::encode_index_buffer(indices, n_vertices).map_err(failed)?;
+        self.add(&encoded, index.bytes(), indices.len(), "TRIANGLES", None);
         Ok(())
     }
 
@@ -311,6 +320,13 @@ impl Streams {
         self.data.extend_from_slice(encoded);
         self.all.push(Stream { start, end: self.data.len(), stride, count, mode, filter });
         self.data.resize(self.data.len().next_multiple_of(4), 0);
+    }
+
+    /// Adds the streams of `next`.
+    fn append(&mut self, next: &Self) {
+        let moved = |at: usize| self.data.len() + at;
+        self.all.extend(next.all.iter().map(|s| Stream { start: moved(s.start), end: moved(s.end), ..*s }));
+        self.data.extend_from_slice(&next.data);
     }
 }
 
