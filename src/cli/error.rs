@@ -214,7 +214,7 @@ impl CliError {
 fn structure_code(error: &StructureError) -> i32 {
     match error {
         StructureError::Input { .. } => code::INPUT,
-        StructureError::Scratch { .. } | StructureError::DiskSpace(_) => code::OUTPUT,
+        StructureError::Scratch { .. } | StructureError::DiskFull | StructureError::DiskSpace(_) => code::OUTPUT,
         StructureError::InflatedTooLarge { .. }
         | StructureError::TooManyAtoms { .. }
         | StructureError::TooManyDuplicates { .. }

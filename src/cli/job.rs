@@ -178,13 +178,13 @@ impl<'a> CommandJob<'a> {
         &self,
         inputs: &[PathBuf],
         files: Vec<Box<dyn Read + Send>>,
-        file: File,
+        scratch: [File; 2],
         folder: &Path,
         write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
     ) -> Result<TilesetReport, CliError> {
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
         let current = Cell::new(0);
-        let scratch = ScratchFile { file, meter: Arc::new(()) };
+        let scratch = scratch.map(|file| ScratchFile { file, meter: Arc::new(()) });
         let source = StreamSource::Files(files);
         let stream =
             StructureStream { source, scratch, block_bytes: BLOCK_BYTES, began: &|number| current.set(number) };

@@ -66,7 +66,7 @@ struct StreamFiles {
     /// Estimated number of atoms.
     atoms: f64,
     /// File without a name, so that the system removes it in any case.
-    scratch: File,
+    scratch: [File; 2],
 }
 
 impl StreamFiles {
@@ -87,8 +87,8 @@ impl StreamFiles {
             inputs.push(Box::new(file));
         }
         let failed = |source| CliError::Output { name: folder.display().to_string(), source };
-        let scratch = tempfile::tempfile_in(folder).map_err(failed)?;
-        Ok(Self { inputs, atoms: bytes as f64 / BYTES_PER_ATOM, scratch })
+        let file = || tempfile::tempfile_in(folder).map_err(failed);
+        Ok(Self { inputs, atoms: bytes as f64 / BYTES_PER_ATOM, scratch: [file()?, file()?] })
     }
 }
 

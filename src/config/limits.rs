@@ -65,9 +65,9 @@ pub struct LimitsConfig {
     /// atoms. Further requests for the same file do not read it again. The least recently used structures are evicted,
     /// also before a request is rejected for lack of memory. 0 keeps none.
     pub structure_cache_bytes: u64,
-    /// Size of temporary files in `server.data_dir` with the indexes of tilesets that do not fit into
-    /// `structure_cache_bytes`, bytes. Default 4 GiB: 80 million atoms at 48 bytes, and their groups. If they are
-    /// full, the least recently used index that no request uses is removed. 0 rejects such tilesets.
+    /// Maximum size of temporary files in `server.data_dir`, bytes. They hold the indexes of tilesets that are larger
+    /// than `structure_cache_bytes`. Default 4 GiB: about 80 million atoms at 48 bytes, with their groups. At the
+    /// limit, the least recently used index that is not in use is removed. 0 rejects such tilesets.
     pub scratch_bytes: u64,
     /// Width and height of a picture, pixels. Default 4,096: at 40 bytes a pixel the largest picture needs 640 MiB, and
     /// rendering takes seconds.

@@ -237,6 +237,7 @@ impl From<StructureError> for Problem {
         let detail = error.to_string();
         match error {
             E::Scratch { .. } => Self::internal(detail),
+            E::DiskFull => Self::new(ProblemType::StoreFull, detail).retry_after(Duration::from_secs(5)),
             E::DiskSpace(error) => Self::from(error).detailed(detail),
             E::Input { .. } | E::NotAStream { .. } => Self::new(ProblemType::UnreadableStructure, detail),
             E::UnknownFormat { found } => Self::new(ProblemType::UnreadableStructure, detail).with("found", found),
@@ -372,7 +373,7 @@ impl From<SurfaceError> for Problem {
                 .with("actual", triangles)
                 .with("resolution", resolution),
             E::TooManyTiles { limit, .. } => Self::new(ProblemType::GridTooLarge, detail).with("limit", limit),
-            E::TilesetTooLarge { limit } => Self::new(ProblemType::TooMuchMemory, detail).with("limit", limit),
+            E::TilesetTooLarge { limit, .. } => Self::new(ProblemType::TooMuchMemory, detail).with("limit", limit),
             E::TooManyOverlaps { overlaps, limit } => exceeded(ProblemType::TooManyCandidates, limit, overlaps),
             E::NoSurface { isovalue: Some(isovalue) } => {
                 Self::new(ProblemType::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)

@@ -4,10 +4,12 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use std::ops::Deref;
 use std::sync::Arc;
 
+use bytes::Bytes;
+
 use super::MemoryReservation;
 use crate::memory_budget::Buffers;
 use crate::pipeline::tileset::{Tileset, TilesetColors};
-use crate::pipeline::{Job, params};
+use crate::pipeline::{Job, estimate_atoms, params};
 use crate::store::{Digest, Namespace};
 use crate::structure::Structure;
 
@@ -68,6 +70,45 @@ impl<T> Deref for Shared<T> {
 
     fn deref(&self) -> &T {
         &self.0.value
+    }
+}
+
+/// Structure of a task or a request.
+#[derive(Debug, Clone)]
+pub(crate) enum Input {
+    /// Structure file, compressed or not.
+    File(Bytes),
+    /// Structure in memory, whose file need not be loaded.
+    Kept(SharedStructure),
+    /// Tileset with its atoms on disk, for jobs on its tiles.
+    Tileset(SharedTileset),
+}
+
+impl Input {
+    /// Returns the file; `None` if it was not loaded.
+    pub(crate) fn file(&self) -> Option<&Bytes> {
+        match self {
+            Self::File(file) => Some(file),
+            Self::Kept(_) | Self::Tileset(_) => None,
+        }
+    }
+
+    /// Returns the size of the file, bytes.
+    pub(crate) fn file_bytes(&self) -> usize {
+        match self {
+            Self::File(file) => file.len(),
+            Self::Kept(kept) => kept.0.file_bytes,
+            Self::Tileset(kept) => kept.0.file_bytes,
+        }
+    }
+
+    /// Returns the number of atoms as estimated from the file.
+    pub(crate) fn atoms(&self) -> f64 {
+        match self {
+            Self::File(file) => estimate_atoms(file),
+            Self::Kept(kept) => kept.0.atoms,
+            Self::Tileset(kept) => kept.0.atoms,
+        }
     }
 }
 

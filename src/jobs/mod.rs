@@ -43,7 +43,7 @@ pub(crate) use broker::{Broker, Dispatch, DispatchError, MemoryBroker, NatsBroke
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};
-pub(crate) use kept::{CacheKey, SharedStructure, SharedTileset};
+pub(crate) use kept::{CacheKey, Input, SharedStructure, SharedTileset};
 pub(crate) use key::ContentKey;
 pub(crate) use owned_job::OwnedJob;
 pub(crate) use pool::{Pool, Settings};
@@ -52,7 +52,7 @@ pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
 pub(crate) use records::unfinished_jobs;
 pub(crate) use results::{REPORT, SaveError, document, is_stored, save};
 pub(crate) use scratch::ScratchSpace;
-pub(crate) use structures::{Input, Structures};
+pub(crate) use structures::Structures;
 pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;

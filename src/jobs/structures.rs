@@ -6,17 +6,16 @@
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
-use bytes::Bytes;
 use metrics::{counter, gauge};
 
 use super::kept::{
-    CacheKey, CacheState, Charge, Charged, Kept, Shared, SharedColors, SharedStructure, SharedTileset, streamed_digest,
-    tileset_digest,
+    CacheKey, CacheState, Charge, Charged, Input, Kept, Shared, SharedColors, SharedStructure, SharedTileset,
+    streamed_digest, tileset_digest,
 };
 use super::{MemoryReservation, ScratchSpace};
 use crate::memory_budget::{Budget, Reclaim};
 use crate::pipeline::tileset::{self, StreamSource, StructureStream, Tileset};
-use crate::pipeline::{Job, JobError, StageClock, estimate_atoms};
+use crate::pipeline::{Job, JobError, StageClock};
 use crate::store::{Digest, Namespace};
 use crate::structure::stream::BLOCK_BYTES;
 use crate::structure::{self, ReadLimits, StructureError};
@@ -29,51 +28,13 @@ use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
 const OVERHEAD: u64 = 4 << 10;
 /// Memory of the atoms of a tileset and of their index, bytes per atom.
 const BYTES_PER_ATOM: u64 = 110;
-/// Size of the cache in blocks of a file that is read as a stream. The buffers of the index take a quarter of it.
+/// Number of blocks that fit into the cache: a stream is read in blocks of this part of the cache. The index buffers
+/// four blocks, which take up to twice their size while they grow.
 const BLOCKS: u64 = 32;
 /// Minimum size of a block, bytes.
 const MIN_BLOCK: usize = 256 << 10;
 /// Time between two checks of a request that waits for another one to read its structure.
 const POLL: Duration = Duration::from_millis(20);
-
-/// Structure of a task or a request.
-#[derive(Debug, Clone)]
-pub(crate) enum Input {
-    /// Structure file, compressed or not.
-    File(Bytes),
-    /// Structure in memory, whose file need not be loaded.
-    Kept(SharedStructure),
-    /// Tileset with its atoms on disk, for jobs on its tiles.
-    Tileset(SharedTileset),
-}
-
-impl Input {
-    /// Returns the file; `None` if it was not loaded.
-    pub(crate) fn file(&self) -> Option<&Bytes> {
-        match self {
-            Self::File(file) => Some(file),
-            Self::Kept(_) | Self::Tileset(_) => None,
-        }
-    }
-
-    /// Returns the size of the file, bytes.
-    pub(crate) fn file_bytes(&self) -> usize {
-        match self {
-            Self::File(file) => file.len(),
-            Self::Kept(kept) => kept.0.file_bytes,
-            Self::Tileset(kept) => kept.0.file_bytes,
-        }
-    }
-
-    /// Returns the number of atoms as estimated from the file.
-    pub(crate) fn atoms(&self) -> f64 {
-        match self {
-            Self::File(file) => estimate_atoms(file),
-            Self::Kept(kept) => kept.0.atoms,
-            Self::Tileset(kept) => kept.0.atoms,
-        }
-    }
-}
 
 /// Cache of structures by namespace and digest, and of tilesets prepared from them, within a limit of memory.
 #[derive(Debug)]
@@ -83,7 +44,7 @@ pub(crate) struct Structures {
     /// Disk space for tilesets whose index would exceed the limit.
     scratch: Option<Arc<ScratchSpace>>,
     state: Mutex<CacheState>,
-    /// Notified when a request has ended making a value.
+    /// Notified when a request stops making a value.
     ended: Condvar,
 }
 
@@ -100,8 +61,8 @@ impl Structures {
         structures
     }
 
-    /// Returns the structure of a file if it is kept, for a `job` on a tile also as a part of its tileset, or this
-    /// tileset.
+    /// Finds a file in the cache. For a `job` on a tile, its tileset comes first: returns the tileset itself if its
+    /// atoms are on disk, else its structure.
     pub(crate) fn find(&self, namespace: Namespace, digest: Digest, job: Option<&Job>) -> Option<Input> {
         let job = job.filter(|job| job.tile.is_some());
         let tilesets = job.map(|job| [tileset_digest(&digest, job), streamed_digest(&digest, job)]);
@@ -116,7 +77,7 @@ impl Structures {
     }
 
     /// Returns the structure of the file with this digest, reading `input` if necessary. Concurrent calls read it once
-    /// if it is kept, else one after the other.
+    /// if it fits into the cache. Otherwise each call reads it, one at a time.
     ///
     /// Memory is charged to the budget until the last reference is dropped, not to the meter of `control`.
     ///
@@ -139,11 +100,11 @@ impl Structures {
             Input::File(file) => file,
             Input::Kept(kept) => return hit(kept.clone()),
             // Has no atoms. Only jobs on tiles have such an input, and they do not read the structure.
-            Input::Tileset(tileset) => return hit(tileset.structure().clone()),
+            Input::Tileset(_) => return Err(StructureError::Scratch { reason: "the atoms are on disk".to_owned() }),
         };
         control.memory.also_held(file.len() as u64);
         let key = (namespace, digest);
-        let found = self.find_or_begin(key, &control.cancel).ok_or(StructureError::Cancelled)?;
+        let found = self.find_or_begin(&[key], &control.cancel).ok_or(StructureError::Cancelled)?;
         if let Lookup::Kept(Kept::Structure(kept)) = found {
             return hit(kept);
         }
@@ -162,8 +123,8 @@ impl Structures {
     }
 
     /// Returns the tileset of a job on the file with this digest, and the colours of its atoms. Prepares them from
-    /// `input` if necessary; concurrent calls prepare them once. `clock` measures the preparation. A tileset that does
-    /// not fit into the cache has its atoms on disk, if the parameters allow it.
+    /// `input` if necessary; concurrent calls prepare them once. `clock` measures the preparation. A tileset too
+    /// large for the cache has its index on disk if its parameters allow it.
     ///
     /// # Errors
     /// Returns the errors of [`Tileset::new`], [`Tileset::of_stream`] and [`Tileset::colors`], and
@@ -179,35 +140,40 @@ impl Structures {
     ) -> Result<(SharedTileset, Option<SharedColors>), JobError> {
         let as_tileset = |kept: Kept| if let Kept::Tileset(tileset) = kept { Some(tileset) } else { None };
         let [of_memory, of_disk] = [tileset_digest(&digest, job), streamed_digest(&digest, job)];
+        let keys = [of_memory, of_disk].map(|digest| (namespace, digest));
         let in_memory = |limits: &ReadLimits| {
             let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
             let prepare = |control: &Control<'_>| Tileset::new(read, job, limits, control, clock);
-            let (key, budget) = ((namespace, of_memory), self.budget.part(self.limit));
-            self.prepared(key, input, control, &budget, (Kept::Tileset, as_tileset), prepare)
+            self.made(keys[0], input, control, &self.budget.part(self.limit), Kept::Tileset, prepare)
         };
         let on_disk = |scratch: &ScratchSpace| {
             let prepare = |control: &Control<'_>| self.streamed(scratch, input, job, limits, control, clock);
             // Only what remains must fit into the cache, not the memory of reading and sorting.
-            let key = (namespace, of_disk);
-            self.prepared(key, input, control, &self.budget, (Kept::Tileset, as_tileset), prepare)
+            self.made(keys[1], input, control, &self.budget, Kept::Tileset, prepare)
         };
-        let tileset = match (input, &self.scratch) {
-            (Input::Tileset(tileset), _) => tileset.clone(),
-            (_, Some(scratch)) if self.limit > 0 && tileset::check_stream(job, 1).is_ok() => {
+        let not_on_disk = tileset::needs_memory(job, 1).map(|(name, ..)| name);
+        let make = || match &self.scratch {
+            Some(scratch) if self.limit > 0 && not_on_disk.is_none() => {
                 // Reading, or copying for an assembly, ends early if the atoms do not fit.
                 let max_atoms = limits.max_atoms.min(self.limit / BYTES_PER_ATOM);
-                let found = self.lock().find(&(namespace, of_disk)).and_then(as_tileset);
-                match found.map_or_else(|| in_memory(&ReadLimits { max_atoms, ..*limits }), Ok) {
-                    Err(
-                        JobError::Surface(SurfaceError::TilesetTooLarge { .. })
-                        | JobError::Structure(
-                            StructureError::TooManyAtoms { .. } | StructureError::AssemblyTooLarge { .. },
-                        ),
-                    ) => on_disk(scratch)?,
-                    made => made?,
+                match in_memory(&ReadLimits { max_atoms, ..*limits }) {
+                    Err(JobError::Surface(SurfaceError::TilesetTooLarge { .. })) => on_disk(scratch),
+                    Err(JobError::Structure(
+                        StructureError::TooManyAtoms { .. } | StructureError::AssemblyTooLarge { .. },
+                    )) if max_atoms < limits.max_atoms => on_disk(scratch),
+                    made => made,
                 }
             }
-            _ => in_memory(limits)?,
+            _ => in_memory(limits).map_err(|error| match error {
+                JobError::Surface(SurfaceError::TilesetTooLarge { limit, .. }) => {
+                    SurfaceError::TilesetTooLarge { limit, parameter: not_on_disk }.into()
+                }
+                error => error,
+            }),
+        };
+        let tileset = match input {
+            Input::Tileset(tileset) => tileset.clone(),
+            _ => self.found_or_made(&keys, control, as_tileset, make)?,
         };
         let of_tileset = if tileset.is_streamed() { of_disk } else { of_memory };
         let Some(coloring) = job.color else { return Ok((tileset, None)) };
@@ -215,7 +181,8 @@ impl Structures {
         let prepare = |control: &Control<'_>| tileset.colors(coloring, control);
         let as_colors = |kept: Kept| if let Kept::Colors(colors) = kept { Some(colors) } else { None };
         let budget = self.budget.part(self.limit);
-        let colors = self.prepared(key, input, control, &budget, (Kept::Colors, as_colors), prepare)?;
+        let make = || self.made(key, input, control, &budget, Kept::Colors, prepare);
+        let colors = self.found_or_made(&[key], control, as_colors, make)?;
         Ok((tileset, Some(colors)))
     }
 
@@ -245,41 +212,53 @@ impl Structures {
             Input::Tileset(_) => return Err(SurfaceError::NoSpheres.into()),
         };
         let block_bytes = usize::try_from(self.limit / BLOCKS).unwrap_or(usize::MAX).clamp(MIN_BLOCK, BLOCK_BYTES);
-        let stream = StructureStream { source, scratch: scratch.file()?, block_bytes, began: &|_| {} };
+        let scratch = [scratch.file()?, scratch.file()?];
+        let stream = StructureStream { source, scratch, block_bytes, began: &|_| {} };
         let tileset = Tileset::of_stream(stream, job, limits, control, clock)?;
         drop(copy);
         let reservation = Arc::new(self.budget.reservation());
         Ok(tileset.with_structure(|structure| self.charged(*structure, input, reservation)))
     }
 
-    /// Returns a value that must be kept, and prepares it with memory of `budget` if necessary.
-    fn prepared<T>(
+    /// Returns the value with one of the keys, and calls `make` if there is none.
+    fn found_or_made<T>(
         &self,
-        key: CacheKey,
-        input: &Input,
+        keys: &[CacheKey],
         control: &Control<'_>,
-        budget: &Budget,
-        (keep, kept_as): (fn(Shared<T>) -> Kept, impl Fn(Kept) -> Option<Shared<T>>),
-        prepare: impl FnOnce(&Control<'_>) -> Result<T, JobError>,
+        kept_as: impl Fn(Kept) -> Option<Shared<T>>,
+        make: impl FnOnce() -> Result<Shared<T>, JobError>,
     ) -> Result<Shared<T>, JobError> {
-        let found = self.find_or_begin(key, &control.cancel).ok_or(SurfaceError::Cancelled)?;
+        let found = self.find_or_begin(keys, &control.cancel).ok_or(SurfaceError::Cancelled)?;
         if let Lookup::Kept(kept) = &found
             && let Some(kept) = kept_as(kept.clone())
         {
             control.memory.also_held(kept.bytes());
             return Ok(kept);
         }
+        make()
+    }
+
+    /// Prepares a value with memory of `budget`, and keeps it. It must fit into the cache.
+    fn made<T>(
+        &self,
+        key: CacheKey,
+        input: &Input,
+        control: &Control<'_>,
+        budget: &Budget,
+        keep: fn(Shared<T>) -> Kept,
+        prepare: impl FnOnce(&Control<'_>) -> Result<T, JobError>,
+    ) -> Result<Shared<T>, JobError> {
         let limit = self.limit;
         let reservation = Arc::new(budget.reservation());
         let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
         let value = prepare(&charged).map_err(|error| match error {
             JobError::Surface(SurfaceError::Memory(
                 OutOfMemory::Limit { limit: of, .. } | OutOfMemory::Budget { limit: of, .. },
-            )) if of == limit => SurfaceError::TilesetTooLarge { limit }.into(),
+            )) if of == limit => SurfaceError::TilesetTooLarge { limit, parameter: None }.into(),
             error => error,
         })?;
         if reservation.bytes() > limit {
-            return Err(SurfaceError::TilesetTooLarge { limit }.into());
+            return Err(SurfaceError::TilesetTooLarge { limit, parameter: None }.into());
         }
         let shared = self.charged(value, input, reservation);
         control.memory.also_held(shared.bytes());
@@ -287,12 +266,13 @@ impl Structures {
         Ok(shared)
     }
 
-    /// Finds a value, or begins to make it: the caller keeps the mark meanwhile. Waits while another request makes it;
-    /// `None` if this one is cancelled.
-    fn find_or_begin(&self, key: CacheKey, cancel: &CancelToken) -> Option<Lookup<'_>> {
+    /// Finds a value with one of the keys, or begins to make it: the caller keeps the mark of the first key meanwhile.
+    /// Waits while another request makes it; `None` if this one is cancelled.
+    fn find_or_begin(&self, keys: &[CacheKey], cancel: &CancelToken) -> Option<Lookup<'_>> {
+        let key = *keys.first()?;
         let mut state = self.lock();
         loop {
-            if let Some(kept) = state.find(&key) {
+            if let Some(kept) = keys.iter().find_map(|key| state.find(key)) {
                 return Some(Lookup::Kept(kept));
             }
             if self.limit == 0 || state.making.insert(key) {
@@ -544,6 +524,31 @@ mod tests {
         let bytes = structures.lock().bytes;
         assert!(bytes > 20_000 * 60, "{bytes}");
         assert!(structures.reclaim(u64::MAX) && structures.lock().kept.is_empty() && held(&budget) == 0);
+    }
+
+    #[test]
+    fn concurrent_requests_for_a_tileset_on_disk_index_it_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let scratch = ScratchSpace::new(folder.path(), 1 << 30);
+        let structures = Structures::new(1 << 20, &Budget::unlimited(), Some(scratch));
+        let (input, digest) = file(20_000);
+        let job = params::parse([("tile", "0/0/0/0"), ("select", "all")]).unwrap().job;
+        let start = Barrier::new(4);
+        let get = || {
+            let (limits, clock, key) = (ReadLimits::default(), StageClock::new(&()), (Namespace::default(), digest));
+            start.wait();
+            let got = structures.tileset(key, &input, &job, &limits, &Control::default(), &clock).unwrap().0;
+            let has_read = clock.finish().iter().any(|(stage, _)| *stage == "read");
+            (got, has_read)
+        };
+        let got: Vec<(SharedTileset, bool)> = std::thread::scope(|scope| {
+            let threads: Vec<_> = (0..4).map(|_| scope.spawn(get)).collect();
+            threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+        });
+        assert!(got.iter().all(|(tileset, _)| Arc::ptr_eq(&tileset.0, &got[0].0.0) && tileset.is_streamed()));
+        // The others do not attempt to read it into memory either.
+        assert_eq!(got.iter().filter(|(_, has_read)| *has_read).count(), 1);
+        assert!(structures.lock().making.is_empty());
     }
 
     #[test]

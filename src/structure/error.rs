@@ -50,6 +50,9 @@ pub enum StructureError {
         /// Message of the system.
         reason: String,
     },
+    /// The disk of the temporary file is full.
+    #[error("the disk of the temporary file is full")]
+    DiskFull,
     /// Temporary files would exceed their limit.
     #[error("{}", disk_space(.0))]
     DiskSpace(OutOfMemory),
@@ -184,7 +187,9 @@ fn disk_space(error: &OutOfMemory) -> String {
             format!("the index of the atoms needs at least {needed} bytes of disk space and the limit is {limit}")
         }
         OutOfMemory::Budget { held, limit, .. } => {
-            format!("other indexes of atoms are in use and take {held} of {limit} bytes of disk space")
+            format!(
+                "temporary files take {held} of {limit} bytes of disk space, and the indexes of other tilesets are in use"
+            )
         }
         OutOfMemory::System { .. } => error.to_string(),
     }

@@ -1,13 +1,13 @@
-//! Temporary file of bytes, which are read again by their offset.
+//! Temporary file with random access.
 
 use std::fs::File;
-use std::io::{Read as _, Seek as _, SeekFrom, Write as _};
+use std::io::{ErrorKind, Read as _, Seek as _, SeekFrom, Write as _};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::error::StructureError;
 use crate::surface::{MemoryMeter, Reservation};
 
-/// Temporary file.
+/// Empty temporary file, and the meter of its size.
 #[derive(Debug)]
 pub struct ScratchFile {
     /// Empty file that can be read and written.
@@ -16,7 +16,7 @@ pub struct ScratchFile {
     pub meter: Arc<dyn MemoryMeter>,
 }
 
-/// Temporary file and the length of its used part.
+/// Temporary file that only grows. Each range is reserved, written once and read by its offset.
 #[derive(Debug)]
 pub struct StoredBytes {
     file: Mutex<(File, u64)>,
@@ -42,7 +42,7 @@ impl StoredBytes {
     /// Writes bytes at a reserved offset, once, and adds them to the meter.
     ///
     /// # Errors
-    /// Returns [`StructureError::Scratch`] and [`StructureError::DiskSpace`].
+    /// Returns [`StructureError::Scratch`], [`StructureError::DiskFull`] and [`StructureError::DiskSpace`].
     pub fn write(&self, offset: u64, bytes: &[u8]) -> Result<(), StructureError> {
         self.bytes.grow(bytes.len() as u64).map_err(StructureError::DiskSpace)?;
         self.at(offset, |file| file.write_all(bytes))
@@ -60,6 +60,9 @@ impl StoredBytes {
         let mut guard = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         let file = &mut guard.0;
         let done = file.seek(SeekFrom::Start(offset)).and_then(|_| act(file));
-        done.map_err(|error| StructureError::Scratch { reason: error.to_string() })
+        done.map_err(|error| match error.kind() {
+            ErrorKind::StorageFull | ErrorKind::QuotaExceeded => StructureError::DiskFull,
+            _ => StructureError::Scratch { reason: error.to_string() },
+        })
     }
 }

@@ -261,6 +261,8 @@ impl<'a> Blocks<'a> {
             if !is_whole {
                 self.hetero.add(&reading);
             }
+            // Subtracts the memory of reading first.
+            drop(reading);
             memory.keep();
             let used = rows(&self.text[head..end]).nth(len).map_or(end, |(start, _)| head + start);
             self.lines += memchr::memchr_iter(b'\n', &self.text[head..used]).count() as u64;
@@ -315,11 +317,11 @@ impl<'a> Blocks<'a> {
         // Ends the loop of the atoms, which has no rows here.
         self.tags.assemblies.extend_from_slice(b"\nsave_\n");
         self.text.drain(..head);
-        let mut is_last = false;
+        let (mut is_last, mut searched) = (false, 0);
         while !is_last {
             check(control)?;
-            let whole =
-                if self.at_end { self.text.len() } else { memchr::memrchr(b'\n', &self.text).map_or(0, |i| i + 1) };
+            let newline = memchr::memrchr(b'\n', &self.text[searched..]);
+            let whole = if self.at_end { self.text.len() } else { newline.map_or(0, |i| searched + i + 1) };
             let kept = self.tags.assemblies.len();
             for line in self.text[..whole].split_inclusive(|&b| b == b'\n') {
                 is_last = is_last || self.tags.is_last(line, self.needs_secondary)?;
@@ -327,6 +329,8 @@ impl<'a> Blocks<'a> {
             self.memory.grow((self.tags.assemblies.len() - kept) as u64)?;
             is_last |= self.at_end;
             self.text.drain(..whole);
+            // The rest has no newline.
+            searched = self.text.len();
             self.fill(self.text.len() + 1, control)?;
         }
         let reading = Reading::new(&self.limits, control);

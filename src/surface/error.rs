@@ -144,10 +144,14 @@ pub enum SurfaceError {
         resolution: f64,
     },
     /// The index of a tileset is too large to be kept, and each tile would need it again.
-    #[error("the index of the tileset has more than {limit} bytes, the limit of the cache of structures")]
+    #[error(
+        "the index of the tileset has more than {limit} bytes, the limit of the cache of structures{}", on_disk(*.parameter)
+    )]
     TilesetTooLarge {
         /// Bytes allowed.
         limit: u64,
+        /// Parameter because of which the index cannot be on disk.
+        parameter: Option<&'static str>,
     },
     /// The sink of the mesh failed. It keeps the cause.
     #[error("the mesh sink failed")]
@@ -192,6 +196,13 @@ impl SurfaceError {
         };
         spacing.filter(|spacing| *spacing <= MAX_RESOLUTION)
     }
+}
+
+/// Describes that a parameter needs an index in memory.
+fn on_disk(parameter: Option<&str>) -> String {
+    parameter.map_or_else(String::new, |name| {
+        format!("; a larger index is on disk, but the parameter `{name}` needs all atoms in memory")
+    })
 }
 
 /// Describes a grid spacing at which a job would fit.

@@ -154,7 +154,8 @@ impl MemoryMeter for Reservation {
     }
 
     fn shrink(&self, bytes: u64) {
-        self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        let held = self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        debug_assert!(held >= bytes, "{bytes} of {held} bytes are subtracted");
         self.meter.shrink(bytes);
     }
 

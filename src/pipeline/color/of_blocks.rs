@@ -46,10 +46,13 @@ impl BlockColors {
                 self.legends.resize(group + 1, Vec::new());
             }
             let mut report = colors.report(&selected[first..first + run.len()]);
-            let n_known = self.legends[group].len();
-            add_new(&mut self.legends[group], std::mem::take(&mut report.legend));
-            let n_new = (self.legends[group].len() - n_known) as u64;
-            self.memory.grow(ENTRY_BYTES * n_new).map_err(SurfaceError::from)?;
+            // The values of a palette do not depend on the atoms.
+            if self.coloring.scheme.palette().is_none() {
+                let n_known = self.legends[group].len();
+                add_new(&mut self.legends[group], std::mem::take(&mut report.legend));
+                let n_new = (self.legends[group].len() - n_known) as u64;
+                self.memory.grow(ENTRY_BYTES * n_new).map_err(SurfaceError::from)?;
+            }
             self.report = Some(report);
             first += run.len();
         }

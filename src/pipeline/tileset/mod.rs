@@ -20,7 +20,7 @@ use std::sync::Arc;
 use self::layout::Layout;
 use self::level::{Buckets, MIN_BUCKET, TilesetLevel};
 use self::source::{LevelSource, NearSpheres, Streamed};
-pub use self::stream::{StreamSource, StructureStream, check_stream};
+pub use self::stream::{StreamSource, StructureStream, check_stream, needs_memory};
 pub use self::units::AssemblyTileset;
 pub use self::write::{LevelReport, TilesetReport, UnitReport, WriteError, unit_folder, write, write_stream};
 use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, Scheme};

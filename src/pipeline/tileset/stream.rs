@@ -18,7 +18,7 @@ use crate::pipeline::{Job, JobError, StageClock};
 use crate::structure::stream::{Block, Blocks, ScratchFile, StoredBytes, check_positions};
 use crate::structure::{Assemblies, AssemblyRules, Placements, ReadLimits, SelectedBlocks, SelectedOfBlock, Structure};
 use crate::surface::clip::influence_of;
-use crate::surface::{Control, Reservation, Spheres, SurfaceError, SurfaceParams};
+use crate::surface::{Control, MemoryMeter as _, Reservation, Spheres, SurfaceError, SurfaceParams};
 
 /// Buffer of the index, in blocks.
 const BUFFERED_BLOCKS: usize = 4;
@@ -41,8 +41,9 @@ pub enum StreamSource<'a> {
 pub struct StructureStream<'a> {
     /// Source of the atoms.
     pub source: StreamSource<'a>,
-    /// File for the index and for large columns of BinaryCIF.
-    pub scratch: ScratchFile,
+    /// File for the index; and file for large columns of BinaryCIF and the atoms of an assembly, which is removed when
+    /// the index is complete.
+    pub scratch: [ScratchFile; 2],
     /// Bytes of a block of text.
     pub block_bytes: usize,
     /// Called with the number of each file before it is read.
@@ -54,6 +55,18 @@ pub struct StructureStream<'a> {
 /// # Errors
 /// Returns [`ParamError::BadValue`].
 pub fn check_stream(job: &Job, n_files: usize) -> Result<(), ParamError> {
+    match needs_memory(job, n_files) {
+        Some((name, value, expected)) => {
+            let expected = format!("{expected} with `--scratch`, which reads the structure as a stream");
+            Err(ParamError::bad_value(name, &value, expected))
+        }
+        None => Ok(()),
+    }
+}
+
+/// Finds a parameter that [`check_stream`] rejects. Returns its name, its value and the expected value.
+#[must_use]
+pub fn needs_memory(job: &Job, n_files: usize) -> Option<(&'static str, String, &'static str)> {
     let selection = &job.selection;
     let of_range = |scheme| matches!(scheme, Scheme::BFactor | Scheme::Occupancy);
     let when = |is_refused: bool, value: String| is_refused.then_some(value);
@@ -62,6 +75,7 @@ pub fn check_stream(job: &Job, n_files: usize) -> Result<(), ParamError> {
         ("select", when(selection.atoms.has_within(), selection.atoms.to_string()), "an expression without `within`"),
         ("assembly", selection.assembly.clone().filter(|_| n_files > 1), "no value for several files, or one file"),
         ("instances", when(selection.instances, "true".to_owned()), "false"),
+        ("unit", selection.unit.map(|unit| unit.to_string()), "no value"),
         ("detail", job.spacing.detail().map(|level| level.to_string()), "a `resolution` instead"),
         (
             "color",
@@ -74,13 +88,7 @@ pub fn check_stream(job: &Job, n_files: usize) -> Result<(), ParamError> {
             "another scheme, such as `bfactor` with a `color_range`",
         ),
     ];
-    match refused.into_iter().find_map(|(name, value, expected)| Some((name, value?, expected))) {
-        Some((name, value, expected)) => {
-            let expected = format!("{expected} with `--scratch`, which reads the structure as a stream");
-            Err(ParamError::bad_value(name, &value, expected))
-        }
-        None => Ok(()),
-    }
+    refused.into_iter().find_map(|(name, value, expected)| Some((name, value?, expected)))
 }
 
 /// Spheres of the blocks so far.
@@ -100,8 +108,10 @@ struct BlockReader<'a> {
     spheres: ReadSpheres,
     /// Description of the first file, without its atoms, and the source of its radii.
     head: Option<(Structure, &'static str)>,
-    /// Assemblies of the latest file.
+    /// Assemblies of the latest file; a job with an assembly has one file.
     assemblies: Assemblies,
+    /// Memory of `assemblies`.
+    memory: Reservation,
 }
 
 impl BlockReader<'_> {
@@ -124,7 +134,8 @@ impl BlockReader<'_> {
             clock.time("select", || self.add(&mut block, &of_block))?;
         }
         self.assemblies = blocks.take_assemblies();
-        control.memory.grow(self.assemblies.bytes()).map_err(SurfaceError::from)?;
+        self.memory = Reservation::new(&control.memory);
+        self.memory.grow(self.assemblies.bytes()).map_err(SurfaceError::from)?;
         Ok(())
     }
 
@@ -132,12 +143,7 @@ impl BlockReader<'_> {
     fn add(&mut self, block: &mut Block, control: &Control<'_>) -> Result<(), JobError> {
         control.memory.grow(SELECT_BYTES * block.len as u64).map_err(SurfaceError::from)?;
         let first = self.selected.n_atoms;
-        let SelectedOfBlock { atoms, mut chains } =
-            self.selected.add(block, &self.job.selection, self.limits, control)?;
-        if matches!(self.spheres, ReadSpheres::Index(_)) {
-            // The order of the atoms is that of the file.
-            chains.fill(0);
-        }
+        let SelectedOfBlock { atoms, chains } = self.selected.add(block, &self.job.selection, self.limits, control)?;
         let structure = &block.structure;
         let colors = self.colors.as_mut().map(|colors| colors.add(structure, &atoms, &chains)).transpose()?;
         let column = |column: &[f64]| atoms.iter().map(|&i| column[i as usize]).collect();
@@ -176,7 +182,7 @@ impl Tileset<Box<Structure>> {
         clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
         let params = SurfaceParams { atom_ids: job.needs_atoms(), ..job.params.clone() };
-        let file = Arc::new(StoredBytes::new(stream.scratch));
+        let [file, columns] = stream.scratch.map(|file| Arc::new(StoredBytes::new(file)));
         let mut side = order_side(params.resolution);
         while side >= 2.0 * MIN_BUCKET {
             side *= 0.5;
@@ -185,19 +191,19 @@ impl Tileset<Box<Structure>> {
         let new_index = || SphereIndex::new(&file, side, buffer, control);
         let is_assembly = job.selection.assembly.is_some();
         let spheres = if is_assembly {
-            ReadSpheres::Distinct(SphereList::new(&file, control)?)
+            ReadSpheres::Distinct(SphereList::new(&columns, control)?)
         } else {
             ReadSpheres::Index(new_index()?)
         };
         let (selected, colors) =
             (SelectedBlocks::new(control), job.color.map(|coloring| BlockColors::new(coloring, control)));
-        let assemblies = Assemblies::default();
-        let mut reader = BlockReader { job, limits, selected, colors, spheres, head: None, assemblies };
+        let (assemblies, memory) = (Assemblies::default(), Reservation::new(&control.memory));
+        let mut reader = BlockReader { job, limits, selected, colors, spheres, head: None, assemblies, memory };
         match stream.source {
             StreamSource::Files(files) => {
                 for (number, input) in files.into_iter().enumerate() {
                     (stream.began)(number);
-                    reader.read((input, stream.block_bytes), &file, control, clock)?;
+                    reader.read((input, stream.block_bytes), &columns, control, clock)?;
                 }
             }
             StreamSource::Structure(structure) => {
@@ -207,7 +213,7 @@ impl Tileset<Box<Structure>> {
                 clock.time("select", || reader.add(&mut block, &of_block))?;
             }
         }
-        let BlockReader { selected, colors, spheres, head, assemblies, .. } = reader;
+        let BlockReader { selected, colors, spheres, head, assemblies, memory: _memory, .. } = reader;
         let atoms_in_file = selected.n_atoms;
         let assembly = match &job.selection.assembly {
             Some(id) => Some(AssemblyRules::find(&assemblies, &selected.chain_names(), id)?),
@@ -224,7 +230,7 @@ impl Tileset<Box<Structure>> {
                 (ReadSpheres::Index(index), _) => index,
                 (ReadSpheres::Distinct(list), Some(placements)) => {
                     let mut index = new_index()?;
-                    place(list, placements, &mut index)?;
+                    place(list, placements, &mut index, control)?;
                     selected.copies = placements.copies();
                     index
                 }
@@ -243,13 +249,19 @@ impl Tileset<Box<Structure>> {
 }
 
 /// Adds the copies of atoms that form an assembly to an index. Their order is that of the copies, then of the chains.
-fn place(list: SphereList, placements: &Placements, index: &mut SphereIndex) -> Result<(), JobError> {
+fn place(
+    list: SphereList,
+    placements: &Placements,
+    index: &mut SphereIndex,
+    control: &Control<'_>,
+) -> Result<(), JobError> {
     let by_chain = placements.copies_by_chain();
     list.each_run(|spheres| {
         for chain in spheres.chunk_by(|a, b| a.order == b.order) {
             let number = chain[0].order;
             let copies = usize::try_from(number).ok().and_then(|number| by_chain.get(number));
             for copy in copies.into_iter().flatten().cloned().flatten() {
+                control.check()?;
                 let operator = &placements.operators[copy];
                 let moved: Vec<[f64; 3]> = chain.iter().map(|sphere| operator.apply(sphere.centre)).collect();
                 let column = |k: usize| moved.iter().map(|at| at[k]).collect();
@@ -438,8 +450,8 @@ mod tests {
         (files.into_inner().unwrap(), report)
     }
 
-    fn scratch() -> ScratchFile {
-        ScratchFile { file: tempfile::tempfile().unwrap(), meter: Arc::new(()) }
+    fn scratch() -> [ScratchFile; 2] {
+        [(); 2].map(|()| ScratchFile { file: tempfile::tempfile().unwrap(), meter: Arc::new(()) })
     }
 
     /// Returns the files of the tileset of a stream.
@@ -478,6 +490,8 @@ mod tests {
             &[("resolution", "4"), ("color", "residue"), ("surface", "ses")],
             &[("resolution", "1"), ("color", "element"), ("chains", "A0,C0"), ("altloc", "A")],
             &[("resolution", "3"), ("color", "bfactor"), ("color_range", "5,40"), ("select", "byres name CA")],
+            // Two values of the legend have the same label.
+            &[("resolution", "4"), ("color", "bfactor"), ("color_range", "0,0.004")],
             &[("resolution", "1.5"), ("select", "water or chain B0"), ("radius_offset", "0.2")],
         ] {
             let job = job(query);
@@ -612,6 +626,7 @@ mod tests {
             (&[("assembly", "1"), ("instances", "true")], "`instances`"),
             (&[("assembly", "1")], "no assemblies"),
             (&[("detail", "2")], "`detail`"),
+            (&[("assembly", "1"), ("unit", "1")], "unit"),
             (&[("color", "bfactor")], "`color_range`"),
             (&[("color", "plddt")], "`bfactor`"),
             (&[("chains", "A0,X")], "chain `X` is not in the file; it has `A0`, `B0`, `I`"),

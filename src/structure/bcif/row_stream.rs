@@ -129,6 +129,8 @@ impl RowStream {
                 continue;
             };
             self.hetero.add(&reading);
+            // Subtracts the memory of reading first.
+            drop(reading);
             memory.keep();
             self.remove(len);
             return Ok(Some(Block { structure, len }));

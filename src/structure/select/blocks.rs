@@ -1,16 +1,19 @@
 //! Selection of the atoms of consecutive blocks of a structure.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
+use std::ops::Range;
 
 use indexmap::IndexMap;
 
-use super::{LeftOut, ModelChoice, Rules, SELECTED_CHAIN, Selected, Selection};
+use super::{ATOMS_PER_TASK, Found, LeftOut, ModelChoice, Rules, SELECTED_CHAIN, Selected, Selection};
 use crate::structure::contents::Kind;
 use crate::structure::copies::{AssemblyRules, chain_column};
 use crate::structure::error::StructureError;
-use crate::structure::read::ReadLimits;
+use crate::structure::pieces;
+use crate::structure::read::{ReadLimits, check};
 use crate::structure::stream::Block;
 use crate::structure::text::list;
+use crate::structure::texts::TextColumn;
 use crate::surface::{Control, MemoryMeter as _, Reservation};
 
 /// Model, chain, number and insertion code of a residue.
@@ -21,7 +24,8 @@ type ResidueId = (i32, String, i32, u8);
 pub struct SelectedOfBlock {
     /// Indices of the atoms in the block, ascending.
     pub atoms: Vec<u32>,
-    /// Number of the chain of each atom among those of all blocks, as assemblies name them, in order of appearance.
+    /// Number of the chain of each atom among those of all blocks, as assemblies name them, in order of appearance; 0
+    /// without an assembly.
     pub chains: Vec<u32>,
 }
 
@@ -38,7 +42,7 @@ struct ChainCounts {
 pub struct SelectedBlocks {
     /// Number of atoms.
     pub n_atoms: u64,
-    /// Counts by the chain names that assemblies use.
+    /// Counts by the chain names that assemblies use; of all chains together without an assembly.
     by_chain: IndexMap<String, ChainCounts>,
     chains: HashSet<String>,
     models: HashSet<i32>,
@@ -56,6 +60,8 @@ pub struct SelectedBlocks {
 /// Memory of the counts of a chain, and of those of a residue name, bytes.
 const CHAIN_BYTES: u64 = 3 * (size_of::<(String, ChainCounts)>() as u64) + 16;
 const NAME_BYTES: u64 = 2 * (size_of::<((String, Kind), u64)>() as u64) + 16;
+/// Memory of the atoms of a run of a chain besides their indices, bytes.
+const RUN_BYTES: u64 = 2 * (size_of::<(u32, Found)>() + size_of::<(u32, Range<usize>)>()) as u64;
 /// Memory of a residue with alternative locations, bytes.
 const ALTERNATIVE_BYTES: u64 = 2 * (size_of::<(ResidueId, usize)>() as u64) + 16;
 
@@ -83,7 +89,7 @@ impl SelectedBlocks {
         self.alternatives = HashMap::new();
     }
 
-    /// Selects atoms of the next block. An assembly is ignored.
+    /// Selects atoms of the next block, of all chains.
     ///
     /// # Errors
     /// Returns [`StructureError::TooManyAtoms`], [`StructureError::NotAStream`] and the errors of memory and
@@ -110,15 +116,18 @@ impl SelectedBlocks {
         let selection = Selection { model, ..selection.clone() };
         let rules = Rules::new(s, &selection, false, limits, control)?;
         self.note(block, &rules)?;
-        let column = chain_column(s);
-        let numbers = column.texts().map(|name| self.number(name)).collect::<Result<Vec<u32>, _>>()?;
+        // Only assemblies need the counts of each chain.
+        let chains = selection.assembly.as_ref().map(|_| chain_column(s));
+        let names: Vec<&str> = chains.map_or_else(|| vec![""], |chains| chains.texts().collect());
+        let numbers = names.into_iter().map(|name| self.number(name)).collect::<Result<Vec<u32>, _>>()?;
+        let residues: Vec<&str> = s.residue.texts().collect();
         let mut selected = SelectedOfBlock { atoms: Vec::new(), chains: Vec::new() };
-        for (chain, found) in rules.find_by_chain(block.len, column, control)? {
+        for (chain, found) in rules.find_by_chain(block.len, chains, control)? {
             let number = numbers[chain as usize];
             let counts = &mut self.by_chain[number as usize];
             counts.n_selected += found.atoms.len() as u64;
             counts.left_out.add(&found.left_out);
-            for (name, kind, n) in found.residues.named(s) {
+            for (name, kind, n) in found.residues.named(&residues) {
                 let n_known = counts.residues.len();
                 *counts.residues.entry((name.to_owned(), kind)).or_default() += n;
                 self.chain_memory.grow(NAME_BYTES * (counts.residues.len() - n_known) as u64)?;
@@ -185,7 +194,7 @@ impl SelectedBlocks {
         Ok(())
     }
 
-    /// Ends the selection of the chains of an `assembly`, or of all.
+    /// Ends the selection. With an `assembly`, only its chains count as selected.
     ///
     /// # Errors
     /// Returns [`StructureError::EmptySelection`], [`StructureError::NotFound`] for a model, chain or alternative
@@ -251,5 +260,33 @@ impl SelectedBlocks {
         let (marks, copies, units) = (None, Vec::new(), Vec::new());
         let n_distinct = usize::try_from(n_selected).unwrap_or(usize::MAX);
         Ok(Selected { atoms: Vec::new(), marks, copies, units, n_distinct, model, left_out })
+    }
+}
+
+impl Rules<'_> {
+    /// Finds the atoms to mesh among the first `n`, in parallel: in file order by runs of atoms of one of the `chains`,
+    /// or of all chains together, with the number 0.
+    fn find_by_chain(
+        &self,
+        n: usize,
+        chains: Option<&TextColumn>,
+        control: &Control<'_>,
+    ) -> Result<Vec<(u32, Found)>, StructureError> {
+        let runs = chains.map_or_else(
+            || vec![(0, n)],
+            |chains| chains.ids()[..n].chunk_by(|a, b| a == b).map(|run| (run[0], run.len())).collect(),
+        );
+        let mut first = 0;
+        let mut ranges: Vec<(u32, Range<usize>)> = Vec::new();
+        for (chain, length) in runs {
+            let end = first + length;
+            ranges.extend((first..end).step_by(ATOMS_PER_TASK).map(|at| (chain, at..end.min(at + ATOMS_PER_TASK))));
+            first = end;
+        }
+        control.memory.grow(RUN_BYTES * ranges.len() as u64)?;
+        let find = |(chain, range): &mut (u32, Range<usize>)| {
+            check(control).map(|()| (*chain, self.find_in(range.clone(), None)))
+        };
+        pieces::map(&mut ranges, find).into_iter().collect()
     }
 }

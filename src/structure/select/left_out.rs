@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use crate::structure::{Kind, Structure};
+use crate::structure::Kind;
 
 /// Maximum number of residue names that are counted separately.
 const MAX_NAMES: usize = 10;
@@ -87,14 +87,9 @@ impl Tally {
         }
     }
 
-    /// Returns the counts with the names of the residues.
-    pub(super) fn named(self, structure: &Structure) -> Vec<(&str, Kind, u64)> {
-        let counts = self.finish();
-        if counts.is_empty() {
-            return Vec::new();
-        }
-        let texts: Vec<&str> = structure.residue.texts().collect();
-        counts.into_iter().map(|((residue, kind), n)| (texts[residue as usize], kind, n)).collect()
+    /// Returns the counts with the names of the residues, which `texts` are.
+    pub(super) fn named<'s>(self, texts: &[&'s str]) -> impl Iterator<Item = (&'s str, Kind, u64)> {
+        self.finish().into_iter().map(|((residue, kind), n)| (texts[residue as usize], kind, n))
     }
 
     fn finish(mut self) -> HashMap<(u32, Kind), u64> {

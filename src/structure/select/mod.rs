@@ -30,7 +30,6 @@ use super::error::StructureError;
 use super::pieces;
 use super::read::{ReadLimits, check};
 use super::text::list;
-use super::texts::TextColumn;
 use crate::surface::Control;
 
 /// Models of a file.
@@ -129,7 +128,8 @@ pub fn select_with(
     if !marks.as_ref().map_or(!atoms.is_empty(), |marks| marks.contains(&true)) {
         return Err(StructureError::EmptySelection { holds: holds(structure, selection, model) });
     }
-    left_out.name_residues(residues.named(structure));
+    let texts: Vec<&str> = structure.residue.texts().collect();
+    left_out.name_residues(residues.named(&texts).collect());
     let selected =
         Selected { n_distinct: atoms.len(), atoms, marks, copies: Vec::new(), units: Vec::new(), model, left_out };
     match assembly {
@@ -249,26 +249,6 @@ impl<'a> Rules<'a> {
             found.residues.append(residues);
         }
         Ok(found)
-    }
-
-    /// Finds the atoms to mesh among the first `n`, in parallel: in file order by runs of atoms of one of the `chains`.
-    fn find_by_chain(
-        &self,
-        n: usize,
-        chains: &TextColumn,
-        control: &Control<'_>,
-    ) -> Result<Vec<(u32, Found)>, StructureError> {
-        let runs = chains.ids()[..n].chunk_by(|a, b| a == b).flat_map(|run| run.chunks(ATOMS_PER_TASK));
-        let mut first = 0;
-        let range = |run: &[u32]| {
-            first += run.len();
-            (run[0], first - run.len()..first)
-        };
-        let mut ranges: Vec<(u32, Range<usize>)> = runs.map(range).collect();
-        let find = |(chain, range): &mut (u32, Range<usize>)| {
-            check(control).map(|()| (*chain, self.find_in(range.clone(), None)))
-        };
-        pieces::map(&mut ranges, find).into_iter().collect()
     }
 
     fn find_in(&self, range: Range<usize>, assembly: Option<&Assembly<'_>>) -> Found {
