@@ -217,7 +217,8 @@ impl MemoryReservation {
     /// Subtracts `bytes` of freed memory.
     pub fn shrink(&self, bytes: u64) {
         self.budget.subtract(bytes);
-        self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        let held = self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        debug_assert!(held >= bytes, "{bytes} of {held} bytes are subtracted");
         self.budget.publish_held(bytes, -1.0);
     }
 

@@ -27,6 +27,12 @@ impl ScratchSpace {
         space
     }
 
+    /// Returns the budget of the disk space.
+    #[cfg(test)]
+    pub(super) const fn budget(&self) -> &Budget {
+        &self.budget
+    }
+
     /// Sets the cache whose tilesets are evicted when the limit is reached.
     pub(super) fn evict_from(&self, cache: Weak<Structures>) {
         self.cache.get_or_init(|| cache);

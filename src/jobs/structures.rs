@@ -529,8 +529,9 @@ mod tests {
     #[test]
     fn concurrent_requests_for_a_tileset_on_disk_index_it_once() {
         let folder = tempfile::tempdir().unwrap();
-        let scratch = ScratchSpace::new(folder.path(), 1 << 30);
-        let structures = Structures::new(1 << 20, &Budget::unlimited(), Some(scratch));
+        let (budget, scratch) = (Budget::unlimited(), ScratchSpace::new(folder.path(), 1 << 30));
+        let space = scratch.budget().clone();
+        let structures = Structures::new(1 << 20, &budget, Some(scratch));
         let (input, digest) = file(20_000);
         let job = params::parse([("tile", "0/0/0/0"), ("select", "all")]).unwrap().job;
         let start = Barrier::new(4);
@@ -549,6 +550,11 @@ mod tests {
         // The others do not attempt to read it into memory either.
         assert_eq!(got.iter().filter(|(_, has_read)| *has_read).count(), 1);
         assert!(structures.lock().making.is_empty());
+        // The memory and the disk space of an index are freed with it.
+        drop(got);
+        let [memory, disk] = [held(&budget), held(&space)];
+        assert!(memory > 0 && memory < 1 << 20 && disk >= 48 * 20_000, "{memory} {disk}");
+        assert!(structures.reclaim(u64::MAX) && held(&budget) == 0 && held(&space) == 0);
     }
 
     #[test]

@@ -184,10 +184,11 @@ impl SphereIndex {
         Ok(())
     }
 
-    /// Writes all spheres, so that the index can be read.
+    /// Writes all spheres, so that the index can be read. Its memory stays added to the meter.
     pub(super) fn finish(mut self) -> Result<Self, JobError> {
         self.flush()?;
         self.memory.shrink(2 * self.buffer_bytes as u64);
+        self.memory.keep();
         Ok(self)
     }
 
