@@ -184,12 +184,16 @@ impl SphereIndex {
         Ok(())
     }
 
-    /// Writes all spheres, so that the index can be read. Its memory stays added to the meter.
+    /// Writes all spheres, so that the index can be read.
     pub(super) fn finish(mut self) -> Result<Self, JobError> {
         self.flush()?;
         self.memory.shrink(2 * self.buffer_bytes as u64);
-        self.memory.keep();
         Ok(self)
+    }
+
+    /// Keeps the memory of the index in the meter, whose owner subtracts it.
+    pub(super) fn keep_memory(&self) {
+        self.memory.keep();
     }
 
     /// Returns the number of spheres in cubes.

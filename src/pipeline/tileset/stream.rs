@@ -357,6 +357,7 @@ impl Layout {
                 let centres = spheres.iter().map(|sphere| sphere.centre);
                 self.add_tiles(number, centres, reach, params, &mut tiles, control)?;
             }
+            level.keep_memory();
             levels.push(LevelSource::File(level));
         }
         levels.reverse();
