@@ -65,7 +65,7 @@ struct StreamFiles {
     inputs: Vec<Box<dyn Read + Send>>,
     /// Estimated number of atoms.
     atoms: f64,
-    /// File without a name, so that the system removes it in any case.
+    /// Files without a name, so that the system removes them in any case.
     scratch: [File; 2],
 }
 

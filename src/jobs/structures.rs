@@ -267,7 +267,7 @@ impl Structures {
     }
 
     /// Finds a value with one of the keys, or begins to make it: the caller keeps the mark of the first key meanwhile.
-    /// Waits while another request makes it; `None` if this one is cancelled.
+    /// Waits while another request makes it; `None` if this one is cancelled. There is at least one key.
     fn find_or_begin(&self, keys: &[CacheKey], cancel: &CancelToken) -> Option<Lookup<'_>> {
         let key = *keys.first()?;
         let mut state = self.lock();

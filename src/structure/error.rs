@@ -188,7 +188,7 @@ fn disk_space(error: &OutOfMemory) -> String {
         }
         OutOfMemory::Budget { held, limit, .. } => {
             format!(
-                "temporary files take {held} of {limit} bytes of disk space, and the indexes of other tilesets are in use"
+                "temporary files take {held} of {limit} bytes of disk space, and indexes of other tilesets are in use"
             )
         }
         OutOfMemory::System { .. } => error.to_string(),

@@ -232,7 +232,8 @@ impl HeteroBlocks {
         if self.0 & OPEN == 0 || are_numbered(self.0) {
             return Ok(());
         }
-        let found = "HETATM records with `label_seq_id` in chains of unknown entity, but no HETATM record without it, or water with it";
+        let found = "HETATM records with `label_seq_id` in chains of unknown entity, but no HETATM record without it, or \
+                     water with it";
         Err(StructureError::NotAStream { found: found.to_owned(), expected })
     }
 }

@@ -145,7 +145,8 @@ pub enum SurfaceError {
     },
     /// The index of a tileset is too large to be kept, and each tile would need it again.
     #[error(
-        "the index of the tileset has more than {limit} bytes, the limit of the cache of structures{}", on_disk(*.parameter)
+        "the index of the tileset has more than {limit} bytes, the limit of the cache of structures{}",
+        on_disk(*.parameter)
     )]
     TilesetTooLarge {
         /// Bytes allowed.
@@ -198,7 +199,7 @@ impl SurfaceError {
     }
 }
 
-/// Describes that a parameter needs an index in memory.
+/// Explains that a parameter needs an index in memory.
 fn on_disk(parameter: Option<&str>) -> String {
     parameter.map_or_else(String::new, |name| {
         format!("; a larger index is on disk, but the parameter `{name}` needs all atoms in memory")

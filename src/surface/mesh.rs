@@ -175,7 +175,7 @@ impl Mesh {
         self.relative_positions()(i)
     }
 
-    /// Returns the function [`Self::position`]. Loops use it, because access to a column as a slice takes time.
+    /// Returns [`Self::position`] as a function that borrows the columns once, for loops over many vertices.
     pub(crate) fn relative_positions(&self) -> impl Fn(usize) -> [f32; 3] + Sync {
         let quantized = self.quantized.as_ref().map(|quantized| (quantized.step, &quantized.positions[..]));
         let positions = &self.positions[..];

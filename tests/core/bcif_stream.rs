@@ -419,6 +419,10 @@ fn a_temporary_file_that_fails_is_an_error() {
         let found = Blocks::new(Box::new(&bytes[..]), ROW, true, &write_only, &ReadLimits::default(), &control);
         assert!(matches!(found.err(), Some(StructureError::Scratch { .. })));
     }
+    // Each write to this device fails for lack of space.
+    let full = scratch(File::options().read(true).write(true).open("/dev/full").unwrap());
+    let found = StoredBytes::new(full).write(0, b"atoms");
+    assert_eq!(found, Err(StructureError::DiskFull));
 }
 
 // ---- memory ----

@@ -355,6 +355,13 @@ fn a_tileset_larger_than_the_cache_is_on_disk() {
         get(&narrow, &format!("{structure}/tileset.json?select=all&resolution=4&color={color}"));
         assert!((9_600_000.0..18_000_000.0).contains(&(disk(&narrow) - before)), "{}", disk(&narrow));
     }
+    // An index on disk cannot have these parameters.
+    let repeated = upload(&narrow, &lattice(30_000, 2));
+    for (query, parameter) in [("assembly=1&unit=1", "`unit`"), ("color=bfactor", "`color`")] {
+        let path = format!("{repeated}/tileset.json?select=all&resolution=4&{query}");
+        let problem = narrow.get(&path).problem(422, "too-much-memory");
+        assert!(problem["detail"].as_str().unwrap().contains(parameter), "{problem}");
+    }
     drop((on_disk, narrow));
     for (scratch, place) in [(1_000_000, "disk space"), (0, "the cache of structures")] {
         let server = started(CACHE, scratch);

@@ -107,8 +107,8 @@ impl Pieces {
             grow(numbering_bytes)?;
             let numbering = Numbering::new(rows);
             let layout = layout(&numbering, storage, mesh.colors.is_some(), atoms)?;
-            // A column of the piece, its form in the file, and the output of the encoder, each at most as long as the
-            // decoded piece. The filter of normals needs 16 bytes of input per vertex.
+            // The columns of the piece, their forms in the file, and the outputs of the encoder, each as long as the
+            // decoded piece at most. The filter of normals needs 16 bytes of input per vertex.
             let scratch = 3 * layout.len + 16 * numbering.vertices.len() as u64;
             grow(scratch)?;
             let piece = source.compress(part, &numbering, layout)?;

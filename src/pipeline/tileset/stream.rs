@@ -627,7 +627,7 @@ mod tests {
             (&[("assembly", "1"), ("instances", "true")], "`instances`"),
             (&[("assembly", "1")], "no assemblies"),
             (&[("detail", "2")], "`detail`"),
-            (&[("assembly", "1"), ("unit", "1")], "unit"),
+            (&[("assembly", "1"), ("unit", "1")], "`unit`"),
             (&[("color", "bfactor")], "`color_range`"),
             (&[("color", "plddt")], "`bfactor`"),
             (&[("chains", "A0,X")], "chain `X` is not in the file; it has `A0`, `B0`, `I`"),

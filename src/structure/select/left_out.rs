@@ -87,7 +87,7 @@ impl Tally {
         }
     }
 
-    /// Returns the counts with the names of the residues, which `texts` are.
+    /// Returns the counts with the names of the residues. `texts` are those of the column of residue names.
     pub(super) fn named<'s>(self, texts: &[&'s str]) -> impl Iterator<Item = (&'s str, Kind, u64)> {
         self.finish().into_iter().map(|((residue, kind), n)| (texts[residue as usize], kind, n))
     }
