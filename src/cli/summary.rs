@@ -176,6 +176,9 @@ fn repeated(report: &Report, instances: &InstancesReport) -> String {
 pub(super) fn left_out(left_out: &LeftOutReport) -> String {
     let LeftOutReport {
         total,
+        other_blocks,
+        spheres,
+        other_models,
         other_chains,
         virtual_sites,
         kinds: _,
@@ -191,6 +194,9 @@ pub(super) fn left_out(left_out: &LeftOutReport) -> String {
         ("alternative locations", alternatives),
         ("virtual sites", virtual_sites),
         ("other chains", other_chains),
+        ("other models", other_models),
+        ("other data blocks", other_blocks),
+        ("coarse-grained spheres", spheres),
     ];
     let counted = counted.into_iter().filter(|(_, n)| **n > 0).map(|(what, n)| format!("{what} {}", grouped(*n)));
     format!("{} atoms: {}", grouped(*total), named.chain(counted).collect::<Vec<_>>().join(", "))

@@ -5,8 +5,8 @@ use super::problem::Problem;
 use super::problem_types::ProblemType;
 use crate::jobs::Failure;
 use crate::pipeline::JobError;
+use crate::structure::SourceFormat;
 use crate::structure::StructureError;
-use crate::structure::atoms::SourceFormat;
 
 /// First bytes of a gzip file.
 pub(super) const GZIP_MAGIC: &[u8] = &[0x1f, 0x8b];

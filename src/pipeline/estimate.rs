@@ -126,7 +126,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
         Err(error) if ends_work(&error) => return Err(error.into()),
         mesh => mesh,
     };
-    let (atoms, atoms_in_file) = (selected.atoms.len() as u64, structure.len() as u64);
+    let (atoms, atoms_in_file) = (selected.atoms.len() as u64, structure.n_in_file());
     let distinct_atoms = selected.n_distinct as u64;
     Ok(Estimate { atoms, distinct_atoms, atoms_in_file, resolution, box_cells, mesh })
 }

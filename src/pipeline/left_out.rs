@@ -26,12 +26,18 @@ pub struct ResidueCount {
     pub atoms: u64,
 }
 
-/// Atoms of the selected models that are not meshed. Each atom is counted once, under the first field that applies.
+/// Atoms of the file that are not meshed. Each atom is counted once, under the first field that applies.
 #[derive(Debug, Clone, Default, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct LeftOutReport {
     /// Total number of these atoms.
     pub total: u64,
+    /// Atoms of data blocks after the first one with atoms.
+    pub other_blocks: u64,
+    /// Spheres of coarse-grained parts of integrative models (`ihm_sphere_obj_site`).
+    pub spheres: u64,
+    /// Atoms of models that are not selected.
+    pub other_models: u64,
     /// Atoms of chains that are not selected or not part of the assembly.
     pub other_chains: u64,
     /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
@@ -53,6 +59,9 @@ impl LeftOutReport {
         let residues = left_out.residues.iter();
         Self {
             total: left_out.total(),
+            other_blocks: left_out.other_blocks,
+            spheres: left_out.spheres,
+            other_models: left_out.other_models,
             other_chains: left_out.other_chains,
             virtual_sites: left_out.virtual_sites,
             kinds: left_out.kinds.iter().map(|(kind, atoms)| KindCount { kind: kind.name(), atoms: *atoms }).collect(),

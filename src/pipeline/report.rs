@@ -79,7 +79,7 @@ pub struct Report {
     /// structure (`context=whole`); absent otherwise.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub selected_atoms: Option<u64>,
-    /// Atoms in all models of the file.
+    /// Atoms of the file: of all models, and those that are not read.
     pub atoms_in_file: u64,
     /// Number of the meshed model; of the first one with `model=all`.
     pub model: i32,
@@ -267,7 +267,7 @@ impl Report {
             source_format: structure.format.name(),
             atoms: selected.atoms.len() as u64,
             selected_atoms: selected.marks.is_some().then(|| selected.n_selected()),
-            atoms_in_file: structure.len() as u64,
+            atoms_in_file: structure.n_in_file(),
             model: selected.model,
             models: None,
             assembly: AssemblyReport::new(&job.selection, selected),

@@ -1,5 +1,9 @@
 //! Values of residues besides those of atoms: helices and strands, and the confidence of predicted models.
 
+use std::collections::{BTreeMap, HashMap};
+use std::fmt;
+use std::ops::Range;
+
 use rustc_hash::FxHashMap;
 
 use super::atoms::Structure;
@@ -63,38 +67,72 @@ pub(super) struct SecondaryRange {
 
 impl SecondaryRange {
     /// Reads a HELIX or SHEET record; `None` if a number is missing.
-    pub(super) fn of_record(line: &[u8]) -> Option<Self> {
+    pub(super) fn of_record(line: &[u8]) -> Option<Result<Self, TwoChains>> {
         let field = |from: usize, to: usize| line.get(from..to.min(line.len())).unwrap_or_default().trim_ascii();
         let helix = line.starts_with(b"HELIX");
-        let [chain, first, last] = if helix { [18, 21, 33] } else { [20, 22, 33] };
+        // Each chain is followed by a residue; two-letter names begin a column before.
+        let [first_chain, first, last_chain, last] = if helix { [18, 21, 30, 33] } else { [20, 22, 31, 33] };
         let residue = |at: usize| {
             let code = field(at + 4, at + 5).first().copied().unwrap_or(0);
             Some((number::integer(field(at, at + 4))?, code))
         };
         let structure = if helix { SecondaryStructure::of_class(field(38, 40)) } else { SecondaryStructure::Strand };
-        let chain = decode(field(chain, chain + 2)).as_ref().into();
-        Some(Self { chain, first: residue(first)?, last: residue(last)?, structure })
+        let [first_chain, last_chain] = [first_chain, last_chain].map(|at| decode(field(at, at + 2)).into_owned());
+        Some(Self::between((&first_chain, residue(first)?), (&last_chain, residue(last)?), structure))
     }
 
     /// Reads the author names of a row of `struct_conf`: type, chain, number and insertion code of the first residue,
-    /// number and insertion code of the last one, and class of the helix.
-    pub(super) fn of_conf([id, chain, first, first_code, last, last_code, class]: [&str; 7]) -> Option<Self> {
+    /// the same of the last one, and class of the helix; `None` if one is missing.
+    pub(super) fn of_conf([id, names @ .., class]: [&str; 8]) -> Option<Result<Self, TwoChains>> {
         let structure = SecondaryStructure::of_conf(id, class)?;
-        Self::of_names([chain, first, first_code, last, last_code], structure)
+        Self::of_names(names, structure)
     }
 
     /// Reads the author names of a row of `struct_sheet_range`, as those of `struct_conf`.
-    pub(super) fn of_sheet(names: [&str; 5]) -> Option<Self> {
+    pub(super) fn of_sheet(names: [&str; 6]) -> Option<Result<Self, TwoChains>> {
         Self::of_names(names, SecondaryStructure::Strand)
     }
 
-    fn of_names([chain, first, first_code, last, last_code]: [&str; 5], structure: SecondaryStructure) -> Option<Self> {
+    fn of_names(
+        [first_chain, first, first_code, last_chain, last, last_code]: [&str; 6],
+        structure: SecondaryStructure,
+    ) -> Option<Result<Self, TwoChains>> {
         let residue = |text: &str, code: &str| {
             let code = known(code).and_then(|code| code.as_bytes().first().copied()).unwrap_or(0);
             Some((number::integer(text.as_bytes())?, code))
         };
-        let (first, last) = (residue(first, first_code)?, residue(last, last_code)?);
-        Some(Self { chain: known(chain)?.into(), first, last, structure })
+        let (first_chain, last_chain) = (known(first_chain)?, known(last_chain).unwrap_or_default());
+        Some(Self::between(
+            (first_chain, residue(first, first_code)?),
+            (last_chain, residue(last, last_code)?),
+            structure,
+        ))
+    }
+
+    fn between(
+        (chain, first): (&str, ResidueNumber),
+        (last_chain, last): (&str, ResidueNumber),
+        structure: SecondaryStructure,
+    ) -> Result<Self, TwoChains> {
+        // Some programs write the chain of the first residue only.
+        if chain == last_chain || last_chain.is_empty() {
+            return Ok(Self { chain: chain.into(), first, last, structure });
+        }
+        Err(TwoChains { first: (chain.into(), first.0), last: (last_chain.into(), last.0) })
+    }
+}
+
+/// Chain and number of the ends of a helix or strand that has two chains.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct TwoChains {
+    first: (Box<str>, i32),
+    last: (Box<str>, i32),
+}
+
+impl fmt::Display for TwoChains {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [(first, m), (last, n)] = [&self.first, &self.last];
+        write!(f, "residue {m} of chain `{first}` to residue {n} of chain `{last}`")
     }
 }
 
@@ -136,46 +174,58 @@ pub struct Annotations {
 impl Annotations {
     /// Bytes of an entry, with its names.
     const ENTRY_BYTES: usize = 80;
+    /// Bytes of a residue while secondary structure is found.
+    const RESIDUE_BYTES: usize = 64;
 
-    /// Adds the memory of the values to that of the structure.
-    pub(super) fn keep(&self, reading: &Reading<'_>) -> Result<(), StructureError> {
-        reading.keep((Self::ENTRY_BYTES * (self.secondary.len() + self.confidence.len())) as u64)
+    /// Adds the memory of the values to that of the structure, and the memory that [`SecondaryRanges`] needs for
+    /// `n_residues`.
+    pub(super) fn keep(&self, n_residues: usize, reading: &Reading<'_>) -> Result<(), StructureError> {
+        let entries = Self::ENTRY_BYTES * (self.secondary.len() + self.confidence.len());
+        let residues = if self.secondary.is_empty() { 0 } else { Self::RESIDUE_BYTES * n_residues };
+        reading.keep((entries + residues) as u64)
     }
 }
 
-/// Secondary structure by chain and residue.
+/// Secondary structure of residues.
 #[derive(Debug)]
 pub struct SecondaryRanges {
-    /// First and last residue of disjoint ranges in ascending order, by id of the chain.
-    of_chains: Vec<Vec<(i64, i64, SecondaryStructure)>>,
+    /// By chain and residue; coil is missing.
+    by_residue: HashMap<(u32, ResidueNumber), SecondaryStructure>,
 }
 
 impl SecondaryRanges {
-    /// Returns the ranges of a structure; `None` if its file describes none. Of ranges that overlap, the one that
-    /// begins first keeps the common residues.
+    /// Finds the secondary structure of each residue; `None` if the file describes none. A range has the residues of
+    /// its chain between its ends, in the order of the first model, or by number if one of its ends is missing. Of
+    /// ranges that overlap, the one that begins first keeps the common residues.
     #[must_use]
     pub fn of(structure: &Structure) -> Option<Self> {
         let ranges = &structure.annotations.secondary;
         if ranges.is_empty() {
             return None;
         }
-        let ids: FxHashMap<&str, usize> = structure.chain.texts().zip(0..).collect();
-        let mut of_chains = vec![Vec::new(); ids.len()];
+        let ids: FxHashMap<&str, u32> = structure.chain.texts().zip(0..).collect();
+        let mut of_chains: BTreeMap<u32, Vec<&SecondaryRange>> = BTreeMap::new();
         for range in ranges {
-            if let Some(&chain) = ids.get(&*range.chain) {
-                of_chains[chain].push((key(range.first), key(range.last), range.structure));
+            if let Some(chain) = ids.get(&*range.chain) {
+                of_chains.entry(*chain).or_default().push(range);
             }
         }
-        for ranges in &mut of_chains {
-            ranges.sort_by_key(|(first, ..)| *first);
-            let mut end = i64::MIN;
-            ranges.retain_mut(|(first, last, _)| {
-                *first = (*first).max(end);
-                end = end.max(last.saturating_add(1));
-                first <= last
-            });
+        // Model of each chain, and its residues in this model.
+        let mut chains: FxHashMap<u32, (i32, Vec<ResidueNumber>)> = FxHashMap::default();
+        for i in (0..structure.len()).filter(|&i| structure.starts_residue[i]) {
+            let chain = structure.chain.id(i);
+            let (model, residues) = chains.entry(chain).or_insert_with(|| (structure.model[i], Vec::new()));
+            if *model == structure.model[i] && of_chains.contains_key(&chain) {
+                residues.push(number(structure, i));
+            }
         }
-        Some(Self { of_chains })
+        let mut by_residue = HashMap::new();
+        for (chain, ranges) in of_chains {
+            let residues = chains.get(&chain).map_or(&[][..], |(_, residues)| residues);
+            by_residue
+                .extend(secondary_residues(residues, &ranges).map(|(place, kind)| ((chain, residues[place]), kind)));
+        }
+        Some(Self { by_residue })
     }
 
     /// Returns the secondary structure of atom `i`; `None` for coil and for atoms that are not protein.
@@ -184,12 +234,52 @@ impl SecondaryRanges {
         if structure.kind[i] != Kind::Protein {
             return None;
         }
-        let ranges = &self.of_chains[structure.chain.id(i) as usize];
-        let residue = key((structure.residue_number[i], structure.insertion_code[i]));
-        let before = ranges.partition_point(|(first, ..)| *first <= residue);
-        let (_, last, kind) = ranges.get(before.checked_sub(1)?)?;
-        (residue <= *last).then_some(*kind)
+        self.by_residue.get(&(structure.chain.id(i), number(structure, i))).copied()
     }
+}
+
+fn number(structure: &Structure, i: usize) -> ResidueNumber {
+    (structure.residue_number[i], structure.insertion_code[i])
+}
+
+/// Returns the places of residues among those of a chain, with their secondary structure. The last of several entries
+/// for a place counts: ranges of which both ends exist come last.
+fn secondary_residues(
+    residues: &[ResidueNumber],
+    ranges: &[&SecondaryRange],
+) -> impl Iterator<Item = (usize, SecondaryStructure)> {
+    let mut by_number: Vec<(i64, usize)> =
+        residues.iter().zip(0..).map(|(&number, place)| (key(number), place)).collect();
+    by_number.sort_unstable();
+    // Residues of a chain may share a number: the first one counts.
+    let first_from = |number: i64| by_number.partition_point(|(other, _)| *other < number);
+    let place = |number: i64| by_number.get(first_from(number)).filter(|(other, _)| *other == number).map(|at| at.1);
+    let (mut in_order, mut in_numbers) = (Vec::new(), Vec::new());
+    for range in ranges {
+        let (first, last) = (key(range.first), key(range.last));
+        match (place(first), place(last)) {
+            (Some(first_ix), Some(last_ix)) if first_ix <= last_ix => {
+                in_order.push((first_ix..last_ix + 1, range.structure));
+            }
+            // Ends in descending order of numbers and of residues are an error of the file.
+            (Some(_), Some(_)) if first > last => {}
+            (Some(first_ix), Some(last_ix)) => in_order.push((last_ix..first_ix + 1, range.structure)),
+            _ => in_numbers.push((first_from(first)..first_from(last.saturating_add(1)), range.structure)),
+        }
+    }
+    let of_numbers: Vec<_> = disjoint(in_numbers).map(|(at, kind)| (by_number[at].1, kind)).collect();
+    of_numbers.into_iter().chain(disjoint(in_order))
+}
+
+/// Returns the places in ranges. Of ranges that overlap, the one that begins first has the common places.
+fn disjoint(mut ranges: Vec<(Range<usize>, SecondaryStructure)>) -> impl Iterator<Item = (usize, SecondaryStructure)> {
+    ranges.sort_by_key(|(places, _)| places.start);
+    let mut end = 0;
+    ranges.into_iter().flat_map(move |(places, kind)| {
+        let start = places.start.max(end);
+        end = end.max(places.end);
+        (start..places.end).map(move |place| (place, kind))
+    })
 }
 
 /// Returns a number with the order of residues.
@@ -210,7 +300,11 @@ impl<'a> Confidences<'a> {
     #[must_use]
     pub fn of(structure: &'a Structure, selected: &[u32]) -> Option<Self> {
         let rows = &structure.annotations.confidence;
-        let ids: FxHashMap<&str, u32> = structure.label_chain.texts().zip(0..).collect();
+        // A chain of several entities has several ids, of which the first is that of the polymer.
+        let mut ids: FxHashMap<&str, u32> = FxHashMap::default();
+        for (chain, id) in structure.label_chain.texts().zip(0..) {
+            ids.entry(chain).or_insert(id);
+        }
         let known = rows.iter().filter_map(|row| {
             let chain = *ids.get(&*row.chain)?;
             Some(((row.model, chain, row.number), (&*row.residue, row.value)))
@@ -245,7 +339,7 @@ mod tests {
 
     #[test]
     fn records_have_the_columns_of_the_format() {
-        let record = SecondaryRange::of_record;
+        let record = |line: &[u8]| SecondaryRange::of_record(line)?.ok();
         let helix = record(b"HELIX    1  H1 SER A   47  GLY A   56  1                                  10    ");
         assert_eq!(helix, Some(range(47, 56, SecondaryStructure::AlphaHelix)));
         let helix =

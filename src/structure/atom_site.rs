@@ -3,109 +3,16 @@
 
 use std::collections::HashMap;
 
+use super::atom_layout::{Layout, NONE, POSITION};
 use super::atoms::{self, Atom, Slices, Tables};
 use super::contents::Kind;
-use super::element::{self, AtomName, atomic_number};
-use super::error::StructureError;
+use super::element::{self, AtomName};
 use super::number::{self, single};
 use super::read::MAX_COORDINATE;
-use super::text;
 use super::warnings::Warnings;
 
 /// Maximum length of the name of an atom, residue or chain, bytes. Names in the dictionary have up to five characters.
 const MAX_NAME: usize = 255;
-
-/// Marks a column that does not exist.
-pub(super) const NONE: usize = usize::MAX;
-
-/// Column index of each item in a row; [`NONE`] for missing items.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Layout {
-    /// Number of items in a row.
-    pub(super) width: usize,
-    group: usize,
-    element: usize,
-    name: [usize; 2],
-    residue: [usize; 2],
-    chain: [usize; 2],
-    number: [usize; 2],
-    sequence_number: usize,
-    insertion_code: usize,
-    altloc: usize,
-    position: [usize; 3],
-    occupancy: usize,
-    b_factor: usize,
-    model: usize,
-    label_chain: usize,
-}
-
-const POSITION: [&str; 3] = ["Cartn_x", "Cartn_y", "Cartn_z"];
-
-impl Layout {
-    /// Returns the layout of rows of `items`, in any letter case, or the index of an item that occurs twice.
-    pub(super) fn of<'n>(items: impl ExactSizeIterator<Item = &'n [u8]>) -> Result<Self, usize> {
-        let width = items.len();
-        let mut found = HashMap::with_capacity(width);
-        for (i, item) in items.enumerate() {
-            if found.insert(item.to_ascii_lowercase(), i).is_some() {
-                return Err(i);
-            }
-        }
-        let column = |item: &str| found.get(item.to_ascii_lowercase().as_bytes()).copied().unwrap_or(NONE);
-        // The author's item comes first, the dictionary's item is the fallback.
-        let pair = |auth: &str, label: &str| match (column(auth), column(label)) {
-            (NONE, label) => [label, NONE],
-            (auth, label) => [auth, label],
-        };
-        Ok(Self {
-            width,
-            group: column("group_PDB"),
-            element: column("type_symbol"),
-            name: pair("auth_atom_id", "label_atom_id"),
-            residue: pair("auth_comp_id", "label_comp_id"),
-            chain: pair("auth_asym_id", "label_asym_id"),
-            number: pair("auth_seq_id", "label_seq_id"),
-            sequence_number: column("label_seq_id"),
-            insertion_code: column("pdbx_PDB_ins_code"),
-            altloc: column("label_alt_id"),
-            position: POSITION.map(column),
-            occupancy: column("occupancy"),
-            b_factor: column("B_iso_or_equiv"),
-            model: column("pdbx_PDB_model_num"),
-            label_chain: column("label_asym_id"),
-        })
-    }
-
-    /// Describes missing coordinate items for [`Passed::lacking`]. Returns `None` if all exist.
-    pub(super) fn missing(&self) -> Option<String> {
-        let missing: Vec<&str> =
-            POSITION.iter().zip(self.position).filter(|(_, column)| *column == NONE).map(|(item, _)| *item).collect();
-        (!missing.is_empty()).then(|| format!("atom_site without {}", missing.join(", ")))
-    }
-
-    /// Returns the text columns. The second of a pair is the fallback for rows where the first has no value.
-    pub(super) fn texts(&self) -> [[usize; 2]; 8] {
-        let alone = |column| [column, NONE];
-        let (names, others) = ([self.name, self.residue, self.chain], [self.group, self.element]);
-        let [name, residue, chain] = names;
-        let [group, element] = others.map(alone);
-        let [code, altloc, label] = [self.insertion_code, self.altloc, self.label_chain].map(alone);
-        [group, element, name, residue, chain, code, altloc, label]
-    }
-
-    /// Returns the number columns, in the same form.
-    pub(super) fn numbers(&self) -> [[usize; 2]; 8] {
-        let [x, y, z] = self.position;
-        let others = [x, y, z, self.occupancy, self.b_factor, self.model, self.sequence_number];
-        let [x, y, z, occupancy, b_factor, model, sequence] = others.map(|column| [column, NONE]);
-        [self.number, x, y, z, occupancy, b_factor, model, sequence]
-    }
-
-    /// Removes `label_seq_id`, except as a fallback for the author's number.
-    pub(super) fn without_sequence_numbers(self) -> Self {
-        Self { sequence_number: NONE, ..self }
-    }
-}
 
 /// Joins the string tables and warnings of readers of consecutive rows, and translates the ids in these rows.
 pub(super) fn join<F>(parts: Vec<(Slices<'_>, AtomSite<F>)>) -> (Tables, Warnings<F>) {
@@ -209,8 +116,14 @@ impl<F> AtomSite<F> {
             0
         } else {
             let span = name(row, [layout.label_chain, NONE])?;
-            self.tables.label_chain.intern(span.text, span.start, span.end)
+            if layout.entity == NONE {
+                self.tables.label_chain.intern(span.text, span.start, span.end)
+            } else {
+                let entity = name(row, [layout.entity, NONE])?;
+                self.tables.chain_of_entity((span.text, span.start, span.end), entity.bytes())
+            }
         };
+        let (residue_number, insertion_code) = self.number(row);
         let hetero = self.hetero(row);
         // Sequence numbers matter only for HETATM records, which are few.
         let in_sequence = !hetero || matches!(row.integer(layout.sequence_number), Ok(Some(_)));
@@ -221,15 +134,73 @@ impl<F> AtomSite<F> {
             residue,
             chain,
             label_chain,
-            residue_number: whole(row, layout.number, 0, "a residue number")?,
-            insertion_code: character(row, layout.insertion_code, "an insertion code")?,
-            altloc: character(row, layout.altloc, "an alternative location")?,
-            occupancy: self.optional(row, layout.occupancy, (1.0, "1"), "an occupancy"),
-            b_factor: self.optional(row, layout.b_factor, (0.0, "0"), "a B-factor"),
-            model: whole(row, [layout.model, NONE], 1, "a model number")?,
+            residue_number,
+            insertion_code,
+            altloc: self.character(row, layout.altloc, "an alternative location", alternative),
+            occupancy: self.optional(row, layout.occupancy, (1.0, "read as 1"), "an occupancy"),
+            b_factor: self.optional(row, layout.b_factor, (0.0, "read as 0"), "a B-factor"),
+            model: whole(row, layout.model, 1, "a model number")?,
             hetero,
             kind: if in_sequence { Kind::Polymer } else { Kind::Ligand },
         })
+    }
+
+    /// Reads residue number and insertion code.
+    #[inline]
+    fn number<R: AtomRow<Fault = F>>(&mut self, row: &R) -> (i32, u8) {
+        let layout = self.layout;
+        let code = self.character(row, layout.insertion_code, "an insertion code", |text| text[0]);
+        let number = match row.integer(layout.number[0]) {
+            Ok(None) => row.integer(layout.number[1]),
+            number => number,
+        };
+        match number {
+            Ok(number) => (number.unwrap_or(0), code),
+            Err(BadNumber) => self.number_text(row, code),
+        }
+    }
+
+    /// Reads a residue number that is no whole number: a number followed by an insertion code, or any text, which
+    /// `label_seq_id` replaces.
+    #[cold]
+    fn number_text<R: AtomRow<Fault = F>>(&mut self, row: &R, code: u8) -> (i32, u8) {
+        let [first, second] = self.layout.number;
+        let column = if matches!(row.integer(first), Ok(None)) { second } else { first };
+        let fault = || row.fault(column, "a residue number (a whole number), ? or .".to_owned());
+        let text = row.text(column).map_or(&[][..], |span| span.bytes());
+        let n_digits = text.len() - text.iter().rev().take_while(|b| b.is_ascii_alphabetic()).count();
+        if let Some(number) = number::integer(&text[..n_digits])
+            && n_digits < text.len()
+        {
+            self.warnings.add("read as number and insertion code", fault);
+            return (number, if code == 0 { text[n_digits] } else { code });
+        }
+        let number = row.integer(second).ok().flatten();
+        self.warnings.add(if number.is_some() { "replaced by label_seq_id" } else { "read as 0" }, fault);
+        (number.unwrap_or(0), code)
+    }
+
+    /// Reads an optional character. `replacement` returns the one that replaces a longer text, with a
+    /// warning.
+    #[inline]
+    fn character<R: AtomRow<Fault = F>>(
+        &mut self,
+        row: &R,
+        column: usize,
+        what: &str,
+        replacement: impl Fn(&[u8]) -> u8,
+    ) -> u8 {
+        match row.text(column).map(|span| span.bytes()) {
+            None | Some([b' ']) => 0,
+            Some([character]) => *character,
+            // An empty or blank quoted value counts as missing.
+            Some(text) if text.iter().all(|&b| b == b' ') => 0,
+            Some(text) => {
+                self.warnings
+                    .add("replaced by one character", || row.fault(column, format!("{what} of one character, ? or .")));
+                replacement(text)
+            }
+        }
     }
 
     /// Reads an optional number. An unreadable one is replaced by the default, with a warning.
@@ -254,11 +225,11 @@ impl<F> AtomSite<F> {
     #[inline]
     fn hetero<R: AtomRow<Fault = F>>(&mut self, row: &R) -> bool {
         let column = self.layout.group;
-        match row.text(column).map(|span| span.bytes()) {
+        match row.text(column).map(|span| span.bytes().trim_ascii_end()) {
             Some(b"HETATM") => true,
             None | Some(b"ATOM") => false,
             Some(_) => {
-                self.warnings.add("ATOM", || row.fault(column, "ATOM or HETATM".to_owned()));
+                self.warnings.add("read as ATOM", || row.fault(column, "ATOM or HETATM".to_owned()));
                 false
             }
         }
@@ -266,8 +237,8 @@ impl<F> AtomSite<F> {
 
     #[inline]
     fn element<R: AtomRow>(&mut self, row: &R, name: u32, residue: u32) -> u8 {
-        let symbol = row.text(self.layout.element).map_or(0, |span| atomic_number(span.bytes()));
-        if symbol != 0 { symbol } else { self.guess(name, residue) }
+        let symbol = row.text(self.layout.element).and_then(|span| element::stated(span.bytes()));
+        symbol.unwrap_or_else(|| self.guess(name, residue))
     }
 
     #[cold]
@@ -313,59 +284,9 @@ fn whole<R: AtomRow>(row: &R, columns: [usize; 2], default: i32, what: &str) -> 
     }
 }
 
-#[inline]
-fn character<R: AtomRow>(row: &R, column: usize, what: &str) -> Result<u8, R::Fault> {
-    match row.text(column) {
-        None => Ok(0),
-        Some(span) if span.len() == 1 => Ok(span.text[span.start]),
-        // An empty or blank quoted value counts as missing.
-        Some(span) if span.bytes().iter().all(|&b| b == b' ') => Ok(0),
-        Some(_) => Err(row.fault(column, format!("{what} of one character, ? or ."))),
-    }
-}
-
-/// Blocks and categories that the reader passed, for the error message of a file without atoms.
-#[derive(Debug, Default)]
-pub(super) struct Passed {
-    categories: Vec<String>,
-    blocks: usize,
-}
-
-impl Passed {
-    /// Maximum number of categories in the message.
-    const KEPT: usize = 10;
-
-    pub(super) fn block(&mut self) {
-        self.blocks += 1;
-    }
-
-    /// Returns true if the message already lists the maximum number of categories.
-    pub(super) fn is_full(&self) -> bool {
-        self.categories.len() >= Self::KEPT
-    }
-
-    /// Adds an `atom_site` without coordinates, described by [`Layout::missing`]. It is always part of the message.
-    pub(super) fn lacking(&mut self, missing: String) {
-        self.categories.push(missing);
-    }
-
-    /// Adds a category, by its name without underscore.
-    pub(super) fn category(&mut self, name: impl AsRef<str> + Into<String>) {
-        if !self.is_full() && !self.categories.iter().any(|c| c == name.as_ref()) {
-            self.categories.push(name.into());
-        }
-    }
-
-    /// Returns the error for a file of this `format` that ends, in this block, without atoms.
-    pub(super) fn no_atoms(self, format: &str, block: Option<String>) -> StructureError {
-        let block = block.map_or_else(|| "no named data block".to_owned(), |b| format!("data block {b}"));
-        let more = if self.blocks > 1 { format!(" (the last of {})", self.blocks) } else { String::new() };
-        let n = self.categories.len();
-        let found = if n == 0 {
-            format!("{format} with {block}{more} and nothing in it")
-        } else {
-            format!("{format} with {block}{more}, categories {}", text::list(self.categories, n))
-        };
-        StructureError::NoAtoms { found }
-    }
+/// Returns a Latin-1 character beyond ASCII for an alternative location of several characters. Different texts rarely
+/// have the same one.
+fn alternative(text: &[u8]) -> u8 {
+    let hash = text.iter().fold(0_u8, |hash, b| hash.wrapping_mul(31).wrapping_add(*b));
+    0xA1 + hash % 95
 }

@@ -3,46 +3,18 @@
 use super::annotations::Annotations;
 use super::assembly::Assemblies;
 use super::contents::Kind;
-use super::duplicates;
 use super::error::StructureError;
-use super::kinds::{self, Sequence};
-use super::pieces;
+use super::kinds;
 use super::radii;
 use super::read::Reading;
-use super::texts::{Interner, TextColumn, translate};
+use super::source::{SourceFields, SourceFormat, Unread};
+pub(super) use super::texts::Tables;
+use super::texts::{Interner, TextColumn, translate, without_entity};
+use super::{pieces, placement};
 use crate::surface::OutOfMemory;
 
-/// The file format that a structure was read from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum SourceFormat {
-    /// PDB, fixed columns.
-    Pdb,
-    /// PDBx/mmCIF.
-    Mmcif,
-    /// BinaryCIF: PDBx/mmCIF in MessagePack.
-    BinaryCif,
-    /// PQR: atoms with charges and radii.
-    Pqr,
-    /// XYZ: frames of elements and coordinates.
-    Xyz,
-}
-
-impl SourceFormat {
-    /// Returns `pdb`, `mmcif`, `bcif`, `pqr` or `xyz`.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Pdb => "pdb",
-            Self::Mmcif => "mmcif",
-            Self::BinaryCif => "bcif",
-            Self::Pqr => "pqr",
-            Self::Xyz => "xyz",
-        }
-    }
-}
-
 /// Atoms of all models of a file, in file order. All columns have the same length, except that `label_chain` and
-/// `radius` may be empty. An atom takes 61 bytes, and 4 more with a radius.
+/// `radius` may be empty. An atom takes 62 bytes, and 4 more with a radius.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
     /// Format of the source file.
@@ -87,6 +59,11 @@ pub struct Structure {
     pub hetero: Vec<bool>,
     /// Kinds.
     pub kind: Vec<Kind>,
+    /// True for the first atom of a residue. Residue names of one number and insertion code are alternatives of one
+    /// residue.
+    pub starts_residue: Vec<bool>,
+    /// Atoms of the file that were not read.
+    pub unread: Unread,
     /// Assemblies that the file describes.
     pub assemblies: Assemblies,
     /// Values of residues that the file has: secondary structure and confidence.
@@ -100,6 +77,12 @@ impl Structure {
     #[must_use]
     pub fn len(&self) -> usize {
         self.element.len()
+    }
+
+    /// Returns the number of atoms of the file, including those that are not read.
+    #[must_use]
+    pub fn n_in_file(&self) -> u64 {
+        self.len() as u64 + self.unread.blocks + self.unread.spheres
     }
 
     /// Returns true if there is no atom.
@@ -120,11 +103,11 @@ impl Structure {
         if self.radius.is_empty() { radii::TABLE } else { radii::OF_FILE }
     }
 
-    /// Returns true if two atoms have the same model, chain, residue name, number and insertion code.
+    /// Returns true if two atoms belong to the same residue and have the same residue name. Looks at the atoms between
+    /// them.
     #[must_use]
     pub fn same_residue(&self, a: usize, b: usize) -> bool {
-        let names = |i: usize| (self.residue.id(i), self.chain.id(i), self.insertion_code[i]);
-        names(a) == names(b) && (self.residue_number[a], self.model[a]) == (self.residue_number[b], self.model[b])
+        self.residue.id(a) == self.residue.id(b) && !self.starts_residue[a.min(b) + 1..=a.max(b)].contains(&true)
     }
 
     /// Returns true if atom `i` is hydrogen or deuterium.
@@ -138,10 +121,12 @@ impl Structure {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Atom {
     pub(super) position: [f64; 3],
+    /// Atomic number, with [`element::GUESSED`] if the file does not contain it.
     pub(super) element: u8,
     pub(super) name: u32,
     pub(super) residue: u32,
     pub(super) chain: u32,
+    /// Chain by `label_asym_id`; the segment id while a PDB file is read.
     pub(super) label_chain: u32,
     pub(super) residue_number: i32,
     pub(super) insertion_code: u8,
@@ -152,46 +137,6 @@ pub(super) struct Atom {
     pub(super) hetero: bool,
     /// Polymer or ligand. [`kinds::assign`] determines the final kind when all atoms have been read.
     pub(super) kind: Kind,
-}
-
-/// Fields of a structure that are not columns.
-#[derive(Debug, Clone)]
-pub(super) struct SourceFields {
-    pub(super) format: SourceFormat,
-    pub(super) id: Option<String>,
-    pub(super) title: Option<String>,
-    pub(super) sequence: Sequence,
-    pub(super) assemblies: Assemblies,
-    pub(super) annotations: Annotations,
-    /// Radius of each atom, Å; empty if the file has none. The reader counts their memory for the structure.
-    pub(super) radii: Vec<f32>,
-    pub(super) warnings: Vec<String>,
-}
-
-/// String tables that atoms refer to while a file is read.
-#[derive(Debug, Default)]
-pub(super) struct Tables {
-    pub(super) name: Interner,
-    pub(super) residue: Interner,
-    pub(super) chain: Interner,
-    pub(super) label_chain: Interner,
-}
-
-impl Tables {
-    /// Returns the number of distinct texts in all tables.
-    pub(super) fn n_texts(&self) -> usize {
-        [&self.name, &self.residue, &self.chain, &self.label_chain].map(|table| table.texts().len()).iter().sum()
-    }
-
-    /// Adds the texts of `other`. Returns, for each table, the new ids by the ids in `other`.
-    fn adopt(&mut self, other: &Self) -> [Vec<u32>; 4] {
-        [
-            self.name.adopt(&other.name),
-            self.residue.adopt(&other.residue),
-            self.chain.adopt(&other.chain),
-            self.label_chain.adopt(&other.label_chain),
-        ]
-    }
 }
 
 macro_rules! columns {
@@ -280,6 +225,7 @@ columns! {
     model: i32 = |a: &Atom| a.model,
     hetero: bool = |a: &Atom| a.hetero,
     kind: Kind = |a: &Atom| a.kind,
+    starts_residue: bool = |_: &Atom| false,
 }
 
 impl Slices<'_> {
@@ -349,25 +295,26 @@ impl Columns {
     /// Returns the finished structure, if not too many atoms have the same position.
     pub(super) fn finish(
         mut self,
-        tables: Tables,
-        source: SourceFields,
+        mut tables: Tables,
+        mut source: SourceFields,
         reading: &Reading<'_>,
     ) -> Result<Structure, StructureError> {
-        duplicates::check(self.len(), |row| self.model_and_position(row), reading)?;
-        kinds::assign(&mut self, &tables, &source.sequence, reading)?;
+        let mut warnings = std::mem::take(&mut source.warnings);
+        warnings.extend(placement::check(&self, reading)?);
+        warnings.extend(kinds::assign(&mut self, &tables, &source, reading)?);
         for (kind, _) in self.kind.iter_mut().zip(&source.radii).filter(|(_, radius)| **radius == 0.0) {
             *kind = Kind::VirtualSite;
         }
-        if tables.label_chain.is_empty() {
+        if tables.label_chain.is_empty() || source.format == SourceFormat::Pdb {
             self.label_chain = Vec::new();
+            tables.label_chain = Interner::default();
         }
-        let entity = |chain: &str| source.sequence.entity_ids.get(chain).cloned().unwrap_or_default();
-        let entities = tables.label_chain.texts().map(entity).collect();
+        let entity = |chain_ix| source.sequence.entity_id(&tables, chain_ix).unwrap_or_default().to_owned();
+        let entities = (0..tables.label_chain.texts().len()).map(entity).collect();
         self.shrink();
         reading.keep(source.assemblies.bytes())?;
-        source.annotations.keep(reading)?;
-        let unknown = self.unknown_elements(&tables, &source.radii);
-        let warnings = source.warnings.into_iter().chain(unknown).collect();
+        source.annotations.keep(self.starts_residue.iter().filter(|starts| **starts).count(), reading)?;
+        warnings.extend(self.unknown_elements(&tables, &source.radii));
         reading.check()?;
         Ok(Structure {
             format: source.format,
@@ -380,7 +327,7 @@ impl Columns {
             name: tables.name.column(self.name),
             residue: tables.residue.column(self.residue),
             chain: tables.chain.column(self.chain),
-            label_chain: tables.label_chain.column(self.label_chain),
+            label_chain: tables.label_chain.column_of(self.label_chain, without_entity),
             entities,
             residue_number: self.residue_number,
             insertion_code: self.insertion_code,
@@ -391,6 +338,8 @@ impl Columns {
             model: self.model,
             hetero: self.hetero,
             kind: self.kind,
+            starts_residue: self.starts_residue,
+            unread: source.unread,
             assemblies: source.assemblies,
             annotations: source.annotations,
             warnings,

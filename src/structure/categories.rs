@@ -5,14 +5,14 @@
 //! `pdbx_struct_oper_list`, `struct_conf` and `struct_sheet_range`; `ModelCIF`, categories `ma_qa_metric` and
 //! `ma_qa_metric_local`.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 
 use super::annotations::{Annotations, ResidueConfidence, SecondaryRange};
 use super::assembly::{Assemblies, Operator};
 use super::error::StructureError;
 use super::number;
 use super::read::Reading;
-use super::text::decode;
+use super::text::{decode, list};
 use crate::surface::MemoryMeter as _;
 
 const ENTITY: &str = "entity";
@@ -25,7 +25,7 @@ const METRIC: &str = "ma_qa_metric";
 const LOCAL: &str = "ma_qa_metric_local";
 
 /// Items to read, by category and name, in the order of [`GROUPS`].
-pub(super) const ITEMS: [(&str, &str); 42] = [
+pub(super) const ITEMS: [(&str, &str); 44] = [
     (ENTITY, "id"),
     (ENTITY, "type"),
     ("entity_poly", "entity_id"),
@@ -51,12 +51,14 @@ pub(super) const ITEMS: [(&str, &str); 42] = [
     (CONF, "beg_auth_asym_id"),
     (CONF, "beg_auth_seq_id"),
     (CONF, "pdbx_beg_PDB_ins_code"),
+    (CONF, "end_auth_asym_id"),
     (CONF, "end_auth_seq_id"),
     (CONF, "pdbx_end_PDB_ins_code"),
     (CONF, "pdbx_PDB_helix_class"),
     (SHEET, "beg_auth_asym_id"),
     (SHEET, "beg_auth_seq_id"),
     (SHEET, "pdbx_beg_PDB_ins_code"),
+    (SHEET, "end_auth_asym_id"),
     (SHEET, "end_auth_seq_id"),
     (SHEET, "pdbx_end_PDB_ins_code"),
     (METRIC, "id"),
@@ -72,7 +74,7 @@ pub(super) const ITEMS: [(&str, &str); 42] = [
 
 /// Names of the data that groups of items describe, and the end of each group among the [`ITEMS`].
 const GROUPS: [(&str, usize); 4] =
-    [("entities", 5), ("assemblies", 21), ("helices and strands", 33), ("confidences", 42)];
+    [("entities", 5), ("assemblies", 21), ("helices and strands", 35), ("confidences", 44)];
 /// First items of the groups after the entities.
 const ASSEMBLIES: usize = GROUPS[0].1;
 const SECONDARY: usize = GROUPS[1].1;
@@ -80,6 +82,9 @@ const CONFIDENCES: usize = GROUPS[2].1;
 
 /// Maximum number of values of an item. The largest entries of the PDB have about ten thousand chains.
 pub(super) const MAX_VALUES: usize = 1 << 18;
+
+/// Maximum number of helices and strands that a warning names.
+const NAMED_RANGES: usize = 20;
 
 /// Returns true if both items, given by index, belong to the same group.
 pub(super) fn describe_the_same(a: usize, b: usize) -> bool {
@@ -214,14 +219,11 @@ impl Categories {
         })
     }
 
-    /// Returns the type of the entity of each chain, if it is known.
-    pub(super) fn of_chains(&self) -> HashMap<String, Entity> {
-        let [ids, types, listed, chains, of_chains, ..] = &self.values;
-        let listed: HashSet<&String> = listed.iter().collect();
-        let types: HashMap<&String, Entity> = ids.iter().zip(types.iter().map(|name| Entity::of(name))).collect();
-        let of = |id: &String| listed.contains(id).then_some(Entity::Polymer).or(types.get(id).copied());
-        let known = chains.iter().zip(of_chains);
-        known.filter_map(|(chain, id)| of(id).map(|entity| (chain.clone(), entity))).collect()
+    /// Returns the types of entities by their ids.
+    pub(super) fn entity_types(&self) -> HashMap<String, Entity> {
+        let [ids, types, polymers, ..] = &self.values;
+        let types = ids.iter().cloned().zip(types.iter().map(|name| Entity::of(name)));
+        types.chain(polymers.iter().map(|id| (id.clone(), Entity::Polymer))).collect()
     }
 
     /// Returns the entity of each chain.
@@ -230,20 +232,36 @@ impl Categories {
         chains.iter().cloned().zip(of_chains.iter().cloned()).collect()
     }
 
-    /// Returns the values of residues.
-    pub(super) fn annotations(&self) -> Annotations {
+    /// Returns the values of residues, and a warning about helices and strands that have two chains.
+    pub(super) fn annotations(&self) -> (Annotations, Option<String>) {
         let row =
             |first: usize, row: usize| move |item: usize| self.values[first + item].get(row).map_or("", String::as_str);
         let conf = (0..self.values[SECONDARY].len()).filter_map(|i| {
             let value = row(SECONDARY, i);
             SecondaryRange::of_conf(std::array::from_fn(value))
         });
-        let first_sheet = SECONDARY + 7;
+        let first_sheet = SECONDARY + 8;
         let sheets = (0..self.values[first_sheet].len()).filter_map(|i| {
             let value = row(first_sheet, i);
             SecondaryRange::of_sheet(std::array::from_fn(value))
         });
-        Annotations { secondary: conf.chain(sheets).collect(), confidence: self.confidences() }
+        let (mut secondary, mut rejected, mut n_rejected) = (Vec::new(), Vec::new(), 0);
+        for range in conf.chain(sheets) {
+            match range {
+                Ok(range) => secondary.push(range),
+                Err(ends) => {
+                    n_rejected += 1;
+                    if rejected.len() < NAMED_RANGES {
+                        rejected.push(ends.to_string());
+                    }
+                }
+            }
+        }
+        let warning = (n_rejected > 0).then(|| {
+            let ends = list(rejected, n_rejected);
+            format!("ignored helices and strands whose ends are in different chains: {ends}")
+        });
+        (Annotations { secondary, confidence: self.confidences() }, warning)
     }
 
     /// Returns the confidences of residues (pLDDT), from the first metric of this type.
@@ -325,11 +343,11 @@ mod tests {
             ("struct_asym.entity_id", "4"),
         ]);
         assert!(known.entities_are_known());
-        let chains = known.of_chains();
         let ids = known.entity_ids();
         assert_eq!(["A", "B", "C", "D"].map(|c| ids.get(c).map(String::as_str)), ["1", "2", "3", "4"].map(Some));
+        let types = known.entity_types();
         assert_eq!(
-            ["A", "B", "C", "D"].map(|c| chains.get(c).copied()),
+            ["1", "2", "3", "4"].map(|id| types.get(id).copied()),
             [Some(Entity::Polymer), Some(Entity::Branched), Some(Entity::Polymer), None]
         );
         assert!(!with(&[("entity.id", "1"), ("struct_asym.entity_id", "1")]).entities_are_known());

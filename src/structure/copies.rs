@@ -108,9 +108,12 @@ impl<'s> AssemblyRules<'s> {
     /// Returns [`StructureError::NotFound`] if the file has none with this id, [`StructureError::BadAssembly`] if it
     /// has no atoms of any of its chains.
     pub(crate) fn find(assemblies: &'s Assemblies, names: &[&str], id: &'s str) -> Result<Self, StructureError> {
-        let ids: HashMap<&str, u32> = names.iter().copied().zip(0..).collect();
+        let mut ids: HashMap<&str, Vec<u32>> = HashMap::new();
+        for (name, id) in names.iter().copied().zip(0..) {
+            ids.entry(name).or_default().push(id);
+        }
         let part = |generator: &'s Generator| {
-            let mut chains: Vec<u32> = generator.chains().filter_map(|name| ids.get(name).copied()).collect();
+            let mut chains: Vec<u32> = generator.chains().filter_map(|name| ids.get(name)).flatten().copied().collect();
             chains.sort_unstable();
             chains.dedup();
             RuleChains { generator, chains }

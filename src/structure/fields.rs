@@ -2,16 +2,17 @@
 
 use std::ops::Range;
 
-use super::atoms::{Atom, SourceFields, Structure, Tables};
+use super::atoms::{Atom, Columns, Structure, Tables};
 use super::contents::Kind;
 use super::error::StructureError;
 use super::growing::GrowingColumns;
 use super::number;
 use super::read::{MAX_COORDINATE, Reading};
+use super::source::SourceFields;
 use super::text::Fault;
 
-/// Maximum number of readable fields of a line. Lines of PQR have at most 11.
-const MAX_FIELDS: usize = 16;
+/// Maximum number of readable fields of a line. Lines of PQR have at most 11, those of extended XYZ about 30.
+pub(super) const MAX_FIELDS: usize = 32;
 
 /// Lines between two checks of the cancellation flag: a few milliseconds.
 const LINES_PER_CHECK: usize = 1 << 14;
@@ -75,6 +76,11 @@ impl<'a> Fields<'a> {
         }
     }
 
+    /// Returns the range of the line.
+    pub(super) fn line(&self) -> Range<usize> {
+        self.line.clone()
+    }
+
     /// Returns the number of fields, including those beyond [`MAX_FIELDS`].
     pub(super) fn len(&self) -> usize {
         self.len
@@ -133,6 +139,11 @@ impl<'a> Rows<'a> {
     /// Creates an empty list for about `expected` atoms.
     pub(super) fn new(reading: &'a Reading<'a>, expected: usize) -> Self {
         Self { reading, columns: GrowingColumns::default(), tables: Tables::default(), expected, n_lines: 0 }
+    }
+
+    /// Returns the columns of the atoms.
+    pub(super) fn columns_mut(&mut self) -> &mut Columns {
+        self.columns.columns_mut()
     }
 
     /// Returns the number of atoms.

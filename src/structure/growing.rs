@@ -1,9 +1,10 @@
 //! Columns that grow while a file is read: limits, memory and cancellation are checked once per chunk of rows.
 
-use super::atoms::{Atom, Columns, SourceFields, Structure, Tables};
+use super::atoms::{Atom, Columns, Structure, Tables};
 use super::duplicates;
 use super::error::StructureError;
 use super::read::Reading;
+use super::source::SourceFields;
 
 /// Rows between two checks: a few milliseconds.
 const CHUNK: usize = 1 << 16;
@@ -28,6 +29,10 @@ impl GrowingColumns {
 
     pub(super) fn columns(&self) -> &Columns {
         &self.columns
+    }
+
+    pub(super) fn columns_mut(&mut self) -> &mut Columns {
+        &mut self.columns
     }
 
     pub(super) fn into_columns(self) -> Columns {

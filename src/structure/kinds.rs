@@ -1,19 +1,27 @@
 //! Assignment of a kind to every atom: first polymer, ligand, water or virtual site, then a more specific kind.
 //!
-//! ATOM records are polymer, except for water and single ions. A HETATM residue is polymer if the file declares it a
-//! polymer: by the entity of its chain or its `label_seq_id` (mmCIF), or by a SEQRES or MODRES record (PDB). It is also
-//! polymer if a backbone bond joins it to an adjacent polymer residue of the file, directly or through other HETATM
-//! residues.
+//! A HETATM residue is polymer if the file declares it a polymer: by the entity of its chain or its `label_seq_id`
+//! (mmCIF), or by a SEQRES or MODRES record (PDB). It is also polymer if a backbone bond joins it to an adjacent
+//! polymer residue of the file, directly or through other HETATM residues.
+//!
+//! ATOM records are polymer, except for water, single ions, and residues of an unknown name that the file does not
+//! declare and no backbone bond joins to an adjacent residue. Without any other polymer, these are polymer as well.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::atomic::Ordering;
 
-use super::atoms::{Columns, Slices, Structure, Tables};
+use super::atoms::{Columns, Slices, Tables};
+use super::bonds::{Joint, bonded, is_bonded};
 use super::categories::{Categories, Entity};
-use super::chemistry::TextClasses;
+use super::chemistry::{Membership, ResidueGroup, TextClasses};
 use super::contents::Kind;
 use super::error::StructureError;
 use super::read::Reading;
+use super::residues::Names;
+use super::source::SourceFields;
+use super::source::SourceFormat;
+use super::text::list;
+use super::texts::without_entity;
 use super::{pieces, residue, sites};
 
 /// Sequence information of a file, by chain.
@@ -21,8 +29,8 @@ use super::{pieces, residue, sites};
 pub(super) struct Sequence {
     /// Chains and residue names of SEQRES and MODRES records, standard residues excepted.
     pub(super) listed: HashSet<Listed>,
-    /// Types of chains (`label_asym_id`) with a known entity.
-    pub(super) entities: HashMap<String, Entity>,
+    /// Types of entities by their ids.
+    pub(super) types: HashMap<String, Entity>,
     /// Entity of each chain (`label_asym_id`), if the file describes it.
     pub(super) entity_ids: HashMap<String, String>,
 }
@@ -30,7 +38,23 @@ pub(super) struct Sequence {
 impl Sequence {
     /// Returns the sequence information of an mmCIF or BinaryCIF file.
     pub(super) fn of(categories: &Categories) -> Self {
-        Self { entities: categories.of_chains(), entity_ids: categories.entity_ids(), ..Self::default() }
+        Self { types: categories.entity_types(), entity_ids: categories.entity_ids(), ..Self::default() }
+    }
+
+    /// Returns the entity of a chain, given by its id in the table, if it is known: by `struct_asym` or, if the file
+    /// does not have this category, by the atoms.
+    pub(super) fn entity_id<'s>(&'s self, tables: &'s Tables, chain: usize) -> Option<&'s str> {
+        if self.entity_ids.is_empty() {
+            return tables.entities.get(chain).map(AsRef::as_ref).filter(|id| !id.is_empty());
+        }
+        let name = without_entity(tables.label_chain.text(u32::try_from(chain).ok()?));
+        self.entity_ids.get(name).map(String::as_str)
+    }
+
+    /// Returns the type of the entity of each chain, if it is known, by id of the chain.
+    pub(super) fn entities(&self, tables: &Tables) -> Vec<Option<Entity>> {
+        let entity = |chain| self.types.get(self.entity_id(tables, chain)?).copied();
+        (0..tables.label_chain.texts().len()).map(entity).collect()
     }
 
     /// Returns true if a record lists the residue name for the chain.
@@ -51,27 +75,36 @@ pub(super) fn listed(chain: &[u8], residue: &[u8]) -> Option<Listed> {
     Some(columns)
 }
 
-/// Maximum length of a bond between carbon and nitrogen of a peptide, Å. The usual length is 1.33 Å; non-bonded
-/// contacts are longer.
-const PEPTIDE_BOND: f64 = 2.0;
-/// Maximum length of a bond between O3' and the next phosphorus, Å. The usual length is 1.6 Å.
-const PHOSPHATE_BOND: f64 = 2.2;
-
-/// Sets the kinds of all atoms. The reader has set ATOM records and rows with a `label_seq_id` to polymer, and other
-/// HETATM records to ligand. Checks for cancellation between passes. Chains are independent and assigned in parallel.
+/// Finds the residues, resolves guessed elements and sets the kinds of all atoms. The reader has set ATOM records and
+/// rows with a `label_seq_id` to polymer, and other HETATM records to ligand. Checks for cancellation between passes.
+/// Chains are independent and assigned in parallel. Returns a warning about residues of ATOM records that are ligands.
 pub(super) fn assign(
     columns: &mut Columns,
     tables: &Tables,
-    sequence: &Sequence,
+    source: &SourceFields,
     reading: &Reading<'_>,
-) -> Result<(), StructureError> {
+) -> Result<Option<String>, StructureError> {
+    if source.format == SourceFormat::Xyz {
+        // A frame is one residue of a polymer.
+        for i in 0..columns.len() {
+            columns.starts_residue[i] = i == 0 || columns.model[i] != columns.model[i - 1];
+        }
+        sites::mark(columns, tables);
+        return reading.check().map(|()| None);
+    }
     let solvent = Solvent::new(tables);
-    let declared = Declared::new(columns, tables, sequence, &solvent, reading);
+    let declared = Declared::new(columns, tables, &source.sequence, &solvent, reading);
     let joints: Vec<Option<Joint>> = tables.name.texts().map(Joint::of).collect();
-    let texts = TextClasses::new(tables, sequence);
+    let names = Names::new(tables);
+    let texts = TextClasses::new(tables, &source.sequence);
     let bytes = usize::try_from(Columns::bytes(columns.len())).unwrap_or(usize::MAX);
     let mut parts = whole_chains(columns, reading.n_pieces(bytes));
-    let assigned = pieces::map(&mut parts, |rows| {
+    let found = pieces::map(&mut parts, |rows| {
+        reading.check()?;
+        let memory = reading.reserve(names.marking_bytes(rows.len()))?;
+        names.mark(rows);
+        drop(memory);
+        names.resolve_elements(rows);
         reading.check()?;
         let has_hetero = rows.hetero.contains(&true);
         if has_hetero {
@@ -83,13 +116,87 @@ pub(super) fn assign(
             bonded(rows, &joints, &declared);
         }
         reading.check()?;
+        Ok(unlinked_residues(rows, &joints, &texts))
+    });
+    let found = found.into_iter().collect::<Result<Vec<Unlinked>, StructureError>>()?;
+    let has_polymer = found.iter().any(|part| part.has_polymer);
+    let has_unlinked = found.iter().any(|part| !part.atoms.is_empty());
+    let findings = if has_polymer { POLYMER } else { 0 } | if has_unlinked { UNLINKED } else { 0 };
+    reading.findings.fetch_or(findings, Ordering::Relaxed);
+    // The other blocks are not known. `BlockFindings::check` checks them.
+    let are_ligands = has_polymer || reading.is_block;
+    pieces::map(&mut parts, |rows| {
+        reading.check()?;
+        if !are_ligands && has_unlinked {
+            texts.unlinked_to_polymer(rows, &solvent);
+        }
         texts.refine(rows);
         Ok(())
-    });
-    assigned.into_iter().collect::<Result<(), StructureError>>()?;
+    })
+    .into_iter()
+    .collect::<Result<(), StructureError>>()?;
     reading.check()?;
     sites::mark(columns, tables);
-    reading.check()
+    reading.check()?;
+    Ok(if are_ligands && has_unlinked { Some(unlinked_warning(found, tables)) } else { None })
+}
+
+/// Residues of ATOM records in some chains that are no part of a polymer.
+#[derive(Debug, Default)]
+struct Unlinked {
+    /// Number of atoms by id of the residue name.
+    atoms: BTreeMap<u32, u64>,
+    /// True if there is a polymer.
+    has_polymer: bool,
+}
+
+/// Sets the kind of residues of ATOM records to ligand if their name is unknown, the file does not declare them to be
+/// part of a polymer, and no bond joins them to an adjacent residue.
+fn unlinked_residues(columns: &mut Slices<'_>, joints: &[Option<Joint>], texts: &TextClasses<'_>) -> Unlinked {
+    let mut unlinked = Unlinked::default();
+    let mut group = ResidueGroup::default();
+    // Programs write the patches of a residue as other names under its number.
+    let (mut residue_end_ix, mut has_polymer_name) = (0, false);
+    let mut first = 0;
+    while first < columns.len() {
+        if first >= residue_end_ix {
+            residue_end_ix = (first + 1..columns.len()).find(|&i| columns.starts_residue[i]).unwrap_or(columns.len());
+            has_polymer_name = (first..residue_end_ix).any(|i| !columns.hetero[i] && texts.is_known(columns, i));
+        }
+        let end = residue_end(columns, first);
+        if columns.kind[first] == Kind::Polymer {
+            match texts.membership(columns, first, &mut group) {
+                Membership::Neutral => {}
+                Membership::Polymer => unlinked.has_polymer = true,
+                Membership::Ligand => columns.kind[first..end].fill(Kind::Ligand),
+                _ if has_polymer_name || is_bonded(columns, first..end, joints) => unlinked.has_polymer = true,
+                Membership::Listed => columns.kind[first..end].fill(Kind::Ligand),
+                Membership::Unknown => {
+                    *unlinked.atoms.entry(columns.residue[first]).or_default() += (end - first) as u64;
+                    columns.kind[first..end].fill(Kind::Ligand);
+                }
+            }
+        }
+        first = end;
+    }
+    unlinked
+}
+
+/// Returns a warning that names the residues, most frequent first.
+fn unlinked_warning(found: Vec<Unlinked>, tables: &Tables) -> String {
+    let mut atoms: BTreeMap<u32, u64> = BTreeMap::new();
+    for (residue, n) in found.into_iter().flat_map(|part| part.atoms) {
+        *atoms.entry(residue).or_default() += n;
+    }
+    let total: u64 = atoms.values().sum();
+    let mut atoms: Vec<(u32, u64)> = atoms.into_iter().collect();
+    atoms.sort_by_key(|(_, n)| std::cmp::Reverse(*n));
+    let n_names = atoms.len();
+    let names = list(atoms.into_iter().map(|(residue, n)| format!("`{}` {n}", tables.residue.text(residue))), n_names);
+    format!(
+        "{total} atoms in ATOM records belong to residues with unknown names that are neither in a sequence nor bonded \
+         to a polymer; treated as ligands: {names}"
+    )
 }
 
 /// Divides the rows at ends of chains into at most `n` parts of similar size.
@@ -107,7 +214,7 @@ fn whole_chains(columns: &mut Columns, n: usize) -> Vec<Slices<'_>> {
 }
 
 /// Residue names of water and single ions.
-struct Solvent {
+pub(super) struct Solvent {
     /// Kind by residue name id; `None` for other residues.
     kinds: Vec<Option<Kind>>,
     any: bool,
@@ -125,7 +232,7 @@ impl Solvent {
         Self { kinds, any }
     }
 
-    fn has(&self, residue: u32) -> bool {
+    pub(super) fn has(&self, residue: u32) -> bool {
         self.kinds[residue as usize].is_some()
     }
 
@@ -142,7 +249,7 @@ impl Solvent {
 }
 
 /// Declarations of a file about its HETATM residues.
-struct Declared<'a> {
+pub(super) struct Declared<'a> {
     /// True for polymers, by `label_chain` id; `None` if the entity of the chain is unknown.
     chains: Vec<Option<bool>>,
     /// True if `label_seq_id` distinguishes polymers from other residues.
@@ -159,18 +266,18 @@ impl<'a> Declared<'a> {
         solvent: &Solvent,
         reading: &Reading<'_>,
     ) -> Self {
-        let is_polymer = |chain| Some(*sequence.entities.get(chain)? == Entity::Polymer);
-        let chains = tables.label_chain.texts().map(is_polymer).collect();
+        let is_polymer = |entity: Option<Entity>| entity.map(|entity| entity == Entity::Polymer);
+        let chains = sequence.entities(tables).into_iter().map(is_polymer).collect();
         let mut declared = Self { chains, numbered: false, tables, sequence };
         let found = declared.sequence_numbers(columns, solvent);
-        // The other blocks are not known. [`HeteroBlocks::agree`] checks them.
+        // The other blocks are not known. `BlockFindings::check` checks them.
         declared.numbered = reading.is_block || are_numbered(found);
-        reading.hetero.store(found, Ordering::Relaxed);
+        reading.findings.store(found, Ordering::Relaxed);
         declared
     }
 
     /// Returns true for polymers if the entity of the chain is known.
-    fn of_entity(&self, label_chain: u32) -> Option<bool> {
+    pub(super) fn of_entity(&self, label_chain: u32) -> Option<bool> {
         self.chains.get(label_chain as usize).copied().flatten()
     }
 
@@ -208,167 +315,32 @@ impl<'a> Declared<'a> {
 /// unknown.
 const WITHOUT: u8 = 1;
 const SOLVENT: u8 = 2;
-const OPEN: u8 = 4;
+pub(super) const OPEN: u8 = 4;
+/// Residues of ATOM records that are no part of a polymer, and other residues of a polymer.
+pub(super) const UNLINKED: u8 = 8;
+pub(super) const POLYMER: u8 = 16;
 
 /// Returns true if `label_seq_id` distinguishes polymers from other residues. Some programs write it for every atom,
 /// even for water.
-const fn are_numbered(found: u8) -> bool {
+pub(super) const fn are_numbered(found: u8) -> bool {
     found & (WITHOUT | SOLVENT) == WITHOUT
-}
-
-/// Findings on the HETATM records of consecutive blocks of a file.
-#[derive(Debug, Default)]
-pub(super) struct HeteroBlocks(u8);
-
-impl HeteroBlocks {
-    /// Adds the findings of a block.
-    pub(super) fn add(&mut self, reading: &Reading<'_>) {
-        self.0 |= reading.hetero.load(Ordering::Relaxed);
-    }
-
-    /// Rejects records whose sequence numbers do not distinguish polymers, as the blocks assume. `expected` describes a
-    /// file of known entities.
-    pub(super) fn check(&self, expected: &'static str) -> Result<(), StructureError> {
-        if self.0 & OPEN == 0 || are_numbered(self.0) {
-            return Ok(());
-        }
-        let found = "HETATM records with `label_seq_id` in chains of unknown entity, but no HETATM record without it, or \
-                     water with it";
-        Err(StructureError::NotAStream { found: found.to_owned(), expected })
-    }
-}
-
-/// Returns the last row before which a file can be divided: the kinds and alternative locations of the rows before and
-/// after it do not depend on each other. Returns `None` without such a row.
-pub(super) fn last_division(structure: &Structure) -> Option<usize> {
-    (1..structure.len()).rev().find(|&i| divides(structure, i))
-}
-
-fn divides(s: &Structure, i: usize) -> bool {
-    let before = i - 1;
-    // A Drude particle follows its atom.
-    if s.name.get(i).starts_with('D') {
-        return false;
-    }
-    if s.chain.id(i) != s.chain.id(before) || s.model[i] != s.model[before] {
-        return true;
-    }
-    // Names of one number and code are alternatives.
-    if (s.residue_number[i], s.insertion_code[i]) == (s.residue_number[before], s.insertion_code[before]) {
-        return false;
-    }
-    let both = |of: fn(&str) -> bool| of(s.residue.get(before)) && of(s.residue.get(i));
-    both(residue::is_water) || (both(residue::is_polymer) && !s.hetero[before] && !s.hetero[i])
-}
-
-/// Backbone atoms that join the residues of a chain.
-#[derive(Debug, Clone, Copy)]
-enum Joint {
-    /// Carbon of a peptide bond.
-    C,
-    /// Nitrogen of a peptide bond.
-    N,
-    /// Oxygen before the phosphorus of the next nucleotide.
-    O3,
-    /// Phosphorus.
-    P,
-}
-
-impl Joint {
-    fn of(name: &str) -> Option<Self> {
-        match name {
-            "C" => Some(Self::C),
-            "N" => Some(Self::N),
-            "O3'" | "O3*" => Some(Self::O3),
-            "P" => Some(Self::P),
-            _ => None,
-        }
-    }
-}
-
-/// The first atom of each [`Joint`] in a residue.
-#[derive(Debug, Clone, Copy, Default)]
-struct Joints([Option<[f64; 3]>; 4]);
-
-impl Joints {
-    /// Returns true if a bond joins this residue to the `next` one.
-    fn lead_to(&self, next: &Self) -> bool {
-        let near = |a: Joint, b: Joint, limit: f64| match (self.0[a as usize], next.0[b as usize]) {
-            (Some(a), Some(b)) => a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>() <= limit * limit,
-            _ => false,
-        };
-        near(Joint::C, Joint::N, PEPTIDE_BOND) || near(Joint::O3, Joint::P, PHOSPHATE_BOND)
-    }
-}
-
-/// Sets the kind of HETATM residues to polymer if backbone bonds join them to a polymer residue, unless the entity of
-/// their chain is known. `joints` are by name id.
-fn bonded(columns: &mut Slices<'_>, joints: &[Option<Joint>], declared: &Declared<'_>) {
-    let open = |columns: &Slices<'_>, i: usize| {
-        columns.kind[i] == Kind::Ligand && columns.hetero[i] && declared.of_entity(columns.label_chain[i]).is_none()
-    };
-    if !(0..columns.len()).any(|i| open(columns, i) && joints[columns.name[i] as usize].is_some()) {
-        return;
-    }
-    // A group is a sequence of residues joined by bonds.
-    let (mut group, mut has_polymer, mut has_open) = (0, false, false);
-    let (mut before, mut first) = (Joints::default(), 0);
-    loop {
-        let (end, here) = residue_from(columns, first, joints);
-        let at_end = first == columns.len();
-        if at_end || !(first > 0 && same_chain(columns, first - 1, first) && before.lead_to(&here)) {
-            if has_polymer && has_open {
-                for i in group..first {
-                    if open(columns, i) {
-                        columns.kind[i] = Kind::Polymer;
-                    }
-                }
-            }
-            (group, has_polymer, has_open) = (first, false, false);
-        }
-        if at_end {
-            return;
-        }
-        if !has_open {
-            // Only the residue before the next open one matters.
-            let Some(next) = (first..columns.len()).find(|&i| open(columns, i)) else { return };
-            let near = residue_start(columns, next.saturating_sub(1).max(first));
-            if near > first {
-                (before, first, group, has_polymer) = (Joints::default(), near, near, false);
-                continue;
-            }
-        }
-        has_polymer |= columns.kind[first] == Kind::Polymer;
-        has_open |= open(columns, first);
-        (before, first) = (here, end);
-    }
 }
 
 pub(super) fn same_chain(columns: &Slices<'_>, a: usize, b: usize) -> bool {
     columns.chain[a] == columns.chain[b] && columns.model[a] == columns.model[b]
 }
 
+/// Returns true if atom `i` begins a residue, or another residue name of it.
+fn starts_residue(columns: &Slices<'_>, i: usize) -> bool {
+    columns.starts_residue[i] || columns.residue[i] != columns.residue[i - 1]
+}
+
 /// Returns the index of the first atom in the residue of atom `i`.
-fn residue_start(columns: &Slices<'_>, i: usize) -> usize {
-    (0..i).rev().find(|&before| !same_residue(columns, before, i)).map_or(0, |before| before + 1)
+pub(super) fn residue_start(columns: &Slices<'_>, i: usize) -> usize {
+    (1..=i).rev().find(|&start| starts_residue(columns, start)).unwrap_or(0)
 }
 
-pub(super) fn same_residue(columns: &Slices<'_>, a: usize, b: usize) -> bool {
-    columns.residue_number[a] == columns.residue_number[b]
-        && columns.residue[a] == columns.residue[b]
-        && columns.insertion_code[a] == columns.insertion_code[b]
-        && same_chain(columns, a, b)
-}
-
-/// Returns the end of the residue that begins with atom `first`, and its joints.
-fn residue_from(columns: &Slices<'_>, first: usize, joints: &[Option<Joint>]) -> (usize, Joints) {
-    let mut found = Joints::default();
-    let mut i = first;
-    while i < columns.len() && same_residue(columns, i, first) {
-        if let Some(joint) = joints[columns.name[i] as usize] {
-            found.0[joint as usize].get_or_insert([columns.x[i], columns.y[i], columns.z[i]]);
-        }
-        i += 1;
-    }
-    (i, found)
+/// Returns the end of the residue that begins with atom `first`.
+pub(super) fn residue_end(columns: &Slices<'_>, first: usize) -> usize {
+    (first + 1..columns.len()).find(|&i| starts_residue(columns, i)).unwrap_or(columns.len())
 }

@@ -83,6 +83,15 @@ mod tests {
                 };
                 chain("ALA A", "XYZ A") + &chain("ALA B", "XYZ B") + &chain("XYZ C", "XYZ C")
             }),
+            ("parts and segments", {
+                let part = |chain: &str, segment: &str| {
+                    (1..15)
+                        .map(|i| atom(" CA ", &format!("ALA {chain}"), i % 3, &format!("  1.00  0.00      {segment}")))
+                        .collect::<String>()
+                };
+                format!("{0}END\n{0}END\n{1}END\n{2}", part("A", "PROA"), part("A", "PROB"), part("B", "PROB"))
+            }),
+            ("unknown residues", many(" C1 ", "QQQ A") + &plain()),
             ("listed residues", {
                 let end = plain().replace("ATOM  ", "HETATM").replace("ALA", "XYZ");
                 format!("TITLE     ONE\nSEQRES   1 A   15  XYZ\nHEADER{:>60}\n{}TITLE     TWO\n{end}", "1ABC", plain())
@@ -145,8 +154,14 @@ mod tests {
     /// Returns the files of this package that the readers accept.
     fn files() -> Vec<(String, Vec<u8>)> {
         let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-        let folders =
-            ["samples", "tests/bcif_support", "fuzz/corpus/pdb", "fuzz/corpus/mmcif", "fuzz/corpus/binarycif"];
+        let folders = [
+            "samples",
+            "tests/cases/atoms",
+            "tests/bcif_support",
+            "fuzz/corpus/pdb",
+            "fuzz/corpus/mmcif",
+            "fuzz/corpus/binarycif",
+        ];
         let entries = folders.iter().flat_map(|folder| std::fs::read_dir(root.join(folder)).unwrap());
         let paths = entries.map(|entry| entry.unwrap().path()).filter(|path| path.is_file());
         let read: Vec<_> = paths.map(|path| (path.display().to_string(), std::fs::read(path).unwrap())).collect();

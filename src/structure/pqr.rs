@@ -1,27 +1,31 @@
 //! Reader of PQR files: atoms with charge and radius, in fields separated by white space.
 //!
 //! A line is `recordName serial atomName residueName [chainID] residueNumber X Y Z charge radius`. Supported
-//! deviations, which PDB2PQR writes: a serial number that touches the record name (`HETATM10000`), and a chain that
-//! touches the residue number (`A1000`). Serial numbers are ignored. Radii replace those of the table. Charges are only
-//! checked.
+//! deviations: a serial number that touches the record name (`HETATM10000`), a chain that touches the residue number
+//! (`A1000`), and fields that touch each other in the columns of PDB up to the coordinates. Serial numbers are ignored.
+//! Radii replace those of the table. Charges are only checked.
 
 use std::collections::HashMap;
+use std::ops::Range;
 
-use super::annotations::Annotations;
-use super::assembly::Assemblies;
-use super::atoms::{Atom, SourceFields, SourceFormat, Structure};
+use super::atoms::{Atom, Structure};
 use super::contents::Kind;
 use super::element::{self, AtomName};
 use super::error::StructureError;
 use super::fields::{Fields, Rows, TextLines};
-use super::kinds::Sequence;
+use super::models::{self, Mark, ModelBoundary};
 use super::number::{self, single};
-use super::read::Reading;
-use super::text::Fault;
-use crate::surface::OutOfMemory;
+use super::read::{MAX_COORDINATE, Reading};
+use super::source::SourceFields;
+use super::source::SourceFormat;
+use super::text::{Fault, trimmed};
+use crate::surface::{MemoryMeter as _, OutOfMemory};
 
 /// Maximum valid radius, Å. Larger numbers are probably from another column.
 const MAX_RADIUS: f64 = 100.0;
+
+/// Maximum radius of an atom of a force field, Å.
+const PLAUSIBLE_RADIUS: f64 = 4.0;
 
 /// Typical length of a line, bytes.
 const BYTES_PER_LINE: usize = 64;
@@ -40,34 +44,171 @@ fn record(fields: &Fields<'_>) -> Option<(bool, usize)> {
     serial.iter().all(u8::is_ascii_digit).then_some((hetero, if touches { 1 } else { 2 }))
 }
 
+/// Columns of the coordinates in PDB files, before which the fields of a line may touch each other.
+const COORDINATES: [usize; 3] = [30, 38, 46];
+const COORDINATES_END: usize = 54;
+/// Ends of the columns of the names of atom and residue in PDB files.
+const NAME_END: usize = 16;
+const RESIDUE_END: usize = 21;
+
+/// Fields of an atom as byte ranges of the text.
+#[derive(Debug, Clone, Copy)]
+struct AtomFields {
+    name: (usize, usize),
+    residue: (usize, usize),
+    chain: (usize, usize),
+    /// Residue number with its insertion code.
+    number: (usize, usize),
+    position: [(usize, usize); 3],
+    charge: (usize, usize),
+    radius: (usize, usize),
+    /// Element symbol after the radius; empty in most files.
+    element: (usize, usize),
+}
+
+impl AtomFields {
+    /// Finds the fields of a line, by white space or else by the columns of PDB; `None` if it has none of these forms.
+    /// `first` is the number of fields before the atom name.
+    fn find(text: &[u8], fields: &Fields<'_>, first: usize) -> Option<Self> {
+        let found = Self::by_white_space(text, fields, first);
+        // A name that crosses the end of its columns touches the next one.
+        let crosses =
+            |(start, end): (usize, usize), column: usize| (start + 1..end).contains(&(fields.line().start + column));
+        let is_whole = |found: &Self| !crosses(found.name, NAME_END) && !crosses(found.residue, RESIDUE_END);
+        match found {
+            Some(found) if is_whole(&found) => Some(found),
+            found => Self::by_columns(text, fields.line()).or(found),
+        }
+    }
+
+    fn by_white_space(text: &[u8], fields: &Fields<'_>, first: usize) -> Option<Self> {
+        let has_element = fields.len() > first && is_element(fields.get(fields.len() - 1));
+        let n = fields.len().saturating_sub(first + usize::from(has_element));
+        let number = first + n.checked_sub(6)?;
+        if !FIELDS.contains(&n) || !(number + 1..number + 6).all(|i| fields.real(i).is_some()) {
+            return None;
+        }
+        let (start, end) = fields.range(number);
+        let touches = n == FIELDS[0] && text[start].is_ascii_alphabetic();
+        let (chain, start) = match (n == FIELDS[1], touches) {
+            (true, _) => (fields.range(number - 1), start),
+            (false, true) => ((start, start + 1), start + 1),
+            (false, false) => ((start, start), start),
+        };
+        Some(Self {
+            name: fields.range(first),
+            residue: fields.range(first + 1),
+            chain,
+            number: (start, end),
+            position: [1, 2, 3].map(|k| fields.range(number + k)),
+            charge: fields.range(number + 4),
+            radius: fields.range(number + 5),
+            element: if has_element { fields.range(number + 6) } else { (start, start) },
+        })
+    }
+
+    /// Uses the columns of PDB up to the coordinates. Residue names may have five letters, as there are no alternative
+    /// locations.
+    fn by_columns(text: &[u8], line: Range<usize>) -> Option<Self> {
+        let end = line.start + COORDINATES_END;
+        if line.end < end {
+            return None;
+        }
+        let rest = Fields::split(text, end..line.end);
+        let field = |from: usize, to: usize| {
+            let (start, end) = trimmed(&text[line.start + from..line.start + to]);
+            (line.start + from + start, line.start + from + end)
+        };
+        let found = Self {
+            name: field(12, 16),
+            residue: field(16, 21),
+            chain: field(21, 22),
+            number: field(22, 27),
+            position: COORDINATES.map(|from| field(from, from + 8)),
+            charge: rest.range(0),
+            radius: rest.range(1),
+            element: rest.range(2),
+        };
+        let is_number = |(start, end): (usize, usize)| start < end && number::real(text, start, end).is_some();
+        let numbers = || found.position.into_iter().chain([found.charge, found.radius]);
+        let is_end = rest.len() == 2 || (rest.len() == 3 && is_element(rest.get(2)));
+        (is_end && numbers().all(is_number)).then_some(found)
+    }
+}
+
+/// Returns true for a field that is an element symbol, which some programs write after the radius.
+fn is_element(field: &[u8]) -> bool {
+    field.len() <= 2 && field.iter().all(u8::is_ascii_alphabetic) && element::stated(field).is_some()
+}
+
 /// Returns true if the first atom of a PDB or PQR file indicates PQR: it has the fields of PQR and either lacks the
 /// columns of PDB or has more decimals than PDB.
 pub(super) fn is_pqr(head: &[u8]) -> bool {
     for line in TextLines::new(head) {
         let fields = Fields::split(head, line.clone());
-        if let Some((_, first)) = record(&fields) {
-            let n = fields.len().saturating_sub(first);
-            let last = first + n;
-            if !FIELDS.contains(&n) || !(last - 5..last).all(|i| fields.real(i).is_some()) {
-                return false;
-            }
-            // A PDB line without a B-factor has the same number of fields, but another column where PQR has the charge.
-            let after_coordinates = fields.range(last - 2).0 >= line.start + 54;
-            let precise = (last - 2..last).any(|i| decimals(fields.get(i)) > 2);
-            return !has_pdb_columns(&head[line]) || (after_coordinates && precise);
-        }
+        let Some((_, first)) = record(&fields) else { continue };
+        let Some(found) = AtomFields::find(head, &fields, first) else { return false };
+        // A PDB line without a B-factor has the same number of fields, but another column where PQR has the charge.
+        let after_coordinates = found.charge.0 >= line.start + COORDINATES_END;
+        let precise = [found.charge, found.radius].iter().any(|&(start, end)| decimals(&head[start..end]) > 2);
+        let has_number = residue_number(&head[found.number.0..found.number.1]).is_some();
+        let line = &head[line];
+        // An element follows the B-factor of many PDB lines, so other columns than those of PDB are no proof.
+        let is_certain = if found.element.0 < found.element.1 {
+            crosses_columns(line) && !line.contains(&b'\t')
+        } else {
+            !has_pdb_columns(line) || (after_coordinates && precise)
+        };
+        return has_number && is_certain;
     }
     false
 }
 
-/// Returns true if the columns of coordinates, occupancy and B-factor hold numbers.
+/// Returns a warning if the occupancies and B-factors of a PDB file may be the charges and radii of PQR: the first
+/// atoms have no other fields after them, B-factors that could be radii, and occupancies that differ.
+pub(super) fn ambiguity(text: &[u8]) -> Option<String> {
+    const LINES: usize = 1000;
+    let mut charges = Vec::new();
+    for line in TextLines::new(text).take(LINES) {
+        let fields = Fields::split(text, line.clone());
+        let Some((_, first)) = record(&fields) else { continue };
+        let found =
+            AtomFields::find(text, &fields, first).filter(|found| found.charge.0 >= line.start + COORDINATES_END)?;
+        let radius = number::real(text, found.radius.0, found.radius.1)?;
+        if !(0.0..=PLAUSIBLE_RADIUS).contains(&radius) {
+            return None;
+        }
+        let charge = &text[found.charge.0..found.charge.1];
+        if radius > 0.0 && !charges.contains(&charge) {
+            charges.push(charge);
+        }
+    }
+    (charges.len() > 1).then(|| {
+        "the occupancies and B-factors may be the charges and radii of a PQR file; read as PDB, with radii of elements"
+            .to_owned()
+    })
+}
+
+/// Returns true if the columns of coordinates, occupancy and B-factor hold numbers, and no number crosses the end of
+/// the occupancy or of the B-factor.
 fn has_pdb_columns(line: &[u8]) -> bool {
     let number = |from: usize, to: usize| {
         let column = line.get(from..to.min(line.len())).unwrap_or_default().trim_ascii();
         (column.is_empty(), number::real(column, 0, column.len()).is_some())
     };
-    [30, 38, 46].into_iter().all(|from| number(from, from + 8).1)
+    COORDINATES.into_iter().all(|from| number(from, from + 8).1)
         && [54, 60].into_iter().all(|from| matches!(number(from, from + 6), (true, _) | (_, true)))
+        && !crosses_columns(line)
+}
+
+/// Returns true if a number crosses the end of the occupancy or of the B-factor of PDB.
+fn crosses_columns(line: &[u8]) -> bool {
+    [60, 66].into_iter().any(|border| {
+        let is_inside = |i: &usize| line.get(*i).is_some_and(|b| *b > b' ');
+        let start = (0..border).rev().take_while(is_inside).last();
+        let end = (border..line.len()).take_while(is_inside).last();
+        start.zip(end).is_some_and(|(start, end)| number::real(line, start, end + 1).is_some())
+    })
 }
 
 /// Returns the number of decimals. In PDB, occupancies and B-factors have two; in PQR, charges and radii have three or
@@ -84,15 +225,25 @@ fn decimals(field: &[u8]) -> usize {
 pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     let expected = text.len() / BYTES_PER_LINE + 1;
     let mut file = Pqr { rows: Rows::new(reading, expected), guesses: HashMap::new(), model: 1 };
-    let (mut radii, mut ended) = (Vec::new(), false);
+    let (mut radii, mut marks) = (Vec::new(), Vec::new());
     for line in TextLines::new(text) {
         file.rows.count_line()?;
         let fields = Fields::split(text, line);
         let Some((hetero, first)) = record(&fields) else {
-            ended |= matches!(fields.get(0), b"MODEL" | b"ENDMDL" | b"END") && file.rows.len() > 0;
+            let boundary = match fields.get(0) {
+                b"MODEL" | b"ENDMDL" => ModelBoundary::Ends,
+                b"END" => ModelBoundary::EndsPart,
+                _ => continue,
+            };
+            let mark = Mark { row: file.rows.len(), boundary };
+            if marks.last() != Some(&mark) {
+                reading.text.grow(size_of::<Mark>() as u64)?;
+                marks.push(mark);
+            }
             continue;
         };
-        file.model += i32::from(std::mem::take(&mut ended));
+        // The final number follows from all parts. Until then, atoms of different parts may have the same position.
+        file.model = i32::try_from(marks.len()).unwrap_or(i32::MAX);
         let (atom, radius) = file.atom(text, &fields, hetero, first).map_err(|fault| fault.locate(text))?;
         file.rows.push(&atom)?;
         if radii.len() == radii.capacity() {
@@ -103,16 +254,8 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         }
         radii.push(radius);
     }
-    file.rows.finish(SourceFields {
-        format: SourceFormat::Pqr,
-        id: None,
-        title: None,
-        sequence: Sequence::default(),
-        assemblies: Assemblies::default(),
-        annotations: Annotations::default(),
-        radii,
-        warnings: Vec::new(),
-    })
+    models::number(&marks, file.rows.columns_mut());
+    file.rows.finish(SourceFields { radii, ..SourceFields::new(SourceFormat::Pqr) })
 }
 
 /// State of reading.
@@ -132,41 +275,56 @@ impl Pqr<'_> {
         hetero: bool,
         first: usize,
     ) -> Result<(Atom, f32), Box<Fault>> {
-        let n = fields.len().saturating_sub(first);
-        if !FIELDS.contains(&n) {
-            // A serial number that touches the record name is no field of its own.
-            let [fewest, most] = FIELDS.map(|n| n + first);
-            let expected = format!(
-                "{fewest} or {most} fields: record, serial, atom, residue, chain (optional), residue number, x, y, z, \
-                 charge and radius"
-            );
-            return Err(Fault::words(fields.range(0).0, format!("{} fields", fields.len()), expected));
+        let found = AtomFields::find(text, fields, first).ok_or_else(|| fields_fault(fields, first))?;
+        let fault = |(start, end): (usize, usize), expected: String| Fault::token(text, start, end, expected);
+        let (start, end) = found.number;
+        let (residue_number, insertion_code) = residue_number(&text[start..end])
+            .ok_or_else(|| fault(found.number, "a residue number, with an optional insertion code".to_owned()))?;
+        let mut position = [0.0; 3];
+        for ((value, field), axis) in position.iter_mut().zip(found.position).zip(["x", "y", "z"]) {
+            *value = number::real(text, field.0, field.1)
+                .filter(|value| value.abs() <= MAX_COORDINATE)
+                .ok_or_else(|| fault(field, format!("the {axis} coordinate in Å, within ±{MAX_COORDINATE}")))?;
         }
-        let number = first + n - 6;
-        let (start, end) = fields.range(number);
-        let touches = n == FIELDS[0] && text[start].is_ascii_alphabetic();
-        let (chain, digits) = match (n == FIELDS[1], touches) {
-            (true, _) => (fields.range(number - 1), start),
-            (false, true) => ((start, start + 1), start + 1),
-            (false, false) => ((start, start), start),
-        };
-        let (residue_number, insertion_code) = residue_number(&text[digits..end])
-            .ok_or_else(|| fields.fault(number, "a residue number, with an optional insertion code"))?;
-        let position = fields.position(number + 1)?;
-        fields.real(number + 4).ok_or_else(|| fields.fault(number + 4, "the charge in e"))?;
-        let radius = fields.real(number + 5).filter(|radius| (0.0..=MAX_RADIUS).contains(radius));
-        let radius =
-            radius.ok_or_else(|| fields.fault(number + 5, format!("the radius in Å, from 0 to {MAX_RADIUS}")))?;
+        let radius = number::real(text, found.radius.0, found.radius.1).filter(|r| (0.0..=MAX_RADIUS).contains(r));
+        let radius = radius.ok_or_else(|| fault(found.radius, format!("the radius in Å, from 0 to {MAX_RADIUS}")))?;
         let tables = &mut self.rows.tables;
-        let ((a, b), (c, d)) = (fields.range(first), fields.range(first + 1));
-        let (name, residue) = (tables.name.intern(text, a, b), tables.residue.intern(text, c, d));
-        let chain = tables.chain.intern(text, chain.0, chain.1);
-        let element = *self.guesses.entry((name, residue)).or_insert_with(|| {
-            element::guess(AtomName { text: fields.get(first), columns: None }, tables.residue.text(residue))
-        });
+        let name = tables.name.intern(text, found.name.0, found.name.1);
+        let residue = tables.residue.intern(text, found.residue.0, found.residue.1);
+        let chain = tables.chain.intern(text, found.chain.0, found.chain.1);
+        let stated = element::stated(&text[found.element.0..found.element.1]);
+        let guess = || {
+            let name = AtomName { text: &text[found.name.0..found.name.1], columns: None };
+            element::guess(name, tables.residue.text(residue))
+        };
+        let element = stated.unwrap_or_else(|| *self.guesses.entry((name, residue)).or_insert_with(guess));
         let plain = self.rows.atom(position, element, name, self.model);
         let kind = if hetero { Kind::Ligand } else { Kind::Polymer };
         Ok((Atom { residue, chain, residue_number, insertion_code, hetero, kind, ..plain }, single(radius)))
+    }
+}
+
+/// Returns the fault of a line that does not have the fields of PQR: their number, or the first that is no number.
+#[cold]
+#[expect(clippy::unnecessary_box_returns, reason = "a boxed fault keeps results small")]
+fn fields_fault(fields: &Fields<'_>, first: usize) -> Box<Fault> {
+    let n = fields.len().saturating_sub(first);
+    if !FIELDS.contains(&n) {
+        // A serial number that touches the record name is no field of its own.
+        let [fewest, most] = FIELDS.map(|n| n + first);
+        let expected = format!(
+            "{fewest} or {most} fields: record, serial, atom, residue, chain (optional), residue number, x, y, z, charge \
+             and radius"
+        );
+        return Fault::words(fields.range(0).0, format!("{} fields", fields.len()), expected);
+    }
+    let numbers = first + n - 5;
+    if let Err(fault) = fields.position(numbers) {
+        return fault;
+    }
+    match fields.real(numbers + 3) {
+        None => fields.fault(numbers + 3, "the charge in e"),
+        Some(_) => fields.fault(numbers + 4, format!("the radius in Å, from 0 to {MAX_RADIUS}")),
     }
 }
 
@@ -181,9 +339,9 @@ fn residue_number(field: &[u8]) -> Option<(i32, u8)> {
 #[cfg(test)]
 #[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
-    use super::super::atoms::SourceFormat;
     use super::super::read::{ReadLimits, read};
     use super::super::select::{Selection, select};
+    use super::super::source::SourceFormat;
     use super::*;
 
     const FILE: &str = "REMARK   1 PQR file generated by PDB2PQR\n\
@@ -213,7 +371,12 @@ mod tests {
         assert_eq!(texts(&s.chain), ["A", "A", "A", "", "A", ""]);
         assert_eq!(s.residue_number, [1, 1, -2, 7, 1000, 1]);
         assert_eq!(s.insertion_code, [0, 0, b'B', 0, 0, 0]);
-        assert_eq!(s.model, [1, 1, 1, 1, 1, 2]);
+        // END separates frames only if they have the same atoms.
+        assert_eq!(s.model, [1; 6]);
+        assert_eq!(parse(&FILE.repeat(2)).unwrap().model[..7], [1; 7]);
+        let frame = "ATOM 1 C GLY 1 0 0 0 0 2\nEND\n";
+        assert_eq!(parse(&frame.repeat(3)).unwrap().model, [1, 2, 3]);
+        assert_eq!(parse(&FILE.replace("TER", "ENDMDL")).unwrap().model, [1, 1, 1, 2, 2, 3]);
         assert_eq!(s.hetero, [false, false, false, true, false, false]);
         let kinds: Vec<&str> = s.kind.iter().map(|kind| kind.name()).collect();
         assert_eq!(kinds, ["protein", "virtual", "protein", "ion", "water", "protein"]);
@@ -223,8 +386,8 @@ mod tests {
     fn spheres_have_the_radii_of_the_file() {
         let s = parse(FILE).unwrap();
         let selected = select(&s, &Selection::default()).unwrap();
-        assert_eq!(selected.atoms, [0, 2]);
-        assert_eq!(selected.spheres(&s).unwrap().radii(), [1.824, 1.9]);
+        assert_eq!(selected.atoms, [0, 2, 5]);
+        assert_eq!(selected.spheres(&s).unwrap().radii(), [1.824, 1.9, 2.0]);
         // Control: the same atom in a PDB file has the radius of the table.
         let pdb = parse("ATOM      1  N   ARG A   1      32.231  15.281 -13.143  1.00 28.28           N\n").unwrap();
         let selected = select(&pdb, &Selection::default()).unwrap();
@@ -253,8 +416,7 @@ mod tests {
             "ATOM 1 N ARG 1 32.2 15.3 -13.1 1.00 28.28",
             "HETATM12345  N   ARG A   1      32.231  15.281 -13.143  0.0000 1.5000",
         ] {
-            let text = pqr.replace("-13.143-0.300", "-13.143 -0.300");
-            assert_eq!(format(&text), SourceFormat::Pqr, "{pqr}");
+            assert_eq!(format(pqr), SourceFormat::Pqr, "{pqr}");
         }
     }
 

@@ -39,6 +39,11 @@ impl Site {
     }
 }
 
+/// Returns true if an atom with this name and without a known element is a virtual site in residues other than water.
+pub(super) fn is_site(name: &str) -> bool {
+    Site::of(name) != Site::InWater
+}
+
 /// CHARMM name for the charge site of four-site water models. Its first letter suggests an oxygen.
 const OXYGEN_LIKE: &str = "OM";
 
@@ -48,18 +53,20 @@ fn by_name(columns: &mut Columns, tables: &Tables) {
         return;
     }
     let sites: Vec<Site> = tables.name.texts().map(Site::of).collect();
-    let water: Vec<bool> = tables.residue.texts().map(residue::is_water).collect();
     let polymer: Vec<bool> = tables.residue.texts().map(residue::is_polymer).collect();
     for i in 0..columns.len() {
         let (name, residue) = (columns.name[i], columns.residue[i] as usize);
+        let is_water = columns.kind[i] == Kind::Water;
         let site = if columns.element[i] == 0 {
             match sites[name as usize] {
                 Site::Anywhere => true,
-                Site::InPolymer => polymer[residue] || water[residue],
-                Site::InWater => water[residue],
+                Site::InPolymer => polymer[residue] || is_water,
+                Site::InWater => is_water,
             }
         } else {
-            oxygen_like && water[residue] && tables.name.text(name) == OXYGEN_LIKE
+            oxygen_like
+                && tables.name.text(name) == OXYGEN_LIKE
+                && residue::is_water(tables.residue.text(columns.residue[i]))
         };
         if site {
             columns.kind[i] = Kind::VirtualSite;

@@ -1,7 +1,7 @@
 //! Detection of the file format of decompressed bytes from their content.
 
-use super::atoms::SourceFormat;
 use super::error::StructureError;
+use super::source::SourceFormat;
 use super::text::quote;
 use super::{pqr, xyz};
 
@@ -31,6 +31,9 @@ pub(super) fn sniff(text: &[u8]) -> Result<SourceFormat, StructureError> {
     let head = &text[..text.len().min(LOOKED_AT)];
     if is_cif(head) {
         return Ok(SourceFormat::Mmcif);
+    }
+    if let Some(name) = molecule_file(head) {
+        return unknown(name.to_owned());
     }
     // The comment of an XYZ file may begin with the name of a PDB record.
     if xyz::is_xyz(head) {
@@ -116,6 +119,17 @@ fn binary(bytes: &[u8]) -> Option<String> {
     (odd * 10 > head.len()).then(|| format!("binary data beginning with {}", hex(head)))
 }
 
+/// Names file formats of small molecules, whose comments may look like other formats.
+fn molecule_file(head: &[u8]) -> Option<&'static str> {
+    let lines = || head.split(|&b| b == b'\n');
+    if lines().any(|line| line.starts_with(b"@<TRIPOS>")) {
+        return Some("Tripos MOL2");
+    }
+    // The fourth line has the version.
+    let counts = lines().nth(3)?.trim_ascii_end();
+    (counts.ends_with(b" V2000") || counts.ends_with(b" V3000")).then_some("an MDL molfile (SDF)")
+}
+
 /// Names unsupported text formats, recognized by typical words.
 fn words(head: &[u8]) -> String {
     let trimmed = head.trim_ascii_start();
@@ -129,12 +143,6 @@ fn words(head: &[u8]) -> String {
     }
     if lower.starts_with(b"{") || lower.starts_with(b"[") {
         return "JSON".to_owned();
-    }
-    if has(b"@<TRIPOS>") {
-        return "Tripos MOL2".to_owned();
-    }
-    if has(b" V2000") || has(b" V3000") {
-        return "an MDL molfile (SDF)".to_owned();
     }
     let line = trimmed.split(|&b| b == b'\n' || b == b'\r').next().unwrap_or_default();
     format!("text beginning with {}", quote(line))

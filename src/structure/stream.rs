@@ -12,12 +12,13 @@ use std::sync::Arc;
 use self::lines::{TagsAfterAtoms, end_of_rows, rows};
 use super::annotations::Annotations;
 use super::assembly::Assemblies;
-use super::atoms::{SourceFormat, Structure};
+use super::atoms::Structure;
 use super::bcif::{self, RowStream, Skeleton};
 use super::decoder::Decoder;
+use super::divisions::{self, BlockFindings};
 use super::error::StructureError;
-use super::kinds::{self, HeteroBlocks};
 use super::read::{ReadLimits, Reading, check, of_text, without_mark};
+use super::source::SourceFormat;
 use super::texts::TextColumn;
 use super::{duplicates, mmcif, sniff};
 use crate::surface::{Control, MemoryMeter as _, Reservation};
@@ -68,6 +69,8 @@ impl Block {
             model: Vec::new(),
             hetero: Vec::new(),
             kind: Vec::new(),
+            starts_residue: Vec::new(),
+            unread: s.unread,
             assemblies: Assemblies::default(),
             annotations: Annotations::default(),
             warnings: Vec::new(),
@@ -116,7 +119,7 @@ pub struct Blocks<'a> {
     /// True at the end of the input.
     at_end: bool,
     finished: bool,
-    hetero: HeteroBlocks,
+    findings: BlockFindings,
     /// True to reject helices and strands after the atoms.
     needs_secondary: bool,
     tags: TagsAfterAtoms,
@@ -150,7 +153,7 @@ impl<'a> Blocks<'a> {
             lines: 0,
             at_end: false,
             finished: false,
-            hetero: HeteroBlocks::default(),
+            findings: BlockFindings::default(),
             needs_secondary,
             tags: TagsAfterAtoms::default(),
             assemblies: Assemblies::default(),
@@ -252,14 +255,14 @@ impl<'a> Blocks<'a> {
             if structure.len() != n_rows && !is_whole {
                 return Err(not_lines(&format!("{} rows in {n_rows} lines", structure.len())));
             }
-            let len = if is_last { Some(structure.len()) } else { kinds::last_division(&structure) };
+            let len = if is_last { Some(structure.len()) } else { divisions::last_division(&structure) };
             let Some(len) = len else {
                 // All residues depend on each other.
                 size = size.saturating_mul(2);
                 continue;
             };
             if !is_whole {
-                self.hetero.add(&reading);
+                self.findings.add(&reading);
             }
             // Subtracts the memory of reading first.
             drop(reading);
@@ -309,7 +312,7 @@ impl<'a> Blocks<'a> {
 
     /// Reads the rest of the data block, from `end` of the text on, and rejects categories that change the atoms.
     fn end(&mut self, end: usize, control: &Control<'_>) -> Result<(), StructureError> {
-        self.hetero.check("the categories `entity` and `struct_asym` before the atoms")?;
+        self.findings.check("the categories `entity` and `struct_asym` before the atoms")?;
         let head = self.head.unwrap_or(0);
         self.text.drain(head..end);
         self.memory.grow(head as u64)?;
@@ -324,10 +327,10 @@ impl<'a> Blocks<'a> {
             let whole = if self.at_end { self.text.len() } else { newline.map_or(0, |i| searched + i + 1) };
             let kept = self.tags.assemblies.len();
             for line in self.text[..whole].split_inclusive(|&b| b == b'\n') {
-                is_last = is_last || self.tags.is_last(line, self.needs_secondary)?;
+                self.tags.add(line, self.needs_secondary)?;
             }
             self.memory.grow((self.tags.assemblies.len() - kept) as u64)?;
-            is_last |= self.at_end;
+            is_last = self.at_end;
             self.text.drain(..whole);
             // The rest has no newline.
             searched = self.text.len();

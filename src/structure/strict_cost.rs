@@ -3,7 +3,8 @@
 
 use rustc_hash::FxHashMap;
 
-use super::atoms::{SourceFormat, Structure};
+use super::atoms::Structure;
+use super::source::SourceFormat;
 
 /// Maximum number of search steps: about a second.
 const MAX_STEPS: u64 = 1_000_000_000;

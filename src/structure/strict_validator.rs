@@ -24,9 +24,9 @@ use std::time::{Duration, Instant};
 
 use pdbtbx::{Context, ErrorLevel, Format, PDBError, ReadOptions, StrictnessLevel};
 
-use super::atoms::SourceFormat;
 use super::error::StructureError;
 use super::read::{self, ReadLimits, Reading, without_mark};
+use super::source::SourceFormat;
 use super::strict_cost::{Cost, count};
 use super::text::decode;
 use super::{inflate, sniff};

@@ -139,7 +139,7 @@ impl Interner {
     }
 
     /// Returns the id of `text`, and adds it if it is new.
-    fn number(&mut self, text: &str) -> u32 {
+    pub(super) fn number(&mut self, text: &str) -> u32 {
         let known = self.texts.get_index_of(text);
         let id = known.unwrap_or_else(|| self.texts.insert_full(text.into()).0);
         // The atom limit of the reader keeps the number of distinct texts below 2³².
@@ -151,9 +151,84 @@ impl Interner {
         other.texts().map(|text| self.number(text)).collect()
     }
 
+    /// Returns a column whose texts are parts of those of the table, so that several ids may have equal texts.
+    pub(super) fn column_of(self, ids: Vec<u32>, part: impl Fn(&str) -> &str) -> TextColumn {
+        TextColumn { ids, texts: self.texts().map(|text| part(text).into()).collect() }
+    }
+
     pub(super) fn column(self, ids: Vec<u32>) -> TextColumn {
         TextColumn { ids, texts: self.texts.into_iter().collect() }
     }
+}
+
+/// String tables that atoms refer to while a file is read.
+#[derive(Debug, Default)]
+pub(super) struct Tables {
+    pub(super) name: Interner,
+    pub(super) residue: Interner,
+    pub(super) chain: Interner,
+    pub(super) label_chain: Interner,
+    /// Entity of each text of `label_chain`; empty if it is unknown. No entries if the atoms do not state entities.
+    pub(super) entities: Vec<Box<str>>,
+}
+
+impl Tables {
+    /// Returns the number of distinct texts in all tables.
+    pub(super) fn n_texts(&self) -> usize {
+        let tables = [&self.name, &self.residue, &self.chain, &self.label_chain];
+        tables.map(|table| table.texts().len()).iter().sum::<usize>() + self.entities.len()
+    }
+
+    /// Adds the texts of `other`. Returns, for each table, the new ids by the ids in `other`.
+    pub(super) fn adopt(&mut self, other: &Self) -> [Vec<u32>; 4] {
+        let label_chains = if other.entities.is_empty() {
+            self.label_chain.adopt(&other.label_chain)
+        } else {
+            let pairs = other.label_chain.texts().zip(other.entities.iter().map(AsRef::as_ref));
+            let adopt = |(text, entity): (&str, &str)| {
+                let chain = without_entity(text).as_bytes();
+                self.chain_of_entity((chain, 0, chain.len()), entity.as_bytes())
+            };
+            pairs.map(adopt).collect()
+        };
+        [self.name.adopt(&other.name), self.residue.adopt(&other.residue), self.chain.adopt(&other.chain), label_chains]
+    }
+
+    /// Returns the id of a chain (`label_asym_id`), a range of a text, of which an atom states the entity. Atoms of one
+    /// chain that state different entities have different ids.
+    #[inline]
+    pub(super) fn chain_of_entity(&mut self, (text, start, end): (&[u8], usize, usize), entity: &[u8]) -> u32 {
+        let id = self.label_chain.intern(text, start, end);
+        match self.entities.get(id as usize) {
+            Some(known) if known.as_bytes() == entity => id,
+            Some(_) => self.chain_of_other_entity(id, entity),
+            None => {
+                self.entities.push(text::decode(entity).into());
+                id
+            }
+        }
+    }
+
+    #[cold]
+    fn chain_of_other_entity(&mut self, chain: u32, entity: &[u8]) -> u32 {
+        let entity = text::decode(entity);
+        if *self.entities[chain as usize] == *entity {
+            return chain;
+        }
+        let id = self.label_chain.number(&format!("{}{ENTITY_MARK}{entity}", self.label_chain.text(chain)));
+        if id as usize == self.entities.len() {
+            self.entities.push(entity.into());
+        }
+        id
+    }
+}
+
+/// Separates the name of a chain from an entity that differs from that of its first atom. No decoded text contains it.
+const ENTITY_MARK: char = '\u{1f}';
+
+/// Returns the name of a chain, without an entity.
+pub(super) fn without_entity(text: &str) -> &str {
+    text.split(ENTITY_MARK).next().unwrap_or_default()
 }
 
 #[cfg(test)]

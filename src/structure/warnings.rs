@@ -5,7 +5,7 @@ use super::error::StructureError;
 /// Maximum number of warnings with their own message. A damaged file may have one per line.
 const KEPT: usize = 10;
 
-/// A fault, and the default that replaces the value.
+/// A fault, and how it was resolved, such as `read as 1`.
 #[derive(Debug, Clone)]
 pub(super) struct Warning<F> {
     pub(super) fault: F,
@@ -56,7 +56,7 @@ impl<F> Warnings<F> {
     pub(super) fn messages(self, locate: impl Fn(F) -> StructureError) -> Vec<String> {
         let more = self.total - self.kept.len() as u64;
         let kept = self.kept.into_iter();
-        let mut messages: Vec<String> = kept.map(|w| format!("{}; read as {}", locate(w.fault), w.used)).collect();
+        let mut messages: Vec<String> = kept.map(|w| format!("{}; {}", locate(w.fault), w.used)).collect();
         if more > 0 {
             messages.push(format!("{more} more values that could not be read"));
         }
@@ -71,7 +71,7 @@ mod tests {
 
     fn warnings(faults: std::ops::Range<u64>) -> Warnings<u64> {
         let mut warnings = Warnings::default();
-        faults.for_each(|i| warnings.add("1", || i));
+        faults.for_each(|i| warnings.add("read as 1", || i));
         warnings
     }
 

@@ -1,18 +1,17 @@
 //! Reader of XYZ files: frames of a line with the number of atoms, a comment line, and a line `El x y z` for each atom.
 //!
-//! Every frame is a model. Further fields of an atom are ignored. Extended XYZ is read if its `Properties` begin with
-//! the element and the position.
+//! Every frame is a model. Further fields of an atom are ignored. The `Properties` of extended XYZ tell which fields
+//! are the element and the position.
 
-use super::annotations::Annotations;
-use super::assembly::Assemblies;
-use super::atoms::{SourceFields, SourceFormat, Structure};
+use super::atoms::Structure;
 use super::element;
 use super::error::StructureError;
-use super::fields::{Fields, Rows, TextLines};
-use super::kinds::Sequence;
+use super::fields::{Fields, MAX_FIELDS, Rows, TextLines};
 use super::number;
 use super::pdb::MAX_TITLE;
 use super::read::Reading;
+use super::source::SourceFields;
+use super::source::SourceFormat;
 use super::text::{Fault, normalize};
 
 /// Length of the shortest atom line, bytes.
@@ -21,17 +20,24 @@ const MIN_LINE: usize = "C 0 0 0\n".len();
 /// Key of extended XYZ in the comment line.
 const PROPERTIES: &[u8] = b"Properties=";
 
-/// Required beginning of its value.
-const SPECIES_AND_POSITION: &[u8] = b"species:S:1:pos:R:3";
+/// Fields of an atom line.
+#[derive(Debug, Clone, Copy)]
+struct AtomFields {
+    element: usize,
+    /// The first of three fields.
+    position: usize,
+}
 
 /// Returns true if the text begins with a line with one integer, any second line and an atom line.
 pub(super) fn is_xyz(head: &[u8]) -> bool {
-    let mut lines = TextLines::new(head).map(|line| Fields::split(head, line));
-    let (Some(count), Some(_comment), Some(atom)) = (lines.next(), lines.next(), lines.next()) else { return false };
+    let mut lines = TextLines::new(head);
+    let (Some(count), Some(comment), Some(atom)) = (lines.next(), lines.next(), lines.next()) else { return false };
+    let [count, atom] = [count, atom].map(|line| Fields::split(head, line));
     let is_element = atom.len() > 1 && (atomic_number(atom.get(0)) != 0);
+    let is_extended = memchr::memmem::find(&head[comment], PROPERTIES).is_some();
     count.len() == 1
         && number::integer(count.get(0)).is_some()
-        && (is_element || (1..4).all(|i| atom.real(i).is_some()))
+        && (is_extended || is_element || (1..4).all(|i| atom.real(i).is_some()))
 }
 
 /// Returns the atomic number of a symbol or a number; 0 if it is neither.
@@ -63,7 +69,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         let count = number_of_atoms(&fields).map_err(|fault| fault.locate(text))?;
         let rows = rows.get_or_insert_with(|| Rows::new(reading, count.min(text.len() / MIN_LINE) + 1));
         let comment = lines.next().ok_or_else(|| ends(text, "a comment line".to_owned()))?;
-        check_properties(text, comment.start, comment.end).map_err(|fault| fault.locate(text))?;
+        let of_frame = atom_fields(text, comment.start, comment.end).map_err(|fault| fault.locate(text))?;
         if model == 0 {
             title = normalize(&text[comment], MAX_TITLE);
         }
@@ -72,36 +78,38 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
             let line = lines.next().ok_or_else(|| ends(text, format!("atom {row} of {count}")))?;
             rows.count_line()?;
             let fields = Fields::split(text, line);
-            atom(text, &fields, rows, model)?;
+            atom(text, &fields, of_frame, rows, model)?;
         }
     }
     let Some(rows) = rows else {
         return Err(StructureError::NoAtoms { found: "an XYZ file of blank lines".to_owned() });
     };
-    rows.finish(SourceFields {
-        format: SourceFormat::Xyz,
-        id: None,
-        title,
-        sequence: Sequence::default(),
-        assemblies: Assemblies::default(),
-        annotations: Annotations::default(),
-        radii: Vec::new(),
-        warnings: Vec::new(),
-    })
+    rows.finish(SourceFields { title, ..SourceFields::new(SourceFormat::Xyz) })
 }
 
 /// Reads an atom.
-fn atom(text: &[u8], fields: &Fields<'_>, rows: &mut Rows<'_>, model: i32) -> Result<(), StructureError> {
+fn atom(
+    text: &[u8],
+    fields: &Fields<'_>,
+    of_frame: AtomFields,
+    rows: &mut Rows<'_>,
+    model: i32,
+) -> Result<(), StructureError> {
+    let AtomFields { element, position } = of_frame;
     if fields.len() == 0 {
         return Err(fields.fault(0, "an element and three coordinates").locate(text));
     }
-    let position = fields.position(1).map_err(|fault| fault.locate(text))?;
-    let z = atomic_number(fields.get(0));
-    let name = if z != 0 && fields.get(0)[0].is_ascii_digit() {
+    let position = fields.position(position).map_err(|fault| fault.locate(text))?;
+    let symbol = fields.get(element);
+    if symbol.is_empty() {
+        return Err(fields.fault(element, "an element").locate(text));
+    }
+    let z = atomic_number(symbol);
+    let name = if z != 0 && symbol[0].is_ascii_digit() {
         let symbol = element::symbol(z).as_bytes();
         rows.tables.name.intern(symbol, 0, symbol.len())
     } else {
-        let (start, end) = fields.range(0);
+        let (start, end) = fields.range(element);
         rows.tables.name.intern(text, start, end)
     };
     let atom = rows.atom(position, z, name, model);
@@ -118,14 +126,40 @@ fn number_of_atoms(fields: &Fields<'_>) -> Result<usize, Box<Fault>> {
     Ok(count)
 }
 
-/// Rejects extended XYZ whose columns have another order.
-fn check_properties(text: &[u8], start: usize, end: usize) -> Result<(), Box<Fault>> {
-    let Some(found) = memchr::memmem::find(&text[start..end], PROPERTIES) else { return Ok(()) };
-    let value = start + found + PROPERTIES.len();
-    if text[value..end].starts_with(SPECIES_AND_POSITION) {
-        return Ok(());
+/// Returns the fields of the atoms of a frame, by the `Properties` of extended XYZ in its comment, such as
+/// `species:S:1:pos:R:3:forces:R:3`.
+fn atom_fields(text: &[u8], start: usize, end: usize) -> Result<AtomFields, Box<Fault>> {
+    let Some(found) = memchr::memmem::find(&text[start..end], PROPERTIES) else {
+        return Ok(AtomFields { element: 0, position: 1 });
+    };
+    let start = start + found + PROPERTIES.len();
+    let quoted = text.get(start) == Some(&b'"');
+    let start = start + usize::from(quoted);
+    let is_end = |b: &u8| if quoted { *b == b'"' } else { *b <= b' ' };
+    let end = text[start..end].iter().position(is_end).map_or(end, |len| start + len);
+    let fault = |expected: &str| Fault::token(text, start, end, expected);
+    let mut words = text[start..end].split(|b| *b == b':');
+    let (mut element, mut position, mut field) = (None, None, 0_usize);
+    while let Some(name) = words.next() {
+        let (Some(kind), Some(width)) = (words.next(), words.next()) else {
+            return Err(fault("properties as triples such as species:S:1"));
+        };
+        let width = number::integer(width).and_then(|width| usize::try_from(width).ok()).filter(|width| *width > 0);
+        let width = width.ok_or_else(|| fault("a positive number of columns in each property"))?;
+        match (name, kind, width) {
+            (b"species", b"S", 1) | (b"Z", b"I", 1) => element = element.or(Some(field)),
+            (b"pos", b"R", 3) => position = position.or(Some(field)),
+            _ => {}
+        }
+        field = field.saturating_add(width);
     }
-    Err(Fault::token(text, value, end, "properties that begin with species:S:1:pos:R:3"))
+    match (element, position) {
+        (Some(element), Some(position)) if element < MAX_FIELDS && position + 3 <= MAX_FIELDS => {
+            Ok(AtomFields { element, position })
+        }
+        (Some(_), Some(_)) => Err(fault(&format!("species and pos among the first {MAX_FIELDS} columns"))),
+        _ => Err(fault("properties with species:S:1 (or Z:I:1) and pos:R:3")),
+    }
 }
 
 /// Returns the error for a file that ends too early.
@@ -166,12 +200,31 @@ mod tests {
     }
 
     #[test]
-    fn extended_files_are_read_if_the_position_follows_the_element() {
-        let frame =
-            |properties: &str| format!("1\nLattice=\"9 0 0\" Properties={properties} pbc=\"T\"\nC 1 2 3 0.5 x\n");
-        assert_eq!(parse(&frame("species:S:1:pos:R:3:charge:R:1")).unwrap().z, [3.0]);
-        let error = parse(&frame("pos:R:3:species:S:1")).unwrap_err().to_string();
-        assert!(error.starts_with("line 2, column 28: found `pos:R:3"), "{error}");
+    fn extended_files_are_read_in_any_order_of_columns() {
+        let frame = |properties: &str, row: &str| {
+            parse(&format!("1\nLattice=\"9 0 0\" Properties={properties} pbc=\"T\"\n{row}\n"))
+        };
+        for (properties, row) in [
+            ("species:S:1:pos:R:3:charge:R:1", "C 1 2 3 0.5 x"),
+            ("pos:R:3:species:S:1", "1 2 3 C"),
+            ("id:I:1:species:S:1:pos:R:3", "7 C 1 2 3"),
+            ("forces:R:3:pos:R:3:Z:I:1", "9 9 9 1 2 3 6"),
+            ("\"species:S:1:pos:R:3\"", "C 1 2 3"),
+        ] {
+            let s = frame(properties, row).unwrap();
+            assert_eq!((s.element[0], s.x[0], s.y[0], s.z[0]), (6, 1.0, 2.0, 3.0), "{properties}");
+        }
+        for (properties, expected) in [
+            ("pos:R:3:mass:R:1", "properties with species:S:1"),
+            ("species:S:1:pos", "properties as triples"),
+            ("species:S:0:pos:R:3", "a positive number of columns"),
+            ("stress:R:40:species:S:1:pos:R:3", "species and pos among the first 32 columns"),
+        ] {
+            let error = frame(properties, "C 1 2 3").unwrap_err().to_string();
+            assert!(error.starts_with("line 2, column 28: found") && error.contains(expected), "{error}");
+        }
+        let error = frame("pos:R:3:species:S:1", "1 2 3").unwrap_err().to_string();
+        assert!(error.ends_with("expected an element"), "{error}");
     }
 
     #[test]

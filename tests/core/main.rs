@@ -40,6 +40,7 @@ mod split;
 mod structure_archive;
 mod structure_assembly;
 mod structure_bcif;
+mod structure_cases;
 mod structure_hostile;
 mod structure_kinds;
 mod structure_mmcif;

@@ -350,6 +350,7 @@ fn entities_decide_at_any_place_in_the_file() {
 fn sequence_numbers_and_bonds_decide_without_entities() {
     let sample = structure(CIF);
     let unknown = modified_cif("LIG").replace("_struct_asym.entity_id", "_struct_asym.other_id");
+    let unknown = unknown.replace("_atom_site.label_entity_id", "_atom_site.other_id");
     assert_eq!(selected(&structure(&unknown)), selected(&sample), "bonds");
     // Far from its neighbours the residue is a ligand.
     let far = with_item(&unknown, "Cartn_x", |x, hetero| if hetero { "99.0".to_owned() } else { x.to_owned() });
@@ -404,7 +405,8 @@ fn single_ions_are_ions_in_any_record() {
     assert_eq!(structure(chlorophyll).kind, [Kind::Cofactor; 2]);
     // Control: a residue of neither metals nor halogens, and alpha carbons.
     for (name, residue, element, kind) in [
-        (" O  ", "O", "O", Kind::Ligand),
+        (" S  ", "S", "S", Kind::Ligand),
+        (" O  ", "O", "O", Kind::Water),
         ("XE  ", "XE", "XE", Kind::Ligand),
         ("SE  ", "MSE", "SE", Kind::Ligand),
         ("BR  ", "5BU", "C", Kind::Ligand),
@@ -454,7 +456,7 @@ fn residues_of_polymers_are_protein_or_nucleic_by_name_backbone_or_neighbour() {
     let listed = "SEQRES   1 A    2  GLY CRO\n".to_owned();
     assert_eq!(kinds(listed.clone() + &chromophore("HETATM")), [Kind::Protein]);
     assert_eq!(kinds(listed + &chromophore("ATOM")), [Kind::Protein]);
-    assert_eq!(kinds(chromophore("ATOM")), [Kind::Protein, Kind::Polymer]);
+    assert_eq!(kinds(chromophore("ATOM")), [Kind::Protein, Kind::Ligand]);
     assert_eq!(kinds(chromophore("HETATM")), [Kind::Protein, Kind::Ligand]);
     // A cofactor or saccharide in the sequence of the file is part of the polymer.
     for name in ["PNS", "NAG"] {

@@ -92,8 +92,10 @@ fn residue_numbers_wrap_in_three_ways() {
     assert_eq!(number("-1234"), (-1234, 0));
     assert_eq!(number("   1A"), (1, b'A'));
     assert_eq!(number("     "), (0, 0));
-    let error = refusal(CA.replace(" -12C", "**** "));
-    assert_eq!(error, "line 1, column 23: found `****`, expected a residue number, decimal or hybrid-36");
+    assert_eq!(number("271a "), (10_010, 0));
+    let s = pdb(CA.replace(" -12C", "**** "));
+    let warning = "line 1, column 23: found `****`, expected a residue number, decimal or hybrid-36; read as 0";
+    assert_eq!((s.residue_number[0], s.warnings), (0, vec![warning.to_owned()]));
 }
 
 #[test]
@@ -249,7 +251,7 @@ fn unreadable_occupancies_and_b_factors_are_warnings() {
     let tabbed = pdb(CA.replace("   0.500  0.50", "  0.5\t  x0 "));
     assert_eq!(tabbed.warnings.len(), 1, "{:?}", tabbed.warnings);
     let many = pdb(CA.replace("  0.50 20", "  x.50 20").repeat(1000));
-    assert_eq!((many.len(), many.warnings.len()), (1000, 11));
+    assert_eq!((many.len(), many.warnings.len()), (1000, 12));
     assert_eq!(many.warnings[9], format!("line 10, column 55: found `  x.50`, {occupancy}"));
     assert_eq!(many.warnings[10], "990 more values that could not be read");
 }

@@ -26,7 +26,7 @@ pub use scheme::{EXPECTED, Hydrophobicity, Scheme};
 pub use vertex::VertexProperty;
 
 use crate::structure::annotations::{Confidences, SecondaryRanges};
-use crate::structure::{Structure, element};
+use crate::structure::{KindSet, Structure, element};
 use crate::surface::Column;
 use of_blocks::{number, without_entities};
 use palette::Rgb;
@@ -158,8 +158,8 @@ pub struct AtomColors<'a> {
     secondary: Option<SecondaryRanges>,
     /// Confidences in a table of the file.
     confidences: Option<Confidences<'a>>,
-    /// Factor that converts B-factors to pLDDT from 0 to 100.
-    plddt_scale: f64,
+    /// Factor that converts B-factors to pLDDT from 0 to 100; `None` if they cannot be pLDDT.
+    plddt_scale: Option<f64>,
 }
 
 impl<'a> AtomColors<'a> {
@@ -217,8 +217,10 @@ impl<'a> AtomColors<'a> {
             return Err(fail(why.to_owned()));
         }
         let confidences = (scheme == Scheme::Plddt).then(|| Confidences::of(structure, selected)).flatten();
-        let of_b_factors = scheme == Scheme::Plddt && confidences.is_none();
-        let plddt_scale = if of_b_factors { plddt_scale(structure).map_err(fail)? } else { 1.0 };
+        let plddt_scale = match (scheme == Scheme::Plddt).then(|| plddt_scale(structure)) {
+            Some(Err(why)) if confidences.is_none() => return Err(fail(why)),
+            scale => scale.and_then(Result::ok),
+        };
         let column = match scheme {
             Scheme::BFactor => Some(&structure.b_factor),
             Scheme::Occupancy => Some(&structure.occupancy),
@@ -265,11 +267,13 @@ impl<'a> AtomColors<'a> {
         tables::secondary(self.secondary.as_ref().and_then(|ranges| ranges.get(self.structure, i)))
     }
 
-    /// Returns the pLDDT of atom `i`, 0 to 100; `None` if the table of the file lacks its residue.
+    /// Returns the pLDDT of atom `i`, 0 to 100. The table of a file may lack ligands, whose B-factors then count.
     fn plddt(&self, i: usize) -> Option<f64> {
-        match &self.confidences {
-            Some(confidences) => confidences.get(self.structure, i),
-            None => Some(f64::from(self.structure.b_factor[i]) * self.plddt_scale),
+        let of_table = self.confidences.as_ref().map(|confidences| confidences.get(self.structure, i));
+        match of_table {
+            Some(Some(value)) => Some(value),
+            Some(None) if KindSet::POLYMER.has(self.structure.kind[i]) => None,
+            _ => self.plddt_scale.map(|scale| f64::from(self.structure.b_factor[i]) * scale),
         }
     }
 
@@ -502,6 +506,12 @@ HETATM Xx X XYZ D W 71.0 1.0 16 0 0
         assert_eq!(found(&model("pLDDT in [0,1]", ["0.5", "0.699", "0.99"], [1, 2, 3])), of_table);
         // Without a scale in its name, values up to 1 are not on a scale to 100.
         assert_eq!(found(&model("pLDDT", ["0.5", "0.699", "0.99"], [1, 2, 3])), of_table);
+        // A ligand that the table lacks has its B-factor.
+        let text =
+            model("pLDDT", ["50", "69.9", "99"], [1, 2, 3]).replace("8 0 0\n", "8 0 0\nC C1 LIG B 1 1 80 40 0 0\n");
+        let with_ligand = structure(&text);
+        let colors = AtomColors::new(&with_ligand, &[0, 1, 2, 3], &coloring(&[("color", "plddt")])).unwrap();
+        assert_eq!([0, 2, 3].map(|i| format!("{:06x}", colors.rgb(i))), ["ff7d45", "0053d6", "65cbf3"]);
         let of_b_factors = ("ff7d45 ff7d45 ff7d45".to_owned(), "b_factor");
         assert_eq!(found(&model("PAE", ["50", "69.9", "99"], [1, 2, 3])), of_b_factors);
         assert_eq!(found(&model("pLDDT", ["50", "69.9", "99"], [11, 12, 13])), of_b_factors);
@@ -518,6 +528,16 @@ HETATM Xx X XYZ D W 71.0 1.0 16 0 0
         assert_eq!(legend.iter().map(|e| e.label.as_str()).collect::<Vec<_>>(), ["3-10 helix", "strand", "other"]);
         let error = AtomColors::new(&structure(CIF), &ALL, &scheme).err().unwrap();
         assert!(error.why.contains("no helices and strands"), "{error}");
+        // Ends in different chains.
+        let text = model("pLDDT", ["50"; 3], [1, 2, 3]);
+        let text =
+            text.replace("_struct_conf.end_auth_seq_id", "_struct_conf.end_auth_asym_id\n_struct_conf.end_auth_seq_id");
+        let text = text.replace("HELX_P A 1 1 5", "HELX_P A 1 B 1 5").replace("STRN A 2 2 ?", "STRN A 2 A 2 ?");
+        let crossing = structure(&text);
+        let colors = AtomColors::new(&crossing, &[0, 1, 2], &scheme).unwrap();
+        assert_eq!([0, 1].map(|i| format!("{:06x}", colors.rgb(i))), ["b0b0b0", "ffc800"]);
+        let warning = "ignored helices and strands whose ends are in different chains: residue 1 of chain `A` to residue 1 of chain `B`";
+        assert_eq!(crossing.warnings, [warning]);
     }
 
     #[test]

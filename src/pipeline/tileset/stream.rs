@@ -214,7 +214,7 @@ impl Tileset<Box<Structure>> {
             }
         }
         let BlockReader { selected, colors, spheres, head, assemblies, memory: _memory, .. } = reader;
-        let atoms_in_file = selected.n_atoms;
+        let atoms_in_file = selected.n_in_files();
         let assembly = match &job.selection.assembly {
             Some(id) => Some(AssemblyRules::find(&assemblies, &selected.chain_names(), id)?),
             None => None,

@@ -101,9 +101,14 @@ impl DecodedColumn<'_> {
     }
 
     /// Returns true if some row has no value.
-    pub(super) fn has_nulls(&self) -> bool {
+    fn has_nulls(&self) -> bool {
         self.mask.as_ref().is_some_and(|mask| mask.contains(&true))
             || matches!(&self.cells, Cells::Text(texts) if texts.ids.iter().any(|&id| id < 0))
+    }
+
+    /// Returns true if some row may have no usable value: no value, or text in a column of numbers.
+    pub(super) fn lacks_values(&self, texts: bool) -> bool {
+        self.has_nulls() || (!texts && matches!(self.cells, Cells::Text(_)))
     }
 
     /// Reserves capacity for `n` more rows.

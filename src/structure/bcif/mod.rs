@@ -25,13 +25,16 @@ use self::column::DecodedColumn;
 use self::column_stream::{DecodeLimits, Raw};
 use self::fault::Fault;
 use self::msgpack::Cursor;
-use super::atom_site::{Layout, Passed};
-use super::atoms::{Columns, SourceFields, SourceFormat, Structure};
+use super::atom_layout::Layout;
+use super::atoms::{Columns, Structure};
 use super::categories::{self, Categories};
+use super::data_blocks::{Passed, SPHERES, UnreadAtoms};
 use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
 use super::read::{ReadLimits, Reading};
+use super::source::SourceFields;
+use super::source::SourceFormat;
 use super::text::{decode, normalize};
 use crate::surface::MemoryMeter as _;
 
@@ -42,20 +45,28 @@ const MAX_UNUSED_TEXTS: usize = 1 << 20;
 
 /// Reads the first data block that has atoms with coordinates.
 pub(super) fn read(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
-    first_block(Cursor::new(bytes), |block, passed| block.structure(reading, passed))
+    structure(Cursor::new(bytes), reading)
 }
 
 /// Reads a file whose large byte strings are in the temporary file, as [`read`] does.
 pub(super) fn read_skeleton(skeleton: &Skeleton, reading: &Reading<'_>) -> Result<Structure, StructureError> {
-    first_block(Cursor::of_skeleton(skeleton), |block, passed| block.structure(reading, passed))
+    structure(Cursor::of_skeleton(skeleton), reading)
 }
 
-/// Applies `read` to the data blocks until it returns a value.
+fn structure(file: Cursor<'_>, reading: &Reading<'_>) -> Result<Structure, StructureError> {
+    let (mut structure, unread) = first_block(file, reading.limits, |block, passed| block.structure(reading, passed))?;
+    structure.unread.blocks = unread.counts.blocks;
+    structure.warnings.extend(unread.warnings());
+    Ok(structure)
+}
+
+/// Applies `read` to the data blocks until it returns a value. Returns the atoms of the blocks after that as well.
 fn first_block<T>(
     mut file: Cursor<'_>,
+    limits: &ReadLimits,
     read: impl Fn(&BinaryBlock<'_>, &mut Passed) -> Result<Option<T>, StructureError>,
-) -> Result<T, StructureError> {
-    let mut passed = Passed::default();
+) -> Result<(T, UnreadAtoms), StructureError> {
+    let (mut passed, mut unread) = (Passed::default(), UnreadAtoms::default());
     let (mut found, mut last, mut any) = (None, None, false);
     let frame = file.map(|key, value| {
         if key != b"dataBlocks" {
@@ -63,19 +74,23 @@ fn first_block<T>(
         }
         any = true;
         value.array(|_, at| {
-            // Data after the atoms must be well-formed, but is not used.
-            if found.is_none() {
-                passed.block();
-                let block = BinaryBlock::read(at, &mut passed)?;
-                found = read(&block, &mut passed).transpose();
-                last = block.name;
+            if found.is_some() {
+                // Data after the atoms must be well-formed, but is not used.
+                if let Ok(block) = BinaryBlock::read(&mut at.clone(), &mut Passed::default()) {
+                    unread.add_block(block.name.as_deref(), block.n_atoms(limits));
+                }
+                return Ok(());
             }
+            passed.block();
+            let block = BinaryBlock::read(at, &mut passed)?;
+            found = read(&block, &mut passed).transpose();
+            last = block.name;
             Ok(())
         })
     });
     frame.map_err(|fault| fault.within("BinaryCIF"))?;
     match found {
-        Some(value) => value,
+        Some(value) => value.map(|value| (value, unread)),
         None if any => Err(passed.no_atoms("BinaryCIF", last)),
         None => Err(Fault::new("nothing", "`dataBlocks`").within("BinaryCIF").into()),
     }
@@ -153,7 +168,7 @@ impl<'a> Category<'a> {
 }
 
 /// Names of the required categories that [`Categories`] does not include.
-const CATEGORIES: [&[u8]; 3] = [b"atom_site", b"entry", b"struct"];
+const CATEGORIES: [&[u8]; 4] = [b"atom_site", b"entry", b"struct", SPHERES.as_bytes()];
 
 /// A data block with its required categories.
 #[derive(Debug, Default)]
@@ -210,9 +225,16 @@ impl<'a> BinaryBlock<'a> {
         let atoms = rows::read(&raw, layout, bounds, reading)?;
         let (columns, tables, warnings) = atoms.map_err(|fault| fault.within(&location))?;
         memory.keep();
-        let replaced = warnings.messages(|fault| fault.within(&location).into());
-        source.warnings.splice(..0, replaced);
+        source.warnings.splice(..0, warnings.messages(|fault| fault.within(&location).into()));
         columns.finish(tables, source, reading).map(Some)
+    }
+
+    /// Returns the number of atoms with coordinates. Columns that cannot be read count as missing, as do more rows than
+    /// the limit.
+    fn n_atoms(&self, limits: &ReadLimits) -> u64 {
+        let Some(category) = self.category("atom_site").filter(|c| c.bounds(limits).is_some()) else { return 0 };
+        let layout = category.columns().and_then(|raw| layout(&raw));
+        if layout.is_ok_and(|layout| layout.missing().is_none()) { category.rows } else { 0 }
     }
 
     /// Returns the columns of the atoms, if the block has some with coordinates.
@@ -238,8 +260,8 @@ impl<'a> BinaryBlock<'a> {
     ) -> Result<(SiteColumns<'a>, SourceFields), StructureError> {
         let (categories, warnings) = self.categories(reading)?;
         if categories.entities_are_known() {
-            // The column is not needed.
-            site.layout = site.layout.without_sequence_numbers();
+            // The columns are not needed.
+            site.layout = site.layout.with_known_entities();
         }
         // Decoded data counts as decompressed data, because a few bytes of run-length encoding may expand to many.
         let limit = reading.limits.max_inflated_bytes;
@@ -251,15 +273,19 @@ impl<'a> BinaryBlock<'a> {
             Ok(category.value(item, max, reading.limits).map_err(|f| f.within(category.location()))?)
         };
         let entry = value("entry", "id", 80)?;
+        let (annotations, rejected) = categories.annotations();
+        let mut unread = UnreadAtoms::default();
+        let spheres = self.category(SPHERES).filter(|category| category.bounds(reading.limits).is_some());
+        unread.counts.spheres = spheres.map_or(0, |category| category.rows);
         let source = SourceFields {
-            format: SourceFormat::BinaryCif,
             id: entry.or_else(|| self.name.clone()),
             title: value("struct", "title", MAX_TITLE)?,
             sequence: Sequence::of(&categories),
-            annotations: categories.annotations(),
+            annotations,
             assemblies: categories.assemblies(),
-            radii: Vec::new(),
-            warnings,
+            unread: unread.counts,
+            warnings: warnings.into_iter().chain(rejected).chain(unread.warnings()).collect(),
+            ..SourceFields::new(SourceFormat::BinaryCif)
         };
         Ok((site, source))
     }

@@ -3,12 +3,13 @@
 use std::sync::Arc;
 
 use super::super::assembly::Assemblies;
-use super::super::atom_site::Layout;
-use super::super::atoms::{Columns, SourceFields, Structure};
+use super::super::atom_layout::Layout;
+use super::super::atoms::{Columns, Structure};
+use super::super::divisions::{self, BlockFindings};
 use super::super::error::StructureError;
-use super::super::kinds::{self, HeteroBlocks};
 use super::super::pieces;
 use super::super::read::{ReadLimits, Reading, check};
+use super::super::source::SourceFields;
 use super::super::stream::Block;
 use super::column::DecodedColumn;
 use super::column_stream::{ColumnStream, DecodeLimits, Raw};
@@ -38,7 +39,7 @@ pub(in super::super) struct RowStream {
     block_rows: usize,
     /// Number of rows with memory in `memory`.
     held: usize,
-    hetero: HeteroBlocks,
+    findings: BlockFindings,
     /// Memory of the rows, the texts and `source`.
     memory: Reservation,
 }
@@ -55,14 +56,19 @@ impl RowStream {
         limits: &ReadLimits,
         control: &Control<'_>,
     ) -> Result<Option<Self>, StructureError> {
-        first_block(Cursor::of_skeleton(skeleton), |block, passed| {
+        let (rows, unread) = first_block(Cursor::of_skeleton(skeleton), limits, |block, passed| {
             let reading = Reading::new(limits, control);
             let Some(site) = block.site(&reading, passed)? else { return Ok(None) };
             if site.bounds.rows <= block_rows {
                 return Ok(Some(None));
             }
             Self::of_block(block, site, block_rows, reading).map(|rows| Some(Some(rows)))
-        })
+        })?;
+        if rows.is_some() && unread.counts.blocks > 0 {
+            let found = "atoms in several data blocks".to_owned();
+            return Err(StructureError::NotAStream { found, expected: "one data block with atoms" });
+        }
+        Ok(rows)
     }
 
     fn of_block<'a>(
@@ -90,7 +96,7 @@ impl RowStream {
             n_rows: bounds.rows,
             block_rows,
             held: 0,
-            hetero: HeteroBlocks::default(),
+            findings: BlockFindings::default(),
             memory: reading.text,
         })
     }
@@ -116,19 +122,19 @@ impl RowStream {
             self.fill(size, &Reading::new(limits, control))?;
             let n = self.table.len;
             if n == 0 {
-                return self.hetero.check("the categories `entity` and `struct_asym`").map(|()| None);
+                return self.findings.check("the categories `entity` and `struct_asym`").map(|()| None);
             }
             let memory = Arc::new(Reservation::new(&control.memory));
             let of_attempt = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
             let reading = Reading::of_block(limits, &of_attempt);
             let structure = self.structure(&reading)?;
             let is_last = self.table.first + n == self.n_rows;
-            let Some(len) = (if is_last { Some(n) } else { kinds::last_division(&structure) }) else {
+            let Some(len) = (if is_last { Some(n) } else { divisions::last_division(&structure) }) else {
                 // All residues depend on each other.
                 size = size.saturating_mul(2);
                 continue;
             };
-            self.hetero.add(&reading);
+            self.findings.add(&reading);
             // Subtracts the memory of reading first.
             drop(reading);
             memory.keep();
@@ -201,7 +207,7 @@ fn open(
         reading.check()?;
         let n = rest.min(CHECKED);
         stream.read(n, &mut column).map_err(within)?;
-        has_nulls |= column.has_nulls();
+        has_nulls |= column.lacks_values(texts);
         column.remove(n);
         rest -= n;
     }

@@ -1,6 +1,7 @@
 //! Decodes columns and converts their rows to atoms, on several threads if there are many rows.
 
-use super::super::atom_site::{self, AtomSite, BadNumber, Layout, Span};
+use super::super::atom_layout::{Layout, NONE};
+use super::super::atom_site::{self, AtomSite, BadNumber, Span};
 use super::super::atoms::{Columns, Tables};
 use super::super::duplicates;
 use super::super::error::StructureError;
@@ -98,7 +99,7 @@ fn whole(value: f64) -> Result<i32, BadNumber> {
 
 /// Returns an upper bound for the memory (bytes) of the decoded columns of the layout.
 pub(super) fn decoded_bytes(layout: &Layout, rows: usize) -> u64 {
-    let columns = |pairs: &[[usize; 2]]| pairs.iter().flatten().filter(|c| **c != atom_site::NONE).count();
+    let columns = |pairs: &[[usize; 2]]| pairs.iter().flatten().filter(|c| **c != NONE).count();
     let row = columns(&layout.texts()) * size_of::<i32>() + columns(&layout.numbers()) * size_of::<f64>();
     row as u64 * rows as u64
 }
@@ -124,7 +125,7 @@ pub(super) fn read<'a>(
 ) -> Result<Result<Atoms, Box<Fault>>, StructureError> {
     let load = |raw: &Raw<'a>, texts: bool| {
         let column = raw.load(bounds, texts)?;
-        let has_nulls = column.has_nulls();
+        let has_nulls = column.lacks_values(texts);
         Ok((column, has_nulls))
     };
     match load_pairs(raw, &layout, n_pieces(bounds.rows, reading) > 1, load) {
@@ -222,8 +223,8 @@ fn check_samples(table: &Table<'_>, layout: Layout, reading: &Reading<'_>) -> Re
 }
 
 /// Reads the columns of the layout, in parallel if requested. The second of a pair is required only if the first has
-/// rows without a value. `load` returns a column, read as texts if its second argument is true, and true if it has such
-/// rows.
+/// rows without a usable value. `load` returns a column, read as texts if its second argument is true, and true if it
+/// has such rows.
 pub(super) fn load_pairs<'a, T: Send, E: Send>(
     raw: &[Raw<'a>],
     layout: &Layout,

@@ -6,17 +6,23 @@
 
 mod row;
 mod rows;
+mod tags;
 
 use self::rows::TableRows;
+use self::tags::has_unread;
+pub(super) use self::tags::{is_of_atoms, is_of_spheres};
 use super::assembly::Assemblies;
-use super::atom_site::{Layout, Passed};
-use super::atoms::{SourceFields, SourceFormat, Structure};
+use super::atom_layout::Layout;
+use super::atoms::Structure;
 use super::categories::Categories;
 use super::cif::{self, Token, TokenKind, Tokenizer};
+use super::data_blocks::{Passed, UnreadAtoms};
 use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
 use super::read::Reading;
+use super::source::SourceFields;
+use super::source::SourceFormat;
 use super::text::{Fault, decode, normalize};
 
 /// Values between two checks of the cancellation flag: a few milliseconds.
@@ -117,13 +123,20 @@ struct Reader<'a> {
     reading: &'a Reading<'a>,
     block: TextBlock,
     rows: Option<TableRows<'a>>,
+    /// True in the data blocks after the one with the atoms.
+    is_past: bool,
+    /// Atoms that are not read.
+    unread: UnreadAtoms,
+    /// Name and number of atoms of a data block that is not read.
+    unread_block: (Option<String>, u64),
     passed: Passed,
 }
 
 impl<'a> Reader<'a> {
     fn new(text: &'a [u8], reading: &'a Reading<'a>) -> Self {
         let (tokens, block, passed) = (Tokenizer::new(text), TextBlock::default(), Passed::default());
-        Self { text, tokens, reading, block, rows: None, passed }
+        let (unread, unread_block) = (UnreadAtoms::default(), (None, 0));
+        Self { text, tokens, reading, block, rows: None, is_past: false, unread, unread_block, passed }
     }
 
     fn run(&mut self) -> Result<(), StopReason> {
@@ -133,7 +146,10 @@ impl<'a> Reader<'a> {
             match token.kind {
                 TokenKind::End | TokenKind::Data => {
                     self.end_block()?;
-                    if self.rows.is_some() || token.kind == TokenKind::End {
+                    if self.rows.is_some() {
+                        return self.rest_of_file(token);
+                    }
+                    if token.kind == TokenKind::End {
                         return Ok(());
                     }
                     self.begin_block(&token);
@@ -144,7 +160,7 @@ impl<'a> Reader<'a> {
                 TokenKind::Loop => {
                     token = self.category()?;
                     if self.rows.is_some() {
-                        return self.rest_of_block(token);
+                        return self.rest_of_file(token);
                     }
                     continue;
                 }
@@ -161,6 +177,7 @@ impl<'a> Reader<'a> {
         let name = &self.text[token.start + b"data_".len()..token.end];
         self.block = TextBlock { name: normalize(name, 80), ..TextBlock::default() };
         self.passed.block();
+        self.unread = UnreadAtoms::default();
     }
 
     /// Reads a tag and its value.
@@ -172,7 +189,11 @@ impl<'a> Reader<'a> {
         }
         self.note_category(tag);
         let name = &self.text[tag.start..tag.end];
-        if !self.block.in_frame && row::has_prefix(name) {
+        if self.is_past {
+            // One atom.
+            let is_atom = !self.block.in_frame && name.eq_ignore_ascii_case(b"_atom_site.Cartn_x");
+            self.unread_block.1 += u64::from(is_atom);
+        } else if !self.block.in_frame && row::has_prefix(name) {
             self.block.tags.push((tag.start, tag.end));
             self.block.values.push((value.start, value.end));
         } else {
@@ -186,7 +207,7 @@ impl<'a> Reader<'a> {
 
     /// Returns the index of an item that describes entities or assemblies.
     fn described_item(&self, tag: &Token) -> Option<usize> {
-        if self.block.in_frame {
+        if self.block.in_frame || self.is_past {
             return None;
         }
         Categories::find(&self.text[tag.start + 1..tag.end])
@@ -201,7 +222,7 @@ impl<'a> Reader<'a> {
     /// Stores the id or title of the entry.
     fn note_value(&mut self, tag: &[u8], value: &Token) {
         let is_id = tag.eq_ignore_ascii_case(b"_entry.id");
-        if self.block.in_frame || !(is_id || tag.eq_ignore_ascii_case(b"_struct.title")) {
+        if self.block.in_frame || self.is_past || !(is_id || tag.eq_ignore_ascii_case(b"_struct.title")) {
             return;
         }
         let (start, end, quoted) = cif::unquote(self.text, value.start, value.end);
@@ -227,6 +248,8 @@ impl<'a> Reader<'a> {
             return Err(token.fault(self.text, "a tag after loop_").into());
         };
         self.note_category(first);
+        let has_tag = |name: &[u8]| tags.iter().any(|tag| self.text[tag.start..tag.end].eq_ignore_ascii_case(name));
+        self.passed.has_fractions |= has_tag(b"_atom_site_fract_x") && !has_tag(b"_atom_site_Cartn_x");
         let is_atom_site = !self.block.in_frame && row::has_prefix(&self.text[first.start..first.end]);
         if is_atom_site && self.rows.is_none() && token.kind == TokenKind::Value {
             let ranges: Vec<_> = tags.iter().map(|t| (t.start, t.end)).collect();
@@ -254,7 +277,21 @@ impl<'a> Reader<'a> {
             }
             token = self.tokens.next()?;
         }
+        self.count_unread(&tags, (i / tags.len()) as u64);
         Ok(token)
+    }
+
+    /// Counts the rows of a loop with atoms or spheres that are not read.
+    fn count_unread(&mut self, tags: &[Token], n_rows: u64) {
+        let tag = |token: &Token| &self.text[token.start..token.end];
+        let Some(first) = tags.first().map(tag).filter(|_| !self.block.in_frame) else { return };
+        if !self.is_past && is_of_spheres(&first[1..]) {
+            self.unread.counts.spheres += n_rows;
+        } else if self.is_past && row::has_prefix(first) {
+            let ranges: Vec<_> = tags.iter().map(|t| (t.start, t.end)).collect();
+            let has_coordinates = row::layout(self.text, &ranges).is_ok_and(|layout| layout.missing().is_none());
+            self.unread_block.1 += if has_coordinates { n_rows } else { 0 };
+        }
     }
 
     /// Returns the columns of `atom_site`, or `None` if it has no coordinates.
@@ -281,19 +318,28 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// Reads the title, the assemblies, the helices and strands, the confidences of a predicted model and, if HETATM
-    /// records need them, the entities after the atoms. Ignores syntax errors, because the atoms are complete.
-    fn rest_of_block(&mut self, mut token: Token) -> Result<(), StopReason> {
-        let hetero = self.rows.as_ref().is_some_and(TableRows::has_hetero);
-        let wanted = |reader: &Self| {
+    /// Reads the title, the assemblies, the helices and strands, the confidences of a predicted model and the entities
+    /// after the atoms, and counts the atoms of other data blocks. Ignores syntax errors, because the atoms are
+    /// complete.
+    fn rest_of_file(&mut self, mut token: Token) -> Result<(), StopReason> {
+        let has_unread = has_unread(&self.text[token.start..]);
+        let is_wanted = |reader: &Self| {
             let known = &reader.block.categories;
-            reader.block.title.is_none()
-                || !known.assemblies_are_known()
-                || !known.secondary_is_known()
-                || (hetero && !known.entities_are_known())
-                || (reader.block.predicted && !known.confidences_are_known())
+            !reader.is_past
+                && (reader.block.title.is_none()
+                    || !known.assemblies_are_known()
+                    || !known.secondary_is_known()
+                    || !known.entities_are_known()
+                    || (reader.block.predicted && !known.confidences_are_known()))
         };
-        while wanted(self) && !matches!(token.kind, TokenKind::End | TokenKind::Data) {
+        while token.kind != TokenKind::End && (has_unread || is_wanted(self)) {
+            self.reading.check()?;
+            if token.kind == TokenKind::Data {
+                self.end_unread_block();
+                self.is_past = true;
+                self.block.in_frame = false;
+                self.unread_block.0 = normalize(&self.text[token.start + b"data_".len()..token.end], 80);
+            }
             let next = match token.kind {
                 TokenKind::Tag => self.item(&token).and_then(|()| Ok(self.tokens.next()?)),
                 TokenKind::Loop => self.category(),
@@ -305,11 +351,18 @@ impl<'a> Reader<'a> {
             };
             match next {
                 Ok(next) => token = next,
-                Err(StopReason::Fault(_)) => return Ok(()),
+                Err(StopReason::Fault(_)) => break,
                 Err(error) => return Err(error),
             }
         }
+        self.end_unread_block();
         Ok(())
+    }
+
+    /// Ends a data block that is not read.
+    fn end_unread_block(&mut self) {
+        let (name, atoms) = std::mem::take(&mut self.unread_block);
+        self.unread.add_block(name.as_deref(), atoms);
     }
 
     fn note_category(&mut self, tag: &Token) {
@@ -329,15 +382,17 @@ impl<'a> Reader<'a> {
         let categories = self.block.categories;
         let too_many = categories.warning();
         let warnings = warnings.messages(|fault| fault.locate(self.text));
+        let (annotations, rejected) = categories.annotations();
+        let counts = self.unread.counts;
         let source = SourceFields {
-            format: SourceFormat::Mmcif,
             id: self.block.entry.or(self.block.name),
             title: self.block.title,
             sequence: Sequence::of(&categories),
-            annotations: categories.annotations(),
+            annotations,
             assemblies: categories.assemblies(),
-            radii: Vec::new(),
-            warnings: warnings.into_iter().chain(too_many).collect(),
+            unread: counts,
+            warnings: warnings.into_iter().chain(too_many).chain(rejected).chain(self.unread.warnings()).collect(),
+            ..SourceFields::new(SourceFormat::Mmcif)
         };
         columns.finish(tables, source, self.reading)
     }

@@ -1,6 +1,7 @@
 //! Text rows of `atom_site`.
 
-use super::super::atom_site::{self, Layout, NONE, Span};
+use super::super::atom_layout::{Layout, NONE};
+use super::super::atom_site::{self, Span};
 use super::super::cif::unquote;
 use super::super::text::Fault;
 

@@ -7,7 +7,8 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::super::atom_site::{self, AtomSite, Layout};
+use super::super::atom_layout::Layout;
+use super::super::atom_site::{self, AtomSite};
 use super::super::atoms::{Atom, Columns, Tables};
 use super::super::cif::{TokenKind, Tokenizer, bare_kind};
 use super::super::error::StructureError;
@@ -38,17 +39,13 @@ pub(super) struct TableRows<'a> {
 
 impl<'a> TableRows<'a> {
     pub(super) fn new(text: &'a [u8], layout: Layout, reading: &'a Reading<'a>) -> Self {
-        Self { text, site: AtomSite::new(layout), columns: GrowingColumns::default(), reading, expected: 1 }
+        let (site, columns) = (AtomSite::new(layout), GrowingColumns::default());
+        Self { text, site, columns, reading, expected: 1 }
     }
 
     /// Returns the columns of the atoms, the tables of texts, and the warnings.
     pub(super) fn into_parts(self) -> (Columns, Tables, Warnings<Box<Fault>>) {
         (self.columns.into_columns(), self.site.tables, self.site.warnings)
-    }
-
-    /// Returns true if a row read so far is a HETATM record.
-    pub(super) fn has_hetero(&self) -> bool {
-        self.columns.columns().hetero.contains(&true)
     }
 
     /// Reads all rows, from the first value at offset `first` on. Returns the offset of the end of the loop.

@@ -12,7 +12,7 @@ use super::super::read::Reading;
 use super::super::text::{Fault, trimmed};
 use super::super::warnings::Warnings;
 use super::LINES_PER_CHECK;
-use super::card::{Card, card, check_length, coordinate, expand_tabs, number, numbered_line, residue_number};
+use super::card::{Card, card, check_length, coordinate, expand_tabs, number, residue_number, segment, stated_element};
 use super::chains::TwoLetterChains;
 use super::records::Line;
 
@@ -57,9 +57,11 @@ impl<'a> Atoms<'a> {
         rows: &mut Slices<'_>,
         reading: &Reading<'_>,
     ) -> Result<Self, StructureError> {
+        let mut tables = Tables::default();
+        tables.label_chain.intern(b"", 0, 0);
         let mut atoms = Self {
             file,
-            tables: Tables::default(),
+            tables,
             warnings: Warnings::default(),
             fault: None,
             left_justified,
@@ -124,7 +126,10 @@ impl<'a> Atoms<'a> {
         let name = self.tables.name.intern_field(card, 12, 16);
         let residue = self.tables.residue.intern_field(card, 17, residue_end);
         let chain = self.tables.chain.intern_field(card, chain_start, 22);
-        let (residue_number, insertion_code) = residue_number(card)?;
+        let (residue_number, insertion_code) = residue_number(card).unwrap_or_else(|fault| {
+            self.warnings.add("read as 0", || fault);
+            (0, 0)
+        });
         let hetero = card[0] == b'H';
         Ok(Atom {
             position,
@@ -132,12 +137,12 @@ impl<'a> Atoms<'a> {
             name,
             residue,
             chain,
-            label_chain: 0,
+            label_chain: self.segment(card),
             residue_number,
             insertion_code,
             altloc: if card[16] > b' ' { card[16] } else { 0 },
-            occupancy: self.optional(card, (54, 60), (1.0, "1"), "an occupancy"),
-            b_factor: self.optional(card, (60, 66), (0.0, "0"), "a B-factor"),
+            occupancy: self.optional(card, (54, 60), (1.0, "read as 1"), "an occupancy"),
+            b_factor: self.optional(card, (60, 66), (0.0, "read as 0"), "a B-factor"),
             // Models are numbered when all pieces have been read.
             model: 0,
             hetero,
@@ -174,17 +179,18 @@ impl<'a> Atoms<'a> {
         default.0
     }
 
+    /// Returns the id of the segment; 0 without one.
+    #[inline]
+    fn segment(&mut self, card: &Card) -> u32 {
+        match segment(card) {
+            (start, end) if start == end => 0,
+            (start, end) => self.tables.label_chain.intern_field(card, start, end),
+        }
+    }
+
     #[inline]
     fn element(&mut self, card: &Card, residue: u32) -> u8 {
-        let symbol = &card[76..78];
-        let (from, to) = trimmed(symbol);
-        if from < to && !numbered_line(card) {
-            let z = atomic_number(&symbol[from..to]);
-            if z != 0 {
-                return z;
-            }
-        }
-        self.guess(card, residue)
+        stated_element(card).unwrap_or_else(|| self.guess(card, residue))
     }
 
     fn guess(&mut self, card: &Card, residue: u32) -> u8 {

@@ -1,5 +1,6 @@
 //! Fixed columns of ATOM records.
 
+use super::super::element;
 use super::super::number::{self, hybrid36, real};
 use super::super::read::MAX_COORDINATE;
 use super::super::text::{Fault, trimmed};
@@ -45,6 +46,39 @@ pub(super) fn coordinate(card: &Card, from: usize, axis: &str) -> Result<f64, Bo
     }
 }
 
+/// Returns the element symbol in columns 77 and 78, or in 78 and 79 if it was shifted by a column; empty if there is
+/// none.
+#[inline]
+fn symbol(card: &Card) -> &[u8] {
+    let start = if card[76].is_ascii_alphabetic() { 76 } else { 77 };
+    let len = card[start..].iter().take_while(|b| b.is_ascii_alphabetic()).count();
+    if len > 2 { &[] } else { &card[start..start + len] }
+}
+
+/// Returns the atomic number that a line states, 0 for dummy atoms; `None` if it states none. A line of PDBQT has a
+/// charge in columns 67 to 76 and then an atom type, which may begin a column later.
+#[inline]
+pub(super) fn stated_element(card: &Card) -> Option<u8> {
+    if card[76..] == [b' '; 4] || numbered_line(card) {
+        return None;
+    }
+    if card[75].is_ascii_digit() && card[66..76].contains(&b'.') && number(card, 66, 76).is_some() {
+        let (from, to) = trimmed(&card[76..80]);
+        return (from < to).then(|| element::pdbqt_type(&card[76 + from..76 + to]));
+    }
+    match symbol(card) {
+        b"" => None,
+        symbol => element::stated(symbol),
+    }
+}
+
+/// Returns the range of the segment id in columns 73 to 76; empty if there is none.
+#[inline]
+pub(super) fn segment(card: &Card) -> (usize, usize) {
+    let is_segment = card[72..76] != [b' '; 4] && card[66..72] == [b' '; 6] && !numbered_line(card);
+    if is_segment { (72, 76) } else { (72, 72) }
+}
+
 /// Parses the number in `card[from..to]`, ignoring surrounding blanks.
 #[inline]
 pub(super) fn number(card: &Card, from: usize, to: usize) -> Option<f64> {
@@ -62,14 +96,24 @@ pub(super) fn number(card: &Card, from: usize, to: usize) -> Option<f64> {
 #[inline]
 pub(super) fn residue_number(card: &Card) -> Result<(i32, u8), Box<Fault>> {
     let code = card[26];
-    if code.is_ascii_digit() && card[22..26].iter().all(|b| b.is_ascii_digit() || *b == b'-') {
-        let number = number::integer(&card[22..27]);
-        return number.map(|n| (n, 0)).ok_or_else(|| Fault::token(card, 22, 27, "a residue number"));
+    if code.is_ascii_digit() {
+        let (from, to) = trimmed(&card[22..27]);
+        if let Some(number) = number::integer(&card[22 + from..22 + to]) {
+            return Ok((number, 0));
+        }
     }
     let (from, to) = trimmed(&card[22..26]);
-    let number = if from == to { Some(0) } else { hybrid36(&card[22 + from..22 + to]) };
+    let text = &card[22 + from..22 + to];
+    let number = if from == to { Some(0) } else { hybrid36(text).or_else(|| hexadecimal(text)) };
     let number = number.ok_or_else(|| Fault::token(card, 22, 26, "a residue number, decimal or hybrid-36"))?;
     Ok((number, if code > b' ' { code } else { 0 }))
+}
+
+/// Parses four lower-case hexadecimal digits, which VMD writes for numbers above 9999.
+fn hexadecimal(text: &[u8]) -> Option<i32> {
+    let is_digit = |b: &u8| matches!(b, b'0'..=b'9' | b'a'..=b'f');
+    let text = std::str::from_utf8(text).ok().filter(|text| text.len() == 4 && text.bytes().all(|b| is_digit(&b)))?;
+    i32::from_str_radix(text, 16).ok()
 }
 
 /// Expands tabs to stops every eight columns. Returns the line and the source column of each byte.

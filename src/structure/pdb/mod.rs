@@ -21,15 +21,18 @@ use std::collections::HashSet;
 use self::assemblies::Remark350;
 use self::atoms::{Atoms, File};
 use self::lines::Lines;
-use self::records::{Line, Mark, ModelBoundary, PieceRecords};
+use self::records::{Line, PieceRecords};
 use super::annotations::Annotations;
-use super::atoms::{Columns, Slices, SourceFields, SourceFormat, Structure, join};
+use super::atoms::{Columns, Slices, Structure, join};
 use super::error::StructureError;
 use super::kinds::Sequence;
-use super::pieces;
+use super::models::{self, Mark};
 use super::read::Reading;
+use super::source::SourceFields;
+use super::source::SourceFormat;
 use super::text::{self, normalize};
 use super::warnings::Warnings;
+use super::{pieces, pqr};
 
 /// Maximum length of a title, characters.
 pub(super) const MAX_TITLE: usize = 1000;
@@ -65,13 +68,22 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         return Err(StructureError::NoAtoms { found: describe(text) });
     }
     let mut warnings = Warnings::default();
+    for records in &found {
+        warnings.append(records.warnings.clone());
+    }
     let tables = join(parts.into_iter().zip(read).map(|((_, rows), atoms)| {
         warnings.append(atoms.warnings);
         (rows, atoms.tables)
     }));
     reading.keep_texts(tables.n_texts())?;
     memory.keep();
-    number_models(&found, &mut columns.model);
+    let mut marks = Vec::new();
+    let mut first_row = 0;
+    for records in &found {
+        marks.extend(records.marks.iter().map(|mark| Mark { row: first_row + mark.row, ..*mark }));
+        first_row += records.atoms.len();
+    }
+    models::number(&marks, &mut columns);
     let (mut id, mut title, mut listed) = (None, Vec::new(), HashSet::new());
     let (mut assemblies, mut annotations) = (Remark350::default(), Annotations::default());
     for records in found {
@@ -83,15 +95,16 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
             assemblies.line(&text[start..end], reading)?;
         }
     }
+    let mut messages = warnings.messages(|fault| fault.locate(text));
+    messages.extend(pqr::ambiguity(text));
     let source = SourceFields {
-        format: SourceFormat::Pdb,
         id,
         title: normalize(&title, MAX_TITLE),
         sequence: Sequence { listed, ..Sequence::default() },
         assemblies: assemblies.finish(reading)?,
         annotations,
-        radii: Vec::new(),
-        warnings: warnings.messages(|fault| fault.locate(text)),
+        warnings: messages,
+        ..SourceFields::new(SourceFormat::Pdb)
     };
     columns.finish(tables, source, reading)
 }
@@ -118,51 +131,6 @@ fn read_atoms<'f>(
         read.extend(pass(&mut parts[first + 1..], true)?);
     }
     Ok(read)
-}
-
-/// Sets the model numbers of all rows.
-fn number_models(found: &[PieceRecords], mut rows: &mut [i32]) {
-    let mut models = Models::default();
-    for records in found {
-        let mut first = 0;
-        for &Mark { row, boundary } in &records.marks {
-            rows = models.fill(rows, row - first);
-            first = row;
-            match boundary {
-                ModelBoundary::Begins(number) => models.begin(number),
-                ModelBoundary::Ends => models.current = None,
-            }
-        }
-        rows = models.fill(rows, records.atoms.len() - first);
-    }
-}
-
-/// Assigns atoms to models. A repeated model number, or atoms after the end of a model, begin a new model.
-#[derive(Default)]
-struct Models {
-    current: Option<i32>,
-    highest: i32,
-    seen: HashSet<i32>,
-}
-
-impl Models {
-    fn begin(&mut self, number: Option<i32>) {
-        let next = self.highest.saturating_add(1);
-        let number = number.filter(|n| !self.seen.contains(n)).unwrap_or(next);
-        self.highest = self.highest.max(number);
-        self.seen.insert(number);
-        self.current = Some(number);
-    }
-
-    /// Assigns the first `n` rows to the current model, and returns the others.
-    fn fill<'r>(&mut self, rows: &'r mut [i32], n: usize) -> &'r mut [i32] {
-        let (rows, others) = rows.split_at_mut(n);
-        if n > 0 && self.current.is_none() {
-            self.begin(None);
-        }
-        rows.fill(self.current.unwrap_or_default());
-        others
-    }
 }
 
 /// Describes the content of a file without atoms.

@@ -6,9 +6,11 @@ use std::ops::Range;
 use super::super::annotations::SecondaryRange;
 use super::super::error::StructureError;
 use super::super::kinds::Listed;
+use super::super::models::{Mark, ModelBoundary};
 use super::super::number;
 use super::super::read::Reading;
 use super::super::text::{Fault, normalize, trimmed};
+use super::super::warnings::Warnings;
 use super::atoms::File;
 use super::card::{MIN_COLUMNS, check_length};
 use super::lines::Lines;
@@ -34,23 +36,6 @@ impl Line {
     }
 }
 
-/// Record at the beginning or end of a model.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum ModelBoundary {
-    /// MODEL, with its number if it has one.
-    Begins(Option<i32>),
-    /// ENDMDL or END.
-    Ends,
-}
-
-/// Boundary of a model, with its position among the atoms.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Mark {
-    /// Number of atoms before it in its piece.
-    pub(super) row: usize,
-    pub(super) boundary: ModelBoundary,
-}
-
 /// Memory of a mark and its model among the known ones, or of a REMARK 350, HELIX or SHEET record, bytes.
 const BYTES_PER_MARK: u64 = 64;
 
@@ -59,6 +44,7 @@ const BYTES_PER_MARK: u64 = 64;
 pub(super) struct PieceRecords {
     /// ATOM and HETATM records.
     pub(super) atoms: Vec<Line>,
+    /// Boundaries of models, by the number of atoms before them in the piece.
     pub(super) marks: Vec<Mark>,
     pub(super) id: Option<String>,
     pub(super) title: Vec<u8>,
@@ -66,6 +52,7 @@ pub(super) struct PieceRecords {
     pub(super) assemblies: Vec<(usize, usize)>,
     /// HELIX and SHEET records.
     pub(super) secondary: Vec<SecondaryRange>,
+    pub(super) warnings: Warnings<Box<Fault>>,
     /// Chains and residue names in SEQRES and MODRES records.
     pub(super) listed: HashSet<Listed>,
     /// The first fault. Records after it are missing.
@@ -129,10 +116,17 @@ impl PieceRecords {
                 let boundary = ModelBoundary::Begins(model_number(start, line)?);
                 self.marks.push(Mark { row: self.atoms.len(), boundary });
             }
-            b"ENDMDL" | b"END" => self.marks.push(Mark { row: self.atoms.len(), boundary: ModelBoundary::Ends }),
+            b"ENDMDL" => self.marks.push(Mark { row: self.atoms.len(), boundary: ModelBoundary::Ends }),
+            b"END" => self.marks.push(Mark { row: self.atoms.len(), boundary: ModelBoundary::EndsPart }),
             b"SEQRES" => sequence::of_chain(line, &mut self.listed),
             b"MODRES" => sequence::of_residue(line, &mut self.listed),
-            b"HELIX" | b"SHEET" => self.secondary.extend(SecondaryRange::of_record(line)),
+            b"HELIX" | b"SHEET" => match SecondaryRange::of_record(line) {
+                Some(Ok(range)) => self.secondary.push(range),
+                Some(Err(ends)) => self
+                    .warnings
+                    .add("ignored", || Fault::words(start, ends.to_string(), "a helix or strand with one chain")),
+                None => {}
+            },
             b"HEADER" if self.id.is_none() => {
                 let id = line.get(62..66).unwrap_or_default();
                 if id.first().is_some_and(u8::is_ascii_digit) && id.iter().all(u8::is_ascii_alphanumeric) {

@@ -11,6 +11,7 @@ use crate::structure::copies::{AssemblyRules, chain_column};
 use crate::structure::error::StructureError;
 use crate::structure::pieces;
 use crate::structure::read::{ReadLimits, check};
+use crate::structure::source::Unread;
 use crate::structure::stream::Block;
 use crate::structure::text::list;
 use crate::structure::texts::TextColumn;
@@ -50,6 +51,9 @@ pub struct SelectedBlocks {
     /// Residues of the file with alternative locations, with the number of their block.
     alternatives: HashMap<ResidueId, usize>,
     n_blocks: usize,
+    /// Atoms that were not read of the files before, and of the current one.
+    unread: Unread,
+    unread_of_file: Unread,
     first_model: Option<i32>,
     /// Memory of `alternatives`.
     memory: Reservation,
@@ -77,6 +81,8 @@ impl SelectedBlocks {
             altlocs: HashSet::new(),
             alternatives: HashMap::new(),
             n_blocks: 0,
+            unread: Unread::default(),
+            unread_of_file: Unread::default(),
             first_model: None,
             memory: Reservation::new(&control.memory),
             chain_memory: Reservation::new(&control.memory),
@@ -85,6 +91,9 @@ impl SelectedBlocks {
 
     /// Begins a file. Residues of different files are different residues.
     pub fn begin_file(&mut self) {
+        let Unread { blocks, spheres } = std::mem::take(&mut self.unread_of_file);
+        self.unread.blocks += blocks;
+        self.unread.spheres += spheres;
         self.memory.shrink(ALTERNATIVE_BYTES * self.alternatives.len() as u64);
         self.alternatives = HashMap::new();
     }
@@ -103,6 +112,7 @@ impl SelectedBlocks {
     ) -> Result<SelectedOfBlock, StructureError> {
         let s = &block.structure;
         self.n_atoms += block.len as u64;
+        self.unread_of_file = s.unread;
         // Indices of atoms have 32 bits.
         let limit = limits.max_atoms.min(u64::from(u32::MAX));
         if self.n_atoms > limit {
@@ -136,6 +146,13 @@ impl SelectedBlocks {
             selected.atoms.extend_from_slice(&found.atoms);
         }
         Ok(selected)
+    }
+
+    /// Returns the number of atoms of the files, including those that were not read.
+    #[must_use]
+    pub fn n_in_files(&self) -> u64 {
+        let unread = [self.unread, self.unread_of_file].map(|unread| unread.blocks + unread.spheres);
+        self.n_atoms + unread.iter().sum::<u64>()
     }
 
     /// Returns the number of a chain.
@@ -242,7 +259,9 @@ impl SelectedBlocks {
         for (number, counts) in std::mem::take(&mut self.by_chain).into_values().enumerate() {
             let of_names: u64 = counts.residues.values().sum();
             if assembly.is_some_and(|assembly| !assembly.covers(number)) {
-                left_out.other_chains += counts.n_selected + counts.left_out.total() + of_names;
+                let LeftOut { other_models, .. } = counts.left_out;
+                left_out.other_models += other_models;
+                left_out.other_chains += counts.n_selected + counts.left_out.total() - other_models + of_names;
                 continue;
             }
             n_selected += counts.n_selected;
@@ -257,6 +276,8 @@ impl SelectedBlocks {
         }
         let counts = residues.iter().map(|((name, kind), n)| (name.as_str(), *kind, *n)).collect();
         left_out.name_residues(counts);
+        left_out.add_unread(self.unread);
+        left_out.add_unread(self.unread_of_file);
         let (marks, copies, units) = (None, Vec::new(), Vec::new());
         let n_distinct = usize::try_from(n_selected).unwrap_or(usize::MAX);
         Ok(Selected { atoms: Vec::new(), marks, copies, units, n_distinct, model, left_out })

@@ -118,18 +118,12 @@ impl Evaluation<'_> {
     /// Marks all atoms of each residue that has a marked atom. The atoms of a residue are consecutive.
     fn complete_residues(&self, marks: &mut [bool]) -> Result<(), StructureError> {
         let s = self.structure;
-        let same = |a: usize, b: usize| {
-            (s.residue_number[a], s.insertion_code[a], s.model[a])
-                == (s.residue_number[b], s.insertion_code[b], s.model[b])
-                && s.residue.id(a) == s.residue.id(b)
-                && s.chain.id(a) == s.chain.id(b)
-        };
         let mut first = 0;
         for i in 1..=marks.len() {
             if i % ATOMS_PER_CHECK == 0 {
                 check(self.control)?;
             }
-            if i == marks.len() || !same(i, first) {
+            if i == marks.len() || !s.same_residue(i - 1, i) {
                 if marks[first..i].contains(&true) {
                     marks[first..i].fill(true);
                 }

@@ -3,13 +3,20 @@
 use std::collections::{BTreeMap, HashMap};
 
 use crate::structure::Kind;
+use crate::structure::source::Unread;
 
 /// Maximum number of residue names that are counted separately.
 const MAX_NAMES: usize = 10;
 
-/// Atoms of the model that were not selected. Each is counted under the first reason that applies, in field order.
+/// Atoms of the file that were not selected. Each is counted under the first reason that applies, in field order.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LeftOut {
+    /// Atoms of data blocks after the first one with atoms.
+    pub other_blocks: u64,
+    /// Spheres of coarse-grained parts of integrative models.
+    pub spheres: u64,
+    /// Atoms of other models.
+    pub other_models: u64,
     /// Atoms of other chains.
     pub other_chains: u64,
     /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
@@ -31,11 +38,25 @@ impl LeftOut {
     #[must_use]
     pub fn total(&self) -> u64 {
         let of_kinds: u64 = self.kinds.iter().map(|(_, n)| n).sum();
-        of_kinds + self.other_chains + self.virtual_sites + self.hydrogens + self.alternatives
+        of_kinds
+            + self.other_blocks
+            + self.spheres
+            + self.other_models
+            + self.other_chains
+            + self.virtual_sites
+            + self.hydrogens
+            + self.alternatives
+    }
+
+    /// Adds the atoms of a file that were not read.
+    pub(super) fn add_unread(&mut self, unread: Unread) {
+        self.other_blocks += unread.blocks;
+        self.spheres += unread.spheres;
     }
 
     /// Adds the counts of other atoms, without kinds and residue names.
     pub(super) fn add(&mut self, other: &Self) {
+        self.other_models += other.other_models;
         self.other_chains += other.other_chains;
         self.virtual_sites += other.virtual_sites;
         self.hydrogens += other.hydrogens;

@@ -130,6 +130,7 @@ pub fn select_with(
     }
     let texts: Vec<&str> = structure.residue.texts().collect();
     left_out.name_residues(residues.named(&texts).collect());
+    left_out.add_unread(structure.unread);
     let selected =
         Selected { n_distinct: atoms.len(), atoms, marks, copies: Vec::new(), units: Vec::new(), model, left_out };
     match assembly {
@@ -198,7 +199,7 @@ impl<'a> Rules<'a> {
                 models.contains(structure.model[i])
                     && structure.kind[i] != Kind::VirtualSite
                     && (*hydrogens || !structure.is_hydrogen(i))
-                    && alternatives.keeps(structure, i)
+                    && alternatives.keeps(i)
             })?);
         }
         let marks = evaluation.marks(condition)?;
@@ -256,6 +257,7 @@ impl<'a> Rules<'a> {
         let Found { mut atoms, mut left_out, mut residues } = Found::default();
         for i in range {
             if !self.models.contains(structure.model[i]) {
+                left_out.other_models += 1;
                 continue;
             }
             let context = self.is_context(i);
@@ -267,7 +269,7 @@ impl<'a> Rules<'a> {
                 residues.add(structure.residue.id(i), structure.kind[i]);
             } else if !self.hydrogens && structure.is_hydrogen(i) {
                 left_out.hydrogens += 1;
-            } else if !self.alternatives.keeps(structure, i) {
+            } else if !self.alternatives.keeps(i) {
                 left_out.alternatives += 1;
             } else {
                 // The reader limits the number of atoms, so indices have 32 bits.

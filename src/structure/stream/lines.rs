@@ -3,34 +3,46 @@
 use super::super::categories::Categories;
 use super::super::cif::{TokenKind, Tokenizer};
 use super::super::error::StructureError;
+use super::super::mmcif;
 use super::not_a_stream;
 
 /// First words of a line after the last row, besides tags.
 const WORDS: [&[u8]; 5] = [b"loop_", b"data_", b"save_", b"global_", b"stop_"];
 
-/// Scanner of the lines after the atoms.
+/// Part of a file after its atoms.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+enum Section {
+    /// Category that describes assemblies.
+    Assemblies,
+    /// Other category of the data block with the atoms.
+    #[default]
+    Other,
+    /// Later data block.
+    LaterBlock,
+}
+
+/// Scanner of the lines after the atoms, up to the end of the file.
 #[derive(Default)]
 pub(super) struct TagsAfterAtoms {
     in_text_field: bool,
     /// Text before the atoms, and the categories after them that describe assemblies.
     pub(super) assemblies: Vec<u8>,
-    /// True in such a category.
-    in_assemblies: bool,
+    section: Section,
     /// True after `loop_`.
     begins_loop: bool,
 }
 
 impl TagsAfterAtoms {
-    /// Returns true if a line begins the next data block. Rejects tags that change the atoms.
-    pub(super) fn is_last(&mut self, line: &[u8], needs_secondary: bool) -> Result<bool, StructureError> {
+    /// Reads a line. Rejects tags that change the atoms, and atoms of other data blocks.
+    pub(super) fn add(&mut self, line: &[u8], needs_secondary: bool) -> Result<(), StructureError> {
         let delimits = line.first() == Some(&b';');
         let is_value = self.in_text_field != delimits;
         self.in_text_field = is_value;
-        if self.in_assemblies && (is_value || delimits) {
+        if self.section == Section::Assemblies && (is_value || delimits) {
             self.assemblies.extend_from_slice(if is_value { line } else { b";" });
         }
         if is_value {
-            return Ok(false);
+            return Ok(());
         }
         // Behind the semicolon that ends a text field.
         let text = &line[usize::from(delimits)..];
@@ -42,35 +54,45 @@ impl TagsAfterAtoms {
             let word = &text[token.start..token.end];
             match token.kind {
                 TokenKind::End => break,
-                TokenKind::Data => return Ok(true),
+                TokenKind::Data => self.section = Section::LaterBlock,
+                TokenKind::Tag if self.section == Section::LaterBlock && mmcif::is_of_atoms(word) => {
+                    return Err(not_a_stream("atoms in several data blocks", "one data block with atoms"));
+                }
+                TokenKind::Tag if self.section == Section::LaterBlock => {}
                 TokenKind::Tag => {
                     check_tag(&word[1..], needs_secondary)?;
-                    self.in_assemblies = Categories::is_assembly(&word[1..]);
-                    if self.in_assemblies && self.begins_loop {
+                    let is_assembly = Categories::is_assembly(&word[1..]);
+                    self.section = if is_assembly { Section::Assemblies } else { Section::Other };
+                    if is_assembly && self.begins_loop {
                         self.assemblies.extend_from_slice(b" loop_");
                     }
                 }
                 TokenKind::Value => {}
-                _ => self.in_assemblies = false,
+                _ if self.section == Section::Assemblies => self.section = Section::Other,
+                _ => {}
             }
             self.begins_loop = token.kind == TokenKind::Loop;
-            if self.in_assemblies {
+            if self.section == Section::Assemblies {
                 // No value begins a line, because a semicolon there would begin a text field.
                 self.assemblies.push(b' ');
                 self.assemblies.extend_from_slice(word);
             }
         }
-        if self.in_assemblies {
+        if self.section == Section::Assemblies {
             // Text with a fault, at which reading in memory ends as well; otherwise blanks or a comment.
             self.assemblies.extend_from_slice(&text[end..]);
             self.assemblies.push(b'\n');
         }
-        Ok(false)
+        Ok(())
     }
 }
 
 /// Rejects a tag after the atoms, without its underscore, that changes them.
 fn check_tag(tag: &[u8], needs_secondary: bool) -> Result<(), StructureError> {
+    if mmcif::is_of_spheres(tag) {
+        let found = "spheres of coarse-grained models after the atoms";
+        return Err(not_a_stream(found, "these spheres before the atoms"));
+    }
     let Some([entities, secondary]) = Categories::find(tag).map(Categories::describes) else { return Ok(()) };
     if entities || (secondary && needs_secondary) {
         let found = format!("`_{}` after the atoms", String::from_utf8_lossy(tag));

@@ -1,0 +1,75 @@
+//! Contents of a file besides the columns of its atoms.
+
+use super::annotations::Annotations;
+use super::assembly::Assemblies;
+use super::kinds::Sequence;
+
+/// The file format that a structure was read from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SourceFormat {
+    /// PDB, fixed columns.
+    Pdb,
+    /// PDBx/mmCIF.
+    Mmcif,
+    /// BinaryCIF: PDBx/mmCIF in MessagePack.
+    BinaryCif,
+    /// PQR: atoms with charges and radii.
+    Pqr,
+    /// XYZ: frames of elements and coordinates.
+    Xyz,
+}
+
+impl SourceFormat {
+    /// Returns `pdb`, `mmcif`, `bcif`, `pqr` or `xyz`.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Pdb => "pdb",
+            Self::Mmcif => "mmcif",
+            Self::BinaryCif => "bcif",
+            Self::Pqr => "pqr",
+            Self::Xyz => "xyz",
+        }
+    }
+}
+
+/// Numbers of the atoms of a file that its structure does not contain.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Unread {
+    /// Atoms of data blocks after the first one with atoms.
+    pub blocks: u64,
+    /// Spheres that represent several residues (`ihm_sphere_obj_site`).
+    pub spheres: u64,
+}
+
+/// Fields of a structure that are not columns.
+#[derive(Debug, Clone)]
+pub(super) struct SourceFields {
+    pub(super) format: SourceFormat,
+    pub(super) id: Option<String>,
+    pub(super) title: Option<String>,
+    pub(super) sequence: Sequence,
+    pub(super) assemblies: Assemblies,
+    pub(super) annotations: Annotations,
+    pub(super) unread: Unread,
+    /// Radius of each atom, Å; empty if the file has none. The reader counts their memory for the structure.
+    pub(super) radii: Vec<f32>,
+    pub(super) warnings: Vec<String>,
+}
+
+impl SourceFields {
+    /// Returns the fields of a file that has only atoms.
+    pub(super) fn new(format: SourceFormat) -> Self {
+        Self {
+            format,
+            id: None,
+            title: None,
+            sequence: Sequence::default(),
+            assemblies: Assemblies::default(),
+            annotations: Annotations::default(),
+            unread: Unread::default(),
+            radii: Vec::new(),
+            warnings: Vec::new(),
+        }
+    }
+}
