@@ -117,27 +117,32 @@ impl<'a> TextClasses<'a> {
                 .lists(self.tables.chain.text(columns.chain[i]), self.tables.residue.text(columns.residue[i]))
     }
 
-    /// Returns true if atom `i` has the residue name of an amino acid or nucleotide.
-    pub(super) fn is_known(&self, columns: &Slices<'_>, i: usize) -> bool {
-        matches!(self.classes[columns.residue[i] as usize], Class::AminoAcid | Class::Nucleotide)
+    /// Returns true for the id of the name of an amino acid or nucleotide.
+    pub(super) fn is_polymer_name(&self, residue: u32) -> bool {
+        matches!(self.classes[residue as usize], Class::AminoAcid | Class::Nucleotide)
+    }
+
+    /// Returns true for the id of a name that is in no list of polymers, cofactors or saccharides.
+    pub(super) fn is_unknown_name(&self, residue: u32) -> bool {
+        self.classes[residue as usize] == Class::Other
     }
 
     /// Returns the relation to a polymer of the residue of kind polymer that begins with `first`. `group` is that of
     /// the residue before, and becomes that of this one.
     pub(super) fn membership(&self, columns: &Slices<'_>, first: usize, group: &mut ResidueGroup) -> Membership {
-        let class = self.classes[columns.residue[first] as usize];
-        if self.is_known(columns, first) || self.is_declared_polymer(columns, first) {
+        let name = columns.residue[first];
+        if self.is_polymer_name(name) || self.is_declared_polymer(columns, first) {
             return Membership::Polymer;
         }
         // Files without residue names have no ligands to tell from a polymer.
-        if self.tables.residue.text(columns.residue[first]).is_empty() {
+        if self.tables.residue.text(name).is_empty() {
             return Membership::Neutral;
         }
         *group = self.group(columns, first, *group);
         match self.entity(columns, first) {
             _ if group.is_ion || group.is_water => Membership::Neutral,
             Some(_) => Membership::Ligand,
-            None if class == Class::Other => Membership::Unknown,
+            None if self.is_unknown_name(name) => Membership::Unknown,
             None => Membership::Listed,
         }
     }
@@ -146,8 +151,7 @@ impl<'a> TextClasses<'a> {
     pub(super) fn unlinked_to_polymer(&self, columns: &mut Slices<'_>, solvent: &Solvent) {
         for i in 0..columns.len() {
             let is_unlinked = columns.kind[i] == Kind::Ligand && !columns.hetero[i] && !solvent.has(columns.residue[i]);
-            let is_unknown = self.classes[columns.residue[i] as usize] == Class::Other;
-            if is_unlinked && is_unknown && self.entity(columns, i).is_none() {
+            if is_unlinked && self.is_unknown_name(columns.residue[i]) && self.entity(columns, i).is_none() {
                 columns.kind[i] = Kind::Polymer;
             }
         }
@@ -208,7 +212,7 @@ impl<'a> TextClasses<'a> {
         while first < columns.len() {
             let end = kinds::residue_end(columns, first);
             let class = self.classes[columns.residue[first] as usize];
-            let is_known = matches!(class, Class::AminoAcid | Class::Nucleotide);
+            let is_known = self.is_polymer_name(columns.residue[first]);
             if !is_known {
                 group = self.group(columns, first, group);
             }

@@ -69,7 +69,7 @@ impl Passed {
         self.categories.len() >= Self::KEPT
     }
 
-    /// Adds an `atom_site` without coordinates, described by [`Layout::missing`]. It is always part of the message.
+    /// Adds an `atom_site` without coordinates, described by `Layout::missing`. It is always part of the message.
     pub(super) fn lacking(&mut self, missing: String) {
         self.categories.push(missing);
     }

@@ -11,7 +11,7 @@ use super::read::Reading;
 /// Model and position of an atom, compared bit by bit.
 type AtomPosition = (i32, [u64; 3]);
 
-/// Average number of rows in a bucket, relative to the number of rows of interest.
+/// A bucket has on average this part of the threshold in rows, and at least one row.
 const BUCKET_PART: u64 = 16;
 /// Bytes of an entry of the exact count.
 const BYTES_PER_POSITION: u64 = 64;

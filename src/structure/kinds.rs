@@ -18,8 +18,7 @@ use super::contents::Kind;
 use super::error::StructureError;
 use super::read::Reading;
 use super::residues::Names;
-use super::source::SourceFields;
-use super::source::SourceFormat;
+use super::source::{SourceFields, SourceFormat};
 use super::text::list;
 use super::texts::without_entity;
 use super::{pieces, residue, sites};
@@ -95,8 +94,8 @@ pub(super) fn assign(
     let solvent = Solvent::new(tables);
     let declared = Declared::new(columns, tables, &source.sequence, &solvent, reading);
     let joints: Vec<Option<Joint>> = tables.name.texts().map(Joint::of).collect();
-    let names = Names::new(tables);
     let texts = TextClasses::new(tables, &source.sequence);
+    let names = Names::new(tables, &texts, &solvent);
     let bytes = usize::try_from(Columns::bytes(columns.len())).unwrap_or(usize::MAX);
     let mut parts = whole_chains(columns, reading.n_pieces(bytes));
     let found = pieces::map(&mut parts, |rows| {
@@ -161,7 +160,8 @@ fn unlinked_residues(columns: &mut Slices<'_>, joints: &[Option<Joint>], texts: 
     while first < columns.len() {
         if first >= residue_end_ix {
             residue_end_ix = (first + 1..columns.len()).find(|&i| columns.starts_residue[i]).unwrap_or(columns.len());
-            has_polymer_name = (first..residue_end_ix).any(|i| !columns.hetero[i] && texts.is_known(columns, i));
+            has_polymer_name =
+                (first..residue_end_ix).any(|i| !columns.hetero[i] && texts.is_polymer_name(columns.residue[i]));
         }
         let end = residue_end(columns, first);
         if columns.kind[first] == Kind::Polymer {

@@ -12,8 +12,8 @@ use super::read::Reading;
 
 /// Distance from all others at which an atom is probably misplaced, Å. Also the edge of the cubes that are compared.
 const FAR: f64 = 1000.0;
-/// Maximum number of cubes whose distances are compared. A structure occupies a few.
-const MAX_CUBES: usize = 1000;
+/// Maximum number of cubes whose distances are compared, each with all others. A structure occupies a few.
+const MAX_CUBES: usize = 128;
 /// Rows between two checks of the cancellation flag: about a millisecond.
 const ROWS_PER_CHECK: usize = 1 << 17;
 
@@ -45,6 +45,7 @@ pub(super) fn check(columns: &Columns, reading: &Reading<'_>) -> Result<Vec<Stri
 fn far_atoms(columns: &Columns, reading: &Reading<'_>) -> Result<Option<String>, StructureError> {
     let mut first = 0;
     for model in columns.model.chunk_by(|a, b| a == b) {
+        reading.check()?;
         let rows = first..first + model.len();
         first = rows.end;
         let Some(cubes) = cubes(columns, rows.clone(), reading)? else { continue };
@@ -52,12 +53,11 @@ fn far_atoms(columns: &Columns, reading: &Reading<'_>) -> Result<Option<String>,
             continue;
         }
         let groups = groups(&cubes);
-        let n_atoms = |group: usize| -> u64 {
-            groups.iter().zip(&cubes).filter(|(of_cube, _)| **of_cube == group).map(|(_, cube)| cube.atoms).sum()
-        };
-        let Some(largest) = groups.iter().copied().max_by_key(|&group| (n_atoms(group), Reverse(group))) else {
-            continue;
-        };
+        let mut n_atoms = vec![0; cubes.len()];
+        for (group, cube) in groups.iter().zip(&cubes) {
+            n_atoms[*group] += cube.atoms;
+        }
+        let Some(largest) = (0..cubes.len()).max_by_key(|&group| (n_atoms[group], Reverse(group))) else { continue };
         let far: Vec<&Content> =
             groups.iter().zip(&cubes).filter(|(group, _)| **group != largest).map(|(_, cube)| cube).collect();
         let Some(example) = far.iter().map(|cube| cube.first).min() else { continue };
@@ -103,7 +103,8 @@ fn cubes(columns: &Columns, rows: Range<usize>, reading: &Reading<'_>) -> Result
     Ok(Some(cubes))
 }
 
-/// Returns the group of each cube: cubes whose atoms have boxes at most [`FAR`] apart, directly or through others.
+/// Returns the group of each cube, named by its first cube: cubes whose atoms have boxes at most [`FAR`] apart,
+/// directly or through others.
 fn groups(cubes: &[Content]) -> Vec<usize> {
     let mut groups = vec![usize::MAX; cubes.len()];
     for start in 0..cubes.len() {

@@ -16,8 +16,7 @@ use super::fields::{Fields, Rows, TextLines};
 use super::models::{self, Mark, ModelBoundary};
 use super::number::{self, single};
 use super::read::{MAX_COORDINATE, Reading};
-use super::source::SourceFields;
-use super::source::SourceFormat;
+use super::source::{SourceFields, SourceFormat};
 use super::text::{Fault, trimmed};
 use crate::surface::{MemoryMeter as _, OutOfMemory};
 
@@ -79,6 +78,10 @@ impl AtomFields {
             Some(found) if is_whole(&found) => Some(found),
             found => Self::by_columns(text, fields.line()).or(found),
         }
+    }
+
+    fn has_element(&self) -> bool {
+        self.element.0 < self.element.1
     }
 
     fn by_white_space(text: &[u8], fields: &Fields<'_>, first: usize) -> Option<Self> {
@@ -154,12 +157,11 @@ pub(super) fn is_pqr(head: &[u8]) -> bool {
         let has_number = residue_number(&head[found.number.0..found.number.1]).is_some();
         let line = &head[line];
         // An element follows the B-factor of many PDB lines, so other columns than those of PDB are no proof.
-        let is_certain = if found.element.0 < found.element.1 {
-            crosses_columns(line) && !line.contains(&b'\t')
+        return if found.has_element() {
+            has_number && crosses_columns(line) && !line.contains(&b'\t')
         } else {
             !has_pdb_columns(line) || (after_coordinates && precise)
         };
-        return has_number && is_certain;
     }
     false
 }
@@ -172,8 +174,8 @@ pub(super) fn ambiguity(text: &[u8]) -> Option<String> {
     for line in TextLines::new(text).take(LINES) {
         let fields = Fields::split(text, line.clone());
         let Some((_, first)) = record(&fields) else { continue };
-        let found =
-            AtomFields::find(text, &fields, first).filter(|found| found.charge.0 >= line.start + COORDINATES_END)?;
+        let found = AtomFields::find(text, &fields, first)
+            .filter(|found| !found.has_element() && found.charge.0 >= line.start + COORDINATES_END)?;
         let radius = number::real(text, found.radius.0, found.radius.1)?;
         if !(0.0..=PLAUSIBLE_RADIUS).contains(&radius) {
             return None;

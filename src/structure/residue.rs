@@ -110,11 +110,6 @@ pub(super) fn is_polymer(residue: &str) -> bool {
     matches!(Class::of(residue), Class::AminoAcid | Class::Nucleotide)
 }
 
-/// Returns true if a residue is in no list.
-pub(super) fn is_unknown(residue: &str) -> bool {
-    Class::of(residue) == Class::Other && !is_water(residue) && !is_ion(residue)
-}
-
 pub(super) fn is_water(residue: &str) -> bool {
     WATER.contains(&residue)
 }

@@ -7,9 +7,9 @@
 use rustc_hash::FxHashMap;
 
 use super::atoms::{Slices, Tables};
+use super::chemistry::TextClasses;
 use super::element::{self, GUESSED};
-use super::kinds::same_chain;
-use super::residue;
+use super::kinds::{Solvent, same_chain};
 
 /// Memory of a name in the map of names, bytes.
 const BYTES_PER_NAME: u64 = 64;
@@ -35,16 +35,17 @@ pub(super) struct Names {
 }
 
 impl Names {
-    pub(super) fn new(tables: &Tables) -> Self {
+    pub(super) fn new(tables: &Tables, texts: &TextClasses<'_>, solvent: &Solvent) -> Self {
         let is_symbol = |name: &str| {
             let z = element::atomic_number(name.as_bytes());
             z != 0 && !element::is_metal(z) && name.bytes().all(|b| b.is_ascii_alphabetic())
         };
+        let names = || (0..).take(tables.residue.texts().len());
         Self {
             symbols: tables.name.texts().map(is_symbol).collect(),
             beads: tables.name.texts().map(element::is_bead).collect(),
-            unknown: tables.residue.texts().map(residue::is_unknown).collect(),
-            polymer: tables.residue.texts().map(residue::is_polymer).collect(),
+            unknown: names().map(|id| texts.is_unknown_name(id) && !solvent.has(id)).collect(),
+            polymer: names().map(|id| texts.is_polymer_name(id)).collect(),
         }
     }
 

@@ -508,7 +508,17 @@ mod tests {
         let behind_text = format!("{HEAD}{rows}_x.y\n;a\ndata_b\n ;\n;\nloop_\n_entity.id\n_entity.type\n1 polymer\n");
         // The last rows have sequence numbers of water, so those of all others have no meaning.
         let water = HEAD.to_owned() + &rows + &row("HETATM", "O", "HOH", "W", 1, "1");
-        for text in [entities, same_line, two_lines.clone(), one_line, behind_text, water] {
+        let two_blocks = format!("{HEAD}{rows}{}{rows}", HEAD.replace("data_x", "data_y"));
+        let spheres = format!("{HEAD}{rows}loop_\n_ihm_sphere_obj_site.id\n_ihm_sphere_obj_site.Cartn_x\n1 0\n");
+        // Residues that are ligands if the file has a polymer.
+        let unknown =
+            ["ALA", "GLY"].iter().fold(["A", "B", "C"].map(|chain| rows_of(chain, false)).concat(), |rows, name| {
+                rows.replace(&format!("C N {name}"), "C C1 QQQ").replace(&format!("C C {name}"), "C C2 QQQ")
+            });
+        let unknown = HEAD.to_owned() + &unknown;
+        let rejected =
+            [entities, same_line, two_lines.clone(), one_line, behind_text, water, two_blocks, spheres, unknown];
+        for text in rejected {
             let found = blocks(&text, 1000).unwrap_err();
             assert!(matches!(found, StructureError::NotAStream { .. }), "{found}");
             assert!(!whole(&text).is_empty());

@@ -10,8 +10,7 @@ use super::fields::{Fields, MAX_FIELDS, Rows, TextLines};
 use super::number;
 use super::pdb::MAX_TITLE;
 use super::read::Reading;
-use super::source::SourceFields;
-use super::source::SourceFormat;
+use super::source::{SourceFields, SourceFormat};
 use super::text::{Fault, normalize};
 
 /// Length of the shortest atom line, bytes.

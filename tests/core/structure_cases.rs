@@ -436,6 +436,8 @@ fn charges_and_radii_are_those_of_pqr() {
     let warnings = |lines: &[String]| structure(lines.concat()).warnings.len();
     assert_eq!(warnings(&[line("-0.42", "1.82"), line("0.60", "1.91").replace("10.000", "20.000")]), 1);
     assert_eq!(warnings(&[line("1.00", "1.82"), line("1.00", "1.91").replace("10.000", "20.000")]), 0);
+    let with_element = line("-0.42", "1.82").trim_end().to_owned() + "           N\n";
+    assert_eq!(warnings(&[with_element, line("0.60", "1.91").replace("10.000", "20.000")]), 0);
     assert_eq!(warnings(&[line("0.50", "21.82"), line("1.00", "1.91").replace("10.000", "20.000")]), 0);
 }
 

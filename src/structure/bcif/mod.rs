@@ -33,8 +33,7 @@ use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
 use super::read::{ReadLimits, Reading};
-use super::source::SourceFields;
-use super::source::SourceFormat;
+use super::source::{SourceFields, SourceFormat};
 use super::text::{decode, normalize};
 use crate::surface::MemoryMeter as _;
 

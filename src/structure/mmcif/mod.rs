@@ -21,8 +21,7 @@ use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
 use super::read::Reading;
-use super::source::SourceFields;
-use super::source::SourceFormat;
+use super::source::{SourceFields, SourceFormat};
 use super::text::{Fault, decode, normalize};
 
 /// Values between two checks of the cancellation flag: a few milliseconds.
