@@ -19,11 +19,14 @@ use super::measure::{Component, components_of};
 use super::memory::{MemoryMeter, Reservation};
 use super::mesh::Mesh;
 use super::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
-use super::sphere_union::{Components, Shell};
+use super::sphere_union::{Components, Shell, rounded};
 use super::spheres::Spheres;
 
 /// Maximum error of the radius of the largest sphere in a cavity, Å.
 const RADIUS_ERROR: f64 = 1e-3;
+
+/// Spheres that are rounded between two checks of the cancellation flag.
+const PER_CHECK: usize = 1 << 14;
 
 /// Number of steps between the radius of the probe and 0 in the search for openings.
 const OPENING_STEPS: u32 = 16;
@@ -85,7 +88,12 @@ impl Boundary<'_> {
         let control = Control { memory, observer: &(), ..self.control.clone() };
         control.memory.grow(LATTICE_BYTES * self.spheres.len() as u64)?;
         let params = SurfaceParams { probe, ..self.params.clone() };
-        let lattice = Lattice::new(self.spheres, &params, &control)?;
+        let mut lattice = Lattice::new(self.spheres, &params, &control)?;
+        // Copies of an atom on an axis of symmetry then coincide or are far enough apart, as in exact measures.
+        for atoms in lattice.atoms.chunks_mut(PER_CHECK) {
+            control.check()?;
+            atoms.iter_mut().flat_map(|atom| &mut atom.frac).for_each(|offset| *offset = rounded(f64::from(*offset)));
+        }
         Ok((control, lattice))
     }
 

@@ -28,7 +28,7 @@ fn exact_of(spheres: &Spheres, surface: SurfaceKind, probe: Option<f64>) -> Exac
     ExactMeasures::of(spheres, &params, &SurfaceLimits::default(), &Control::default()).unwrap()
 }
 
-fn exact(balls: &[Ball], surface: SurfaceKind, probe: Option<f64>) -> ExactMeasures {
+pub(crate) fn exact(balls: &[Ball], surface: SurfaceKind, probe: Option<f64>) -> ExactMeasures {
     exact_of(&spheres(balls), surface, probe)
 }
 
@@ -152,10 +152,10 @@ fn spread(n: u32) -> impl Iterator<Item = [f64; 3]> {
 }
 
 /// Pseudorandom numbers from 0 to 1, the same in every run.
-struct Numbers(u64);
+pub(crate) struct Numbers(pub(crate) u64);
 
 impl Numbers {
-    fn next(&mut self) -> f64 {
+    pub(crate) fn next(&mut self) -> f64 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         f64::from((self.0 >> 40) as u32) / f64::from(1_u32 << 24)
     }
@@ -344,7 +344,7 @@ fn all_surfaces_without_a_probe_are_the_van_der_waals_surface() {
 }
 
 /// Returns spheres at the corners of a truncated icosahedron.
-fn fullerene() -> Vec<Ball> {
+pub(crate) fn fullerene() -> Vec<Ball> {
     let golden = f64::midpoint(1.0, 5.0_f64.sqrt());
     let mut balls: Vec<Ball> = Vec::new();
     for kind in [[0.0, 1.0, 3.0 * golden], [1.0, 2.0 + golden, 2.0 * golden], [2.0, 1.0 + 2.0 * golden, golden]] {

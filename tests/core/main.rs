@@ -15,6 +15,7 @@ mod bcif_stream;
 mod cancellation;
 mod cavities;
 mod cut;
+mod degenerate;
 mod exact_areas;
 mod exact_measures;
 mod formats_meshopt;

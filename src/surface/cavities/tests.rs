@@ -235,6 +235,42 @@ fn a_cubic_hole_has_the_symmetry_of_its_spheres() {
 }
 
 #[test]
+fn a_symmetric_cavity_changes_by_the_order_of_a_perturbation() {
+    // The probe touches four spheres at each vertex of the cavity.
+    let corner = |i: u32| ([0, 1, 2].map(|k| if i >> k & 1 == 0 { -2.0 } else { 2.0 }), 1.8);
+    let balls: Vec<Ball> = (0..8).map(corner).chain([([0.0, 0.0, 60.0], 1.0)]).collect();
+    let measures = |balls: &[Ball]| {
+        let [Cavity { area, volume, accessible_area, accessible_volume, .. }] = cavities(balls, 1.2)[..] else {
+            panic!("one cavity")
+        };
+        [area, volume, accessible_area, accessible_volume]
+    };
+    let still = measures(&balls);
+    let mut state = 1_u64;
+    let mut number = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        f64::from((state >> 40) as u32) / f64::from(1_u32 << 23) - 1.0
+    };
+    let mut largest = |noise: f64| {
+        let moved: Vec<Ball> = balls.iter().map(|(c, r)| (c.map(|x| x + noise * number()), *r)).collect();
+        still.iter().zip(measures(&moved)).map(|(a, b)| (b / a - 1.0).abs()).fold(0.0, f64::max)
+    };
+    for k in 3..=14 {
+        let noise = 10.0_f64.powi(-k);
+        let change = largest(noise);
+        assert!(change < 1e-5 + 30.0 * noise, "{noise}: {change}");
+    }
+    assert!(largest(0.01) > 1e-3, "the control");
+    // Copies of the spheres, as at a special position of an assembly.
+    for shift in [1e-16, 1e-12, 1e-11, 1e-10, 1e-9, 1e-7] {
+        let copies = balls.iter().map(|([x, y, z], r)| ([x + shift, y - shift, *z], *r));
+        let twice = measures(&balls.iter().copied().chain(copies).collect::<Vec<_>>());
+        let change = still.iter().zip(twice).map(|(a, b)| (b / a - 1.0).abs()).fold(0.0, f64::max);
+        assert!(change < 1e-5, "copies {shift} Å away: {change}");
+    }
+}
+
+#[test]
 fn random_clusters_have_the_cavities_of_a_flood_fill() {
     let mut state = 3_u64;
     let mut number = || {

@@ -3,9 +3,9 @@
 use crate::surface::candidates::Comparisons;
 use crate::surface::error::SurfaceError;
 
-/// Tolerance of all covering tests, Å: a cap covers only points that lie farther than this inside it. Points at which
-/// caps meet are then exposed, which moves the surface by the tolerance at most. Without such a point, the surface
-/// would move farther.
+/// Tolerance of the covering tests for meshes and components, Å: a cap covers only points that lie farther than this
+/// inside it. Points at which caps meet are then exposed, which moves the surface by the tolerance at most. Without
+/// such a point, the surface would move farther.
 pub(super) const TOLERANCE: f64 = 1e-6;
 
 /// Caps that are sorted without a check of the cancellation flag: a few milliseconds.
@@ -44,6 +44,20 @@ pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
+/// Returns the squared sine of the angle between two unit vectors, whose product is `cos`.
+pub(super) fn sin2(a: [f64; 3], b: [f64; 3], cos: f64) -> f64 {
+    // The difference loses all digits for vectors that are nearly parallel.
+    if cos.abs() < 0.999 {
+        return 1.0 - cos * cos;
+    }
+    let normal = cross(a, b);
+    dot(normal, normal)
+}
+
+pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|k| a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3])
+}
+
 /// Fills `caps` with the caps on the sphere of number `own` that no other cap contains, largest first.
 ///
 /// # Errors
@@ -64,7 +78,7 @@ pub(super) fn caps(
 }
 
 /// Adds the caps of all `neighbours` on the sphere of number `own`.
-pub(super) fn add_caps(own: u32, radius: f64, neighbours: &[Neighbour], caps: &mut Vec<Cap>) -> Cover {
+fn add_caps(own: u32, radius: f64, neighbours: &[Neighbour], caps: &mut Vec<Cap>) -> Cover {
     for other in neighbours {
         let distance2 = dot(other.to, other.to);
         let (sum, difference) = (radius + other.radius, radius - other.radius);
@@ -133,6 +147,6 @@ impl Cap {
         let cos = dot(self.axis, other.axis);
         // On the edge of the other cap, n·axis is at least height·cos − sin·sin.
         let over = other.height * cos - self.height - tolerance;
-        over >= 0.0 && over * over >= (1.0 - other.height * other.height) * (1.0 - cos * cos)
+        over >= 0.0 && over * over >= (1.0 - other.height * other.height) * sin2(self.axis, other.axis, cos)
     }
 }

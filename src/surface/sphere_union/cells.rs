@@ -9,13 +9,17 @@ use super::caps::Neighbour;
 use super::radius;
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::{LatticeAtom, to_i32, to_u32};
+use crate::surface::lattice::{LatticeAtom, to_f32, to_i32, to_u32};
 
 /// Maximum memory per sphere, bytes: its cell while sorting, its number and its entry in the index.
 const BYTES: u64 = 64;
 
 /// Spheres or cells between two checks of the cancellation flag: a few milliseconds.
 const PER_CHECK: usize = 1 << 16;
+
+/// Step to which centres are rounded, Å: the precision of [`LatticeAtom`] half-way between grid points. Two centres
+/// then coincide or are far enough apart to define the plane of their circle.
+const COORDINATE_STEP: f64 = 1.0 / (1_u32 << 25) as f64;
 
 /// Cells with the diameter of the largest sphere as edge length: spheres that overlap lie in neighbouring cells.
 pub(super) struct Cells<'a> {
@@ -118,5 +122,21 @@ impl Around<'_> {
                 found.push(Neighbour { to, radius: *radius, index: *index });
             }
         }
+    }
+}
+
+/// Rounds the offset of a centre from its cell to [`COORDINATE_STEP`].
+pub(in crate::surface) fn rounded(offset: f64) -> f32 {
+    to_f32((offset / COORDINATE_STEP).round() * COORDINATE_STEP)
+}
+
+/// Places a sphere on the lattice with a spacing of 1 Å, and rounds its centre to [`COORDINATE_STEP`].
+pub(super) fn on_lattice(centre: [f64; 3], radius: f64, number: usize) -> LatticeAtom {
+    let cell = centre.map(f64::round);
+    LatticeAtom {
+        cell: cell.map(to_i32),
+        inv_length2: to_f32(radius.powi(-2)),
+        frac: std::array::from_fn(|k| rounded(centre[k] - cell[k])),
+        source: to_u32(number),
     }
 }

@@ -9,20 +9,24 @@ struct Direction {
     x: f64,
     y: f64,
     order: f64,
+    /// Number of the cap whose edge crosses the circle here; [`NO_CAP`] at both ends of the whole circle.
+    cap: u32,
 }
 
-impl Direction {
-    const FIRST: Self = Self { x: 1.0, y: 0.0, order: 0.0 };
-    const LAST: Self = Self { x: 1.0, y: 0.0, order: 4.0 };
+const NO_CAP: u32 = u32::MAX;
 
-    fn new(x: f64, y: f64) -> Self {
+impl Direction {
+    const FIRST: Self = Self { x: 1.0, y: 0.0, order: 0.0, cap: NO_CAP };
+    const LAST: Self = Self { order: 4.0, ..Self::FIRST };
+
+    fn new(x: f64, y: f64, cap: u32) -> Self {
         let along = y / (x.abs() + y.abs());
         let order = match (x < 0.0, y < 0.0) {
             (false, false) => along,
             (true, _) => 2.0 - along,
             (false, true) => 4.0 + along,
         };
-        Self { x, y, order }
+        Self { x, y, order, cap }
     }
 }
 
@@ -36,6 +40,9 @@ pub(super) struct Exposed {
     pub(super) middle: [f64; 2],
     /// Cosine and sine of φ; φ is from 0 to π.
     pub(super) half: [f64; 2],
+    /// Numbers of the caps that cover the circle before the first and after the last direction, counter-clockwise;
+    /// `None` for a whole circle.
+    pub(super) end_caps: Option<[u32; 2]>,
 }
 
 /// Part of a circle that no cap covers. Caps are subtracted one by one; points on the edge of a cap remain.
@@ -62,8 +69,8 @@ impl Uncovered {
         self.ranges.len()
     }
 
-    /// Subtracts the directions n with n·(p, q) > `bound`.
-    pub(super) fn cover(&mut self, [p, q]: [f64; 2], bound: f64) {
+    /// Subtracts the directions n with n·(p, q) > `bound`, which the cap of number `cap` covers.
+    pub(super) fn cover(&mut self, [p, q]: [f64; 2], bound: f64, cap: u32) {
         let length = (p * p + q * q).sqrt();
         if bound >= length {
             return;
@@ -74,16 +81,18 @@ impl Uncovered {
         }
         let (p, q, cos) = (p / length, q / length, bound / length);
         let sin = (1.0 - cos * cos).max(0.0).sqrt();
-        let from = Direction::new(p * cos + q * sin, q * cos - p * sin);
-        let to = Direction::new(p * cos - q * sin, q * cos + p * sin);
+        let from = Direction::new(p * cos + q * sin, q * cos - p * sin, cap);
+        let to = Direction::new(p * cos - q * sin, q * cos + p * sin, cap);
         let Self { ranges, next } = self;
         next.clear();
         // A cap that contains direction 0 covers the directions before `to` and those after `from`.
         let wraps = from.order > to.order;
         for &(start, end) in &*ranges {
             if wraps {
-                let (start, end) =
-                    (if to.order > start.order { to } else { start }, if from.order < end.order { from } else { end });
+                let (start, end) = (
+                    if to.order >= start.order { to } else { start },
+                    if from.order <= end.order { from } else { end },
+                );
                 if start.order <= end.order {
                     next.push((start, end));
                 }
@@ -110,7 +119,7 @@ impl Uncovered {
         };
         let continues = first_start == Direction::FIRST && last_end == Direction::LAST;
         if self.ranges.len() == 1 && continues {
-            each(Exposed { middle: [1.0, 0.0], half: [-1.0, 0.0] });
+            each(Exposed { middle: [1.0, 0.0], half: [-1.0, 0.0], end_caps: None });
             return;
         }
         let mut own = &self.ranges[..];
@@ -138,7 +147,7 @@ fn exposed(a: Direction, b: Direction, span: f64) -> Exposed {
     let scale = (x * x + y * y).sqrt().recip();
     let middle = [x * scale, y * scale];
     let half = [a.x * middle[0] + a.y * middle[1], (a.x * middle[1] - a.y * middle[0]).abs()];
-    Exposed { middle, half }
+    Exposed { middle, half, end_caps: Some([a.cap, b.cap]) }
 }
 
 #[cfg(test)]
@@ -151,18 +160,27 @@ mod tests {
         ([cos, sin], half.to_radians().cos())
     }
 
-    /// Returns the middle and half-angle of each exposed arc, degrees.
+    /// Returns the middle and half-angle of each exposed arc, degrees. Checks that the caps around it end at its ends.
     fn exposed_by(caps: &[(f64, f64)]) -> Vec<[f64; 2]> {
         let mut left = Uncovered::default();
         left.reset();
-        for &(middle, half) in caps {
+        for (&(middle, half), number) in caps.iter().zip(0..) {
             let (direction, bound) = cap(middle, half);
-            left.cover(direction.map(|c| 0.7 * c), 0.7 * bound);
+            left.cover(direction.map(|c| 0.7 * c), 0.7 * bound, number);
         }
         let mut arcs = Vec::new();
         left.arcs(|arc| {
             let middle = arc.middle[1].atan2(arc.middle[0]).to_degrees().rem_euclid(360.0);
-            arcs.push([middle, arc.half[1].atan2(arc.half[0]).to_degrees()]);
+            let half = arc.half[1].atan2(arc.half[0]).to_degrees();
+            assert_eq!(arc.end_caps.is_none(), caps.is_empty());
+            for (cap, (ends, side)) in
+                arc.end_caps.into_iter().flatten().zip([(middle - half, 1.0), (middle + half, -1.0)])
+            {
+                let (from, reach) = caps[cap as usize];
+                let off = (from + side * reach - ends + 180.0).rem_euclid(360.0) - 180.0;
+                assert!(off.abs() < 1e-5, "{caps:?}: cap {cap} at {ends}");
+            }
+            arcs.push([middle, half]);
         });
         arcs
     }
@@ -197,13 +215,13 @@ mod tests {
         let mut left = Uncovered::default();
         left.reset();
         // Exact numbers: both caps end at (0, 1) and (0, −1).
-        left.cover([1.0, 0.0], 0.0);
-        left.cover([-1.0, 0.0], 0.0);
+        left.cover([1.0, 0.0], 0.0, 0);
+        left.cover([-1.0, 0.0], 0.0, 1);
         let mut arcs = Vec::new();
         left.arcs(|arc| arcs.push(arc));
         assert_eq!(arcs.len(), 2, "{arcs:?}");
         assert!(arcs.iter().all(|arc| arc.half == [1.0, 0.0] && arc.middle[0] == 0.0), "{arcs:?}");
-        left.cover([-1.0, 0.0], -1e-9);
+        left.cover([-1.0, 0.0], -1e-9, 2);
         assert!(left.is_empty());
     }
 }

@@ -1,8 +1,8 @@
 //! Exact areas and volumes of surfaces of spheres, in closed form from the exposed arcs.
 //!
 //! The contact part of a solvent-excluded surface on a sphere is the exposed part of the enlarged sphere, scaled to the
-//! radius of the sphere. A toroidal part belongs to an arc, a concave part to a vertex. A concave part is the polygon
-//! that the planes of the vertex's arcs bound on the sphere of the probe, without the parts within the probe at other
+//! radius of the sphere. A toroidal part belongs to an arc, a concave part to a vertex. A concave part is the spherical
+//! convex hull of the points of contact on the sphere of the probe, without the parts within the probe at other
 //! vertices (Quan and Stamm, J. Comput. Phys. 322, 2016). A point of a toroidal or concave part counts for the sphere
 //! whose point of contact with the probe is nearest.
 
@@ -11,11 +11,11 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::caps::{self, Cap, Cover, Neighbour, TOLERANCE, dot};
-use super::cells::Cells;
+use super::caps::{self, Cap, Cover, Neighbour, dot};
+use super::cells::{Cells, on_lattice};
 use super::circle::Uncovered;
 use super::components::Components;
-use super::concave::{ArcEnd, Vertices};
+use super::concave::{COINCIDENT, Vertex, Vertices};
 use super::region::{EdgeArc, Region};
 use super::torus::ProbePath;
 use super::{CELLS_PER_PART, radius};
@@ -23,7 +23,7 @@ use crate::surface::candidates::{Comparisons, OverlapCount};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::kernel::Shape;
-use crate::surface::lattice::{LatticeAtom, effective_radius, to_f32, to_i32, to_u32};
+use crate::surface::lattice::{LatticeAtom, effective_radius, to_i32};
 use crate::surface::memory::Reservation;
 use crate::surface::params::{SurfaceKind, SurfaceLimits, SurfaceParams, bad};
 use crate::surface::spheres::Spheres;
@@ -88,8 +88,12 @@ impl AddAssign for ComponentMeasures {
     }
 }
 
+/// Tolerance within which a larger cap contains a smaller one, Å. Of caps that are equal up to rounding one remains,
+/// because a common edge would bound the face twice.
+pub(super) const EQUAL_CAPS: f64 = 1e-12;
+
 /// Spheres that are converted between two checks of the cancellation flag.
-const PER_CHECK: usize = 1 << 14;
+pub(super) const PER_CHECK: usize = 1 << 14;
 
 /// Measures of the spheres, or of the probes at vertices, of a run of cells.
 #[derive(Default)]
@@ -98,13 +102,14 @@ pub(super) struct PartMeasures {
     pub(super) of_spheres: Vec<(u32, AreaParts)>,
     /// Integrals of components, by number. A component may have several entries.
     pub(super) of_components: Vec<(u32, Integrals)>,
-    pub(super) ends: Vec<ArcEnd>,
+    /// Ends of arcs; a vertex occurs once per arc.
+    pub(super) arc_ends: Vec<Vertex>,
 }
 
 impl PartMeasures {
     /// Returns the memory of all entries, bytes.
     fn bytes(&self) -> usize {
-        size_of_val(&*self.of_spheres) + size_of_val(&*self.of_components) + size_of_val(&*self.ends)
+        size_of_val(&*self.of_spheres) + size_of_val(&*self.of_components) + size_of_val(&*self.arc_ends)
     }
 }
 
@@ -233,17 +238,6 @@ impl Components<'_> {
     }
 }
 
-/// Places a sphere on the lattice with a spacing of 1 Å.
-fn on_lattice(centre: [f64; 3], radius: f64, number: usize) -> LatticeAtom {
-    let cell = centre.map(f64::round);
-    LatticeAtom {
-        cell: cell.map(to_i32),
-        inv_length2: to_f32(radius.powi(-2)),
-        frac: std::array::from_fn(|k| to_f32(centre[k] - cell[k])),
-        source: to_u32(number),
-    }
-}
-
 impl FaceSearch<'_> {
     /// Returns the areas of each sphere and the integrals of each component.
     fn run(&self) -> Result<(Vec<AreaParts>, Vec<Integrals>), SurfaceError> {
@@ -259,16 +253,15 @@ impl FaceSearch<'_> {
                 }
             }
         };
-        let mut ends = Vec::new();
+        let mut arc_ends = Vec::new();
         let cells = Cells::new(self.atoms, self.control)?;
         for part in self.each(&cells, |own, scratch, part, comparisons| self.face(own, scratch, part, comparisons))? {
             add(&part);
-            ends.extend(part.ends);
+            arc_ends.extend(part.arc_ends);
         }
-        if let Some(probe) = self.probe.filter(|_| !ends.is_empty()) {
-            self.control.memory.grow((size_of::<LatticeAtom>() * ends.len()) as u64)?;
-            let probes: Vec<LatticeAtom> = ends.iter().map(|end| end.probe).collect();
-            let vertices = Vertices { ends: &ends, probe, search: self };
+        if let Some(probe) = self.probe.filter(|_| !arc_ends.is_empty()) {
+            let vertices = Vertices::new(arc_ends, probe, self)?;
+            let probes = vertices.probes()?;
             let cells = Cells::new(&probes, self.control)?;
             let concave = |own, scratch: &mut Scratch, part: &mut PartMeasures, comparisons: &mut Comparisons<'_>| {
                 vertices.concave(own, scratch, part, comparisons)
@@ -328,8 +321,7 @@ impl FaceSearch<'_> {
     ) -> Result<(), SurfaceError> {
         let length = radius(&self.atoms[own as usize]);
         let Some(first) = self.components.map_or(Some(0), |components| components.first(own)) else { return Ok(()) };
-        // Equal edges must not bound the face twice: of caps that differ by less than the tolerance, one remains.
-        if caps::caps(own, length, neighbours, -TOLERANCE, caps, comparisons)? == Cover::Whole {
+        if caps::caps(own, length, neighbours, -EQUAL_CAPS, caps, comparisons)? == Cover::Whole {
             return Ok(());
         }
         Region::outside(caps, first, uncovered, comparisons, regions, |cap, arc| {
@@ -377,17 +369,17 @@ impl FaceSearch<'_> {
         }
         let excluded = [areas[0] + areas[1], flux];
         part.of_components.push((component, Integrals { excluded, ..Integrals::default() }));
-        // The ends of a very short arc are one vertex, and its planes cancel each other.
-        if arc.is_circle() || 2.0 * edge * arc.half_angle < TOLERANCE {
+        let Some([before, after]) = arc.end_caps else { return };
+        // Both ends of an arc this short are one vertex; longer arcs end there as well.
+        if 2.0 * edge * arc.half_angle < COINCIDENT {
             return;
         }
         let [cos, sin] = arc.half;
-        for side in [1.0, -1.0] {
-            let at = std::array::from_fn(|k| {
-                middle[k] + f64::from(self.origin[k]) + edge * (cos * arc.middle[k] - side * sin * arc.along[k])
-            });
-            let tangent = std::array::from_fn(|k| sin * arc.middle[k] + side * cos * arc.along[k]);
-            part.ends.push(ArcEnd { probe: on_lattice(at, probe, part.ends.len()), tangent, spheres, component });
+        let middle: [f64; 3] = std::array::from_fn(|k| f64::from(first.frac[k]) + to_plane * cap.axis[k]);
+        // At the start of the arc, the spheres are clockwise as seen from the probe, so they change places.
+        for (side, spheres) in [(-1.0, [spheres[1], spheres[0], before]), (1.0, [spheres[0], spheres[1], after])] {
+            let at = std::array::from_fn(|k| middle[k] + edge * (cos * arc.middle[k] + side * sin * arc.along[k]));
+            part.arc_ends.push(Vertex::new(first.cell, at, spheres, component));
         }
     }
 }

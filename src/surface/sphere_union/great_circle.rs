@@ -31,7 +31,7 @@ impl GreatCircle {
     pub(super) fn uncover(&self, caps: &[Cap], tolerance: f64, uncovered: &mut Uncovered) {
         uncovered.reset();
         for cap in caps {
-            uncovered.cover([dot(cap.axis, self.first), dot(cap.axis, self.second)], cap.height + tolerance);
+            uncovered.cover([dot(cap.axis, self.first), dot(cap.axis, self.second)], cap.height + tolerance, cap.index);
         }
     }
 

@@ -29,6 +29,7 @@ use rayon::prelude::*;
 
 use self::caps::{Cap, Cover, Neighbour, TOLERANCE, dot};
 use self::cells::Cells;
+pub(super) use self::cells::rounded;
 use self::circle::{Exposed, Uncovered};
 pub(super) use self::components::Components;
 pub(super) use self::distance::{BrickUnion, Feature, Lanes, Nearest};
@@ -313,7 +314,7 @@ impl Circle {
             ([-y, x, 0.0], x * x + y * y)
         };
         let first = vector.map(|c| c / length2.sqrt());
-        let second = [y * first[2] - z * first[1], z * first[0] - x * first[2], x * first[1] - y * first[0]];
+        let second = caps::cross(cap.axis, first);
         let sin = (1.0 - cap.height * cap.height).max(0.0).sqrt();
         let centre = cap.axis.map(|c| c * cap.height * radius);
         Self { centre, axis: cap.axis, first, second, radius: radius * sin, sin }
@@ -334,11 +335,11 @@ impl Circle {
             let cos = dot(cap.axis, own.axis);
             let bound = cap.height + tolerance - own.height * cos;
             // No point of the circle lies within the cap.
-            if bound >= 0.0 && bound * bound >= self.sin * self.sin * (1.0 - cos * cos) {
+            if bound >= 0.0 && bound * bound >= self.sin * self.sin * caps::sin2(cap.axis, own.axis, cos) {
                 continue;
             }
             let toward = [dot(cap.axis, self.first), dot(cap.axis, self.second)].map(|c| c * self.sin);
-            uncovered.cover(toward, bound);
+            uncovered.cover(toward, bound, cap.index);
             if uncovered.is_empty() {
                 break;
             }

@@ -32,18 +32,14 @@ pub(super) struct EdgeArc {
     pub(super) half: [f64; 2],
     /// Half-angle, from 0 to π.
     pub(super) half_angle: f64,
+    /// Numbers of the caps that cover the edge before the start and after the end of the arc; `None` for a whole edge.
+    pub(super) end_caps: Option<[u32; 2]>,
 }
 
 impl EdgeArc {
-    fn new(circle: &Circle, Exposed { middle: [x, y], half }: Exposed) -> Self {
+    fn new(circle: &Circle, Exposed { middle: [x, y], half, end_caps }: Exposed) -> Self {
         let vector = |x: f64, y: f64| std::array::from_fn(|k| x * circle.first[k] + y * circle.second[k]);
-        Self { middle: vector(x, y), along: vector(-y, x), half, half_angle: half[1].atan2(half[0]) }
-    }
-
-    /// Returns true if the arc is the whole circle and has no ends.
-    #[expect(clippy::float_cmp, reason = "a whole circle is stored with exactly these values")]
-    pub(super) fn is_circle(&self) -> bool {
-        self.half == [-1.0, 0.0]
+        Self { middle: vector(x, y), along: vector(-y, x), half, half_angle: half[1].atan2(half[0]), end_caps }
     }
 }
 
