@@ -1,16 +1,12 @@
 // Stage `interpolate`: positions of the vertices on crossing edges, analytic normals, and nearest atoms if requested.
 // One workgroup per brick; a lane finds the edge of its vertex by rank among the crossing edges.
-//
-// Normals are those at the linearly interpolated crossings, which stage `refine` moves by little.
 #include shared/params.wgsl
 #include shared/atom.wgsl
 #include shared/bits.wgsl
 #include shared/tiles.wgsl
-#include shared/chunk.wgsl
 #include shared/kernel.wgsl
 #include shared/record.wgsl
 #include shared/quantize.wgsl
-#include shared/crossing.wgsl
 #include shared/counters.wgsl
 #include shared/vertices.wgsl
 
@@ -21,19 +17,17 @@ override NEAREST: bool = false;
 @group(0) @binding(1) var<storage, read> atoms: array<Atom>;
 @group(0) @binding(2) var<storage, read> tiles: array<Tile>;
 @group(0) @binding(3) var<storage, read> bricks: array<u32>;
-@group(0) @binding(4) var<storage, read> halo: array<u32>;
-@group(0) @binding(5) var<storage, read> lists: array<u32>;
-@group(0) @binding(6) var<storage, read> heads: array<vec4<u32>>;
-@group(0) @binding(7) var<storage, read> field: array<f32>;
-@group(0) @binding(8) var<storage, read> crossings: array<f32>;
-@group(0) @binding(9) var<storage, read> records: array<BrickRecord>;
-@group(0) @binding(10) var<storage, read> counts: array<u32>;
-@group(0) @binding(11) var<storage, read> offsets: array<vec2<u32>>;
+@group(0) @binding(4) var<storage, read> lists: array<u32>;
+@group(0) @binding(5) var<storage, read> heads: array<vec4<u32>>;
+@group(0) @binding(6) var<storage, read> crossings: array<f32>;
+@group(0) @binding(7) var<storage, read> records: array<BrickRecord>;
+@group(0) @binding(8) var<storage, read> counts: array<u32>;
+@group(0) @binding(9) var<storage, read> offsets: array<vec2<u32>>;
 // Words of the requested vertex layout: three per position and normal, or two per position and one per normal.
-@group(0) @binding(12) var<storage, read_write> positions: array<u32>;
-@group(0) @binding(13) var<storage, read_write> normals: array<u32>;
-@group(0) @binding(14) var<storage, read_write> sources: array<u32>;
-@group(0) @binding(15) var<storage, read_write> counters: Counters;
+@group(0) @binding(10) var<storage, read_write> positions: array<u32>;
+@group(0) @binding(11) var<storage, read_write> normals: array<u32>;
+@group(0) @binding(12) var<storage, read_write> sources: array<u32>;
+@group(0) @binding(13) var<storage, read_write> counters: Counters;
 
 // Number of candidates staged at once.
 const PIECE: u32 = 128u;
@@ -51,19 +45,6 @@ fn gradient_of(p: vec3<f32>, atom: vec4<f32>) -> vec3<f32> {
 // Radius of a staged atom: ρ, or half of it for kernels whose support is twice the radius.
 fn radius_of(atom: vec4<f32>) -> f32 {
     return select(0.5, 1.0, KERNEL == GAUSSIAN) * inverseSqrt(atom.w);
-}
-
-// Density at the second grid point of an edge.
-fn density_beyond(edge: Edge) -> f32 {
-    let next = first_point(edge) + vec3<u32>(vec3<u32>(0u, 1u, 2u) == vec3<u32>(edge.axis));
-    let beyond = (next.x | next.y | next.z) > 7u;
-    let slot = slots[select(0u, edge.axis + 1u, beyond)];
-    if (slot == NONE) {
-        // A brick out of reach of all atoms.
-        return 0.0;
-    }
-    let point = next & vec3<u32>(7u);
-    return field[slot * 512u + point.z * 64u + point.y * 8u + point.x];
 }
 
 // Stages the candidates from `start` on, padded to a multiple of four by distant atoms.
@@ -106,9 +87,10 @@ fn main(
     for (var base = 0u; base < n; base += LANES) {
         let vertex = base + lane;
         let mine = vertex < n;
-        // The vertex, and the linearly interpolated crossing.
-        var at = vec3<f32>(0.0);
         var p = vec3<f32>(0.0);
+        if (mine) {
+            p = vertex_of(edge_of(vertex));
+        }
         var gradient = vec3<f32>(0.0);
         var nearest = 3.402823e38;
         var source = 0u;
@@ -120,12 +102,6 @@ fn main(
                 workgroupBarrier();
             }
             // No barriers follow, so lanes without a vertex may skip the rest.
-            if (mine && start == 0u) {
-                let edge = edge_of(vertex);
-                at = vertex_of(edge);
-                let inner = field[slots[0] * 512u + edge.z * 64u + edge.bit];
-                p = point_on(edge, crossing_at(inner, density_beyond(edge)));
-            }
             if (mine) {
                 for (var i = 0u; i < in_piece; i += 4u) {
                     gradient += gradient_of(p, staged[i]);
@@ -135,7 +111,7 @@ fn main(
                 }
                 if (NEAREST) {
                     for (var i = 0u; i < in_piece; i++) {
-                        let d = length(at - staged[i].xyz) - radius_of(staged[i]);
+                        let d = length(p - staged[i].xyz) - radius_of(staged[i]);
                         if (d < nearest) {
                             nearest = d;
                             source = start + i;
@@ -148,7 +124,7 @@ fn main(
             if (NEAREST) {
                 sources[first + vertex] = atoms[lists[head.x + source]].source;
             }
-            write_vertex(first + vertex, origin, at, gradient);
+            write_vertex(first + vertex, origin, p, gradient);
         }
     }
     workgroupBarrier();

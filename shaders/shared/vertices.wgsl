@@ -1,12 +1,12 @@
 // Vertices of a brick in workgroup memory, and their output. Requires `params`, `records`, `positions`, `normals`,
-// `counters`, `crossings`, `halo`, shared/chunk, shared/record and shared/quantize.
+// `counters`, `crossings`, shared/record and shared/quantize.
 
 const LANES: u32 = 128u;
 
 var<workgroup> crossing: array<u32, 48>;
 var<workgroup> layers: array<u32, 8>;
-// Slots of the brick and of its neighbours towards +x, +y and +z.
-var<workgroup> slots: array<u32, 4>;
+// Slot of the brick in the chunk.
+var<workgroup> slot: u32;
 // Keys of the highest position per axis so far, and of the highest negative position.
 var<workgroup> bounds: array<atomic<u32>, 6>;
 
@@ -39,12 +39,10 @@ fn load_brick(lane: u32, id: u32) {
         crossing[lane] = records[id].crossing[lane];
     } else if (lane < 56u) {
         layers[lane - 48u] = records[id].layers[lane - 48u];
-    } else if (lane < 59u) {
-        slots[lane - 55u] = slot_of(records[id].neighbours[1u << (lane - 56u)]);
-    } else if (lane == 59u) {
-        slots[0] = id - params.first_brick;
-    } else if (lane < 66u) {
-        atomicStore(&bounds[lane - 60u], atomicLoad(&counters.bounds[lane - 60u]));
+    } else if (lane == 56u) {
+        slot = id - params.first_brick;
+    } else if (lane < 63u) {
+        atomicStore(&bounds[lane - 57u], atomicLoad(&counters.bounds[lane - 57u]));
     }
 }
 
@@ -77,15 +75,11 @@ fn first_point(edge: Edge) -> vec3<u32> {
     return vec3<u32>(edge.bit & 7u, edge.bit >> 3u, edge.z);
 }
 
-// Point on an edge, relative to the first grid point of the brick.
-fn point_on(edge: Edge, t: f32) -> vec3<f32> {
+// Point of the surface on an edge, relative to the first grid point of the brick.
+fn vertex_of(edge: Edge) -> vec3<f32> {
+    let t = crossings[3u * (slot * 512u + edge.z * 64u + edge.bit) + edge.axis];
     let axis = vec3<u32>(0u, 1u, 2u) == vec3<u32>(edge.axis);
     return vec3<f32>(first_point(edge)) + select(vec3<f32>(0.0), vec3<f32>(t), axis);
-}
-
-// Point of the surface on an edge.
-fn vertex_of(edge: Edge) -> vec3<f32> {
-    return point_on(edge, crossings[3u * (slots[0] * 512u + edge.z * 64u + edge.bit) + edge.axis]);
 }
 
 // Writes vertex `at` with the position `p`, relative to the grid point `origin`, and a normal along `outward`.

@@ -4,7 +4,6 @@
 #include shared/atom.wgsl
 #include shared/bits.wgsl
 #include shared/tiles.wgsl
-#include shared/chunk.wgsl
 #include shared/record.wgsl
 #include shared/quantize.wgsl
 #include shared/counters.wgsl
@@ -19,17 +18,16 @@ override NEAREST: bool = false;
 @group(0) @binding(2) var<storage, read> boundary: array<vec4<u32>>;
 @group(0) @binding(3) var<storage, read> tiles: array<Tile>;
 @group(0) @binding(4) var<storage, read> bricks: array<u32>;
-@group(0) @binding(5) var<storage, read> halo: array<u32>;
-@group(0) @binding(6) var<storage, read> lists: array<u32>;
-@group(0) @binding(7) var<storage, read> heads: array<vec4<u32>>;
-@group(0) @binding(8) var<storage, read> crossings: array<f32>;
-@group(0) @binding(9) var<storage, read> records: array<BrickRecord>;
-@group(0) @binding(10) var<storage, read> counts: array<u32>;
-@group(0) @binding(11) var<storage, read> offsets: array<vec2<u32>>;
-@group(0) @binding(12) var<storage, read_write> positions: array<u32>;
-@group(0) @binding(13) var<storage, read_write> normals: array<u32>;
-@group(0) @binding(14) var<storage, read_write> sources: array<u32>;
-@group(0) @binding(15) var<storage, read_write> counters: Counters;
+@group(0) @binding(5) var<storage, read> lists: array<u32>;
+@group(0) @binding(6) var<storage, read> heads: array<vec4<u32>>;
+@group(0) @binding(7) var<storage, read> crossings: array<f32>;
+@group(0) @binding(8) var<storage, read> records: array<BrickRecord>;
+@group(0) @binding(9) var<storage, read> counts: array<u32>;
+@group(0) @binding(10) var<storage, read> offsets: array<vec2<u32>>;
+@group(0) @binding(11) var<storage, read_write> positions: array<u32>;
+@group(0) @binding(12) var<storage, read_write> normals: array<u32>;
+@group(0) @binding(13) var<storage, read_write> sources: array<u32>;
+@group(0) @binding(14) var<storage, read_write> counters: Counters;
 
 @compute @workgroup_size(128)
 fn main(

@@ -219,13 +219,12 @@ fn vertices(
                 x.map(|c| c * h)
             };
             let x = at(linear);
-            let g = density.gradient(x);
             let f = density.value(x);
-            let t = refined(linear, value >= iso, f / iso, f / (g[axis] * h));
+            let t = refined(linear, value >= iso, f / iso, f / (density.gradient(x)[axis] * h));
             let moved = at(t.clamp(margin, 1.0 - margin));
             ids[i][axis] = u32::try_from(positions.len()).unwrap_or(NONE);
             positions.push(std::array::from_fn(|k| to_f32(moved[k] - centre[k])));
-            // The normal is that at the linearly interpolated point, the nearest sphere that of the vertex.
+            let g = density.gradient(moved);
             let length = g.iter().map(|c| c * c).sum::<f64>().sqrt();
             normals.push(if length > 1e-9 { g.map(|c| to_f32(-c / length)) } else { [0.0; 3] });
             if params.atom_ids {

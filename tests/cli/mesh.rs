@@ -71,16 +71,18 @@ fn glb_is_the_same_in_a_file_and_in_a_pipe() {
     // Vertices without a gradient, small and large buffers, 16-bit and 32-bit indices; then the longest possible
     // report.
     let long = folder.file("long.cif", long_report());
-    for (input, resolution) in [
-        (Path::new(sample), "8"),
-        (Path::new(sample), "0.6"),
-        (Path::new(sample), "0.45"),
-        (Path::new(sample), "0.3"),
-        (&long, "0.4"),
+    let lone = folder.file("lone.xyz", "1\n\nC 0 0 0\n");
+    for (input, resolution, radius_scale) in [
+        (&*lone, "20", "0.4"),
+        (Path::new(sample), "0.6", "1"),
+        (Path::new(sample), "0.45", "1"),
+        (Path::new(sample), "0.3", "1"),
+        (&*long, "0.4", "1"),
     ] {
         let output = folder.path("out.glb");
-        assert_code(&mesh(input, &output, &["--quiet", "--resolution", resolution]), 0);
-        let piped = run(["mesh", input.to_str().unwrap(), "-o", "-", "--quiet", "--resolution", resolution]);
+        let args = ["--quiet", "--resolution", resolution, "--radius-scale", radius_scale];
+        assert_code(&mesh(input, &output, &args), 0);
+        let piped = run([&["mesh", input.to_str().unwrap(), "-o", "-"], &args[..]].concat());
         assert_code(&piped, 0);
         let file = fs::read(&output).unwrap();
         assert!(piped.stdout == file, "{resolution}: {} and {} bytes", piped.stdout.len(), file.len());

@@ -298,7 +298,7 @@ fn a_quantized_mesh_takes_less_memory_and_less_of_a_limit() {
 /// With a very wide spacing vertices lie out of reach of all atoms. Their normals come from the adjacent triangles.
 #[test]
 fn quantized_vertices_without_a_gradient_have_normals() {
-    let (spheres, params) = (spheres(&[[0.0, 0.0, 0.0, 1.7]]), params(SURFACES[0], 8.0));
+    let (spheres, params) = (spheres(&[[0.0, 0.0, 0.0, 0.7]]), params(SURFACES[0], 20.0));
     let small = quantized(&spheres, &params);
     for small_bytes in [0, 16 << 20] {
         let mut engine = engine_with(|b| b.small_bytes = small_bytes);

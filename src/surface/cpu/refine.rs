@@ -1,5 +1,5 @@
 //! Stage `refine` of surfaces of spheres: moves vertices along their edges to the surface. For isosurfaces,
-//! `interpolate` does it, from the same sum over atoms as the normals.
+//! `interpolate` does it.
 
 use std::ops::Range;
 
