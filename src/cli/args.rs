@@ -259,7 +259,8 @@ pub(crate) struct SurfaceArgs {
     /// Add exact areas and volume to the report, in total and by chain; `--surface vdw`, `sas` and `ses` only
     #[arg(long)]
     pub(crate) exact: bool,
-    /// Add the surface area buried between two sets of chains, with `--exact`; a slash joins chains of a side: H/L,A
+    /// Add the surface area buried between two sets of chains, half the sum over both sides, with `--exact`; a slash
+    /// joins chains of a side: H/L,A
     #[arg(long, value_name = "A,B")]
     pub(crate) interface: Option<String>,
 }

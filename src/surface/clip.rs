@@ -82,8 +82,9 @@ impl Mesh {
     }
 
     /// Adds skirts to a clipped mesh with this boundary. A skirt is a strip of triangles from an edge of the boundary
-    /// into the molecule, one grid spacing (Å) deep. It hides the gap to an adjacent mesh with another spacing.
-    pub(crate) fn add_skirts(&mut self, boundary: &[[u32; 2]], spacing: f64) {
+    /// into the molecule, one grid spacing deep, cut off at the faces of the box, which are at a distance of `half`
+    /// from the centre. It hides the gap to an adjacent mesh with another spacing. Lengths are in Å.
+    pub(crate) fn add_skirts(&mut self, boundary: &[[u32; 2]], half: f64, spacing: f64) {
         let mut upper: Vec<u32> = boundary.as_flattened().to_vec();
         upper.sort_unstable();
         upper.dedup();
@@ -96,7 +97,7 @@ impl Mesh {
             let normal = self.normals[v];
             let position = &mut self.positions[v];
             for k in 0..3 {
-                position[k] -= to_f32(spacing) * normal[k];
+                position[k] = (position[k] - to_f32(spacing) * normal[k]).clamp(-to_f32(half), to_f32(half));
             }
         }
     }
@@ -109,7 +110,8 @@ mod tests {
 
     #[test]
     fn skirts_close_the_edges_of_a_clipped_mesh() {
-        let spheres = Spheres::new(vec![1.5], vec![0.5], vec![-1.0], vec![4.0]).unwrap();
+        // The centre lies outside the box, so skirts at the nearest face would leave it.
+        let spheres = Spheres::new(vec![3.0], vec![0.5], vec![-1.0], vec![4.0]).unwrap();
         let options = SurfaceOptions { resolution: Some(0.5), ..SurfaceOptions::default() };
         let params = SurfaceParams::new(&options).unwrap();
         let run = CpuBackend::default().run(&spheres, &params, &SurfaceLimits::default(), &Control::default());
@@ -132,14 +134,20 @@ mod tests {
         let (part, exact) = (part.unwrap(), exact.unwrap());
         assert_eq!((part.euler, part.closed, part.oriented, part.manifold), (exact.euler, false, true, false));
         assert_eq!((exact.closed, exact.oriented, exact.manifold, part.area), (false, true, false, exact.area));
-        mesh.add_skirts(&boundary, 0.5);
+        mesh.add_skirts(&boundary, 2.0, 0.5);
         assert_eq!(mesh.n_triangles(), n_triangles + 2 * before.len());
         // All open edges are now those of the skirts.
         assert!(open(&mesh).iter().all(|edge| edge.iter().any(|v| *v as usize >= n_vertices)));
-        let radius = |v: usize| {
+        // They are a spacing deep, but do not leave the box.
+        let (mut n_cut, mut n_deep) = (0, 0);
+        for v in n_vertices..mesh.n_vertices() {
             let p: [f64; 3] = std::array::from_fn(|k| mesh.centre[k] + f64::from(mesh.position(v)[k]));
-            ((p[0] - 1.5).powi(2) + (p[1] - 0.5).powi(2) + (p[2] + 1.0).powi(2)).sqrt()
-        };
-        assert!((n_vertices..mesh.n_vertices()).all(|v| (radius(v) - 3.5).abs() < 0.02));
+            assert!(p.iter().all(|c| c.abs() <= 2.0), "{p:?}");
+            let radius = ((p[0] - 3.0).powi(2) + (p[1] - 0.5).powi(2) + (p[2] + 1.0).powi(2)).sqrt();
+            let is_deep = (radius - 3.5).abs() < 0.02;
+            assert!(is_deep || (3.5..4.02).contains(&radius) && p.iter().any(|c| c.abs() > 1.999), "{p:?}: {radius}");
+            (n_cut, n_deep) = (n_cut + usize::from(!is_deep), n_deep + usize::from(is_deep));
+        }
+        assert!(n_cut > 0 && n_deep > 0, "{n_cut} {n_deep}");
     }
 }

@@ -167,7 +167,7 @@ pub const TABLE: &[Parameter] = &[
         name: "interface",
         domain: Domain::Text { expected: areas::EXPECTED },
         default: "absent",
-        doc: "Adds to the report the exact surface area buried between two sets of chains; needs exact=true.",
+        doc: "Adds to the report the exact surface area buried between two sets of chains, half the sum over both sides; needs exact=true.",
     },
     Parameter {
         name: "color",

@@ -204,11 +204,11 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         // Without the skirts.
         let measure = || Measures::of_part(&mesh, boundary.len(), &control);
         let measures = clock.time(Stage::Measure.name(), measure)?;
-        clock.time("clip", || mesh.add_skirts(&boundary, resolution));
+        clock.time("clip", || mesh.add_skirts(&boundary, half, resolution));
         // The same step for all tiles of a level.
         let packing = match job.compress {
             Compress::None => Packing::Full,
-            Compress::Quantize | Compress::Meshopt => Packing::Quantized(Step::covering(half + resolution)),
+            Compress::Quantize | Compress::Meshopt => Packing::Quantized(Step::covering(half)),
         };
         if let Some(step) = packing.step() {
             mesh.quantize(step);
