@@ -128,3 +128,12 @@ fn exact_measures_do_not_depend_on_the_distance_from_the_origin() {
         assert!(((both - alone) / near - 1.0).abs() < limit, "{both} − {alone}, {near}");
     }
 }
+
+#[test]
+fn a_probe_that_just_fits_between_three_spheres_is_cut_by_that_on_the_other_side() {
+    let balls = [[0.25, 0.0, 0.0], [0.0, 0.25, 0.0], [0.0, 0.0, 0.25]].map(|centre| (centre, 0.1));
+    let fits = (2.0_f64 / 3.0).sqrt() / 4.0 - 0.1;
+    let [found, wider] = [0.0, 1e-6].map(|more| exact(&balls, SurfaceKind::Ses, Some(fits + more)).area());
+    assert!((found / wider - 1.0).abs() < 0.03, "{found}, {wider}");
+    assert!((found / 0.529 - 1.0).abs() > 0.2, "the area of both probes uncut: {found}");
+}

@@ -2,7 +2,7 @@
 //!
 //! `classify` places a vertex by linear interpolation. A sum over the atoms there gives density and slope for a step
 //! along the edge, and a second sum gives the normal at the final position: near saddles of the density, the step turns
-//! it by up to 150°.
+//! it by up to 170°.
 
 use std::ops::Range;
 
