@@ -74,7 +74,7 @@ use crate::surface::{
     Backend, Control, Measures, Mesh, MeshOutput, MeshSink, Simplify, SinkFailed, Spheres, Stage, SurfaceError,
     SurfaceParams, TriangleQuality, Validation, lattice,
 };
-use color::{MeshColors, Scheme};
+use color::{MeshColors, MeshedSurface, Scheme};
 use cut::Cut;
 use estimate::MeshPlan;
 use job_backend::{Division, of_job};
@@ -320,7 +320,9 @@ fn run_loaded<S: Deref<Target = Structure>>(
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
     let color = |colors: MeshColors| {
-        clock.time("color", || colors.apply(&mut mesh, params.resolution, pockets.as_ref(), &control))
+        let parts = division.and_then(Division::parts);
+        let surface = MeshedSurface { spheres: &spheres, params: &params, limits: &limits.surface, parts };
+        clock.time("color", || colors.apply(&mut mesh, &surface, pockets.as_ref(), &control))
     };
     let color = colors.map(color).transpose()?;
     to_atom_indices(&mut mesh, job, &selected, &control)?;

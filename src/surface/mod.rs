@@ -13,6 +13,7 @@ pub(crate) mod clip;
 pub mod column;
 pub mod control;
 pub mod cpu;
+pub(crate) mod curvature;
 pub mod devices;
 pub mod error;
 pub(crate) mod grid_limit;

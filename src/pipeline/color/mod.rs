@@ -23,6 +23,7 @@ pub(super) use of_blocks::BlockColors;
 pub(super) use of_mesh::MeshColors;
 pub use palette::Palette;
 pub use scheme::{EXPECTED, Hydrophobicity, Scheme};
+pub(super) use vertex::MeshedSurface;
 pub use vertex::VertexProperty;
 
 use crate::structure::annotations::{Confidences, SecondaryRanges};

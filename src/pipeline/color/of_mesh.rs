@@ -7,7 +7,7 @@ use super::super::pockets::lined_by;
 use super::of_map::{significant, symmetric_range};
 use super::palette::Rgb;
 use super::tables::{OTHER, category};
-use super::vertex::{self, ValueSource, VertexProperty};
+use super::vertex::{self, MeshedSurface, ValueSource, VertexProperty};
 use super::{AtomColors, ColorBlend, ColorError, ColorReport, Coloring, MapReport, Palette, Scheme};
 use super::{MAX_ENTRIES, entry, extremes, of_vertices, round, scaled, stops};
 use crate::structure::Structure;
@@ -88,15 +88,15 @@ impl MeshColors {
         Some(Self { coloring: self.coloring, source })
     }
 
-    /// Sets the colours of the vertices. `resolution` is the grid spacing, Å; `pockets` are those of the scheme
-    /// `pocket`. Returns the report.
+    /// Sets the colours of the vertices of the mesh of `surface`. `pockets` are those of the scheme `pocket`. Returns the
+    /// report.
     ///
     /// # Errors
     /// Returns [`JobError::Color`] if the map has no value at any vertex, and the errors of memory and cancellation.
     pub(in super::super) fn apply(
         &self,
         mesh: &mut Mesh,
-        resolution: f64,
+        surface: &MeshedSurface<'_>,
         pockets: Option<&Pockets>,
         control: &Control<'_>,
     ) -> Result<ColorReport, JobError> {
@@ -116,7 +116,7 @@ impl MeshColors {
                 (Some(colors), report)
             }
             ColorSource::Vertices(source) => {
-                let values = vertex::values(mesh, source, control)?;
+                let values = vertex::values(mesh, source, surface, control)?;
                 let palette = palette.or(scheme.palette()).unwrap_or(Palette::Viridis);
                 let (of_values, map) = match source {
                     ValueSource::Map(map, offset) => {
@@ -146,7 +146,7 @@ impl MeshColors {
             }
         };
         if let Some(colors) = colors.as_mut().filter(|_| blend == ColorBlend::Smooth) {
-            vertex::blend(colors, &mesh.triangles, resolution, control)?;
+            vertex::blend(colors, &mesh.triangles, surface.params.resolution, control)?;
             report.blend = Some(blend.name());
         }
         mesh.colors = colors;

@@ -2,10 +2,13 @@
 //!
 //! Both kinds of colours are computed on the host from the finished mesh, so that every backend gives the same ones.
 
+use super::super::parts::spheres_of;
 use super::{depth, of_map};
 use crate::formats::linear_of_srgb;
+use crate::structure::AtomPart;
 use crate::structure::map::Map;
-use crate::surface::{Column, Control, Mesh, SurfaceError, Vertices};
+use crate::surface::curvature::mean_curvatures;
+use crate::surface::{Column, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, Vertices};
 
 /// Memory of a value and its sums while values are computed, bytes per vertex.
 const VALUE_BYTES: u64 = 20;
@@ -34,6 +37,15 @@ pub enum VertexProperty {
     Map,
 }
 
+/// Surface of a mesh.
+pub(in super::super) struct MeshedSurface<'a> {
+    pub(in super::super) spheres: &'a Spheres,
+    pub(in super::super) params: &'a SurfaceParams,
+    pub(in super::super) limits: &'a SurfaceLimits,
+    /// Parts that have meshes of their own.
+    pub(in super::super) parts: Option<&'a [AtomPart]>,
+}
+
 /// Source of the values of the vertices.
 pub(super) enum ValueSource {
     Curvature,
@@ -45,12 +57,18 @@ pub(super) enum ValueSource {
 }
 
 /// Returns the value of each vertex; NaN for those without one.
-pub(super) fn values(mesh: &Mesh, source: &ValueSource, control: &Control<'_>) -> Result<Vec<f32>, SurfaceError> {
+pub(super) fn values(
+    mesh: &Mesh,
+    source: &ValueSource,
+    surface: &MeshedSurface<'_>,
+    control: &Control<'_>,
+) -> Result<Vec<f32>, SurfaceError> {
     control.check()?;
     let bytes = if matches!(source, ValueSource::Depth) { DEPTH_BYTES } else { VALUE_BYTES };
     let _memory = control.reserve(bytes * mesh.n_vertices() as u64)?;
     Ok(match source {
-        ValueSource::Curvature => curvatures(mesh),
+        ValueSource::Curvature if surface.params.surface.kernel().is_some() => of_density(mesh, surface, control)?,
+        ValueSource::Curvature => of_normals(mesh),
         ValueSource::Radial(centroid) => {
             let origin: [f64; 3] = std::array::from_fn(|k| mesh.centre[k] - centroid[k]);
             let distance = |i| length(std::array::from_fn(|k| origin[k] + f64::from(mesh.position(i)[k])));
@@ -79,10 +97,24 @@ fn normal(mesh: &Mesh, i: usize) -> [f64; 3] {
     }
 }
 
-/// Returns the mean curvature of each vertex: half the divergence of the normals, averaged over the area of its
-/// triangles. The normals are those of the exact surface and interpolated linearly in a triangle, so that thin
-/// triangles have little weight.
-fn curvatures(mesh: &Mesh) -> Vec<f32> {
+/// Returns the mean curvature of each vertex of an isosurface, from the density of its part.
+fn of_density(mesh: &Mesh, surface: &MeshedSurface<'_>, control: &Control<'_>) -> Result<Vec<f32>, SurfaceError> {
+    let MeshedSurface { spheres, params, limits, parts } = *surface;
+    let mut curvatures = vec![0.0; mesh.n_vertices()];
+    for (i, spheres) in spheres_of(spheres, parts).enumerate() {
+        let rows = parts.map_or(0..mesh.n_vertices(), |_| mesh.parts[i].vertices.clone());
+        if !rows.is_empty() {
+            let found = mean_curvatures(mesh, rows.clone(), &spheres, params, limits, control)?;
+            curvatures[rows].copy_from_slice(&found);
+        }
+    }
+    Ok(curvatures)
+}
+
+/// Returns the mean curvature of each vertex of a surface of spheres: half the divergence of the normals, averaged over
+/// the area of its triangles. The normals are those of the exact surface and interpolated linearly in a triangle, so
+/// that thin triangles have little weight.
+fn of_normals(mesh: &Mesh) -> Vec<f32> {
     // Sums of area and of divergence times area.
     let mut sums = vec![[0.0; 2]; mesh.n_vertices()];
     for triangle in &mesh.triangles[..] {
@@ -181,6 +213,7 @@ pub(super) fn length(a: [f64; 3]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::surface::{SurfaceKind, SurfaceOptions};
 
     #[test]
     fn every_srgb_level_survives_a_round_trip() {
@@ -192,6 +225,15 @@ mod tests {
     #[test]
     fn blending_spreads_equally_at_every_spacing() {
         assert_eq!([4.0, 1.0, 0.5, 0.25, 0.01].map(rounds), [1, 4, 16, 64, 64]);
+    }
+
+    /// Returns the values of the vertices of a mesh of a surface of spheres.
+    fn values_of_ses(mesh: &Mesh, source: &ValueSource) -> Vec<f32> {
+        let spheres = Spheres::new(vec![0.0], vec![0.0], vec![0.0], vec![1.0]).unwrap();
+        let options = SurfaceOptions { surface: Some(SurfaceKind::Ses), ..SurfaceOptions::default() };
+        let (params, limits) = (SurfaceParams::new(&options).unwrap(), SurfaceLimits::default());
+        let surface = MeshedSurface { spheres: &spheres, params: &params, limits: &limits, parts: None };
+        values(mesh, source, &surface, &Control::default()).unwrap()
     }
 
     /// Torus around z with the radii `large` and `small`, and the exact mean curvature of its vertices.
@@ -217,8 +259,7 @@ mod tests {
     #[test]
     fn curvatures_are_those_of_a_torus_and_change_sign_with_its_normals() {
         let (mut mesh, expected) = torus(3.0, 1.5);
-        let control = Control::default();
-        let of = |mesh: &Mesh| values(mesh, &ValueSource::Curvature, &control).unwrap();
+        let of = |mesh: &Mesh| values_of_ses(mesh, &ValueSource::Curvature);
         let worst = |found: &[f32], sign: f64| {
             let off = found.iter().zip(&expected).map(|(found, expected)| (f64::from(*found) - sign * expected).abs());
             off.fold(0.0, f64::max)
@@ -233,7 +274,7 @@ mod tests {
     #[test]
     fn distances_are_from_the_centroid() {
         let (mesh, _) = torus(3.0, 1.0);
-        let found = values(&mesh, &ValueSource::Radial([5.0, 0.0, 4.0]), &Control::default()).unwrap();
+        let found = values_of_ses(&mesh, &ValueSource::Radial([5.0, 0.0, 4.0]));
         // The vertex on the outer ring lies 4 Å from the axis and 4 Å below the centroid.
         assert!((f64::from(found[0]) - 32.0_f64.sqrt()).abs() < 1e-5, "{}", found[0]);
     }
@@ -244,7 +285,7 @@ mod tests {
         let (mesh, expected) = torus(3.0, 1.5);
         let mut rounded = mesh.clone();
         assert!(rounded.quantize(Step::covering(5.0)));
-        let found = values(&rounded, &ValueSource::Curvature, &Control::default()).unwrap();
+        let found = values_of_ses(&rounded, &ValueSource::Curvature);
         let mean = |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / expected.len() as f64;
         let off = mean(&mut found.iter().zip(&expected).map(|(found, expected)| f64::from(*found) - expected));
         assert!(off.abs() < 5e-3, "{off}");

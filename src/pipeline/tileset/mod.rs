@@ -23,7 +23,7 @@ use self::source::{LevelSource, NearSpheres, Streamed};
 pub use self::stream::{StreamSource, StructureStream, check_stream, needs_memory};
 pub use self::units::AssemblyTileset;
 pub use self::write::{LevelReport, TilesetReport, UnitReport, WriteError, unit_folder, write, write_stream};
-use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, Scheme};
+use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, MeshedSurface, Scheme};
 use super::params::ParamError;
 use super::report::Counts;
 use super::{Choice, Job, JobError, Product, ProgressSink, Report, StageClock, load};
@@ -285,7 +285,8 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         if mesh.triangles.is_empty() {
             return empty();
         }
-        let color = |colors: MeshColors| clock.time("color", || colors.apply(mesh, spacing, None, control));
+        let surface = MeshedSurface { spheres: &spheres, params: &params, limits, parts: None };
+        let color = |colors: MeshColors| clock.time("color", || colors.apply(mesh, &surface, None, control));
         let color = colors.map(color).transpose()?;
         if !job.params.atom_ids {
             mesh.atom_ids = None;

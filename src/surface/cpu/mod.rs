@@ -11,6 +11,7 @@
 mod bin;
 mod brick_atoms;
 mod classify;
+mod curvature;
 pub(crate) mod distance;
 mod edge;
 mod emit;

@@ -2,6 +2,7 @@
 
 use super::bin::Tiles;
 use super::brick_atoms::{BrickAtoms, nearest_atoms};
+use super::curvature;
 use super::interpolate::sums;
 use super::{Field, RunContext, checked_field};
 use crate::surface::candidates;
@@ -115,6 +116,18 @@ impl PointField {
             }
         }
         samples
+    }
+
+    /// Returns the mean curvature of the level set of the density through each point, per spacing; not finite where the
+    /// gradient vanishes, and for surfaces of spheres.
+    pub(in crate::surface) fn mean_curvatures(&self, near: &mut NearbySpheres, points: &[[f32; 3]]) -> Vec<f32> {
+        let Field::Density(constants) = &self.field else { return vec![f32::NAN; points.len()] };
+        let mut found = Vec::with_capacity(points.len());
+        for chunk in points.chunks(LANES) {
+            let curvatures = curvature::mean_curvatures(constants, &mut near.atoms, &lanes(chunk));
+            found.extend_from_slice(&curvatures[..chunk.len()]);
+        }
+        found
     }
 
     /// Returns the nearest sphere of each point, in the caller's numbering.
