@@ -26,9 +26,9 @@ HEAD = ["structure", "atoms", "SAS area, Å²", "voronotalt: area", "volume", "a
         "an atom, Å²", "SES area, Å²", "MSMS: area", "volume", "its SAS area", "cavities: molmesh, MSMS"]  # fmt: skip
 
 
-def molmesh(binary, file, surface, *more):
+def molmesh(binary, file, surface):
     """Returns the report of molmesh with exact measures and cavities."""
-    command = [binary, "mesh", file, "--surface", surface, "--exact", "--resolution", "4", "--cavities", "keep", *more]
+    command = [binary, "mesh", file, "--surface", surface, "--exact", "--resolution", "4", "--cavities", "keep"]
     command += ["--backend", "cpu", "--report", "json", "--format", "ply", "-o", "/dev/null"]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
@@ -48,7 +48,9 @@ def row(binary, path, folder):
     """Returns the row of the table for a structure file. Writes temporary files to `folder`."""
     made, structure = prepare(path, folder), heavy(path)
     spheres = [(*a.atom.pos.tolist(), RADII[a.atom.element.name.upper()]) for a in structure[0].all()]
-    sas = molmesh(binary, made["file"], "sas", "--areas", str(folder / "areas.csv"), "--areas-by", "atom")["exact"]
+    command = [binary, "areas", made["file"], "--surface", "sas", "--by", "atom", "-o", folder / "areas.csv"]
+    done = subprocess.run([*command, "--report", "json"], capture_output=True, text=True, check=True)
+    sas = json.loads(done.stdout)["exact"]
     with open(folder / "areas.csv", encoding="utf-8") as file:
         own = [float(line["area"]) for line in csv.DictReader(file)]
     tessellation = voronotalt.RadicalTessellation([voronotalt.Ball(*sphere) for sphere in spheres], probe=PROBE)

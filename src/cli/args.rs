@@ -1,6 +1,7 @@
 //! Command-line flags. Parameter values stay text here. [`molmesh::pipeline::params`] parses them for the command line
 //! and for HTTP, so that both reject a value with the same message.
 
+mod areas;
 #[cfg(feature = "server")]
 mod keys;
 mod render;
@@ -16,6 +17,7 @@ use molmesh::pipeline::integer::{parse_integer, whole_number};
 use molmesh::surface::DeviceChoice;
 
 use super::error::EXIT_CODES;
+pub(crate) use areas::AreasArgs;
 #[cfg(feature = "server")]
 pub(crate) use keys::{KeyCommand, NewKeyArgs, SignArgs, SigningKeyArgs};
 pub(crate) use render::{PictureArgs, RenderArgs};
@@ -52,6 +54,8 @@ pub(crate) enum Command {
     Render(Box<RenderArgs>),
     /// Mesh one structure into the files of a 3D Tiles tileset, for structures that are too large for one file
     Tileset(Box<TilesetArgs>),
+    /// Write a table of the exact areas of one structure, without a mesh
+    Areas(Box<AreasArgs>),
     /// Serve meshes over HTTP
     #[cfg(feature = "server")]
     Serve(Box<ServeArgs>),
@@ -129,12 +133,6 @@ pub(crate) struct MeshArgs {
     /// Write the atoms of the file to a CSV table, one row per index of `--atom-ids`; `-` is stdout
     #[arg(long, value_name = "FILE")]
     pub(crate) atoms: Option<PathBuf>,
-    /// Write the exact areas of atoms, residues or chains to a CSV table, with `--exact`; `-` is stdout
-    #[arg(long, value_name = "FILE")]
-    pub(crate) areas: Option<PathBuf>,
-    /// Rows of the table of areas: atom, residue or chain [default: residue]
-    #[arg(long, value_name = "LEVEL")]
-    pub(crate) areas_by: Option<String>,
     #[command(flatten)]
     pub(crate) job: JobArgs,
 }
@@ -199,8 +197,8 @@ pub(crate) struct SurfaceArgs {
     #[arg(long, value_name = "Å")]
     pub(crate) probe: Option<String>,
     /// Values of parameters that are not given: default, ses-like, vdw-like, molstar, blinn or quicksurf. `ses-like`
-    /// approximates the solvent-excluded surface: its area is off by -4.3 to +11.9 % and its volume by -0.3 to +4.7 %
-    /// over eleven proteins, more for small structures (volume +9 to +15 % for short DNA helices)
+    /// approximates the solvent-excluded surface: its area is off by -6.2 to +11.9 % and its volume by -0.3 to +6.8 %
+    /// on 18 proteins, more for small structures (volume +9 to +15 % for three short DNA helices)
     #[arg(long, value_name = "PRESET")]
     pub(crate) preset: Option<String>,
     /// Grid spacing in Å [default: 0.5]
@@ -291,12 +289,11 @@ pub(crate) struct ColorArgs {
     pub(crate) color_offset: Option<String>,
 }
 
-// Atom selection.
+// Atoms.
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Atoms")]
-#[expect(clippy::struct_excessive_bools, reason = "each is a flag of the command line")]
-pub(crate) struct SelectionArgs {
-    /// Atoms to mesh: an expression such as `polymer,ligand` or `protein and within 5 of (resn HEM)`, made of kinds
+pub(crate) struct AtomArgs {
+    /// Atoms to use: an expression such as `polymer,ligand` or `protein and within 5 of (resn HEM)`, made of kinds
     /// (polymer, protein, nucleic, ligand, cofactor, glycan, ion, water, hydrogen, all), chain, resi, resn, name, elem,
     /// within, byres, and, or, not [default: polymer]
     #[arg(long, value_name = "ATOMS")]
@@ -313,15 +310,23 @@ pub(crate) struct SelectionArgs {
     /// Comma-separated chains, by author name [default: all]
     #[arg(long, value_name = "A,B")]
     pub(crate) chains: Option<String>,
-    /// Model number, or all: one part of the mesh per model [default: the first]
-    #[arg(long, value_name = "N")]
-    pub(crate) model: Option<String>,
     /// Alternative location [default: the one with the highest occupancy in each residue]
     #[arg(long, value_name = "X")]
     pub(crate) altloc: Option<String>,
     /// Id of the biological assembly to build [default: asymmetric-unit, the atoms as they are in the file]
     #[arg(long, value_name = "ID")]
     pub(crate) assembly: Option<String>,
+}
+
+// Atoms of a mesh, and its division.
+#[derive(Debug, ClapArgs)]
+#[command(next_help_heading = "Atoms")]
+pub(crate) struct SelectionArgs {
+    #[command(flatten)]
+    pub(crate) atoms: AtomArgs,
+    /// Model number, or all: one part of the mesh per model [default: the first]
+    #[arg(long, value_name = "N")]
+    pub(crate) model: Option<String>,
     /// Mesh each distinct set of chains of the assembly once and repeat the mesh (glb and gltf only); surfaces of
     /// neighbouring instances are not joined
     #[arg(long)]
@@ -339,35 +344,43 @@ pub(crate) struct SelectionArgs {
     pub(crate) split: Option<String>,
 }
 
-// Limits.
+// Limits of all commands that read a structure.
 #[expect(clippy::struct_field_names, reason = "the fields are named like their flags")]
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Limits")]
-pub(crate) struct LimitArgs {
+pub(crate) struct CommonLimitArgs {
     /// Atoms in all models of the file, and in the assembly [default: 20000000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_atoms: Option<u64>,
     /// Atoms of one model, or of the assembly, at exactly the same position [default: 1000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_duplicates: Option<u64>,
-    /// Copies of chains in the assembly, or instances [default: 10000]
+    /// Copies of chains in the assembly [default: 10000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_copies: Option<u64>,
+    /// Bytes of each input file after decompression, such as 64MiB [default: 4GiB]
+    #[arg(long, value_name = "BYTES", value_parser = size)]
+    pub(crate) max_input_bytes: Option<u64>,
+    /// Pairs of an atom and a brick that its support reaches [default: 1073741824]
+    #[arg(long, value_name = "N", value_parser = count)]
+    pub(crate) max_candidates: Option<u64>,
+}
+
+// Limits.
+#[derive(Debug, ClapArgs)]
+#[command(next_help_heading = "Limits")]
+pub(crate) struct LimitArgs {
+    #[command(flatten)]
+    pub(crate) common: CommonLimitArgs,
     /// Parts of a mesh with `--split` or `--model all` [default: 1000]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_parts: Option<u64>,
     /// Grid points of the map [default: 67108864]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_map_points: Option<u64>,
-    /// Bytes of the input, and of the map, after decompression, such as 64MiB [default: 4GiB]
-    #[arg(long, value_name = "BYTES", value_parser = size)]
-    pub(crate) max_input_bytes: Option<u64>,
     /// Grid points in occupied bricks [default: 4294967296]
     #[arg(long, value_name = "N", value_parser = count)]
     pub(crate) max_grid_points: Option<u64>,
-    /// Pairs of an atom and a brick that its support reaches [default: 1073741824]
-    #[arg(long, value_name = "N", value_parser = count)]
-    pub(crate) max_candidates: Option<u64>,
     /// Bytes of vertices and triangles, such as 64MiB [default: 8GiB]
     #[arg(long, value_name = "BYTES", value_parser = size)]
     pub(crate) max_mesh_bytes: Option<u64>,

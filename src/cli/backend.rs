@@ -89,15 +89,22 @@ pub(crate) struct SelectedBackend {
     pub(crate) no_gpu: Option<String>,
 }
 
+/// Checks the value of `--threads`.
+///
+/// # Errors
+/// Returns [`CliError::Usage`].
+pub(crate) fn check_threads(threads: Option<usize>) -> Result<(), CliError> {
+    let Some(n) = threads.filter(|n| !(1..=MAX_THREADS).contains(n)) else { return Ok(()) };
+    let message = format!("parameter `threads`: {n} is not allowed; expected a number from 1 to {MAX_THREADS}");
+    Err(CliError::usage(message))
+}
+
 /// Rejects flags that contradict each other.
 ///
 /// # Errors
 /// Returns [`CliError::Usage`] if they do.
 pub(crate) fn check(requested: &BackendRequest<'_>) -> Result<(), CliError> {
-    if let Some(n) = requested.threads.filter(|n| !(1..=MAX_THREADS).contains(n)) {
-        let message = format!("parameter `threads`: {n} is not allowed; expected a number from 1 to {MAX_THREADS}");
-        return Err(CliError::usage(message));
-    }
+    check_threads(requested.threads)?;
     if requested.backend == BackendName::Gpu && *requested.devices == DeviceChoice::Cpu {
         return Err(CliError::usage("parameter `devices`: cpu is not allowed with --backend gpu; expected a GPU"));
     }

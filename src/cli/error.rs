@@ -7,7 +7,7 @@ use molmesh::picture::PictureError;
 use molmesh::pipeline::JobError;
 use molmesh::structure::StructureError;
 use molmesh::structure::map::MapError;
-use molmesh::surface::SurfaceError;
+use molmesh::surface::{MAX_SIMPLIFY_SPACINGS, SurfaceError};
 use thiserror::Error;
 
 use super::style::Style;
@@ -294,8 +294,14 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
             Some("try a coarser --resolution or smaller radii, or raise --max-candidates".to_owned())
         }
         SurfaceError::TooManyTiles { .. } => Some("try a coarser --resolution".to_owned()),
-        SurfaceError::TooManyTriangles { simplify: Some(_), .. } => {
-            Some("try a larger --simplify, a coarser --resolution, or a larger --max-triangles".to_owned())
+        SurfaceError::TooManyTriangles { simplify: Some(error), resolution, .. } => {
+            let has_largest_error = *error >= MAX_SIMPLIFY_SPACINGS * resolution;
+            let hint = if has_largest_error {
+                "try a coarser --resolution or a larger --max-triangles"
+            } else {
+                "try a larger --simplify, a coarser --resolution, or a larger --max-triangles"
+            };
+            Some(hint.to_owned())
         }
         SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
         SurfaceError::DeviceMemory { .. } => coarser_or("try --backend cpu"),

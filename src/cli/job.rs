@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
 use molmesh::pipeline::tileset::{self, StreamSource, StructureStream, TilesetReport, WriteError};
-use molmesh::pipeline::{self, AreaLevel, AtomAreas, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
+use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
 use molmesh::structure::stream::{BLOCK_BYTES, ScratchFile};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
@@ -37,31 +37,10 @@ pub(super) struct CommandJob<'a> {
     pub(super) progress: Progress,
     /// Findings of the strict validator, if it ran.
     pub(super) findings: Option<Vec<Diagnostic>>,
-    /// Tables that are requested, with their paths and outputs.
-    tables: Vec<(Table, &'a Path, Output)>,
-    /// The structure, kept for the tables.
+    /// Output of the table of atoms, if it is requested.
+    atom_table: Option<Output>,
+    /// The structure, kept for the table of atoms.
     structure: OnceCell<Arc<Structure>>,
-    /// Exact areas, kept for their table.
-    pub(super) areas: Option<AtomAreas>,
-}
-
-/// Table that is written beside the mesh.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Table {
-    /// Atoms of the file.
-    Atoms,
-    /// Exact areas.
-    Areas(AreaLevel),
-}
-
-impl Table {
-    /// Returns the name in the report.
-    const fn name(self) -> &'static str {
-        match self {
-            Self::Atoms => "atom_table",
-            Self::Areas(_) => "area_table",
-        }
-    }
 }
 
 impl<'a> CommandJob<'a> {
@@ -100,11 +79,7 @@ impl<'a> CommandJob<'a> {
             if streamed.is_some() { request::limits_of_stream(&args.limits) } else { request::limits(&args.limits) };
         let mut requested = BackendRequest::for_command(args, purpose);
         backend::check(&requested)?;
-        if let Some(n) = args.threads {
-            // Reading, exact areas and colours run on the global threads.
-            let built = rayon::ThreadPoolBuilder::new().num_threads(n).build_global();
-            built.map_err(|error| CliError::Internal(error.to_string()))?;
-        }
+        set_threads(args.threads)?;
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
         let map = args.color.map.as_deref();
@@ -127,19 +102,16 @@ impl<'a> CommandJob<'a> {
         let selected = backend::select(&requested)?;
         let progress = Progress::new(!args.quiet);
         let findings = if strict { Some(check(path, &input, &limits)?) } else { None };
-        let (tables, structure, areas) = (Vec::new(), OnceCell::new(), None);
-        let job =
-            Self { path, args, job, limits, cancel, input, selected, progress, findings, tables, structure, areas };
+        let (atom_table, structure) = (None, OnceCell::new());
+        let job = Self { path, args, job, limits, cancel, input, selected, progress, findings, atom_table, structure };
         Ok((job, output))
     }
 
-    /// Adds a table in the file `path`, beside the mesh in the file `mesh`.
-    pub(super) fn add_table(&mut self, table: Table, path: &'a Path, mesh: &Path) -> Result<(), CliError> {
+    /// Adds a table of the atoms in the file `path`, beside the mesh in the file `mesh`.
+    pub(super) fn add_atom_table(&mut self, path: &Path, mesh: &Path) -> Result<(), CliError> {
         output::refuse_input(self.path, path)?;
-        for other in [mesh].into_iter().chain(self.tables.iter().map(|(_, other, _)| *other)) {
-            output::refuse_same(path, other)?;
-        }
-        self.tables.push((table, path, Output::open(path, &self.cancel)?));
+        output::refuse_same(path, mesh)?;
+        self.atom_table = Some(Output::open(path, &self.cancel)?);
         Ok(())
     }
 
@@ -153,7 +125,7 @@ impl<'a> CommandJob<'a> {
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
         let read = |control: &Control<'_>| {
             let structure = structure::read_with(&self.input, &self.limits.read, control).map(Arc::new)?;
-            if !self.tables.is_empty() {
+            if self.atom_table.is_some() {
                 self.structure.get_or_init(|| Arc::clone(&structure));
             }
             Ok(structure)
@@ -216,14 +188,8 @@ impl<'a> CommandJob<'a> {
 
     /// Converts the error of the job.
     pub(super) fn failure(&self, source: JobError) -> CliError {
-        match source {
-            JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
-            source => {
-                let strict_finding = worst_finding(&source, &self.input, &self.limits).map(String::into_boxed_str);
-                let map = self.args.color.map.as_deref().filter(|_| matches!(source, JobError::Map(_)));
-                CliError::Job { name: name_of(map.unwrap_or(self.path)), strict_finding, source }
-            }
-        }
+        let map = self.args.color.map.as_deref().filter(|_| matches!(source, JobError::Map(_)));
+        failure(source, map.unwrap_or(self.path), &self.input, &self.limits)
     }
 
     /// Completes the output and writes the report. `writing` is the time already spent on writing.
@@ -240,15 +206,10 @@ impl<'a> CommandJob<'a> {
         }
         let start = Instant::now();
         let mut outputs = vec![output];
-        let mut kinds = Vec::new();
-        for (table, _, mut output) in std::mem::take(&mut self.tables) {
-            let written = match (table, self.structure.get(), &self.areas) {
-                (Table::Atoms, Some(structure), _) => table::write_csv(structure, &mut output),
-                (Table::Areas(level), Some(structure), Some(areas)) => areas.write_csv(structure, level, &mut output),
-                _ => return Err(CliError::Internal(format!("the job has no {}", table.name()))),
-            };
-            written.map_err(|source| output.failure(source))?;
-            kinds.push(table.name());
+        if let Some(mut output) = self.atom_table.take() {
+            let absent = || CliError::Internal("the job has no structure".to_owned());
+            let structure = self.structure.get().ok_or_else(absent)?;
+            table::write_csv(structure, &mut output).map_err(|source| output.failure(source))?;
             outputs.push(output);
         }
         let to_stdout = outputs.iter().any(Output::is_stdout);
@@ -256,14 +217,16 @@ impl<'a> CommandJob<'a> {
         Output::finish(outputs)?;
         report.add_timing("write", (writing + start.elapsed()).as_secs_f64() * 1e3);
         let of = |(name, bytes): &(String, u64), format| Written { name: name.clone(), format, bytes: *bytes };
-        let tables = kinds.into_iter().zip(&names[1..]).map(|(kind, file)| (kind, of(file, "csv"))).collect();
-        let written = WrittenFiles { mesh: of(&names[0], format.name()), tables };
-        write_report(self.args, &report, self.findings.as_deref(), &written, to_stdout)
+        let atom_table = names.get(1).map(|file| of(file, "csv"));
+        let written = WrittenFiles { mesh: of(&names[0], format.name()), atom_table };
+        let (args, findings) = (self.args, self.findings.as_deref());
+        let text = || summary::text(&report, &written, findings.map(finding_lines).as_deref(), Style::stderr());
+        write_report(args.report, args.quiet, to_stdout, text, || json_report(&report, findings, &written))
     }
 }
 
 /// Reads the input, of at most `limit` bytes. The limit of decompressed bytes also suits a compressed input.
-fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
+pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
     let stdin = is_stdio(path);
     let name = || name_of(path);
     let read = || -> io::Result<Vec<u8>> {
@@ -305,6 +268,23 @@ fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic
     }
 }
 
+/// Converts the error of a job on the `input` that the file `path` contains.
+pub(super) fn failure(source: JobError, path: &Path, input: &[u8], limits: &JobLimits) -> CliError {
+    if let JobError::Surface(SurfaceError::Cancelled) = source {
+        return CliError::Interrupted;
+    }
+    let strict_finding = worst_finding(&source, input, limits).map(String::into_boxed_str);
+    CliError::Job { name: name_of(path), strict_finding, source }
+}
+
+/// Sets the number of the global threads, on which reading, exact areas and colours run.
+pub(super) fn set_threads(n: Option<usize>) -> Result<(), CliError> {
+    backend::check_threads(n)?;
+    let Some(n) = n else { return Ok(()) };
+    let built = rayon::ThreadPoolBuilder::new().num_threads(n).build_global();
+    built.map_err(|error| CliError::Internal(error.to_string()))
+}
+
 /// Returns the worst finding of the strict validator if the file has a syntax error.
 fn worst_finding(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
     let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
@@ -319,24 +299,23 @@ fn finding(finding: &Diagnostic) -> String {
     format!("{place}{}", finding.message.split_whitespace().collect::<Vec<_>>().join(" "))
 }
 
-/// Writes the report: text to stderr, JSON to stdout, or to stderr if the file is on stdout.
-fn write_report(
-    args: &JobArgs,
-    report: &Report,
-    findings: Option<&[Diagnostic]>,
-    written: &WrittenFiles,
+/// Writes the report: text to stderr unless `is_quiet`, JSON to stdout, or to stderr if the file is on stdout.
+pub(super) fn write_report(
+    style: ReportStyle,
+    is_quiet: bool,
     file_on_stdout: bool,
+    text: impl FnOnce() -> String,
+    json: impl FnOnce() -> Result<String, CliError>,
 ) -> Result<(), CliError> {
-    match args.report {
-        ReportStyle::Text if args.quiet => Ok(()),
+    match style {
+        ReportStyle::Text if is_quiet => Ok(()),
         ReportStyle::Text => {
-            let text = summary::text(report, written, findings.map(finding_lines).as_deref(), Style::stderr());
-            // The mesh is finished, so a closed stderr is not an error.
-            drop(io::stderr().write_all(text.as_bytes()));
+            // The file is finished, so a closed stderr is not an error.
+            drop(io::stderr().write_all(text().as_bytes()));
             Ok(())
         }
         ReportStyle::Json => {
-            let text = json_report(report, findings, written)?;
+            let text = json()?;
             let printed =
                 if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::print(&text) };
             printed.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
@@ -358,10 +337,9 @@ fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Writt
     let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialized: {e}"));
     let mut value = serde_json::to_value(report).map_err(failed)?;
     if let Value::Object(map) = &mut value {
-        let file = |file: &Written| json!({ "file": file.name, "format": file.format, "bytes": file.bytes });
-        map.insert("output".to_owned(), file(&written.mesh));
-        for (kind, table) in &written.tables {
-            map.insert((*kind).to_owned(), file(table));
+        map.insert("output".to_owned(), written.mesh.json());
+        if let Some(table) = &written.atom_table {
+            map.insert("atom_table".to_owned(), table.json());
         }
         if let Some(findings) = findings {
             map.insert("findings".to_owned(), findings_json(findings));

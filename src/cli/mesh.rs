@@ -6,12 +6,12 @@ use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink, GlbSinkError};
 use molmesh::pipeline::params::Request;
-use molmesh::pipeline::{AreaLevel, JobError, Product, ProgressSink};
+use molmesh::pipeline::{JobError, Product, ProgressSink};
 use molmesh::surface::SurfaceError;
 
 use super::args::MeshArgs;
 use super::error::CliError;
-use super::job::{CommandJob, Table};
+use super::job::CommandJob;
 use super::output::{Output, is_stdio};
 use super::request;
 
@@ -23,21 +23,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let paths = (args.input.as_path(), args.output.as_path());
     let (mut job, mut output) = CommandJob::prepare(job, strict, paths, format, &args.job)?;
     if let Some(path) = &args.atoms {
-        job.add_table(Table::Atoms, path, &args.output)?;
-    }
-    if args.areas_by.is_some() && args.areas.is_none() {
-        return Err(CliError::usage("`--areas-by` needs `--areas FILE`"));
-    }
-    if let Some(path) = &args.areas {
-        if !args.job.surface.exact {
-            return Err(CliError::usage("`--areas` needs `--exact`"));
-        }
-        let name = args.areas_by.as_deref().unwrap_or(AreaLevel::default().name());
-        let level = name.parse().map_err(|()| {
-            let expected = AreaLevel::ALL.map(AreaLevel::name).join(", ");
-            CliError::usage(format!("`--areas-by`: `{name}` is not allowed; expected one of {expected}"))
-        })?;
-        job.add_table(Table::Areas(level), path, &args.output)?;
+        job.add_atom_table(path, &args.output)?;
     }
     let product = if format == Format::Glb && output.has_random_access() {
         run_to_file(&job, &output)?
@@ -52,7 +38,6 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
         report.add_timing("encode", encode(&product, format, &mut output, &job.progress)?);
         writing = output.writing;
     }
-    job.areas.clone_from(&product.areas);
     // The process ends soon, which frees the memory at once.
     std::mem::forget(product);
     job.finish(output, report, format, writing)

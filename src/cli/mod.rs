@@ -2,6 +2,7 @@
 //!
 //! A command starts only what it needs: `mesh` has no async runtime and no log.
 
+mod areas;
 mod args;
 mod backend;
 #[cfg(feature = "server")]
@@ -63,6 +64,7 @@ fn run() -> i32 {
         Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
         Command::Render(args) => panics::contained(|| render::run(&args)),
         Command::Tileset(args) => panics::contained(|| tileset::run(&args)),
+        Command::Areas(args) => panics::contained(|| areas::run(&args)),
         #[cfg(feature = "server")]
         Command::Serve(args) => serve::run(&args),
         #[cfg(feature = "server")]

@@ -1,12 +1,15 @@
 //! Turns flags into a request. Names and values are those of an HTTP query and have the same parser.
 
 use molmesh::formats::Format;
+use molmesh::pipeline::params::areas::AreasRequest;
 use molmesh::pipeline::params::{self, ParamError, Request};
 use molmesh::pipeline::tileset;
 use molmesh::pipeline::{Job, JobLimits};
 use molmesh::structure::read::DISTANCES_PER_PAIR;
 
-use super::args::{JobArgs, LimitArgs, MeshArgs, PictureArgs, RenderArgs, TilesetArgs};
+use super::args::{
+    AreasArgs, AtomArgs, CommonLimitArgs, JobArgs, LimitArgs, MeshArgs, PictureArgs, RenderArgs, TilesetArgs,
+};
 use super::error::CliError;
 
 /// Parses the flags of `mesh`.
@@ -39,6 +42,22 @@ pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
         });
     }
     Ok(request)
+}
+
+/// Parses the flags of `areas`.
+pub(super) fn parse_areas(args: &AreasArgs) -> Result<AreasRequest, CliError> {
+    let mut pairs = given(&[
+        ("surface", &args.surface),
+        ("by", &args.by),
+        ("probe", &args.probe),
+        ("radius_scale", &args.radius_scale),
+        ("radius_offset", &args.radius_offset),
+        ("interface", &args.interface),
+        ("model", &args.model),
+    ]);
+    pairs.extend(atom_pairs(&args.atoms));
+    let pairs: Vec<_> = pairs.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
+    params::areas::parse(&pairs).map_err(|error| refusal(&error))
 }
 
 /// Parses the flags of `render`.
@@ -87,34 +106,43 @@ fn with_caret(text: &str, column: usize) -> String {
 
 /// Returns the default limits, changed by the flags.
 pub(super) fn limits(args: &LimitArgs) -> JobLimits {
+    let mut limits = common_limits(&args.common);
+    set(&mut limits.read.max_parts, args.max_parts);
+    set(&mut limits.map.max_inflated_bytes, args.common.max_input_bytes);
+    set(&mut limits.map.max_points, args.max_map_points);
+    set(&mut limits.surface.max_grid_points, args.max_grid_points);
+    set(&mut limits.surface.max_mesh_bytes, args.max_mesh_bytes);
+    limits
+}
+
+/// Returns the default limits, changed by the flags for the input.
+pub(super) fn common_limits(args: &CommonLimitArgs) -> JobLimits {
     let mut limits = JobLimits::default();
-    let set = |limit: &mut u64, flag: Option<u64>| *limit = flag.unwrap_or(*limit);
     set(&mut limits.read.max_atoms, args.max_atoms);
     set(&mut limits.read.max_duplicates, args.max_duplicates);
     set(&mut limits.read.max_copies, args.max_copies);
-    set(&mut limits.read.max_parts, args.max_parts);
     set(&mut limits.read.max_inflated_bytes, args.max_input_bytes);
-    set(&mut limits.map.max_inflated_bytes, args.max_input_bytes);
-    set(&mut limits.map.max_points, args.max_map_points);
-    set(&mut limits.surface.max_grid_points, args.max_grid_points);
     set(&mut limits.surface.max_candidates, args.max_candidates);
     set(&mut limits.read.max_distances, args.max_candidates.map(|pairs| pairs.saturating_mul(DISTANCES_PER_PAIR)));
-    set(&mut limits.surface.max_mesh_bytes, args.max_mesh_bytes);
     limits
+}
+
+fn set(limit: &mut u64, flag: Option<u64>) {
+    *limit = flag.unwrap_or(*limit);
 }
 
 /// Returns the limits of a structure that is read as a stream, changed by the flags. Its atoms are not in memory.
 pub(super) fn limits_of_stream(args: &LimitArgs) -> JobLimits {
     let mut limits = limits(args);
-    limits.read.max_atoms = args.max_atoms.unwrap_or_else(|| u32::MAX.into());
-    limits.read.max_inflated_bytes = args.max_input_bytes.unwrap_or(1 << 40);
+    limits.read.max_atoms = args.common.max_atoms.unwrap_or_else(|| u32::MAX.into());
+    limits.read.max_inflated_bytes = args.common.max_input_bytes.unwrap_or(1 << 40);
     limits
 }
 
 /// Returns names and values as in a query.
 fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'static str, String)> {
     let (surface, atoms) = (&args.surface, &args.selection);
-    let given = [
+    let job_pairs = [
         ("surface", &surface.surface),
         ("probe", &surface.probe),
         ("preset", &surface.preset),
@@ -134,10 +162,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("color_range", &args.color.color_range),
         ("color_blend", &args.color.color_blend),
         ("color_offset", &args.color.color_offset),
-        ("chains", &atoms.chains),
         ("model", &atoms.model),
-        ("altloc", &atoms.altloc),
-        ("assembly", &atoms.assembly),
         ("unit", &atoms.unit),
         ("context", &atoms.context),
         ("split", &atoms.split),
@@ -148,8 +173,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("validation", &args.validation),
         ("interface", &surface.interface),
     ];
-    let mut pairs: Vec<_> =
-        own.iter().copied().chain(given).filter_map(|(name, value)| value.clone().map(|value| (name, value))).collect();
+    let mut pairs = given(&[own, &job_pairs].concat());
     if surface.atom_ids {
         pairs.push(("atom_ids", "true".to_owned()));
     }
@@ -165,6 +189,12 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
     if args.check {
         pairs.push(("check", "strict".to_owned()));
     }
+    pairs.extend(atom_pairs(&atoms.atoms));
+    pairs
+}
+
+/// Returns names and values of the atoms as in a query.
+fn atom_pairs(atoms: &AtomArgs) -> Vec<(&'static str, String)> {
     // The short flags add to `--select` or to its default.
     let mut select = atoms.select.clone();
     for (flag, class) in [(atoms.ligands, "ligand"), (atoms.waters, "water"), (atoms.hydrogens, "hydrogens")] {
@@ -172,8 +202,12 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
             select = Some(format!("{},{class}", select.as_deref().unwrap_or("polymer")));
         }
     }
-    pairs.extend(select.map(|select| ("select", select)));
-    pairs
+    given(&[("chains", &atoms.chains), ("altloc", &atoms.altloc), ("assembly", &atoms.assembly), ("select", &select)])
+}
+
+/// Returns the parameters that have a value.
+fn given(flags: &[(&'static str, &Option<String>)]) -> Vec<(&'static str, String)> {
+    flags.iter().filter_map(|(name, value)| Some((*name, value.as_ref()?.clone()))).collect()
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use molmesh::pipeline::{
     PocketReport, Report, SimplificationReport, TriangleReport,
 };
 use molmesh::surface::Validation;
+use serde_json::{Value, json};
 
 use super::page::Page;
 use super::style::Style;
@@ -22,17 +23,29 @@ pub(crate) struct Written {
     pub(crate) bytes: u64,
 }
 
+impl Written {
+    /// Returns the file as text.
+    pub(super) fn text(&self) -> String {
+        format!("{} ({}, {} bytes)", self.name, self.format, grouped(self.bytes))
+    }
+
+    /// Returns the file as JSON.
+    pub(super) fn json(&self) -> Value {
+        json!({ "file": self.name, "format": self.format, "bytes": self.bytes })
+    }
+}
+
 /// Files of a command.
 pub(crate) struct WrittenFiles {
     /// Mesh or picture.
     pub(crate) mesh: Written,
-    /// Tables that were requested, with their names in the report.
-    pub(crate) tables: Vec<(&'static str, Written)>,
+    /// Table of the atoms, if it was requested.
+    pub(crate) atom_table: Option<Written>,
 }
 
 /// Formats the summary. `findings` are those of the strict validator, if it ran.
 pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[String]>, style: Style) -> String {
-    let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
+    let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report.title.as_deref()));
     let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
     let models = match report.models {
         Some(1) => "1 model".to_owned(),
@@ -93,7 +106,10 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     if let Some(shapes) = &report.triangle_shapes {
         page.row("angles", &angles(shapes));
     }
-    page.row("area", &format!("{} Å²", decimal(report.area)));
+    let deficit =
+        |percent| format!(" (macromolecules: up to {} % below the exact area; see --exact)", decimal(percent));
+    let deficit = report.area_deficit_percent.map(deficit).unwrap_or_default();
+    page.row("area", &format!("{} Å²{deficit}", decimal(report.area)));
     if let Some(volume) = report.volume {
         page.row("volume", &format!("{} Å³", decimal(volume)));
     }
@@ -101,10 +117,8 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
         page.row("exact", &exact_measures(exact));
     }
     page.row("backend", &format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
-    for Written { name, format, bytes } in
-        [&written.mesh].into_iter().chain(written.tables.iter().map(|(_, file)| file))
-    {
-        page.row("wrote", &format!("{name} ({format}, {} bytes)", grouped(*bytes)));
+    for file in [&written.mesh].into_iter().chain(&written.atom_table) {
+        page.row("wrote", &file.text());
     }
     if let Some(findings) = findings {
         add_findings(&mut page, findings);
@@ -114,8 +128,10 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
 }
 
 fn simplified(found: &SimplificationReport) -> String {
-    let [most, mean] = [found.max_deviation, found.mean_deviation];
-    format!("from {} triangles, deviation up to {most:.3} Å, mean {mean:.4} Å", grouped(found.triangles_before))
+    let SimplificationReport { triangles_before, max_deviation, mean_deviation, intersections } = *found;
+    let deviation = format!("deviation up to {max_deviation:.3} Å, mean {mean_deviation:.4} Å");
+    let text = format!("from {} triangles, {deviation}", grouped(triangles_before));
+    if intersections == 0 { text } else { format!("{text}, {} pairs of triangles intersect", grouped(intersections)) }
 }
 
 fn angles(shapes: &TriangleReport) -> String {
@@ -124,7 +140,7 @@ fn angles(shapes: &TriangleReport) -> String {
 }
 
 /// Formats exact areas and volume.
-fn exact_measures(exact: &ExactReport) -> String {
+pub(super) fn exact_measures(exact: &ExactReport) -> String {
     let parts = exact.parts.as_ref().map(|parts| {
         let [contact, toroidal, concave] = [parts.contact, parts.toroidal, parts.concave].map(decimal);
         format!(" (contact {contact}, toroidal {toroidal}, concave {concave})")
@@ -136,8 +152,8 @@ fn exact_measures(exact: &ExactReport) -> String {
 }
 
 /// Returns the structure's title, cut to one line.
-fn title(report: &Report) -> String {
-    let title = report.title.as_deref().unwrap_or_default();
+pub(super) fn title(title: Option<&str>) -> String {
+    let title = title.unwrap_or_default();
     let mut chars = title.chars();
     let short: String = chars.by_ref().take(90).collect();
     if chars.next().is_some() { format!("{short}…") } else { short }
@@ -302,12 +318,12 @@ fn bar(fraction: f64) -> String {
 }
 
 /// Formats `1234567` as `1,234,567`.
-fn grouped(n: u64) -> String {
+pub(super) fn grouped(n: u64) -> String {
     indicatif::HumanCount(n).to_string()
 }
 
 /// Formats a number with one decimal from 100, two from 1 and three below 1.
-fn decimal(value: f64) -> String {
+pub(super) fn decimal(value: f64) -> String {
     let digits = match value.abs() {
         v if v >= 100.0 => 1,
         v if v >= 1.0 => 2,
@@ -424,6 +440,7 @@ mod tests {
                 legend: vec![LegendEntry { label: "A".into(), color: "#4fa59b".into() }],
             }),
             exact: None,
+            area_deficit_percent: None,
             backend: "cpu",
             arithmetic: String::new(),
             device: "2 threads".into(),
@@ -451,7 +468,7 @@ mod tests {
     #[test]
     fn summary_is_complete_and_fits_one_screen() {
         let mesh = Written { name: "a.glb".to_owned(), format: "glb", bytes: 720_000 };
-        let text = text(&report(), &WrittenFiles { mesh, tables: Vec::new() }, None, Style::PLAIN);
+        let text = text(&report(), &WrittenFiles { mesh, atom_table: None }, None, Style::PLAIN);
         for part in [
             "4PTI TRYPSIN INHIBITOR",
             "454 of 514",

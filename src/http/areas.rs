@@ -8,7 +8,6 @@ use axum::extract::State;
 use axum::http::header::{self, HeaderMap};
 use axum::response::{IntoResponse, Response};
 
-use super::area_parameters;
 use super::guard::Caller;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AreaParameters, ConditionHeaders, EntryPath, StructurePath};
@@ -21,6 +20,8 @@ use super::source::{Loaded, StructureSource};
 use super::state::Shared;
 use crate::jobs::Failure;
 use crate::pipeline::areas;
+use crate::pipeline::params;
+use crate::pipeline::params::areas::AreasRequest;
 
 problem_responses!(StructureProblems: [
     READING,
@@ -95,7 +96,7 @@ async fn answer(
     query: Pairs,
     headers: &HeaderMap,
 ) -> Result<Response, Problem> {
-    let area_parameters::Areas { job, level, canonical } = area_parameters::parse(&parsed_request::pairs(query)?)?;
+    let AreasRequest { job, level, canonical } = params::areas::parse(&parsed_request::pairs(query)?)?;
     let surface = app.config.limits.job().surface;
     let write = async |loaded: Loaded, delivery| {
         app.admit_work(caller)?;
@@ -103,9 +104,9 @@ async fn answer(
         let listing = loaded.list_atoms(app, caller, delivery, 0, move |structure, limits, control, memory| {
             let refused = |error| Problem::from(Failure::Job { error, diagnostics: Vec::new() });
             let start = Instant::now();
-            let measured = areas::measure_selection(structure, &job, (limits, &surface), control);
+            let measured = areas::measure_selection(structure, &job, limits, &surface, control);
             meter.charge(&payer, start.elapsed());
-            let areas = measured.map_err(refused)?;
+            let areas = measured.map_err(refused)?.areas;
             // A row may have one atom only.
             memory.grow(BYTES_PER_ROW * areas.len() as u64)?;
             let mut text = Vec::new();

@@ -35,7 +35,6 @@ mod state;
 mod guard;
 
 // Requests: preferences, bodies, structures, parameters.
-mod area_parameters;
 mod atom_parameters;
 mod body_hasher;
 mod color_parameters;

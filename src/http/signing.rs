@@ -7,8 +7,9 @@ use super::jobs::{MAX_WAIT_S, Poll};
 use super::parsed_request::parse_address;
 use super::problem::Problem;
 use super::scopes::{OperationScope, Parameters, TABLE};
-use super::{area_parameters, atom_parameters, color_parameters, results};
+use super::{atom_parameters, color_parameters, results};
 use crate::formats::Format;
+use crate::pipeline::params;
 use crate::store::Namespace;
 
 /// Checks that a signature can open `target`, a path with or without a query.
@@ -54,7 +55,7 @@ fn check_parameters(row: &OperationScope, file: Option<&str>, uri: &Uri) -> Resu
     match row.parameters() {
         Parameters::Mesh => parse_address(file, &pairs).map(drop).map_err(Problem::into_detail),
         Parameters::Atoms => atom_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
-        Parameters::Areas => area_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
+        Parameters::Areas => params::areas::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Tileset | Parameters::Subtree => {
             Err("a signature is valid for one URL, and a tileset has many; use a key".to_owned())

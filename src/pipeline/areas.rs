@@ -1,13 +1,17 @@
 //! Exact areas of a surface of spheres: in total, by chain, residue and atom, and buried between two sets of chains.
 
+mod table;
+
 use std::fmt;
-use std::io::{self, Write};
 use std::str::FromStr;
 
 use serde::Serialize;
 
-use super::{Job, JobError, SPHERE_BYTES};
-use crate::structure::{self, ReadLimits, Selected, Structure, select, table};
+pub use self::table::AreaLevel;
+use self::table::Row;
+use super::load::{SPHERE_BYTES, load};
+use super::{Job, JobError, LeftOutReport, StageClock};
+use crate::structure::{ReadLimits, Selected, Structure, select};
 use crate::surface::{AreaParts, Control, ExactMeasures, Spheres, SurfaceError, SurfaceKind, SurfaceLimits};
 
 /// Description of the values of `interface`.
@@ -119,41 +123,6 @@ pub struct InterfaceSide {
     pub buried: f64,
 }
 
-/// Rows of a table of areas.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum AreaLevel {
-    /// A row for each atom.
-    Atom,
-    /// A row for each residue.
-    #[default]
-    Residue,
-    /// A row for each chain.
-    Chain,
-}
-
-impl AreaLevel {
-    /// All levels.
-    pub const ALL: [Self; 3] = [Self::Atom, Self::Residue, Self::Chain];
-
-    /// Returns the name of the level.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Atom => "atom",
-            Self::Residue => "residue",
-            Self::Chain => "chain",
-        }
-    }
-}
-
-impl FromStr for AreaLevel {
-    type Err = ();
-
-    fn from_str(text: &str) -> Result<Self, ()> {
-        Self::ALL.into_iter().find(|level| level.name() == text).ok_or(())
-    }
-}
-
 /// Areas of the surface on each atom, Å².
 #[derive(Debug, Clone, PartialEq)]
 pub struct AtomAreas {
@@ -172,6 +141,27 @@ fn round(value: f64) -> f64 {
     (value * 1e4).round() / 1e4
 }
 
+/// Exact areas of a selection, without a mesh.
+#[derive(Debug, Clone)]
+pub struct MeasuredSelection {
+    /// Atoms that were not measured.
+    pub left_out: LeftOutReport,
+    /// Measures of the selection, or with an interface, those of its sides.
+    pub measures: SelectionMeasures,
+    /// Areas of the atoms; with an interface, of those of both sides.
+    pub areas: AtomAreas,
+}
+
+/// Measures of a selection.
+#[derive(Debug, Clone, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SelectionMeasures {
+    /// All atoms together.
+    Exact(ExactReport),
+    /// Surface area buried between two sets of chains.
+    Interface(InterfaceReport),
+}
+
 /// Measures the atoms that a job selects, without a mesh.
 ///
 /// # Errors
@@ -179,17 +169,19 @@ fn round(value: f64) -> f64 {
 pub fn measure_selection(
     structure: &Structure,
     job: &Job,
-    (read, surface): (&ReadLimits, &SurfaceLimits),
+    read: &ReadLimits,
+    surface: &SurfaceLimits,
     control: &Control<'_>,
-) -> Result<AtomAreas, JobError> {
-    let selected = structure::select_with(structure, &job.selection, read, control)?;
-    control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
-    let spheres = selected.spheres(structure)?;
-    selected.check_duplicates(&spheres, read, control)?;
-    match &job.interface {
-        Some(interface) => Ok(interface.measure(structure, &selected, &spheres, job, surface, control)?.1),
-        None => Ok(whole(structure, &selected, &spheres, job, surface, control)?.1),
-    }
+) -> Result<MeasuredSelection, JobError> {
+    let (_, selected, spheres) = load(|_| Ok(structure), job, read, &StageClock::new(&()), control)?;
+    let (measures, areas) = if let Some(interface) = &job.interface {
+        let (report, areas) = interface.measure(structure, &selected, &spheres, job, surface, control)?;
+        (SelectionMeasures::Interface(report), areas)
+    } else {
+        let (report, areas) = whole(structure, &selected, &spheres, job, surface, control)?;
+        (SelectionMeasures::Exact(report), areas)
+    };
+    Ok(MeasuredSelection { left_out: LeftOutReport::new(&selected.left_out), measures, areas })
 }
 
 /// Measures `spheres`, those of the `selected` atoms.
@@ -200,13 +192,12 @@ pub(super) fn measure(
     job: &Job,
     limits: &SurfaceLimits,
     control: &Control<'_>,
-) -> Result<(ExactReport, AtomAreas), JobError> {
-    let (mut report, mut areas) = whole(structure, selected, spheres, job, limits, control)?;
+) -> Result<ExactReport, JobError> {
+    let (mut report, _) = whole(structure, selected, spheres, job, limits, control)?;
     if let Some(interface) = &job.interface {
-        let (buried, of_sides) = interface.measure(structure, selected, spheres, job, limits, control)?;
-        (report.interface, areas) = (Some(buried), of_sides);
+        report.interface = Some(interface.measure(structure, selected, spheres, job, limits, control)?.0);
     }
-    Ok((report, areas))
+    Ok(report)
 }
 
 /// Measures all spheres, without an interface.
@@ -306,95 +297,5 @@ impl Interface {
         let atoms = rows.iter().map(|&row| selected.atoms[row as usize]).collect();
         let has_parts = job.params.surface == SurfaceKind::Ses;
         Ok((InterfaceReport { area, sides }, AtomAreas { atoms, areas, alone: Some(alone), has_parts }))
-    }
-}
-
-/// Row of a table: some atoms with the sums of their areas.
-struct Row {
-    /// Index of the first atom in the structure.
-    first: usize,
-    atoms: u64,
-    parts: AreaParts,
-    alone: f64,
-}
-
-impl AtomAreas {
-    /// Returns the number of atoms.
-    #[must_use]
-    pub fn len(&self) -> usize {
-        self.atoms.len()
-    }
-
-    /// Returns true if there is no atom.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.atoms.is_empty()
-    }
-
-    /// Returns the rows of a table. Chains are in the order of their first atoms, and contain all copies. A residue
-    /// ends with its last consecutive atom.
-    fn rows(&self, structure: &Structure, level: AreaLevel) -> Vec<Row> {
-        let mut rows: Vec<Row> = Vec::new();
-        let mut of_chains = std::collections::HashMap::new();
-        let mut before = None;
-        for (n, &atom) in self.atoms.iter().enumerate() {
-            let i = atom as usize;
-            let row = match level {
-                AreaLevel::Atom => rows.len(),
-                // The first atom of a copy has a lower index than the last one of the copy before.
-                AreaLevel::Residue => {
-                    let is_same = before.is_some_and(|last| last < i && structure.same_residue(last, i));
-                    rows.len() - usize::from(is_same)
-                }
-                AreaLevel::Chain => *of_chains.entry(structure.chain.id(i)).or_insert(rows.len()),
-            };
-            if row == rows.len() {
-                rows.push(Row { first: i, atoms: 0, parts: AreaParts::default(), alone: 0.0 });
-            }
-            rows[row].atoms += 1;
-            rows[row].parts += self.areas[n];
-            rows[row].alone += self.alone.as_ref().map_or(0.0, |alone| alone[n]);
-            before = Some(i);
-        }
-        rows
-    }
-
-    /// Writes a table as CSV (RFC 4180, lines end in LF) with areas in Å², rounded to 0.0001 Å². With an interface, it
-    /// has the atoms of both sides, and the columns `alone` and `buried`. With a solvent-excluded surface, it has the
-    /// columns `contact`, `toroidal` and `concave`.
-    ///
-    /// # Errors
-    /// Returns the errors of `out`.
-    pub fn write_csv(&self, structure: &Structure, level: AreaLevel, out: &mut dyn Write) -> io::Result<()> {
-        let columns = match level {
-            AreaLevel::Atom => 0..8,
-            AreaLevel::Residue => 3..8,
-            AreaLevel::Chain => 6..8,
-        };
-        let counts = level != AreaLevel::Atom;
-        let mut header = table::COLUMNS[columns.clone()].to_vec();
-        header.extend(counts.then_some("atoms"));
-        header.push("area");
-        if self.has_parts {
-            header.extend(["contact", "toroidal", "concave"]);
-        }
-        if self.alone.is_some() {
-            header.extend(["alone", "buried"]);
-        }
-        table::write_rows(out, &header, self.rows(structure, level), |text, Row { first, atoms, parts, alone }| {
-            table::put_columns(text, structure, first, columns.clone());
-            if counts {
-                write!(text, ",{atoms}")?;
-            }
-            let area = parts.total();
-            write!(text, ",{area:.4}")?;
-            if self.has_parts {
-                write!(text, ",{:.4},{:.4},{:.4}", parts.contact, parts.toroidal, parts.concave)?;
-            }
-            if self.alone.is_some() {
-                write!(text, ",{alone:.4},{:.4}", alone - area)?;
-            }
-            Ok(())
-        })
     }
 }

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use super::{AtomAreas, Job, JobError, ProgressSink, Report, StageClock};
+use super::{Job, JobError, ProgressSink, Report, StageClock};
 use crate::formats::{Compress, CompressedGlb, Encoder, Format, FormatError, Meta, Pieces, Storage};
 use crate::surface::{Control, Mesh, SurfaceError};
 
@@ -17,8 +17,6 @@ pub struct Product {
     pub storage: Storage,
     /// Report of the job.
     pub report: Report,
-    /// Exact areas of the atoms, if they are requested.
-    pub areas: Option<AtomAreas>,
     /// Compressed form of the mesh, for [`Compress::Meshopt`]. The columns of `mesh` are empty then.
     pub pieces: Option<Pieces>,
     /// PNG of the mesh, if one was drawn. The mesh is empty then.
@@ -40,7 +38,7 @@ pub enum File<'a> {
 
 impl Product {
     pub(super) fn new(mesh: Mesh, storage: Storage, report: Report) -> Self {
-        Self { mesh, bounds: None, storage, report, areas: None, pieces: None, picture: None, streamed_bytes: None }
+        Self { mesh, bounds: None, storage, report, pieces: None, picture: None, streamed_bytes: None }
     }
 
     /// Returns the metadata for a mesh file.

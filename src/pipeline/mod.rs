@@ -38,7 +38,7 @@ mod work;
 
 use std::ops::Deref;
 
-pub use areas::{AreaLevel, AtomAreas, ExactReport, Interface};
+pub use areas::{AreaLevel, ExactReport, Interface, InterfaceReport, MeasuredSelection, SelectionMeasures};
 pub use auto::AutoBackend;
 pub use cavities::{Cavities, CavityReport, LiningResidue};
 pub use clock::{ProgressSink, StageClock};
@@ -279,7 +279,7 @@ fn run_loaded<S: Deref<Target = Structure>>(
     let prepare = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, map, &control);
     let colors = job.color.map(prepare).transpose()?;
     let measure = || areas::measure(&structure, &selected, &spheres, job, &limits.surface, &control);
-    let (exact, areas) = job.exact.then(|| clock.time("exact", measure)).transpose()?.unzip();
+    let exact = job.exact.then(|| clock.time("exact", measure)).transpose()?;
     let pockets = pockets::search(job, &spheres, &limits.surface, &clock, &control)?;
     let of_pockets = pockets.as_ref().filter(|_| job.split == Split::Pocket);
     let parts = pockets::parts(of_pockets, &structure, &selected, job.split, &limits.read, &control)?;
@@ -345,7 +345,7 @@ fn run_loaded<S: Deref<Target = Structure>>(
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
-    let mut product = Product { bounds, areas, ..Product::new(mesh, storage, report) };
+    let mut product = Product { bounds, ..Product::new(mesh, storage, report) };
     product.compress(job, &control, progress)?;
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
         let clock = StageClock::new(progress);

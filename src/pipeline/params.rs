@@ -3,6 +3,7 @@
 //! The query of the HTTP service, `/v1/capabilities` and the command line use one table of names, descriptions and
 //! ranges. The module depends on neither HTTP nor flags.
 
+pub mod areas;
 mod canonical;
 mod choices;
 mod domain;
@@ -321,7 +322,6 @@ fn unknown_of(name: &str, known: impl IntoIterator<Item = &'static str>) -> Para
 ///
 /// # Errors
 /// Returns [`ParamError::Unknown`] for the first one that is not.
-#[cfg(feature = "server")]
 pub(crate) fn check_names(pairs: &[(String, String)], known: &'static [&'static str]) -> Result<(), ParamError> {
     let bad = pairs.iter().find(|(name, _)| !known.contains(&name.as_str()));
     bad.map_or(Ok(()), |(name, _)| Err(unknown_of(name, known.iter().copied())))

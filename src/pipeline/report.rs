@@ -191,6 +191,11 @@ pub struct Report {
     pub parts: Vec<PartReport>,
     /// Surface area in Å², including the walls of voids.
     pub area: f64,
+    /// Upper estimate for macromolecules, in percent of the exact area, of the area that the mesh lacks at the creases
+    /// between spheres: with `surface=vdw` or `sas`, the default radii and probe, and a grid spacing of at most 2 Å.
+    /// Absent with `exact`, and if the mesh is simplified or cut.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub area_deficit_percent: Option<f64>,
     /// Enclosed volume in Å³, voids subtracted; null if the mesh is cut open.
     #[cfg_attr(feature = "server", schema(required))]
     pub volume: Option<f64>,
@@ -276,7 +281,7 @@ impl Report {
             warnings: structure.warnings.clone(),
             radii: structure.radii_name(),
             surface: params.surface.name(),
-            probe: params.surface.has_probe().then_some(params.probe),
+            probe: params.used_probe(),
             preset: params.preset.name(),
             resolution: counts.resolution,
             resolution_from: job.spacing.parameter(),
@@ -314,6 +319,7 @@ impl Report {
             component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
             parts: Vec::new(),
             area: measures.area,
+            area_deficit_percent: area_deficit_percent(structure, job, counts),
             volume: (!is_open).then_some(measures.volume),
             exact: None,
             report_units: Units::Angstrom.name(),
@@ -362,10 +368,18 @@ impl Report {
     }
 }
 
+/// Returns [`crate::surface::SurfaceParams::area_deficit_percent`] of a mesh whose area nothing else changes: radii of
+/// the file, simplification or a cut. A report with exact areas needs no estimate.
+fn area_deficit_percent(structure: &Structure, job: &Job, counts: &Counts) -> Option<f64> {
+    let needs_estimate = !job.exact && structure.radius.is_empty() && job.simplify.is_none() && !counts.cut;
+    job.params.area_deficit_percent(counts.resolution).filter(|_| needs_estimate)
+}
+
 /// Fields of the report that mesh files do not contain. The last digits of `exact` and `triangle_shapes` depend on
-/// mathematical libraries.
-const EXCLUDED_EXTRAS: [&str; 11] = [
+/// mathematical libraries; `area_deficit_percent` describes the grid spacing, not the mesh.
+const EXCLUDED_EXTRAS: [&str; 12] = [
     "timings_ms",
+    "area_deficit_percent",
     "device",
     "backend_reason",
     "fallback",

@@ -17,11 +17,11 @@ use super::spheres::Spheres;
 
 /// Edge length of the cubes whose vertices share a list of atoms, spacings.
 const SIDE: i32 = 16;
-/// Memory per vertex while it is sorted with its cube, bytes, and that of its result.
+/// Memory per vertex, bytes: its cube and row while they are sorted, and its curvature.
 const VERTEX_BYTES: u64 = 40;
 
-/// Returns the mean curvature at the vertices in `rows` of `mesh`, the mesh of the isosurface of `spheres` with `params`,
-/// Å⁻¹: positive where the surface is convex, 0 where the gradient vanishes.
+/// Returns the mean curvature at the vertices in `rows` of `mesh`, the mesh of the isosurface of `spheres` with
+/// `params`, Å⁻¹: positive where the surface is convex, 0 where the gradient vanishes.
 ///
 /// # Errors
 /// Those of preparing the field, [`SurfaceError::Memory`] and [`SurfaceError::Cancelled`].
@@ -44,7 +44,7 @@ pub(crate) fn mean_curvatures(
     let cube = |row: usize| spacings(row).map(|c| to_i32((c / f64::from(SIDE)).floor()));
     let mut sorted: Vec<([i32; 3], u32)> = rows.clone().map(|row| (cube(row), to_u32(row))).collect();
     checked_sort::sort(&mut sorted, Ord::cmp, control)?;
-    let of_cube = |entries: &&[([i32; 3], u32)]| {
+    let cube_curvatures = |entries: &&[([i32; 3], u32)]| {
         control.check()?;
         let low = entries[0].0.map(|c| c * SIDE);
         let mut near = field.near([low, low.map(|c| c + SIDE)]);
@@ -56,7 +56,7 @@ pub(crate) fn mean_curvatures(
         Ok(field.mean_curvatures(&mut near, &points))
     };
     let cubes: Vec<&[([i32; 3], u32)]> = sorted.chunk_by(|a, b| a.0 == b.0).collect();
-    let found: Vec<Vec<f32>> = cubes.par_iter().map(of_cube).collect::<Result<_, SurfaceError>>()?;
+    let found: Vec<Vec<f32>> = cubes.par_iter().map(cube_curvatures).collect::<Result<_, SurfaceError>>()?;
     let mut curvatures = vec![0.0; rows.len()];
     for ((_, row), curvature) in sorted.iter().zip(found.iter().flatten()) {
         if curvature.is_finite() {

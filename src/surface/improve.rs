@@ -11,7 +11,6 @@
 //! again without the vertices of the intersecting triangles.
 
 mod cube;
-mod intersections;
 mod patch;
 mod shapes;
 

@@ -139,7 +139,7 @@ impl Shape {
     /// Returns the shape of validated parameters.
     #[must_use]
     pub fn new(params: &SurfaceParams) -> Self {
-        let enlarged = if params.surface.has_probe() { params.probe } else { 0.0 };
+        let enlarged = params.used_probe().unwrap_or(0.0);
         params.surface.kernel().map_or(Self::Sphere { enlarged }, |kernel| Self::Density(Profile::new(kernel, params)))
     }
 

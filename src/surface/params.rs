@@ -239,6 +239,26 @@ impl SurfaceParams {
         self.surface.kernel().ok_or_else(|| bad("surface", format!("`{}`", self.surface), expected()))
     }
 
+    /// Returns an upper estimate, in percent of the exact area, of the area that a mesh with this grid spacing, Å,
+    /// lacks at its creases. It is fitted to 25 macromolecules with the default radii and probe (`docs/surface.md`);
+    /// `None` for others, above 2 Å, and for surfaces without creases.
+    #[must_use]
+    pub fn area_deficit_percent(&self, spacing: f64) -> Option<f64> {
+        let is_fitted = spacing <= 2.0 && self.radius_scale.total_cmp(&1.0).is_eq() && self.radius_offset == 0.0;
+        let percent = |per_angstrom: f64| (10.0 * per_angstrom * spacing).round() / 10.0;
+        match self.surface {
+            SurfaceKind::Vdw if is_fitted => Some(percent(16.0)),
+            SurfaceKind::Sas if is_fitted && self.probe == DEFAULT_PROBE => Some(percent(12.0)),
+            _ => None,
+        }
+    }
+
+    /// Returns the radius of the probe in Å; `None` for surfaces without one.
+    #[must_use]
+    pub fn used_probe(&self) -> Option<f64> {
+        self.surface.has_probe().then_some(self.probe)
+    }
+
     /// Returns the isovalue of an isosurface; `None` for a surface of spheres.
     #[must_use]
     pub fn level(&self) -> Option<f64> {

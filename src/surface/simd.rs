@@ -98,7 +98,7 @@ dispatched! {
 }
 
 /// Number of the method: increased by every change of the code that changes the bytes of meshes.
-const METHOD: u32 = 3;
+const METHOD: u32 = 4;
 
 /// Names the arithmetic that determines the last bits of results on this processor: the method, the system and
 /// architecture, whose mathematical functions differ, and fused or not. The width of vectors does not matter.

@@ -21,6 +21,21 @@ pub(super) fn length(a: Vector) -> f32 {
     dot(a, a).sqrt()
 }
 
+/// Applies `f` to each pair of components.
+pub(super) fn map_components(a: Vector, b: Vector, f: impl Fn(f32, f32) -> f32) -> Vector {
+    std::array::from_fn(|k| f(a[k], b[k]))
+}
+
+/// Returns the bounding box of a triangle.
+pub(super) fn bounds([a, b, c]: Corners) -> [Vector; 2] {
+    [f32::min, f32::max].map(|f: fn(f32, f32) -> f32| map_components(map_components(a, b, f), c, f))
+}
+
+/// Returns the centroid of a triangle.
+pub(super) fn centroid([a, b, c]: Corners) -> Vector {
+    std::array::from_fn(|k| (a[k] + b[k] + c[k]) / 3.0)
+}
+
 /// Returns the normal of a triangle, twice as long as its area.
 pub(super) fn area_vector([a, b, c]: Corners) -> Vector {
     cross(sub(b, a), sub(c, a))
@@ -50,8 +65,8 @@ pub(super) fn segment_intersects(from: Vector, to: Vector, triangle: &Corners) -
     if volume6(triangle, from) * volume6(triangle, to) >= 0.0 {
         return false;
     }
-    let around = [[a, b], [b, c], [c, a]].map(|[p, q]| volume6(&[p, q, from], to) > 0.0);
-    around == [true; 3] || around == [false; 3]
+    let around = [[a, b], [b, c], [c, a]].map(|[p, q]| volume6(&[p, q, from], to));
+    around.iter().all(|volume| *volume > 0.0) || around.iter().all(|volume| *volume < 0.0)
 }
 
 /// Rounds down to a whole number.

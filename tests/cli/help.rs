@@ -25,6 +25,7 @@ fn help_is_stable() {
     snapshot("mesh", &["mesh", "--help"]);
     snapshot("render", &["render", "--help"]);
     snapshot("tileset", &["tileset", "--help"]);
+    snapshot("areas", &["areas", "--help"]);
     snapshot("serve", &["serve", "--help"]);
     snapshot("doctor", &["doctor", "--help"]);
     snapshot("config", &["config", "--help"]);

@@ -16,6 +16,7 @@ mod http_support;
 mod tools;
 
 mod access;
+mod areas;
 mod browser;
 mod config_print;
 mod deploy;

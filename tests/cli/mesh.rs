@@ -427,32 +427,39 @@ fn the_table_of_atoms_has_the_row_of_every_index() {
 }
 
 #[test]
-fn the_table_of_areas_has_the_sum_of_the_report() {
+fn meshes_with_creases_state_how_much_of_the_area_they_lack() {
     let folder = Folder::new();
     let sample = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb"));
-    let (output, table) = (folder.path("4pti.glb"), folder.path("4pti.csv"));
-    let flags = ["--surface", "sas", "--exact", "--areas", table.to_str().unwrap(), "--resolution", "1.5"];
-    let done = mesh(sample, &output, &[&flags[..], &["--report", "json"]].concat());
-    assert_code(&done, 0);
-    let report = json(&stdout(&done));
-    assert_eq!(report["area_table"]["format"], "csv");
-    let text = fs::read_to_string(&table).unwrap();
-    let mut rows = text.lines();
-    assert_eq!(rows.next().unwrap(), "residue_name,residue_number,insertion_code,chain,model,atoms,area");
-    let area: f64 = rows.map(|row| row.rsplit(',').next().unwrap().parse::<f64>().unwrap()).sum();
-    assert!((area - report["exact"]["area"].as_f64().unwrap()).abs() < 0.01, "{area} {report}");
-    let done = mesh(sample, &output, &flags);
-    assert!(stderr(&done).contains("exact") && stderr(&done).contains("4pti.csv (csv, "), "{}", stderr(&done));
-    for (more, code) in [
-        (["--areas-by", "model"], 2),
-        (["--atoms", table.to_str().unwrap()], 2),
-        (["--interface", "A"], 2),
-        (["--interface", "A,Z"], 4),
-    ] {
-        assert_code(&mesh(sample, &output, &[&flags[..], &more].concat()), code);
-    }
-    for alone in [["--areas", table.to_str().unwrap()], ["--areas-by", "atom"], ["--interface", "A,B"]] {
-        assert_code(&mesh(sample, &output, &alone), 2);
+    for (surface, resolution, part) in
+        [("sas", "0.5", Some(6.0)), ("vdw", "1", Some(16.0)), ("ses", "1", None), ("gaussian", "1", None)]
+    {
+        let flags = ["--surface", surface, "--resolution", resolution];
+        let exact = if surface == "gaussian" { &[][..] } else { &["--exact"] };
+        let output = folder.path("4pti.glb");
+        let json_of = |more: &[&str]| {
+            let done = mesh(sample, &output, &[&flags[..], more, &["--report", "json"]].concat());
+            assert_code(&done, 0);
+            json(&stdout(&done))
+        };
+        let (report, measured) = (json_of(&[]), json_of(exact));
+        assert_eq!(report["area_deficit_percent"].as_f64(), part, "{surface}");
+        assert!(exact.is_empty() || measured["area_deficit_percent"].is_null(), "{surface}");
+        // It was measured with the default radii and probe, at spacings up to 2 Å, on whole meshes.
+        let mut others = vec!["--radius-scale 0.5", "--radius-offset 0.1", "--simplify 0.1", "--resolution 2.5"];
+        others.extend((surface == "sas").then_some("--probe 3"));
+        for other in others.into_iter().filter(|_| part.is_some()) {
+            let other: Vec<&str> = other.split(' ').collect();
+            let surface = if other[0] == "--resolution" { &flags[..2] } else { &flags[..] };
+            let done = mesh(sample, &output, &[surface, &other, &["--report", "json"]].concat());
+            assert!(json(&stdout(&done))["area_deficit_percent"].is_null(), "{other:?}");
+        }
+        if let Some(part) = part {
+            let [area, exact] = [&measured["area"], &measured["exact"]["area"]].map(|v| v.as_f64().unwrap());
+            let found = 100.0 * (1.0 - area / exact);
+            assert!(found < part && found > 0.2 * part, "{surface}: {found} {part}");
+        }
+        let text = stderr(&mesh(sample, &output, &flags));
+        assert_eq!(text.contains("below the exact area; see --exact"), part.is_some(), "{text}");
     }
 }
 

@@ -2,7 +2,8 @@
 
 use std::collections::HashMap;
 
-use molmesh::pipeline::{AreaLevel, Choice, JobError, JobLimits, Product, areas, params, run};
+use molmesh::pipeline::areas::MeasuredSelection;
+use molmesh::pipeline::{AreaLevel, Choice, JobError, JobLimits, Product, SelectionMeasures, areas, params, run};
 use molmesh::structure::{self, ReadLimits, Selection, Structure};
 use molmesh::surface::{Control, CpuBackend, SurfaceLimits};
 
@@ -24,10 +25,17 @@ fn product(input: &[u8], pairs: &[(&str, &str)]) -> Result<Product, JobError> {
     run(input, &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
 }
 
+/// Measures a structure without a mesh.
+fn measured(structure: &Structure, pairs: &[(&str, &str)]) -> MeasuredSelection {
+    let job = params::parse(pairs.iter().copied().chain([("exact", "true")])).unwrap().job;
+    let (read, surface) = (ReadLimits::default(), SurfaceLimits::default());
+    areas::measure_selection(structure, &job, &read, &surface, &Control::default()).unwrap()
+}
+
 /// Rows of a table, by the names of its columns.
-fn rows(product: &Product, structure: &Structure, level: AreaLevel) -> Vec<HashMap<String, String>> {
+fn rows(measured: &MeasuredSelection, structure: &Structure, level: AreaLevel) -> Vec<HashMap<String, String>> {
     let mut text = Vec::new();
-    product.areas.as_ref().unwrap().write_csv(structure, level, &mut text).unwrap();
+    measured.areas.write_csv(structure, level, &mut text).unwrap();
     let text = String::from_utf8(text).unwrap();
     let mut lines = text.lines().map(|line| line.split(',').map(str::to_owned).collect::<Vec<_>>());
     let names = lines.next().unwrap();
@@ -44,10 +52,11 @@ fn rows_of_all_levels_have_the_sum_of_the_report() {
     let column = "area";
     for surface in ["vdw", "sas", "ses"] {
         let product = product(&bytes, &[("surface", surface)]).unwrap();
+        let measured = measured(&structure, &[("surface", surface)]);
         let exact = product.report.exact.as_ref().unwrap();
         let area = exact.area;
         for level in AreaLevel::ALL {
-            let rows = rows(&product, &structure, level);
+            let rows = rows(&measured, &structure, level);
             assert!((sum(&rows, column) - area).abs() < 1e-4 * rows.len() as f64, "{surface}, {}", level.name());
             if level != AreaLevel::Atom {
                 assert!((sum(&rows, "atoms") - product.report.atoms as f64).abs() < 0.5);
@@ -58,7 +67,7 @@ fn rows_of_all_levels_have_the_sum_of_the_report() {
         assert!((exact.chains.iter().map(|chain| chain.area).sum::<f64>() - area).abs() < 1e-3);
         assert_eq!(exact.parts.is_some(), surface == "ses");
         if let Some(parts) = &exact.parts {
-            let rows = rows(&product, &structure, AreaLevel::Atom);
+            let rows = rows(&measured, &structure, AreaLevel::Atom);
             let sums = ["contact", "toroidal", "concave"].map(|part| sum(&rows, part));
             for (of_rows, total) in sums.into_iter().zip([parts.contact, parts.toroidal, parts.concave]) {
                 assert!(total > 100.0 && (of_rows - total).abs() < 1e-4 * rows.len() as f64, "{parts:?}");
@@ -68,9 +77,9 @@ fn rows_of_all_levels_have_the_sum_of_the_report() {
         // The mesh is coarse, but of the same surface.
         assert!((product.report.volume.unwrap() / exact.volume - 1.0).abs() < 0.05, "{surface}");
         // The first residue of the DNA.
-        let first = &rows(&product, &structure, AreaLevel::Residue)[0];
+        let first = &rows(&measured, &structure, AreaLevel::Residue)[0];
         assert_eq!((first["chain"].as_str(), first["residue_number"].as_str()), ("A", "1"));
-        let atoms: Vec<_> = rows(&product, &structure, AreaLevel::Atom)
+        let atoms: Vec<_> = rows(&measured, &structure, AreaLevel::Atom)
             .into_iter()
             .filter(|row| row["chain"] == "A" && row["residue_number"] == "1")
             .collect();
@@ -94,11 +103,12 @@ fn buried_areas_agree_with_freesasa() {
         std::fs::write(&path, selected.atoms.iter().enumerate().filter_map(row).collect::<String>()).unwrap();
         path
     });
-    let product = product(&bytes, &[("surface", "sas"), ("interface", "A,B")]).unwrap();
+    let pairs = [("surface", "sas"), ("interface", "A,B")];
+    let (product, measured) = (product(&bytes, &pairs).unwrap(), measured(&structure, &pairs));
     let interface = product.report.exact.as_ref().unwrap().interface.as_ref().unwrap();
     let [first, second] = &interface.sides;
     for level in AreaLevel::ALL {
-        let rows = rows(&product, &structure, level);
+        let rows = rows(&measured, &structure, level);
         assert!((sum(&rows, "buried") - first.buried - second.buried).abs() < 1e-4 * rows.len() as f64);
         assert!((sum(&rows, "alone") - first.alone - second.alone).abs() < 1e-4 * rows.len() as f64);
         assert!(rows.iter().all(|row| row["buried"].parse::<f64>().unwrap() > -1e-4));
@@ -117,21 +127,21 @@ fn buried_areas_agree_with_freesasa() {
 fn areas_without_a_mesh_are_those_of_the_job() {
     let (bytes, structure) = complex();
     let pairs = [("surface", "ses"), ("assembly", "1")];
-    let product = product(&bytes, &pairs).unwrap();
-    let job = params::parse(pairs.into_iter().chain([("exact", "true")])).unwrap().job;
-    let (read, surface) = (ReadLimits::default(), SurfaceLimits::default());
-    let found = areas::measure_selection(&structure, &job, (&read, &surface), &Control::default()).unwrap();
-    assert_eq!(Some(&found), product.areas.as_ref());
+    let whole = measured(&structure, &pairs);
+    let SelectionMeasures::Exact(found) = &whole.measures else { panic!("{:?}", whole.measures) };
+    let expected = product(&bytes, &pairs).unwrap().report.exact.unwrap();
+    assert_eq!(serde_json::to_value(found).unwrap(), serde_json::to_value(&expected).unwrap());
     let buried = [("surface", "ses"), ("interface", "A,B")];
-    let job = params::parse(buried.into_iter().chain([("exact", "true")])).unwrap().job;
-    let of_sides = areas::measure_selection(&structure, &job, (&read, &surface), &Control::default()).unwrap();
-    assert_eq!(Some(&of_sides), self::product(&bytes, &buried).unwrap().areas.as_ref());
-    assert_ne!(found, of_sides);
+    let of_sides = measured(&structure, &buried);
+    let SelectionMeasures::Interface(found) = &of_sides.measures else { panic!("{:?}", of_sides.measures) };
+    let expected = product(&bytes, &buried).unwrap().report.exact.unwrap().interface;
+    assert_eq!(serde_json::to_value(found).unwrap(), serde_json::to_value(&expected).unwrap());
+    assert_ne!(whole.areas, of_sides.areas);
     // Copies of a chain have rows of their own, except in the table of chains.
-    let single = self::product(&bytes, &pairs[..1]).unwrap();
-    let count = |product: &Product, level| rows(product, &structure, level).len();
-    assert_eq!(count(&product, AreaLevel::Residue), 2 * count(&single, AreaLevel::Residue));
-    assert_eq!(count(&product, AreaLevel::Chain), count(&single, AreaLevel::Chain));
+    let single = measured(&structure, &pairs[..1]);
+    let count = |measured: &MeasuredSelection, level| rows(measured, &structure, level).len();
+    assert_eq!(count(&whole, AreaLevel::Residue), 2 * count(&single, AreaLevel::Residue));
+    assert_eq!(count(&whole, AreaLevel::Chain), count(&single, AreaLevel::Chain));
 }
 
 #[test]

@@ -7,6 +7,8 @@ use molmesh::pipeline::{Choice, JobError, JobLimits, Product, estimate, run};
 use molmesh::structure;
 use molmesh::surface::{Control, CpuBackend, Measures, SurfaceError, Validation};
 
+use crate::tools;
+
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 const CHAINS: &[u8] = include_bytes!("../structures/1ubq.pdb.gz");
 
@@ -117,6 +119,42 @@ fn a_limit_on_triangles_ends_the_simplification() {
     }
 }
 
+/// Answer of `mesh_distance.py`.
+#[derive(serde::Deserialize)]
+struct Compared {
+    distance: f64,
+    intersections: u64,
+}
+
+#[test]
+fn stated_deviations_are_those_that_another_program_measures() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: String, product: &Product| {
+        let path = folder.path().join(name);
+        product.file(Format::Ply).unwrap().write(&mut std::fs::File::create(&path).unwrap()).unwrap();
+        path
+    };
+    let (mut stated, mut pairs) = (Vec::new(), Vec::new());
+    for surface in ["gaussian", "ses", "vdw"] {
+        let pairs_of = |error: &'static str| [("surface", surface), ("resolution", "1"), ("simplify", error)];
+        let whole = write(format!("{surface}.ply"), &meshed(SAMPLE, &pairs_of("0.1")[..2]));
+        for error in ["0.1", "1"] {
+            let product = meshed(SAMPLE, &pairs_of(error));
+            let simplified = write(format!("{surface}-{error}.ply"), &product);
+            stated.push((surface, error, product.report.simplification.unwrap()));
+            pairs.push(format!("{}\t{}", whole.display(), simplified.display()));
+        }
+    }
+    let Some(found) = tools::python::<Compared>("mesh_distance.py", &pairs) else { return };
+    for ((surface, error, stated), Compared { distance, intersections }) in stated.iter().zip(&found) {
+        // Points are at most 1 Å from a sample; in practice, the excess is below a tenth of that.
+        let what = format!("{surface} {error}: {stated:?} stated, {distance} found");
+        let most = stated.max_deviation;
+        assert!(*distance > 0.9 * most && *distance < most + 0.1, "{what}");
+        assert_eq!(*intersections, stated.intersections, "{what}");
+    }
+}
+
 #[test]
 fn parts_are_simplified_on_their_own() {
     let pairs = [("split", "residue-group"), ("select", "all"), ("resolution", "0.4")];
@@ -140,8 +178,13 @@ fn parts_are_simplified_on_their_own() {
 
 #[test]
 fn a_larger_error_leaves_fewer_triangles_and_the_parameter_is_part_of_the_key() {
-    let triangles = ["0.01", "0.05", "0.2", "0.5"].map(|error| meshed(SAMPLE, &[("simplify", error)]).report.triangles);
-    assert!(triangles.windows(2).all(|pair| pair[1] < pair[0]), "{triangles:?}");
+    for surface in ["gaussian", "ses", "vdw"] {
+        let triangles = ["0.01", "0.05", "0.2", "0.3", "0.5"].map(|error| {
+            let report = meshed(SAMPLE, &[("surface", surface), ("simplify", error)]).report;
+            report.triangles
+        });
+        assert!(triangles.windows(2).all(|pair| pair[1] < pair[0]), "{surface} {triangles:?}");
+    }
     let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
     assert_ne!(canonical(&[]), canonical(&[("simplify", "0.1")]));
     assert_ne!(canonical(&[("simplify", "0.2")]), canonical(&[("simplify", "0.1")]));

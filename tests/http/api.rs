@@ -702,9 +702,9 @@ fn areas_are_those_of_the_library() {
         assert_eq!((reply.status, reply.header("content-type")), (200, Some("text/csv")), "{query}");
         let kind = query.split('&').next().and_then(|pair| pair.split_once('='));
         let job = params::parse(kind.into_iter().chain([("exact", "true")])).unwrap().job;
-        let areas = areas::measure_selection(&structure, &job, (&read, &surface), &Control::default()).unwrap();
+        let measured = areas::measure_selection(&structure, &job, &read, &surface, &Control::default()).unwrap();
         let mut expected = Vec::new();
-        areas.write_csv(&structure, level, &mut expected).unwrap();
+        measured.areas.write_csv(&structure, level, &mut expected).unwrap();
         assert_eq!(reply.text(), String::from_utf8(expected).unwrap(), "{query}");
         tags.insert(reply.header("etag").unwrap().to_owned());
     }

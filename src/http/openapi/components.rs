@@ -4,7 +4,7 @@
 use serde_json::{Map, Value, json};
 
 use super::bodies::request_bodies;
-use crate::http::area_parameters;
+use crate::pipeline::params::areas;
 
 /// Temporary extension of an error response with its problem types, from which [`share`] derives the name of the
 /// component.
@@ -120,10 +120,10 @@ impl Components {
 fn parameter_name(path: &str, parameter: &Value) -> String {
     let name = parameter["name"].as_str().unwrap_or_default();
     let segment = path.trim_start_matches("/v1").split('/').nth(1).unwrap_or_default();
-    let is_of_areas = path.ends_with("/areas") && area_parameters::REDEFINED.contains(&name);
+    let is_areas_parameter = path.ends_with("/areas") && areas::REDEFINED.contains(&name);
     if parameter["in"] == "path" {
         format!("{segment}-{name}")
-    } else if is_of_areas {
+    } else if is_areas_parameter {
         format!("areas-{name}")
     } else {
         name.to_owned()

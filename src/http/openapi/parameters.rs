@@ -9,7 +9,7 @@ use utoipa::{IntoParams, Modify};
 
 use super::components::pascal_case;
 use crate::formats::Format;
-use crate::http::{area_parameters, atom_parameters, color_parameters};
+use crate::http::{atom_parameters, color_parameters};
 use crate::pipeline::params::{self, Domain, TABLE};
 use crate::pipeline::{AreaLevel, areas, tileset};
 use crate::surface::SurfaceKind;
@@ -225,7 +225,7 @@ parameters!(
         let text = || ObjectBuilder::new().schema_type(Type::String);
         let levels = text().enum_values(Some(AreaLevel::ALL.map(AreaLevel::name)));
         let levels = levels.default(Some(Value::from(AreaLevel::default().name())));
-        let surfaces = text().enum_values(Some(area_parameters::SURFACES.map(SurfaceKind::name)));
+        let surfaces = text().enum_values(Some(params::areas::SURFACES.map(SurfaceKind::name)));
         let interfaces = text().min_length(Some(1)).max_length(Some(params::MAX_VALUE_BYTES));
         let interfaces = interfaces.title(Some(areas::EXPECTED));
         let rows = "Rows of the table. Value: atom, residue or chain. Default: residue.";
@@ -234,11 +234,11 @@ parameters!(
              `buried`. Value: {}.", areas::EXPECTED
         );
         let own = vec![
-            own(area_parameters::BY, Required::False, rows, levels),
+            own(params::areas::BY, Required::False, rows, levels),
             own("surface", Required::True, "Type of the surface. Value: vdw, sas or ses.", surfaces),
             own("interface", Required::False, doc, interfaces),
         ];
-        let others = mesh_parameters(&area_parameters::NAMES);
+        let others = mesh_parameters(&params::areas::NAMES);
         let others: Vec<_> = others.filter(|other| own.iter().all(|own| own.name != other.name)).collect();
         own.into_iter().chain(others).collect()
     }

@@ -88,8 +88,8 @@ impl MeshColors {
         Some(Self { coloring: self.coloring, source })
     }
 
-    /// Sets the colours of the vertices of the mesh of `surface`. `pockets` are those of the scheme `pocket`. Returns the
-    /// report.
+    /// Sets the colours of the vertices of the mesh of `surface`. `pockets` are those of the scheme `pocket`. Returns
+    /// the report.
     ///
     /// # Errors
     /// Returns [`JobError::Color`] if the map has no value at any vertex, and the errors of memory and cancellation.

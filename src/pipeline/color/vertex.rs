@@ -2,7 +2,7 @@
 //!
 //! Both kinds of colours are computed on the host from the finished mesh, so that every backend gives the same ones.
 
-use super::super::parts::spheres_of;
+use super::super::SPHERE_BYTES;
 use super::{depth, of_map};
 use crate::formats::linear_of_srgb;
 use crate::structure::AtomPart;
@@ -37,8 +37,9 @@ pub enum VertexProperty {
     Map,
 }
 
-/// Surface of a mesh.
+/// Surface of a mesh whose vertices are coloured.
 pub(in super::super) struct MeshedSurface<'a> {
+    /// Spheres of the mesh, or of all parts.
     pub(in super::super) spheres: &'a Spheres,
     pub(in super::super) params: &'a SurfaceParams,
     pub(in super::super) limits: &'a SurfaceLimits,
@@ -67,8 +68,10 @@ pub(super) fn values(
     let bytes = if matches!(source, ValueSource::Depth) { DEPTH_BYTES } else { VALUE_BYTES };
     let _memory = control.reserve(bytes * mesh.n_vertices() as u64)?;
     Ok(match source {
-        ValueSource::Curvature if surface.params.surface.kernel().is_some() => of_density(mesh, surface, control)?,
-        ValueSource::Curvature => of_normals(mesh),
+        ValueSource::Curvature if surface.params.surface.kernel().is_some() => {
+            density_curvatures(mesh, surface, control)?
+        }
+        ValueSource::Curvature => normal_curvatures(mesh),
         ValueSource::Radial(centroid) => {
             let origin: [f64; 3] = std::array::from_fn(|k| mesh.centre[k] - centroid[k]);
             let distance = |i| length(std::array::from_fn(|k| origin[k] + f64::from(mesh.position(i)[k])));
@@ -98,15 +101,21 @@ fn normal(mesh: &Mesh, i: usize) -> [f64; 3] {
 }
 
 /// Returns the mean curvature of each vertex of an isosurface, from the density of its part.
-fn of_density(mesh: &Mesh, surface: &MeshedSurface<'_>, control: &Control<'_>) -> Result<Vec<f32>, SurfaceError> {
+fn density_curvatures(
+    mesh: &Mesh,
+    surface: &MeshedSurface<'_>,
+    control: &Control<'_>,
+) -> Result<Vec<f32>, SurfaceError> {
     let MeshedSurface { spheres, params, limits, parts } = *surface;
+    let Some(parts) = parts else {
+        return mean_curvatures(mesh, 0..mesh.n_vertices(), spheres, params, limits, control);
+    };
     let mut curvatures = vec![0.0; mesh.n_vertices()];
-    for (i, spheres) in spheres_of(spheres, parts).enumerate() {
-        let rows = parts.map_or(0..mesh.n_vertices(), |_| mesh.parts[i].vertices.clone());
-        if !rows.is_empty() {
-            let found = mean_curvatures(mesh, rows.clone(), &spheres, params, limits, control)?;
-            curvatures[rows].copy_from_slice(&found);
-        }
+    for (part, range) in parts.iter().zip(&mesh.parts).filter(|(_, range)| !range.vertices.is_empty()) {
+        let _spheres = control.reserve(SPHERE_BYTES * part.rows.len() as u64)?;
+        let spheres = spheres.subset(&part.rows);
+        let values = mean_curvatures(mesh, range.vertices.clone(), &spheres, params, limits, control)?;
+        curvatures[range.vertices.clone()].copy_from_slice(&values);
     }
     Ok(curvatures)
 }
@@ -114,7 +123,7 @@ fn of_density(mesh: &Mesh, surface: &MeshedSurface<'_>, control: &Control<'_>) -
 /// Returns the mean curvature of each vertex of a surface of spheres: half the divergence of the normals, averaged over
 /// the area of its triangles. The normals are those of the exact surface and interpolated linearly in a triangle, so
 /// that thin triangles have little weight.
-fn of_normals(mesh: &Mesh) -> Vec<f32> {
+fn normal_curvatures(mesh: &Mesh) -> Vec<f32> {
     // Sums of area and of divergence times area.
     let mut sums = vec![[0.0; 2]; mesh.n_vertices()];
     for triangle in &mesh.triangles[..] {
@@ -259,16 +268,16 @@ mod tests {
     #[test]
     fn curvatures_are_those_of_a_torus_and_change_sign_with_its_normals() {
         let (mut mesh, expected) = torus(3.0, 1.5);
-        let of = |mesh: &Mesh| values_of_ses(mesh, &ValueSource::Curvature);
+        let curvatures = |mesh: &Mesh| values_of_ses(mesh, &ValueSource::Curvature);
         let worst = |found: &[f32], sign: f64| {
             let off = found.iter().zip(&expected).map(|(found, expected)| (f64::from(*found) - sign * expected).abs());
             off.fold(0.0, f64::max)
         };
-        assert!(worst(&of(&mesh), 1.0) < 2e-3, "{}", worst(&of(&mesh), 1.0));
+        assert!(worst(&curvatures(&mesh), 1.0) < 2e-3, "{}", worst(&curvatures(&mesh), 1.0));
         // The inner ring of this torus has the curvature 0, the outer one 4/9 Å⁻¹.
         assert!(expected.iter().any(|h| h.abs() < 1e-9) && expected.iter().any(|h| (h - 4.0 / 9.0).abs() < 1e-9));
         mesh.normals.iter_mut().for_each(|normal| *normal = normal.map(|v| -v));
-        assert!(worst(&of(&mesh), -1.0) < 2e-3 && worst(&of(&mesh), 1.0) > 0.5);
+        assert!(worst(&curvatures(&mesh), -1.0) < 2e-3 && worst(&curvatures(&mesh), 1.0) > 0.5);
     }
 
     #[test]

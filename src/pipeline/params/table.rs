@@ -95,7 +95,7 @@ pub const TABLE: &[Parameter] = &[
         name: "preset",
         domain: Domain::Choice(Preset::NAMES),
         default: "default",
-        doc: "A named pair of smoothness and isovalue for the gaussian kernel. ses-like approximates the solvent-excluded surface without a probe: area within −4.3 to +11.9 % and volume within −0.3 to +4.7 % on eleven proteins, worse for small structures (volume +9 to +15 % for short DNA helices).",
+        doc: "A named pair of smoothness and isovalue for the gaussian kernel. ses-like approximates the solvent-excluded surface without a probe: area within −6.2 to +11.9 % and volume within −0.3 to +6.8 % on 18 proteins, worse for small structures (volume +9 to +15 % for three short DNA helices).",
     },
     Parameter {
         name: "surface",

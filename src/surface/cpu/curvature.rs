@@ -1,8 +1,9 @@
 //! Mean curvature of the level sets of a density.
 //!
-//! Let G = −∇F up to a factor, and M the derivative of G. The outward normal is G/|G|, and half its divergence is the mean
-//! curvature: (tr M / |G| − GᵀMG / |G|³) / 2. An atom adds s/ρ² to the diagonal of M, and takes 2 t dᵢdⱼ/ρ⁴ from it, where
-//! d is the vector from the atom, s the slope of its density over u = d²/ρ², and t the rate at which the slope falls.
+//! Let G = −∇F up to a factor, and M the derivative of G. The outward normal is G/|G|, and half its divergence is the
+//! mean curvature: `(tr M / |G| − GᵀMG / |G|³) / 2`. An atom adds s/ρ² to the diagonal of M, and takes 2 t dᵢdⱼ/ρ⁴ from
+//! it, where d is the vector from the atom, s the slope of its density over u = d²/ρ², and t the rate at which the
+//! slope falls.
 
 use std::f32::consts::LN_2;
 
@@ -18,11 +19,11 @@ dispatched! {
 pub(super) fn mean_curvatures(c: &Constants, around: &mut BrickAtoms, p: &Lanes) -> [f32; LANES] {
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
         // One copy of the loop per kernel.
-        let of = |kernel| Constants { kernel, ..*c };
+        let with_kernel = |kernel| Constants { kernel, ..*c };
         match c.kernel {
-            Kernel::Gaussian => sum::<true>(&of(Kernel::Gaussian), around, p),
-            Kernel::SoftObject => sum::<true>(&of(Kernel::SoftObject), around, p),
-            Kernel::InverseSquare => sum::<true>(&of(Kernel::InverseSquare), around, p),
+            Kernel::Gaussian => sum::<true>(&with_kernel(Kernel::Gaussian), around, p),
+            Kernel::SoftObject => sum::<true>(&with_kernel(Kernel::SoftObject), around, p),
+            Kernel::InverseSquare => sum::<true>(&with_kernel(Kernel::InverseSquare), around, p),
         }
     } else {
         sum::<false>(c, around, p)

@@ -1,6 +1,5 @@
 //! Triangles of a cube, with their surroundings, and their improvement.
 
-use super::intersections::intersections;
 use super::patch::Patch;
 use super::{CubeIndex, Cubes, MARGIN, SIDE};
 use crate::surface::control::Control;
@@ -9,6 +8,7 @@ use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{to_f32, to_u32};
 use crate::surface::mesh::Mesh;
 use crate::surface::triangle::Vector;
+use crate::surface::triangle_grid::TriangleGrid;
 
 /// Number of rounds of collapses, flips and moves.
 const ROUNDS: usize = 3;
@@ -144,7 +144,8 @@ impl<'a> CubeMesh<'a> {
             *row != self.triangles[*i] || row.iter().any(|v| patch.is_moved[*v as usize])
         };
         let changed: Vec<bool> = indices.iter().zip(&rows).map(is_changed).collect();
-        let pairs = intersections(&patch.points, &rows, &changed, to_f32(self.cubes.spacing));
+        let corners = rows.iter().map(|row| row.map(|v| patch.points[v as usize])).collect();
+        let pairs = TriangleGrid::new(corners, to_f32(self.cubes.spacing)).intersections(&rows, &changed);
         let of_pairs = pairs.into_iter().flatten().filter(|i| changed[*i]);
         of_pairs.flat_map(|i| rows[i].into_iter().chain(self.triangles[indices[i]])).collect()
     }

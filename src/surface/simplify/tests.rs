@@ -2,7 +2,12 @@
 
 use std::f64::consts::PI;
 
+use super::deviation::samples;
+use super::fans::topology;
+use super::piece::ClosedComponents;
 use super::*;
+use crate::surface::triangle::{length, sub};
+use crate::surface::triangle_grid::TriangleGrid;
 use crate::surface::{Backend as _, CpuBackend, Measures, Spheres, SurfaceKind, SurfaceLimits, SurfaceOptions};
 use crate::surface::{SurfaceParams, Validation};
 
@@ -43,6 +48,10 @@ fn simplified_meshes_are_closed_manifolds_within_the_error() {
             assert!(simplified.n_triangles() < before, "{what}: {} of {before}", simplified.n_triangles());
             before = simplified.n_triangles();
             assert!(found.deviation.maximum < 1.5 * error && found.deviation.mean < 0.5 * error, "{what}");
+            let corners = |t: &[u32; 3]| t.map(|v| simplified.position(v as usize));
+            let grid = TriangleGrid::new(simplified.triangles.iter().map(corners).collect(), 0.4);
+            let all = vec![true; simplified.n_triangles()];
+            assert_eq!(grid.intersections(&simplified.triangles, &all), Vec::<[usize; 2]>::new(), "{what}");
             assert!((m.volume / whole.volume - 1.0).abs() < 2.0 * error, "{what}");
             // Every vertex is used, and is one of the original with its normal.
             let used: std::collections::HashSet<u32> = simplified.triangles.iter().flatten().copied().collect();
@@ -167,19 +176,60 @@ fn distances_from_a_grid_are_those_of_a_search_through_all_triangles() {
     let point = |i: u16| [0.37, 1.13, 2.71].map(|k: f32| 7.0 * (f32::from(i) * k).sin());
     for cell in [0.1, 0.8, 20.0] {
         let grid = TriangleGrid::new(corners.clone(), cell);
+        let mut nearest = 0;
         for i in 0..300 {
             // With one triangle, a grid has one cell, or few.
-            let alone = corners.iter().map(|one| TriangleGrid::new(vec![*one], 100.0).distance(point(i)));
+            let alone = corners.iter().map(|one| TriangleGrid::new(vec![*one], 100.0).distance(point(i), &mut 0));
             let expected = alone.fold(f32::INFINITY, f32::min);
-            let found = grid.distance(point(i));
-            assert!(
-                (found - expected).abs() <= 1e-5 * expected.max(1.0),
-                "{cell}, {:?}: {found}, {expected}",
-                point(i)
-            );
+            let mut near = nearest;
+            let found = grid.distance(point(i), &mut nearest);
+            let what = format!("{cell}, {:?}: {found}, {expected}", point(i));
+            assert!((found - expected).abs() <= 1e-5 * expected.max(1.0), "{what}");
+            let of_nearest = TriangleGrid::new(vec![corners[nearest as usize]], 100.0).distance(point(i), &mut 0);
+            assert!((of_nearest - found).abs() <= 1e-6, "{what}");
+            assert!(!grid.is_within(point(i), 0.999 * found - 1e-5, &mut near), "{what}");
+            assert!(grid.is_within(point(i), 1.001 * found + 1e-5, &mut near), "{what}");
         }
     }
-    assert!(TriangleGrid::new(Vec::new(), 1.0).distance([0.0; 3]).is_infinite());
+    assert!(TriangleGrid::new(Vec::new(), 1.0).distance([0.0; 3], &mut 0).is_infinite());
+}
+
+#[test]
+fn samples_are_near_every_point_of_a_triangle() {
+    let corners = [[0.0, 0.0, 0.0], [3.1, 0.2, 0.0], [0.4, 1.9, 0.7]];
+    for step in [0.3, 1.0, 2.9, 5.0] {
+        // A neighbour at each edge has the points that the triangle leaves to it.
+        let [a, b, c] = corners;
+        let points = samples([4, 9, 2], corners, step).chain(samples([9, 4, 2], [b, a, c], step)).chain(corners);
+        let points: Vec<_> = points.collect();
+        for (i, j) in (0..=40).flat_map(|i| (0..=40 - i).map(move |j| (i, j))) {
+            let [u, v] = [i, j].map(|n: u8| f32::from(n) / 40.0);
+            let p: [f32; 3] = std::array::from_fn(|k| a[k] + u * (b[k] - a[k]) + v * (c[k] - a[k]));
+            let nearest = points.iter().map(|q| length(sub(p, *q))).fold(f32::INFINITY, f32::min);
+            assert!(nearest < 0.58 * step, "{step} {p:?}: {nearest}");
+        }
+    }
+    // Of two triangles with a common edge, one has its points.
+    let edge =
+        |rows: [u32; 3], corners: Corners| samples(rows, corners, 1.0).filter(|p| p[1] == 0.0 && p[2] == 0.0).count();
+    let [p, q] = [[0.0; 3], [4.5, 0.0, 0.0]];
+    for [v, w] in [[1, 2], [2, 1]] {
+        let (above, below) = (edge([v, w, 3], [p, q, [2.0, 3.0, 0.0]]), edge([w, v, 4], [q, p, [2.0, -3.0, 0.0]]));
+        assert_eq!((above + below, above.min(below)), (4, 0));
+    }
+}
+
+#[test]
+fn errors_of_a_larger_permitted_error_contain_those_of_a_smaller_one() {
+    let of = |permitted: f64| piece::errors(permitted, 0.5).collect::<Vec<f64>>();
+    assert_eq!(of(0.3), [0.125, 0.0625, 0.031_25]);
+    assert_eq!(of(0.01), [0.003_906_25, 0.001_953_125, 0.000_976_562_5]);
+    assert_eq!(of(0.4), of(1.0), "at most half a grid spacing");
+    for permitted in [0.02, 0.05, 0.1, 0.31] {
+        let [smaller, larger] = [of(0.9 * permitted), of(permitted)];
+        assert!(larger[0] <= 0.7 * permitted && larger[0] > 0.35 * permitted, "{permitted} {larger:?}");
+        assert!(larger.contains(&smaller[0]) && larger[0] >= smaller[0], "{smaller:?} {larger:?}");
+    }
 }
 
 #[test]
@@ -190,11 +240,11 @@ fn closed_components_keep_half_of_their_volume() {
     let triangles = [&outwards[..], &[[4, 0, 1]]].concat();
     let piece = CubePiece { vertices: vec![0, 1, 2, 3, 4], positions, triangles };
     let closed = ClosedComponents::new(&piece, &fans::BoundaryFans::default());
-    assert!(closed.remain_in(&piece, &outwards));
+    assert!(closed.keep_volume(&piece, &outwards));
     let inverted = outwards.map(|[a, b, c]| [a, c, b]);
-    assert!(!closed.remain_in(&piece, &inverted));
+    assert!(!closed.keep_volume(&piece, &inverted));
     let flatter = outwards.map(|triangle| triangle.map(|v| if v == 3 { 4 } else { v }));
-    assert!(!closed.remain_in(&piece, &flatter));
+    assert!(!closed.keep_volume(&piece, &flatter));
     let open = ClosedComponents::new(&piece, &[([0, 1], 2)].into_iter().collect());
-    assert!(open.remain_in(&piece, &flatter), "components with a boundary are not measured");
+    assert!(open.keep_volume(&piece, &flatter), "components with a boundary are not measured");
 }

@@ -1,17 +1,18 @@
-//! Parameters of `…/areas`: `by`, and those of a mesh that affect its exact areas.
+//! Parameters of a table of exact areas: `by`, and those of a mesh that affect its exact areas.
 
-use crate::pipeline::params::{self, ParamError};
+use super::ParamError;
 use crate::pipeline::{AreaLevel, Job};
 use crate::surface::SurfaceKind;
 
 /// Name of the parameter that selects the rows.
-pub(super) const BY: &str = "by";
+pub(crate) const BY: &str = "by";
 /// Values of `surface`.
-pub(super) const SURFACES: [SurfaceKind; 3] = [SurfaceKind::Vdw, SurfaceKind::Sas, SurfaceKind::Ses];
+pub(crate) const SURFACES: [SurfaceKind; 3] = [SurfaceKind::Vdw, SurfaceKind::Sas, SurfaceKind::Ses];
 /// Parameters whose description differs from that of a mesh.
-pub(super) const REDEFINED: [&str; 2] = ["surface", "interface"];
+#[cfg(feature = "server")]
+pub(crate) const REDEFINED: [&str; 2] = ["surface", "interface"];
 /// Names of the parameters.
-pub(super) const NAMES: [&str; 11] = [
+pub(crate) const NAMES: [&str; 11] = [
     BY,
     "surface",
     "probe",
@@ -26,19 +27,22 @@ pub(super) const NAMES: [&str; 11] = [
 ];
 
 /// Areas that a request asks for.
-pub(super) struct Areas {
-    pub(super) job: Job,
-    pub(super) level: AreaLevel,
+#[derive(Debug, Clone)]
+pub struct AreasRequest {
+    /// Job with exact areas, whose parameters of the mesh have no effect.
+    pub job: Job,
+    /// Rows of the table.
+    pub level: AreaLevel,
     /// Canonical text of the parameters, equal for equal tables only.
-    pub(super) canonical: String,
+    pub canonical: String,
 }
 
 /// Parses the parameters.
 ///
 /// # Errors
 /// Returns a [`ParamError`], including if no surface with exact areas is named.
-pub(super) fn parse(pairs: &[(String, String)]) -> Result<Areas, ParamError> {
-    params::check_names(pairs, &NAMES)?;
+pub fn parse(pairs: &[(String, String)]) -> Result<AreasRequest, ParamError> {
+    super::check_names(pairs, &NAMES)?;
     let surface = value_of(pairs, "surface").unwrap_or("no value");
     if !SURFACES.iter().any(|kind| kind.name() == surface) {
         let expected = format!("{}, which have exact areas", SURFACES.map(SurfaceKind::name).join(", "));
@@ -49,7 +53,7 @@ pub(super) fn parse(pairs: &[(String, String)]) -> Result<Areas, ParamError> {
     }
     let (own, of_mesh): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == BY);
     let of_mesh = of_mesh.iter().map(|(name, value)| (name.as_str(), value.as_str()));
-    let job = params::parse(of_mesh.chain([("exact", "true")]))?.job;
+    let job = super::parse(of_mesh.chain([("exact", "true")]))?.job;
     let level = match &own[..] {
         [] => AreaLevel::default(),
         [(_, value)] => {
@@ -58,8 +62,8 @@ pub(super) fn parse(pairs: &[(String, String)]) -> Result<Areas, ParamError> {
         }
         _ => return Err(ParamError::Repeated { name: BY }),
     };
-    let canonical = format!("{BY}={}&{}", level.name(), params::canonical(&job));
-    Ok(Areas { job, level, canonical })
+    let canonical = format!("{BY}={}&{}", level.name(), super::canonical(&job));
+    Ok(AreasRequest { job, level, canonical })
 }
 
 fn value_of<'a>(pairs: &'a [(String, String)], name: &str) -> Option<&'a str> {
@@ -70,7 +74,7 @@ fn value_of<'a>(pairs: &'a [(String, String)], name: &str) -> Option<&'a str> {
 mod tests {
     use super::*;
 
-    fn parsed(pairs: &[(&str, &str)]) -> Result<Areas, ParamError> {
+    fn parsed(pairs: &[(&str, &str)]) -> Result<AreasRequest, ParamError> {
         let pairs: Vec<_> = pairs.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect();
         parse(&pairs)
     }

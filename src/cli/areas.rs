@@ -1,0 +1,103 @@
+//! `molmesh areas`: writes a table of the exact areas of one structure.
+
+use molmesh::pipeline::areas::measure_selection;
+use molmesh::pipeline::params::areas::AreasRequest;
+use molmesh::pipeline::{Job, LeftOutReport, MeasuredSelection, SelectionMeasures};
+use molmesh::structure::{self, Structure};
+use molmesh::surface::{CancelToken, Control};
+use serde::Serialize;
+use serde_json::Value;
+
+use super::args::AreasArgs;
+use super::error::CliError;
+use super::output::{self, Output};
+use super::page::Page;
+use super::style::Style;
+use super::summary::{self, Written, decimal, exact_measures, grouped};
+use super::{interrupt, job, request};
+
+/// Runs the command.
+pub(super) fn run(args: &AreasArgs) -> Result<(), CliError> {
+    let AreasRequest { job, level, .. } = request::parse_areas(args)?;
+    let limits = request::common_limits(&args.limits);
+    job::set_threads(args.threads)?;
+    let cancel = CancelToken::default();
+    interrupt::watch(&cancel)?;
+    output::refuse_input(&args.input, &args.output)?;
+    let mut output = Output::open(&args.output, &cancel)?;
+    let input = job::read(&args.input, limits.read.max_inflated_bytes)?;
+    let control = Control { cancel, ..Control::default() };
+    let failure = |error| job::failure(error, &args.input, &input, &limits);
+    let structure = structure::read_with(&input, &limits.read, &control).map_err(|error| failure(error.into()))?;
+    let measured = measure_selection(&structure, &job, &limits.read, &limits.surface, &control).map_err(failure)?;
+    measured.areas.write_csv(&structure, level, &mut output).map_err(|source| output.failure(source))?;
+    let to_stdout = output.is_stdout();
+    let written = Written { name: output.name.clone(), format: "csv", bytes: output.bytes };
+    Output::finish(vec![output])?;
+    let text = || text(&structure, &job, &measured, &written);
+    job::write_report(args.report, args.quiet, to_stdout, text, || json(&structure, &job, &measured, &written))
+}
+
+/// Formats the summary.
+fn text(structure: &Structure, job: &Job, measured: &MeasuredSelection, written: &Written) -> String {
+    let title = summary::title(structure.title.as_deref());
+    let mut page = Page::new(Style::stderr(), structure.id.as_deref().unwrap_or("structure"), &title);
+    let atoms = grouped(measured.areas.len() as u64);
+    let atoms_in_file = grouped(structure.len() as u64);
+    page.row("atoms", &format!("{atoms} of {atoms_in_file} in the file"));
+    if let Some(id) = &job.selection.assembly {
+        page.row("assembly", &format!("{id}; the atoms are those of all copies"));
+    }
+    if measured.left_out.total > 0 {
+        page.row("left out", &summary::left_out(&measured.left_out));
+    }
+    for warning in &structure.warnings {
+        page.row("warning", warning);
+    }
+    let probe = job.params.used_probe().map(|radius| format!(", probe {radius} Å")).unwrap_or_default();
+    page.row("surface", &format!("{}{probe}", job.params.surface));
+    match &measured.measures {
+        SelectionMeasures::Exact(exact) => page.row("exact", &exact_measures(exact)),
+        SelectionMeasures::Interface(interface) => {
+            for side in &interface.sides {
+                let areas = format!("{} Å² alone, {} Å² buried", decimal(side.alone), decimal(side.buried));
+                page.row(&side.chains.join("/"), &areas);
+            }
+            page.row("interface", &format!("{} Å²", decimal(interface.area)));
+        }
+    }
+    page.row("wrote", &written.text());
+    page.finish()
+}
+
+/// Report of a table of areas.
+#[derive(Serialize)]
+struct AreasReport<'a> {
+    #[serde(flatten)]
+    measures: &'a SelectionMeasures,
+    id: Option<&'a str>,
+    /// Number of atoms in the table, with all copies of an assembly.
+    atoms: usize,
+    left_out: &'a LeftOutReport,
+    warnings: &'a [String],
+    surface: &'static str,
+    /// Radius of the probe, Å; null for a surface without one.
+    probe: Option<f64>,
+    output: Value,
+}
+
+/// Formats the report as JSON.
+fn json(structure: &Structure, job: &Job, measured: &MeasuredSelection, written: &Written) -> Result<String, CliError> {
+    let report = AreasReport {
+        measures: &measured.measures,
+        id: structure.id.as_deref(),
+        atoms: measured.areas.len(),
+        left_out: &measured.left_out,
+        warnings: &structure.warnings,
+        surface: job.params.surface.name(),
+        probe: job.params.used_probe(),
+        output: written.json(),
+    };
+    let text = serde_json::to_string_pretty(&report).map_err(|error| CliError::Internal(error.to_string()))?;
+    Ok(text + "\n")
+}
