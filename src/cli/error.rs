@@ -7,7 +7,7 @@ use molmesh::picture::PictureError;
 use molmesh::pipeline::JobError;
 use molmesh::structure::StructureError;
 use molmesh::structure::map::MapError;
-use molmesh::surface::{MAX_SIMPLIFY_SPACINGS, SurfaceError};
+use molmesh::surface::SurfaceError;
 use thiserror::Error;
 
 use super::style::Style;
@@ -295,11 +295,11 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         }
         SurfaceError::TooManyTiles { .. } => Some("try a coarser --resolution".to_owned()),
         SurfaceError::TooManyTriangles { simplify: Some(error), resolution, .. } => {
-            let has_largest_error = *error >= MAX_SIMPLIFY_SPACINGS * resolution;
-            let hint = if has_largest_error {
-                "try a coarser --resolution or a larger --max-triangles"
-            } else {
+            // Above one grid spacing, a larger error hardly changes the number of triangles.
+            let hint = if error < resolution {
                 "try a larger --simplify, a coarser --resolution, or a larger --max-triangles"
+            } else {
+                "try a coarser --resolution or a larger --max-triangles"
             };
             Some(hint.to_owned())
         }

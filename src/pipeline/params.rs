@@ -71,6 +71,15 @@ impl ParamError {
         let value = format!("`{}`", value.chars().take(64).collect::<String>());
         Self::BadValue { name, value, expected: expected.into() }
     }
+
+    /// Returns the name of the parameter.
+    #[must_use]
+    pub fn parameter(&self) -> &str {
+        match self {
+            Self::Unknown { name, .. } => name,
+            Self::Repeated { name } | Self::BadValue { name, .. } | Self::BadExpression { name, .. } => name,
+        }
+    }
 }
 
 /// Parsed parameters.

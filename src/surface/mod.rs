@@ -60,7 +60,7 @@ pub use pockets::{DEFAULT_POCKET_PROBE, POCKET_PROBES, Pocket, Pockets};
 pub use quantize::Step;
 pub use reference::ReferenceBackend;
 pub use simd::arithmetic;
-pub use simplify::{Deviation, MAX_SIMPLIFY_SPACINGS, SIMPLIFY_ERRORS, Simplification, Simplify};
+pub use simplify::{Deviation, SIMPLIFY_ERRORS, Simplification, Simplify};
 pub use sink::{MeshPart, MeshSink, SinkFailed, Vertices};
 pub use sphere_union::{AreaParts, ExactMeasures};
 pub use spheres::Spheres;

@@ -40,8 +40,8 @@ const MIN_PASSES: usize = 2;
 
 /// Edge length of a cube, in grid spacings. A piece then has some thousand triangles.
 const SIDE: f64 = 24.0;
-/// Largest error, in grid spacings: with larger ones, most results fail the checks.
-pub const MAX_SIMPLIFY_SPACINGS: f64 = 2.0;
+/// Largest error, in grid spacings. Above one, the number of triangles hardly changes.
+const MAX_SPACINGS: f64 = 2.0;
 /// Memory per triangle while the mesh is simplified, bytes: its cube and index, and copies of its corners.
 pub(crate) const TRIANGLE_BYTES: u64 = 112;
 
@@ -91,11 +91,11 @@ type TrianglesByCube = Vec<(Cube, u32)>;
 /// # Errors
 /// [`SurfaceError::BadParameter`] for an error of more than 2 grid spacings.
 pub(crate) fn check_error(error: f64, spacing: f64) -> Result<(), SurfaceError> {
-    let most = MAX_SIMPLIFY_SPACINGS * spacing;
+    let most = MAX_SPACINGS * spacing;
     if error <= most {
         return Ok(());
     }
-    let expected = format!("at most {MAX_SIMPLIFY_SPACINGS} grid spacings: {most:.3} Å with this grid");
+    let expected = format!("at most {MAX_SPACINGS} grid spacings: {most:.3} Å with this grid");
     Err(bad("simplify", format!("`{error}`"), &expected))
 }
 

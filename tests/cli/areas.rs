@@ -105,6 +105,7 @@ fn wrong_flags_and_selections_are_named() {
         (&["areas", SAMPLE, "--surface", "sas", "--by", "model"], 2),
         (&["areas", SAMPLE, "--surface", "sas", "--model", "all"], 2),
         (&["areas", SAMPLE, "--surface", "sas", "--interface", "A"], 2),
+        (&["areas", SAMPLE, "--surface", "sas", "--threads", "1025"], 2),
         (&["areas", SAMPLE, "--surface", "sas", "--interface", "A,Z"], 4),
         (&["areas", SAMPLE, "--surface", "sas", "--select", "chain Z"], 4),
         (&["areas", SAMPLE, "--surface", "sas", "-o", SAMPLE], 2),

@@ -464,6 +464,19 @@ fn meshes_with_creases_state_how_much_of_the_area_they_lack() {
 }
 
 #[test]
+fn the_advice_about_too_many_triangles_names_a_larger_error_only_where_it_helps() {
+    let folder = Folder::new();
+    let sample = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb"));
+    for (error, helps) in [("0.1", true), ("0.5", false), ("1", false)] {
+        let failed = mesh(sample, &folder.path("4pti.glb"), &["--simplify", error, "--max-triangles", "10"]);
+        assert_code(&failed, 5);
+        let text = stderr(&failed);
+        assert_eq!(text.contains("a larger --simplify"), helps, "{error}: {text}");
+        assert!(text.contains("a coarser --resolution"), "{error}: {text}");
+    }
+}
+
+#[test]
 fn the_table_of_atoms_and_the_mesh_are_written_together() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());

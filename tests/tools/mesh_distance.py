@@ -2,7 +2,7 @@
 
 Reads the names of two mesh files, separated by a tab, from each line of standard input. Prints one line of JSON for
 each: the largest distance of a point on one surface from the other, at points 0.3 apart on both, and the number of
-pairs of triangles of the second file that cross.
+pairs of triangles of the second file that intersect.
 """
 
 import json

@@ -95,13 +95,7 @@ mod tests {
             (&[("surface", "sas"), ("resolution", "1")], "resolution"),
         ] {
             let error = parsed(pairs).err().unwrap();
-            let found = match &error {
-                ParamError::BadValue { name, .. }
-                | ParamError::Repeated { name }
-                | ParamError::BadExpression { name, .. } => *name,
-                ParamError::Unknown { name, .. } => name.as_str(),
-            };
-            assert_eq!(found, name, "{error}");
+            assert_eq!(error.parameter(), name, "{error}");
         }
     }
 }

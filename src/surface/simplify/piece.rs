@@ -15,21 +15,23 @@ use crate::surface::union_find::UnionFind;
 /// Largest error that is passed to meshoptimizer, relative to the permitted error. Its error is an average, so the
 /// largest distance exceeds it, and most results of a larger one would be rejected.
 const MAX_SHARE_OF_PERMITTED: f64 = 0.7;
-/// Number of errors that are tried even if they are smaller than [`MIN_SPACINGS`].
+/// Number of errors that are tried even if they are smaller than [`MIN_TRIED_SPACINGS`].
 const MIN_TRIES: usize = 3;
 /// Largest error that is tried, in grid spacings: with larger ones, later pieces have large triangles and fail.
-const MAX_SPACINGS: f64 = 0.5;
+const MAX_TRIED_SPACINGS: f64 = 0.5;
 /// Smallest error that is tried, in grid spacings.
-const MIN_SPACINGS: f64 = 1.0 / 16.0;
+const MIN_TRIED_SPACINGS: f64 = 1.0 / 16.0;
 
 /// Returns the errors to pass to meshoptimizer one after another for a permitted error, Å, largest first. All permitted
 /// errors share one sequence, so that a larger permitted error hardly ever leaves more triangles.
 pub(super) fn errors(permitted: f64, spacing: f64) -> impl Iterator<Item = f64> {
-    let largest = MAX_SPACINGS * spacing;
+    let largest = MAX_TRIED_SPACINGS * spacing;
     let steps = (largest / (MAX_SHARE_OF_PERMITTED * permitted)).log2().ceil().max(0.0);
     let first = largest * (-steps).exp2();
     let errors = std::iter::successors(Some(first), |error| Some(0.5 * error)).enumerate();
-    errors.take_while(move |(n, error)| *n < MIN_TRIES || *error >= MIN_SPACINGS * spacing).map(|(_, error)| error)
+    errors
+        .take_while(move |(n, error)| *n < MIN_TRIES || *error >= MIN_TRIED_SPACINGS * spacing)
+        .map(|(_, error)| error)
 }
 
 /// Result of the simplification of a piece, with the vertex numbers of the mesh.
