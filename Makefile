@@ -92,7 +92,7 @@ fuzz: ## Fuzz readers, configuration, keys, records and requests, 30 s per targe
 
 # BINARY=target/debug/molmesh uses the binary of the tests.
 chaos: override KILLS := $(or $(KILLS),200)
-chaos: $(if $(BINARY),,release) ## Kill the service at random points, KILLS=200 times, and check that no job is lost
+chaos: $(if $(BINARY),,release) ## Kill or stop the service at random points, KILLS=200 times, and check that no job is lost
 	python3 benches/load/chaos.py $(or $(BINARY),target/release/molmesh) samples/4pti.pdb --kills $(KILLS)
 
 soak: override HOURS := $(or $(HOURS),1)

@@ -1,13 +1,17 @@
 #!/usr/bin/env python3
-"""Checks that accepted jobs survive kills at random points.
+"""Checks that accepted jobs survive kills and stops at random points.
 
     python3 benches/load/chaos.py target/release/molmesh samples/4pti.pdb --kills 200
 
 Clients submit asynchronous jobs without a pause. The service is killed (`kill -9`) while it serves, while it recovers
-the jobs of the process before, and while it drains after SIGTERM. All limits have their defaults, so a job that is
-started three times and killed each time fails; any other end without a result is an error. Finally the script waits for
-all jobs and compares every result with the output of `molmesh mesh`. The exit code is 1 if a job is lost, a result is
-wrong, or no job was open at most of the kills, because such a run tests nothing.
+the jobs of the process before, and while it drains after SIGTERM. A third of the restarts follow an orderly stop
+instead: SIGTERM with a drain timeout that is too short for most jobs, sometimes cut by a second SIGTERM. After it,
+every open job must have the number of attempts that it had before the process started.
+
+All limits of jobs have their defaults, so a job that is started three times and killed each time fails; any other end
+without a result is an error. Finally the script waits for all jobs and compares every result with the output of
+`molmesh mesh`. The exit code is 1 if a job is lost, a result is wrong, a stop counts an attempt, or no job was open at
+most of the kills and stops, because such a run tests nothing.
 """
 
 import argparse
@@ -22,6 +26,8 @@ import time
 from mixed import UNAVAILABLE, Expected, Server, fetch, folder
 
 OPEN = ("accepted", "running")
+# Longest drain, ms. The kills of this phase come within it.
+DRAIN_MS = 300
 # Time for all remaining jobs to end, s.
 FINISH_TIMEOUT = 300
 
@@ -54,14 +60,18 @@ class Clients:
 
 
 def open_jobs(data):
-    """Returns the number of records on disk whose jobs have not ended."""
-    jobs, number = os.path.join(data, "store", "jobs"), 0
-    for name in os.listdir(jobs) if os.path.isdir(jobs) else []:
-        with open(os.path.join(jobs, name), "rb") as file:
-            text = file.read()
-        # Temporary files of writes that the kill interrupted are incomplete.
-        number += name.endswith(".json") and json.loads(text)["status"] in OPEN
-    return number
+    """Returns status and number of attempts of each job on disk that has not ended, by id."""
+    folder, jobs = os.path.join(data, "store", "jobs"), {}
+    names = set(os.listdir(folder) if os.path.isdir(folder) else [])
+    for name in names:
+        job, _, extension = name.partition(".")
+        # Temporary files of writes that the kill interrupted are incomplete. A crash may leave both records of a job.
+        if extension == "json" and f"{job}.ended.json" not in names:
+            with open(os.path.join(folder, name), "rb") as file:
+                record = json.load(file)
+            if record["status"] in OPEN:
+                jobs[job] = record["status"], record["attempts"]
+    return jobs
 
 
 def kill(server, phase, dice):
@@ -74,9 +84,29 @@ def kill(server, phase, dice):
         time.sleep(dice.uniform(0.05, 0.4))
     if phase == "drain":
         server.process.terminate()
-        time.sleep(dice.uniform(0, 0.3))
+        time.sleep(dice.uniform(0, DRAIN_MS / 1000))
     server.process.kill()
     server.process.wait()
+
+
+def stop(server, before, dice):
+    """Starts the service and stops it at a random point. `before` has the open jobs of the time before. Returns the
+    errors."""
+    server.start()
+    time.sleep(dice.uniform(0.05, 0.4))
+    server.process.terminate()
+    if dice.random() < 0.3:
+        time.sleep(dice.uniform(0, DRAIN_MS / 1000))
+        server.process.terminate()
+    code = server.process.wait()
+    # A short drain may cut off a request of a client, which sends it again.
+    errors = [] if code in (0, 1) else [f"bad: the service stopped with {code}"]
+    for job, found in open_jobs(server.folder).items():
+        # A job that the process did not claim is as the last kill left it.
+        earlier = before.get(job, ("accepted", 0))
+        if found not in (earlier, ("accepted", earlier[1])):
+            errors.append(f"bad: {earlier} before a stop, {found} after it")
+    return errors
 
 
 def outcome(port, job, mesh, deadline):
@@ -101,29 +131,37 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("binary")
     parser.add_argument("structures", nargs="+")
-    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--kills", type=int, default=200, help="number of kills and stops")
     parser.add_argument("--seed", type=int, default=random.randrange(1 << 32))
     parser.add_argument("--clients", type=int, default=3)
     parser.add_argument("--port", type=int, default=18500)
     args = parser.parse_args()
     print(f"seed {args.seed}", flush=True)
     dice, data = random.Random(args.seed), folder()
-    server = Server(args.binary, data, args.port, ["--backend", "cpu"])
+    server = Server(args.binary, data, args.port, ["--backend", "cpu", "--set", "server.termination_notice_ms=none", "--set", ""])
     clients = Clients(args.port, Expected(args.binary, args.structures), args.seed, args.clients)
-    phases, with_jobs = collections.Counter(), 0
+    phases, with_jobs, jobs, errors = collections.Counter(), 0, {}, []
     for _ in range(args.kills):
-        phase = dice.choice(["load", "load", "recovery", "drain"])
-        kill(server, phase, dice)
+        phase = dice.choice(["load", "load", "recovery", "drain", "stop", "stop"])
+        server.command[-1] = f"server.drain_timeout_ms={dice.randrange(DRAIN_MS) if phase == 'stop' else DRAIN_MS}"
+        if phase == "stop":
+            errors += stop(server, jobs, dice)
+        else:
+            kill(server, phase, dice)
         phases[phase] += 1
-        with_jobs += open_jobs(data) > 0
+        jobs = open_jobs(data)
+        with_jobs += len(jobs) > 0
     clients.finish()
     server.start()
     deadline = time.monotonic() + FINISH_TIMEOUT
     ends = collections.Counter(outcome(args.port, job, mesh, deadline) for job, mesh in clients.jobs.items())
     code, _ = server.stop()
-    print(f"{args.kills} kills: {dict(phases)}; jobs were open at {with_jobs} of them")
+    with open(server.log, encoding="utf-8", errors="replace") as log:
+        errors += [f"bad: {line.strip()}" for line in log if "could not be recorded in time" in line]
+    print(f"{args.kills} kills and stops: {dict(phases)}; jobs were open at {with_jobs} of them")
     print(f"{len(clients.jobs)} accepted jobs: {dict(ends)}; the service stopped with {code}")
-    bad = [end for end in ends if end.startswith("bad")]
+    print("\n".join(errors), end="\n" if errors else "")
+    bad = errors + [end for end in ends if end.startswith("bad")]
     if bad or code or not ends["successful"] or with_jobs <= args.kills // 2:
         sys.exit(f"errors occurred with seed {args.seed}: see above")
 

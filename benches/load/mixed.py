@@ -26,7 +26,7 @@ class Server:
     def __init__(self, binary, folder, port, extra=()):
         self.command = [binary, "serve", "--listen", f"127.0.0.1:{port}", "--metrics-listen", f"127.0.0.1:{port + 1}"]
         self.command += ["--data-dir", folder, "--set", "archive.url=none", *extra]
-        self.port, self.log = port, os.path.join(folder, "log.txt")
+        self.port, self.folder, self.log = port, folder, os.path.join(folder, "log.txt")
 
     def start(self):
         """Starts the service. Returns the time until it is ready, s."""

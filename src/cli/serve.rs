@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use molmesh::config::{Loaded, LogFormat};
-use molmesh::http::{Chosen, ServeError, Server, has_viewer, shutdown_signals};
+use molmesh::http::{Chosen, ServeError, Server, Stopped, has_viewer, shutdown_signals};
 use molmesh::store::LockError;
 use molmesh::structure::strict_validator;
 use molmesh::surface::Backend;
@@ -75,11 +75,26 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         drop(io::stderr().write_all(text.as_bytes()));
     }
 
-    let drained =
+    let stopped =
         runtime.block_on(async { server.run(shutdown_signals()).await }).map_err(|e| CliError::Service(e.to_string()));
     // Do not wait for file reads and jobs that outlast the drain timeout.
     runtime.shutdown_timeout(Duration::from_millis(100));
-    if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
+    check(&stopped?)
+}
+
+/// Fails if the stop was not orderly.
+fn check(stopped: &Stopped) -> Result<(), CliError> {
+    let mut left = Vec::new();
+    if !stopped.requests_finished {
+        left.push("every request was finished".to_owned());
+    }
+    if stopped.jobs_unrecorded > 0 {
+        left.push(format!("the state of {} asynchronous jobs was recorded", stopped.jobs_unrecorded));
+    }
+    if stopped.is_orderly() {
+        return Ok(());
+    }
+    Err(CliError::Service(format!("stopped before {}", left.join(" and "))))
 }
 
 /// Returns the number of threads of the async runtime: a quarter of the cores, at least two. They serve sockets;

@@ -90,6 +90,8 @@ mod middleware;
 
 mod router;
 
+mod wind_down;
+
 mod server;
 
 pub use page::has_viewer;
@@ -97,3 +99,4 @@ pub use reconcile::{LostJob, Reconciled, reconcile};
 pub use server::{Chosen, ServeError, Server};
 pub use signing::check_signable;
 pub use stop::{Stop, shutdown_signals};
+pub use wind_down::Stopped;

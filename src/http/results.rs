@@ -255,3 +255,8 @@ pub(super) async fn all_saved(app: &App) {
     // The semaphore is never closed.
     drop(app.save_permits.acquire_many(permits).await);
 }
+
+/// Returns the number of results that are being stored.
+pub(super) fn unsaved(app: &App) -> usize {
+    app.config.jobs.concurrent_saves - app.save_permits.available_permits()
+}

@@ -10,13 +10,14 @@ use quick_cache::sync::Cache;
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
-use tokio::task::{JoinHandle, JoinSet};
+use tokio::task::JoinSet;
 
 use super::problem::Problem;
 use super::state::{App, Shared};
 use super::stop::{self, Stop};
 use super::store_health::StoreHealth;
-use super::{accept, capabilities, key_reload, metrics, results, router};
+use super::wind_down::{Stopped, wind_down};
+use super::{accept, capabilities, key_reload, metrics, router};
 use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::client_shares::ClientShares;
@@ -40,9 +41,6 @@ const RECONCILE: Duration = Duration::from_mins(1);
 
 /// Number of results whose headers are cached, about 2 KB each.
 const CACHED_HEADERS: usize = 1024;
-
-/// Time for cancelled jobs to stop and for their records to be written.
-const CANCELLING: Duration = Duration::from_secs(1);
 
 /// Error of a server that cannot start.
 #[derive(Debug, Error)]
@@ -209,13 +207,13 @@ impl Server {
     }
 
     /// Serves until `orders` requests a stop, then shuts down in the phases of [`Stop`]: `server.termination_notice_ms`
-    /// for [`Stop::Notice`], `server.drain_timeout_ms` for [`Stop::Drain`], one second for cancelled jobs. A further
-    /// order during the drain cuts it short. Must run on a tokio runtime with timers and several threads. Returns true
-    /// if every request was finished; unfinished durable jobs are left for the next process.
+    /// for [`Stop::Notice`], `server.drain_timeout_ms` for [`Stop::Drain`], one second for cancelled work. A further
+    /// order during the drain cuts it short. Must run on a tokio runtime with timers and several threads. Unfinished
+    /// durable jobs return to the queue.
     ///
     /// # Errors
     /// [`ServeError`].
-    pub async fn run(self, mut orders: watch::Receiver<Stop>) -> Result<bool, ServeError> {
+    pub async fn run(self, mut orders: watch::Receiver<Stop>) -> Result<Stopped, ServeError> {
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());
         // Dropping the set aborts its tasks.
@@ -237,11 +235,11 @@ impl Server {
         }
         background.spawn(publish(Arc::clone(&self.app), recorder));
         stop::reached(&mut orders, Stop::Notice).await;
-        let requests = wind_down(&self.app, &stop, &mut orders, serving).await;
+        let stopped_with = wind_down(&self.app, &stop, &mut orders, serving).await;
         drop(background);
         self.traces.shut_down().await;
         drop(self.data);
-        Ok(requests)
+        Ok(stopped_with)
     }
 }
 
@@ -277,53 +275,6 @@ pub(super) async fn connect_broker(
     // Identifies the store without revealing its secret.
     let id = Digest::of(&derive(secret, "store")).to_string();
     NatsBroker::connect(&config.broker, url, &id, creates).await.map_err(ServeError::Broker)
-}
-
-/// Shuts the service down in the phases that `orders` requests. Returns true if every request was finished.
-async fn wind_down(
-    app: &Shared,
-    stop: &watch::Sender<Stop>,
-    orders: &mut watch::Receiver<Stop>,
-    mut serving: JoinHandle<bool>,
-) -> bool {
-    let notice = Duration::from_millis(app.config.server.termination_notice_ms.unwrap_or_default());
-    if orders.has_changed().is_ok() && *orders.borrow() == Stop::Notice && !notice.is_zero() {
-        stop.send_replace(Stop::Notice);
-        tracing::info!(notice_ms = notice.as_millis(), "termination notice: not ready, but serving");
-        drop(tokio::time::timeout(notice, stop::reached(orders, Stop::Drain)).await);
-    }
-    tracing::info!("draining: finishing requests, accepting no new ones");
-    let end = tokio::time::Instant::now() + Duration::from_millis(app.config.server.drain_timeout_ms);
-    // Only orders received from here on count as new.
-    orders.borrow_and_update();
-    app.job_store.stop_claiming();
-    app.pool.leave();
-    stop.send_replace(Stop::Drain);
-    let cut = async {
-        tokio::select! {
-            () = tokio::time::sleep_until(end) => {}
-            () = stop::further(orders) => {}
-        }
-        stop.send_replace(Stop::Now);
-    };
-    tokio::pin!(cut);
-    // Requests whose bodies are still arriving may submit jobs; after the last one no job can be submitted.
-    let served = tokio::select! {
-        served = &mut serving => Some(served),
-        () = cut.as_mut() => None,
-    };
-    let (requests, jobs) = if let Some(served) = served {
-        (served, app.pool.drain(cut).await)
-    } else {
-        // Cancelled jobs end their requests, which respond before their connections are closed.
-        tokio::join!(serving, app.pool.drain(std::future::ready(())))
-    };
-    let requests = requests.unwrap_or(false);
-    // Records of ended jobs and results that are being stored.
-    let ends = async { tokio::join!(app.job_store.all_recorded(), results::all_saved(app)) };
-    let complete = tokio::time::timeout(CANCELLING, ends).await.is_ok();
-    tracing::info!(requests, jobs, complete, "stopped");
-    requests
 }
 
 /// Publishes the gauges that no event updates.

@@ -103,6 +103,9 @@ pub(crate) trait Broker: Send + Sync {
     /// Tells other nodes that this node claims no more jobs.
     fn stop(&self);
 
+    /// Waits until the ends of claims and locks are sent to the broker.
+    fn flush(&self) -> BoxFuture<'_, ()>;
+
     /// Returns true if a node that claims jobs answers.
     fn has_workers(&self) -> BoxFuture<'_, bool>;
 

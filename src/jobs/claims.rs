@@ -12,6 +12,7 @@ use super::job_store::JobStore;
 use super::record::{JobRecord, Status};
 use super::retry;
 use super::runner::Runner;
+use super::runs::RunResult;
 use super::{EndError, Refusal, Task};
 use crate::store::{Digest, StoreError};
 use crate::sync::{Handle, sleep};
@@ -60,14 +61,7 @@ impl JobStore {
         Handle::current().spawn(self.clone().claim_jobs());
     }
 
-    /// Claims no more jobs.
-    pub(crate) fn stop_claiming(&self) {
-        self.0.stopping.send_replace(true);
-        self.0.broker.stop();
-    }
-
     async fn claim_jobs(self) {
-        let mut stopping = self.0.stopping.subscribe();
         let has_gpu = !self.0.pool.backend().devices().is_empty();
         loop {
             let next = async {
@@ -77,43 +71,59 @@ impl JobStore {
             };
             let claimed = tokio::select! {
                 claimed = next => claimed,
-                _ = stopping.wait_for(|stops| *stops) => None,
+                () = self.0.runs.finish() => None,
             };
             let Some((claim, slot)) = claimed else { return };
-            let jobs = self.clone();
-            Handle::current().spawn(async move { jobs.run_claimed(claim, slot).await });
+            let (jobs, run) = (self.clone(), self.count_run());
+            Handle::current().spawn(async move { run.end(jobs.run_claimed(claim, slot).await) });
         }
     }
 
-    /// Runs a claimed job unless it has ended or runs in this process already.
-    async fn run_claimed(&self, claim: Claim, slot: OwnedSemaphorePermit) {
-        let Some(record) = self.record_of(&claim).await else {
+    /// Starts the run of a claimed job unless it has ended or runs in this process already. Returns the result of the
+    /// claim, unless the run has its own.
+    async fn run_claimed(&self, claim: Claim, slot: OwnedSemaphorePermit) -> Option<RunResult> {
+        let record = tokio::select! {
+            biased;
+            record = self.record_of(&claim) => record,
+            () = self.0.runs.return_jobs() => {
+                claim.release(Duration::ZERO);
+                return Some(RunResult::Returned);
+            }
+        };
+        let Some(record) = record else {
             claim.done().await;
-            return;
+            return None;
         };
         let job = self.insert_open(record.clone());
         if job.ended().is_some() {
             // Its end could not be written before.
-            match self.0.write_job(&job).await {
-                Ok(()) => claim.done().await,
+            return Some(match self.0.write_job(&job).await {
+                Ok(()) => {
+                    claim.done().await;
+                    RunResult::Finished
+                }
                 Err(error) => {
                     tracing::error!(job_id = %job.id(), %error, "cannot record the end of a job");
                     claim.release(DUPLICATE);
+                    RunResult::Unrecorded
                 }
-            }
-            return;
+            });
         }
         if !self.0.try_own(&job) {
             claim.release(DUPLICATE);
-            return;
+            return None;
         }
         job.adopt(record.clone());
         match self.0.track(&record) {
-            Ok(digest) => self.spawn(Runner { job, digest, ticket: None, claim: Some(claim), slot: Some(slot) }),
+            Ok(digest) => {
+                self.spawn(Runner { job, digest, ticket: None, claim: Some(claim), slot: Some(slot) });
+                None
+            }
             Err(error) => {
-                self.finish(&job, Err(error)).await;
+                let recorded = self.finish(&job, Err(error)).await;
                 job.release();
                 claim.done().await;
+                Some(if recorded { RunResult::Finished } else { RunResult::Unrecorded })
             }
         }
     }

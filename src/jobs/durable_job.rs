@@ -89,9 +89,13 @@ impl DurableJob {
         })
     }
 
-    /// Marks the job as running and counts an attempt. Returns false if the job has ended, for example by a dismissal.
-    pub(super) fn begin(&self) -> bool {
+    /// Marks the job as running and counts an attempt, if `may_begin` returns true. Returns false otherwise, or if the
+    /// job has ended, for example by a dismissal.
+    pub(super) fn begin(&self, may_begin: impl FnOnce() -> bool) -> bool {
         self.update(|view, now| {
+            if !may_begin() {
+                return false;
+            }
             view.record.attempts += 1;
             view.record.status = Status::Running;
             view.record.started_ms = Some(now);

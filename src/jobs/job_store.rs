@@ -22,6 +22,7 @@ use super::record::{Helper, JobId, JobRecord, Requester, Status, now_ms};
 use super::records::existing;
 use super::retry::retry;
 use super::runner::Runner;
+use super::runs::Runs;
 use super::{AcceptError, ContentKey, EndError, OnStart, Pool, SaveError, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
@@ -106,10 +107,8 @@ pub(super) struct JobStoreState {
     pub(super) saves: SingleFlight<ContentKey, Result<(), SaveError>>,
     /// Meshes whose partitions this process computes.
     pub(super) shared_meshes: Mutex<HashSet<ContentKey>>,
-    /// Number of jobs with a runner.
-    pub(super) running: watch::Sender<usize>,
-    /// True once no more jobs are claimed.
-    pub(super) stopping: watch::Sender<bool>,
+    /// Claims and runners of jobs.
+    pub(super) runs: Runs,
 }
 
 /// Jobs by id.
@@ -186,8 +185,7 @@ impl JobStore {
             slots,
             saves: SingleFlight::default(),
             shared_meshes: Mutex::default(),
-            running: watch::channel(0).0,
-            stopping: watch::channel(false).0,
+            runs: Runs::default(),
         }))
     }
 
@@ -359,18 +357,12 @@ impl JobStore {
     /// detected.
     pub(super) fn on_start(&self, job: &Arc<DurableJob>) -> OnStart {
         let (jobs, job) = (self.clone(), Arc::clone(job));
-        OnStart::new(async move {
-            if job.begin()
-                && let Err(error) = jobs.0.write_job(&job).await
-            {
-                tracing::error!(job_id = %job.id(), %error, "cannot record an attempt to run a job");
-            }
-        })
+        OnStart::new(async move { jobs.begin(&job).await })
     }
 
     /// Records the end of a job and makes it visible, unless it was dismissed meanwhile. Its result is pinned until
-    /// then.
-    pub(super) async fn finish(&self, job: &DurableJob, ending: Result<(String, Pin), EndError>) {
+    /// then. Returns false if the store has rejected the record.
+    pub(super) async fn finish(&self, job: &DurableJob, ending: Result<(String, Pin), EndError>) -> bool {
         let id = job.id();
         let changed = match &ending {
             Ok((key, _pin)) => {
@@ -387,13 +379,15 @@ impl JobStore {
             }
         };
         if !changed {
-            return;
+            return true;
         }
         let write = || self.0.write_job(job);
+        let written = retry(&id, self.0.retry_time(), StoreError::is_temporary, write).await;
         // Without the record a restart runs the job again: wasted work, but nothing is lost.
-        if let Err(error) = retry(&id, self.0.retry_time(), StoreError::is_temporary, write).await {
+        if let Err(error) = &written {
             tracing::error!(job_id = %id, %error, "cannot record the end of a job");
             job.publish_end(job.record());
         }
+        written.is_ok()
     }
 }

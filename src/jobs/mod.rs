@@ -31,6 +31,7 @@ mod records;
 mod results;
 mod retry;
 mod runner;
+mod runs;
 mod scratch;
 mod structures;
 #[cfg(test)]

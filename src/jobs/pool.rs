@@ -174,18 +174,16 @@ impl Pool {
         self.shared.queue.leave();
     }
 
-    /// Accepts no more jobs and waits for the accepted ones until `end`; then cancels the rest, whose tickets end as
-    /// stopped. Returns true if every job finished.
-    pub(crate) async fn drain(&self, end: impl Future<Output = ()>) -> bool {
+    /// Accepts no more jobs and waits for the accepted ones.
+    pub(crate) async fn finish(&self) {
         self.shared.queue.close();
-        let in_time = tokio::select! {
-            () = self.shared.queue.idle() => true,
-            () = end => false,
-        };
-        if !in_time {
-            self.shared.queue.cancel_all();
-        }
-        in_time
+        self.shared.queue.idle().await;
+    }
+
+    /// Accepts no more jobs and cancels the accepted ones, whose tickets end as stopped.
+    pub(crate) fn cancel(&self) {
+        self.shared.queue.close();
+        self.shared.queue.cancel_all();
     }
 }
 
@@ -200,7 +198,6 @@ fn count(mode: &'static str, ticket: &Ticket) {
 
 impl Drop for Pool {
     fn drop(&mut self) {
-        self.shared.queue.close();
-        self.shared.queue.cancel_all();
+        self.cancel();
     }
 }

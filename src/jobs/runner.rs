@@ -15,6 +15,7 @@ use super::record::JobRecord;
 use super::records::LoadError;
 use super::results::{self, SaveError};
 use super::retry::{self, retry};
+use super::runs::RunResult;
 use super::{ContentKey, EndError, Failure, Finished, Refusal, Ticket};
 use crate::pipeline::JobError;
 use crate::store::{Digest, Pin, StoreError};
@@ -53,11 +54,19 @@ type Work = (Ticket, Option<WorkLock>);
 /// End of the run of a job.
 enum RunEnd {
     /// The job has ended.
-    Done,
+    Done {
+        /// False if the store has rejected the record of the end.
+        recorded: bool,
+    },
     /// Another worker has claimed the job.
     Superseded,
-    /// The job returns to the queue, and can be claimed after this time.
-    Return(Duration),
+    /// The job returns to the queue.
+    Return {
+        /// Time after which the job can be claimed.
+        delay: Duration,
+        /// False if the store has rejected the record, in which the attempt still counts.
+        recorded: bool,
+    },
 }
 
 /// Result of one attempt to run a job.
@@ -79,16 +88,12 @@ fn memory_pause(earlier: u32) -> Duration {
     (retry::FIRST_PAUSE * (1 << earlier.min(16))).min(MAX_MEMORY_PAUSE)
 }
 
-/// Marks a job as running in this process until it is dropped.
-struct RunningJob {
-    jobs: JobStore,
-    job: Arc<DurableJob>,
-}
+/// Ownership of a job, until it is dropped.
+struct Ownership(Arc<DurableJob>);
 
-impl Drop for RunningJob {
+impl Drop for Ownership {
     fn drop(&mut self) {
-        self.job.release();
-        self.jobs.0.running.send_modify(|running| *running -= 1);
+        self.0.release();
     }
 }
 
@@ -97,33 +102,37 @@ impl JobStore {
     pub(super) fn spawn(&self, runner: Runner) {
         let record = runner.job.record();
         let log = record.requester.parent(&self.0.pool.settings().tracer).log_span(Some(record.id.as_str()));
-        self.0.running.send_modify(|running| *running += 1);
-        let running = RunningJob { jobs: self.clone(), job: Arc::clone(&runner.job) };
-        let run = async move {
-            runner.run(&running.jobs).await;
-            drop(running);
+        let (ownership, run, jobs) = (Ownership(Arc::clone(&runner.job)), self.count_run(), self.clone());
+        let work = async move {
+            let result = runner.run(&jobs).await;
+            drop(ownership);
+            run.end(result);
         };
-        Handle::current().spawn(run.instrument(log));
-    }
-
-    /// Waits until no job of this process runs any more: each has ended or is left to another process, and its record
-    /// is written. The pool must be drained.
-    pub(crate) async fn all_recorded(&self) {
-        drop(self.0.running.subscribe().wait_for(|running| *running == 0).await);
+        Handle::current().spawn(work.instrument(log));
     }
 }
 
 impl Runner {
-    async fn run(self, jobs: &JobStore) {
+    /// Runs the job. Returns the result, unless another worker has claimed the job.
+    async fn run(self, jobs: &JobStore) -> Option<RunResult> {
         let Self { job, digest, mut ticket, claim, mut slot } = self;
-        let (mut pause, stop) = (retry::FIRST_PAUSE, job.stop());
+        let (mut pause, stop) = (Duration::ZERO, job.stop());
         let mut counted = job.record().attempts - u32::from(ticket.is_some());
         let end = loop {
-            let attempt = attempt(jobs, &job, (&mut ticket, &mut slot), digest);
+            let attempt = async {
+                if !pause.is_zero() {
+                    sleep(pause).await;
+                }
+                attempt(jobs, &job, (&mut ticket, &mut slot), digest).await
+            };
+            // Dropping the attempt with its ticket stops the work.
             let attempt = tokio::select! {
+                biased;
                 attempt = attempt => attempt,
-                // Dropping the ticket stops the work.
-                () = stop.notified() => break if job.is_decided() { RunEnd::Done } else { RunEnd::Superseded },
+                () = stop.notified() => {
+                    break if job.is_decided() { RunEnd::Done { recorded: true } } else { RunEnd::Superseded };
+                }
+                () = jobs.0.runs.return_jobs() => Attempt::Stopped,
             };
             match attempt {
                 Attempt::Ended(ending) => {
@@ -131,36 +140,39 @@ impl Runner {
                         tracing::warn!(job_id = %job.id(), "another worker runs a later attempt of a job that failed");
                         break RunEnd::Superseded;
                     }
-                    jobs.finish(&job, ending).await;
-                    break RunEnd::Done;
+                    break RunEnd::Done { recorded: jobs.finish(&job, ending).await };
                 }
                 Attempt::OutOfMemory(error) => {
                     let waits = job.record().memory_waits;
                     let waited: Duration = (0..waits).map(memory_pause).sum();
                     let never_fits = matches!(error, OutOfMemory::Limit { .. });
                     if never_fits || waited >= jobs.0.allowed() {
-                        jobs.finish(&job, Err(EndError::Job(error.into()))).await;
-                        break RunEnd::Done;
+                        break RunEnd::Done { recorded: jobs.finish(&job, Err(EndError::Job(error.into()))).await };
                     }
                     tracing::info!(job_id = %job.id(), %error, "a job waits for memory");
                     break jobs.return_to_queue(&job, (counted, 1), memory_pause(waits)).await;
                 }
                 Attempt::StoreFailed => {
                     counted = job.record().attempts;
-                    sleep(pause).await;
-                    pause = (pause * 2).min(retry::MAX_PAUSE);
+                    pause = (pause * 2).clamp(retry::FIRST_PAUSE, retry::MAX_PAUSE);
                 }
-                Attempt::Locked => break RunEnd::Return(LOCKED_DELAY),
+                Attempt::Locked => break RunEnd::Return { delay: LOCKED_DELAY, recorded: true },
                 Attempt::Stopped => break jobs.return_to_queue(&job, (counted, 0), Duration::ZERO).await,
             }
         };
         job.release();
-        match (end, claim) {
-            (RunEnd::Done, Some(claim)) => claim.done().await,
+        match (&end, claim) {
+            (RunEnd::Done { .. }, Some(claim)) => claim.done().await,
             (RunEnd::Superseded, Some(claim)) => claim.abandon(),
-            (RunEnd::Return(delay), Some(claim)) => claim.release(delay),
-            (RunEnd::Done | RunEnd::Superseded, None) => {}
-            (RunEnd::Return(_), None) => jobs.dispatch(&Dispatch::of(&job.record())).await,
+            (RunEnd::Return { delay, .. }, Some(claim)) => claim.release(*delay),
+            (RunEnd::Done { .. } | RunEnd::Superseded, None) => {}
+            (RunEnd::Return { .. }, None) => jobs.dispatch(&Dispatch::of(&job.record())).await,
+        }
+        match end {
+            RunEnd::Done { recorded: true } => Some(RunResult::Finished),
+            RunEnd::Return { recorded: true, .. } => Some(RunResult::Returned),
+            RunEnd::Done { .. } | RunEnd::Return { .. } => Some(RunResult::Unrecorded),
+            RunEnd::Superseded => None,
         }
     }
 }
@@ -227,11 +239,8 @@ async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &JobRecord, dige
         }
         sleep(PAUSE).await;
     };
-    if ticket.joined_running
-        && job.begin()
-        && let Err(error) = jobs.0.write_job(job).await
-    {
-        tracing::error!(job_id = %job.id(), %error, "cannot record an attempt to run a job");
+    if ticket.joined_running {
+        jobs.begin(job).await;
     }
     Ok((ticket, lock))
 }
@@ -257,14 +266,14 @@ async fn join_or_load(
         return Ok(Some((ticket, None)));
     }
     let lock = jobs.0.broker.lock(&work_key(&task)).await.ok_or(Attempt::Locked)?;
-    // Without the lock, the last attempt may still run on another node.
-    if record.attempts >= jobs.0.config.attempts {
-        return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
-    }
     // An earlier process may have ended between storing the result and updating the record.
     let stored = jobs.stored_result(&task, format).await.map_err(|error| store_failed(record, &error))?;
     if let Some(stored) = stored {
         return Err(Attempt::Ended(Ok(stored)));
+    }
+    // Without the lock, the last attempt may still run on another node.
+    if record.attempts >= jobs.0.config.attempts {
+        return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
     }
     if let Some(end) = jobs.needless_helper(record, format).await {
         return Err(Attempt::Ended(Ok(end)));
@@ -335,12 +344,15 @@ impl JobStore {
         if self.is_superseded(job).await {
             return RunEnd::Superseded;
         }
-        if job.return_to_queue(attempts, memory_waits)
-            && let Err(error) = self.0.write_job(job).await
-        {
+        let mut written = Ok(());
+        if job.return_to_queue(attempts, memory_waits) {
+            let write = || self.0.write_job(job);
+            written = retry(&job.id(), self.0.retry_time(), StoreError::is_temporary, write).await;
+        }
+        if let Err(error) = &written {
             tracing::warn!(job_id = %job.id(), %error, "an interrupted attempt is counted");
         }
-        RunEnd::Return(delay)
+        RunEnd::Return { delay, recorded: written.is_ok() }
     }
 
     /// Returns true if another process has begun a later attempt of a job, because the claim of this one had expired.

@@ -3,6 +3,7 @@
 mod cluster;
 mod joined;
 mod records;
+mod stops;
 
 use std::fmt::Debug;
 use std::future::Future;
@@ -299,7 +300,7 @@ async fn the_last_record_has_the_latest_state() {
     let fixture = Fixture::new(1, MAX_WAIT).await;
     let id = fixture.store_record().await;
     let job = Arc::new(DurableJob::new(fixture.on_record(&id).await));
-    assert!(job.begin());
+    assert!(job.begin(|| true));
     // Another task writes the record when the worker wants to record the start.
     let turn = job.writing.lock().await;
     let (jobs, begun) = (fixture.jobs.clone(), Arc::clone(&job));
@@ -363,7 +364,7 @@ async fn versions_of_states_continue_after_a_restart() {
     let job = DurableJob::new(fixture.on_record(&id).await);
     let mut versions = vec![job.view().version];
     for _ in 0..5 {
-        assert!(job.begin());
+        assert!(job.begin(|| true));
         versions.push(job.view().version);
     }
     tokio::time::sleep(Duration::from_millis(50)).await;

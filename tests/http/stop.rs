@@ -4,6 +4,7 @@ use crate::http_support;
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -162,6 +163,81 @@ fn asynchronous_jobs_are_accepted_during_the_drain() {
     assert!(server.wait());
     let record = record(&server, &id);
     assert_eq!((&record["status"], &record["attempts"]), (&"accepted".into(), &0.into()), "{record}");
+}
+
+/// Folder of the store that is replaced by a file until this is dropped, so that every operation on it fails.
+struct Blocked([PathBuf; 2]);
+
+impl Blocked {
+    fn new(server: &Running, folder: &str) -> Self {
+        let paths = ["", ".aside"].map(|end| server.dir.path().join(format!("store/{folder}{end}")));
+        std::fs::rename(&paths[0], &paths[1]).unwrap();
+        std::fs::write(&paths[0], b"").unwrap();
+        Self(paths)
+    }
+}
+
+impl Drop for Blocked {
+    fn drop(&mut self) {
+        std::fs::remove_file(&self.0[0]).unwrap();
+        std::fs::rename(&self.0[1], &self.0[0]).unwrap();
+    }
+}
+
+/// Starts a server with one asynchronous job whose result is being stored, which fails until the folder is free again.
+fn storing(change: impl FnOnce(&mut Config)) -> (Running, String, Blocked) {
+    let backend = Fake::new(Mode::Slow(Duration::from_millis(500)));
+    let server = start(Arc::clone(&backend) as _, |config| {
+        with_long_timeouts(config);
+        config.jobs.save_retry_ms = NEVER_MS;
+        change(config);
+    });
+    let job = submit(&server, 1);
+    wait_for("the start is recorded", || record(&server, &job)["attempts"] == 1);
+    let blocked = Blocked::new(&server, "results");
+    wait_for("the result is being stored", || server.get(&format!("/v1/jobs/{job}")).json()["stage"] == "encode");
+    (server, job, blocked)
+}
+
+#[test]
+fn a_result_is_stored_within_the_drain() {
+    let (mut server, job, blocked) = storing(|_| {});
+    server.request_stop(Stop::Drain);
+    std::thread::sleep(Duration::from_millis(1500));
+    drop(blocked);
+    let stopped = server.stopped();
+    assert!(stopped.is_orderly() && stopped.jobs_finished == 1 && stopped.jobs_returned == 0, "{stopped:?}");
+    let record = record(&server, &job);
+    assert_eq!((&record["status"], &record["attempts"]), (&"successful".into(), &1.into()), "{record}");
+    let result = server.dir.path().join(format!("store/results/{}.glb", record["result"].as_str().unwrap()));
+    assert!(result.exists(), "{}", result.display());
+}
+
+#[test]
+fn a_job_whose_result_is_not_stored_in_time_returns_to_the_queue() {
+    for (drain_timeout_ms, cut) in [(100, false), (NEVER_MS, true)] {
+        let (mut server, job, blocked) = storing(|config| config.server.drain_timeout_ms = drain_timeout_ms);
+        server.request_stop(Stop::Drain);
+        if cut {
+            wait_for("the listener is closed", || TcpStream::connect(server.addr).is_err());
+            server.request_stop(Stop::Now);
+        }
+        let stopped = server.stopped();
+        assert!(stopped.is_orderly() && stopped.jobs_finished == 0 && stopped.jobs_returned == 1, "{stopped:?}");
+        let record = record(&server, &job);
+        assert_eq!((&record["status"], &record["attempts"]), (&"accepted".into(), &0.into()), "{record}");
+        drop(blocked);
+    }
+}
+
+#[test]
+fn a_job_that_cannot_be_recorded_is_reported() {
+    let (mut server, _, results) = storing(|config| config.server.drain_timeout_ms = 100);
+    let records = Blocked::new(&server, "jobs");
+    server.request_stop(Stop::Drain);
+    let stopped = server.stopped();
+    assert!(!stopped.is_orderly() && stopped.requests_finished && stopped.jobs_unrecorded == 1, "{stopped:?}");
+    drop((results, records));
 }
 
 #[test]

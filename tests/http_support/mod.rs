@@ -11,7 +11,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use molmesh::config::Config;
-use molmesh::http::{Chosen, Server, Stop};
+use molmesh::http::{Chosen, Server, Stop, Stopped};
 use molmesh::picture::SelectedRenderer;
 use molmesh::surface::{
     Backend, Control, FoundDevice, GridStats, Mesh, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits,
@@ -202,7 +202,7 @@ pub(crate) struct Running {
     pub(crate) addr: SocketAddr,
     pub(crate) metrics: SocketAddr,
     stop_sender: tokio::sync::watch::Sender<Stop>,
-    thread: Option<JoinHandle<bool>>,
+    thread: Option<JoinHandle<Stopped>>,
     pub(crate) dir: tempfile::TempDir,
 }
 
@@ -240,9 +240,9 @@ pub(crate) fn start_on(
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
     let (stop_sender, stop_receiver) = tokio::sync::watch::channel(Stop::Serve);
     let thread = std::thread::spawn(move || {
-        let drained = runtime.block_on(server.run(stop_receiver)).unwrap();
+        let stopped = runtime.block_on(server.run(stop_receiver)).unwrap();
         runtime.shutdown_timeout(Duration::from_secs(1));
-        drained
+        stopped
     });
     Running { addr, metrics, stop_sender, thread: Some(thread), dir }
 }
@@ -278,14 +278,19 @@ impl Running {
         self.stop_sender.send_if_modified(|now| std::mem::replace(now, (*now).max(stop)) < stop);
     }
 
-    /// Drains and waits. Returns true if every request was finished.
+    /// Drains and waits. Returns true if the stop was orderly.
     pub(crate) fn join(mut self) -> bool {
         self.stop();
         self.wait()
     }
 
-    /// Waits for the requested stop. Returns true if every request was finished. The data folder still exists.
+    /// Waits for the requested stop. Returns true if it was orderly. The data folder still exists.
     pub(crate) fn wait(&mut self) -> bool {
+        self.stopped().is_orderly()
+    }
+
+    /// Waits for the requested stop and returns its result.
+    pub(crate) fn stopped(&mut self) -> Stopped {
         self.thread.take().unwrap().join().unwrap()
     }
 }

@@ -226,6 +226,10 @@ impl Broker for MemoryBroker {
 
     fn stop(&self) {}
 
+    fn flush(&self) -> BoxFuture<'_, ()> {
+        Box::pin(std::future::ready(()))
+    }
+
     fn has_workers(&self) -> BoxFuture<'_, bool> {
         Box::pin(std::future::ready(true))
     }

@@ -9,6 +9,7 @@
 //!
 //! Uses only what servers from version 2.9 on offer.
 
+mod endings;
 mod lease;
 mod lock;
 mod search;
@@ -32,6 +33,7 @@ use tokio::sync::Mutex as AsyncMutex;
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
+use endings::Endings;
 use search::JobSearch;
 
 use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, WorkLock};
@@ -66,6 +68,7 @@ struct NatsState {
     creates: bool,
     /// Last error of the connection.
     failure: Arc<Mutex<Option<String>>>,
+    endings: Endings,
     /// Task that answers other nodes that look for a worker.
     responder: OnceLock<AbortHandle>,
     /// Queues by lane and class; `None` until they exist.
@@ -136,6 +139,7 @@ impl NatsBroker {
             store: store.to_owned(),
             creates,
             failure,
+            endings: Endings::default(),
             responder: OnceLock::new(),
             queues: Mutex::new(None),
             search: AsyncMutex::new(JobSearch::default()),
@@ -364,11 +368,11 @@ impl Broker for NatsBroker {
     }
 
     fn stop(&self) {
-        if let Some(responder) = self.0.responder.get() {
-            responder.abort();
-        }
-        let state = Arc::clone(&self.0);
-        tokio::spawn(async move { state.end_search().await });
+        NatsState::stop_claiming(&self.0);
+    }
+
+    fn flush(&self) -> BoxFuture<'_, ()> {
+        Box::pin(self.0.flush())
     }
 
     fn has_workers(&self) -> BoxFuture<'_, bool> {

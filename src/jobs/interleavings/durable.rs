@@ -88,6 +88,13 @@ impl Fixture {
         Some(JobRecord::from_bytes(&found.bytes().now_or_never().unwrap().unwrap()).unwrap())
     }
 
+    /// Returns the record of the open job in the store, without a step of the scheduler.
+    fn open_record(&self) -> JobRecord {
+        let path = Path::from(Name::job(id().as_str()).unwrap().to_string());
+        let found = self.objects.get(&path).now_or_never().unwrap().unwrap();
+        JobRecord::from_bytes(&found.bytes().now_or_never().unwrap().unwrap()).unwrap()
+    }
+
     /// Stores a result of the job.
     fn store_result(&self, entry: &QueuedTask) {
         let arithmetic = self.jobs.0.pool.file_arithmetics(&entry.task.job).remove(0);
@@ -108,6 +115,8 @@ impl Fixture {
                     fixture.queue.done(id, None, None);
                     continue;
                 }
+                // Workers reserve memory between this check and the start.
+                thread::yield_now();
                 OnStart::run_all(std::mem::take(&mut entry.on_start));
                 let memory = OutOfMemory::Budget { needed: 1, held: 1, limit: 1 };
                 let failure = match thread_rng().gen_range(0..4) {
@@ -256,4 +265,56 @@ fn a_job_has_one_end_which_is_visible_once_it_is_on_record() {
 #[should_panic(expected = "a visible end is not on record")]
 fn an_end_that_is_visible_before_it_is_on_record_is_detected() {
     drop(explore(|client| client.cancels_without_record()));
+}
+
+/// Explores schedules of a stop while two workers run a job. Returns the names of all states after it.
+fn explore_stops(stop: fn(&JobStore)) -> BTreeSet<&'static str> {
+    let mut config = shuttle::Config::new();
+    config.stack_size = STACK;
+    let states = Arc::<std::sync::Mutex<BTreeSet<_>>>::default();
+    let of_model = Arc::clone(&states);
+    let model = move || {
+        let fixture = Fixture::new();
+        let workers = [fixture.worker(), fixture.worker()];
+        drop(fixture.accept());
+        // The job may run meanwhile.
+        (0..thread_rng().gen_range(0..300)).for_each(|_| thread::yield_now());
+        fixture.jobs.stop_claiming();
+        stop(&fixture.jobs);
+        block_on(fixture.jobs.all_recorded());
+        for worker in workers {
+            worker.join().unwrap();
+        }
+        let record = fixture.on_record().unwrap_or_else(|| fixture.open_record());
+        let is_counted = !record.status.is_final() && record.attempts > 0;
+        assert!(!is_counted, "a stop counts an attempt: {record:?}");
+        of_model.lock().unwrap().insert(record.status.name());
+    };
+    shuttle::Runner::new(RandomScheduler::new(SCHEDULES), config).run(model);
+    let states = states.lock().unwrap();
+    states.clone()
+}
+
+#[test]
+fn a_stop_counts_no_attempt() {
+    let states = explore_stops(|jobs| {
+        jobs.return_jobs();
+        jobs.0.pool.cancel();
+    });
+    assert_eq!(states, BTreeSet::from(["accepted", "failed", "successful"]), "the schedules reach every state");
+}
+
+#[test]
+#[should_panic(expected = "a stop counts an attempt")]
+fn an_attempt_that_begins_after_the_return_is_detected() {
+    drop(explore_stops(|jobs| {
+        jobs.return_jobs();
+        jobs.0.pool.cancel();
+        block_on(jobs.all_recorded());
+        let Some(job) = jobs.0.lock().jobs.get(&id()).cloned() else { return };
+        // A worker that does not check whether jobs return.
+        if job.begin(|| true) {
+            block_on(jobs.0.write_job(&job)).unwrap();
+        }
+    }));
 }

@@ -2,16 +2,16 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::{MAX_WAIT, SAMPLE, ended, is, task, until};
+use super::{MAX_WAIT, SAMPLE, ended, is, stops, task, until};
 use crate::config::{JobsConfig, StoreConfig};
 use crate::formats::Format;
-use crate::jobs::broker::tests::{nats, server};
+use crate::jobs::broker::tests::{LEASE, nats, server};
 use crate::jobs::{
     Broker, Budget, EndError, JobId, JobSpec, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Status,
 };
@@ -121,6 +121,27 @@ async fn a_running_job_is_cancelled_from_another_node() {
         // The worker is free again.
         let next = a.accept("2", None).await;
         ended(&mut a.watch(&next).await).await;
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_stopped_node_returns_its_job_to_another_one() {
+    with_all(|a, b| async move {
+        b.jobs.start_claiming();
+        // Takes seconds.
+        let id = a.accept("0.2", None).await;
+        let read = async || a.jobs.0.read(&id).await.unwrap().unwrap();
+        until("the attempt", || async { read().await.attempts == 1 }).await;
+        let begun = Instant::now();
+        let stopped = stops::stop(&b.jobs, Duration::ZERO).await;
+        assert_eq!((stopped.returned, stopped.finished, stopped.unrecorded), (1, 0, 0));
+        let record = read().await;
+        assert_eq!((record.status, record.attempts), (Status::Accepted, 0), "{record:?}");
+        a.jobs.start_claiming();
+        until("the attempt of the other node", || async { read().await.attempts == 1 }).await;
+        assert!(begun.elapsed() < LEASE, "the claim or the lock was not released: {:?}", begun.elapsed());
+        a.jobs.dismiss(&id, Namespace::default()).await.unwrap();
     })
     .await;
 }

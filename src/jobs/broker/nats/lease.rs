@@ -5,21 +5,22 @@ use std::time::Duration;
 
 use async_nats::jetstream::message::{AckKind, Acker};
 use futures_util::future::BoxFuture;
-use tokio::runtime::Handle;
 use tokio::task::AbortHandle;
 use tokio::time::sleep;
 
+use super::endings::Endings;
 use crate::jobs::broker::Lease;
 
 /// Claim of a message, which is extended until the lease is dropped.
 pub(super) struct NatsLease {
     acker: Arc<Acker>,
     extend: AbortHandle,
+    endings: Endings,
 }
 
 impl NatsLease {
     /// Extends the claim of a message at regular intervals.
-    pub(super) fn start(acker: Acker, interval: Duration) -> Self {
+    pub(super) fn start(acker: Acker, interval: Duration, endings: Endings) -> Self {
         let acker = Arc::new(acker);
         let extended = Arc::clone(&acker);
         let extend = tokio::spawn(async move {
@@ -30,7 +31,7 @@ impl NatsLease {
                 }
             }
         });
-        Self { acker, extend: extend.abort_handle() }
+        Self { acker, extend: extend.abort_handle(), endings }
     }
 }
 
@@ -55,9 +56,8 @@ impl Lease for NatsLease {
     }
 
     fn release(self: Box<Self>, delay: Duration) {
-        // Claims may be dropped after the end of the runtime.
-        let Ok(runtime) = Handle::try_current() else { return };
-        runtime.spawn(async move {
+        let endings = self.endings.clone();
+        endings.send(async move {
             if let Err(error) = self.acker.ack_with(AckKind::Nak(Some(delay))).await {
                 tracing::debug!(%error, "a job returns to the queue when its claim expires");
             }

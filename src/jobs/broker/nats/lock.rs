@@ -8,7 +8,6 @@ use async_nats::jetstream::Context;
 use async_nats::jetstream::context::PublishErrorKind;
 use async_nats::jetstream::message::PublishMessage;
 use async_nats::jetstream::stream::{Config, StorageType};
-use tokio::runtime::Handle;
 use tokio::time::sleep;
 
 use super::NatsState;
@@ -67,11 +66,10 @@ impl NatsState {
             }
         });
         let (extend, context, stream) = (extend.abort_handle(), self.context.clone(), self.locks());
+        let endings = self.endings.clone();
         Some(WorkLock::new(move || {
             extend.abort();
-            // Locks may be dropped after the end of the runtime.
-            let Ok(runtime) = Handle::try_current() else { return };
-            runtime.spawn(async move {
+            endings.send(async move {
                 let Ok(stream) = context.get_stream_no_info(stream).await else { return };
                 if let Err(error) = stream.delete_message(last.load(Ordering::Acquire)).await {
                     tracing::debug!(%error, "the lock of some work ends when it expires");

@@ -1,5 +1,6 @@
 //! Search for the next job among the consumers of all lanes.
 
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
@@ -68,9 +69,13 @@ impl NatsState {
         }
     }
 
-    /// Ends the search for jobs.
-    pub(super) async fn end_search(&self) {
-        self.leave(&mut *self.search.lock().await);
+    /// Ends the search for jobs, and tells other nodes.
+    pub(super) fn stop_claiming(self: &Arc<Self>) {
+        if let Some(responder) = self.responder.get() {
+            responder.abort();
+        }
+        let state = Arc::clone(self);
+        tokio::spawn(async move { state.leave(&mut *state.search.lock().await) });
     }
 
     /// Waits for a job and claims it, or returns an error of the server.
@@ -161,6 +166,7 @@ impl NatsState {
             drop(acker.ack_with(AckKind::Term).await);
             return Ok(None);
         };
-        Ok(Some(Claim::new(id, NatsLease::start(acker, Duration::from_millis(self.config.lease_ms / 3)))))
+        let interval = Duration::from_millis(self.config.lease_ms / 3);
+        Ok(Some(Claim::new(id, NatsLease::start(acker, interval, self.endings.clone()))))
     }
 }
