@@ -290,17 +290,18 @@ async fn publish(app: Shared, recorder: Option<Recorder>) {
 /// Dispatches jobs that the broker has lost, at regular intervals.
 async fn reconcile(jobs: JobStore) {
     loop {
-        // A broker that was away may have lost jobs.
         while jobs.broker_down().is_some() {
             tokio::time::sleep(BROKER_CHECK).await;
         }
+        let losses = jobs.broker_losses();
         match jobs.reconcile().await {
             Ok(0) => {}
             Ok(dispatched) => tracing::warn!(jobs = dispatched, "dispatched jobs that the broker did not have"),
             Err(error) => tracing::warn!(%error, "the records of jobs were not read"),
         }
         let end = tokio::time::Instant::now() + RECONCILE;
-        while tokio::time::Instant::now() < end && jobs.broker_down().is_none() {
+        let may_lack_jobs = || jobs.broker_down().is_some() || jobs.broker_losses() != losses;
+        while tokio::time::Instant::now() < end && !may_lack_jobs() {
             tokio::time::sleep(BROKER_CHECK).await;
         }
     }

@@ -112,7 +112,10 @@ pub(crate) trait Broker: Send + Sync {
     /// Returns the number of queued jobs.
     fn queued(&self) -> usize;
 
-    /// Returns the reason for which no job can be dispatched now, if there is one.
+    /// Returns how often the broker may have lost jobs.
+    fn losses(&self) -> usize;
+
+    /// Returns the reason for which no job can be dispatched or claimed now, if there is one.
     fn down(&self) -> Option<String>;
 }
 

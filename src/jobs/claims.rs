@@ -35,7 +35,12 @@ impl JobStore {
         self.can_dispatch() && self.0.broker.has_workers().await
     }
 
-    /// Returns the reason for which no job can be dispatched now, if there is one.
+    /// Returns how often the broker may have lost jobs, which [`Self::reconcile`] dispatches again.
+    pub(crate) fn broker_losses(&self) -> usize {
+        self.0.broker.losses()
+    }
+
+    /// Returns the reason for which no job can be dispatched or claimed now, if there is one.
     pub(crate) fn broker_down(&self) -> Option<String> {
         self.0.broker.down()
     }

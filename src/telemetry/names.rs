@@ -55,7 +55,7 @@ metrics! {
     JOBS_OPEN = "molmesh_jobs_open", Gauge;
     /// Asynchronous jobs that wait for a worker; with `broker.url`, jobs that wait or run on any node.
     BROKER_QUEUED = "molmesh_broker_jobs_queued", Gauge;
-    /// 1 while the NATS server answers, else 0.
+    /// 1 while jobs can be dispatched to the NATS server and claimed, else 0.
     BROKER_UP = "molmesh_broker_up", Gauge;
     /// Synchronous requests whose meshes other nodes computed.
     JOBS_TRANSFERRED = "molmesh_jobs_transferred_total", Counter;
@@ -63,6 +63,8 @@ metrics! {
     PARTITIONS = "molmesh_mesh_partitions_total", Counter, computed: "here|elsewhere";
     /// Claims of jobs whose earlier claim expired or was returned.
     BROKER_REDELIVERIES = "molmesh_broker_redeliveries_total", Counter;
+    /// Claims that the NATS server did not answer or rejected. They are repeated.
+    BROKER_CLAIM_ERRORS = "molmesh_broker_claim_errors_total", Counter;
     /// Unfinished asynchronous jobs that were dispatched again, such as those of an earlier process.
     JOBS_RECOVERED = "molmesh_jobs_recovered_total", Counter;
     /// Jobs that a fallback backend ran instead of the selected one.

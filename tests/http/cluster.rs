@@ -59,16 +59,6 @@ fn get(addr: SocketAddr, path: &str) -> Reply {
     send(addr, "GET", path, &[], b"")
 }
 
-/// Removes all messages of the queue.
-fn purge(nats: &NatsServer) {
-    let mut server = TcpStream::connect(nats.address().trim_start_matches("nats://")).unwrap();
-    server.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
-    let purge = "CONNECT {\"verbose\":false}\r\nSUB purged 1\r\nPUB $JS.API.STREAM.PURGE.molmesh-jobs purged 0\r\n\r\n";
-    server.write_all(purge.as_bytes()).unwrap();
-    let answer = BufReader::new(server).lines().map(Result::unwrap).find(|line| line.contains("purged\":"));
-    assert!(answer.is_some_and(|answer| answer.contains("\"success\":true")));
-}
-
 fn kill_all<const N: usize>(nodes: [Process; N]) {
     for node in nodes {
         node.kill();
@@ -247,6 +237,27 @@ fn a_cluster_recovers_from_the_loss_of_its_queue() {
 }
 
 #[test]
+fn jobs_of_a_lost_stream_are_dispatched_again_at_once() {
+    for program in nats::programs() {
+        let cluster = Cluster::start(&program);
+        let api = cluster.node("a", "api");
+        let job = submit(api.addr, "/v1/meshes?format=stl&resolution=1", SAMPLE);
+        let is_queued = || cluster.nats.jetstream("STREAM.INFO.molmesh-jobs").contains("\"messages\":1,");
+        assert!(is_queued());
+        cluster.nats.jetstream("STREAM.DELETE.molmesh-jobs");
+        let begun = Instant::now();
+        for status in [503, 200] {
+            wait_for("the loss is reported", || get(api.addr, "/readyz").status == status);
+        }
+        wait_for("the job is dispatched", is_queued);
+        assert!(begun.elapsed() < Duration::from_secs(20), "{:?}", begun.elapsed());
+        let worker = cluster.node("w", "worker");
+        successful(api.addr, &job);
+        kill_all([api, worker]);
+    }
+}
+
+#[test]
 fn the_command_reconcile_finds_and_dispatches_lost_jobs() {
     for program in nats::programs() {
         let mut cluster = Cluster::start(&program);
@@ -261,7 +272,7 @@ fn the_command_reconcile_finds_and_dispatches_lost_jobs() {
         let job = submit(api.addr, "/v1/meshes?format=stl&resolution=1", SAMPLE);
         assert_eq!(counts(&reconcile(&cluster, &["--dry-run"])), (1.into(), 0), "it is queued");
         api.kill();
-        purge(&cluster.nats);
+        cluster.nats.jetstream("STREAM.PURGE.molmesh-jobs");
         for _ in 0..2 {
             let found = reconcile(&cluster, &["--dry-run"]);
             assert_eq!((counts(&found), &found["dispatched"]), ((1.into(), 1), &0.into()));

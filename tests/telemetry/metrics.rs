@@ -41,6 +41,7 @@ const ROWS: &[Row] = &[
     (t::BROKER_QUEUED, &[], held),
     (t::BROKER_UP, &[], cluster),
     (t::BROKER_REDELIVERIES, &[], cluster),
+    (t::BROKER_CLAIM_ERRORS, &[], lost_consumers),
     (t::JOBS_TRANSFERRED, &[], cluster),
     (t::PARTITIONS, &["computed=\"here\""], cluster),
     (t::JOBS_RECOVERED, &[], restart),
@@ -88,6 +89,30 @@ const ROWS: &[Row] = &[
     (t::PROCESS_THREADS, &[], nothing),
     (t::PROCESS_START, &[], nothing),
 ];
+
+/// Jobs of consumers that are deleted while a node waits for jobs.
+fn lost_consumers(look: &dyn Fn()) {
+    let Some(program) = nats::programs().pop() else { return };
+    let (queue, folder) = (nats::NatsServer::start(&program), tempfile::tempdir().unwrap());
+    let server = start(Fake::new(Mode::Octahedra), |config| {
+        config.broker.url = Some(queue.address().to_owned());
+        config.store.url = Some(format!("file://{}", folder.path().display()));
+    });
+    let failed = || scrape().moves(t::BROKER_CLAIM_ERRORS, &[]);
+    let (before, mut jobs) = (failed(), 0);
+    wait_for("a failed claim", || {
+        let is_complete = || queue.jetstream("STREAM.INFO.molmesh-jobs").contains("\"consumer_count\":48");
+        wait_for("the consumers", is_complete);
+        for lane in 0..8 {
+            queue.jetstream(&format!("CONSUMER.DELETE.molmesh-jobs.lane-{lane}-2"));
+        }
+        // The node may create them again before it looks for the job.
+        jobs += 1;
+        let _accepted = server.post("/v1/meshes", &[("prefer", "respond-async")], &sample(jobs));
+        failed() > before
+    });
+    look();
+}
 
 /// Requests a mesh until it comes from the memory cache.
 fn meshes(look: &dyn Fn()) {

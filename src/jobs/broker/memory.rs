@@ -238,6 +238,10 @@ impl Broker for MemoryBroker {
         self.0.lock().waiting
     }
 
+    fn losses(&self) -> usize {
+        0
+    }
+
     fn down(&self) -> Option<String> {
         None
     }

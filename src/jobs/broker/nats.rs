@@ -13,22 +13,23 @@ mod endings;
 mod lease;
 mod lock;
 mod search;
+mod streams;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Duration;
 
 use async_nats::connection::State;
-use async_nats::jetstream::consumer::{AckPolicy, Consumer, pull};
+use async_nats::jetstream::consumer::{Consumer, pull};
 use async_nats::jetstream::context::PublishErrorKind;
 use async_nats::jetstream::message::PublishMessage;
-use async_nats::jetstream::stream::{Config as StreamConfig, DiscardPolicy, LastRawMessageErrorKind, RetentionPolicy};
+use async_nats::jetstream::stream::LastRawMessageErrorKind;
 use async_nats::jetstream::{Context, ContextBuilder};
 use async_nats::{Client as Connection, ConnectOptions, Event};
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use futures_util::stream::{self, BoxStream, StreamExt as _};
-use metrics::gauge;
+use metrics::counter;
 use tokio::sync::Mutex as AsyncMutex;
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
@@ -40,7 +41,7 @@ use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, WorkLock};
 use crate::config::BrokerConfig;
 use crate::jobs::record::JobId;
 use crate::store::Digest;
-use crate::telemetry::{BROKER_QUEUED, BROKER_UP};
+use crate::telemetry::BROKER_CLAIM_ERRORS;
 
 /// Number of lanes. Clients share them by the remainder of their numbers.
 const LANES: usize = 8;
@@ -54,6 +55,15 @@ const QUEUES: usize = LANES * CLASSES;
 const REQUEST: Duration = Duration::from_secs(5);
 /// Interval at which the server is asked for the number of jobs, and idle workers look for jobs.
 const POLL: Duration = Duration::from_secs(1);
+
+/// Kind of a request to the server.
+#[derive(Debug, Clone, Copy)]
+enum RequestKind {
+    /// Check of streams and queues.
+    Check,
+    /// Claim of a job.
+    Claim,
+}
 
 /// Consumer of one lane and class.
 type Queue = Consumer<pull::Config>;
@@ -76,12 +86,14 @@ struct NatsState {
     search: AsyncMutex<JobSearch>,
     /// Number of jobs in the stream when it was last asked.
     queued: AtomicUsize,
-    /// Number of lost connections.
+    /// Number of times that the connection or the stream was lost.
     losses: Arc<AtomicUsize>,
-    /// Number of lost connections when the server was last asked.
+    /// Number of losses when the server was last asked.
     checked: AtomicUsize,
-    /// Reason for which the last request failed.
-    down: Mutex<Option<String>>,
+    /// Creation time of the stream, ns since 1970, when the server was last asked.
+    created: Mutex<Option<i128>>,
+    /// Reason for which the last request of each kind failed.
+    failures: Mutex<[Option<String>; 2]>,
 }
 
 impl Drop for NatsState {
@@ -146,25 +158,11 @@ impl NatsBroker {
             queued: AtomicUsize::new(0),
             losses,
             checked: AtomicUsize::new(usize::MAX),
-            down: Mutex::new(None),
+            created: Mutex::new(None),
+            failures: Mutex::default(),
         }));
-        tokio::spawn(watch(Arc::downgrade(&broker.0)));
+        tokio::spawn(streams::watch(Arc::downgrade(&broker.0)));
         Ok(broker)
-    }
-}
-
-/// Asks the server for the number of jobs at regular intervals, and creates stream and queues if they are missing.
-async fn watch(broker: std::sync::Weak<NatsState>) {
-    loop {
-        let Some(state) = broker.upgrade() else { return };
-        let losses = state.losses.load(Ordering::Acquire);
-        let asked =
-            timeout(REQUEST, state.check_streams()).await.unwrap_or_else(|_elapsed| Err("no answer".to_owned()));
-        gauge!(BROKER_UP).set(f64::from(u8::from(asked.is_ok())));
-        state.set_unavailable(asked.err());
-        state.checked.store(losses, Ordering::Release);
-        drop(state);
-        sleep(POLL).await;
     }
 }
 
@@ -175,15 +173,6 @@ fn lane_and_class(job: &Dispatch) -> (usize, usize) {
 }
 
 impl NatsState {
-    fn stream(&self) -> String {
-        format!("{}-jobs", self.config.prefix)
-    }
-
-    /// Returns the description of the stream, which names the store of its jobs.
-    fn description(&self) -> String {
-        format!("jobs of the store {}", self.store)
-    }
-
     /// Returns the subject on which nodes look for a worker.
     fn worker_subject(&self) -> String {
         format!("{}.worker", self.config.prefix)
@@ -204,75 +193,6 @@ impl NatsState {
             };
             tokio::spawn(respond).abort_handle()
         });
-    }
-
-    fn set_unavailable(&self, why: Option<String>) {
-        let mut down = lock(&self.down);
-        match (&*down, &why) {
-            (None, Some(why)) => tracing::warn!(why, "the broker does not answer"),
-            (Some(_), None) => tracing::info!("the broker answers"),
-            _ => {}
-        }
-        *down = why;
-    }
-
-    /// Updates the number of jobs. Creates streams and consumers if they are missing.
-    async fn check_streams(&self) -> Result<(), String> {
-        let found = self.context.get_stream(self.stream()).await;
-        let has_locks = self.context.get_stream(self.locks()).await.is_ok();
-        let used_by =
-            found.as_ref().ok().map(|stream| stream.cached_info().config.description.clone().unwrap_or_default());
-        if used_by.as_ref().is_some_and(|other| *other != self.description()) {
-            // Its jobs are not in the store of this node.
-            *lock(&self.queues) = None;
-            let stream = self.stream();
-            return Err(format!("the stream {stream} is that of another store: check store.url and broker.prefix"));
-        }
-        let jobs = match found {
-            Ok(stream) if !self.creates || (self.queues().is_some() && has_locks) => {
-                stream.cached_info().state.messages
-            }
-            Err(error) if !self.creates => return Err(format!("the stream {}: {error}", self.stream())),
-            _ => self.create().await?,
-        };
-        let jobs = usize::try_from(jobs).unwrap_or(usize::MAX);
-        self.queued.store(jobs, Ordering::Relaxed);
-        gauge!(BROKER_QUEUED).set(u32::try_from(jobs).unwrap_or(u32::MAX));
-        Ok(())
-    }
-
-    /// Creates stream and queues, or updates their settings. Returns the number of jobs.
-    async fn create(&self) -> Result<u64, String> {
-        let config = StreamConfig {
-            name: self.stream(),
-            description: Some(self.description()),
-            subjects: vec![format!("{}.jobs.>", self.config.prefix)],
-            retention: RetentionPolicy::WorkQueue,
-            discard: DiscardPolicy::New,
-            max_messages: i64::try_from(self.config.queue).unwrap_or(i64::MAX),
-            max_messages_per_subject: 1,
-            num_replicas: self.config.replicas,
-            ..StreamConfig::default()
-        };
-        let info = self.context.create_or_update_stream(config).await.map_err(|error| error.to_string())?;
-        self.context.create_or_update_stream(self.lock_stream()).await.map_err(|error| error.to_string())?;
-        let mut queues = Vec::new();
-        for lane in 0..LANES {
-            for class in 0..CLASSES {
-                let config = pull::Config {
-                    durable_name: Some(format!("lane-{lane}-{class}")),
-                    filter_subject: format!("{}.jobs.{lane}.{class}.*", self.config.prefix),
-                    ack_policy: AckPolicy::Explicit,
-                    ack_wait: Duration::from_millis(self.config.lease_ms),
-                    max_ack_pending: i64::from(u32::MAX),
-                    ..pull::Config::default()
-                };
-                let queue = self.context.create_consumer_on_stream(config, self.stream()).await;
-                queues.push(queue.map_err(|error| error.to_string())?);
-            }
-        }
-        *lock(&self.queues) = Some(queues.into());
-        Ok(info.state.messages)
     }
 
     fn queues(&self) -> Option<Arc<[Queue]>> {
@@ -327,10 +247,15 @@ impl Broker for NatsBroker {
         self.0.respond();
         Box::pin(async move {
             loop {
+                let losses = self.losses();
                 match self.0.next(prefers_gpu).await {
                     Ok(claim) => return claim,
                     Err(why) => {
-                        tracing::debug!(why, "no job was claimed");
+                        counter!(BROKER_CLAIM_ERRORS).increment(1);
+                        // A loss is reported already, and the next request may be answered.
+                        if losses == self.losses() {
+                            self.0.set_failure(RequestKind::Claim, Some(format!("no job can be claimed: {why}")));
+                        }
                         sleep(POLL).await;
                     }
                 }
@@ -386,14 +311,18 @@ impl Broker for NatsBroker {
         self.0.queued.load(Ordering::Relaxed)
     }
 
+    fn losses(&self) -> usize {
+        self.0.losses.load(Ordering::Acquire)
+    }
+
     fn down(&self) -> Option<String> {
         if self.0.connection.connection_state() != State::Connected {
             let failure = lock(&self.0.failure).clone().unwrap_or_else(|| "connecting".to_owned());
             return Some(format!("not connected: {failure}"));
         }
-        if self.0.checked.load(Ordering::Acquire) != self.0.losses.load(Ordering::Acquire) {
+        if self.0.checked.load(Ordering::Acquire) != self.losses() {
             return Some("the broker is being asked for its queue".to_owned());
         }
-        lock(&self.0.down).clone()
+        lock(&self.0.failures).iter().flatten().next().cloned()
     }
 }

@@ -1,5 +1,6 @@
 //! Conformance tests of brokers: the same for every implementation.
 
+mod nats_lost;
 mod nats_only;
 #[path = "nats_server.rs"]
 pub(crate) mod server;
@@ -19,6 +20,8 @@ use crate::jobs::record::JobId;
 use crate::store::Digest;
 use server::NatsServer;
 
+/// Maximum time of a test on one broker.
+const MAX_TEST: Duration = Duration::from_mins(2);
 /// Maximum time of a step of a test.
 const MAX_WAIT: Duration = Duration::from_secs(20);
 /// Time in which a job that may be claimed is claimed.
@@ -53,7 +56,7 @@ impl Shared {
                 let crash = move || {
                     let runtime = Runtime::new().unwrap();
                     let broker = runtime.block_on(async { Arc::new(connect(&server).await) });
-                    let claim = runtime.block_on(work(broker));
+                    let claim = runtime.block_on(bounded(work(broker)));
                     // The claim is neither extended nor returned.
                     runtime.shutdown_background();
                     std::mem::forget(claim);
@@ -69,24 +72,52 @@ async fn connect(address: &str) -> NatsBroker {
     let lease_ms = u64::try_from(LEASE.as_millis()).unwrap();
     let config = BrokerConfig { lease_ms, queue: LIMIT, ..BrokerConfig::default() };
     let broker = NatsBroker::connect(&config, address, "a", true).await.unwrap();
-    let begun = Instant::now();
-    while let Some(why) = broker.down() {
-        assert!(begun.elapsed() < MAX_WAIT, "{why}");
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+    until_down(&broker, MAX_WAIT, |why| why.is_none()).await;
     broker
+}
+
+/// Waits until the reason for which a broker is down is the expected one.
+async fn until_down(broker: &dyn Broker, limit: Duration, mut is_expected: impl FnMut(Option<&str>) -> bool) {
+    let begun = Instant::now();
+    loop {
+        let why = broker.down();
+        if is_expected(why.as_deref()) {
+            return;
+        }
+        assert!(begun.elapsed() < limit, "{why:?} after {limit:?}");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
 }
 
 pub(crate) async fn nats(server: &NatsServer) -> NatsBroker {
     connect(server.address()).await
 }
 
+/// Runs a test, which fails if it waits too long.
+pub(crate) async fn bounded<F: Future>(test: F) -> F::Output {
+    tokio::time::timeout(MAX_TEST, test).await.expect("the test ends")
+}
+
 /// Runs a test on every broker: within the process, and on every installed version of NATS.
 async fn with_all<F: Future<Output = ()>>(test: impl Fn(Arc<Shared>) -> F) {
-    test(Arc::new(Shared::Memory(MemoryBroker::new(LIMIT)))).await;
+    let run = async |shared: Shared| {
+        // Lives until a failure of the test is known, so that the server explains itself.
+        let shared = Arc::new(shared);
+        bounded(test(Arc::clone(&shared))).await;
+    };
+    run(Shared::Memory(MemoryBroker::new(LIMIT))).await;
     for program in server::programs() {
         println!("{}", program.display());
-        test(Arc::new(Shared::Nats(NatsServer::start(&program)))).await;
+        run(Shared::Nats(NatsServer::start(&program))).await;
+    }
+}
+
+/// Runs a test on every installed version of NATS.
+pub(crate) async fn on_nats(test: impl AsyncFn(&mut NatsServer)) {
+    for program in server::programs() {
+        println!("{}", program.display());
+        let mut server = NatsServer::start(&program);
+        bounded(test(&mut server)).await;
     }
 }
 

@@ -8,10 +8,10 @@ use async_nats::jetstream::message::AckKind;
 use async_nats::{Client as Connection, Subscriber};
 use futures_util::StreamExt as _;
 use metrics::counter;
-use tokio::time::timeout;
+use tokio::time::{sleep, timeout};
 
 use super::lease::NatsLease;
-use super::{CLASSES, LANES, NatsState, POLL, QUEUES, Queue, REQUEST, lane_and_class};
+use super::{CLASSES, LANES, NatsState, POLL, QUEUES, Queue, REQUEST, RequestKind, lane_and_class};
 use crate::jobs::broker::{Claim, Dispatch};
 use crate::telemetry::BROKER_REDELIVERIES;
 
@@ -85,7 +85,11 @@ impl NatsState {
         // Time of the search for an announced job of the other kind.
         let mut due: Option<Instant> = None;
         loop {
-            let queues = self.queues().ok_or("the stream does not exist yet")?;
+            let Some(queues) = self.queues() else {
+                // The check of the streams reports why they do not exist.
+                sleep(POLL).await;
+                continue;
+            };
             if let Some(claim) = self.scan(search, &queues, prefers_gpu).await? {
                 self.leave(search);
                 return Ok(claim);
@@ -136,7 +140,9 @@ impl NatsState {
                 if search.empty_until[number] > Instant::now() {
                     continue;
                 }
-                if let Some(claim) = self.fetch(&queues[number]).await? {
+                let claim = self.fetch(&queues[number]).await?;
+                self.set_failure(RequestKind::Claim, None);
+                if let Some(claim) = claim {
                     search.turn = lane + 1;
                     search.claims[lane] += 1;
                     return Ok(Some(claim));

@@ -6,8 +6,7 @@ use std::time::{Duration, Instant};
 use futures_util::StreamExt as _;
 
 use super::super::{Broker, Dispatch, NatsBroker};
-use super::server::{self, NatsServer};
-use super::{SOON, claim, job, nats, none_within};
+use super::{MAX_WAIT, SOON, claim, job, nats, none_within, on_nats, until_down};
 use crate::config::BrokerConfig;
 use crate::jobs::rank::DEFAULT_URGENCY;
 
@@ -15,13 +14,12 @@ use crate::jobs::rank::DEFAULT_URGENCY;
 async fn jobs_are_dispatched_and_claimed_concurrently() {
     // With `MOLMESH_DISPATCHES=20000` and `--no-capture` it prints the rates of a long run.
     let n: usize = std::env::var("MOLMESH_DISPATCHES").map_or(1000, |n| n.parse().unwrap());
-    for program in server::programs() {
-        let server = NatsServer::start(&program);
+    on_nats(async |server| {
         let config = BrokerConfig { queue: n, ..BrokerConfig::default() };
         let connect = async || Arc::new(NatsBroker::connect(&config, server.address(), "a", true).await.unwrap());
         let nodes = [connect().await, connect().await, connect().await];
-        while nodes.iter().any(|node| node.down().is_some()) {
-            tokio::time::sleep(Duration::from_millis(20)).await;
+        for node in &nodes {
+            until_down(&**node, MAX_WAIT, |why| why.is_none()).await;
         }
         let jobs: Vec<_> = (0..n as u64).map(|n| job(n % 100, DEFAULT_URGENCY)).collect();
         let mut times = Vec::new();
@@ -55,84 +53,67 @@ async fn jobs_are_dispatched_and_claimed_concurrently() {
         }
         let claims = n as f64 / begun.elapsed().as_secs_f64();
         println!(
-            "{}: dispatch p50 {:?}, p99 {:?}; {rate:.0} dispatches per s from one node; {claims:.0} claims per s by three",
-            program.display(),
+            "dispatch p50 {:?}, p99 {:?}; {rate:.0} dispatches per s from one node; {claims:.0} claims per s by three",
             times[times.len() / 2],
             times[times.len() * 99 / 100]
         );
-    }
+    })
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_node_with_another_store_gets_no_jobs() {
-    for program in server::programs() {
-        let server = NatsServer::start(&program);
-        let broker: Arc<dyn Broker> = Arc::new(nats(&server).await);
+    on_nats(async |server| {
+        let broker: Arc<dyn Broker> = Arc::new(nats(server).await);
         assert!(!broker.has_workers().await);
         assert_eq!(broker.dispatch(&job(1, DEFAULT_URGENCY)).await, Ok(true));
         let other = NatsBroker::connect(&BrokerConfig::default(), server.address(), "b", true).await.unwrap();
-        let begun = Instant::now();
-        while !other.down().is_some_and(|why| why.contains("another store")) {
-            assert!(begun.elapsed() < SOON, "{:?}", other.down());
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
+        until_down(&other, SOON, |why| why.is_some_and(|why| why.contains("another store"))).await;
         none_within(&(Arc::new(other) as _), SOON / 2).await;
         // Control: a node with the same store gets the job, and is found.
-        let same: Arc<dyn Broker> = Arc::new(nats(&server).await);
+        let same: Arc<dyn Broker> = Arc::new(nats(server).await);
         let claimed = claim(&same).await;
         assert!(broker.has_workers().await);
         claimed.done().await;
-    }
+    })
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stream_that_cannot_be_created_is_reported() {
-    for program in server::programs() {
-        let server = NatsServer::start(&program);
+    on_nats(async |server| {
         let config = BrokerConfig { replicas: 3, ..BrokerConfig::default() };
         let broker = NatsBroker::connect(&config, server.address(), "a", true).await.unwrap();
-        let begun = Instant::now();
-        while !broker.down().is_some_and(|why| why.contains("replicas")) {
-            assert!(begun.elapsed() < SOON, "{:?}", broker.down());
-            tokio::time::sleep(Duration::from_millis(20)).await;
-        }
-    }
+        until_down(&broker, SOON, |why| why.is_some_and(|why| why.contains("replicas"))).await;
+    })
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_broker_that_comes_back_is_used_again() {
-    for program in server::programs() {
-        let mut server = NatsServer::start(&program);
-        let broker: Arc<dyn Broker> = Arc::new(nats(&server).await);
+    on_nats(async |server| {
+        let broker: Arc<dyn Broker> = Arc::new(nats(server).await);
         let queued = job(1, DEFAULT_URGENCY);
         assert_eq!(broker.dispatch(&queued).await, Ok(true));
         for keeps_data in [true, false] {
             server.stop(keeps_data);
-            let begun = Instant::now();
-            while broker.down().is_none() {
-                assert!(begun.elapsed() < SOON, "the stop is not noticed");
-                tokio::time::sleep(Duration::from_millis(20)).await;
-            }
+            until_down(&*broker, SOON, |why| why.is_some()).await;
             server.restart();
-            let begun = Instant::now();
-            while let Some(why) = broker.down() {
-                assert!(begun.elapsed() < SOON, "{why}");
-                tokio::time::sleep(Duration::from_millis(20)).await;
-            }
+            until_down(&*broker, SOON, |why| why.is_none()).await;
             // Without its data the broker has lost the job.
             assert_eq!(broker.dispatch(&queued).await, Ok(!keeps_data));
             let claimed = claim(&broker).await;
             assert_eq!(claimed.id, queued.id);
             claimed.release(Duration::ZERO);
         }
-    }
+    })
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn workers_first_claim_jobs_that_suit_them() {
-    for program in server::programs() {
-        let server = NatsServer::start(&program);
-        let [gpu, cpu] = [nats(&server).await, nats(&server).await].map(Arc::new);
+    on_nats(async |server| {
+        let [gpu, cpu] = [nats(server).await, nats(server).await].map(Arc::new);
         let of = |suits_gpu: bool, urgency: u8| Dispatch { suits_gpu, ..job(1, urgency) };
         // Queued jobs: those that suit the worker first, but not before more urgent ones.
         let jobs = [of(false, 3), of(true, 3), of(false, 3), of(true, 3), of(false, 0)];
@@ -176,14 +157,14 @@ async fn workers_first_claim_jobs_that_suit_them() {
         let claimed = tokio::time::timeout(SOON, cpu.claim(false)).await.expect("a job is available");
         assert_eq!(claimed.id, other.id);
         claimed.done().await;
-    }
+    })
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn idle_nodes_share_jobs_that_are_dispatched_at_once() {
-    for program in server::programs() {
-        let server = NatsServer::start(&program);
-        let nodes = [nats(&server).await, nats(&server).await].map(Arc::new);
+    on_nats(async |server| {
+        let nodes = [nats(server).await, nats(server).await].map(Arc::new);
         let mut late = 0;
         for _ in 0..20 {
             let claims = nodes.clone().map(|node| tokio::spawn(async move { node.claim(false).await }));
@@ -200,5 +181,6 @@ async fn idle_nodes_share_jobs_that_are_dispatched_at_once() {
             late += usize::from(begun.elapsed() > Duration::from_millis(400));
         }
         assert!(late < 5, "{late} of 20 times, a node missed the announcement");
-    }
+    })
+    .await;
 }
