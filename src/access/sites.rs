@@ -1,6 +1,6 @@
 //! Origins whose pages may read responses, and host names under which the service is reached.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 
 use crate::config::{Config, Hosts, Origins};
 
@@ -17,6 +17,13 @@ impl Sites {
     pub(super) fn new(config: &Config) -> Self {
         let on_loopback = config.server.listen.ip().to_canonical().is_loopback();
         Self { origins: config.access.cors_origins.clone(), hosts: config.server.hosts.clone(), on_loopback }
+    }
+
+    /// Creates the sites of the metrics listener. On a loopback address it answers to the names of the service, and on
+    /// another one to any name, such as the address of a pod.
+    pub(crate) fn for_metrics(config: &Config, address: SocketAddr) -> Self {
+        let on_loopback = address.ip().to_canonical().is_loopback();
+        Self { origins: None, hosts: config.server.hosts.clone().filter(|_| on_loopback), on_loopback }
     }
 
     /// Returns true if pages of all origins may read responses.

@@ -30,7 +30,7 @@ pub(super) fn run(args: &AreasArgs) -> Result<(), CliError> {
     let failure = |error| job::failure(error, &args.input, &input, &limits);
     let structure = structure::read_with(&input, &limits.read, &control).map_err(|error| failure(error.into()))?;
     let measured = measure_selection(&structure, &job, &limits.read, &limits.surface, &control).map_err(failure)?;
-    measured.areas.write_csv(&structure, level, &mut output).map_err(|source| output.failure(source))?;
+    measured.areas.write_csv(&structure, level, &control, &mut output).map_err(|source| output.failure(source))?;
     let to_stdout = output.is_stdout();
     let written = Written { name: output.name.clone(), format: "csv", bytes: output.bytes };
     Output::finish(vec![output])?;

@@ -49,7 +49,7 @@ impl<'a> Url<'a> {
                 "parameter `url`: `{text}` is not allowed; expected http://host:port/"
             )));
         }
-        Ok(Self { authority, path: if path.is_empty() { "/readyz" } else { path } })
+        Ok(Self { authority, path: if ["", "/"].contains(&path) { "/readyz" } else { path } })
     }
 
     /// Returns host and port, by default port 80. Keeps the brackets of an IPv6 address, which the resolver needs.
@@ -100,6 +100,7 @@ mod tests {
         let is = |socket: &str, path: &str| (socket.to_owned(), path.to_owned());
         assert_eq!(url("http://127.0.0.1:8080/livez").unwrap(), is("127.0.0.1:8080", "/livez"));
         assert_eq!(url("http://example").unwrap(), is("example:80", "/readyz"));
+        assert_eq!(url("http://example/").unwrap(), is("example:80", "/readyz"));
         assert_eq!(url("http://[::1]/x").unwrap(), is("[::1]:80", "/x"));
         assert_eq!(url("http://[::1]:9").unwrap(), is("[::1]:9", "/readyz"));
         for bad in ["https://x/", "x", "http://", "http:///x", "http://a b/", "http://a/\r\nX: y"] {

@@ -40,8 +40,9 @@ pub struct JobsConfig {
     /// blocks of 4 KiB, and listing them at the start takes seconds. At the limit, the record of the ended job that was
     /// not used for the longest time is removed; if all jobs are open, new ones get a 503.
     pub records: usize,
-    /// Number of asynchronous jobs of one client on record. Default 10,000: one client cannot displace the records of
-    /// the others. At the limit as for `records`, among the jobs of the client.
+    /// Number of asynchronous jobs of one client on record. Default 2,500, a quarter of the default of `broker.queue`:
+    /// one client can neither displace the records of the others nor fill the queue. At the limit as for `records`,
+    /// among the jobs of the client.
     pub records_per_client: usize,
 }
 
@@ -58,7 +59,7 @@ impl Default for JobsConfig {
             save_retry_ms: 60_000,
             concurrent_saves: 4,
             records: 100_000,
-            records_per_client: 10_000,
+            records_per_client: 2500,
         }
     }
 }

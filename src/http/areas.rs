@@ -1,13 +1,11 @@
 //! `…/areas`: exact areas of the atoms, residues or chains of a structure as CSV, without a mesh.
 
-use std::sync::Arc;
-use std::time::Instant;
-
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::header::{self, HeaderMap};
 use axum::response::{IntoResponse, Response};
 
+use super::document;
 use super::guard::Caller;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AreaParameters, ConditionHeaders, EntryPath, StructurePath};
@@ -86,9 +84,6 @@ pub(super) async fn of_entry(
     answer(&app, &caller, source, query, &headers).await
 }
 
-/// Memory charged for a row, bytes.
-const BYTES_PER_ROW: u64 = 128;
-
 async fn answer(
     app: &Shared,
     caller: &Caller,
@@ -99,22 +94,12 @@ async fn answer(
     let AreasRequest { job, level, canonical } = params::areas::parse(&parsed_request::pairs(query)?)?;
     let surface = app.config.limits.job().surface;
     let write = async |loaded: Loaded, delivery| {
-        app.admit_work(caller)?;
-        let (meter, payer) = (Arc::clone(app), caller.clone());
-        let listing = loaded.list_atoms(app, caller, delivery, 0, move |structure, limits, control, memory| {
+        let listing = loaded.list_atoms(app, caller, delivery, move |structure, limits, control, memory| {
             let refused = |error| Problem::from(Failure::Job { error, diagnostics: Vec::new() });
-            let start = Instant::now();
-            let measured = areas::measure_selection(structure, &job, limits, &surface, control);
-            meter.charge(&payer, start.elapsed());
-            let areas = measured.map_err(refused)?.areas;
-            // A row may have one atom only.
-            memory.grow(BYTES_PER_ROW * areas.len() as u64)?;
-            let mut text = Vec::new();
-            areas.write_csv(structure, level, &mut text).map_err(Problem::internal)?;
-            Ok((text, ()))
+            let areas = areas::measure_selection(structure, &job, limits, &surface, control).map_err(refused)?.areas;
+            document::collect(memory, control, |out| areas.write_csv(structure, level, control, out))
         });
-        let (text, ()) = listing.await?;
-        Ok(([(header::CONTENT_TYPE, "text/csv")], Body::from(text)).into_response())
+        Ok(([(header::CONTENT_TYPE, "text/csv")], Body::from(listing.await?)).into_response())
     };
     source.document(app, caller, headers, &canonical, None, write).await
 }

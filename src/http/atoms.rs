@@ -1,16 +1,15 @@
 //! `…/atoms`: identity of the atoms of a structure, in columns that are indexed by `_ATOM` of a mesh, or the atoms of a
 //! mesh with their positions.
 
-use std::collections::HashSet;
-
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::header::{self, HeaderMap};
 use axum::response::{IntoResponse, Response};
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 use utoipa::ToSchema;
 
 use super::atom_parameters::{self, Positions};
+use super::document;
 use super::guard::Caller;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AtomParameters, ConditionHeaders, EntryPath, StructurePath};
@@ -22,38 +21,38 @@ use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
 use crate::structure::{self, Selected, Structure, element};
+use crate::surface::{MemoryMeter, OutOfMemory, Reservation};
 
-/// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
-const BYTES_PER_ATOM: u64 = 24;
-/// Memory charged for the index and the position of an atom, bytes, in addition.
-const BYTES_PER_POSITION: u64 = 72;
+/// Memory of a selected atom while atoms are selected, bytes: its index in a part, in the whole, and in the whole as it
+/// grows.
+pub(super) const SELECTED_BYTES: u64 = 3 * size_of::<u32>() as u64;
 
 /// Atoms of all models in file order: row `i` describes the atom with index `i` in `_ATOM` of a mesh. With
 /// `positions=true`, the atoms of a mesh in its order.
 #[derive(Debug, Serialize, ToSchema)]
-pub(super) struct AtomsDocument {
+pub(super) struct AtomsDocument<'a> {
     /// Number of atoms, the length of each column of `atoms`.
     count: usize,
     /// Distinct atom names.
-    names: Vec<String>,
+    names: Vec<&'a str>,
     /// Distinct element symbols; `?` for an unknown element.
     elements: Vec<&'static str>,
     /// Columns with one row per atom.
-    atoms: AtomColumns,
+    atoms: AtomColumns<'a>,
     /// Columns with one row per residue.
-    residues: ResidueColumns,
+    residues: ResidueColumns<'a>,
 }
 
 /// Columns with one row per atom.
 #[derive(Debug, Default, Serialize, ToSchema)]
-struct AtomColumns {
+struct AtomColumns<'a> {
     /// Index into `names`.
     name: Vec<u32>,
     /// Index into `elements`.
     element: Vec<u8>,
     /// Index of the atom in the file, as in `_ATOM`; with `positions=true` only.
     #[serde(skip_serializing_if = "Option::is_none")]
-    index: Option<Vec<u32>>,
+    index: Option<&'a [u32]>,
     /// First coordinate in Å, rounded to 0.001 Å; with `positions=true` only, like `y` and `z`.
     #[serde(skip_serializing_if = "Option::is_none")]
     x: Option<Vec<f64>>,
@@ -67,22 +66,39 @@ struct AtomColumns {
 
 /// Columns with one row per residue.
 #[derive(Debug, Default, Serialize, ToSchema)]
-struct ResidueColumns {
+struct ResidueColumns<'a> {
     /// Index of the first atom. The residue ends before the first atom of the next one.
     first: Vec<usize>,
     /// Residue name.
-    name: Vec<String>,
+    name: Vec<&'a str>,
     /// Residue number given by the author.
     number: Vec<i32>,
     /// Insertion code; empty if there is none.
-    insertion_code: Vec<String>,
+    #[schema(value_type = Vec<String>)]
+    insertion_code: Vec<InsertionCode>,
     /// Chain name given by the author; empty if the file leaves it blank.
-    chain: Vec<String>,
+    chain: Vec<&'a str>,
     /// Model number.
     model: Vec<i32>,
     /// Kind of the first atom: `protein`, `nucleic`, `polymer` (any other polymer), `cofactor`, `glycan`, `ligand`
     /// (any other ligand), `ion`, `water` or `virtual` (a site that is not an atom).
     kind: Vec<&'static str>,
+}
+
+/// Insertion code as a text; 0 is none.
+#[derive(Debug, PartialEq)]
+struct InsertionCode(u8);
+
+impl ResidueColumns<'_> {
+    /// Memory of a residue, bytes.
+    const BYTES_PER_ROW: u64 =
+        (size_of::<usize>() + 3 * size_of::<&str>() + 2 * size_of::<i32>() + size_of::<InsertionCode>()) as u64;
+}
+
+impl Serialize for InsertionCode {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        if self.0 == 0 { serializer.serialize_str("") } else { serializer.serialize_char(char::from(self.0)) }
+    }
 }
 
 problem_responses!(StructureProblems: [
@@ -166,60 +182,70 @@ async fn list(
     delivery: Delivery,
     positions: Option<Positions>,
 ) -> Result<Response, Problem> {
-    let bytes_per_atom = if positions.is_some() { 0 } else { BYTES_PER_ATOM };
-    let listing =
-        loaded.list_atoms(app, caller, delivery, bytes_per_atom, move |structure, limits, control, memory| {
-            let select =
-                |Positions { selection, .. }: Positions| structure::select_with(structure, &selection, limits, control);
-            let selected = positions.map(select).transpose()?;
-            if let Some(selected) = &selected {
-                memory.grow((BYTES_PER_ATOM + BYTES_PER_POSITION) * selected.atoms.len() as u64)?;
-            }
-            let text = serde_json::to_vec(&document(structure, selected.as_ref())).map_err(Problem::internal)?;
-            Ok((text, ()))
-        });
-    let (text, ()) = listing.await?;
-    Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response())
+    let listing = loaded.list_atoms(app, caller, delivery, move |structure, limits, control, memory| {
+        let select =
+            |Positions { selection, .. }: Positions| structure::select_with(structure, &selection, limits, control);
+        if positions.is_some() {
+            control.memory.grow(SELECTED_BYTES * structure.len() as u64)?;
+        }
+        let selected = positions.map(select).transpose()?;
+        let columns = Reservation::new(&control.memory);
+        let document = document(structure, selected.as_ref(), &columns)?;
+        document::collect(memory, control, |out| Ok(serde_json::to_writer(out, &document)?))
+    });
+    Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(listing.await?)).into_response())
 }
 
-/// Builds the columns, of the selected atoms with their positions or of all atoms.
-fn document(structure: &Structure, selected: Option<&Selected>) -> AtomsDocument {
+/// Builds the columns, of the selected atoms with their positions or of all atoms, charged to `memory`.
+fn document<'a>(
+    structure: &'a Structure,
+    selected: Option<&'a Selected>,
+    memory: &Reservation,
+) -> Result<AtomsDocument<'a>, OutOfMemory> {
     let count = selected.map_or(structure.len(), |selected| selected.atoms.len());
     let index = |row: usize| selected.map_or(row, |selected| selected.atoms[row] as usize);
-    let copies: HashSet<usize> =
-        selected.iter().flat_map(|selected| &selected.copies).map(|copy| copy.rows.start).collect();
+    let copies = selected.map_or(&[][..], |selected| &selected.copies);
+    // Copies are in the order of their rows.
+    let starts_copy = |row: usize| copies.binary_search_by_key(&row, |copy| copy.rows.start).is_ok();
+    let starts_residue =
+        |row: usize| row == 0 || starts_copy(row) || !structure.same_residue(index(row - 1), index(row));
+    let mut residues = ResidueColumns::default();
+    let n_residues = (0..count).filter(|row| starts_residue(*row)).count();
+    memory.grow(ResidueColumns::BYTES_PER_ROW * n_residues as u64)?;
+    residues.first.reserve_exact(n_residues);
+    residues.first.extend((0..count).filter(|row| starts_residue(*row)));
+    let first = || residues.first.iter().map(|row| index(*row));
+    residues.name = first().map(|i| structure.residue.get(i)).collect();
+    residues.number = first().map(|i| structure.residue_number[i]).collect();
+    residues.insertion_code = first().map(|i| InsertionCode(structure.insertion_code[i])).collect();
+    residues.chain = first().map(|i| structure.chain.get(i)).collect();
+    residues.model = first().map(|i| structure.model[i]).collect();
+    residues.kind = first().map(|i| structure.kind[i].name()).collect();
     let mut elements: Vec<&'static str> = Vec::new();
     // Index of each atomic number in `elements`.
     let mut element_at = [u8::MAX; 1 + element::SYMBOLS.len()];
-    let mut atoms = AtomColumns::default();
-    let mut residues = ResidueColumns::default();
-    for row in 0..count {
-        let i = index(row);
+    let mut element = |i: usize| {
         let number = usize::from(structure.element[i]);
         if element_at[number] == u8::MAX {
             element_at[number] = u8::try_from(elements.len()).unwrap_or(0);
             elements.push(if number == 0 { "?" } else { element::SYMBOLS[number - 1] });
         }
-        atoms.name.push(structure.name.id(i));
-        atoms.element.push(element_at[number]);
-        if row > 0 && !copies.contains(&row) && structure.same_residue(index(row - 1), i) {
-            continue;
-        }
-        residues.first.push(row);
-        residues.name.push(structure.residue.get(i).to_owned());
-        residues.number.push(structure.residue_number[i]);
-        let code = structure.insertion_code[i];
-        residues.insertion_code.push(if code == 0 { String::new() } else { char::from(code).to_string() });
-        residues.chain.push(structure.chain.get(i).to_owned());
-        residues.model.push(structure.model[i]);
-        residues.kind.push(structure.kind[i].name());
-    }
+        element_at[number]
+    };
+    memory.grow((size_of::<u32>() + size_of::<u8>()) as u64 * count as u64)?;
+    let mut atoms = AtomColumns {
+        name: (0..count).map(|row| structure.name.id(index(row))).collect(),
+        element: (0..count).map(|row| element(index(row))).collect(),
+        ..AtomColumns::default()
+    };
     if let Some(selected) = selected {
+        memory.grow(6 * size_of::<f64>() as u64 * count as u64)?;
         let [x, y, z] = positions(structure, selected);
-        atoms.index = Some(selected.atoms.clone());
+        atoms.index = Some(&selected.atoms);
         (atoms.x, atoms.y, atoms.z) = (Some(x), Some(y), Some(z));
     }
-    AtomsDocument { count, names: structure.name.texts().map(str::to_owned).collect(), elements, atoms, residues }
+    memory.grow((size_of::<&str>() * structure.name.texts().len()) as u64)?;
+    Ok(AtomsDocument { count, names: structure.name.texts().collect(), elements, atoms, residues })
 }
 
 /// Returns the coordinates of the selected atoms, with their copies, in Å, rounded to 0.001 Å.
@@ -237,14 +263,36 @@ fn positions(structure: &Structure, selected: &Selected) -> [Vec<f64>; 3] {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
+    use crate::jobs::Budget;
     use crate::structure::{ReadLimits, Selection};
+    use crate::surface::Control;
+
+    #[test]
+    fn columns_are_charged_before_they_are_built() {
+        let structure = structure::read(include_bytes!("../../samples/4pti.pdb"), &ReadLimits::default()).unwrap();
+        let listed = |limit: u64| {
+            let memory: Arc<dyn MemoryMeter> = Arc::new(Budget::new(limit).reservation());
+            let columns = Reservation::new(&memory);
+            let listed = document(&structure, None, &columns)?;
+            let rows = (5 * listed.count + 65 * listed.residues.first.len()) as u64;
+            Ok::<_, OutOfMemory>((rows, memory.budget().unwrap()[1]))
+        };
+        let (rows, held) = listed(1 << 20).unwrap();
+        assert!((rows..rows + 4096).contains(&held), "{rows} {held}");
+        for limit in [100, rows / 2, held - 1] {
+            assert!(matches!(listed(limit), Err(OutOfMemory::Limit { .. })), "{limit}");
+        }
+    }
 
     #[test]
     fn rows_are_those_of_the_file() {
         let text = include_bytes!("../../samples/4pti.pdb");
         let structure = structure::read(text, &ReadLimits::default()).unwrap();
-        let listed = document(&structure, None);
+        let memory = Reservation::new(&Control::default().memory);
+        let listed = document(&structure, None, &memory).unwrap();
         let text = std::str::from_utf8(text).unwrap();
         let lines: Vec<&str> = text.lines().filter(|l| l.starts_with("ATOM") || l.starts_with("HETATM")).collect();
         assert_eq!(
@@ -266,9 +314,6 @@ mod tests {
         }
         assert_eq!(listed.residues.kind.first(), Some(&"protein"));
         assert_eq!(listed.residues.kind.last(), Some(&"water"));
-        // The charged memory suffices.
-        let bytes = serde_json::to_vec(&listed).unwrap().len() as u64;
-        assert!(bytes < BYTES_PER_ATOM * listed.count as u64, "{bytes}");
     }
 
     #[test]
@@ -277,20 +322,20 @@ mod tests {
         let packed = std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/structures/1pfe.cif.gz")).unwrap();
         let structure = structure::read(&packed, &ReadLimits::default()).unwrap();
         let mut selection = Selection { atoms: "ligand".parse().unwrap(), ..Selection::default() };
-        let one = document(&structure, Some(&structure::select(&structure, &selection).unwrap()));
+        let memory = Reservation::new(&Control::default().memory);
+        let unit = structure::select(&structure, &selection).unwrap();
+        let one = document(&structure, Some(&unit), &memory).unwrap();
         selection.assembly = Some("1".to_owned());
-        let two = document(&structure, Some(&structure::select(&structure, &selection).unwrap()));
+        let assembly = structure::select(&structure, &selection).unwrap();
+        let two = document(&structure, Some(&assembly), &memory).unwrap();
         // Two quinoxaline-2-carboxylic acids with 12 atoms each; the assembly has two copies.
         assert_eq!((one.count, two.count), (24, 48));
-        assert_eq!(
-            (&one.residues.name[..], &one.residues.first[..]),
-            (&["QUI".to_owned(), "QUI".to_owned()][..], &[0, 12][..])
-        );
+        assert_eq!((&one.residues.name[..], &one.residues.first[..]), (&["QUI", "QUI"][..], &[0, 12][..]));
         assert_eq!(two.residues.first, [0, 12, 24, 36]);
-        let placed = |listed: &AtomsDocument| -> Vec<(u32, [f64; 3])> {
+        let placed = |listed: &AtomsDocument<'_>| -> Vec<(u32, [f64; 3])> {
             let AtomColumns { index, x, y, z, .. } = &listed.atoms;
             let [x, y, z] = [x, y, z].map(|axis| axis.clone().unwrap());
-            index.iter().flatten().enumerate().map(|(row, &i)| (i, [x[row], y[row], z[row]])).collect()
+            index.unwrap().iter().enumerate().map(|(row, &i)| (i, [x[row], y[row], z[row]])).collect()
         };
         let (unit, assembly) = (placed(&one), placed(&two));
         assert_eq!(assembly[..24], unit);
@@ -303,7 +348,5 @@ mod tests {
             let error = expected.iter().zip(moved).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
             assert!(error < 2e-3 && *copied == index, "{row}: {error}");
         }
-        let bytes = serde_json::to_vec(&two).unwrap().len() as u64;
-        assert!(bytes < (BYTES_PER_ATOM + BYTES_PER_POSITION) * two.count as u64 + 1000, "{bytes}");
     }
 }

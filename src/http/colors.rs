@@ -9,8 +9,10 @@ use axum::http::{Response as HttpResponse, StatusCode};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 
+use super::atoms::SELECTED_BYTES;
 use super::color_parameters::{self, expected};
 use super::delivery;
+use super::document;
 use super::guard::Caller;
 use super::openapi::meshes::AtomColorsResponse;
 use super::openapi::parameters::{ColorParameters, ConditionHeaders, EntryPath, RangeHeaders, StructurePath};
@@ -29,8 +31,6 @@ use crate::surface::Control;
 
 /// Header with scheme, palette, range and legend.
 pub(super) const LEGEND: HeaderName = HeaderName::from_static("molmesh-colors");
-/// Bytes per colour.
-const COLOR_BYTES: u64 = 4;
 /// Largest number of entries of the legend, which must fit into a header.
 const MAX_ENTRIES: usize = 24;
 
@@ -122,19 +122,24 @@ async fn list(
     coloring: Coloring,
 ) -> Result<(Bytes, HeaderValue), Problem> {
     let max_atoms = app.config.limits.job().read.max_atoms;
-    let list = move |structure: &Structure, limits: &ReadLimits, control: &Control<'_>, memory: &MemoryReservation| {
+    let list = move |structure: &Structure, limits: &ReadLimits, control: &Control<'_>, memory: MemoryReservation| {
         // The list has the atoms of the file. Copies in an assembly affect only the range of numbers.
         let limits = ReadLimits { max_atoms, ..*limits };
+        // The selected atoms, and copies of the names of chains or entities.
+        let names = structure.chain.texts().chain(structure.entities.iter().map(String::as_str));
+        let names: u64 = names.map(|name| 64 + name.len() as u64).sum();
+        control.memory.grow(SELECTED_BYTES * structure.len() as u64 + names)?;
         let selected = structure::select_with(structure, &job.selection, &limits, control)?.atoms;
-        memory.grow(size_of::<u32>() as u64 * selected.len() as u64)?;
         let colors = AtomColors::new(structure, &selected, &coloring).map_err(not_colorable)?;
-        let list: Vec<u8> = (0..structure.len()).flat_map(|i| colors.of(i)).collect();
+        let list = document::collect(memory, control, |out| {
+            (0..structure.len()).try_for_each(|i| out.write_all(&colors.of(i)))
+        })?;
         let mut report = colors.report(&selected);
         report.legend.truncate(MAX_ENTRIES);
         let legend = serde_json::to_string(&report).map_err(Problem::internal)?;
         Ok((list, HeaderValue::from_str(&ascii(&legend)).map_err(Problem::internal)?))
     };
-    loaded.list_atoms(app, caller, delivery, COLOR_BYTES, list).await
+    loaded.list_atoms(app, caller, delivery, list).await
 }
 
 fn not_colorable(error: ColorError) -> Problem {

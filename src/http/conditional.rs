@@ -11,6 +11,11 @@ pub(super) fn is_unchanged(headers: &HeaderMap, etag: &HeaderValue) -> bool {
     tags(headers, IF_NONE_MATCH).any(|tag| tag == "*" || tag.strip_prefix("W/").unwrap_or(tag).as_bytes() == etag)
 }
 
+/// Returns true if the client names any current file (`If-None-Match: *`) instead of a tag.
+pub(super) fn names_any(headers: &HeaderMap) -> bool {
+    tags(headers, IF_NONE_MATCH).any(|tag| tag == "*")
+}
+
 /// Fails if the client expects a file with another `etag`, by strong comparison.
 pub(super) fn check_match(headers: &HeaderMap, etag: &HeaderValue) -> Result<(), Problem> {
     if !headers.contains_key(IF_MATCH) || tags(headers, IF_MATCH).any(|tag| tag == "*" || tag.as_bytes() == etag) {

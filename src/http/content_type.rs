@@ -85,7 +85,8 @@ impl DeclaredType {
     }
 }
 
-fn contradiction(declared: &str, found: &str) -> Problem {
+/// Returns the problem of a body whose bytes are not of the declared type.
+pub(super) fn contradiction(declared: &str, found: &str) -> Problem {
     Problem::new(
         ProblemType::UnsupportedMediaType,
         format!("the body is declared as {declared}, but its bytes are {found}; omit `Content-Type` or correct it"),

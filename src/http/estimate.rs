@@ -2,7 +2,6 @@
 //! of `POST /v1/meshes`.
 
 use std::sync::Arc;
-use std::time::Instant;
 
 use axum::Json;
 use axum::body::Body;
@@ -121,17 +120,13 @@ pub(super) async fn create(
     let Loaded { input, digest, reservation } = source.find(&app, &caller, &digest, None).await?;
     drop(source);
     let seconds = app.pool.expected(&input, &job);
-    let reading = app.read(caller.client, (reservation, delivery), {
-        let (app, job) = (Arc::clone(&app), job.clone());
+    let reading = app.read(&caller, (reservation, delivery), {
+        let (app, job, namespace) = (Arc::clone(&app), job.clone(), caller.namespace);
         move |control| {
-            let start = Instant::now();
             let choice = Choice { backend: app.pool.backend().as_ref(), reason: app.pool.reason() };
             let limits = app.config.limits.job();
-            let read =
-                |control: &Control<'_>| app.structures().get(caller.namespace, digest, &input, &limits.read, control);
-            let estimate = pipeline::estimate(read, &job, &limits, &choice, control);
-            app.charge(&caller, start.elapsed());
-            estimate
+            let read = |control: &Control<'_>| app.structures().get(namespace, digest, &input, &limits.read, control);
+            pipeline::estimate(read, &job, &limits, &choice, control)
         }
     });
     let estimate = reading.await?.map_err(|error| declared.explain(error.into()))?;

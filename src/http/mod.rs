@@ -34,6 +34,8 @@ mod state;
 
 mod guard;
 
+mod reading;
+
 // Requests: preferences, bodies, structures, parameters.
 mod atom_parameters;
 mod body_hasher;
@@ -50,6 +52,7 @@ mod parsed_request;
 mod stream;
 
 mod delivery;
+mod document;
 
 // Resources. `openapi` holds the parts of their description that they share.
 mod openapi;

@@ -14,7 +14,7 @@ use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::scopes;
 use super::state::Shared;
-use crate::access::{Access, SignatureCheck, authority};
+use crate::access::{Access, SignatureCheck, Sites, authority};
 
 /// Fetch metadata that browsers send to trustworthy addresses.
 const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
@@ -32,14 +32,20 @@ pub(super) async fn check(State(app): State<Shared>, request: Request, next: Nex
     }
 }
 
-fn admit(access: &Access, request: &Request) -> Result<(), Problem> {
+/// Returns the host that the request names. Fails if the listener does not answer to it.
+pub(super) fn check_host(sites: &Sites, request: &Request) -> Result<Option<Authority>, Problem> {
     let host = host(request)?;
     if let Some(host) = &host
-        && !access.sites().answers(host.as_str())
+        && !sites.answers(host.as_str())
     {
         let detail = format!("this service does not answer to `{host}`; the operator can add it to server.hosts");
         return Err(Problem::new(ProblemType::WrongHost, detail));
     }
+    Ok(host)
+}
+
+fn admit(access: &Access, request: &Request) -> Result<(), Problem> {
+    let host = check_host(access.sites(), request)?;
     if is_foreign(access, request, host.as_ref()) && !has_key(access, request) && !opens_page(request) {
         let detail = "a page of another origin made this request, and the service does not allow that origin";
         return Err(Problem::new(ProblemType::CrossSite, detail));

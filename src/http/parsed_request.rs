@@ -6,7 +6,7 @@ use axum::extract::rejection::QueryRejection;
 use axum::http::header::HeaderMap;
 use bytes::Bytes;
 
-use super::content_type::DeclaredType;
+use super::content_type::{DeclaredType, contradiction};
 use super::form::UploadedFile;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -17,6 +17,7 @@ use crate::formats::Format;
 use crate::pipeline::MapFile;
 use crate::pipeline::params::{self, Request};
 use crate::store::Digest;
+use crate::structure::detect_format;
 
 /// Size of a JSON document, bytes, up to which it is parsed on the async runtime: a few microseconds.
 const MAX_INLINE_JSON: usize = 4096;
@@ -68,9 +69,9 @@ impl ParsedRequest {
         let (source, fields, declared, map) = if is_json {
             let json = upload::receive_json(app, headers, body).await?;
             let (source, fields) = if json.len() <= MAX_INLINE_JSON {
-                named(&json)?
+                parse_json(&json)?
             } else {
-                tokio::task::spawn_blocking(move || named(&json)).await.map_err(Problem::internal)??
+                tokio::task::spawn_blocking(move || parse_json(&json)).await.map_err(Problem::internal)??
             };
             // The type is that of the document, not that of the structure.
             (source, fields, DeclaredType::Neutral, None)
@@ -148,6 +149,14 @@ fn bad_digest(text: &str) -> Problem {
     .with("parameter", "structure")
     .with("value", shown)
     .with("expected", expected)
+}
+
+/// Parses a body that is declared as JSON. A structure file under that type is a contradiction.
+fn parse_json(bytes: &[u8]) -> Result<(StructureSource, Vec<(String, String)>), Problem> {
+    named(bytes).map_err(|problem| match detect_format(bytes) {
+        Ok(Some(format)) => contradiction("application/json", format.name()),
+        _ => problem,
+    })
 }
 
 /// Parses `{"pdb_id": …}` or `{"structure": …}`; the other members are parameters.

@@ -71,14 +71,18 @@ pub(super) async fn show(
     let (key, format) = parse(&file, caller.namespace).ok_or_else(|| no_such_result(&file))?;
     let etag = delivery::etag(&key);
     let expected = conditional::check_match(&headers, &etag);
-    if expected.is_ok() && conditional::is_unchanged(&headers, &etag) {
-        return Ok(
-            (StatusCode::NOT_MODIFIED, [(header::ETAG, etag), (header::CACHE_CONTROL, IMMUTABLE)]).into_response()
-        );
+    let is_unchanged = expected.is_ok() && conditional::is_unchanged(&headers, &etag);
+    let not_modified =
+        || (StatusCode::NOT_MODIFIED, [(header::ETAG, etag), (header::CACHE_CONTROL, IMMUTABLE)]).into_response();
+    // A client that names the tag of a result has it, even if it is no longer stored.
+    if is_unchanged && !conditional::names_any(&headers) {
+        return Ok(not_modified());
     }
     wait_for_save(&app, &key).await;
-    let found = stored(&app, &caller, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))?;
-    expected.map(|()| found)
+    // `If-None-Match` comes before `Range`.
+    let (method, sent) = if is_unchanged { (Method::HEAD, HeaderMap::new()) } else { (method, headers) };
+    let found = stored(&app, &caller, &key, format, &method, &sent).await?.ok_or_else(|| no_such_result(&file))?;
+    expected.map(|()| if is_unchanged { not_modified() } else { found })
 }
 
 /// Get the report of a stored mesh

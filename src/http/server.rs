@@ -18,7 +18,7 @@ use super::stop::{self, Stop};
 use super::store_health::StoreHealth;
 use super::wind_down::{Stopped, wind_down};
 use super::{accept, capabilities, key_reload, metrics, router};
-use crate::access::{Access, AccessError};
+use crate::access::{Access, AccessError, Sites};
 use crate::archive::Archive;
 use crate::client_shares::ClientShares;
 use crate::config::{Config, Role};
@@ -227,9 +227,9 @@ impl Server {
         let serving = accept::serve(self.listener, router, Arc::clone(&config), budget, stopped.clone());
         let serving = tokio::spawn(serving);
         let mut recorder = None;
-        if let Some((listener, _)) = self.metrics_listener {
+        if let Some((listener, address)) = self.metrics_listener {
             let of_process = telemetry::recorder()?;
-            let router = metrics::router(of_process.clone());
+            let router = metrics::router(of_process.clone(), Sites::for_metrics(&self.app.config, address));
             background.spawn(accept::serve(listener, router, config, Budget::unlimited(), stopped).map(drop));
             recorder = Some(of_process);
         }

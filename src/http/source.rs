@@ -54,29 +54,24 @@ impl Loaded {
         Self { input: Input::File(bytes), digest, reservation: Arc::new(reservation) }
     }
 
-    /// Reads the structure and lists its atoms by `list`, on a blocking thread. The list counts towards the memory
-    /// budget until it is sent: with `bytes_per_atom` of the file, and with what `list` adds to the reservation.
-    /// `delivery` is released when the work has stopped.
+    /// Reads the structure and lists its atoms by `list`, on a blocking thread. `list` gets the reservation of its
+    /// list, which counts towards the memory budget until the list is sent. `delivery` is released when the work has
+    /// stopped.
     pub(super) async fn list_atoms<T: Send + 'static>(
         self,
         app: &Shared,
         caller: &Caller,
         delivery: Delivery,
-        bytes_per_atom: u64,
-        list: impl FnOnce(&Structure, &ReadLimits, &Control<'_>, &MemoryReservation) -> Result<(Vec<u8>, T), Problem>
-        + Send
-        + 'static,
-    ) -> Result<(Bytes, T), Problem> {
+        list: impl FnOnce(&Structure, &ReadLimits, &Control<'_>, MemoryReservation) -> Result<T, Problem> + Send + 'static,
+    ) -> Result<T, Problem> {
         let mut limits = app.config.limits.job().read;
         limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
         let reservation = app.pool.settings().budget.reservation();
         let (structures, namespace) = (app.structures(), caller.namespace);
         let Self { input, digest, reservation: file } = self;
-        let listing = app.read(caller.client, (file, delivery), move |control| {
+        let listing = app.read(caller, (file, delivery), move |control| {
             let structure = structures.get(namespace, digest, &input, &limits, control)?;
-            reservation.grow(bytes_per_atom * structure.len() as u64)?;
-            let (bytes, rest) = list(&structure, &limits, control, &reservation)?;
-            Ok((reservation.attach(bytes), rest))
+            list(&structure, &limits, control, reservation)
         });
         listing.await?
     }
@@ -174,6 +169,7 @@ impl StructureSource {
         if conditional::is_unchanged(headers, &validators[0].1) {
             return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
         }
+        app.admit_work(caller)?;
         let delivery = app.delivery(caller.client)?;
         let loaded = self.find(app, caller, &digest, job).await?;
         let validators = self::validators(&loaded.digest, variant)?;

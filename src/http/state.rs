@@ -1,14 +1,11 @@
 //! State of the service that the handlers share.
 
 use std::sync::{Arc, Mutex, OnceLock};
-use std::time::Duration;
 
 use axum::http::HeaderMap;
 use bytes::Bytes;
 use quick_cache::sync::Cache;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
-use tokio::task::JoinHandle;
-use tokio::time::{Instant, timeout_at};
 
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -23,17 +20,8 @@ use crate::pipeline::Job;
 use crate::reader_line::ReaderLine;
 use crate::single_flight::SingleFlight;
 use crate::store::{Namespace, Secret, Store};
-use crate::surface::{CancelToken, Control, FoundDevice, MemoryMeter as _};
+use crate::surface::{FoundDevice, MemoryMeter as _};
 use crate::telemetry::Tracer;
-
-/// Cancels the work when its request ends.
-struct CancelOnDrop(CancelToken);
-
-impl Drop for CancelOnDrop {
-    fn drop(&mut self) {
-        self.0.cancel();
-    }
-}
 
 /// State of the service.
 pub(super) struct App {
@@ -97,38 +85,6 @@ impl App {
         Arc::clone(&self.pool.settings().structures)
     }
 
-    /// Runs `work`, which reads a structure, on a blocking thread. Waits for the share of the client and for a permit
-    /// first, at most for half of `jobs.deadline_ms`, which limits all together. A request that would probably wait
-    /// longer is refused at once. If the request ends earlier, the work is cancelled; permits,
-    /// memory and `held` are released when it has stopped.
-    pub(super) async fn read<T: Send + 'static>(
-        &self,
-        client: Client,
-        held: impl Send + 'static,
-        work: impl FnOnce(&Control<'_>) -> T + Send + 'static,
-    ) -> Result<T, Failure> {
-        let limit = Duration::from_millis(self.config.jobs.deadline_ms);
-        let end = Instant::now() + limit;
-        let late = |_elapsed| Failure::Deadline { limit };
-        let panicked = |message: String| Failure::Panicked { message };
-        let waited = || Failure::Waited { limit, wait: self.reader_line.estimated_wait() };
-        let waiting = self.reader_line.enter(limit / 2).ok_or_else(waited)?;
-        let begin_by = Instant::now() + limit / 2;
-        // In this order, a client that waits for its share takes no permit of others.
-        let share = self.reader_shares.wait(client.0, begin_by).await.map_err(|_full| waited())?;
-        let permit = timeout_at(begin_by, Arc::clone(&self.readers).acquire_owned()).await;
-        let permit = permit.map_err(|_elapsed| waited())?.map_err(|closed| panicked(closed.to_string()))?;
-        let reading_time = waiting.begin();
-        let stop = CancelOnDrop(CancelToken::default());
-        let (cancel, reservation) = (stop.0.clone(), self.pool.settings().budget.reservation());
-        let reading = spawn_holding((held, permit, share, reading_time), move || {
-            let control =
-                Control { cancel, deadline: Some(end.into_std()), memory: Arc::new(reservation), ..Control::default() };
-            work(&control)
-        });
-        timeout_at(end, reading).await.map_err(late)?.map_err(|error| panicked(error.to_string()))
-    }
-
     /// Takes a delivery slot for a request for a mesh.
     pub(super) fn delivery(&self, client: Client) -> Result<Delivery, Problem> {
         let permit = Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {
@@ -144,18 +100,6 @@ impl App {
     }
 }
 
-/// Runs `work` on a blocking thread. The thread drops `held` after the work, even if the caller has stopped waiting.
-fn spawn_holding<T: Send + 'static>(
-    held: impl Send + 'static,
-    work: impl FnOnce() -> T + Send + 'static,
-) -> JoinHandle<T> {
-    tokio::task::spawn_blocking(move || {
-        let value = work();
-        drop(held);
-        value
-    })
-}
-
 /// Delivery slot: slot of a request in `jobs.deliveries`, and in the share of its client.
 pub(super) struct Delivery {
     _permit: OwnedSemaphorePermit,
@@ -164,22 +108,3 @@ pub(super) struct Delivery {
 
 /// State as handlers extract it.
 pub(super) type Shared = Arc<App>;
-
-#[cfg(test)]
-mod tests {
-    use std::sync::mpsc;
-
-    use super::*;
-
-    #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
-    async fn a_request_that_ends_early_releases_nothing_before_its_work_has_stopped() {
-        let (go, wait) = mpsc::sync_channel::<()>(1);
-        let permits = Arc::new(Semaphore::new(1));
-        let held = Arc::clone(&permits).acquire_owned().await.unwrap();
-        let reading = spawn_holding(held, move || wait.recv().is_ok());
-        assert!(tokio::time::timeout(Duration::from_millis(50), reading).await.is_err(), "the request has left");
-        assert_eq!(permits.available_permits(), 0);
-        go.send(()).unwrap();
-        drop(tokio::time::timeout(Duration::from_mins(1), permits.acquire()).await.unwrap().unwrap());
-    }
-}

@@ -244,7 +244,7 @@ async fn summarize(
     let limits = app.config.limits.job().read;
     let (structures, namespace) = (app.structures(), caller.namespace);
     let Loaded { input, digest, reservation } = loaded;
-    let parsing = app.read(caller.client, (reservation, delivery), move |control| {
+    let parsing = app.read(caller, (reservation, delivery), move |control| {
         let kept = structures.get(namespace, digest, &input, &limits, control)?;
         Ok(summary(&digest, input.file_bytes(), &kept, limits.max_copies))
     });

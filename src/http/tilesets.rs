@@ -4,7 +4,6 @@
 //! A tileset has no state of its own: its URL and those of its tiles name the structure and all parameters.
 
 use std::sync::Arc;
-use std::time::Instant;
 
 use axum::body::Body;
 use axum::extract::{FromRequestParts, Query};
@@ -223,14 +222,11 @@ impl TilesetRequest {
         // Finds the tileset in the cache, as jobs on its tiles do.
         let of_tile = Job { tile: Some(TileAddress::ROOT), ..job.clone() };
         let made = async |loaded: Loaded, delivery: Delivery| {
-            app.admit_work(&caller)?;
             let Loaded { input, digest, reservation } = loaded;
-            let (shared, payer, key) = (Arc::clone(&app), caller.clone(), (caller.namespace, digest));
-            let made = app.read(caller.client, (reservation, delivery), move |control| {
-                let (start, limits) = (Instant::now(), shared.config.limits.job().read);
-                let written = write(&Preparation { app: &shared, key, input: &input, job: &job, limits, control });
-                shared.charge(&payer, start.elapsed());
-                written
+            let (shared, key) = (Arc::clone(&app), (caller.namespace, digest));
+            let made = app.read(&caller, (reservation, delivery), move |control| {
+                let limits = shared.config.limits.job().read;
+                write(&Preparation { app: &shared, key, input: &input, job: &job, limits, control })
             });
             Ok(([(header::CONTENT_TYPE, media_type)], Body::from(made.await??)).into_response())
         };

@@ -16,8 +16,17 @@ use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::state::App;
 use crate::jobs::MemoryReservation;
+use crate::pipeline::JobError;
 use crate::store::Digest;
+use crate::structure::{SourceFormat, detect_format};
 use crate::surface::MemoryMeter as _;
+
+/// Advice if a body that is declared as JSON is too large.
+const NOT_JSON: &str = "a structure file must not be declared as application/json";
+/// Length from which the start of a form body must have a line end, bytes.
+const MAX_LINE_BYTES: usize = 160;
+/// Length of the start of a body in which line ends are sought, bytes.
+const LINE_SAMPLE: usize = 64 << 10;
 
 /// Returns true if the body is declared as a form.
 pub(super) fn is_multipart(headers: &HeaderMap) -> bool {
@@ -54,18 +63,41 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
         return Err(bad_encoding(&format!("the body is declared as {name}, but is not {name} data")));
     }
     upload.declared.check_bytes(&upload.bytes)?;
+    // A job on a file of an unknown format is not accepted.
+    let format = detect_format(&upload.bytes);
+    if !matches!(format, Ok(Some(SourceFormat::BinaryCif) | None)) {
+        check_lines(headers, &upload.bytes)?;
+    }
+    if let Some(format) = format.map_err(|error| upload.declared.explain(JobError::from(error).into()))? {
+        upload.declared.check_format(format.name())?;
+    }
     Ok(upload)
+}
+
+/// Rejects a text without line ends that curl has sent with `-d`, which removes them.
+fn check_lines(headers: &HeaderMap, bytes: &[u8]) -> Result<(), Problem> {
+    let essence = text(headers, &CONTENT_TYPE).and_then(|t| t.split(';').next()).unwrap_or_default();
+    let is_form = essence.trim().eq_ignore_ascii_case("application/x-www-form-urlencoded");
+    if is_form
+        && bytes.len() > MAX_LINE_BYTES
+        && memchr::memchr2(b'\n', b'\r', &bytes[..bytes.len().min(LINE_SAMPLE)]).is_none()
+    {
+        let detail = "the file has no line ends: curl removes them with `-d`; use `--data-binary`";
+        return Err(Problem::new(ProblemType::UnreadableStructure, detail));
+    }
+    Ok(())
 }
 
 /// Receives a JSON document.
 pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> Result<Bytes, Problem> {
     let limit = Limit { key: "limits.json_bytes", max: app.config.limits.json_bytes };
-    let announced = announced(headers, limit)?;
+    let announced = announced(headers, limit).map_err(|problem| problem.advise(NOT_JSON))?;
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
     let reservation = app.uploads.reservation();
-    let (bytes, _digest) = in_time(app, collect(body, announced, limit, &reservation)).await?;
+    let received = in_time(app, collect(body, announced, limit, &reservation)).await;
+    let (bytes, _digest) = received.map_err(|problem| problem.advise(NOT_JSON))?;
     // The document is charged until it has been parsed.
     Ok(reservation.attach(bytes))
 }

@@ -12,13 +12,17 @@ use self::table::Row;
 use super::load::{SPHERE_BYTES, load};
 use super::{Job, JobError, LeftOutReport, StageClock};
 use crate::structure::{ReadLimits, Selected, Structure, select};
-use crate::surface::{AreaParts, Control, ExactMeasures, Spheres, SurfaceError, SurfaceKind, SurfaceLimits};
+use crate::surface::{
+    AreaParts, Control, ExactMeasures, Reservation, Spheres, SurfaceError, SurfaceKind, SurfaceLimits,
+};
 
 /// Description of the values of `interface`.
 pub(crate) const EXPECTED: &str = "the chains of both sides, separated by a comma, such as A,B; several chains of a side are joined by a slash: H/L,A";
 
+/// Largest number of chains in a report.
+const MAX_CHAINS: usize = 1000;
 /// Number of atoms between two checks for cancellation.
-const ATOMS_PER_CHECK: u32 = 1 << 16;
+const ATOMS_PER_CHECK: usize = 1 << 16;
 
 /// Two sets of chains without a common chain.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -60,7 +64,10 @@ pub struct ExactReport {
     /// Parts of this area; `surface=ses` only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub parts: Option<AreaPartsReport>,
-    /// Areas of the chains, in the order of their first atoms.
+    /// Number of chains.
+    pub chain_count: u64,
+    /// Areas of the chains, in the order of their first atoms, at most 1,000. `…/areas?by=chain` and
+    /// `molmesh areas --by chain` list all.
     pub chains: Vec<ChainArea>,
     /// Surface area buried between two sets of chains; absent without `interface`.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -217,6 +224,7 @@ fn whole(
         area: round(parts.total()),
         volume: round(whole.volume),
         parts: has_parts.then(|| AreaPartsReport::new(parts)),
+        chain_count: 0,
         chains: Vec::new(),
         interface: None,
     };
@@ -227,7 +235,10 @@ fn whole(
         area: round(parts.total()),
         parts: has_parts.then(|| AreaPartsReport::new(parts)),
     };
-    report.chains = areas.rows(structure, AreaLevel::Chain).into_iter().map(chain).collect();
+    let memory = Reservation::new(&control.memory);
+    let rows = areas.rows(structure, AreaLevel::Chain, control, &memory)?;
+    report.chain_count = rows.len() as u64;
+    report.chains = rows.into_iter().take(MAX_CHAINS).map(chain).collect();
     Ok((report, areas))
 }
 
@@ -244,7 +255,7 @@ impl Interface {
         let mut is_meshed = vec![false; sides[0].len()];
         let mut rows = [Vec::new(), Vec::new()];
         for (row, &atom) in (0_u32..).zip(&selected.atoms) {
-            if row.is_multiple_of(ATOMS_PER_CHECK) {
+            if (row as usize).is_multiple_of(ATOMS_PER_CHECK) {
                 control.check()?;
             }
             let chain = structure.chain.id(atom as usize) as usize;

@@ -30,7 +30,7 @@ const S3_PART: usize = 8 << 20;
 /// Size of a write to a file, bytes: large enough to make waking a thread worthwhile.
 const FILE_PART: usize = 1 << 20;
 /// Folder of the objects of [`Backend::check`].
-const CHECK: &str = "check";
+pub(super) const CHECK: &str = "check";
 
 /// URL prefix of a folder.
 pub(super) const FOLDER_URL: &str = "file://";
@@ -254,26 +254,6 @@ impl Backend {
             listed.try_filter_map(|meta| std::future::ready(Ok(parsed(meta)))).try_collect().await.map_err(fail)?;
         names.sort_by(|(a, _), (b, _)| a.cmp(b));
         Ok(names)
-    }
-
-    /// Writes, reads and removes a small object.
-    pub(super) async fn check(&self) -> Result<(), StoreError> {
-        self.check_folder().await?;
-        // Nodes that share a store may have the same process id.
-        let file = secret::unique().map_err(|e| self.fail("check", CHECK, &e))?;
-        let path = Path::from_iter([CHECK, &file]);
-        let fail = |e: object_store::Error| self.fail("check", path.as_ref(), &e);
-        let written = Bytes::from(file.into_bytes());
-        let answered = async {
-            self.objects.put(&path, written.clone().into()).await?;
-            let read = self.objects.get(&path).await?.bytes().await?;
-            self.objects.delete(&path).await.map(|()| read)
-        };
-        let read = self.timed(answered).await.map_err(fail)?;
-        if read == written {
-            return Ok(());
-        }
-        Err(self.fail("check", path.as_ref(), &io::Error::other("the bytes read differ from the bytes written")))
     }
 
     /// Reads the secret of the store, or creates it.

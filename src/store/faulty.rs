@@ -13,12 +13,12 @@ use object_store::local::LocalFileSystem;
 use object_store::path::Path;
 use object_store::{
     CopyOptions, GetOptions, GetResult, GetResultPayload, ListResult, MultipartUpload, ObjectMeta, ObjectStore,
-    PutMultipartOptions, PutOptions, PutPayload, PutResult, Result, UploadPart,
+    PutMode, PutMultipartOptions, PutOptions, PutPayload, PutResult, Result, UploadPart,
 };
 use tempfile::TempDir;
 
 use super::backend::Backend;
-use super::{Folder, Store};
+use super::{Folder, Store, StoreError};
 use crate::config::StoreConfig;
 
 /// Injected faults.
@@ -41,6 +41,8 @@ pub(crate) struct Faults {
     operations: AtomicUsize,
     /// Number of operations that failed because of `error_every`.
     pub(crate) errors: AtomicUsize,
+    /// Writes replace objects that exist, even if they must not.
+    pub(crate) replaces: AtomicBool,
     /// Reads return half of the bytes.
     pub(crate) truncate: AtomicBool,
     /// Number of reads of job records.
@@ -157,6 +159,8 @@ impl ObjectStore for Faulty {
         if at.as_ref().starts_with(Folder::Results.as_str()) {
             self.faults.result_writes.fetch_add(1, Ordering::SeqCst);
         }
+        let replaces = self.faults.replaces.load(Ordering::SeqCst);
+        let options = if replaces { PutMode::Overwrite.into() } else { options };
         self.files.put_opts(at, payload, options).await
     }
 
@@ -243,4 +247,12 @@ pub(crate) async fn open_faulty(dir: &std::path::Path, config: StoreConfig) -> (
     let objects = Arc::new(Faulty { files, faults: Arc::clone(&faults) });
     let store = Store::open_backend(Backend::over(objects, root, &config), &config, false).await.unwrap();
     (faults, store)
+}
+
+/// Opens a store in `dir` that replaces objects although a write must only create them.
+pub(crate) async fn open_replacing(dir: &std::path::Path) -> Result<Store, StoreError> {
+    let (config, faults) = (StoreConfig::default(), Faults { replaces: AtomicBool::new(true), ..Faults::default() });
+    let files = LocalFileSystem::new_with_prefix(dir).unwrap();
+    let objects = Arc::new(Faulty { files, faults: Arc::new(faults) });
+    Store::open_backend(Backend::over(objects, dir.to_owned(), &config), &config, false).await
 }

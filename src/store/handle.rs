@@ -81,6 +81,7 @@ impl Store {
         is_shared: bool,
     ) -> Result<Self, StoreError> {
         backend.check().await.map_err(|e| backend.open_error(&e))?;
+        backend.check_creation().await.map_err(|e| backend.open_error(&e))?;
         let clock = Clock::start();
         let now = clock.now();
         // Not fatal: credentials may permit uploads without permitting their listing.

@@ -10,6 +10,7 @@
 //! for space under a lock. Reads take no lock. Their results enter index and cache only if the name has not changed.
 
 mod backend;
+mod check;
 mod clock;
 mod digest;
 mod error;

@@ -35,6 +35,9 @@ fn split(url: &str) -> Option<(&str, Path)> {
     Some((bucket, Path::parse(prefix).ok()?))
 }
 
+/// Values of environment variables that mean true.
+const TRUE: [&str; 5] = ["1", "true", "on", "yes", "y"];
+
 /// Returns the object store below the prefix, and the bucket. Sends nothing yet.
 pub(super) fn connect(config: &StoreConfig, url: &str) -> Result<(Arc<dyn ObjectStore>, Bucket), String> {
     let (name, prefix) = split(url).ok_or("expected s3://bucket or s3://bucket/prefix")?;
@@ -58,13 +61,22 @@ pub(super) fn connect(config: &StoreConfig, url: &str) -> Result<(Arc<dyn Object
         builder = builder.with_region(region);
     }
     if let Some(endpoint) = &config.endpoint {
-        builder = builder.with_endpoint(endpoint.trim_end_matches('/'));
+        let endpoint = endpoint.trim_end_matches('/');
+        // `AWS_ENDPOINT_URL_S3` precedes the other one.
+        builder = builder.with_endpoint(endpoint).with_config(AmazonS3ConfigKey::S3Endpoint, endpoint);
     }
     if let Some(id) = &config.access_key_id {
         builder = builder.with_access_key_id(id);
     }
     if let Some(secret) = &config.secret_access_key {
         builder = builder.with_secret_access_key(secret.reveal());
+    }
+    let value = |key| builder.get_config_value(&key);
+    let allows_http =
+        value(key(ClientConfigKey::AllowHttp)).is_some_and(|value| TRUE.contains(&value.to_ascii_lowercase().as_str()));
+    let endpoint = value(AmazonS3ConfigKey::S3Endpoint).or_else(|| value(AmazonS3ConfigKey::Endpoint));
+    if let Some(endpoint) = endpoint.filter(|url| url.starts_with("http://") && !allows_http) {
+        return Err(format!("the endpoint {endpoint} is not encrypted; store.allow_http permits it"));
     }
     crate::tls::install_provider();
     let s3 = builder.build().map_err(|e| e.to_string())?;
@@ -141,6 +153,15 @@ mod tests {
         {
             assert_eq!(of(bad), None, "{bad}");
         }
+    }
+
+    #[test]
+    fn an_endpoint_without_encryption_must_be_permitted() {
+        let mut config = StoreConfig { endpoint: Some("http://s3.test:9000".to_owned()), ..StoreConfig::default() };
+        let refused = connect(&config, "s3://meshes").map(drop).unwrap_err();
+        assert!(refused.contains("http://s3.test:9000") && refused.contains("store.allow_http"), "{refused}");
+        config.allow_http = true;
+        connect(&config, "s3://meshes").map(drop).unwrap();
     }
 
     #[test]

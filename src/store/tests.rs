@@ -9,7 +9,7 @@ use bytes::Bytes;
 use futures_util::TryStreamExt as _;
 use tempfile::TempDir;
 
-use super::faulty::{error, faulty, open_faulty};
+use super::faulty::{error, faulty, open_faulty, open_replacing};
 use super::{Folder, Name, Store, StoreError};
 use crate::config::StoreConfig;
 
@@ -53,6 +53,14 @@ async fn a_full_disk_is_reported_and_stored_objects_remain() {
     faults.full.store(false, Ordering::Relaxed);
     store.put(&name(4), body(8 << 20)).await.unwrap();
     assert_eq!((store.usage(Folder::Results).bytes, files(&dir).len()), (8 << 20, 1));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_store_without_conditional_writes_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    drop(Store::open(&StoreConfig::default(), dir.path()).await.unwrap());
+    let refused = open_replacing(&dir.path().join("store")).await.map(drop).unwrap_err();
+    assert!(refused.to_string().contains("must support conditional writes"), "{refused}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -309,8 +309,10 @@ impl Columns {
             self.label_chain = Vec::new();
             tables.label_chain = Interner::default();
         }
-        let entity = |chain_ix| source.sequence.entity_id(&tables, chain_ix).unwrap_or_default().to_owned();
-        let entities = (0..tables.label_chain.texts().len()).map(entity).collect();
+        let entity = |chain_ix| source.sequence.entity_id(&tables, chain_ix).unwrap_or_default();
+        let entities = (0..tables.label_chain.texts().len()).map(entity);
+        reading.keep(entities.clone().map(|entity| (size_of::<String>() + entity.len()) as u64).sum())?;
+        let entities = entities.map(str::to_owned).collect();
         self.shrink();
         reading.keep(source.assemblies.bytes())?;
         source.annotations.keep(self.starts_residue.iter().filter(|starts| **starts).count(), reading)?;

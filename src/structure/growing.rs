@@ -17,14 +17,14 @@ pub(super) struct GrowingColumns {
     next_check: usize,
     /// Number of rows at which the next search for atoms at the same position is due.
     next_search: usize,
-    /// Number of texts whose memory is reserved.
-    n_texts: usize,
+    /// Reserved memory of texts, bytes.
+    text_bytes: u64,
 }
 
 impl GrowingColumns {
     /// Takes columns with rows. The caller has reserved their memory.
     pub(super) fn filled(columns: Columns, tables: &Tables) -> Self {
-        Self { next_check: columns.len(), next_search: 2 * columns.len(), columns, n_texts: tables.n_texts() }
+        Self { next_check: columns.len(), next_search: 2 * columns.len(), columns, text_bytes: tables.bytes() }
     }
 
     pub(super) fn columns(&self) -> &Columns {
@@ -49,7 +49,7 @@ impl GrowingColumns {
         source: SourceFields,
         reading: &Reading<'_>,
     ) -> Result<Structure, StructureError> {
-        reading.keep_texts(tables.n_texts() - self.n_texts)?;
+        reading.keep(tables.bytes() - self.text_bytes)?;
         self.columns.finish(tables, source, reading)
     }
 
@@ -89,8 +89,8 @@ impl GrowingColumns {
             duplicates::check(n, |row| self.columns.model_and_position(row), reading)?;
             self.next_search = (2 * n).max(CHUNK);
         }
-        reading.keep_texts(tables.n_texts() - self.n_texts)?;
-        self.n_texts = tables.n_texts();
+        reading.keep(tables.bytes() - self.text_bytes)?;
+        self.text_bytes = tables.bytes();
         if n == self.columns.capacity() {
             let more = if n == 0 { expected } else { (n / 2).max(CHUNK) };
             self.columns.reserve(more.clamp(1, limit - n), reading)?;

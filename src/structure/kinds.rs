@@ -44,7 +44,7 @@ impl Sequence {
     /// does not have this category, by the atoms.
     pub(super) fn entity_id<'s>(&'s self, tables: &'s Tables, chain: usize) -> Option<&'s str> {
         if self.entity_ids.is_empty() {
-            return tables.entities.get(chain).map(AsRef::as_ref).filter(|id| !id.is_empty());
+            return tables.entity(chain).filter(|id| !id.is_empty());
         }
         let name = without_entity(tables.label_chain.text(u32::try_from(chain).ok()?));
         self.entity_ids.get(name).map(String::as_str)

@@ -71,7 +71,7 @@ pub(crate) use copies::{AssemblyRules, Placements};
 pub use copies::{PlacedCopy, Unit};
 pub use error::StructureError;
 pub use kind_set::KindSet;
-pub use read::{ReadLimits, read, read_with};
+pub use read::{ReadLimits, detect_format, read, read_with};
 pub use select::{
     BadExpression, Context, Expression, LeftOut, ModelChoice, Selected, SelectedBlocks, SelectedOfBlock, Selection,
     select, select_with,

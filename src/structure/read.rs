@@ -55,9 +55,6 @@ impl ReadLimits {
     }
 }
 
-/// Memory of a distinct text in a string table, bytes: its entry, its allocation and its hash.
-const BYTES_PER_TEXT: u64 = 96;
-
 /// Limits, cancellation and memory while one file is read.
 pub(super) struct Reading<'a> {
     pub(super) limits: &'a ReadLimits,
@@ -98,19 +95,14 @@ impl<'a> Reading<'a> {
         Ok(self.control.reserve(bytes)?)
     }
 
-    /// Adds the memory of `n` more distinct texts of a piece.
-    pub(super) fn hold_texts(&self, n: usize) -> Result<(), StructureError> {
-        Ok(self.text.grow(BYTES_PER_TEXT * n as u64)?)
+    /// Adds the memory of more texts of a piece, bytes.
+    pub(super) fn hold_texts(&self, bytes: u64) -> Result<(), StructureError> {
+        Ok(self.text.grow(bytes)?)
     }
 
     /// Reserves memory that belongs to the structure.
     pub(super) fn keep(&self, bytes: u64) -> Result<(), StructureError> {
         Ok(self.control.memory.grow(bytes)?)
-    }
-
-    /// Adds the memory of `n` more distinct texts, which belong to the structure.
-    pub(super) fn keep_texts(&self, n: usize) -> Result<(), StructureError> {
-        self.keep(BYTES_PER_TEXT * n as u64)
     }
 }
 
@@ -188,6 +180,18 @@ fn check_sample(inflated: &[u8], reading: &Reading<'_>) -> Result<(), StructureE
         Err(error @ (StructureError::TooManyDuplicates { .. } | StructureError::Cancelled)) => Err(error),
         _ => Ok(()),
     }
+}
+
+/// Returns the format of a file from its first bytes; `None` for a compressed file, which is not decompressed.
+///
+/// # Errors
+/// [`StructureError::UnknownFormat`].
+pub fn detect_format(bytes: &[u8]) -> Result<Option<SourceFormat>, StructureError> {
+    if inflate::encoding(bytes).is_some() {
+        return Ok(None);
+    }
+    let head = &bytes[..bytes.len().min(SAMPLE_BYTES)];
+    sniff::sniff(without_mark(head)).map(Some)
 }
 
 /// Strips the byte order mark that some editors write before UTF-8 text.
@@ -319,6 +323,22 @@ mod tests {
             }
             assert_eq!(read_within(&gzip(&text), most, u64::MAX).0.unwrap(), structure);
         }
+    }
+
+    #[test]
+    fn distinct_names_are_charged_by_their_length() {
+        let mut cif = "data_x\nloop_\n".to_owned();
+        for item in ["type_symbol", "auth_atom_id", "auth_comp_id", "Cartn_x", "Cartn_y", "Cartn_z"] {
+            writeln!(cif, "_atom_site.{item}").unwrap();
+        }
+        let held = |length: usize| {
+            let mut cif = cif.clone();
+            (0..40_000).for_each(|i| writeln!(cif, "C C {i:x<length$} {} {} 1.0", i % 200, i / 200).unwrap());
+            let (read, budget) = read_within(&gzip(cif.as_bytes()), u64::MAX, u64::MAX);
+            assert_eq!(read.unwrap().len(), 40_000);
+            budget.held.load(Ordering::SeqCst)
+        };
+        assert_eq!(held(255) - held(55), 40_000 * 200);
     }
 
     #[test]

@@ -51,31 +51,44 @@ pub(crate) fn put_columns(text: &mut Vec<u8>, structure: &Structure, i: usize, c
     let (mut index, mut number, mut model) = (itoa::Buffer::new(), itoa::Buffer::new(), itoa::Buffer::new());
     let mut bytes = [0; 4];
     let fields = [
-        index.format(i),
-        structure.name.get(i),
-        element::symbol(structure.element[i]),
-        structure.residue.get(i),
-        number.format(structure.residue_number[i]),
-        if code == 0 { "" } else { char::from(code).encode_utf8(&mut bytes) },
-        structure.chain.get(i),
-        model.format(structure.model[i]),
-        structure.kind[i].name(),
+        CsvField::Number(index.format(i)),
+        CsvField::Text(structure.name.get(i)),
+        CsvField::Text(element::symbol(structure.element[i])),
+        CsvField::Text(structure.residue.get(i)),
+        CsvField::Number(number.format(structure.residue_number[i])),
+        CsvField::Text(if code == 0 { "" } else { char::from(code).encode_utf8(&mut bytes) }),
+        CsvField::Text(structure.chain.get(i)),
+        CsvField::Number(model.format(structure.model[i])),
+        CsvField::Text(structure.kind[i].name()),
     ];
     for (n, field) in fields[columns].iter().enumerate() {
         if n > 0 {
             text.push(b',');
         }
-        put_field(text, field);
+        match field {
+            CsvField::Number(number) => text.extend_from_slice(number.as_bytes()),
+            CsvField::Text(name) => put_text(text, name),
+        }
     }
 }
 
-/// Appends a field, in quotes if it contains a separator or a quote.
-fn put_field(rows: &mut Vec<u8>, text: &str) {
+/// Field of a row.
+enum CsvField<'a> {
+    Number(&'a str),
+    Text(&'a str),
+}
+
+/// Appends a text, in quotes if it contains a separator or a quote. A spreadsheet would execute a text that begins with
+/// one of `=+-@`, a tab or a line end as a formula, so an apostrophe precedes it.
+fn put_text(rows: &mut Vec<u8>, text: &str) {
+    let mark = if text.starts_with(['=', '+', '-', '@', '\t', '\r', '\n']) { "'" } else { "" };
     if !text.contains(['"', ',', '\n', '\r']) {
+        rows.extend_from_slice(mark.as_bytes());
         rows.extend_from_slice(text.as_bytes());
         return;
     }
     rows.push(b'"');
+    rows.extend_from_slice(mark.as_bytes());
     rows.extend_from_slice(text.replace('"', "\"\"").as_bytes());
     rows.push(b'"');
 }
@@ -112,9 +125,11 @@ mod tests {
         let cif = "data_x\nloop_\n_atom_site.type_symbol\n_atom_site.auth_atom_id\n_atom_site.auth_comp_id\n\
                    _atom_site.auth_asym_id\n_atom_site.pdbx_PDB_ins_code\n_atom_site.auth_seq_id\n\
                    _atom_site.Cartn_x\n_atom_site.Cartn_y\n_atom_site.Cartn_z\n\
-                   C 'O5\"' 'A,B' A B -7 0 0 0\nXx ? ? ? ? ? 4 0 0\n";
+                   C 'O5\"' 'A,B' A B -7 0 0 0\nXx ? ? ? ? ? 4 0 0\nC =1+1 -x '@,' + 1 8 0 0\n";
         let rows: Vec<String> = csv(cif.as_bytes()).lines().skip(1).map(str::to_owned).collect();
         assert_eq!(rows[0], "0,\"O5\"\"\",C,\"A,B\",-7,B,A,1,polymer");
         assert_eq!(rows[1], "1,,?,,0,,,1,polymer");
+        // Names that a spreadsheet would take for formulas.
+        assert_eq!(rows[2], "2,'=1+1,C,'-x,1,'+,\"'@,\",1,polymer");
     }
 }

@@ -70,17 +70,24 @@ fn short(len: usize) -> u32 {
     u32::try_from(len).unwrap_or(0)
 }
 
+/// Returns the memory of a distinct text, bytes: its entry, its hash and its allocation.
+fn text_bytes(text: &str) -> u64 {
+    96 + text.len() as u64
+}
+
 /// Assigns ids to texts.
 #[derive(Debug)]
 pub(super) struct Interner {
     texts: IndexSet<Box<str>, RandomState>,
+    /// Memory of the texts, bytes.
+    bytes: u64,
     /// Up to eight bytes of a text, their count, and its id. Direct mapped; an entry with count 0 is vacant.
     cache: Box<[(u64, u32, u32); 1 << CACHE_BITS]>,
 }
 
 impl Default for Interner {
     fn default() -> Self {
-        Self { texts: IndexSet::default(), cache: Box::new([(0, 0, 0); 1 << CACHE_BITS]) }
+        Self { texts: IndexSet::default(), bytes: 0, cache: Box::new([(0, 0, 0); 1 << CACHE_BITS]) }
     }
 }
 
@@ -140,8 +147,10 @@ impl Interner {
 
     /// Returns the id of `text`, and adds it if it is new.
     pub(super) fn number(&mut self, text: &str) -> u32 {
-        let known = self.texts.get_index_of(text);
-        let id = known.unwrap_or_else(|| self.texts.insert_full(text.into()).0);
+        let id = self.texts.get_index_of(text).unwrap_or_else(|| {
+            self.bytes += text_bytes(text);
+            self.texts.insert_full(text.into()).0
+        });
         // The atom limit of the reader keeps the number of distinct texts below 2³².
         u32::try_from(id).unwrap_or(u32::MAX)
     }
@@ -169,14 +178,27 @@ pub(super) struct Tables {
     pub(super) chain: Interner,
     pub(super) label_chain: Interner,
     /// Entity of each text of `label_chain`; empty if it is unknown. No entries if the atoms do not state entities.
-    pub(super) entities: Vec<Box<str>>,
+    entities: Vec<Box<str>>,
+    /// Memory of the entities, bytes.
+    entity_bytes: u64,
 }
 
 impl Tables {
-    /// Returns the number of distinct texts in all tables.
-    pub(super) fn n_texts(&self) -> usize {
+    /// Returns the memory of all tables, bytes.
+    pub(super) fn bytes(&self) -> u64 {
         let tables = [&self.name, &self.residue, &self.chain, &self.label_chain];
-        tables.map(|table| table.texts().len()).iter().sum::<usize>() + self.entities.len()
+        tables.map(|table| table.bytes).iter().sum::<u64>() + self.entity_bytes
+    }
+
+    /// Returns the entity of a text of `label_chain`, empty if it is unknown; `None` if the atoms do not state
+    /// entities.
+    pub(super) fn entity(&self, label_chain: usize) -> Option<&str> {
+        self.entities.get(label_chain).map(AsRef::as_ref)
+    }
+
+    fn add_entity(&mut self, entity: &str) {
+        self.entity_bytes += text_bytes(entity);
+        self.entities.push(entity.into());
     }
 
     /// Adds the texts of `other`. Returns, for each table, the new ids by the ids in `other`.
@@ -203,7 +225,7 @@ impl Tables {
             Some(known) if known.as_bytes() == entity => id,
             Some(_) => self.chain_of_other_entity(id, entity),
             None => {
-                self.entities.push(text::decode(entity).into());
+                self.add_entity(&text::decode(entity));
                 id
             }
         }
@@ -217,7 +239,7 @@ impl Tables {
         }
         let id = self.label_chain.number(&format!("{}{ENTITY_MARK}{entity}", self.label_chain.text(chain)));
         if id as usize == self.entities.len() {
-            self.entities.push(entity.into());
+            self.add_entity(&entity);
         }
         id
     }

@@ -107,7 +107,7 @@ impl Reservation {
     ///
     /// # Errors
     /// [`OutOfMemory`].
-    pub(super) fn reserve_rows<T>(&self, rows: &mut Vec<T>, n: usize) -> Result<(), OutOfMemory> {
+    pub(crate) fn reserve_rows<T>(&self, rows: &mut Vec<T>, n: usize) -> Result<(), OutOfMemory> {
         let old = rows.capacity();
         if rows.len() + n <= old {
             return Ok(());
@@ -124,7 +124,7 @@ impl Reservation {
     ///
     /// # Errors
     /// [`OutOfMemory`].
-    pub(super) fn reserve_entries<K: Eq + Hash, V>(
+    pub(crate) fn reserve_entries<K: Eq + Hash, V>(
         &self,
         table: &mut FxHashMap<K, V>,
         n: usize,

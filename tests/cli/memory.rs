@@ -218,6 +218,49 @@ fn attacks_are_refused_within_the_memory_limit() {
     }
 }
 
+/// Returns an mmCIF file of `n` residues with one atom, whose chain and residue have names of 255 characters. JSON and
+/// CSV escape most of these.
+fn long_names(n: usize) -> Vec<u8> {
+    let name = format!("x{}", "\"".repeat(254));
+    let mut text = b"data_x\nloop_\n".to_vec();
+    for item in ["type_symbol", "label_atom_id", "label_comp_id", "auth_asym_id", "auth_seq_id"] {
+        writeln!(text, "_atom_site.{item}").unwrap();
+    }
+    text.extend(b"_atom_site.Cartn_x\n_atom_site.Cartn_y\n_atom_site.Cartn_z\n");
+    for i in 0..n {
+        let [x, y, z] = [i % 100, i / 100 % 100, i / 10_000].map(|n| n * 8);
+        writeln!(text, "C C {name} {name} {i} {x} {y} {z}").unwrap();
+    }
+    text
+}
+
+/// Documents about atoms are charged as they grow: they end with a problem, and the process lives.
+#[test]
+fn documents_with_long_names_stay_within_the_memory_limit() {
+    let (folder, limit) = (Folder::new(), MemoryLimit::new(LIMIT));
+    let budget = format!("limits.memory_bytes={BUDGET}MiB");
+    let mut service = Service::start_limited(&folder, &limit, &["--devices", "cpu", "--set", &budget]);
+    let addr = service.addr.parse().unwrap();
+    let structure = |n: usize| {
+        let reply = send(addr, "POST", "/v1/structures", &[GZIP], &gzip(&long_names(n)));
+        assert_eq!(reply.status, 201, "{}", String::from_utf8_lossy(&reply.body));
+        reply.header("location").unwrap().to_owned()
+    };
+    let [small, large] = [100, 150_000].map(structure);
+    let idle = service.memory("VmRSS");
+    for document in ["atoms", "atoms?positions=true&select=all", "areas?surface=sas", "areas?by=atom&surface=vdw"] {
+        let get = |structure: &str| send(addr, "GET", &format!("{structure}/{document}"), &[], b"");
+        let reply = get(&small);
+        assert!(reply.status == 200 && reply.body.len() > 100 * 1000, "{document}: {}", reply.body.len());
+        get(&large).problem(422, "too-much-memory");
+        assert!(service.lives(), "{document}: the process ended");
+    }
+    assert_eq!(send(addr, "GET", &format!("{large}/colors?scheme=chain"), &[], b"").body.len(), 4 * 150_000);
+    let used = service.memory("VmHWM").saturating_sub(idle);
+    assert!(used <= BUDGET + OVERHEAD, "{used} MiB above {idle} MiB");
+    assert_eq!(service.stop("TERM").0, Some(0));
+}
+
 /// Negative control: with a budget above the limit of the process, the same attack ends it.
 #[test]
 fn a_budget_above_the_limit_of_the_process_is_fatal() {

@@ -35,7 +35,7 @@ fn measured(structure: &Structure, pairs: &[(&str, &str)]) -> MeasuredSelection 
 /// Rows of a table, by the names of its columns.
 fn rows(measured: &MeasuredSelection, structure: &Structure, level: AreaLevel) -> Vec<HashMap<String, String>> {
     let mut text = Vec::new();
-    measured.areas.write_csv(structure, level, &mut text).unwrap();
+    measured.areas.write_csv(structure, level, &Control::default(), &mut text).unwrap();
     let text = String::from_utf8(text).unwrap();
     let mut lines = text.lines().map(|line| line.split(',').map(str::to_owned).collect::<Vec<_>>());
     let names = lines.next().unwrap();

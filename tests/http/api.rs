@@ -217,6 +217,7 @@ fn a_media_type_that_contradicts_the_content_is_rejected() {
         ("chemical/x-bcif", cif, 415),
         ("chemical/x-mmcif", CRAMBIN, 415),
         ("chemical/x-pdb", CRAMBIN, 415),
+        ("application/json", &SAMPLE[..8000], 415),
     ] {
         let reply = SERVER.post("/v1/meshes", &[("content-type", declared)], body);
         match status {
@@ -228,6 +229,28 @@ fn a_media_type_that_contradicts_the_content_is_rejected() {
             }
             _ => drop(reply.problem(422, "unreadable-structure")),
         }
+    }
+}
+
+#[test]
+fn files_that_cannot_be_structures_are_rejected_before_a_job_is_accepted() {
+    let prefer = ("prefer", "respond-async");
+    SERVER.post("/v1/meshes", &[prefer], b"{}").problem(422, "unreadable-structure");
+    SERVER.post("/v1/meshes", &[prefer, ("content-type", "image/png")], b"{}").problem(415, "unsupported-media-type");
+    // `curl -d @file` removes the line ends.
+    let line: Vec<u8> = SAMPLE.iter().copied().filter(|byte| *byte != b'\n').collect();
+    for prefer in [&[prefer][..], &[]] {
+        let headers = [&[("content-type", "application/x-www-form-urlencoded")], prefer].concat();
+        let problem = SERVER.post("/v1/meshes", &headers, &line).problem(422, "unreadable-structure");
+        assert!(problem["detail"].as_str().unwrap().contains("--data-binary"), "{problem}");
+    }
+}
+
+#[test]
+fn a_result_that_is_not_stored_is_absent_for_any_condition() {
+    let path = format!("/v1/results/{}.glb", "0".repeat(64));
+    for headers in [&[][..], &[("if-none-match", "*")]] {
+        send(SERVER.addr, "GET", &path, headers, b"").problem(404, "not-found");
     }
 }
 
@@ -368,7 +391,7 @@ fn only_glb_and_gltf_are_quantized() {
     }
     let form =
         b"--XX\r\ncontent-disposition: form-data; name=\"compress\"\r\n\r\nquantize\r\n--XX\r\ncontent-disposition: \
-        form-data; name=\"file\"\r\n\r\nx\r\n--XX--\r\n";
+        form-data; name=\"file\"\r\n\r\nHEADER\r\n--XX--\r\n";
     let kind = ("content-type", "multipart/form-data; boundary=XX");
     let refused = server.post("/v1/meshes", &[kind, ("accept", "application/ply")], form);
     assert_eq!(refused.problem(400, "bad-parameter")["parameter"], "compress");
@@ -704,11 +727,27 @@ fn areas_are_those_of_the_library() {
         let job = params::parse(kind.into_iter().chain([("exact", "true")])).unwrap().job;
         let measured = areas::measure_selection(&structure, &job, &read, &surface, &Control::default()).unwrap();
         let mut expected = Vec::new();
-        measured.areas.write_csv(&structure, level, &mut expected).unwrap();
+        measured.areas.write_csv(&structure, level, &Control::default(), &mut expected).unwrap();
         assert_eq!(reply.text(), String::from_utf8(expected).unwrap(), "{query}");
         tags.insert(reply.header("etag").unwrap().to_owned());
     }
     assert_eq!(tags.len(), 4);
+}
+
+#[test]
+fn reports_list_at_most_a_thousand_chains() {
+    let mut cif = b"data_x\nloop_\n_atom_site.type_symbol\n_atom_site.auth_asym_id\n_atom_site.Cartn_x\n\
+                    _atom_site.Cartn_y\n_atom_site.Cartn_z\n"
+        .to_vec();
+    for i in 0..1001 {
+        writeln!(cif, "C chain{i} {} {} 0", 8 * (i % 40), 8 * (i / 40)).unwrap();
+    }
+    let reply = SERVER.post("/v1/report?surface=sas&exact=true&resolution=3", &[], &cif);
+    let exact = &reply.json()["exact"];
+    assert_eq!((exact["chain_count"].as_u64(), exact["chains"].as_array().unwrap().len()), (Some(1001), 1000));
+    let location = SERVER.post("/v1/structures", &[], &cif).header("location").unwrap().to_owned();
+    let table = SERVER.get(&format!("{location}/areas?surface=sas&by=chain"));
+    assert_eq!(table.text().lines().count(), 1002);
 }
 
 #[test]

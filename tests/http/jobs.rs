@@ -139,9 +139,9 @@ fn failures_are_reported_as_for_synchronous_requests() {
     for member in ["detail", "limit", "actual", "suggested_resolution"] {
         assert_eq!(told[member], now[member], "{member}");
     }
-    let job = submit(&server, "/v1/meshes", &[], b"not a structure");
+    let job = submit(&server, "/v1/meshes", &[], b"HEADER\nnot a structure");
     ended(&server, &job, "failed");
-    server.get(&format!("{job}/result")).problem(422, "unreadable-structure");
+    server.get(&format!("{job}/result")).problem(422, "no-atoms");
 }
 
 #[test]

@@ -133,6 +133,7 @@ fn surfaces(seen: &Seen, server: &Running) {
         get(kept, &[("range", "bytes=0-9")], 206);
         get(kept, &[("range", "bytes=99999999-")], 416);
         get(kept, &[("if-none-match", "*")], 304);
+        get(kept, &[("if-none-match", "*"), ("range", "bytes=0-9")], 304);
         // `If-Match`: only a matching `ETag` is accepted.
         let other = [("if-match", "\"other\""), ("if-none-match", "*")];
         for path in [&path, kept, &format!("{base}/atoms"), &kept.replace(".glb", "/report.json")] {
@@ -228,8 +229,8 @@ fn jobs(seen: &Seen) {
     seen.expect(500, server.addr, ("DELETE", &format!("/v1/jobs/{damaged}")), &[], b"");
     get(&format!("{NO_JOB}?wait=1000"), 400);
     // A job without a result ends with the problem of a synchronous request.
-    result(&ended(seen, &server, &vec![b' '; 100_001]), 413);
-    result(&ended(seen, &server, b"nothing"), 422);
+    result(&ended(seen, &server, format!("HEADER{}", " ".repeat(100_001)).as_bytes()), 413);
+    result(&ended(seen, &server, b"HEADER\nnothing"), 422);
     backend.set(Mode::Panic);
     result(&ended(seen, &server, &sample(1)), 500);
     backend.set(Mode::Slow(Duration::from_secs(30)));

@@ -4,6 +4,7 @@ use crate::access_support;
 use crate::http_support;
 
 use std::io::Write as _;
+use std::net::SocketAddr;
 
 use access_support::Keys;
 use http_support::{Fake, Mode, Reply, Running, SAMPLE, connect, log_lines, read_reply, send, start};
@@ -26,7 +27,11 @@ fn get(server: &Running, path: &str, headers: &[(&str, &str)]) -> Reply {
 
 /// Sends the head of a GET request with these lines after the request line.
 fn raw(server: &Running, target: &str, version: &str, lines: &str) -> Reply {
-    let mut stream = connect(server.addr);
+    raw_at(server.addr, target, version, lines)
+}
+
+fn raw_at(address: SocketAddr, target: &str, version: &str, lines: &str) -> Reply {
+    let mut stream = connect(address);
     write!(stream, "GET {target} HTTP/{version}\r\n{lines}connection: close\r\n\r\n").unwrap();
     read_reply(&mut stream, false)
 }
@@ -36,6 +41,10 @@ fn requests_name_one_host_of_this_machine() {
     let own = server(|c| c.server.hosts = "meshes.example".parse().ok());
     for host in ["localhost", "LOCALHOST:81", "127.0.0.1:8080", "127.9.9.9", "[::1]:80", "meshes.example:443"] {
         assert_eq!(raw(&own, "/livez", "1.1", &format!("host: {host}\r\n")).status, 200, "{host}");
+    }
+    for (host, status) in [("localhost:9", 200), ("127.0.0.1", 200), ("meshes.example", 200), ("evil.example", 421)] {
+        let reply = raw_at(own.metrics, "/metrics", "1.1", &format!("host: {host}\r\n"));
+        assert_eq!(reply.status, status, "{host}");
     }
     for host in ["evil.example", "localhost.evil.example", "192.0.2.1", "127.0.0.1.evil.example:80"] {
         for path in ["/", "/livez", "/v1/capabilities"] {

@@ -162,7 +162,7 @@ fn failures_are_reported_in_spans_and_log_lines() {
     let server = traced(Arc::clone(&backend) as _, &collector, |_| {});
     assert_eq!(server.post("/v1/meshes", &[("traceparent", PARENT)], SAMPLE).status, 500);
     let other = PARENT.replace(TRACE, "22222222222222222222222222222222");
-    assert_eq!(server.post("/v1/meshes", &[("traceparent", &other)], b"nothing to read").status, 422);
+    assert_eq!(server.post("/v1/meshes", &[("traceparent", &other)], b"HEADER without atoms").status, 422);
     assert!(server.join());
     let spans = collector.trace(TRACE);
     let (request, job) = (named(&spans, "POST /v1/meshes"), named(&spans, "job"));
@@ -186,7 +186,7 @@ fn an_asynchronous_job_stays_in_the_trace_of_its_request() {
     assert_eq!(reply.status, 202);
     let id = reply.json()["jobID"].as_str().unwrap().to_owned();
     let failing = [("prefer", "respond-async"), ("x-request-id", "later-2")];
-    let failed = server.post("/v1/meshes", &failing, b"nothing to read");
+    let failed = server.post("/v1/meshes", &failing, b"HEADER without atoms");
     for location in [reply.header("location").unwrap(), failed.header("location").unwrap()] {
         wait_for("the job ends", || !server.get(&format!("{location}?wait=20")).json()["finished"].is_null());
     }

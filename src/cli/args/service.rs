@@ -51,7 +51,7 @@ pub(crate) struct ServeArgs {
 // `molmesh healthcheck`.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct HealthcheckArgs {
-    /// URL to request
+    /// URL to request; without a path, /readyz of it
     #[arg(long, default_value = "http://127.0.0.1:8080/readyz")]
     pub(crate) url: String,
     /// Seconds to wait for the response

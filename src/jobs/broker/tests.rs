@@ -27,7 +27,7 @@ const MAX_WAIT: Duration = Duration::from_secs(20);
 /// Time in which a job that may be claimed is claimed.
 const SOON: Duration = Duration::from_secs(5);
 /// Lease of claims.
-pub(crate) const LEASE: Duration = Duration::from_secs(2);
+const LEASE: Duration = Duration::from_secs(2);
 /// Maximum number of jobs.
 const LIMIT: usize = 40;
 

@@ -3,9 +3,11 @@
 use std::io::{self, Write};
 use std::str::FromStr;
 
-use super::AtomAreas;
+use rustc_hash::FxHashMap;
+
+use super::{ATOMS_PER_CHECK, AtomAreas};
 use crate::structure::{Structure, table};
-use crate::surface::AreaParts;
+use crate::surface::{AreaParts, Control, Reservation, SurfaceError};
 
 /// Rows of a table of areas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -65,12 +67,24 @@ impl AtomAreas {
     }
 
     /// Returns the rows of a table. Chains are in the order of their first atoms, and contain all copies. A residue
-    /// ends with its last consecutive atom.
-    pub(super) fn rows(&self, structure: &Structure, level: AreaLevel) -> Vec<Row> {
+    /// ends with its last consecutive atom. The rows are charged to `memory`.
+    ///
+    /// # Errors
+    /// Fails if the memory budget is used up, or the work is cancelled.
+    pub(super) fn rows(
+        &self,
+        structure: &Structure,
+        level: AreaLevel,
+        control: &Control<'_>,
+        memory: &Reservation,
+    ) -> Result<Vec<Row>, SurfaceError> {
         let mut rows: Vec<Row> = Vec::new();
-        let mut of_chains = std::collections::HashMap::new();
+        let mut of_chains = FxHashMap::default();
         let mut before = None;
         for (n, &atom) in self.atoms.iter().enumerate() {
+            if n.is_multiple_of(ATOMS_PER_CHECK) {
+                control.check()?;
+            }
             let i = atom as usize;
             let row = match level {
                 AreaLevel::Atom => rows.len(),
@@ -79,9 +93,13 @@ impl AtomAreas {
                     let is_same = before.is_some_and(|last| last < i && structure.same_residue(last, i));
                     rows.len() - usize::from(is_same)
                 }
-                AreaLevel::Chain => *of_chains.entry(structure.chain.id(i)).or_insert(rows.len()),
+                AreaLevel::Chain => {
+                    memory.reserve_entries(&mut of_chains, 1)?;
+                    *of_chains.entry(structure.chain.id(i)).or_insert(rows.len())
+                }
             };
             if row == rows.len() {
+                memory.reserve_rows(&mut rows, 1)?;
                 rows.push(Row { first: i, atoms: 0, parts: AreaParts::default(), alone: 0.0 });
             }
             rows[row].atoms += 1;
@@ -89,7 +107,7 @@ impl AtomAreas {
             rows[row].alone += self.alone.as_ref().map_or(0.0, |alone| alone[n]);
             before = Some(i);
         }
-        rows
+        Ok(rows)
     }
 
     /// Writes a table as CSV (RFC 4180, lines end in LF) with areas in Å², rounded to 0.0001 Å². With an interface, it
@@ -97,8 +115,14 @@ impl AtomAreas {
     /// columns `contact`, `toroidal` and `concave`.
     ///
     /// # Errors
-    /// Returns the errors of `out`.
-    pub fn write_csv(&self, structure: &Structure, level: AreaLevel, out: &mut dyn Write) -> io::Result<()> {
+    /// Returns the errors of `out`, and a [`SurfaceError`] as an error of kind `Other`.
+    pub fn write_csv(
+        &self,
+        structure: &Structure,
+        level: AreaLevel,
+        control: &Control<'_>,
+        out: &mut dyn Write,
+    ) -> io::Result<()> {
         let columns = match level {
             AreaLevel::Atom => 0..8,
             AreaLevel::Residue => 3..8,
@@ -114,7 +138,9 @@ impl AtomAreas {
         if self.alone.is_some() {
             header.extend(["alone", "buried"]);
         }
-        table::write_rows(out, &header, self.rows(structure, level), |text, Row { first, atoms, parts, alone }| {
+        let memory = Reservation::new(&control.memory);
+        let rows = self.rows(structure, level, control, &memory).map_err(io::Error::other)?;
+        table::write_rows(out, &header, rows, |text, Row { first, atoms, parts, alone }| {
             table::put_columns(text, structure, first, columns.clone());
             if counts {
                 write!(text, ",{atoms}")?;

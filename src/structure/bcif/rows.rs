@@ -169,12 +169,12 @@ pub(super) fn convert(
         rest = others;
     }
     let read = pieces::map(&mut parts, |(rows, (slices, site))| -> Result<_, StructureError> {
-        let mut n_texts = 0;
+        let mut text_bytes = 0;
         for index in rows.clone() {
             if index % ROWS_PER_CHECK == 0 {
                 reading.check()?;
-                reading.hold_texts(site.tables.n_texts() - n_texts)?;
-                n_texts = site.tables.n_texts();
+                reading.hold_texts(site.tables.bytes() - text_bytes)?;
+                text_bytes = site.tables.bytes();
             }
             match site.atom(&BinaryRow { table, index }) {
                 Ok(atom) => slices.put(&atom),
@@ -189,7 +189,7 @@ pub(super) fn convert(
         }
     }
     let (tables, warnings) = atom_site::join(parts.into_iter().map(|(_, part)| part).collect());
-    reading.keep_texts(tables.n_texts())?;
+    reading.keep(tables.bytes())?;
     Ok(Ok((columns, tables, warnings)))
 }
 

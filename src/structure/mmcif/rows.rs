@@ -131,14 +131,14 @@ impl<'a> TableRows<'a> {
         let failed = AtomicBool::new(false);
         let read = pieces::map(&mut parts, |(stretch, (slices, site))| {
             let stop = || failed.load(Ordering::Relaxed) || reading.check().is_err();
-            let (mut scanner, mut at, mut n_texts) = (Scanner::new(text), stretch.from, 0);
+            let (mut scanner, mut at, mut text_bytes) = (Scanner::new(text), stretch.from, 0);
             let mut whole = false;
             while !stop() {
                 let to = stretch.to.min(at + BYTES_PER_CHARGE);
                 let space = slices.space();
                 let done = scanner.rows(site, space, |atom| _ = slices.put(atom), at, to, &stop).unwrap_or(at);
-                reading.hold_texts(site.tables.n_texts() - n_texts)?;
-                n_texts = site.tables.n_texts();
+                reading.hold_texts(site.tables.bytes() - text_bytes)?;
+                text_bytes = site.tables.bytes();
                 if to == stretch.to || done == at {
                     whole = slices.space() == 0 && text[done..stretch.to].iter().all(|&b| b <= b' ');
                     break;
@@ -154,7 +154,7 @@ impl<'a> TableRows<'a> {
             return Ok(None);
         }
         (self.site.tables, self.site.warnings) = atom_site::join(parts.into_iter().map(|(_, part)| part).collect());
-        reading.keep_texts(self.site.tables.n_texts())?;
+        reading.keep(self.site.tables.bytes())?;
         memory.keep();
         self.columns = GrowingColumns::filled(columns, &self.site.tables);
         Ok(Some(end))

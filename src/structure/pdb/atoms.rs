@@ -71,7 +71,7 @@ impl<'a> Atoms<'a> {
         rows.rewind();
         for lines in lines.chunks(LINES_PER_CHECK) {
             reading.check()?;
-            let n_texts = atoms.tables.n_texts();
+            let text_bytes = atoms.tables.bytes();
             for line in lines {
                 match atoms.atom(*line) {
                     Ok(atom) => rows.put(&atom),
@@ -81,7 +81,7 @@ impl<'a> Atoms<'a> {
                     }
                 };
             }
-            reading.hold_texts(atoms.tables.n_texts() - n_texts)?;
+            reading.hold_texts(atoms.tables.bytes() - text_bytes)?;
         }
         Ok(atoms)
     }

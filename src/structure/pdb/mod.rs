@@ -74,7 +74,7 @@ pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, Stru
         warnings.append(atoms.warnings);
         (rows, atoms.tables)
     }));
-    reading.keep_texts(tables.n_texts())?;
+    reading.keep(tables.bytes())?;
     memory.keep();
     let mut marks = Vec::new();
     let mut first_row = 0;

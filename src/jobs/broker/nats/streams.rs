@@ -37,7 +37,8 @@ impl NatsState {
         format!("jobs of the store {}", self.store)
     }
 
-    /// Sets or clears the reason for which requests of a kind fail. Logs the first failure and the end of the last one.
+    /// Sets or clears the reason for which requests of a kind fail. Logs only the first failure and the end of the last
+    /// one.
     pub(super) fn set_failure(&self, kind: RequestKind, why: Option<String>) {
         let mut failures = lock(&self.failures);
         let failed = failures.iter().any(Option::is_some);

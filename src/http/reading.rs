@@ -1,0 +1,92 @@
+//! Reading of structures outside of jobs, on blocking threads.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::task::JoinHandle;
+use tokio::time::{Instant, timeout_at};
+
+use super::guard::Caller;
+use super::state::App;
+use crate::jobs::Failure;
+use crate::surface::{CancelToken, Control};
+
+/// Cancels the work when its request ends.
+struct CancelOnDrop(CancelToken);
+
+impl Drop for CancelOnDrop {
+    fn drop(&mut self) {
+        self.0.cancel();
+    }
+}
+
+impl App {
+    /// Runs `work`, which reads a structure, on a blocking thread, and charges its time to the caller. First waits for
+    /// the share of the client and for a permit, for at most half of `jobs.deadline_ms`, which limits the whole call. A
+    /// request that would probably wait longer is refused at once. If the request ends early, the work is cancelled;
+    /// permits, memory and `held` are released when it has stopped.
+    pub(super) async fn read<T: Send + 'static>(
+        self: &Arc<Self>,
+        caller: &Caller,
+        held: impl Send + 'static,
+        work: impl FnOnce(&Control<'_>) -> T + Send + 'static,
+    ) -> Result<T, Failure> {
+        let limit = Duration::from_millis(self.config.jobs.deadline_ms);
+        let end = Instant::now() + limit;
+        let late = |_elapsed| Failure::Deadline { limit };
+        let panicked = |message: String| Failure::Panicked { message };
+        let waited = || Failure::Waited { limit, wait: self.reader_line.estimated_wait() };
+        let waiting = self.reader_line.enter(limit / 2).ok_or_else(waited)?;
+        let begin_by = Instant::now() + limit / 2;
+        // In this order, a client that waits for its share takes no permit of others.
+        let share = self.reader_shares.wait(caller.client.0, begin_by).await.map_err(|_full| waited())?;
+        let permit = timeout_at(begin_by, Arc::clone(&self.readers).acquire_owned()).await;
+        let permit = permit.map_err(|_elapsed| waited())?.map_err(|closed| panicked(closed.to_string()))?;
+        let reading_time = waiting.begin();
+        let stop = CancelOnDrop(CancelToken::default());
+        let (cancel, reservation) = (stop.0.clone(), self.pool.settings().budget.reservation());
+        let (app, payer) = (Arc::clone(self), caller.clone());
+        let reading = spawn_holding((held, permit, share, reading_time), move || {
+            let begun = Instant::now();
+            let control =
+                Control { cancel, deadline: Some(end.into_std()), memory: Arc::new(reservation), ..Control::default() };
+            let value = work(&control);
+            app.charge(&payer, begun.elapsed());
+            value
+        });
+        timeout_at(end, reading).await.map_err(late)?.map_err(|error| panicked(error.to_string()))
+    }
+}
+
+/// Runs `work` on a blocking thread. The thread drops `held` after the work, even if the caller has stopped waiting.
+fn spawn_holding<T: Send + 'static>(
+    held: impl Send + 'static,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> JoinHandle<T> {
+    tokio::task::spawn_blocking(move || {
+        let value = work();
+        drop(held);
+        value
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc;
+
+    use tokio::sync::Semaphore;
+
+    use super::*;
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+    async fn a_request_that_ends_early_releases_nothing_before_its_work_has_stopped() {
+        let (go, wait) = mpsc::sync_channel::<()>(1);
+        let permits = Arc::new(Semaphore::new(1));
+        let held = Arc::clone(&permits).acquire_owned().await.unwrap();
+        let reading = spawn_holding(held, move || wait.recv().is_ok());
+        assert!(tokio::time::timeout(Duration::from_millis(50), reading).await.is_err(), "the request has left");
+        assert_eq!(permits.available_permits(), 0);
+        go.send(()).unwrap();
+        drop(tokio::time::timeout(Duration::from_mins(1), permits.acquire()).await.unwrap().unwrap());
+    }
+}

@@ -1,0 +1,58 @@
+//! Checks of a store with small objects, at the start and while the service runs.
+
+use std::io;
+
+use bytes::Bytes;
+use object_store::path::Path;
+use object_store::{ObjectStoreExt as _, PutMode};
+
+use super::backend::{Backend, CHECK};
+use super::error::StoreError;
+use super::secret;
+
+impl Backend {
+    /// Writes, reads and removes a small object.
+    pub(super) async fn check(&self) -> Result<(), StoreError> {
+        self.check_folder().await?;
+        // Nodes that share a store may have the same process id.
+        let file = secret::unique().map_err(|e| self.fail("check", CHECK, &e))?;
+        let path = Path::from_iter([CHECK, &file]);
+        let fail = |e: object_store::Error| self.fail("check", path.as_ref(), &e);
+        let written = Bytes::from(file.into_bytes());
+        let answered = async {
+            self.objects().put(&path, written.clone().into()).await?;
+            let read = self.objects().get(&path).await?.bytes().await?;
+            self.objects().delete(&path).await.map(|()| read)
+        };
+        let read = self.timed(answered).await.map_err(fail)?;
+        if read == written {
+            return Ok(());
+        }
+        Err(self.fail("check", path.as_ref(), &io::Error::other("the bytes read differ from the bytes written")))
+    }
+
+    /// Checks that the store refuses to replace an object that must be created. Otherwise nodes could record two jobs
+    /// for one idempotency key, or replace the end of a job.
+    pub(super) async fn check_creation(&self) -> Result<(), StoreError> {
+        let file = secret::unique().map_err(|e| self.fail("check", CHECK, &e))?;
+        let path = Path::from_iter([CHECK, &file]);
+        let create = || self.objects().put_opts(&path, Bytes::from_static(b"created").into(), PutMode::Create.into());
+        let answered = async {
+            // The first request may be repeated after its object was created.
+            match create().await {
+                Ok(_) | Err(object_store::Error::AlreadyExists { .. }) => {}
+                Err(error) => return Err(error),
+            }
+            let again = create().await;
+            self.objects().delete(&path).await?;
+            again.map(drop)
+        };
+        let why = match self.timed(answered).await {
+            Err(object_store::Error::AlreadyExists { .. }) => return Ok(()),
+            Err(error) => error.to_string(),
+            Ok(()) => "it replaced an object".to_owned(),
+        };
+        let why = format!("{why}; the store must support conditional writes (If-None-Match: *)");
+        Err(self.fail("check", path.as_ref(), &io::Error::other(why)))
+    }
+}
