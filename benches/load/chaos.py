@@ -138,12 +138,14 @@ def main():
     args = parser.parse_args()
     print(f"seed {args.seed}", flush=True)
     dice, data = random.Random(args.seed), folder()
-    server = Server(args.binary, data, args.port, ["--backend", "cpu", "--set", "server.termination_notice_ms=none", "--set", ""])
+    server = Server(args.binary, data, args.port, ["--backend", "cpu", "--set", "server.termination_notice_ms=none"])
+    command = server.command
     clients = Clients(args.port, Expected(args.binary, args.structures), args.seed, args.clients)
     phases, with_jobs, jobs, errors = collections.Counter(), 0, {}, []
     for _ in range(args.kills):
         phase = dice.choice(["load", "load", "recovery", "drain", "stop", "stop"])
-        server.command[-1] = f"server.drain_timeout_ms={dice.randrange(DRAIN_MS) if phase == 'stop' else DRAIN_MS}"
+        drain_ms = dice.randrange(DRAIN_MS) if phase == "stop" else DRAIN_MS
+        server.command = [*command, "--set", f"server.drain_timeout_ms={drain_ms}"]
         if phase == "stop":
             errors += stop(server, jobs, dice)
         else:
@@ -152,6 +154,7 @@ def main():
         jobs = open_jobs(data)
         with_jobs += len(jobs) > 0
     clients.finish()
+    server.command = command
     server.start()
     deadline = time.monotonic() + FINISH_TIMEOUT
     ends = collections.Counter(outcome(args.port, job, mesh, deadline) for job, mesh in clients.jobs.items())

@@ -84,15 +84,15 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
 
 /// Fails if the stop was not orderly.
 fn check(stopped: &Stopped) -> Result<(), CliError> {
+    if stopped.is_orderly() {
+        return Ok(());
+    }
     let mut left = Vec::new();
     if !stopped.requests_finished {
         left.push("every request was finished".to_owned());
     }
     if stopped.jobs_unrecorded > 0 {
         left.push(format!("the state of {} asynchronous jobs was recorded", stopped.jobs_unrecorded));
-    }
-    if stopped.is_orderly() {
-        return Ok(());
     }
     Err(CliError::Service(format!("stopped before {}", left.join(" and "))))
 }

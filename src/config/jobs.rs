@@ -7,12 +7,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct JobsConfig {
-    /// Number of concurrent jobs. Default 2: the backend uses all cores for one job, and a second one fills them while
-    /// the first reads its file or measures its mesh. GPUs run more: see `devices.jobs`.
+    /// Number of concurrent jobs of each lane: short requests, long requests, asynchronous jobs. Default 2: the backend
+    /// uses all cores for one job, and a second one fills them while the first reads its file or measures its mesh. GPUs
+    /// run more: see `devices.jobs`.
     pub workers: usize,
-    /// Number of queued interactive requests. Default 64: at a typical 0.1 s per job on two workers the last one waits
-    /// three seconds; a longer queue would only delay refusals. Further requests get a 503 with an estimated
-    /// `Retry-After`.
+    /// Number of queued requests in each lane, short and long. Default 64: at a typical 0.1 s per job on two workers the
+    /// last one waits three seconds; a longer queue would only delay refusals. Further requests get a 503 with an
+    /// estimated `Retry-After`.
     pub queue: usize,
     /// Number of concurrent requests for meshes, from the submission of the job to the last byte of the response.
     /// Default 256: each one holds a thread while its mesh is written, and some threads must stay free to read files.
@@ -23,9 +24,6 @@ pub struct JobsConfig {
     /// Time from the claim of an asynchronous job by a worker to its result, ms. Default 3,600,000: no connection is
     /// held for it.
     pub batch_deadline_ms: u64,
-    /// Maximum time that an asynchronous job yields to interactive requests, ms. Default 10,000: interactive requests
-    /// come first, but asynchronous jobs must make progress under constant load.
-    pub batch_max_delay_ms: u64,
     /// Maximum number of attempts to run an asynchronous job. Default 3: a job that crashed the process that often is
     /// assumed to crash it again.
     pub attempts: u32,
@@ -54,7 +52,6 @@ impl Default for JobsConfig {
             deliveries: 256,
             deadline_ms: 60_000,
             batch_deadline_ms: 3_600_000,
-            batch_max_delay_ms: 10_000,
             attempts: 3,
             save_retry_ms: 60_000,
             concurrent_saves: 4,

@@ -158,9 +158,9 @@ struct Limits {
     memory_bytes: u64,
     /// Largest width and height of a picture, in pixels.
     picture_side: u32,
-    /// Maximum number of jobs that run at the same time.
+    /// Maximum number of jobs of each lane that run at the same time: short requests, long requests, asynchronous jobs.
     workers: usize,
-    /// Maximum number of jobs in the queue.
+    /// Maximum number of jobs in the queue of each lane of requests.
     queue: usize,
     /// Maximum number of concurrent mesh requests.
     deliveries: usize,

@@ -25,6 +25,7 @@ use super::problem_types::ProblemType;
 use super::request_id::RequestId;
 use super::source::Loaded;
 use super::state::Shared;
+use crate::jobs::{Pool, Rank};
 use crate::pipeline::{self, Choice, Estimate, MeshEstimate};
 use crate::surface::Control;
 
@@ -119,7 +120,7 @@ pub(super) async fn create(
     let digest = source.digest(&app, &caller).await?;
     let Loaded { input, digest, reservation } = source.find(&app, &caller, &digest, None).await?;
     drop(source);
-    let seconds = app.pool.expected(&input, &job);
+    let (seconds, lane) = (app.pool.expected(&input, &job), Pool::lane(&Rank::default(), &input, &job));
     let reading = app.read(&caller, (reservation, delivery), {
         let (app, job, namespace) = (Arc::clone(&app), job.clone(), caller.namespace);
         move |control| {
@@ -133,7 +134,7 @@ pub(super) async fn create(
     // The estimate from the file size does not include the copies in an assembly.
     let guess = seconds * estimate.atoms as f64 / estimate.distinct_atoms as f64;
     let seconds = estimate.work(&job).map_or(guess, |units| app.pool.seconds(units));
-    let wait = app.pool.estimated_wait().as_secs_f64();
+    let wait = app.pool.estimated_wait(lane).as_secs_f64();
     let mesh = estimate.mesh.as_ref().ok();
     let file_bytes = |m: &MeshEstimate| match job.compress.compressed_vertex_bytes() {
         0 => format.estimated_bytes(m.bytes, m.vertices, m.triangles),

@@ -24,12 +24,17 @@ use crate::jobs::{JobId, JobView};
 
 /// `Last-Event-ID`.
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
+/// Id of the final event, on every node. Ids of other events are numbers.
+const FINAL_ID: &str = "end";
 
 /// State of one event stream.
 struct Listener {
     watched: watch::Receiver<JobView>,
     stopping: watch::Receiver<Stop>,
+    /// Version of the last state that the client has.
     seen: u64,
+    /// Id of the last event.
+    id: u64,
     over: bool,
 }
 
@@ -56,14 +61,15 @@ pub(super) async fn show(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let watched = app.job_store.watch(&id, caller.namespace).await?.ok_or_else(|| jobs::no_such_job(id.as_str()))?;
-    let last = headers.get(LAST_EVENT_ID).and_then(|id| id.to_str().ok()?.trim().parse::<u64>().ok());
-    // An id from the future is unknown: the clock was set back.
-    let seen = last.filter(|last| *last <= watched.borrow().version).unwrap_or(0);
-    if last == Some(watched.borrow().version) && watched.borrow().record.status.is_final() {
+    let last = headers.get(LAST_EVENT_ID).and_then(|id| id.to_str().ok()).map_or("", str::trim);
+    if last == FINAL_ID && watched.borrow().record.status.is_final() {
         // A 204 stops browsers from reconnecting.
         return Ok(StatusCode::NO_CONTENT.into_response());
     }
-    let listener = Listener { watched, stopping: app.stopping.clone(), seen, over: false };
+    let id = last.parse().unwrap_or(0);
+    // An id from the future is that of a node whose clock is ahead: this node sends its state.
+    let seen = if id <= watched.borrow().version { id } else { 0 };
+    let listener = Listener { watched, stopping: app.stopping.clone(), seen, id, over: false };
     let events = stream::unfold(listener, |mut listener| async move {
         let event = listener.next().await?;
         Some((Ok::<_, Infallible>(event), listener))
@@ -82,7 +88,10 @@ impl Listener {
             news = self.watched.wait_for(|view| view.version > seen || view.record.status.is_final()) => {
                 let view = news.ok()?;
                 (self.seen, self.over) = (view.version, view.record.status.is_final());
-                let event = Event::default().id(view.version.to_string()).event(view.record.status.name());
+                // Greater than every id that the client has, although the clocks of nodes differ.
+                self.id = self.id.saturating_add(1).max(view.version);
+                let id = if self.over { FINAL_ID.to_owned() } else { self.id.to_string() };
+                let event = Event::default().id(id).event(view.record.status.name());
                 Some(event.data(serde_json::to_string(&jobs::document(&view)).unwrap_or_default()))
             }
             // The stream ends with the service; clients reconnect.

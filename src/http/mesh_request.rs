@@ -24,7 +24,7 @@ use super::source::{self, Loaded, StructureSource};
 use super::state::Shared;
 use super::timing::Timing;
 use super::{conditional, delivery, jobs, results};
-use crate::jobs::{ContentKey, Failure, Input, JobSpec, Refusal, Task, Ticket};
+use crate::jobs::{ContentKey, Failure, Input, JobSpec, Lane, Refusal, Task, Ticket};
 use crate::store::Digest;
 use crate::telemetry::{SpanParent, TraceSpan};
 
@@ -166,7 +166,7 @@ impl MeshRequest {
         if self.is_answered_with_job() {
             return self.accept(loaded, None).await;
         }
-        if self.is_transferred().await {
+        if self.is_transferred(&loaded).await {
             return self.transfer(loaded).await;
         }
         let report = self.parsed.report;
@@ -253,7 +253,7 @@ impl MeshRequest {
         let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());
         let view = accepted.await.map_err(Problem::internal)??;
         let duration = Duration::from_secs_f64(app.pool.expected(&loaded.input, &parsed.request.job));
-        let mut response = jobs::accepted(&view, app.pool.estimated_wait() + duration);
+        let mut response = jobs::accepted(&view, app.pool.estimated_wait(Lane::Batch) + duration);
         if preferences.respond_async {
             response.headers_mut().insert(PREFERENCE_APPLIED, HeaderValue::from_static("respond-async"));
         }

@@ -50,7 +50,7 @@ impl App {
             let begun = Instant::now();
             let control =
                 Control { cancel, deadline: Some(end.into_std()), memory: Arc::new(reservation), ..Control::default() };
-            let value = work(&control);
+            let value = app.pool.run(|| work(&control));
             app.charge(&payer, begun.elapsed());
             value
         });

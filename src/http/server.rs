@@ -136,7 +136,6 @@ impl Server {
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
-            batch_max_delay: Duration::from_millis(config.jobs.batch_max_delay_ms),
             limits: config.limits.job(),
             structures: Structures::new(config.limits.structure_cache_bytes, &budget, scratch),
             budget,
@@ -235,11 +234,11 @@ impl Server {
         }
         background.spawn(publish(Arc::clone(&self.app), recorder));
         stop::reached(&mut orders, Stop::Notice).await;
-        let stopped_with = wind_down(&self.app, &stop, &mut orders, serving).await;
+        let result = wind_down(&self.app, &stop, &mut orders, serving).await;
         drop(background);
         self.traces.shut_down().await;
         drop(self.data);
-        Ok(stopped_with)
+        Ok(result)
     }
 }
 

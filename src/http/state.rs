@@ -15,7 +15,7 @@ use crate::access::Access;
 use crate::archive::Archive;
 use crate::client_shares::{ClientShares, SharePermit};
 use crate::config::Config;
-use crate::jobs::{Budget, Client, ContentKey, Failure, JobStore, Pool, Structures};
+use crate::jobs::{Budget, Client, ContentKey, Failure, JobStore, Lane, Pool, Structures};
 use crate::pipeline::Job;
 use crate::reader_line::ReaderLine;
 use crate::single_flight::SingleFlight;
@@ -94,7 +94,7 @@ impl App {
                 format!("{limit} meshes are being computed or sent, which is the limit"),
             )
             .with("limit", limit)
-            .retry_after(self.pool.estimated_wait())
+            .retry_after(self.pool.estimated_wait(Lane::Short))
         })?;
         Ok(Delivery { _permit: permit, _share: self.delivery_shares.take(client.0)? })
     }

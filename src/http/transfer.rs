@@ -15,16 +15,17 @@ use super::source::Loaded;
 use super::timing::SERVER_TIMING;
 use super::{delivery, results};
 use crate::config::Role;
-use crate::jobs::{AcceptError, ContentKey, Failure, OwnedJob, Status};
+use crate::jobs::{AcceptError, ContentKey, Failure, OwnedJob, Pool, Status};
 use crate::telemetry::JOBS_TRANSFERRED;
 
 impl MeshRequest {
     /// Returns true if other nodes compute the mesh: this node only answers requests, or its queue is long. Strict
     /// checks and reports stay, because the store does not hold their results.
-    pub(super) async fn is_transferred(&self) -> bool {
+    pub(super) async fn is_transferred(&self, loaded: &Loaded) -> bool {
         let Self { app, parsed, preferences, method, .. } = self;
         let limit = Duration::from_millis(app.config.broker.transfer_wait_ms);
-        let is_busy = || app.config.server.role == Role::Api || app.pool.estimated_wait() > limit;
+        let lane = Pool::lane(&preferences.rank, &loaded.input, &parsed.request.job);
+        let is_busy = || app.config.server.role == Role::Api || app.pool.estimated_wait(lane) > limit;
         let is_file = !parsed.report && !parsed.request.strict && !parsed.declared.is_structure();
         let is_plain = preferences.wait.is_none() && *method != Method::HEAD;
         app.config.broker.url.is_some() && is_file && is_plain && is_busy() && app.job_store.has_workers().await

@@ -9,6 +9,7 @@ use tokio::sync::OwnedSemaphorePermit;
 use super::broker::{Claim, Dispatch, JobEvent};
 use super::durable_job::DurableJob;
 use super::job_store::JobStore;
+use super::rank::Lane;
 use super::record::{JobRecord, Status};
 use super::retry;
 use super::runner::Runner;
@@ -57,7 +58,7 @@ impl JobStore {
         let (waiting, limit, pool) = (self.0.broker.queued(), self.0.max_queued, &self.0.pool);
         // As if the jobs ahead took as long as this one.
         let ahead = pool.expected(&task.input, &task.job) * waiting as f64 / pool.settings().workers as f64;
-        let wait = pool.estimated_wait() + Duration::try_from_secs_f64(ahead).unwrap_or(Duration::MAX);
+        let wait = pool.estimated_wait(Lane::Batch) + Duration::try_from_secs_f64(ahead).unwrap_or(Duration::MAX);
         Refusal::QueueFull { waiting, limit, wait }
     }
 
@@ -76,7 +77,7 @@ impl JobStore {
             };
             let claimed = tokio::select! {
                 claimed = next => claimed,
-                () = self.0.runs.finish() => None,
+                () = self.0.runs.finishing() => None,
             };
             let Some((claim, slot)) = claimed else { return };
             let (jobs, run) = (self.clone(), self.count_run());
@@ -90,7 +91,7 @@ impl JobStore {
         let record = tokio::select! {
             biased;
             record = self.record_of(&claim) => record,
-            () = self.0.runs.return_jobs() => {
+            () = self.0.runs.returning() => {
                 claim.release(Duration::ZERO);
                 return Some(RunResult::Returned);
             }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use futures_util::future::{BoxFuture, join_all};
 
-use super::rank::Rank;
+use super::rank::{Lane, Rank};
 use super::{Outcome, Task};
 use crate::pipeline::{ProgressSink, Tracker, params};
 use crate::single_flight::ResultSender;
@@ -41,6 +41,12 @@ impl Progress {
         self.begun.store(true, Ordering::Release);
     }
 
+    /// Marks the job as queued, and forgets its finished stages.
+    pub(super) fn restart(&self) {
+        self.begun.store(false, Ordering::Release);
+        drop(self.stages());
+    }
+
     /// Takes the finished stages, each with its start and its duration.
     pub(super) fn stages(&self) -> Vec<(&'static str, Instant, Duration)> {
         std::mem::take(&mut *self.ended.lock().unwrap_or_else(PoisonError::into_inner))
@@ -72,7 +78,8 @@ impl OnStart {
     /// Runs the work of all requests that share a job concurrently, and waits for its end.
     pub(super) fn run_all(all: Vec<Self>) {
         let Some(runtime) = all.first().map(|first| first.runtime.clone()) else { return };
-        runtime.block_on(join_all(all.into_iter().map(|each| each.work)));
+        // The work runs on a thread of the runtime: threads that it starts would inherit the priority of this one.
+        drop(runtime.block_on(runtime.spawn(join_all(all.into_iter().map(|each| each.work)))));
     }
 }
 
@@ -81,6 +88,7 @@ pub(super) struct CoalescedJob {
     pub(super) id: u64,
     pub(super) work: Digest,
     pub(super) rank: Rank,
+    pub(super) lane: Lane,
     /// Expected work, in the units of [`crate::pipeline::estimate_work`].
     pub(super) units: f64,
     /// Start tag of fair queueing: the lowest one runs first.
@@ -88,6 +96,8 @@ pub(super) struct CoalescedJob {
     pub(super) accepted: Instant,
     pub(super) begun: Option<Instant>,
     pub(super) cancel: CancelToken,
+    /// True from the cancellation of a short job until it is queued in the long lane.
+    pub(super) is_moving: bool,
     pub(super) progress: Arc<Progress>,
     /// Span of the job, a child of the span of its first request.
     pub(super) span: TraceSpan,

@@ -10,8 +10,9 @@ use std::time::Duration;
 use bytes::Bytes;
 use shuttle::future::block_on;
 
+use super::coalesced_job::QueuedTask;
 use super::queue::Queue;
-use super::rank::{Client, DEFAULT_URGENCY, Rank};
+use super::rank::{Client, DEFAULT_URGENCY, Lane, Rank};
 use super::{Failure, Input, Refusal, Task, Ticket};
 use crate::pipeline::params;
 use crate::store::{Digest, Namespace};
@@ -47,20 +48,24 @@ fn ran(mut ticket: Ticket) -> bool {
     ticket.outcome.take().is_some_and(|mut outcome| block_on(outcome.recv()).is_some())
 }
 
-/// Starts two workers, which count their runs.
+/// Starts a worker of each lane, which counts its runs.
 fn workers(queue: &Arc<Queue>, runs: &Arc<AtomicUsize>) -> Vec<JoinHandle<()>> {
-    let worker = || {
+    let worker = |lane| {
         let (queue, runs) = (Arc::clone(queue), Arc::clone(runs));
         thread::spawn(move || {
-            while let Some(entry) = queue.pop() {
-                runs.fetch_add(1, Ordering::SeqCst);
+            while let Some(entry) = queue.pop(lane) {
+                let QueuedTask { id, task, cancel, .. } = entry;
                 thread::yield_now();
+                if cancel.is_cancelled() && queue.restart(id, task).is_none() {
+                    continue;
+                }
+                runs.fetch_add(1, Ordering::SeqCst);
                 let outcome = Err(Failure::Panicked { message: "scripted".to_owned() });
-                queue.done(entry.id, Some(outcome), None);
+                queue.done(id, Some(outcome), None);
             }
         })
     };
-    vec![worker(), worker()]
+    Lane::ALL.map(worker).into()
 }
 
 fn join(workers: Vec<JoinHandle<()>>) {
@@ -73,7 +78,7 @@ fn join(workers: Vec<JoinHandle<()>>) {
 fn every_waiting_request_gets_an_outcome_although_others_leave() {
     shuttle::check_random(
         || {
-            let (queue, runs) = (Arc::new(Queue::new(8, 2, Duration::ZERO)), Arc::default());
+            let (queue, runs) = (Arc::new(Queue::new(8, 2)), Arc::default());
             let workers = workers(&queue, &runs);
             let requests: Vec<_> = (0..4)
                 .map(|n| {
@@ -96,10 +101,39 @@ fn every_waiting_request_gets_an_outcome_although_others_leave() {
 }
 
 #[test]
+fn jobs_that_move_to_the_long_lane_end_although_others_leave_and_the_service_stops() {
+    shuttle::check_random(
+        || {
+            let (queue, runs) = (Arc::new(Queue::new(8, 1)), Arc::default());
+            let workers = workers(&queue, &runs);
+            let mut requests: Vec<_> = (0..3)
+                .map(|n| {
+                    let queue = Arc::clone(&queue);
+                    thread::spawn(move || push(&queue, n % 2, false).is_ok_and(|ticket| n == 2 || ran(ticket)))
+                })
+                .collect();
+            let of_queue = Arc::clone(&queue);
+            requests.push(thread::spawn(move || {
+                for _ in 0..4 {
+                    of_queue.make_room();
+                    thread::yield_now();
+                }
+                true
+            }));
+            queue.close();
+            requests.into_iter().for_each(|request| drop(request.join().unwrap()));
+            block_on(queue.idle());
+            join(workers);
+        },
+        SCHEDULES,
+    );
+}
+
+#[test]
 fn no_request_waits_for_ever_when_the_service_stops() {
     shuttle::check_random(
         || {
-            let (queue, runs) = (Arc::new(Queue::new(8, 2, Duration::ZERO)), Arc::default());
+            let (queue, runs) = (Arc::new(Queue::new(8, 2)), Arc::default());
             let workers = workers(&queue, &runs);
             let requests: Vec<_> = (0..3)
                 .map(|n| {
@@ -123,7 +157,7 @@ fn no_request_waits_for_ever_when_the_service_stops() {
 fn durable_jobs_run_or_are_left_to_the_next_process() {
     shuttle::check_random(
         || {
-            let (queue, runs) = (Arc::new(Queue::new(8, 2, Duration::ZERO)), Arc::default());
+            let (queue, runs) = (Arc::new(Queue::new(8, 2)), Arc::default());
             let workers = workers(&queue, &runs);
             let requests: Vec<_> = (0..3)
                 .map(|n| {

@@ -36,6 +36,7 @@ mod scratch;
 mod structures;
 #[cfg(test)]
 mod tests;
+mod threads;
 mod ticket;
 mod worker;
 
@@ -48,7 +49,7 @@ pub(crate) use kept::{CacheKey, Input, SharedStructure, SharedTileset};
 pub(crate) use key::ContentKey;
 pub(crate) use owned_job::OwnedJob;
 pub(crate) use pool::{Pool, Settings};
-pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
+pub(crate) use rank::{Client, DEFAULT_URGENCY, Lane, Rank};
 pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
 pub(crate) use records::unfinished_jobs;
 pub(crate) use results::{REPORT, SaveError, document, is_stored, save};

@@ -8,6 +8,8 @@ use metrics::counter;
 
 use super::devices::DeviceMonitor;
 use super::queue::Queue;
+use super::rank::{Lane, Rank};
+use super::threads::ThreadPools;
 use super::{Budget, Client, Input, OnStart, Refusal, Structures, Task, Ticket, worker};
 use crate::picture::SelectedRenderer;
 use crate::pipeline::{self, Job, JobLimits, file_arithmetic};
@@ -17,12 +19,10 @@ use crate::telemetry::{JOBS_SUBMITTED, Tracer};
 /// Settings of a [`Pool`].
 #[derive(Clone)]
 pub(crate) struct Settings {
-    /// Number of concurrent jobs.
+    /// Number of concurrent jobs of each lane.
     pub(crate) workers: usize,
     /// Number of queued jobs.
     pub(crate) queue: usize,
-    /// Maximum time that a durable job yields to interactive ones.
-    pub(crate) batch_max_delay: Duration,
     /// Limits of every job.
     pub(crate) limits: JobLimits,
     /// Memory budget for uploads and meshes.
@@ -44,7 +44,6 @@ impl Settings {
         Self {
             workers,
             queue: 8,
-            batch_max_delay: Duration::from_secs(10),
             limits: JobLimits::default(),
             structures: Structures::new(1 << 20, &budget, None),
             budget,
@@ -65,6 +64,7 @@ pub(super) struct WorkerContext {
     pub(super) backend: Arc<dyn Backend>,
     pub(super) reason: String,
     pub(super) settings: Settings,
+    pub(super) threads: ThreadPools,
     monitor: DeviceMonitor,
 }
 
@@ -83,18 +83,21 @@ pub(crate) struct Pool {
 impl Pool {
     /// Starts the workers. `reason` is the reason for the choice of the backend, for reports.
     pub(crate) fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
+        let workers = settings.workers;
         let pool = Self::without_workers(settings, backend, reason);
-        for n in 0..pool.shared.settings.workers {
+        for (n, lane) in Lane::ALL.into_iter().flat_map(|lane| (0..workers).map(move |n| (n, lane))) {
             let shared = Arc::clone(&pool.shared);
-            std::thread::Builder::new().name(format!("molmesh-job-{n}")).spawn(move || worker::work(&shared))?;
+            let name = format!("molmesh-{lane:?}-{n}").to_lowercase();
+            std::thread::Builder::new().name(name).spawn(move || worker::work(&shared, lane))?;
         }
         Ok(pool)
     }
 
     /// Creates a pool whose workers have not started.
     pub(super) fn without_workers(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> Self {
-        let queue = Arc::new(Queue::new(settings.queue, settings.workers, settings.batch_max_delay));
-        Self { shared: Arc::new(WorkerContext { queue, backend, reason, settings, monitor: DeviceMonitor::default() }) }
+        let queue = Arc::new(Queue::new(settings.queue, settings.workers));
+        let (threads, monitor) = (ThreadPools::new(settings.workers), DeviceMonitor::default());
+        Self { shared: Arc::new(WorkerContext { queue, backend, reason, settings, threads, monitor }) }
     }
 
     /// Accepts a task whose mesh must be finished within `allowed`, time in the queue included. `on_start` is called
@@ -131,9 +134,19 @@ impl Pool {
         self.shared.queue.expected(units)
     }
 
-    /// Estimates the queueing time of a job that is accepted now.
-    pub(crate) fn estimated_wait(&self) -> Duration {
-        self.shared.queue.estimated_wait()
+    /// Returns the lane of a job.
+    pub(crate) fn lane(rank: &Rank, input: &Input, job: &Job) -> Lane {
+        Lane::of(rank, pipeline::estimate_work(input.atoms(), job))
+    }
+
+    /// Estimates the queueing time of a job of a lane that is accepted now.
+    pub(crate) fn estimated_wait(&self, lane: Lane) -> Duration {
+        self.shared.queue.estimated_wait(lane)
+    }
+
+    /// Runs the work of a short request that is not a job on threads of its own.
+    pub(crate) fn run<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        self.shared.threads.run(Lane::Short, work)
     }
 
     /// Returns true if a job waits for a worker.

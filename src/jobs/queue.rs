@@ -1,27 +1,42 @@
 //! Queued and running jobs behind one lock. A job that nobody waits for is removed, or cancelled if it runs.
+//!
+//! Each lane has workers of its own. A job that takes longer than the short lane allows gives its worker to a job that
+//! waits, and starts again in the long lane.
+
+mod estimates;
+mod lanes;
 
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 
-use metrics::gauge;
 use tokio::sync::Notify;
 
 use super::coalesced_job::{CoalescedJob, OnStart, Progress, QueuedTask, work_key};
 use super::cost::WorkRate;
-use super::rank::{self, Shares};
+use super::rank::{Lane, Shares};
 use super::{Outcome, Refusal, Task, Ticket};
 use crate::pipeline;
 use crate::single_flight::{self, ResultReceiver};
 use crate::surface::CancelToken;
 use crate::sync::{Condvar, Mutex, MutexGuard};
-use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, SpanKind, TraceSpan};
+use crate::telemetry::{SpanKind, TraceSpan};
+
+/// Times of a job.
+struct Times {
+    /// Time from acceptance to the outcome.
+    allowed: Duration,
+    /// Expected duration, s.
+    expected: f64,
+}
 
 struct QueueState {
     jobs: Vec<CoalescedJob>,
-    shares: Shares,
+    /// Shares of the clients in each lane.
+    shares: [Shares; Lane::ALL.len()],
     rate: WorkRate,
-    /// Waiting workers, each with its own condition. The last one began to wait last: its memory and caches are warm.
-    idle_workers: Vec<Arc<Condvar>>,
+    /// Waiting workers of each lane, each with its own condition. The last one began to wait last: its memory and
+    /// caches are warm.
+    idle_workers: [Vec<Arc<Condvar>>; Lane::ALL.len()],
     closed: bool,
     /// True once queued durable jobs are left to the next process.
     leaving: bool,
@@ -35,6 +50,29 @@ impl QueueState {
         self.jobs.iter().filter(|job| job.begun.is_none())
     }
 
+    fn waiting_in(&self, lane: Lane) -> impl Iterator<Item = &CoalescedJob> {
+        self.waiting().filter(move |job| job.lane == lane)
+    }
+
+    fn len(&self, lane: Lane) -> usize {
+        self.jobs.iter().filter(|job| job.lane == lane).count()
+    }
+
+    /// Wakes up all workers that wait.
+    fn wake_all(&mut self) {
+        for worker in self.idle_workers.iter_mut().flat_map(|workers| workers.drain(..)) {
+            worker.notify_one();
+        }
+    }
+
+    /// Puts the job at an index into a lane, to be started. Returns a worker to be woken up.
+    fn enqueue(&mut self, at: usize, lane: Lane) -> Option<Arc<Condvar>> {
+        let job = &mut self.jobs[at];
+        job.lane = lane;
+        job.tag = self.shares[lane as usize].tag(job.rank.client, job.units);
+        self.idle_workers[lane as usize].pop()
+    }
+
     fn find(&self, id: u64) -> Option<usize> {
         self.jobs.iter().position(|job| job.id == id)
     }
@@ -46,24 +84,22 @@ pub(super) struct Queue {
     idle: Notify,
     limit: usize,
     workers: usize,
-    batch_max_delay: Duration,
 }
 
 impl Queue {
-    /// Creates a queue of `limit` slots in front of `workers` workers. Durable jobs yield to interactive ones for
-    /// `batch_max_delay` at most.
-    pub(super) fn new(limit: usize, workers: usize, batch_max_delay: Duration) -> Self {
+    /// Creates a queue with `limit` slots and `workers` workers in each lane.
+    pub(super) fn new(limit: usize, workers: usize) -> Self {
         let state = QueueState {
             jobs: Vec::with_capacity(limit.min(1024) + workers),
-            shares: Shares::default(),
+            shares: Default::default(),
             rate: WorkRate::default(),
-            idle_workers: Vec::with_capacity(workers),
+            idle_workers: Default::default(),
             closed: false,
             leaving: false,
             next_id: 0,
             published: 0,
         };
-        Self { state: Mutex::new(state), idle: Notify::new(), limit, workers, batch_max_delay }
+        Self { state: Mutex::new(state), idle: Notify::new(), limit, workers }
     }
 
     fn lock(&self) -> MutexGuard<'_, QueueState> {
@@ -88,30 +124,33 @@ impl Queue {
         let expected = state.rate.seconds(units);
         let now = Instant::now();
         let (sender, outcome) = single_flight::channel();
-        let tag = state.shares.tag(&task.rank, units);
+        let lane = Lane::of(&task.rank, units);
         let (progress, span) = (Arc::new(Progress::default()), job_span(&task, now));
         state.jobs.push(CoalescedJob {
             id,
             work: work_key(&task),
             rank: task.rank,
+            lane,
             units,
-            tag,
+            tag: 0.0,
             accepted: now,
             begun: None,
             cancel: CancelToken::default(),
+            is_moving: false,
             progress: Arc::clone(&progress),
             span: span.clone(),
             outcome: Some(sender),
             on_start: on_start.into_iter().collect(),
             task: Some(task),
         });
+        let at = state.jobs.len() - 1;
+        let worker = state.enqueue(at, lane);
         self.publish(&mut state);
-        let worker = state.idle_workers.pop();
         drop(state);
         if let Some(worker) = worker {
             worker.notify_one();
         }
-        Ok(self.ticket(id, Some(outcome), progress, span, (allowed, expected)))
+        Ok(self.ticket(id, lane, Some(outcome), (progress, span), Times { allowed, expected }))
     }
 
     /// Accepts a task that needs no input: joins an identical job, which takes `on_start` unless it runs. `None` if
@@ -136,10 +175,18 @@ impl Queue {
             return Err(Refusal::Draining);
         }
         let (work, now) = (work_key(task), Instant::now());
-        let same = |job: &&mut CoalescedJob| job.work == work && !job.cancel.is_cancelled();
-        if let Some(job) = state.jobs.iter_mut().find(same) {
-            job.rank.batch &= task.rank.batch;
-            let joined_running = job.begun.is_some();
+        let same = |job: &CoalescedJob| job.work == work && (job.is_moving || !job.cancel.is_cancelled());
+        if let Some(at) = state.jobs.iter().position(same) {
+            let joined_running = state.jobs[at].begun.is_some();
+            if state.jobs[at].rank.batch && !task.rank.batch {
+                state.jobs[at].rank.batch = false;
+                let lane = Lane::of(&task.rank, state.jobs[at].units);
+                let worker = if joined_running { None } else { state.enqueue(at, lane) };
+                if let Some(worker) = worker {
+                    worker.notify_one();
+                }
+            }
+            let job = &mut state.jobs[at];
             if !joined_running {
                 job.on_start.extend(on_start.take());
             }
@@ -148,7 +195,8 @@ impl Queue {
             }
             let outcome = job.outcome.as_ref().map(ResultReceiver::of);
             let (progress, span) = (Arc::clone(&job.progress), job.span.clone());
-            let mut ticket = self.ticket(job.id, outcome, progress, span, (allowed, state.rate.seconds(job.units)));
+            let times = Times { allowed, expected: state.rate.seconds(job.units) };
+            let mut ticket = self.ticket(job.id, job.lane, outcome, (progress, span), times);
             (ticket.is_shared, ticket.joined_running) = (true, joined_running);
             return Ok(Some(ticket));
         }
@@ -156,16 +204,24 @@ impl Queue {
             let id = state.next_id;
             state.next_id += 1;
             // The next process runs the job. Without a sender the ticket ends as stopped.
-            return Ok(Some(self.ticket(id, None, Arc::default(), job_span(task, now), (allowed, 0.0))));
+            return Ok(Some(self.ticket(
+                id,
+                Lane::Batch,
+                None,
+                (Arc::default(), job_span(task, now)),
+                Times { allowed, expected: 0.0 },
+            )));
         }
         // A broker has queued durable jobs; no more are claimed than there are workers.
         if task.rank.batch {
             return Ok(None);
         }
-        let wait = self.wait(state, now);
+        let units = pipeline::estimate_work(task.input.atoms(), &task.job);
+        let lane = Lane::of(&task.rank, units);
+        let wait = self.wait(state, lane, now);
         // A job of a free worker counts as running before the worker has woken up.
-        if state.jobs.len() >= self.limit + self.workers {
-            return Err(Refusal::QueueFull { waiting: state.waiting().count(), limit: self.limit, wait });
+        if state.len(lane) >= self.limit + self.workers {
+            return Err(Refusal::QueueFull { waiting: state.waiting_in(lane).count(), limit: self.limit, wait });
         }
         if wait > allowed {
             return Err(Refusal::TooLate { wait, allowed });
@@ -173,55 +229,53 @@ impl Queue {
         Ok(None)
     }
 
-    /// Creates the ticket of a job that is allowed a time and expected to take a number of seconds. To be finished in
+    /// Creates the ticket of a job. To be finished in
     /// time, it must begin by then, but half of the time is never given up.
     fn ticket(
         self: &Arc<Self>,
         job: u64,
+        lane: Lane,
         outcome: Option<ResultReceiver<Outcome>>,
-        progress: Arc<Progress>,
-        span: TraceSpan,
-        (allowed, expected): (Duration, f64),
+        (progress, span): (Arc<Progress>, TraceSpan),
+        Times { allowed, expected }: Times,
     ) -> Ticket {
         let (queue, now) = (Arc::clone(self), Instant::now());
         let running = Duration::try_from_secs_f64(expected).unwrap_or(Duration::MAX).min(allowed / 2);
         let (deadline, start_by) = (now + allowed, now + allowed.saturating_sub(running));
         let (is_shared, joined_running) = (false, false);
-        Ticket { queue, job, outcome, deadline, start_by, allowed, progress, span, is_shared, joined_running }
+        Ticket { queue, job, lane, outcome, deadline, start_by, allowed, progress, span, is_shared, joined_running }
     }
 
-    /// Takes the next job; blocks until there is one. `None` once the queue is closed and empty.
-    pub(super) fn pop(&self) -> Option<QueuedTask> {
+    /// Takes the next job of a lane; blocks until there is one. `None` once the queue is closed and the lane is empty.
+    pub(super) fn pop(&self, lane: Lane) -> Option<QueuedTask> {
         let mut state = self.lock();
         let filled = Arc::new(Condvar::new());
         loop {
-            if let Some(entry) = self.take(&mut state) {
+            if let Some(entry) = Self::take(&mut state, lane) {
                 self.publish(&mut state);
                 return Some(entry);
             }
-            if state.closed {
+            // A job that moves to the long lane is still to come.
+            let is_last = lane != Lane::Long || !state.jobs.iter().any(|job| job.is_moving);
+            if state.closed && is_last {
                 return None;
             }
-            state.idle_workers.push(Arc::clone(&filled));
+            state.idle_workers[lane as usize].push(Arc::clone(&filled));
             state = filled.wait(state).unwrap_or_else(PoisonError::into_inner);
-            state.idle_workers.retain(|worker| !Arc::ptr_eq(worker, &filled));
+            state.idle_workers[lane as usize].retain(|worker| !Arc::ptr_eq(worker, &filled));
         }
     }
 
     /// Takes the most urgent job of the client with the lowest tag.
-    fn take(&self, state: &mut QueueState) -> Option<QueuedTask> {
-        let now = Instant::now();
-        let waited = |job: &CoalescedJob| now.saturating_duration_since(job.accepted);
-        let turn = |job: &CoalescedJob| rank::turn(&job.rank, job.tag, job.id, waited(job), self.batch_max_delay);
-        let next = state.waiting().reduce(|a, b| if rank::before(&turn(b), &turn(a)) { b } else { a })?;
-        let (client, batch) = (next.rank.client, next.rank.batch);
-        let own = state.waiting().filter(|job| job.rank.client == client && job.rank.batch == batch);
+    fn take(state: &mut QueueState, lane: Lane) -> Option<QueuedTask> {
+        let next = state.waiting_in(lane).min_by(|a, b| a.tag.total_cmp(&b.tag).then(a.id.cmp(&b.id)))?;
+        let (client, tag) = (next.rank.client, next.tag);
+        let own = state.waiting_in(lane).filter(|job| job.rank.client == client);
         let id = own.min_by_key(|job| (job.rank.urgency, job.id))?.id;
-        let tag = next.tag;
-        state.shares.begin(tag);
+        state.shares[lane as usize].begin(tag);
         let at = state.find(id)?;
         let job = &mut state.jobs[at];
-        job.begun = Some(now);
+        job.begun = Some(Instant::now());
         job.progress.begin();
         Some(QueuedTask {
             id,
@@ -269,8 +323,11 @@ impl Queue {
 
     /// Updates the metrics and, if no job is left, the shares and the callers of `idle`.
     fn after_removal(&self, state: &mut QueueState) {
+        if state.closed {
+            state.wake_all();
+        }
         if state.jobs.is_empty() {
-            state.shares.reset();
+            state.shares.iter_mut().for_each(Shares::reset);
             self.idle.notify_waiters();
         }
         self.publish(state);
@@ -280,9 +337,7 @@ impl Queue {
     pub(super) fn close(&self) {
         let mut state = self.lock();
         state.closed = true;
-        for worker in state.idle_workers.drain(..) {
-            worker.notify_one();
-        }
+        state.wake_all();
     }
 
     /// Leaves queued durable jobs, now and from now on, for the next process: their tickets end as stopped.
@@ -308,7 +363,7 @@ impl Queue {
             senders.push(job.outcome.take());
         }
         state.jobs = running;
-        self.publish(&mut state);
+        self.after_removal(&mut state);
         drop(state);
         drop((left, senders));
     }
@@ -322,53 +377,6 @@ impl Queue {
             }
             notified.await;
         }
-    }
-
-    /// Estimates the queueing time of a job that is accepted now.
-    pub(super) fn estimated_wait(&self) -> Duration {
-        self.wait(&self.lock(), Instant::now())
-    }
-
-    /// Returns true if a job waits for a worker.
-    pub(super) fn has_waiting(&self) -> bool {
-        self.lock().waiting().next().is_some()
-    }
-
-    /// Estimates the duration of a job of `units` work, s.
-    pub(super) fn expected(&self, units: f64) -> f64 {
-        self.lock().rate.seconds(units)
-    }
-
-    /// Estimates the remaining work of all jobs, divided by the number of workers.
-    fn wait(&self, state: &QueueState, now: Instant) -> Duration {
-        if state.jobs.len() < self.workers {
-            return Duration::ZERO;
-        }
-        let left = |job: &CoalescedJob| {
-            let spent = job.begun.map_or(0.0, |begun| now.saturating_duration_since(begun).as_secs_f64());
-            let cost = state.rate.seconds(job.units);
-            // A job that takes longer than expected may still run for a while.
-            (cost - spent).max(0.1 * cost)
-        };
-        let ahead: f64 = state.jobs.iter().map(left).sum();
-        Duration::try_from_secs_f64(ahead / self.workers as f64).unwrap_or(Duration::MAX)
-    }
-
-    /// Updates the metrics of the queue: the age of queued jobs grows without any event.
-    pub(super) fn refresh(&self) {
-        self.publish(&mut self.lock());
-    }
-
-    #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of jobs are small")]
-    fn publish(&self, state: &mut QueueState) {
-        let now = Instant::now();
-        let waiting = state.waiting().count();
-        let oldest = state.waiting().map(|job| now.saturating_duration_since(job.accepted)).max().unwrap_or_default();
-        // Incremented by the difference, so that several pools in one process add up.
-        gauge!(QUEUE_DEPTH).increment(waiting as f64 - state.published as f64);
-        state.published = waiting;
-        gauge!(QUEUE_AGE).set(oldest.as_secs_f64());
-        gauge!(QUEUE_WAIT).set(self.wait(state, now).as_secs_f64());
     }
 }
 

@@ -1,9 +1,7 @@
-//! Order of queued jobs: interactive jobs before durable ones, fair shares for clients, bounded delays.
+//! Order of queued jobs: lanes with workers of their own, and in each lane fair shares for clients.
 //!
 //! Shares follow start-time fair queueing (Goyal, Vin, Cheng, 1996): the tag of a job is the virtual time, in units of
 //! work, at which the earlier jobs of its client would be finished; the lowest tag runs first.
-
-use std::time::Duration;
 
 use rustc_hash::FxHashMap;
 use sha2::{Digest as _, Sha256};
@@ -40,17 +38,32 @@ impl Default for Rank {
     }
 }
 
-/// Sort key of a job: the lowest one runs first.
-pub(super) type Turn = (bool, f64, u64);
-
-/// Returns the sort key of a job. Durable jobs yield to interactive ones until they have waited for `batch_max_delay`.
-pub(super) fn turn(rank: &Rank, tag: f64, id: u64, waited: Duration, batch_max_delay: Duration) -> Turn {
-    (rank.batch && waited < batch_max_delay, tag, id)
+/// Jobs that share workers. Jobs of one lane never wait for those of another.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Lane {
+    /// Requests that take a moment.
+    Short,
+    /// Other requests, for which a client waits.
+    Long,
+    /// Durable jobs.
+    Batch,
 }
 
-/// Returns true if `a` runs before `b`.
-pub(super) fn before(a: &Turn, b: &Turn) -> bool {
-    a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)).is_lt()
+/// Largest work of a job in the lane of short ones, in the units of [`crate::pipeline::estimate_work`]: about 50 ms on
+/// two cores. Not a time, whose estimate depends on the jobs of all clients.
+const SHORT_WORK: f64 = 12_500.0;
+
+impl Lane {
+    pub(super) const ALL: [Self; 3] = [Self::Short, Self::Long, Self::Batch];
+
+    /// Returns the lane of a job with this amount of work.
+    pub(super) fn of(rank: &Rank, units: f64) -> Self {
+        match rank.batch {
+            true => Self::Batch,
+            false if units > SHORT_WORK => Self::Long,
+            false => Self::Short,
+        }
+    }
 }
 
 /// Virtual time of fair queueing.
@@ -59,13 +72,13 @@ pub(super) struct Shares {
     /// Virtual time: the tag of the job that started last.
     clock: f64,
     /// Virtual end of the jobs of each client.
-    ends: FxHashMap<(Client, bool), f64>,
+    ends: FxHashMap<Client, f64>,
 }
 
 impl Shares {
     /// Returns the tag of the client's next job, which has the expected work `cost`.
-    pub(super) fn tag(&mut self, rank: &Rank, cost: f64) -> f64 {
-        let end = self.ends.entry((rank.client, rank.batch)).or_insert(self.clock);
+    pub(super) fn tag(&mut self, client: Client, cost: f64) -> f64 {
+        let end = self.ends.entry(client).or_insert(self.clock);
         let start = end.max(self.clock);
         *end = start + cost;
         start
@@ -91,46 +104,37 @@ impl Shares {
 mod tests {
     use super::*;
 
-    fn rank(client: &str, batch: bool) -> Rank {
-        Rank { client: Client::named(client), batch, ..Rank::default() }
-    }
-
     #[test]
     fn clients_alternate_however_many_jobs_one_has() {
         let mut shares = Shares::default();
-        let (greedy, modest) = (rank("greedy", false), rank("modest", false));
-        let first: Vec<f64> = (0..50).map(|_| shares.tag(&greedy, 1.0)).collect();
+        let (greedy, modest) = (Client::named("greedy"), Client::named("modest"));
+        let first: Vec<f64> = (0..50).map(|_| shares.tag(greedy, 1.0)).collect();
         shares.begin(first[0]);
-        let tag = shares.tag(&modest, 1.0);
+        let tag = shares.tag(modest, 1.0);
         // After the running job, before the others.
         assert!(first.iter().filter(|t| **t < tag).count() <= 1, "{tag} {first:?}");
         // A client with larger jobs gets fewer of them.
-        let large = rank("large", false);
-        let tags = [shares.tag(&large, 10.0), shares.tag(&large, 10.0)];
+        let large = Client::named("large");
+        let tags = [shares.tag(large, 10.0), shares.tag(large, 10.0)];
         assert!(first.iter().filter(|t| **t < tags[1]).count() >= 9);
     }
 
     #[test]
-    fn interactive_jobs_run_before_durable_ones_up_to_the_maximum_delay() {
-        let delay = Duration::from_secs(7);
-        let (person, batch) = (rank("a", false), rank("b", true));
-        let at = |rank, tag, id, waited| turn(rank, tag, id, waited, delay);
-        for waited in [Duration::ZERO, delay / 2] {
-            assert!(before(&at(&person, 5.0, 2, waited), &at(&batch, 0.0, 1, waited)));
-        }
-        assert!(before(&at(&batch, 0.0, 1, delay), &at(&person, 5.0, 2, delay)));
-        assert!(before(&at(&person, 1.0, 1, delay), &at(&person, 1.0, 2, delay)));
+    fn durable_and_long_jobs_have_lanes_of_their_own() {
+        let [request, durable] = [false, true].map(|batch| Rank { batch, ..Rank::default() });
+        assert_eq!([Lane::of(&request, 1e3), Lane::of(&request, 1e5)], [Lane::Short, Lane::Long]);
+        assert_eq!([Lane::of(&durable, 1e3), Lane::of(&durable, 1e5)], [Lane::Batch; 2]);
     }
 
     #[test]
     fn idle_clients_are_forgotten() {
         let mut shares = Shares::default();
         for n in 0..100 {
-            let tag = shares.tag(&rank(&n.to_string(), false), 1.0);
+            let tag = shares.tag(Client::named(&n.to_string()), 1.0);
             shares.begin(tag + 2.0);
         }
         assert!(shares.ends.len() <= 66, "{}", shares.ends.len());
         shares.reset();
-        assert!(shares.tag(&rank("x", false), 1.0).abs() < 1e-12);
+        assert!(shares.tag(Client::named("x"), 1.0).abs() < 1e-12);
     }
 }

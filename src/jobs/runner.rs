@@ -132,7 +132,7 @@ impl Runner {
                 () = stop.notified() => {
                     break if job.is_decided() { RunEnd::Done { recorded: true } } else { RunEnd::Superseded };
                 }
-                () = jobs.0.runs.return_jobs() => Attempt::Stopped,
+                () = jobs.0.runs.returning() => Attempt::Stopped,
             };
             match attempt {
                 Attempt::Ended(ending) => {

@@ -29,7 +29,7 @@ pub(super) enum RunResult {
     Unrecorded,
 }
 
-/// Number of asynchronous jobs by what a stop has made of them.
+/// Numbers of asynchronous jobs by their state after a stop.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct StoppedJobs {
     /// Jobs that have ended since the stop began.
@@ -58,17 +58,17 @@ pub(super) struct Runs {
 
 impl Runs {
     /// Waits until no more jobs are claimed.
-    pub(super) async fn finish(&self) {
+    pub(super) async fn finishing(&self) {
         self.reached(Phase::Finish).await;
     }
 
     /// Waits until unfinished jobs return to the queue.
-    pub(super) async fn return_jobs(&self) {
+    pub(super) async fn returning(&self) {
         self.reached(Phase::Return).await;
     }
 
     /// Returns true once unfinished jobs return to the queue.
-    fn returns_jobs(&self) -> bool {
+    fn are_returning(&self) -> bool {
         *self.phase.borrow() == Phase::Return
     }
 
@@ -116,7 +116,7 @@ impl JobStore {
 
     /// Counts and records an attempt, unless the job has ended or returns to the queue.
     pub(super) async fn begin(&self, job: &DurableJob) {
-        if job.begin(|| !self.0.runs.returns_jobs())
+        if job.begin(|| !self.0.runs.are_returning())
             && let Err(error) = self.0.write_job(job).await
         {
             tracing::error!(job_id = %job.id(), %error, "cannot record an attempt to run a job");
@@ -142,7 +142,8 @@ impl JobStore {
         self.0.broker.flush().await;
     }
 
-    /// Returns what has become of the jobs since the stop began. Jobs that still run are not on record.
+    /// Returns the numbers of jobs that ended or returned since the stop began. Jobs that still run count as
+    /// unrecorded.
     pub(crate) fn stopped_jobs(&self) -> StoppedJobs {
         let counts = self.0.runs.counts.borrow();
         StoppedJobs { unrecorded: counts.stopped.unrecorded + counts.running, ..counts.stopped }

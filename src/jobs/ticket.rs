@@ -5,10 +5,14 @@ use std::time::{Duration, Instant};
 
 use super::coalesced_job::Progress;
 use super::queue::Queue;
+use super::rank::Lane;
 use super::{Failure, Outcome};
 use crate::single_flight::ResultReceiver;
 use crate::sync::timeout;
 use crate::telemetry::TraceSpan;
+
+/// Interval at which a queued job asks for a worker.
+const QUEUED_TICK: Duration = Duration::from_millis(20);
 
 /// Handle of an accepted job.
 #[must_use = "dropping the ticket cancels the job"]
@@ -16,6 +20,8 @@ pub(crate) struct Ticket {
     pub(super) queue: Arc<Queue>,
     /// Number of the job in the queue.
     pub(super) job: u64,
+    /// Lane in which the job was queued.
+    pub(super) lane: Lane,
     /// `None` if the job is left for the next process.
     pub(super) outcome: Option<ResultReceiver<Outcome>>,
     pub(super) deadline: Instant,
@@ -36,16 +42,25 @@ impl Ticket {
     pub(crate) async fn wait(&mut self) -> Outcome {
         let Some(outcome) = &mut self.outcome else { return Err(Failure::Stopped) };
         let limit = self.allowed;
-        for end in [self.start_by, self.deadline] {
-            match timeout(end.saturating_duration_since(Instant::now()), outcome.recv()).await {
-                Ok(outcome) => return outcome.unwrap_or(Err(Failure::Stopped)),
-                Err(_elapsed) if self.progress.now().is_none() => {
-                    return Err(Failure::Waited { limit, wait: self.queue.estimated_wait() });
-                }
-                Err(_elapsed) => {}
+        let mut has_begun = false;
+        loop {
+            let (now, is_queued) = (Instant::now(), self.progress.now().is_none());
+            has_begun |= !is_queued;
+            if !has_begun && now >= self.start_by {
+                return Err(Failure::Waited { limit, wait: self.queue.estimated_wait(self.lane) });
+            }
+            if now >= self.deadline {
+                return Err(Failure::Deadline { limit });
+            }
+            if is_queued && self.lane == Lane::Short {
+                self.queue.make_room();
+            }
+            let tick = if is_queued { now + QUEUED_TICK } else { self.deadline };
+            let end = tick.min(self.deadline);
+            if let Ok(outcome) = timeout(end.saturating_duration_since(now), outcome.recv()).await {
+                return outcome.unwrap_or(Err(Failure::Stopped));
             }
         }
-        Err(Failure::Deadline { limit })
     }
 }
 

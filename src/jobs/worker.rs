@@ -10,6 +10,7 @@ use metrics::{counter, histogram};
 
 use super::coalesced_job::QueuedTask;
 use super::pool::WorkerContext;
+use super::rank::Lane;
 use super::{Failure, Finished, JobId, MemoryReservation, OnStart, Outcome, Settings, Task};
 use crate::formats::Pieces;
 use crate::pipeline::{self, Choice, JobError, Product, ProgressSink, Report, StageClock};
@@ -18,15 +19,29 @@ use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, Control, SurfaceError};
 use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan};
 
-/// Runs jobs until the queue is closed and empty.
-pub(super) fn work(shared: &WorkerContext) {
-    while let Some(entry) = shared.queue.pop() {
+/// End of a task.
+enum TaskEnd {
+    Ended(Outcome),
+    /// The job was cancelled before its start.
+    Dismissed,
+    /// The job is queued again, in another lane.
+    Restarted,
+}
+
+/// Runs the jobs of a lane until the queue is closed and the lane is empty.
+pub(super) fn work(shared: &WorkerContext, lane: Lane) {
+    while let Some(entry) = shared.queue.pop(lane) {
         let (id, client, is_typical) = (entry.id, entry.task.rank.client, entry.task.is_typical());
         let partitions = entry.task.partitions.clone();
         let start = Instant::now();
-        let outcome = run(shared, entry);
+        let end = shared.threads.run(lane, || run(shared, entry));
         // Helpers have computed a part of a divided mesh.
         let is_typical = is_typical && !partitions.is_some_and(|partitions| partitions.is_divided());
+        let outcome = match end {
+            TaskEnd::Ended(outcome) => Some(outcome),
+            TaskEnd::Dismissed => None,
+            TaskEnd::Restarted => continue,
+        };
         if let Some(meter) = &shared.settings.meter {
             meter(client, start.elapsed());
         }
@@ -37,16 +52,16 @@ pub(super) fn work(shared: &WorkerContext) {
     }
 }
 
-/// Runs one job. `None` if it was cancelled before its start.
-fn run(shared: &WorkerContext, entry: QueuedTask) -> Option<Outcome> {
-    let QueuedTask { task, cancel, progress, on_start, accepted, span, .. } = entry;
+/// Runs one job.
+fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
+    let QueuedTask { id: entry_id, task, cancel, progress, on_start, accepted, span } = entry;
     let log = span.as_parent().log_span(task.id.as_ref().map(JobId::as_str));
     let _entered = log.enter();
     let id = task.id.clone();
     if cancel.is_cancelled() {
         counter!(JOBS_FINISHED, "outcome" => "dismissed").increment(1);
         end_span(&span, id, "dismissed", None);
-        return None;
+        return TaskEnd::Dismissed;
     }
     let waited = accepted.elapsed();
     span.part("queue", accepted, waited);
@@ -101,6 +116,9 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Option<Outcome> {
         reservation.set(bytes_of(&product));
         Ok(Finished { product, diagnostics, digest: task.digest, reservation })
     });
+    let was_cancelled = matches!(outcome, Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }));
+    let task = if was_cancelled { shared.queue.restart(entry_id, task) } else { Some(task) };
+    let Some(task) = task else { return TaskEnd::Restarted };
     // Frees the input before the outcome is sent, so that the receiver sees the true memory use.
     drop(task);
     let outcome = outcome.map(Arc::new);
@@ -108,7 +126,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> Option<Outcome> {
         span.part(stage, begun, time);
     }
     end_span(&span, id, count_outcome(&outcome), Some(&outcome));
-    Some(outcome)
+    TaskEnd::Ended(outcome)
 }
 
 /// Computes the mesh of a task, on its structure or on a tileset that is kept in memory.

@@ -75,11 +75,11 @@ metrics! {
                 improve|cavities|simplify|index|clip|measure|roundtrip|color|draw|png|encode";
     /// Results of synchronous requests that were not stored.
     RESULTS_NOT_STORED = "molmesh_results_not_stored_total", Counter, reason: "busy|failed";
-    /// Interactive and claimed jobs that wait in the queue of the pool.
+    /// Jobs that wait for a worker, in all lanes.
     QUEUE_DEPTH = "molmesh_queue_depth", Gauge;
     /// Time for which the oldest job in the queue has waited.
     QUEUE_AGE = "molmesh_queue_oldest_age_seconds", Gauge;
-    /// Estimated time that a new job would wait in the queue.
+    /// Estimated time that a new request would wait in the queue: the longer one of short and long requests.
     QUEUE_WAIT = "molmesh_queue_estimated_wait_seconds", Gauge;
     /// Bytes of uploads, jobs and meshes held in memory.
     MEMORY_HELD = "molmesh_memory_held_bytes", Gauge;

@@ -68,11 +68,6 @@ const ROWS: &[Row] = &[
         "http/openapi_statuses::the_server_returns_every_documented_status_and_no_other",
     ),
     (
-        "jobs.batch_max_delay_ms",
-        "molmesh_queue_oldest_age_seconds",
-        "http/limits::asynchronous_jobs_yield_for_the_maximum_delay",
-    ),
-    (
         "jobs.attempts",
         "molmesh_jobs_finished_total",
         "http/jobs_durable::a_job_that_repeatedly_crashes_the_process_fails",

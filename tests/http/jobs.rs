@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use http_support::{Fake, Mode, Reply, Running, SAMPLE, connect, sample, send, start, wait_for};
+use http_support::{Fake, LONG, Mode, Reply, Running, SAMPLE, connect, sample, send, start, wait_for};
 use serde_json::Value;
 
 const LATER: (&str, &str) = ("prefer", "respond-async");
@@ -249,8 +249,8 @@ fn an_idempotency_key_maps_many_requests_to_one_job() {
     assert_eq!(backend.started.load(Ordering::SeqCst), 2);
 }
 
-/// Returns the events of a stream until it ends: id, name, document.
-fn events(server: &Running, path: &str, last: Option<&str>) -> Vec<(u64, String, Value)> {
+/// Returns the events of a stream until it ends: id (`None` for that of the end), name, document.
+fn events(server: &Running, path: &str, last: Option<&str>) -> Vec<(Option<u64>, String, Value)> {
     let mut stream = connect(server.addr);
     let last = last.map_or(String::new(), |id| format!("last-event-id: {id}\r\n"));
     write!(
@@ -258,11 +258,11 @@ fn events(server: &Running, path: &str, last: Option<&str>) -> Vec<(u64, String,
         "GET {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\naccept: text/event-stream\r\n{last}\r\n"
     )
     .unwrap();
-    let (mut found, mut id, mut name) = (Vec::new(), 0, String::new());
+    let (mut found, mut id, mut name) = (Vec::new(), None, String::new());
     for line in BufReader::new(stream).lines() {
         let line = line.unwrap();
         if let Some(text) = line.strip_prefix("id: ") {
-            id = text.parse().unwrap();
+            id = if text == "end" { None } else { Some(text.parse().unwrap()) };
         } else if let Some(text) = line.strip_prefix("event: ") {
             text.clone_into(&mut name);
         } else if let Some(text) = line.strip_prefix("data: ") {
@@ -283,14 +283,14 @@ fn events_start_with_a_snapshot_and_end_with_the_job() {
     assert_eq!(seen[0].1, "accepted", "{seen:?}");
     assert_eq!(seen.last().unwrap().1, "successful");
     assert!(seen.iter().any(|(_, name, _)| name == "running"), "{seen:?}");
-    assert!(seen.windows(2).all(|pair| pair[0].0 < pair[1].0), "{seen:?}");
-    let fraction = |e: &(u64, String, Value)| e.2["fraction"].as_f64().unwrap();
+    let (end, before) = seen.split_last().unwrap();
+    assert!(end.0.is_none() && before.windows(2).all(|pair| pair[0].0.unwrap() < pair[1].0.unwrap()), "{seen:?}");
+    let fraction = |e: &(Option<u64>, String, Value)| e.2["fraction"].as_f64().unwrap();
     assert!(seen.windows(2).all(|pair| fraction(&pair[0]) <= fraction(&pair[1])), "{seen:?}");
     // Reconnecting returns new events only, and 204 after the last one.
-    let (end, before) = (seen.last().unwrap().0, seen[0].0);
-    let again = events(&server, &path, Some(&before.to_string()));
-    assert_eq!((again.len(), again[0].0), (1, end));
-    let over = send(server.addr, "GET", &path, &[("last-event-id", &end.to_string())], b"");
+    let again = events(&server, &path, Some(&before[0].0.unwrap().to_string()));
+    assert_eq!((again.len(), again[0].0), (1, None));
+    let over = send(server.addr, "GET", &path, &[("last-event-id", "end")], b"");
     assert_eq!(over.status, 204);
     ended(&server, &first, "successful");
     server.get("/v1/jobs/00000000000000000000000000000000/events").problem(404, "no-such-job");
@@ -336,14 +336,14 @@ fn a_job_that_would_wait_too_long_is_rejected_immediately() {
     });
     // The service measures the duration of jobs.
     for n in 0..12 {
-        assert_eq!(server.post("/v1/meshes", &[], &sample(n)).status, 200);
+        assert_eq!(server.post(LONG, &[], &sample(n)).status, 200);
     }
     // 12 s of work, of which 2 s fit into the deadline.
     let replies: Vec<_> = std::thread::scope(|scope| {
         let post = |n| {
             scope.spawn({
                 let server = &server;
-                move || server.post("/v1/meshes", &[], &sample(n))
+                move || server.post(LONG, &[], &sample(n))
             })
         };
         let posted: Vec<_> = (20..50).map(post).collect();

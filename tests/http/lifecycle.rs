@@ -84,9 +84,10 @@ fn a_disconnecting_client_cancels_its_job() {
 fn a_queued_job_of_a_disconnected_client_never_runs() {
     let backend = Fake::new(Mode::Slow(Duration::from_millis(400)));
     let server = start(Arc::clone(&backend) as _, |c| c.jobs.workers = 1);
-    let first = begin(&server, SAMPLE);
+    // Both take long, so the first keeps its worker.
+    let first = begin(&server, &carbons(20_000));
     wait_for("the first job to run", || backend.started.load(Ordering::SeqCst) == 1);
-    let second = begin(&server, &sample(2));
+    let second = begin(&server, &carbons(20_001));
     std::thread::sleep(Duration::from_millis(100));
     drop(second);
     wait_for("the first job to end", || backend.finished.load(Ordering::SeqCst) == 1);

@@ -8,7 +8,7 @@ use std::sync::{Arc, Barrier};
 use std::time::{Duration, Instant};
 
 use http_support::{
-    Fake, Mode, Reply, Running, SAMPLE, carbons, connect, gzip, read_reply, sample, send, start, wait_for,
+    Fake, LONG, Mode, Reply, Running, SAMPLE, carbons, connect, gzip, read_reply, sample, send, start, wait_for,
 };
 use molmesh::config::Config;
 use molmesh::surface::cpu::CpuBackend;
@@ -402,12 +402,11 @@ fn a_full_queue_rejects_with_retry_after() {
     });
     let server = &server;
     std::thread::scope(|scope| {
-        let accepted: Vec<_> =
-            (0..3).map(|n| scope.spawn(move || server.post("/v1/meshes", &[], &sample(n)).status)).collect();
+        let accepted: Vec<_> = (0..3).map(|n| scope.spawn(move || server.post(LONG, &[], &sample(n)).status)).collect();
         wait_for("two jobs to wait", || server.metric("molmesh_queue_depth", &[]) >= 2.0);
         wait_for("one job to run", || backend.started.load(Ordering::SeqCst) == 1);
         let start = Instant::now();
-        let refused = server.post("/v1/meshes", &[], &sample(9));
+        let refused = server.post(LONG, &[], &sample(9));
         assert!(start.elapsed() < Duration::from_secs(10), "{:?}", start.elapsed());
         let problem = refused.problem(503, "queue-full");
         assert_eq!((&problem["limit"], &problem["actual"]), (&2.into(), &2.into()));
@@ -860,25 +859,40 @@ fn idle_event_streams_send_heartbeats() {
 }
 
 #[test]
-fn asynchronous_jobs_yield_for_the_maximum_delay() {
-    for (batch_max_delay_ms, order) in [(1, [2, 3, 4]), (3_600_000, [2, 4, 3])] {
-        let backend = Fake::new(Mode::Held);
-        let server =
-            start(Arc::clone(&backend) as _, |c| (c.jobs.workers, c.jobs.batch_max_delay_ms) = (1, batch_max_delay_ms));
-        let server = &server;
-        std::thread::scope(|scope| {
-            let running = scope.spawn(|| server.post("/v1/meshes", &[], &carbons(2)).status);
-            wait_for("one to run", || backend.started.load(Ordering::SeqCst) == 1);
-            assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], &carbons(3)).status, 202);
-            let waiting = scope.spawn(|| server.post("/v1/meshes", &[], &carbons(4)).status);
-            wait_for("two to wait", || server.metric("molmesh_queue_depth", &[]) >= 2.0);
-            std::thread::sleep(Duration::from_millis(5));
-            backend.set(Mode::Octahedra);
-            assert_eq!((running.join().unwrap(), waiting.join().unwrap()), (200, 200));
-        });
-        wait_for("all to have begun", || backend.started.load(Ordering::SeqCst) == 3);
-        assert_eq!(*backend.begun.lock().unwrap(), order, "maximum delay of {batch_max_delay_ms} ms");
+fn requests_do_not_wait_for_asynchronous_jobs() {
+    let backend = Fake::new(Mode::Held);
+    let server = start(Arc::clone(&backend) as _, |c| c.jobs.workers = 1);
+    for n in [2, 3] {
+        assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], &carbons(n)).status, 202);
     }
+    wait_for("an asynchronous job to run", || backend.started.load(Ordering::SeqCst) == 1);
+    std::thread::scope(|scope| {
+        let request = scope.spawn(|| server.post("/v1/meshes", &[], &carbons(4)).status);
+        wait_for("the request to run", || backend.started.load(Ordering::SeqCst) == 2);
+        backend.set(Mode::Octahedra);
+        assert_eq!(request.join().unwrap(), 200);
+    });
+    wait_for("all to have begun", || backend.started.load(Ordering::SeqCst) == 3);
+    assert_eq!(*backend.begun.lock().unwrap(), [2, 4, 3]);
+}
+
+#[test]
+fn a_request_that_takes_longer_than_expected_delays_no_other() {
+    let backend = Fake::new(Mode::Held);
+    let server = start(Arc::clone(&backend) as _, |c| c.jobs.workers = 1);
+    std::thread::scope(|scope| {
+        let post = |n| server.post("/v1/meshes", &[], &carbons(n)).status;
+        let long = scope.spawn(move || post(2));
+        wait_for("one to run", || backend.started.load(Ordering::SeqCst) == 1);
+        // The worker is not taken from it unless another job waits.
+        std::thread::sleep(Duration::from_millis(300));
+        assert_eq!(backend.started.load(Ordering::SeqCst), 1);
+        let short = scope.spawn(move || post(3));
+        wait_for("both to run", || backend.started.load(Ordering::SeqCst) == 3);
+        backend.set(Mode::Octahedra);
+        assert_eq!((long.join().unwrap(), short.join().unwrap()), (200, 200));
+    });
+    assert_eq!(backend.cancelled.load(Ordering::SeqCst), 1);
 }
 
 /// Sends concurrent requests until a result is not stored because too many are.

@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use archive_support::{Remote, status};
 use http_support::{
-    Fake, Mode, Reply, Running, SAMPLE, connect, read_reply, sample, send, start, start_cold, wait_for,
+    Fake, LONG, Mode, Reply, Running, SAMPLE, connect, read_reply, sample, send, start, start_cold, wait_for,
 };
 use molmesh::config::Config;
 use molmesh::surface::CpuBackend;
@@ -298,17 +298,17 @@ fn failures(seen: &Seen) {
         }
     }
     let backend = Fake::new(Mode::Slow(Duration::from_secs(2)));
-    let full = start(Arc::clone(&backend) as _, |c| (c.jobs.workers, c.jobs.queue) = (1, 1));
+    let full = &start(Arc::clone(&backend) as _, |c| (c.jobs.workers, c.jobs.queue) = (1, 1));
     archive(full.dir.path(), "4pti", SAMPLE);
-    let busy = |n| seen.expect(202, full.addr, ("POST", "/v1/meshes"), &[LATER], &sample(n));
-    busy(1);
-    wait_for("it runs", || backend.started.load(Ordering::SeqCst) == 1);
     std::thread::scope(|scope| {
-        scope.spawn(|| full.post("/v1/meshes", &[], &sample(2)));
+        for n in [1, 2] {
+            scope.spawn(move || full.post(LONG, &[], &sample(n)));
+        }
+        wait_for("one runs", || backend.started.load(Ordering::SeqCst) == 1);
         wait_for("one waits", || full.metric("molmesh_queue_depth", &[]) >= 1.0);
-        seen.expect(503, full.addr, ("POST", "/v1/meshes"), &[], &sample(3));
-        seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/surface.glb"), &[], b"");
-        seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/report.json"), &[], b"");
+        seen.expect(503, full.addr, ("POST", LONG), &[], &sample(3));
+        seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/surface.glb?resolution=0.2"), &[], b"");
+        seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/report.json?resolution=0.2"), &[], b"");
     });
     // The request alone exceeds the first limit, and together with its connection the second one.
     for (memory_bytes, status) in [(1_000, 422), (400_000, 503)] {

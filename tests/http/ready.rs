@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use http_support::{Fake, Mode, Running, SAMPLE, log_lines, sample, start, start_cold, wait_for};
+use http_support::{Fake, LONG, Mode, Running, SAMPLE, log_lines, sample, start, start_cold, wait_for};
 use molmesh::http::Stop;
 use molmesh::surface::{
     Backend, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
@@ -106,11 +106,11 @@ fn a_full_queue_does_not_affect_readiness() {
     });
     let server = &server;
     std::thread::scope(|scope| {
-        let clients = [0, 1].map(|n| scope.spawn(move || server.post("/v1/meshes", &[], &sample(n)).status));
+        let clients = [0, 1].map(|n| scope.spawn(move || server.post(LONG, &[], &sample(n)).status));
         wait_for("one to run", || backend.started.load(Ordering::SeqCst) == 1);
         wait_for("one to wait", || server.metric("molmesh_queue_depth", &[]) >= 1.0);
         for _ in 0..20 {
-            server.post("/v1/meshes", &[], SAMPLE).problem(503, "queue-full");
+            server.post(LONG, &[], SAMPLE).problem(503, "queue-full");
             let reply = server.get("/readyz");
             assert_eq!((reply.status, failing(&reply.json())), (200, vec![]));
         }

@@ -20,6 +20,8 @@ use molmesh::surface::{
 
 /// Sample of the product.
 pub(crate) const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
+/// Path of a mesh of the sample that takes long, by its estimate.
+pub(crate) const LONG: &str = "/v1/meshes?resolution=0.2";
 
 /// Behaviour of the fake backend.
 #[derive(Debug, Clone, Copy, PartialEq)]

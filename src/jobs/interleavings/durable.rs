@@ -53,7 +53,7 @@ impl Fixture {
     fn new() -> Self {
         let (store, objects) = block_on(open_bytes(1 << 20));
         let budget = Budget::new(1 << 30);
-        let settings = Settings { batch_max_delay: Duration::ZERO, ..Settings::of_test(2, budget) };
+        let settings = Settings::of_test(2, budget);
         let pool = Arc::new(Pool::without_workers(settings, Arc::new(ReferenceBackend), "a test".to_owned()));
         let queue = Arc::clone(&pool.shared.queue);
         let config = JobsConfig { attempts: ATTEMPTS, ..JobsConfig::default() };
@@ -109,7 +109,7 @@ impl Fixture {
     fn worker(&self) -> JoinHandle<()> {
         let fixture = self.clone();
         thread::spawn(move || {
-            while let Some(mut entry) = fixture.queue.pop() {
+            while let Some(mut entry) = fixture.queue.pop(Lane::Batch) {
                 let id = entry.id;
                 if entry.cancel.is_cancelled() {
                     fixture.queue.done(id, None, None);
