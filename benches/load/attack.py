@@ -7,6 +7,8 @@ Each attack has a service of its own, whose memory is really limited by a contro
 segment, where no group can be created):
 
 - identical atoms, 300,000 and 10,000,000, with `radius_scale=10`
+- small uploads with large documents or much work: names of 255 escaped characters, spheres of 50 Å with a search for
+  pockets, nested distances, and a million atoms in as many chains
 - a JSON document of 20 MB, and a form whose part header does not end
 - 60 HTTP/2 connections with 64 requests each for one stored result, which take a byte of each body every ten seconds,
   while a healthy client on another loopback address measures its latency
@@ -27,6 +29,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.parse
 from collections import Counter
 
 from memory_group import MemoryGroup, status
@@ -124,6 +127,55 @@ def identical_atoms(table, binary):
                 aim = 1 if number < 1_000_000 else 10
                 reached = response.startswith(("422", "503")) and busy < aim and peak < 2048 * MIB and back is not None
                 table.add(f"{number:,} identical atoms, radius_scale=10, {target}", measured, f"refused within 2 GiB and {aim} s of processor time", reached)
+
+
+def named_atoms(n):
+    """Returns an mmCIF file of `n` residues, each in a chain of its own, with names of 255 escaped characters."""
+    items = ("type_symbol", "label_atom_id", "label_comp_id", "auth_asym_id", "auth_seq_id", "Cartn_x", "Cartn_y", "Cartn_z")
+    head = "data_x\nloop_\n" + "".join(f"_atom_site.{item}\n" for item in items)
+    name = "x" + '"' * 254
+    rows = (f"C C {name} {name} {i} {i % 100 * 8} {i // 100 % 100 * 8} {i // 10_000 * 8}\n" for i in range(n))
+    return gzip.compress((head + "".join(rows)).encode(), 6)
+
+
+def chains(n):
+    """Returns an mmCIF file of `n` atoms in `n` chains."""
+    head = "data_x\nloop_\n" + "".join(f"_atom_site.{item}\n" for item in ("type_symbol", "auth_asym_id", "Cartn_x", "Cartn_y", "Cartn_z"))
+    rows = (f"C c{i} {i % 100 * 4} {i // 100 % 100 * 4} {i // 10_000 * 4}\n" for i in range(n))
+    return gzip.compress((head + "".join(rows)).encode(), 6)
+
+
+def spheres(n):
+    """Returns a PQR file of `n` spheres of 50 Å on a line."""
+    return gzip.compress("".join(f"ATOM 1 C ALA 1 {i / 1000} 0 0 0.0 50.0\n" for i in range(n)).encode(), 6)
+
+
+def small_uploads(table, binary):
+    select = "all"
+    for _ in range(8):
+        select = f"within 50 of ({select})"
+    select = urllib.parse.quote(select)
+    lattice = gzip.compress(b"1000000\n\n" + b"".join(b"C %d %d %d\n" % (4 * (i % 100), 4 * (i // 100 % 100), 4 * (i // 10_000)) for i in range(1_000_000)), 6)
+    named, pockets = named_atoms(300_000), "report.json?pockets=true&resolution=3&pocket_probe"
+    # The limits of `candidate_pairs` allow 25 s of processor time.
+    attacks = [
+        ("300,000 residues with names of 255 escaped characters", named, ["atoms", "areas?by=atom", "areas"], 5),
+        ("1,000,000 atoms in as many chains", chains(1_000_000), ["report.json?exact=true&surface=sas&resolution=3"], 60),
+        ("100,000 spheres of 50 Å", spheres(100_000), [f"{pockets}=4", f"{pockets}=20"], 25),
+        ("1,000,000 atoms", lattice, [f"{pockets}=10", f"atoms?select={select}", "areas?surface=sas"], 60),
+    ]
+    for name, body, targets, most in attacks:
+        for target in targets:
+            with Limited(binary, 4096) as server:
+                made = fetch(server.port, "POST", "/v1/structures", body, {"content-encoding": "gzip"})
+                begin, busy, response = time.monotonic(), cpu_time(server), slug(made)
+                if made[0] in (200, 201):
+                    response = slug(fetch(server.port, "GET", f"{made[1]['location']}/{target}", timeout=300))
+                took, busy, lives = time.monotonic() - begin, cpu_time(server) - busy, server.lives()
+                peak = server.memory("VmHWM") - server.idle if lives else 0
+                measured = f"{response} in {took:.1f} s ({busy:.1f} s of processor time), {len(body) / 1024:.0f} KiB sent; peak {peak / MIB:.0f} MiB above idle"
+                reached = lives and response.startswith(("200", "422")) and busy < most and peak < 2048 * MIB
+                table.add(f"{name}, {target.partition('&')[0] if 'select' not in target else 'eight nested within'}", measured, f"result or refusal within 2 GiB and {most} s of processor time", reached)
 
 
 def json_body(table, binary):
@@ -351,11 +403,12 @@ def main():
     parser.add_argument("structure")
     parser.add_argument("--clients", type=int, default=100, help="requests to each target at once")
     parser.add_argument("--seconds", type=float, default=15, help="time to measure the healthy client alone")
-    parser.add_argument("--only", nargs="+", default=("atoms", "json", "header", "readers", "uploads"))
+    parser.add_argument("--only", nargs="+", default=("atoms", "small", "json", "header", "readers", "uploads"))
     args = parser.parse_args()
     table = Table()
     attacks = {
         "atoms": lambda: identical_atoms(table, args.binary),
+        "small": lambda: small_uploads(table, args.binary),
         "json": lambda: json_body(table, args.binary),
         "header": lambda: endless_header(table, args.binary),
         "readers": lambda: slow_readers(table, args.binary, args.structure, args.seconds),

@@ -12,6 +12,13 @@ All limits of jobs have their defaults, so a job that is started three times and
 without a result is an error. Finally the script waits for all jobs and compares every result with the output of
 `molmesh mesh`. The exit code is 1 if a job is lost, a result is wrong, a stop counts an attempt, or no job was open at
 most of the kills and stops, because such a run tests nothing.
+
+    python3 benches/load/chaos.py target/release/molmesh samples/4pti.pdb --kills 20 --job-seconds 30
+
+With `--job-seconds`, one job at a time that takes about this long alone is stopped at a random point, again and again
+until it ends within a drain of `--drain-ms`. The script prints a row for each stop: no stop may count an attempt. The
+last row is the control, a kill (`kill -9`), which counts one. The exit code is 1 if an attempt was counted, a stop was
+not orderly, or a job did not end with the right mesh.
 """
 
 import argparse
@@ -19,6 +26,8 @@ import collections
 import json
 import os
 import random
+import re
+import subprocess
 import sys
 import threading
 import time
@@ -127,6 +136,100 @@ def outcome(port, job, mesh, deadline):
     return "successful" if (status, body) == (200, mesh) else f"bad: result with status {status}"
 
 
+def long_mesh(binary, structure, seconds):
+    """Finds a mesh that takes about `seconds`. Returns its parameters, and its bytes by `molmesh mesh`."""
+    resolution = 0.2
+    while True:
+        parameters = {"quality": "high", "format": "ply-text", "resolution": f"{resolution:.3g}"}
+        options = [part for name, value in parameters.items() for part in (f"--{name}", value)]
+        command, begin = [binary, "mesh", structure, "-o", "-", "--backend", "cpu", *options], time.perf_counter()
+        mesh = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, check=True).stdout
+        took = time.perf_counter() - begin
+        if took > 0.8 * seconds:
+            return "&".join(f"{name}={value}" for name, value in parameters.items()), mesh
+        # The time is about inversely proportional to the square of the grid spacing.
+        resolution *= max(took / seconds, 0.05) ** 0.5
+
+
+def record(data, job):
+    """Returns the record of a job on disk."""
+    name = os.path.join(data, "store", "jobs", job.rpartition("/")[2])
+    ended = f"{name}.ended.json"
+    with open(ended if os.path.exists(ended) else f"{name}.json", "rb") as file:
+        return json.load(file)
+
+
+class LongJob:
+    """One job at a time, with a service that is stopped while it runs."""
+
+    def __init__(self, server, structure, query):
+        self.server, self.structure, self.query, self.jobs = server, structure, query, []
+
+    def ensure(self):
+        """Starts the service. It continues the last job; if that one has ended, the next job begins."""
+        self.server.start()
+        if self.jobs and record(self.server.folder, self.jobs[-1])["status"] in OPEN:
+            return
+        body = self.structure + b"REMARK 900 %032x\n" % random.getrandbits(128)
+        path = f"/v1/meshes?{self.query}"
+        status, headers, text = fetch(self.server.port, "POST", path, body, {"prefer": "respond-async"})
+        if status != 202:
+            sys.exit(f"status {status}: {text[:200]}")
+        self.jobs.append(headers["location"])
+
+    def interrupt(self, seconds, end):
+        """Runs the job for some seconds and ends the service. Prints the row. Returns the number of attempts that were
+        counted, and true if the end was orderly."""
+        self.ensure()
+        time.sleep(seconds)
+        stage = json.loads(fetch(self.server.port, "GET", self.jobs[-1])[2])["stage"]
+        code, took = end()
+        with open(self.server.log, encoding="utf-8", errors="replace") as log:
+            lines = [line for line in log if "jobs_returned" in line] if code >= 0 else []
+        counts = ", ".join(f"{n} {what}" for what, n in re.findall(r"jobs_(\w+)=(\d+)", lines[-1])) if lines else "-"
+        found = record(self.server.folder, self.jobs[-1])
+        # The attempt that made the mesh counts.
+        counted = found["attempts"] - (found["status"] == "successful")
+        print(
+            f"{len(self.jobs):>3} {seconds:>8.1f} {stage or '-':<12} {took:>8.1f} {code:>4} {counts:<36}"
+            f" {counted:>8} {found['status']}",
+            flush=True,
+        )
+        return counted, code == 0
+
+    def kill(self):
+        begin = time.perf_counter()
+        self.server.process.kill()
+        return self.server.process.wait(), time.perf_counter() - begin
+
+
+def stop_long_jobs(args, dice):
+    """Stops long jobs at random points, and prints a table."""
+    query, mesh = long_mesh(args.binary, args.structures[0], args.job_seconds)
+    drain = ["--set", "server.termination_notice_ms=none", "--set", f"server.drain_timeout_ms={args.drain_ms}"]
+    server = Server(args.binary, folder(), args.port, ["--backend", "cpu", *drain])
+    with open(args.structures[0], "rb") as file:
+        long = LongJob(server, file.read(), query)
+    long.ensure()
+    begin = time.perf_counter()
+    ends = [outcome(args.port, long.jobs[0], mesh, time.monotonic() + FINISH_TIMEOUT)]
+    alone = time.perf_counter() - begin
+    server.stop()
+    print(f"{query}: {alone:.1f} s alone, {ends[0]}; drain of {args.drain_ms} ms")
+    print(f"job after, s {'stage':<12} took, s code {'jobs by the log':<36} attempts status")
+    stops = [long.interrupt(dice.uniform(0, alone), server.stop) for _ in range(args.kills)]
+    counted, _ = long.interrupt(dice.uniform(0.2, 0.8) * alone, long.kill)
+    server.start()
+    deadline = time.monotonic() + FINISH_TIMEOUT
+    ends += [outcome(args.port, job, mesh, deadline) for job in long.jobs[1:]]
+    server.stop()
+    attempts, orderly = sum(attempts for attempts, _ in stops), sum(orderly for _, orderly in stops)
+    print(f"{len(stops)} stops, {orderly} of them orderly: {attempts} attempts counted; a kill: {counted}")
+    print(f"{len(long.jobs)} accepted jobs: {dict(collections.Counter(ends))}")
+    if attempts or orderly < len(stops) or counted != 1 or set(ends) != {"successful"}:
+        sys.exit(f"errors occurred with seed {args.seed}: see above")
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("binary")
@@ -135,9 +238,13 @@ def main():
     parser.add_argument("--seed", type=int, default=random.randrange(1 << 32))
     parser.add_argument("--clients", type=int, default=3)
     parser.add_argument("--port", type=int, default=18500)
+    parser.add_argument("--job-seconds", type=float, help="stop one job that takes this long alone")
+    parser.add_argument("--drain-ms", type=int, default=2000, help="drain with --job-seconds")
     args = parser.parse_args()
     print(f"seed {args.seed}", flush=True)
     dice, data = random.Random(args.seed), folder()
+    if args.job_seconds:
+        return stop_long_jobs(args, dice)
     server = Server(args.binary, data, args.port, ["--backend", "cpu", "--set", "server.termination_notice_ms=none"])
     command = server.command
     clients = Clients(args.port, Expected(args.binary, args.structures), args.seed, args.clients)

@@ -19,7 +19,7 @@ from mixed import UNAVAILABLE, Server
 
 SMALL, BATCH, HEAVY = "127.0.0.2", "127.0.0.3", "127.0.0.4"
 PORT = 18400
-REPORT = "pockets=true&pocket_probe=10&resolution=3"
+REPORT = "pockets=true&pocket_probe=5&resolution=3"
 
 
 def fetch(client, method, path, body=None, headers=None, timeout=600):

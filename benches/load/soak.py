@@ -39,7 +39,7 @@ MAX_GROWTH, MAX_EXCESS = 1.0, 20.0
 REST = 120
 # Minutes per block and number of series of the bootstrap.
 BLOCK, RESAMPLED = 5, 400
-GAUGES = ("molmesh_memory_held_bytes", "molmesh_jobs_open", "molmesh_connections", "molmesh_queue_depth")
+GAUGES = ("molmesh_memory_held_bytes", "molmesh_broker_jobs_queued", "molmesh_connections", "molmesh_queue_depth")
 # Structures in memory: they fill their limit during the warm-up or later, and stay.
 CACHE = "molmesh_structure_cache_bytes"
 

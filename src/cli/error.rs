@@ -244,6 +244,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         | SurfaceError::NoCavity { .. } => code::USAGE,
         SurfaceError::GridTooLarge { .. }
         | SurfaceError::PocketGridTooLarge { .. }
+        | SurfaceError::TooManyPocketRows { .. }
         | SurfaceError::TooManyCandidates { .. }
         | SurfaceError::TooManyOverlaps { .. }
         | SurfaceError::MeshTooLarge { .. }

@@ -15,8 +15,8 @@ pub struct DevicesConfig {
     #[serde(rename = "use", serialize_with = "write", deserialize_with = "read")]
     #[schemars(with = "String")]
     pub choice: DeviceChoice,
-    /// Number of concurrent jobs per device and lane, if that exceeds `jobs.workers`. Default 16: a device finishes a small job
-    /// before the next file is read, and only concurrent jobs can share a submission.
+    /// Number of concurrent jobs per device and lane, if that exceeds `jobs.workers`. Default 16: a device finishes a
+    /// small job before the next file is read, and only concurrent jobs can share a submission.
     pub jobs: usize,
     /// Maximum number of small jobs in a submission. Default 16: a submission costs as much as meshing one small job,
     /// so a larger batch gains little and delays its first job.

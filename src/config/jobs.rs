@@ -8,11 +8,11 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct JobsConfig {
     /// Number of concurrent jobs of each lane: short requests, long requests, asynchronous jobs. Default 2: the backend
-    /// uses all cores for one job, and a second one fills them while the first reads its file or measures its mesh. GPUs
-    /// run more: see `devices.jobs`.
+    /// uses all cores for one job, and a second one fills them while the first reads its file or measures its mesh.
+    /// GPUs run more: see `devices.jobs`.
     pub workers: usize,
-    /// Number of queued requests in each lane, short and long. Default 64: at a typical 0.1 s per job on two workers the
-    /// last one waits three seconds; a longer queue would only delay refusals. Further requests get a 503 with an
+    /// Number of queued requests in each lane, short and long. Default 64: at a typical 0.1 s per job on two workers
+    /// the last one waits three seconds; a longer queue would only delay refusals. Further requests get a 503 with an
     /// estimated `Retry-After`.
     pub queue: usize,
     /// Number of concurrent requests for meshes, from the submission of the job to the last byte of the response.

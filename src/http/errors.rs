@@ -363,6 +363,9 @@ impl From<SurfaceError> for Problem {
             E::PocketGridTooLarge { grid_points, limit, .. } => {
                 exceeded(ProblemType::GridTooLarge, limit, grid_points).with("parameter", "pockets")
             }
+            E::TooManyPocketRows { rows, limit } => {
+                exceeded(ProblemType::TooManyCandidates, limit, rows).with("parameter", "pockets")
+            }
             E::TooManyCandidates { candidates, limit, resolution, .. } => {
                 fitting(exceeded(ProblemType::TooManyCandidates, limit, candidates).with("resolution", resolution))
             }

@@ -3,13 +3,10 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::PoisonError;
 
-use metrics::gauge;
-
 use super::broker::Dispatch;
 use super::record::JobId;
 use crate::store::Pin;
 use crate::sync::{Mutex, MutexGuard};
-use crate::telemetry::JOBS_OPEN;
 
 /// Unfinished job on record.
 struct OpenJob {
@@ -41,7 +38,6 @@ impl OpenJobs {
         let order = open.next;
         open.next += 1;
         let replaced = open.jobs.insert(dispatch.id.clone(), OpenJob { order, dispatch, _pins: pins });
-        publish(&open);
         drop(open);
         // Unpins without the lock.
         drop(replaced);
@@ -49,10 +45,8 @@ impl OpenJobs {
 
     /// Removes a job that has ended.
     pub(super) fn remove(&self, id: &JobId) {
-        let mut open = self.lock();
-        let removed = open.jobs.remove(id);
-        publish(&open);
-        drop(open);
+        let removed = self.lock().jobs.remove(id);
+        // Unpins without the lock.
         drop(removed);
     }
 
@@ -67,8 +61,4 @@ impl OpenJobs {
         all.sort_unstable_by_key(|(order, _)| *order);
         all.into_iter().map(|(_, dispatch)| dispatch).collect()
     }
-}
-
-fn publish(open: &OpenJobTable) {
-    gauge!(JOBS_OPEN).set(u32::try_from(open.jobs.len()).unwrap_or(u32::MAX));
 }

@@ -47,7 +47,7 @@ impl PocketReport {
 
 impl Job {
     /// Returns the radius of the large probe, Å, if the job lists pockets, colours them or makes parts of them.
-    fn pocket_probe(&self) -> Option<f64> {
+    pub(super) fn pocket_probe(&self) -> Option<f64> {
         let needed = self.split == Split::Pocket || self.color.is_some_and(|color| color.scheme.needs_pockets());
         self.pockets.or_else(|| needed.then_some(DEFAULT_POCKET_PROBE))
     }

@@ -4,6 +4,7 @@ use super::Job;
 use super::color::{Scheme, VertexProperty};
 #[cfg(feature = "server")]
 use crate::surface::SurfaceParams;
+use crate::surface::pockets::{SPACING, rows};
 use crate::surface::{SurfaceKind, TriangleQuality};
 
 /// Approximate bytes of text per atom. A line of a PDB file has 81, a line of an mmCIF file 90 to 110.
@@ -79,6 +80,7 @@ pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
         + 0.7 * relative_time(job.params.surface) * mesh(atoms, resolution)
         + exact(job, atoms)
         + cavities(job, atoms)
+        + pockets(job, atoms)
         + depth(job, VERTICES * atoms * (0.5 / resolution).powi(2))
         + simplification(job, VERTICES * atoms * (0.5 / resolution).powi(2))
         + improvement(job, VERTICES * atoms * (0.5 / resolution).powi(2))
@@ -120,6 +122,7 @@ pub(super) fn counted_work(job: &Job, atoms: u64, counts: [u64; 3]) -> f64 {
         + tries * relative_time(job.params.surface) * mesh
         + exact(job, atoms as f64)
         + cavities(job, atoms as f64)
+        + pockets(job, atoms as f64)
         + depth(job, counts[2] as f64)
         + simplification(job, counts[2] as f64)
         + improvement(job, counts[2] as f64)
@@ -142,6 +145,20 @@ const CAVITIES: f64 = 18.0;
 /// Estimates the work of the search for cavities, in atoms at 0.5 Å.
 fn cavities(job: &Job, atoms: f64) -> f64 {
     if job.cavities.is_some() { CAVITIES * atoms } else { 0.0 }
+}
+
+/// Work of the search for pockets at a row of grid points in reach of a probe, in atoms: 20 ns on two cores.
+const POCKET_ROW: f64 = 0.005;
+/// Typical radius of an atom, Å.
+const RADIUS: f64 = 1.8;
+
+/// Estimates the work of the search for pockets, in atoms at 0.5 Å.
+fn pockets(job: &Job, atoms: f64) -> f64 {
+    let rows = |large: f64| {
+        let [radius, small, large] = [RADIUS, job.params.probe, large].map(|length| length / SPACING);
+        rows(radius, small, large)
+    };
+    POCKET_ROW * atoms * job.pocket_probe().map_or(0.0, rows)
 }
 
 /// Work of the depth of a vertex, in atoms: 0.4 µs on two cores.
@@ -225,6 +242,14 @@ mod tests {
         let at = |pairs: &[(&str, &str)]| super::estimate_work(1e4, &params::parse(pairs.iter().copied()).unwrap().job);
         let [with, without] = [&[("cavities", "keep")][..], &[]].map(at);
         assert!((with - without - 18e4).abs() < 1.0, "{with} {without}");
+    }
+
+    #[test]
+    fn wide_searches_for_pockets_cost_more() {
+        let at = |pairs: &[(&str, &str)]| super::estimate_work(1e4, &params::parse(pairs.iter().copied()).unwrap().job);
+        let [without, narrow, wide] =
+            [&[][..], &[("pockets", "true")], &[("pockets", "true"), ("pocket_probe", "20")]].map(at);
+        assert!(narrow > without + 1e4 && wide > without + 5.0 * (narrow - without), "{without} {narrow} {wide}");
     }
 
     #[test]

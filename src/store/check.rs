@@ -31,26 +31,33 @@ impl Backend {
         Err(self.fail("check", path.as_ref(), &io::Error::other("the bytes read differ from the bytes written")))
     }
 
-    /// Checks that the store refuses to replace an object that must be created. Otherwise nodes could record two jobs
-    /// for one idempotency key, or replace the end of a job.
+    /// Checks that the store creates an object and refuses to replace it. Otherwise nodes could record two jobs for one
+    /// idempotency key, replace the end of a job, or have different secrets.
     pub(super) async fn check_creation(&self) -> Result<(), StoreError> {
         let file = secret::unique().map_err(|e| self.fail("check", CHECK, &e))?;
         let path = Path::from_iter([CHECK, &file]);
-        let create = || self.objects().put_opts(&path, Bytes::from_static(b"created").into(), PutMode::Create.into());
+        let create = |content: &'static [u8]| {
+            self.objects().put_opts(&path, Bytes::from_static(content).into(), PutMode::Create.into())
+        };
         let answered = async {
-            // The first request may be repeated after its object was created.
-            match create().await {
+            // The client repeats a request that was not answered, so the first one may find its own object.
+            match create(b"first").await {
                 Ok(_) | Err(object_store::Error::AlreadyExists { .. }) => {}
                 Err(error) => return Err(error),
             }
-            let again = create().await;
+            let second = create(b"second").await;
+            let kept = self.objects().get(&path).await?.bytes().await?;
             self.objects().delete(&path).await?;
-            again.map(drop)
+            match second {
+                Err(object_store::Error::AlreadyExists { .. }) => Ok(kept == "first"),
+                Err(error) => Err(error),
+                Ok(_) => Ok(false),
+            }
         };
         let why = match self.timed(answered).await {
-            Err(object_store::Error::AlreadyExists { .. }) => return Ok(()),
+            Ok(true) => return Ok(()),
+            Ok(false) => "it replaced an object".to_owned(),
             Err(error) => error.to_string(),
-            Ok(()) => "it replaced an object".to_owned(),
         };
         let why = format!("{why}; the store must support conditional writes (If-None-Match: *)");
         Err(self.fail("check", path.as_ref(), &io::Error::other(why)))

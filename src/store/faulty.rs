@@ -21,6 +21,18 @@ use super::backend::Backend;
 use super::{Folder, Store, StoreError};
 use crate::config::StoreConfig;
 
+/// Result of a write that must create an object.
+#[derive(Debug, Default, Clone, Copy)]
+pub(crate) enum Creation {
+    /// Succeeds unless the object exists.
+    #[default]
+    Conditional,
+    /// Replaces the object if it exists.
+    Replacing,
+    /// Fails as if the object existed.
+    Refused,
+}
+
 /// Injected faults.
 #[derive(Debug, Default)]
 pub(crate) struct Faults {
@@ -41,8 +53,8 @@ pub(crate) struct Faults {
     operations: AtomicUsize,
     /// Number of operations that failed because of `error_every`.
     pub(crate) errors: AtomicUsize,
-    /// Writes replace objects that exist, even if they must not.
-    pub(crate) replaces: AtomicBool,
+    /// Result of writes that must create an object.
+    creation: Creation,
     /// Reads return half of the bytes.
     pub(crate) truncate: AtomicBool,
     /// Number of reads of job records.
@@ -159,9 +171,14 @@ impl ObjectStore for Faulty {
         if at.as_ref().starts_with(Folder::Results.as_str()) {
             self.faults.result_writes.fetch_add(1, Ordering::SeqCst);
         }
-        let replaces = self.faults.replaces.load(Ordering::SeqCst);
-        let options = if replaces { PutMode::Overwrite.into() } else { options };
-        self.files.put_opts(at, payload, options).await
+        match self.faults.creation {
+            Creation::Replacing => self.files.put_opts(at, payload, PutMode::Overwrite.into()).await,
+            Creation::Refused if options.mode == PutMode::Create => {
+                let (path, source) = (at.to_string(), Box::new(io::Error::from(io::ErrorKind::AlreadyExists)));
+                Err(object_store::Error::AlreadyExists { path, source })
+            }
+            Creation::Conditional | Creation::Refused => self.files.put_opts(at, payload, options).await,
+        }
     }
 
     async fn put_multipart_opts(&self, at: &Path, options: PutMultipartOptions) -> Result<Box<dyn MultipartUpload>> {
@@ -249,10 +266,14 @@ pub(crate) async fn open_faulty(dir: &std::path::Path, config: StoreConfig) -> (
     (faults, store)
 }
 
-/// Opens a store in `dir` that replaces objects although a write must only create them.
-pub(crate) async fn open_replacing(dir: &std::path::Path) -> Result<Store, StoreError> {
-    let (config, faults) = (StoreConfig::default(), Faults { replaces: AtomicBool::new(true), ..Faults::default() });
+/// Returns the objects of the folder `dir`, which are created in this way.
+pub(crate) fn objects_created(creation: Creation, dir: &std::path::Path) -> Arc<dyn ObjectStore> {
     let files = LocalFileSystem::new_with_prefix(dir).unwrap();
-    let objects = Arc::new(Faulty { files, faults: Arc::new(faults) });
+    Arc::new(Faulty { files, faults: Arc::new(Faults { creation, ..Faults::default() }) })
+}
+
+/// Opens a store in the folder `dir` whose objects are created in this way.
+pub(crate) async fn open_creating(creation: Creation, dir: &std::path::Path) -> Result<Store, StoreError> {
+    let (config, objects) = (StoreConfig::default(), objects_created(creation, dir));
     Store::open_backend(Backend::over(objects, dir.to_owned(), &config), &config, false).await
 }

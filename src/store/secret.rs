@@ -18,13 +18,16 @@ pub(crate) type Secret = [u8; BYTES];
 
 /// Reads the secret in the folder `root`, or creates it. Only the owner may read the file. Blocks.
 pub(super) fn in_folder(root: &FilePath) -> io::Result<Secret> {
-    let path = root.join(NAME);
-    match std::fs::read(&path) {
-        Ok(bytes) => return secret(&bytes),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-        Err(error) => return Err(error),
+    match std::fs::read(root.join(NAME)) {
+        Ok(bytes) => secret(&bytes),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => create_in_folder(root),
+        Err(error) => Err(error),
     }
-    let fresh = random()?;
+}
+
+/// Creates the secret in the folder `root`, or reads that of a process that was faster.
+fn create_in_folder(root: &FilePath) -> io::Result<Secret> {
+    let (path, fresh) = (root.join(NAME), random()?);
     // The name appears with the complete content. Of processes that create it at once, one succeeds.
     let staged = root.join(format!(".{NAME}.{}.tmp", unique()?));
     let mut options = OpenOptions::new();
@@ -68,23 +71,30 @@ pub(super) fn unique() -> io::Result<String> {
     Ok(format!("{:016x}", u64::from_be_bytes([a, b, c, d, e, f, g, h])))
 }
 
-/// Reads the secret in a bucket, or creates it. Processes that create it at once get the same one.
+/// Reads the secret in a bucket, or creates it.
 pub(super) async fn in_bucket(objects: &dyn ObjectStore) -> object_store::Result<Secret> {
-    let path = Path::from(NAME);
-    let generic = |error: io::Error| object_store::Error::Generic { store: "S3", source: error.into() };
-    match objects.get(&path).await {
-        Ok(read) => return secret(&read.bytes().await?).map_err(generic),
-        Err(object_store::Error::NotFound { .. }) => {}
-        Err(error) => return Err(error),
+    match read_in_bucket(objects).await {
+        Err(object_store::Error::NotFound { .. }) => create_in_bucket(objects).await,
+        read => read,
     }
-    let fresh = random().map_err(generic)?;
+}
+
+/// Creates the secret in a bucket, or reads that of a process that was faster.
+async fn create_in_bucket(objects: &dyn ObjectStore) -> object_store::Result<Secret> {
+    let (path, fresh) = (Path::from(NAME), random().map_err(generic)?);
     match objects.put_opts(&path, Bytes::copy_from_slice(&fresh).into(), PutMode::Create.into()).await {
         Ok(_) => Ok(fresh),
-        Err(object_store::Error::AlreadyExists { .. }) => {
-            secret(&objects.get(&path).await?.bytes().await?).map_err(generic)
-        }
+        Err(object_store::Error::AlreadyExists { .. }) => read_in_bucket(objects).await,
         Err(error) => Err(error),
     }
+}
+
+async fn read_in_bucket(objects: &dyn ObjectStore) -> object_store::Result<Secret> {
+    secret(&objects.get(&Path::from(NAME)).await?.bytes().await?).map_err(generic)
+}
+
+fn generic(error: io::Error) -> object_store::Error {
+    object_store::Error::Generic { store: "S3", source: error.into() }
 }
 
 fn random() -> io::Result<Secret> {
@@ -104,6 +114,36 @@ mod tests {
     use object_store::memory::InMemory;
 
     use super::*;
+    use crate::store::faulty::{Creation, objects_created};
+
+    #[test]
+    fn processes_that_create_the_secret_of_a_folder_at_once_share_it() {
+        let dir = tempfile::tempdir().unwrap();
+        // No process has found a secret.
+        let create = || create_in_folder(dir.path()).unwrap();
+        let secrets = std::thread::scope(|scope| {
+            let threads: Vec<_> = std::iter::repeat_with(|| scope.spawn(create)).take(8).collect();
+            threads.into_iter().map(|thread| thread.join().unwrap()).collect::<Vec<_>>()
+        });
+        assert!(secrets.iter().all(|secret| *secret == secrets[0]), "{secrets:?}");
+        assert_eq!(in_folder(dir.path()).unwrap(), secrets[0]);
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no staged file remains");
+    }
+
+    #[tokio::test]
+    async fn processes_that_create_the_secret_of_a_bucket_at_once_share_it() {
+        // No process has found a secret.
+        let create = async |objects: &dyn ObjectStore| {
+            let (one, other) = tokio::join!(create_in_bucket(objects), create_in_bucket(objects));
+            [one.unwrap(), other.unwrap(), in_bucket(objects).await.unwrap()]
+        };
+        let [one, other, read] = create(&InMemory::new()).await;
+        assert_eq!([other, read], [one, one]);
+        // The control: a store without conditional writes, which is refused at the start.
+        let dir = tempfile::tempdir().unwrap();
+        let [one, other, _] = create(objects_created(Creation::Replacing, dir.path()).as_ref()).await;
+        assert_ne!(one, other);
+    }
 
     #[test]
     fn a_folder_keeps_its_secret_readable_only_by_its_owner() {

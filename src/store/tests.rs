@@ -7,9 +7,10 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
 use futures_util::TryStreamExt as _;
+use futures_util::future::join_all;
 use tempfile::TempDir;
 
-use super::faulty::{error, faulty, open_faulty, open_replacing};
+use super::faulty::{Creation, error, faulty, open_creating, open_faulty};
 use super::{Folder, Name, Store, StoreError};
 use crate::config::StoreConfig;
 
@@ -59,8 +60,26 @@ async fn a_full_disk_is_reported_and_stored_objects_remain() {
 async fn a_store_without_conditional_writes_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     drop(Store::open(&StoreConfig::default(), dir.path()).await.unwrap());
-    let refused = open_replacing(&dir.path().join("store")).await.map(drop).unwrap_err();
-    assert!(refused.to_string().contains("must support conditional writes"), "{refused}");
+    let open = async |creation| open_creating(creation, &dir.path().join("store")).await.map(drop);
+    open(Creation::Conditional).await.unwrap();
+    for creation in [Creation::Replacing, Creation::Refused] {
+        let refused = open(creation).await.unwrap_err().to_string();
+        assert!(refused.contains("must support conditional writes"), "{creation:?}: {refused}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nodes_that_open_an_empty_store_at_once_share_its_secret() {
+    let dir = tempfile::tempdir().unwrap();
+    let open = async |folder: &str| {
+        let url = Some(format!("file://{}", dir.path().join(folder).display()));
+        let config = StoreConfig { url, ..StoreConfig::default() };
+        Store::open_shared(&config, dir.path()).await.unwrap().secret().await.unwrap()
+    };
+    let secrets = join_all((0..8).map(|_| open("one"))).await;
+    assert!(secrets.iter().all(|secret| *secret == secrets[0]), "{secrets:?}");
+    // The control.
+    assert_ne!(open("other").await, secrets[0]);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -135,6 +135,17 @@ pub enum SurfaceError {
         /// Spacing, Å.
         spacing: f64,
     },
+    /// The search for pockets would pass over more rows of grid points than allowed.
+    #[error(
+        "the search for pockets would pass over {rows} rows of grid points in reach of the probes, the limit is \
+         {limit}; a smaller selection, pocket_probe or smaller radii have fewer"
+    )]
+    TooManyPocketRows {
+        /// Rows of grid points of all spheres enlarged by the probes.
+        rows: u64,
+        /// Rows allowed.
+        limit: u64,
+    },
     /// A tileset would have too many tiles.
     #[error("the tileset would have more than {limit} tiles at {resolution} Å; a coarser grid needs fewer")]
     TooManyTiles {

@@ -51,8 +51,6 @@ metrics! {
     JOBS_SUBMITTED = "molmesh_jobs_submitted_total", Counter, mode: "sync|async", dedup: "yes|no";
     /// Completed jobs, by outcome.
     JOBS_FINISHED = "molmesh_jobs_finished_total", Counter, outcome: "successful|failed|dismissed|panicked";
-    /// Asynchronous jobs that have not ended.
-    JOBS_OPEN = "molmesh_jobs_open", Gauge;
     /// Asynchronous jobs that wait for a worker; with `broker.url`, jobs that wait or run on any node.
     BROKER_QUEUED = "molmesh_broker_jobs_queued", Gauge;
     /// 1 while jobs can be dispatched to the NATS server and claimed, else 0.

@@ -83,10 +83,10 @@ struct Process {
     log: Arc<Mutex<String>>,
 }
 
-fn command(service: &Service, prefix: &str, data_dir: &Path) -> Command {
+fn command(name: &str, service: &Service, prefix: &str, data_dir: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_molmesh"));
     command
-        .args(["serve", "--listen", "127.0.0.1:0", "--backend", "reference", "--data-dir"])
+        .args([name, "--listen", "127.0.0.1:0", "--backend", "reference", "--data-dir"])
         .arg(data_dir)
         .args(["--set", "archive.url=none", "--set", "jobs.workers=1", "--set", "jobs.attempts=1000"])
         .args(["--set", "server.metrics_listen=none", "--set", "log.filter=debug", "--set", "store.allow_http=true"])
@@ -101,7 +101,7 @@ fn command(service: &Service, prefix: &str, data_dir: &Path) -> Command {
 
 impl Process {
     fn start(service: &Service, prefix: &str, data_dir: &Path) -> Self {
-        let mut child = command(service, prefix, data_dir).spawn().unwrap();
+        let mut child = command("serve", service, prefix, data_dir).spawn().unwrap();
         let log: Arc<Mutex<String>> = Arc::default();
         let (lines, kept) = (BufReader::new(child.stderr.take().unwrap()).lines(), Arc::clone(&log));
         std::thread::spawn(move || {
@@ -142,6 +142,32 @@ fn any_open(service: &Service, prefix: &str, data_dir: &Path) -> bool {
         }
         open
     })
+}
+
+#[test]
+fn the_start_and_doctor_accept_the_same_stores() {
+    let unconditional = "it replaced an object; the store must support conditional writes";
+    for (options, refusal) in
+        [(&[][..], None), (&["--unlisted"][..], None), (&["--unconditional"][..], Some(unconditional))]
+    {
+        let (service, folder) = (Service::start(options), tempfile::tempdir().unwrap());
+        let mut doctor = command("doctor", &service, "kind", &folder.path().join("doctor"));
+        let done = doctor.args(["--report", "json"]).stdout(Stdio::piped()).output().unwrap();
+        let document: Value = serde_json::from_slice(&done.stdout).unwrap_or_else(|e| panic!("{e}: {done:?}"));
+        let check = document["checks"].as_array().unwrap().iter().find(|check| check["name"] == "store").unwrap();
+        let found = check["detail"].as_str().unwrap();
+        assert_eq!(check["state"], if refusal.is_some() { "failed" } else { "ok" }, "{options:?}: {found}");
+        if let Some(text) = refusal {
+            let started = command("serve", &service, "kind", folder.path()).output().unwrap();
+            let log = String::from_utf8(started.stderr).unwrap();
+            assert_eq!((started.status.code(), done.status.code()), (Some(1), Some(1)), "{log}");
+            assert!(found.contains(text) && log.contains(text), "{found}\n{log}");
+        } else {
+            let log = Process::start(&service, "kind", folder.path()).kill();
+            let warns = log.contains("leftovers of crashed processes were not removed");
+            assert_eq!(warns, options.contains(&"--unlisted"), "{log}");
+        }
+    }
 }
 
 #[test]
@@ -293,7 +319,7 @@ fn asynchronous_jobs_survive_an_s3_outage() {
     let place = service.config("away");
     let access = service.access.clone();
     let elsewhere = tempfile::tempdir().unwrap();
-    let mut starting = command(&service, "away", elsewhere.path());
+    let mut starting = command("serve", &service, "away", elsewhere.path());
     drop(service);
     send(addr, "POST", "/v1/meshes?format=stl", &[LATER], &sample(6)).problem(503, "store-failed");
     let refused = starting.output().unwrap();

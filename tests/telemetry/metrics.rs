@@ -15,7 +15,7 @@ use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, sample, start, start_cold, wait_for};
+use http_support::{Fake, LONG, Mode, Running, SAMPLE, carbons, connect, sample, start, start_cold, wait_for};
 use metrics_support::{Devices, Scrape, check, queries};
 use molmesh::surface::CpuBackend;
 use molmesh::telemetry::{self as t, METRICS, Metric, MetricKind, recorder};
@@ -37,7 +37,6 @@ const ROWS: &[Row] = &[
     (t::QUOTA_CLIENTS, &[], quotas),
     (t::JOBS_SUBMITTED, &["mode=\"sync\"", "dedup=\"no\""], meshes),
     (t::JOBS_FINISHED, &["outcome=\"successful\""], meshes),
-    (t::JOBS_OPEN, &[], held),
     (t::BROKER_QUEUED, &[], held),
     (t::BROKER_UP, &[], cluster),
     (t::BROKER_REDELIVERIES, &[], cluster),
@@ -137,7 +136,7 @@ fn tileset_on_disk(look: &dyn Fn()) {
     look();
 }
 
-/// One running and two queued jobs, one of them asynchronous.
+/// A running and a queued request, and a running and a queued asynchronous job.
 fn held(look: &dyn Fn()) {
     let backend = Fake::new(Mode::Held);
     let server = start(Arc::clone(&backend) as _, |config| {
@@ -147,15 +146,19 @@ fn held(look: &dyn Fn()) {
         config.limits.memory_bytes = 1 << 30;
     });
     std::thread::scope(|scope| {
-        let running = scope.spawn(|| server.post("/v1/meshes", &[], &sample(1)));
-        wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
+        // Long requests: a short one that runs gives way.
+        let requests = [1, 4].map(|n| {
+            let server = &server;
+            scope.spawn(move || server.post(LONG, &[], &sample(n)))
+        });
+        wait_for("a job runs", || backend.started.load(Ordering::SeqCst) == 1);
         let later = [("prefer", "respond-async")];
         assert_eq!(server.post("/v1/meshes", &later, &sample(2)).status, 202);
         assert_eq!(server.post("/v1/meshes", &later, &sample(3)).status, 202);
         // A worker claims one job; the other one waits in the broker.
         look();
         backend.set(Mode::Octahedra);
-        assert_eq!(running.join().unwrap().status, 200);
+        assert!(requests.into_iter().all(|request| request.join().unwrap().status == 200));
     });
 }
 

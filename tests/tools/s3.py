@@ -2,13 +2,15 @@
 
 Prints one line of JSON when it is ready and ends at the end of standard input. The bucket is `meshes`. With
 `--guarded`, it accepts only the printed credentials. After the line `away` it drops every connection; after `back` it
-serves again. It echoes each line.
+serves again. It echoes each line. With `--unconditional`, it ignores the conditions of writes, as services without
+conditional writes do; with `--unlisted`, it does not list multipart uploads.
 """
 
 import json
 import logging
 import socket
 import sys
+import urllib.parse
 
 import boto3
 from moto import settings
@@ -52,6 +54,12 @@ class Gate:
         if self.away:
             environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
             raise ConnectionAbortedError
+        if "--unconditional" in sys.argv and environ["REQUEST_METHOD"] == "PUT":
+            environ.pop("HTTP_IF_NONE_MATCH", None)
+        query = urllib.parse.parse_qs(environ["QUERY_STRING"], keep_blank_values=True)
+        if "--unlisted" in sys.argv and environ["REQUEST_METHOD"] == "GET" and "uploads" in query:
+            start_response("501 Not Implemented", [("content-length", "0")])
+            return []
         return self.app(environ, start_response)
 
 

@@ -311,3 +311,22 @@ fn limits_and_cancellation_end_the_search() {
     control.cancel.cancel();
     assert_eq!(search(&balls, u64::MAX, &control), Err(SurfaceError::Cancelled));
 }
+
+#[test]
+fn rows_in_reach_of_probes_are_limited() {
+    let balls = [([0.0; 3], 50.0), ([30.0, 0.0, 0.0], 50.0)];
+    let run = |max_candidates: u64| {
+        let limits = SurfaceLimits { max_candidates, ..SurfaceLimits::default() };
+        find(&spheres(&balls), &params(1.4), 20.0, &limits, &Control::default())
+    };
+    // The disc of a ball's layer has as many rows as its height; a sum over layers gives its area.
+    let disc = |radius: f64| {
+        let half = |z: i32| (radius / SPACING).powi(2) - f64::from(z).powi(2);
+        (-200..=200).map(half).filter(|half2| *half2 > 0.0).map(|half2| 2.0 * half2.sqrt()).sum::<f64>()
+    };
+    let rows = 2.0 * (2.0 * disc(51.4) + disc(70.0));
+    let Err(SurfaceError::TooManyPocketRows { rows: counted, limit }) = run(10) else { panic!("50 rows are too few") };
+    assert!(limit == 50 && (counted as f64 / rows - 1.0).abs() < 0.01, "{counted} {rows}");
+    let least = counted.div_ceil(ROWS_PER_PAIR);
+    assert!(run(least).is_ok() && run(least - 1).is_err());
+}
