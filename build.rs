@@ -111,6 +111,8 @@ mod shaders {
     pub(super) fn build() {
         let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
         let (mut generated, mut broken, mut n) = (String::new(), Vec::new(), 0);
+        // FNV-1a.
+        let mut hash = 0xcbf2_9ce4_8422_2325_u64;
         for (table, layouts_table, folder, names) in TABLES {
             n += names.len();
             let mut layouts = BTreeSet::new();
@@ -126,6 +128,8 @@ mod shaders {
                     Ok((source, module)) => {
                         let file = format!("{}{name}.wgsl", folder.replace('/', "_"));
                         fs::write(out.join(&file), &source).expect("OUT_DIR can be written");
+                        let add = |hash: u64, byte| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3);
+                        hash = source.bytes().fold(hash, add);
                         let bindings = bindings(&module, by_enum);
                         writeln!(
                             generated,
@@ -147,6 +151,8 @@ mod shaders {
             }
         }
         assert!(broken.is_empty(), "{} of {n} shaders are broken:\n{}", broken.len(), broken.join("\n"));
+        writeln!(generated, "/// Hash of all sources.\npub(super) const SHADERS_HASH: &str = \"{hash:016x}\";")
+            .expect("writing to a string cannot fail");
         fs::write(out.join("shaders.rs"), generated).expect("OUT_DIR can be written");
     }
 

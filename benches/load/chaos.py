@@ -17,8 +17,8 @@ most of the kills and stops, because such a run tests nothing.
 
 With `--job-seconds`, one job at a time that takes about this long alone is stopped at a random point, again and again
 until it ends within a drain of `--drain-ms`. The script prints a row for each stop: no stop may count an attempt. The
-last row is the control, a kill (`kill -9`), which counts one. The exit code is 1 if an attempt was counted, a stop was
-not orderly, or a job did not end with the right mesh.
+last row is the control, a kill (`kill -9`), which counts one. The exit code is 1 if a stop counted an attempt or was not
+orderly, the kill did not count one, or a job did not end with the right mesh.
 """
 
 import argparse
@@ -166,21 +166,24 @@ class LongJob:
         self.server, self.structure, self.query, self.jobs = server, structure, query, []
 
     def ensure(self):
-        """Starts the service. It continues the last job; if that one has ended, the next job begins."""
+        """Starts the service. It continues the last job; if that one has ended, the next job begins. Returns the number of
+        attempts that the job had before."""
+        last = record(self.server.folder, self.jobs[-1]) if self.jobs else {"status": "none"}
         self.server.start()
-        if self.jobs and record(self.server.folder, self.jobs[-1])["status"] in OPEN:
-            return
+        if last["status"] in OPEN:
+            return last["attempts"]
         body = self.structure + b"REMARK 900 %032x\n" % random.getrandbits(128)
         path = f"/v1/meshes?{self.query}"
         status, headers, text = fetch(self.server.port, "POST", path, body, {"prefer": "respond-async"})
         if status != 202:
             sys.exit(f"status {status}: {text[:200]}")
         self.jobs.append(headers["location"])
+        return 0
 
     def interrupt(self, seconds, end):
         """Runs the job for some seconds and ends the service. Prints the row. Returns the number of attempts that were
         counted, and true if the end was orderly."""
-        self.ensure()
+        before = self.ensure()
         time.sleep(seconds)
         stage = json.loads(fetch(self.server.port, "GET", self.jobs[-1])[2])["stage"]
         code, took = end()
@@ -189,7 +192,7 @@ class LongJob:
         counts = ", ".join(f"{n} {what}" for what, n in re.findall(r"jobs_(\w+)=(\d+)", lines[-1])) if lines else "-"
         found = record(self.server.folder, self.jobs[-1])
         # The attempt that made the mesh counts.
-        counted = found["attempts"] - (found["status"] == "successful")
+        counted = found["attempts"] - before - (found["status"] == "successful")
         print(
             f"{len(self.jobs):>3} {seconds:>8.1f} {stage or '-':<12} {took:>8.1f} {code:>4} {counts:<36}"
             f" {counted:>8} {found['status']}",

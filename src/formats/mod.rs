@@ -35,8 +35,9 @@ pub use storage::{Normals, Storage, Units};
 
 use crate::surface::Mesh;
 
-/// Name and version of the program, for formats with such a field.
-const GENERATOR: &str = concat!("molmesh ", env!("CARGO_PKG_VERSION"));
+/// Name of the program, for formats with such a field; without its version, since equal meshes have equal bytes in
+/// every release.
+const GENERATOR: &str = "molmesh";
 
 /// Metadata of a mesh for the file.
 #[derive(Debug, Clone, Default)]

@@ -9,6 +9,7 @@ use wgpu::{
 };
 
 use super::error::GpuError;
+use super::shaders::SHADERS_HASH;
 use super::{choose, hardware};
 use crate::surface::{DeviceChoice, DeviceFacts, DeviceKind, FoundDevice};
 
@@ -165,9 +166,10 @@ pub(super) fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
         .map_err(|error| GpuError::Failed(format!("the device cannot be opened: {error}")))
 }
 
-/// Identifies the arithmetic of a device: model, driver, and the processor, which prepares jobs and measures meshes.
+/// Identifies the arithmetic of a device: model, driver, shaders, and the processor, which prepares jobs and measures
+/// meshes.
 pub(super) fn arithmetic(name: &str, device: &str) -> String {
-    format!("{name} {device} {}", crate::surface::arithmetic())
+    format!("{name} {device} {SHADERS_HASH} {}", crate::surface::arithmetic())
 }
 
 /// Describes a device and its driver, for display.

@@ -39,7 +39,8 @@ struct Listener {
 }
 
 problem_responses!(EventsProblems: [[
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::RecordUnreadable, ProblemType::StoreFailed,
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::RecordUnreadable,
+    ProblemType::OtherRelease, ProblemType::StoreFailed,
 ]]);
 
 /// Follow a job as server-sent events

@@ -37,6 +37,9 @@ pub(super) const API_KEY: HeaderName = HeaderName::from_static("x-api-key");
 pub(super) const RATE_LIMIT_POLICY: HeaderName = HeaderName::from_static("ratelimit-policy");
 pub(super) const RATE_LIMIT: HeaderName = HeaderName::from_static("ratelimit");
 
+/// Maximum time that a request waits until the records of jobs were read, after a start.
+const RECORDS_WAIT: Duration = Duration::from_secs(5);
+
 /// Remote address of a connection.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Peer(pub(super) IpAddr);
@@ -124,6 +127,12 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
             return problem.into_response();
         }
     };
+    // Until then, inputs of unfinished jobs are not protected from eviction, and their ends are not known.
+    if !app.job_store.records_read(RECORDS_WAIT).await {
+        discard_body(request).await;
+        let detail = "the service has just started and still reads the records of its jobs";
+        return Problem::new(ProblemType::NotReady, detail).retry_after(RECORDS_WAIT).into_response();
+    }
     let account = caller.account.clone();
     let running = account.as_ref().map(|account| app.access.meter().admit(account, Instant::now())).transpose();
     request.extensions_mut().insert(caller);

@@ -75,8 +75,8 @@ problem_responses!(ReadyProblems: [[ProblemType::NotReady]]);
 /// Check that the service is ready for requests
 ///
 /// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts
-/// jobs, can write and read the store, can dispatch jobs, and has no unreadable job record in quarantine. The response
-/// does not depend on the load.
+/// jobs, can write and read the store, can dispatch jobs, and has read the records of unfinished jobs, of which none is
+/// in quarantine. The response does not depend on the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
     responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyProblems))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {
@@ -137,10 +137,14 @@ fn broker(app: &Shared) -> ReadinessCheck {
 }
 
 async fn records(app: &Shared) -> ReadinessCheck {
-    let found = match app.store.quarantined().await {
-        Ok(0) => Ok("no job record is in quarantine".to_owned()),
-        Ok(count) => Err(format!("{count} job records cannot be read and are in quarantine; see the log")),
-        Err(_logged) => Err("the quarantine of job records cannot be read".to_owned()),
+    if !app.job_store.has_read_records() {
+        return ReadinessCheck::new("records", Err("the records of jobs are being read".to_owned()));
+    }
+    let found = match (app.store.quarantined().await, app.job_store.jobs_of_other_releases()) {
+        (Ok(0), 0) => Ok("no job record is in quarantine".to_owned()),
+        (Ok(0), n) => Ok(format!("no job record is in quarantine; jobs left to the releases that wrote them: {n}")),
+        (Ok(count), _) => Err(format!("{count} job records cannot be read and are in quarantine; see the log")),
+        (Err(_logged), _) => Err("the quarantine of job records cannot be read".to_owned()),
     };
     ReadinessCheck::new("records", found)
 }

@@ -128,12 +128,18 @@ impl Poll {
     }
 }
 
-problem_responses!(ShowProblems: [[ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::RecordUnreadable, ProblemType::StoreFailed]]);
-problem_responses!(DismissProblems: [[ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::JobEnded, ProblemType::RecordUnreadable, ProblemType::StoreFull, ProblemType::StoreFailed]]);
+problem_responses!(ShowProblems: [[
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::RecordUnreadable,
+    ProblemType::OtherRelease, ProblemType::StoreFailed,
+]]);
+problem_responses!(DismissProblems: [[
+    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::JobEnded,
+    ProblemType::RecordUnreadable, ProblemType::OtherRelease, ProblemType::StoreFull, ProblemType::StoreFailed,
+]]);
 problem_responses!(ResultProblems: [READING, MESHING, [
     ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::NoResultYet, ProblemType::JobDismissed,
     ProblemType::ResultGone, ProblemType::JobAbandoned,
-    ProblemType::RecordUnreadable,
+    ProblemType::RecordUnreadable, ProblemType::OtherRelease,
     ProblemType::StoreFull, ProblemType::StoreFailed,
 ]]);
 
@@ -232,7 +238,7 @@ pub(super) async fn result(State(app): State<Shared>, caller: Caller, id: JobId)
                 Problem::new(ProblemType::ResultGone, "the result was removed after some time; request the mesh again")
             };
             let key = ContentKey::parse(key, caller.namespace).map_err(|_bad| gone())?;
-            let format = record.format.parse().map_err(|_bad| gone())?;
+            let format = record.format.parse().map_err(|_unknown| Problem::of_other_release())?;
             if !is_stored(&app.store, format, &key).await? {
                 return Err(gone());
             }

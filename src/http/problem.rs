@@ -47,6 +47,12 @@ impl Problem {
         Self::new(ProblemType::ShuttingDown, detail).retry_after(Duration::from_secs(1))
     }
 
+    /// Creates the problem of a job whose record this release cannot read.
+    pub(super) fn of_other_release() -> Self {
+        let detail = "another release of the service wrote the record of the job, and this one cannot read it";
+        Self::new(ProblemType::OtherRelease, detail).retry_after(Duration::from_secs(5))
+    }
+
     /// Creates an internal error. The message goes to the log, not to the client.
     pub(super) fn internal(message: impl std::fmt::Display) -> Self {
         tracing::error!(%message, "internal error");

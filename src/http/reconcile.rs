@@ -6,7 +6,9 @@ use serde::Serialize;
 
 use super::server::{ServeError, connect_broker};
 use crate::config::Config;
-use crate::jobs::{Broker as _, Dispatch, DispatchError, JobRecord, NatsBroker, rfc3339, unfinished_jobs};
+use crate::jobs::{
+    Broker as _, Dispatch, DispatchError, JobRecord, NatsBroker, UnfinishedJobs, rfc3339, unfinished_jobs,
+};
 use crate::store::Store;
 
 /// Interval at which the broker is asked whether it answers.
@@ -19,7 +21,9 @@ pub struct Reconciled {
     pub unfinished: usize,
     /// Number of lost jobs that were dispatched; 0 for a dry run.
     pub dispatched: usize,
-    /// Number of records that cannot be parsed. The next node that reads them moves them into quarantine.
+    /// Number of unfinished jobs that are left to the releases that wrote their records.
+    pub of_other_releases: usize,
+    /// Number of damaged records. The next node that reads them moves them into quarantine.
     pub unreadable: usize,
     /// Unfinished jobs that the broker did not have, oldest first.
     pub lost: Vec<LostJob>,
@@ -55,8 +59,10 @@ pub async fn reconcile(config: &Config, url: &str, dry_run: bool, limit: Duratio
         }
         tokio::time::sleep(CHECK).await;
     }
-    let (records, unreadable) = unfinished_jobs(&store).await?;
-    let mut result = Reconciled { unfinished: records.len(), dispatched: 0, unreadable, lost: Vec::new(), error: None };
+    let UnfinishedJobs { records, of_other_releases, unreadable } = unfinished_jobs(&store).await?;
+    let unfinished = records.len();
+    let mut result =
+        Reconciled { unfinished, dispatched: 0, of_other_releases, unreadable, lost: Vec::new(), error: None };
     for record in records {
         if let Err(error) = result.examine(&record, &broker, dry_run).await {
             result.error = Some(error.to_string());

@@ -38,6 +38,8 @@ const UPKEEP: Duration = Duration::from_secs(5);
 const BROKER_CHECK: Duration = Duration::from_secs(1);
 /// Interval at which jobs that the broker has lost are dispatched again.
 const RECONCILE: Duration = Duration::from_mins(1);
+/// Pause after a failed attempt to read the records of jobs.
+const RETRY: Duration = Duration::from_secs(1);
 
 /// Number of results whose headers are cached, about 2 KB each.
 const CACHED_HEADERS: usize = 1024;
@@ -153,7 +155,7 @@ impl Server {
         };
         let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
-        let job_store = start_jobs(&config, &store, &pool, secret).await?;
+        let job_store = open_jobs(&config, &store, &pool, secret).await?;
         ::metrics::gauge!(telemetry::MEMORY_LIMIT).set(config.limits.memory_bytes as f64);
         let archive = Archive::new(&config, pool.settings().budget.clone());
         let capabilities = capabilities::document(&config, &pool, &found);
@@ -220,8 +222,8 @@ impl Server {
         background.spawn(key_reload::run(Arc::clone(&self.app.access)));
         let app = Arc::clone(&self.app);
         background.spawn_blocking(move || warm_up(&app));
-        background.spawn(reconcile(self.app.job_store.clone()));
-        background.spawn(sweep(self.app.store.clone(), Duration::from_millis(self.app.config.store.sweep_ms)));
+        background.spawn(dispatch_jobs(self.app.job_store.clone(), self.app.config.server.role != Role::Api));
+        background.spawn(sweep(Arc::clone(&self.app)));
         let (router, budget) = (router::router(&self.app), self.app.pool.settings().budget.clone());
         let serving = accept::serve(self.listener, router, Arc::clone(&config), budget, stopped.clone());
         let serving = tokio::spawn(serving);
@@ -242,8 +244,8 @@ impl Server {
     }
 }
 
-/// Creates the job store, dispatches the unfinished jobs of earlier processes, and starts to claim jobs.
-async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Secret) -> Result<JobStore, ServeError> {
+/// Creates the job store. Reads no record of a job.
+async fn open_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Secret) -> Result<JobStore, ServeError> {
     let describe = |error: &EndError| Problem::from(error.clone()).record("");
     let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
     let broker: Arc<dyn Broker> = match &config.broker.url {
@@ -252,16 +254,7 @@ async fn start_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Se
     };
     let partition_time = config.broker.url.as_ref().and(config.broker.partition_time());
     let broker = (broker, config.broker.queue, partition_time);
-    let job_store = JobStore::new(store.clone(), Arc::clone(pool), broker, jobs, output_bytes, secret, describe);
-    // The inputs of open jobs are pinned before a request can evict them.
-    let recovered = job_store.reconcile().await?;
-    if recovered > 0 {
-        tracing::info!(jobs = recovered, "dispatched jobs of an earlier process");
-    }
-    if config.server.role != Role::Api {
-        job_store.start_claiming();
-    }
-    Ok(job_store)
+    Ok(JobStore::new(store.clone(), Arc::clone(pool), broker, jobs, output_bytes, secret, describe))
 }
 
 /// Connects to the broker of the nodes that share the store with this secret. With `creates`, creates what is missing.
@@ -286,19 +279,41 @@ async fn publish(app: Shared, recorder: Option<Recorder>) {
     }
 }
 
-/// Dispatches jobs that the broker has lost, at regular intervals.
-async fn reconcile(jobs: JobStore) {
+/// Reads the records of unfinished jobs, claims jobs if `claims`, and dispatches jobs that the broker has lost, at
+/// regular intervals.
+async fn dispatch_jobs(jobs: JobStore, claims: bool) {
+    // Also without the broker, because requests wait for the records.
+    while !jobs.has_read_records() {
+        match jobs.reconcile().await {
+            Ok(0) => {}
+            Ok(recovered) => tracing::info!(jobs = recovered, "dispatched jobs of an earlier process"),
+            Err(error) => {
+                tracing::warn!(%error, "the records of jobs were not read");
+                tokio::time::sleep(RETRY).await;
+            }
+        }
+    }
+    if claims {
+        jobs.start_claiming();
+    }
     loop {
         while jobs.broker_down().is_some() {
             tokio::time::sleep(BROKER_CHECK).await;
         }
         let losses = jobs.broker_losses();
-        match jobs.reconcile().await {
-            Ok(0) => {}
-            Ok(dispatched) => tracing::warn!(jobs = dispatched, "dispatched jobs that the broker did not have"),
-            Err(error) => tracing::warn!(%error, "the records of jobs were not read"),
-        }
-        let end = tokio::time::Instant::now() + RECONCILE;
+        let pause = match jobs.reconcile().await {
+            Ok(0) => RECONCILE,
+            Ok(dispatched) => {
+                tracing::warn!(jobs = dispatched, "dispatched jobs that the broker did not have");
+                RECONCILE
+            }
+            // The inputs of jobs whose records were not read are not protected.
+            Err(error) => {
+                tracing::warn!(%error, "the records of jobs were not read");
+                RETRY
+            }
+        };
+        let end = tokio::time::Instant::now() + pause;
         let may_lack_jobs = || jobs.broker_down().is_some() || jobs.broker_losses() != losses;
         while tokio::time::Instant::now() < end && !may_lack_jobs() {
             tokio::time::sleep(BROKER_CHECK).await;
@@ -306,11 +321,14 @@ async fn reconcile(jobs: JobStore) {
     }
 }
 
-/// Removes expired objects of the store at regular intervals.
-async fn sweep(store: Store, interval: Duration) {
+/// Removes expired objects of the store at regular intervals, once the inputs of unfinished jobs are protected.
+async fn sweep(app: Shared) {
+    let interval = Duration::from_millis(app.config.store.sweep_ms);
     loop {
         tokio::time::sleep(interval).await;
-        store.sweep(store.now()).await;
+        if app.job_store.has_read_records() {
+            app.store.sweep(app.store.now()).await;
+        }
     }
 }
 

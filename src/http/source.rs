@@ -20,7 +20,7 @@ use super::problem_types::ProblemType;
 use super::state::{Delivery, Shared};
 use crate::archive::{Entry, FetchError, UnavailableReason};
 use crate::jobs::{Input, MemoryReservation};
-use crate::pipeline::Job;
+use crate::pipeline::{Job, algorithm_versions};
 use crate::store::{Digest, Name};
 use crate::structure::{ArchiveError, EntryId, ReadLimits, Structure};
 use crate::surface::Control;
@@ -202,11 +202,11 @@ fn validators(digest: &Digest, variant: &str) -> Result<[(HeaderName, HeaderValu
     Ok([(header::ETAG, etag(digest, variant)?), (header::CACHE_CONTROL, CACHE)])
 }
 
-/// Returns the `ETag` of a document of a structure: a digest of its file, the parameters `variant` and the program,
-/// because the last digits of numbers depend on the version and on mathematical libraries.
+/// Returns the `ETag` of a document of a structure: a digest of its file, the parameters `variant`, the versions of the
+/// algorithms and the system, because the last digits of numbers depend on mathematical libraries.
 pub(super) fn etag(digest: &Digest, variant: &str) -> Result<HeaderValue, Problem> {
-    let program = concat!("molmesh ", env!("CARGO_PKG_VERSION"));
-    let digest = Digest::of(format!("{program} {OS} {ARCH}\n{digest}&{variant}").as_bytes());
+    let versions = algorithm_versions::of_document();
+    let digest = Digest::of(format!("molmesh {versions} {OS} {ARCH}\n{digest}&{variant}").as_bytes());
     HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)
 }
 

@@ -24,6 +24,8 @@ const POLL: Duration = Duration::from_secs(5);
 const MAX_UNWATCHED: usize = 6;
 /// Time after which a job that runs in this process already may be claimed again.
 const DUPLICATE: Duration = Duration::from_secs(5);
+/// Time after which a job of another release may be claimed again: short, because a node of that release may be idle.
+const OTHER_RELEASE: Duration = Duration::from_secs(5);
 
 impl JobStore {
     /// Returns true if a job can be dispatched now.
@@ -76,8 +78,9 @@ impl JobStore {
                 Some((self.0.broker.claim(has_gpu).await, slot))
             };
             let claimed = tokio::select! {
-                claimed = next => claimed,
+                biased;
                 () = self.0.runs.finishing() => None,
+                claimed = next => claimed,
             };
             let Some((claim, slot)) = claimed else { return };
             let (jobs, run) = (self.clone(), self.count_run());
@@ -96,9 +99,16 @@ impl JobStore {
                 return Some(RunResult::Returned);
             }
         };
-        let Some(record) = record else {
-            claim.done().await;
-            return None;
+        let record = match record {
+            Ok(Some(record)) => record,
+            Ok(None) => {
+                claim.done().await;
+                return None;
+            }
+            Err(OfOtherRelease) => {
+                claim.release(OTHER_RELEASE);
+                return None;
+            }
         };
         let job = self.insert_open(record.clone());
         if job.ended().is_some() {
@@ -134,13 +144,16 @@ impl JobStore {
         }
     }
 
-    /// Reads the record of a claimed job. Waits while the store fails. `None` if no such job is open.
-    async fn record_of(&self, claim: &Claim) -> Option<JobRecord> {
+    /// Reads the record of a claimed job; `None` if no such job is open. Waits while the store fails.
+    async fn record_of(&self, claim: &Claim) -> Result<Option<JobRecord>, OfOtherRelease> {
         let mut pause = retry::FIRST_PAUSE;
         loop {
             match self.0.read(&claim.id).await {
-                Ok(record) => return record.filter(|record| !record.status.is_final()),
-                Err(StoreError::Quarantined { .. }) => return None,
+                Ok(Some(record)) if record.status.is_final() => return Ok(None),
+                Ok(Some(record)) if record.request().is_err() => return Err(OfOtherRelease),
+                Ok(record) => return Ok(record),
+                Err(StoreError::Quarantined { .. }) => return Ok(None),
+                Err(StoreError::OtherRelease { .. }) => return Err(OfOtherRelease),
                 Err(error) => tracing::warn!(job_id = %claim.id, %error, "a claimed job waits for the store"),
             }
             sleep(pause).await;
@@ -229,6 +242,12 @@ impl JobStore {
                 self.0.lock().jobs.remove(&id);
                 true
             }
+            Err(StoreError::OtherRelease { .. }) => {
+                // A node of that release has taken the job over.
+                self.0.lock().jobs.remove(&id);
+                job.stop().notify_one();
+                true
+            }
             Err(error) => {
                 tracing::debug!(job_id = %id, %error, "the record of a followed job was not read");
                 false
@@ -236,6 +255,9 @@ impl JobStore {
         }
     }
 }
+
+/// Error of a claimed job whose record another release wrote, or whose parameters this release does not know.
+struct OfOtherRelease;
 
 /// Returns true if only the task that follows a job uses it.
 fn is_unused(job: &DurableJob) -> bool {

@@ -99,6 +99,8 @@ pub(super) struct JobStoreState {
     jobs: Mutex<JobMap>,
     /// Unfinished jobs that this process knows of.
     pub(super) open: OpenJobs,
+    /// True once the records of earlier processes were read.
+    pub(super) records_read: watch::Sender<bool>,
     /// Permits to write the record of a begun or ended job.
     pub(super) writes: Semaphore,
     /// Permits to claim a job, one per worker.
@@ -181,6 +183,7 @@ impl JobStore {
             secret,
             jobs: Mutex::new(JobMap { jobs: HashMap::new(), trim_at: MAX_ENDED + MAX_ENDED / 10 }),
             open: OpenJobs::default(),
+            records_read: watch::Sender::new(false),
             writes: Semaphore::new(CONCURRENT_WRITES),
             slots,
             saves: SingleFlight::default(),
@@ -256,7 +259,7 @@ impl JobStore {
         }
         drop(reservation);
         let dispatch = Dispatch::of(&record);
-        inner.open.insert(dispatch.clone(), pins);
+        inner.open.insert(id.clone(), Some(dispatch.clone()), pins);
         if is_dispatched {
             self.dispatch(&dispatch).await;
             let known = self.known(&id, namespace);

@@ -1,9 +1,9 @@
-//! Content keys: names of results that follow from input, parameters, format, arithmetic and version.
+//! Content keys: names of results that follow from input, parameters, format, arithmetic and versions of algorithms.
 
 use std::fmt;
 
 use crate::formats::Format;
-use crate::pipeline::{Job, params};
+use crate::pipeline::{Job, algorithm_versions, params};
 use crate::store::{BadDigest, Digest, Name, Namespace, StoreError};
 
 /// Name of a mesh file, with the namespace in which it is stored. Equal names mean equal bytes in every namespace.
@@ -15,16 +15,17 @@ pub(crate) struct ContentKey {
 
 impl ContentKey {
     /// Returns the key of a result. `arithmetic` names the arithmetic of the backend, followed by that of a picture's
-    /// renderer. The version is part of the key, since a release may change the last bits.
+    /// renderer. Releases with the same algorithms give the same keys.
     pub(crate) fn new(input: &Digest, job: &Job, format: Format, arithmetic: &str, namespace: Namespace) -> Self {
-        let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));
-        let text = format!("molmesh {version}\n{arithmetic}\n{}\n{canonical}\n{input}\n", format.name());
+        let (canonical, versions) = (params::canonical(job), algorithm_versions::of_file(job));
+        let text = format!("molmesh {versions}\n{arithmetic}\n{}\n{canonical}\n{input}\n", format.name());
         Self { digest: Digest::of(text.as_bytes()), namespace }
     }
 
-    /// Returns the key of the results of one of `count` partitions of the mesh.
+    /// Returns the key of the results of one of `count` partitions of the mesh. Only the same release can read them.
     pub(super) fn of_partition(&self, index: u32, count: u32) -> Self {
-        Self { digest: Digest::of(format!("{self}\n{index}/{count}\n").as_bytes()), ..*self }
+        let version = env!("CARGO_PKG_VERSION");
+        Self { digest: Digest::of(format!("{self}\n{version}\n{index}/{count}\n").as_bytes()), ..*self }
     }
 
     /// Returns the identity of the work whose result has this key.

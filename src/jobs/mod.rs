@@ -51,7 +51,7 @@ pub(crate) use owned_job::OwnedJob;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Lane, Rank};
 pub(crate) use record::{JobId, JobRecord, Status, rfc3339};
-pub(crate) use records::unfinished_jobs;
+pub(crate) use records::{UnfinishedJobs, unfinished_jobs};
 pub(crate) use results::{REPORT, SaveError, document, is_stored, save};
 pub(crate) use scratch::ScratchSpace;
 pub(crate) use structures::Structures;

@@ -12,7 +12,8 @@ use crate::sync::{Mutex, MutexGuard};
 struct OpenJob {
     /// Position in the order of insertion.
     order: u64,
-    dispatch: Dispatch,
+    /// `None` for a job of another release, which this process does not dispatch.
+    dispatch: Option<Dispatch>,
     /// Keeps inputs and record in the store.
     _pins: Vec<Pin>,
 }
@@ -32,12 +33,13 @@ impl OpenJobs {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Adds a job whose record is stored. `pins` keep its inputs and its record.
-    pub(super) fn insert(&self, dispatch: Dispatch, pins: Vec<Pin>) {
+    /// Adds a job whose record is stored, without `dispatch` if another release must run it. `pins` keep its inputs and
+    /// its record.
+    pub(super) fn insert(&self, id: JobId, dispatch: Option<Dispatch>, pins: Vec<Pin>) {
         let mut open = self.lock();
         let order = open.next;
         open.next += 1;
-        let replaced = open.jobs.insert(dispatch.id.clone(), OpenJob { order, dispatch, _pins: pins });
+        let replaced = open.jobs.insert(id, OpenJob { order, dispatch, _pins: pins });
         drop(open);
         // Unpins without the lock.
         drop(replaced);
@@ -55,9 +57,16 @@ impl OpenJobs {
         self.lock().jobs.keys().cloned().collect()
     }
 
-    /// Returns the dispatches of all jobs, in the order of insertion.
+    /// Returns the number of jobs of other releases.
+    pub(super) fn of_other_releases(&self) -> usize {
+        self.lock().jobs.values().filter(|job| job.dispatch.is_none()).count()
+    }
+
+    /// Returns the dispatches of the jobs of this release, in the order of insertion.
     pub(super) fn all(&self) -> Vec<Dispatch> {
-        let mut all: Vec<_> = self.lock().jobs.values().map(|job| (job.order, job.dispatch.clone())).collect();
+        let open = self.lock();
+        let mut all: Vec<_> = open.jobs.values().filter_map(|job| Some((job.order, job.dispatch.clone()?))).collect();
+        drop(open);
         all.sort_unstable_by_key(|(order, _)| *order);
         all.into_iter().map(|(_, dispatch)| dispatch).collect()
     }

@@ -91,7 +91,7 @@ impl JobStore {
         can_divide.then(key)
     }
 
-    /// Returns true if a helper can compute partitions here: this node has the release and the arithmetic of the
+    /// Returns true if a helper can compute partitions here: this node has the algorithms and the arithmetic of the
     /// writer, and no other job of this process, which has the same processor, works on the mesh.
     pub(super) fn can_help(&self, helper: &Helper, task: &Task, format: Format) -> bool {
         let key = self.key_of_mesh(task, format);

@@ -11,7 +11,7 @@ use thiserror::Error;
 
 use crate::formats::Format;
 use crate::pipeline::{MapFile, params};
-use crate::store::{Namespace, OWNER_DIGITS, Secret, derive};
+use crate::store::{Digest, Namespace, OWNER_DIGITS, Secret, derive};
 use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, traceparent, tracestate};
 
 /// Error of a text that is not a job id.
@@ -117,8 +117,10 @@ impl Status {
     }
 }
 
-/// Stored state of a job.
+/// Stored state of a job. A field that this release does not know means a record of another release, because writing
+/// the record would remove the field.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct JobRecord {
     /// Id of the job.
     pub(crate) id: JobId,
@@ -168,12 +170,13 @@ pub(crate) struct JobRecord {
 
 /// Helper of a job: another worker, which computes partitions of its mesh.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct Helper {
     /// Number of the helper, from 0.
     pub(crate) number: u32,
     /// Number of partitions.
     pub(crate) partitions: u32,
-    /// Key of the mesh, with the release and the arithmetic of the worker that joins the partitions.
+    /// Key of the mesh, which follows from the algorithms and the arithmetic of the worker that joins the partitions.
     pub(crate) mesh: String,
 }
 
@@ -184,7 +187,7 @@ fn is_zero(n: &u32) -> bool {
 
 /// Id and W3C trace context of the request that created a job.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 pub(crate) struct Requester {
     /// Id of the request.
     pub(crate) request: Option<String>,
@@ -217,44 +220,70 @@ impl Requester {
 
 /// Version of the record format.
 const VERSION: u64 = 1;
+/// Name of the last field, the SHA-256 of all bytes before it. The first records have neither checksum nor version.
+const CHECKSUM: &str = "sha256";
+/// Last field up to its value.
+const CHECKSUM_FIELD: &[u8] = b",\"sha256\":\"";
 
-/// Version of a stored record; the first records have none.
-#[derive(Debug, Serialize, Deserialize)]
-struct Versioned<T> {
-    #[serde(default = "first_version")]
+/// Record with the version of its format.
+#[derive(Debug, Serialize)]
+struct Versioned<'a> {
     version: u64,
     #[serde(flatten)]
-    content: T,
+    content: &'a JobRecord,
 }
 
-fn first_version() -> u64 {
-    VERSION
+/// Divides a record into the bytes before the checksum, and the checksum; `None` for a record without one.
+fn split_checksum(bytes: &[u8]) -> Option<(&[u8], Digest)> {
+    let (rest, digest) = bytes.strip_suffix(b"\"}")?.split_last_chunk::<64>()?;
+    let digest = std::str::from_utf8(digest).ok()?.parse().ok()?;
+    Some((rest.strip_suffix(CHECKSUM_FIELD)?, digest))
 }
 
 /// Error of a stored record.
 #[derive(Debug, Error)]
 pub(super) enum BadRecord {
-    /// The document is damaged.
+    /// The record is torn or was changed.
+    #[error("it is damaged: {0}")]
+    Damaged(String),
+    /// Another release wrote the record.
     #[error("{0}")]
-    Damaged(#[from] serde_json::Error),
-    /// A later release wrote the record.
-    #[error("the record has version {0}, expected {VERSION}")]
-    Version(u64),
+    OtherRelease(String),
 }
 
 impl JobRecord {
     /// Returns the document to store.
     pub(super) fn to_bytes(&self) -> Bytes {
-        Bytes::from(serde_json::to_vec(&Versioned { version: VERSION, content: self }).unwrap_or_default())
+        let mut text = serde_json::to_vec(&Versioned { version: VERSION, content: self }).unwrap_or_default();
+        // The brace follows the checksum.
+        text.pop();
+        let checksum = Digest::of(&text);
+        text.extend_from_slice(CHECKSUM_FIELD);
+        text.extend_from_slice(format!("{checksum}\"}}").as_bytes());
+        Bytes::from(text)
     }
 
-    /// Parses a stored document.
+    /// Parses a stored document. A checksum that matches distinguishes a record of another release from a damaged one.
     pub(super) fn from_bytes(bytes: &[u8]) -> Result<Self, BadRecord> {
-        // The version first: other fields of another version may have other types.
-        match serde_json::from_slice::<Versioned<Map<String, Value>>>(bytes)?.version {
-            VERSION => Ok(serde_json::from_slice(bytes)?),
-            other => Err(BadRecord::Version(other)),
+        let checked = split_checksum(bytes);
+        if let Some((content, checksum)) = checked
+            && Digest::of(content) != checksum
+        {
+            return Err(BadRecord::Damaged("its checksum does not match".to_owned()));
         }
+        let mut fields: Map<String, Value> =
+            serde_json::from_slice(bytes).map_err(|error| BadRecord::Damaged(error.to_string()))?;
+        let version = fields.remove("version").unwrap_or(VERSION.into());
+        if version != VERSION {
+            return Err(BadRecord::OtherRelease(format!("it has version {version}, expected {VERSION}")));
+        }
+        if checked.is_some() {
+            fields.remove(CHECKSUM);
+        }
+        serde_json::from_value(fields.into()).map_err(|error| match checked {
+            Some(_) => BadRecord::OtherRelease(error.to_string()),
+            None => BadRecord::Damaged(error.to_string()),
+        })
     }
 
     /// Parses the stored parameters and the format.
@@ -296,7 +325,6 @@ const MAX_MS: u64 = 253_402_300_799_000;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::Digest;
 
     #[test]
     fn ids_are_random_or_follow_their_key() {
@@ -371,14 +399,50 @@ mod tests {
         old.as_object_mut().unwrap().remove("requester").unwrap();
         assert_eq!(serde_json::from_value::<JobRecord>(old).unwrap().requester, Requester::default());
         let old = serde_json::to_vec(&record).unwrap();
-        assert_eq!(JobRecord::from_bytes(&old).unwrap(), record, "the first records have no version");
-        let later = br#"{"version":2,"id":7}"#;
-        assert!(matches!(JobRecord::from_bytes(later), Err(BadRecord::Version(2))));
-        for damaged in [b"".as_slice(), &text[..text.len() / 2], b"[]", br#"{"version":1}"#] {
+        assert_eq!(JobRecord::from_bytes(&old).unwrap(), record, "the first records have neither version nor checksum");
+        let hostile = String::from_utf8(old).unwrap().replace(record.id.as_str(), "../../x");
+        assert!(matches!(JobRecord::from_bytes(hostile.as_bytes()), Err(BadRecord::Damaged(_))));
+    }
+
+    /// Returns a record with this field, and a checksum that matches.
+    fn with_field(record: &JobRecord, name: &str, value: Value) -> Vec<u8> {
+        let mut fields = serde_json::to_value(Versioned { version: VERSION, content: record }).unwrap();
+        fields[name] = value;
+        let text = fields.to_string();
+        let content = text.strip_suffix('}').unwrap();
+        let checksum = Digest::of(content.as_bytes());
+        format!("{content},\"{CHECKSUM}\":\"{checksum}\"}}").into_bytes()
+    }
+
+    #[test]
+    fn records_of_other_releases_are_not_taken_for_damaged_ones() {
+        let record = record(&[("resolution", "0.5")]);
+        assert_eq!(with_field(&record, "attempts", 1.into()), record.to_bytes(), "the control");
+        let with_later = |value: &str| with_field(&record, "later", value.into());
+        let later = [
+            with_field(&record, "version", 2.into()),
+            with_field(&record, "version", "next".into()),
+            with_field(&record, "status", "paused".into()),
+            with_field(&record, "requester", serde_json::json!({ "region": "x" })),
+            with_later("x"),
+            br#"{"version":2,"id":7}"#.to_vec(),
+        ];
+        for bytes in later {
+            let found = JobRecord::from_bytes(&bytes);
+            assert!(matches!(found, Err(BadRecord::OtherRelease(_))), "{found:?}");
+        }
+        let text = record.to_bytes();
+        for damaged in [b"".as_slice(), b"[]", br#"{"version":1}"#, b"{\"later\":1}"] {
             assert!(matches!(JobRecord::from_bytes(damaged), Err(BadRecord::Damaged(_))), "{damaged:?}");
         }
-        let hostile = String::from_utf8(text).unwrap().replace(record.id.as_str(), "../../x");
-        assert!(serde_json::from_str::<JobRecord>(&hostile).is_err());
+        for length in 0..text.len() {
+            assert!(matches!(JobRecord::from_bytes(&text[..length]), Err(BadRecord::Damaged(_))), "{length}");
+        }
+        for bit in 0..8 * text.len() {
+            let mut flipped = text.to_vec();
+            flipped[bit / 8] ^= 1 << (bit % 8);
+            assert!(matches!(JobRecord::from_bytes(&flipped), Err(BadRecord::Damaged(_))), "bit {bit}");
+        }
     }
 
     #[test]

@@ -3,8 +3,12 @@
 //! The record of an open job is `ID.json`. At its end, the record `ID.ended.json` is written, then the other one is
 //! removed, so that one of them exists at any time. If both exist, the job has ended. The end of a job is thus known
 //! from the name, and a start reads the records of open jobs only. The record of an end is never replaced.
+//!
+//! A damaged record goes into quarantine. A record of another release stays as it is: a node of that release runs the
+//! job.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::{StreamExt as _, stream};
@@ -16,12 +20,13 @@ use super::claims::input_of;
 use super::durable_job::DurableJob;
 use super::job_store::{JobStore, JobStoreState};
 use super::rank::{Client, Rank};
-use super::record::{JobId, JobRecord};
+use super::record::{BadRecord, JobId, JobRecord};
 use super::{AcceptError, EndError, Input, JobView, Task};
 use crate::formats::Format;
 use crate::pipeline::MapFile;
 use crate::store::{BadDigest, Digest, Name, Namespace, Pin, RecordCaps, RecordReservation, Store, StoreError};
 use crate::surface::OutOfMemory;
+use crate::sync::timeout;
 use crate::telemetry::{JOBS_RECOVERED, shorten};
 
 /// Concurrent reads of records.
@@ -55,7 +60,11 @@ impl JobStoreState {
         let (input, map) = input_of(record)?;
         let pins = self.pins(&record.id, [input].into_iter().chain(map), record.namespace);
         let pins = pins.map_err(|error| EndError::Lost { why: error.to_string() })?;
-        self.open.insert(Dispatch::of(record), pins);
+        let request = record.request();
+        if let Err(why) = &request {
+            tracing::warn!(job_id = %record.id, why, "a job is left to the release that wrote its record");
+        }
+        self.open.insert(record.id.clone(), request.is_ok().then(|| Dispatch::of(record)), pins);
         Ok(input)
     }
 
@@ -82,7 +91,11 @@ impl JobStoreState {
         let end = if self.store.put_new(&ended, record.to_bytes()).await? {
             record
         } else {
-            self.read_document(&ended).await?.unwrap_or(record)
+            match self.read_document(&ended).await {
+                // The job has ended; this release cannot show that end.
+                Err(StoreError::OtherRelease { .. }) => record,
+                read => read?.unwrap_or(record),
+            }
         };
         self.store.delete(&open).await?;
         Ok(end)
@@ -105,16 +118,17 @@ impl JobStoreState {
     /// Reads the record of a job.
     pub(super) async fn read(&self, id: &JobId) -> Result<Option<JobRecord>, StoreError> {
         // In this order, a job that ends meanwhile is not missed.
-        let open = self.read_document(&Name::job(id.as_str())?).await?;
+        let open = self.read_document(&Name::job(id.as_str())?).await;
         let ended = self.read_document(&Name::ended_job(id.as_str())?).await?;
-        Ok(ended.or(open))
+        if ended.is_some() { Ok(ended) } else { open }
     }
 
-    /// Reads a document. One that cannot be parsed goes into quarantine.
+    /// Reads a document. A damaged one goes into quarantine.
     async fn read_document(&self, name: &Name) -> Result<Option<JobRecord>, StoreError> {
         match self.store.get(name).await?.map(|stored| JobRecord::from_bytes(&stored.bytes)) {
             Some(Ok(record)) => return Ok(Some(record)),
-            Some(Err(error)) => {
+            Some(Err(BadRecord::OtherRelease(why))) => return Err(StoreError::OtherRelease { why }),
+            Some(Err(error @ BadRecord::Damaged(_))) => {
                 let short = shorten(&name.to_string());
                 tracing::error!(name = short, %error, "the record of a job cannot be read; moving it into quarantine");
                 self.store.quarantine(name).await?;
@@ -127,7 +141,7 @@ impl JobStoreState {
 
     /// Reads the records of open jobs that this process does not know yet, in the order of their acceptance. Removes
     /// those of jobs that have ended. Forgets jobs that are not on record any more.
-    async fn read_unknown(&self) -> Result<Vec<JobRecord>, StoreError> {
+    async fn read_unknown(&self) -> Result<UnknownJobs, StoreError> {
         let mut known = self.open.ids();
         let RecordNames { mut unfinished, ended } = RecordNames::of(&self.store).await?;
         for name in ended {
@@ -137,20 +151,37 @@ impl JobStoreState {
         for gone in &known {
             self.open.remove(gone);
         }
-        let read = |name: Name| async move { self.read_document(&name).await };
+        let read = |name: Name| async move { (self.read_document(&name).await, name) };
         let mut reads = stream::iter(unfinished).map(read).buffer_unordered(CONCURRENT_READS);
-        let mut records = Vec::new();
-        while let Some(read) = reads.next().await {
+        let mut unknown = UnknownJobs { records: Vec::new(), error: None };
+        while let Some((read, name)) = reads.next().await {
             match read {
-                Ok(record) => records.extend(record),
+                Ok(record) => unknown.records.extend(record),
                 Err(StoreError::Quarantined { .. }) => {}
-                Err(error) => return Err(error),
+                Err(error @ StoreError::OtherRelease { .. }) => self.leave(&name, &error),
+                Err(error) => unknown.error = Some(error),
             }
         }
         drop(reads);
-        records.sort_by_key(|record| (record.created_ms, record.id.clone()));
-        Ok(records)
+        unknown.records.sort_by_key(|record| (record.created_ms, record.id.clone()));
+        Ok(unknown)
     }
+
+    /// Leaves an open job to the release that wrote its record.
+    fn leave(&self, name: &Name, error: &StoreError) {
+        if let Ok(id) = name.stem().parse::<JobId>() {
+            tracing::warn!(job_id = %id, %error, "a job is left to the release that wrote its record");
+            self.open.insert(id, None, vec![self.store.pin(name)]);
+        }
+    }
+}
+
+/// Records of open jobs that this process did not know.
+struct UnknownJobs {
+    /// In the order of acceptance.
+    records: Vec<JobRecord>,
+    /// Last error of a record that was not read. It does not delay the jobs of the others.
+    error: Option<StoreError>,
 }
 
 /// Names of the records in a store that are not those of ends.
@@ -173,22 +204,33 @@ impl RecordNames {
     }
 }
 
-/// Reads the records of all unfinished jobs of a store, in the order of their acceptance. Changes nothing. Returns them
-/// and the number of records that cannot be parsed, which the next node that reads them moves into quarantine.
-pub(crate) async fn unfinished_jobs(store: &Store) -> Result<(Vec<JobRecord>, usize), StoreError> {
+/// Records of the unfinished jobs of a store.
+#[derive(Debug, Default)]
+pub(crate) struct UnfinishedJobs {
+    /// Records that this release can read, in the order of their acceptance.
+    pub(crate) records: Vec<JobRecord>,
+    /// Number of records of other releases.
+    pub(crate) of_other_releases: usize,
+    /// Number of damaged records, which the next node that reads them moves into quarantine.
+    pub(crate) unreadable: usize,
+}
+
+/// Reads the records of all unfinished jobs of a store. Changes nothing.
+pub(crate) async fn unfinished_jobs(store: &Store) -> Result<UnfinishedJobs, StoreError> {
     let read = |name: Name| async move { store.get(&name).await };
     let mut reads = stream::iter(RecordNames::of(store).await?.unfinished).map(read).buffer_unordered(CONCURRENT_READS);
-    let (mut records, mut unreadable) = (Vec::new(), 0);
+    let mut jobs = UnfinishedJobs::default();
     while let Some(read) = reads.next().await {
         match read?.map(|stored| JobRecord::from_bytes(&stored.bytes)) {
-            Some(Ok(record)) => records.push(record),
-            Some(Err(_)) => unreadable += 1,
+            Some(Ok(record)) if record.request().is_ok() => jobs.records.push(record),
+            Some(Ok(_) | Err(BadRecord::OtherRelease(_))) => jobs.of_other_releases += 1,
+            Some(Err(BadRecord::Damaged(_))) => jobs.unreadable += 1,
             // The job has ended meanwhile.
             None => {}
         }
     }
-    records.sort_by_key(|record| (record.created_ms, record.id.clone()));
-    Ok((records, unreadable))
+    jobs.records.sort_by_key(|record| (record.created_ms, record.id.clone()));
+    Ok(jobs)
 }
 
 /// Returns the job that has the idempotency key of `record`, if both requests are the same.
@@ -251,20 +293,28 @@ impl JobStore {
     }
 
     /// Dispatches the unfinished jobs that neither the broker nor this process has, such as those of an earlier
-    /// process, and returns their number.
+    /// process, and returns their number. After the error of a single record, the others were handled.
     pub(crate) async fn reconcile(&self) -> Result<usize, StoreError> {
         let inner = &self.0;
-        for record in inner.read_unknown().await? {
+        let UnknownJobs { records, mut error } = inner.read_unknown().await?;
+        // If no record was read, the store fails, and no input is protected yet.
+        let is_any_read = !records.is_empty() || error.is_none();
+        for record in records {
             if record.status.is_final() {
-                inner.write_end(record).await?;
+                if let Err(failed) = inner.write_end(record).await {
+                    error = Some(failed);
+                }
             } else if let Err(error) = inner.track(&record) {
                 let job = self.insert_open(record);
                 self.finish(&job, Err(error)).await;
             }
         }
+        if is_any_read {
+            inner.records_read.send_replace(true);
+        }
         let mut dispatched = 0;
         if inner.broker.down().is_some() {
-            return Ok(0);
+            return error.map_or(Ok(0), Err);
         }
         for dispatch in inner.open.all() {
             if inner.lock().jobs.get(&dispatch.id).is_some_and(|job| job.is_owned()) {
@@ -280,6 +330,21 @@ impl JobStore {
             }
         }
         counter!(JOBS_RECOVERED).increment(dispatched as u64);
-        Ok(dispatched)
+        error.map_or(Ok(dispatched), Err)
+    }
+
+    /// Waits for at most `limit` until the records of earlier processes were read. Returns true if they were.
+    pub(crate) async fn records_read(&self, limit: Duration) -> bool {
+        timeout(limit, self.0.records_read.subscribe().wait_for(|read| *read)).await.is_ok()
+    }
+
+    /// Returns true once the records of earlier processes were read.
+    pub(crate) fn has_read_records(&self) -> bool {
+        *self.0.records_read.borrow()
+    }
+
+    /// Returns the number of unfinished jobs of other releases, which this process leaves alone.
+    pub(crate) fn jobs_of_other_releases(&self) -> usize {
+        self.0.open.of_other_releases()
     }
 }

@@ -356,9 +356,13 @@ impl JobStore {
     }
 
     /// Returns true if another process has begun a later attempt of a job, because the claim of this one had expired.
+    /// Its release may be another one.
     pub(super) async fn is_superseded(&self, job: &DurableJob) -> bool {
         let own = job.record();
-        matches!(self.0.read(&own.id).await, Ok(Some(stored)) if stored.attempts > own.attempts)
+        match self.0.read(&own.id).await {
+            Ok(stored) => stored.is_some_and(|stored| stored.attempts > own.attempts),
+            Err(error) => matches!(error, StoreError::OtherRelease { .. }),
+        }
     }
 
     /// Locks the work of a job that runs already. `None` if another node does the same work.

@@ -318,7 +318,9 @@ async fn records_that_cannot_be_read_go_into_quarantine() {
     let fixture = Fixture::new(1, MAX_WAIT).await;
     let good = fixture.store_record().await;
     let whole = fixture.on_record(&good).await.to_bytes();
-    let bad = [Bytes::new(), whole.slice(..whole.len() / 2), Bytes::from_static(br#"{"version":2,"id":[]}"#)];
+    let mut flipped = whole.to_vec();
+    flipped[whole.len() / 3] ^= 1;
+    let bad = [Bytes::new(), whole.slice(..whole.len() / 2), Bytes::from(flipped)];
     let names: Vec<_> = bad.iter().map(|_| Name::job(new_id().as_str()).unwrap()).collect();
     for (name, bytes) in names.iter().zip(&bad) {
         fixture.store.put(name, bytes.clone()).await.unwrap();

@@ -1,5 +1,7 @@
 //! Complete run of one job, from a structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
+#[cfg(feature = "server")]
+pub(crate) mod algorithm_versions;
 pub mod areas;
 mod auto;
 mod cavities;

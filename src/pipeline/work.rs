@@ -4,7 +4,7 @@ use super::Job;
 use super::color::{Scheme, VertexProperty};
 #[cfg(feature = "server")]
 use crate::surface::SurfaceParams;
-use crate::surface::pockets::{SPACING, rows};
+use crate::surface::pockets::{SPACING, rows_in_reach};
 use crate::surface::{SurfaceKind, TriangleQuality};
 
 /// Approximate bytes of text per atom. A line of a PDB file has 81, a line of an mmCIF file 90 to 110.
@@ -156,7 +156,7 @@ const RADIUS: f64 = 1.8;
 fn pockets(job: &Job, atoms: f64) -> f64 {
     let rows = |large: f64| {
         let [radius, small, large] = [RADIUS, job.params.probe, large].map(|length| length / SPACING);
-        rows(radius, small, large)
+        rows_in_reach(radius, small, large)
     };
     POCKET_ROW * atoms * job.pocket_probe().map_or(0.0, rows)
 }

@@ -78,6 +78,12 @@ pub enum StoreError {
         /// Name of the record.
         name: String,
     },
+    /// Another release wrote a job record, which this one cannot read.
+    #[error("another release wrote the record of the job: {why}")]
+    OtherRelease {
+        /// What this release does not know.
+        why: String,
+    },
     /// A structure file is damaged and is in quarantine.
     #[error("the stored structure {digest} was damaged and is in the folder `quarantine` of the store")]
     Damaged {

@@ -176,7 +176,7 @@ fn find_at(
 
 /// Returns the number of rows of grid points that the search passes over for a sphere of this radius. All lengths are
 /// in spacings.
-pub(crate) fn rows(radius: f64, small: f64, large: f64) -> f64 {
+pub(crate) fn rows_in_reach(radius: f64, small: f64, large: f64) -> f64 {
     // With the small probe twice: to find where it fits, and to find which pockets the sphere lines.
     PI * (2.0 * (radius + small).powi(2) + (radius + large).powi(2))
 }
@@ -205,7 +205,7 @@ impl Grid {
             source: atom.source,
         };
         let mut balls: Vec<Ball> = atoms.iter().map(ball).collect();
-        let rows = to_u64(balls.iter().map(|ball| rows(ball.radius, small, large)).sum());
+        let rows = to_u64(balls.iter().map(|ball| rows_in_reach(ball.radius, small, large)).sum());
         let limit = ROWS_PER_PAIR.saturating_mul(limits.max_candidates);
         if rows > limit {
             return Err(SurfaceError::TooManyPocketRows { rows, limit });

@@ -97,15 +97,12 @@ dispatched! {
     }
 }
 
-/// Number of the method: increased by every change of the code that changes the bytes of meshes.
-const METHOD: u32 = 4;
-
-/// Names the arithmetic that determines the last bits of results on this processor: the method, the system and
-/// architecture, whose mathematical functions differ, and fused or not. The width of vectors does not matter.
+/// Names the arithmetic that determines the last bits of results on this processor: the system and architecture, whose
+/// mathematical functions differ, and fused or not. The width of vectors does not matter.
 #[must_use]
 pub fn arithmetic() -> String {
     let fused = if is_fused() { "fma" } else { "no-fma" };
-    format!("method {METHOD} {} {} {fused}", std::env::consts::OS, std::env::consts::ARCH)
+    format!("{} {} {fused}", std::env::consts::OS, std::env::consts::ARCH)
 }
 
 /// The vector extension that the dispatched functions use here, for display.

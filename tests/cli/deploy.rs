@@ -411,7 +411,7 @@ fn pod_matches_the_image_and_its_configuration() {
     assert!(bytes(volume) > files, "{volume} on the volume");
     // Paths of the probes exist.
     let described = read("openapi.yaml");
-    for (probe, path) in [("startupProbe", "/readyz"), ("readinessProbe", "/readyz"), ("livenessProbe", "/livez")] {
+    for (probe, path) in [("startupProbe", "/livez"), ("readinessProbe", "/readyz"), ("livenessProbe", "/livez")] {
         assert_eq!(container[probe]["httpGet"], json!({ "path": path, "port": "http" }), "{probe}");
         assert!(described.contains(&format!("\n  {path}:\n")), "{path} is not described");
     }

@@ -47,6 +47,7 @@ mod origins;
 mod pictures;
 mod raw_sockets;
 mod ready;
+mod recorded_bytes;
 mod results;
 mod schemathesis;
 mod service_s3;

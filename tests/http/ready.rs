@@ -2,16 +2,23 @@
 
 use crate::http_support;
 
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use http_support::{Fake, LONG, Mode, Running, SAMPLE, log_lines, sample, start, start_cold, wait_for};
+use http_support::{
+    Fake, LONG, Mode, Running, SAMPLE, log_lines, sample, send, start, start_after, start_cold, wait_for,
+};
+use molmesh::config::Config;
 use molmesh::http::Stop;
 use molmesh::surface::{
     Backend, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 use serde_json::Value;
+
+/// Record of a later release.
+const RECORD: &str = r#"{"version":2}"#;
 
 /// Returns the names of failed checks. Asserts that all four checks are present.
 #[track_caller]
@@ -71,9 +78,13 @@ fn unreadable_job_records_make_the_service_unready_until_they_are_deleted() {
         std::fs::write(jobs.join(format!("{id}.json")), "{").unwrap();
     }
     let server = start_cold(Fake::new(Mode::Octahedra), |c| folder.path().clone_into(&mut c.server.data_dir));
-    wait_for("the first mesh", || failing(&server.get("/readyz").json()) == ["records"]);
-    let problem = server.get("/readyz").problem(503, "not-ready");
-    assert!(problem["detail"].as_str().unwrap().starts_with("2 job records"), "{problem}");
+    let in_quarantine =
+        |document: &Value| document["checks"][4]["detail"].as_str().unwrap().starts_with("2 job records");
+    wait_for("the first mesh and the records", || {
+        let document = server.get("/readyz").json();
+        failing(&document) == ["records"] && in_quarantine(&document)
+    });
+    server.get("/readyz").problem(503, "not-ready");
     let log = log_lines("the record of a job cannot be read").concat();
     assert!(ids.iter().all(|id| log.contains(&format!("jobs/{}….json", &id[..8])) && !log.contains(id)), "{log}");
     for path in ["", "/events", "/result"] {
@@ -84,6 +95,63 @@ fn unreadable_job_records_make_the_service_unready_until_they_are_deleted() {
     }
     assert_eq!(server.get("/readyz").status, 200);
     server.get(&format!("/v1/jobs/{}", ids[0])).problem(404, "no-such-job");
+}
+
+#[test]
+fn jobs_of_another_release_do_not_affect_readiness() {
+    let folder = tempfile::tempdir().unwrap();
+    let jobs = folder.path().join("store/jobs");
+    std::fs::create_dir_all(&jobs).unwrap();
+    let id = "0".repeat(32);
+    let file = jobs.join(format!("{id}.json"));
+    std::fs::write(&file, RECORD).unwrap();
+    let server = start(Fake::new(Mode::Octahedra), |c| folder.path().clone_into(&mut c.server.data_dir));
+    let document = server.get("/readyz").json();
+    assert!(document.to_string().contains("jobs left to the releases that wrote them: 1"), "{document}");
+    for path in ["", "/events", "/result"] {
+        let reply = server.get(&format!("/v1/jobs/{id}{path}"));
+        assert!(reply.header("retry-after").is_some());
+        reply.problem(503, "other-release");
+    }
+    send(server.addr, "DELETE", &format!("/v1/jobs/{id}"), &[], b"").problem(503, "other-release");
+    assert_eq!(std::fs::read_to_string(file).unwrap(), RECORD);
+}
+
+#[test]
+fn a_service_that_reads_its_records_is_alive_and_not_ready() {
+    let folder = tempfile::tempdir().unwrap();
+    let jobs = folder.path().join("store/jobs");
+    std::fs::create_dir_all(&jobs).unwrap();
+    let id = "0".repeat(32);
+    let file = jobs.join(format!("{id}.json"));
+    std::fs::write(&file, RECORD).unwrap();
+    // A pipe cannot be opened until it is written.
+    let replace_by_pipe = || {
+        std::fs::remove_file(&file).unwrap();
+        assert!(Command::new("mkfifo").arg(&file).status().unwrap().success());
+    };
+    let change = |c: &mut Config| {
+        folder.path().clone_into(&mut c.server.data_dir);
+        c.store.timeout_ms = 600_000;
+    };
+    let server = start_after(Fake::new(Mode::Octahedra), Vec::new(), change, replace_by_pipe);
+    wait_for("the first mesh", || failing(&server.get("/readyz").json()) == ["records"]);
+    let problem = server.get("/readyz").problem(503, "not-ready");
+    assert_eq!(problem["detail"], "the records of jobs are being read");
+    assert_eq!((server.get("/livez").status, server.get("/version").status), (200, 200));
+    let path = format!("/v1/jobs/{id}");
+    server.get(&path).problem(503, "not-ready");
+    let pipe = folder.path().join("pipe");
+    std::fs::rename(&file, &pipe).unwrap();
+    std::fs::write(&file, RECORD).unwrap();
+    // Unlike a write, this does not wait for a reader.
+    drop(std::fs::OpenOptions::new().read(true).write(true).open(pipe).unwrap());
+    // The pipe was empty, and so was the record.
+    let detail = || server.get("/readyz").json()["detail"].as_str().unwrap_or_default().to_owned();
+    wait_for("the records are read", || detail().starts_with("1 job records"));
+    server.get(&path).problem(500, "record-unreadable");
+    std::fs::remove_file(folder.path().join(format!("store/quarantine/{id}.json"))).unwrap();
+    assert_eq!(server.get("/readyz").status, 200);
 }
 
 #[test]

@@ -226,6 +226,16 @@ pub(crate) fn start_on(
     found: Vec<FoundDevice>,
     change: impl FnOnce(&mut Config),
 ) -> Running {
+    start_after(backend, found, change, || {})
+}
+
+/// Starts a server, which runs after `prepare`; its store is open before.
+pub(crate) fn start_after(
+    backend: Arc<dyn Backend>,
+    found: Vec<FoundDevice>,
+    change: impl FnOnce(&mut Config),
+    prepare: impl FnOnce(),
+) -> Running {
     LazyLock::force(&LOG);
     let dir = tempfile::tempdir().unwrap();
     let mut config = Config::default();
@@ -239,6 +249,7 @@ pub(crate) fn start_on(
     let renderer = SelectedRenderer::cpu("set by a test");
     let chosen = Chosen { backend, reason: "set by a test".to_owned(), renderer, devices: found };
     let server = runtime.block_on(Server::bind(config, chosen)).unwrap();
+    prepare();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
     let (stop_sender, stop_receiver) = tokio::sync::watch::channel(Stop::Serve);
     let thread = std::thread::spawn(move || {

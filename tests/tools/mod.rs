@@ -334,7 +334,8 @@ fn is_set(variable: &str) -> bool {
     std::env::var_os(variable).is_some_and(|value| !value.is_empty())
 }
 
-fn print_skipped(why: &str) {
+/// Prints that a test is skipped, also where tools are required: the cause is the machine.
+pub fn print_skipped(why: &str) {
     let test = std::thread::current().name().unwrap_or("a test").to_owned();
     // The harness hides the output of `eprintln!` if the test passes.
     std::io::stderr().write_all(format!("SKIPPED: {test}: {why}\n").as_bytes()).unwrap();

@@ -31,6 +31,7 @@ const ERROR_NAMES: &[(&str, &[&str], &str)] = &[
     ("503", &["device-failed", "queue-full", "store-failed"], "ReportUnavailable"),
     ("503", &["device-failed", "queue-full"], "EntryReportUnavailable"),
     ("503", &["shutting-down"], "JobResultUnavailable"),
+    ("503", &["other-release", "store-full"], "JobUnavailable"),
     ("503", &["store-full"], "UploadUnavailable"),
     ("503", &["too-many-deliveries", "store-failed"], "StructureUnavailable"),
     ("503", &["too-many-deliveries"], "EntryUnavailable"),

@@ -214,10 +214,14 @@ async fn a_later_attempt_of_another_node_supersedes_an_earlier_one() {
     let job = a.jobs.insert_open(record.clone());
     assert!(!a.jobs.is_superseded(&job).await, "control: there is no other attempt");
     (record.attempts, record.status) = (2, Status::Running);
-    b.store.put(&crate::store::Name::job(id.as_str()).unwrap(), record.to_bytes()).await.unwrap();
+    let name = Name::job(id.as_str()).unwrap();
+    b.store.put(&name, record.to_bytes()).await.unwrap();
     assert!(a.jobs.is_superseded(&job).await);
     job.adopt(record);
     assert!(!a.jobs.is_superseded(&job).await, "control: the same attempt");
+    // A node of a later release.
+    b.store.put(&name, Bytes::from_static(br#"{"version":2}"#)).await.unwrap();
+    assert!(a.jobs.is_superseded(&job).await);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -3,13 +3,16 @@
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use super::{Fixture, MAX_WAIT, ended, new_id};
+use bytes::Bytes;
+
+use super::{Fixture, MAX_WAIT, ended, new_id, until};
 use crate::config::JobsConfig;
+use crate::jobs::broker::{Broker as _, Dispatch};
 use crate::jobs::durable_job::DurableJob;
 use crate::jobs::job_store::MAX_ENDED;
 use crate::jobs::record::{JobRecord, now_ms};
 use crate::jobs::{AcceptError, JobId, Status};
-use crate::store::{Folder, Namespace, StoreError};
+use crate::store::{Folder, Name, Namespace, StoreError};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn records_are_limited_in_total_and_for_each_client() {
@@ -94,6 +97,49 @@ async fn a_start_reads_the_records_of_open_jobs_only() {
     // The names alone identify the client: its ended records are removed down to the cap.
     fixture.accept().await.unwrap();
     assert_eq!(count(), ENDED as u64);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn jobs_of_other_releases_are_left_alone() {
+    let fixture = Fixture::new(1, MAX_WAIT).await;
+    let own = fixture.store_record().await;
+    let [later_version, later_parameter, absent] = [(); 3].map(|()| new_id());
+    let record = JobRecord {
+        id: later_parameter.clone(),
+        parameters: vec![("later".to_owned(), "1".to_owned())],
+        ..fixture.on_record(&own).await
+    };
+    let stored = [(&later_version, Bytes::from_static(br#"{"version":2}"#)), (&later_parameter, record.to_bytes())];
+    let name = |id: &JobId| Name::job(id.as_str()).unwrap();
+    for (id, bytes) in &stored {
+        fixture.store.put(&name(id), bytes.clone()).await.unwrap();
+    }
+    // Nodes of the other release have dispatched the jobs. There is one worker, which claims them in order.
+    let dispatches =
+        [&later_version, &later_parameter, &absent].map(|id| Dispatch { id: id.clone(), ..Dispatch::of(&record) });
+    for dispatch in &dispatches {
+        assert!(fixture.broker.dispatch(dispatch).await.unwrap());
+    }
+    until("the last claim", || async { !fixture.broker.holds(&dispatches[2]).await.unwrap() }).await;
+    for dispatch in &dispatches[..2] {
+        assert!(fixture.broker.holds(dispatch).await.unwrap(), "the claim was given back");
+    }
+    assert!(!fixture.jobs.has_read_records(), "control: the records were not read yet");
+    assert_eq!(fixture.jobs.reconcile().await.unwrap(), 1, "only the own job is dispatched");
+    assert!(fixture.jobs.has_read_records());
+    ended(&mut fixture.watch(&own).await).await;
+    assert_eq!((fixture.jobs.jobs_of_other_releases(), fixture.store.quarantined().await.unwrap()), (2, 0));
+    for (id, bytes) in &stored {
+        assert_eq!(&fixture.store.get(&name(id)).await.unwrap().unwrap().bytes, bytes, "the record is unchanged");
+    }
+    let space = Namespace::default();
+    for refused in [fixture.jobs.view(&later_version, space).await, fixture.jobs.dismiss(&later_version, space).await] {
+        assert!(matches!(refused, Err(StoreError::OtherRelease { .. })), "{refused:?}");
+    }
+    let view = fixture.jobs.view(&later_parameter, space).await.unwrap().unwrap();
+    assert_eq!((view.record.status, view.record.attempts), (Status::Accepted, 0));
+    let dismissed = fixture.jobs.dismiss(&later_parameter, space).await.unwrap().unwrap();
+    assert_eq!((dismissed.record.status, fixture.jobs.jobs_of_other_releases()), (Status::Dismissed, 1));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -5,7 +5,7 @@ use crate::structure::{Context, Selection, Split};
 use crate::surface::{PaperParams, SurfaceParams, TriangleQuality};
 
 /// Returns all parameters of a job as one line of text, which is equal for equal jobs only. It is part of the content
-/// key.
+/// key. A new parameter is written only if it differs from its default, so that the keys of other jobs stay the same.
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that the compiler requires every new field here.

@@ -73,9 +73,10 @@ spec:
         capabilities: { drop: [ALL] }
       resources:
         {{- toYaml .resources | nindent 8 }}
-      # A worker is ready after its first mesh. A GPU builds its pipelines before that.
+      # Answers once the store is open. The first mesh and the records of jobs are a matter of readiness: however long
+      # they take, the pod is not killed.
       startupProbe:
-        httpGet: { path: {{ if eq .role "api" }}/livez{{ else }}/readyz{{ end }}, port: http }
+        httpGet: { path: /livez, port: http }
         periodSeconds: 1
         timeoutSeconds: 2
         failureThreshold: 120

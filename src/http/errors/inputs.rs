@@ -1,0 +1,107 @@
+//! Conversion of the errors of structures, colour schemes and maps into problems.
+
+use std::time::Duration;
+
+use crate::http::problem::Problem;
+use crate::http::problem_types::ProblemType;
+use crate::jobs::Failure;
+use crate::pipeline::color::{self, ColorError};
+use crate::structure::map::MapError;
+use crate::structure::{Split, StructureError};
+
+impl From<StructureError> for Problem {
+    fn from(error: StructureError) -> Self {
+        use StructureError as E;
+        let detail = error.to_string();
+        match error {
+            E::Scratch { .. } => Self::internal(detail),
+            E::DiskFull => Self::new(ProblemType::StoreFull, detail).retry_after(Duration::from_secs(5)),
+            E::DiskSpace(error) => Self::from(error).detailed(detail),
+            E::Input { .. } | E::NotAStream { .. } => Self::new(ProblemType::UnreadableStructure, detail),
+            E::UnknownFormat { found } => Self::new(ProblemType::UnreadableStructure, detail).with("found", found),
+            E::Syntax { line, column, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)
+                .with("line", line)
+                .with("column", column)
+                .with("found", found)
+                .with("expected", expected),
+            E::Malformed { location, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)
+                .with("location", location)
+                .with("found", found)
+                .with("expected", expected),
+            E::Decompress { encoding, .. } => {
+                Self::new(ProblemType::UnreadableStructure, detail).with("encoding", encoding)
+            }
+            E::InflatedTooLarge { limit } => Self::new(ProblemType::InflatedTooLarge, detail).with("limit", limit),
+            E::BadAssembly { id, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)
+                .with("location", format!("assembly {id}"))
+                .with("found", found)
+                .with("expected", expected),
+            E::TooManyCopies { limit, .. } => Self::new(ProblemType::TooManyCopies, detail).with("limit", limit),
+            E::TooManyDistances { limit } => {
+                Self::new(ProblemType::TooManyCandidates, detail).with("parameter", "select").with("limit", limit)
+            }
+            E::TooManyParts { rule, limit } => {
+                let parameter = rule.split('=').next().unwrap_or(rule);
+                Self::new(ProblemType::TooManyParts, detail).with("parameter", parameter).with("limit", limit)
+            }
+            E::NoEntities => Self::new(ProblemType::BadParameter, detail)
+                .with("parameter", "split")
+                .with("value", Split::Entity.name())
+                .with("expected", "none, chain or residue-group"),
+            E::AssemblyTooLarge { atoms, limit, .. } => {
+                Self::new(ProblemType::TooManyAtoms, detail).with("limit", limit).with("actual", atoms)
+            }
+            E::TooManyAtoms { limit } => Self::new(ProblemType::TooManyAtoms, detail).with("limit", limit),
+            E::TooManyDuplicates { limit, x, y, z } => {
+                Self::new(ProblemType::TooManyDuplicates, detail).with("limit", limit).with("position", vec![x, y, z])
+            }
+            E::Memory(error) => error.into(),
+            E::Cancelled => Self::from(Failure::Stopped),
+            E::NoAtoms { found } => Self::new(ProblemType::NoAtoms, detail).with("found", found),
+            E::EmptySelection { holds } => Self::new(ProblemType::EmptySelection, detail).with("found", holds),
+            E::NotFound { what, requested, available } => {
+                let parameter = match what {
+                    "chain" => "chains",
+                    "selected chain" => "select",
+                    "interface chain" => "interface",
+                    "alternative location" => "altloc",
+                    other => other,
+                };
+                Self::new(ProblemType::EmptySelection, detail)
+                    .with("parameter", parameter)
+                    .with("value", requested.trim_matches('`'))
+                    .with("expected", available)
+            }
+        }
+    }
+}
+
+impl From<ColorError> for Problem {
+    fn from(error: ColorError) -> Self {
+        Self::new(ProblemType::BadParameter, error.to_string())
+            .with("parameter", "color")
+            .with("value", error.scheme)
+            .with("expected", color::EXPECTED)
+    }
+}
+
+impl From<MapError> for Problem {
+    fn from(error: MapError) -> Self {
+        use MapError as E;
+        let problem = |problem_type| Self::new(problem_type, error.to_string()).with("parameter", "map");
+        match &error {
+            E::UnknownFormat { found } => problem(ProblemType::UnreadableMap).with("found", found.as_str()),
+            E::Malformed { location, found, expected } => problem(ProblemType::UnreadableMap)
+                .with("location", location.as_str())
+                .with("found", found.as_str())
+                .with("expected", expected.as_str()),
+            E::Decompress { encoding, .. } => problem(ProblemType::UnreadableMap).with("encoding", *encoding),
+            E::TooManyPoints { points, limit } => {
+                problem(ProblemType::MapTooLarge).with("actual", *points).with("limit", *limit)
+            }
+            E::InflatedTooLarge { limit } => problem(ProblemType::InflatedTooLarge).with("limit", *limit),
+            E::Memory(error) => (*error).into(),
+            E::Cancelled => Self::from(Failure::Stopped),
+        }
+    }
+}
