@@ -1,6 +1,8 @@
 //! Memory budget of all requests, in bytes: uploads, archive entries, jobs from reading to the mesh, meshes that are
 //! not yet sent, the buffers of connections, and structures that are kept for further requests.
 
+mod shares;
+
 use std::fmt::Debug;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
@@ -8,6 +10,7 @@ use std::sync::{Arc, OnceLock, Weak};
 use bytes::{Bytes, BytesMut};
 use metrics::gauge;
 
+use self::shares::{Holdings, MemoryShares};
 use crate::surface::{MemoryMeter, OutOfMemory};
 use crate::telemetry::{MEMORY_HELD, MEMORY_USED, SCRATCH_BYTES};
 
@@ -21,7 +24,12 @@ pub(crate) trait Reclaim: Debug + Send + Sync {
 #[derive(Debug, Clone)]
 pub struct Budget {
     limit: u64,
+    /// Memory that each request needs besides its reservations, bytes.
+    per_request: u64,
     held: Arc<AtomicU64>,
+    shares: Arc<MemoryShares>,
+    /// Client whose reservations these are; `None` for memory that belongs to none.
+    holdings: Option<Arc<Holdings>>,
     /// Budget of which this one is a part.
     whole: Option<Arc<Self>>,
     reclaim: Arc<OnceLock<Weak<dyn Reclaim>>>,
@@ -42,7 +50,16 @@ impl Budget {
     #[must_use]
     pub fn new(limit: u64) -> Self {
         let gauges = Gauges { used: MEMORY_USED, held: Some(MEMORY_HELD) };
-        Self { limit, held: Arc::default(), reclaim: Arc::default(), whole: None, gauges }
+        let (shares, held, reclaim) = (MemoryShares::new(1.0), Arc::default(), Arc::default());
+        Self { limit, per_request: 0, held, shares, holdings: None, reclaim, whole: None, gauges }
+    }
+
+    /// Creates the budget of a service, of `limit` bytes: each request takes `per_request` bytes besides its
+    /// reservations, and a client whose requests hold more than the fraction `share`, besides one of them, leaves as
+    /// much to others.
+    #[must_use]
+    pub fn of_service(limit: u64, per_request: u64, share: f64) -> Self {
+        Self { per_request, shares: MemoryShares::new(share), ..Self::new(limit) }
     }
 
     /// Creates a budget of `limit` bytes of temporary files.
@@ -54,12 +71,48 @@ impl Budget {
     /// Creates a budget of `limit` bytes that is a part of this one: its reservations count in both.
     #[must_use]
     pub fn part(&self, limit: u64) -> Self {
-        Self { whole: Some(Arc::new(self.clone())), ..Self::new(limit) }
+        let shares = MemoryShares::new(self.shares.share);
+        Self { whole: Some(Arc::new(self.clone())), shares, ..Self::new(limit) }
+    }
+
+    /// Returns the budget for a client: its reservations count towards its share as well.
+    #[must_use]
+    pub fn for_client(&self, client: u64) -> Self {
+        let whole = self.whole.as_ref().map(|whole| Arc::new(whole.for_client(client)));
+        Self { holdings: Some(self.shares.of(client)), whole, ..self.clone() }
+    }
+
+    /// Checks that a client whose other work holds more than its share leaves as much to others after it has taken
+    /// `bytes`. `own` are the bytes of the work that takes them.
+    fn check_share(&self, bytes: u64, own: u64) -> Result<(), OutOfMemory> {
+        let Some(holdings) = &self.holdings else { return Ok(()) };
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a size")]
+        #[expect(clippy::cast_precision_loss, reason = "a share needs no exact bytes")]
+        let share = (self.limit as f64 * self.shares.share) as u64;
+        let held = holdings.bytes.load(Ordering::Relaxed);
+        let missing = || {
+            let taken = self.held.load(Ordering::Relaxed).saturating_add(bytes);
+            taken.saturating_sub(self.limit.saturating_sub(share))
+        };
+        if held.saturating_sub(own) <= share || missing() == 0 || (self.free(missing()) && missing() == 0) {
+            return Ok(());
+        }
+        Err(OutOfMemory::Share { needed: bytes, held, limit: share })
+    }
+
+    /// Checks that work of `bytes` fits if there is no other work.
+    fn check_alone(&self, bytes: u64) -> Result<(), OutOfMemory> {
+        let needed = bytes.saturating_add(self.per_request);
+        if needed > self.limit {
+            return Err(OutOfMemory::Limit { needed, limit: self.limit });
+        }
+        self.whole.as_ref().map_or(Ok(()), |whole| whole.check_alone(bytes))
     }
 
     /// Adds `bytes` regardless of the limit.
     fn add(&self, bytes: u64) {
         self.held.fetch_add(bytes, Ordering::Relaxed);
+        self.holdings.iter().for_each(|of_client| _ = of_client.bytes.fetch_add(bytes, Ordering::Relaxed));
         match &self.whole {
             Some(whole) => whole.add(bytes),
             None => publish(self.gauges.used, bytes, 1.0),
@@ -74,6 +127,7 @@ impl Budget {
 
     fn subtract(&self, bytes: u64) {
         self.held.fetch_sub(bytes, Ordering::Relaxed);
+        self.holdings.iter().for_each(|of_client| _ = of_client.bytes.fetch_sub(bytes, Ordering::Relaxed));
         match &self.whole {
             Some(whole) => whole.subtract(bytes),
             None => publish(self.gauges.used, bytes, -1.0),
@@ -92,16 +146,23 @@ impl Budget {
         self.reclaim.get_or_init(|| owner);
     }
 
+    /// Has memory freed that nobody uses, at least `bytes` if possible. Returns true if some was freed.
+    fn free(&self, bytes: u64) -> bool {
+        self.reclaim.get().and_then(Weak::upgrade).is_some_and(|owner| owner.reclaim(bytes))
+    }
+
     /// Checks that at most the limit is in use.
     ///
     /// # Errors
     /// [`OutOfMemory::Budget`].
     pub fn check(&self) -> Result<(), OutOfMemory> {
-        self.take(0)
+        self.take(0, 0)
     }
 
-    /// Takes `bytes`, within the limit. A failure changes nothing.
-    fn take(&self, bytes: u64) -> Result<(), OutOfMemory> {
+    /// Takes `bytes` for work that holds `own` bytes, within the limit and the share of the client. A failure changes
+    /// nothing.
+    fn take(&self, bytes: u64, own: u64) -> Result<(), OutOfMemory> {
+        self.check_share(bytes, own)?;
         let limit = self.limit;
         let take = |held: u64| held.checked_add(bytes).filter(|sum| *sum <= limit);
         let mut reclaimed = true;
@@ -111,17 +172,16 @@ impl Budget {
                 return Err(OutOfMemory::Budget { needed: bytes, held, limit });
             }
             let missing = held.saturating_add(bytes).saturating_sub(limit);
-            reclaimed = self.reclaim.get().and_then(Weak::upgrade).is_some_and(|owner| owner.reclaim(missing));
+            reclaimed = self.free(missing);
         }
-        let Some(whole) = &self.whole else {
-            publish(self.gauges.used, bytes, 1.0);
-            return Ok(());
-        };
-        let taken = whole.take(bytes);
-        if taken.is_err() {
-            self.held.fetch_sub(bytes, Ordering::Relaxed);
+        match &self.whole {
+            Some(whole) => whole.take(bytes, own).inspect_err(|_| {
+                self.held.fetch_sub(bytes, Ordering::Relaxed);
+            })?,
+            None => publish(self.gauges.used, bytes, 1.0),
         }
-        taken
+        self.holdings.iter().for_each(|of_client| _ = of_client.bytes.fetch_add(bytes, Ordering::Relaxed));
+        Ok(())
     }
 
     /// Takes `bytes` regardless of the limit until the result is dropped, for buffers that are bounded elsewhere.
@@ -172,9 +232,11 @@ impl MemoryReservation {
     /// Adds `bytes` to the reservation. A failure changes nothing.
     ///
     /// # Errors
-    /// [`OutOfMemory::Limit`] if the work alone exceeds the budget, else [`OutOfMemory::Budget`].
+    /// [`OutOfMemory::Limit`] if the work alone exceeds the budget, else [`OutOfMemory::Share`] or
+    /// [`OutOfMemory::Budget`].
     pub fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
-        self.budget.take(bytes).map_err(|error| self.check(bytes).err().unwrap_or(error))?;
+        let own = self.of_work();
+        self.budget.take(bytes, own).map_err(|error| self.check(bytes).err().unwrap_or(error))?;
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
         self.budget.publish_held(bytes, 1.0);
         Ok(())
@@ -199,6 +261,11 @@ impl MemoryReservation {
         }
         buffer.extend_from_slice(data);
         Ok(())
+    }
+
+    /// Returns the bytes that the work of this reservation holds, here and elsewhere.
+    fn of_work(&self) -> u64 {
+        self.bytes().saturating_add(self.elsewhere.load(Ordering::Relaxed))
     }
 
     /// Returns the size of the reservation, bytes.
@@ -233,6 +300,7 @@ impl MemoryReservation {
     pub(crate) fn to_buffers(&self) -> Buffers {
         let bytes = self.bytes.swap(0, Ordering::Relaxed);
         self.budget.publish_held(bytes, -1.0);
+        debug_assert!(self.budget.holdings.is_none(), "memory that no request uses belongs to no client");
         Buffers { budget: self.budget.clone(), bytes }
     }
 
@@ -264,7 +332,15 @@ impl MemoryMeter for MemoryReservation {
     }
 
     fn budget(&self) -> Option<[u64; 2]> {
-        Some([self.budget.limit, self.bytes().saturating_add(self.elsewhere.load(Ordering::Relaxed))])
+        Some([self.budget.limit, self.of_work()])
+    }
+
+    fn check(&self, bytes: u64) -> Result<(), OutOfMemory> {
+        self.budget.check_alone(self.of_work().saturating_add(bytes))
+    }
+
+    fn available(&self) -> u64 {
+        self.budget.limit.saturating_sub(self.of_work().saturating_add(self.budget.per_request))
     }
 
     fn also_held(&self, bytes: u64) {
@@ -368,6 +444,73 @@ mod tests {
         assert_eq!(own.check(51), Err(OutOfMemory::Limit { needed: 101, limit: 100 }));
         drop(other);
         own.grow(50).unwrap();
+    }
+
+    #[test]
+    fn work_counts_with_what_each_request_needs_besides() {
+        let budget = Budget::of_service(100, 30, 1.0);
+        let (connection, own) = (budget.buffers(30), budget.reservation());
+        own.grow(70).unwrap();
+        // The service is idle otherwise, so the request would never fit.
+        assert_eq!(own.grow(1), Err(OutOfMemory::Limit { needed: 101, limit: 100 }));
+        let other = budget.buffers(30);
+        own.shrink(40);
+        assert_eq!(held(own.grow(11).unwrap_err()), 90);
+        // In a part, the limit of the whole counts as well.
+        drop((connection, other, own));
+        let of_part = budget.part(80).reservation();
+        assert_eq!(of_part.check(80), Err(OutOfMemory::Limit { needed: 110, limit: 100 }));
+        assert_eq!((of_part.check(70), of_part.check(81).is_err()), (Ok(()), true));
+    }
+
+    #[test]
+    fn a_client_with_more_than_its_share_leaves_one_to_others() {
+        let budget = Budget::of_service(100, 0, 0.25);
+        let [first, second] = [1, 2].map(|client| budget.for_client(client));
+        // One request may take everything.
+        let (alone, input) = (first.reservation(), first.reservation());
+        input.grow(10).unwrap();
+        alone.also_held(10);
+        alone.grow(90).unwrap();
+        drop((alone, input));
+        // Beside others that hold its share, it may as well.
+        let (large, small) = (first.reservation(), first.reservation());
+        small.grow(25).unwrap();
+        large.grow(75).unwrap();
+        drop((large, small));
+        let requests = [(); 4].map(|()| first.reservation());
+        let taken = requests.iter().map(|request| request.grow(25)).collect::<Vec<_>>();
+        let refused = Err(OutOfMemory::Share { needed: 25, held: 75, limit: 25 });
+        assert_eq!(taken, [Ok(()), Ok(()), Ok(()), refused]);
+        // Memory of no client is not limited by shares, and counts.
+        let kept = budget.reservation();
+        let other = second.reservation();
+        other.grow(20).unwrap();
+        kept.grow(5).unwrap();
+        assert_eq!(held(other.grow(1).unwrap_err()), 100);
+        drop((requests, kept, first));
+        other.grow(80).unwrap();
+        assert_eq!(budget.shares.clients().len(), 1, "clients without memory are forgotten");
+        drop((other, second));
+        assert!(budget.shares.clients().is_empty());
+        // Control: without shares, a client takes everything.
+        let budget = Budget::new(100).for_client(1);
+        let requests = [(); 4].map(|()| budget.reservation());
+        let taken: u64 = requests.iter().map(|request| request.grow(25).map_or(0, |()| 25)).sum();
+        assert_eq!(taken, 100);
+    }
+
+    #[test]
+    fn a_part_has_shares_of_its_own() {
+        let budget = Budget::of_service(100, 0, 0.25);
+        let part = budget.part(40);
+        let first = part.for_client(1);
+        let requests = [(); 4].map(|()| first.reservation());
+        let taken = requests.iter().filter(|request| request.grow(10).is_ok()).count();
+        assert_eq!(taken, 3);
+        part.for_client(2).reservation().grow(10).unwrap();
+        drop(requests);
+        assert_eq!((part.used(), budget.used()), (0, 0));
     }
 
     #[test]

@@ -17,8 +17,8 @@ most of the kills and stops, because such a run tests nothing.
 
 With `--job-seconds`, one job at a time that takes about this long alone is stopped at a random point, again and again
 until it ends within a drain of `--drain-ms`. The script prints a row for each stop: no stop may count an attempt. The
-last row is the control, a kill (`kill -9`), which counts one. The exit code is 1 if a stop counted an attempt or was not
-orderly, the kill did not count one, or a job did not end with the right mesh.
+last row is the control, a kill (`kill -9`), which counts one. The exit code is 1 if a stop counted an attempt or was
+not orderly, the kill did not count one, or a job did not end with the right mesh.
 """
 
 import argparse
@@ -166,8 +166,8 @@ class LongJob:
         self.server, self.structure, self.query, self.jobs = server, structure, query, []
 
     def ensure(self):
-        """Starts the service. It continues the last job; if that one has ended, the next job begins. Returns the number of
-        attempts that the job had before."""
+        """Starts the service. It continues the last job; if that one has ended, the next job begins. Returns the number
+        of attempts that the job had before."""
         last = record(self.server.folder, self.jobs[-1]) if self.jobs else {"status": "none"}
         self.server.start()
         if last["status"] in OPEN:

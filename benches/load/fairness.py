@@ -108,7 +108,7 @@ def main():
             select = f"within 50 of ({select})"
         heavy = [
             f"{structure}/report.json?{REPORT}",
-            f"{structure}/atoms?select={urllib.parse.quote(select)}",
+            f"{structure}/atoms?positions=true&select={urllib.parse.quote(select)}",
             f"{structure}/areas?surface=sas",
         ]
 

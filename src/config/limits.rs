@@ -49,8 +49,8 @@ pub struct LimitsConfig {
     /// Number of pairs of an atom and a brick (8³ grid points) that its support reaches. Default 134,217,728: 64 atoms
     /// per brick of `grid_points`, several times the number in ordinary structures. Limits the computing time to about
     /// 25 s of one core, and the memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648. Also limits
-    /// the search for overlapping spheres and, for each pair, `within` to 64 tested distances and the search for pockets
-    /// to 5 rows of grid points.
+    /// the search for overlapping spheres and, for each pair, `within` to 64 tested distances and the search for
+    /// pockets to 5 rows of grid points.
     pub candidate_pairs: u64,
     /// Size of a mesh in memory (24 bytes a vertex, 12 a triangle), bytes. Default 2 GiB: 85 million triangles.
     pub mesh_bytes: u64,

@@ -46,12 +46,13 @@ pub struct ServerConfig {
     /// Number of open connections. Default 1,024. Further ones get a 503 and are closed. The hard limit of open files
     /// should be a few hundred higher; `molmesh doctor` compares them.
     pub connections: usize,
-    /// Share of one client in each of four limits, as a fraction from 0 to 1. A share has at least one slot. In
+    /// Share of one client in each of five limits, as a fraction from 0 to 1. A share has at least one slot. In
     /// `server.connections`, clients are told apart by the address of the peer; `trusted_proxies` have no share. In
     /// `jobs.deliveries`, `archive.concurrent` and the threads that read structures outside of jobs (`jobs.workers`),
     /// they are told apart by key, or by address without a key. Default 0.25: one client cannot occupy the service, and
     /// three others find free slots. With 1 a client may use all slots. Connections and deliveries beyond the share get
-    /// a 503. Fetches wait for half of `archive.timeout_ms` first, and readers for `jobs.deadline_ms`.
+    /// a 503. Fetches wait for half of `archive.timeout_ms` first, and readers for `jobs.deadline_ms`. Of
+    /// `limits.memory_bytes`, a client whose other requests hold more than the share leaves as much to others.
     #[serde(deserialize_with = "telemetry::ratio")]
     #[schemars(range(min = 0, max = 1))]
     pub client_share: f64,

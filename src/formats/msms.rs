@@ -84,7 +84,7 @@ impl MsmsPlan {
 /// Decimals of a coordinate.
 const COORDINATES: Decimals = Decimals::of(Units::Angstrom);
 
-/// Returns the three lines of the header.
+/// Returns the three lines of the header. The number of words of the first one is not that of the fields of a row.
 fn header(rows: Rows, n: usize, mesh: &Mesh, meta: &Meta) -> String {
     let number = |key: &str| meta.extras.get(key).and_then(Value::as_f64).unwrap_or_default();
     let surface = meta.extras.get("surface").and_then(Value::as_str).map(|name| text::word(Some(name)) + " ");
@@ -97,7 +97,7 @@ fn header(rows: Rows, n: usize, mesh: &Mesh, meta: &Meta) -> String {
     let density = if area > 0.0 { mesh.positions.len() as f64 / area } else { 0.0 };
     let (spheres, probe) = (number("atoms_in_file"), number("probe"));
     format!(
-        "# {GENERATOR} {surface}{title} of {name}\n{count} #sphere density probe_r\n\
+        "# {GENERATOR} {surface}surface {title} of {name}\n{count} #sphere density probe_r\n\
          {n:7} {spheres:7} {density:5.2} {probe:5.2}\n"
     )
 }
@@ -145,7 +145,7 @@ mod tests {
         let meta = Meta { name: Some("a name of\nmany words".into()), extras };
         let header = header(Rows::Vertices, 37, &mesh, &meta);
         let lines: Vec<&str> = header.lines().collect();
-        assert_eq!(lines[0], format!("# {GENERATOR} ses vertices of a_name_of_many_words"));
+        assert_eq!(lines[0], format!("# {GENERATOR} ses surface vertices of a_name_of_many_words"));
         assert_eq!(lines[1..], ["#vertex #sphere density probe_r", "     37     327  9.25  1.40"]);
         assert!(lines.iter().all(|line| line.split_whitespace().count() < 9));
     }

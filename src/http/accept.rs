@@ -50,11 +50,17 @@ const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
 const SOCKET_BUFFER: usize = 256 << 10;
 /// Receive buffer of a connection, bytes, as charged to the memory budget.
 const RECEIVE_BUFFER: usize = 64 << 10;
+/// Buffers of a connection, bytes.
+const CONNECTION_BYTES: u64 = (SOCKET_BUFFER + RECEIVE_BUFFER) as u64;
 /// Interval of HTTP/2 pings.
 const PING: Duration = Duration::from_secs(20);
-
 /// Time for the last responses, such as those of cancelled jobs.
 const LAST_RESPONSES: Duration = Duration::from_secs(1);
+
+/// Creates the memory budget of the service. A request has at least the buffers of its connection.
+pub(super) fn budget(limit: u64, client_share: f64) -> Budget {
+    Budget::of_service(limit, CONNECTION_BYTES, client_share)
+}
 
 /// Serves `router` on `listener` until the drain. Then open requests may finish until [`Stop::Now`], and the responses
 /// of cancelled ones for [`LAST_RESPONSES`] after it. Returns true if all requests finished before [`Stop::Now`].
@@ -115,7 +121,7 @@ pub(super) async fn serve(
         let pace = Pace::new(MinimumRate::new(&config));
         let stream = Guarded::new(
             stream,
-            (slot, GaugeGuard::new(gauge!(CONNECTIONS)), budget.buffers((SOCKET_BUFFER + RECEIVE_BUFFER) as u64)),
+            (slot, GaugeGuard::new(gauge!(CONNECTIONS)), budget.buffers(CONNECTION_BYTES)),
             MAX_TIME_FACTOR * Duration::from_millis(config.write_timeout_ms),
             Arc::clone(&pace),
         );

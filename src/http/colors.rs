@@ -125,10 +125,7 @@ async fn list(
     let list = move |structure: &Structure, limits: &ReadLimits, control: &Control<'_>, memory: MemoryReservation| {
         // The list has the atoms of the file. Copies in an assembly affect only the range of numbers.
         let limits = ReadLimits { max_atoms, ..*limits };
-        // The selected atoms, and copies of the names of chains or entities.
-        let names = structure.chain.texts().chain(structure.entities.iter().map(String::as_str));
-        let names: u64 = names.map(|name| 64 + name.len() as u64).sum();
-        control.memory.grow(SELECTED_BYTES * structure.len() as u64 + names)?;
+        control.memory.grow(SELECTED_BYTES * structure.len() as u64)?;
         let selected = structure::select_with(structure, &job.selection, &limits, control)?.atoms;
         let colors = AtomColors::new(structure, &selected, &coloring).map_err(not_colorable)?;
         let list = document::collect(memory, control, |out| {

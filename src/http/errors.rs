@@ -104,6 +104,10 @@ impl From<OutOfMemory> for Problem {
         let full = || Self::new(ProblemType::MemoryFull, error.to_string()).retry_after(Duration::from_secs(1));
         match error {
             OutOfMemory::Budget { held, limit, .. } => full().with("limit", limit).with("actual", held),
+            OutOfMemory::Share { limit, held, .. } => Self::new(ProblemType::ShareExceeded, error.to_string())
+                .with("limit", limit)
+                .with("actual", held)
+                .retry_after(Duration::from_secs(1)),
             OutOfMemory::Limit { needed, limit } => {
                 Self::new(ProblemType::TooMuchMemory, error.to_string()).with("limit", limit).with("actual", needed)
             }

@@ -112,7 +112,7 @@ pub(super) async fn create(
     app.admit_work(&caller)?;
     // The response is no mesh, so `Accept` does not choose a format.
     headers.remove(ACCEPT);
-    let parsed = ParsedRequest::from_body(&app, query, &headers, body).await?;
+    let parsed = ParsedRequest::from_body(&app, &caller, query, &headers, body).await?;
     let ParsedRequest { source, request, format, declared, .. } = parsed;
     let job = request.job;
     // An estimate is about half the work of a mesh, so it takes a delivery slot as well.

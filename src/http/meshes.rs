@@ -8,6 +8,7 @@ use axum::http::header::HeaderMap;
 use axum::http::{Extensions, HeaderValue, header};
 use axum::response::Response;
 
+use super::guard::Caller;
 use super::mesh_request::MeshRequest;
 use super::openapi::bodies::{AS_FOR_MESHES, STRUCTURE_TO_MESH, StructureFile};
 use super::openapi::meshes::{MeshOrJob, ReportResponse};
@@ -79,7 +80,8 @@ async fn answer(
 ) -> Result<Response, Problem> {
     let timing = Timing::start();
     let preferences = RequestPreferences::of(headers, extensions)?;
-    let parsed = ParsedRequest { report, ..ParsedRequest::from_body(app, query, headers, body).await? };
+    let caller = Caller::of(extensions);
+    let parsed = ParsedRequest { report, ..ParsedRequest::from_body(app, &caller, query, headers, body).await? };
     let mut response = MeshRequest::from_upload(Arc::clone(app), parsed, preferences, timing).answer().await?;
     if !report {
         response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));

@@ -8,6 +8,7 @@ use bytes::Bytes;
 
 use super::content_type::{DeclaredType, contradiction};
 use super::form::UploadedFile;
+use super::guard::Caller;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
@@ -58,6 +59,7 @@ impl ParsedRequest {
     /// structure. Invalid parameters in the query are rejected before the body is received.
     pub(super) async fn from_body(
         app: &Shared,
+        caller: &Caller,
         query: Pairs,
         headers: &HeaderMap,
         body: Body,
@@ -67,7 +69,7 @@ impl ParsedRequest {
         let body_has_parameters = is_json || upload::is_multipart(headers);
         let early = if body_has_parameters { None } else { Some(finish(app, &mut request, headers)?) };
         let (source, fields, declared, map) = if is_json {
-            let json = upload::receive_json(app, headers, body).await?;
+            let json = upload::receive_json(app, caller, headers, body).await?;
             let (source, fields) = if json.len() <= MAX_INLINE_JSON {
                 parse_json(&json)?
             } else {
@@ -77,7 +79,7 @@ impl ParsedRequest {
             (source, fields, DeclaredType::Neutral, None)
         } else {
             let UploadedFile { bytes, digest, reservation, map, fields, declared } =
-                upload::receive(app, headers, body).await?;
+                upload::receive(app, caller, headers, body).await?;
             (StructureSource::Uploaded(Loaded::file(bytes, digest, reservation)), fields, declared, map)
         };
         if body_has_parameters {

@@ -221,7 +221,7 @@ pub(super) const PROBLEM_TYPES: &[ProblemEntry] = &[
     row(ProblemType::TooManyDeliveries, "too-many-deliveries", S::SERVICE_UNAVAILABLE, true, "Too many meshes are being sent",
         "`limit` mesh requests are in progress, most of them waiting for slow clients. Retry after `Retry-After` seconds."),
     row(ProblemType::ShareExceeded, "share-exceeded", S::SERVICE_UNAVAILABLE, true, "The client holds its share",
-        "Connections, meshes in progress and fetches from the archive are limited, and this client (its key, or its address) holds `limit` of them, its share. Wait for the end of its other requests, then retry."),
+        "Connections, meshes in progress, fetches from the archive and memory are limited, and this client (its key, or its address) holds its share: `limit` of them, or `limit` bytes. Wait for the end of its other requests, then retry."),
     row(ProblemType::ShuttingDown, "shutting-down", S::SERVICE_UNAVAILABLE, false, "The service is shutting down",
         "The service stopped before the job was done. Retry: another instance, or this one after its restart, will run it."),
     row(ProblemType::TooManyConnections, "too-many-connections", S::SERVICE_UNAVAILABLE, true, "Too many connections",

@@ -23,8 +23,8 @@ impl Drop for CancelOnDrop {
 impl App {
     /// Runs `work`, which reads a structure, on a blocking thread, and charges its time to the caller. First waits for
     /// the share of the client and for a permit, for at most half of `jobs.deadline_ms`, which limits the whole call. A
-    /// request that would probably wait longer is refused at once. If the request ends early, the work is cancelled;
-    /// permits, memory and `held` are released when it has stopped.
+    /// request that would probably wait longer, or be late, is refused at once. If the request ends early, the work is
+    /// cancelled; permits, memory and `held` are released when it has stopped.
     pub(super) async fn read<T: Send + 'static>(
         self: &Arc<Self>,
         caller: &Caller,
@@ -42,9 +42,13 @@ impl App {
         let share = self.reader_shares.wait(caller.client.0, begin_by).await.map_err(|_full| waited())?;
         let permit = timeout_at(begin_by, Arc::clone(&self.readers).acquire_owned()).await;
         let permit = permit.map_err(|_elapsed| waited())?.map_err(|closed| panicked(closed.to_string()))?;
+        let left = end.saturating_duration_since(Instant::now());
+        if waiting.is_late(left) {
+            return Err(waited());
+        }
         let reading_time = waiting.begin();
         let stop = CancelOnDrop(CancelToken::default());
-        let (cancel, reservation) = (stop.0.clone(), self.pool.settings().budget.reservation());
+        let (cancel, reservation) = (stop.0.clone(), self.memory(caller.client).reservation());
         let (app, payer) = (Arc::clone(self), caller.clone());
         let reading = spawn_holding((held, permit, share, reading_time), move || {
             let begun = Instant::now();

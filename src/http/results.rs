@@ -171,7 +171,7 @@ pub(super) async fn stored(
     let share = app.delivery_shares.take(caller.client.0)?;
     // Pieces of running responses are charged regardless of the limit. While it is exceeded, new responses are
     // rejected.
-    let budget = app.pool.settings().budget.clone();
+    let budget = app.memory(caller.client);
     let charged = body.map_ok(move |piece| {
         // The share is held until the body is dropped.
         _ = &share;

@@ -23,8 +23,9 @@ use crate::archive::Archive;
 use crate::client_shares::ClientShares;
 use crate::config::{Config, Role};
 use crate::jobs::{
-    Broker, Budget, Client, EndError, JobStore, MemoryBroker, NatsBroker, Pool, ScratchSpace, Settings, Structures,
+    Broker, Client, EndError, JobStore, MemoryBroker, NatsBroker, Pool, ScratchSpace, Settings, Structures,
 };
+use crate::memory_budget::Budget;
 use crate::picture::SelectedRenderer;
 use crate::single_flight::SingleFlight;
 use crate::store::{Digest, FolderLock, LockError, Secret, Store, StoreError, derive};
@@ -132,7 +133,7 @@ impl Server {
             telemetry::recorder()?;
         }
         let traces = Traces::start(&config.telemetry)?;
-        let budget = Budget::new(config.limits.memory_bytes);
+        let budget = accept::budget(config.limits.memory_bytes, config.server.client_share);
         let scratch_bytes = config.limits.scratch_bytes;
         let scratch = (scratch_bytes > 0).then(|| ScratchSpace::new(&config.server.data_dir, scratch_bytes));
         let settings = Settings {

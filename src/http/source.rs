@@ -66,7 +66,7 @@ impl Loaded {
     ) -> Result<T, Problem> {
         let mut limits = app.config.limits.job().read;
         limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
-        let reservation = app.pool.settings().budget.reservation();
+        let reservation = app.memory(caller.client).reservation();
         let (structures, namespace) = (app.structures(), caller.namespace);
         let Self { input, digest, reservation: file } = self;
         let listing = app.read(caller, (file, delivery), move |control| {
@@ -127,7 +127,7 @@ impl StructureSource {
 
     /// Returns the file.
     pub(super) async fn load(&self, app: &Shared, caller: &Caller) -> Result<Loaded, Problem> {
-        let reservation = || app.pool.settings().budget.reservation();
+        let reservation = || app.memory(caller.client).reservation();
         match self {
             Self::Uploaded(loaded) => Ok(loaded.clone()),
             Self::Stored(digest) => {

@@ -85,6 +85,11 @@ impl App {
         Arc::clone(&self.pool.settings().structures)
     }
 
+    /// Returns the memory budget for the requests of a client.
+    pub(super) fn memory(&self, client: Client) -> Budget {
+        self.pool.settings().budget.for_client(client.0)
+    }
+
     /// Takes a delivery slot for a request for a mesh.
     pub(super) fn delivery(&self, client: Client) -> Result<Delivery, Problem> {
         let permit = Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {

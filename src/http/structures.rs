@@ -32,14 +32,14 @@ use crate::store::Digest;
 use crate::structure::contents::Counts;
 use crate::structure::{Contents, Structure, StructureError};
 
-/// Maximum number of listed chains, and of listed assemblies.
+/// Maximum number of listed models, chains and assemblies each.
 const MAX_LISTED: usize = 1000;
 
 /// Contents of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(example = json!({
     "digest": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "bytes": 71_928, "format": "pdb",
-    "id": "4PTI", "title": "THE GEOMETRY OF THE REACTIVE SITE", "atoms": 514, "models": [1], "model": 1,
+    "id": "4PTI", "title": "THE GEOMETRY OF THE REACTIVE SITE", "atoms": 514, "model_count": 1, "models": [1], "model": 1,
     "atoms_in_model": {
         "polymer": 454, "protein": 454, "nucleic": 0, "ligand": 0, "cofactor": 0, "glycan": 0, "ion": 0, "water": 60,
         "hydrogens": 0, "virtual_sites": 0,
@@ -70,7 +70,9 @@ pub(super) struct StructureDocument {
     title: Option<String>,
     /// Atoms in all models.
     atoms: u64,
-    /// Model numbers.
+    /// Number of models.
+    model_count: usize,
+    /// The first 1,000 model numbers.
     models: Vec<i32>,
     /// Number of the model that the counts below refer to.
     model: i32,
@@ -161,7 +163,7 @@ pub(super) async fn create(
         return Err(Problem::new(ProblemType::UnsupportedMediaType, detail).with("declared", "application/json"));
     }
     let UploadedFile { bytes, digest, reservation, map, fields, declared } =
-        upload::receive(&app, &headers, body).await?;
+        upload::receive(&app, &caller, &headers, body).await?;
     if let Some(name) = map.map(|_| "map").or(fields.first().map(|(name, _)| name.as_str())) {
         return Err(Problem::new(
             ProblemType::BadParameter,
@@ -246,6 +248,7 @@ async fn summarize(
     let Loaded { input, digest, reservation } = loaded;
     let parsing = app.read(caller, (reservation, delivery), move |control| {
         let kept = structures.get(namespace, digest, &input, &limits, control)?;
+        let _contents = control.reserve(kept.table_bytes())?;
         Ok(summary(&digest, input.file_bytes(), &kept, limits.max_copies))
     });
     parsing.await?.map_err(|error: StructureError| JobError::from(error).into())
@@ -266,7 +269,8 @@ fn summary(digest: &Digest, bytes: usize, structure: &Structure, max_copies: u64
         id: structure.id.clone(),
         title: structure.title.clone(),
         atoms: contents.atoms,
-        models: contents.models,
+        model_count: contents.models.len(),
+        models: contents.models.into_iter().take(MAX_LISTED).collect(),
         model: contents.model,
         atoms_in_model: contents.counts,
         alternatives: contents.alternatives,

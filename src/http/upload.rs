@@ -11,6 +11,7 @@ use futures_util::StreamExt as _;
 use super::body_hasher::BodyHasher;
 use super::content_type::{DeclaredType, GZIP_MAGIC, ZSTD_MAGIC};
 use super::form::{self, UploadedFile};
+use super::guard::Caller;
 use super::limit::Limit;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -40,21 +41,26 @@ pub(super) fn is_json(headers: &HeaderMap) -> bool {
 }
 
 /// Receives a structure: a file, or a form around one.
-pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Result<UploadedFile, Problem> {
+pub(super) async fn receive(
+    app: &App,
+    caller: &Caller,
+    headers: &HeaderMap,
+    body: Body,
+) -> Result<UploadedFile, Problem> {
     let limit = Limit { key: "limits.body_bytes", max: app.config.limits.body_bytes };
     let announced = announced(headers, limit)?;
+    let reservation = app.uploads.for_client(caller.client.0).reservation();
     // A declared length is rejected before the body arrives.
-    app.uploads.reservation().check(announced)?;
+    reservation.check(announced)?;
     let coding = content_encoding(headers)?;
     let upload = if is_multipart(headers) {
         if coding.is_some() {
             return Err(bad_encoding("a form cannot be compressed as a whole; compress the file in it"));
         }
         let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
-        let form = form::read(&app.config.limits, limit, content_type, announced, body, app.uploads.reservation());
+        let form = form::read(&app.config.limits, limit, content_type, announced, body, reservation);
         in_time(app, form).await?
     } else {
-        let reservation = app.uploads.reservation();
         let (bytes, digest) = in_time(app, collect(body, announced, limit, &reservation)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
         UploadedFile { bytes, digest, reservation, map: None, fields: Vec::new(), declared }
@@ -89,13 +95,18 @@ fn check_lines(headers: &HeaderMap, bytes: &[u8]) -> Result<(), Problem> {
 }
 
 /// Receives a JSON document.
-pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> Result<Bytes, Problem> {
+pub(super) async fn receive_json(
+    app: &App,
+    caller: &Caller,
+    headers: &HeaderMap,
+    body: Body,
+) -> Result<Bytes, Problem> {
     let limit = Limit { key: "limits.json_bytes", max: app.config.limits.json_bytes };
     let announced = announced(headers, limit).map_err(|problem| problem.advise(NOT_JSON))?;
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
-    let reservation = app.uploads.reservation();
+    let reservation = app.uploads.for_client(caller.client.0).reservation();
     let received = in_time(app, collect(body, announced, limit, &reservation)).await;
     let (bytes, _digest) = received.map_err(|problem| problem.advise(NOT_JSON))?;
     // The document is charged until it has been parsed.

@@ -22,11 +22,15 @@ pub(crate) enum Refusal {
         wait: Duration,
     },
     /// The job would miss its deadline in the queue.
-    #[error("the jobs ahead take about {} s and the deadline is {} s", wait.as_secs_f64().ceil(), allowed.as_secs_f64())]
+    #[error(
+        "the jobs ahead take about {:.0} s and this one must begin within {:.0} s",
+        wait.as_secs_f64().ceil(),
+        allowed.as_secs_f64().floor()
+    )]
     TooLate {
         /// Estimated time in the queue.
         wait: Duration,
-        /// Time allowed from acceptance to the mesh.
+        /// Time from acceptance in which the job must begin to meet its deadline.
         allowed: Duration,
     },
     /// The pool is shutting down.

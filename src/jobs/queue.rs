@@ -223,14 +223,20 @@ impl Queue {
         if state.len(lane) >= self.limit + self.workers {
             return Err(Refusal::QueueFull { waiting: state.waiting_in(lane).count(), limit: self.limit, wait });
         }
+        let allowed = Self::begin_within(allowed, state.rate.seconds(units));
         if wait > allowed {
             return Err(Refusal::TooLate { wait, allowed });
         }
         Ok(None)
     }
 
-    /// Creates the ticket of a job. To be finished in
-    /// time, it must begin by then, but half of the time is never given up.
+    /// Returns the time in which a job must begin to be finished within `allowed`, at least half of it.
+    fn begin_within(allowed: Duration, expected: f64) -> Duration {
+        let running = Duration::try_from_secs_f64(expected).unwrap_or(Duration::MAX).min(allowed / 2);
+        allowed.saturating_sub(running)
+    }
+
+    /// Creates the ticket of a job.
     fn ticket(
         self: &Arc<Self>,
         job: u64,
@@ -240,8 +246,7 @@ impl Queue {
         Times { allowed, expected }: Times,
     ) -> Ticket {
         let (queue, now) = (Arc::clone(self), Instant::now());
-        let running = Duration::try_from_secs_f64(expected).unwrap_or(Duration::MAX).min(allowed / 2);
-        let (deadline, start_by) = (now + allowed, now + allowed.saturating_sub(running));
+        let (deadline, start_by) = (now + allowed, now + Self::begin_within(allowed, expected));
         let (is_shared, joined_running) = (false, false);
         Ticket { queue, job, lane, outcome, deadline, start_by, allowed, progress, span, is_shared, joined_running }
     }
@@ -288,13 +293,16 @@ impl Queue {
         })
     }
 
-    /// Removes a finished job and sends its outcome to every ticket. `time` is the duration of a successful run.
+    /// Removes a finished job and sends its outcome to every ticket. `time` is the duration of a run that tells how
+    /// long such jobs take; one without success would have taken longer.
     pub(super) fn done(&self, id: u64, outcome: Option<Outcome>, time: Option<Duration>) {
         let mut state = self.lock();
         let Some(at) = state.find(id) else { return };
         let job = state.jobs.swap_remove(at);
-        if let Some(time) = time {
-            state.rate.learn(job.units, time.as_secs_f64());
+        let is_success = matches!(outcome, Some(Ok(_)));
+        let time = time.map(|time| time.as_secs_f64());
+        if let Some(seconds) = time.filter(|seconds| is_success || *seconds > state.rate.seconds(job.units)) {
+            state.rate.learn(job.units, seconds);
         }
         self.after_removal(&mut state);
         drop(state);

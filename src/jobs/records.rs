@@ -271,7 +271,7 @@ impl JobStore {
 
     /// Loads the input of a task and its map, charged to the memory budget before they are read.
     pub(super) async fn load_input(&self, task: &mut Task) -> Result<(), LoadError> {
-        let reservation = self.0.pool.settings().budget.reservation();
+        let reservation = self.0.pool.settings().budget.for_client(task.rank.client.0).reservation();
         let map: Option<Digest> = match &task.job.map {
             Some(map) => Some(map.digest().parse().map_err(|_bad: BadDigest| LoadError::Removed)?),
             None => None,

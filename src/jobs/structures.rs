@@ -110,7 +110,8 @@ impl Structures {
         }
         counter!(STRUCTURE_CACHE_REQUESTS, "result" => "miss").increment(1);
         let reservation = Arc::new(self.budget.reservation());
-        reservation.also_held(file.len() as u64);
+        // Such as the file, and the memory for drawing.
+        reservation.also_held(control.memory.budget().map_or(0, |[_, held]| held));
         let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
         let structure = structure::read_with(file, limits, &charged)?;
         reservation.grow(OVERHEAD)?;

@@ -8,6 +8,7 @@ use super::queue::Queue;
 use super::rank::Lane;
 use super::{Failure, Outcome};
 use crate::single_flight::ResultReceiver;
+use crate::surface::OutOfMemory;
 use crate::sync::timeout;
 use crate::telemetry::TraceSpan;
 
@@ -58,7 +59,13 @@ impl Ticket {
             let tick = if is_queued { now + QUEUED_TICK } else { self.deadline };
             let end = tick.min(self.deadline);
             if let Ok(outcome) = timeout(end.saturating_duration_since(now), outcome.recv()).await {
-                return outcome.unwrap_or(Err(Failure::Stopped));
+                return match outcome.unwrap_or(Err(Failure::Stopped)) {
+                    // The share is that of the client that sent the job first.
+                    Err(Failure::Memory(OutOfMemory::Share { needed, .. })) if self.is_shared => {
+                        Err(Failure::Memory(OutOfMemory::System { needed }))
+                    }
+                    outcome => outcome,
+                };
             }
         }
     }

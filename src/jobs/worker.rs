@@ -16,7 +16,7 @@ use crate::formats::Pieces;
 use crate::pipeline::{self, Choice, JobError, Product, ProgressSink, Report, StageClock};
 use crate::structure::strict_validator::{self, Diagnostic, Level, MAX_UNREAD_BYTES};
 use crate::structure::{ReadLimits, StructureError};
-use crate::surface::{Column, Control, SurfaceError};
+use crate::surface::{Column, Control, MemoryMeter as _, SurfaceError};
 use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan};
 
 /// End of a task.
@@ -46,8 +46,12 @@ pub(super) fn work(shared: &WorkerContext, lane: Lane) {
             meter(client, start.elapsed());
         }
         shared.publish_devices();
-        // Only successful jobs count in the duration estimate.
-        let time = (matches!(outcome, Some(Ok(_))) && is_typical).then(|| start.elapsed());
+        // Successful jobs count in the duration estimate, and those that were cancelled, such as at a deadline.
+        let counts = matches!(
+            outcome,
+            Some(Ok(_) | Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }))
+        );
+        let time = (counts && is_typical).then(|| start.elapsed());
         shared.queue.done(id, outcome, time);
     }
 }
@@ -66,9 +70,13 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
     let waited = accepted.elapsed();
     span.part("queue", accepted, waited);
     let outcome = shared.settings.budget.check().map_err(Failure::from).and_then(|()| {
-        let reservation = Arc::new(shared.settings.budget.reservation());
+        let budget = shared.settings.budget.for_client(task.rank.client.0);
+        let (reservation, drawing) = (Arc::new(budget.reservation()), budget.reservation());
         // The memory for drawing is known in advance: reserved now, jobs do not fail at their end for lack of it.
-        reservation.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
+        // Reading notes the file and the map.
+        drawing.also_held(input_bytes(&task));
+        drawing.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
+        reservation.also_held(drawing.bytes());
         let control = Control {
             cancel: cancel.clone(),
             memory: Arc::<MemoryReservation>::clone(&reservation),
@@ -81,7 +89,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
             let file = task.input.file();
             let (diagnostics, checked) = if task.strict {
                 let begun = Instant::now();
-                let found = check(shared, file, &control);
+                let found = check(shared, &task, &control);
                 progress.ended("check", begun, begun.elapsed());
                 (Some(found?), Some(begun.elapsed()))
             } else {
@@ -113,6 +121,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
             counter!(JOBS_FALLBACK).increment(1);
             tracing::warn!(renderer, why, "a picture fell back to another renderer");
         }
+        drop(drawing);
         reservation.set(bytes_of(&product));
         Ok(Finished { product, diagnostics, digest: task.digest, reservation })
     });
@@ -172,10 +181,14 @@ fn end_span(span: &TraceSpan, id: Option<JobId>, label: &'static str, outcome: O
 }
 
 /// Runs the strict validator. Fails if it finds errors.
-fn check(shared: &WorkerContext, file: Option<&Bytes>, control: &Control<'_>) -> Result<Vec<Diagnostic>, Failure> {
+fn check(shared: &WorkerContext, task: &Task, control: &Control<'_>) -> Result<Vec<Diagnostic>, Failure> {
     let missing = || Failure::Panicked { message: "a strict task has no file".to_owned() };
-    let file = file.ok_or_else(missing)?;
-    let diagnostics = strict_validator::check(file, &shared.settings.limits.read, control).map_err(JobError::from)?;
+    let file = task.input.file().ok_or_else(missing)?;
+    // The job notes its file when it reads it.
+    let memory = shared.settings.budget.for_client(task.rank.client.0).reservation();
+    memory.also_held(control.memory.budget().map_or(0, |[_, held]| held).saturating_add(input_bytes(task)));
+    let control = Control { memory: Arc::new(memory), ..control.clone() };
+    let diagnostics = strict_validator::check(file, &shared.settings.limits.read, &control).map_err(JobError::from)?;
     if diagnostics.iter().any(|d| d.level == Level::Error) {
         return Err(Failure::Check { diagnostics });
     }
@@ -220,6 +233,12 @@ fn count(report: &Report) {
     for (stage, ms) in &report.timings_ms {
         histogram!(STAGE_DURATION, "stage" => stage.clone()).record(ms.as_f64().unwrap_or_default() / 1e3);
     }
+}
+
+/// Returns the size of the file and the map of a task, bytes.
+fn input_bytes(task: &Task) -> u64 {
+    let map = task.job.map.as_ref().map_or(0, |map| map.as_ref().len());
+    (task.input.file().map_or(0, Bytes::len) + map) as u64
 }
 
 /// Memory use of a product, bytes.

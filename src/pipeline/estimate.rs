@@ -191,7 +191,7 @@ pub(super) const fn ends_work(error: &SurfaceError) -> bool {
         error,
         SurfaceError::Cancelled
             | SurfaceError::Deadline
-            | SurfaceError::Memory(OutOfMemory::Budget { .. } | OutOfMemory::System { .. })
+            | SurfaceError::Memory(OutOfMemory::Budget { .. } | OutOfMemory::Share { .. } | OutOfMemory::System { .. })
     )
 }
 

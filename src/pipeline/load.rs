@@ -19,6 +19,7 @@ pub(super) fn load<S: Deref<Target = Structure>>(
     clock: &StageClock<'_>,
     control: &Control<'_>,
 ) -> Result<(S, Selected, Spheres), JobError> {
+    control.memory.also_held(job.map.as_ref().map_or(0, |map| map.as_ref().len() as u64));
     let read = clock.time("read", || read(control))?;
     let structure = &*read;
     control.check()?;

@@ -53,8 +53,6 @@ impl MapFile {
 
     /// Reads the map.
     pub(super) fn read(&self, limits: &MapLimits, control: &Control<'_>) -> Result<Map, JobError> {
-        let bytes = self.as_ref();
-        control.memory.also_held(bytes.len() as u64);
-        Ok(map::read(bytes, limits, control)?)
+        Ok(map::read(self.as_ref(), limits, control)?)
     }
 }

@@ -11,6 +11,8 @@ use crate::surface::{SurfaceKind, TriangleQuality};
 pub const BYTES_PER_ATOM: f64 = 90.0;
 /// Approximate compression ratio of structure files.
 const COMPRESSION: f64 = 4.0;
+/// Largest ratio of compression by gzip.
+const MAX_GZIP_RATIO: u64 = 1032;
 /// Approximate ratio of the sizes of atoms in text and in BinaryCIF. It does not apply to compressed input, whose
 /// format is unknown and whose sizes differ less.
 const BINARY: f64 = 5.0;
@@ -50,6 +52,14 @@ const fn relative_time(surface: SurfaceKind) -> f64 {
     }
 }
 
+/// Returns the size at the end of a gzip file: that of its last member, modulo 2³². `None` if the size cannot be that
+/// of the whole file.
+fn gzip_size(input: &[u8]) -> Option<u32> {
+    let size = input.starts_with(&[0x1f, 0x8b]).then(|| input.last_chunk().map(|size| u32::from_le_bytes(*size)))??;
+    let (least, most) = (input.len() as u64, input.len() as u64 * MAX_GZIP_RATIO);
+    (least..=most).contains(&u64::from(size)).then_some(size)
+}
+
 /// Estimates the number of atoms in a structure file from its size.
 #[must_use]
 pub fn estimate_atoms(input: &[u8]) -> f64 {
@@ -58,7 +68,7 @@ pub fn estimate_atoms(input: &[u8]) -> f64 {
     let binary = matches!(input.first(), Some(0x80..=0x8F | 0xDE | 0xDF));
     let len = input.len() as f64;
     let bytes = match (compressed, binary) {
-        (true, _) => len * COMPRESSION,
+        (true, _) => gzip_size(input).map_or(len * COMPRESSION, f64::from),
         (false, true) => len.max((len - DESCRIPTION) * BINARY),
         (false, false) => len,
     };
@@ -225,6 +235,8 @@ mod tests {
         let coarse = estimate_work(&text, &at("1"));
         assert!(estimate_work(&text, &at("0.5")) > 2.0 * coarse);
         assert!(estimate_work(&gzip, &at("1")) > 2.0 * coarse);
+        let sized = [&gzip[..], &9_000_000_u32.to_le_bytes()].concat();
+        assert!((estimate_work(&sized, &at("0.5")) - 102_000.0).abs() < 1.0, "the size at the end");
         let binary = |first: u8| estimate_work(&[&[first][..], &vec![0; 450_000]].concat(), &at("1"));
         assert!(binary(0x83) > 2.0 * binary(b'A'));
         assert!((estimate_work(&text, &at("0.5")) - 3000.0).abs() < 1.0);

@@ -81,7 +81,7 @@ pub enum StoreError {
     /// Another release wrote a job record, which this one cannot read.
     #[error("another release wrote the record of the job: {why}")]
     OtherRelease {
-        /// What this release does not know.
+        /// Field, parameter or version that this release does not know.
         why: String,
     },
     /// A structure file is damaged and is in quarantine.

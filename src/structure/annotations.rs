@@ -172,15 +172,17 @@ pub struct Annotations {
 }
 
 impl Annotations {
-    /// Bytes of an entry, with its names.
-    const ENTRY_BYTES: usize = 80;
+    /// Bytes of an entry besides its names.
+    const ENTRY_BYTES: usize = 112;
     /// Bytes of a residue while secondary structure is found.
     const RESIDUE_BYTES: usize = 64;
 
     /// Adds the memory of the values to that of the structure, and the memory that [`SecondaryRanges`] needs for
     /// `n_residues`.
     pub(super) fn keep(&self, n_residues: usize, reading: &Reading<'_>) -> Result<(), StructureError> {
-        let entries = Self::ENTRY_BYTES * (self.secondary.len() + self.confidence.len());
+        let names = self.secondary.iter().map(|range| range.chain.len());
+        let names = names.chain(self.confidence.iter().map(|row| row.chain.len() + row.residue.len()));
+        let entries = names.map(|bytes| Self::ENTRY_BYTES + bytes).sum::<usize>();
         let residues = if self.secondary.is_empty() { 0 } else { Self::RESIDUE_BYTES * n_residues };
         reading.keep((entries + residues) as u64)
     }

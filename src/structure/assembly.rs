@@ -3,7 +3,7 @@
 //! Dictionary: PDBx/mmCIF, categories `pdbx_struct_assembly_gen` and `pdbx_struct_oper_list`; wwPDB format 3.3,
 //! REMARK 350. The tables are stored as in the file; operator expressions are expanded for the selected assembly only.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use indexmap::IndexMap;
 
@@ -98,6 +98,17 @@ impl Generator {
     pub(super) fn chains(&self) -> impl Iterator<Item = &str> {
         let names = self.chains.split(|c: char| c == ',' || c.is_whitespace()).filter(|name| !name.is_empty());
         names.map(|name| if name == "NULL" { "" } else { name })
+    }
+
+    /// Returns the ids of the chains in order, each once. `ids` are those of each name.
+    pub(super) fn chain_ids(&self, ids: &HashMap<&str, Vec<u32>>) -> Vec<u32> {
+        // A file may repeat a name any number of times.
+        let mut seen = HashSet::new();
+        let known = self.chains().filter_map(|name| ids.get_key_value(name));
+        let known = known.filter(|(name, _)| seen.insert(**name));
+        let mut chains: Vec<u32> = known.flat_map(|(_, ids)| ids).copied().collect();
+        chains.sort_unstable();
+        chains
     }
 }
 

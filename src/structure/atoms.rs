@@ -13,6 +13,12 @@ use super::texts::{Interner, TextColumn, translate, without_entity};
 use super::{pieces, placement};
 use crate::surface::OutOfMemory;
 
+/// Memory of the rows of a name in tables that exist at once, bytes, besides copies of the name: counts of its chain or
+/// of its residue name while their list grows, its number and its colour.
+const ROW_BYTES: usize = 320;
+/// Memory of a model in the set and in the list of models, bytes.
+const MODEL_BYTES: usize = 32;
+
 /// Atoms of all models of a file, in file order. All columns have the same length, except that `label_chain` and
 /// `radius` may be empty. An atom takes 62 bytes, and 4 more with a radius.
 #[derive(Debug, Clone, PartialEq)]
@@ -89,6 +95,17 @@ impl Structure {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.element.is_empty()
+    }
+
+    /// Returns an upper bound of the memory of the tables by name and model that work on the structure makes, bytes: to
+    /// select, summarize and colour atoms.
+    #[must_use]
+    pub fn table_bytes(&self) -> u64 {
+        let columns = [&self.name, &self.residue, &self.chain, &self.label_chain];
+        let of_names: usize = columns.iter().flat_map(|column| column.texts()).map(|name| ROW_BYTES + name.len()).sum();
+        let of_entities: usize = self.entities.iter().map(String::len).sum();
+        let n_models = self.model.chunk_by(|a, b| a == b).count();
+        (of_names + of_entities + MODEL_BYTES * n_models) as u64
     }
 
     /// Returns the van der Waals radius of atom `i`, Å: the radius in the file or, without one, of the element.
@@ -300,6 +317,7 @@ impl Columns {
         reading: &Reading<'_>,
     ) -> Result<Structure, StructureError> {
         let mut warnings = std::mem::take(&mut source.warnings);
+        let by_name = reading.reserve(2 * tables.bytes())?;
         warnings.extend(placement::check(&self, reading)?);
         warnings.extend(kinds::assign(&mut self, &tables, &source, reading)?);
         for (kind, _) in self.kind.iter_mut().zip(&source.radii).filter(|(_, radius)| **radius == 0.0) {
@@ -309,6 +327,8 @@ impl Columns {
             self.label_chain = Vec::new();
             tables.label_chain = Interner::default();
         }
+        // Kinds were found by tables of names.
+        drop(by_name);
         let entity = |chain_ix| source.sequence.entity_id(&tables, chain_ix).unwrap_or_default();
         let entities = (0..tables.label_chain.texts().len()).map(entity);
         reading.keep(entities.clone().map(|entity| (size_of::<String>() + entity.len()) as u64).sum())?;

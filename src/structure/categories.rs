@@ -83,6 +83,9 @@ const CONFIDENCES: usize = GROUPS[2].1;
 /// Maximum number of values of an item. The largest entries of the PDB have about ten thousand chains.
 pub(super) const MAX_VALUES: usize = 1 << 18;
 
+/// Memory of a copy of a value besides its text, bytes: its entry in a map and its allocation.
+const COPY_BYTES: u64 = 128;
+
 /// Maximum number of helices and strands that a warning names.
 const NAMED_RANGES: usize = 20;
 
@@ -217,6 +220,12 @@ impl Categories {
                  the rest are treated as unknown"
             )
         })
+    }
+
+    /// Returns an upper bound of the memory of what is made of the values, bytes: maps of entities and annotations copy
+    /// them.
+    pub(super) fn copy_bytes(&self) -> u64 {
+        self.bytes + COPY_BYTES * self.values.iter().map(Vec::len).sum::<usize>() as u64
     }
 
     /// Returns the types of entities by their ids.

@@ -105,20 +105,21 @@ impl<'s> AssemblyRules<'s> {
     /// Finds an assembly among those of a file. `names` are the names of its chains by number.
     ///
     /// # Errors
-    /// Returns [`StructureError::NotFound`] if the file has none with this id, [`StructureError::BadAssembly`] if it
-    /// has no atoms of any of its chains.
-    pub(crate) fn find(assemblies: &'s Assemblies, names: &[&str], id: &'s str) -> Result<Self, StructureError> {
+    /// Returns [`StructureError::NotFound`], [`StructureError::BadAssembly`] without atoms, and the errors of memory.
+    pub(crate) fn find(
+        assemblies: &'s Assemblies,
+        names: &[&str],
+        id: &'s str,
+        control: &Control<'_>,
+    ) -> Result<Self, StructureError> {
         let mut ids: HashMap<&str, Vec<u32>> = HashMap::new();
-        for (name, id) in names.iter().copied().zip(0..) {
-            ids.entry(name).or_default().push(id);
-        }
+        names.iter().copied().zip(0..).for_each(|(name, id)| ids.entry(name).or_default().push(id));
         let part = |generator: &'s Generator| {
-            let mut chains: Vec<u32> = generator.chains().filter_map(|name| ids.get(name)).flatten().copied().collect();
-            chains.sort_unstable();
-            chains.dedup();
-            RuleChains { generator, chains }
+            let chains = generator.chain_ids(&ids);
+            control.memory.grow(size_of::<RuleChains<'_>>() as u64 + size_of_val(&*chains) as u64)?;
+            Ok::<_, StructureError>(RuleChains { generator, chains })
         };
-        let parts: Vec<RuleChains<'s>> = assemblies.generators(id).map(part).collect();
+        let parts = assemblies.generators(id).map(part).collect::<Result<Vec<RuleChains<'s>>, _>>()?;
         if parts.is_empty() {
             let known = assemblies.list(0);
             let n = known.len();
@@ -132,11 +133,10 @@ impl<'s> AssemblyRules<'s> {
         let mut covered = vec![false; names.len()];
         parts.iter().flat_map(|part| &part.chains).for_each(|&chain| covered[chain as usize] = true);
         if !covered.contains(&true) {
-            let named: Vec<String> = parts.iter().flat_map(|part| part.generator.chains()).map(shown).collect();
-            let n = named.len();
+            let named = || parts.iter().flat_map(|part| part.generator.chains()).map(shown);
             return Err(StructureError::BadAssembly {
                 id: id.chars().take(40).collect(),
-                found: format!("chains without atoms: {}", list(named, n)),
+                found: format!("chains without atoms: {}", list(named(), named().count())),
                 expected: format!("chains of the file: {}", list(names.iter().copied().map(shown), names.len())),
             });
         }
@@ -233,9 +233,9 @@ impl<'s> Assembly<'s> {
     ///
     /// # Errors
     /// Returns the errors of [`AssemblyRules::find`].
-    pub(super) fn find(structure: &'s Structure, id: &'s str) -> Result<Self, StructureError> {
+    pub(super) fn find(structure: &'s Structure, id: &'s str, control: &Control<'_>) -> Result<Self, StructureError> {
         let column = chain_column(structure);
-        let rules = AssemblyRules::find(&structure.assemblies, &column.texts().collect::<Vec<_>>(), id)?;
+        let rules = AssemblyRules::find(&structure.assemblies, &column.texts().collect::<Vec<_>>(), id, control)?;
         Ok(Self { structure, column, rules })
     }
 

@@ -42,6 +42,11 @@ impl<'a> Decoder<'a> {
         })
     }
 
+    /// Returns the largest window of decompressed bytes that the decoder keeps.
+    pub(super) const fn window(&self) -> u64 {
+        if matches!(self, Self::Zstd(_)) { MAX_ZSTD_WINDOW } else { 0 }
+    }
+
     /// Reads at most `limit` bytes to the end of `out`. Reads less only at the end of the input.
     ///
     /// # Errors

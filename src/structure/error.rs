@@ -191,6 +191,6 @@ fn disk_space(error: &OutOfMemory) -> String {
                 "temporary files take {held} of {limit} bytes of disk space, and indexes of other tilesets are in use"
             )
         }
-        OutOfMemory::System { .. } => error.to_string(),
+        OutOfMemory::Share { .. } | OutOfMemory::System { .. } => error.to_string(),
     }
 }

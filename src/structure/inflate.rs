@@ -109,6 +109,7 @@ fn zstd(
             rest = rest.get(8..).and_then(|r| r.get(size..)).ok_or_else(|| broken("truncated frame".to_owned()))?;
             continue;
         }
+        let _window = reading.reserve(zstd_window(rest).min(MAX_ZSTD_WINDOW))?;
         let mut decoder = ruzstd::decoding::StreamingDecoder::new_with_max_window_size(rest, MAX_ZSTD_WINDOW)
             .map_err(|e| broken(e.to_string()))?;
         append(&mut decoder, &mut out, limit, reading, check, |e| broken(e.to_string()))?;
@@ -122,6 +123,22 @@ fn zstd(
         rest = decoder.into_inner();
     }
     Ok(out)
+}
+
+/// Returns the size of the window that a frame declares (RFC 8878, 3.1.1.1), bytes; 0 if its header is incomplete. A
+/// frame of a single segment has a window of its content.
+fn zstd_window(frame: &[u8]) -> u64 {
+    let Some(&flags) = frame.get(ZSTD.len()) else { return 0 };
+    let fields = &frame[ZSTD.len() + 1..];
+    if flags & 0x20 == 0 {
+        let descriptor = u64::from(fields.first().copied().unwrap_or_default());
+        let base = 1 << (10 + (descriptor >> 3));
+        return base + base / 8 * (descriptor & 7);
+    }
+    let (dictionary, size) = ([0, 1, 2, 4][usize::from(flags & 3)], 1 << (flags >> 6));
+    let content = fields.get(dictionary..).unwrap_or_default().iter().take(size);
+    let length = content.rev().fold(0, |length, byte| length << 8 | u64::from(*byte));
+    if size == 2 { length + 256 } else { length }
 }
 
 /// Bytes decompressed between two checks of the cancellation flag: a few milliseconds.

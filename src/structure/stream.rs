@@ -158,6 +158,7 @@ impl<'a> Blocks<'a> {
             tags: TagsAfterAtoms::default(),
             assemblies: Assemblies::default(),
         };
+        blocks.memory.grow(blocks.input.window())?;
         let mut size = STEP;
         loop {
             blocks.fill(size, control)?;

@@ -138,7 +138,7 @@ pub enum SurfaceError {
     /// The search for pockets would pass over more rows of grid points than allowed.
     #[error(
         "the search for pockets would pass over {rows} rows of grid points in reach of the probes, the limit is \
-         {limit}; a smaller selection, pocket_probe or smaller radii have fewer"
+         {limit}; select fewer atoms, or use smaller radii or a smaller pocket_probe"
     )]
     TooManyPocketRows {
         /// Rows of grid points of all spheres enlarged by the probes.

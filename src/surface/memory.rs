@@ -21,6 +21,19 @@ pub enum OutOfMemory {
         /// Size of the budget, bytes.
         limit: u64,
     },
+    /// Other work of the client holds more than its share of the budget, and other clients would get too little.
+    #[error(
+        "this client holds {held} bytes of memory; with {needed} more, less than a share of {limit} bytes would be left \
+         for others"
+    )]
+    Share {
+        /// Requested bytes.
+        needed: u64,
+        /// Bytes that the client holds.
+        held: u64,
+        /// Share of a client, bytes.
+        limit: u64,
+    },
     /// The work needs more than the whole budget, so it cannot succeed later either.
     #[error("the request needs at least {needed} bytes of memory at once and the limit is {limit}")]
     Limit {
@@ -161,6 +174,14 @@ impl MemoryMeter for Reservation {
 
     fn budget(&self) -> Option<[u64; 2]> {
         self.meter.budget()
+    }
+
+    fn check(&self, bytes: u64) -> Result<(), OutOfMemory> {
+        self.meter.check(bytes)
+    }
+
+    fn available(&self) -> u64 {
+        self.meter.available()
     }
 
     fn also_held(&self, bytes: u64) {

@@ -59,7 +59,8 @@ metrics! {
     JOBS_TRANSFERRED = "molmesh_jobs_transferred_total", Counter;
     /// Partitions of the shared meshes that this node wrote, computed by it or by helpers on other nodes.
     PARTITIONS = "molmesh_mesh_partitions_total", Counter, computed: "here|elsewhere";
-    /// Claims of jobs whose earlier claim expired or was returned.
+    /// Claims of jobs whose earlier claim expired or was returned. During an update it also counts jobs of other
+    /// releases, which a node returns every 5 s.
     BROKER_REDELIVERIES = "molmesh_broker_redeliveries_total", Counter;
     /// Claims that the NATS server did not answer or rejected. They are repeated.
     BROKER_CLAIM_ERRORS = "molmesh_broker_claim_errors_total", Counter;

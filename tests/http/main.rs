@@ -39,6 +39,8 @@ mod jobs_durable;
 mod lifecycle;
 mod limits;
 mod maps;
+#[cfg(target_os = "linux")]
+mod memory;
 mod namespaces;
 mod openapi;
 mod openapi_clients;

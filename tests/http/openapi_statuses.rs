@@ -310,9 +310,10 @@ fn failures(seen: &Seen) {
         seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/surface.glb?resolution=0.2"), &[], b"");
         seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/report.json?resolution=0.2"), &[], b"");
     });
-    // The request alone exceeds the first limit, and together with its connection the second one.
-    for (memory_bytes, status) in [(1_000, 422), (400_000, 503)] {
+    // The request alone exceeds the first limit, and together with other connections the second one.
+    for (memory_bytes, connections, status) in [(1_000, 0, 422), (1 << 20, 4, 503)] {
         let crowded = fake(Mode::Octahedra, |c| c.limits.memory_bytes = memory_bytes);
+        let _idle: Vec<_> = (0..connections).map(|_| connect(crowded.addr)).collect();
         for document in DOCUMENTS {
             seen.expect(status, crowded.addr, ("GET", &format!("/v1/pdb/4pti/{document}")), &[], b"");
         }
@@ -356,10 +357,11 @@ fn restarts(seen: &Seen) {
     get(&server, &structure, 422);
     get(&server, &format!("{structure}/atoms"), 422);
     assert!(server.join());
-    let tight: [(Change, u16); 2] =
-        [(|c| c.limits.memory_bytes = 1_000, 422), (|c| c.limits.memory_bytes = 400_000, 503)];
-    for (change, status) in tight {
+    let tight: [(Change, usize, u16); 2] =
+        [(|c| c.limits.memory_bytes = 1_000, 0, 422), (|c| c.limits.memory_bytes = 1 << 20, 4, 503)];
+    for (change, connections, status) in tight {
         let server = begin(change);
+        let _idle: Vec<_> = (0..connections).map(|_| connect(server.addr)).collect();
         get(&server, &structure, status);
         for document in DOCUMENTS {
             get(&server, &format!("{structure}/{document}"), status);

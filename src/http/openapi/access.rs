@@ -17,14 +17,13 @@ const BEARER: &str = "bearer";
 const API_KEY: &str = "apiKey";
 const SIGNED: &str = "signedAddress";
 
-/// Problems of an operation that requires a scope, from [`crate::http::guard::check`].
-const GUARD_PROBLEMS: &[ProblemType] = &[
+/// Problems of an operation that requires a scope.
+const KEY_PROBLEMS: &[ProblemType] = &[
     ProblemType::KeyRequired,
     ProblemType::KeyInvalid,
     ProblemType::KeyExpired,
     ProblemType::ScopeMissing,
     ProblemType::QuotaExceeded,
-    ProblemType::NotReady,
 ];
 /// Further problems of an operation that accepts signed URLs.
 const SIGNED_URL_PROBLEMS: &[ProblemType] = &[ProblemType::SignatureInvalid, ProblemType::SignatureExpired];
@@ -76,7 +75,7 @@ fn restrict(operation: &mut Operation, scope: Scope, is_get: bool) {
         SecurityRequirement::new(BEARER, scopes()),
         SecurityRequirement::new(API_KEY, scopes()),
     ];
-    let mut groups = vec![GUARD_PROBLEMS];
+    let mut groups = vec![KEY_PROBLEMS];
     if is_get {
         security.push(SecurityRequirement::new(SIGNED, nothing));
         groups.push(SIGNED_URL_PROBLEMS);

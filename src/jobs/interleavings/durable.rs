@@ -2,7 +2,6 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::time::Duration;
 
 use bytes::Bytes;
 use futures_util::FutureExt as _;
@@ -17,8 +16,8 @@ use shuttle::scheduler::RandomScheduler;
 use super::super::coalesced_job::QueuedTask;
 use super::super::queue::Queue;
 use super::super::{
-    Budget, ContentKey, EndError, Failure, JobId, JobRecord, JobSpec, JobStore, JobView, MemoryBroker, OnStart, Pool,
-    REPORT, Settings, Status, results,
+    Budget, ContentKey, EndError, Failure, JobId, JobRecord, JobSpec, JobStore, JobView, Lane, MemoryBroker, OnStart,
+    Pool, REPORT, Settings, Status, results,
 };
 use super::task;
 use crate::config::JobsConfig;

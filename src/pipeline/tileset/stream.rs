@@ -216,7 +216,7 @@ impl Tileset<Box<Structure>> {
         let BlockReader { selected, colors, spheres, head, assemblies, memory: _memory, .. } = reader;
         let atoms_in_file = selected.n_in_files();
         let assembly = match &job.selection.assembly {
-            Some(id) => Some(AssemblyRules::find(&assemblies, &selected.chain_names(), id)?),
+            Some(id) => Some(AssemblyRules::find(&assemblies, &selected.chain_names(), id, control)?),
             None => None,
         };
         let n_of_chains = selected.n_of_chains();

@@ -272,6 +272,7 @@ impl<'a> BinaryBlock<'a> {
             Ok(category.value(item, max, reading.limits).map_err(|f| f.within(category.location()))?)
         };
         let entry = value("entry", "id", 80)?;
+        reading.hold_texts(categories.copy_bytes())?;
         let (annotations, rejected) = categories.annotations();
         let mut unread = UnreadAtoms::default();
         let spheres = self.category(SPHERES).filter(|category| category.bounds(reading.limits).is_some());

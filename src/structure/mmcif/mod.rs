@@ -381,6 +381,7 @@ impl<'a> Reader<'a> {
         let categories = self.block.categories;
         let too_many = categories.warning();
         let warnings = warnings.messages(|fault| fault.locate(self.text));
+        self.reading.hold_texts(categories.copy_bytes())?;
         let (annotations, rejected) = categories.annotations();
         let counts = self.unread.counts;
         let source = SourceFields {

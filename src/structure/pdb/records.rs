@@ -85,9 +85,9 @@ impl PieceRecords {
         Ok(records)
     }
 
-    /// Returns the number of marks and of REMARK 350, HELIX and SHEET records.
+    /// Returns the number of marks, of REMARK 350, HELIX and SHEET records, and of listed residue names.
     fn n_noted(&self) -> usize {
-        self.marks.len() + self.assemblies.len() + self.secondary.len()
+        self.marks.len() + self.assemblies.len() + self.secondary.len() + self.listed.len()
     }
 
     #[inline]

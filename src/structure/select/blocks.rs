@@ -50,6 +50,8 @@ pub struct SelectedBlocks {
     altlocs: HashSet<u8>,
     /// Residues of the file with alternative locations, with the number of their block.
     alternatives: HashMap<ResidueId, usize>,
+    /// Length of the names of chains in `alternatives`, bytes.
+    alternative_names: u64,
     n_blocks: usize,
     /// Atoms that were not read of the files before, and of the current one.
     unread: Unread,
@@ -57,11 +59,11 @@ pub struct SelectedBlocks {
     first_model: Option<i32>,
     /// Memory of `alternatives`.
     memory: Reservation,
-    /// Memory of `by_chain`.
+    /// Memory of `by_chain`, `chains` and `models`.
     chain_memory: Reservation,
 }
 
-/// Memory of the counts of a chain, and of those of a residue name, bytes.
+/// Memory of the counts of a chain, and of those of a residue name, bytes, besides the names.
 const CHAIN_BYTES: u64 = 3 * (size_of::<(String, ChainCounts)>() as u64) + 16;
 const NAME_BYTES: u64 = 2 * (size_of::<((String, Kind), u64)>() as u64) + 16;
 /// Memory of the atoms of a run of a chain besides their indices, bytes.
@@ -80,6 +82,7 @@ impl SelectedBlocks {
             models: HashSet::new(),
             altlocs: HashSet::new(),
             alternatives: HashMap::new(),
+            alternative_names: 0,
             n_blocks: 0,
             unread: Unread::default(),
             unread_of_file: Unread::default(),
@@ -94,7 +97,8 @@ impl SelectedBlocks {
         let Unread { blocks, spheres } = std::mem::take(&mut self.unread_of_file);
         self.unread.blocks += blocks;
         self.unread.spheres += spheres;
-        self.memory.shrink(ALTERNATIVE_BYTES * self.alternatives.len() as u64);
+        let names = std::mem::take(&mut self.alternative_names);
+        self.memory.shrink(ALTERNATIVE_BYTES * self.alternatives.len() as u64 + names);
         self.alternatives = HashMap::new();
     }
 
@@ -140,7 +144,9 @@ impl SelectedBlocks {
             for (name, kind, n) in found.residues.named(&residues) {
                 let n_known = counts.residues.len();
                 *counts.residues.entry((name.to_owned(), kind)).or_default() += n;
-                self.chain_memory.grow(NAME_BYTES * (counts.residues.len() - n_known) as u64)?;
+                if counts.residues.len() > n_known {
+                    self.chain_memory.grow(NAME_BYTES + name.len() as u64)?;
+                }
             }
             selected.chains.resize(selected.chains.len() + found.atoms.len(), number);
             selected.atoms.extend_from_slice(&found.atoms);
@@ -184,11 +190,15 @@ impl SelectedBlocks {
         let s = &block.structure;
         for name in s.chain.texts() {
             if !self.chains.contains(name) {
+                // A message about an unknown chain lists the names.
+                self.chain_memory.grow(2 * (NAME_BYTES + name.len() as u64))?;
                 self.chains.insert(name.to_owned());
             }
         }
         self.n_blocks += 1;
+        let n_known = self.models.len();
         self.models.extend(s.model[..block.len].chunk_by(|a, b| a == b).map(|run| run[0]));
+        self.chain_memory.grow(NAME_BYTES * (self.models.len() - n_known) as u64)?;
         for i in 0..block.len {
             if s.altloc[i] == 0 || !rules.models.contains(s.model[i]) {
                 continue;
@@ -198,7 +208,9 @@ impl SelectedBlocks {
             let n_known = self.alternatives.len();
             let block_of_residue = *self.alternatives.entry(residue).or_insert(self.n_blocks);
             if self.alternatives.len() > n_known {
-                self.memory.grow(ALTERNATIVE_BYTES)?;
+                let name = s.chain.get(i).len() as u64;
+                self.alternative_names += name;
+                self.memory.grow(ALTERNATIVE_BYTES + name)?;
             }
             if block_of_residue != self.n_blocks {
                 let (chain, number) = (s.chain.get(i), s.residue_number[i]);

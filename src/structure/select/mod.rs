@@ -99,7 +99,7 @@ pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, 
 }
 
 /// Selects atoms as [`select`] does, within `limits`. Checks for cancellation every few milliseconds, and adds the
-/// memory of an assembly to the meter of `control`.
+/// memory of an assembly, and [`Structure::table_bytes`], to the meter of `control`.
 ///
 /// # Errors
 /// Returns the errors of [`select`], [`StructureError::TooManyDistances`], [`StructureError::Memory`] and
@@ -110,7 +110,8 @@ pub fn select_with(
     limits: &ReadLimits,
     control: &Control<'_>,
 ) -> Result<Selected, StructureError> {
-    let mut assembly = selection.assembly.as_deref().map(|id| Assembly::find(structure, id)).transpose()?;
+    control.memory.grow(structure.table_bytes())?;
+    let mut assembly = selection.assembly.as_deref().map(|id| Assembly::find(structure, id, control)).transpose()?;
     let rules = Rules::new(structure, selection, true, limits, control)?;
     let mut found = rules.find(structure.len(), assembly.as_ref(), control)?;
     if let Some(number) = selection.unit
@@ -243,8 +244,9 @@ impl<'a> Rules<'a> {
         let mut ranges: Vec<Range<usize>> = (0..n).step_by(ATOMS_PER_TASK).map(range).collect();
         let parts = pieces::map(&mut ranges, |range| check(control).map(|()| self.find_in(range.clone(), assembly)));
         let mut found = Found::default();
-        for part in parts {
-            let Found { atoms, left_out, residues } = part?;
+        let parts = parts.into_iter().collect::<Result<Vec<Found>, StructureError>>()?;
+        found.atoms.reserve_exact(parts.iter().map(|part| part.atoms.len()).sum());
+        for Found { atoms, left_out, residues } in parts {
             found.atoms.extend_from_slice(&atoms);
             found.left_out.add(&left_out);
             found.residues.append(residues);
