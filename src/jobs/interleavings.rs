@@ -54,9 +54,9 @@ fn workers(queue: &Arc<Queue>, runs: &Arc<AtomicUsize>) -> Vec<JoinHandle<()>> {
         let (queue, runs) = (Arc::clone(queue), Arc::clone(runs));
         thread::spawn(move || {
             while let Some(entry) = queue.pop(lane) {
-                let QueuedTask { id, task, cancel, .. } = entry;
+                let QueuedTask { id, task, cancel, on_start, .. } = entry;
                 thread::yield_now();
-                if cancel.is_cancelled() && queue.restart(id, task).is_none() {
+                if cancel.is_cancelled() && queue.restart(id, task, on_start).is_none() {
                     continue;
                 }
                 runs.fetch_add(1, Ordering::SeqCst);

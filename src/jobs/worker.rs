@@ -22,7 +22,7 @@ use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_
 /// End of a task.
 enum TaskEnd {
     Ended(Outcome),
-    /// The job was cancelled before its start.
+    /// All clients left before the start of the job.
     Dismissed,
     /// The job is queued again, in another lane.
     Restarted,
@@ -63,6 +63,10 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
     let _entered = log.enter();
     let id = task.id.clone();
     if cancel.is_cancelled() {
+        // It may have had to give its worker away before the threads of the worker were ready.
+        if shared.queue.restart(entry_id, task, on_start).is_none() {
+            return TaskEnd::Restarted;
+        }
         counter!(JOBS_FINISHED, "outcome" => "dismissed").increment(1);
         end_span(&span, id, "dismissed", None);
         return TaskEnd::Dismissed;
@@ -126,7 +130,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
         Ok(Finished { product, diagnostics, digest: task.digest, reservation })
     });
     let was_cancelled = matches!(outcome, Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }));
-    let task = if was_cancelled { shared.queue.restart(entry_id, task) } else { Some(task) };
+    let task = if was_cancelled { shared.queue.restart(entry_id, task, Vec::new()) } else { Some(task) };
     let Some(task) = task else { return TaskEnd::Restarted };
     // Frees the input before the outcome is sent, so that the receiver sees the true memory use.
     drop(task);
@@ -250,4 +254,64 @@ fn bytes_of(Product { mesh, pieces, picture, .. }: &Product) -> u64 {
 
 fn ms(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use super::*;
+    use crate::jobs::rank::{DEFAULT_URGENCY, Rank};
+    use crate::jobs::{Budget, Client, Input, Pool};
+    use crate::pipeline::params;
+    use crate::store::{Digest, Namespace};
+    use crate::surface::ReferenceBackend;
+    use crate::telemetry::SpanParent;
+
+    fn task(resolution: &str) -> Task {
+        let file = Bytes::from_static(include_bytes!("../../samples/4pti.pdb"));
+        Task {
+            digest: Digest::of(&file),
+            input: Input::File(file),
+            namespace: Namespace::default(),
+            strict: false,
+            job: params::parse([("resolution", resolution)]).unwrap().job,
+            rank: Rank { client: Client::named("a"), batch: false, urgency: DEFAULT_URGENCY },
+            reservation: None,
+            parent: SpanParent::default(),
+            id: None,
+            partitions: None,
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_job_that_gives_its_worker_away_before_it_begins_runs_later() {
+        let settings = Settings::of_test(1, Budget::new(1 << 30));
+        let pool = Pool::without_workers(settings, Arc::new(ReferenceBackend), "a test".to_owned());
+        let (shared, started) = (&pool.shared, Arc::new(AtomicBool::new(false)));
+        let start = {
+            let started = Arc::clone(&started);
+            OnStart::new(async move { started.store(true, Ordering::SeqCst) })
+        };
+        let mut ticket = pool.submit(task("2"), Duration::from_mins(1), Some(start)).unwrap();
+        let entry = shared.queue.pop(Lane::Short).unwrap();
+        let other = pool.submit(task("3"), Duration::from_mins(1), None).unwrap();
+        // The system starts the threads of the worker late.
+        while !entry.cancel.is_cancelled() {
+            std::thread::sleep(Duration::from_millis(5));
+            shared.queue.make_room();
+        }
+        let run = |entry| tokio::task::block_in_place(|| super::run(shared, entry));
+        assert!(matches!(run(entry), TaskEnd::Restarted) && !started.load(Ordering::SeqCst));
+        let entry = shared.queue.pop(Lane::Long).unwrap();
+        let id = entry.id;
+        let TaskEnd::Ended(outcome) = run(entry) else { panic!("the job did not run") };
+        assert!(started.load(Ordering::SeqCst));
+        shared.queue.done(id, Some(outcome), None);
+        assert!(ticket.wait().await.is_ok());
+        // Control: nobody waits for a job that was cancelled because its client left.
+        let entry = shared.queue.pop(Lane::Short).unwrap();
+        drop(other);
+        assert!(matches!(run(entry), TaskEnd::Dismissed));
+    }
 }

@@ -22,7 +22,10 @@ export async function browser(...flags) {
   return chromium.launch({ executablePath: MOLMESH_CHROMIUM, args, timeout: TIMEOUT_MS });
 }
 
-/** Opens a page in a new context. It records its requests (`requests`) and its errors and warnings (`errors`). */
+/**
+ * Opens a page in a new context. It records its requests (`requests`), its errors and warnings (`errors`), and the
+ * responses that report a problem (`problems`).
+ */
 export async function open(browser, options = {}) {
   const { url = SERVICE_URL + "/", before, ...rest } = options;
   const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, reducedMotion: "reduce", acceptDownloads: true, ...rest });
@@ -30,9 +33,13 @@ export async function open(browser, options = {}) {
   const page = await context.newPage();
   page.errors = [];
   page.requests = [];
+  page.problems = [];
   page.on("console", (message) => ["error", "warning"].includes(message.type()) && page.errors.push(`${message.type()}: ${message.text()}`));
   page.on("pageerror", (error) => page.errors.push(`exception: ${error.message}`));
   page.on("request", (request) => page.requests.push(`${request.method()} ${request.url()}`));
+  page.on("response", async (response) => {
+    if (response.status() >= 400) page.problems.push(`${response.url()}: ${await response.text().catch(String)}`);
+  });
   await page.addInitScript(() => {
     window.measures = [];
     new PerformanceObserver((list) => window.measures.push(...list.getEntries().map((e) => ({ ms: e.duration, ...e.detail })))).observe({ type: "measure", buffered: true });
@@ -91,7 +98,7 @@ export async function reportValue(page, row) {
 /** Fails if a page has errors that match no pattern of `allowed`, or sent a request to another server. */
 export function assertClean(page, ...allowed) {
   const errors = page.errors.filter((line) => !allowed.some((pattern) => pattern.test(line)));
-  assert.deepEqual(errors, [], "the page has errors");
+  assert.deepEqual(errors, [], ["the page has errors", ...page.problems].join("\n"));
   const foreign = page.requests.filter((line) => !line.includes(` ${new URL(page.url()).origin}/`) && !line.includes(" blob:"));
   assert.deepEqual(foreign, [], "the page sent requests to other servers");
 }

@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use super::Queue;
-use crate::jobs::Task;
 use crate::jobs::rank::Lane;
+use crate::jobs::{OnStart, Task};
 use crate::surface::CancelToken;
 
 /// Time after which a job of the short lane gives its worker to one that waits.
@@ -30,7 +30,8 @@ impl Queue {
     }
 
     /// Queues a job again, in the long lane, if [`Self::make_room`] has cancelled it. Otherwise returns its task.
-    pub(in crate::jobs) fn restart(&self, id: u64, task: Task) -> Option<Task> {
+    /// `on_start` is the work that its worker has not waited for yet.
+    pub(in crate::jobs) fn restart(&self, id: u64, task: Task, on_start: Vec<OnStart>) -> Option<Task> {
         let mut state = self.lock();
         let Some(at) = state.find(id) else { return Some(task) };
         let job = &mut state.jobs[at];
@@ -38,6 +39,7 @@ impl Queue {
             return Some(task);
         }
         job.task = Some(task);
+        job.on_start.extend(on_start);
         (job.begun, job.cancel) = (None, CancelToken::default());
         job.progress.restart();
         let worker = state.enqueue(at, Lane::Long);
