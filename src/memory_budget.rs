@@ -58,7 +58,7 @@ impl Budget {
     /// reservations, and a client whose requests hold more than the fraction `share`, besides one of them, leaves as
     /// much to others.
     #[must_use]
-    pub fn of_service(limit: u64, per_request: u64, share: f64) -> Self {
+    pub fn for_service(limit: u64, per_request: u64, share: f64) -> Self {
         Self { per_request, shares: MemoryShares::new(share), ..Self::new(limit) }
     }
 
@@ -235,7 +235,7 @@ impl MemoryReservation {
     /// [`OutOfMemory::Limit`] if the work alone exceeds the budget, else [`OutOfMemory::Share`] or
     /// [`OutOfMemory::Budget`].
     pub fn grow(&self, bytes: u64) -> Result<(), OutOfMemory> {
-        let own = self.of_work();
+        let own = self.work_bytes();
         self.budget.take(bytes, own).map_err(|error| self.check(bytes).err().unwrap_or(error))?;
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
         self.budget.publish_held(bytes, 1.0);
@@ -264,7 +264,7 @@ impl MemoryReservation {
     }
 
     /// Returns the bytes that the work of this reservation holds, here and elsewhere.
-    fn of_work(&self) -> u64 {
+    fn work_bytes(&self) -> u64 {
         self.bytes().saturating_add(self.elsewhere.load(Ordering::Relaxed))
     }
 
@@ -332,15 +332,15 @@ impl MemoryMeter for MemoryReservation {
     }
 
     fn budget(&self) -> Option<[u64; 2]> {
-        Some([self.budget.limit, self.of_work()])
+        Some([self.budget.limit, self.work_bytes()])
     }
 
     fn check(&self, bytes: u64) -> Result<(), OutOfMemory> {
-        self.budget.check_alone(self.of_work().saturating_add(bytes))
+        self.budget.check_alone(self.work_bytes().saturating_add(bytes))
     }
 
     fn available(&self) -> u64 {
-        self.budget.limit.saturating_sub(self.of_work().saturating_add(self.budget.per_request))
+        self.budget.limit.saturating_sub(self.work_bytes().saturating_add(self.budget.per_request))
     }
 
     fn also_held(&self, bytes: u64) {
@@ -448,7 +448,7 @@ mod tests {
 
     #[test]
     fn work_counts_with_what_each_request_needs_besides() {
-        let budget = Budget::of_service(100, 30, 1.0);
+        let budget = Budget::for_service(100, 30, 1.0);
         let (connection, own) = (budget.buffers(30), budget.reservation());
         own.grow(70).unwrap();
         // The service is idle otherwise, so the request would never fit.
@@ -465,7 +465,7 @@ mod tests {
 
     #[test]
     fn a_client_with_more_than_its_share_leaves_one_to_others() {
-        let budget = Budget::of_service(100, 0, 0.25);
+        let budget = Budget::for_service(100, 0, 0.25);
         let [first, second] = [1, 2].map(|client| budget.for_client(client));
         // One request may take everything.
         let (alone, input) = (first.reservation(), first.reservation());
@@ -502,7 +502,7 @@ mod tests {
 
     #[test]
     fn a_part_has_shares_of_its_own() {
-        let budget = Budget::of_service(100, 0, 0.25);
+        let budget = Budget::for_service(100, 0, 0.25);
         let part = budget.part(40);
         let first = part.for_client(1);
         let requests = [(); 4].map(|()| first.reservation());

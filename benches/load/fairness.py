@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Measures the latency of a small mesh while other clients send heavy work.
+"""Measures the latency of a small mesh and a small document while other clients send heavy work.
 
-Prints p50 and p99 of new meshes of 4PTI, one after another, alone, beside two asynchronous jobs, beside the three
-heaviest requests, and beside both. Each client has its own loopback address, so Linux only.
+Prints p50 and p99 of new meshes of 4PTI and of its list of atoms, one after another, alone, beside two asynchronous
+jobs, beside the three heaviest requests (a mesh and two documents), and beside both. Each client has its own loopback
+address, so Linux only.
 """
 
 import argparse
 import gzip
-import http.client
 import itertools
 import statistics
 import tempfile
@@ -15,6 +15,7 @@ import threading
 import time
 import urllib.parse
 
+import mixed
 from mixed import UNAVAILABLE, Server
 
 SMALL, BATCH, HEAVY = "127.0.0.2", "127.0.0.3", "127.0.0.4"
@@ -22,15 +23,9 @@ PORT = 18400
 REPORT = "pockets=true&pocket_probe=5&resolution=3"
 
 
-def fetch(client, method, path, body=None, headers=None, timeout=600):
+def fetch(client, method, path, body=None, headers=None):
     """Sends a request from the address of a client. Returns status, headers and body."""
-    connection = http.client.HTTPConnection("127.0.0.1", PORT, timeout=timeout, source_address=(client, 0))
-    try:
-        connection.request(method, path, body, {"connection": "close", **(headers or {})})
-        response = connection.getresponse()
-        return response.status, response.headers, response.read()
-    finally:
-        connection.close()
+    return mixed.fetch(PORT, method, path, body, headers, timeout=600, client=client)
 
 
 def lattice(side):
@@ -74,19 +69,31 @@ def batch(body):
     return run
 
 
-def small_meshes(sample, seconds):
-    """Sends new small meshes for some seconds. Returns their times, s."""
-    times, end = [], time.perf_counter() + seconds
-    for number in itertools.count():
-        if time.perf_counter() > end:
-            return times
-        body = f"REMARK 900 {time.time_ns()} {number}\n".encode() + sample
-        begin = time.perf_counter()
-        status, _, text = fetch(SMALL, "POST", "/v1/meshes?resolution=1", body)
-        times.append(time.perf_counter() - begin)
-        if status != 200:
-            print(f"status {status}: {text[:200]}")
+def timed(times, *request):
+    """Sends a request of the small client, and adds its time in ms to a list."""
+    begin = time.perf_counter()
+    status, _, text = fetch(SMALL, *request)
+    times.append(1e3 * (time.perf_counter() - begin))
+    if status != 200:
+        print(f"status {status}: {text[:200]}")
+
+
+def small_requests(sample, seconds):
+    """Sends new small meshes and small documents for some seconds. Returns the times of both in ms."""
+    meshes, documents, end = [], [], time.perf_counter() + seconds
+    atoms = fetch(SMALL, "POST", "/v1/structures", sample)[1]["location"] + "/atoms?positions=true"
+    while time.perf_counter() < end:
+        timed(meshes, "POST", "/v1/meshes?resolution=1", f"REMARK 900 {time.time_ns()}\n".encode() + sample)
+        timed(documents, "GET", atoms)
         time.sleep(0.02)
+    return meshes, documents
+
+
+def figures(times):
+    """Returns p50, p99 and the maximum as columns."""
+    times = sorted(times)
+    p99 = times[min(len(times) - 1, len(times) * 99 // 100)]
+    return f"{statistics.median(times):>7.1f} {p99:>7.1f} {times[-1]:>7.1f}"
 
 
 def main():
@@ -118,15 +125,14 @@ def main():
         # Different files, so that the two jobs do not share their work.
         jobs = [batch(body), batch(lattice(args.side - 1))]
         requests = [get(path) for path in heavy]
-        print(f"{'beside':<24} {'meshes':>7} {'p50, ms':>8} {'p99, ms':>8} {'max, ms':>8}")
-        small_meshes(sample, 3)
+        print(f"{'times in ms':<24} {'mesh: p50, p99, max':>23}   {'document: p50, p99, max':>23}")
+        small_requests(sample, 3)
         for name, load in (("nothing", []), ("two jobs", jobs), ("three requests", requests), ("both", jobs + requests)):
             running = Load(load)
             time.sleep(3 if load else 0)
-            times = sorted(1e3 * t for t in small_meshes(sample, args.seconds))
+            meshes, documents = small_requests(sample, args.seconds)
             running.stop()
-            p99 = times[min(len(times) - 1, len(times) * 99 // 100)]
-            print(f"{name:<24} {len(times):>7} {statistics.median(times):>8.1f} {p99:>8.1f} {times[-1]:>8.1f}", flush=True)
+            print(f"{name:<24} {figures(meshes)}   {figures(documents)}", flush=True)
             if load:
                 # The requests of this load end before the next one.
                 server.stop()

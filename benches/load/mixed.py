@@ -59,9 +59,9 @@ class Server:
         return sum(float(line.rpartition(" ")[2]) for line in text.splitlines() if re.match(rf"{name}[ {{]", line))
 
 
-def fetch(port, method, path, body=None, headers=None, timeout=60):
-    """Sends a request on a new connection. Returns status, headers and body."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=timeout)
+def fetch(port, method, path, body=None, headers=None, timeout=60, client="127.0.0.1"):
+    """Sends a request from the address of a client on a new connection. Returns status, headers and body."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=timeout, source_address=(client, 0))
     try:
         connection.request(method, path, body, {"connection": "close", **(headers or {})})
         response = connection.getresponse()

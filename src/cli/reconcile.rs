@@ -37,7 +37,7 @@ pub(super) fn run(args: &ReconcileArgs) -> Result<(), CliError> {
 
 /// Formats the result as text.
 fn text(found: &Reconciled, dry_run: bool) -> String {
-    let Reconciled { unfinished, dispatched, of_other_releases, unreadable, lost, error: _ } = found;
+    let Reconciled { unfinished, dispatched, other_release_count, unreadable, lost, error: _ } = found;
     let mut page = Page::new(Style::stdout(), "jobs", &format!("{unfinished} unfinished on record"));
     let state = if dry_run { "not dispatched (--dry-run)".to_owned() } else { format!("{dispatched} dispatched") };
     page.row("lost", &format!("{} without a message in the broker, {state}", lost.len()));
@@ -47,8 +47,8 @@ fn text(found: &Reconciled, dry_run: bool) -> String {
     if lost.len() > MAX_LISTED {
         page.row("", &format!("and {} others", lost.len() - MAX_LISTED));
     }
-    if *of_other_releases > 0 {
-        page.row("left", &format!("{of_other_releases} jobs to the releases that wrote their records"));
+    if *other_release_count > 0 {
+        page.row("left", &format!("{other_release_count} jobs to the releases that wrote their records"));
     }
     if *unreadable > 0 {
         page.row(

@@ -59,7 +59,7 @@ const LAST_RESPONSES: Duration = Duration::from_secs(1);
 
 /// Creates the memory budget of the service. A request has at least the buffers of its connection.
 pub(super) fn budget(limit: u64, client_share: f64) -> Budget {
-    Budget::of_service(limit, CONNECTION_BYTES, client_share)
+    Budget::for_service(limit, CONNECTION_BYTES, client_share)
 }
 
 /// Serves `router` on `listener` until the drain. Then open requests may finish until [`Stop::Now`], and the responses

@@ -224,7 +224,7 @@ impl From<StoreError> for Problem {
             StoreError::Quarantined { .. } => {
                 Self::new(ProblemType::RecordUnreadable, "the record of the job is damaged and in quarantine")
             }
-            StoreError::OtherRelease { .. } => Self::of_other_release(),
+            StoreError::OtherRelease { .. } => Self::other_release(),
             StoreError::Damaged { digest } => Self::new(
                 ProblemType::NoSuchStructure,
                 format!("the stored structure `{digest}` was damaged and has been removed: upload it again"),

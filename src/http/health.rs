@@ -140,7 +140,7 @@ async fn records(app: &Shared) -> ReadinessCheck {
     if !app.job_store.has_read_records() {
         return ReadinessCheck::new("records", Err("the records of jobs are being read".to_owned()));
     }
-    let found = match (app.store.quarantined().await, app.job_store.jobs_of_other_releases()) {
+    let found = match (app.store.quarantined().await, app.job_store.other_release_count()) {
         (Ok(0), 0) => Ok("no job record is in quarantine".to_owned()),
         (Ok(0), n) => Ok(format!("no job record is in quarantine; jobs left to the releases that wrote them: {n}")),
         (Ok(count), _) => Err(format!("{count} job records cannot be read and are in quarantine; see the log")),

@@ -238,7 +238,7 @@ pub(super) async fn result(State(app): State<Shared>, caller: Caller, id: JobId)
                 Problem::new(ProblemType::ResultGone, "the result was removed after some time; request the mesh again")
             };
             let key = ContentKey::parse(key, caller.namespace).map_err(|_bad| gone())?;
-            let format = record.format.parse().map_err(|_unknown| Problem::of_other_release())?;
+            let format = record.format.parse().map_err(|_unknown| Problem::other_release())?;
             if !is_stored(&app.store, format, &key).await? {
                 return Err(gone());
             }

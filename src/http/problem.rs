@@ -48,7 +48,7 @@ impl Problem {
     }
 
     /// Creates the problem of a job whose record this release cannot read.
-    pub(super) fn of_other_release() -> Self {
+    pub(super) fn other_release() -> Self {
         let detail = "another release of the service wrote the record of the job, and this one cannot read it";
         Self::new(ProblemType::OtherRelease, detail).retry_after(Duration::from_secs(5))
     }

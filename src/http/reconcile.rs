@@ -22,7 +22,7 @@ pub struct Reconciled {
     /// Number of lost jobs that were dispatched; 0 for a dry run.
     pub dispatched: usize,
     /// Number of unfinished jobs that are left to the releases that wrote their records.
-    pub of_other_releases: usize,
+    pub other_release_count: usize,
     /// Number of damaged records. The next node that reads them moves them into quarantine.
     pub unreadable: usize,
     /// Unfinished jobs that the broker did not have, oldest first.
@@ -59,10 +59,10 @@ pub async fn reconcile(config: &Config, url: &str, dry_run: bool, limit: Duratio
         }
         tokio::time::sleep(CHECK).await;
     }
-    let UnfinishedJobs { records, of_other_releases, unreadable } = unfinished_jobs(&store).await?;
+    let UnfinishedJobs { records, other_release_count, unreadable } = unfinished_jobs(&store).await?;
     let unfinished = records.len();
     let mut result =
-        Reconciled { unfinished, dispatched: 0, of_other_releases, unreadable, lost: Vec::new(), error: None };
+        Reconciled { unfinished, dispatched: 0, other_release_count, unreadable, lost: Vec::new(), error: None };
     for record in records {
         if let Err(error) = result.examine(&record, &broker, dry_run).await {
             result.error = Some(error.to_string());

@@ -205,7 +205,7 @@ fn validators(digest: &Digest, variant: &str) -> Result<[(HeaderName, HeaderValu
 /// Returns the `ETag` of a document of a structure: a digest of its file, the parameters `variant`, the versions of the
 /// algorithms and the system, because the last digits of numbers depend on mathematical libraries.
 pub(super) fn etag(digest: &Digest, variant: &str) -> Result<HeaderValue, Problem> {
-    let versions = algorithm_versions::of_document();
+    let versions = algorithm_versions::document_versions();
     let digest = Digest::of(format!("molmesh {versions} {OS} {ARCH}\n{digest}&{variant}").as_bytes());
     HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)
 }

@@ -105,7 +105,7 @@ impl JobStore {
                 claim.done().await;
                 return None;
             }
-            Err(OfOtherRelease) => {
+            Err(FromOtherRelease) => {
                 claim.release(OTHER_RELEASE);
                 return None;
             }
@@ -145,15 +145,15 @@ impl JobStore {
     }
 
     /// Reads the record of a claimed job; `None` if no such job is open. Waits while the store fails.
-    async fn record_of(&self, claim: &Claim) -> Result<Option<JobRecord>, OfOtherRelease> {
+    async fn record_of(&self, claim: &Claim) -> Result<Option<JobRecord>, FromOtherRelease> {
         let mut pause = retry::FIRST_PAUSE;
         loop {
             match self.0.read(&claim.id).await {
                 Ok(Some(record)) if record.status.is_final() => return Ok(None),
-                Ok(Some(record)) if record.request().is_err() => return Err(OfOtherRelease),
+                Ok(Some(record)) if record.request().is_err() => return Err(FromOtherRelease),
                 Ok(record) => return Ok(record),
                 Err(StoreError::Quarantined { .. }) => return Ok(None),
-                Err(StoreError::OtherRelease { .. }) => return Err(OfOtherRelease),
+                Err(StoreError::OtherRelease { .. }) => return Err(FromOtherRelease),
                 Err(error) => tracing::warn!(job_id = %claim.id, %error, "a claimed job waits for the store"),
             }
             sleep(pause).await;
@@ -217,7 +217,7 @@ impl JobStore {
 
     /// Reads the record of a job that may have changed in another process. Returns true if the job has ended or is
     /// gone.
-    async fn refresh(&self, job: &Arc<DurableJob>) -> bool {
+    pub(super) async fn refresh(&self, job: &Arc<DurableJob>) -> bool {
         let id = job.id();
         match self.0.read(&id).await {
             Ok(Some(record)) if record.status.is_final() => {
@@ -257,7 +257,7 @@ impl JobStore {
 }
 
 /// Error of a claimed job whose record another release wrote, or whose parameters this release does not know.
-struct OfOtherRelease;
+struct FromOtherRelease;
 
 /// Returns true if only the task that follows a job uses it.
 fn is_unused(job: &DurableJob) -> bool {

@@ -17,7 +17,7 @@ impl ContentKey {
     /// Returns the key of a result. `arithmetic` names the arithmetic of the backend, followed by that of a picture's
     /// renderer. Releases with the same algorithms give the same keys.
     pub(crate) fn new(input: &Digest, job: &Job, format: Format, arithmetic: &str, namespace: Namespace) -> Self {
-        let (canonical, versions) = (params::canonical(job), algorithm_versions::of_file(job));
+        let (canonical, versions) = (params::canonical(job), algorithm_versions::file_versions(job));
         let text = format!("molmesh {versions}\n{arithmetic}\n{}\n{canonical}\n{input}\n", format.name());
         Self { digest: Digest::of(text.as_bytes()), namespace }
     }

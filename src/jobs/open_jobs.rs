@@ -58,7 +58,7 @@ impl OpenJobs {
     }
 
     /// Returns the number of jobs of other releases.
-    pub(super) fn of_other_releases(&self) -> usize {
+    pub(super) fn other_release_count(&self) -> usize {
         self.lock().jobs.values().filter(|job| job.dispatch.is_none()).count()
     }
 

@@ -5,6 +5,8 @@
 
 mod estimates;
 mod lanes;
+#[cfg(test)]
+mod tests;
 
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};

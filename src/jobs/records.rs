@@ -210,7 +210,7 @@ pub(crate) struct UnfinishedJobs {
     /// Records that this release can read, in the order of their acceptance.
     pub(crate) records: Vec<JobRecord>,
     /// Number of records of other releases.
-    pub(crate) of_other_releases: usize,
+    pub(crate) other_release_count: usize,
     /// Number of damaged records, which the next node that reads them moves into quarantine.
     pub(crate) unreadable: usize,
 }
@@ -223,7 +223,7 @@ pub(crate) async fn unfinished_jobs(store: &Store) -> Result<UnfinishedJobs, Sto
     while let Some(read) = reads.next().await {
         match read?.map(|stored| JobRecord::from_bytes(&stored.bytes)) {
             Some(Ok(record)) if record.request().is_ok() => jobs.records.push(record),
-            Some(Ok(_) | Err(BadRecord::OtherRelease(_))) => jobs.of_other_releases += 1,
+            Some(Ok(_) | Err(BadRecord::OtherRelease(_))) => jobs.other_release_count += 1,
             Some(Err(BadRecord::Damaged(_))) => jobs.unreadable += 1,
             // The job has ended meanwhile.
             None => {}
@@ -344,7 +344,7 @@ impl JobStore {
     }
 
     /// Returns the number of unfinished jobs of other releases, which this process leaves alone.
-    pub(crate) fn jobs_of_other_releases(&self) -> usize {
-        self.0.open.of_other_releases()
+    pub(crate) fn other_release_count(&self) -> usize {
+        self.0.open.other_release_count()
     }
 }

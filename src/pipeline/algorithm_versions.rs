@@ -42,13 +42,13 @@ const fn surface(kind: SurfaceKind) -> u32 {
 }
 
 /// Names the versions that determine the file of a job.
-pub(crate) fn of_file(job: &Job) -> String {
+pub(crate) fn file_versions(job: &Job) -> String {
     let picture = job.picture.map(|_| format!(" pictures {PICTURES}")).unwrap_or_default();
     let surface = surface(job.params.surface);
     format!("structures {STRUCTURES} surface {surface} meshes {MESHES}{picture}")
 }
 
 /// Names the versions that determine the documents of a structure.
-pub(crate) fn of_document() -> String {
+pub(crate) fn document_versions() -> String {
     format!("structures {STRUCTURES} documents {DOCUMENTS}")
 }

@@ -12,8 +12,9 @@ use super::cut::Cut;
 use super::finest_fit::with_finest_fit;
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::job_backend::{Division, of_job};
+use super::work::{self, WorkCounts};
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
-use super::{parts, work};
+use super::{parts, pockets};
 use crate::formats::Compress;
 use crate::structure::{AtomPart, Structure, StructureError};
 use crate::surface::cpu::{LATTICE_BYTES, check_work, scan};
@@ -38,6 +39,8 @@ pub struct Estimate {
     pub resolution: f64,
     /// Cells of a dense grid.
     pub box_cells: u64,
+    /// Rows of grid points that the search for pockets would pass over; 0 without a search.
+    pub pocket_rows: u64,
     /// Estimate of the grid and the mesh, or the error that the job would return.
     pub mesh: Result<MeshEstimate, SurfaceError>,
 }
@@ -109,7 +112,10 @@ pub fn estimate<S: Deref<Target = Structure>>(
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
     let simplifies = job.simplify.map_or(Ok(()), |wanted| check_error(wanted.error, params.resolution));
-    let mesh = simplifies.and_then(|()| refused.map_or_else(|| plan.mesh(&lattices, choice, control), Err));
+    let pocket_rows = pockets::rows(job, &spheres, &limits.surface, control);
+    // In the order of the job, the search for pockets comes first.
+    let checked = pocket_rows.clone().map(drop).and(simplifies).and(refused.map_or(Ok(()), Err));
+    let mesh = checked.and_then(|()| plan.mesh(&lattices, choice, control));
     drop(lattices);
     let mesh = match (mesh, job.spacing) {
         (Ok(mesh), Spacing::MaxTriangles(limit)) => Ok(mesh.at_most(limit, &params)),
@@ -128,15 +134,17 @@ pub fn estimate<S: Deref<Target = Structure>>(
     };
     let (atoms, atoms_in_file) = (selected.atoms.len() as u64, structure.n_in_file());
     let distinct_atoms = selected.n_distinct as u64;
-    Ok(Estimate { atoms, distinct_atoms, atoms_in_file, resolution, box_cells, mesh })
+    let pocket_rows = pocket_rows.unwrap_or(0);
+    Ok(Estimate { atoms, distinct_atoms, atoms_in_file, resolution, box_cells, pocket_rows, mesh })
 }
 
 impl Estimate {
     /// Returns the work of the job in atoms at 0.5 Å, if the job would be accepted.
     #[must_use]
     pub fn work(&self, job: &Job) -> Option<f64> {
-        let MeshEstimate { grid_points, pairs, whole_vertices, .. } = self.mesh.as_ref().ok()?;
-        Some(work::counted_work(job, self.atoms_in_file, [*pairs, *grid_points, *whole_vertices]))
+        let Self { atoms_in_file: atoms, pocket_rows, .. } = *self;
+        let MeshEstimate { grid_points, pairs, whole_vertices: vertices, .. } = *self.mesh.as_ref().ok()?;
+        Some(work::counted_work(job, &WorkCounts { atoms, pairs, grid_points, vertices, pocket_rows }))
     }
 }
 
@@ -368,6 +376,40 @@ mod tests {
             let ratio = mesh.triangles as f64 / report.triangles as f64;
             assert!((0.8..1.25).contains(&ratio), "{resolution}: {ratio}");
         }
+    }
+
+    #[test]
+    fn searches_for_pockets_are_limited_and_cost_their_rows() {
+        let backend = CpuBackend::new(None).unwrap();
+        let choice = Choice { backend: &backend, reason: "" };
+        let of = |pairs: &[(&str, &str)], surface: SurfaceLimits| {
+            let (job, limits) = (params::parse(pairs.iter().copied()).unwrap().job, JobLimits::default());
+            let (limits, control) = (JobLimits { surface, ..limits }, Control::default());
+            let done = run(SAMPLE, &job, &limits, &choice, &control, &(), None).map(drop);
+            let estimate = estimate(read, &job, &limits, &choice, &control).unwrap();
+            match (done, &estimate.mesh) {
+                (Ok(()), Ok(_)) => Ok((estimate.pocket_rows, estimate.work(&job).unwrap())),
+                (Err(JobError::Surface(error)), Err(refused)) if error == *refused => Err(error),
+                (done, mesh) => panic!("{done:?} and {mesh:?}"),
+            }
+        };
+        let coarse = ("resolution", "3");
+        let search = |probe, surface| of(&[("pockets", "true"), ("pocket_probe", probe), coarse], surface);
+        let (no_rows, without) = of(&[coarse], SurfaceLimits::default()).unwrap();
+        assert_eq!(no_rows, 0);
+        let mut rows = 0;
+        for probe in ["4", "20"] {
+            let (counted, with) = search(probe, SurfaceLimits::default()).unwrap();
+            assert!(counted > rows && ((with - without) / (0.005 * counted as f64) - 1.0).abs() < 1e-9, "{counted}");
+            rows = counted;
+        }
+        // Five rows count as a pair. The mesh has fewer pairs.
+        let most = |max_candidates| search("20", SurfaceLimits { max_candidates, ..SurfaceLimits::default() });
+        let least = rows.div_ceil(5);
+        assert!(most(least).is_ok());
+        assert_eq!(most(least - 1), Err(SurfaceError::TooManyPocketRows { rows, limit: 5 * (least - 1) }));
+        let small = SurfaceLimits { max_grid_points: 50_000, ..SurfaceLimits::default() };
+        assert!(matches!(search("4", small), Err(SurfaceError::PocketGridTooLarge { .. })));
     }
 
     #[test]

@@ -6,7 +6,7 @@ use serde::Serialize;
 use super::clock::StageClock;
 use super::{Job, LiningResidue, Report};
 use crate::structure::{AtomPart, ReadLimits, Selected, Split, Structure, StructureError};
-use crate::surface::pockets::find;
+use crate::surface::pockets::{count_rows, find};
 use crate::surface::{Control, DEFAULT_POCKET_PROBE, Mesh, Pocket, Pockets, Spheres, SurfaceError, SurfaceLimits};
 
 /// Pocket: a region outside the molecule that the probe can enter and a large probe cannot. It does not depend on the
@@ -66,6 +66,19 @@ pub(super) fn search(
 ) -> Result<Option<Pockets>, SurfaceError> {
     let search = |probe| clock.time("pockets", || find(spheres, &job.params, probe, limits, control));
     job.pocket_probe().map(search).transpose()
+}
+
+/// Counts the rows of grid points that [`search`] passes over; 0 if the job needs no pockets.
+///
+/// # Errors
+/// Returns the errors of [`count_rows`].
+pub(super) fn rows(
+    job: &Job,
+    spheres: &Spheres,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<u64, SurfaceError> {
+    job.pocket_probe().map_or(Ok(0), |probe| count_rows(spheres, &job.params, probe, limits, control))
 }
 
 /// Returns the index of the pocket that each vertex lines; `None` for vertices that line no pocket.

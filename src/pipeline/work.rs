@@ -119,23 +119,40 @@ pub(crate) fn suits_gpu(atoms: f64, job: &Job) -> bool {
 
 /// Work of a job besides its atoms and its grid, in atoms: about 1 ms.
 const OVERHEAD: f64 = 250.0;
-/// Work per pair of an atom and a brick, per grid point and per vertex, in atoms.
-const COUNTED: [f64; 3] = [0.019, 0.00023, 0.0032];
+/// Work per pair of an atom and a brick, in atoms.
+const PAIR: f64 = 0.019;
+/// Work per grid point, in atoms.
+const GRID_POINT: f64 = 0.00023;
+/// Work per vertex, in atoms.
+const VERTEX: f64 = 0.0032;
 
-/// Estimates the work of a job on a file of `atoms` atoms whose numbers of pairs, grid points and vertices are known,
-/// in atoms at 0.5 Å.
-pub(super) fn counted_work(job: &Job, atoms: u64, counts: [u64; 3]) -> f64 {
-    let mesh: f64 = counts.iter().zip(COUNTED).map(|(n, work)| *n as f64 * work).sum();
+/// Counts that tell the work of a job.
+pub(super) struct WorkCounts {
+    /// Atoms of the file.
+    pub(super) atoms: u64,
+    /// Pairs of an atom and a brick.
+    pub(super) pairs: u64,
+    pub(super) grid_points: u64,
+    pub(super) vertices: u64,
+    /// Rows of grid points that the search for pockets passes over.
+    pub(super) pocket_rows: u64,
+}
+
+/// Estimates the work of a job with known counts, in atoms at 0.5 Å.
+pub(super) fn counted_work(job: &Job, counts: &WorkCounts) -> f64 {
+    let [atoms, pairs, grid_points, vertices, pocket_rows] =
+        [counts.atoms, counts.pairs, counts.grid_points, counts.vertices, counts.pocket_rows].map(|n| n as f64);
+    let mesh = PAIR * pairs + GRID_POINT * grid_points + VERTEX * vertices;
     let tries = if job.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
     OVERHEAD
-        + 0.3 * atoms as f64
+        + 0.3 * atoms
         + tries * relative_time(job.params.surface) * mesh
-        + exact(job, atoms as f64)
-        + cavities(job, atoms as f64)
-        + pockets(job, atoms as f64)
-        + depth(job, counts[2] as f64)
-        + simplification(job, counts[2] as f64)
-        + improvement(job, counts[2] as f64)
+        + exact(job, atoms)
+        + cavities(job, atoms)
+        + POCKET_ROW * pocket_rows
+        + depth(job, vertices)
+        + simplification(job, vertices)
+        + improvement(job, vertices)
         + drawing(job)
 }
 
@@ -210,6 +227,13 @@ mod tests {
     use super::*;
     use crate::pipeline::params;
 
+    const fn counts(atoms: u64, pairs: u64, grid_points: u64, vertices: u64) -> WorkCounts {
+        WorkCounts { atoms, pairs, grid_points, vertices, pocket_rows: 0 }
+    }
+
+    /// Counts of 1AON at 0.5 Å.
+    const LARGE_PROTEIN: WorkCounts = counts(58_870, 1_300_000, 20_000_000, 2_100_000);
+
     fn estimate_work(input: &[u8], job: &Job) -> f64 {
         super::estimate_work(estimate_atoms(input), job)
     }
@@ -267,7 +291,7 @@ mod tests {
     #[test]
     fn depths_cost_more() {
         let at = |color: &str| params::parse([("color", color), ("resolution", "0.5")]).unwrap().job;
-        let counted = |color: &str| counted_work(&at(color), 58_870, [1_300_000, 20_000_000, 2_100_000]);
+        let counted = |color: &str| counted_work(&at(color), &LARGE_PROTEIN);
         let guessed = |color: &str| super::estimate_work(58_870.0, &at(color));
         let [counted, guessed] = [counted("depth") - counted("radial"), guessed("depth") - guessed("radial")];
         assert!(counted > 1e5 && (0.9..1.1).contains(&(counted / guessed)), "{counted} {guessed}");
@@ -276,7 +300,7 @@ mod tests {
     #[test]
     fn simplifications_and_improvements_cost_more() {
         let at = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().job;
-        let counted = |pairs: &[(&str, &str)]| counted_work(&at(pairs), 58_870, [1_300_000, 20_000_000, 2_100_000]);
+        let counted = |pairs: &[(&str, &str)]| counted_work(&at(pairs), &LARGE_PROTEIN);
         let guessed = |pairs: &[(&str, &str)]| super::estimate_work(58_870.0, &at(pairs));
         let without = &[("resolution", "0.5")];
         for (parameter, least) in [(("simplify", "0.1"), 1e6), (("quality", "high"), 5e6)] {
@@ -289,11 +313,10 @@ mod tests {
     #[test]
     fn counted_work_agrees_for_proteins_and_not_for_a_sphere_on_a_fine_grid() {
         let at = |resolution: &str| params::parse([("resolution", resolution)]).unwrap().job;
-        // 1AON at 0.5 Å.
-        let protein = counted_work(&at("0.5"), 58_870, [1_300_000, 20_000_000, 2_100_000]);
+        let protein = counted_work(&at("0.5"), &LARGE_PROTEIN);
         assert!((0.5..2.0).contains(&(protein / super::estimate_work(58_870.0, &at("0.5")))), "{protein}");
         // An atom at 0.02 Å takes tens of milliseconds, 4 µs for each unit.
-        let sphere = counted_work(&at("0.02"), 1, [70_000, 36_000_000, 140_000]);
+        let sphere = counted_work(&at("0.02"), &counts(1, 70_000, 36_000_000, 140_000));
         assert!((2e3..2e4).contains(&sphere), "{sphere}");
         assert!(super::estimate_work(1.0, &at("0.02")) > 100.0 * sphere, "the control");
     }

@@ -103,6 +103,8 @@ struct Grid {
     largest: f64,
     size: [usize; 3],
     origin: [i32; 3],
+    /// Number of rows within reach of the probes.
+    rows: u64,
 }
 
 /// Finds the pockets of `spheres` with the radii and the probe of `params` and a large probe of the radius
@@ -132,20 +134,9 @@ fn find_at(
 ) -> Result<Pockets, SurfaceError> {
     let memory = Arc::new(Reservation::new(&control.memory));
     let control = &Control { memory: Arc::<Reservation>::clone(&memory), observer: &(), ..control.clone() };
-    let params = SurfaceParams {
-        surface: SurfaceKind::Sas,
-        resolution: spacing,
-        atom_ids: false,
-        quantize: None,
-        ..params.clone()
-    };
+    let params = params_at(spacing, params);
     let [small, large] = [params.probe, pocket_probe].map(|probe| probe / spacing);
-    let grid = {
-        let working = Arc::new(Reservation::new(&control.memory));
-        let control = &Control { memory: Arc::<Reservation>::clone(&working), ..control.clone() };
-        control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
-        Grid::new(&Lattice::new(spheres, &params, control)?, small, large, limits)?
-    };
+    let grid = Grid::around(spheres, &params, pocket_probe, limits, control)?;
     control.memory.grow(BALL_BYTES * grid.balls.len() as u64)?;
     let outside = grid.reached(small, control)?;
     let mut pocket = grid.reached(large, control)?.dilated(&Element::cube(REMOVED / spacing), control)?;
@@ -174,6 +165,27 @@ fn find_at(
     Ok(Pockets { list, regions, spacing, origin, _memory: memory })
 }
 
+/// Counts the rows of grid points that [`find`] passes over, without a search.
+///
+/// # Errors
+/// Those errors of [`find`] that end it before the search.
+pub(crate) fn count_rows(
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    pocket_probe: f64,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<u64, SurfaceError> {
+    let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+    control.memory.grow(BALL_BYTES * spheres.len() as u64)?;
+    Ok(Grid::around(spheres, &params_at(SPACING, params), pocket_probe, limits, control)?.rows)
+}
+
+/// Returns the parameters of the surface that the centre of the small probe reaches, on a grid of this spacing, Å.
+fn params_at(spacing: f64, params: &SurfaceParams) -> SurfaceParams {
+    SurfaceParams { surface: SurfaceKind::Sas, resolution: spacing, atom_ids: false, quantize: None, ..params.clone() }
+}
+
 /// Returns the number of rows of grid points that the search passes over for a sphere of this radius. All lengths are
 /// in spacings.
 pub(crate) fn rows_in_reach(radius: f64, small: f64, large: f64) -> f64 {
@@ -182,6 +194,20 @@ pub(crate) fn rows_in_reach(radius: f64, small: f64, large: f64) -> f64 {
 }
 
 impl Grid {
+    /// Returns the grid around spheres, with the spacing and the small probe of `params`.
+    fn around(
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        pocket_probe: f64,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<Self, SurfaceError> {
+        let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+        control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
+        let [small, large] = [params.probe, pocket_probe].map(|probe| probe / params.resolution);
+        Self::new(&Lattice::new(spheres, params, control)?, small, large, limits)
+    }
+
     /// Returns the grid around atoms whose radii include the small probe. The large probe fits between the atoms and
     /// the sides of the grid. Probes are in spacings.
     fn new(lattice: &Lattice, small: f64, large: f64, limits: &SurfaceLimits) -> Result<Self, SurfaceError> {
@@ -211,7 +237,7 @@ impl Grid {
             return Err(SurfaceError::TooManyPocketRows { rows, limit });
         }
         balls.par_sort_by(|a, b| a.centre[2].total_cmp(&b.centre[2]));
-        Ok(Self { balls, largest, size, origin: low.map(to_i32) })
+        Ok(Self { balls, largest, size, origin: low.map(to_i32), rows })
     }
 
     /// Returns the points that a probe covers that does not overlap the spheres.

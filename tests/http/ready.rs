@@ -2,6 +2,7 @@
 
 use crate::http_support;
 
+use std::path::PathBuf;
 use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,6 +17,7 @@ use molmesh::surface::{
     Backend, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 use serde_json::Value;
+use tempfile::TempDir;
 
 /// Record of a later release.
 const RECORD: &str = r#"{"version":2}"#;
@@ -28,6 +30,21 @@ fn failing(document: &Value) -> Vec<String> {
     assert_eq!(names, ["accepting", "devices", "store", "broker", "records"]);
     assert!(checks.iter().all(|check| !check["detail"].as_str().unwrap().is_empty()), "{document}");
     checks.iter().filter(|check| check["ok"] == false).map(|check| check["name"].as_str().unwrap().to_owned()).collect()
+}
+
+/// Returns the file of the record of a job in a data folder.
+fn record_file(folder: &TempDir, id: &str) -> PathBuf {
+    folder.path().join(format!("store/jobs/{id}.json"))
+}
+
+/// Creates a data folder whose jobs have this record.
+fn data_folder(ids: &[&str], record: &str) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::create_dir_all(folder.path().join("store/jobs")).unwrap();
+    for id in ids {
+        std::fs::write(record_file(&folder, id), record).unwrap();
+    }
+    folder
 }
 
 /// Makes the store unavailable or available. Replaces its folder by a file, because permissions do not apply to root.
@@ -70,13 +87,8 @@ fn failure_and_recovery_of_the_store_are_detected() {
 
 #[test]
 fn unreadable_job_records_make_the_service_unready_until_they_are_deleted() {
-    let folder = tempfile::tempdir().unwrap();
-    let jobs = folder.path().join("store/jobs");
-    std::fs::create_dir_all(&jobs).unwrap();
     let ids = ["0", "1"].map(|digit| digit.repeat(32));
-    for id in &ids {
-        std::fs::write(jobs.join(format!("{id}.json")), "{").unwrap();
-    }
+    let folder = data_folder(&[&ids[0], &ids[1]], "{");
     let server = start_cold(Fake::new(Mode::Octahedra), |c| folder.path().clone_into(&mut c.server.data_dir));
     let in_quarantine =
         |document: &Value| document["checks"][4]["detail"].as_str().unwrap().starts_with("2 job records");
@@ -99,12 +111,9 @@ fn unreadable_job_records_make_the_service_unready_until_they_are_deleted() {
 
 #[test]
 fn jobs_of_another_release_do_not_affect_readiness() {
-    let folder = tempfile::tempdir().unwrap();
-    let jobs = folder.path().join("store/jobs");
-    std::fs::create_dir_all(&jobs).unwrap();
     let id = "0".repeat(32);
-    let file = jobs.join(format!("{id}.json"));
-    std::fs::write(&file, RECORD).unwrap();
+    let folder = data_folder(&[&id], RECORD);
+    let file = record_file(&folder, &id);
     let server = start(Fake::new(Mode::Octahedra), |c| folder.path().clone_into(&mut c.server.data_dir));
     let document = server.get("/readyz").json();
     assert!(document.to_string().contains("jobs left to the releases that wrote them: 1"), "{document}");
@@ -119,12 +128,9 @@ fn jobs_of_another_release_do_not_affect_readiness() {
 
 #[test]
 fn a_service_that_reads_its_records_is_alive_and_not_ready() {
-    let folder = tempfile::tempdir().unwrap();
-    let jobs = folder.path().join("store/jobs");
-    std::fs::create_dir_all(&jobs).unwrap();
     let id = "0".repeat(32);
-    let file = jobs.join(format!("{id}.json"));
-    std::fs::write(&file, RECORD).unwrap();
+    let folder = data_folder(&[&id], RECORD);
+    let file = record_file(&folder, &id);
     // A pipe cannot be opened until it is written.
     let replace_by_pipe = || {
         std::fs::remove_file(&file).unwrap();

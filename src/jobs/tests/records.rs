@@ -128,7 +128,7 @@ async fn jobs_of_other_releases_are_left_alone() {
     assert_eq!(fixture.jobs.reconcile().await.unwrap(), 1, "only the own job is dispatched");
     assert!(fixture.jobs.has_read_records());
     ended(&mut fixture.watch(&own).await).await;
-    assert_eq!((fixture.jobs.jobs_of_other_releases(), fixture.store.quarantined().await.unwrap()), (2, 0));
+    assert_eq!((fixture.jobs.other_release_count(), fixture.store.quarantined().await.unwrap()), (2, 0));
     for (id, bytes) in &stored {
         assert_eq!(&fixture.store.get(&name(id)).await.unwrap().unwrap().bytes, bytes, "the record is unchanged");
     }
@@ -139,7 +139,7 @@ async fn jobs_of_other_releases_are_left_alone() {
     let view = fixture.jobs.view(&later_parameter, space).await.unwrap().unwrap();
     assert_eq!((view.record.status, view.record.attempts), (Status::Accepted, 0));
     let dismissed = fixture.jobs.dismiss(&later_parameter, space).await.unwrap().unwrap();
-    assert_eq!((dismissed.record.status, fixture.jobs.jobs_of_other_releases()), (Status::Dismissed, 1));
+    assert_eq!((dismissed.record.status, fixture.jobs.other_release_count()), (Status::Dismissed, 1));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
