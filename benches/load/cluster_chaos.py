@@ -31,7 +31,6 @@ def main():
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=random.randrange(1 << 32))
     parser.add_argument("--clients", type=int, default=4, help="clients of each node")
-    parser.add_argument("--partition-ms", type=int, default=1, help="by default, nodes share meshes of some milliseconds")
     parser.add_argument("--port", type=int, default=18600)
     args = parser.parse_args()
     print(f"seed {args.seed}", flush=True)
@@ -40,7 +39,7 @@ def main():
     # A job may be started at every kill, so attempts are not limited. No record of an ended job is removed.
     cluster = Cluster(
         args.binary, args.nats, args.port, ["api", "api", "worker", "worker"],
-        ["broker.lease_ms=2000", f"broker.partition_ms={args.partition_ms}", "jobs.attempts=100000", "jobs.records_per_client=100000"],
+        ["broker.lease_ms=2000", "jobs.attempts=100000", "jobs.records_per_client=100000"],
     )
     cluster.start()
     apis = enumerate(cluster.of_role("api"))

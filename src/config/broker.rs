@@ -1,7 +1,6 @@
 //! Settings of the broker, which dispatches asynchronous jobs.
 
 use std::path::PathBuf;
-use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -40,9 +39,6 @@ pub struct BrokerConfig {
     /// ms. Default 1,000: a transfer also writes input, record and result. Nodes with the role `api` transfer all such
     /// requests.
     pub transfer_wait_ms: u64,
-    /// Target time of one partition of a mesh that the workers of a cluster share, ms. Default 2,000: each helper reads
-    /// the structure again, and each partition passes the store. 0: one worker computes each mesh.
-    pub partition_ms: u64,
     /// Number of asynchronous jobs that wait for a worker; with `url`, of jobs that wait or run. Default 10,000: at 0.1
     /// s per job on two workers the last one waits for eight minutes. Further requests for jobs get a 503 with an
     /// estimated `Retry-After`.
@@ -60,16 +56,8 @@ impl Default for BrokerConfig {
             replicas: 1,
             lease_ms: 30_000,
             transfer_wait_ms: 1000,
-            partition_ms: 2000,
             queue: 10_000,
         }
-    }
-}
-
-impl BrokerConfig {
-    /// Returns the expected time of the partitions of a mesh; `None` if meshes are not divided.
-    pub(crate) fn partition_time(&self) -> Option<Duration> {
-        (self.partition_ms > 0).then(|| Duration::from_millis(self.partition_ms))
     }
 }
 

@@ -237,7 +237,6 @@ impl MeshRequest {
             reservation: Some(Arc::clone(&loaded.reservation)),
             parent: SpanParent::current(),
             id: None,
-            partitions: None,
         }
     }
 
@@ -274,7 +273,6 @@ impl MeshRequest {
             parameters: pairs.clone(),
             format: *format,
             idempotency_key: self.preferences.idempotency_key.clone(),
-            helper: None,
         })
     }
 

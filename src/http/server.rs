@@ -253,8 +253,7 @@ async fn open_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Sec
         Some(url) => Arc::new(connect_broker(config, url, &secret, true).await?),
         None => Arc::new(MemoryBroker::new(config.broker.queue)),
     };
-    let partition_time = config.broker.url.as_ref().and(config.broker.partition_time());
-    let broker = (broker, config.broker.queue, partition_time);
+    let broker = (broker, config.broker.queue);
     Ok(JobStore::new(store.clone(), Arc::clone(pool), broker, jobs, output_bytes, secret, describe))
 }
 

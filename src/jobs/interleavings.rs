@@ -35,7 +35,6 @@ fn task(number: u8, batch: bool) -> Task {
         reservation: None,
         parent: SpanParent::default(),
         id: None,
-        partitions: None,
     }
 }
 

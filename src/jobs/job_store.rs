@@ -6,7 +6,7 @@
 //! contents, so computing one twice is harmless; a crash costs time and never loses a job.
 
 use std::borrow::Cow;
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -18,7 +18,7 @@ use tracing::Instrument as _;
 use super::broker::{Broker, Dispatch};
 use super::durable_job::DurableJob;
 use super::open_jobs::OpenJobs;
-use super::record::{Helper, JobId, JobRecord, Requester, Status, now_ms};
+use super::record::{JobId, JobRecord, Requester, Status, now_ms};
 use super::records::existing;
 use super::retry::retry;
 use super::runner::Runner;
@@ -54,8 +54,6 @@ pub(crate) struct JobSpec {
     pub(crate) format: Format,
     /// Idempotency key of the request.
     pub(crate) idempotency_key: Option<String>,
-    /// Helper of another job, if the task is one.
-    pub(crate) helper: Option<Helper>,
 }
 
 /// State of a job that its watchers see.
@@ -87,8 +85,6 @@ pub(super) struct JobStoreState {
     pub(super) broker: Arc<dyn Broker>,
     /// Maximum number of queued jobs.
     pub(super) max_queued: usize,
-    /// Expected time of the partitions into which workers divide a mesh; `None` if they do not.
-    pub(super) partition_time: Option<Duration>,
     pub(super) config: JobsConfig,
     /// Maximum size of a result, bytes.
     pub(super) output_bytes: u64,
@@ -107,8 +103,6 @@ pub(super) struct JobStoreState {
     pub(super) slots: Arc<Semaphore>,
     /// Results that are being stored: jobs that shared work store its result once.
     pub(super) saves: SingleFlight<ContentKey, Result<(), SaveError>>,
-    /// Meshes whose partitions this process computes.
-    pub(super) shared_meshes: Mutex<HashSet<ContentKey>>,
     /// Claims and runners of jobs.
     pub(super) runs: Runs,
 }
@@ -164,7 +158,7 @@ impl JobStore {
     pub(crate) fn new(
         store: Store,
         pool: Arc<Pool>,
-        (broker, max_queued, partition_time): (Arc<dyn Broker>, usize, Option<Duration>),
+        (broker, max_queued): (Arc<dyn Broker>, usize),
         config: JobsConfig,
         output_bytes: u64,
         secret: Secret,
@@ -176,7 +170,6 @@ impl JobStore {
             pool,
             broker,
             max_queued,
-            partition_time,
             config,
             output_bytes,
             describe,
@@ -187,7 +180,6 @@ impl JobStore {
             writes: Semaphore::new(CONCURRENT_WRITES),
             slots,
             saves: SingleFlight::default(),
-            shared_meshes: Mutex::default(),
             runs: Runs::default(),
         }))
     }
@@ -199,9 +191,7 @@ impl JobStore {
         let (client, namespace) = (spec.task.rank.client.0, spec.task.namespace);
         let id = match &spec.idempotency_key {
             Some(key) => JobId::from_key(&inner.secret, namespace, client, key),
-            // Helpers neither displace the records of the client nor count towards its limit.
-            None => JobId::random(&inner.secret, if spec.helper.is_some() { !client } else { client })
-                .map_err(AcceptError::Random)?,
+            None => JobId::random(&inner.secret, client).map_err(AcceptError::Random)?,
         };
         let record = JobRecord {
             id: id.clone(),
@@ -210,7 +200,6 @@ impl JobStore {
             map: spec.map.as_ref().map(|(digest, _)| digest.to_string()),
             parameters: spec.parameters,
             format: spec.format.name().to_owned(),
-            helper: spec.helper,
             client,
             urgency: spec.task.rank.urgency,
             suits_gpu: suits_gpu(spec.task.input.atoms(), &spec.task.job),

@@ -22,17 +22,6 @@ impl ContentKey {
         Self { digest: Digest::of(text.as_bytes()), namespace }
     }
 
-    /// Returns the key of the results of one of `count` partitions of the mesh. Only the same release can read them.
-    pub(super) fn of_partition(&self, index: u32, count: u32) -> Self {
-        let version = env!("CARGO_PKG_VERSION");
-        Self { digest: Digest::of(format!("{self}\n{version}\n{index}/{count}\n").as_bytes()), ..*self }
-    }
-
-    /// Returns the identity of the work whose result has this key.
-    pub(super) fn work(&self) -> Digest {
-        Digest::of(format!("{}\n{self}\n", self.namespace).as_bytes())
-    }
-
     /// Parses the name of a result in a namespace.
     pub(crate) fn parse(text: &str, namespace: Namespace) -> Result<Self, BadDigest> {
         Ok(Self { digest: text.parse()?, namespace })

@@ -22,7 +22,6 @@ mod kept;
 mod key;
 mod open_jobs;
 mod owned_job;
-mod partitions;
 mod pool;
 mod queue;
 mod rank;
@@ -62,7 +61,6 @@ use std::sync::Arc;
 use crate::pipeline::{Job, Product};
 use crate::store::{Digest, Namespace};
 use crate::structure::strict_validator::Diagnostic;
-use crate::surface::PartitionSource;
 use crate::telemetry::SpanParent;
 
 /// Work for the pool.
@@ -86,16 +84,6 @@ pub(crate) struct Task {
     pub(crate) parent: SpanParent,
     /// Id of the durable job; `None` for an interactive request.
     pub(crate) id: Option<JobId>,
-    /// Partitions of the mesh that other workers may compute; `None` if this process computes all of it.
-    pub(crate) partitions: Option<Arc<dyn PartitionSource>>,
-}
-
-impl Task {
-    /// Returns true if the time that the task takes tells how long others take. The first tile prepares the tileset,
-    /// others have no surface; helpers compute partitions only.
-    fn is_typical(&self) -> bool {
-        self.job.tile.is_none() && self.job.helper.is_none()
-    }
 }
 
 /// Result of a job.

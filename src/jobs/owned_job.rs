@@ -13,14 +13,13 @@ pub(crate) struct OwnedJob {
     jobs: JobStore,
     id: JobId,
     namespace: Namespace,
-    runtime: Handle,
 }
 
 impl OwnedJob {
-    /// Owns an accepted job from now on. Uses the current runtime.
+    /// Owns an accepted job from now on.
     pub(crate) fn new(jobs: JobStore, view: &JobView) -> Self {
         let (id, namespace) = (view.record.id.clone(), view.record.namespace);
-        Self { jobs, id, namespace, runtime: Handle::current() }
+        Self { jobs, id, namespace }
     }
 
     /// Watches the state of the job; `None` if its record was lost.
@@ -42,7 +41,7 @@ impl Drop for OwnedJob {
                 tracing::debug!(job_id = %id, %error, "the record of a job that its owner has left expires later");
             }
         };
-        self.runtime.spawn(end.in_current_span());
+        Handle::current().spawn(end.in_current_span());
     }
 }
 

@@ -136,9 +136,6 @@ pub(crate) struct JobRecord {
     pub(crate) parameters: Vec<(String, String)>,
     /// Mesh format, as a file name extension.
     pub(crate) format: String,
-    /// Helper of another job, which computes partitions of its mesh.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) helper: Option<Helper>,
     /// Number of the client, for fair queueing after a restart.
     pub(crate) client: u64,
     /// Urgency among the jobs of the client.
@@ -166,18 +163,6 @@ pub(crate) struct JobRecord {
     /// Request that created the job.
     #[serde(default)]
     pub(crate) requester: Requester,
-}
-
-/// Helper of a job: another worker, which computes partitions of its mesh.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct Helper {
-    /// Number of the helper, from 0.
-    pub(crate) number: u32,
-    /// Number of partitions.
-    pub(crate) partitions: u32,
-    /// Key of the mesh, which follows from the algorithms and the arithmetic of the worker that joins the partitions.
-    pub(crate) mesh: String,
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde calls")]
@@ -292,7 +277,6 @@ impl JobRecord {
         let format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
         params::set_format(&mut request.job, format).map_err(|e| e.to_string())?;
         request.job.map = self.map.clone().map(MapFile::not_loaded);
-        request.job.helper = self.helper.as_ref().map(|helper| helper.number);
         Ok((request, format))
     }
 
@@ -355,7 +339,6 @@ mod tests {
             map: None,
             parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect(),
             format: "glb".to_owned(),
-            helper: None,
             client: u64::MAX,
             urgency: 3,
             suits_gpu: false,

@@ -264,7 +264,6 @@ impl JobStore {
             reservation: None,
             parent: record.requester.parent(&self.0.pool.settings().tracer),
             id: Some(record.id.clone()),
-            partitions: None,
         };
         Ok((task, format))
     }

@@ -29,8 +29,6 @@ const TICK: Duration = Duration::from_millis(100);
 const PAUSE: Duration = Duration::from_millis(500);
 /// Time after which a job whose work another node does is claimed again.
 const LOCKED_DELAY: Duration = Duration::from_millis(500);
-/// Pause before the end of a helper that this node cannot use.
-const SURPLUS_PAUSE: Duration = Duration::from_millis(250);
 /// Upper limit of the pause after an attempt that lacked memory. Each attempt repeats the work.
 const MAX_MEMORY_PAUSE: Duration = Duration::from_mins(1);
 
@@ -275,17 +273,8 @@ async fn join_or_load(
     if record.attempts >= jobs.0.config.attempts {
         return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
     }
-    if let Some(end) = jobs.needless_helper(record, format).await {
-        return Err(Attempt::Ended(Ok(end)));
-    }
-    if let Some(helper) = record.helper.as_ref().filter(|helper| !jobs.can_help(helper, &task, format)) {
-        // Otherwise this node would claim all helpers before others claim any.
-        sleep(SURPLUS_PAUSE).await;
-        return Err(Attempt::Ended(Ok(jobs.end_of_helper(helper, format, record.namespace).map_err(lost)?)));
-    }
     match jobs.load_input(&mut task).await {
         Ok(()) => {
-            task.partitions = jobs.partitions_of(record, &task, format);
             let ticket = pool.submit(task, jobs.0.allowed(), on_start).map_err(refused)?;
             Ok(Some((ticket, Some(lock))))
         }
@@ -311,9 +300,6 @@ async fn save(jobs: &JobStore, record: &JobRecord, finished: Arc<Finished>) -> R
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
     let failed = |error| EndError::Save { error, resolution };
     let pin = jobs.0.store.pin(&key.name(format.name()).map_err(|error| failed(error.into()))?);
-    if let Some(helper) = &record.helper {
-        return jobs.end_of_helper(helper, format, record.namespace).map_err(lost);
-    }
     let start = || {
         let (store, finished, limit) = (jobs.0.store.clone(), Arc::clone(&finished), jobs.0.output_bytes);
         async move { results::save(&store, finished, format, &key, limit).await.map(drop) }

@@ -61,7 +61,7 @@ impl Fixture {
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
         let broker = MemoryBroker::new(1000);
-        let dispatch = (Arc::new(broker.clone()) as _, 1000, None);
+        let dispatch = (Arc::new(broker.clone()) as _, 1000);
         let jobs = JobStore::new(store.clone(), pool, dispatch, config, 1 << 30, [0; 32], describe);
         jobs.start_claiming();
         Self { faults, store, jobs, broker, dir }
@@ -80,8 +80,7 @@ impl Fixture {
     async fn accept_from(&self, client: &str) -> Result<JobView, AcceptError> {
         let parameters = vec![("resolution".to_owned(), "2".to_owned())];
         let (task, file) = (task(client, "2"), Bytes::from_static(SAMPLE));
-        let spec =
-            JobSpec { task, file, map: None, parameters, format: Format::Stl, idempotency_key: None, helper: None };
+        let spec = JobSpec { task, file, map: None, parameters, format: Format::Stl, idempotency_key: None };
         self.jobs.accept(spec, None).await
     }
 
@@ -100,7 +99,6 @@ impl Fixture {
             map: None,
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),
-            helper: None,
             client: 1,
             urgency: DEFAULT_URGENCY,
             suits_gpu: false,
@@ -146,7 +144,6 @@ fn task(client: &str, resolution: &str) -> Task {
         reservation: None,
         parent: SpanParent::default(),
         id: None,
-        partitions: None,
     }
 }
 
@@ -230,7 +227,7 @@ async fn a_result_that_is_never_stored_is_computed_for_every_attempt() {
     fixture.jobs = JobStore::new(
         fixture.store.clone(),
         Arc::clone(&fixture.jobs.0.pool),
-        (Arc::new(MemoryBroker::new(8)), 8, None),
+        (Arc::new(MemoryBroker::new(8)), 8),
         fixture.jobs.0.config.clone(),
         100,
         [0; 32],

@@ -31,12 +31,9 @@ enum TaskEnd {
 /// Runs the jobs of a lane until the queue is closed and the lane is empty.
 pub(super) fn work(shared: &WorkerContext, lane: Lane) {
     while let Some(entry) = shared.queue.pop(lane) {
-        let (id, client, is_typical) = (entry.id, entry.task.rank.client, entry.task.is_typical());
-        let partitions = entry.task.partitions.clone();
+        let (id, client, is_tile) = (entry.id, entry.task.rank.client, entry.task.job.tile.is_some());
         let start = Instant::now();
         let end = shared.threads.run(lane, || run(shared, entry));
-        // Helpers have computed a part of a divided mesh.
-        let is_typical = is_typical && !partitions.is_some_and(|partitions| partitions.is_divided());
         let outcome = match end {
             TaskEnd::Ended(outcome) => Some(outcome),
             TaskEnd::Dismissed => None,
@@ -46,12 +43,13 @@ pub(super) fn work(shared: &WorkerContext, lane: Lane) {
             meter(client, start.elapsed());
         }
         shared.publish_devices();
-        // Successful jobs count in the duration estimate, and those that were cancelled, such as at a deadline.
+        // Successful jobs count in the duration estimate, and those that were cancelled, such as at a deadline. The
+        // time of a tile says little about other jobs: the first one prepares the tileset, and others have no surface.
         let counts = matches!(
             outcome,
             Some(Ok(_) | Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }))
         );
-        let time = (counts && is_typical).then(|| start.elapsed());
+        let time = (counts && !is_tile).then(|| start.elapsed());
         shared.queue.done(id, outcome, time);
     }
 }
@@ -84,7 +82,6 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
         let control = Control {
             cancel: cancel.clone(),
             memory: Arc::<MemoryReservation>::clone(&reservation),
-            partitions: task.partitions.clone(),
             ..Control::default()
         };
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };

@@ -17,7 +17,6 @@ mod estimate;
 mod file;
 mod finest_fit;
 mod fit;
-mod helper;
 mod host_cores;
 mod instances;
 pub mod integer;
@@ -51,8 +50,6 @@ pub use draw::draw;
 pub use error::JobError;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::{File, Product};
-#[cfg(feature = "server")]
-pub(crate) use helper::is_divisible;
 pub use instances::{AssemblyReport, InstancesReport};
 pub use left_out::{KindCount, LeftOutReport, ResidueCount};
 pub use limits::JobLimits;
@@ -64,9 +61,9 @@ pub use report::{PictureReport, Quantization, Report, file_arithmetic};
 pub use shapes::TriangleReport;
 pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
-pub use work::{BYTES_PER_ATOM, estimate_atoms, estimate_work, mesh_work};
 #[cfg(feature = "server")]
-pub(crate) use work::{suits_gpu, surface_work};
+pub(crate) use work::suits_gpu;
+pub use work::{BYTES_PER_ATOM, estimate_atoms, estimate_work, mesh_work};
 
 use crate::formats::tileset::TileAddress;
 use crate::formats::{Compress, GlbSink, Normals, Packing, Step, Storage, Units};
@@ -106,8 +103,6 @@ pub struct Job {
     pub quality: TriangleQuality,
     /// Tile to mesh instead of the whole structure.
     pub tile: Option<TileAddress>,
-    /// Number of a helper, which computes partitions of the mesh for another process; `None` for the mesh itself.
-    pub helper: Option<u32>,
     /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
@@ -257,9 +252,6 @@ fn run_whole<S: Deref<Target = Structure>>(
 ) -> Result<Product, JobError> {
     let clock = StageClock::new(progress);
     let loaded = load(read, job, &limits.read, &clock, &Control { observer: &clock, ..control.clone() })?;
-    if job.helper.is_some() {
-        return helper::run(loaded, job, limits, choice.reason, control, clock);
-    }
     run_loaded(loaded, job, limits, choice, control, clock, progress, sink)
 }
 

@@ -2,8 +2,6 @@
 
 use super::Job;
 use super::color::{Scheme, VertexProperty};
-#[cfg(feature = "server")]
-use crate::surface::SurfaceParams;
 use crate::surface::pockets::{SPACING, rows_in_reach};
 use crate::surface::{SurfaceKind, TriangleQuality};
 
@@ -97,12 +95,6 @@ pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
         + drawing(job)
 }
 
-/// Estimates the work of the mesh of this number of spheres, in atoms at 0.5 Å.
-#[cfg(feature = "server")]
-pub(crate) fn surface_work(spheres: f64, params: &SurfaceParams) -> f64 {
-    relative_time(params.surface) * mesh_work(spheres, params.resolution)
-}
-
 /// Minimum work of a surface that a GPU should compute, in atoms at 0.5 Å: about 40 ms on two cores. A GPU needs some
 /// milliseconds for any job.
 #[cfg(feature = "server")]
@@ -114,7 +106,7 @@ const MIN_GPU_WORK: f64 = 10_000.0;
 pub(crate) fn suits_gpu(atoms: f64, job: &Job) -> bool {
     let resolution = job.spacing.expected(&job.params, atoms);
     let surface = relative_time(job.params.surface) * mesh_work(atoms, resolution);
-    job.tile.is_none() && job.helper.is_none() && surface >= MIN_GPU_WORK && 2.0 * surface >= estimate_work(atoms, job)
+    job.tile.is_none() && surface >= MIN_GPU_WORK && 2.0 * surface >= estimate_work(atoms, job)
 }
 
 /// Work of a job besides its atoms and its grid, in atoms: about 1 ms.

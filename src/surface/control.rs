@@ -6,7 +6,6 @@ use std::time::Instant;
 
 use super::error::SurfaceError;
 use super::memory::{MemoryMeter, OutOfMemory, Reservation};
-use super::partitions::PartitionSource;
 
 /// Stages of a meshing run, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -116,13 +115,11 @@ pub struct Control<'a> {
     pub observer: &'a dyn Observer,
     /// Receives memory before it is allocated. The result of a run stays added; the owner of the meter subtracts it.
     pub memory: Arc<dyn MemoryMeter>,
-    /// Partitions of the first mesh that the CPU backend computes; `None` if this process computes all of it.
-    pub partitions: Option<Arc<dyn PartitionSource>>,
 }
 
 impl Default for Control<'_> {
     fn default() -> Self {
-        Self { cancel: CancelToken::default(), deadline: None, observer: &(), memory: Arc::new(()), partitions: None }
+        Self { cancel: CancelToken::default(), deadline: None, observer: &(), memory: Arc::new(()) }
     }
 }
 

@@ -57,8 +57,6 @@ metrics! {
     BROKER_UP = "molmesh_broker_up", Gauge;
     /// Synchronous requests whose meshes other nodes computed.
     JOBS_TRANSFERRED = "molmesh_jobs_transferred_total", Counter;
-    /// Partitions of the shared meshes that this node wrote, computed by it or by helpers on other nodes.
-    PARTITIONS = "molmesh_mesh_partitions_total", Counter, computed: "here|elsewhere";
     /// Claims of jobs whose earlier claim expired or was returned. During an update it also counts jobs of other
     /// releases, which a node returns every 5 s.
     BROKER_REDELIVERIES = "molmesh_broker_redeliveries_total", Counter;

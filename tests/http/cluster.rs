@@ -36,12 +36,6 @@ impl Cluster {
         node
     }
 
-    /// Returns the number of partitions that helpers have stored.
-    fn partitions(&self) -> usize {
-        let files = std::fs::read_dir(self.folder.path().join("store/results")).into_iter().flatten();
-        files.filter(|file| file.as_ref().unwrap().path().extension().is_some_and(|end| end == "partition")).count()
-    }
-
     /// Returns a command with the configuration of a node.
     fn command(&self, role: &str) -> Command {
         let mut program = Command::new(env!("CARGO_BIN_EXE_molmesh"));
@@ -166,41 +160,6 @@ fn a_job_of_a_killed_worker_runs_again_on_another_one() {
         assert!(time < LEASE + Duration::from_secs(5), "{time:?}");
         assert_eq!(send(api.addr, "DELETE", &job, &[], b"").status, 200);
         kill_all([api, second]);
-    }
-}
-
-#[test]
-fn a_mesh_that_workers_share_survives_the_loss_of_any_of_them() {
-    let path = "/v1/meshes?format=stl&resolution=0.1&surface=vdw";
-    for program in nats::programs() {
-        let shared = |cluster: &Cluster, name: &str, role: &str, partition_ms: &str| {
-            let mut command = cluster.command(role);
-            command.env("MOLMESH__BROKER__PARTITION_MS", partition_ms);
-            let node = Process::spawn(command, &cluster.folder.path().join(name));
-            wait_for("the node to be ready", || get(node.addr, "/readyz").status == 200);
-            node
-        };
-        let alone = Cluster::start(&program);
-        let node = shared(&alone, "a", "all", "0");
-        let job = submit(node.addr, path, SAMPLE);
-        successful(node.addr, &job);
-        let expected = result(node.addr, &job);
-        assert_eq!(alone.partitions(), 0);
-        node.kill();
-        for killed in [None, Some(0), Some(1)] {
-            let cluster = Cluster::start(&program);
-            let [first, second, api] = [("w1", "worker"), ("w2", "worker"), ("a", "api")]
-                .map(|(name, role)| shared(&cluster, name, role, "5"));
-            let job = submit(api.addr, path, SAMPLE);
-            wait_for("a partition of another worker", || cluster.partitions() > 0);
-            let mut workers = [Some(first), Some(second)];
-            if let Some(worker) = killed.and_then(|n: usize| workers[n].take()) {
-                worker.kill();
-            }
-            successful(api.addr, &job);
-            assert!(result(api.addr, &job) == expected, "without {killed:?}");
-            workers.into_iter().flatten().chain([api]).for_each(Process::kill);
-        }
     }
 }
 

@@ -94,11 +94,6 @@ const ROWS: &[Row] = &[
         "molmesh_jobs_transferred_total",
         "http/cluster::synchronous_requests_are_computed_by_workers",
     ),
-    (
-        "broker.partition_ms",
-        "molmesh_mesh_partitions_total",
-        "http/cluster::a_mesh_that_workers_share_survives_the_loss_of_any_of_them",
-    ),
     ("broker.queue", "queue-full", "http/limits::a_full_broker_rejects_jobs_with_retry_after"),
     ("devices.jobs", "molmesh_device_jobs", "http/devices::devices_are_listed_with_their_reasons"),
     ("devices.batch", "molmesh_device_shared_submissions_total", "gpu/pool::small_jobs_share_a_submission"),

@@ -42,7 +42,6 @@ const ROWS: &[Row] = &[
     (t::BROKER_REDELIVERIES, &[], cluster),
     (t::BROKER_CLAIM_ERRORS, &[], lost_consumers),
     (t::JOBS_TRANSFERRED, &[], cluster),
-    (t::PARTITIONS, &["computed=\"here\""], cluster),
     (t::JOBS_RECOVERED, &[], restart),
     (t::RECORDS_QUARANTINED, &[], damaged_record),
     (t::JOBS_FALLBACK, &[], devices),
@@ -221,16 +220,6 @@ fn cluster(look: &dyn Fn()) {
         config.server.role = molmesh::config::Role::Api;
     });
     wait_for("a transferred request", || api.post("/v1/meshes", &[], &sample(1)).status == 200);
-    let folder = tempfile::tempdir().unwrap();
-    let alone = start(Arc::new(CpuBackend::default()), |config| {
-        shared(config);
-        "alone".clone_into(&mut config.broker.prefix);
-        config.broker.partition_ms = 1;
-        config.store.url = Some(format!("file://{}", folder.path().display()));
-    });
-    let job = alone.post("/v1/meshes?resolution=0.3", &later, SAMPLE);
-    let state = || alone.get(&format!("{}?wait=20", job.header("location").unwrap())).json()["status"].clone();
-    wait_for("a mesh in partitions", || state() == "successful");
     look();
 }
 

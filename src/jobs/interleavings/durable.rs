@@ -58,7 +58,7 @@ impl Fixture {
         let config = JobsConfig { attempts: ATTEMPTS, ..JobsConfig::default() };
         let describe = |error: &EndError| Value::String(error.to_string());
         let broker = MemoryBroker::new(8);
-        let dispatch = (Arc::new(broker.clone()) as _, 8, None);
+        let dispatch = (Arc::new(broker.clone()) as _, 8);
         let jobs = JobStore::new(store.clone(), pool, dispatch, config, 1 << 20, [0; 32], describe);
         jobs.start_claiming();
         Self { jobs, queue, broker, store, objects, ends: Arc::default() }
@@ -73,7 +73,6 @@ impl Fixture {
             parameters: Vec::new(),
             format: Format::Glb,
             idempotency_key: Some(KEY.to_owned()),
-            helper: None,
         };
         let mut client = Client { fixture: self, ended: false };
         client.sees(&block_on(self.jobs.accept(spec, None)).unwrap());

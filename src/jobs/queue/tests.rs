@@ -26,7 +26,6 @@ fn task(content: u8) -> Task {
         reservation: None,
         parent: SpanParent::default(),
         id: None,
-        partitions: None,
     }
 }
 

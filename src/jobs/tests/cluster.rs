@@ -16,7 +16,7 @@ use crate::jobs::{
     Broker, Budget, EndError, JobId, JobSpec, JobStore, MemoryBroker, NatsBroker, Pool, Settings, Status,
 };
 use crate::store::{Folder, Name, Namespace, Store};
-use crate::surface::{Backend, CpuBackend, ReferenceBackend};
+use crate::surface::ReferenceBackend;
 
 /// Node of a cluster.
 struct Node {
@@ -26,25 +26,14 @@ struct Node {
 
 /// Starts a node over the shared folder `shared`. It does not claim jobs yet.
 async fn node(shared: &Path, broker: Arc<dyn Broker>) -> Node {
-    node_with(shared, broker, Arc::new(ReferenceBackend), None).await
-}
-
-/// Starts a node with a backend, which divides meshes into partitions of a time.
-async fn node_with(
-    shared: &Path,
-    broker: Arc<dyn Broker>,
-    backend: Arc<dyn Backend>,
-    partition_time: Option<Duration>,
-) -> Node {
     let url = Some(format!("file://{}", shared.display()));
     let store = Store::open_shared(&StoreConfig { url, ..StoreConfig::default() }, shared).await.unwrap();
     let budget = Budget::new(1 << 30);
     let settings = Settings::of_test(1, budget);
-    let pool = Arc::new(Pool::start(settings, backend, "a test".to_owned()).unwrap());
+    let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
     let describe = |error: &EndError| Value::String(format!("{error:?}"));
     let secret = store.secret().await.unwrap();
-    let broker = (broker, 1000, partition_time);
-    let jobs = JobStore::new(store.clone(), pool, broker, JobsConfig::default(), 1 << 30, secret, describe);
+    let jobs = JobStore::new(store.clone(), pool, (broker, 1000), JobsConfig::default(), 1 << 30, secret, describe);
     Node { jobs, store }
 }
 
@@ -58,7 +47,6 @@ impl Node {
             parameters: vec![("resolution".to_owned(), resolution.to_owned())],
             format: Format::Stl,
             idempotency_key: key.map(str::to_owned),
-            helper: None,
         };
         self.jobs.accept(spec, None).await.unwrap().record.id
     }
@@ -226,60 +214,4 @@ async fn a_later_attempt_of_another_node_supersedes_an_earlier_one() {
     assert!(a.jobs.is_superseded(&job).await);
     assert!(a.jobs.refresh(&job).await && !is_followed(), "the job is left to that node");
     tokio::time::timeout(MAX_WAIT, stop.notified()).await.expect("the own run stops");
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn workers_share_a_mesh_and_it_has_the_bytes_of_one_worker() {
-    let backend = || Arc::new(CpuBackend::new(Some(1)).unwrap());
-    // Returns the mesh and the largest number of partitions in the store.
-    let run = async |broker: [Arc<dyn Broker>; 2], time: Option<Duration>, workers: usize| {
-        let shared = tempfile::tempdir().unwrap();
-        let [a, b] = broker.map(|broker| node_with(shared.path(), broker, backend(), time));
-        let nodes = [a.await, b.await];
-        nodes[..workers].iter().for_each(|node| node.jobs.start_claiming());
-        let id = nodes[0].accept("0.25", None).await;
-        let mut seen = nodes[0].watch(&id).await;
-        let mut partitions = 0;
-        while !seen.borrow().record.status.is_final() {
-            let stored = nodes[0].store.list(Folder::Results).await.unwrap();
-            let found = stored.iter().filter(|(name, _)| name.to_string().ends_with(".partition")).count();
-            partitions = found.max(partitions);
-            tokio::time::sleep(Duration::from_millis(2)).await;
-        }
-        ended(&mut seen).await;
-        let record = seen.borrow().record.clone();
-        assert_eq!(record.status, Status::Successful, "{:?}", record.problem);
-        let name = Name::result(&record.result.unwrap(), "stl").unwrap();
-        let mesh = nodes[1].store.get(&name).await.unwrap().unwrap().bytes;
-        // The records of partitions are removed, or their jobs are cancelled.
-        for node in &nodes {
-            tokio::time::timeout(MAX_WAIT, node.jobs.all_recorded()).await.expect("no job runs any more");
-        }
-        (mesh, partitions)
-    };
-    let in_process = || {
-        let broker = MemoryBroker::new(1000);
-        [Arc::new(broker.clone()) as Arc<dyn Broker>, Arc::new(broker)]
-    };
-    let (whole, partitions) = run(in_process(), None, 2).await;
-    assert_eq!(partitions, 0);
-    let soon = Some(Duration::from_micros(200));
-    // A single worker computes all partitions itself.
-    assert_eq!(run(in_process(), soon, 1).await, (whole.clone(), 0));
-    // On a busy machine, the second worker may come too late to share a mesh.
-    let mut is_shared = false;
-    for _ in 0..10 {
-        let (mesh, partitions) = run(in_process(), soon, 2).await;
-        assert!(mesh == whole);
-        is_shared = partitions > 0;
-        if is_shared {
-            break;
-        }
-    }
-    assert!(is_shared);
-    on_nats(async |server| {
-        let (mesh, partitions) = run([Arc::new(nats(server).await), Arc::new(nats(server).await)], soon, 2).await;
-        assert!(mesh == whole && partitions > 0);
-    })
-    .await;
 }

@@ -18,7 +18,6 @@ pub fn canonical(job: &Job) -> String {
         simplify,
         quality,
         tile,
-        helper,
         spacing,
         validation,
         compress,
@@ -75,7 +74,6 @@ pub fn canonical(job: &Job) -> String {
         simplify.and_then(|wanted| wanted.max_triangles).map(|limit| format!("max_triangles={limit}")),
         (*quality != TriangleQuality::Standard).then(|| format!("quality={}", quality.name())),
         tile.map(|tile| format!("tile={}", tile.path())),
-        helper.map(|number| format!("helper={number}")),
         exact.then(|| "exact=true".to_owned()),
         // Quotes the names, which may contain `&`.
         interface.as_ref().map(|interface| format!("interface={:?}", interface.sides)),

@@ -12,7 +12,6 @@ use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32, to_u64};
 use crate::surface::memory::{MemoryMeter as _, Reservation};
 use crate::surface::params::SurfaceLimits;
-use crate::surface::partitions::MeshPartition;
 use crate::surface::simd::dispatched;
 use crate::surface::{candidates, grid_limit};
 
@@ -149,16 +148,6 @@ impl Tiles {
     /// The atoms that reach tile `t`, ascending.
     pub(super) fn atoms(&self, t: usize) -> &[u32] {
         &self.atoms[self.starts[t]..self.starts[t + 1]]
-    }
-
-    /// Returns the tiles of a partition, with about the same number of atoms as the other partitions.
-    pub(super) fn of_partition(&self, MeshPartition { index, count }: MeshPartition) -> Range<usize> {
-        let (starts, count) = (&self.starts[..self.len()], u64::from(count.max(1)));
-        let cut = |index: u64| {
-            let before = self.atoms.len() as u64 * index / count;
-            starts.partition_point(|start| (*start as u64) < before)
-        };
-        cut(index.into())..cut(u64::from(index) + 1)
     }
 }
 

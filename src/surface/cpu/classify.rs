@@ -4,8 +4,6 @@
 
 use std::num::NonZeroU16;
 
-use bytemuck::{Pod, Zeroable};
-
 use super::edge::Edge;
 use super::field::BrickField;
 use crate::surface::cases::CASES;
@@ -17,15 +15,16 @@ use crate::surface::sphere_union::Feature;
 pub(super) type Inside = [u64; 8];
 
 /// Brick that the surface intersects, in the form that the later stages need.
-#[derive(Debug, Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
+#[derive(Debug, Clone)]
 pub(super) struct SurfaceBrick {
+    /// Slot within the tile (0 to 8 per axis; 8 never occurs here).
+    pub(super) slot: u16,
     /// Crossing edges: word `3·z + axis`, bit `8·y + x` of the owning grid point. Vertices are numbered in this order.
     pub(super) crossing: [u64; 24],
-    /// Active cells: word z, bit `8·y + x`.
-    pub(super) active: [u64; 8],
     /// Vertices of the brick before each word.
     pub(super) before: [u16; 24],
+    /// Active cells: word z, bit `8·y + x`.
+    pub(super) active: [u64; 8],
     /// First vertex, counted within the tile.
     pub(super) vertex: u32,
     /// First triangle, counted within the tile.
@@ -34,15 +33,11 @@ pub(super) struct SurfaceBrick {
     pub(super) case: u32,
     /// Candidates in the tile's list of kept candidates.
     pub(super) candidates: [u32; 2],
-    /// The cells of each sheet in the tile's list, if there are several sheets.
-    pub(super) sheets: u32,
     /// Number of connected sheets of surface within the brick; `None` if a cell holds two of them, which requires a
     /// search.
     pub(super) n_sheets: Option<NonZeroU16>,
-    /// Slot within the tile (0 to 8 per axis; 8 never occurs here).
-    pub(super) slot: u16,
-    /// Makes the size a multiple of the alignment.
-    pub(super) padding: u32,
+    /// The cells of each sheet in the tile's list, if there are several sheets.
+    pub(super) sheets: u32,
 }
 
 /// Results of `classify` for the bricks of one tile, appended brick by brick.
@@ -231,7 +226,6 @@ fn classify(found: &mut ClassifiedBricks, slot: usize, around: &Neighbourhood<'_
         candidates: [to_u32(found.candidates.len()), to_u32(found.candidates.len() + candidates.len())],
         n_sheets: None,
         sheets: to_u32(found.sheets.len()),
-        padding: 0,
     };
     found.candidates.extend_from_slice(candidates);
     let mut n = 0_u16;

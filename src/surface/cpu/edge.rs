@@ -1,7 +1,5 @@
 //! Grid edges of a brick, on which its vertices lie.
 
-use bytemuck::{Pod, Zeroable};
-
 /// Grid points along a brick's side with the neighbours' first layer.
 const N: u16 = 9;
 const SIDE: usize = N as usize;
@@ -10,8 +8,7 @@ const SIDE: usize = N as usize;
 pub(super) const EDGES: usize = (3 * SIDE * SIDE * SIDE).next_power_of_two();
 
 /// Edge of a brick: `z << 8 | (8·y + x) << 2 | axis` of its first grid point, and bit 11 if that point is inside.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
-#[repr(transparent)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Edge(u16);
 
 const STARTS_INSIDE: u16 = 1 << 11;

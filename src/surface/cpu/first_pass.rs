@@ -9,7 +9,6 @@ use super::bin::{Bricks, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, ClassifiedBricks, Inside, Neighbourhood};
 use super::distance::DistanceField;
 use super::field::{self, BrickField, GridPointRange};
-use super::partitions::PassCounts;
 use super::slabs::{PartialTiles, Slab};
 use super::{Field, NO_BRICK, RunContext, Tile, scan};
 use crate::surface::control::Stage;
@@ -60,7 +59,7 @@ impl Default for TileScratch {
 /// Candidates of a brick between two checks of the cancellation flag: a fraction of a millisecond.
 const CANDIDATES_PER_CHECK: usize = 4096;
 /// Memory of a tile's table of bricks, bytes.
-pub(super) const TILE_BYTES: u64 = (size_of::<u16>() * BRICK_POINTS) as u64;
+const TILE_BYTES: u64 = (size_of::<u16>() * BRICK_POINTS) as u64;
 
 thread_local! {
     // Thread-local, because rayon would create a scratch for each part of the work. Allocating fresh memory takes
@@ -91,14 +90,6 @@ pub(super) struct PassCounters {
 }
 
 impl PassCounters {
-    /// Returns the counts so far.
-    pub(super) fn counts(&self) -> PassCounts {
-        let [bricks, grid_points, candidates, candidate_pairs] =
-            [&self.bricks, &self.grid_points, &self.candidates, &self.candidate_pairs]
-                .map(|count| count.load(Ordering::Relaxed));
-        PassCounts { bricks, grid_points, candidates, candidate_pairs }
-    }
-
     /// Extrapolates a count of the finished slabs to all `n` slabs.
     fn all_slabs(&self, so_far: u64, n: usize) -> u64 {
         let done = self.slabs_done.load(Ordering::Relaxed) + 1;
@@ -140,62 +131,13 @@ impl Pass<'_> {
         Ok(tile)
     }
 
-    /// Adds the counts of a partition that another process computed: of the pass, of its vertices and triangles, and
-    /// its number of slabs.
-    ///
-    /// # Errors
-    /// Returns the error of the first limit that is exceeded.
-    pub(super) fn add(
-        &self,
-        found: &PassCounts,
-        [vertices, triangles]: [u64; 2],
-        slabs: usize,
-    ) -> Result<(), SurfaceError> {
-        let counters = &self.counters;
-        counters.bricks.fetch_add(found.bricks, Ordering::Relaxed);
-        counters.candidates.fetch_add(found.candidates, Ordering::Relaxed);
-        let done = counters.slabs_done.fetch_add(slabs, Ordering::Relaxed) + slabs;
-        self.add_pairs(found.candidate_pairs)?;
-        self.add_grid_points(found.grid_points)?;
-        self.context.control.observer.progress(Stage::Field, done, self.slabs.len());
-        self.add_mesh(vertices, triangles)
-    }
-
     /// Counts `n` more candidate pairs, and their memory in the tile's lists.
     fn count(&self, n: u64, memory: &Reservation) -> Result<(), SurfaceError> {
         self.context.control.check()?;
         memory.grow(size_of::<u32>() as u64 * n)?;
-        self.add_pairs(n)
-    }
-
-    /// Counts `n` more candidate pairs.
-    fn add_pairs(&self, n: u64) -> Result<(), SurfaceError> {
         let all = self.counters.candidate_pairs.fetch_add(n, Ordering::Relaxed) + n;
         if all > candidates::limit(self.context.limits) {
             return Err(candidates::exceeded(&[self.lattice], all, self.context.limits));
-        }
-        Ok(())
-    }
-
-    /// Counts `n` more grid points.
-    fn add_grid_points(&self, n: u64) -> Result<(), SurfaceError> {
-        let (counters, limits) = (&self.counters, self.context.limits);
-        let so_far = counters.grid_points.fetch_add(n, Ordering::Relaxed) + n;
-        if so_far > limits.max_grid_points {
-            let all = counters.all_slabs(so_far, self.slabs.len());
-            return Err(grid_limit::exceeded(self.lattice, all, limits));
-        }
-        Ok(())
-    }
-
-    /// Counts more vertices and triangles.
-    fn add_mesh(&self, vertices: u64, triangles: u64) -> Result<(), SurfaceError> {
-        let (counters, limit) = (&self.counters, self.context.limits.max_mesh_bytes);
-        let bytes = self.context.params.mesh_bytes(vertices, triangles);
-        let so_far = counters.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        if so_far > limit {
-            let all = counters.all_slabs(so_far, self.slabs.len());
-            return Err(scan::too_large(all, self.lattice.spacing, limit));
         }
         Ok(())
     }
@@ -215,7 +157,12 @@ impl Pass<'_> {
             }
         }
         let reached = count_occupied(&scratch.bricks, layers, counters);
-        self.add_grid_points(reached as u64 * BRICK_POINTS as u64)?;
+        let occupied = reached as u64 * BRICK_POINTS as u64;
+        let grid_points = counters.grid_points.fetch_add(occupied, Ordering::Relaxed) + occupied;
+        if grid_points > self.context.limits.max_grid_points {
+            let all = counters.all_slabs(grid_points, self.slabs.len());
+            return Err(grid_limit::exceeded(self.lattice, all, self.context.limits));
+        }
         memory.grow(TILE_BYTES + ClassifiedBricks::max_bytes(reached))?;
         let mut bricks = vec![NO_BRICK; BRICK_POINTS];
         let mut found = ClassifiedBricks::with_capacity(reached);
@@ -233,7 +180,12 @@ impl Pass<'_> {
         self.context.control.span(Stage::Classify, || found.shrink_to_fit());
         self.context.control.memory.grow(TILE_BYTES + found.bytes())?;
         drop(memory);
-        self.add_mesh(found.vertices.into(), found.triangles.into())?;
+        let bytes = self.context.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
+        let so_far = counters.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        if so_far > self.context.limits.max_mesh_bytes {
+            let all = counters.all_slabs(so_far, self.slabs.len());
+            return Err(scan::too_large(all, self.lattice.spacing, self.context.limits.max_mesh_bytes));
+        }
         Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0, first_piece: 0 })
     }
 }

@@ -20,7 +20,6 @@ mod first_pass;
 mod interpolate;
 mod measure;
 mod neighbours;
-mod partitions;
 pub(super) mod points;
 mod refine;
 pub(crate) mod scan;
@@ -42,7 +41,6 @@ use self::first_pass::Pass;
 pub(super) use self::interpolate::MAX_SHARE;
 use self::neighbours::NumberedBrick;
 use self::scan::Totals;
-use self::slabs::{PartialTiles, Slab};
 use super::backend::{Backend, GridStats, MeshOutput};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
@@ -198,7 +196,7 @@ pub(crate) fn check_work(
 }
 
 /// Results of the stages for a tile.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Tile {
     coord: [i32; 3],
     found: ClassifiedBricks,
@@ -255,85 +253,59 @@ pub(crate) const LATTICE_BYTES: u64 = 41;
 const RESULT_BYTES: u64 = (size_of::<slabs::Slab>() + 3 * size_of::<(usize, Tile)>()) as u64;
 
 fn scan(spheres: &Spheres, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
-    scan_lattice(place(spheres, context)?, context)
-}
-
-/// Places spheres on the lattice.
-fn place(spheres: &Spheres, context: RunContext<'_>) -> Result<Lattice, SurfaceError> {
-    context.control.span(Stage::Bin, || {
+    let lattice = context.control.span(Stage::Bin, || {
         candidates::check(spheres, context.params, context.limits)?;
         context.control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
         Lattice::new(spheres, context.params, context.control)
-    })
-}
-
-/// Inputs of the first pass.
-struct FirstPass {
-    lattice: Lattice,
-    tiles: Tiles,
-    field: Field,
-    /// Value of the field on the surface.
-    level: f32,
-    slabs: Vec<Slab>,
-}
-
-impl FirstPass {
-    /// Prepares the first pass over a lattice.
-    fn new(lattice: Lattice, context: RunContext<'_>) -> Result<Self, SurfaceError> {
-        let RunContext { params, limits, control, free_threads } = context;
-        let tiles = control.span(Stage::Bin, || -> Result<_, SurfaceError> {
-            let tiles = Tiles::new(&lattice, limits, control)?;
-            if tiles.len() as f64 * f64::from(TILE).powi(3) > limits.max_grid_points as f64 {
-                // Rejects a grid that exceeds the limit before any of it is computed.
-                occupancy::count(&lattice, limits, control)?;
-            }
-            Ok(tiles)
-        });
-        let tiles = tiles?;
-        control.check()?;
-        let field = control.span(Stage::Bin, || checked_field(&lattice, context))?;
-        control.check()?;
-        let level = field.level(params);
-        let slabs = slabs::cut(&tiles, free_threads);
-        control.memory.grow(RESULT_BYTES * slabs.len() as u64)?;
-        Ok(Self { lattice, tiles, field, level, slabs })
-    }
-
-    /// Returns the pass.
-    fn pass<'a>(&'a self, context: RunContext<'a>) -> Pass<'a> {
-        Pass {
-            lattice: &self.lattice,
-            tiles: &self.tiles,
-            slabs: &self.slabs,
-            partial_tiles: PartialTiles::default(),
-            field: &self.field,
-            iso: self.level,
-            context,
-            counters: first_pass::PassCounters::default(),
-        }
-    }
+    });
+    scan_lattice(lattice?, context)
 }
 
 fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
-    let RunContext { params, limits, control, .. } = context;
-    let source = partitions::source(lattice.atoms.len(), context);
-    let first = FirstPass::new(lattice, context)?;
-    let pass = first.pass(context);
-    let mut done = partitions::evaluate_all(&pass, source)?;
-    let counts = pass.counters.counts();
+    let RunContext { params, limits, control, free_threads } = context;
+    let tiles = control.span(Stage::Bin, || -> Result<_, SurfaceError> {
+        let tiles = Tiles::new(&lattice, limits, control)?;
+        if tiles.len() as f64 * f64::from(TILE).powi(3) > limits.max_grid_points as f64 {
+            // Rejects a grid that exceeds the limit before any of it is computed.
+            occupancy::count(&lattice, limits, control)?;
+        }
+        Ok(tiles)
+    });
+    let tiles = tiles?;
+    control.check()?;
+    let field = control.span(Stage::Bin, || checked_field(&lattice, context))?;
+    control.check()?;
+    let level = field.level(params);
+    let slabs = slabs::cut(&tiles, free_threads);
+    control.memory.grow(RESULT_BYTES * slabs.len() as u64)?;
+    let pass = Pass {
+        lattice: &lattice,
+        tiles: &tiles,
+        slabs: &slabs,
+        partial_tiles: slabs::PartialTiles::default(),
+        field: &field,
+        iso: level,
+        context,
+        counters: first_pass::PassCounters::default(),
+    };
+    let evaluated = threads::each(slabs.len(), |i| pass.evaluate(i))?;
+    let counters = pass.counters;
+    let mut done: Vec<(usize, Tile)> =
+        slabs.iter().zip(evaluated).filter_map(|(slab, tile)| Some((slab.tile, tile?))).collect();
+    done.sort_unstable_by_key(|(t, _)| *t);
+    let mut done: Vec<Tile> = done.into_iter().map(|(_, tile)| tile).collect();
     control.check()?;
     let totals = control.span(Stage::Scan, || scan::scan(&mut done, params, limits))?;
     if totals.triangles == 0 {
         return Err(SurfaceError::NoSurface { isovalue: params.level() });
     }
-    let FirstPass { lattice, tiles, field, level, .. } = first;
     let surface_bricks = done.iter().map(|tile| tile.found.bricks.len() as u64).sum();
     let grid = GridStats {
-        bricks: counts.bricks,
+        bricks: counters.bricks.into_inner(),
         surface_bricks,
-        grid_points: counts.grid_points,
+        grid_points: counters.grid_points.into_inner(),
         box_cells: lattice.box_cells,
-        candidates: counts.candidates,
+        candidates: counters.candidates.into_inner(),
         overlaps: field.overlaps(),
     };
     let pieces = pieces(&mut done);

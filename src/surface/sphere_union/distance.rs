@@ -1,7 +1,5 @@
 //! Signed distance from points of a brick to the boundary of a union of spheres.
 
-use bytemuck::{Pod, Zeroable};
-
 use super::{Arc, SphereUnion};
 use crate::surface::lattice::LatticeAtom;
 use crate::surface::simd::{LANES, dispatched, extent};
@@ -35,8 +33,7 @@ pub(in crate::surface) struct BrickUnion {
 
 /// Part of the boundary: a face, stored as the number of its sphere, or an arc with its ends, stored as its number with
 /// the highest bit set.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
-#[repr(transparent)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(in crate::surface) struct Feature(u32);
 
 /// Marks an arc in [`Feature`].
