@@ -23,7 +23,7 @@ pub(crate) use keys::{KeyCommand, NewKeyArgs, SignArgs, SigningKeyArgs};
 pub(crate) use render::{PictureArgs, RenderArgs};
 #[cfg(feature = "server")]
 pub(crate) use service::{
-    ConfigCommand, ConfigStyle, DoctorArgs, HealthcheckArgs, LogStyle, PrintArgs, ReconcileArgs, ServeArgs, TextOrJson,
+    ConfigCommand, ConfigStyle, DoctorArgs, HealthcheckArgs, LogStyle, PrintArgs, ServeArgs, TextOrJson,
 };
 pub(crate) use tileset::TilesetArgs;
 
@@ -62,9 +62,6 @@ pub(crate) enum Command {
     /// List devices, show which are used, and check that a service would start and be ready
     #[cfg(feature = "server")]
     Doctor(Box<DoctorArgs>),
-    /// Dispatch the unfinished jobs that the broker of a cluster has lost, as each node does every minute
-    #[cfg(feature = "server")]
-    Reconcile(ReconcileArgs),
     /// Print the configuration of the service or its schema
     #[cfg(feature = "server")]
     #[command(subcommand)]

@@ -25,8 +25,6 @@ mod output;
 mod page;
 mod panics;
 mod progress;
-#[cfg(feature = "server")]
-mod reconcile;
 mod render;
 mod request;
 #[cfg(feature = "server")]
@@ -69,8 +67,6 @@ fn run() -> i32 {
         Command::Serve(args) => serve::run(&args),
         #[cfg(feature = "server")]
         Command::Doctor(args) => doctor::run(&args),
-        #[cfg(feature = "server")]
-        Command::Reconcile(args) => reconcile::run(&args),
         #[cfg(feature = "server")]
         Command::Config(command) => config::run(&command),
         #[cfg(feature = "server")]

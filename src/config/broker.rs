@@ -35,10 +35,6 @@ pub struct BrokerConfig {
     /// Time after which another worker may claim a job whose worker has stopped, ms. Default 30,000: workers extend
     /// their claims three times in this time.
     pub lease_ms: u64,
-    /// Estimated time in the queue of a node above which other nodes compute the meshes of its synchronous requests,
-    /// ms. Default 1,000: a transfer also writes input, record and result. Nodes with the role `api` transfer all such
-    /// requests.
-    pub transfer_wait_ms: u64,
     /// Number of asynchronous jobs that wait for a worker; with `url`, of jobs that wait or run. Default 10,000: at 0.1
     /// s per job on two workers the last one waits for eight minutes. Further requests for jobs get a 503 with an
     /// estimated `Retry-After`.
@@ -55,7 +51,6 @@ impl Default for BrokerConfig {
             prefix: "molmesh".to_owned(),
             replicas: 1,
             lease_ms: 30_000,
-            transfer_wait_ms: 1000,
             queue: 10_000,
         }
     }

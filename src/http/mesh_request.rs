@@ -30,15 +30,15 @@ use crate::telemetry::{SpanParent, TraceSpan};
 
 /// Request for a mesh or its report.
 pub(super) struct MeshRequest {
-    pub(super) app: Shared,
-    pub(super) method: Method,
+    app: Shared,
+    method: Method,
     /// Conditions and the range of a GET request; empty for an upload.
-    pub(super) headers: HeaderMap,
-    pub(super) parsed: ParsedRequest,
-    pub(super) preferences: RequestPreferences,
+    headers: HeaderMap,
+    parsed: ParsedRequest,
+    preferences: RequestPreferences,
     /// `Cache-Control` of the response; `None` if it belongs to this request alone.
     cache: Option<HeaderValue>,
-    pub(super) timing: Timing,
+    timing: Timing,
 }
 
 /// Reads a GET request: the path names the structure and ends in `surface.{ext}` (`{file}`) or in `report.json`.
@@ -146,7 +146,7 @@ impl MeshRequest {
         Ok(Some(self.with_cache_control(response)))
     }
 
-    pub(super) fn with_cache_control(&self, mut response: Response) -> Response {
+    fn with_cache_control(&self, mut response: Response) -> Response {
         if let Some(cache) = &self.cache {
             response.headers_mut().insert(header::CACHE_CONTROL, cache.clone());
         }
@@ -165,9 +165,6 @@ impl MeshRequest {
         app.admit_work(&self.preferences.caller)?;
         if self.is_answered_with_job() {
             return self.accept(loaded, None).await;
-        }
-        if self.is_transferred(&loaded).await {
-            return self.transfer(loaded).await;
         }
         let report = self.parsed.report;
         let permit = app.delivery(self.preferences.caller.client)?;
@@ -260,7 +257,7 @@ impl MeshRequest {
     }
 
     /// Returns the durable job of the request. Loads the file of the structure if it is not in memory.
-    pub(super) async fn job_spec(&self, loaded: &mut Loaded) -> Result<JobSpec, Problem> {
+    async fn job_spec(&self, loaded: &mut Loaded) -> Result<JobSpec, Problem> {
         if loaded.input.file().is_none() {
             *loaded = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
         }
@@ -282,7 +279,7 @@ impl MeshRequest {
         if is_late { self.advise(problem) } else { problem }
     }
 
-    pub(super) fn failed(&self, failure: Failure) -> Problem {
+    fn failed(&self, failure: Failure) -> Problem {
         let problem = self.parsed.declared.explain(failure);
         if problem.is(ProblemType::Deadline) { self.advise(problem) } else { problem }
     }

@@ -15,7 +15,6 @@ mod socket;
 mod store_health;
 mod tilesets;
 mod timing;
-mod transfer;
 
 mod stop;
 
@@ -58,7 +57,6 @@ mod document;
 mod openapi;
 
 mod jobs;
-mod reconcile;
 mod results;
 
 mod mesh_request;
@@ -98,7 +96,6 @@ mod wind_down;
 mod server;
 
 pub use page::has_viewer;
-pub use reconcile::{LostJob, Reconciled, reconcile};
 pub use server::{Chosen, ServeError, Server};
 pub use signing::check_signable;
 pub use stop::{Stop, shutdown_signals};

@@ -250,23 +250,15 @@ async fn open_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Sec
     let describe = |error: &EndError| Problem::from(error.clone()).record("");
     let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
     let broker: Arc<dyn Broker> = match &config.broker.url {
-        Some(url) => Arc::new(connect_broker(config, url, &secret, true).await?),
+        Some(url) => {
+            // Identifies the store without revealing its secret.
+            let id = Digest::of(&derive(&secret, "store")).to_string();
+            Arc::new(NatsBroker::connect(&config.broker, url, &id).await.map_err(ServeError::Broker)?)
+        }
         None => Arc::new(MemoryBroker::new(config.broker.queue)),
     };
     let broker = (broker, config.broker.queue);
     Ok(JobStore::new(store.clone(), Arc::clone(pool), broker, jobs, output_bytes, secret, describe))
-}
-
-/// Connects to the broker of the nodes that share the store with this secret. With `creates`, creates what is missing.
-pub(super) async fn connect_broker(
-    config: &Config,
-    url: &str,
-    secret: &Secret,
-    creates: bool,
-) -> Result<NatsBroker, ServeError> {
-    // Identifies the store without revealing its secret.
-    let id = Digest::of(&derive(secret, "store")).to_string();
-    NatsBroker::connect(&config.broker, url, &id, creates).await.map_err(ServeError::Broker)
 }
 
 /// Publishes the gauges that no event updates.

@@ -83,9 +83,6 @@ pub(crate) trait Broker: Send + Sync {
     /// Queues a job. Returns false if it is queued or claimed already.
     fn dispatch<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>>;
 
-    /// Returns true if a job is queued or claimed.
-    fn holds<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>>;
-
     /// Waits for a job and claims it: first one that suits a GPU if `prefers_gpu`, else first one that does not. If the
     /// future is dropped, a job that it has claimed can be claimed again after its lease.
     fn claim(&self, prefers_gpu: bool) -> BoxFuture<'_, Claim>;
@@ -100,14 +97,11 @@ pub(crate) trait Broker: Send + Sync {
     /// Returns the events of a job that are published from now on.
     fn events(&self, id: &JobId) -> BoxFuture<'_, BoxStream<'static, JobEvent>>;
 
-    /// Tells other nodes that this node claims no more jobs.
+    /// Leaves announced jobs to other nodes: this node claims no more jobs.
     fn stop(&self);
 
     /// Waits until the ends of claims and locks are sent to the broker.
     fn flush(&self) -> BoxFuture<'_, ()>;
-
-    /// Returns true if a node that claims jobs answers.
-    fn has_workers(&self) -> BoxFuture<'_, bool>;
 
     /// Returns the number of queued jobs.
     fn queued(&self) -> usize;

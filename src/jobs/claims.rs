@@ -28,16 +28,6 @@ const DUPLICATE: Duration = Duration::from_secs(5);
 const OTHER_RELEASE: Duration = Duration::from_secs(5);
 
 impl JobStore {
-    /// Returns true if a job can be dispatched now.
-    fn can_dispatch(&self) -> bool {
-        self.0.broker.down().is_none() && self.0.broker.queued() < self.0.max_queued
-    }
-
-    /// Returns true if a job that is dispatched now finds a worker.
-    pub(crate) async fn has_workers(&self) -> bool {
-        self.can_dispatch() && self.0.broker.has_workers().await
-    }
-
     /// Returns how often the broker may have lost jobs, which [`Self::reconcile`] dispatches again.
     pub(crate) fn broker_losses(&self) -> usize {
         self.0.broker.losses()

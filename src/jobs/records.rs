@@ -24,7 +24,7 @@ use super::record::{BadRecord, JobId, JobRecord};
 use super::{AcceptError, EndError, Input, JobView, Task};
 use crate::formats::Format;
 use crate::pipeline::MapFile;
-use crate::store::{BadDigest, Digest, Name, Namespace, Pin, RecordCaps, RecordReservation, Store, StoreError};
+use crate::store::{BadDigest, Digest, Name, Namespace, Pin, RecordCaps, RecordReservation, StoreError};
 use crate::surface::OutOfMemory;
 use crate::sync::timeout;
 use crate::telemetry::{JOBS_RECOVERED, shorten};
@@ -143,11 +143,17 @@ impl JobStoreState {
     /// those of jobs that have ended. Forgets jobs that are not on record any more.
     async fn read_unknown(&self) -> Result<UnknownJobs, StoreError> {
         let mut known = self.open.ids();
-        let RecordNames { mut unfinished, ended } = RecordNames::of(&self.store).await?;
-        for name in ended {
-            self.store.delete(&name).await?;
+        let records = self.store.job_records().await?;
+        let (ends, others): (Vec<_>, Vec<_>) = records.into_iter().partition(Name::is_ended_job);
+        let mut unfinished = Vec::new();
+        for name in others {
+            if ends.binary_search(&Name::ended_job(name.stem())?).is_ok() {
+                // A crash has left it behind.
+                self.store.delete(&name).await?;
+            } else if name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id)) {
+                unfinished.push(name);
+            }
         }
-        unfinished.retain(|name| name.stem().parse().is_ok_and(|id: JobId| !known.remove(&id)));
         for gone in &known {
             self.open.remove(gone);
         }
@@ -182,55 +188,6 @@ struct UnknownJobs {
     records: Vec<JobRecord>,
     /// Last error of a record that was not read. It does not delay the jobs of the others.
     error: Option<StoreError>,
-}
-
-/// Names of the records in a store that are not those of ends.
-struct RecordNames {
-    /// Records of unfinished jobs.
-    unfinished: Vec<Name>,
-    /// Records of jobs that have ended, which a crash has left behind.
-    ended: Vec<Name>,
-}
-
-impl RecordNames {
-    async fn of(store: &Store) -> Result<Self, StoreError> {
-        let (ends, others): (Vec<_>, Vec<_>) = store.job_records().await?.into_iter().partition(Name::is_ended_job);
-        let (mut unfinished, mut ended) = (Vec::new(), Vec::new());
-        for name in others {
-            let has_ended = ends.binary_search(&Name::ended_job(name.stem())?).is_ok();
-            if has_ended { &mut ended } else { &mut unfinished }.push(name);
-        }
-        Ok(Self { unfinished, ended })
-    }
-}
-
-/// Records of the unfinished jobs of a store.
-#[derive(Debug, Default)]
-pub(crate) struct UnfinishedJobs {
-    /// Records that this release can read, in the order of their acceptance.
-    pub(crate) records: Vec<JobRecord>,
-    /// Number of records of other releases.
-    pub(crate) other_release_count: usize,
-    /// Number of damaged records, which the next node that reads them moves into quarantine.
-    pub(crate) unreadable: usize,
-}
-
-/// Reads the records of all unfinished jobs of a store. Changes nothing.
-pub(crate) async fn unfinished_jobs(store: &Store) -> Result<UnfinishedJobs, StoreError> {
-    let read = |name: Name| async move { store.get(&name).await };
-    let mut reads = stream::iter(RecordNames::of(store).await?.unfinished).map(read).buffer_unordered(CONCURRENT_READS);
-    let mut jobs = UnfinishedJobs::default();
-    while let Some(read) = reads.next().await {
-        match read?.map(|stored| JobRecord::from_bytes(&stored.bytes)) {
-            Some(Ok(record)) if record.request().is_ok() => jobs.records.push(record),
-            Some(Ok(_) | Err(BadRecord::OtherRelease(_))) => jobs.other_release_count += 1,
-            Some(Err(BadRecord::Damaged(_))) => jobs.unreadable += 1,
-            // The job has ended meanwhile.
-            None => {}
-        }
-    }
-    jobs.records.sort_by_key(|record| (record.created_ms, record.id.clone()));
-    Ok(jobs)
 }
 
 /// Returns the job that has the idempotency key of `record`, if both requests are the same.

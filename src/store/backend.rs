@@ -33,7 +33,7 @@ const FILE_PART: usize = 1 << 20;
 pub(super) const CHECK: &str = "check";
 
 /// URL prefix of a folder.
-pub(super) const FOLDER_URL: &str = "file://";
+const FOLDER_URL: &str = "file://";
 
 /// Returns the folder of a store in `data_dir`.
 fn folder_of(data_dir: &FilePath) -> PathBuf {
@@ -273,24 +273,13 @@ impl Backend {
         outcome.map_err(|error| self.open_error(&error))
     }
 
-    /// Returns true if the bucket has a secret; always true for a folder.
-    pub(super) async fn has_secret(&self) -> Result<bool, StoreError> {
-        if self.is_local() {
-            return Ok(true);
-        }
-        match secret::is_in_bucket(self.objects.as_ref()).await {
-            Err(object_store::Error::NotFound { .. }) => Ok(false),
-            found => found.map(|()| true).map_err(|error| self.open_error(&self.fail("secret", "secret", &error))),
-        }
-    }
-
     /// Checks that the folder of the store is still there: a write would create it again, and its objects would be lost
     /// when the right folder returns.
     pub(super) async fn check_folder(&self) -> Result<(), StoreError> {
         let StorageKind::Local(root) = &self.kind else { return Ok(()) };
         let Some(secret) = self.secret.get().copied() else { return Ok(()) };
         let root = root.clone();
-        let found = move || secret::is_in_folder(&root, Some(&secret));
+        let found = move || secret::is_in_folder(&root, &secret);
         self.blocking("folder", "", found).await
     }
 

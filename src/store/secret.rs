@@ -49,20 +49,15 @@ fn create_in_folder(root: &FilePath) -> io::Result<Secret> {
 }
 
 /// Fails if the folder `root` has no secret, or another one than `expected`. Blocks.
-pub(super) fn is_in_folder(root: &FilePath, expected: Option<&Secret>) -> io::Result<()> {
+pub(super) fn is_in_folder(root: &FilePath, expected: &Secret) -> io::Result<()> {
     let found = match std::fs::read(root.join(NAME)) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => None,
         found => Some(found?),
     };
-    if found.is_some_and(|found| expected.is_none_or(|expected| found == expected)) {
+    if found.is_some_and(|found| found == expected) {
         return Ok(());
     }
     Err(io::Error::other("the folder of the store is missing, or another folder is in its place"))
-}
-
-/// Fails if a bucket has no secret.
-pub(super) async fn is_in_bucket(objects: &dyn ObjectStore) -> object_store::Result<()> {
-    objects.head(&Path::from(NAME)).await.map(|_| ())
 }
 
 /// Returns 16 random hexadecimal digits, for names that no other process chooses.

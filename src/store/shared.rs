@@ -3,20 +3,18 @@
 //! The index is updated from a list of the store before anything is removed. Inputs are not evicted for space, because
 //! another node may be about to read them, and their age is that of their last write.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::backend::{Backend, FOLDER_URL};
+use super::backend::Backend;
 use super::error::StoreError;
 use super::handle::Store;
 use super::index::EvictionCandidate;
 use super::name::{Folder, Name};
 use super::object::Meta;
-use super::secret;
 use crate::config::StoreConfig;
-use crate::sync::{spawn_blocking, timeout};
 
 /// Number of objects that are updated in the index under one lock.
 const REFRESHED: usize = 1000;
@@ -30,27 +28,6 @@ impl Store {
     /// As for [`open`](Self::open).
     pub(crate) async fn open_shared(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
         let backend = Backend::open(config, data_dir).await?;
-        Self::open_backend(backend, config, true).await
-    }
-
-    /// Opens the store of a cluster as [`open_shared`](Self::open_shared) does, and creates nothing if there is none.
-    ///
-    /// # Errors
-    /// As for [`open`](Self::open); [`StoreError::Open`] if there is no store.
-    pub(crate) async fn open_existing(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
-        let location = config.url.clone().unwrap_or_default();
-        let root = location.strip_prefix(FOLDER_URL).map(PathBuf::from);
-        let failed = |reason: String| StoreError::Open { key: "store.url", location: location.clone(), reason };
-        if let Some(root) = root {
-            let found = spawn_blocking(move || secret::is_in_folder(&root, None));
-            let found = timeout(Duration::from_millis(config.timeout_ms), found).await;
-            let found = found.map_err(|_elapsed| failed("the folder does not answer".to_owned()))?;
-            found.map_err(|error| failed(error.to_string()))?.map_err(|error| failed(error.to_string()))?;
-        }
-        let backend = Backend::open(config, data_dir).await?;
-        if !backend.has_secret().await? {
-            return Err(failed("it is not the store of a service".to_owned()));
-        }
         Self::open_backend(backend, config, true).await
     }
 

@@ -55,8 +55,6 @@ metrics! {
     BROKER_QUEUED = "molmesh_broker_jobs_queued", Gauge;
     /// 1 while jobs can be dispatched to the NATS server and claimed, else 0.
     BROKER_UP = "molmesh_broker_up", Gauge;
-    /// Synchronous requests whose meshes other nodes computed.
-    JOBS_TRANSFERRED = "molmesh_jobs_transferred_total", Counter;
     /// Claims of jobs whose earlier claim expired or was returned. During an update it also counts jobs of other
     /// releases, which a node returns every 5 s.
     BROKER_REDELIVERIES = "molmesh_broker_redeliveries_total", Counter;

@@ -266,8 +266,6 @@ fn unreachable_service_exits_with_1() {
     drop(listener);
     assert_code(&run(["healthcheck", "--url", &url, "--timeout", "1"]), 1);
     assert_code(&run(["healthcheck", "--url", "ftp://x"]), 2);
-    // Only a cluster has jobs to reconcile.
-    assert_code(&run(["reconcile", "--dry-run"]), 2);
     assert_code(&run(["healthcheck", "--timeout=-1"]), 2);
 }
 

@@ -31,7 +31,6 @@ fn help_is_stable() {
     snapshot("config", &["config", "--help"]);
     snapshot("config-print", &["config", "print", "--help"]);
     snapshot("healthcheck", &["healthcheck", "--help"]);
-    snapshot("reconcile", &["reconcile", "--help"]);
     snapshot("key", &["key", "--help"]);
     snapshot("key_new", &["key", "new", "--help"]);
     snapshot("key_signing", &["key", "signing", "--help"]);

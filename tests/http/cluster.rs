@@ -217,52 +217,6 @@ fn jobs_of_a_lost_stream_are_dispatched_again_at_once() {
 }
 
 #[test]
-fn the_command_reconcile_finds_and_dispatches_lost_jobs() {
-    for program in nats::programs() {
-        let mut cluster = Cluster::start(&program);
-        let reconcile = |cluster: &Cluster, more: &[&str]| {
-            let mut command = cluster.command("all");
-            let output = command.args(["reconcile", "--report", "json"]).args(more).output().unwrap();
-            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-            serde_json::from_slice::<Value>(&output.stdout).unwrap()
-        };
-        let counts = |found: &Value| (found["unfinished"].clone(), found["lost"].as_array().unwrap().len());
-        let api = cluster.node("a", "api");
-        let job = submit(api.addr, "/v1/meshes?format=stl&resolution=1", SAMPLE);
-        assert_eq!(counts(&reconcile(&cluster, &["--dry-run"])), (1.into(), 0), "it is queued");
-        api.kill();
-        cluster.nats.jetstream("STREAM.PURGE.molmesh-jobs");
-        for _ in 0..2 {
-            let found = reconcile(&cluster, &["--dry-run"]);
-            assert_eq!((counts(&found), &found["dispatched"]), ((1.into(), 1), &0.into()));
-            let lost = &found["lost"][0];
-            assert_eq!((lost["id"].as_str(), lost["status"].as_str()), (job.rsplit('/').next(), Some("accepted")));
-        }
-        let found = reconcile(&cluster, &[]);
-        assert_eq!((counts(&found), &found["dispatched"]), ((1.into(), 1), &1.into()));
-        assert_eq!(counts(&reconcile(&cluster, &["--dry-run"])), (1.into(), 0));
-        // It creates nothing, and fails without store, stream or broker.
-        let fails = |cluster: &Cluster, more: &[&str], reason: &str| {
-            let failed = cluster.command("all").arg("reconcile").args(more).output().unwrap();
-            let text = String::from_utf8_lossy(&failed.stderr);
-            assert!(failed.status.code() == Some(1) && text.contains(reason), "{text}");
-        };
-        let missing = cluster.folder.path().join("missing");
-        fails(
-            &cluster,
-            &["--set", &format!("store.url=file://{}", missing.display())],
-            "the folder of the store is missing",
-        );
-        assert!(!missing.exists());
-        for _ in 0..2 {
-            fails(&cluster, &["--set", "broker.prefix=other"], "the stream other-jobs");
-        }
-        cluster.nats.stop(true);
-        fails(&cluster, &[], "broker.url");
-    }
-}
-
-#[test]
 fn settings_of_a_cluster_that_contradict_each_other_are_rejected() {
     for (set, why) in [
         (&["server.role=worker"][..], "server.role needs broker.url"),
@@ -279,48 +233,6 @@ fn settings_of_a_cluster_that_contradict_each_other_are_rejected() {
         let output = program.args(set.iter().flat_map(|set| ["--set", set])).output().unwrap();
         let message = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.code() == Some(2) && message.contains(why), "{message}");
-    }
-}
-
-#[test]
-fn synchronous_requests_are_computed_by_workers() {
-    for program in nats::programs() {
-        let cluster = Cluster::start(&program);
-        let (api, worker) = (cluster.node("a", "api"), cluster.node("w", "worker"));
-        let path = "/v1/meshes?format=stl&resolution=1";
-        let reply = send(api.addr, "POST", path, &[], SAMPLE);
-        assert_eq!(reply.status, 200, "{}", reply.text());
-        let timing = reply.header("server-timing").unwrap();
-        assert!(timing.contains("transfer;dur="), "{timing}");
-        assert!(reply.header("etag").is_some() && reply.header("molmesh-triangles").is_some(), "{:?}", reply.headers);
-        // The second request finds the result in the store.
-        let again = send(api.addr, "POST", path, &[], SAMPLE);
-        assert!(again.header("server-timing").unwrap().contains("hit"));
-        assert!(again.status == 200 && again.body == reply.body);
-        // Errors are those of the node itself. No record remains.
-        send(api.addr, "POST", "/v1/meshes", &[], b"REMARK no atoms\n").problem(422, "no-atoms");
-        send(api.addr, "POST", "/v1/meshes?isovalue=1000", &[], SAMPLE).problem(422, "no-surface");
-        let records = cluster.folder.path().join("store/jobs");
-        wait_for("the records to be removed", || std::fs::read_dir(&records).unwrap().next().is_none());
-        // A client that disconnects stops the work.
-        let long = "/v1/meshes?format=stl&resolution=0.1&quality=high";
-        let mut client = TcpStream::connect(api.addr).unwrap();
-        let head = format!("POST {long} HTTP/1.1\r\nhost: localhost\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
-        client.write_all(&[head.as_bytes(), SAMPLE].concat()).unwrap();
-        let names = || -> Vec<String> {
-            let all = std::fs::read_dir(&records).unwrap();
-            all.map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned()).collect()
-        };
-        wait_for("the job", || !names().is_empty());
-        drop(client);
-        wait_for("the end of the job", || names().iter().all(|name| name.ends_with(".ended.json")));
-        // Without the queue the node computes the mesh itself.
-        let mut cluster = cluster;
-        cluster.nats.stop(true);
-        wait_for("the loss is noticed", || get(api.addr, "/readyz").status == 503);
-        let reply = send(api.addr, "POST", path, &[], &sample(1));
-        assert!(reply.status == 200 && !reply.header("server-timing").unwrap().contains("transfer"));
-        kill_all([api, worker]);
     }
 }
 

@@ -89,11 +89,6 @@ const ROWS: &[Row] = &[
         "molmesh_broker_redeliveries_total",
         "http/cluster::a_job_of_a_killed_worker_runs_again_on_another_one",
     ),
-    (
-        "broker.transfer_wait_ms",
-        "molmesh_jobs_transferred_total",
-        "http/cluster::synchronous_requests_are_computed_by_workers",
-    ),
     ("broker.queue", "queue-full", "http/limits::a_full_broker_rejects_jobs_with_retry_after"),
     ("devices.jobs", "molmesh_device_jobs", "http/devices::devices_are_listed_with_their_reasons"),
     ("devices.batch", "molmesh_device_shared_submissions_total", "gpu/pool::small_jobs_share_a_submission"),

@@ -41,7 +41,6 @@ const ROWS: &[Row] = &[
     (t::BROKER_UP, &[], cluster),
     (t::BROKER_REDELIVERIES, &[], cluster),
     (t::BROKER_CLAIM_ERRORS, &[], lost_consumers),
-    (t::JOBS_TRANSFERRED, &[], cluster),
     (t::JOBS_RECOVERED, &[], restart),
     (t::RECORDS_QUARANTINED, &[], damaged_record),
     (t::JOBS_FALLBACK, &[], devices),
@@ -215,11 +214,6 @@ fn cluster(look: &dyn Fn()) {
     wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
     let _drained = server.join();
     let _server = start(Fake::new(Mode::Octahedra), shared);
-    let api = start(Fake::new(Mode::Octahedra), |config| {
-        shared(config);
-        config.server.role = molmesh::config::Role::Api;
-    });
-    wait_for("a transferred request", || api.post("/v1/meshes", &[], &sample(1)).status == 200);
     look();
 }
 

@@ -68,7 +68,7 @@ pub(crate) enum LogStyle {
     Json,
 }
 
-/// Values of `--report` of `doctor` and `reconcile`.
+/// Values of `doctor --report`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum TextOrJson {
     /// Text
@@ -93,23 +93,6 @@ pub(crate) struct DoctorArgs {
     pub(crate) timeout: f64,
     #[command(flatten)]
     pub(crate) serve: ServeArgs,
-}
-
-// `molmesh reconcile`.
-#[derive(Debug, ClapArgs)]
-pub(crate) struct ReconcileArgs {
-    /// List the lost jobs without dispatching them
-    #[arg(long)]
-    pub(crate) dry_run: bool,
-    /// Format of the report on stdout
-    #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
-    pub(crate) report: TextOrJson,
-    /// Configuration file (TOML) of the nodes
-    #[arg(long, value_name = "FILE", env = "MOLMESH_CONFIG", hide_env_values = true)]
-    pub(crate) config: Option<PathBuf>,
-    /// Set one value of the configuration, such as `broker.url=nats://host:4222`; may be repeated
-    #[arg(long, value_name = "SECTION.KEY=VALUE")]
-    pub(crate) set: Vec<String>,
 }
 
 // `molmesh config`.

@@ -123,6 +123,12 @@ impl MemoryBroker {
     pub(crate) fn is_empty(&self) -> bool {
         self.0.lock().held.is_empty()
     }
+
+    /// Returns true if a job is queued or claimed.
+    #[cfg(test)]
+    pub(crate) fn holds(&self, id: &JobId) -> bool {
+        self.0.lock().held.contains_key(id)
+    }
 }
 
 /// Claim of a job of a [`MemoryBroker`]. It lasts as long as the process.
@@ -176,10 +182,6 @@ impl Broker for MemoryBroker {
         Box::pin(std::future::ready(queued))
     }
 
-    fn holds<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>> {
-        Box::pin(std::future::ready(Ok(self.0.lock().held.contains_key(&job.id))))
-    }
-
     fn claim(&self, _prefers_gpu: bool) -> BoxFuture<'_, Claim> {
         // All workers of a process have the same devices.
         Box::pin(async {
@@ -228,10 +230,6 @@ impl Broker for MemoryBroker {
 
     fn flush(&self) -> BoxFuture<'_, ()> {
         Box::pin(std::future::ready(()))
-    }
-
-    fn has_workers(&self) -> BoxFuture<'_, bool> {
-        Box::pin(std::future::ready(true))
     }
 
     fn queued(&self) -> usize {

@@ -16,23 +16,20 @@ mod search;
 mod streams;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use async_nats::connection::State;
 use async_nats::jetstream::consumer::{Consumer, pull};
 use async_nats::jetstream::context::PublishErrorKind;
 use async_nats::jetstream::message::PublishMessage;
-use async_nats::jetstream::stream::LastRawMessageErrorKind;
 use async_nats::jetstream::{Context, ContextBuilder};
 use async_nats::{Client as Connection, ConnectOptions, Event};
-use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use futures_util::stream::{self, BoxStream, StreamExt as _};
 use metrics::counter;
 use tokio::sync::Mutex as AsyncMutex;
-use tokio::task::AbortHandle;
-use tokio::time::{sleep, timeout};
+use tokio::time::sleep;
 
 use endings::Endings;
 use search::JobSearch;
@@ -74,13 +71,9 @@ struct NatsState {
     config: BrokerConfig,
     /// Identity of the store that all nodes share.
     store: String,
-    /// True to create streams and queues that are missing.
-    creates: bool,
     /// Last error of the connection.
     failure: Arc<Mutex<Option<String>>>,
     endings: Endings,
-    /// Task that answers other nodes that look for a worker.
-    responder: OnceLock<AbortHandle>,
     /// Queues by lane and class; `None` until they exist.
     queues: Mutex<Option<Arc<[Queue]>>>,
     search: AsyncMutex<JobSearch>,
@@ -96,14 +89,6 @@ struct NatsState {
     failures: Mutex<[Option<String>; 2]>,
 }
 
-impl Drop for NatsState {
-    fn drop(&mut self) {
-        if let Some(responder) = self.responder.get() {
-            responder.abort();
-        }
-    }
-}
-
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -114,11 +99,11 @@ pub(crate) struct NatsBroker(Arc<NatsState>);
 
 impl NatsBroker {
     /// Connects to the server of the configuration. Does not wait until it answers. `store` identifies the store of the
-    /// nodes. Without `creates`, streams and queues must exist, and their settings remain.
+    /// nodes.
     ///
     /// # Errors
     /// Returns the reason if an address or the credentials are malformed.
-    pub(crate) async fn connect(config: &BrokerConfig, url: &str, store: &str, creates: bool) -> Result<Self, String> {
+    pub(crate) async fn connect(config: &BrokerConfig, url: &str, store: &str) -> Result<Self, String> {
         crate::tls::install_provider();
         let (losses, failure) = (Arc::new(AtomicUsize::new(0)), Arc::new(Mutex::new(None)));
         let (counted, failed) = (Arc::clone(&losses), Arc::clone(&failure));
@@ -149,10 +134,8 @@ impl NatsBroker {
             context,
             config: config.clone(),
             store: store.to_owned(),
-            creates,
             failure,
             endings: Endings::default(),
-            responder: OnceLock::new(),
             queues: Mutex::new(None),
             search: AsyncMutex::new(JobSearch::default()),
             queued: AtomicUsize::new(0),
@@ -173,28 +156,6 @@ fn lane_and_class(job: &Dispatch) -> (usize, usize) {
 }
 
 impl NatsState {
-    /// Returns the subject on which nodes look for a worker.
-    fn worker_subject(&self) -> String {
-        format!("{}.worker", self.config.prefix)
-    }
-
-    /// Answers nodes that look for a worker.
-    fn respond(self: &Arc<Self>) {
-        self.responder.get_or_init(|| {
-            let (connection, subject, state) = (self.connection.clone(), self.worker_subject(), Arc::downgrade(self));
-            let respond = async move {
-                let Ok(mut asked) = connection.queue_subscribe(subject, "workers".to_owned()).await else { return };
-                while let Some(request) = asked.next().await {
-                    let claims = state.upgrade().is_some_and(|state| state.queues().is_some());
-                    if let Some(reply) = request.reply.filter(|_| claims) {
-                        drop(connection.publish(reply, Bytes::new()).await);
-                    }
-                }
-            };
-            tokio::spawn(respond).abort_handle()
-        });
-    }
-
     fn queues(&self) -> Option<Arc<[Queue]>> {
         lock(&self.queues).clone()
     }
@@ -231,20 +192,7 @@ impl Broker for NatsBroker {
         })
     }
 
-    fn holds<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>> {
-        Box::pin(async move {
-            let failed = |error: &dyn std::fmt::Display| DispatchError::Unavailable { why: error.to_string() };
-            let stream = self.0.context.get_stream_no_info(self.0.stream()).await.map_err(|error| failed(&error))?;
-            match stream.get_last_raw_message_by_subject(&self.0.subject_of(job)).await {
-                Ok(_) => Ok(true),
-                Err(error) if error.kind() == LastRawMessageErrorKind::NoMessageFound => Ok(false),
-                Err(error) => Err(failed(&error)),
-            }
-        })
-    }
-
     fn claim(&self, prefers_gpu: bool) -> BoxFuture<'_, Claim> {
-        self.0.respond();
         Box::pin(async move {
             loop {
                 let losses = self.losses();
@@ -298,13 +246,6 @@ impl Broker for NatsBroker {
 
     fn flush(&self) -> BoxFuture<'_, ()> {
         Box::pin(self.0.flush())
-    }
-
-    fn has_workers(&self) -> BoxFuture<'_, bool> {
-        Box::pin(async {
-            let asked = timeout(POLL, self.0.connection.request(self.0.worker_subject(), Bytes::new())).await;
-            asked.is_ok_and(|answer| answer.is_ok())
-        })
     }
 
     fn queued(&self) -> usize {

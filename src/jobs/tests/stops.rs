@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use super::{Fixture, MAX_WAIT, ended, is, until};
 use crate::config::JobsConfig;
-use crate::jobs::broker::Broker as _;
+use crate::jobs::broker::{Broker as _, Dispatch};
 use crate::jobs::runs::StoppedJobs;
-use crate::jobs::{Dispatch, JobId, JobStore, Status};
+use crate::jobs::{JobId, JobStore, Status};
 use crate::store::Folder;
 
 /// Time in which unfinished jobs return to the queue.

@@ -69,11 +69,8 @@ impl NatsState {
         }
     }
 
-    /// Ends the search for jobs, and tells other nodes.
+    /// Ends the search for jobs, and leaves announced ones to other nodes.
     pub(super) fn stop_claiming(self: &Arc<Self>) {
-        if let Some(responder) = self.responder.get() {
-            responder.abort();
-        }
         let state = Arc::clone(self);
         tokio::spawn(async move { state.leave(&mut *state.search.lock().await) });
     }

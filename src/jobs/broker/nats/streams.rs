@@ -28,7 +28,7 @@ pub(super) async fn watch(broker: Weak<NatsState>) {
 }
 
 impl NatsState {
-    pub(super) fn stream(&self) -> String {
+    fn stream(&self) -> String {
         format!("{}-jobs", self.config.prefix)
     }
 
@@ -69,8 +69,7 @@ impl NatsState {
             Ok(_) => None,
         };
         let info = match (found, missing) {
-            (Ok(info), None) if !self.creates || self.queues().is_some() => info,
-            (_, Some(missing)) if !self.creates => return Err(missing),
+            (Ok(info), None) if self.queues().is_some() => info,
             (_, missing) => {
                 let existed = self.queues().is_some();
                 let info = self.create().await?;

@@ -5,10 +5,9 @@ use std::time::{Duration, Instant};
 
 use tokio::task::JoinHandle;
 
-use super::super::{Broker, Claim, Dispatch, NatsBroker};
+use super::super::{Broker, Claim, Dispatch};
 use super::server::NatsServer;
-use super::{SOON, claim, connect, job, nats, none_within, on_nats, until_down};
-use crate::config::BrokerConfig;
+use super::{SOON, claim, job, nats, none_within, on_nats, until_down};
 use crate::jobs::rank::DEFAULT_URGENCY;
 use crate::store::Digest;
 
@@ -88,13 +87,13 @@ async fn a_lost_stream_is_created_again_and_its_jobs_can_be_dispatched_again() {
     on_nats(async |server| {
         let [a, b] = nodes(server).await;
         let lost = dispatched(&*a).await;
-        assert_eq!((a.down(), a.losses(), b.losses(), a.holds(&lost).await), (None, 0, 0, Ok(true)));
+        assert_eq!((a.down(), a.losses(), b.losses()), (None, 0, 0));
         server.jetstream(DELETE_STREAM);
         until_down(&*a, SOON, |why| why.is_some()).await;
         for node in [&a, &b] {
             until_down(&**node, SOON, |why| why.is_none() && node.losses() > 0).await;
         }
-        assert_eq!((a.losses(), b.losses(), b.holds(&lost).await), (1, 1, Ok(false)));
+        assert_eq!((a.losses(), b.losses()), (1, 1));
         assert_eq!(a.dispatch(&lost).await, Ok(true));
         let claimed = claim(&b).await;
         assert_eq!(claimed.id, lost.id);
@@ -127,29 +126,6 @@ async fn a_lost_stream_of_locks_is_created_again() {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
         assert_eq!((a.losses(), b.losses()), (0, 0), "no job was lost");
-    })
-    .await;
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_node_that_creates_nothing_reports_what_is_missing() {
-    on_nats(async |server| {
-        let node = NatsBroker::connect(&BrokerConfig::default(), server.address(), "a", false).await.unwrap();
-        until_down(&node, SOON, |why| why.is_some_and(|why| why.contains("molmesh-jobs"))).await;
-        for (request, reason) in
-            [(DELETE_CONSUMER, "47 of 48 consumers"), (DELETE_LOCKS, "molmesh-work"), (DELETE_STREAM, "molmesh-jobs")]
-        {
-            let other = nats(server).await;
-            until_down(&node, SOON, |why| why.is_none()).await;
-            drop(other);
-            // A check that the other node has begun ends.
-            tokio::time::sleep(Duration::from_millis(200)).await;
-            assert_eq!(node.down(), None);
-            server.jetstream(request);
-            until_down(&node, SOON, |why| why.is_some_and(|why| why.contains(reason))).await;
-        }
-        connect(server.address()).await;
-        until_down(&node, SOON, |why| why.is_none()).await;
     })
     .await;
 }
