@@ -1,6 +1,5 @@
-//! `molmesh-bench commands`: time of whole `molmesh mesh` commands, from start to exit, on several backends in one run.
-//!
-//! `molmesh doctor --calibrate` runs first, so `auto` knows the costs of this machine. The backends take turns.
+//! `molmesh-bench commands`: time of whole `molmesh mesh` commands, from start to exit, on several backends in one run,
+//! which take turns.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -35,7 +34,7 @@ pub(crate) struct CommandsArgs {
     json: Option<PathBuf>,
 }
 
-/// Folder for the calibration and the meshes. Dropping it removes it.
+/// Folder for the meshes. Dropping it removes it.
 struct Scratch(PathBuf);
 
 impl Scratch {
@@ -44,30 +43,24 @@ impl Scratch {
         std::fs::create_dir(&folder).map_err(Error::file(&folder))?;
         Ok(Self(folder))
     }
-
-    /// Runs the binary. Returns its time, s.
-    fn time(&self, binary: &Path, args: &[&str], files: &[&Path]) -> Result<f64> {
-        let begin = Instant::now();
-        let output = Command::new(binary)
-            .args(args)
-            .args(files)
-            .env("XDG_CACHE_HOME", &self.0)
-            .stdin(Stdio::null())
-            .output()
-            .map_err(Error::file(binary))?;
-        let seconds = begin.elapsed().as_secs_f64();
-        // `doctor` exits with another code if the machine fails a check; the first mesh shows whether it works.
-        if output.status.success() || args[0] == "doctor" {
-            Ok(seconds)
-        } else {
-            Err(Error::failed(format!("{args:?}: {}", String::from_utf8_lossy(&output.stderr))))
-        }
-    }
 }
 
 impl Drop for Scratch {
     fn drop(&mut self) {
         drop(std::fs::remove_dir_all(&self.0));
+    }
+}
+
+/// Runs the binary. Returns its time, s.
+fn time(binary: &Path, args: &[&str], files: &[&Path]) -> Result<f64> {
+    let begin = Instant::now();
+    let output =
+        Command::new(binary).args(args).args(files).stdin(Stdio::null()).output().map_err(Error::file(binary))?;
+    let seconds = begin.elapsed().as_secs_f64();
+    if output.status.success() {
+        Ok(seconds)
+    } else {
+        Err(Error::failed(format!("{args:?}: {}", String::from_utf8_lossy(&output.stderr))))
     }
 }
 
@@ -81,7 +74,6 @@ pub(crate) fn run(args: &CommandsArgs) -> Result<()> {
     };
     let files = args.ids.iter().map(find).collect::<Result<Vec<_>>>()?;
     let scratch = Scratch::new()?;
-    scratch.time(&args.binary, &["doctor", "--calibrate", "--set", "archive.url=none"], &[])?;
     let mesh = scratch.0.join("mesh.glb");
     print(&format!(
         "medians, ms\n\n| structure | {} |\n|---|{}\n",
@@ -94,7 +86,7 @@ pub(crate) fn run(args: &CommandsArgs) -> Result<()> {
         for run in 0..=args.runs {
             for (backend, times) in args.backends.iter().zip(&mut times) {
                 let flags = ["mesh", "--resolution", "0.5", "--compress", "quantize", "--backend", backend, "-o"];
-                let seconds = scratch.time(&args.binary, &flags, &[&mesh, file])?;
+                let seconds = time(&args.binary, &flags, &[&mesh, file])?;
                 if run > 0 {
                     times.push(seconds * 1e3);
                 }

@@ -83,7 +83,7 @@ pub(crate) enum Command {
 /// Values of `--backend`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum BackendName {
-    /// The CPU or a GPU, whichever is estimated to finish each mesh first; the CPU if no GPU can be used
+    /// A GPU for jobs that are large enough; the CPU for others, and if no GPU can be used
     Auto,
     /// All cores, with the widest vector instructions of the processor
     Cpu,

@@ -18,12 +18,13 @@ use molmesh::surface::reference::ReferenceBackend;
 use molmesh::surface::{Backend, DeviceChoice, FoundDevice};
 
 use super::args::{BackendName, JobArgs};
-use super::calibration::Calibration;
 use super::error::CliError;
-use super::estimate::Estimate;
 
 /// Maximum number of threads of the CPU backend: more than any machine has cores.
 const MAX_THREADS: usize = 1024;
+/// Work of a command up to which `--backend auto` takes the CPU, in the units of
+/// [`estimate_work`](molmesh::pipeline::estimate_work): 4 s on two cores. A GPU takes up to a second to start.
+const MAX_CPU_WORK: f64 = 1e6;
 
 /// Requested backend and devices.
 #[derive(Debug)]
@@ -69,9 +70,10 @@ impl<'a> BackendRequest<'a> {
         matches!(self.purpose, Purpose::Mesh | Purpose::Picture)
     }
 
-    /// Returns the number of threads of a command's CPU backend.
-    fn n_threads(&self) -> usize {
-        self.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, NonZero::get))
+    /// Returns true if the user leaves the choice of a command's backend to its work, and a GPU would not be faster.
+    fn is_too_small(&self) -> bool {
+        let is_free = self.backend == BackendName::Auto && *self.devices == DeviceChoice::Auto;
+        is_free && self.work.is_some_and(|work| work <= MAX_CPU_WORK)
     }
 }
 
@@ -83,6 +85,7 @@ pub(crate) struct SelectedBackend {
     /// Renderer of pictures with its reason; the CPU if no pictures are needed.
     pub(crate) renderer: SelectedRenderer,
     /// All discovered devices, used or not.
+    #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) devices: Vec<FoundDevice>,
     /// Reason for not using a GPU, if none is used.
     #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
@@ -132,61 +135,20 @@ pub(crate) fn select(requested: &BackendRequest<'_>) -> Result<SelectedBackend, 
     })
 }
 
-/// Estimate for a command, with the calibration that it is based on.
-struct CommandEstimate {
-    estimate: Estimate,
-    calibration: Option<Calibration>,
-    /// Reason why a calibration is ignored.
-    ignored: Option<String>,
-}
-
-impl CommandEstimate {
-    /// Returns the estimate for a command if both backend and devices are `auto`.
-    fn new(requested: &BackendRequest<'_>) -> Option<Self> {
-        let free = requested.backend == BackendName::Auto && *requested.devices == DeviceChoice::Auto;
-        let work = requested.work.filter(|_| free)?;
-        let (calibration, ignored) = match Calibration::load() {
-            Ok(found) => (found, None),
-            Err(why) => (None, Some(why)),
-        };
-        let costs = calibration.as_ref().map(Calibration::costs).unwrap_or_default();
-        Some(Self { estimate: Estimate::new(&costs, work, requested.n_threads()), calibration, ignored })
-    }
-
-    /// Notes that another device than those in use was measured. It is not known before they are discovered.
-    fn check_device(&mut self, devices: &[FoundDevice]) {
-        let gpu = self.calibration.as_ref().and_then(|calibration| calibration.gpu.as_ref());
-        if let Some(gpu) = gpu.filter(|gpu| !gpu.is_among(devices)) {
-            self.ignored = Some(format!("the calibration is of another GPU, {} ({})", gpu.device, gpu.driver));
-        }
-    }
-
-    /// Describes the estimate for reports.
-    fn text(&self) -> String {
-        let ignored = self.ignored.iter().map(|why| format!("; {why}"));
-        std::iter::once(self.estimate.to_string()).chain(ignored).collect()
-    }
-}
-
 /// Selects a GPU, or the CPU if the request allows any backend.
 fn gpu_or_cpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliError> {
-    let mut estimate = CommandEstimate::new(requested);
-    if let Some(estimate) = estimate.as_ref().filter(|estimate| !estimate.estimate.favours_gpu()) {
-        let why = format!("a GPU is not expected to be faster ({})", estimate.text());
+    if requested.is_too_small() {
+        let why = "a GPU is not expected to be faster".to_owned();
         return instead_of_gpu(requested, format!("auto: {why}"), NoGpu { why, devices: Vec::new() });
     }
     let auto = requested.backend == BackendName::Auto;
     let listed = matches!(requested.devices, DeviceChoice::Listed(_));
     match gpu(requested) {
         Ok(mut selected) => {
-            if let Some(estimate) = &mut estimate {
-                estimate.check_device(&selected.devices);
-            }
-            let estimate = estimate.map(|estimate| format!(", {}", estimate.text())).unwrap_or_default();
             selected.reason = if listed {
                 format!("--devices {}", requested.devices)
             } else if auto {
-                format!("auto: {}{estimate}", selected.reason)
+                format!("auto: {}", selected.reason)
             } else {
                 "requested".to_owned()
             };
@@ -200,8 +162,7 @@ fn gpu_or_cpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliErro
             let reason = if *requested.devices == DeviceChoice::Cpu {
                 "--devices cpu".to_owned()
             } else {
-                let estimate = estimate.map(|estimate| format!(", {}", estimate.text())).unwrap_or_default();
-                format!("auto: no GPU: {}{estimate}", none.why)
+                format!("auto: no GPU: {}", none.why)
             };
             instead_of_gpu(requested, reason, none)
         }
@@ -214,7 +175,8 @@ fn instead_of_gpu(requested: &BackendRequest<'_>, reason: String, none: NoGpu) -
 }
 
 fn cpu(requested: &BackendRequest<'_>) -> Result<Box<dyn Backend>, CliError> {
-    let threads = if requested.is_command() { Some(requested.n_threads()) } else { requested.threads };
+    let all = || std::thread::available_parallelism().map_or(1, NonZero::get);
+    let threads = requested.threads.or_else(|| requested.is_command().then(all));
     let backend = CpuBackend::new(threads).map_err(|why| CliError::NoBackend { requested: "cpu", why })?;
     Ok(Box::new(backend))
 }

@@ -7,13 +7,11 @@ mod args;
 mod backend;
 #[cfg(feature = "server")]
 mod banner;
-mod calibration;
 #[cfg(feature = "server")]
 mod config;
 #[cfg(feature = "server")]
 mod doctor;
 mod error;
-mod estimate;
 #[cfg(feature = "server")]
 mod healthcheck;
 mod interrupt;

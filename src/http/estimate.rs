@@ -26,7 +26,7 @@ use super::request_id::RequestId;
 use super::source::Loaded;
 use super::state::Shared;
 use crate::jobs::{Pool, Rank};
-use crate::pipeline::{self, Choice, Estimate, MeshEstimate};
+use crate::pipeline::{self, Estimate, MeshEstimate};
 use crate::surface::Control;
 
 /// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and grid points are exact; the size of the mesh
@@ -121,10 +121,11 @@ pub(super) async fn create(
     let Loaded { input, digest, reservation } = source.find(&app, &caller, &digest, None).await?;
     drop(source);
     let (seconds, lane) = (app.pool.expected(&input, &job), Pool::lane(&Rank::default(), &input, &job));
+    let backend = app.pool.choice(&input, &job).backend.name();
     let reading = app.read(&caller, (reservation, delivery), {
         let (app, job, namespace) = (Arc::clone(&app), job.clone(), caller.namespace);
         move |control| {
-            let choice = Choice { backend: app.pool.backend().as_ref(), reason: app.pool.reason() };
+            let choice = app.pool.choice(&input, &job);
             let limits = app.config.limits.job();
             let read = |control: &Control<'_>| app.structures().get(namespace, digest, &input, &limits.read, control);
             pipeline::estimate(read, &job, &limits, &choice, control)
@@ -161,7 +162,7 @@ pub(super) async fn create(
         structure: digest.to_string(),
         seconds,
         wait_seconds: wait,
-        backend: app.pool.backend().name(),
+        backend,
     };
     Ok(([(CACHE_CONTROL, "no-store")], Json(document)).into_response())
 }

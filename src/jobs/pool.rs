@@ -12,7 +12,7 @@ use super::rank::{Lane, Rank};
 use super::threads::ThreadPools;
 use super::{Budget, Client, Input, OnStart, Refusal, Structures, Task, Ticket, worker};
 use crate::picture::SelectedRenderer;
-use crate::pipeline::{self, Job, JobLimits, file_arithmetic};
+use crate::pipeline::{self, Choice, Job, JobLimits, file_arithmetic};
 use crate::surface::Backend;
 use crate::telemetry::{JOBS_SUBMITTED, Tracer};
 
@@ -69,6 +69,16 @@ pub(super) struct WorkerContext {
 }
 
 impl WorkerContext {
+    /// Returns the backend of a job, with the reason.
+    pub(super) fn choice(&self, input: &Input, job: &Job) -> Choice<'_> {
+        match self.backend.cpu() {
+            Some(backend) if !pipeline::suits_gpu(input.atoms(), job) => {
+                Choice { backend, reason: "auto: the job does not suit a GPU" }
+            }
+            _ => Choice { backend: self.backend.as_ref(), reason: &self.reason },
+        }
+    }
+
     /// Updates metrics and log with the state of the devices.
     pub(super) fn publish_devices(&self) {
         self.monitor.publish(&self.backend.devices());
@@ -162,6 +172,11 @@ impl Pool {
     /// Returns the backend.
     pub(crate) fn backend(&self) -> &Arc<dyn Backend> {
         &self.shared.backend
+    }
+
+    /// Returns the backend of a job, with the reason.
+    pub(crate) fn choice(&self, input: &Input, job: &Job) -> Choice<'_> {
+        self.shared.choice(input, job)
     }
 
     /// Returns the reason for the choice of the backend.

@@ -84,7 +84,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
             memory: Arc::<MemoryReservation>::clone(&reservation),
             ..Control::default()
         };
-        let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
+        let choice = shared.choice(&task.input, &task.job);
         let work = || {
             OnStart::run_all(on_start);
             let file = task.input.file();

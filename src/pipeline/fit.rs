@@ -8,7 +8,6 @@ use std::sync::Arc;
 
 use super::clock::StageClock;
 use super::spacing::{COARSEST, FINEST, Spacing};
-use super::work::search_work;
 use super::{Choice, Job};
 use crate::structure::Context;
 use crate::surface::{
@@ -177,9 +176,6 @@ pub(super) fn mesh(
     control: &Control<'_>,
 ) -> Result<Fitted, SurfaceError> {
     let mut search = Search::new(limit, &job.params, spheres.len());
-    let expected = Spacing::MaxTriangles(limit).expected(&job.params, spheres.len() as f64);
-    let assigned = choice.backend.for_job(job.params.surface, search_work(spheres.len() as f64, expected));
-    let backend = assigned.as_deref().unwrap_or(choice.backend);
     // The last mesh with its memory.
     let mut last: Option<(f64, MeshOutput, Arc<Reservation>)> = None;
     // Name of the backend that computed the meshes.
@@ -205,8 +201,8 @@ pub(super) fn mesh(
         let observer: &dyn Observer = if search.tries() == 0 { &without_progress } else { clock };
         let memory = Arc::new(Reservation::new(&control.memory));
         let control = Control { observer, memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-        let made = unless_empty(clock.pass(|| backend.run(spheres, &params, limits, &control)))?;
-        let by = made.as_ref().map(|m| m.made_by.as_ref().map_or(backend.name(), |s| s.backend));
+        let made = unless_empty(clock.pass(|| choice.backend.run(spheres, &params, limits, &control)))?;
+        let by = made.as_ref().map(|m| m.made_by.as_ref().map_or(choice.backend.name(), |s| s.backend));
         if by.is_some() && made_by.is_some() && by != made_by {
             // The counts of different backends, and therefore the spacing, may differ slightly. The content key names
             // one backend, so all counts must come from it.

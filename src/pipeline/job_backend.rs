@@ -6,12 +6,11 @@ use std::sync::Arc;
 
 use super::cut::Cut;
 use super::parts::{self, Run};
-use super::work::mesh_work;
 use crate::structure::AtomPart;
 use crate::surface::improve::improve;
 use crate::surface::{
-    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Reservation, Spheres, Stage, SurfaceError, SurfaceKind,
-    SurfaceLimits, SurfaceParams, TriangleQuality,
+    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Reservation, Spheres, Stage, SurfaceError, SurfaceLimits,
+    SurfaceParams, TriangleQuality,
 };
 
 /// Division of a mesh.
@@ -46,13 +45,13 @@ impl<'a> Division<'a> {
     }
 }
 
-/// Returns `backend` or, if the job has a division or a high quality, a backend that processes the meshes of `backend`.
+/// Returns the backend of a job or, if the job has a division or a high quality, a backend that processes its meshes.
 pub(super) fn of_job<'a>(
     backend: &'a dyn Backend,
     division: Option<Division<'a>>,
     quality: TriangleQuality,
 ) -> AnyBackend<'a> {
-    let inner = AnyBackend::Borrowed(backend);
+    let inner = backend.for_job().map_or(AnyBackend::Borrowed(backend), AnyBackend::Owned);
     if division.is_none() && quality == TriangleQuality::Standard {
         return inner;
     }
@@ -78,7 +77,6 @@ impl<'a> Deref for AnyBackend<'a> {
 
 /// Backend that processes the meshes of another backend.
 struct JobBackend<'a> {
-    /// The chosen backend, or the one that it assigned to the job.
     inner: AnyBackend<'a>,
     division: Option<Division<'a>>,
     quality: TriangleQuality,
@@ -98,10 +96,7 @@ impl JobBackend<'_> {
 
     /// Meshes each of `parts` and joins the meshes. Limits apply to all parts together, before quantizing.
     fn join(&self, parts: &[AtomPart], run: &Run<'_>, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
-        let work = parts.iter().map(|part| mesh_work(part.rows.len() as f64, run.params.resolution)).sum();
-        let assigned = self.inner.for_job(run.params.surface, work);
-        let inner = AnyBackend::Borrowed(assigned.as_deref().unwrap_or(&*self.inner));
-        let backend = JobBackend { inner, division: None, quality: self.quality };
+        let backend = JobBackend { inner: AnyBackend::Borrowed(&*self.inner), division: None, quality: self.quality };
         // The content key names one backend. If it fails after some parts, the fallback meshes all parts again.
         for _attempt in 0..2 {
             let memory = Arc::new(Reservation::new(&control.memory));
@@ -149,17 +144,8 @@ impl Backend for JobBackend<'_> {
         self.inner.describe()
     }
 
-    fn supports(&self, surface: SurfaceKind) -> bool {
-        self.inner.supports(surface)
-    }
-
     fn devices(&self) -> Vec<DeviceStatus> {
         self.inner.devices()
-    }
-
-    fn for_job(&self, surface: SurfaceKind, work: f64) -> Option<Box<dyn Backend + '_>> {
-        let inner = AnyBackend::Owned(self.inner.for_job(surface, work)?);
-        Some(Box::new(JobBackend { inner, division: self.division, quality: self.quality }))
     }
 
     fn write(

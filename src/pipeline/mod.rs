@@ -8,7 +8,6 @@ mod cavities;
 mod clock;
 pub mod color;
 mod components;
-pub mod cost;
 mod cut;
 #[cfg(feature = "png")]
 mod draw;
@@ -17,7 +16,6 @@ mod estimate;
 mod file;
 mod finest_fit;
 mod fit;
-mod host_cores;
 mod instances;
 pub mod integer;
 mod job_backend;
@@ -63,7 +61,7 @@ pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
 #[cfg(feature = "server")]
 pub(crate) use work::suits_gpu;
-pub use work::{BYTES_PER_ATOM, estimate_atoms, estimate_work, mesh_work};
+pub use work::{BYTES_PER_ATOM, estimate_atoms, estimate_work};
 
 use crate::formats::tileset::TileAddress;
 use crate::formats::{Compress, GlbSink, Normals, Packing, Step, Storage, Units};

@@ -5,7 +5,7 @@ use super::devices::DeviceStatus;
 use super::error::SurfaceError;
 use super::measure::{Measures, Validation};
 use super::mesh::Mesh;
-use super::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
+use super::params::{SurfaceLimits, SurfaceParams};
 use super::simd;
 use super::sink::{MeshPart, MeshSink, SinkFailed};
 use super::spheres::Spheres;
@@ -138,8 +138,6 @@ pub struct BackendIdentity {
     pub arithmetic: String,
     /// The hardware that it ran on, for display.
     pub device: String,
-    /// Predicted times that decided between several backends, if there was a choice.
-    pub prediction: Option<String>,
     /// The reason why this backend replaced the requested one; `None` if it did not.
     pub fallback_reason: Option<String>,
 }
@@ -148,15 +146,14 @@ impl BackendIdentity {
     /// Creates the identity of a backend or renderer that did not replace another one.
     #[must_use]
     pub fn new(backend: &'static str, arithmetic: String, device: String) -> Self {
-        Self { backend, arithmetic, device, prediction: None, fallback_reason: None }
+        Self { backend, arithmetic, device, fallback_reason: None }
     }
 
-    /// Adds the prediction and the reason for a fallback, if there are any, to the reason for the choice of a backend.
+    /// Adds the reason for a fallback, if there is one, to the reason for the choice of a backend.
     #[must_use]
     pub fn reason(&self, choice: &str) -> String {
-        let prediction = self.prediction.iter().map(|prediction| format!("; {prediction}"));
         let fallback = self.fallback_reason.iter().map(|why| format!("; but {why}"));
-        std::iter::once(choice.to_owned()).chain(prediction).chain(fallback).collect()
+        std::iter::once(choice.to_owned()).chain(fallback).collect()
     }
 }
 
@@ -182,12 +179,6 @@ pub trait Backend: Send + Sync {
     /// Returns the identity of this backend for the report of a mesh.
     fn identity(&self) -> BackendIdentity {
         BackendIdentity::new(self.name(), self.arithmetic(), self.describe())
-    }
-
-    /// Returns true if the backend supports this surface. [`Self::write`] rejects others.
-    fn supports(&self, surface: SurfaceKind) -> bool {
-        let _ = surface;
-        true
     }
 
     /// Meshes `spheres`, in memory or, if there is a `sink`, into the sink. Both get the same rows.
@@ -217,10 +208,14 @@ pub trait Backend: Send + Sync {
         self.write(spheres, params, limits, control, None)
     }
 
-    /// Chooses one backend for a job of several meshes of `surface`, which must come from the same backend. `work` is
-    /// the total number of atoms at 0.5 Å. Returns `None` if this backend has no alternatives.
-    fn for_job(&self, surface: SurfaceKind, work: f64) -> Option<Box<dyn Backend + '_>> {
-        let _ = (surface, work);
+    /// Returns a backend for one job, whose meshes must come from the same backend: after a fallback, it stays with the
+    /// fallback. `None` if this backend has no fallback.
+    fn for_job(&self) -> Option<Box<dyn Backend + '_>> {
+        None
+    }
+
+    /// Returns the backend for jobs that do not suit a GPU; `None` if this backend takes them as well.
+    fn cpu(&self) -> Option<&dyn Backend> {
         None
     }
 

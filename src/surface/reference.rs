@@ -12,7 +12,7 @@ use super::error::SurfaceError;
 use super::kernel::{MIN_DISTANCE2, Profile};
 use super::lattice::{EDGE_MARGIN, slightly_coarser, to_f32, to_i32, to_u64};
 use super::mesh::Mesh;
-use super::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
+use super::params::{SurfaceLimits, SurfaceParams};
 use super::sink::MeshSink;
 use super::spheres::Spheres;
 
@@ -141,10 +141,6 @@ impl Backend for ReferenceBackend {
 
     fn describe(&self) -> String {
         "sequential reference, 1 thread, double precision".to_owned()
-    }
-
-    fn supports(&self, surface: SurfaceKind) -> bool {
-        surface.kernel().is_some()
     }
 
     fn write(

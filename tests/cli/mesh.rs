@@ -218,8 +218,7 @@ fn json_report_has_its_fields() {
     assert_eq!((&report["surface"], &report["resolution"]), (&"gaussian".into(), &0.5.into()));
     // The start of a GPU would take longer than this job.
     assert_eq!(report["backend"], "cpu");
-    let reason = report["backend_reason"].as_str().unwrap();
-    assert!(reason.starts_with("auto: a GPU is not expected to be faster (estimated "), "{report}");
+    assert_eq!(report["backend_reason"], "auto: a GPU is not expected to be faster");
     assert!(report["area"].as_f64().unwrap() > 100.0 && report["volume"].as_f64().unwrap() > 50.0, "{report}");
     for stage in ["read", "field", "emit", "measure", "encode", "write"] {
         assert!(report["timings_ms"][stage].as_f64().is_some_and(|ms| ms >= 0.0), "{stage}: {report}");

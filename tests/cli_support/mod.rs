@@ -50,8 +50,6 @@ fn prepared(mut command: Command) -> Command {
     }
     // Without a desktop, a layer of Mesa prints errors to stderr.
     command.env("NODEVICE_SELECT", "1");
-    // A calibration of this machine would change the choice of the backend.
-    command.env("XDG_CACHE_HOME", concat!(env!("CARGO_TARGET_TMPDIR"), "/empty-cache"));
     // Tests use no network, and no load balancer needs notice of a shutdown.
     command.env("MOLMESH__ARCHIVE__URL", "none");
     command.env("MOLMESH__SERVER__TERMINATION_NOTICE_MS", "none");

@@ -1,33 +1,29 @@
-//! A service with two backends: both are used under load, and results of either are found again.
+//! A service with a CPU and a GPU backend: each runs the jobs that suit it, and results of either are found again.
 
 use crate::http_support;
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use http_support::{Fake, Mode, Reply, Running, SAMPLE, sample, send, start, wait_for};
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, sample, send, start};
 use molmesh::pipeline::AutoBackend;
-use molmesh::surface::{
-    Backend, Control, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceKind, SurfaceLimits, SurfaceParams,
-};
+use molmesh::surface::{Backend, Control, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
 
-/// Fake backend with a name and, derived from it, an arithmetic of its own.
-struct Named(&'static str, Arc<Fake>);
+/// Fake backend with a name and, derived from it, an arithmetic of its own. It can fail.
+#[derive(Clone)]
+struct Named {
+    name: &'static str,
+    fake: Arc<Fake>,
+    fails: Arc<AtomicBool>,
+}
 
 impl Backend for Named {
     fn name(&self) -> &'static str {
-        self.0
+        self.name
     }
 
     fn describe(&self) -> String {
-        format!("the {}", self.0)
-    }
-
-    /// The GPU makes isosurfaces only.
-    fn supports(&self, surface: SurfaceKind) -> bool {
-        self.0 != "gpu" || surface.kernel().is_some()
+        format!("the {}", self.name)
     }
 
     fn write(
@@ -38,21 +34,24 @@ impl Backend for Named {
         control: &Control<'_>,
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
-        self.1.write(spheres, params, limits, control, sink)
+        if self.fails.load(Ordering::SeqCst) {
+            return Err(SurfaceError::Device { why: "lost by a test".to_owned() });
+        }
+        self.fake.write(spheres, params, limits, control, sink)
     }
 }
 
-/// Starts a service whose CPU and GPU take `times`, ms, for any job.
-fn service(times: [u64; 2]) -> (Running, [Arc<Fake>; 2]) {
-    let fakes = times.map(|ms| Fake::new(Mode::Slow(Duration::from_millis(ms))));
-    let [cpu, gpu] = fakes.each_ref().map(Arc::clone);
-    let backend = AutoBackend::new(Box::new(Named("cpu", cpu)), Box::new(Named("gpu", gpu)));
-    let server = start(Arc::new(backend), |config| (config.jobs.workers, config.jobs.concurrent_saves) = (8, 16));
-    (server, fakes)
+/// Starts a service. Returns its CPU and its GPU as well.
+fn service() -> (Running, [Named; 2]) {
+    let named = |name| Named { name, fake: Fake::new(Mode::Octahedra), fails: Arc::default() };
+    let backends = ["cpu", "gpu"].map(named);
+    let [cpu, gpu] = backends.clone().map(Box::new);
+    (start(Arc::new(AutoBackend::new(cpu, gpu)), |_| {}), backends)
 }
 
-fn started(fakes: &[Arc<Fake>; 2]) -> usize {
-    fakes.iter().map(|fake| fake.started.load(Ordering::SeqCst)).sum()
+/// Returns the number of meshes that each backend has started.
+fn started(backends: &[Named; 2]) -> [usize; 2] {
+    backends.each_ref().map(|backend| backend.fake.started.load(Ordering::SeqCst))
 }
 
 #[track_caller]
@@ -62,76 +61,52 @@ fn header<'a>(reply: &'a Reply, name: &str) -> &'a str {
 }
 
 #[test]
-fn both_backends_work_under_load_and_either_result_is_found() {
-    let (server, fakes) = service([160, 80]);
-    let post = |n: usize| server.post("/v1/meshes", &[], &sample(n));
-    // Without load, the faster backend gets every job.
-    for n in 0..3 {
-        let reply = post(n);
-        assert_eq!(header(&reply, "molmesh-backend"), "gpu");
-        let reason = header(&reply, "molmesh-backend-reason");
-        assert!(reason.contains("ms on the CPU") && reason.contains("ms on a GPU"), "{reason}");
-    }
-    // A surface that the GPU does not make does not count as a failure of the GPU.
-    for surface in ["vdw", "sas", "ses"] {
-        let reply = server.post(&format!("/v1/meshes?surface={surface}"), &[], SAMPLE);
-        assert_eq!(header(&reply, "molmesh-backend"), "cpu");
-        assert!(!header(&reply, "molmesh-backend-reason").contains("but"), "{surface}");
-    }
-    let together: Vec<Reply> = std::thread::scope(|scope| {
-        let clients: Vec<_> = (10..18).map(|n| scope.spawn(move || post(n))).collect();
-        clients.into_iter().map(|client| client.join().unwrap()).collect()
-    });
-    let used: BTreeSet<&str> = together.iter().map(|reply| header(reply, "molmesh-backend")).collect();
-    assert_eq!(used, BTreeSet::from(["cpu", "gpu"]));
-    // Results are stored in the background.
-    for reply in &together {
-        assert_eq!(server.get(header(reply, "content-location")).status, 200);
-    }
-    let before = started(&fakes);
-    for (n, first) in (10..18).zip(&together) {
-        let again = post(n);
-        assert!(header(&again, "server-timing").contains("hit"), "{n}");
+fn jobs_run_on_the_backend_that_they_suit_and_either_result_is_found() {
+    let (server, backends) = service();
+    for (n, query, used, reason) in [
+        (0, "", "gpu", "set by a test"),
+        (1, "?surface=ses", "gpu", "set by a test"),
+        (2, "?resolution=2", "cpu", "auto: the job does not suit a GPU"),
+    ] {
+        let post = |path: &str| server.post(&format!("{path}{query}"), &[], &sample(n));
+        assert_eq!(post("/v1/estimate").json()["backend"], used, "{query}");
+        let before = started(&backends);
+        let first = post("/v1/meshes");
+        assert_eq!(header(&first, "molmesh-backend"), used, "{query}");
+        assert_eq!(header(&first, "molmesh-backend-reason"), reason, "{query}");
+        let after = started(&backends);
+        let meshes = [0, 1].map(|k| after[k] - before[k]);
+        assert_eq!(meshes, ["cpu", "gpu"].map(|name| usize::from(name == used)), "{query}");
+        // Results are stored in the background.
+        assert_eq!(server.get(header(&first, "content-location")).status, 200);
+        let again = post("/v1/meshes");
+        assert!(header(&again, "server-timing").contains("hit"), "{query}");
         for name in ["etag", "content-location", "molmesh-backend"] {
-            assert_eq!(header(&again, name), header(first, name), "{n}");
+            assert_eq!(header(&again, name), header(&first, name), "{query}");
         }
-        assert_eq!(again.body, first.body, "{n}");
+        assert_eq!(again.body, first.body, "{query}");
+        assert_eq!(started(&backends), after, "a stored result was computed again");
     }
-    assert_eq!(started(&fakes), before, "a stored result was computed again");
-    let tags: BTreeSet<&str> = together.iter().map(|reply| header(reply, "etag")).collect();
-    assert_eq!(tags.len(), together.len());
 }
 
 #[test]
-fn validators_name_the_result_of_one_backend() {
-    let (server, fakes) = service([40, 20]);
+fn the_cpu_replaces_the_gpu_and_validators_name_its_result() {
+    let (server, backends) = service();
     let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
     let path = format!("{structure}/surface.glb");
     let with = |name: &str, value: &str| send(server.addr, "GET", &path, &[(name, value)], b"");
     // The arithmetic is not known before the run.
     let head = send(server.addr, "HEAD", &path, &[], b"");
     assert_eq!((head.status, head.header("etag")), (200, None));
-    // The slower backend makes the mesh while the other one is busy.
-    fakes[1].set(Mode::Held);
-    let busy: Vec<_> = (0..4)
-        .map(|n| {
-            let addr = server.addr;
-            std::thread::spawn(move || send(addr, "POST", "/v1/meshes", &[], &sample(n)).status)
-        })
-        .collect();
-    wait_for("a job on the faster backend", || fakes[1].begun.lock().unwrap().iter().any(|atoms| *atoms < 900));
-    // By now the held jobs are late, and the first backend has finished its own.
-    std::thread::sleep(Duration::from_millis(400));
+    backends[1].fails.store(true, Ordering::SeqCst);
     let reply = server.get(&path);
+    backends[1].fails.store(false, Ordering::SeqCst);
     assert_eq!(header(&reply, "molmesh-backend"), "cpu");
-    fakes[1].set(Mode::Octahedra);
-    for client in busy {
-        assert_eq!(client.join().unwrap(), 200);
-    }
+    assert_eq!(header(&reply, "molmesh-backend-reason"), "set by a test; but the GPU failed: lost by a test");
     let etag = header(&reply, "etag").to_owned();
     assert_eq!(server.get(header(&reply, "content-location")).header("etag"), Some(etag.as_str()));
-    // The idle service prefers the other backend, but the result exists.
-    let before = started(&fakes);
+    // The GPU works again, but the result exists.
+    let before = started(&backends);
     assert_eq!(header(&server.get(&path), "etag"), etag);
     assert_eq!(send(server.addr, "HEAD", &path, &[], b"").header("etag"), Some(etag.as_str()));
     assert_eq!(with("if-none-match", &etag).status, 304);
@@ -143,5 +118,5 @@ fn validators_name_the_result_of_one_backend() {
     assert_eq!(server.get(&format!("/v1/jobs/{job}?wait=20")).json()["status"], "successful");
     let result = server.get(&format!("/v1/jobs/{job}/result"));
     assert_eq!(result.header("location"), reply.header("content-location"));
-    assert_eq!(started(&fakes), before, "a stored result was computed again");
+    assert_eq!(started(&backends), before, "a stored result was computed again");
 }

@@ -70,8 +70,7 @@ impl Backend for Devices {
             Some(_) => "cpu".to_owned(),
             None => self.served.lock().unwrap().map_or_else(|| self.arithmetic(), str::to_owned),
         };
-        let made_by =
-            Some(BackendIdentity { backend, arithmetic, device: device.to_owned(), prediction: None, fallback_reason });
+        let made_by = Some(BackendIdentity { backend, arithmetic, device: device.to_owned(), fallback_reason });
         Ok(MeshOutput { made_by, ..self.fake.write(spheres, params, limits, control, sink)? })
     }
 

@@ -152,7 +152,7 @@ impl Backend for Devices {
     ) -> Result<MeshOutput, SurfaceError> {
         let fallback_reason = Some("fallback of a test".to_owned());
         let (arithmetic, device) = ("cpu".to_owned(), "the processor".to_owned());
-        let made_by = Some(BackendIdentity { backend: "cpu", arithmetic, device, prediction: None, fallback_reason });
+        let made_by = Some(BackendIdentity { backend: "cpu", arithmetic, device, fallback_reason });
         Ok(MeshOutput { made_by, ..self.0.write(spheres, params, limits, control, sink)? })
     }
 

@@ -84,10 +84,6 @@ pub(crate) struct DoctorArgs {
     /// Format of the report on stdout
     #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
     pub(crate) report: TextOrJson,
-    /// Measure the CPU and the GPU for `--backend auto` of later commands, and store the result in the cache folder
-    /// (`$XDG_CACHE_HOME` or `~/.cache`)
-    #[arg(long)]
-    pub(crate) calibrate: bool,
     /// Seconds to wait for the store and for the remote archive
     #[arg(long, value_name = "SECONDS", default_value_t = 5.0)]
     pub(crate) timeout: f64,

@@ -1,7 +1,6 @@
 //! `molmesh doctor`: reports the machine and its devices, which are used and why, and checks that a service with this
 //! configuration would start and be ready.
 
-mod calibrate;
 mod checks;
 mod external;
 mod machine;
@@ -53,8 +52,6 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     let config: Config = loaded.config.clone();
     let mut checks = vec![checks::sources(args.serve.config.as_deref(), &loaded), checks::log(&config)];
     checks.extend(checks::warnings(&loaded));
-    // First, because it measures the start of a GPU.
-    checks.extend(args.calibrate.then(|| calibrate::run(&config.devices.choice)));
     // The same steps as in a service: query all drivers, build the pipelines of the selected devices, make a mesh.
     let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);
     match backend::select(&BackendRequest::for_service(args.serve.backend, &config.devices)) {
