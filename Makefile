@@ -1,4 +1,4 @@
-# Main targets: `make run` and `make test`. `make help` lists all targets.
+# Main targets: `make run`, `make test` and `make install`. `make help` lists all targets.
 #
 # Optional variables: PROFILE=release runs optimized tests; ARGS passes flags to `make run`; SECONDS=180 fuzzes each
 # target for longer.
@@ -9,13 +9,16 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
+.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
 
 run: web-if-possible ## Build (the first time takes minutes) and serve on http://127.0.0.1:8080
 	$(CARGO) run --profile fast-build --bin molmesh -- serve $(ARGS)
+
+install: web-if-possible ## Install the command molmesh, with the service and its web page, into ~/.cargo/bin
+	$(CARGO) install --path . --locked --profile fast-build
 
 STEPS := tools web fmt-check lint deny-if-installed matrix static-if-possible interleavings tests
 

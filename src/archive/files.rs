@@ -1,5 +1,6 @@
 //! Entries in local files: those of the folder, and the copies on disk. Reading takes a permit and a part of the memory
-//! budget, both before a file is read.
+//! budget, both before a file is read. The thread that reads holds the permit and the bytes hold the memory, so that a
+//! client that disconnects releases neither too early.
 
 use std::sync::Arc;
 use std::time::Duration;

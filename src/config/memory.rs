@@ -1,4 +1,5 @@
-//! Memory of this machine and of this process's control group.
+//! Memory of this machine and of this process's control group. Limits of processes (`ulimit`) are ignored, because they
+//! count address space instead of memory.
 
 use std::fs;
 use std::path::Path;

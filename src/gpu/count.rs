@@ -1,4 +1,8 @@
 //! First half of a job: the stages that evaluate a chunk and count its vertices and triangles.
+//!
+//! `scan` is not a single-pass scan, whose workgroups wait for each other: WebGPU does not guarantee that they all make
+//! progress, so it could hang. Instead, `classify` adds up the counts of each group of bricks, and every workgroup of
+//! `scan` adds up the groups before its own.
 
 use super::buffers::BufferId;
 use super::engine::Engine;

@@ -1,8 +1,8 @@
 //! Engine of one device: its budget, pipelines and buffers, and the upload of jobs.
 //!
-//! Several small jobs share a submission, with output buffers whose size is estimated. A larger job takes two: the
-//! first counts its vertices and triangles, the second writes them to buffers of exact size. A job that exceeds the
-//! budget is cut into chunks of tiles.
+//! Several small jobs share a submission, with output buffers whose size is estimated: reading the counts back first
+//! would take longer than the job. A larger job takes two submissions: the first counts its vertices and triangles, the
+//! second writes them to buffers of exact size. A job that exceeds the budget is cut into chunks of tiles.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

@@ -1,5 +1,5 @@
 //! `…/atoms`: identity of the atoms of a structure, in columns that are indexed by `_ATOM` of a mesh, or the atoms of a
-//! mesh with their positions.
+//! mesh with their positions. Labels in the mesh itself would double the size of a small one.
 
 use axum::body::Body;
 use axum::extract::State;

@@ -1,4 +1,5 @@
-//! `/livez`, `/readyz` and `/version`, for orchestrators.
+//! `/livez`, `/readyz` and `/version`, for orchestrators. An orchestrator that removes a busy node moves its load to
+//! the others, so readiness does not depend on the load.
 
 use std::time::Duration;
 

@@ -1,4 +1,7 @@
 //! Queued or running job that several identical requests share.
+//!
+//! The job has no deadline, because those of its requests differ. Each request leaves at its own, and the job is
+//! cancelled when the last one has left. Its work is charged to the client that asked first.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};

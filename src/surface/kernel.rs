@@ -2,7 +2,8 @@
 //!
 //! This is the only implementation of the formulas on the CPU. `d` is the distance to the atom's centre and `ρ` the
 //! atom's length scale: its radius for the Gaussian, the radius of its support for the two others. All kernels and
-//! their slopes vanish at `u = support()`; an isolated atom's density at its radius is 1.
+//! their slopes vanish at `u = support()`; an isolated atom's density at its radius is 1. Without a support, each grid
+//! point would depend on every atom; an abrupt cut-off would leave steps in the surface.
 //!
 //! Sources: J. Blinn, ACM TOG 1(3), 1982 (Gaussian); G. Wyvill, C. `McPheeters`, B. Wyvill, The Visual Computer 2,
 //! 1986 (soft object); S. Dias, K. Bora, A. Gomes, HPDC 2010 (all three as blending functions of molecules).

@@ -1,5 +1,5 @@
-//! Checks of the documentation: the README begins with the two commands, the shell and Python blocks of all pages run,
-//! and the page of errors lists every error type.
+//! Checks of the documentation: the first block of the README has the two commands, the shell and Python blocks of all
+//! pages run, and the page of errors lists every error type.
 //!
 //! Blocks marked `sh` and `python` run; blocks marked `console` (docker, kubectl, make, endless commands) do not.
 #![cfg(unix)]
@@ -156,10 +156,14 @@ fn missing_rows(page: &str, types: &Value) -> Vec<String> {
 }
 
 #[test]
-fn the_readme_begins_with_the_two_commands() {
-    let readme = std::fs::read_to_string(root().join("README.md")).unwrap();
-    let code: Vec<&str> = readme.lines().filter(|l| !l.starts_with("```") && !l.is_empty()).take(2).collect();
+fn the_first_block_of_the_readme_has_the_two_commands() {
+    let read = |name: &str| std::fs::read_to_string(root().join(name)).unwrap();
+    let readme = read("README.md");
+    let block = readme.lines().skip_while(|line| !line.starts_with("```")).skip(1);
+    let code: Vec<&str> = block.take_while(|line| *line != "```").collect();
     assert_eq!(code, ["make run", "make test"]);
+    assert!(read(".ci/run").lines().any(|line| line == code[1]), "CI runs another command");
+    assert!(read("Makefile").lines().any(|line| line.starts_with("run: ")), "there is no target for {}", code[0]);
 }
 
 #[test]

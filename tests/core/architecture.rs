@@ -605,12 +605,21 @@ fn map_faults(map: &str, modules: &[String], exists: impl Fn(&str) -> bool) -> V
     faults
 }
 
-/// Returns the decision records (file names) that `index` does not link, and numbers that are missing or used twice.
+/// Returns the number of a decision record: the four digits at the beginning of its file name.
+fn record_number(name: &str) -> Option<&str> {
+    let (number, _) = name.split_once('-')?;
+    (number.len() == 4 && number.bytes().all(|c| c.is_ascii_digit())).then_some(number)
+}
+
+/// Returns the decision records (sorted file names) that `index` does not link, that have no number, or that have the
+/// number of another one. Numbers of removed records are absent.
 fn record_faults(index: &str, records: &[String]) -> Vec<String> {
     let unlisted = records.iter().filter(|name| !index.contains(&format!("({name})")));
     let mut faults: Vec<String> = unlisted.map(|name| format!("docs/adr/README.md: {name} is missing")).collect();
-    let misnumbered = records.iter().zip(1..).filter(|(name, number)| !name.starts_with(&format!("{number:04}-")));
-    faults.extend(misnumbered.map(|(name, number)| format!("docs/adr/{name}: expected the number {number:04}")));
+    let unnumbered = records.iter().filter(|name| record_number(name).is_none());
+    faults.extend(unnumbered.map(|name| format!("docs/adr/{name}: expected a number of four digits")));
+    let repeated = records.windows(2).filter(|pair| record_number(&pair[0]) == record_number(&pair[1]));
+    faults.extend(repeated.map(|pair| format!("docs/adr/{}: {} has its number", pair[1], pair[0])));
     faults
 }
 
@@ -874,5 +883,11 @@ fn control_an_incomplete_index_is_reported() {
     assert_eq!(record_faults("[A](0001-a.md) [B](0002-b.md)", &records).len(), 0);
     assert_eq!(record_faults("[A](0001-a.md)", &records), ["docs/adr/README.md: 0002-b.md is missing"]);
     let gap = ["0001-a.md", "0003-c.md"].map(String::from);
-    assert_eq!(record_faults("(0001-a.md) (0003-c.md)", &gap), ["docs/adr/0003-c.md: expected the number 0002"]);
+    assert_eq!(record_faults("(0001-a.md) (0003-c.md)", &gap).len(), 0);
+    let unnumbered = ["0001-a.md", "12-b.md"].map(String::from);
+    let faults = record_faults("(0001-a.md) (12-b.md)", &unnumbered);
+    assert_eq!(faults, ["docs/adr/12-b.md: expected a number of four digits"]);
+    let repeated = ["0001-a.md", "0001-b.md"].map(String::from);
+    let faults = record_faults("(0001-a.md) (0001-b.md)", &repeated);
+    assert_eq!(faults, ["docs/adr/0001-b.md: 0001-a.md has its number"]);
 }

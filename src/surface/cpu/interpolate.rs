@@ -2,7 +2,9 @@
 //!
 //! `classify` places a vertex by linear interpolation. A sum over the atoms there gives density and slope for a step
 //! along the edge, and a second sum gives the normal at the final position: near saddles of the density, the step turns
-//! it by up to 170°.
+//! it by up to 170°. A second sum only for vertices that moved far would spare half of them, but change normals, and
+//! with them those of the backends relative to each other, by up to 2°. Edge parameters are replaced in place: the page
+//! faults of a second column took as long as the step.
 
 use std::ops::Range;
 
