@@ -339,10 +339,6 @@ impl MemoryMeter for MemoryReservation {
         self.budget.check_alone(self.work_bytes().saturating_add(bytes))
     }
 
-    fn available(&self) -> u64 {
-        self.budget.limit.saturating_sub(self.work_bytes().saturating_add(self.budget.per_request))
-    }
-
     fn also_held(&self, bytes: u64) {
         self.elsewhere.fetch_add(bytes, Ordering::Relaxed);
     }
@@ -440,7 +436,7 @@ mod tests {
         assert_eq!(own.grow(81), Err(OutOfMemory::Limit { needed: 101, limit: 100 }));
         // Its input is in another reservation.
         own.also_held(30);
-        assert_eq!((own.available(), held(own.grow(50).unwrap_err())), (50, 70));
+        assert_eq!(held(own.grow(50).unwrap_err()), 70);
         assert_eq!(own.check(51), Err(OutOfMemory::Limit { needed: 101, limit: 100 }));
         drop(other);
         own.grow(50).unwrap();

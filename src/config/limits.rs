@@ -120,7 +120,6 @@ impl LimitsConfig {
                 max_candidates: self.candidate_pairs,
             },
             picture: PictureLimits { max_side: self.picture_side },
-            max_file_bytes: self.output_bytes,
             map: MapLimits { max_points: self.map_points, max_inflated_bytes: self.inflated_bytes },
         }
     }

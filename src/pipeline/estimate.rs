@@ -9,7 +9,6 @@ use std::sync::Arc;
 
 use super::color::{AtomColors, Scheme};
 use super::cut::Cut;
-use super::finest_fit::with_finest_fit;
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::job_backend::{Division, of_job};
 use super::work::{self, WorkCounts};
@@ -18,7 +17,7 @@ use super::{parts, pockets};
 use crate::formats::Compress;
 use crate::structure::{AtomPart, Structure, StructureError};
 use crate::surface::cpu::{LATTICE_BYTES, check_work, scan};
-use crate::surface::lattice::{Lattice, slightly_coarser};
+use crate::surface::lattice::Lattice;
 use crate::surface::params::MAX_RESOLUTION;
 use crate::surface::simplify::{self, check_error};
 use crate::surface::{
@@ -106,7 +105,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
         }
     }
     let _storage = super::storage(job, &mut params, &spheres);
-    let plan = MeshPlan::new(&spheres, division, &params, job, limits);
+    let plan = MeshPlan::new(&spheres, division, &params, job, &limits.surface);
     let choice = plan.choice(undivided, choice);
     let lattices = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
@@ -128,7 +127,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
         let mesh = job.max_triangles().map_or(mesh, |limit| mesh.at_most(limit, &params));
         Ok(MeshEstimate { bytes: with_attributes(&mesh), ..mesh })
     });
-    let mesh = match mesh.map_err(|error| with_finest_fit(error, &plan, choice, control)) {
+    let mesh = match mesh {
         Err(error) if ends_work(&error) => return Err(error.into()),
         mesh => mesh,
     };
@@ -194,7 +193,7 @@ pub(super) fn check_memory(
 const ID_BYTES: u64 = 4;
 
 /// Returns true if `error` ends the estimate as well, not only the mesh.
-pub(super) const fn ends_work(error: &SurfaceError) -> bool {
+const fn ends_work(error: &SurfaceError) -> bool {
     matches!(
         error,
         SurfaceError::Cancelled
@@ -205,24 +204,19 @@ pub(super) const fn ends_work(error: &SurfaceError) -> bool {
 
 /// Returns the number of vertices of a mesh of `area` Å².
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate")]
-pub(super) fn n_vertices(area: f64, spacing: f64) -> u64 {
+fn n_vertices(area: f64, spacing: f64) -> u64 {
     (1.5 * area / (spacing * spacing)).round() as u64
 }
 
 /// Spheres whose grid and mesh are planned.
-#[derive(Clone, Copy)]
 pub(super) struct MeshPlan<'a> {
-    pub(super) spheres: &'a Spheres,
-    pub(super) parts: Option<&'a [AtomPart]>,
-    pub(super) cut: Option<&'a Cut<'a>>,
-    pub(super) params: &'a SurfaceParams,
-    pub(super) limits: &'a SurfaceLimits,
-    /// Bytes that colours and atom indices add to a vertex.
-    pub(super) attribute_bytes: u64,
+    spheres: &'a Spheres,
+    parts: Option<&'a [AtomPart]>,
+    cut: Option<&'a Cut<'a>>,
+    params: &'a SurfaceParams,
+    limits: &'a SurfaceLimits,
     /// Storage of the mesh in its file.
-    pub(super) compress: Compress,
-    /// Maximum size of the mesh's file.
-    pub(super) max_file_bytes: u64,
+    compress: Compress,
 }
 
 /// Lattices of all parts, and their memory.
@@ -246,17 +240,14 @@ impl<'a> MeshPlan<'a> {
         division: Option<Division<'a>>,
         params: &'a SurfaceParams,
         job: &Job,
-        limits: &'a JobLimits,
+        limits: &'a SurfaceLimits,
     ) -> Self {
-        // The size of a picture does not depend on its mesh.
-        let max_file_bytes = if job.picture.is_some() { u64::MAX } else { limits.max_file_bytes };
-        let (limits, attribute_bytes) = (&limits.surface, job.attribute_bytes());
         let (parts, cut) = (division.and_then(Division::parts), division.and_then(Division::cut));
-        Self { spheres, parts, cut, params, limits, attribute_bytes, compress: job.compress, max_file_bytes }
+        Self { spheres, parts, cut, params, limits, compress: job.compress }
     }
 
     /// Returns the memory of a compressed mesh, which is held besides the mesh, bytes.
-    pub(super) fn compressed_bytes(&self, vertices: u64) -> u64 {
+    fn compressed_bytes(&self, vertices: u64) -> u64 {
         vertices.saturating_mul(self.compress.compressed_vertex_bytes())
     }
 
@@ -289,18 +280,27 @@ impl<'a> MeshPlan<'a> {
         control: &Control<'_>,
     ) -> Result<MeshEstimate, SurfaceError> {
         let Self { spheres, params, limits, .. } = *self;
-        let (mut bricks, mut pairs, h) = (0, 0, params.resolution);
+        let (mut bricks, mut pairs, mut n_atoms, h) = (0, 0, 0, params.resolution);
         candidates::check(spheres, params, limits)?;
+        let too_large = |grid_points: u64, n_atoms: usize| {
+            let fraction = n_atoms as f64 / spheres.len() as f64;
+            parts::grid_too_large(grid_points, fraction, lattices.len(), h, limits)
+        };
         for lattice in lattices {
-            let counts = check_work(lattice, params, limits, control)?;
+            n_atoms += lattice.atoms.len();
+            let counts = check_work(lattice, params, limits, control).map_err(|error| match error {
+                SurfaceError::GridTooLarge { grid_points, .. } => {
+                    too_large(grid_points.saturating_add(512 * bricks), n_atoms)
+                }
+                error => error,
+            })?;
             bricks += counts.reached;
             pairs += counts.candidates;
         }
-        let (grid_points, limit) = (512 * bricks, limits.max_grid_points);
-        if grid_points > limit {
+        let grid_points = 512 * bricks;
+        if grid_points > limits.max_grid_points {
             // Each part fits the limit, but not all parts together.
-            let suggested_resolution = slightly_coarser(h * (grid_points as f64 / limit as f64).cbrt());
-            return Err(SurfaceError::GridTooLarge { grid_points, limit, resolution: h, suggested_resolution });
+            return Err(too_large(grid_points, n_atoms));
         }
         let [whole_area, area] = self.areas(COARSE_FACTOR * h, choice, control)?;
         let [whole_vertices, vertices] = [whole_area, area].map(|area| n_vertices(area, h));
@@ -315,17 +315,24 @@ impl<'a> MeshPlan<'a> {
         Ok(MeshEstimate { bricks, grid_points, pairs, area, vertices, whole_vertices, triangles, bytes })
     }
 
+    /// Returns the error of a run that failed with `error`. A run ends soon after its mesh exceeds a limit, when it has
+    /// found little of the surface. An estimate of the whole mesh suggests a better spacing.
+    pub(super) fn run_error(&self, error: SurfaceError, choice: &Choice<'_>, control: &Control<'_>) -> SurfaceError {
+        if !matches!(error, SurfaceError::MeshTooLarge { .. }) {
+            return error;
+        }
+        match self.lattices(control).and_then(|lattices| self.mesh(&lattices, choice, control)) {
+            Err(planned) if ends_work(&planned) || matches!(planned, SurfaceError::MeshTooLarge { .. }) => planned,
+            _ => error,
+        }
+    }
+
     fn unquantized(&self) -> SurfaceParams {
         SurfaceParams { atom_ids: false, quantize: None, ..self.params.clone() }
     }
 
     /// Returns the areas of a coarser mesh before and after the cut, Å². They are equal without a cut.
-    pub(super) fn areas(
-        &self,
-        coarse: f64,
-        choice: &Choice<'_>,
-        control: &Control<'_>,
-    ) -> Result<[f64; 2], SurfaceError> {
+    fn areas(&self, coarse: f64, choice: &Choice<'_>, control: &Control<'_>) -> Result<[f64; 2], SurfaceError> {
         let (spheres, limits) = (self.spheres, self.limits);
         let single = SurfaceParams { atom_ids: self.cut.is_some(), ..self.unquantized() };
         let resolution = coarse.clamp(MIN_COARSE_SPACING, MAX_RESOLUTION).max(single.resolution);
@@ -448,35 +455,53 @@ mod tests {
     }
 
     #[test]
-    fn the_finest_spacing_that_fits_is_suggested() {
+    fn repetitions_with_suggested_spacings_are_accepted() {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
-        let suggested = |resolution: f64, max_grid_points: u64| {
+        let refused = |surface: &str, resolution: f64, limits: SurfaceLimits| {
             let text = resolution.to_string();
-            let job = params::parse([("resolution", text.as_str())]).unwrap().job;
-            let surface = SurfaceLimits { max_grid_points, ..SurfaceLimits::default() };
-            let limits = JobLimits { surface, ..JobLimits::default() };
-            let refused = run(SAMPLE, &job, &limits, &choice, &Control::default(), &(), None).map(drop);
-            let planned = estimate(read, &job, &limits, &choice, &Control::default()).unwrap().mesh.map(drop);
-            let spacing = |error: SurfaceError| match error {
-                SurfaceError::GridTooLarge { suggested_resolution, .. } => suggested_resolution,
+            let job = params::parse([("surface", surface), ("resolution", text.as_str())]).unwrap().job;
+            let (limits, control) = (JobLimits { surface: limits, ..JobLimits::default() }, Control::default());
+            let error = match run(SAMPLE, &job, &limits, &choice, &control, &(), None).err()? {
+                JobError::Surface(error) => error,
                 error => panic!("{error}"),
             };
-            let planned = planned.map_err(spacing);
-            let refused = refused.map_err(|error| match error {
-                JobError::Surface(error) => spacing(error),
-                error => panic!("{error}"),
-            });
-            assert_eq!(refused, planned);
-            refused
+            Some((error, estimate(read, &job, &limits, &choice, &control).unwrap().mesh.err()))
         };
-        for (resolution, limit) in [(0.05, 20_000_000), (0.02, 1_000_000), (0.3, 200_000), (0.9, 40_000)] {
-            let fits = suggested(resolution, limit).unwrap_err();
-            assert!(fits > resolution && suggested(fits, limit).is_ok(), "{limit}: {fits}");
-            // Control: a slightly finer grid does not fit.
-            assert!(suggested(0.97 * fits - 0.01, limit).is_err(), "{limit}: {fits}");
+        let any = SurfaceLimits::default();
+        for (surface, resolution, limits) in [
+            ("gaussian", 0.05, SurfaceLimits { max_grid_points: 20_000_000, ..any }),
+            ("gaussian", 0.02, SurfaceLimits { max_grid_points: 1_000_000, ..any }),
+            ("gaussian", 0.3, SurfaceLimits { max_grid_points: 200_000, ..any }),
+            ("gaussian", 0.9, SurfaceLimits { max_grid_points: 40_000, ..any }),
+            ("gaussian", 0.4, SurfaceLimits { max_candidates: 10_000, ..any }),
+            // The pairs of arcs are counted once those of the atoms fit.
+            ("ses", 0.05, SurfaceLimits { max_candidates: 200_000, ..any }),
+            // The run ends early, with few triangles.
+            ("gaussian", 0.1, SurfaceLimits { max_mesh_bytes: 300_000, ..any }),
+            (
+                "gaussian",
+                0.4,
+                SurfaceLimits { max_grid_points: 100_000, max_candidates: 10_000, max_mesh_bytes: 100_000 },
+            ),
+        ] {
+            let (mut spacing, mut count) = (resolution, 0);
+            while let Some((error, planned)) = refused(surface, spacing, limits) {
+                let suggested = error.suggested_resolution().unwrap_or_else(|| panic!("{error}"));
+                if count == 0 {
+                    let planned = planned.and_then(|planned| planned.suggested_resolution());
+                    assert_eq!(planned, Some(suggested), "{error}");
+                }
+                count += 1;
+                assert!(suggested > spacing && count <= 3, "refusal {count}: {error}");
+                spacing = suggested;
+            }
+            assert!(count > 0, "{resolution} {limits:?}");
+            // Control: half of the spacing does not fit.
+            assert!(refused(surface, 0.5 * spacing, limits).is_some(), "{spacing} {limits:?}");
         }
-        assert!(suggested(1.0, 511).unwrap_err().is_infinite(), "a grid has one brick");
+        let (error, _) = refused("gaussian", 1.0, SurfaceLimits { max_grid_points: 511, ..any }).unwrap();
+        assert_eq!(error.suggested_resolution(), None, "a grid has one brick");
     }
 
     #[test]

@@ -14,7 +14,6 @@ mod draw;
 mod error;
 mod estimate;
 mod file;
-mod finest_fit;
 mod fit;
 mod instances;
 pub mod integer;
@@ -283,10 +282,7 @@ fn run_loaded<S: Deref<Target = Structure>>(
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
     let (mut output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
-        let fitted = fit::mesh(&spheres, job, limit, &limits.surface, &choice, &clock, &control).map_err(|error| {
-            let plan = MeshPlan::new(&spheres, division, &params, job, limits);
-            finest_fit::with_finest_fit(error, &plan, plan.choice(&whole, &planner), &control)
-        })?;
+        let fitted = fit::mesh(&spheres, job, limit, &limits.surface, &choice, &clock, &control)?;
         params.resolution = fitted.resolution;
         let storage = storage(job, &mut params, &spheres);
         (fitted.output, Some(fitted.tries), storage)
@@ -296,13 +292,15 @@ fn run_loaded<S: Deref<Target = Structure>>(
             sink.set_storage(storage);
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
-        let plan = MeshPlan::new(&spheres, division, &params, job, limits);
+        let plan = MeshPlan::new(&spheres, division, &params, job, &limits.surface);
         let planner = plan.choice(&whole, &planner);
         let checked = if sink.is_none() { estimate::check_memory(&plan, job, planner, &control) } else { Ok(()) };
         let meshed = simplify::params_of_input(job, &params)?;
-        let write = |()| clock.pass(|| backend.write(&spheres, &meshed, &limits.surface, &control, sink));
-        let written = checked.and_then(write);
-        (written.map_err(|error| finest_fit::with_finest_fit(error, &plan, planner, &control))?, None, storage)
+        let write = |()| {
+            let written = clock.pass(|| backend.write(&spheres, &meshed, &limits.surface, &control, sink));
+            written.map_err(|error| plan.run_error(error, planner, &control))
+        };
+        (checked.and_then(write)?, None, storage)
     };
     let search = |mode| {
         clock.time("cavities", || cavities::search(mode, &spheres, &params, &limits.surface, &mut output, &control))

@@ -11,11 +11,11 @@ use super::SPHERE_BYTES;
 use super::fit::WithoutProgress;
 use crate::structure::AtomPart;
 use crate::surface::cpu::scan;
-use crate::surface::lattice::to_f32;
+use crate::surface::lattice::{to_f32, to_u64};
 use crate::surface::mesh::joined_bounds;
 use crate::surface::{
     Backend, BackendIdentity, Control, GridStats, Measures, Mesh, MeshOutput, PartRange, Spheres, Stage, SurfaceError,
-    SurfaceLimits, SurfaceParams,
+    SurfaceLimits, SurfaceParams, candidates, grid_limit,
 };
 
 /// Rows per parallel task.
@@ -92,7 +92,7 @@ pub(super) fn join(
             Ok(output) if !joined.made_by(output.made_by.as_ref(), backend) => return Ok(None),
             Ok(output) => joined.push(part, output, run, &control)?,
             Err(SurfaceError::NoSurface { .. }) => joined.skip(part),
-            Err(error) => return Err(joined.error(error, run, n_atoms as f64 / spheres.len() as f64)),
+            Err(error) => return Err(joined.error(error, run, parts.len(), n_atoms as f64 / spheres.len() as f64)),
         }
         let [n_vertices, n_triangles] = [joined.mesh.n_vertices(), joined.mesh.n_triangles()];
         scan::check_size(run.single, run.limits, n_vertices as u64, n_triangles as u64)?;
@@ -101,6 +101,20 @@ pub(super) fn join(
         }
     }
     joined.finish(run.single).map(Some)
+}
+
+/// Returns the error of `n_parts` parts whose grids are too large together. The first of them, with `fraction` of the
+/// atoms, have about `grid_points` grid points.
+pub(super) fn grid_too_large(
+    grid_points: u64,
+    fraction: f64,
+    n_parts: usize,
+    resolution: f64,
+    limits: &SurfaceLimits,
+) -> SurfaceError {
+    // The number of grid points of a part that fails is an estimate.
+    let all = to_u64(grid_points as f64 / fraction).max(limits.max_grid_points.saturating_add(1));
+    grid_limit::exceeded(resolution, all, n_parts, limits)
 }
 
 /// Spheres, parameters and limits of all parts.
@@ -214,37 +228,26 @@ impl Joined {
         }
     }
 
-    /// Converts the error of a part to an error of all parts. `fraction` of the atoms are in this part and the previous
-    /// ones.
-    fn error(&self, error: SurfaceError, run: &Run<'_>, fraction: f64) -> SurfaceError {
+    /// Converts the error of one of `n_parts` parts to an error of all parts. `fraction` of the atoms are in this part
+    /// and the previous ones.
+    fn error(&self, error: SurfaceError, run: &Run<'_>, n_parts: usize, fraction: f64) -> SurfaceError {
         use SurfaceError as E;
-        let limit = run.limits.max_candidates;
+        let (limits, resolution) = (run.limits, run.single.resolution);
         match error {
-            E::GridTooLarge { grid_points, resolution, suggested_resolution, .. } => E::GridTooLarge {
-                // The number of grid points of a part that fails is an estimate.
-                grid_points: self
-                    .grid
-                    .grid_points
-                    .saturating_add(grid_points)
-                    .max(run.limits.max_grid_points.saturating_add(1)),
-                limit: run.limits.max_grid_points,
-                resolution,
-                suggested_resolution,
-            },
-            // A spacing that fits one part need not fit all parts.
-            E::TooManyCandidates { candidates, resolution, .. } => E::TooManyCandidates {
-                candidates: self.grid.candidates + candidates,
-                limit,
-                resolution,
-                suggested_resolution: None,
-            },
+            E::GridTooLarge { grid_points, .. } => {
+                let so_far = self.grid.grid_points.saturating_add(grid_points);
+                grid_too_large(so_far, fraction, n_parts, resolution, limits)
+            }
+            E::TooManyCandidates { candidates, .. } => {
+                candidates::too_many(self.grid.candidates + candidates, run.spheres, run.single, limits)
+            }
             E::TooManyOverlaps { overlaps, .. } => {
-                E::TooManyOverlaps { overlaps: self.grid.overlaps + overlaps, limit }
+                E::TooManyOverlaps { overlaps: self.grid.overlaps + overlaps, limit: limits.max_candidates }
             }
             E::MeshTooLarge { bytes, .. } => {
                 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "casts saturate")]
                 let all = (self.bytes(run.single).saturating_add(bytes) as f64 / fraction) as u64;
-                scan::too_large(all, run.single.resolution, run.limits.max_mesh_bytes)
+                scan::too_large(all, resolution, limits.max_mesh_bytes)
             }
             other => other,
         }

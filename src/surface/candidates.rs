@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use super::control::Control;
 use super::error::SurfaceError;
 use super::kernel::Shape;
-use super::lattice::{BRICK, Lattice, effective_radius, to_u64};
+use super::lattice::{BRICK, Lattice, effective_radius, slightly_coarser, to_u64};
 use super::params::{MAX_RESOLUTION, SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
 
@@ -28,8 +28,7 @@ pub(crate) fn limit(limits: &SurfaceLimits) -> u64 {
 /// # Errors
 /// [`SurfaceError::TooManyCandidates`].
 pub(crate) fn check(spheres: &Spheres, params: &SurfaceParams, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
-    let shape = Shape::new(params);
-    let reach = |radius: f32| shape.reach(shape.length(effective_radius(radius, params)));
+    let reach = reach(params);
     let brick = f64::from(BRICK) * params.resolution;
     // Bricks fill space, so a sphere reaches at least as many as its volume holds, and at least one.
     let bricks = |radius: &f32| (4.0 / 3.0 * PI * (reach(*radius) / brick).powi(3)).max(1.0);
@@ -39,7 +38,24 @@ pub(crate) fn check(spheres: &Spheres, params: &SurfaceParams, limits: &SurfaceL
         return Ok(());
     }
     let least = to_u64(spheres.radii().iter().map(bricks).sum());
-    if least <= limit { Ok(()) } else { Err(error(least, limit, n, reach(largest), params.resolution)) }
+    if least <= limit { Ok(()) } else { Err(too_many(least, spheres, params, limits)) }
+}
+
+/// Returns the error of a run on `spheres` that has at least `candidates` pairs.
+pub(crate) fn too_many(
+    candidates: u64,
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+) -> SurfaceError {
+    let (_, largest) = spheres.radius_range();
+    error(candidates, limit(limits), spheres.len(), reach(params)(largest), params.resolution)
+}
+
+/// Returns the function of a sphere's radius that gives the distance at which its effect ends, Å.
+fn reach(params: &SurfaceParams) -> impl Fn(f32) -> f64 {
+    let shape = Shape::new(params);
+    move |radius| shape.reach(shape.length(effective_radius(radius, params)))
 }
 
 /// Returns the error of a run on `lattices` that has at least `candidates` pairs.
@@ -123,18 +139,20 @@ impl<'a> Comparisons<'a> {
 }
 
 fn error(candidates: u64, limit: u64, n_spheres: usize, reach: f64, resolution: f64) -> SurfaceError {
-    let suggested_resolution = fitting(limit as f64 / n_spheres as f64, reach);
+    let suggested_resolution = fitting(limit as f64 / n_spheres as f64, reach, resolution);
     SurfaceError::TooManyCandidates { candidates, limit, resolution, suggested_resolution }
 }
 
-/// Returns a spacing (Å) at which a sphere that reaches `reach` Å has no more than `pairs` candidate pairs, if there is
-/// one.
-fn fitting(pairs: f64, reach: f64) -> Option<f64> {
-    // A sphere touches at most 2·reach/brick + 2 bricks along each axis.
-    let along = pairs.cbrt() - 2.0;
-    let spacing = 2.0 * reach / (f64::from(BRICK) * along);
-    let rounded = (spacing * 101.0).ceil() / 100.0;
-    (along > 0.0 && rounded <= MAX_RESOLUTION).then_some(rounded)
+/// Returns a spacing above `resolution` (Å) at which spheres that reach `reach` Å probably have no more than `pairs`
+/// candidate pairs each, if there is one.
+fn fitting(pairs: f64, reach: f64, resolution: f64) -> Option<f64> {
+    // Among random positions, a sphere of q bricks touches 1 + 6q + 3πq² + 4/3πq³ bricks on average, which is about
+    // 4/3π(q + 0.7)³, and at most (2q + 2)³. Spheres at similar positions may exceed the mean: then this spacing was
+    // refused as well, and the maximum is certain to fit.
+    let by_mean = (pairs * 0.75 / PI).cbrt() - 0.7;
+    let by_maximum = 0.5 * pairs.cbrt() - 1.0;
+    let spacings = [by_mean, by_maximum].map(|radius| slightly_coarser(reach / (f64::from(BRICK) * radius.max(0.0))));
+    spacings.into_iter().find(|spacing| *spacing > resolution && *spacing <= MAX_RESOLUTION)
 }
 
 #[cfg(test)]
@@ -225,8 +243,12 @@ mod tests {
 
     #[test]
     fn no_spacing_is_suggested_if_none_fits() {
-        assert_eq!(fitting(8.0, 3.0), None);
-        assert_eq!(fitting(27.0, 4.0), Some(1.01));
-        assert_eq!(fitting(27.0, 400.0), None);
+        assert_eq!(fitting(1.0, 3.0, 0.5), None);
+        assert_eq!(fitting(8.0, 3.0, 0.5), Some(0.73));
+        assert_eq!(fitting(8.0, 3.0, 0.73), None);
+        // The mean does not fit: the maximum does.
+        assert_eq!(fitting(27.0, 4.0, 0.3), Some(0.46));
+        assert_eq!(fitting(27.0, 4.0, 0.46), Some(1.05));
+        assert_eq!(fitting(27.0, 400.0, 0.3), None);
     }
 }

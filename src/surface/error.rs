@@ -45,7 +45,7 @@ pub enum SurfaceError {
         limit: u64,
         /// Requested spacing, Å.
         resolution: f64,
-        /// A spacing that would fit, in Å. A backend extrapolates it; the pipeline counts the grid.
+        /// A spacing that probably fits, in Å; infinite if there is none.
         suggested_resolution: f64,
     },
     /// The spheres would reach more grid bricks than allowed in total: too many of them overlap.
@@ -61,7 +61,7 @@ pub enum SurfaceError {
         limit: u64,
         /// Requested spacing, Å.
         resolution: f64,
-        /// A spacing that is certain to fit, in Å, if there is one.
+        /// A spacing that probably fits, in Å, if there is one.
         suggested_resolution: Option<f64>,
     },
     /// Too many pairs of spheres enlarged by the probe overlap.
@@ -83,7 +83,7 @@ pub enum SurfaceError {
         bytes: u64,
         /// Bytes allowed.
         limit: u64,
-        /// A spacing that would fit, in Å.
+        /// A spacing that probably fits, in Å; infinite if there is none.
         suggested_resolution: f64,
     },
     /// The triangle limit cannot be met at any spacing that still shows the surface, or with the error of a
@@ -175,7 +175,7 @@ pub enum SurfaceError {
         needed: u64,
         /// Bytes available on the device.
         available: u64,
-        /// A spacing that would fit, in Å.
+        /// A spacing that probably fits, in Å; infinite if there is none.
         suggested_resolution: f64,
     },
     /// Every device that could have run the job failed, and there is no fallback.
@@ -196,7 +196,8 @@ pub enum SurfaceError {
 }
 
 impl SurfaceError {
-    /// Returns a grid spacing at which the job would fit, Å, if the error is about a size and there is one.
+    /// Returns a grid spacing at which the job probably fits, Å, if the error is about a size and there is one. It is
+    /// an estimate that errs on the coarse side. The job may still exceed another limit there.
     #[must_use]
     pub fn suggested_resolution(&self) -> Option<f64> {
         let spacing = match self {

@@ -7,14 +7,13 @@
 mod order;
 
 use bytemuck::{Pod, Zeroable};
-use rayon::prelude::*;
 
 use self::order::Placing;
 use super::column::Column;
 use super::control::Control;
 use super::error::SurfaceError;
-use super::kernel::{MIN_DISTANCE2, Shape};
-use super::params::{SurfaceKind, SurfaceParams};
+use super::kernel::Shape;
+use super::params::SurfaceParams;
 use super::spheres::Spheres;
 
 /// Grid points along a brick's edge.
@@ -134,37 +133,10 @@ pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     half + reach + 2.0 * params.resolution
 }
 
-/// Returns true if a grid point is certain to lie inside the surface: the one nearest to the centre of a sphere, with a
-/// margin for rounding. The densities of several spheres together may have a surface even if this is false.
-#[must_use]
-pub fn is_certain_to_have_surface(spheres: &Spheres, params: &SurfaceParams) -> bool {
-    let (shape, spacing) = (Shape::new(params), params.resolution);
-    (0..spheres.len()).into_par_iter().with_min_len(PART).any(|i| {
-        let radius = effective_radius(spheres.radius(i), params);
-        let distance2 = spheres.centre(i).map(|c| (c - (c / spacing).round() * spacing).powi(2)).iter().sum::<f64>();
-        match &shape {
-            Shape::Density(profile) => {
-                let length2 = profile.length(radius).powi(2);
-                profile.value(distance2 / length2, MIN_DISTANCE2 / length2) > INSIDE_MARGIN * params.isovalue
-            }
-            // The solvent-excluded surface encloses the spheres without the probe.
-            Shape::Sphere { enlarged } => {
-                let inside = if params.surface == SurfaceKind::Sas { radius + enlarged } else { radius };
-                INSIDE_MARGIN * distance2.sqrt() < inside
-            }
-        }
-    })
-}
-
 /// Radius of a sphere after scale and offset, Å.
 pub(super) fn effective_radius(r: f32, params: &SurfaceParams) -> f64 {
     f64::from(r) * params.radius_scale + params.radius_offset
 }
-
-/// Spheres that one task tests for a surface.
-const PART: usize = 1 << 13;
-/// Margin of [`is_certain_to_have_surface`].
-const INSIDE_MARGIN: f64 = 1.001;
 
 /// The tile that a grid point belongs to.
 // Written without `map`, here and below: `map` may not be inlined, and these functions run for every atom.
@@ -181,7 +153,7 @@ pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
     [tile[2], tile[1], tile[0]]
 }
 
-/// Returns a spacing slightly above `spacing`, rounded up to hundredths of an Å, as a suggestion that fits.
+/// Returns a spacing about 5 % above an estimate, rounded up to hundredths of an Å, as a suggestion.
 pub(crate) fn slightly_coarser(spacing: f64) -> f64 {
     (spacing * 105.0).ceil() / 100.0
 }

@@ -76,11 +76,6 @@ pub trait MemoryMeter: Debug + Send + Sync {
         if needed <= limit { Ok(()) } else { Err(OutOfMemory::Limit { needed, limit }) }
     }
 
-    /// Returns the bytes that this work could add if no other work used memory.
-    fn available(&self) -> u64 {
-        self.budget().map_or(u64::MAX, |[limit, held]| limit.saturating_sub(held))
-    }
-
     /// Notes that the work holds `bytes` until its end that another meter counts.
     fn also_held(&self, bytes: u64) {
         let _ = bytes;
@@ -178,10 +173,6 @@ impl MemoryMeter for Reservation {
 
     fn check(&self, bytes: u64) -> Result<(), OutOfMemory> {
         self.meter.check(bytes)
-    }
-
-    fn available(&self) -> u64 {
-        self.meter.available()
     }
 
     fn also_held(&self, bytes: u64) {

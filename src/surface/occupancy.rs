@@ -90,47 +90,11 @@ pub struct WorkCounts {
 /// # Errors
 /// Those of [`Occupancy::new`].
 pub fn count(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<WorkCounts, SurfaceError> {
-    try_count(lattice, limits, control)?.map_err(|excess| excess.error(lattice, limits))
-}
-
-/// Counts the bricks and pairs of `lattice` as [`count`] does. If they exceed a limit, returns an estimate of the
-/// counts.
-///
-/// # Errors
-/// [`SurfaceError::Cancelled`] and [`SurfaceError::Memory`].
-pub(crate) fn try_count(
-    lattice: &Lattice,
-    limits: &SurfaceLimits,
-    control: &Control<'_>,
-) -> Result<Result<WorkCounts, Excess>, SurfaceError> {
     let memory = Reservation::new(&control.memory);
     let reaches = Reaches::new(lattice, &memory)?;
     let mut found = FoundBricks::new(false, &memory);
-    let searched = found.search(lattice, &reaches, limits, control)?;
-    Ok(searched.map(|()| WorkCounts { reached: found.n_reached, candidates: found.n_candidates }))
-}
-
-/// Count that exceeds its limit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Excess {
-    /// Grid points of the whole lattice, an estimate.
-    GridPoints(u64),
-    /// Candidate pairs: those that were counted before the search ended, and an estimate for the whole lattice.
-    Pairs {
-        /// Pairs so far.
-        counted: u64,
-        /// Estimate of all pairs.
-        all: u64,
-    },
-}
-
-impl Excess {
-    fn error(self, lattice: &Lattice, limits: &SurfaceLimits) -> SurfaceError {
-        match self {
-            Self::GridPoints(grid_points) => grid_limit::exceeded(lattice, grid_points, limits),
-            Self::Pairs { counted, .. } => candidates::exceeded(&[lattice], counted, limits),
-        }
-    }
+    found.search(lattice, &reaches, limits, control)?;
+    Ok(WorkCounts { reached: found.n_reached, candidates: found.n_candidates })
 }
 
 /// Rejects a run before any of it is computed if the atoms of all `lattices` together have too many pairs. Counts the
@@ -194,7 +158,7 @@ impl Occupancy {
         let memory = Reservation::new(&control.memory);
         let reaches = Reaches::new(lattice, &memory)?;
         let mut found = FoundBricks::new(true, &memory);
-        found.search(lattice, &reaches, limits, control)?.map_err(|excess| excess.error(lattice, limits))?;
+        found.search(lattice, &reaches, limits, control)?;
         let FoundBricks { tiles, atom_bricks, .. } = found;
         let Reaches { of_atoms, longest } = reaches;
         Ok(Self { tiles, reaches: of_atoms, max_reach: longest, atom_bricks, _memory: memory })
@@ -294,14 +258,14 @@ impl<'a> FoundBricks<'a> {
         reaches: &Reaches,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Result<(), Excess>, SurfaceError> {
+    ) -> Result<(), SurfaceError> {
         let atoms = &lattice.atoms[..];
         // Before any brick is allocated.
         let least = reaches.least_grid_points();
         if least > limits.max_grid_points {
             // The spheres lie in the box, where they may overlap.
             let all = least.saturating_mul(atoms.len() as u64).min(lattice.box_points).max(least);
-            return Ok(Err(Excess::GridPoints(all)));
+            return Err(grid_limit::exceeded(lattice.spacing, all, 1, limits));
         }
         let n_runs = reaches.runs_per_block(limits);
         let mut runs = runs(atoms);
@@ -313,19 +277,18 @@ impl<'a> FoundBricks<'a> {
             let marks = block.par_iter().map(mark).collect::<Result<Vec<_>, SurfaceError>>()?;
             marks.into_iter().try_for_each(|marks| self.add(&marks))?;
             let grid_points = 512 * self.n_reached;
-            let of_all = |so_far: u64| to_u64(so_far as f64 * (atoms.len() as f64 / seen as f64));
             if grid_points > limits.max_grid_points {
-                let all = of_all(grid_points).min(lattice.box_points.max(grid_points));
-                return Ok(Err(Excess::GridPoints(all)));
+                let all = to_u64(grid_points as f64 * (atoms.len() as f64 / seen as f64));
+                let all = all.min(lattice.box_points.max(grid_points));
+                return Err(grid_limit::exceeded(lattice.spacing, all, 1, limits));
             }
             if self.n_candidates > candidates::limit(limits) {
-                let counted = self.n_candidates;
-                return Ok(Err(Excess::Pairs { counted, all: of_all(counted) }));
+                return Err(candidates::exceeded(&[lattice], self.n_candidates, limits));
             }
             // Atoms are in tile order.
             self.complete(atoms.get(seen).map(|next| tile_of(next.cell)[2] + first_step))?;
         }
-        Ok(Ok(()))
+        Ok(())
     }
 
     /// Adds the marks of a run.

@@ -312,11 +312,15 @@ fn limits_of_meshing_apply_to_all_parts_together() {
     };
     assert_eq!(limit, bytes - 1);
     assert!(with(few, &suggested_resolution.to_string()).is_ok(), "{suggested_resolution}");
-    let error = with(SurfaceLimits { max_candidates: 3000, ..surface }, "0.8").unwrap_err();
-    let JobError::Surface(SurfaceError::TooManyCandidates { candidates, limit: 3000, .. }) = error else {
+    let few = SurfaceLimits { max_candidates: 3000, ..surface };
+    let error = with(few, "0.8").unwrap_err();
+    let JobError::Surface(SurfaceError::TooManyCandidates { candidates, limit: 3000, suggested_resolution, .. }) =
+        error
+    else {
         panic!("{error}")
     };
     assert!(candidates > 3000);
+    assert!(with(few, &suggested_resolution.unwrap().to_string()).is_ok(), "{suggested_resolution:?}");
 }
 
 #[test]

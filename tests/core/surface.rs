@@ -454,7 +454,7 @@ fn limits_are_checked_and_suggested_spacings_fit() {
             let error = backend.run(&at, &params(Kernel::Gaussian, h), &limits, &Control::default()).unwrap_err();
             let mut h = suggestion(&error).unwrap_or_else(|| panic!("{error}"));
             assert!(started.elapsed().as_secs_f64() < 60.0, "rejected late");
-            // A backend extrapolates, so its suggestion may need further steps. The pipeline suggests one that fits.
+            // A backend extrapolates, so its suggestion may need further steps.
             for attempt in 0.. {
                 match backend.run(&at, &params(Kernel::Gaussian, h), &limits, &Control::default()) {
                     Ok(_) => break,

@@ -204,7 +204,6 @@ const LIMITS: JobLimits = JobLimits {
     },
     surface: SurfaceLimits { max_grid_points: 1 << 19, max_mesh_bytes: 8 << 20, max_candidates: 1 << 18 },
     picture: molmesh::picture::PictureLimits { max_side: 64 },
-    max_file_bytes: 8 << 20,
     map: molmesh::structure::map::MapLimits { max_points: 1 << 16, max_inflated_bytes: 1 << 20 },
 };
 

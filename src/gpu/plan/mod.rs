@@ -55,7 +55,7 @@ impl Plan {
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let occupancy = Occupancy::new(lattice, limits, control)?;
         let (bases, n_bricks) = tile_bases(&occupancy.tiles)
-            .ok_or_else(|| grid_limit::exceeded(lattice, u64::from(u32::MAX) * 512, limits))?;
+            .ok_or_else(|| grid_limit::exceeded(lattice.spacing, u64::from(u32::MAX) * 512, 1, limits))?;
         let occupied = &occupancy.tiles;
         let per_tile = size_of::<Tile>() + size_of::<u32>() + size_of::<u64>();
         let rows = per_tile * occupied.len() + 2 * size_of::<u32>() * (n_bricks + 1);

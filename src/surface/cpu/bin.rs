@@ -9,11 +9,11 @@ use rustc_hash::FxHashMap;
 
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32, to_u64};
+use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32};
 use crate::surface::memory::{MemoryMeter as _, Reservation};
 use crate::surface::params::SurfaceLimits;
 use crate::surface::simd::dispatched;
-use crate::surface::{candidates, grid_limit};
+use crate::surface::{candidates, grid_limit, occupancy};
 
 /// Bricks along a tile's edge with the layer beyond.
 pub(super) const SIDE: usize = 9;
@@ -90,10 +90,11 @@ impl Tiles {
                 unchecked = 0;
             }
             if n > max_tiles || index.len() as u64 > max_tiles {
-                // Extrapolated from the atoms so far.
-                let tiles = n.max(index.len() as u64) as f64 * (lattice.atoms.len() as f64 / f64::from(i + 1));
-                let grid_points = to_u64(512.0 * tiles).min(lattice.box_points).max(limits.max_grid_points + 1);
-                return Err(grid_limit::exceeded(lattice, grid_points, limits));
+                // A tile has up to 512 bricks, which are counted up to the limit, in the memory of these lists.
+                drop((index, hits, lasting, scratch));
+                let counted = occupancy::count(lattice, limits, control).err();
+                let exceeded = || grid_limit::exceeded(lattice.spacing, limits.max_grid_points + 1, 1, limits);
+                return Err(counted.unwrap_or_else(exceeded));
             }
             if pairs > max_pairs {
                 return Err(candidates::exceeded(&[lattice], pairs, limits));

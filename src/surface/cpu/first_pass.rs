@@ -161,7 +161,7 @@ impl Pass<'_> {
         let grid_points = counters.grid_points.fetch_add(occupied, Ordering::Relaxed) + occupied;
         if grid_points > self.context.limits.max_grid_points {
             let all = counters.all_slabs(grid_points, self.slabs.len());
-            return Err(grid_limit::exceeded(self.lattice, all, self.context.limits));
+            return Err(grid_limit::exceeded(self.lattice.spacing, all, 1, self.context.limits));
         }
         memory.grow(TILE_BYTES + ClassifiedBricks::max_bytes(reached))?;
         let mut bricks = vec![NO_BRICK; BRICK_POINTS];
