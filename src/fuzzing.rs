@@ -14,7 +14,7 @@ use crate::structure::{ReadLimits, Structure, StructureError};
 /// # Errors
 /// Returns the first error in the file.
 pub fn key_file(text: &str) -> Result<(), KeyFileError> {
-    access::parse_key_file(text, 60).map(drop)
+    access::parse_key_file(text).map(drop)
 }
 
 /// Returns true if a path and query carry a valid signature at the start of 1970.

@@ -188,7 +188,7 @@ fn network_errors_suggest_copying_the_files() {
     let addr = Remote::saying(status(404)).addr;
     let folder = tempfile::tempdir().unwrap();
     let url = format!("archive.url=http://{addr}/{{id}}.cif");
-    let flags = ["fetch", "--set", &url, "--set", "archive.backoff_ms=1", "--data"];
+    let flags = ["fetch", "--set", &url, "--data"];
     let [_, stderr] = run(1, command().args(flags).arg(folder.path()));
     assert!(stderr.contains("cannot be connected to") && stderr.contains("copy the files"), "{stderr}");
     assert_eq!(names(folder.path()), Vec::<String>::new(), "no file remains");

@@ -291,7 +291,8 @@ def uploads():
     """Returns the requests of a burst: target, headers and body."""
     side = 99
     grid = pdb([(2 * x, 2 * y, 2 * z) for x in range(side) for y in range(side) for z in range(side)])
-    # 79 MB of text with fewer atoms than `limits.labels`, and three times as much, close to `limits.body_bytes`.
+    # 79 MB of text with fewer than a million atoms, so that they are listed, and three times as much, close to
+    # `limits.body_bytes`.
     large, plain = gzip.compress(grid, 1), grid * 3
     bomb = gzip.compress(b"REMARK\n" * 10_000, 9) * 8000
     form = b"\r\n".join([b"--XX", b'Content-Disposition: form-data; name="structure"; filename="a.pdb"', b"", plain, b"--XX--", b""])

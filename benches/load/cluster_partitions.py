@@ -98,7 +98,7 @@ def main():
     print(f"seed {args.seed}", flush=True)
     dice, expected = random.Random(args.seed), Expected(args.binary, args.structures)
     settings = ["jobs.attempts=100000", "jobs.records_per_client=100000", f"broker.lease_ms={LEASE * 1e3:.0f}"]
-    settings += ["store.check_interval_ms=500", "store.timeout_ms=2000"]
+    settings.append("store.timeout_ms=2000")
     cluster = Cluster(args.binary, args.nats, args.port, ["api", "worker", "worker"], settings)
     cluster.nats.command[cluster.nats.command.index("127.0.0.1")] = "0.0.0.0"
     network = Network(2)

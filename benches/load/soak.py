@@ -31,12 +31,12 @@ from statistics import median
 
 from mixed import Expected, Load, Server, folder
 
-KEPT = ["store.result_ttl_ms=90000", "store.input_ttl_ms=90000", "store.job_ttl_ms=90000", "store.sweep_ms=10000"]
-KEPT += ["store.max_bytes=2GiB", "store.memory_bytes=8MiB", "limits.structure_cache_bytes=8MiB"]
+KEPT = ["store.result_ttl_ms=90000", "store.input_ttl_ms=90000", "store.job_ttl_ms=90000"]
+KEPT += ["store.max_bytes=2GiB", "limits.structure_cache_bytes=8MiB"]
 # Limits of the growth of the resident memory, % per hour, and of its excess over the idle value, %.
 MAX_GROWTH, MAX_EXCESS = 1.0, 20.0
 # Seconds without requests after which all stored objects have expired and all connections are closed.
-REST = 120
+REST = 170
 # Minutes per block and number of series of the bootstrap.
 BLOCK, RESAMPLED = 5, 400
 GAUGES = ("molmesh_memory_held_bytes", "molmesh_broker_jobs_queued", "molmesh_connections", "molmesh_queue_depth")

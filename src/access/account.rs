@@ -3,6 +3,10 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+/// Length of the quota window of addresses, and of keys without their own, s: a used-up quota is restored within a
+/// minute. The window begins with the client's first request, so that not all clients retry at the same time.
+pub(super) const WINDOW_S: u64 = 60;
+
 /// Limits of one client. `None` means unlimited.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Quota {

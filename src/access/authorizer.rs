@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::{Instant, SystemTime};
 
-use super::account::Quota;
+use super::account::{Quota, WINDOW_S};
 use super::error::AccessError;
 use super::keys::{Denied, Key, KeyRing};
 use super::meter::QuotaMeter;
@@ -14,6 +14,10 @@ use super::sign::{Signature, SignatureCheck, SigningKeys};
 use super::sites::Sites;
 use super::{file, forwarded};
 use crate::config::{AccessConfig, Config, Origins, ServerConfig};
+
+/// Number of addresses with a separate quota, about 2 MB. Further addresses share one quota, because forgetting an
+/// address would give it a new one.
+const MAX_ADDRESSES: usize = 10_000;
 
 /// Access control of a configuration.
 #[derive(Debug)]
@@ -55,21 +59,21 @@ impl Access {
         }
         let keys = config.keys_file.clone().map(|path| {
             let seen = Mutex::new(stamp(&path));
-            let ring = RwLock::new(Arc::new(read(&path, config.window_s)?));
+            let ring = RwLock::new(Arc::new(read(&path)?));
             Ok::<_, AccessError>(Keys { path, ring, seen })
         });
         let signing = config.signing_secret.as_ref().map(|secret| SigningKeys::parse(secret.reveal()));
         let quota = Quota {
             requests: config.address_requests,
             work_s: config.address_work_s,
-            concurrent: config.address_concurrent,
-            window_s: config.window_s,
+            concurrent: None,
+            window_s: WINDOW_S,
         };
         Ok(Self {
             keys: keys.transpose()?,
             signing: signing.transpose().map_err(AccessError::Signing)?,
             address_quota: (!quota.is_unlimited()).then(|| Arc::new(quota)),
-            meter: Arc::new(QuotaMeter::new(config.max_addresses)),
+            meter: Arc::new(QuotaMeter::new(MAX_ADDRESSES)),
             sites,
             config,
             server,
@@ -142,7 +146,7 @@ impl Access {
             return Ok(None);
         }
         *seen = now;
-        let ring = read(&keys.path, self.config.window_s)?;
+        let ring = read(&keys.path)?;
         let n = ring.0.len();
         *keys.ring.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(ring);
         self.meter.forget_keys(Instant::now());
@@ -150,9 +154,9 @@ impl Access {
     }
 }
 
-fn read(path: &Path, window_s: u64) -> Result<KeyRing, AccessError> {
+fn read(path: &Path) -> Result<KeyRing, AccessError> {
     let text = fs::read_to_string(path).map_err(|error| AccessError::Read { path: path.to_owned(), error })?;
-    file::parse(&text, window_s).map_err(|error| AccessError::Keys { path: path.to_owned(), error })
+    file::parse(&text).map_err(|error| AccessError::Keys { path: path.to_owned(), error })
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use super::account::Quota;
+use super::account::{Quota, WINDOW_S};
 use super::error::KeyFileError;
 use super::keys::{Key, KeyRing, Scope};
 use super::token;
@@ -20,8 +20,8 @@ const NAMES: [&str; 10] =
 
 type Field<'a> = (Range<usize>, &'a DeValue<'a>);
 
-/// Parses a key file. `window_s` is the quota window of keys without their own, s.
-pub(crate) fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> {
+/// Parses a key file.
+pub(crate) fn parse(text: &str) -> Result<KeyRing, KeyFileError> {
     let wrong = |span: Range<usize>, reason: String| KeyFileError { line: line_of(text, span.start), reason };
     let table = DeTable::parse(text).map_err(|e| wrong(e.span().unwrap_or_default(), e.message().to_owned()))?;
     let mut keys = BTreeMap::new();
@@ -33,7 +33,7 @@ pub(crate) fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> 
         for entry in entries {
             let fields =
                 entry.get_ref().as_table().ok_or_else(|| wrong(entry.span(), "expected [[key]]".to_owned()))?;
-            let key = key(fields, entry.span(), window_s).map_err(|(span, reason)| wrong(span, reason))?;
+            let key = key(fields, entry.span()).map_err(|(span, reason)| wrong(span, reason))?;
             let (span, id) = (entry.span(), key.id.clone());
             if keys.insert(id.clone(), Arc::new(key)).is_some() {
                 return Err(wrong(span, format!("duplicate key `{id}`")));
@@ -46,7 +46,7 @@ pub(crate) fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> 
 /// Span and cause of an error.
 type SpannedError = (Range<usize>, String);
 
-fn key(fields: &DeTable<'_>, span_of_key: Range<usize>, window_s: u64) -> Result<Key, SpannedError> {
+fn key(fields: &DeTable<'_>, span_of_key: Range<usize>) -> Result<Key, SpannedError> {
     for name in fields.keys() {
         if !NAMES.contains(&&**name.get_ref()) {
             return Err((name.span(), unknown(name.get_ref(), NAMES)));
@@ -82,7 +82,7 @@ fn key(fields: &DeTable<'_>, span_of_key: Range<usize>, window_s: u64) -> Result
         requests: count("requests")?,
         work_s: count("work_s")?,
         concurrent: count("concurrent")?,
-        window_s: count("window_s")?.unwrap_or(window_s),
+        window_s: count("window_s")?.unwrap_or(WINDOW_S),
     };
     Ok(Key {
         id: id.to_owned(),
@@ -191,13 +191,13 @@ mod tests {
             id: "b".into(),
             group: "b".into(),
             scopes: vec![Scope::Read],
-            quota: Arc::new(Quota { window_s: 60, ..Quota::default() }),
+            quota: Arc::new(Quota { window_s: WINDOW_S, ..Quota::default() }),
             expires: None,
             note: None,
             ..full.clone()
         };
         let text = format!("# keys\n{}\n{}", format_key(&full), format_key(&plain));
-        let ring = parse(&text, 60).unwrap_or_else(|e| panic!("{e}\n{text}"));
+        let ring = parse(&text).unwrap_or_else(|e| panic!("{e}\n{text}"));
         assert_eq!(ring.0.len(), 2);
         for key in [&full, &plain] {
             let read = &ring.0[&key.id];
@@ -210,7 +210,7 @@ mod tests {
         assert!(
             !format_key(&plain).contains("group")
                 && !format_key(&plain).contains("window_s")
-                && parse("", 60).unwrap().0.is_empty()
+                && parse("").unwrap().0.is_empty()
         );
     }
 
@@ -241,7 +241,7 @@ mod tests {
         ] {
             let text = good.replace(change.0, change.1);
             assert_ne!(text, good, "{change:?}");
-            let error = parse(&text, 60).map(|ring| ring.0.len()).unwrap_err();
+            let error = parse(&text).map(|ring| ring.0.len()).unwrap_err();
             assert_eq!(error.line, line, "{error}\n{text}");
             assert!(error.reason.contains(reason), "{error}\n{text}");
             assert!(!error.reason.contains(&hash.to_string()[20..]), "{error}");

@@ -19,6 +19,9 @@ use crate::telemetry::{SpanKind, SpanParent, TraceSpan};
 
 /// Longest pause that a host can request.
 const MAX_PAUSE: Duration = Duration::from_mins(10);
+/// Longest `Retry-After` of a host that a fetch waits for, because callers wait meanwhile. For longer ones, requests to
+/// the host pause until then.
+const MAX_RETRY_AFTER: Duration = Duration::from_secs(5);
 /// Retry time reported to callers if no better one is known.
 const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(1);
 
@@ -196,7 +199,7 @@ impl Remote {
         match &answer {
             Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_) | Failed::Busy(_)) => permit.succeeded(),
             Err(Failed::Other { retry_after: Some(wait), reason, .. })
-                if reason.is_temporary() && *wait > Duration::from_millis(self.config.retry_after_ms) =>
+                if reason.is_temporary() && *wait > MAX_RETRY_AFTER =>
             {
                 permit.asked_to_wait((*wait).min(MAX_PAUSE));
             }

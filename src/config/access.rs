@@ -24,22 +24,12 @@ pub struct AccessConfig {
     pub signing_secret: Option<Secret>,
     /// File that contains the value of `signing_secret`. Default `none`.
     pub signing_secret_file: Option<PathBuf>,
-    /// Requests of one address per window. Default `none`: unlimited. Requests with a key have the key's quota instead.
+    /// Requests of one address per minute. Default `none`: unlimited. Requests with a key have the key's quota instead.
     #[serde(deserialize_with = "count")]
     pub address_requests: Option<u64>,
-    /// Computing time for the jobs of one address per window, s. Default `none`: unlimited.
+    /// Computing time for the jobs of one address per minute, s. Default `none`: unlimited.
     #[serde(deserialize_with = "count")]
     pub address_work_s: Option<u64>,
-    /// Concurrent requests of one address, each counted to the last byte of the response. Default `none`: unlimited.
-    #[serde(deserialize_with = "count")]
-    pub address_concurrent: Option<u64>,
-    /// Length of a quota window, s, for addresses and for keys without their own. Default 60: a used-up quota is
-    /// restored within a minute. The window begins with the client's first request, so that not all clients retry at
-    /// the same time.
-    pub window_s: u64,
-    /// Number of addresses with a separate quota. Default 10,000, about 2 MB. Further addresses share one quota,
-    /// because forgetting an address would give it a new one.
-    pub max_addresses: usize,
     /// Origins whose pages may read responses and send requests without a key: `auto`, `*`, or a list such as
     /// `https://viewer.example`. Default `auto`: loopback origins if the service listens on a loopback address, no
     /// others. `none`: only pages of this server.
@@ -62,9 +52,6 @@ impl Default for AccessConfig {
             signing_secret_file: None,
             address_requests: None,
             address_work_s: None,
-            address_concurrent: None,
-            window_s: 60,
-            max_addresses: 10_000,
             cors_origins: Some(Origins::Auto),
             cors_credentials: false,
             hsts_s: None,

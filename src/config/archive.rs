@@ -15,8 +15,9 @@ pub struct ArchiveConfig {
     /// Local folder, flat or in wwPDB's `divided` layout. Default `none`: `archive` in the data folder, so that one
     /// mount is enough.
     pub dir: Option<PathBuf>,
-    /// Time between checks of a local file for changes, ms. Default 1,000: a check costs a dozen system calls, and
-    /// entries change rarely.
+    /// Time between checks of a local file for changes, ms. Fixed: a check costs a dozen system calls, and entries
+    /// change rarely.
+    #[serde(skip)]
     pub local_check_interval_ms: u64,
     /// URL templates of an entry, tried in order until one has it; `none` disables the remote archive. Default:
     /// compressed mmCIF from RCSB's download service, the smallest complete format.
@@ -32,38 +33,41 @@ pub struct ArchiveConfig {
     /// Allows host names that resolve to private, loopback and link-local addresses. Default false: DNS records that
     /// others control must not give access to the operator's machines. IP addresses in `url` are always allowed.
     pub allow_private: bool,
-    /// Time for a connection, name resolution and TLS included, ms. Default 5,000.
+    /// Time for a connection, name resolution and TLS included, ms. Fixed: a host that needs longer is unreachable.
+    #[serde(skip)]
     pub connect_timeout_ms: u64,
-    /// Time for the head of a response, and the longest pause within its body, ms. Default 10,000: archives serve
-    /// stored files.
+    /// Time for the head of a response, and the longest pause within its body, ms. Fixed: archives serve stored files.
+    #[serde(skip)]
     pub first_byte_timeout_ms: u64,
     /// Total time for an entry, ms: waiting for other fetches, half of it for those of the same client, all attempts
     /// and pauses. Default 60,000: 100 MB at 14 Mbit/s.
     pub timeout_ms: u64,
-    /// Attempts per URL, the first included. Default 3. Retries only temporary failures: no connection, timeouts,
-    /// damaged files, 429 and 5xx.
+    /// Attempts per URL, the first included. Fixed: retries only bridge temporary failures, which are no connection,
+    /// timeouts, damaged files, 429 and 5xx.
+    #[serde(skip)]
     pub attempts: u32,
     /// Longest pause before the second attempt, ms. It doubles with every further attempt, and the pause is a random
-    /// part of it, so that servers do not retry in step. Default 200.
+    /// part of it, so that servers do not retry in step. Fixed: callers wait meanwhile.
+    #[serde(skip)]
     pub backoff_ms: u64,
-    /// Longest `Retry-After` of the archive that a fetch waits for, ms; for longer ones, requests to the host pause
-    /// until then. Default 5,000: callers wait meanwhile.
-    pub retry_after_ms: u64,
     /// Size of an entry as sent, bytes. Default 256 MiB, as for uploads. At most `concurrent` entries are in memory.
     pub max_bytes: u64,
     /// Number of concurrent fetches. Default 8: public archives ask for restraint.
     pub concurrent: usize,
-    /// Time for which a copy is used without revalidation, ms. Default 86,400,000, a day: entries are released and
-    /// revised weekly.
+    /// Time for which a copy is used without revalidation, ms. Fixed to a day: entries are released and revised weekly.
+    #[serde(skip)]
     pub revalidate_after_ms: u64,
-    /// Time for which a missing entry is not requested again, ms. Default 60,000.
+    /// Time for which a missing entry is not requested again, ms. Fixed: a new entry is found within a minute.
+    #[serde(skip)]
     pub retry_missing_after_ms: u64,
     /// Size of the copies on disk, bytes; the least recently used ones are evicted. Default 4 GiB: ten thousand typical
     /// entries.
     pub cache_bytes: u64,
-    /// Consecutive failures after which requests to a host pause. Default 5.
+    /// Consecutive failures after which requests to a host pause. Fixed: more than one fetch with all its attempts.
+    #[serde(skip)]
     pub breaker_failures: u32,
-    /// Length of the pause before one request tests the host, ms. Default 30,000.
+    /// Length of the pause before one request tests the host, ms. Fixed: one request in this time burdens no host.
+    #[serde(skip)]
     pub breaker_ms: u64,
 }
 
@@ -80,7 +84,6 @@ impl Default for ArchiveConfig {
             timeout_ms: 60_000,
             attempts: 3,
             backoff_ms: 200,
-            retry_after_ms: 5000,
             max_bytes: 256 << 20,
             concurrent: 8,
             revalidate_after_ms: 86_400_000,

@@ -27,12 +27,14 @@ pub struct JobsConfig {
     /// Maximum number of attempts to run an asynchronous job. Default 3: a job that crashed the process that often is
     /// assumed to crash it again.
     pub attempts: u32,
-    /// Time for which an asynchronous job retries to store its mesh, ms. Default 60,000: longer than a restart of the
-    /// store takes. After that the mesh is computed again, for at most `attempts` attempts.
+    /// Time for which an asynchronous job retries to store its mesh, ms. Fixed: longer than a restart of the store
+    /// takes. After that the mesh is computed again, for at most `attempts` attempts.
+    #[serde(skip)]
     pub save_retry_ms: u64,
-    /// Number of results of synchronous requests that are stored concurrently. Default 4: more would compete with
-    /// meshing, as would more than one while jobs wait for a worker; a result that is not stored is computed again for
-    /// the next request.
+    /// Number of results of synchronous requests that are stored concurrently. Fixed: more would compete with meshing,
+    /// as would more than one while jobs wait for a worker; a result that is not stored is computed again for the next
+    /// request.
+    #[serde(skip)]
     pub concurrent_saves: usize,
     /// Number of asynchronous jobs on record, open and ended. Default 100,000: the records take 400 MB of disk in
     /// blocks of 4 KiB, and listing them at the start takes seconds. At the limit, the record of the ended job that was

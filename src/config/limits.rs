@@ -16,32 +16,20 @@ use crate::surface::SurfaceLimits;
 pub struct LimitsConfig {
     /// Size of a request body as sent, bytes. Default 256 MiB: the largest PDB entries have about 100 MB compressed.
     pub body_bytes: u64,
-    /// Size of a JSON request body, bytes. Default 64 KiB: a document names a structure and about thirty parameters.
-    pub json_bytes: u64,
-    /// Size of the headers of a form part, and of the preamble before the first part, bytes. Default 16 KiB: browsers
-    /// send a few hundred bytes.
-    pub part_head_bytes: u64,
-    /// Number of parts of a form. Default 128: one file and all parameters are fewer than half.
-    pub parts: usize,
     /// Size of a structure or map file after decompression, bytes. Default 2 GiB: the largest entries inflate to about
     /// 1 GB. Stops compression bombs.
     pub inflated_bytes: u64,
     /// Number of atoms in all models of a structure, and of an assembly. Default 10,000,000: four times the largest PDB
     /// entry; at 80 bytes each 800 MB.
     pub atoms: u64,
-    /// Number of atoms of one model, or of an assembly, at exactly the same position. Default 1,000: structures have at
-    /// most a few, and the work of a mesh grows with the square of their number.
-    pub duplicate_atoms: u64,
     /// Number of copies of chains in an assembly, or of instances. Default 10,000: six times as many as in the largest
     /// virus of the PDB.
     pub assembly_copies: u64,
-    /// Number of parts of a mesh with `split` or `model=all`. Default 1,000: most structures have fewer chains. Each
-    /// part is meshed on its own and adds about a kilobyte to the header of a glTF.
-    pub mesh_parts: u64,
     /// Number of grid points of a map for `color=map`. Default 67,108,864: 406 along each axis, 256 MiB in memory.
     pub map_points: u64,
-    /// Number of atoms whose names or colours are listed, for web pages that show them. Default 1,000,000: about 10 MB
-    /// of JSON, the most that is useful in a browser.
+    /// Number of atoms whose names or colours are listed, for web pages that show them. Fixed: about 10 MB of JSON, the
+    /// most that is useful in a browser.
+    #[serde(skip)]
     pub labels: u64,
     /// Number of grid points in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; 4 GiB as 32-bit
     /// numbers.
@@ -70,8 +58,9 @@ pub struct LimitsConfig {
     /// than `structure_cache_bytes`. Default 4 GiB: about 80 million atoms at 48 bytes, with their groups. At the
     /// limit, the least recently used index that is not in use is removed. 0 rejects such tilesets.
     pub scratch_bytes: u64,
-    /// Width and height of a picture, pixels. Default 4,096: at 40 bytes a pixel the largest picture needs 640 MiB, and
+    /// Width and height of a picture, pixels. Fixed: at 40 bytes a pixel the largest picture needs 640 MiB, and
     /// rendering takes seconds.
+    #[serde(skip)]
     pub picture_side: u32,
 }
 
@@ -79,14 +68,9 @@ impl Default for LimitsConfig {
     fn default() -> Self {
         Self {
             body_bytes: 256 << 20,
-            json_bytes: 64 << 10,
-            part_head_bytes: 16 << 10,
-            parts: 128,
             inflated_bytes: 2 << 30,
             atoms: 10_000_000,
-            duplicate_atoms: 1000,
             assembly_copies: 10_000,
-            mesh_parts: 1000,
             map_points: 64 << 20,
             labels: 1_000_000,
             grid_points: 1 << 30,
@@ -109,10 +93,9 @@ impl LimitsConfig {
             read: ReadLimits {
                 max_inflated_bytes: self.inflated_bytes,
                 max_atoms: self.atoms,
-                max_duplicates: self.duplicate_atoms,
                 max_copies: self.assembly_copies,
-                max_parts: self.mesh_parts,
                 max_distances: self.candidate_pairs.saturating_mul(DISTANCES_PER_PAIR),
+                ..ReadLimits::default()
             },
             surface: SurfaceLimits {
                 max_grid_points: self.grid_points,

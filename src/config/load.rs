@@ -285,8 +285,6 @@ impl Tree {
 /// Returns the minimum of a number. A limit or timeout of zero would prevent all service.
 pub(super) fn minimum(key: &str) -> u64 {
     match key {
-        // Minimum buffer of the HTTP/1.1 parser.
-        "server.head_bytes" => 8 << 10,
         // Keeps no structures, indexes on disk or readback buffers.
         "limits.structure_cache_bytes" | "limits.scratch_bytes" | "devices.readback_bytes" => 0,
         _ => 1,

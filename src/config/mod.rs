@@ -1,7 +1,8 @@
 //! Configuration of the service: defaults, then a TOML file, then `MOLMESH__SECTION__KEY`, then flags.
 //!
 //! One struct per section. The documentation of every key states its unit and the reason for its default; keys end in
-//! their unit (`_ms`, `_bytes`). Unknown keys are rejected in every layer.
+//! their unit (`_ms`, `_bytes`). Unknown keys are rejected in every layer. Skipped fields have no key: they are fixed
+//! in a service, and only tests change them.
 
 mod access;
 mod archive;

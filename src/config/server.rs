@@ -57,27 +57,23 @@ pub struct ServerConfig {
     #[schemars(range(min = 0, max = 1))]
     pub client_share: f64,
     /// Time for the head of a request, ms, counted from the connection or the previous response; also the time that an
-    /// idle HTTP/1.1 connection is kept. Default 15,000: slow clients need seconds, only attackers need a minute.
+    /// idle HTTP/1.1 connection is kept. Fixed: slow clients need seconds, only attackers need a minute.
+    #[serde(skip)]
     pub header_timeout_ms: u64,
-    /// Time for the whole body of a request, ms. Default 60,000: 256 MiB at 36 Mbit/s.
+    /// Time for the whole body of a request, ms. Fixed: 256 MiB at 36 Mbit/s.
+    #[serde(skip)]
     pub body_timeout_ms: u64,
-    /// Time in which a client must receive `write_bytes` of a response body, or the rest of it, ms. Default 30,000:
-    /// buffers and delivery slots are held until a body is sent. A client that has received more may pause longer, one
-    /// second per 16 KiB, up to four times this value. Event streams are exempt.
+    /// Time in which a client must receive 16 KiB of a response body, or the rest of it, ms. Fixed: buffers and
+    /// delivery slots are held until a body is sent. A client that has received more may pause longer, one second per
+    /// 16 KiB, up to four times this value. Event streams are exempt.
+    #[serde(skip)]
     pub write_timeout_ms: u64,
-    /// Bytes of a response body that a client must receive within `write_timeout_ms`. Default 16 KiB: half a kilobyte
-    /// per second, so that a connection of 8 KiB/s carries a dozen concurrent bodies.
-    pub write_bytes: u64,
-    /// Size of the head of a request, that is its request line and headers, bytes, at least 8 KiB. Default 64 KiB:
-    /// browsers and proxies send a few KiB. Larger heads get a 431.
-    pub head_bytes: u32,
-    /// Number of concurrent requests on one HTTP/2 connection. Default 64: a page sends a dozen; clients can open
-    /// further connections, which are counted.
-    pub streams: u32,
-    /// Longest silence of an event stream before a comment is sent, ms. Default 15,000: proxies commonly close idle
-    /// connections after half a minute.
+    /// Longest silence of an event stream before a comment is sent, ms. Fixed: proxies commonly close idle connections
+    /// after half a minute.
+    #[serde(skip)]
     pub heartbeat_ms: u64,
-    /// Time that an idle HTTP/2 connection is kept, ms. Default 120,000: proxies usually reuse it within that time.
+    /// Time that an idle HTTP/2 connection is kept, ms. Fixed: proxies usually reuse it within that time.
+    #[serde(skip)]
     pub idle_timeout_ms: u64,
     /// Time after SIGTERM in which `/readyz` answers 503 while all requests are served, on new connections too, ms;
     /// `none` skips it. Default 3,000: load balancers and orchestrators need a second or two to stop sending requests.
@@ -108,9 +104,6 @@ impl Default for ServerConfig {
             header_timeout_ms: 15_000,
             body_timeout_ms: 60_000,
             write_timeout_ms: 30_000,
-            write_bytes: 16 << 10,
-            head_bytes: 64 << 10,
-            streams: 64,
             heartbeat_ms: 15_000,
             idle_timeout_ms: 120_000,
             termination_notice_ms: Some(3000),

@@ -35,19 +35,19 @@ pub struct StoreConfig {
     /// Time without a response after which a request to S3 fails or is retried, and time limit of an operation of a
     /// folder, ms. Default 30,000: a part of 8 MiB at 2 Mbit/s, or an upload of 256 MiB on a slow disk.
     pub timeout_ms: u64,
-    /// Minimum time between health checks of the store, ms; `/readyz` writes, reads and removes a small object. Default
-    /// 5,000: orchestrators send a request every few seconds.
+    /// Minimum time between health checks of the store, ms; `/readyz` writes, reads and removes a small object. Fixed:
+    /// orchestrators send a request every few seconds.
+    #[serde(skip)]
     pub check_interval_ms: u64,
-    /// Time after which a health check of the store fails, ms. Default 10,000: a busy disk takes seconds, and load must
-    /// not make the service unready.
-    pub check_timeout_ms: u64,
-    /// Time between removals of expired objects, ms. Default 60,000: times to live are hours.
+    /// Time between removals of expired objects, ms. Fixed: times to live are hours.
+    #[serde(skip)]
     pub sweep_ms: u64,
     /// Capacity for results and inputs together, bytes. Default 10 GiB: thousands of meshes. The least recently used
     /// objects are evicted.
     pub max_bytes: u64,
-    /// Maximum number of results, their reports and inputs together. Default 500,000: their index takes up to 200 MB of
-    /// memory. The least recently used objects are evicted.
+    /// Maximum number of results, their reports and inputs together. Fixed: their index takes up to 200 MB of memory.
+    /// The least recently used objects are evicted.
+    #[serde(skip)]
     pub max_objects: u64,
     /// Time that a result is kept after its last use, ms. Default 86,400,000 (a day): most repeated requests come soon.
     pub result_ttl_ms: u64,
@@ -57,9 +57,11 @@ pub struct StoreConfig {
     /// Time that a job record is kept after it was last written or read, ms. Default 86,400,000 (a day), as for
     /// results.
     pub job_ttl_ms: u64,
-    /// Memory for cached small results, bytes. Default 256 MiB: thousands of small proteins.
+    /// Memory for cached small results, bytes. Fixed: thousands of small proteins.
+    #[serde(skip)]
     pub memory_bytes: u64,
-    /// Largest result that is cached in memory, bytes. Default 4 MiB: hundreds of results of that size fit.
+    /// Largest result that is cached in memory, bytes. Fixed: dozens of results of that size fit.
+    #[serde(skip)]
     pub memory_object_bytes: u64,
 }
 
@@ -76,7 +78,6 @@ impl Default for StoreConfig {
             secret_access_key_file: None,
             timeout_ms: 30_000,
             check_interval_ms: 5000,
-            check_timeout_ms: 10_000,
             sweep_ms: 60_000,
             max_bytes: 10 << 30,
             max_objects: 500_000,

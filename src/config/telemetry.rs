@@ -32,13 +32,16 @@ pub struct TelemetryConfig {
     pub secret_headers: Option<SecretHeaders>,
     /// File that contains the value of `secret_headers`. Default `none`.
     pub secret_headers_file: Option<PathBuf>,
-    /// Maximum time to send a batch, retries included, ms. Default 10,000, the default of OpenTelemetry's exporters.
+    /// Maximum time to send a batch, retries included, ms. Fixed: the default of OpenTelemetry's exporters.
+    #[serde(skip)]
     pub timeout_ms: u64,
-    /// Maximum number of spans that wait for export; further ones are dropped. Default 4,096: the spans of some 250
-    /// requests, about 2 MB.
+    /// Maximum number of spans that wait for export; further ones are dropped. Fixed: the spans of some 250 requests,
+    /// about 2 MB.
+    #[serde(skip)]
     pub queue: usize,
-    /// Maximum time to export the queued spans when the service stops, ms. Default 2,000: a running collector needs a
-    /// fraction of it, and an unreachable one must not delay the stop.
+    /// Maximum time to export the queued spans when the service stops, ms. Fixed: a running collector needs a fraction
+    /// of it, and an unreachable one must not delay the stop.
+    #[serde(skip)]
     pub flush_timeout_ms: u64,
 }
 

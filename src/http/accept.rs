@@ -52,6 +52,12 @@ const SOCKET_BUFFER: usize = 256 << 10;
 const RECEIVE_BUFFER: usize = 64 << 10;
 /// Buffers of a connection, bytes.
 const CONNECTION_BYTES: u64 = (SOCKET_BUFFER + RECEIVE_BUFFER) as u64;
+/// Maximum size of the head of a request, that is its request line and headers, bytes. Browsers and proxies send a few
+/// KiB. Larger heads get a 431.
+const HEAD_BYTES: u32 = 64 << 10;
+/// Maximum number of concurrent requests on one HTTP/2 connection. A page sends a dozen; clients can open further
+/// connections, which are counted.
+const MAX_STREAMS: u32 = 64;
 /// Interval of HTTP/2 pings.
 const PING: Duration = Duration::from_secs(20);
 /// Time for the last responses, such as those of cancelled jobs.
@@ -293,7 +299,7 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
         .http1()
         .timer(TokioTimer::new())
         .header_read_timeout(Duration::from_millis(config.header_timeout_ms))
-        .max_buf_size(config.head_bytes as usize);
+        .max_buf_size(HEAD_BYTES as usize);
     builder
         .http2()
         .timer(TokioTimer::new())
@@ -302,9 +308,9 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
         .keep_alive_timeout(MAX_TIME_FACTOR * Duration::from_millis(config.write_timeout_ms))
         .initial_stream_window_size(WINDOWS[0])
         .initial_connection_window_size(WINDOWS[1])
-        .max_concurrent_streams(config.streams)
+        .max_concurrent_streams(MAX_STREAMS)
         .max_send_buf_size(STREAM_BUFFER)
-        .max_header_list_size(config.head_bytes);
+        .max_header_list_size(HEAD_BYTES);
     builder
 }
 

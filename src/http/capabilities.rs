@@ -9,9 +9,9 @@ use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
 use super::openapi::problem_responses;
-use super::page;
 use super::problem_types::ProblemType;
 use super::state::Shared;
+use super::{form, pace, page, upload};
 use crate::config::Config;
 use crate::formats::Format;
 use crate::jobs::Pool;
@@ -340,9 +340,9 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
     let (limits, server, jobs) = (&config.limits, &config.server, &config.jobs);
     Limits {
         body_bytes: limits.body_bytes,
-        json_bytes: limits.json_bytes,
-        part_head_bytes: limits.part_head_bytes,
-        parts: limits.parts,
+        json_bytes: upload::MAX_JSON_BYTES,
+        part_head_bytes: form::MAX_HEAD_BYTES as u64,
+        parts: form::MAX_PARTS,
         inflated_bytes: limits.inflated_bytes,
         atoms: limits.atoms,
         labels: limits.labels,
@@ -361,7 +361,7 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         body_timeout_ms: server.body_timeout_ms,
         header_timeout_ms: server.header_timeout_ms,
         write_timeout_ms: server.write_timeout_ms,
-        write_bytes: server.write_bytes,
+        write_bytes: pace::MIN_BYTES,
         connections: server.connections,
     }
 }

@@ -16,10 +16,14 @@ use super::content_type::DeclaredType;
 use super::limit::Limit;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
-use crate::config::LimitsConfig;
 use crate::jobs::MemoryReservation;
 use crate::store::Digest;
 
+/// Maximum size of the headers of a part, and of the preamble before the first part, bytes. Browsers send a few
+/// hundred.
+pub(super) const MAX_HEAD_BYTES: usize = 16 << 10;
+/// Maximum number of parts. One file and all parameters are fewer than half.
+pub(super) const MAX_PARTS: usize = 128;
 /// Maximum size of a parameter field, bytes.
 const MAX_FIELD_BYTES: usize = 4096;
 /// Maximum length of a boundary (RFC 2046, 5.1.1).
@@ -76,33 +80,21 @@ impl Stream for Feed<'_> {
 /// Allowance for the content of a part, which the parser does not buffer.
 const UNBOUNDED: usize = usize::MAX;
 
-/// Limits of a form.
-struct FormLimits {
-    body: Limit,
-    head: Limit,
-    parts: Limit,
+fn head_too_long() -> Problem {
+    let limit = Limit { key: None, max: MAX_HEAD_BYTES as u64 };
+    limit.exceeded("the preamble or the headers of a part have", "bytes")
 }
 
-impl FormLimits {
-    fn new(limits: &LimitsConfig, body: Limit) -> Self {
-        let head = Limit { key: "limits.part_head_bytes", max: limits.part_head_bytes };
-        Self { body, head, parts: Limit { key: "limits.parts", max: limits.parts as u64 } }
-    }
-
-    fn head_too_long(&self) -> Problem {
-        self.head.exceeded("the preamble or the headers of a part have", "bytes")
-    }
-
-    fn problem(&self, error: &multer::Error) -> Problem {
-        match error {
-            multer::Error::StreamSizeExceeded { .. } => self.body.exceeded_by_body(),
-            multer::Error::StreamReadFailed(cause)
-                if matches!(cause.downcast_ref::<FeedError>(), Some(FeedError::HeadTooLong)) =>
-            {
-                self.head_too_long()
-            }
-            other => Problem::new(ProblemType::BadRequest, format!("the form cannot be read: {other}")),
+/// Returns the problem of an error of the parser, for a body with this limit.
+fn unreadable(error: &multer::Error, body: Limit) -> Problem {
+    match error {
+        multer::Error::StreamSizeExceeded { .. } => body.exceeded_by_body(),
+        multer::Error::StreamReadFailed(cause)
+            if matches!(cause.downcast_ref::<FeedError>(), Some(FeedError::HeadTooLong)) =>
+        {
+            head_too_long()
         }
+        other => Problem::new(ProblemType::BadRequest, format!("the form cannot be read: {other}")),
     }
 }
 
@@ -123,37 +115,35 @@ pub(super) struct UploadedFile {
 /// Reads a form of `announced` bytes, 0 if unknown: one structure file in `file` or `structure`, at most one map in
 /// `map`, parameters in the other fields.
 pub(super) async fn read(
-    limits: &LimitsConfig,
-    within: Limit,
+    limit: Limit,
     content_type: &str,
     announced: u64,
     body: Body,
     reservation: MemoryReservation,
 ) -> Result<UploadedFile, Problem> {
-    let bounds = FormLimits::new(limits, within);
-    let boundary = multer::parse_boundary(content_type).map_err(|e| bounds.problem(&e))?;
+    let failed = |error: multer::Error| unreadable(&error, limit);
+    let boundary = multer::parse_boundary(content_type).map_err(failed)?;
     if boundary.len() > MAX_BOUNDARY {
         let detail = format!("the form's boundary has more than {MAX_BOUNDARY} characters");
         return Err(Problem::new(ProblemType::BadRequest, detail).with("limit", MAX_BOUNDARY));
     }
     // Upper limit of the parser's buffer.
-    reservation.grow(bounds.head.max.saturating_add(PIECE as u64))?;
+    reservation.grow((MAX_HEAD_BYTES + PIECE) as u64)?;
     let allowance = AtomicUsize::new(0);
     let mut feed = Feed { body: body.into_data_stream(), rest: Bytes::new(), allowance: &allowance, paused: false };
-    let constraints = Constraints::new().size_limit(SizeLimit::new().whole_stream(bounds.body.max));
+    let constraints = Constraints::new().size_limit(SizeLimit::new().whole_stream(limit.max));
     let mut form = Multipart::with_constraints(&mut feed, boundary, constraints);
     let (mut file, mut map, mut fields) = (None, None, Vec::new());
-    let head = usize::try_from(bounds.head.max).unwrap_or(UNBOUNDED);
     loop {
-        allowance.store(head, Ordering::Relaxed);
-        let Some(mut field) = form.next_field().await.map_err(|e| bounds.problem(&e))? else { break };
+        allowance.store(MAX_HEAD_BYTES, Ordering::Relaxed);
+        let Some(mut field) = form.next_field().await.map_err(failed)? else { break };
         allowance.store(UNBOUNDED, Ordering::Relaxed);
         // The head may have begun in a piece that the allowance did not count.
-        if head_bytes(field.headers()) > head {
-            return Err(bounds.head_too_long());
+        if head_bytes(field.headers()) > MAX_HEAD_BYTES {
+            return Err(head_too_long());
         }
-        if fields.len() + usize::from(file.is_some()) + usize::from(map.is_some()) >= limits.parts {
-            return Err(bounds.parts.exceeded("the form has", "parts"));
+        if fields.len() + usize::from(file.is_some()) + usize::from(map.is_some()) >= MAX_PARTS {
+            return Err(Limit { key: None, max: MAX_PARTS as u64 }.exceeded("the form has", "parts"));
         }
         let name = field.name().unwrap_or_default().to_owned();
         reservation.grow(name.len() as u64)?;
@@ -169,7 +159,7 @@ pub(super) async fn read(
         }
         let declared = DeclaredType::new(field.content_type().map_or("", |mime| mime.as_ref()));
         let (mut content, mut hasher) = (BytesMut::new(), BodyHasher::default());
-        while let Some(chunk) = field.chunk().await.map_err(|e| bounds.problem(&e))? {
+        while let Some(chunk) = field.chunk().await.map_err(failed)? {
             // A map is the second file, so the announced length is not its own.
             reservation.extend(&mut content, &chunk, if is_structure { announced } else { 0 })?;
             if is_file {
@@ -189,9 +179,9 @@ pub(super) async fn read(
     }
     drop(form);
     // The epilogue is ignored, but the connection can be reused only if the body is read to its end.
-    allowance.store(head, Ordering::Relaxed);
+    allowance.store(MAX_HEAD_BYTES, Ordering::Relaxed);
     while let Some(piece) = feed.next().await {
-        piece.map_err(|e| bounds.problem(&multer::Error::StreamReadFailed(e.into())))?;
+        piece.map_err(|e| failed(multer::Error::StreamReadFailed(e.into())))?;
     }
     let Some((bytes, digest, declared)) = file else {
         let detail = "the form has no file; it belongs in a field named `file` or `structure`";

@@ -1,12 +1,13 @@
-//! Limit of a request body, with the configuration key that sets it.
+//! Limit of a request body.
 
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 
-/// Upper limit with its configuration key.
+/// Upper limit.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Limit {
-    pub(super) key: &'static str,
+    /// Configuration key that sets it, unless it is fixed.
+    pub(super) key: Option<&'static str>,
     pub(super) max: u64,
 }
 
@@ -18,7 +19,8 @@ impl Limit {
 
     /// Returns the problem of an exceeded limit; `what` begins the sentence.
     pub(super) fn exceeded(self, what: &str, unit: &str) -> Problem {
-        let Self { key, max } = self;
-        Problem::new(ProblemType::BodyTooLarge, format!("{what} more than {max} {unit} ({key})")).with("limit", max)
+        let max = self.max;
+        let key = self.key.map_or(String::new(), |key| format!(" ({key})"));
+        Problem::new(ProblemType::BodyTooLarge, format!("{what} more than {max} {unit}{key}")).with("limit", max)
     }
 }

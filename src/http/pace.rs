@@ -45,12 +45,15 @@ tokio::task_local! {
     static STREAM: Arc<Pace>;
 }
 
-/// Number of bytes that a client must read within a time.
+/// Time in which a client must read [`MIN_BYTES`].
 #[derive(Debug, Clone, Copy)]
 pub(super) struct MinimumRate {
-    bytes: u64,
     within: Duration,
 }
+
+/// Bytes of a response body that a client must read within the time of its [`MinimumRate`]: half a kilobyte per second,
+/// so that a connection of 8 KiB/s carries a dozen concurrent bodies.
+pub(super) const MIN_BYTES: u64 = 16 << 10;
 
 /// Number of bytes for which a client may pause one second longer.
 const BYTES_PER_SECOND: u64 = 16 << 10;
@@ -66,7 +69,7 @@ impl MinimumRate {
     }
 
     pub(super) fn new(config: &ServerConfig) -> Self {
-        Self { bytes: config.write_bytes, within: Duration::from_millis(config.write_timeout_ms) }
+        Self { within: Duration::from_millis(config.write_timeout_ms) }
     }
 }
 
@@ -123,7 +126,7 @@ impl Pace {
         state.offered -= bytes;
         state.taken += bytes;
         state.total += bytes;
-        if state.taken >= self.rate.bytes {
+        if state.taken >= MIN_BYTES {
             (state.taken, state.since) = (0, Instant::now());
         }
         let waker = if state.offered == 0 { state.waker.take() } else { None };

@@ -43,7 +43,7 @@ pub(super) struct App {
     pub(super) reader_line: Arc<ReaderLine>,
     /// Shares of the clients in `readers`.
     pub(super) reader_shares: Arc<ClientShares>,
-    /// Permits of `jobs.concurrent_saves`.
+    /// Permits to store results of synchronous requests.
     pub(super) save_permits: Arc<Semaphore>,
     /// Held while a save starts, so that its permit and its entry in `saves` appear together.
     pub(super) save_start: Mutex<()>,

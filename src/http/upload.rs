@@ -22,6 +22,8 @@ use crate::store::Digest;
 use crate::structure::{SourceFormat, detect_format};
 use crate::surface::MemoryMeter as _;
 
+/// Maximum size of a JSON body, bytes. A document names a structure and about thirty parameters.
+pub(super) const MAX_JSON_BYTES: u64 = 64 << 10;
 /// Advice if a body that is declared as JSON is too large.
 const NOT_JSON: &str = "a structure file must not be declared as application/json";
 /// Length from which the start of a form body must have a line end, bytes.
@@ -47,7 +49,7 @@ pub(super) async fn receive(
     headers: &HeaderMap,
     body: Body,
 ) -> Result<UploadedFile, Problem> {
-    let limit = Limit { key: "limits.body_bytes", max: app.config.limits.body_bytes };
+    let limit = Limit { key: Some("limits.body_bytes"), max: app.config.limits.body_bytes };
     let announced = announced(headers, limit)?;
     let reservation = app.uploads.for_client(caller.client.0).reservation();
     // A declared length is rejected before the body arrives.
@@ -58,7 +60,7 @@ pub(super) async fn receive(
             return Err(bad_encoding("a form cannot be compressed as a whole; compress the file in it"));
         }
         let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
-        let form = form::read(&app.config.limits, limit, content_type, announced, body, reservation);
+        let form = form::read(limit, content_type, announced, body, reservation);
         in_time(app, form).await?
     } else {
         let (bytes, digest) = in_time(app, collect(body, announced, limit, &reservation)).await?;
@@ -101,7 +103,7 @@ pub(super) async fn receive_json(
     headers: &HeaderMap,
     body: Body,
 ) -> Result<Bytes, Problem> {
-    let limit = Limit { key: "limits.json_bytes", max: app.config.limits.json_bytes };
+    let limit = Limit { key: None, max: MAX_JSON_BYTES };
     let announced = announced(headers, limit).map_err(|problem| problem.advise(NOT_JSON))?;
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
@@ -119,7 +121,7 @@ fn announced(headers: &HeaderMap, limit: Limit) -> Result<u64, Problem> {
     if length > limit.max { Err(limit.exceeded_by_body().with("actual", length)) } else { Ok(length) }
 }
 
-/// Limits the reception of a body to `server.body_timeout_ms`.
+/// Limits the time for the reception of a body.
 async fn in_time<T>(app: &App, receive: impl Future<Output = Result<T, Problem>>) -> Result<T, Problem> {
     tokio::time::timeout(Duration::from_millis(app.config.server.body_timeout_ms), receive).await.map_err(
         |_elapsed| {

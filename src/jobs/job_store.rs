@@ -68,7 +68,7 @@ pub(crate) struct JobView {
     /// Number of this state: the time of the change, ms since 1970. Grows with every change, even across restarts.
     pub(crate) version: u64,
     /// Record of an end that was decided but is not written yet. The end is visible once it is on record, or
-    /// after the store has rejected the record for `jobs.save_retry_ms`.
+    /// after the store has rejected the record for [`JobStoreState::retry_time`].
     pub(super) end: Option<Box<JobRecord>>,
 }
 

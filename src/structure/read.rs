@@ -35,8 +35,10 @@ impl Default for ReadLimits {
         Self {
             max_inflated_bytes: 4 << 30,
             max_atoms: 20_000_000,
+            // Structures have at most a few, and the work of a mesh grows with the square of their number.
             max_duplicates: 1000,
             max_copies: 10_000,
+            // Most structures have fewer chains. Each part is meshed on its own and adds about a kilobyte to a glTF.
             max_parts: 1000,
             max_distances: DISTANCES_PER_PAIR << 30,
         }

@@ -72,7 +72,7 @@ impl Traces {
         Tracer(self.provider.tracer_with_scope(scope))
     }
 
-    /// Exports the queued spans, for `telemetry.flush_timeout_ms` at most, and stops the export.
+    /// Exports the queued spans, for a limited time, and stops the export.
     pub(crate) async fn shut_down(self) {
         let Self { provider, flush_timeout } = self;
         let flush = move || provider.shutdown_with_timeout(flush_timeout);

@@ -275,9 +275,8 @@ fn memory_of_a_structure_is_returned() {
 #[test]
 fn memory_of_a_large_mesh_is_returned() {
     let folder = Folder::new();
-    // Neither the structure nor the result is kept in memory.
-    let sets = ["limits.structure_cache_bytes=0", "store.memory_object_bytes=1"];
-    let service = Service::start(&folder, &[&["--devices", "cpu"][..], &sets.map(|s| ["--set", s]).concat()].concat());
+    // The structure is not kept in memory, and the result is too large for that.
+    let service = Service::start(&folder, &["--devices", "cpu", "--set", "limits.structure_cache_bytes=0"]);
     let before = service.memory("VmRSS");
     let input = folder.file("block.pdb", cli_support::block(60));
     let (body, output) = (format!("@{}", input.display()), folder.path("block.stl"));
@@ -293,11 +292,11 @@ fn memory_of_a_large_mesh_is_returned() {
 #[test]
 fn cancelled_job_returns_its_memory() {
     let folder = Folder::new();
-    let sets = ["limits.duplicate_atoms=80000", "limits.candidate_pairs=1000000000"];
-    let service = Service::start(&folder, &[&["--devices", "cpu"][..], &sets.map(|s| ["--set", s]).concat()].concat());
+    let service = Service::start(&folder, &["--devices", "cpu", "--set", "limits.candidate_pairs=1000000000"]);
     let before = service.memory("VmRSS");
-    // Most candidate lists are long enough to be freed when their tile is finished.
-    let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 80_000]));
+    // Most candidate lists are long enough to be freed when their tile is finished. 1,000 atoms may have one position.
+    let positions: Vec<_> = (0..80_000_u32).map(|i| [f64::from(i / 1000) * 0.001, 0.0, 0.0]).collect();
+    let input = folder.file("near.pdb", cli_support::pdb(&positions));
     let body = format!("@{}", input.display());
     let url = format!("http://{}/v1/meshes?radius_scale=10", service.addr);
     let job = curl(&["-H", "Prefer: respond-async", "--data-binary", &body, &url]);

@@ -134,17 +134,7 @@ fn requests_cut_off_by_the_drain_get_a_response() {
 fn second_signal_ends_the_drain() {
     for signals in [["TERM", "TERM"], ["INT", "TERM"], ["TERM", "INT"]] {
         let folder = Folder::new();
-        let service = Service::start(
-            &folder,
-            &[
-                "--devices",
-                "cpu",
-                "--set",
-                "server.drain_timeout_ms=3600000",
-                "--set",
-                "server.body_timeout_ms=3600000",
-            ],
-        );
+        let service = Service::start(&folder, &["--devices", "cpu", "--set", "server.drain_timeout_ms=3600000"]);
         let mut stream = connect(addr(&service));
         stream.write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: localhost\r\ncontent-length: 5000\r\n\r\n").unwrap();
         stream.write_all(&SAMPLE[..1000]).unwrap();

@@ -277,7 +277,7 @@ fn concurrent_requests_are_counted_to_the_last_byte() {
 
 #[test]
 fn addresses_have_quotas_also_behind_trusted_proxies() {
-    let limited = |c: &mut Config| (c.access.address_requests, c.access.window_s) = (Some(2), 86_400);
+    let limited = |c: &mut Config| c.access.address_requests = Some(2);
     let own = server(Mode::Octahedra, limited);
     let ask = |server: &Running, header: (&str, &str)| get(server, "/v1/capabilities", &[header]).status;
     // Without trusted proxies the peer is the client.
@@ -310,29 +310,32 @@ fn addresses_have_quotas_also_behind_trusted_proxies() {
 }
 
 #[test]
-fn addresses_have_quotas_of_time_and_concurrency() {
-    let server = server(Mode::Slow(Duration::from_secs(2)), |c| {
-        c.access.address_work_s = Some(1);
-        c.access.address_concurrent = Some(1);
-        c.access.window_s = 86_400;
-    });
+fn addresses_have_quotas_of_time() {
+    let server = server(Mode::Slow(Duration::from_secs(2)), |c| c.access.address_work_s = Some(1));
     let first = server.post("/v1/meshes", &[], SAMPLE);
     assert_eq!(first.status, 200);
-    let policy = first.header("ratelimit-policy").unwrap();
-    assert!(policy.contains("\"work\";q=1") && policy.contains("\"concurrency\";q=1"), "{policy}");
+    assert_eq!(first.header("ratelimit-policy"), Some("\"work\";q=1;qu=\"molmesh-work-seconds\";w=60"));
     // Two seconds of computing exceed the quota of one. Other requests are served.
     let again = server.post("/v1/meshes?resolution=1.5", &[], SAMPLE);
     assert_eq!(again.problem(429, "quota-exceeded")["violated-policies"], serde_json::json!(["work"]));
-    wait_for("no request is running", || get(&server, "/v1/capabilities", &[]).status == 200);
-    // A request with an incomplete body is running.
+    assert_eq!(get(&server, "/v1/capabilities", &[]).status, 200);
+}
+
+#[test]
+fn a_request_is_concurrent_while_its_body_arrives() {
+    let keys = Keys::new(&[("a", "mesh,read", "concurrent = 1")]);
+    let server = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let head = format!(
+        "POST /v1/structures HTTP/1.1\r\nhost: localhost\r\nx-api-key: {}\r\ncontent-length: 1000\r\n\r\nATOM",
+        keys.text("a")
+    );
     let upload = || {
         let mut stream = connect(server.addr);
-        stream
-            .write_all(b"POST /v1/structures HTTP/1.1\r\nhost: localhost\r\ncontent-length: 1000\r\n\r\nATOM")
-            .unwrap();
+        stream.write_all(head.as_bytes()).unwrap();
         stream.set_nonblocking(true).unwrap();
         stream
     };
+    let status = || with(&server, keys.text("a"), "/v1/capabilities").status;
     let mut sending = upload();
     wait_for("the concurrent request is rejected", || {
         // A request is counted until shortly after its response was read, so the upload may be rejected. Sends it
@@ -340,10 +343,10 @@ fn addresses_have_quotas_of_time_and_concurrency() {
         if sending.peek(&mut [0]).is_ok() {
             sending = upload();
         }
-        get(&server, "/v1/capabilities", &[]).status == 429
+        status() == 429
     });
     drop(sending);
-    wait_for("the upload has ended", || get(&server, "/v1/capabilities", &[]).status == 200);
+    wait_for("the upload has ended", || status() == 200);
 }
 
 #[test]

@@ -43,7 +43,6 @@ impl Cluster {
             .env("MOLMESH__BROKER__URL", self.nats.address())
             .env("MOLMESH__BROKER__LEASE_MS", LEASE.as_millis().to_string())
             .env("MOLMESH__STORE__URL", format!("file://{}", self.folder.path().join("store").display()))
-            .env("MOLMESH__STORE__CHECK_INTERVAL_MS", "200")
             .env("MOLMESH__SERVER__ROLE", role);
         program
     }

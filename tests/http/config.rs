@@ -75,6 +75,9 @@ fn errors_of_unknown_keys_name_the_nearest_key_and_the_source() {
         ("queue = 3", None, None, "queue", "jobs.queue", ".tmp"),
         ("", Some("MOLMESH__JOBS__WORKER"), None, "jobs.worker", "jobs.workers", "MOLMESH__JOBS__WORKER"),
         ("", Some("MOLMESH__LISTEN"), None, "listen", "server.listen", "MOLMESH__LISTEN"),
+        // A fixed value has no key.
+        ("[server]\nheader_timeout_ms = 1", None, None, "server.header_timeout_ms", "", ".tmp"),
+        ("", Some("MOLMESH__STORE__SWEEP_MS"), None, "store.sweep_ms", "", "MOLMESH__STORE__SWEEP_MS"),
         ("", None, Some("server.lisen"), "server.lisen", "server.listen", "command line"),
         ("", None, Some("server"), "server", "", "command line"),
     ] {
@@ -116,7 +119,6 @@ fn errors_of_bad_values_name_key_value_and_expected_range() {
         ("access.address_requests", "many"),
         ("access.address_requests", "0"),
         ("access.hsts_s", "-1"),
-        ("access.window_s", "0"),
         ("access.cors_origins", "https://viewer.example/"),
         ("access.cors_credentials", "perhaps"),
     ] {
@@ -290,8 +292,8 @@ fn variables_without_two_underscores_are_reported() {
         let [warning] = &warnings(name)[..] else { panic!("{name}: {:?}", warnings(name)) };
         assert!(warning.contains(name) && warning.contains(" MOLMESH__LIMITS__ATOMS,"), "{warning}");
     }
-    let [of_many] = &warnings("MOLMESH_SERVER_HEADER_TIMEOUT_MS")[..] else { panic!("one warning") };
-    assert!(of_many.contains(" MOLMESH__SERVER__HEADER_TIMEOUT_MS,"), "{of_many}");
+    let [of_many] = &warnings("MOLMESH_SERVER_DRAIN_TIMEOUT_MS")[..] else { panic!("one warning") };
+    assert!(of_many.contains(" MOLMESH__SERVER__DRAIN_TIMEOUT_MS,"), "{of_many}");
     for name in ["MOLMESH_CONFIG", "MOLMESH_KEY", "LIMITS_ATOMS", "OTHER_LIMITS_ATOMS"] {
         assert_eq!(warnings(name), [""; 0], "{name}");
     }

@@ -68,7 +68,7 @@ fn the_schema_and_the_loader_reject_the_same_files() {
     let good = [
         "[limits]\nbody_bytes = \"64MiB\"\natoms = 5",
         "[limits]\nbody_bytes = \"1_000 KiB\"",
-        "[server]\nmetrics_listen = \"none\"\ntermination_notice_ms = \"none\"\nhead_bytes = 8192",
+        "[server]\nmetrics_listen = \"none\"\ntermination_notice_ms = \"none\"",
         "[server]\nmetrics_listen = \"127.0.0.1:9090\"\ntermination_notice_ms = 1",
         "[devices]\nmin_partition_bricks = \"none\"\nuse = \"0,2\"",
         "[archive]\nurl = [\"http://a/{id}\", \"https://b/{middle}/{id_upper}.cif\"]\nproxy = \"http://p:1\"",
@@ -92,7 +92,7 @@ fn the_schema_and_the_loader_reject_the_same_files() {
         "[limits]\nbody_bytes = \"5 MB\"",
         "[limits]\nbody_bytes = \"none\"",
         "[devices]\nmin_partition_bricks = 0",
-        "[server]\nhead_bytes = 8191",
+        "[server]\nheader_timeout_ms = 15000",
         "[server]\nlisten = 8080",
         "[archive]\nallow_private = \"maybe\"",
         "[archive]\nurl = \"file:///pdb/{id}\"",

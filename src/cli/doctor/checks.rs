@@ -109,7 +109,7 @@ pub(super) fn memory(machine: &Machine, loaded: &Loaded, devices: usize) -> Chec
     };
     let parts = [
         (&*budget, config.limits.memory_bytes),
-        ("store.memory_bytes", config.store.memory_bytes),
+        ("results in memory", config.store.memory_bytes),
         ("readback buffers", config.devices.readback_bytes.saturating_mul(devices)),
         ("others", OTHER_MEMORY),
     ];
@@ -189,10 +189,10 @@ mod tests {
 
     #[test]
     fn budgets_above_the_memory_are_a_warning() {
-        let pairs =
-            [("limits.memory_bytes", "1GiB"), ("store.memory_bytes", "1MiB"), ("devices.readback_bytes", "1MiB")];
+        let pairs = [("limits.memory_bytes", "1GiB"), ("devices.readback_bytes", "1MiB")];
         let flags = pairs.map(|(key, value)| (key.to_owned(), value.to_owned()));
-        let loaded = molmesh::config::load(None, [], &flags).unwrap();
+        let mut loaded = molmesh::config::load(None, [], &flags).unwrap();
+        loaded.config.store.memory_bytes = 1 << 20;
         let check = |limit| {
             let memory = AvailableMemory { limit, machine: None };
             super::memory(&Machine { memory, ..Machine::default() }, &loaded, 1)
