@@ -42,7 +42,8 @@ pub struct JobsConfig {
     pub records: usize,
     /// Number of asynchronous jobs of one client on record. Default 2,500, a quarter of the default of `broker.queue`:
     /// one client can neither displace the records of the others nor fill the queue. At the limit as for `records`,
-    /// among the jobs of the client.
+    /// among the jobs of the client. Jobs run in the order of their acceptance, so this also bounds the number of jobs
+    /// of one client for which the others wait.
     pub records_per_client: usize,
 }
 

@@ -4,10 +4,12 @@
 //! dispatches unfinished jobs again ([`JobStore::reconcile`](super::JobStore::reconcile)). A job may therefore be
 //! run twice; results are named by their contents, and the first end on record counts.
 //!
-//! Clients take turns. Of the jobs of one client, the most urgent runs first, then the oldest.
+//! Within a level of urgency, jobs run in the order of dispatch, whichever client sent them: shares of clients are
+//! enforced when jobs are accepted.
 
 mod memory;
 mod nats;
+mod order;
 #[cfg(test)]
 pub(crate) mod tests;
 
@@ -23,7 +25,6 @@ use thiserror::Error;
 pub(crate) use memory::MemoryBroker;
 pub(crate) use nats::NatsBroker;
 
-use super::rank::Client;
 use super::record::{JobId, JobRecord};
 use crate::store::Digest;
 
@@ -32,9 +33,7 @@ use crate::store::Digest;
 pub(crate) struct Dispatch {
     /// Id of the job.
     pub(crate) id: JobId,
-    /// Client, for fair queueing.
-    pub(crate) client: Client,
-    /// Urgency among the jobs of the client, from 0 (first) to 7 (last).
+    /// Urgency, from 0 (first) to 7 (last).
     pub(crate) urgency: u8,
     /// True for a job that workers with a GPU should run.
     pub(crate) suits_gpu: bool,
@@ -43,8 +42,8 @@ pub(crate) struct Dispatch {
 impl Dispatch {
     /// Returns the dispatch of the job of a record.
     pub(crate) fn of(record: &JobRecord) -> Self {
-        let JobRecord { id, client, urgency, suits_gpu, .. } = record;
-        Self { id: id.clone(), client: Client(*client), urgency: *urgency, suits_gpu: *suits_gpu }
+        let JobRecord { id, urgency, suits_gpu, .. } = record;
+        Self { id: id.clone(), urgency: *urgency, suits_gpu: *suits_gpu }
     }
 }
 
@@ -83,8 +82,8 @@ pub(crate) trait Broker: Send + Sync {
     /// Queues a job. Returns false if it is queued or claimed already.
     fn dispatch<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>>;
 
-    /// Waits for a job and claims it: first one that suits a GPU if `prefers_gpu`, else first one that does not. If the
-    /// future is dropped, a job that it has claimed can be claimed again after its lease.
+    /// Waits for a job and claims it: of one level of urgency, first a job that suits a GPU if `prefers_gpu`, else first
+    /// one that does not. If the future is dropped, a job that it has claimed can be claimed again after its lease.
     fn claim(&self, prefers_gpu: bool) -> BoxFuture<'_, Claim>;
 
     /// Locks work that one node at a time does. `None` if another run has the lock. If the broker does not answer, the
@@ -96,9 +95,6 @@ pub(crate) trait Broker: Send + Sync {
 
     /// Returns the events of a job that are published from now on.
     fn events(&self, id: &JobId) -> BoxFuture<'_, BoxStream<'static, JobEvent>>;
-
-    /// Leaves announced jobs to other nodes: this node claims no more jobs.
-    fn stop(&self);
 
     /// Waits until the ends of claims and locks are sent to the broker.
     fn flush(&self) -> BoxFuture<'_, ()>;

@@ -16,7 +16,7 @@ pub(crate) struct Rank {
     pub(crate) client: Client,
     /// True for a background job: no connection waits for the result.
     pub(crate) batch: bool,
-    /// Urgency among the jobs of the same client, from 0 (first) to 7 (last) as in RFC 9218.
+    /// Urgency from 0 (first) to 7 (last) as in RFC 9218.
     pub(crate) urgency: u8,
 }
 

@@ -136,9 +136,9 @@ pub(crate) struct JobRecord {
     pub(crate) parameters: Vec<(String, String)>,
     /// Mesh format, as a file name extension.
     pub(crate) format: String,
-    /// Number of the client, for fair queueing after a restart.
+    /// Number of the client, for its shares and quotas after a restart.
     pub(crate) client: u64,
-    /// Urgency among the jobs of the client.
+    /// Urgency from 0 (first) to 7 (last).
     pub(crate) urgency: u8,
     /// True for a job that workers with a GPU should run.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]

@@ -126,7 +126,6 @@ impl JobStore {
     /// Claims no more jobs.
     pub(crate) fn stop_claiming(&self) {
         self.0.runs.phase.send_replace(Phase::Finish);
-        self.0.broker.stop();
     }
 
     /// Returns all unfinished jobs to the queue. Their attempts do not count, and other processes can claim them at

@@ -12,6 +12,7 @@ use std::process::Command;
 
 use deploy_support::{Recipe, at, bytes, kinds, only, read, root, sections, strings, under, yaml};
 use molmesh::config::{Config, Role, load};
+use molmesh::telemetry::BROKER_QUEUED;
 use serde_json::{Value, json};
 
 /// User id of the service in a container.
@@ -245,19 +246,8 @@ fn the_chart_renders_valid_manifests() {
     let Some(rendered) = chart(&shared) else { return };
     let folder = cli_support::Folder::new();
     let keda = chart(&[&shared[..], &["keda.enabled=true", "broker.secret=nats"]].concat()).unwrap();
-    let gpu = [
-        "keda.enabled=true",
-        "workers[0].name=cpu",
-        "workers[1].name=gpu",
-        "workers[1].gpu=true",
-        "workers[0].minReplicas=1",
-        "workers[0].maxReplicas=2",
-        "workers[1].minReplicas=1",
-        "workers[1].maxReplicas=2",
-    ];
-    let gpu = chart(&[&shared[..], &gpu].concat()).unwrap();
-    let files = [rendered, keda, gpu].map(Result::unwrap);
-    let names = ["chart.yaml", "keda.yaml", "gpu.yaml"];
+    let files = [rendered, keda].map(Result::unwrap);
+    let names = ["chart.yaml", "keda.yaml"];
     let files: Vec<_> = names.iter().zip(&files).map(|(name, text)| folder.file(name, text)).collect();
     let Some(found) = yaml(&files) else { return };
     assert_eq!(found[0].errors, [""; 0]);
@@ -270,18 +260,19 @@ fn the_chart_renders_valid_manifests() {
         assert!(kinds(0).contains(kind), "no {kind}");
     }
     assert!(kinds(1).contains("ScaledObject"));
-    let triggers = |n: usize| {
-        let scaled = found[n].documents.iter().filter(|document| document["kind"] == "ScaledObject");
-        scaled.map(|scaled| scaled["spec"]["triggers"].as_array().unwrap().clone()).collect::<Vec<_>>()
+    let kind = |n: usize, kind: &str| found[n].documents.iter().find(|document| document["kind"] == kind).unwrap();
+    let triggers = kind(1, "ScaledObject")["spec"]["triggers"].as_array().unwrap();
+    let [trigger] = &triggers[..] else { panic!("one number for each kind of workers") };
+    assert_eq!(trigger["metadata"]["valueLocation"], BROKER_QUEUED);
+    assert_eq!(trigger["metadata"]["url"], "http://surfaces.default:9090/metrics");
+    // Only the autoscalers need the metrics of the service.
+    let has_metrics = |n: usize| {
+        let ports = kind(n, "Service")["spec"]["ports"].as_array().unwrap();
+        ports.iter().any(|port| port["name"] == "metrics" && port["port"] == 9090)
     };
-    assert_eq!(triggers(1).iter().map(Vec::len).collect::<Vec<_>>(), [48], "one trigger for each queue");
-    let [cpu, gpu] = &triggers(2)[..] else { panic!("two kinds of workers") };
-    let of = |triggers: &[Value], class: &str| {
-        triggers.iter().all(|trigger| class.contains(&trigger["metadata"]["consumer"].as_str().unwrap()[7..]))
-    };
-    assert!(cpu.len() == 24 && gpu.len() == 24 && of(cpu, "024") && of(gpu, "135"));
+    assert_eq!([0, 1].map(has_metrics), [false, true]);
     // The configuration of the pods is valid.
-    let map = found[0].documents.iter().find(|document| document["kind"] == "ConfigMap").unwrap();
+    let map = kind(0, "ConfigMap");
     let file = folder.file("molmesh.toml", map["data"]["molmesh.toml"].as_str().unwrap());
     let config = load(Some(&file), [], &[]).unwrap().config;
     assert_eq!((config.broker.url.as_deref(), config.broker.replicas), (Some("nats://nats:4222"), 3));

@@ -287,7 +287,8 @@ parameters!(
         ),
         (
             "Priority", None, "u=3",
-            "Urgency among the requests of one client, from `u=0` (most urgent) to `u=7` (RFC 9218).",
+            "Urgency from `u=0` (most urgent) to `u=7` (RFC 9218). It orders the waiting requests of one client. Jobs \
+             of all clients have three levels: 0 to 2, 3 and 4, 5 to 7.",
         ),
         (
             // Tabs are allowed at both ends, where HTTP removes them.

@@ -1,6 +1,6 @@
 //! Broker within a process. A new process dispatches the unfinished jobs of the store again.
 
-use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
@@ -9,8 +9,8 @@ use futures_util::stream::{self, BoxStream, StreamExt as _};
 use metrics::gauge;
 use tokio::sync::{Notify, broadcast};
 
+use super::order::{QUEUES, QueueOrder};
 use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, Lease, WorkLock};
-use crate::jobs::rank::Client;
 use crate::jobs::record::JobId;
 use crate::store::Digest;
 use crate::sync::{Handle, Mutex, MutexGuard, sleep};
@@ -19,24 +19,21 @@ use crate::telemetry::BROKER_QUEUED;
 /// Number of events that a slow follower may miss before it skips some.
 const EVENTS: usize = 256;
 
-/// Position of a job among those of its client: urgency, then order of dispatch.
-type Place = (u8, u64);
-
-/// State of a job that the broker holds.
+/// Place of a job that the broker holds.
 #[derive(Debug, Clone, Copy)]
-struct HeldJob {
-    client: Client,
-    place: Place,
+struct Place {
+    queue: usize,
+    /// Number in the order of dispatch.
+    number: u64,
 }
 
 #[derive(Debug, Default)]
 struct BrokerState {
-    /// Queued jobs of each client. No client has none.
-    queued: HashMap<Client, BTreeMap<Place, JobId>>,
-    /// Clients with queued jobs, in the order of their turns.
-    turns: VecDeque<Client>,
+    /// Queued jobs of each queue by number.
+    queues: [BTreeMap<u64, JobId>; QUEUES.len()],
+    order: QueueOrder,
     /// All jobs that are queued, delayed or claimed.
-    held: HashMap<JobId, HeldJob>,
+    held: HashMap<JobId, Place>,
     /// Work that is being done.
     locked: HashSet<Digest>,
     next: u64,
@@ -45,25 +42,15 @@ struct BrokerState {
 }
 
 impl BrokerState {
-    fn enqueue(&mut self, id: JobId, job: HeldJob) {
-        let jobs = self.queued.entry(job.client).or_default();
-        if jobs.is_empty() {
-            self.turns.push_back(job.client);
-        }
-        jobs.insert(job.place, id);
+    fn enqueue(&mut self, id: JobId, place: Place) {
+        self.queues[place.queue].insert(place.number, id);
         self.count(self.waiting + 1);
     }
 
-    /// Takes the first job of the client whose turn it is.
-    fn take(&mut self) -> Option<JobId> {
-        let client = self.turns.pop_front()?;
-        let jobs = self.queued.get_mut(&client)?;
-        let (_, id) = jobs.pop_first()?;
-        if jobs.is_empty() {
-            self.queued.remove(&client);
-        } else {
-            self.turns.push_back(client);
-        }
+    fn take(&mut self, prefers_gpu: bool) -> Option<JobId> {
+        let order = self.order.next(prefers_gpu);
+        let (queue, id) = order.into_iter().find_map(|queue| Some((queue, self.queues[queue].pop_first()?.1)))?;
+        self.order.claimed(queue);
         self.count(self.waiting - 1);
         Some(id)
     }
@@ -88,9 +75,9 @@ impl BrokerShared {
 
     /// Takes the next job. Passes the notification on if further jobs are queued: two notifications without a waiter
     /// count as one.
-    fn take(&self) -> Option<JobId> {
+    fn take(&self, prefers_gpu: bool) -> Option<JobId> {
         let mut state = self.lock();
-        let taken = state.take();
+        let taken = state.take(prefers_gpu);
         if taken.is_some() && state.waiting > 0 {
             self.filled.notify_one();
         }
@@ -99,8 +86,8 @@ impl BrokerShared {
 
     fn requeue(&self, id: JobId) {
         let mut state = self.lock();
-        if let Some(job) = state.held.get(&id).copied() {
-            state.enqueue(id, job);
+        if let Some(place) = state.held.get(&id).copied() {
+            state.enqueue(id, place);
             drop(state);
             self.filled.notify_one();
         }
@@ -168,11 +155,10 @@ impl Broker for MemoryBroker {
         } else if state.waiting >= self.0.limit {
             Err(DispatchError::Full)
         } else {
-            let place = (job.urgency, state.next);
+            let place = Place { queue: job.queue(), number: state.next };
             state.next += 1;
-            let held = HeldJob { client: job.client, place };
-            state.held.insert(job.id.clone(), held);
-            state.enqueue(job.id.clone(), held);
+            state.held.insert(job.id.clone(), place);
+            state.enqueue(job.id.clone(), place);
             Ok(true)
         };
         drop(state);
@@ -182,12 +168,11 @@ impl Broker for MemoryBroker {
         Box::pin(std::future::ready(queued))
     }
 
-    fn claim(&self, _prefers_gpu: bool) -> BoxFuture<'_, Claim> {
-        // All workers of a process have the same devices.
-        Box::pin(async {
+    fn claim(&self, prefers_gpu: bool) -> BoxFuture<'_, Claim> {
+        Box::pin(async move {
             loop {
                 let filled = self.0.filled.notified();
-                if let Some(id) = self.0.take() {
+                if let Some(id) = self.0.take(prefers_gpu) {
                     let lease = MemoryLease { broker: Arc::clone(&self.0), id: id.clone() };
                     return Claim::new(id, lease);
                 }
@@ -225,8 +210,6 @@ impl Broker for MemoryBroker {
         };
         Box::pin(std::future::ready(stream::unfold((receiver, id), next).boxed()))
     }
-
-    fn stop(&self) {}
 
     fn flush(&self) -> BoxFuture<'_, ()> {
         Box::pin(std::future::ready(()))

@@ -1,11 +1,8 @@
 //! Broker over NATS JetStream, for the nodes of a cluster.
 //!
-//! Queued and claimed jobs are the messages of a stream with one subject per job, `PREFIX.jobs.LANE.CLASS.ID`: the
-//! stream rejects a second message with a subject, and an acknowledged message is removed. Each client belongs to a
-//! lane, by its number. Lanes take turns, so a client with many jobs delays those of other lanes by one job only.
-//! Within a lane, jobs of a higher level of urgency precede the others. Each level has two classes, with an even number
-//! for jobs that suit a CPU and an odd one for those that suit a GPU: three of four claims first look for those that
-//! suit the worker. Events of jobs are plain messages, which may be lost.
+//! Queued and claimed jobs are the messages of a stream with one subject per job, `PREFIX.jobs.QUEUE.ID`: the stream
+//! rejects a second message with a subject, and an acknowledged message is removed. Each queue has a consumer. Events
+//! of jobs are plain messages, which may be lost.
 //!
 //! Uses only what servers from version 2.9 on offer.
 
@@ -28,26 +25,17 @@ use async_nats::{Client as Connection, ConnectOptions, Event};
 use futures_util::future::BoxFuture;
 use futures_util::stream::{self, BoxStream, StreamExt as _};
 use metrics::counter;
-use tokio::sync::Mutex as AsyncMutex;
 use tokio::time::sleep;
 
 use endings::Endings;
-use search::JobSearch;
 
+use super::order::{QUEUES, QueueOrder};
 use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, WorkLock};
 use crate::config::BrokerConfig;
 use crate::jobs::record::JobId;
 use crate::store::Digest;
 use crate::telemetry::BROKER_CLAIM_ERRORS;
 
-/// Number of lanes. Clients share them by the remainder of their numbers.
-const LANES: usize = 8;
-/// Level of each urgency from 0 to 7: urgent, normal, background.
-const LEVEL: [usize; 8] = [0, 0, 0, 1, 2, 2, 2, 2];
-/// Number of classes: each level has a class of jobs that suit a CPU, and one of jobs that suit a GPU.
-const CLASSES: usize = 6;
-/// Number of queues.
-const QUEUES: usize = LANES * CLASSES;
 /// Time limit of a request to the server.
 const REQUEST: Duration = Duration::from_secs(5);
 /// Interval at which the server is asked for the number of jobs, and idle workers look for jobs.
@@ -62,7 +50,7 @@ enum RequestKind {
     Claim,
 }
 
-/// Consumer of one lane and class.
+/// Consumer of one queue.
 type Queue = Consumer<pull::Config>;
 
 struct NatsState {
@@ -74,9 +62,9 @@ struct NatsState {
     /// Last error of the connection.
     failure: Arc<Mutex<Option<String>>>,
     endings: Endings,
-    /// Queues by lane and class; `None` until they exist.
+    /// Queues by number; `None` until they exist.
     queues: Mutex<Option<Arc<[Queue]>>>,
-    search: AsyncMutex<JobSearch>,
+    order: Mutex<QueueOrder>,
     /// Number of jobs in the stream when it was last asked.
     queued: AtomicUsize,
     /// Number of times that the connection or the stream was lost.
@@ -137,7 +125,7 @@ impl NatsBroker {
             failure,
             endings: Endings::default(),
             queues: Mutex::new(None),
-            search: AsyncMutex::new(JobSearch::default()),
+            order: Mutex::default(),
             queued: AtomicUsize::new(0),
             losses,
             checked: AtomicUsize::new(usize::MAX),
@@ -149,20 +137,13 @@ impl NatsBroker {
     }
 }
 
-/// Returns the lane and the class of a job.
-fn lane_and_class(job: &Dispatch) -> (usize, usize) {
-    let lane = usize::try_from(job.client.0 % LANES as u64).unwrap_or_default();
-    (lane, 2 * LEVEL[usize::from(job.urgency.min(7))] + usize::from(job.suits_gpu))
-}
-
 impl NatsState {
     fn queues(&self) -> Option<Arc<[Queue]>> {
         lock(&self.queues).clone()
     }
 
     fn subject_of(&self, job: &Dispatch) -> String {
-        let (lane, class) = lane_and_class(job);
-        format!("{}.jobs.{lane}.{class}.{}", self.config.prefix, job.id.as_str())
+        format!("{}.jobs.{}.{}", self.config.prefix, QUEUES[job.queue()], job.id.as_str())
     }
 
     fn events_of(&self, id: &JobId) -> String {
@@ -196,17 +177,19 @@ impl Broker for NatsBroker {
         Box::pin(async move {
             loop {
                 let losses = self.losses();
-                match self.0.next(prefers_gpu).await {
-                    Ok(claim) => return claim,
+                match self.0.search(prefers_gpu).await {
+                    Ok(Some(claim)) => return claim,
+                    // The check of the streams reports why there are no queues.
+                    Ok(None) => {}
                     Err(why) => {
                         counter!(BROKER_CLAIM_ERRORS).increment(1);
                         // A loss is reported already, and the next request may be answered.
                         if losses == self.losses() {
                             self.0.set_failure(RequestKind::Claim, Some(format!("no job can be claimed: {why}")));
                         }
-                        sleep(POLL).await;
                     }
                 }
+                sleep(POLL).await;
             }
         })
     }
@@ -238,10 +221,6 @@ impl Broker for NatsBroker {
                 }
             }
         })
-    }
-
-    fn stop(&self) {
-        NatsState::stop_claiming(&self.0);
     }
 
     fn flush(&self) -> BoxFuture<'_, ()> {

@@ -15,7 +15,7 @@ use tokio::runtime::Runtime;
 
 use super::{Broker, Claim, Dispatch, DispatchError, JobEvent, MemoryBroker, NatsBroker};
 use crate::config::BrokerConfig;
-use crate::jobs::rank::{Client, DEFAULT_URGENCY};
+use crate::jobs::rank::DEFAULT_URGENCY;
 use crate::jobs::record::JobId;
 use crate::store::Digest;
 use server::NatsServer;
@@ -121,8 +121,8 @@ pub(crate) async fn on_nats(test: impl AsyncFn(&mut NatsServer)) {
     }
 }
 
-fn job(client: u64, urgency: u8) -> Dispatch {
-    Dispatch { id: JobId::random(&[0; 32], client).unwrap(), client: Client(client), urgency, suits_gpu: false }
+fn job(urgency: u8) -> Dispatch {
+    Dispatch { id: JobId::random(&[0; 32], 0).unwrap(), urgency, suits_gpu: false }
 }
 
 /// Claims a job that must be available.
@@ -138,13 +138,13 @@ async fn none_within(broker: &Arc<dyn Broker>, time: Duration) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn jobs_of_a_client_follow_urgency_then_age() {
+async fn jobs_follow_the_level_of_their_urgency_then_the_order_of_dispatch() {
     with_all(|shared| async move {
         let broker = shared.node().await;
-        let jobs = [(DEFAULT_URGENCY, 2), (7, 5), (0, 0), (DEFAULT_URGENCY, 3), (7, 6), (0, 1), (DEFAULT_URGENCY, 4)];
+        let jobs = [(DEFAULT_URGENCY, 3), (7, 6), (2, 0), (4, 4), (5, 7), (0, 1), (DEFAULT_URGENCY, 5), (1, 2)];
         let mut expected = Vec::new();
         for (urgency, place) in jobs {
-            let job = job(1, urgency);
+            let job = job(urgency);
             assert_eq!(broker.dispatch(&job).await, Ok(true));
             expected.push((place, job.id));
         }
@@ -160,61 +160,76 @@ async fn jobs_of_a_client_follow_urgency_then_age() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_client_with_many_jobs_delays_others_by_one_job() {
+async fn a_job_that_is_more_urgent_precedes_earlier_ones() {
     with_all(|shared| async move {
         let broker = shared.node().await;
-        for _ in 0..20 {
-            assert_eq!(broker.dispatch(&job(1, 0)).await, Ok(true));
+        for _ in 0..10 {
+            assert_eq!(broker.dispatch(&job(DEFAULT_URGENCY)).await, Ok(true));
         }
-        let modest = [job(2, 7), job(3, 7)];
-        for job in &modest {
+        // After them, the next claim does not ask the queues in turn.
+        for _ in 0..4 {
+            claim(&broker).await.done().await;
+        }
+        let urgent = job(0);
+        for job in [&job(7), &urgent] {
             assert_eq!(broker.dispatch(job).await, Ok(true));
         }
-        let mut first = Vec::new();
-        for _ in 0..3 {
-            let claimed = claim(&broker).await;
-            first.push(claimed.id.clone());
-            claimed.done().await;
-        }
-        assert!(modest.iter().all(|job| first.contains(&job.id)), "{first:?}");
+        let claimed = claim(&broker).await;
+        assert_eq!(claimed.id, urgent.id);
+        claimed.done().await;
     })
     .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_client_that_comes_later_gets_its_turn() {
+async fn no_job_waits_for_ever_behind_more_urgent_ones() {
     with_all(|shared| async move {
         let broker = shared.node().await;
         for _ in 0..30 {
-            assert_eq!(broker.dispatch(&job(1, DEFAULT_URGENCY)).await, Ok(true));
+            assert_eq!(broker.dispatch(&job(0)).await, Ok(true));
         }
-        // The other queues are known to be empty now.
-        for _ in 0..3 {
-            claim(&broker).await.done().await;
-        }
-        let later = job(2, 0);
-        assert_eq!(broker.dispatch(&later).await, Ok(true));
+        let last = Dispatch { suits_gpu: true, ..job(7) };
+        assert_eq!(broker.dispatch(&last).await, Ok(true));
         let mut jobs_before = 0;
         loop {
             let claimed = claim(&broker).await;
-            let is_later = claimed.id == later.id;
+            let is_last = claimed.id == last.id;
             claimed.done().await;
-            if is_later {
+            if is_last {
                 break;
             }
             jobs_before += 1;
-            tokio::time::sleep(Duration::from_millis(100)).await;
         }
-        assert!(jobs_before <= 15, "{jobs_before} jobs of the other client came first");
+        assert!((3..8).contains(&jobs_before), "{jobs_before} jobs came first");
     })
     .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn workers_first_claim_jobs_that_suit_them() {
+    for (prefers_gpu, expected) in [(false, [4, 0, 2, 1, 3]), (true, [4, 1, 3, 0, 2])] {
+        with_all(move |shared| async move {
+            let broker = shared.node().await;
+            let jobs = [(false, 3), (true, 3), (false, 3), (true, 3), (false, 0)]
+                .map(|(suits_gpu, urgency)| Dispatch { suits_gpu, ..job(urgency) });
+            for job in &jobs {
+                assert_eq!(broker.dispatch(job).await, Ok(true));
+            }
+            for number in expected {
+                let claimed = tokio::time::timeout(SOON, broker.claim(prefers_gpu)).await.expect("a job is available");
+                assert_eq!(claimed.id, jobs[number].id, "{number}");
+                claimed.done().await;
+            }
+        })
+        .await;
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_job_is_queued_once_until_it_is_done() {
     with_all(|shared| async move {
         let (a, b) = (shared.node().await, shared.node().await);
-        let job = job(1, DEFAULT_URGENCY);
+        let job = job(DEFAULT_URGENCY);
         assert_eq!(a.dispatch(&job).await, Ok(true));
         assert_eq!((b.dispatch(&job).await, a.dispatch(&job).await), (Ok(false), Ok(false)), "it is queued");
         let claimed = claim(&b).await;
@@ -232,9 +247,9 @@ async fn a_full_queue_rejects_jobs() {
     with_all(|shared| async move {
         let broker = shared.node().await;
         for _ in 0..LIMIT {
-            assert_eq!(broker.dispatch(&job(1, DEFAULT_URGENCY)).await, Ok(true));
+            assert_eq!(broker.dispatch(&job(DEFAULT_URGENCY)).await, Ok(true));
         }
-        let more = job(2, DEFAULT_URGENCY);
+        let more = job(DEFAULT_URGENCY);
         assert_eq!(broker.dispatch(&more).await, Err(DispatchError::Full));
         let begun = Instant::now();
         while broker.queued() < LIMIT {
@@ -251,7 +266,7 @@ async fn a_full_queue_rejects_jobs() {
 async fn a_returned_job_is_claimed_again_after_its_delay() {
     with_all(|shared| async move {
         let broker = shared.node().await;
-        let job = job(1, DEFAULT_URGENCY);
+        let job = job(DEFAULT_URGENCY);
         assert_eq!(broker.dispatch(&job).await, Ok(true));
         drop(claim(&broker).await);
         let claimed = claim(&broker).await;
@@ -269,7 +284,7 @@ async fn a_returned_job_is_claimed_again_after_its_delay() {
 async fn a_job_of_a_crashed_node_is_claimed_again() {
     with_all(|shared| async move {
         let broker = shared.node().await;
-        let job = job(1, DEFAULT_URGENCY);
+        let job = job(DEFAULT_URGENCY);
         assert_eq!(broker.dispatch(&job).await, Ok(true));
         let begun = Instant::now();
         shared.crash(|broker| async move { broker.claim(false).await }).await;
@@ -301,8 +316,8 @@ async fn nodes_share_the_jobs() {
         let workers = nodes.clone().map(|node| tokio::spawn(work(node)));
         tokio::time::sleep(Duration::from_millis(200)).await;
         let mut expected = BTreeSet::new();
-        for n in 0..30 {
-            let job = job(n % 5, DEFAULT_URGENCY);
+        for _ in 0..30 {
+            let job = job(DEFAULT_URGENCY);
             assert_eq!(nodes[0].dispatch(&job).await, Ok(true));
             expected.insert(job.id);
         }
@@ -322,7 +337,7 @@ async fn nodes_share_the_jobs() {
 async fn followers_get_the_events_of_their_job() {
     with_all(|shared| async move {
         let (a, b) = (shared.node().await, shared.node().await);
-        let (job, other) = (job(1, 3), job(1, 3));
+        let (job, other) = (job(3), job(3));
         let mut events = b.events(&job.id).await;
         // A subscription takes effect after a round trip.
         tokio::time::sleep(Duration::from_millis(100)).await;

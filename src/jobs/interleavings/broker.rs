@@ -10,7 +10,6 @@ use tokio::sync::watch;
 
 use super::SCHEDULES;
 use crate::jobs::broker::{Broker, Claim, Dispatch, MemoryBroker};
-use crate::jobs::rank::Client;
 use crate::jobs::record::JobId;
 use crate::store::Digest;
 use crate::sync::thread;
@@ -61,8 +60,7 @@ fn explore(returns_early: bool) {
     let model = move || {
         let (broker, counts) = (MemoryBroker::new(8), Arc::<RunCounts>::default());
         let job = |n: u64| JobId::from_key(&[0; 32], crate::store::Namespace::default(), n, "k");
-        let jobs: Vec<_> =
-            (0..JOBS).map(|n| Dispatch { id: job(n), client: Client(n % 2), urgency: 3, suits_gpu: false }).collect();
+        let jobs: Vec<_> = (0..JOBS).map(|n| Dispatch { id: job(n), urgency: 3, suits_gpu: n % 2 == 0 }).collect();
         let node = || {
             let (broker, jobs) = (broker.clone(), jobs.clone());
             thread::spawn(move || {

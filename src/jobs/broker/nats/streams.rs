@@ -9,8 +9,9 @@ use async_nats::jetstream::stream::{Config, DiscardPolicy, Info, RetentionPolicy
 use metrics::gauge;
 use tokio::time::{sleep, timeout};
 
-use super::{CLASSES, LANES, NatsBroker, NatsState, POLL, QUEUES, REQUEST, RequestKind, lock};
+use super::{NatsBroker, NatsState, POLL, REQUEST, RequestKind, lock};
 use crate::jobs::broker::Broker as _;
+use crate::jobs::broker::order::QUEUES;
 use crate::telemetry::{BROKER_QUEUED, BROKER_UP};
 
 /// Checks streams and queues at regular intervals.
@@ -62,8 +63,8 @@ impl NatsState {
         }
         let missing = match &found {
             Err(error) => Some(format!("the stream {name}: {error}")),
-            Ok(info) if info.state.consumer_count < QUEUES => {
-                Some(format!("the stream {name} has {} of {QUEUES} consumers", info.state.consumer_count))
+            Ok(info) if info.state.consumer_count < QUEUES.len() => {
+                Some(format!("the stream {name} has {} of {} consumers", info.state.consumer_count, QUEUES.len()))
             }
             Ok(_) if !has_locks => Some(format!("the stream {} is missing", self.locks())),
             Ok(_) => None,
@@ -106,19 +107,17 @@ impl NatsState {
         let info = self.context.create_or_update_stream(config).await.map_err(|error| error.to_string())?;
         self.context.create_or_update_stream(self.lock_stream()).await.map_err(|error| error.to_string())?;
         let mut queues = Vec::new();
-        for lane in 0..LANES {
-            for class in 0..CLASSES {
-                let config = pull::Config {
-                    durable_name: Some(format!("lane-{lane}-{class}")),
-                    filter_subject: format!("{}.jobs.{lane}.{class}.*", self.config.prefix),
-                    ack_policy: AckPolicy::Explicit,
-                    ack_wait: Duration::from_millis(self.config.lease_ms),
-                    max_ack_pending: i64::from(u32::MAX),
-                    ..pull::Config::default()
-                };
-                let queue = self.context.create_consumer_on_stream(config, self.stream()).await;
-                queues.push(queue.map_err(|error| error.to_string())?);
-            }
+        for name in QUEUES {
+            let config = pull::Config {
+                durable_name: Some(name.to_owned()),
+                filter_subject: format!("{}.jobs.{name}.*", self.config.prefix),
+                ack_policy: AckPolicy::Explicit,
+                ack_wait: Duration::from_millis(self.config.lease_ms),
+                max_ack_pending: i64::from(u32::MAX),
+                ..pull::Config::default()
+            };
+            let queue = self.context.create_consumer_on_stream(config, self.stream()).await;
+            queues.push(queue.map_err(|error| error.to_string())?);
         }
         *lock(&self.queues) = Some(queues.into());
         Ok(info)

@@ -12,9 +12,9 @@ use crate::jobs::rank::DEFAULT_URGENCY;
 use crate::store::Digest;
 
 /// Deletes the consumer for the jobs of [`dispatched`].
-const DELETE_CONSUMER: &str = "CONSUMER.DELETE.molmesh-jobs.lane-1-2";
+const DELETE_CONSUMER: &str = "CONSUMER.DELETE.molmesh-jobs.normal-cpu";
 /// Deletes another consumer.
-const DELETE_OTHER: &str = "CONSUMER.DELETE.molmesh-jobs.lane-7-5";
+const DELETE_OTHER: &str = "CONSUMER.DELETE.molmesh-jobs.low-gpu";
 /// Deletes the stream of jobs.
 const DELETE_STREAM: &str = "STREAM.DELETE.molmesh-jobs";
 /// Deletes the stream of locks.
@@ -28,7 +28,7 @@ async fn nodes(server: &NatsServer) -> [Arc<dyn Broker>; 2] {
 }
 
 async fn dispatched(broker: &dyn Broker) -> Dispatch {
-    let job = job(1, DEFAULT_URGENCY);
+    let job = job(DEFAULT_URGENCY);
     assert_eq!(broker.dispatch(&job).await, Ok(true));
     job
 }
@@ -52,7 +52,7 @@ async fn assert_claims(claim: JoinHandle<Claim>, job: &Dispatch) {
 async fn lost_consumers_are_created_again() {
     on_nats(async |server| {
         let [a, b] = nodes(server).await;
-        assert!(server.jetstream("STREAM.INFO.molmesh-jobs").contains("\"consumer_count\":48"));
+        assert!(server.jetstream("STREAM.INFO.molmesh-jobs").contains("\"consumer_count\":6"));
         for lost in [&[DELETE_CONSUMER] as &[_], &[DELETE_OTHER, DELETE_CONSUMER]] {
             // A job that is dispatched afterwards.
             let claim = start_claim(&b).await;
@@ -68,7 +68,7 @@ async fn lost_consumers_are_created_again() {
             }
             assert_claims(start_claim(&a).await, &job).await;
             let begun = Instant::now();
-            while !server.jetstream("STREAM.INFO.molmesh-jobs").contains("\"consumer_count\":48") {
+            while !server.jetstream("STREAM.INFO.molmesh-jobs").contains("\"consumer_count\":6") {
                 assert!(begun.elapsed() < SOON);
                 tokio::time::sleep(Duration::from_millis(20)).await;
             }

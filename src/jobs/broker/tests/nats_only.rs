@@ -21,7 +21,7 @@ async fn jobs_are_dispatched_and_claimed_concurrently() {
         for node in &nodes {
             until_down(&**node, MAX_WAIT, |why| why.is_none()).await;
         }
-        let jobs: Vec<_> = (0..n as u64).map(|n| job(n % 100, DEFAULT_URGENCY)).collect();
+        let jobs: Vec<_> = (0..n).map(|_| job(DEFAULT_URGENCY)).collect();
         let mut times = Vec::new();
         for job in &jobs[..n / 10] {
             let begun = Instant::now();
@@ -65,7 +65,7 @@ async fn jobs_are_dispatched_and_claimed_concurrently() {
 async fn a_node_with_another_store_gets_no_jobs() {
     on_nats(async |server| {
         let broker: Arc<dyn Broker> = Arc::new(nats(server).await);
-        assert_eq!(broker.dispatch(&job(1, DEFAULT_URGENCY)).await, Ok(true));
+        assert_eq!(broker.dispatch(&job(DEFAULT_URGENCY)).await, Ok(true));
         let other = NatsBroker::connect(&BrokerConfig::default(), server.address(), "b").await.unwrap();
         until_down(&other, SOON, |why| why.is_some_and(|why| why.contains("another store"))).await;
         none_within(&(Arc::new(other) as _), SOON / 2).await;
@@ -91,7 +91,7 @@ async fn a_stream_that_cannot_be_created_is_reported() {
 async fn a_broker_that_comes_back_is_used_again() {
     on_nats(async |server| {
         let broker: Arc<dyn Broker> = Arc::new(nats(server).await);
-        let queued = job(1, DEFAULT_URGENCY);
+        let queued = job(DEFAULT_URGENCY);
         assert_eq!(broker.dispatch(&queued).await, Ok(true));
         for keeps_data in [true, false] {
             server.stop(keeps_data);
@@ -109,25 +109,13 @@ async fn a_broker_that_comes_back_is_used_again() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn workers_first_claim_jobs_that_suit_them() {
+async fn new_jobs_go_to_idle_workers_that_they_suit() {
     on_nats(async |server| {
         let [gpu, cpu] = [nats(server).await, nats(server).await].map(Arc::new);
-        let of = |suits_gpu: bool, urgency: u8| Dispatch { suits_gpu, ..job(1, urgency) };
-        // Queued jobs: those that suit the worker first, but not before more urgent ones.
-        let jobs = [of(false, 3), of(true, 3), of(false, 3), of(true, 3), of(false, 0)];
-        for job in &jobs {
-            assert_eq!(cpu.dispatch(job).await, Ok(true));
-        }
-        // The fourth claim takes a job of the other kind.
-        for (number, prefers_gpu) in [(4, true), (1, true), (0, false), (2, true), (3, true)] {
-            let claimed = tokio::time::timeout(SOON, cpu.claim(prefers_gpu)).await.expect("a job is available");
-            assert_eq!(claimed.id, jobs[number].id, "{number}");
-            claimed.done().await;
-        }
-        // New jobs: an idle worker that they suit precedes the others, unless its thread has to wait.
+        // An idle worker that a job suits precedes the others, unless its thread has to wait.
         let mut suited = 0;
         for n in 0..20 {
-            let job = of(n % 2 == 0, 3);
+            let job = Dispatch { suits_gpu: n % 2 == 1, ..job(DEFAULT_URGENCY) };
             let claim = |broker: &Arc<NatsBroker>, prefers_gpu| {
                 let broker = Arc::clone(broker);
                 Box::pin(async move { broker.claim(prefers_gpu).await })
@@ -149,10 +137,12 @@ async fn workers_first_claim_jobs_that_suit_them() {
             claimed.done().await;
         }
         assert!(suited > 15, "{suited} of 20 jobs went to the worker that they suit");
-        // A worker takes what does not suit it if nothing else waits.
-        let other = of(true, 3);
-        assert_eq!(cpu.dispatch(&other).await, Ok(true));
-        let claimed = tokio::time::timeout(SOON, cpu.claim(false)).await.expect("a job is available");
+        // A worker takes what does not suit it if no other one is idle.
+        let claim = tokio::spawn(async move { cpu.claim(false).await });
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        let other = Dispatch { suits_gpu: true, ..job(DEFAULT_URGENCY) };
+        assert_eq!(gpu.dispatch(&other).await, Ok(true));
+        let claimed = tokio::time::timeout(SOON, claim).await.expect("the job is claimed").unwrap();
         assert_eq!(claimed.id, other.id);
         claimed.done().await;
     })
@@ -170,7 +160,7 @@ async fn idle_nodes_share_jobs_that_are_dispatched_at_once() {
             tokio::time::sleep(Duration::from_millis(300)).await;
             let begun = Instant::now();
             for _ in 0..2 {
-                assert_eq!(nodes[0].dispatch(&job(1, DEFAULT_URGENCY)).await, Ok(true));
+                assert_eq!(nodes[0].dispatch(&job(DEFAULT_URGENCY)).await, Ok(true));
             }
             for claim in claims {
                 tokio::time::timeout(SOON, claim).await.expect("a job for each node").unwrap().done().await;
