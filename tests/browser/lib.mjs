@@ -13,6 +13,7 @@ export const MODULES = MOLMESH_MODULES;
 export const ROOT = MOLMESH_ROOT;
 export const require = createRequire(path.join(MODULES, "x.js"));
 export const { chromium } = require("playwright-core");
+const sharp = require("sharp");
 /** Maximum time of one step, ms. A machine that runs ten other tests may need minutes. */
 export const TIMEOUT_MS = 180_000;
 
@@ -129,19 +130,8 @@ export async function picture(page, selector = "#view-home") {
   await waitForFrames(page);
   const png = await page.locator(selector).screenshot({ timeout: TIMEOUT_MS });
   await setCaptions("");
-  const helper = await page.context().browser().newPage();
-  const decoded = await helper.evaluate(async (text) => {
-    const bitmap = await createImageBitmap(await (await fetch(`data:image/png;base64,${text}`)).blob());
-    const canvas = new OffscreenCanvas(bitmap.width, bitmap.height);
-    const context = canvas.getContext("2d");
-    context.drawImage(bitmap, 0, 0);
-    const { data } = context.getImageData(0, 0, bitmap.width, bitmap.height);
-    let text64 = "";
-    for (let i = 0; i < data.length; i += 0x8000) text64 += String.fromCharCode(...data.subarray(i, i + 0x8000));
-    return { width: bitmap.width, height: bitmap.height, data: btoa(text64) };
-  }, png.toString("base64"));
-  await helper.close();
-  return { width: decoded.width, height: decoded.height, data: Buffer.from(decoded.data, "base64") };
+  const { data, info } = await sharp(png).ensureAlpha().raw().toBuffer({ resolveWithObject: true });
+  return { width: info.width, height: info.height, data };
 }
 
 /** Waits until pending changes are drawn, including the full-resolution frame that follows a movement. */
