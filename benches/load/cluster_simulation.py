@@ -19,9 +19,9 @@ import random
 CLAIMS_PER_SECOND = 10_000
 # Requests of one job to an S3 store (`benches/load/store_requests.py`).
 WRITES_PER_JOB, READS_PER_JOB = 6, 20
-# Messages of one job to NATS, without the answers: dispatch, announcement, requests to three queues (a job of normal
-# urgency is in the third), lock, release of the lock, acknowledgement, and four events.
-MESSAGES_PER_JOB = 12
+# Messages of one job to NATS, without the answers: dispatch, two announcements, requests to three queues (a job of
+# normal urgency is in the third), lock, release of the lock, acknowledgement, and four events.
+MESSAGES_PER_JOB = 13
 # Time of a job beside its mesh: requests to queue and store, s.
 OVERHEAD = 0.05
 # Standard deviation of the logarithm of the time of a job.

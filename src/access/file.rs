@@ -247,9 +247,9 @@ mod tests {
             assert!(!error.reason.contains(&hash.to_string()[20..]), "{error}");
         }
         assert_eq!(
-            parse(&format!("{good}{good}"), 60).unwrap_err(),
+            parse(&format!("{good}{good}")).unwrap_err(),
             KeyFileError { line: 5, reason: "duplicate key `a`".into() }
         );
-        assert!(parse(&good, 60).is_ok());
+        assert!(parse(&good).is_ok());
     }
 }

@@ -13,7 +13,7 @@ pub enum GpuError {
     /// The device has too little memory, even in chunks.
     #[error(
         "the device has too little memory: {needed} bytes are needed, {available} are available; \
-         {suggested_resolution} Å would fit"
+         {suggested_resolution} Å should fit"
     )]
     OutOfMemory {
         /// Bytes that the job's smallest chunk and its output need.

@@ -62,7 +62,7 @@ fn oversized(what: &str, actual: u64, limit: u64, resolution: f64) -> Problem {
     if fits > MAX_RESOLUTION {
         return Problem::new(ProblemType::MeshTooLarge, what.to_owned()).with("limit", limit).with("actual", actual);
     }
-    Problem::new(ProblemType::MeshTooLarge, format!("{what}; a resolution of {fits} Å would fit"))
+    Problem::new(ProblemType::MeshTooLarge, format!("{what}; a resolution of {fits} Å should fit"))
         .with("limit", limit)
         .with("actual", actual)
         .with("suggested_resolution", fits)
@@ -318,7 +318,7 @@ mod tests {
     fn a_format_that_cannot_count_the_triangles_is_explained_by_their_number() {
         let error = FormatError::TooMany { format: "STL", what: "triangles", count: 400, limit: 100 };
         let problem = format_problem(&error, 0.5).record("");
-        assert_eq!(problem["detail"], format!("{error}; a resolution of 1.05 Å would fit"));
+        assert_eq!(problem["detail"], format!("{error}; a resolution of 1.05 Å should fit"));
         assert_eq!((&problem["limit"], &problem["suggested_resolution"]), (&100.into(), &1.05.into()));
         // No grid is coarser than 20 Å.
         let none = file_too_large(200_000, 100, 0.5).record("");
@@ -327,7 +327,7 @@ mod tests {
         let file = format_problem(&FormatError::GlbTooLarge { bytes: 400, limit: 100 }, 0.5).record("");
         assert_eq!(
             file["detail"],
-            "the file would have 400 bytes and the limit is 100; a resolution of 1.05 Å would fit"
+            "the file would have 400 bytes and the limit is 100; a resolution of 1.05 Å should fit"
         );
     }
 }

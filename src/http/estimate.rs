@@ -1,5 +1,5 @@
-//! `POST /v1/estimate`: size and duration of a mesh, and a resolution that fits if it is too large. Takes the requests
-//! of `POST /v1/meshes`.
+//! `POST /v1/estimate`: size and duration of a mesh, and a resolution that should fit if it is too large. Takes the
+//! requests of `POST /v1/meshes`.
 
 use std::sync::Arc;
 

@@ -204,8 +204,9 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
 }
 
 /// Stores the result of a synchronous request in the background. Returns false, and stores nothing, if too many results
-/// are being stored already: the permitted number, or one while jobs wait for a worker. The mesh is encoded a second time:
-/// with a copy of the response, a slow client would delay the store, or a slow store the client.
+/// are being stored already: [`concurrent_saves`](crate::config::JobsConfig), or one while jobs wait for a worker. The
+/// mesh is encoded a second time: with a copy of the response, a slow client would delay the store, or a slow store the
+/// client.
 pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format, key: &ContentKey) -> bool {
     let _starting = app.save_start.lock().unwrap_or_else(PoisonError::into_inner);
     if app.saves.running(key).is_some() {

@@ -82,8 +82,8 @@ pub(crate) trait Broker: Send + Sync {
     /// Queues a job. Returns false if it is queued or claimed already.
     fn dispatch<'a>(&'a self, job: &'a Dispatch) -> BoxFuture<'a, Result<bool, DispatchError>>;
 
-    /// Waits for a job and claims it: of one level of urgency, first a job that suits a GPU if `prefers_gpu`, else first
-    /// one that does not. If the future is dropped, a job that it has claimed can be claimed again after its lease.
+    /// Waits for a job and claims it. Within a level of urgency, jobs that suit a GPU come first if `prefers_gpu`, else
+    /// the others. If the future is dropped, a job that it has claimed can be claimed again after its lease.
     fn claim(&self, prefers_gpu: bool) -> BoxFuture<'_, Claim>;
 
     /// Locks work that one node at a time does. `None` if another run has the lock. If the broker does not answer, the

@@ -277,7 +277,6 @@ mod tests {
             reservation: None,
             parent: SpanParent::default(),
             id: None,
-            partitions: None,
         }
     }
 

@@ -297,6 +297,9 @@ impl<'a> MeshPlan<'a> {
             bricks += counts.reached;
             pairs += counts.candidates;
         }
+        if pairs > candidates::limit(limits) {
+            return Err(candidates::too_many(pairs, spheres, params, limits));
+        }
         let grid_points = 512 * bricks;
         if grid_points > limits.max_grid_points {
             // Each part fits the limit, but not all parts together.

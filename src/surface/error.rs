@@ -52,7 +52,7 @@ pub enum SurfaceError {
     #[error(
         "the spheres would reach at least {candidates} grid bricks in total at {resolution} Å, the limit is {limit}; {}",
         suggested_resolution
-            .map_or_else(|| "a coarser grid or smaller radii reach fewer".to_owned(), |h| format!("{h} Å would fit"))
+            .map_or_else(|| "a coarser grid or smaller radii reach fewer".to_owned(), |h| format!("{h} Å should fit"))
     )]
     TooManyCandidates {
         /// Pairs of a sphere and a brick (a lower bound: counting stops soon after the limit).
@@ -221,8 +221,8 @@ fn on_disk(parameter: Option<&str>) -> String {
 /// Describes a grid spacing at which a job would fit.
 fn fitting(spacing: f64) -> String {
     if spacing <= MAX_RESOLUTION {
-        format!("; {spacing} Å would fit")
+        format!("; {spacing} Å should fit")
     } else {
-        "; no grid spacing that would fit was found".to_owned()
+        "; no coarser grid spacing is suggested".to_owned()
     }
 }

@@ -173,7 +173,7 @@ const MEMBERS: &[Member] = &[
     ("limit", Some(Type::Integer), "The limit that was exceeded."),
     ("actual", Some(Type::Integer), "The value that exceeds the limit."),
     ("resolution", Some(Type::Number), "Grid spacing of the rejected mesh in Å."),
-    ("suggested_resolution", Some(Type::Number), "Grid spacing in Å at which the mesh would fit."),
+    ("suggested_resolution", Some(Type::Number), "Grid spacing in Å at which the mesh should fit."),
     ("isovalue", Some(Type::Number), "Isovalue that the density does not reach."),
     ("estimated_wait_s", Some(Type::Number), "Estimated time in the queue in seconds."),
     ("line", Some(Type::Integer), "Line in the file or JSON document, from 1."),

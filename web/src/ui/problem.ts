@@ -4,7 +4,7 @@ import { type Problem } from "../api/problem";
 import { el } from "./dom";
 
 export interface Remedies {
-  /** Applies a grid spacing that fits. */
+  /** Applies a grid spacing that should fit. */
   takeResolution(resolution: number): void;
   /** Resets a parameter to its default. */
   reset(parameter: string): void;

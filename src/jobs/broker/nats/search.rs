@@ -7,7 +7,7 @@ use async_nats::jetstream::message::AckKind;
 use async_nats::{Client as Connection, Subscriber};
 use futures_util::StreamExt as _;
 use metrics::counter;
-use tokio::time::{sleep, timeout};
+use tokio::time::{Instant, timeout, timeout_at};
 
 use super::lease::NatsLease;
 use super::{NatsState, POLL, Queue, REQUEST, RequestKind, lock};
@@ -18,7 +18,8 @@ use crate::telemetry::BROKER_REDELIVERIES;
 /// Time that an idle worker waits before it claims a new job that suits the other kind of workers.
 const PRECEDENCE: Duration = Duration::from_millis(5);
 
-/// Republishes the announcements that arrive before the subscription ends: this node is no longer idle.
+/// Republishes the announcements that arrive before the subscription ends: this node is no longer idle. A node that
+/// stops passes on none: another one then finds the job within [`POLL`].
 async fn pass_on(mut announcements: Subscriber, connection: Connection) {
     drop(announcements.drain().await);
     while let Some(message) = announcements.next().await {
@@ -27,23 +28,30 @@ async fn pass_on(mut announcements: Subscriber, connection: Connection) {
 }
 
 impl NatsState {
-    /// Returns the subject of announcements, whose content is the name of a queue with a new job.
-    fn announcement(&self) -> String {
-        format!("{}.new", self.config.prefix)
+    /// Returns the subject of announcements to workers of a kind, whose content is the name of a queue with a new job.
+    /// Each kind has its own: a node that passes an announcement on must not send it to both kinds again.
+    fn announcement(&self, to_gpu: bool) -> String {
+        format!("{}.new.{}", self.config.prefix, if to_gpu { "gpu" } else { "cpu" })
     }
 
     /// Tells an idle node of each kind that there is a new job.
     pub(super) async fn announce(&self, job: &Dispatch) {
-        // Idle nodes also look for jobs at intervals.
-        drop(self.connection.publish(self.announcement(), QUEUES[job.queue()].into()).await);
+        for to_gpu in [false, true] {
+            // Idle nodes also look for jobs at intervals.
+            drop(self.connection.publish(self.announcement(to_gpu), QUEUES[job.queue()].into()).await);
+        }
+    }
+
+    /// Subscribes an idle node to announcements, of which each idle node of its kind gets a part.
+    async fn announcements(&self, prefers_gpu: bool) -> Result<Subscriber, String> {
+        let announcements = self.connection.queue_subscribe(self.announcement(prefers_gpu), "idle".to_owned()).await;
+        announcements.map_err(|error| error.to_string())
     }
 
     /// Waits for a job and claims it, or returns an error of the server. `None` if there are no queues.
     pub(super) async fn search(&self, prefers_gpu: bool) -> Result<Option<Claim>, String> {
-        // Jobs that are dispatched from now on are announced; earlier ones are found in the queues.
-        let group = if prefers_gpu { "idle-gpu" } else { "idle-cpu" };
-        let announcements = self.connection.queue_subscribe(self.announcement(), group.to_owned()).await;
-        let mut announcements = announcements.map_err(|error| error.to_string())?;
+        // A busy node finds jobs in the queues and gets no announcements, which it would have to pass on.
+        let mut announcements = None;
         let mut asked = lock(&self.order).next(prefers_gpu).to_vec();
         while let Some(queues) = self.queues() {
             for queue in asked {
@@ -51,33 +59,49 @@ impl NatsState {
                 self.set_failure(RequestKind::Claim, None);
                 if claim.is_some() {
                     lock(&self.order).claimed(queue);
-                    tokio::spawn(pass_on(announcements, self.connection.clone()));
+                    if let Some(announcements) = announcements {
+                        tokio::spawn(pass_on(announcements, self.connection.clone()));
+                    }
                     return Ok(claim);
                 }
             }
-            asked = self.announced(&mut announcements, prefers_gpu).await?;
+            asked = if let Some(announcements) = &mut announcements {
+                self.announced(announcements, prefers_gpu).await?
+            } else {
+                // Jobs that are dispatched from now on are announced; earlier ones are found in the queues.
+                announcements = Some(self.announcements(prefers_gpu).await?);
+                lock(&self.order).next(prefers_gpu).to_vec()
+            };
         }
         Ok(None)
     }
 
     /// Waits until there may be a job. Returns the numbers of the queues to be asked.
     async fn announced(&self, announcements: &mut Subscriber, prefers_gpu: bool) -> Result<Vec<usize>, String> {
+        // Queues of new jobs that suit the other kind of workers.
+        let mut unsuited = Vec::new();
+        let mut end = Instant::now() + POLL;
         loop {
-            match timeout(POLL, announcements.next()).await {
+            match timeout_at(end, announcements.next()).await {
                 Ok(Some(message)) => {
                     let queue = QUEUES.iter().position(|name| message.payload == name.as_bytes());
-                    let Some(queue) = queue else { continue };
-                    if suits_gpu(queue) != prefers_gpu {
-                        sleep(PRECEDENCE).await;
+                    let Some(queue) = queue.filter(|queue| !unsuited.contains(queue)) else { continue };
+                    if suits_gpu(queue) == prefers_gpu {
+                        unsuited.insert(0, queue);
+                        return Ok(unsuited);
                     }
-                    return Ok(vec![queue]);
+                    if unsuited.is_empty() {
+                        end = Instant::now() + PRECEDENCE;
+                    }
+                    unsuited.push(queue);
                 }
                 Ok(None) => return Err("the connection is closed".to_owned()),
+                Err(_elapsed) if !unsuited.is_empty() => return Ok(unsuited),
                 // A job of a stopped worker returns without an announcement.
                 Err(_elapsed) if self.queued.load(Ordering::Relaxed) > 0 => {
                     return Ok(lock(&self.order).next(prefers_gpu).to_vec());
                 }
-                Err(_elapsed) => {}
+                Err(_elapsed) => end = Instant::now() + POLL,
             }
         }
     }
