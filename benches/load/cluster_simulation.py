@@ -16,7 +16,7 @@ import math
 import random
 
 # Claims per second of one NATS server (test `jobs_are_dispatched_and_claimed_concurrently`).
-CLAIMS_PER_SECOND = 10_000
+CLAIMS_PER_SECOND = 1_200
 # Requests of one job to an S3 store (`benches/load/store_requests.py`).
 WRITES_PER_JOB, READS_PER_JOB = 6, 20
 # Messages of one job to NATS, without the answers: dispatch, two announcements, requests to three queues (a job of

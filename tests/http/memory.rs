@@ -218,7 +218,7 @@ fn memory_of_requests_for_stored_structures_is_charged() {
 fn memory_that_is_not_charged_is_found() {
     let (grown, memory) = growth(std::process::id(), || vec![1_u8; 64 << 20]);
     assert!((60..80).contains(&grown) && memory.contains(&1), "{grown} MiB");
-    // What is charged may be a multiple of what is used.
+    // The charge may be a multiple of the use.
     let (folder, case) = (Folder::new(), &UPLOADS[0]);
     let used = measured(&folder, case).unwrap();
     assert_eq!(is_refused(&folder, case, used + 6 * grown - UNCHARGED), Ok(false));
