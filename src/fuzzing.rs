@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 use std::time::UNIX_EPOCH;
 
 use crate::access::{self, KeyFileError, SignatureCheck, SigningKeys};
-use crate::config::{ForwardedHeader, Proxies};
+use crate::config::Proxies;
 use crate::jobs::JobRecord;
 use crate::structure::{ReadLimits, Structure, StructureError};
 
@@ -24,11 +24,11 @@ pub fn has_valid_signature(keys: &SigningKeys, target: &str) -> bool {
     matches!(keys.check(path, query, UNIX_EPOCH), SignatureCheck::Valid(_))
 }
 
-/// Returns the client of a request from the trusted proxy 10.0.0.1 with these values of `header`. All addresses in
-/// 10.0.0.0/8 are trusted.
+/// Returns the client of a request from the trusted proxy 10.0.0.1 with these values of `X-Forwarded-For`. All
+/// addresses in 10.0.0.0/8 are trusted.
 #[must_use]
-pub fn forwarded(header: ForwardedHeader, values: &[&str]) -> IpAddr {
-    access::forwarded_client(IpAddr::from([10, 0, 0, 1]), header, values.iter().copied(), PROXIES.as_ref())
+pub fn forwarded(values: &[&str]) -> IpAddr {
+    access::forwarded_client(IpAddr::from([10, 0, 0, 1]), values.iter().copied(), PROXIES.as_ref())
 }
 
 /// Returns true if [`forwarded`] trusts this address.

@@ -31,7 +31,7 @@ from statistics import median
 
 from mixed import Expected, Load, Server, folder
 
-KEPT = ["store.result_ttl_ms=90000", "store.input_ttl_ms=90000", "store.job_ttl_ms=90000"]
+KEPT = ["store.result_ttl_ms=90000", "store.input_ttl_ms=90000"]
 KEPT += ["store.max_bytes=2GiB", "limits.structure_cache_bytes=8MiB"]
 # Limits of the growth of the resident memory, % per hour, and of its excess over the idle value, %.
 MAX_GROWTH, MAX_EXCESS = 1.0, 20.0

@@ -126,14 +126,9 @@ impl Access {
         &self.config
     }
 
-    /// Returns the client address of a request from `peer`, given the values of the forwarding header.
+    /// Returns the client address of a request from `peer`, given the values of `X-Forwarded-For`.
     pub(crate) fn client<'a>(&self, peer: IpAddr, values: impl DoubleEndedIterator<Item = &'a str>) -> IpAddr {
-        forwarded::client(peer, self.server.forwarded_header, values, self.server.trusted_proxies.as_ref())
-    }
-
-    /// Returns the name of the forwarding header.
-    pub(crate) fn forwarded_header(&self) -> &'static str {
-        self.server.forwarded_header.name()
+        forwarded::client(peer, values, self.server.trusted_proxies.as_ref())
     }
 
     /// Reads the key file again if it has changed, or always with `force`. Returns the number of keys, or `None` if the

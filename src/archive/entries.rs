@@ -66,7 +66,7 @@ struct Known {
 #[derive(Debug, Clone)]
 pub struct Archive {
     shared: Arc<ArchiveState>,
-    /// Client whose share of `archive.concurrent` limits the fetches; `None`: no share.
+    /// Client whose share limits its concurrent fetches; `None`: no share.
     client: Option<u64>,
 }
 
@@ -121,14 +121,14 @@ impl Archive {
         Arc::clone(&self.shared.files.readers.line)
     }
 
-    /// Returns the archive for a client, which may fetch its share of `archive.concurrent` entries at once.
+    /// Returns the archive for a client, which may fetch as many entries at once as its share.
     #[must_use]
     pub fn for_client(&self, client: u64) -> Self {
         Self { shared: Arc::clone(&self.shared), client: Some(client) }
     }
 
-    /// Returns the bytes of an entry from the first source that has it. Waits at most `archive.timeout_ms`, half
-    /// of it for a slot in the share of the client. Must run on a tokio runtime with timers.
+    /// Returns the bytes of an entry from the first source that has it. Waits at most a minute, half of it for a
+    /// slot in the share of the client. Must run on a tokio runtime with timers.
     ///
     /// # Errors
     /// Returns any [`FetchError`].

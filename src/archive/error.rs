@@ -59,7 +59,7 @@ pub enum FetchError {
         /// Estimated time until a reader is free.
         wait: Duration,
     },
-    /// The client was fetching its share of entries for half of `archive.timeout_ms`.
+    /// The client was fetching its share of entries for half a minute.
     #[error("entry {id} cannot be fetched now: this client is fetching {limit} entries, which is its share")]
     Share {
         /// Requested entry.

@@ -97,7 +97,7 @@ impl Files {
     }
 
     /// Runs blocking `work` on its own thread, with a permit that it keeps to its end. Waits for the permit at most for
-    /// half of `archive.timeout_ms`.
+    /// half of the time for an entry.
     async fn with_permit<T: Send + 'static>(
         &self,
         id: &EntryId,

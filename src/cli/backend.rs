@@ -3,11 +3,11 @@
 use std::num::NonZero;
 #[cfg(feature = "gpu")]
 use std::sync::Arc;
-#[cfg(all(feature = "gpu", feature = "server"))]
-use std::time::Duration;
 
 #[cfg(feature = "server")]
 use molmesh::config::DevicesConfig;
+#[cfg(all(feature = "gpu", feature = "server"))]
+use molmesh::config::JOBS_PER_DEVICE;
 #[cfg(feature = "gpu")]
 use molmesh::picture::CpuRenderer;
 use molmesh::picture::SelectedRenderer;
@@ -46,10 +46,10 @@ pub(crate) enum Purpose {
     Mesh,
     /// One mesh and its picture.
     Picture,
-    /// A service.
+    /// A service, with the size of the readback buffers of each GPU, bytes.
     #[cfg(feature = "server")]
-    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only GPUs have settings"))]
-    Service(DevicesConfig),
+    #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only GPUs have buffers"))]
+    Service(u64),
 }
 
 impl<'a> BackendRequest<'a> {
@@ -62,7 +62,7 @@ impl<'a> BackendRequest<'a> {
     /// Creates the request of a service.
     #[cfg(feature = "server")]
     pub(crate) fn for_service(backend: BackendName, config: &'a DevicesConfig) -> Self {
-        let purpose = Purpose::Service(config.clone());
+        let purpose = Purpose::Service(config.readback_bytes);
         Self { backend, devices: &config.choice, threads: None, work: None, purpose }
     }
 
@@ -209,17 +209,11 @@ fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
     if let Some(why) = discovery.no_device_reason() {
         return Err(NoGpu { why, devices: discovery.devices });
     }
-    let settings = match &requested.purpose {
+    let settings = match requested.purpose {
         #[cfg(feature = "server")]
-        Purpose::Service(config) => PoolSettings {
-            queue: config.jobs,
-            batch: config.batch,
-            min_partition_bricks: config.min_partition_bricks,
-            hang_timeout: Duration::from_millis(config.hang_timeout_ms),
-            cool_down: Duration::from_millis(config.cool_down_ms),
-            readback_bytes: Some(config.readback_bytes),
-            ..PoolSettings::default()
-        },
+        Purpose::Service(readback_bytes) => {
+            PoolSettings { queue: JOBS_PER_DEVICE, readback_bytes: Some(readback_bytes), ..PoolSettings::default() }
+        }
         _ => PoolSettings::default(),
     };
     let backend = match GpuBackend::start(&discovery, &settings) {

@@ -38,10 +38,6 @@ pub struct AccessConfig {
     pub cors_origins: Option<Origins>,
     /// Allows pages of these origins to send credentials, such as the cookies of a proxy. Default false. Excludes `*`.
     pub cors_credentials: bool,
-    /// Duration of HTTP Strict Transport Security, s. Default `none`: no header, because TLS is the proxy's task and
-    /// browsers remember the header.
-    #[serde(deserialize_with = "count")]
-    pub hsts_s: Option<u64>,
 }
 
 impl Default for AccessConfig {
@@ -54,7 +50,6 @@ impl Default for AccessConfig {
             address_work_s: None,
             cors_origins: Some(Origins::Auto),
             cors_credentials: false,
-            hsts_s: None,
         }
     }
 }

@@ -40,7 +40,8 @@ pub struct ArchiveConfig {
     #[serde(skip)]
     pub first_byte_timeout_ms: u64,
     /// Total time for an entry, ms: waiting for other fetches, half of it for those of the same client, all attempts
-    /// and pauses. Default 60,000: 100 MB at 14 Mbit/s.
+    /// and pauses. Fixed: 100 MB at 14 Mbit/s, and the time that an upload may take.
+    #[serde(skip)]
     pub timeout_ms: u64,
     /// Attempts per URL, the first included. Fixed: retries only bridge temporary failures, which are no connection,
     /// timeouts, damaged files, 429 and 5xx.
@@ -50,9 +51,12 @@ pub struct ArchiveConfig {
     /// part of it, so that servers do not retry in step. Fixed: callers wait meanwhile.
     #[serde(skip)]
     pub backoff_ms: u64,
-    /// Size of an entry as sent, bytes. Default 256 MiB, as for uploads. At most `concurrent` entries are in memory.
+    /// Size of an entry as sent, bytes. Fixed: the largest PDB entries have about 100 MB compressed. At most
+    /// `concurrent` entries are in memory.
+    #[serde(skip)]
     pub max_bytes: u64,
-    /// Number of concurrent fetches. Default 8: public archives ask for restraint.
+    /// Number of concurrent fetches. Fixed: public archives ask for restraint.
+    #[serde(skip)]
     pub concurrent: usize,
     /// Time for which a copy is used without revalidation, ms. Fixed to a day: entries are released and revised weekly.
     #[serde(skip)]

@@ -9,14 +9,15 @@ use serde::{Deserialize, Serialize};
 pub struct JobsConfig {
     /// Number of concurrent jobs of each lane: short requests, long requests, asynchronous jobs. Default 2: the backend
     /// uses all cores for one job, and a second one fills them while the first reads its file or measures its mesh.
-    /// GPUs run more: see `devices.jobs`.
+    /// At least 16 for each GPU.
     pub workers: usize,
     /// Number of queued requests in each lane, short and long. Default 64: at a typical 0.1 s per job on two workers
     /// the last one waits three seconds; a longer queue would only delay refusals. Further requests get a 503 with an
     /// estimated `Retry-After`.
     pub queue: usize,
     /// Number of concurrent requests for meshes, from the submission of the job to the last byte of the response.
-    /// Default 256: each one holds a thread while its mesh is written, and some threads must stay free to read files.
+    /// Fixed: each one holds a thread while its mesh is written, and some threads must stay free to read files.
+    #[serde(skip)]
     pub deliveries: usize,
     /// Time from acceptance to the finished mesh, ms, time in the queue included; also the longest wait for `Prefer:
     /// wait=`. Default 60,000: proxies commonly cut an exchange after a minute.
@@ -36,14 +37,16 @@ pub struct JobsConfig {
     /// request.
     #[serde(skip)]
     pub concurrent_saves: usize,
-    /// Number of asynchronous jobs on record, open and ended. Default 100,000: the records take 400 MB of disk in
-    /// blocks of 4 KiB, and listing them at the start takes seconds. At the limit, the record of the ended job that was
-    /// not used for the longest time is removed; if all jobs are open, new ones get a 503.
+    /// Number of asynchronous jobs on record, open and ended. Fixed: the records take 400 MB of disk in blocks of 4
+    /// KiB, and listing them at the start takes seconds. At the limit, the record of the ended job that was not used
+    /// for the longest time is removed; if all jobs are open, new ones get a 503.
+    #[serde(skip)]
     pub records: usize,
     /// Number of asynchronous jobs of one client on record. Default 2,500, a quarter of the default of `broker.queue`:
-    /// one client can neither displace the records of the others nor fill the queue. At the limit as for `records`,
-    /// among the jobs of the client. Jobs run in the order of their acceptance, so this also bounds the number of jobs
-    /// of one client for which the others wait.
+    /// one client can neither displace the records of the others nor fill the queue. At the limit, the record of its
+    /// ended job that was not used for the longest time is removed; if all its jobs are open, new ones get a 503. Jobs
+    /// run in the order of their acceptance, so this also bounds the number of jobs of one client for which the others
+    /// wait.
     pub records_per_client: usize,
 }
 

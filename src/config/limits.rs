@@ -22,10 +22,12 @@ pub struct LimitsConfig {
     /// Number of atoms in all models of a structure, and of an assembly. Default 10,000,000: four times the largest PDB
     /// entry; at 80 bytes each 800 MB.
     pub atoms: u64,
-    /// Number of copies of chains in an assembly, or of instances. Default 10,000: six times as many as in the largest
-    /// virus of the PDB.
+    /// Number of copies of chains in an assembly, or of instances. Fixed: six times as many as in the largest virus of
+    /// the PDB.
+    #[serde(skip)]
     pub assembly_copies: u64,
-    /// Number of grid points of a map for `color=map`. Default 67,108,864: 406 along each axis, 256 MiB in memory.
+    /// Number of grid points of a map for `color=map`. Fixed: 406 along each axis, 256 MiB in memory.
+    #[serde(skip)]
     pub map_points: u64,
     /// Number of atoms whose names or colours are listed, for web pages that show them. Fixed: about 10 MB of JSON, the
     /// most that is useful in a browser.
@@ -42,8 +44,9 @@ pub struct LimitsConfig {
     pub candidate_pairs: u64,
     /// Size of a mesh in memory (24 bytes a vertex, 12 a triangle), bytes. Default 2 GiB: 85 million triangles.
     pub mesh_bytes: u64,
-    /// Size of a mesh file, bytes. Default 3 GiB: below the 4 GiB limit of GLB, and above the mesh in memory because
+    /// Size of a mesh file, bytes. Fixed: below the 4 GiB limit of GLB, and above the default of `mesh_bytes` because
     /// text formats are larger.
+    #[serde(skip)]
     pub output_bytes: u64,
     /// Memory of all requests together, bytes: uploads, jobs from decompression to the finished mesh, responses, and
     /// buffers of connections. Default 8 GiB, or half of the memory of the machine or control group if that is less.

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{ForwardedHeader, Hosts, Proxies, list, telemetry};
+use super::{Hosts, Proxies, list, telemetry};
 
 /// Role of a node of a cluster.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -47,11 +47,11 @@ pub struct ServerConfig {
     /// should be a few hundred higher; `molmesh doctor` compares them.
     pub connections: usize,
     /// Share of one client in each of five limits, as a fraction from 0 to 1. A share has at least one slot. In
-    /// `server.connections`, clients are told apart by the address of the peer; `trusted_proxies` have no share. In
-    /// `jobs.deliveries`, `archive.concurrent` and the threads that read structures outside of jobs (`jobs.workers`),
-    /// they are told apart by key, or by address without a key. Default 0.25: one client cannot occupy the service, and
-    /// three others find free slots. With 1 a client may use all slots. Connections and deliveries beyond the share get
-    /// a 503. Fetches wait for half of `archive.timeout_ms` first, and readers for `jobs.deadline_ms`. Of
+    /// `server.connections`, clients are told apart by the address of the peer; `trusted_proxies` have no share. In the
+    /// 256 meshes in progress, the 8 fetches from the archive and the threads that read structures outside of jobs
+    /// (`jobs.workers`), they are told apart by key, or by address without a key. Default 0.25: one client cannot
+    /// occupy the service, and three others find free slots. With 1 a client may use all slots. Connections and meshes
+    /// beyond the share get a 503. Fetches wait for half a minute first, and readers for half of `jobs.deadline_ms`. Of
     /// `limits.memory_bytes`, a client whose other requests hold more than the share leaves as much to others.
     #[serde(deserialize_with = "telemetry::ratio")]
     #[schemars(range(min = 0, max = 1))]
@@ -81,14 +81,11 @@ pub struct ServerConfig {
     /// Time after `termination_notice_ms` for running requests and jobs to finish, ms. Default 20,000: orchestrators
     /// commonly kill after 30 seconds; with `termination_notice_ms` and one second for cancelled jobs a stop takes 24.
     pub drain_timeout_ms: u64,
-    /// Trusted proxies, by address or network, whose forwarding header names the client. Default `none`: the peer is
-    /// the client, and its forwarding headers are ignored.
+    /// Trusted proxies, by address or network, whose `X-Forwarded-For` names the client. Default `none`: the peer is
+    /// the client, and the header is ignored.
     #[serde(with = "list")]
     #[schemars(schema_with = "Proxies::schema")]
     pub trusted_proxies: Option<Proxies>,
-    /// Forwarding header of the trusted proxies: `x-forwarded-for` or `forwarded` (RFC 7239). Default
-    /// `x-forwarded-for`, which most proxies write. The other header is ignored, because the client may have sent it.
-    pub forwarded_header: ForwardedHeader,
 }
 
 impl Default for ServerConfig {
@@ -109,7 +106,6 @@ impl Default for ServerConfig {
             termination_notice_ms: Some(3000),
             drain_timeout_ms: 20_000,
             trusted_proxies: None,
-            forwarded_header: ForwardedHeader::default(),
         }
     }
 }

@@ -21,9 +21,6 @@ pub struct StoreConfig {
     pub region: Option<String>,
     /// Allows an endpoint with plain `http`. Default false: contents would not be encrypted.
     pub allow_http: bool,
-    /// Puts the bucket into the path of URLs instead of the host name. Default true: all S3-compatible services accept
-    /// it.
-    pub path_style: bool,
     /// Access key id. Default `none`: `AWS_ACCESS_KEY_ID`, else the other AWS credential sources of the machine.
     pub access_key_id: Option<String>,
     /// Secret access key. Default `none`: `AWS_SECRET_ACCESS_KEY`. Prefer the environment variable or
@@ -49,14 +46,12 @@ pub struct StoreConfig {
     /// The least recently used objects are evicted.
     #[serde(skip)]
     pub max_objects: u64,
-    /// Time that a result is kept after its last use, ms. Default 86,400,000 (a day): most repeated requests come soon.
+    /// Time that a result and the record of a job are kept after their last use, ms. Default 86,400,000 (a day): most
+    /// repeated requests come soon.
     pub result_ttl_ms: u64,
     /// Time that an input is kept after its last use, ms. Default 604,800,000 (7 days): users mesh a structure again
     /// with other parameters.
     pub input_ttl_ms: u64,
-    /// Time that a job record is kept after it was last written or read, ms. Default 86,400,000 (a day), as for
-    /// results.
-    pub job_ttl_ms: u64,
     /// Memory for cached small results, bytes. Fixed: thousands of small proteins.
     #[serde(skip)]
     pub memory_bytes: u64,
@@ -72,7 +67,6 @@ impl Default for StoreConfig {
             endpoint: None,
             region: None,
             allow_http: false,
-            path_style: true,
             access_key_id: None,
             secret_access_key: None,
             secret_access_key_file: None,
@@ -83,7 +77,6 @@ impl Default for StoreConfig {
             max_objects: 500_000,
             result_ttl_ms: 86_400_000,
             input_ttl_ms: 604_800_000,
-            job_ttl_ms: 86_400_000,
             memory_bytes: 256 << 20,
             memory_object_bytes: 4 << 20,
         }

@@ -24,8 +24,6 @@ pub struct TelemetryConfig {
     #[serde(deserialize_with = "ratio")]
     #[schemars(range(min = 0, max = 1))]
     pub sample_ratio: f64,
-    /// Value of the resource attribute `service.name`. Default `molmesh`.
-    pub service_name: String,
     /// HTTP headers for the collector, as `name=value,name=value`, such as an API key. Default `none`. Prefer the
     /// environment variable or `secret_headers_file` to the configuration file.
     #[schemars(with = "Option<Secret>")]
@@ -50,7 +48,6 @@ impl Default for TelemetryConfig {
         Self {
             endpoint: None,
             sample_ratio: 1.0,
-            service_name: "molmesh".to_owned(),
             secret_headers: None,
             secret_headers_file: None,
             timeout_ms: 10_000,

@@ -86,7 +86,6 @@ pub(super) fn cors(access: &Arc<Access>) -> CorsLayer {
 /// Adds security headers that the handler has not set.
 pub(super) async fn restrain(State(app): State<Shared>, request: Request, next: Next) -> Response {
     let mut response = next.run(request).await;
-    let config = app.access.config();
     let sites = app.access.sites();
     let headers = response.headers_mut();
     // Browsers must not interpret a mesh as a script or a page.
@@ -100,9 +99,6 @@ pub(super) async fn restrain(State(app): State<Shared>, request: Request, next: 
     headers.insert(CROSS_ORIGIN_RESOURCE_POLICY, HeaderValue::from_static(embedders));
     or(headers, header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
     or(headers, header::CONTENT_SECURITY_POLICY, POLICY);
-    if let Some(value) = config.hsts_s.and_then(|age| HeaderValue::try_from(format!("max-age={age}")).ok()) {
-        headers.insert(header::STRICT_TRANSPORT_SECURITY, value);
-    }
     response
 }
 

@@ -84,7 +84,7 @@ impl Caller {
 
     fn address(access: &Access, request: &Request) -> Self {
         let Some(Peer(peer)) = request.extensions().get::<Peer>() else { return Self::default() };
-        let values = request.headers().get_all(access.forwarded_header()).iter().filter_map(|v| v.to_str().ok());
+        let values = request.headers().get_all("x-forwarded-for").iter().filter_map(|v| v.to_str().ok());
         Self::new(&client_name(access.client(*peer, values)), false, access.address_quota())
     }
 

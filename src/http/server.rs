@@ -21,7 +21,7 @@ use super::{accept, capabilities, key_reload, metrics, router};
 use crate::access::{Access, AccessError, Sites};
 use crate::archive::Archive;
 use crate::client_shares::ClientShares;
-use crate::config::{Config, Role};
+use crate::config::{Config, JOBS_PER_DEVICE, Role};
 use crate::jobs::{
     Broker, Client, EndError, JobStore, MemoryBroker, NatsBroker, Pool, ScratchSpace, Settings, Structures,
 };
@@ -137,7 +137,7 @@ impl Server {
         let scratch_bytes = config.limits.scratch_bytes;
         let scratch = (scratch_bytes > 0).then(|| ScratchSpace::new(&config.server.data_dir, scratch_bytes));
         let settings = Settings {
-            workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
+            workers: config.jobs.workers.max(JOBS_PER_DEVICE * backend.devices().len()),
             queue: config.jobs.queue,
             limits: config.limits.job(),
             structures: Structures::new(config.limits.structure_cache_bytes, &budget, scratch),

@@ -51,9 +51,9 @@ pub(super) struct App {
     pub(super) saves: SingleFlight<ContentKey, ()>,
     /// Phase of the shutdown, which ends long responses.
     pub(super) stopping: watch::Receiver<Stop>,
-    /// Permits of `jobs.deliveries`.
+    /// Permits for requests for meshes.
     pub(super) deliveries: Arc<Semaphore>,
-    /// Shares of the clients in `jobs.deliveries`. Stored results that are being sent count as well.
+    /// Shares of the clients in these permits. Stored results that are being sent count as well.
     pub(super) delivery_shares: Arc<ClientShares>,
     /// True if the first mesh was computed, false if it failed; unset before.
     pub(super) first_mesh: OnceLock<bool>,
@@ -105,7 +105,7 @@ impl App {
     }
 }
 
-/// Delivery slot: slot of a request in `jobs.deliveries`, and in the share of its client.
+/// Delivery slot: permit of a request for a mesh, and its slot in the share of its client.
 pub(super) struct Delivery {
     _permit: OwnedSemaphorePermit,
     _share: SharePermit,

@@ -91,12 +91,12 @@ pub enum StoreError {
         digest: Digest,
     },
     /// The limit of jobs on record is reached, and all of them are open.
-    #[error("{limit} jobs are on record ({key}), and none of them has ended")]
+    #[error("{limit} jobs {scope} are on record, and none of them has ended")]
     TooManyRecords {
         /// Largest number of jobs on record.
         limit: usize,
-        /// Configuration key of the limit.
-        key: &'static str,
+        /// Jobs that the limit counts.
+        scope: &'static str,
     },
     /// The name is invalid.
     #[error(transparent)]

@@ -106,8 +106,7 @@ impl Store {
     pub(super) fn ttl(&self, folder: Folder) -> Duration {
         match folder {
             Folder::Inputs => Duration::from_millis(self.0.config.input_ttl_ms),
-            Folder::Jobs => Duration::from_millis(self.0.config.job_ttl_ms),
-            Folder::Results => Duration::from_millis(self.0.config.result_ttl_ms),
+            Folder::Jobs | Folder::Results => Duration::from_millis(self.0.config.result_ttl_ms),
         }
     }
 

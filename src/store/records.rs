@@ -117,8 +117,9 @@ impl Store {
                     return Ok((RecordReservation { store: self.clone(), name: name.clone() }, removed));
                 }
                 Admission::Full(scope, limit) => {
-                    let key = if scope.is_some() { "jobs.records_per_client" } else { "jobs.records" };
-                    return Err(StoreError::TooManyRecords { limit, key });
+                    let scope =
+                        if scope.is_some() { "of the client (jobs.records_per_client)" } else { "of all clients" };
+                    return Err(StoreError::TooManyRecords { limit, scope });
                 }
                 Admission::Remove(candidate) => {
                     if self.evict_record(&candidate).await? {

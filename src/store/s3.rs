@@ -44,7 +44,6 @@ pub(super) fn connect(config: &StoreConfig, url: &str) -> Result<(Arc<dyn Object
     let key = AmazonS3ConfigKey::Client;
     let mut builder = AmazonS3Builder::from_env()
         .with_bucket_name(name)
-        .with_virtual_hosted_style_request(!config.path_style)
         // Not every service supports bulk deletion, and few objects are deleted at once.
         .with_disable_bulk_delete(true)
         // Clients may read slowly, so only the time between two reads of a body is limited, not the total.

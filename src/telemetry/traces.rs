@@ -52,7 +52,7 @@ impl Traces {
             .build();
         let processor = BatchSpanProcessor::builder(exporter(config, endpoint)?).with_batch_config(batch).build();
         let resource = Resource::builder_empty()
-            .with_service_name(config.service_name.clone())
+            .with_service_name("molmesh")
             .with_attribute(opentelemetry::KeyValue::new("service.version", env!("CARGO_PKG_VERSION")))
             .build();
         let provider = provider(config.sample_ratio).with_resource(resource).with_span_processor(processor).build();

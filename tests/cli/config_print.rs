@@ -43,11 +43,7 @@ fn the_printed_configuration_loads_to_the_same() {
     );
     let odd = "quote\" back\\slash \u{7f}tab\t line\n Å end";
     let env = pairs(&[("MOLMESH__JOBS__QUEUE", "5"), ("MOLMESH__SERVER__TERMINATION_NOTICE_MS", "none")]);
-    let flags = pairs(&[
-        ("server.data_dir", odd),
-        ("devices.min_partition_bricks", "none"),
-        ("limits.atoms", "18446744073709551615"),
-    ]);
+    let flags = pairs(&[("server.data_dir", odd), ("limits.atoms", "18446744073709551615")]);
     let loaded = load(Some(&file), env, &flags).unwrap();
     assert_eq!(loaded.config.store.secret_access_key.as_ref().unwrap().reveal(), "from a file");
     assert_eq!(loaded.config.server.data_dir, Path::new(odd));
@@ -60,10 +56,10 @@ fn the_printed_configuration_loads_to_the_same() {
 #[test]
 fn every_value_is_printed_with_its_source() {
     let folder = Folder::new();
-    let file = folder.file("molmesh.toml", "[jobs]\nworkers = 3\nqueue = 4\ndeliveries = 7\n");
+    let file = folder.file("molmesh.toml", "[jobs]\nworkers = 3\nqueue = 4\nrecords_per_client = 7\n");
     let done = molmesh()
         .env("MOLMESH__JOBS__QUEUE", "5")
-        .args(["config", "print", "--set", "jobs.deliveries=8", "--backend", "cpu", "--config"])
+        .args(["config", "print", "--set", "jobs.records_per_client=8", "--backend", "cpu", "--config"])
         .arg(&file)
         .output()
         .unwrap();
@@ -72,7 +68,7 @@ fn every_value_is_printed_with_its_source() {
     for line in [
         format!("workers = 3 # {}", file.display()),
         "queue = 5 # MOLMESH__JOBS__QUEUE".to_owned(),
-        "deliveries = 8 # command line".to_owned(),
+        "records_per_client = 8 # command line".to_owned(),
         "attempts = 3 # default".to_owned(),
         "# Not part of this file: --backend cpu".to_owned(),
     ] {

@@ -292,21 +292,12 @@ fn addresses_have_quotas_also_behind_trusted_proxies() {
             ["", "203.0.113.7, ", "203.0.113.8, "].map(|forged| ask(&behind, forwarded(&format!("{forged}{client}"))));
         assert_eq!(statuses, [200, 200, 429], "{client}");
     }
-    // Addresses of one IPv6 network are one client. The other header is ignored.
+    // Addresses of one IPv6 network are one client. `Forwarded`, which proxies pass on, is ignored.
     assert_eq!(ask(&behind, forwarded("2001:db8:0:1:ffff::1")), 429);
     assert_eq!(ask(&behind, forwarded("2001:db8:0:2::1")), 200);
     let statuses = ["198.51.100.7", "198.51.100.8", "198.51.100.9"]
         .map(|address| ask(&behind, ("forwarded", &format!("for={address}"))));
     assert_eq!(statuses, [200, 200, 429]);
-    let standard = server(Mode::Octahedra, |c| {
-        limited(c);
-        c.server.trusted_proxies = "127.0.0.1".parse().ok();
-        c.server.forwarded_header = molmesh::config::ForwardedHeader::Forwarded;
-    });
-    let statuses =
-        ["a", "b", "c"].map(|by| ask(&standard, ("forwarded", &format!("for=\"[2001:db8::1]:81\";by=_{by}"))));
-    assert_eq!(statuses, [200, 200, 429]);
-    assert_eq!(ask(&standard, ("forwarded", "for=192.0.2.9")), 200);
 }
 
 #[test]
@@ -608,10 +599,8 @@ fn security_headers_are_sent() {
             "{path}: {policy}"
         );
         assert_eq!(policy.contains("script-src 'self'"), ["/", "/docs"].contains(&path), "{path}: {policy}");
-        assert_eq!((reply.header("strict-transport-security"), reply.header("server")), (None, None), "{path}");
+        assert_eq!(reply.header("server"), None, "{path}");
         let version = env!("CARGO_PKG_VERSION");
         assert!(!reply.headers.iter().any(|(_, value)| value.contains(version)), "{path}: {:?}", reply.headers);
     }
-    let strict = server(Mode::Octahedra, |c| c.access.hsts_s = Some(31_536_000));
-    assert_eq!(get(&strict, "/", &[]).header("strict-transport-security"), Some("max-age=31536000"));
 }

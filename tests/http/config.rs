@@ -78,6 +78,7 @@ fn errors_of_unknown_keys_name_the_nearest_key_and_the_source() {
         // A fixed value has no key.
         ("[server]\nheader_timeout_ms = 1", None, None, "server.header_timeout_ms", "", ".tmp"),
         ("", Some("MOLMESH__STORE__SWEEP_MS"), None, "store.sweep_ms", "", "MOLMESH__STORE__SWEEP_MS"),
+        ("", None, Some("jobs.deliveries"), "jobs.deliveries", "", "command line"),
         ("", None, Some("server.lisen"), "server.lisen", "server.listen", "command line"),
         ("", None, Some("server"), "server", "", "command line"),
     ] {
@@ -103,7 +104,7 @@ fn errors_of_bad_values_name_key_value_and_expected_range() {
         ("jobs.workers", "-1"),
         ("jobs.queue", "5MiB"),
         ("jobs.queue", "none"),
-        ("devices.min_partition_bricks", "0"),
+        ("server.termination_notice_ms", "0"),
         ("limits.body_bytes", "5 MB"),
         ("limits.body_bytes", "99999999999GiB"),
         ("server.listen", "localhost"),
@@ -115,10 +116,9 @@ fn errors_of_bad_values_name_key_value_and_expected_range() {
         ("archive.proxy", "proxy"),
         ("archive.allow_private", "maybe"),
         ("server.trusted_proxies", "proxy"),
-        ("server.forwarded_header", "x-real-ip"),
         ("access.address_requests", "many"),
         ("access.address_requests", "0"),
-        ("access.hsts_s", "-1"),
+        ("access.address_work_s", "-1"),
         ("access.cors_origins", "https://viewer.example/"),
         ("access.cors_credentials", "perhaps"),
     ] {
@@ -134,13 +134,11 @@ fn errors_of_bad_values_name_key_value_and_expected_range() {
 
 #[test]
 fn optional_numbers_are_cleared_by_none_and_set_again() {
-    let spread = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().config.devices.min_partition_bricks;
-    assert_eq!(spread(&[]), Some(molmesh::surface::devices::MIN_PARTITION_BRICKS));
-    assert_eq!(spread(&[("devices.min_partition_bricks", "none")]), None);
-    assert_eq!(
-        spread(&[("devices.min_partition_bricks", "none"), ("devices.min_partition_bricks", "5_000")]),
-        Some(5000)
-    );
+    let notice = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().config.server.termination_notice_ms;
+    assert_eq!(notice(&[]), Some(3000));
+    assert_eq!(notice(&[("server.termination_notice_ms", "none")]), None);
+    let again = [("server.termination_notice_ms", "none"), ("server.termination_notice_ms", "5_000")];
+    assert_eq!(notice(&again), Some(5000));
 }
 
 #[test]
@@ -151,7 +149,7 @@ fn optional_counts_are_read_from_every_layer() {
     assert_eq!(requests(&[("access.address_requests", "5"), ("access.address_requests", "none")]), None);
     let lists = file(
         "[access]\naddress_requests = 7\ncors_origins = [\"https://a.example\", \"http://b.example:81\"]\n\
-         [server]\ntrusted_proxies = [\"10.0.0.0/8\", \"::1\"]\nforwarded_header = \"forwarded\"",
+         [server]\ntrusted_proxies = [\"10.0.0.0/8\", \"::1\"]",
     );
     let config = load(Some(lists.path()), [], &[]).unwrap().config;
     assert_eq!(config.access.address_requests, Some(7));

@@ -22,8 +22,6 @@ const ROWS: &[Row] = &[
     ("limits.body_bytes", "body-too-large", "http/limits::bodies_are_limited_with_and_without_a_declared_length"),
     ("limits.inflated_bytes", "inflated-too-large", "http/limits::compression_bombs_stop_at_the_inflated_limit"),
     ("limits.atoms", "too-many-atoms", "http/limits::atoms_are_limited"),
-    ("limits.assembly_copies", "too-many-copies", "http/limits::assemblies_are_limited"),
-    ("limits.map_points", "map-too-large", "http/maps::maps_are_limited"),
     ("limits.grid_points", "grid-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
     (
         "limits.candidate_pairs",
@@ -31,7 +29,6 @@ const ROWS: &[Row] = &[
         "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit",
     ),
     ("limits.mesh_bytes", "mesh-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
-    ("limits.output_bytes", "mesh-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
     ("limits.memory_bytes", "memory-full", "cli/memory::a_burst_of_large_uploads_stays_within_the_memory_limit"),
     (
         "limits.structure_cache_bytes",
@@ -41,7 +38,6 @@ const ROWS: &[Row] = &[
     ("limits.scratch_bytes", "molmesh_scratch_bytes", "http/tilesets::a_tileset_larger_than_the_cache_is_on_disk"),
     ("jobs.workers", "molmesh_queue_depth", "http/limits::a_full_queue_rejects_with_retry_after"),
     ("jobs.queue", "queue-full", "http/limits::a_full_queue_rejects_with_retry_after"),
-    ("jobs.deliveries", "too-many-deliveries", "http/limits::slow_readers_cannot_occupy_all_threads"),
     ("jobs.deadline_ms", "deadline", "http/limits::the_deadline_includes_queueing_and_stops_the_job"),
     (
         "jobs.batch_deadline_ms",
@@ -53,7 +49,6 @@ const ROWS: &[Row] = &[
         "molmesh_jobs_finished_total",
         "http/jobs_durable::a_job_that_repeatedly_crashes_the_process_fails",
     ),
-    ("jobs.records", "too-many-jobs", "http/jobs_durable::open_jobs_are_limited"),
     (
         "jobs.records_per_client",
         "too-many-jobs",
@@ -70,27 +65,11 @@ const ROWS: &[Row] = &[
         "http/cluster::a_job_of_a_killed_worker_runs_again_on_another_one",
     ),
     ("broker.queue", "queue-full", "http/limits::a_full_broker_rejects_jobs_with_retry_after"),
-    ("devices.jobs", "molmesh_device_jobs", "http/devices::devices_are_listed_with_their_reasons"),
-    ("devices.batch", "molmesh_device_shared_submissions_total", "gpu/pool::small_jobs_share_a_submission"),
-    (
-        "devices.min_partition_bricks",
-        "molmesh_device_partitions_total",
-        "gpu/multi_device::concurrent_callers_neither_deadlock_nor_mix_partitions",
-    ),
-    (
-        "devices.hang_timeout_ms",
-        "molmesh_device_lost_total",
-        "gpu/pool::a_hung_device_is_taken_out_and_its_job_retried",
-    ),
     (
         "devices.readback_bytes",
         "molmesh_device_memory_bytes",
         "gpu/meshes::a_device_with_reserved_memory_allocates_no_readback_buffer",
     ),
-    ("devices.cool_down_ms", "molmesh_device_up", "gpu/pool::a_device_is_used_again_after_its_cool_down"),
-    ("archive.timeout_ms", "molmesh_archive_requests_total", "http/archive_http::slow_heads_and_bodies_time_out"),
-    ("archive.max_bytes", "entry-too-large", "http/archive_http::bodies_are_limited_during_the_transfer"),
-    ("archive.concurrent", "molmesh_archive_fetch_seconds", "http/archive_http::concurrent_fetches_are_limited"),
     ("archive.cache_bytes", "molmesh_archive_cache_bytes", "http/archive_http::least_recently_used_copies_are_evicted"),
     (
         "store.timeout_ms",
@@ -108,14 +87,8 @@ const ROWS: &[Row] = &[
         "molmesh_store_removed_total",
         "http/store::objects_expire_by_folder_and_use_prolongs_their_life",
     ),
-    (
-        "store.job_ttl_ms",
-        "molmesh_store_removed_total",
-        "http/store::objects_expire_by_folder_and_use_prolongs_their_life",
-    ),
     ("access.address_requests", "quota-exceeded", "http/access::addresses_have_quotas_also_behind_trusted_proxies"),
     ("access.address_work_s", "quota-exceeded", "http/access::addresses_have_quotas_of_time"),
-    ("access.hsts_s", "", "http/access::security_headers_are_sent"),
     ("telemetry.sample_ratio", "molmesh_trace_spans_total", "telemetry/traces::a_fraction_of_the_traces_is_recorded"),
 ];
 

@@ -128,7 +128,7 @@ fn found() -> Vec<FoundDevice> {
 #[test]
 fn devices_are_listed_with_their_reasons() {
     let backend = Devices::new();
-    let server = start_on(Arc::clone(&backend) as _, found(), |config| config.devices.jobs = 5);
+    let server = start_on(Arc::clone(&backend) as _, found(), |_| {});
     wait_for("ready", || server.get("/readyz").status == 200);
     let can = server.get("/v1/capabilities").json();
     let member = |name: &str| -> Vec<serde_json::Value> {
@@ -139,8 +139,8 @@ fn devices_are_listed_with_their_reasons() {
     assert_eq!(member("reason"), ["discrete", "discrete", "not in --devices 0,1"]);
     assert_eq!(can["devices"][0]["binding_bytes"], 2_u64 << 30);
     assert_eq!(can["devices"][0]["subgroups"], serde_json::json!([32, 32]));
-    // Five concurrent jobs per device, because only queued jobs share a submission.
-    assert_eq!(can["limits"]["workers"], 10);
+    // 16 concurrent jobs per device, because only queued jobs share a submission.
+    assert_eq!(can["limits"]["workers"], 32);
     backend.second_is_down.store(true, Ordering::SeqCst);
     let device = &server.get("/v1/capabilities").json()["devices"][1];
     assert_eq!((&device["up"], &device["reason"]), (&false.into(), &"device lost by a test".into()));

@@ -88,7 +88,6 @@ fn request_job_and_stages_form_one_tree() {
     let collector = Collector::start(CollectorMode::Accept);
     let secret = "authorization=Bearer sesame-8731";
     let server = traced(Arc::new(CpuBackend::new(None).unwrap()), &collector, |config| {
-        config.telemetry.service_name = "surfaces".to_owned();
         config.telemetry.secret_headers = Some(serde_json::from_value(secret.into()).unwrap());
     });
     let headers = [("traceparent", PARENT), ("tracestate", "rojo=1, congo=2"), ("x-request-id", "tree-1")];
@@ -146,7 +145,7 @@ fn request_job_and_stages_form_one_tree() {
     let requests = collector.requests();
     let resource = requests[0].resource_spans[0].resource.as_ref().unwrap();
     let service = Span { attributes: resource.attributes.clone(), ..Span::default() };
-    assert_eq!(attribute(&service, "service.name").as_deref(), Some("surfaces"));
+    assert_eq!(attribute(&service, "service.name").as_deref(), Some("molmesh"));
     assert_eq!(attribute(&service, "service.version").as_deref(), Some(env!("CARGO_PKG_VERSION")));
     for head in collector.heads() {
         assert!(head.starts_with("post /v1/traces http/1.1") && head.contains("application/x-protobuf"), "{head}");

@@ -53,7 +53,7 @@ pub(crate) struct ServiceArgs {
     /// Measure the first request of this number of new services instead
     #[arg(long, value_name = "N")]
     cold: Option<usize>,
-    /// Further arguments of `molmesh serve`, such as `--set devices.jobs=4`
+    /// Further arguments of `molmesh serve`, such as `--set jobs.workers=4`
     #[arg(last = true, value_name = "ARGS")]
     serve: Vec<String>,
     /// Also write the results to this file, as JSON

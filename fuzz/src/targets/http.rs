@@ -53,7 +53,6 @@ pub(super) const WORDS: &[&str] = &[
     "If-Match: ",
     "Accept: ",
     "Accept-Encoding: ",
-    "Forwarded: for=",
     "X-Forwarded-For: ",
     "traceparent: 00-",
     "tracestate: ",

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 
 use molmesh::access::SigningKeys;
 use molmesh::archive::Archive;
-use molmesh::config::{self, Config, ForwardedHeader};
+use molmesh::config::{self, Config};
 use molmesh::fuzzing;
 use molmesh::memory_budget::Budget;
 use molmesh::pipeline::params;
@@ -76,22 +76,8 @@ pub(super) fn config_words() -> Vec<String> {
 }
 
 /// Words of headers that name the client of a proxy.
-pub(super) const FORWARDED: &[&str] = &[
-    "for=",
-    "For=\"",
-    ";proto=https",
-    ";by=",
-    ", ",
-    "\n",
-    "10.0.0.1",
-    "192.0.2.60",
-    "[2001:db8::1]",
-    "::ffff:10.0.0.2",
-    ":4711",
-    "_hidden",
-    "unknown",
-    "\\\"",
-];
+pub(super) const FORWARDED: &[&str] =
+    &[", ", "\n", "10.0.0.1", "192.0.2.60", "[2001:db8::1]", "::ffff:10.0.0.2", ":4711", "unknown"];
 /// Words of key files.
 pub(super) const KEY_FILE: &[&str] = &[
     "[[key]]\n",
@@ -221,14 +207,12 @@ pub(super) fn signature(bytes: &[u8]) {
 pub(super) fn forwarded(bytes: &[u8]) {
     let text = String::from_utf8_lossy(bytes);
     let values: Vec<&str> = text.lines().collect();
-    let forged: Vec<&str> = ["for=203.0.113.77, 203.0.113.77"].into_iter().chain(values.iter().copied()).collect();
-    for header in [ForwardedHeader::XForwardedFor, ForwardedHeader::Forwarded] {
-        let client = fuzzing::forwarded(header, &values);
-        let is_proxy = fuzzing::is_trusted_proxy(client);
-        assert!(is_proxy || !text.is_empty(), "an address that nobody named: {client}");
-        if !is_proxy {
-            assert_eq!(fuzzing::forwarded(header, &forged), client, "an earlier value changes the client");
-        }
+    let forged: Vec<&str> = ["203.0.113.77"].into_iter().chain(values.iter().copied()).collect();
+    let client = fuzzing::forwarded(&values);
+    let is_proxy = fuzzing::is_trusted_proxy(client);
+    assert!(is_proxy || !text.is_empty(), "an address that nobody named: {client}");
+    if !is_proxy {
+        assert_eq!(fuzzing::forwarded(&forged), client, "an earlier value changes the client");
     }
 }
 

@@ -24,14 +24,14 @@ async fn records_are_limited_in_total_and_for_each_client() {
     for client in ["a", "a", "b"] {
         open.push(fixture.accept_from(client).await.unwrap().record.id);
     }
-    for (client, limit, key) in
-        [("a", 2, "jobs.records_per_client"), ("b", 3, "jobs.records"), ("c", 3, "jobs.records")]
+    for (client, limit, of_whom) in [("a", 2, "of the client"), ("b", 3, "of all clients"), ("c", 3, "of all clients")]
     {
         let refused = fixture.accept_from(client).await;
-        let Err(AcceptError::Store(StoreError::TooManyRecords { limit: l, key: k })) = refused else {
+        let Err(AcceptError::Store(StoreError::TooManyRecords { limit: l, scope })) = refused else {
             panic!("{refused:?}")
         };
-        assert_eq!((l, k), (limit, key), "the request would join the work of the others");
+        assert_eq!(l, limit, "the request would join the work of the others");
+        assert!(scope.starts_with(of_whom), "{scope}");
     }
     fixture.faults.silence(None);
     fixture.all_ended().await;
