@@ -6,6 +6,7 @@
 //!
 //! Uses only what servers from version 2.9 on offer.
 
+mod empty_queues;
 mod endings;
 mod lease;
 mod lock;
@@ -25,8 +26,9 @@ use async_nats::{Client as Connection, ConnectOptions, Event};
 use futures_util::future::BoxFuture;
 use futures_util::stream::{self, BoxStream, StreamExt as _};
 use metrics::counter;
-use tokio::time::sleep;
+use tokio::time::{Instant, sleep};
 
+use empty_queues::EmptyQueues;
 use endings::Endings;
 
 use super::order::{QUEUES, QueueOrder};
@@ -65,6 +67,7 @@ struct NatsState {
     /// Queues by number; `None` until they exist.
     queues: Mutex<Option<Arc<[Queue]>>>,
     order: Mutex<QueueOrder>,
+    empty: Mutex<EmptyQueues>,
     /// Number of jobs in the stream when it was last asked.
     queued: AtomicUsize,
     /// Number of times that the connection or the stream was lost.
@@ -126,12 +129,14 @@ impl NatsBroker {
             endings: Endings::default(),
             queues: Mutex::new(None),
             order: Mutex::default(),
+            empty: Mutex::default(),
             queued: AtomicUsize::new(0),
             losses,
             checked: AtomicUsize::new(usize::MAX),
             created: Mutex::new(None),
             failures: Mutex::default(),
         }));
+        broker.0.hear().await?;
         tokio::spawn(streams::watch(Arc::downgrade(&broker.0)));
         Ok(broker)
     }
@@ -160,6 +165,7 @@ impl Broker for NatsBroker {
             match sent.map_err(|error| failed(&error))?.await {
                 Ok(_) => {
                     self.0.queued.fetch_add(1, Ordering::Relaxed);
+                    lock(&self.0.empty).note_job(job.queue(), Instant::now());
                     self.0.announce(job).await;
                     Ok(true)
                 }

@@ -1,6 +1,7 @@
 //! Conformance tests of brokers: the same for every implementation.
 
 mod nats_lost;
+mod nats_messages;
 mod nats_only;
 #[path = "nats_server.rs"]
 pub(crate) mod server;

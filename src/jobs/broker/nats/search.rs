@@ -1,10 +1,11 @@
 //! Search for the next job: asks the queues in order, then waits for the announcement of a new job.
 
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use async_nats::jetstream::message::AckKind;
-use async_nats::{Client as Connection, Subscriber};
+use async_nats::{Client as Connection, Message, Subscriber};
 use futures_util::StreamExt as _;
 use metrics::counter;
 use tokio::time::{Instant, timeout, timeout_at};
@@ -27,6 +28,11 @@ async fn pass_on(mut announcements: Subscriber, connection: Connection) {
     }
 }
 
+/// Returns the number of the queue that an announcement names.
+fn announced_queue(message: &Message) -> Option<usize> {
+    QUEUES.iter().position(|name| message.payload == name.as_bytes())
+}
+
 impl NatsState {
     /// Returns the subject of announcements to workers of a kind, whose content is the name of a queue with a new job.
     /// Each kind has its own: a node that passes an announcement on must not send it to both kinds again.
@@ -42,6 +48,25 @@ impl NatsState {
         }
     }
 
+    /// Notes the jobs that any node announces, until the broker is dropped: a busy node also asks their queues again.
+    pub(super) async fn hear(self: &Arc<Self>) -> Result<(), String> {
+        // Each job is announced to both kinds of workers.
+        let heard = self.connection.subscribe(self.announcement(false)).await;
+        let (mut heard, broker) = (heard.map_err(|error| error.to_string())?, Arc::downgrade(self));
+        tokio::spawn(async move {
+            loop {
+                let next = timeout(POLL, heard.next()).await;
+                let Some(state) = broker.upgrade() else { return };
+                match next.map(|message| message.as_ref().map(announced_queue)) {
+                    Ok(Some(Some(queue))) => lock(&state.empty).note_job(queue, Instant::now()),
+                    Ok(Some(None)) | Err(_) => {}
+                    Ok(None) => return,
+                }
+            }
+        });
+        Ok(())
+    }
+
     /// Subscribes an idle node to announcements, of which each idle node of its kind gets a part.
     async fn announcements(&self, prefers_gpu: bool) -> Result<Subscriber, String> {
         let announcements = self.connection.queue_subscribe(self.announcement(prefers_gpu), "idle".to_owned()).await;
@@ -50,11 +75,13 @@ impl NatsState {
 
     /// Waits for a job and claims it, or returns an error of the server. `None` if there are no queues.
     pub(super) async fn search(&self, prefers_gpu: bool) -> Result<Option<Claim>, String> {
-        // A busy node finds jobs in the queues and gets no announcements, which it would have to pass on.
+        // A busy node finds jobs in the queues and is no receiver of announcements, which it would have to pass on.
         let mut announcements = None;
         let mut asked = lock(&self.order).next(prefers_gpu).to_vec();
+        asked.retain(|queue| !lock(&self.empty).contains(*queue, Instant::now()));
         while let Some(queues) = self.queues() {
             for queue in asked {
+                let begun = Instant::now();
                 let claim = self.fetch(&queues[queue]).await?;
                 self.set_failure(RequestKind::Claim, None);
                 if claim.is_some() {
@@ -64,6 +91,7 @@ impl NatsState {
                     }
                     return Ok(claim);
                 }
+                lock(&self.empty).note_empty(queue, begun);
             }
             asked = if let Some(announcements) = &mut announcements {
                 self.announced(announcements, prefers_gpu).await?
@@ -84,8 +112,8 @@ impl NatsState {
         loop {
             match timeout_at(end, announcements.next()).await {
                 Ok(Some(message)) => {
-                    let queue = QUEUES.iter().position(|name| message.payload == name.as_bytes());
-                    let Some(queue) = queue.filter(|queue| !unsuited.contains(queue)) else { continue };
+                    let queue = announced_queue(&message).filter(|queue| !unsuited.contains(queue));
+                    let Some(queue) = queue else { continue };
                     if suits_gpu(queue) == prefers_gpu {
                         unsuited.insert(0, queue);
                         return Ok(unsuited);
