@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use async_nats::jetstream::message::AckKind;
-use async_nats::{Client as Connection, Message, Subscriber};
+use async_nats::{Client as Connection, HeaderMap, Message, Subscriber};
 use futures_util::StreamExt as _;
 use metrics::counter;
 use tokio::time::{Instant, timeout, timeout_at};
@@ -18,13 +18,20 @@ use crate::telemetry::BROKER_REDELIVERIES;
 
 /// Time that an idle worker waits before it claims a new job that suits the other kind of workers.
 const PRECEDENCE: Duration = Duration::from_millis(5);
+/// Header of an announcement that a node has passed on.
+const PASSED_ON: &str = "Passed-On";
 
-/// Republishes the announcements that arrive before the subscription ends: this node is no longer idle. A node that
+/// Republishes the announcements that arrive before the subscription ends: this node is no longer idle. Those with a
+/// header were passed on already. Thus a job has at most four announcements, however many nodes there are. A node that
 /// stops passes on none: another one then finds the job within [`POLL`].
 async fn pass_on(mut announcements: Subscriber, connection: Connection) {
+    let mut headers = HeaderMap::new();
+    headers.insert(PASSED_ON, "true");
     drop(announcements.drain().await);
     while let Some(message) = announcements.next().await {
-        drop(connection.publish(message.subject, message.payload).await);
+        if message.headers.is_none() {
+            drop(connection.publish_with_headers(message.subject, headers.clone(), message.payload).await);
+        }
     }
 }
 

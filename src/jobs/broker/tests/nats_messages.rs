@@ -1,13 +1,14 @@
 //! Tests that count messages to the server.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use async_nats::Subscriber;
+use async_nats::{HeaderMap, Subscriber};
 use futures_util::StreamExt as _;
 
-use super::super::Broker;
 use super::super::order::QUEUES;
+use super::super::{Broker, Dispatch};
 use super::server::NatsServer;
 use super::{claim, job, nats, on_nats};
 use crate::jobs::rank::DEFAULT_URGENCY;
@@ -32,6 +33,12 @@ async fn count(messages: &mut Subscriber) -> usize {
         n += 1;
     }
     n
+}
+
+/// Queues a job without an announcement.
+async fn put(connection: &async_nats::Client, queue: &str, job: &Dispatch) {
+    let subject = format!("molmesh.jobs.{queue}.{}", job.id.as_str());
+    connection.request(subject, "".into()).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -70,6 +77,67 @@ async fn a_busy_node_does_not_overlook_urgent_jobs_of_other_nodes() {
         let claimed = claim(&node).await;
         assert_eq!(claimed.id, urgent.id);
         claimed.done().await;
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_has_at_most_four_announcements_however_many_nodes_there_are() {
+    on_nats(async |server| {
+        let nodes = [nats(server).await, nats(server).await, nats(server).await, nats(server).await].map(Arc::new);
+        let mut announcements = observe(server, "molmesh.new.*").await;
+        let begun = Arc::new(AtomicUsize::new(0));
+        let workers = nodes.clone().map(|node| {
+            let begun = Arc::clone(&begun);
+            tokio::spawn(async move {
+                while begun.fetch_add(1, Ordering::Relaxed) < JOBS {
+                    let claim = node.claim(false).await;
+                    tokio::time::sleep(Duration::from_millis(5)).await;
+                    claim.done().await;
+                }
+            })
+        });
+        // All nodes wait for jobs.
+        tokio::time::sleep(ARRIVAL).await;
+        let dispatch = |job: Dispatch| async {
+            let job = job;
+            assert_eq!(nodes[0].dispatch(&job).await, Ok(true));
+        };
+        let jobs = (0..JOBS).map(|_| job(DEFAULT_URGENCY));
+        futures_util::stream::iter(jobs).for_each_concurrent(None, dispatch).await;
+        for worker in workers {
+            worker.await.unwrap();
+        }
+        let n = count(&mut announcements).await;
+        assert!((2 * JOBS..=4 * JOBS).contains(&n), "{n} announcements of {JOBS} jobs");
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_announcement_is_passed_on_once() {
+    on_nats(async |server| {
+        let node: Arc<dyn Broker> = Arc::new(nats(server).await);
+        let connection = async_nats::connect(server.address()).await.unwrap();
+        let mut announcements = observe(server, "molmesh.new.*").await;
+        let mut passed_on = HeaderMap::new();
+        passed_on.insert("Passed-On", "true");
+        for (headers, is_passed_on) in [(HeaderMap::new(), true), (passed_on, false)] {
+            let waiting = {
+                let node = Arc::clone(&node);
+                tokio::spawn(async move { node.claim(false).await })
+            };
+            tokio::time::sleep(ARRIVAL).await;
+            put(&connection, "normal-cpu", &job(DEFAULT_URGENCY)).await;
+            // They arrive together: the node claims the job after the first one.
+            for _ in 0..JOBS {
+                let sent = connection.publish_with_headers("molmesh.new.cpu", headers.clone(), "normal-cpu".into());
+                sent.await.unwrap();
+            }
+            waiting.await.unwrap().done().await;
+            let n = count(&mut announcements).await;
+            assert_eq!(n > JOBS, is_passed_on, "{n} announcements");
+        }
     })
     .await;
 }
