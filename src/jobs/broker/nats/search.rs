@@ -23,7 +23,7 @@ const PASSED_ON: &str = "Passed-On";
 
 /// Republishes the announcements that arrive before the subscription ends: this node is no longer idle. Those with a
 /// header were passed on already. Thus a job has at most four announcements, however many nodes there are. A node that
-/// stops passes on none: another one then finds the job within [`POLL`].
+/// stops passes on none: another idle node counts the jobs within [`POLL`], and looks for them at its next interval.
 async fn pass_on(mut announcements: Subscriber, connection: Connection) {
     let mut headers = HeaderMap::new();
     headers.insert(PASSED_ON, "true");
@@ -84,6 +84,7 @@ impl NatsState {
     pub(super) async fn search(&self, prefers_gpu: bool) -> Result<Option<Claim>, String> {
         // A busy node finds jobs in the queues and is no receiver of announcements, which it would have to pass on.
         let mut announcements = None;
+        let mut poll = Instant::now() + POLL;
         let mut asked = lock(&self.order).next(prefers_gpu).to_vec();
         asked.retain(|queue| !lock(&self.empty).contains(*queue, Instant::now()));
         while let Some(queues) = self.queues() {
@@ -101,7 +102,7 @@ impl NatsState {
                 lock(&self.empty).note_empty(queue, begun);
             }
             asked = if let Some(announcements) = &mut announcements {
-                self.announced(announcements, prefers_gpu).await?
+                self.announced(announcements, prefers_gpu, &mut poll).await?
             } else {
                 // Jobs that are dispatched from now on are announced; earlier ones are found in the queues.
                 announcements = Some(self.announcements(prefers_gpu).await?);
@@ -111,11 +112,17 @@ impl NatsState {
         Ok(None)
     }
 
-    /// Waits until there may be a job. Returns the numbers of the queues to be asked.
-    async fn announced(&self, announcements: &mut Subscriber, prefers_gpu: bool) -> Result<Vec<usize>, String> {
+    /// Waits until there may be a job. Returns the numbers of the queues to be asked: at `poll`, which then becomes the
+    /// next such time, all of them, otherwise those with an announced job.
+    async fn announced(
+        &self,
+        announcements: &mut Subscriber,
+        prefers_gpu: bool,
+        poll: &mut Instant,
+    ) -> Result<Vec<usize>, String> {
         // Queues of new jobs that suit the other kind of workers.
         let mut unsuited = Vec::new();
-        let mut end = Instant::now() + POLL;
+        let mut end = *poll;
         loop {
             match timeout_at(end, announcements.next()).await {
                 Ok(Some(message)) => {
@@ -132,11 +139,14 @@ impl NatsState {
                 }
                 Ok(None) => return Err("the connection is closed".to_owned()),
                 Err(_elapsed) if !unsuited.is_empty() => return Ok(unsuited),
-                // A job of a stopped worker returns without an announcement.
-                Err(_elapsed) if self.queued.load(Ordering::Relaxed) > 0 => {
-                    return Ok(lock(&self.order).next(prefers_gpu).to_vec());
+                Err(_elapsed) => {
+                    *poll = Instant::now() + POLL;
+                    // A job of a stopped worker returns without an announcement.
+                    if self.queued.load(Ordering::Relaxed) > 0 {
+                        return Ok(lock(&self.order).next(prefers_gpu).to_vec());
+                    }
+                    end = *poll;
                 }
-                Err(_elapsed) => end = Instant::now() + POLL,
             }
         }
     }

@@ -10,7 +10,7 @@ use futures_util::StreamExt as _;
 use super::super::order::QUEUES;
 use super::super::{Broker, Dispatch};
 use super::server::NatsServer;
-use super::{claim, job, nats, on_nats};
+use super::{SOON, claim, job, nats, on_nats};
 use crate::jobs::rank::DEFAULT_URGENCY;
 
 /// Number of jobs of a test.
@@ -138,6 +138,28 @@ async fn an_announcement_is_passed_on_once() {
             let n = count(&mut announcements).await;
             assert_eq!(n > JOBS, is_passed_on, "{n} announcements");
         }
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_idle_node_finds_a_job_that_was_not_announced_beside_jobs_of_others() {
+    on_nats(async |server| {
+        let node: Arc<dyn Broker> = Arc::new(nats(server).await);
+        let connection = async_nats::connect(server.address()).await.unwrap();
+        let waiting = tokio::spawn(async move { node.claim(false).await });
+        tokio::time::sleep(ARRIVAL).await;
+        let (job, begun) = (job(7), Instant::now());
+        put(&connection, "low-cpu", &job).await;
+        while !waiting.is_finished() {
+            assert!(begun.elapsed() < SOON, "the node does not look for jobs");
+            // A job that another node claims.
+            connection.publish("molmesh.new.cpu", "normal-gpu".into()).await.unwrap();
+            tokio::time::sleep(ARRIVAL).await;
+        }
+        let claimed = waiting.await.unwrap();
+        assert_eq!(claimed.id, job.id);
+        claimed.done().await;
     })
     .await;
 }
