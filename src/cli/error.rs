@@ -12,7 +12,7 @@ use thiserror::Error;
 
 use super::style::Style;
 
-/// Exit codes. They are documented in `--help` and in the README and do not change meaning.
+/// Exit codes. They are documented in `--help` and in `docs/start/cli.md` and do not change meaning.
 pub(crate) mod code {
     /// Success.
     pub(crate) const OK: i32 = 0;

@@ -26,7 +26,7 @@ use tokio::time::Instant;
 use tower::ServiceExt as _;
 
 use super::guard::Peer;
-use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, MinimumRate, Pace, STREAM_BUFFER, Streams};
+use super::pace::{self, GaugeGuard, MAX_TIME_FACTOR, Pace, STREAM_BUFFER, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::problem_types::ProblemType;
 use super::socket::Guarded;
@@ -81,6 +81,7 @@ pub(super) async fn serve(
     let slots = Arc::new(Semaphore::new(config.connections));
     let shares = ClientShares::new(config.connections, config.client_share);
     let refusals = Arc::new(Semaphore::new(MAX_REFUSALS));
+    let write_timeout = Duration::from_millis(config.write_timeout_ms);
     let mut connections = JoinSet::new();
     let mut stopping = false;
     loop {
@@ -115,7 +116,7 @@ pub(super) async fn serve(
             Err(problem) => {
                 counter!(REJECTED, "reason" => problem.slug()).increment(1);
                 if let Ok(hold) = Arc::clone(&refusals).try_acquire_owned() {
-                    refuse(stream, &problem, hold, Pace::new(MinimumRate::new(&config)));
+                    refuse(stream, &problem, hold, Pace::new(write_timeout));
                 }
                 continue;
             }
@@ -124,11 +125,11 @@ pub(super) async fn serve(
             tracing::debug!(%error, "the client disconnected at once");
             continue;
         }
-        let pace = Pace::new(MinimumRate::new(&config));
+        let pace = Pace::new(write_timeout);
         let stream = Guarded::new(
             stream,
             (slot, GaugeGuard::new(gauge!(CONNECTIONS)), budget.buffers(CONNECTION_BYTES)),
-            MAX_TIME_FACTOR * Duration::from_millis(config.write_timeout_ms),
+            MAX_TIME_FACTOR * write_timeout,
             Arc::clone(&pace),
         );
         let run = connection(stream, (peer, pace), router.clone(), Arc::clone(&config), budget.clone(), stop.clone());
@@ -229,7 +230,7 @@ async fn connection(
 ) {
     let activity = Arc::new(Activity::default());
     let phase = stop.clone();
-    let (rate, broken) = (MinimumRate::new(&config), Arc::new(Notify::new()));
+    let (write_timeout, broken) = (Duration::from_millis(config.write_timeout_ms), Arc::new(Notify::new()));
     let service = service_fn(|request: Request<Incoming>| {
         let working = Working::on(&activity);
         let (phase, pace, version) = (phase.clone(), Arc::clone(&pace), request.version());
@@ -246,7 +247,7 @@ async fn connection(
             Ok::<_, Infallible>(Pace::watch(answer, &pace, version))
         }
     });
-    let builder = builder(&config, Streams::new(rate, &broken, budget));
+    let builder = builder(&config, Streams::new(write_timeout, &broken, budget));
     let connection = builder.serve_connection(TokioIo::new(stream), service);
     tokio::pin!(connection);
     let (mut stopping, mut in_grace) = (false, false);

@@ -21,7 +21,6 @@ use metrics::{Gauge, counter, gauge};
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
-use crate::config::ServerConfig;
 use crate::memory_budget::Budget;
 use crate::telemetry::{BODIES_OPEN, REJECTED};
 
@@ -45,38 +44,20 @@ tokio::task_local! {
     static STREAM: Arc<Pace>;
 }
 
-/// Time in which a client must read [`MIN_BYTES`].
-#[derive(Debug, Clone, Copy)]
-pub(super) struct MinimumRate {
-    within: Duration,
-}
-
-/// Bytes of a response body that a client must read within the time of its [`MinimumRate`]: half a kilobyte per second,
-/// so that a connection of 8 KiB/s carries a dozen concurrent bodies.
+/// Bytes of a response body that a client must read within `server.write_timeout_ms`: half a kilobyte per second, so
+/// that a connection of 8 KiB/s carries a dozen concurrent bodies.
 pub(super) const MIN_BYTES: u64 = 16 << 10;
 
 /// Number of bytes for which a client may pause one second longer.
 const BYTES_PER_SECOND: u64 = 16 << 10;
-/// Maximum time without progress, as a multiple of the rate's time.
+/// Maximum time without progress, as a multiple of `server.write_timeout_ms`.
 pub(super) const MAX_TIME_FACTOR: u32 = 4;
-
-impl MinimumRate {
-    /// Returns the time for the next bytes of a client that has read `total` bytes. A slow client on a fast line fills
-    /// the buffers of its system first, then pauses until it has read a part of these megabytes.
-    fn allowed_time(&self, total: u64) -> Duration {
-        let more = Duration::from_secs(total / BYTES_PER_SECOND);
-        self.within.saturating_add(more).min(MAX_TIME_FACTOR * self.within)
-    }
-
-    pub(super) fn new(config: &ServerConfig) -> Self {
-        Self { within: Duration::from_millis(config.write_timeout_ms) }
-    }
-}
 
 /// Pace at which one client reads its bodies.
 #[derive(Debug)]
 pub(super) struct Pace {
-    rate: MinimumRate,
+    /// Time in which the client must read [`MIN_BYTES`].
+    within: Duration,
     state: Mutex<PaceState>,
 }
 
@@ -84,7 +65,7 @@ pub(super) struct Pace {
 struct PaceState {
     /// Bytes that hyper holds and the client has not read.
     offered: u64,
-    /// Bytes read since `since`, fewer than the rate requires.
+    /// Bytes read since `since`, fewer than [`MIN_BYTES`].
     taken: u64,
     since: Instant,
     /// Bytes read in all.
@@ -94,9 +75,17 @@ struct PaceState {
 }
 
 impl Pace {
-    pub(super) fn new(rate: MinimumRate) -> Arc<Self> {
+    /// Creates the pace of a client that must read [`MIN_BYTES`] within this time.
+    pub(super) fn new(within: Duration) -> Arc<Self> {
         let state = PaceState { offered: 0, taken: 0, since: Instant::now(), total: 0, waker: None };
-        Arc::new(Self { rate, state: Mutex::new(state) })
+        Arc::new(Self { within, state: Mutex::new(state) })
+    }
+
+    /// Returns the time for the next bytes of a client that has read `total` bytes. A slow client on a fast line fills
+    /// the buffers of its system first, then pauses until it has read a part of these megabytes.
+    fn allowed_time(&self, total: u64) -> Duration {
+        let more = Duration::from_secs(total / BYTES_PER_SECOND);
+        self.within.saturating_add(more).min(MAX_TIME_FACTOR * self.within)
     }
 
     /// Returns the size of a piece, a power of two that grows while an HTTP/1.1 client reads. Each stream of HTTP/2 has
@@ -150,7 +139,7 @@ impl Pace {
         std::future::poll_fn(|cx| self.poll_taken(cx)).await;
     }
 
-    /// Waits until the client was too slow for the whole time of the rate.
+    /// Waits until the client was too slow for the whole time that it has.
     pub(super) async fn stalled(&self) {
         loop {
             let now = Instant::now();
@@ -158,7 +147,7 @@ impl Pace {
                 let state = self.state();
                 // Without outstanding bytes the time starts now.
                 let since = if state.offered == 0 { now } else { state.since };
-                since + self.rate.allowed_time(state.total)
+                since + self.allowed_time(state.total)
             };
             if due <= now {
                 return;
@@ -296,14 +285,15 @@ impl HttpBody for Paced {
 /// stream is charged to `budget`.
 #[derive(Clone)]
 pub(super) struct Streams {
-    rate: MinimumRate,
+    /// Time in which a client must read [`MIN_BYTES`].
+    within: Duration,
     broken: Arc<Notify>,
     budget: Budget,
 }
 
 impl Streams {
-    pub(super) fn new(rate: MinimumRate, broken: &Arc<Notify>, budget: Budget) -> Self {
-        Self { rate, broken: Arc::clone(broken), budget }
+    pub(super) fn new(within: Duration, broken: &Arc<Notify>, budget: Budget) -> Self {
+        Self { within, broken: Arc::clone(broken), budget }
     }
 }
 
@@ -313,7 +303,7 @@ where
     F::Output: Send,
 {
     fn execute(&self, stream: F) {
-        let (pace, broken) = (Pace::new(self.rate), Arc::clone(&self.broken));
+        let (pace, broken) = (Pace::new(self.within), Arc::clone(&self.broken));
         let buffers = self.budget.buffers(STREAM_BUFFER as u64);
         tokio::spawn(async move {
             let stalled = tokio::select! {
@@ -322,7 +312,7 @@ where
             };
             if stalled {
                 cut_off();
-                if tokio::time::timeout(pace.rate.within, pace.taken()).await.is_err() {
+                if tokio::time::timeout(pace.within, pace.taken()).await.is_err() {
                     broken.notify_one();
                 }
             }
@@ -339,7 +329,7 @@ mod tests {
     #[tokio::test]
     async fn streams_are_charged_to_the_memory_budget() {
         let (budget, done) = (Budget::new(STREAM_BUFFER as u64), Arc::new(Notify::new()));
-        let streams = Streams::new(MinimumRate::new(&ServerConfig::default()), &Arc::default(), budget.clone());
+        let streams = Streams::new(Duration::from_secs(30), &Arc::default(), budget.clone());
         for _ in 0..2 {
             let done = Arc::clone(&done);
             streams.execute(async move { done.notified().await });

@@ -257,7 +257,6 @@ async fn open_jobs(config: &Config, store: &Store, pool: &Arc<Pool>, secret: Sec
         }
         None => Arc::new(MemoryBroker::new(config.broker.queue)),
     };
-    let broker = (broker, config.broker.queue);
     Ok(JobStore::new(store.clone(), Arc::clone(pool), broker, jobs, output_bytes, secret, describe))
 }
 

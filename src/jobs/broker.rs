@@ -102,6 +102,9 @@ pub(crate) trait Broker: Send + Sync {
     /// Returns the number of queued jobs.
     fn queued(&self) -> usize;
 
+    /// Returns the maximum number of queued jobs.
+    fn limit(&self) -> usize;
+
     /// Returns how often the broker may have lost jobs.
     fn losses(&self) -> usize;
 

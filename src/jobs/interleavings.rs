@@ -12,30 +12,16 @@ use shuttle::future::block_on;
 
 use super::coalesced_job::QueuedTask;
 use super::queue::Queue;
-use super::rank::{Client, DEFAULT_URGENCY, Lane, Rank};
-use super::{Failure, Input, Refusal, Task, Ticket};
-use crate::pipeline::params;
-use crate::store::{Digest, Namespace};
+use super::rank::{Lane, Rank};
+use super::{Failure, Refusal, Task, Ticket};
 use crate::sync::thread::{self, JoinHandle};
-use crate::telemetry::SpanParent;
 
 /// Number of schedules of a test.
 const SCHEDULES: usize = 10_000;
 
 /// Creates a task; tasks of the same number are identical.
 fn task(number: u8, batch: bool) -> Task {
-    let file = Bytes::from(vec![number]);
-    Task {
-        digest: Digest::of(&file),
-        input: Input::File(file),
-        namespace: Namespace::default(),
-        strict: false,
-        job: params::parse(std::iter::empty::<(&str, &str)>()).unwrap().job,
-        rank: Rank { client: Client::named("a"), batch, urgency: DEFAULT_URGENCY },
-        reservation: None,
-        parent: SpanParent::default(),
-        id: None,
-    }
+    Task::of_test(Bytes::from(vec![number]), &[], Rank { batch, ..Rank::default() })
 }
 
 fn push(queue: &Arc<Queue>, number: u8, batch: bool) -> Result<Ticket, Refusal> {

@@ -83,8 +83,6 @@ pub(super) struct JobStoreState {
     pub(super) store: Store,
     pub(super) pool: Arc<Pool>,
     pub(super) broker: Arc<dyn Broker>,
-    /// Maximum number of queued jobs.
-    pub(super) max_queued: usize,
     pub(super) config: JobsConfig,
     /// Maximum size of a result, bytes.
     pub(super) output_bytes: u64,
@@ -158,7 +156,7 @@ impl JobStore {
     pub(crate) fn new(
         store: Store,
         pool: Arc<Pool>,
-        (broker, max_queued): (Arc<dyn Broker>, usize),
+        broker: Arc<dyn Broker>,
         config: JobsConfig,
         output_bytes: u64,
         secret: Secret,
@@ -169,7 +167,6 @@ impl JobStore {
             store,
             pool,
             broker,
-            max_queued,
             config,
             output_bytes,
             describe,
@@ -229,7 +226,7 @@ impl JobStore {
             tracing::warn!(why, "a job was rejected, because it cannot be dispatched");
             return Err(AcceptError::BrokerDown);
         }
-        if is_dispatched && inner.broker.queued() >= inner.max_queued {
+        if is_dispatched && inner.broker.queued() >= inner.broker.limit() {
             return Err(self.queue_full(&spec.task).into());
         }
         let (digest, map) = (spec.task.digest, spec.map.as_ref().map(|(digest, _)| *digest));

@@ -61,8 +61,8 @@ impl Fixture {
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
         let broker = MemoryBroker::new(1000);
-        let dispatch = (Arc::new(broker.clone()) as _, 1000);
-        let jobs = JobStore::new(store.clone(), pool, dispatch, config, 1 << 30, [0; 32], describe);
+        let shared = Arc::new(broker.clone());
+        let jobs = JobStore::new(store.clone(), pool, shared, config, 1 << 30, [0; 32], describe);
         jobs.start_claiming();
         Self { faults, store, jobs, broker, dir }
     }
@@ -132,19 +132,27 @@ impl Fixture {
     }
 }
 
+impl Task {
+    /// Returns a task for tests.
+    pub(super) fn of_test(file: Bytes, parameters: &[(&str, &str)], rank: Rank) -> Self {
+        Self {
+            digest: Digest::of(&file),
+            input: Input::File(file),
+            namespace: Namespace::default(),
+            strict: false,
+            job: params::parse(parameters.iter().copied()).unwrap().job,
+            rank,
+            reservation: None,
+            parent: SpanParent::default(),
+            id: None,
+        }
+    }
+}
+
 /// Returns a task of a client.
 fn task(client: &str, resolution: &str) -> Task {
-    Task {
-        input: Input::File(Bytes::from_static(SAMPLE)),
-        digest: Digest::of(SAMPLE),
-        namespace: Namespace::default(),
-        strict: false,
-        job: params::parse([("resolution", resolution)]).unwrap().job,
-        rank: Rank { client: Client::named(client), batch: true, urgency: DEFAULT_URGENCY },
-        reservation: None,
-        parent: SpanParent::default(),
-        id: None,
-    }
+    let rank = Rank { client: Client::named(client), batch: true, ..Rank::default() };
+    Task::of_test(Bytes::from_static(SAMPLE), &[("resolution", resolution)], rank)
 }
 
 fn new_id() -> JobId {
@@ -227,7 +235,7 @@ async fn a_result_that_is_never_stored_is_computed_for_every_attempt() {
     fixture.jobs = JobStore::new(
         fixture.store.clone(),
         Arc::clone(&fixture.jobs.0.pool),
-        (Arc::new(MemoryBroker::new(8)), 8),
+        Arc::new(MemoryBroker::new(8)),
         fixture.jobs.0.config.clone(),
         100,
         [0; 32],

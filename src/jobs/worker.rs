@@ -258,26 +258,12 @@ mod tests {
     use std::sync::atomic::{AtomicBool, Ordering};
 
     use super::*;
-    use crate::jobs::rank::{DEFAULT_URGENCY, Rank};
-    use crate::jobs::{Budget, Client, Input, Pool};
-    use crate::pipeline::params;
-    use crate::store::{Digest, Namespace};
+    use crate::jobs::{Budget, Pool, Rank};
     use crate::surface::ReferenceBackend;
-    use crate::telemetry::SpanParent;
 
     fn task(resolution: &str) -> Task {
         let file = Bytes::from_static(include_bytes!("../../samples/4pti.pdb"));
-        Task {
-            digest: Digest::of(&file),
-            input: Input::File(file),
-            namespace: Namespace::default(),
-            strict: false,
-            job: params::parse([("resolution", resolution)]).unwrap().job,
-            rank: Rank { client: Client::named("a"), batch: false, urgency: DEFAULT_URGENCY },
-            reservation: None,
-            parent: SpanParent::default(),
-            id: None,
-        }
+        Task::of_test(file, &[("resolution", resolution)], Rank::default())
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

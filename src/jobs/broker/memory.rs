@@ -219,6 +219,10 @@ impl Broker for MemoryBroker {
         self.0.lock().waiting
     }
 
+    fn limit(&self) -> usize {
+        self.0.limit
+    }
+
     fn losses(&self) -> usize {
         0
     }

@@ -237,6 +237,10 @@ impl Broker for NatsBroker {
         self.0.queued.load(Ordering::Relaxed)
     }
 
+    fn limit(&self) -> usize {
+        self.0.config.queue
+    }
+
     fn losses(&self) -> usize {
         self.0.losses.load(Ordering::Acquire)
     }

@@ -58,8 +58,8 @@ impl Fixture {
         let config = JobsConfig { attempts: ATTEMPTS, ..JobsConfig::default() };
         let describe = |error: &EndError| Value::String(error.to_string());
         let broker = MemoryBroker::new(8);
-        let dispatch = (Arc::new(broker.clone()) as _, 8);
-        let jobs = JobStore::new(store.clone(), pool, dispatch, config, 1 << 20, [0; 32], describe);
+        let shared = Arc::new(broker.clone());
+        let jobs = JobStore::new(store.clone(), pool, shared, config, 1 << 20, [0; 32], describe);
         jobs.start_claiming();
         Self { jobs, queue, broker, store, objects, ends: Arc::default() }
     }

@@ -6,27 +6,14 @@ use std::time::Duration;
 use bytes::Bytes;
 
 use super::Queue;
-use crate::jobs::rank::{Client, DEFAULT_URGENCY, Lane, Rank};
-use crate::jobs::{Failure, Input, Refusal, Task};
-use crate::pipeline::{JobError, params};
-use crate::store::{Digest, Namespace};
+use crate::jobs::rank::{Lane, Rank};
+use crate::jobs::{Failure, Refusal, Task};
+use crate::pipeline::JobError;
 use crate::surface::SurfaceError;
-use crate::telemetry::SpanParent;
 
 /// Creates a task that takes long, on a file of this content.
 fn task(content: u8) -> Task {
-    let file = Bytes::from(vec![content]);
-    Task {
-        digest: Digest::of(&file),
-        input: Input::File(file),
-        namespace: Namespace::default(),
-        strict: false,
-        job: params::parse([("resolution", "0.01")]).unwrap().job,
-        rank: Rank { client: Client::named("a"), batch: false, urgency: DEFAULT_URGENCY },
-        reservation: None,
-        parent: SpanParent::default(),
-        id: None,
-    }
+    Task::of_test(Bytes::from(vec![content]), &[("resolution", "0.01")], Rank::default())
 }
 
 /// Returns the expected duration of the task.

@@ -33,7 +33,7 @@ async fn node(shared: &Path, broker: Arc<dyn Broker>) -> Node {
     let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
     let describe = |error: &EndError| Value::String(format!("{error:?}"));
     let secret = store.secret().await.unwrap();
-    let jobs = JobStore::new(store.clone(), pool, (broker, 1000), JobsConfig::default(), 1 << 30, secret, describe);
+    let jobs = JobStore::new(store.clone(), pool, broker, JobsConfig::default(), 1 << 30, secret, describe);
     Node { jobs, store }
 }
 
