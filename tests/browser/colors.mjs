@@ -6,7 +6,8 @@ import {
 } from "./lib.mjs";
 
 const chromium = await browser();
-const page = await start(chromium);
+// Small, because surfaces are compared by their pictures.
+const page = await start(chromium, { viewport: { width: 600, height: 600 } });
 const surfaces = () => page.requests.filter((line) => line.includes("/surface.glb")).length;
 const colored = (p) => p.evaluate(() => window.measures.filter((e) => e.atoms).length);
 const ready = (p) => p.waitForFunction(() => !document.querySelector("#colour").disabled, null, { timeout: TIMEOUT_MS });
@@ -92,7 +93,6 @@ await run({
     await ready(page);
     await waitForFrames(page);
     // Without a scheme the surface is grey, so that no hue of a legend is its own.
-    await page.setViewportSize({ width: 600, height: 600 });
     await page.evaluate(() => document.documentElement.style.setProperty("--plain", "#8a8a8a"));
     for (let i = 0; i < 3; i += 1) await page.locator("#theme").click();
     const plain = await stablePicture(page);
@@ -130,7 +130,6 @@ await run({
     const other = again.data.filter((value, i) => Math.abs(value - plain.data[i]) > 3).length;
     assert.ok(other < again.data.length / 1000, `${other} values differ from the picture without colours`);
     assert.equal(surfaces(), before + ofVertices.length);
-    await page.setViewportSize({ width: 1280, height: 800 });
     assertClean(page);
   },
 

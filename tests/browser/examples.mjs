@@ -55,7 +55,7 @@ await run({
   },
 
   "model-viewer shows a surface": async () => {
-    const page = await open(chromium, { url: `${origin}/model-viewer.html` });
+    const page = await open(chromium, { url: `${origin}/model-viewer.html`, viewport: { width: 480, height: 400 } });
     await page.waitForFunction(() => document.querySelector("#surface").loaded, null, { timeout: TIMEOUT_MS });
     await page.waitForFunction(() => document.querySelector("#surface").modelIsVisible, null, { timeout: TIMEOUT_MS });
     const shape = silhouette(await picture(page, "#surface"));

@@ -279,7 +279,7 @@ await run({
     // The initial turn starts and ends by itself, so an observer records it.
     const other = await start(chromium, {
       reducedMotion: "no-preference",
-      viewport: { width: 500, height: 500 },
+      viewport: { width: 320, height: 400 },
       before: (p) => p.addInitScript(() => new MutationObserver(() => (window.turned ||= !!document.querySelector('#turn[aria-pressed="true"]'))).observe(document, { subtree: true, childList: true, attributes: true })),
     });
     await other.waitForFunction(() => window.turned);

@@ -30,7 +30,7 @@ async function settled(of = page) {
       return isStill;
     },
     null,
-    { timeout: TIMEOUT_MS, polling: 1000 },
+    { timeout: TIMEOUT_MS, polling: 400 },
   );
   const [, tiles, triangles, spacing] = /^(\d+) tiles?, ([\d,]+) triangles, ([\d.]+)/.exec(await now(of));
   return { tiles: Number(tiles), triangles: Number(triangles.replaceAll(",", "")), spacing: Number(spacing) };
@@ -40,7 +40,7 @@ async function zoom(steps) {
   await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
   for (let i = 0; i < steps; i += 1) {
     await page.mouse.wheel(0, -400);
-    await page.waitForTimeout(50);
+    await page.waitForTimeout(20);
   }
 }
 const tileRequests = () => page.requests.filter((line) => line.includes("surface.glb?") && line.includes("tile="));
@@ -58,7 +58,7 @@ await run({
       `REMARK 350   BIOMT${k + 1} ${String(serial + 1).padStart(3)}${row.slice(0, 3).map((v) => v.toFixed(6).padStart(10)).join("")}${row[3].toFixed(5).padStart(15)}`;
     const rules = operators.flatMap((rows, serial) => rows.map((row, k) => line(row, k, serial)));
     const header = ["REMARK 350 BIOMOLECULE: 1", "REMARK 350 APPLY THE FOLLOWING TO CHAINS: A", ...rules, ""].join("\n");
-    const own = await start(chromium);
+    const own = await start(chromium, { viewport: { width: 640, height: 480 } });
     await waitForMesh(own, () => drop(own, "blocks.pdb", Buffer.concat([Buffer.from(header), block(48, 28, 24)])));
     const structure = new URL(own.url()).searchParams.get("structure");
     const shown = async (pairs) => {
@@ -117,7 +117,7 @@ await run({
     await page.mouse.move(box.x + box.width * 0.9, box.y + box.height / 2);
     for (let i = 0; i < 25; i += 1) {
       await page.mouse.wheel(0, -400);
-      await page.waitForTimeout(50);
+      await page.waitForTimeout(20);
     }
     await page.waitForFunction(() => /cannot be reached/.test(document.querySelector("#problem").textContent), null, { timeout: TIMEOUT_MS });
     await page.context().setOffline(false);

@@ -8,7 +8,7 @@ const PAGE = `<!doctype html><html lang="en"><meta charset="utf-8"><title>varian
 <script type="importmap">{ "imports": { "three": "/three/build/three.module.js" } }</script>
 <script type="module" src="/@google/model-viewer/dist/model-viewer.min.js"></script>
 <script>self.ModelViewerElement = { meshoptDecoderLocation: "/meshoptimizer/meshopt_decoder.cjs" };</script>
-<model-viewer id="viewer" style="width: 300px; height: 300px"></model-viewer>
+<model-viewer id="viewer" style="width: 64px; height: 64px"></model-viewer>
 <script type="module">
 import * as THREE from "three";
 import { GLTFLoader } from "/three/examples/jsm/loaders/GLTFLoader.js";
