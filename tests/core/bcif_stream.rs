@@ -318,15 +318,14 @@ fn changed_files_give_the_results_of_files_in_memory() {
     let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 1_000, ..ReadLimits::default() };
     let mut changed = CRAMBIN.to_vec();
     let (mut read_still, mut rejected) = (0, 0);
-    for at in (0..CRAMBIN.len()).step_by(11) {
+    for at in (0..CRAMBIN.len()).step_by(7) {
         // Values, lengths, extensions and containers.
-        for value in [changed[at] ^ 0x01, changed[at] ^ 0x80, 0xC7, 0xC6, 0xDD] {
-            changed[at] = value;
-            let outcome = assert_equal_results(&changed, &limits, 40, &(at, value));
-            read_still += usize::from(outcome == Outcome::Read);
-            rejected += usize::from(outcome == Outcome::NotAStream);
-            changed[at] = CRAMBIN[at];
-        }
+        let value = [changed[at] ^ 0x01, changed[at] ^ 0x80, 0xC7, 0xC6, 0xDD][at % 5];
+        changed[at] = value;
+        let outcome = assert_equal_results(&changed, &limits, 40, &(at, value));
+        read_still += usize::from(outcome == Outcome::Read);
+        rejected += usize::from(outcome == Outcome::NotAStream);
+        changed[at] = CRAMBIN[at];
     }
     assert!(read_still > 100 && rejected < read_still / 10, "{read_still} {rejected}");
 }

@@ -39,13 +39,20 @@ def points(corners, step):
 def largest_distance(own, other):
     """Returns the largest distance of points of the triangles `own` from the triangles `other`."""
     places, owners = points(other, STEP)
-    queries = points(own, STEP)[0]
+    # Triangles share the points of their edges.
+    queries = np.unique(points(own, STEP)[0].round(4), axis=0)
     _, near = cKDTree(places).query(queries, k=NEIGHBOURS)
-    best = np.full(len(queries), np.inf)
-    for column in near.T:
-        nearest = trimesh.triangles.closest_point(other[owners[column]], queries)
-        best = np.minimum(best, np.linalg.norm(nearest - queries, axis=1))
-    return float(best.max())
+
+    def distances(rows, neighbours):
+        found = [trimesh.triangles.closest_point(other[owners[column]], queries[rows]) for column in neighbours.T]
+        return np.min([np.linalg.norm(place - queries[rows], axis=1) for place in found], axis=0)
+
+    # The first neighbour bounds each distance, so that few points need the others.
+    bounds = distances(slice(None), near[:, :1])
+    rows = np.argsort(bounds)[-1000:]
+    largest = distances(rows, near[rows]).max()
+    rows = np.flatnonzero(bounds > largest)
+    return float(max(largest, distances(rows, near[rows]).max(initial=0)))
 
 
 def intersections(vertices, faces):
