@@ -42,7 +42,7 @@ pub(crate) struct GpuArgs {
     /// Measure only cases whose name contains one of these texts; 7cgo-x9-0.5 (gigabytes of mesh) only by its full name
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     only: Vec<String>,
-    /// Number of atoms of the generated case, which needs no file
+    /// Number of atoms of the generated case, which needs no file, and of the largest jobs of --pool
     #[arg(long, value_name = "N", default_value_t = 60_000)]
     atoms: usize,
     /// Encoding of vertices: none (single precision, 24 bytes each) or quantize (12 bytes)
@@ -82,7 +82,7 @@ pub(crate) fn run(args: &GpuArgs) -> Result<()> {
         return Err(Error::Usage("--runs, --atoms, --jobs, --pool and --callers must be at least 1".to_owned()));
     }
     let results = if let Some(n) = args.pool {
-        pool::run(&args.devices, n, args.callers)?
+        pool::run(&args.devices, n, args.callers, args.atoms)?
     } else if let Some(min_bricks) = args.spread {
         several::run(&args.devices, min_bricks, &loaded(args)?, args.runs)?
     } else {

@@ -31,13 +31,14 @@ struct PoolRate {
     shared: u64,
 }
 
-/// Runs `n` small jobs and fewer large ones on 1, 2, … devices of `choice`, with `callers` callers per device.
-pub(super) fn run(choice: &DeviceChoice, n: usize, callers: usize) -> Result<Value> {
+/// Runs `n` small jobs and fewer large ones, of up to `most` atoms, on 1, 2, … devices of `choice`, with `callers`
+/// callers per device.
+pub(super) fn run(choice: &DeviceChoice, n: usize, callers: usize, most: usize) -> Result<Value> {
     print("jobs at 0.5 Å, prepared by their callers, to a mesh in memory\n")?;
     print("   devices   atoms    jobs  callers         s    jobs/s  CPU ms/job  shared\n")?;
     let mut rates = Vec::new();
     on_more_devices(choice, &PoolSettings::default(), |backend, devices| {
-        for (atoms, share) in SIZES {
+        for (atoms, share) in SIZES.into_iter().filter(|(atoms, _)| *atoms <= most) {
             let (jobs, callers) = ((n * share).div_ceil(100), callers * devices);
             // The first jobs allocate buffers.
             run_jobs(backend, atoms, 2 * callers, callers)?;
