@@ -9,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
+.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -20,7 +20,7 @@ run: web-if-possible ## Build (the first time takes minutes) and serve on http:/
 install: web-if-possible ## Install the command molmesh, with the service and its web page, into ~/.cargo/bin
 	$(CARGO) install --path . --locked --profile fast-build
 
-STEPS := tools web fmt-check lint deny-if-installed matrix static-if-possible interleavings tests
+STEPS := web fmt-check lint matrix tools deny static-if-possible interleavings tests
 
 # The steps add a line to the file SKIPPED for each check that they skip. The step `tests` prints this file; after the
 # failure of another step, it is printed here.
@@ -63,13 +63,8 @@ matrix: ## Clippy on the other supported combinations of features
 interleavings: ## Explore interleavings of threads and tasks in the queue, durable jobs, the device pool and the store (Shuttle)
 	$(CARGO) test --quiet --locked --lib --features shuttle interleavings
 
-deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (three minutes) when absent
-	@command -v cargo-deny >/dev/null || $(CARGO) install cargo-deny --locked
-	$(CARGO) deny --workspace check licenses bans sources
-
-deny-if-installed:
-	@if command -v cargo-deny >/dev/null; then $(MAKE) --no-print-directory deny; \
-	else echo "SKIPPED: cargo-deny is not installed; make deny installs and runs it" | tee -a "$${SKIPPED:-/dev/null}"; fi
+deny: ## Licences, bans and sources of all dependencies, with cargo-deny, which `make tools` installs
+	PATH="$(CURDIR)/target/test-tools/venv/bin:$$PATH" $(CARGO) deny --workspace check licenses bans sources
 
 audit: ## Known vulnerabilities of dependencies; ADVISORY_DB=FOLDER names the database, ALLOW_SKIP=1 permits its absence
 	deploy/audit.sh
