@@ -126,10 +126,10 @@ release: web-if-possible ## Build the optimized binary, target/release/molmesh
 static: ## Build the command line as a static file for any Linux, CPU only: dist/molmesh; installs what it needs
 	deploy/static.sh
 
-# For the tests, without link-time optimization. Without Linux or network access, the tests of the static executable are
-# skipped, or fail if CI is set. A failed build is an error.
+# For the tests, with their profile, so that both share procedural macros and build scripts. Without Linux or network
+# access, the tests of the static executable are skipped, or fail if CI is set. A failed build is an error.
 static-if-possible:
-	@deploy/static.sh fast-build || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
+	@deploy/static.sh dev || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
 
 clean: ## Remove all build output
 	$(CARGO) clean

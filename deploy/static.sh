@@ -4,7 +4,7 @@
 # musl-tools and g++, if they are missing. Exits with 3 if these are not available, and with the build's status if the
 # build fails.
 #
-# `static.sh PROFILE` builds with another Cargo profile than release, for tests: only target/TARGET/PROFILE/molmesh.
+# `static.sh dev` builds with the profile of the tests: only target/TARGET/debug/molmesh.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # shellcheck source=deploy/container/engine.sh
@@ -29,9 +29,9 @@ cxx=CXX_${target//-/_}
 export "$cxx=${!cxx:-g++}"
 profile=${1:-release}
 cargo build --profile "$profile" --locked --bin molmesh --no-default-features --features cli --target "$target"
-if [ "$profile" != release ]; then
+if [ "$profile" = dev ]; then
     # A build without changes counts as new.
-    touch "target/$target/$profile/molmesh"
+    touch "target/$target/debug/molmesh"
     exit
 fi
 mkdir -p dist

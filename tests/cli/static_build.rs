@@ -1,4 +1,4 @@
-//! The static executable, without the service. `make test` builds it with the profile `fast-build`.
+//! The static executable, without the service. `make test` builds it with the profile of the tests.
 #![cfg(target_os = "linux")]
 #![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
@@ -26,7 +26,7 @@ fn changed(path: &Path) -> SystemTime {
 /// Returns the static executable, if it is newer than the sources.
 fn tool() -> Option<PathBuf> {
     let root = Path::new(ROOT);
-    let tool = root.join(format!("target/{}-unknown-linux-musl/fast-build/molmesh", std::env::consts::ARCH));
+    let tool = root.join(format!("target/{}-unknown-linux-musl/debug/molmesh", std::env::consts::ARCH));
     let built = fs::metadata(&tool).and_then(|meta| meta.modified()).ok();
     let sources = ["src", "Cargo.toml", "Cargo.lock"].map(|name| changed(&root.join(name))).into_iter().max();
     if built.is_some() && built >= sources {
