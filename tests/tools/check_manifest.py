@@ -9,6 +9,9 @@ import json
 import pathlib
 import sys
 
+# jsonschema would spend seconds on the grammars of a format that is not checked here.
+sys.modules["rfc3987_syntax"] = None
+
 import jsonschema
 import kubernetes_validate
 import yaml
