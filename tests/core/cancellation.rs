@@ -288,7 +288,7 @@ fn simplifications_and_improvements_end_soon_after_cancellation_at_any_time() {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
     for (stage, parameter) in [("simplify", ("simplify", "0.1")), ("improve", ("quality", "high"))] {
-        let (input, job) = (lattice(12), job(&[("resolution", "0.5"), parameter]));
+        let (input, job) = (lattice(8), job(&[("resolution", "0.5"), parameter]));
         let run = |control: &Control<'_>, progress: &dyn ProgressSink| {
             pipeline::run(&input, &job, &JobLimits::default(), &choice, control, progress, None)
         };
@@ -315,7 +315,7 @@ fn pictures_end_soon_after_cancellation_at_any_time() {
     let coarse = job(&[("resolution", "0.7")]);
     let product =
         pipeline::run(&lattice(20), &coarse, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
-    let picture = PictureParams { width: 4096, height: 4096, ..PictureParams::default() };
+    let picture = PictureParams { width: 2048, height: 2048, ..PictureParams::default() };
     let renderer = SelectedRenderer::cpu("set by a test");
     let draw = |at: &CancelIn| pipeline::draw(&mut product.clone(), &picture, &renderer, &at.control(), at);
     let mut whole = product.clone();

@@ -93,7 +93,7 @@ fn a_device_draws_the_picture_of_the_cpu() {
 #[test]
 fn pictures_end_soon_after_cancellation() {
     let Some(gpu) = gpu(false) else { return };
-    let large = PictureParams { width: 2800, height: 2800, ..params(Style::Surface, View::Front) };
+    let large = PictureParams { width: 2000, height: 2000, ..params(Style::Surface, View::Front) };
     let mesh = Arc::new(balls());
     let begun = Instant::now();
     gpu.render(&mesh, &large, &Control::default()).unwrap();
