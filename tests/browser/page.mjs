@@ -278,6 +278,7 @@ await run({
     await stablePicture(page);
     // The initial turn starts and ends by itself, so an observer records it.
     const other = await start(chromium, {
+      url: `${SERVICE_URL}/?resolution=1.5`,
       reducedMotion: "no-preference",
       viewport: { width: 320, height: 400 },
       before: (p) => p.addInitScript(() => new MutationObserver(() => (window.turned ||= !!document.querySelector('#turn[aria-pressed="true"]'))).observe(document, { subtree: true, childList: true, attributes: true })),

@@ -58,7 +58,7 @@ await run({
       `REMARK 350   BIOMT${k + 1} ${String(serial + 1).padStart(3)}${row.slice(0, 3).map((v) => v.toFixed(6).padStart(10)).join("")}${row[3].toFixed(5).padStart(15)}`;
     const rules = operators.flatMap((rows, serial) => rows.map((row, k) => line(row, k, serial)));
     const header = ["REMARK 350 BIOMOLECULE: 1", "REMARK 350 APPLY THE FOLLOWING TO CHAINS: A", ...rules, ""].join("\n");
-    const own = await start(chromium, { viewport: { width: 640, height: 480 } });
+    const own = await start(chromium, { viewport: { width: 500, height: 400 } });
     await waitForMesh(own, () => drop(own, "blocks.pdb", Buffer.concat([Buffer.from(header), block(48, 28, 24)])));
     const structure = new URL(own.url()).searchParams.get("structure");
     const shown = async (pairs) => {
