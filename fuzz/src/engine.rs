@@ -230,7 +230,7 @@ mod tests {
         for target in TARGETS {
             assert!(!seeds(&crate::corpus(target.name)).unwrap().is_empty(), "{} has no seeds", target.name);
             // Without counters, all mutations start from seeds.
-            let passed = crate::one(target.name, 2, fastrand::u64(..), Coverage::default());
+            let passed = crate::one(target.name, 1, fastrand::u64(..), Coverage::default());
             assert_eq!(passed, Ok(true), "{}", target.name);
         }
         // Negative controls.
