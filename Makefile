@@ -52,11 +52,10 @@ lint: ## Clippy and documentation of everything; warnings are errors
 	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --quiet
 
-# `lint` checks all features together. No code of the library depends on `cli`, so that `cli,gpu` and `cli,server` check
-# the library with `gpu` and with `server` alone as well.
+# `lint` checks all features together, and `static-if-possible` compiles `cli` alone. No code of the library depends on
+# `cli`, so that `cli,gpu` and `cli,server` check the library with `gpu` and with `server` alone as well.
 matrix: ## Clippy on the other supported combinations of features
 	$(CARGO) clippy --locked --lib --no-default-features -- -D warnings
-	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
 
@@ -128,10 +127,11 @@ release: web-if-possible ## Build the optimized binary, target/release/molmesh
 static: ## Build the command line as a static file for any Linux, CPU only: dist/molmesh; installs what it needs
 	deploy/static.sh
 
-# For the tests, with their profile, so that both share procedural macros and build scripts. Without Linux or network
-# access, the tests of the static executable are skipped, or fail if CI is set. A failed build is an error.
+# For the tests, with their profile, so that both share procedural macros and build scripts. Warnings are errors. Without
+# Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A failed build is an
+# error.
 static-if-possible:
-	@deploy/static.sh dev || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
+	@RUSTFLAGS="-D warnings" deploy/static.sh dev || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
 
 clean: ## Remove all build output
 	$(CARGO) clean
