@@ -63,7 +63,8 @@ fn difference(a: &Mesh, b: &Mesh) -> Option<&'static str> {
 /// Asserts that `devices` devices made the mesh and that one device gives the same bytes. Returns the mesh.
 #[track_caller]
 fn assert_same(ran: &CompletedJob, job: &GpuJob, devices: usize, what: &str) -> Mesh {
-    assert_equals(ran, &run(&mut engine(), job).unwrap().meshed, job, devices, what)
+    let alone = run(&mut engine(), job).unwrap().meshed;
+    assert_equals(ran, &alone, job, devices, what)
 }
 
 /// The same, with the mesh of one device.
