@@ -127,9 +127,9 @@ release: web-if-possible ## Build the optimized binary, target/release/molmesh
 static: ## Build the command line as a static file for any Linux, CPU only: dist/molmesh; installs what it needs
 	deploy/static.sh
 
-# For the tests, with their profile, so that both share procedural macros and build scripts. Warnings are errors. Without
-# Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A failed build is an
-# error.
+# For the tests, with their profile, so that both share procedural macros and build scripts. Warnings are errors.
+# Without Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A failed build
+# is an error.
 static-if-possible:
 	@RUSTFLAGS="-D warnings" deploy/static.sh dev || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
 

@@ -17,7 +17,7 @@ const sharp = require("sharp");
 /** Maximum time of one step, ms. A machine that runs ten other tests may need minutes. */
 export const TIMEOUT_MS = 180_000;
 
-/** Starts a browser that reaches only this machine and renders WebGL, but not the page around it, with a software GPU. */
+/** Starts a browser that reaches only this machine. A software GPU renders WebGL, but not the page around it. */
 export async function browser(...flags) {
   const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1", ...flags];
   return chromium.launch({ executablePath: MOLMESH_CHROMIUM, args, timeout: TIMEOUT_MS });
