@@ -16,12 +16,12 @@ import math
 import random
 
 # Claims per second of one NATS server (test `jobs_are_dispatched_and_claimed_concurrently`).
-CLAIMS_PER_SECOND = 1_200
+CLAIMS_PER_SECOND = 5_000
 # Requests of one job to an S3 store (`benches/load/store_requests.py`).
 WRITES_PER_JOB, READS_PER_JOB = 6, 20
-# Messages of one job to NATS, without the answers: dispatch, two announcements, requests to three queues (a job of
-# normal urgency is in the third), lock, release of the lock, acknowledgement, and four events.
-MESSAGES_PER_JOB = 13
+# Messages of one job to NATS, without the answers and copies: dispatch, two announcements, a request, lock, release of
+# the lock, acknowledgement, and four events.
+MESSAGES_PER_JOB = 11
 # Time of a job beside its mesh: requests to queue and store, s.
 OVERHEAD = 0.05
 # Standard deviation of the logarithm of the time of a job.

@@ -165,6 +165,7 @@ impl Broker for NatsBroker {
             match sent.map_err(|error| failed(&error))?.await {
                 Ok(_) => {
                     self.0.queued.fetch_add(1, Ordering::Relaxed);
+                    // The announcement reaches this node later.
                     lock(&self.0.empty).note_job(job.queue(), Instant::now());
                     self.0.announce(job).await;
                     Ok(true)

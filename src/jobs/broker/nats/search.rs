@@ -82,7 +82,7 @@ impl NatsState {
 
     /// Waits for a job and claims it, or returns an error of the server. `None` if there are no queues.
     pub(super) async fn search(&self, prefers_gpu: bool) -> Result<Option<Claim>, String> {
-        // A busy node finds jobs in the queues and is no receiver of announcements, which it would have to pass on.
+        // A busy node finds jobs in the queues. It does not join those that share announcements and must pass them on.
         let mut announcements = None;
         let mut poll = Instant::now() + POLL;
         let mut asked = lock(&self.order).next(prefers_gpu).to_vec();
@@ -124,8 +124,10 @@ impl NatsState {
         let mut unsuited = Vec::new();
         let mut end = *poll;
         loop {
-            match timeout_at(end, announcements.next()).await {
-                Ok(Some(message)) => {
+            // A timeout alone would not end while messages arrive.
+            let message = if Instant::now() < end { timeout_at(end, announcements.next()).await.ok() } else { None };
+            match message {
+                Some(Some(message)) => {
                     let queue = announced_queue(&message).filter(|queue| !unsuited.contains(queue));
                     let Some(queue) = queue else { continue };
                     if suits_gpu(queue) == prefers_gpu {
@@ -137,9 +139,9 @@ impl NatsState {
                     }
                     unsuited.push(queue);
                 }
-                Ok(None) => return Err("the connection is closed".to_owned()),
-                Err(_elapsed) if !unsuited.is_empty() => return Ok(unsuited),
-                Err(_elapsed) => {
+                Some(None) => return Err("the connection is closed".to_owned()),
+                None if !unsuited.is_empty() => return Ok(unsuited),
+                None => {
                     *poll = Instant::now() + POLL;
                     // A job of a stopped worker returns without an announcement.
                     if self.queued.load(Ordering::Relaxed) > 0 {
@@ -151,26 +153,58 @@ impl NatsState {
         }
     }
 
-    /// Claims the first job of a queue.
+    /// Claims the first job of a queue, and removes messages of other programs before it.
     async fn fetch(&self, queue: &Queue) -> Result<Option<Claim>, String> {
-        let fetched = async {
-            let mut messages = queue.fetch().max_messages(1).messages().await.map_err(|error| error.to_string())?;
-            messages.next().await.transpose().map_err(|error| error.to_string())
-        };
-        let fetched =
-            timeout(REQUEST, fetched).await.map_err(|_elapsed| "no answer to a request for jobs".to_owned())??;
-        let Some(message) = fetched else { return Ok(None) };
-        if message.info().is_ok_and(|info| info.delivered > 1) {
-            counter!(BROKER_REDELIVERIES).increment(1);
-        }
-        let (message, acker) = message.split();
-        let id = message.subject.as_str().rsplit('.').next().and_then(|id| id.parse().ok());
-        let Some(id) = id else {
-            // A message of another program.
+        loop {
+            let fetched = async {
+                let mut messages = queue.fetch().max_messages(1).messages().await.map_err(|error| error.to_string())?;
+                messages.next().await.transpose().map_err(|error| error.to_string())
+            };
+            let fetched =
+                timeout(REQUEST, fetched).await.map_err(|_elapsed| "no answer to a request for jobs".to_owned())??;
+            let Some(message) = fetched else { return Ok(None) };
+            if message.info().is_ok_and(|info| info.delivered > 1) {
+                counter!(BROKER_REDELIVERIES).increment(1);
+            }
+            let (message, acker) = message.split();
+            if let Some(id) = message.subject.as_str().rsplit('.').next().and_then(|id| id.parse().ok()) {
+                let interval = Duration::from_millis(self.config.lease_ms / 3);
+                return Ok(Some(Claim::new(id, NatsLease::start(acker, interval, self.endings.clone()))));
+            }
             drop(acker.ack_with(AckKind::Term).await);
-            return Ok(None);
-        };
-        let interval = Duration::from_millis(self.config.lease_ms / 3);
-        Ok(Some(Claim::new(id, NatsLease::start(acker, interval, self.endings.clone()))))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::jobs::broker::tests::on_nats;
+
+    #[tokio::test]
+    async fn an_announcement_is_passed_on_once() {
+        on_nats(async |server| {
+            let connection = async_nats::connect(server.address()).await.unwrap();
+            let mut passed_on = HeaderMap::new();
+            passed_on.insert(PASSED_ON, "true");
+            for (headers, expected) in [(None, 1), (Some(passed_on), 0)] {
+                let received = connection.subscribe("announcements").await.unwrap();
+                let mut observed = connection.subscribe("announcements").await.unwrap();
+                if let Some(headers) = headers {
+                    connection.publish_with_headers("announcements", headers, "job".into()).await.unwrap();
+                } else {
+                    connection.publish("announcements", "job".into()).await.unwrap();
+                }
+                assert_eq!(observed.next().await.unwrap().payload.as_ref(), b"job");
+                pass_on(received, connection.clone()).await;
+                connection.publish("announcements", "end".into()).await.unwrap();
+                let mut n = 0;
+                while observed.next().await.unwrap().payload.as_ref() != b"end" {
+                    n += 1;
+                }
+                assert_eq!(n, expected);
+            }
+        })
+        .await;
     }
 }

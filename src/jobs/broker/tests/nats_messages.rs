@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use async_nats::{HeaderMap, Subscriber};
+use async_nats::Subscriber;
 use futures_util::StreamExt as _;
 
 use super::super::order::QUEUES;
@@ -110,34 +110,6 @@ async fn a_job_has_at_most_four_announcements_however_many_nodes_there_are() {
         }
         let n = count(&mut announcements).await;
         assert!((2 * JOBS..=4 * JOBS).contains(&n), "{n} announcements of {JOBS} jobs");
-    })
-    .await;
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_announcement_is_passed_on_once() {
-    on_nats(async |server| {
-        let node: Arc<dyn Broker> = Arc::new(nats(server).await);
-        let connection = async_nats::connect(server.address()).await.unwrap();
-        let mut announcements = observe(server, "molmesh.new.*").await;
-        let mut passed_on = HeaderMap::new();
-        passed_on.insert("Passed-On", "true");
-        for (headers, is_passed_on) in [(HeaderMap::new(), true), (passed_on, false)] {
-            let waiting = {
-                let node = Arc::clone(&node);
-                tokio::spawn(async move { node.claim(false).await })
-            };
-            tokio::time::sleep(ARRIVAL).await;
-            put(&connection, "normal-cpu", &job(DEFAULT_URGENCY)).await;
-            // They arrive together: the node claims the job after the first one.
-            for _ in 0..JOBS {
-                let sent = connection.publish_with_headers("molmesh.new.cpu", headers.clone(), "normal-cpu".into());
-                sent.await.unwrap();
-            }
-            waiting.await.unwrap().done().await;
-            let n = count(&mut announcements).await;
-            assert_eq!(n > JOBS, is_passed_on, "{n} announcements");
-        }
     })
     .await;
 }
