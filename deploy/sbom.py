@@ -34,6 +34,7 @@ def crates(path):
     def ref(text):
         if text.startswith(at):
             return APPLICATION
+        text = re.sub(r"^path\+[^#]*#", "workspace/", text)
         return re.sub(r"^registry\+[^#]*#", "crates/", text)
 
     application = {key: own[key] for key in ("type", "name", "version", "description", "licenses")}
@@ -41,6 +42,9 @@ def crates(path):
     bom["metadata"]["component"] = application
     for component in bom["components"]:
         component["bom-ref"] = ref(component["bom-ref"])
+        # cargo-cyclonedx adds the folder.
+        if component["bom-ref"].startswith("workspace/"):
+            component["purl"] = f"pkg:cargo/{component['name']}@{component['version']}"
     for edge in bom["dependencies"]:
         edge["ref"] = ref(edge["ref"])
         edge["dependsOn"] = sorted({ref(text) for text in edge.get("dependsOn", [])})

@@ -18,7 +18,7 @@ SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct 2>/dev/null || 
 export SOURCE_DATE_EPOCH
 mkdir -p dist
 # cargo-cyclonedx always writes beside the manifest of each package.
-trap 'rm -f molmesh.crates.json bench/molmesh.crates.json target/root.tar' EXIT
+trap 'rm -f molmesh.crates.json */molmesh.crates.json crates/*/molmesh.crates.json target/root.tar' EXIT
 cargo cyclonedx -qq --format json --spec-version 1.5 --target "$target" --override-filename molmesh.crates
 python3 deploy/sbom.py molmesh.crates.json >dist/molmesh.cdx.json
 files=(dist/molmesh.cdx.json)

@@ -19,12 +19,6 @@
 //! backend and the `server` feature the HTTP service. All lengths are ångström. `ARCHITECTURE.md` describes the
 //! folders.
 
-pub mod formats;
-pub mod picture;
-pub mod pipeline;
-pub mod structure;
-pub mod surface;
-
 #[cfg(feature = "server")]
 pub mod access;
 #[cfg(feature = "server")]
@@ -36,8 +30,6 @@ pub mod config;
 #[cfg(feature = "server")]
 #[doc(hidden)]
 pub mod fuzzing;
-#[cfg(feature = "gpu")]
-pub mod gpu;
 #[cfg(feature = "server")]
 pub mod http;
 #[cfg(feature = "server")]
@@ -50,13 +42,20 @@ mod reader_line;
 mod single_flight;
 #[cfg(feature = "server")]
 pub mod store;
-#[cfg(any(feature = "server", feature = "gpu"))]
-mod sync;
 #[cfg(feature = "server")]
 pub mod telemetry;
 #[cfg(feature = "server")]
 mod tls;
 
+pub use molmesh_formats as formats;
+#[cfg(feature = "gpu")]
+pub use molmesh_gpu as gpu;
+pub use molmesh_picture as picture;
+pub use molmesh_pipeline as pipeline;
+pub use molmesh_structure as structure;
+pub use molmesh_surface as surface;
+#[cfg(feature = "server")]
+use molmesh_sync as sync;
 pub use pipeline::{Job as Options, JobError as Error};
 pub use surface::Mesh;
 

@@ -14,7 +14,7 @@ SMOOTHNESS, TOLERANCE = 1.25, 0.01
 TAIL = math.log(1 / TOLERANCE)
 END = 1 + TAIL / SMOOTHNESS
 SCALE = 1 / (1 - TOLERANCE * (1 + TAIL))
-CASES = Path(__file__).resolve().parents[2] / "src/surface/cases.rs"
+CASES = Path(__file__).resolve().parents[2] / "crates/surface/src/cases.rs"
 
 
 def case_table():

@@ -21,7 +21,7 @@ const SCHEDULES: usize = 10_000;
 
 /// Creates a task; tasks of the same number are identical.
 fn task(number: u8, batch: bool) -> Task {
-    Task::of_test(Bytes::from(vec![number]), &[], Rank { batch, ..Rank::default() })
+    Task::for_test(Bytes::from(vec![number]), &[], Rank { batch, ..Rank::default() })
 }
 
 fn push(queue: &Arc<Queue>, number: u8, batch: bool) -> Result<Ticket, Refusal> {

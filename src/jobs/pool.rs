@@ -40,7 +40,7 @@ pub(crate) struct Settings {
 #[cfg(test)]
 impl Settings {
     /// Returns settings for tests: CPU pictures and a small cache of structures.
-    pub(super) fn of_test(workers: usize, budget: Budget) -> Self {
+    pub(super) fn for_test(workers: usize, budget: Budget) -> Self {
         Self {
             workers,
             queue: 8,

@@ -57,7 +57,7 @@ impl Fixture {
 
     async fn open_within(dir: TempDir, config: JobsConfig, budget: Budget) -> Self {
         let (faults, store) = faulty_in(dir.path(), 1 << 30).await;
-        let settings = Settings::of_test(1, budget);
+        let settings = Settings::for_test(1, budget);
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
         let broker = MemoryBroker::new(1000);
@@ -134,7 +134,7 @@ impl Fixture {
 
 impl Task {
     /// Returns a task for tests.
-    pub(super) fn of_test(file: Bytes, parameters: &[(&str, &str)], rank: Rank) -> Self {
+    pub(super) fn for_test(file: Bytes, parameters: &[(&str, &str)], rank: Rank) -> Self {
         Self {
             digest: Digest::of(&file),
             input: Input::File(file),
@@ -152,7 +152,7 @@ impl Task {
 /// Returns a task of a client.
 fn task(client: &str, resolution: &str) -> Task {
     let rank = Rank { client: Client::named(client), batch: true, ..Rank::default() };
-    Task::of_test(Bytes::from_static(SAMPLE), &[("resolution", resolution)], rank)
+    Task::for_test(Bytes::from_static(SAMPLE), &[("resolution", resolution)], rank)
 }
 
 fn new_id() -> JobId {

@@ -263,12 +263,12 @@ mod tests {
 
     fn task(resolution: &str) -> Task {
         let file = Bytes::from_static(include_bytes!("../../samples/4pti.pdb"));
-        Task::of_test(file, &[("resolution", resolution)], Rank::default())
+        Task::for_test(file, &[("resolution", resolution)], Rank::default())
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn a_job_that_gives_its_worker_away_before_it_begins_runs_later() {
-        let settings = Settings::of_test(1, Budget::new(1 << 30));
+        let settings = Settings::for_test(1, Budget::new(1 << 30));
         let pool = Pool::without_workers(settings, Arc::new(ReferenceBackend), "a test".to_owned());
         let (shared, started) = (&pool.shared, Arc::new(AtomicBool::new(false)));
         let start = {

@@ -85,7 +85,8 @@ fn dockerfile_uses_the_compiler_of_the_package() {
 /// Returns the files that the build reads, relative to the root: sources, shaders, files that sources name by a
 /// relative path (`"../web/…"`), and the targets of the package, without which cargo rejects it.
 fn read_by_the_build() -> BTreeSet<PathBuf> {
-    let mut files: BTreeSet<PathBuf> = ["src", "shaders"].into_iter().flat_map(deploy_support::files).collect();
+    let mut files: BTreeSet<PathBuf> =
+        ["src", "crates", "shaders"].into_iter().flat_map(deploy_support::files).collect();
     let named: Vec<PathBuf> = files
         .iter()
         .filter(|path| path.extension().is_some_and(|extension| extension == "rs"))

@@ -28,7 +28,7 @@ fn tool() -> Option<PathBuf> {
     let root = Path::new(ROOT);
     let tool = root.join(format!("target/{}-unknown-linux-musl/debug/molmesh", std::env::consts::ARCH));
     let built = fs::metadata(&tool).and_then(|meta| meta.modified()).ok();
-    let sources = ["src", "Cargo.toml", "Cargo.lock"].map(|name| changed(&root.join(name))).into_iter().max();
+    let sources = ["src", "crates", "Cargo.toml", "Cargo.lock"].map(|name| changed(&root.join(name))).into_iter().max();
     if built.is_some() && built >= sources {
         return Some(tool);
     }

@@ -18,7 +18,7 @@ use molmesh::surface::{CpuBackend, arithmetic};
 struct Row {
     /// Path below the structure.
     path: &'static str,
-    /// Number in `src/pipeline/algorithm_versions.rs` of the code that it tests.
+    /// Number in `crates/pipeline/src/algorithm_versions.rs` of the code that it tests.
     number: &'static str,
 }
 
@@ -93,8 +93,8 @@ fn reused_etags(recorded: &Record, now: &Record) -> Option<String> {
         now.iter().filter(|(path, now)| is_reused(path, now)).map(|(path, _)| path.as_str()).collect();
     (!changed.is_empty()).then(|| {
         format!(
-            "other bytes have the same ETag: increase {} in src/pipeline/algorithm_versions.rs by one, then record the \
-             bytes with MOLMESH_BLESS=1 cargo nextest run --test http recorded_bytes\n{}",
+            "other bytes have the same ETag: increase {} in crates/pipeline/src/algorithm_versions.rs by one, then \
+             record the bytes with MOLMESH_BLESS=1 cargo nextest run --test http recorded_bytes\n{}",
             to_increase(&changed).join(" and "),
             changed.join("\n")
         )
@@ -154,8 +154,8 @@ fn recorded_bytes_have_not_changed() {
         other_etags(&recorded, &now),
         [""; 0],
         "their ETags have changed, so no stored result and no copy of a client can be used any more. If a number in \
-         src/pipeline/algorithm_versions.rs was increased, record the bytes with MOLMESH_BLESS=1 cargo nextest run \
-         --test http recorded_bytes; else the parameters of the key have changed"
+         crates/pipeline/src/algorithm_versions.rs was increased, record the bytes with MOLMESH_BLESS=1 cargo nextest \
+         run --test http recorded_bytes; else the parameters of the key have changed"
     );
 }
 

@@ -52,7 +52,7 @@ impl Fixture {
     fn new() -> Self {
         let (store, objects) = block_on(open_bytes(1 << 20));
         let budget = Budget::new(1 << 30);
-        let settings = Settings::of_test(2, budget);
+        let settings = Settings::for_test(2, budget);
         let pool = Arc::new(Pool::without_workers(settings, Arc::new(ReferenceBackend), "a test".to_owned()));
         let queue = Arc::clone(&pool.shared.queue);
         let config = JobsConfig { attempts: ATTEMPTS, ..JobsConfig::default() };

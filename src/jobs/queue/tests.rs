@@ -1,4 +1,4 @@
-//! Refusal of jobs that would begin too late, and the estimates that it depends on.
+//! Refusal of jobs that would end too late, and the estimates that it depends on.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,7 +13,7 @@ use crate::surface::SurfaceError;
 
 /// Creates a task that takes long, on a file of this content.
 fn task(content: u8) -> Task {
-    Task::of_test(Bytes::from(vec![content]), &[("resolution", "0.01")], Rank::default())
+    Task::for_test(Bytes::from(vec![content]), &[("resolution", "0.01")], Rank::default())
 }
 
 /// Returns the expected duration of the task.

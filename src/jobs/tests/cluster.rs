@@ -29,7 +29,7 @@ async fn node(shared: &Path, broker: Arc<dyn Broker>) -> Node {
     let url = Some(format!("file://{}", shared.display()));
     let store = Store::open_shared(&StoreConfig { url, ..StoreConfig::default() }, shared).await.unwrap();
     let budget = Budget::new(1 << 30);
-    let settings = Settings::of_test(1, budget);
+    let settings = Settings::for_test(1, budget);
     let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
     let describe = |error: &EndError| Value::String(format!("{error:?}"));
     let secret = store.secret().await.unwrap();

@@ -1,0 +1,159 @@
+//! Tables of exact areas.
+
+use std::io::{self, Write};
+use std::str::FromStr;
+
+use molmesh_structure::{Structure, table};
+use molmesh_surface::{AreaParts, Control, Reservation, SurfaceError};
+use rustc_hash::FxHashMap;
+
+use super::{ATOMS_PER_CHECK, AtomAreas};
+
+/// Rows of a table of areas.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum AreaLevel {
+    /// A row for each atom.
+    Atom,
+    /// A row for each residue.
+    #[default]
+    Residue,
+    /// A row for each chain.
+    Chain,
+}
+
+impl AreaLevel {
+    /// All levels.
+    pub const ALL: [Self; 3] = [Self::Atom, Self::Residue, Self::Chain];
+
+    /// Returns the name of the level.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Atom => "atom",
+            Self::Residue => "residue",
+            Self::Chain => "chain",
+        }
+    }
+}
+
+impl FromStr for AreaLevel {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        Self::ALL.into_iter().find(|level| level.name() == text).ok_or(())
+    }
+}
+
+/// Row of a table: some atoms with the sums of their areas.
+pub(super) struct Row {
+    /// Index of the first atom in the structure.
+    pub(super) first: usize,
+    pub(super) atoms: u64,
+    pub(super) parts: AreaParts,
+    alone: f64,
+}
+
+impl AtomAreas {
+    /// Returns the number of atoms.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.atoms.len()
+    }
+
+    /// Returns true if there is no atom.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.atoms.is_empty()
+    }
+
+    /// Returns the rows of a table. Chains are in the order of their first atoms, and contain all copies. A residue
+    /// ends with its last consecutive atom. The rows are charged to `memory`.
+    ///
+    /// # Errors
+    /// Fails if the memory budget is used up, or the work is cancelled.
+    pub(super) fn rows(
+        &self,
+        structure: &Structure,
+        level: AreaLevel,
+        control: &Control<'_>,
+        memory: &Reservation,
+    ) -> Result<Vec<Row>, SurfaceError> {
+        let mut rows: Vec<Row> = Vec::new();
+        let mut of_chains = FxHashMap::default();
+        let mut before = None;
+        for (n, &atom) in self.atoms.iter().enumerate() {
+            if n.is_multiple_of(ATOMS_PER_CHECK) {
+                control.check()?;
+            }
+            let i = atom as usize;
+            let row = match level {
+                AreaLevel::Atom => rows.len(),
+                // The first atom of a copy has a lower index than the last one of the copy before.
+                AreaLevel::Residue => {
+                    let is_same = before.is_some_and(|last| last < i && structure.same_residue(last, i));
+                    rows.len() - usize::from(is_same)
+                }
+                AreaLevel::Chain => {
+                    memory.reserve_entries(&mut of_chains, 1)?;
+                    *of_chains.entry(structure.chain.id(i)).or_insert(rows.len())
+                }
+            };
+            if row == rows.len() {
+                memory.reserve_rows(&mut rows, 1)?;
+                rows.push(Row { first: i, atoms: 0, parts: AreaParts::default(), alone: 0.0 });
+            }
+            rows[row].atoms += 1;
+            rows[row].parts += self.areas[n];
+            rows[row].alone += self.alone.as_ref().map_or(0.0, |alone| alone[n]);
+            before = Some(i);
+        }
+        Ok(rows)
+    }
+
+    /// Writes a table as CSV (RFC 4180, lines end in LF) with areas in Å², rounded to 0.0001 Å². With an interface, it
+    /// has the atoms of both sides, and the columns `alone` and `buried`. With a solvent-excluded surface, it has the
+    /// columns `contact`, `toroidal` and `concave`.
+    ///
+    /// # Errors
+    /// Returns the errors of `out`, and a [`SurfaceError`] as an error of kind `Other`.
+    pub fn write_csv(
+        &self,
+        structure: &Structure,
+        level: AreaLevel,
+        control: &Control<'_>,
+        out: &mut dyn Write,
+    ) -> io::Result<()> {
+        let columns = match level {
+            AreaLevel::Atom => 0..8,
+            AreaLevel::Residue => 3..8,
+            AreaLevel::Chain => 6..8,
+        };
+        let counts = level != AreaLevel::Atom;
+        let mut header = table::COLUMNS[columns.clone()].to_vec();
+        header.extend(counts.then_some("atoms"));
+        header.push("area");
+        if self.has_parts {
+            header.extend(["contact", "toroidal", "concave"]);
+        }
+        if self.alone.is_some() {
+            header.extend(["alone", "buried"]);
+        }
+        let memory = Reservation::new(&control.memory);
+        let rows = self.rows(structure, level, control, &memory).map_err(io::Error::other)?;
+        table::write_rows(out, &header, rows, |text, Row { first, atoms, parts, alone }| {
+            table::put_columns(text, structure, first, columns.clone());
+            if counts {
+                write!(text, ",{atoms}")?;
+            }
+            let area = parts.total();
+            write!(text, ",{area:.4}")?;
+            if self.has_parts {
+                write!(text, ",{:.4},{:.4},{:.4}", parts.contact, parts.toroidal, parts.concave)?;
+            }
+            if self.alone.is_some() {
+                write!(text, ",{alone:.4},{:.4}", alone - area)?;
+            }
+            Ok(())
+        })
+    }
+}

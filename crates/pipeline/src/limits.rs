@@ -1,0 +1,26 @@
+//! Limits of one job.
+
+use molmesh_picture::PictureLimits;
+use molmesh_structure::ReadLimits;
+use molmesh_structure::map::MapLimits;
+use molmesh_surface::SurfaceLimits;
+
+/// Limits of one job.
+#[derive(Debug, Clone, Copy)]
+pub struct JobLimits {
+    /// Limits of reading.
+    pub read: ReadLimits,
+    /// Limits of meshing.
+    pub surface: SurfaceLimits,
+    /// Limits of drawing.
+    pub picture: PictureLimits,
+    /// Limits of reading a map.
+    pub map: MapLimits,
+}
+
+impl Default for JobLimits {
+    fn default() -> Self {
+        let (read, surface, picture) = <(ReadLimits, SurfaceLimits, PictureLimits)>::default();
+        Self { read, surface, picture, map: MapLimits::default() }
+    }
+}
