@@ -185,18 +185,18 @@ await run({
     const other = await open(chromium, { url: `http://127.0.0.1:${server.address().port}/` });
     await other.waitForFunction(() => window.loaded, null, { timeout: TIMEOUT_MS });
     const set = (name, value) => other.locator("#viewer").evaluate((node, [name, value]) => node.setAttribute(name, value), [name, value]);
-    const opaque = await picture(other, "#viewer");
+    const opaque = await stablePicture(other, "#viewer");
     await set("transparency", "70");
-    const clear = await picture(other, "#viewer");
+    const clear = await stablePicture(other, "#viewer");
     assert.ok(differing(opaque, clear) > 5000, "the surface is still opaque");
     assert.deepEqual(await waitForSticks(other, () => set("sticks", "")), { sticks: 48, bonds: 52 });
-    const withSticks = await picture(other, "#viewer");
+    const withSticks = await stablePicture(other, "#viewer");
     assert.ok(differing(clear, withSticks) > 500, "no sticks are visible");
     // Attributes that are removed or invalid have their defaults.
     await other.locator("#viewer").evaluate((node) => node.removeAttribute("sticks"));
-    assert.equal(differing(clear, await picture(other, "#viewer")), 0);
+    assert.equal(differing(clear, await stablePicture(other, "#viewer")), 0);
     await set("transparency", "nine");
-    assert.equal(differing(opaque, await picture(other, "#viewer")), 0);
+    assert.equal(differing(opaque, await stablePicture(other, "#viewer")), 0);
     assert.deepEqual(other.errors, []);
     server.close();
   },

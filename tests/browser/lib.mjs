@@ -139,7 +139,8 @@ export async function picture(page, selector = "#view-home") {
 /** Waits until pending changes are drawn, including the full-resolution frame that follows a movement. */
 export const waitForFrames = (page) =>
   page.evaluate(async () => {
-    const canvases = [...document.querySelectorAll("canvas")];
+    const roots = [document, ...[...document.querySelectorAll("molmesh-viewer")].map((viewer) => viewer.shadowRoot ?? viewer)];
+    const canvases = roots.flatMap((root) => [...root.querySelectorAll("canvas")]);
     const isCoarse = ({ width, clientWidth }) => width < Math.floor(clientWidth * Math.min(devicePixelRatio, 2));
     // A turning surface may stay at a lower resolution.
     const end = performance.now() + 600;
@@ -147,10 +148,10 @@ export const waitForFrames = (page) =>
   });
 
 /** Returns a picture after two in a row are equal, because earlier changes may still have to be drawn. */
-export async function stablePicture(page) {
+export async function stablePicture(page, selector) {
   const end = performance.now() + TIMEOUT_MS;
-  for (let last = await picture(page); ; ) {
-    const next = await picture(page);
+  for (let last = await picture(page, selector); ; ) {
+    const next = await picture(page, selector);
     if (next.data.equals(last.data)) return next;
     assert.ok(performance.now() < end, "the picture keeps changing");
     last = next;
