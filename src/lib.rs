@@ -37,7 +37,7 @@ mod jobs;
 #[cfg(feature = "server")]
 pub mod memory_budget;
 #[cfg(feature = "server")]
-mod reader_line;
+pub mod readers;
 #[cfg(feature = "server")]
 mod single_flight;
 #[cfg(feature = "server")]

@@ -15,9 +15,9 @@ use tokio::time::Instant;
 use super::address::{PublicResolver, Refused};
 use super::error::UnavailableReason;
 use super::gzip::{self, StopOnDrop};
-use super::readers::{Busy, Readers};
 use crate::config::{ArchiveConfig, Templates};
 use crate::memory_budget::MemoryReservation;
+use crate::readers::{Busy, Readers};
 use crate::store::Digest;
 use crate::surface::OutOfMemory;
 use crate::telemetry::{SpanContext, traceparent};
@@ -55,8 +55,8 @@ pub(super) struct Checks<'a> {
     /// Inflated bytes after which the check of a gzip file stops.
     pub(super) inflated_bytes: u64,
     pub(super) readers: &'a Readers,
-    /// Time until which a check may begin.
-    pub(super) begin_by: Instant,
+    /// Time until which a check must end.
+    pub(super) end: Instant,
 }
 
 /// Failure of a request.
@@ -172,7 +172,8 @@ pub(super) async fn get(
     let text = |name: HeaderName| Some(response.headers().get(name)?.to_str().ok()?.to_owned());
     let origin = Origin { url: name, etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
     let bytes = body(response, config, &reservation).await?;
-    let reading = checks.readers.wait(checks.begin_by).await.map_err(Failed::Busy)?;
+    let end = checks.end.into_std();
+    let reading = checks.readers.wait(None, end, end).await.map_err(Failed::Busy)?;
     // The deadline drops this future, which ends the check.
     let request = StopOnDrop::default();
     let (stop, inflated_bytes) = (Arc::clone(&request.0), checks.inflated_bytes);

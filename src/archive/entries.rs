@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use metrics::{counter, histogram};
 use quick_cache::sync::Cache;
-use tokio::sync::Semaphore;
+
 use tracing::Instrument as _;
 
 use super::client::Answer;
@@ -17,7 +17,7 @@ use super::remote::Remote;
 use crate::client_shares::{ClientShares, ShareExceeded, SharePermit};
 use crate::config::Config;
 use crate::memory_budget::Budget;
-use crate::reader_line::ReaderLine;
+use crate::readers::Readers;
 use crate::single_flight::SingleFlight;
 use crate::store::Digest;
 use crate::structure::{EntryId, Stamp};
@@ -110,15 +110,10 @@ impl Archive {
         Self { shared: Arc::new(shared), client: None }
     }
 
-    /// Returns the permits to read structures outside of jobs, one per worker. Reading an entry takes one.
+    /// Returns the readers of structures outside of jobs, one per worker. Reading an entry takes one.
     #[must_use]
-    pub fn readers(&self) -> Arc<Semaphore> {
-        Arc::clone(&self.shared.files.readers.permits)
-    }
-
-    /// Returns the requests that wait for one of the [`readers`](Self::readers).
-    pub(crate) fn reader_line(&self) -> Arc<ReaderLine> {
-        Arc::clone(&self.shared.files.readers.line)
+    pub fn readers(&self) -> Readers {
+        self.shared.files.readers.clone()
     }
 
     /// Returns the archive for a client, which may fetch as many entries at once as its share.

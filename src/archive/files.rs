@@ -10,9 +10,9 @@ use tokio::time::Instant;
 
 use super::disk::{Disk, Found};
 use super::error::FetchError;
-use super::readers::{Busy, Readers};
 use crate::config::Config;
 use crate::memory_budget::Budget;
+use crate::readers::{Busy, Readers};
 use crate::store::{Digest, Hasher};
 use crate::structure::{Archive as Folder, ArchiveError, EntryId, Stamp};
 
@@ -34,7 +34,7 @@ impl Files {
             folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
             disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
             memory,
-            readers: Readers::new(config.jobs.workers),
+            readers: Readers::new(config.jobs.workers, config.server.client_share),
             timeout: Duration::from_millis(archive.timeout_ms),
         }
     }
@@ -105,8 +105,9 @@ impl Files {
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, FetchError> {
         let limit = self.timeout / 2;
-        let busy = |Busy(wait)| FetchError::Busy { id: id.clone(), limit, wait };
-        let reading = self.readers.wait(deadline.min(Instant::now() + limit)).await.map_err(busy)?;
+        let busy = |Busy { wait }| FetchError::Busy { id: id.clone(), limit, wait };
+        let begin_by = deadline.min(Instant::now() + limit);
+        let reading = self.readers.wait(None, begin_by.into_std(), deadline.into_std()).await.map_err(busy)?;
         blocking(move || {
             let value = work();
             drop(reading);

@@ -12,7 +12,6 @@ mod entries;
 mod error;
 mod files;
 mod gzip;
-mod readers;
 mod remote;
 
 pub use entries::{Archive, Entry, Source};

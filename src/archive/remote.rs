@@ -11,9 +11,9 @@ use tokio::time::Instant;
 use super::breaker::Breaker;
 use super::client::{self, Answer, Checks, Failed, Origin};
 use super::error::{FetchError, UnavailableReason};
-use super::readers::{Busy, Readers};
 use crate::config::{ArchiveConfig, Config, Template};
 use crate::memory_budget::Budget;
+use crate::readers::{Busy, Readers};
 use crate::structure::EntryId;
 use crate::telemetry::{SpanKind, SpanParent, TraceSpan};
 
@@ -129,7 +129,7 @@ impl Remote {
                     return Err(FetchError::TooLarge { id: id.clone(), bytes, limit: self.config.max_bytes });
                 }
                 Err(Failed::Memory(error)) => return Err(FetchError::Memory { id: id.clone(), error }),
-                Err(Failed::Busy(Busy(wait))) => {
+                Err(Failed::Busy(Busy { wait })) => {
                     let limit = Duration::from_millis(self.config.timeout_ms);
                     return Err(FetchError::Busy { id: id.clone(), limit, wait });
                 }
@@ -189,7 +189,7 @@ impl Remote {
         let span = TraceSpan::start(&SpanParent::current(), "GET", SpanKind::Client, std::time::Instant::now());
         let trace = self.sends_trace.then(|| span.context());
         let reservation = self.memory.reservation();
-        let checks = Checks { inflated_bytes: self.inflated_bytes, readers: &self.readers, begin_by: deadline };
+        let checks = Checks { inflated_bytes: self.inflated_bytes, readers: &self.readers, end: deadline };
         let get = client::get(client, url, known, &self.config, &checks, reservation, trace.as_ref());
         let answer = tokio::time::timeout_at(deadline, get)
             .await
@@ -259,7 +259,7 @@ mod tests {
     fn pauses_double_and_are_random() {
         let mut config = Config::default();
         config.archive.backoff_ms = 1000;
-        let remote = Remote::new(&config, Budget::unlimited(), Readers::new(1)).unwrap();
+        let remote = Remote::new(&config, Budget::unlimited(), Readers::new(1, 1.0)).unwrap();
         let longest = |attempt| (0..200).map(|_| remote.pause(attempt, None)).max().unwrap_or_default().as_millis();
         for (attempt, span) in [(1, 1000), (2, 2000), (3, 4000)] {
             let longest = longest(attempt);

@@ -132,10 +132,10 @@ impl From<Refusal> for Problem {
                 .with("actual", waiting)
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait),
-            Refusal::TooLate { wait, allowed } => Self::new(ProblemType::QueueFull, error.to_string())
+            Refusal::TooLate { wait, expected, allowed } => Self::new(ProblemType::QueueFull, error.to_string())
                 .with("limit", u64::try_from(allowed.as_millis()).unwrap_or(u64::MAX))
                 .with("estimated_wait_s", wait.as_secs_f64())
-                .retry_after(wait.saturating_sub(allowed)),
+                .retry_after(wait.saturating_add(expected).saturating_sub(allowed)),
             Refusal::Draining => Self::shutting_down(error.to_string()),
         }
     }

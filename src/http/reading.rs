@@ -1,14 +1,15 @@
 //! Reading of structures outside of jobs, on blocking threads.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, timeout_at};
+use tokio::time::timeout_at;
 
 use super::guard::Caller;
 use super::state::App;
 use crate::jobs::Failure;
+use crate::readers::Busy;
 use crate::surface::{CancelToken, Control};
 
 /// Cancels the work when its request ends.
@@ -32,33 +33,23 @@ impl App {
         work: impl FnOnce(&Control<'_>) -> T + Send + 'static,
     ) -> Result<T, Failure> {
         let limit = Duration::from_millis(self.config.jobs.deadline_ms);
-        let end = Instant::now() + limit;
+        let now = Instant::now();
+        let (begin_by, end) = (now + limit / 2, now + limit);
         let late = |_elapsed| Failure::Deadline { limit };
-        let panicked = |message: String| Failure::Panicked { message };
-        let waited = || Failure::Waited { limit, wait: self.reader_line.estimated_wait() };
-        let waiting = self.reader_line.enter(limit / 2).ok_or_else(waited)?;
-        let begin_by = Instant::now() + limit / 2;
-        // In this order, a client that waits for its share takes no permit of others.
-        let share = self.reader_shares.wait(caller.client.0, begin_by).await.map_err(|_full| waited())?;
-        let permit = timeout_at(begin_by, Arc::clone(&self.readers).acquire_owned()).await;
-        let permit = permit.map_err(|_elapsed| waited())?.map_err(|closed| panicked(closed.to_string()))?;
-        let left = end.saturating_duration_since(Instant::now());
-        if waiting.is_late(left) {
-            return Err(waited());
-        }
-        let reading_time = waiting.begin();
+        let waited = |Busy { wait }| Failure::Waited { limit, wait };
+        let permit = self.readers.wait(Some(caller.client.0), begin_by, end).await.map_err(waited)?;
         let stop = CancelOnDrop(CancelToken::default());
         let (cancel, reservation) = (stop.0.clone(), self.memory(caller.client).reservation());
         let (app, payer) = (Arc::clone(self), caller.clone());
-        let reading = spawn_holding((held, permit, share, reading_time), move || {
+        let reading = spawn_holding((held, permit), move || {
             let begun = Instant::now();
-            let control =
-                Control { cancel, deadline: Some(end.into_std()), memory: Arc::new(reservation), ..Control::default() };
+            let control = Control { cancel, deadline: Some(end), memory: Arc::new(reservation), ..Control::default() };
             let value = app.pool.run(|| work(&control));
             app.charge(&payer, begun.elapsed());
             value
         });
-        timeout_at(end, reading).await.map_err(late)?.map_err(|error| panicked(error.to_string()))
+        let read = timeout_at(end.into(), reading).await.map_err(late)?;
+        read.map_err(|error| Failure::Panicked { message: error.to_string() })
     }
 }
 

@@ -163,8 +163,6 @@ impl Server {
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let uploads = pool.settings().budget.part(config.limits.memory_bytes / 2);
         let readers = archive.readers();
-        let reader_shares = ClientShares::new(config.jobs.workers, config.server.client_share);
-        let reader_line = archive.reader_line();
         let delivery_shares = ClientShares::new(config.jobs.deliveries, config.server.client_share);
         let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
         let (stop, stopping) = watch::channel(Stop::Serve);
@@ -179,8 +177,6 @@ impl Server {
             result_headers: Cache::new(CACHED_HEADERS),
             uploads,
             readers,
-            reader_line,
-            reader_shares,
             save_permits,
             save_start: Mutex::new(()),
             saves: SingleFlight::default(),

@@ -17,7 +17,7 @@ use crate::client_shares::{ClientShares, SharePermit};
 use crate::config::Config;
 use crate::jobs::{Budget, Client, ContentKey, Failure, JobStore, Lane, Pool, Structures};
 use crate::pipeline::Job;
-use crate::reader_line::ReaderLine;
+use crate::readers::Readers;
 use crate::single_flight::SingleFlight;
 use crate::store::{Namespace, Secret, Store};
 use crate::surface::{FoundDevice, MemoryMeter as _};
@@ -37,12 +37,8 @@ pub(super) struct App {
     pub(super) result_headers: Cache<ContentKey, Arc<HeaderMap>>,
     /// Part of the memory budget for request bodies: the rest is enough to mesh those that were received.
     pub(super) uploads: Budget,
-    /// Permits to read structures outside of jobs: one per worker.
-    pub(super) readers: Arc<Semaphore>,
-    /// Requests that wait for one of `readers`.
-    pub(super) reader_line: Arc<ReaderLine>,
-    /// Shares of the clients in `readers`.
-    pub(super) reader_shares: Arc<ClientShares>,
+    /// Readers of structures outside of jobs: one per worker.
+    pub(super) readers: Readers,
     /// Permits to store results of synchronous requests.
     pub(super) save_permits: Arc<Semaphore>,
     /// Held while a save starts, so that its permit and its entry in `saves` appear together.

@@ -94,6 +94,9 @@ pub(super) struct CoalescedJob {
     pub(super) lane: Lane,
     /// Expected work, in the units of [`crate::pipeline::estimate_work`].
     pub(super) units: f64,
+    /// True for a tile, whose time says little about other jobs: the first one prepares the tileset, and others have no
+    /// surface.
+    pub(super) is_tile: bool,
     /// Start tag of fair queueing: the lowest one runs first.
     pub(super) tag: f64,
     pub(super) accepted: Instant,
@@ -112,6 +115,11 @@ pub(super) struct CoalescedJob {
 }
 
 impl CoalescedJob {
+    /// Returns the time for which the job has run; zero while it is queued.
+    pub(super) fn spent(&self, now: Instant) -> Duration {
+        self.begun.map_or(Duration::ZERO, |begun| now.saturating_duration_since(begun))
+    }
+
     /// Returns true if no ticket is left.
     pub(super) fn is_abandoned(&self) -> bool {
         self.outcome.as_ref().is_none_or(|sender| sender.receiver_count() == 0)

@@ -23,14 +23,17 @@ pub(crate) enum Refusal {
     },
     /// The job would miss its deadline in the queue.
     #[error(
-        "the jobs ahead take about {:.0} s and this one must begin within {:.0} s",
+        "the jobs ahead take about {:.0} s and this one about {:.0} s, and it must end within {:.0} s (`jobs.deadline_ms`)",
         wait.as_secs_f64().ceil(),
+        expected.as_secs_f64().ceil(),
         allowed.as_secs_f64().floor()
     )]
     TooLate {
         /// Estimated time in the queue.
         wait: Duration,
-        /// Time from acceptance in which the job must begin to meet its deadline.
+        /// Estimated duration beside the jobs that run.
+        expected: Duration,
+        /// Time from acceptance to the result.
         allowed: Duration,
     },
     /// The pool is shutting down.
@@ -55,7 +58,11 @@ pub(crate) enum Failure {
     #[error("the deadline of {} s passed", limit.as_secs_f64())]
     Deadline { limit: Duration },
     /// No worker or reader was free in time, so the work did not begin.
-    #[error("the work did not begin, because all workers are busy; the work ahead takes about {} s", wait.as_secs_f64().ceil())]
+    #[error(
+        "the work could not begin in time to end within {} s (`jobs.deadline_ms`); the work ahead takes about {} s",
+        limit.as_secs_f64(),
+        wait.as_secs_f64().ceil()
+    )]
     Waited {
         /// Time allowed from acceptance to the result.
         limit: Duration,

@@ -23,14 +23,6 @@ use crate::surface::CancelToken;
 use crate::sync::{Condvar, Mutex, MutexGuard};
 use crate::telemetry::{SpanKind, TraceSpan};
 
-/// Times of a job.
-struct Times {
-    /// Time from acceptance to the outcome.
-    allowed: Duration,
-    /// Expected duration, s.
-    expected: f64,
-}
-
 struct QueueState {
     jobs: Vec<CoalescedJob>,
     /// Shares of the clients in each lane.
@@ -123,8 +115,8 @@ impl Queue {
         let id = state.next_id;
         state.next_id += 1;
         let units = pipeline::estimate_work(task.input.atoms(), &task.job);
-        let expected = state.rate.seconds(units);
         let now = Instant::now();
+        let is_durable = task.rank.batch;
         let (sender, outcome) = single_flight::channel();
         let lane = Lane::of(&task.rank, units);
         let (progress, span) = (Arc::new(Progress::default()), job_span(&task, now));
@@ -134,6 +126,7 @@ impl Queue {
             rank: task.rank,
             lane,
             units,
+            is_tile: task.job.tile.is_some(),
             tag: 0.0,
             accepted: now,
             begun: None,
@@ -152,7 +145,9 @@ impl Queue {
         if let Some(worker) = worker {
             worker.notify_one();
         }
-        Ok(self.ticket(id, lane, Some(outcome), (progress, span), Times { allowed, expected }))
+        let mut ticket = self.ticket(id, lane, Some(outcome), (progress, span), allowed);
+        ticket.is_durable = is_durable;
+        Ok(ticket)
     }
 
     /// Accepts a task that needs no input: joins an identical job, which takes `on_start` unless it runs. `None` if
@@ -197,22 +192,15 @@ impl Queue {
             }
             let outcome = job.outcome.as_ref().map(ResultReceiver::of);
             let (progress, span) = (Arc::clone(&job.progress), job.span.clone());
-            let times = Times { allowed, expected: state.rate.seconds(job.units) };
-            let mut ticket = self.ticket(job.id, job.lane, outcome, (progress, span), times);
-            (ticket.is_shared, ticket.joined_running) = (true, joined_running);
+            let mut ticket = self.ticket(job.id, job.lane, outcome, (progress, span), allowed);
+            (ticket.is_durable, ticket.is_shared, ticket.joined_running) = (task.rank.batch, true, joined_running);
             return Ok(Some(ticket));
         }
         if state.leaving && task.rank.batch {
             let id = state.next_id;
             state.next_id += 1;
             // The next process runs the job. Without a sender the ticket ends as stopped.
-            return Ok(Some(self.ticket(
-                id,
-                Lane::Batch,
-                None,
-                (Arc::default(), job_span(task, now)),
-                Times { allowed, expected: 0.0 },
-            )));
+            return Ok(Some(self.ticket(id, Lane::Batch, None, (Arc::default(), job_span(task, now)), allowed)));
         }
         // A broker has queued durable jobs; no more are claimed than there are workers.
         if task.rank.batch {
@@ -220,22 +208,16 @@ impl Queue {
         }
         let units = pipeline::estimate_work(task.input.atoms(), &task.job);
         let lane = Lane::of(&task.rank, units);
-        let wait = self.wait(state, lane, now);
+        let (wait, expected) = (self.wait(state, lane, now), Self::expected_now(state, lane, units, now));
         // A job of a free worker counts as running before the worker has woken up.
         if state.len(lane) >= self.limit + self.workers {
             return Err(Refusal::QueueFull { waiting: state.waiting_in(lane).count(), limit: self.limit, wait });
         }
-        let allowed = Self::begin_within(allowed, state.rate.seconds(units));
-        if wait > allowed {
-            return Err(Refusal::TooLate { wait, allowed });
+        // A job alone in its lane always tries: only jobs that run correct the estimate.
+        if state.len(lane) > 0 && wait.saturating_add(expected) > allowed {
+            return Err(Refusal::TooLate { wait, expected, allowed });
         }
         Ok(None)
-    }
-
-    /// Returns the time in which a job must begin to be finished within `allowed`, at least half of it.
-    fn begin_within(allowed: Duration, expected: f64) -> Duration {
-        let running = Duration::try_from_secs_f64(expected).unwrap_or(Duration::MAX).min(allowed / 2);
-        allowed.saturating_sub(running)
     }
 
     /// Creates the ticket of a job.
@@ -245,12 +227,11 @@ impl Queue {
         lane: Lane,
         outcome: Option<ResultReceiver<Outcome>>,
         (progress, span): (Arc<Progress>, TraceSpan),
-        Times { allowed, expected }: Times,
+        allowed: Duration,
     ) -> Ticket {
-        let (queue, now) = (Arc::clone(self), Instant::now());
-        let (deadline, start_by) = (now + allowed, now + Self::begin_within(allowed, expected));
-        let (is_shared, joined_running) = (false, false);
-        Ticket { queue, job, lane, outcome, deadline, start_by, allowed, progress, span, is_shared, joined_running }
+        let (queue, deadline) = (Arc::clone(self), Instant::now() + allowed);
+        let (is_durable, is_shared, joined_running) = (false, false, false);
+        Ticket { queue, job, lane, outcome, deadline, allowed, progress, span, is_durable, is_shared, joined_running }
     }
 
     /// Takes the next job of a lane; blocks until there is one. `None` once the queue is closed and the lane is empty.
@@ -296,13 +277,13 @@ impl Queue {
     }
 
     /// Removes a finished job and sends its outcome to every ticket. `time` is the duration of a run that tells how
-    /// long such jobs take; one without success would have taken longer.
+    /// long such jobs take; one without success would have taken longer. That of a tile is not used.
     pub(super) fn done(&self, id: u64, outcome: Option<Outcome>, time: Option<Duration>) {
         let mut state = self.lock();
         let Some(at) = state.find(id) else { return };
         let job = state.jobs.swap_remove(at);
         let is_success = matches!(outcome, Some(Ok(_)));
-        let time = time.map(|time| time.as_secs_f64());
+        let time = time.filter(|_| !job.is_tile).map(|time| time.as_secs_f64());
         if let Some(seconds) = time.filter(|seconds| is_success || *seconds > state.rate.seconds(job.units)) {
             state.rate.learn(job.units, seconds);
         }

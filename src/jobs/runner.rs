@@ -185,7 +185,10 @@ async fn attempt(
     let record = job.record();
     let (mut ticket, lock) = match ticket.take() {
         // Other nodes may find the record and dispatch the job.
-        Some(ticket) => (ticket, jobs.lock_work(&record, digest).await),
+        Some(mut ticket) => {
+            ticket.is_durable = true;
+            (ticket, jobs.lock_work(&record, digest).await)
+        }
         None => match submit(jobs, job, &record, digest).await {
             Ok(submitted) => submitted,
             Err(attempt) => return attempt,
@@ -225,7 +228,7 @@ async fn attempt(
             Attempt::Stopped
         }
         Err(Failure::Memory(error)) => Attempt::OutOfMemory(error),
-        Err(Failure::Waited { limit, .. }) => Attempt::Ended(Err(Failure::Deadline { limit }.into())),
+
         Err(failure) => Attempt::Ended(Err(failure.into())),
     }
 }

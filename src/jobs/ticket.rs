@@ -26,12 +26,13 @@ pub(crate) struct Ticket {
     /// `None` if the job is left for the next process.
     pub(super) outcome: Option<ResultReceiver<Outcome>>,
     pub(super) deadline: Instant,
-    /// Moment at which a job that is still queued gives up, because it would probably miss its deadline.
-    pub(super) start_by: Instant,
     pub(super) allowed: Duration,
     pub(super) progress: Arc<Progress>,
     /// Span of the job.
     pub(crate) span: TraceSpan,
+    /// True for an accepted asynchronous job, which may wait until its deadline. A request gives up as soon as it would
+    /// probably miss it.
+    pub(super) is_durable: bool,
     /// True if the task joined a queued or running job.
     pub(crate) is_shared: bool,
     /// True if the task joined a running job. The `on_start` callback of the task is not called then.
@@ -39,18 +40,18 @@ pub(crate) struct Ticket {
 }
 
 impl Ticket {
-    /// Waits for the outcome, at most until the deadline, or until the job must have begun. Cancel safe.
+    /// Waits for the outcome, at most until the deadline, or as long as the job can begin in time. Cancel safe.
     pub(crate) async fn wait(&mut self) -> Outcome {
         let Some(outcome) = &mut self.outcome else { return Err(Failure::Stopped) };
         let limit = self.allowed;
-        let mut has_begun = false;
         loop {
             let (now, is_queued) = (Instant::now(), self.progress.now().is_none());
-            has_begun |= !is_queued;
-            if !has_begun && now >= self.start_by {
+            let has_passed = now >= self.deadline;
+            let gives_up = is_queued && !self.is_durable;
+            if gives_up && (has_passed || self.queue.would_be_late(self.job, self.deadline)) {
                 return Err(Failure::Waited { limit, wait: self.queue.estimated_wait(self.lane) });
             }
-            if now >= self.deadline {
+            if has_passed {
                 return Err(Failure::Deadline { limit });
             }
             if is_queued && self.lane == Lane::Short {

@@ -31,7 +31,7 @@ enum TaskEnd {
 /// Runs the jobs of a lane until the queue is closed and the lane is empty.
 pub(super) fn work(shared: &WorkerContext, lane: Lane) {
     while let Some(entry) = shared.queue.pop(lane) {
-        let (id, client, is_tile) = (entry.id, entry.task.rank.client, entry.task.job.tile.is_some());
+        let (id, client) = (entry.id, entry.task.rank.client);
         let start = Instant::now();
         let end = shared.threads.run(lane, || run(shared, entry));
         let outcome = match end {
@@ -43,14 +43,12 @@ pub(super) fn work(shared: &WorkerContext, lane: Lane) {
             meter(client, start.elapsed());
         }
         shared.publish_devices();
-        // Successful jobs count in the duration estimate, and those that were cancelled, such as at a deadline. The
-        // time of a tile says little about other jobs: the first one prepares the tileset, and others have no surface.
+        // Successful jobs count in the duration estimate, and those that were cancelled, such as at a deadline.
         let counts = matches!(
             outcome,
             Some(Ok(_) | Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }))
         );
-        let time = (counts && !is_tile).then(|| start.elapsed());
-        shared.queue.done(id, outcome, time);
+        shared.queue.done(id, outcome, counts.then(|| start.elapsed()));
     }
 }
 

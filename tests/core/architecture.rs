@@ -22,7 +22,7 @@ const MODULES: &[&str] = &[
     "telemetry",
     "access",
     "client_shares",
-    "reader_line",
+    "readers",
     "single_flight",
     "memory_budget",
     "store",

@@ -547,7 +547,8 @@ async fn a_fetch_that_waits_for_a_reader_ends_in_time() {
     });
     let archive = place.archive();
     let readers = archive.readers();
-    let hold = || async { Arc::clone(&readers).acquire_owned().await.unwrap() };
+    let far = Instant::now() + Duration::from_mins(1);
+    let hold = || async { readers.wait(None, far, far).await.unwrap() };
     let busy = |ended: Result<Entry, FetchError>| assert!(matches!(ended, Err(FetchError::Busy { .. })), "{ended:?}");
     // Before the folder is read.
     let held = hold().await;

@@ -352,8 +352,8 @@ fn a_job_that_would_wait_too_long_is_rejected_immediately() {
     assert!(replies.iter().any(|reply| reply.status == 200));
     // Others were accepted, but did not begin or end in time.
     let is_immediate = |reply: &&Reply| {
-        let begins_late = |problem: Value| problem["detail"].as_str().unwrap().contains("must begin within");
-        reply.status == 503 && begins_late(reply.problem(503, "queue-full"))
+        let ends_late = |problem: Value| problem["detail"].as_str().unwrap().contains("must end within");
+        reply.status == 503 && ends_late(reply.problem(503, "queue-full"))
     };
     let rejected = replies.iter().find(is_immediate).expect("a request is rejected because of the work ahead");
     assert!(rejected.header("retry-after").unwrap().parse::<u64>().unwrap() >= 1);

@@ -6,6 +6,7 @@ use metrics::gauge;
 
 use super::{Queue, QueueState};
 use crate::jobs::coalesced_job::CoalescedJob;
+use crate::jobs::cost::WorkRate;
 use crate::jobs::rank::Lane;
 use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT};
 
@@ -25,16 +26,43 @@ impl Queue {
         self.lock().rate.seconds(units)
     }
 
+    /// Returns true if a queued request would probably miss its `deadline` even if it began now. One that is alone in
+    /// its lane does begin now.
+    pub(in crate::jobs) fn would_be_late(&self, id: u64, deadline: Instant) -> bool {
+        let (state, now) = (self.lock(), Instant::now());
+        let Some(job) = state.find(id).map(|at| &state.jobs[at]) else { return false };
+        let left = deadline.saturating_duration_since(now);
+        state.len(job.lane) > 1 && Self::expected_now(&state, job.lane, job.units, now) > left
+    }
+
+    /// Estimates the duration of a job of `units` work in a lane at this moment.
+    pub(super) fn expected_now(state: &QueueState, lane: Lane, units: f64, now: Instant) -> Duration {
+        Duration::try_from_secs_f64(Self::rate_now(state, lane, now).seconds(units)).unwrap_or(Duration::MAX)
+    }
+
+    /// Returns the rate of a lane at this moment: a running job that takes longer than expected counts as if it had
+    /// just ended. Otherwise a burst of jobs would be accepted before the first one has shown how long they take.
+    fn rate_now(state: &QueueState, lane: Lane, now: Instant) -> WorkRate {
+        let mut rate = state.rate;
+        for job in state.jobs.iter().filter(|job| job.lane == lane && !job.is_tile) {
+            let spent = job.spent(now).as_secs_f64();
+            if spent > rate.seconds(job.units) {
+                rate.learn(job.units, spent);
+            }
+        }
+        rate
+    }
+
     /// Estimates the remaining work of all jobs of a lane, divided by the number of its workers.
     pub(super) fn wait(&self, state: &QueueState, lane: Lane, now: Instant) -> Duration {
         if state.len(lane) < self.workers {
             return Duration::ZERO;
         }
+        let rate = Self::rate_now(state, lane, now);
         let left = |job: &CoalescedJob| {
-            let spent = job.begun.map_or(0.0, |begun| now.saturating_duration_since(begun).as_secs_f64());
-            let cost = state.rate.seconds(job.units);
+            let cost = rate.seconds(job.units);
             // A job that takes longer than expected may still run for a while.
-            (cost - spent).max(0.1 * cost)
+            (cost - job.spent(now).as_secs_f64()).max(0.1 * cost)
         };
         let ahead: f64 = state.jobs.iter().filter(|job| job.lane == lane).map(left).sum();
         Duration::try_from_secs_f64(ahead / self.workers as f64).unwrap_or(Duration::MAX)
