@@ -2,7 +2,6 @@
 
 use std::error::Error;
 use std::path::Path;
-use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use bytes::{Bytes, BytesMut};
@@ -14,12 +13,12 @@ use tokio::time::Instant;
 
 use super::address::{PublicResolver, Refused};
 use super::error::UnavailableReason;
-use super::gzip::{self, StopOnDrop};
 use crate::config::{ArchiveConfig, Templates};
 use crate::memory_budget::MemoryReservation;
 use crate::readers::{Busy, Readers};
 use crate::store::Digest;
-use crate::surface::OutOfMemory;
+use crate::structure::is_complete_gzip;
+use crate::surface::{CancelOnDrop, OutOfMemory};
 use crate::telemetry::{SpanContext, traceparent};
 
 /// Maximum number of redirects.
@@ -172,13 +171,14 @@ pub(super) async fn get(
     let text = |name: HeaderName| Some(response.headers().get(name)?.to_str().ok()?.to_owned());
     let origin = Origin { url: name, etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
     let bytes = body(response, config, &reservation).await?;
+    // A truncated HTTP/1.1 body may look complete, but gzip has a length and a checksum, and a damaged file must not be
+    // cached for a day. The deadline drops this future, which ends the check.
     let end = checks.end.into_std();
     let reading = checks.readers.wait(None, end, end).await.map_err(Failed::Busy)?;
-    // The deadline drops this future, which ends the check.
-    let request = StopOnDrop::default();
-    let (stop, inflated_bytes) = (Arc::clone(&request.0), checks.inflated_bytes);
+    let request = CancelOnDrop::default();
+    let (cancel, inflated_bytes) = (request.0.clone(), checks.inflated_bytes);
     let checked = tokio::task::spawn_blocking(move || {
-        let is_damaged = compressed && !gzip::is_complete_gzip(&bytes, inflated_bytes, &stop);
+        let is_damaged = compressed && !is_complete_gzip(&bytes, inflated_bytes, &cancel);
         let digest = if is_damaged { None } else { Some(Digest::of(&bytes)) };
         let bytes = reservation.attach(bytes);
         drop(reading);

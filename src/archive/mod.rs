@@ -11,7 +11,6 @@ mod disk;
 mod entries;
 mod error;
 mod files;
-mod gzip;
 mod remote;
 
 pub use entries::{Archive, Entry, Source};

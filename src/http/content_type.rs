@@ -5,13 +5,7 @@ use super::problem::Problem;
 use super::problem_types::ProblemType;
 use crate::jobs::Failure;
 use crate::pipeline::JobError;
-use crate::structure::SourceFormat;
-use crate::structure::StructureError;
-
-/// First bytes of a gzip file.
-pub(super) const GZIP_MAGIC: &[u8] = &[0x1f, 0x8b];
-/// First bytes of a zstd file.
-pub(super) const ZSTD_MAGIC: &[u8] = &[0x28, 0xb5, 0x2f, 0xfd];
+use crate::structure::{GZIP_MAGIC, SourceFormat, StructureError, ZSTD_MAGIC};
 
 /// Declared type of a body.
 #[derive(Debug, Clone, PartialEq, Eq)]

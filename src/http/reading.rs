@@ -10,16 +10,7 @@ use super::guard::Caller;
 use super::state::App;
 use crate::jobs::Failure;
 use crate::readers::Busy;
-use crate::surface::{CancelToken, Control};
-
-/// Cancels the work when its request ends.
-struct CancelOnDrop(CancelToken);
-
-impl Drop for CancelOnDrop {
-    fn drop(&mut self) {
-        self.0.cancel();
-    }
-}
+use crate::surface::{CancelOnDrop, Control};
 
 impl App {
     /// Runs `work`, which reads a structure, on a blocking thread, and charges its time to the caller. First waits for
@@ -38,7 +29,7 @@ impl App {
         let late = |_elapsed| Failure::Deadline { limit };
         let waited = |Busy { wait }| Failure::Waited { limit, wait };
         let permit = self.readers.wait(Some(caller.client.0), begin_by, end).await.map_err(waited)?;
-        let stop = CancelOnDrop(CancelToken::default());
+        let stop = CancelOnDrop::default();
         let (cancel, reservation) = (stop.0.clone(), self.memory(caller.client).reservation());
         let (app, payer) = (Arc::clone(self), caller.clone());
         let reading = spawn_holding((held, permit), move || {

@@ -9,7 +9,7 @@ use bytes::{Bytes, BytesMut};
 use futures_util::StreamExt as _;
 
 use super::body_hasher::BodyHasher;
-use super::content_type::{DeclaredType, GZIP_MAGIC, ZSTD_MAGIC};
+use super::content_type::DeclaredType;
 use super::form::{self, UploadedFile};
 use super::guard::Caller;
 use super::limit::Limit;
@@ -19,7 +19,7 @@ use super::state::App;
 use crate::jobs::MemoryReservation;
 use crate::pipeline::JobError;
 use crate::store::Digest;
-use crate::structure::{SourceFormat, detect_format};
+use crate::structure::{GZIP_MAGIC, SourceFormat, ZSTD_MAGIC, detect_format};
 use crate::surface::MemoryMeter as _;
 
 /// Maximum size of a JSON body, bytes. A document names a structure and about thirty parameters.

@@ -1,5 +1,6 @@
 //! Estimate of a job's work from the size of its input, before the input is read.
 
+use molmesh_structure::{GZIP_MAGIC, ZSTD_MAGIC};
 use molmesh_surface::pockets::{SPACING, rows_in_reach};
 use molmesh_surface::{SurfaceKind, TriangleQuality};
 
@@ -53,7 +54,7 @@ const fn relative_time(surface: SurfaceKind) -> f64 {
 /// Returns the size at the end of a gzip file: that of its last member, modulo 2³². `None` if the size cannot be that
 /// of the whole file.
 fn gzip_size(input: &[u8]) -> Option<u32> {
-    let size = input.starts_with(&[0x1f, 0x8b]).then(|| input.last_chunk().map(|size| u32::from_le_bytes(*size)))??;
+    let size = input.starts_with(GZIP_MAGIC).then(|| input.last_chunk().map(|size| u32::from_le_bytes(*size)))??;
     let (least, most) = (input.len() as u64, input.len() as u64 * MAX_GZIP_RATIO);
     (least..=most).contains(&u64::from(size)).then_some(size)
 }
@@ -61,7 +62,7 @@ fn gzip_size(input: &[u8]) -> Option<u32> {
 /// Estimates the number of atoms in a structure file from its size.
 #[must_use]
 pub fn estimate_atoms(input: &[u8]) -> f64 {
-    let compressed = input.starts_with(&[0x1f, 0x8b]) || input.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]);
+    let compressed = input.starts_with(GZIP_MAGIC) || input.starts_with(ZSTD_MAGIC);
     // First byte of a MessagePack map; no text begins with it.
     let binary = matches!(input.first(), Some(0x80..=0x8F | 0xDE | 0xDF));
     let len = input.len() as f64;

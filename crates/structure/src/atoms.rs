@@ -339,7 +339,12 @@ impl Columns {
         source.annotations.keep(self.starts_residue.iter().filter(|starts| **starts).count(), reading)?;
         warnings.extend(self.unknown_elements(&tables, &source.radii));
         reading.check()?;
-        Ok(Structure {
+        Ok(self.into_structure(tables, SourceFields { warnings, ..source }, entities))
+    }
+
+    /// Returns the structure of rows whose kinds are known. `entities` are those of the texts of `label_chain`.
+    pub(super) fn into_structure(self, tables: Tables, source: SourceFields, entities: Vec<String>) -> Structure {
+        Structure {
             format: source.format,
             id: source.id,
             title: source.title,
@@ -365,7 +370,7 @@ impl Columns {
             unread: source.unread,
             assemblies: source.assemblies,
             annotations: source.annotations,
-            warnings,
-        })
+            warnings: source.warnings,
+        }
     }
 }

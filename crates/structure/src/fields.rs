@@ -15,7 +15,7 @@ use super::text::Fault;
 pub(super) const MAX_FIELDS: usize = 32;
 
 /// Lines between two checks of the cancellation flag: a few milliseconds.
-const LINES_PER_CHECK: usize = 1 << 14;
+pub(super) const LINES_PER_CHECK: usize = 1 << 14;
 
 /// All lines of a text as byte ranges, without line endings (LF, CR LF or CR).
 #[derive(Debug)]

@@ -8,7 +8,7 @@ use molmesh_surface::{Control, MemoryMeter, Reservation};
 use super::atoms::Structure;
 use super::error::StructureError;
 use super::source::SourceFormat;
-use super::{bcif, inflate, mmcif, pdb, pieces, pqr, sniff, xyz};
+use super::{bcif, decoder, mmcif, pdb, pieces, pqr, sniff, xyz};
 
 /// Limits of reading, checked before memory is allocated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -149,7 +149,8 @@ pub fn read_in_pieces(bytes: &[u8], limits: &ReadLimits, n: usize) -> Result<Str
 fn of_bytes(bytes: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     reading.check()?;
     let check = |inflated: &[u8]| check_sample(inflated, reading);
-    let plain = inflate::inflate(bytes, reading.limits.max_inflated_bytes, reading, &check)?;
+    let limit = reading.limits.max_inflated_bytes;
+    let plain = decoder::inflate(bytes, limit, &reading.text, reading.control, &check)?;
     of_text(without_mark(&plain), reading)
 }
 
@@ -195,7 +196,7 @@ fn check_sample(inflated: &[u8], reading: &Reading<'_>) -> Result<(), StructureE
 /// # Errors
 /// [`StructureError::UnknownFormat`].
 pub fn detect_format(bytes: &[u8]) -> Result<Option<SourceFormat>, StructureError> {
-    if inflate::encoding(bytes).is_some() {
+    if decoder::encoding(bytes).is_some() {
         return Ok(None);
     }
     let head = &bytes[..bytes.len().min(SAMPLE_BYTES)];

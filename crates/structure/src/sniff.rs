@@ -1,5 +1,6 @@
 //! Detection of the file format of decompressed bytes from their content.
 
+use super::decoder::{GZIP_MAGIC, ZSTD_MAGIC};
 use super::error::StructureError;
 use super::source::SourceFormat;
 use super::text::quote;
@@ -94,8 +95,8 @@ fn binary(bytes: &[u8]) -> Option<String> {
         return Some("MMTF (MessagePack)".to_owned());
     }
     let magic: [(&[u8], &str); 14] = [
-        (b"\x1f\x8b", "gzip inside a compressed file"),
-        (b"\x28\xb5\x2f\xfd", "zstd inside a compressed file"),
+        (GZIP_MAGIC, "gzip inside a compressed file"),
+        (ZSTD_MAGIC, "zstd inside a compressed file"),
         (b"PK\x03\x04", "a ZIP archive"),
         (b"BZh", "bzip2 data"),
         (b"\xfd7zXZ\0", "xz data"),

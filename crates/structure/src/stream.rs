@@ -6,30 +6,30 @@
 
 mod lines;
 
-use std::io::Read;
+use std::io::{BufReader, Read};
 use std::sync::Arc;
 
 use molmesh_surface::{Control, MemoryMeter as _, Reservation};
 
 use self::lines::{TagsAfterAtoms, end_of_rows, rows};
-use super::annotations::Annotations;
 use super::assembly::Assemblies;
-use super::atoms::Structure;
+use super::atoms::{Columns, Structure, Tables};
 use super::bcif::{self, RowStream, Skeleton};
 use super::decoder::Decoder;
 use super::divisions::{self, BlockFindings};
 use super::error::StructureError;
 use super::read::{ReadLimits, Reading, check, of_text, without_mark};
-use super::source::SourceFormat;
-use super::texts::TextColumn;
+use super::source::{SourceFields, SourceFormat};
 use super::{duplicates, mmcif, sniff};
 
 pub use super::stored::{ScratchFile, StoredBytes};
 
 /// Bytes of the rows of a block: about 270,000 atoms.
 pub const BLOCK_BYTES: usize = 16 << 20;
-/// Bytes that are read at a time.
-const STEP: usize = 1 << 20;
+/// Size of the buffer of the input, bytes.
+const BUFFER: usize = 1 << 18;
+/// Bytes that are read at first.
+const FIRST_BYTES: usize = 1 << 20;
 /// Bytes of a block for each row of a BinaryCIF file.
 const ROW_BYTES: usize = 60;
 /// Size of a block relative to the smallest byte string that is moved to the temporary file: 64 KiB of 16 MiB.
@@ -47,35 +47,9 @@ pub struct Block {
 impl Block {
     /// Takes the structure without its atoms: format, id and title.
     pub fn take_description(&mut self) -> Structure {
-        let s = &mut self.structure;
-        Structure {
-            format: s.format,
-            id: s.id.take(),
-            title: s.title.take(),
-            x: Vec::new(),
-            y: Vec::new(),
-            z: Vec::new(),
-            element: Vec::new(),
-            name: TextColumn::default(),
-            residue: TextColumn::default(),
-            chain: TextColumn::default(),
-            label_chain: TextColumn::default(),
-            entities: Vec::new(),
-            residue_number: Vec::new(),
-            insertion_code: Vec::new(),
-            altloc: Vec::new(),
-            occupancy: Vec::new(),
-            b_factor: Vec::new(),
-            radius: Vec::new(),
-            model: Vec::new(),
-            hetero: Vec::new(),
-            kind: Vec::new(),
-            starts_residue: Vec::new(),
-            unread: s.unread,
-            assemblies: Assemblies::default(),
-            annotations: Annotations::default(),
-            warnings: Vec::new(),
-        }
+        let Structure { format, id, title, unread, .. } = &mut self.structure;
+        let source = SourceFields { id: id.take(), title: title.take(), unread: *unread, ..SourceFields::new(*format) };
+        Columns::default().into_structure(Tables::default(), source, Vec::new())
     }
 }
 
@@ -113,12 +87,8 @@ pub struct Blocks<'a> {
     binary: Option<Binary>,
     /// Bytes of the rows of a block.
     block_bytes: usize,
-    /// Decompressed bytes so far.
-    inflated: u64,
     /// Number of lines in the blocks so far.
     lines: u64,
-    /// True at the end of the input.
-    at_end: bool,
     finished: bool,
     findings: BlockFindings,
     /// True to reject helices and strands after the atoms.
@@ -142,32 +112,30 @@ impl<'a> Blocks<'a> {
         limits: &ReadLimits,
         control: &Control<'_>,
     ) -> Result<Self, StructureError> {
+        let input = Box::new(BufReader::with_capacity(BUFFER, input));
         let mut blocks = Self {
-            input: Decoder::new(input)?,
+            input: Decoder::new(input, limits.max_inflated_bytes, control)?,
             limits: *limits,
             text: Vec::new(),
             memory: Reservation::new(&control.memory),
             head: None,
             binary: None,
             block_bytes,
-            inflated: 0,
             lines: 0,
-            at_end: false,
             finished: false,
             findings: BlockFindings::default(),
             needs_secondary,
             tags: TagsAfterAtoms::default(),
             assemblies: Assemblies::default(),
         };
-        blocks.memory.grow(blocks.input.window())?;
-        let mut size = STEP;
+        let mut size = FIRST_BYTES;
         loop {
             blocks.fill(size, control)?;
             let text = without_mark(&blocks.text);
             match sniff::sniff(text)? {
                 SourceFormat::Mmcif => {
                     blocks.head = mmcif::first_row(text).map(|first| blocks.text.len() - text.len() + first);
-                    if blocks.head.is_none() && !blocks.at_end {
+                    if blocks.head.is_none() && !blocks.input.at_end() {
                         size *= 2;
                         continue;
                     }
@@ -191,7 +159,7 @@ impl<'a> Blocks<'a> {
     fn open_binary(&mut self, stored: &Arc<StoredBytes>, control: &Control<'_>) -> Result<Binary, StructureError> {
         let mut skeleton = Skeleton::new(stored, (self.block_bytes / MOVED_PART) as u64, control);
         skeleton.add(without_mark(&self.text))?;
-        while !self.at_end {
+        while !self.input.at_end() {
             self.text.clear();
             self.fill(1, control)?;
             skeleton.add(&self.text)?;
@@ -233,7 +201,7 @@ impl<'a> Blocks<'a> {
             self.fill(head.saturating_add(size), control)?;
             let most = self.text.len().min(head.saturating_add(size));
             let rows_end = end_of_rows(&self.text[head..most]).map(|end| head + end);
-            let is_last = rows_end.is_some() || (self.at_end && most == self.text.len());
+            let is_last = rows_end.is_some() || (self.input.at_end() && most == self.text.len());
             let whole_lines = || memchr::memrchr(b'\n', &self.text[head..most]).map_or(head, |i| head + i + 1);
             let end = rows_end.unwrap_or_else(|| if is_last { most } else { whole_lines() });
             let n_rows = rows(&self.text[head..end]).count();
@@ -288,28 +256,7 @@ impl<'a> Blocks<'a> {
 
     /// Reads until the text has `size` bytes, or the input ends.
     fn fill(&mut self, size: usize, control: &Control<'_>) -> Result<(), StructureError> {
-        while !self.at_end && self.text.len() < size {
-            check(control)?;
-            let old = self.text.capacity();
-            if self.text.len() + STEP > old {
-                // Doubles, because the size of the input is unknown.
-                let new = (2 * old).max(self.text.len() + STEP);
-                self.memory.grow(new as u64)?;
-                self.text.reserve_exact(new - self.text.len());
-                self.memory.shrink(old as u64);
-            }
-            let n = self.input.read(STEP as u64, &mut self.text)?;
-            self.count(n)?;
-        }
-        Ok(())
-    }
-
-    /// Counts decompressed bytes.
-    fn count(&mut self, n: u64) -> Result<(), StructureError> {
-        self.at_end = n < STEP as u64;
-        self.inflated += n;
-        let limit = self.limits.max_inflated_bytes;
-        if self.inflated > limit { Err(StructureError::InflatedTooLarge { limit }) } else { Ok(()) }
+        self.input.fill(size, &mut self.text, &self.memory, control)
     }
 
     /// Reads the rest of the data block, from `end` of the text on, and rejects categories that change the atoms.
@@ -326,13 +273,13 @@ impl<'a> Blocks<'a> {
         while !is_last {
             check(control)?;
             let newline = memchr::memrchr(b'\n', &self.text[searched..]);
-            let whole = if self.at_end { self.text.len() } else { newline.map_or(0, |i| searched + i + 1) };
+            let whole = if self.input.at_end() { self.text.len() } else { newline.map_or(0, |i| searched + i + 1) };
             let kept = self.tags.assemblies.len();
             for line in self.text[..whole].split_inclusive(|&b| b == b'\n') {
                 self.tags.add(line, self.needs_secondary)?;
             }
             self.memory.grow((self.tags.assemblies.len() - kept) as u64)?;
-            is_last = self.at_end;
+            is_last = self.input.at_end();
             self.text.drain(..whole);
             // The rest has no newline.
             searched = self.text.len();

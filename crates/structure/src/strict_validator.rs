@@ -26,11 +26,11 @@ use molmesh_surface::{Control, Reservation};
 use pdbtbx::{Context, ErrorLevel, Format, PDBError, ReadOptions, StrictnessLevel};
 
 use super::error::StructureError;
-use super::read::{self, ReadLimits, Reading, without_mark};
+use super::read::{self, ReadLimits, without_mark};
 use super::source::SourceFormat;
 use super::strict_cost::{Cost, count};
 use super::text::decode;
-use super::{inflate, sniff};
+use super::{decoder, sniff};
 
 /// Maximum size of a text that is checked, bytes.
 pub const MAX_BYTES: u64 = 8 << 20;
@@ -140,9 +140,9 @@ pub fn quiet_panics() {
 /// Returns errors of decompression and format detection, of limits, of memory and of cancellation.
 pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result<Vec<Diagnostic>, StructureError> {
     let limit = limits.max_inflated_bytes.min(MAX_BYTES);
-    let reading = Reading::new(limits, control);
+    let text_memory = Reservation::new(&control.memory);
     let too_large = || vec![Diagnostic::note(format!("not checked: the text is larger than {limit} bytes"))];
-    let plain = match inflate::inflate(bytes, limit, &reading, &|_| Ok(())) {
+    let plain = match decoder::inflate(bytes, limit, &text_memory, control, &|_| Ok(())) {
         Err(StructureError::InflatedTooLarge { .. }) if limit < limits.max_inflated_bytes => return Ok(too_large()),
         plain => plain?,
     };
@@ -157,7 +157,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
         SourceFormat::Pqr => return unread("PQR"),
         SourceFormat::Xyz => return unread("XYZ"),
     };
-    let memory = reading.reserve(MEMORY_PER_BYTE * text.len() as u64)?;
+    let memory = control.reserve(MEMORY_PER_BYTE * text.len() as u64)?;
     let of_structure = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
     let cost = match read::read_with(text, limits, &of_structure) {
         Ok(structure) => Cost::of(&structure, text),
@@ -178,7 +178,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
                        of the residues of a chain, the atoms of a residue and the records that refer to atoms";
         return Ok(vec![Diagnostic::note(message.to_owned())]);
     }
-    let held = (memory, reading.reserve(cost.bytes())?, ThreadSlot::wait(control)?);
+    let held = (memory, control.reserve(cost.bytes())?, ThreadSlot::wait(control)?);
     let (text, (sender, receiver)) = (text.to_vec(), mpsc::sync_channel(1));
     let run = move || {
         INSIDE.set(true);

@@ -103,6 +103,16 @@ impl CancelToken {
     }
 }
 
+/// Cancels its token when it is dropped.
+#[derive(Debug, Default)]
+pub struct CancelOnDrop(pub CancelToken);
+
+impl Drop for CancelOnDrop {
+    fn drop(&mut self) {
+        self.0.cancel();
+    }
+}
+
 /// Cancellation, deadline, observer and memory of a run.
 #[derive(Clone)]
 pub struct Control<'a> {

@@ -46,7 +46,7 @@ pub mod union_find;
 pub use backend::{Backend, BackendIdentity, GridStats, MeshOutput, StreamedMesh};
 pub use cavities::Cavity;
 pub use column::{Column, SharedBytes};
-pub use control::{CancelToken, Control, Observer, Stage};
+pub use control::{CancelOnDrop, CancelToken, Control, Observer, Stage};
 pub use cpu::CpuBackend;
 pub use devices::{DeviceChoice, DeviceFacts, DeviceKind, DeviceName, DeviceStatus, FoundDevice};
 pub use error::SurfaceError;

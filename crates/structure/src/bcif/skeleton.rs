@@ -106,14 +106,7 @@ impl Skeleton {
     }
 
     fn append(&mut self, bytes: &[u8]) -> Result<(), StructureError> {
-        let (len, old) = (self.bytes.len(), self.bytes.capacity());
-        if len + bytes.len() > old {
-            // Doubles, because the size of the input is unknown.
-            let new = (2 * old).max(len + bytes.len());
-            self.memory.grow(new as u64)?;
-            self.bytes.reserve_exact(new - len);
-            self.memory.shrink(old as u64);
-        }
+        self.memory.reserve_rows(&mut self.bytes, bytes.len())?;
         self.bytes.extend_from_slice(bytes);
         Ok(())
     }

@@ -11,7 +11,7 @@ use std::fmt;
 pub use error::MapError;
 use molmesh_surface::{Control, MemoryMeter as _, OutOfMemory, Reservation};
 
-use super::inflate;
+use super::decoder;
 
 /// Values that are read between two checks of the cancellation flag: about a millisecond.
 const VALUES_PER_CHECK: usize = 1 << 14;
@@ -134,12 +134,12 @@ impl Map {
 /// Returns a [`MapError`]. Never panics on any input.
 pub fn read(bytes: &[u8], limits: &MapLimits, control: &Control<'_>) -> Result<Map, MapError> {
     check(control)?;
-    let inflated = inflate::inflate_once(bytes, limits.max_inflated_bytes, control)?;
-    let bytes = inflated.bytes();
-    if ccp4::is_ccp4(bytes) {
-        ccp4::read(bytes, limits, control)
-    } else if dx::is_dx(bytes) {
-        dx::read(bytes, limits, control)
+    let memory = Reservation::new(&control.memory);
+    let bytes = decoder::inflate(bytes, limits.max_inflated_bytes, &memory, control, &|_| Ok(()))?;
+    if ccp4::is_ccp4(&bytes) {
+        ccp4::read(&bytes, limits, control)
+    } else if dx::is_dx(&bytes) {
+        dx::read(&bytes, limits, control)
     } else {
         Err(MapError::UnknownFormat { found: shown(bytes.get(..8.min(bytes.len())).unwrap_or_default()) })
     }

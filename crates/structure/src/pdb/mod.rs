@@ -36,9 +36,6 @@ use super::{pieces, pqr};
 /// Maximum length of a title, characters.
 pub(super) const MAX_TITLE: usize = 1000;
 
-/// Lines between two checks of the cancellation flag: a few milliseconds.
-const LINES_PER_CHECK: usize = 1 << 14;
-
 pub(super) fn read(text: &[u8], reading: &Reading<'_>) -> Result<Structure, StructureError> {
     let file = File::new(text);
     let mut ranges = pieces::cut(text, 0, reading.n_pieces(text.len()));

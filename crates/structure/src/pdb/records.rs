@@ -7,6 +7,7 @@ use molmesh_surface::MemoryMeter as _;
 
 use super::super::annotations::SecondaryRange;
 use super::super::error::StructureError;
+use super::super::fields::LINES_PER_CHECK;
 use super::super::kinds::Listed;
 use super::super::models::{Mark, ModelBoundary};
 use super::super::number;
@@ -16,7 +17,7 @@ use super::super::warnings::Warnings;
 use super::atoms::File;
 use super::card::{MIN_COLUMNS, check_length};
 use super::lines::Lines;
-use super::{LINES_PER_CHECK, MAX_TITLE, sequence};
+use super::{MAX_TITLE, sequence};
 
 /// Beginning of an ATOM or HETATM record. Columns beyond the first 96 are left out: they are not read.
 #[derive(Debug, Clone, Copy)]

@@ -6,7 +6,7 @@ use std::ops::Range;
 use indexmap::IndexMap;
 use molmesh_surface::{Control, MemoryMeter as _, Reservation};
 
-use super::{ATOMS_PER_TASK, Found, LeftOut, ModelChoice, Rules, SELECTED_CHAIN, Selected, Selection};
+use super::{ATOMS_PER_TASK, Found, LeftOut, ModelChoice, Rules, SELECTED_CHAIN, Selected, Selection, not_found};
 use crate::contents::Kind;
 use crate::copies::{AssemblyRules, chain_column};
 use crate::error::StructureError;
@@ -14,7 +14,6 @@ use crate::pieces;
 use crate::read::{ReadLimits, check};
 use crate::source::Unread;
 use crate::stream::Block;
-use crate::text::list;
 use crate::texts::TextColumn;
 
 /// Model, chain, number and insertion code of a residue.
@@ -233,12 +232,6 @@ impl SelectedBlocks {
         selection: &Selection,
         assembly: Option<&AssemblyRules<'_>>,
     ) -> Result<Selected, StructureError> {
-        let missing = |what, requested: String, mut available: Vec<String>| {
-            available.sort_unstable();
-            let n = available.len();
-            let available = if n == 0 { "none".to_owned() } else { list(available, n) };
-            Err(StructureError::NotFound { what, requested, available })
-        };
         let mut names = Vec::new();
         selection.atoms.condition.chains(&mut names);
         let of_expression = names.into_iter().map(|name| (SELECTED_CHAIN, name));
@@ -251,12 +244,13 @@ impl SelectedBlocks {
             let is_known = self.chains.contains(name) || (name == "_" && self.chains.contains(""));
             if !is_known {
                 let known = self.chains.iter().map(|name| format!("`{name}`")).collect();
-                return missing(what, format!("`{}`", name.chars().take(40).collect::<String>()), known);
+                return Err(not_found(what, format!("`{}`", name.chars().take(40).collect::<String>()), known));
             }
         }
         let model = match selection.model {
             ModelChoice::Number(number) if !self.models.contains(&number) => {
-                return missing("model", number.to_string(), self.models.iter().map(i32::to_string).collect());
+                let known = self.models.iter().map(i32::to_string).collect();
+                return Err(not_found("model", number.to_string(), known));
             }
             ModelChoice::Number(number) => number,
             ModelChoice::First | ModelChoice::All => self.first_model.unwrap_or(1),
@@ -265,7 +259,7 @@ impl SelectedBlocks {
             && !u8::try_from(letter).is_ok_and(|letter| self.altlocs.contains(&letter))
         {
             let known = self.altlocs.iter().map(|letter| char::from(*letter).to_string()).collect();
-            return missing("alternative location", format!("`{letter}`"), known);
+            return Err(not_found("alternative location", format!("`{letter}`"), known));
         }
         let (mut n_selected, mut left_out, mut residues) = (0, LeftOut::default(), BTreeMap::new());
         for (number, counts) in std::mem::take(&mut self.by_chain).into_values().enumerate() {

@@ -339,17 +339,18 @@ fn alternative(structure: &Structure, selection: &Selection, models: Models) -> 
     match u8::try_from(requested) {
         Ok(letter) if letter != 0 && present[usize::from(letter)] => Ok(Some(letter)),
         _ => {
-            let letters: Vec<String> =
-                (1..=u8::MAX).filter(|&b| present[usize::from(b)]).map(|b| char::from(b).into()).collect();
-            let n = letters.len();
-            let available = if n == 0 { "none".to_owned() } else { list(letters, n) };
-            Err(StructureError::NotFound {
-                what: "alternative location",
-                requested: format!("`{requested}`"),
-                available,
-            })
+            let letters = (1..=u8::MAX).filter(|&b| present[usize::from(b)]).map(|b| char::from(b).into()).collect();
+            Err(not_found("alternative location", format!("`{requested}`"), letters))
         }
     }
+}
+
+/// Returns the error for a requested value that is not among the `available` ones.
+fn not_found(what: &'static str, requested: String, mut available: Vec<String>) -> StructureError {
+    available.sort_unstable();
+    let n = available.len();
+    let available = if n == 0 { "none".to_owned() } else { list(available, n) };
+    StructureError::NotFound { what, requested, available }
 }
 
 /// Describes the contents of the file and the parameters that select them.
