@@ -9,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint matrix wasm deny audit sbom container tests bench figures gallery release clean
+.PHONY: help run install test interleavings fuzz chaos soak attack nightly nightly-data tools static static-if-possible web web-if-possible fmt fmt-check lint wasm deny audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -20,7 +20,7 @@ run: web-if-possible ## Build (the first time takes minutes) and serve on http:/
 install: web-if-possible ## Install the command molmesh, with the service and its web page, into ~/.cargo/bin
 	$(CARGO) install --path . --locked --profile fast-build
 
-STEPS := web fmt-check lint matrix tools deny static-if-possible interleavings tests
+STEPS := web fmt-check lint wasm tools deny static-if-possible interleavings tests
 
 # The steps add a line to the file SKIPPED for each check that they skip. The step `tests` prints this file; after the
 # failure of another step, it is printed here.
@@ -33,7 +33,7 @@ test: ## All checks and tests; installs what they need
 	done
 
 tools: ## Install what the tests need (a Python environment, Node packages, software Vulkan, Chromium)
-	@if [ -f tests/tools/setup.sh ]; then bash tests/tools/setup.sh; fi
+	@bash tests/tools/setup.sh
 
 web: ## Build the web page into web/dist, for the next build of the server; needs Node 20.19 or later
 	@sh web/build.sh
@@ -48,17 +48,10 @@ fmt: ## Format
 fmt-check:
 	$(CARGO) fmt --all -- --check
 
+# `static-if-possible` compiles the program without the feature `gpu`.
 lint: ## Clippy and documentation of everything; warnings are errors
 	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --quiet
-
-# `lint` checks all features together, and `static-if-possible` compiles `cli` alone. No code of the library depends on
-# `cli`, so that `cli,gpu` and `cli,server` check the library with `gpu` and with `server` alone as well.
-matrix: ## Clippy on the other supported combinations of features, and on the core for WebAssembly
-	$(CARGO) clippy --locked --lib --no-default-features -- -D warnings
-	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
-	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
-	$(MAKE) --no-print-directory wasm
 
 WASM := wasm32-unknown-unknown
 wasm: ## Clippy on the core for WebAssembly; installs Rust's standard library for it with rustup
@@ -81,7 +74,7 @@ sbom: ## Write the bill of materials, dist/molmesh.cdx.json
 # BINARY=FILE uses an existing binary. Base images are created here, without an image registry.
 container: $(if $(BINARY),,release) ## Build and test the images (two to four minutes plus the binary); needs root on Debian, or docker
 	deploy/container/build.sh --binary $(or $(BINARY),target/release/molmesh) --base-from-debootstrap
-	deploy/container/check.py
+	deploy/container/check.py $(if $(BINARY),,--max-program 35000000)
 	deploy/kubernetes/check.sh
 	deploy/sbom.sh cpu gpu
 
@@ -130,11 +123,11 @@ figures: ## Update the tables of docs/research/paper.md and its figures from doc
 release: web-if-possible ## Build the optimized binary, target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh
 
-static: ## Build the command line as a static file for any Linux, CPU only: dist/molmesh; installs what it needs
+static: web-if-possible ## Build a static file for any Linux, without GPU support: dist/molmesh; installs what it needs
 	deploy/static.sh
 
-# For the tests, with their profile, so that both share procedural macros and build scripts. Warnings are errors.
-# Without Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A failed build
+# For the tests, with their profile, so that both share procedural macros and build scripts. Warnings are errors, as in
+# `lint`. Without Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A failed build
 # is an error.
 static-if-possible:
 	@RUSTFLAGS="-D warnings" deploy/static.sh dev || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }

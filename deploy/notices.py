@@ -2,11 +2,11 @@
 """Writes the licences of everything in the binary to standard output.
 
 Covers the crates that cargo links into `molmesh` (normal dependencies for the target and features) with all their
-licence and notice files, meshoptimizer, the standard library, musl if the target uses it, and, with the service,
-third-party parts of the web pages. For a crate without a licence file, the text of a licence that it names is used:
+licence and notice files, meshoptimizer, the standard library, musl if the target uses it, and third-party parts of the
+web pages. For a crate without a licence file, the text of a licence that it names is used:
 Apache-2.0, or MIT with its authors. If the crate permits neither, the command fails and names it.
 
-Usage: deploy/notices.py [--target TRIPLE] [--features cli,server,gpu]
+Usage: deploy/notices.py [--target TRIPLE] [--no-default-features]
 """
 
 import argparse
@@ -86,7 +86,7 @@ def mit(authors):
     return f"MIT License\n\nCopyright (c) {authors}\n\n{terms[at:]}"
 
 
-def texts(packages, page, musl):
+def texts(packages, musl):
     """Maps each distinct licence text to the crates that it belongs to."""
     of = collections.OrderedDict()
 
@@ -108,12 +108,11 @@ def texts(packages, page, musl):
                 missing.append(f"{who}: {package['license']}")
             else:
                 add(text[1], f"{who} (without a licence file; {text[0]} of {package['license']})")
-    if page:
-        web = ROOT / "web" / "swagger"
-        for name in ("LICENSE", "NOTICE", "swagger-ui-bundle.js.LICENSE.txt"):
-            add((web / name).read_text(encoding="utf-8"), f"Swagger UI ({name})")
-        for name, file in VIEWER:
-            add((ROOT / "web" / "licences" / file).read_text(encoding="utf-8"), f"{name} (in the page at /)")
+    web = ROOT / "web" / "swagger"
+    for name in ("LICENSE", "NOTICE", "swagger-ui-bundle.js.LICENSE.txt"):
+        add((web / name).read_text(encoding="utf-8"), f"Swagger UI ({name})")
+    for name, file in VIEWER:
+        add((ROOT / "web" / "licences" / file).read_text(encoding="utf-8"), f"{name} (in the page at /)")
     add(mit("2016-2026 Arseny Kapoulkine"), "meshoptimizer, in the crate meshopt (MIT)")
     if musl:
         add(mit("2005-2020 Rich Felker, et al."), "musl libc (MIT)")
@@ -127,11 +126,10 @@ def texts(packages, page, musl):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--target", default=host())
-    parser.add_argument("--features")
+    parser.add_argument("--no-default-features", action="store_true")
     options = parser.parse_args()
     target, musl = options.target, options.target.endswith("-musl")
-    chosen = ["--no-default-features", f"--features={options.features}"] if options.features else []
-    page = not chosen or "server" in options.features.split(",")
+    chosen = ["--no-default-features"] if options.no_default_features else []
     metadata = json.loads(cargo("metadata", "--format-version=1", "--locked", f"--filter-platform={target}"))
     packages = linked(metadata, target, chosen)
     line = "-" * 100
@@ -139,10 +137,9 @@ def main():
     print(f"its licences ({target}).\n")
     for package in packages:
         print(f"  {package['name']} {package['version']}: {package['license'] or 'see its text'}")
-    if page:
-        print("  Swagger UI, in the page at /docs: Apache-2.0")
-        for name, _ in VIEWER:
-            print(f"  {name}, in the page at /: MIT")
+    print("  Swagger UI, in the page at /docs: Apache-2.0")
+    for name, _ in VIEWER:
+        print(f"  {name}, in the page at /: MIT")
     print("  meshoptimizer, in the crate meshopt: MIT")
     if "-linux-" in target:
         print(
@@ -152,7 +149,7 @@ def main():
     if musl:
         print("  musl libc: MIT")
     print("  the Rust standard library: MIT OR Apache-2.0")
-    for text, who in texts(packages, page, musl).items():
+    for text, who in texts(packages, musl).items():
         print(f"\n{line}\n" + "\n".join(who) + f"\n{line}\n\n{text}")
 
 

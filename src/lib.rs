@@ -15,36 +15,22 @@
 //! these tasks: `select.rs`, `mesh.rs` and `report.rs`.
 //!
 //! [`surface`] is the meshing core, which converts spheres to a mesh. [`structure`] reads files, [`formats`] encodes
-//! meshes, [`picture`] renders them, and [`pipeline`] runs one job from bytes to report. The `gpu` feature adds the GPU
-//! backend and the `server` feature the HTTP service. All lengths are ångström. `ARCHITECTURE.md` describes the
-//! folders.
+//! meshes, [`picture`] renders them, and [`pipeline`] runs one job from bytes to report. The feature `gpu` adds the GPU
+//! backend. All lengths are ångström. `ARCHITECTURE.md` describes the folders.
 
-#[cfg(feature = "server")]
 pub mod access;
-#[cfg(feature = "server")]
 pub mod archive;
-#[cfg(feature = "server")]
 mod client_shares;
-#[cfg(feature = "server")]
 pub mod config;
-#[cfg(feature = "server")]
 #[doc(hidden)]
 pub mod fuzzing;
-#[cfg(feature = "server")]
 pub mod http;
-#[cfg(feature = "server")]
 mod jobs;
-#[cfg(feature = "server")]
 pub mod memory_budget;
-#[cfg(feature = "server")]
 pub mod readers;
-#[cfg(feature = "server")]
 mod single_flight;
-#[cfg(feature = "server")]
 pub mod store;
-#[cfg(feature = "server")]
 pub mod telemetry;
-#[cfg(feature = "server")]
 mod tls;
 
 pub use molmesh_formats as formats;
@@ -54,7 +40,6 @@ pub use molmesh_picture as picture;
 pub use molmesh_pipeline as pipeline;
 pub use molmesh_structure as structure;
 pub use molmesh_surface as surface;
-#[cfg(feature = "server")]
 use molmesh_sync as sync;
 pub use pipeline::{Job as Options, JobError as Error};
 pub use surface::Mesh;

@@ -8,7 +8,8 @@
 #
 # A binary from this machine contains the web page if `make web` ran before its build, as `make release` does. It must
 # not need a newer libc than the base; otherwise the image build fails. Environment variables: SUITE (trixie),
-# BASE_IMAGE, RUST_IMAGE, NODE_IMAGE, and SOURCE (address of the sources for the image label).
+# BASE_IMAGE, RUST_IMAGE, NODE_IMAGE, and SOURCE (address of the sources for the image label). Exits with 3 if this
+# machine cannot install what is missing, create the base, or run a container of it.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
 # shellcheck source=deploy/container/engine.sh
@@ -39,11 +40,15 @@ if [ -n "$binary" ]; then
 fi
 if $debootstrap; then
     suite=${SUITE:-trixie}
+    # Podman has a mode without this privilege, but check.py enters the network of a container.
+    unshare --net true || impossible "this machine does not permit network namespaces"
     command -v debootstrap >/dev/null || install_packages debootstrap
     mkdir -p target/container
     deploy/container/debian-base.sh "$suite" target/container/base.tar
     BASE_IMAGE=localhost/molmesh-base:$suite
-    "${engine[@]}" import target/container/base.tar "$BASE_IMAGE" >/dev/null
+    { "${engine[@]}" import target/container/base.tar "$BASE_IMAGE" >/dev/null &&
+        "${engine[@]}" run --rm --network none --ulimit nofile=1024:1024 --ulimit nproc=4096:4096 "$BASE_IMAGE" true; } ||
+        impossible "this machine cannot run containers"
     rm target/container/base.tar
 fi
 if [ -n "${BASE_IMAGE:-}" ]; then arguments+=(--build-arg "BASE_IMAGE=$BASE_IMAGE"); fi

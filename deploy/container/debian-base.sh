@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Creates the equivalent of `debian:SUITE-slim` without an image registry: essential packages with security updates,
-# without documentation and translations. Needs root and debootstrap. Usage: debian-base.sh SUITE OUT.tar
+# without documentation and translations. Needs root and debootstrap. Exits with 3 if debootstrap fails, as it does
+# without a network or the capabilities of root. Usage: debian-base.sh SUITE OUT.tar
 set -euo pipefail
 
 suite=$1
@@ -14,7 +15,7 @@ trap 'rm -rf "$work"' EXIT
 root=$work/root
 
 debootstrap --variant=minbase --force-check-gpg --keyring="$keyring" "$suite" "$root" "$mirror" >"$work/log" 2>&1 ||
-    { tail -20 "$work/log" >&2; exit 1; }
+    { tail -20 "$work/log" >&2; exit 3; }
 
 # As in Debian's image: the same files are excluded from packages installed later.
 cat >"$root/etc/dpkg/dpkg.cfg.d/slim" <<'SLIM'

@@ -19,16 +19,25 @@ pick_engine() {
     if [ "${engine[0]}" = podman ] && command -v runc >/dev/null; then engine+=(--runtime "$(command -v runc)"); fi
 }
 
-# Installs Debian packages. Prints the log only on failure.
+# Ends the script with 3: this machine lacks what the script needs.
+impossible() {
+    echo "$1" >&2
+    exit 3
+}
+
+# Installs Debian packages. Prints the log only on failure. Exits with 3 without root, apt-get or a network.
 install_packages() {
     if [ "$(id -u)" -ne 0 ] || ! command -v apt-get >/dev/null; then
-        echo "missing packages: $*; installing them needs root and apt-get" >&2
-        exit 1
+        impossible "missing packages: $*; installing them needs root and apt-get"
     fi
     echo "installing $*" >&2
     local log
     log=$(mktemp)
-    { apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 install -qy --no-install-recommends "$@"; } >"$log" 2>&1 ||
-        { tail -20 "$log" >&2; exit 1; }
+    local -x DEBIAN_FRONTEND=noninteractive LC_ALL=C
+    if ! { apt-get update -q && apt-get -o DPkg::Lock::Timeout=300 install -qy --no-install-recommends "$@"; } >"$log" 2>&1; then
+        tail -20 "$log" >&2
+        if grep -q 'Failed to fetch' "$log"; then impossible "apt-get cannot fetch $*"; fi
+        exit 1
+    fi
     rm -f "$log"
 }

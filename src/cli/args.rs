@@ -2,10 +2,8 @@
 //! and for HTTP, so that both reject a value with the same message.
 
 mod areas;
-#[cfg(feature = "server")]
 mod keys;
 mod render;
-#[cfg(feature = "server")]
 mod service;
 mod tileset;
 
@@ -18,10 +16,8 @@ use molmesh::surface::DeviceChoice;
 
 use super::error::EXIT_CODES;
 pub(crate) use areas::AreasArgs;
-#[cfg(feature = "server")]
 pub(crate) use keys::{KeyCommand, NewKeyArgs, SignArgs, SigningKeyArgs};
 pub(crate) use render::{PictureArgs, RenderArgs};
-#[cfg(feature = "server")]
 pub(crate) use service::{
     ConfigCommand, ConfigStyle, DoctorArgs, HealthcheckArgs, LogStyle, PrintArgs, ServeArgs, TextOrJson,
 };
@@ -57,24 +53,18 @@ pub(crate) enum Command {
     /// Write a table of the exact areas of one structure, without a mesh
     Areas(Box<AreasArgs>),
     /// Serve meshes over HTTP
-    #[cfg(feature = "server")]
     Serve(Box<ServeArgs>),
     /// List devices, show which are used, and check that a service would start and be ready
-    #[cfg(feature = "server")]
     Doctor(Box<DoctorArgs>),
     /// Print the configuration of the service or its schema
-    #[cfg(feature = "server")]
     #[command(subcommand)]
     Config(ConfigCommand),
     /// Check that a running service is ready; exit code 0 if it is
-    #[cfg(feature = "server")]
     Healthcheck(HealthcheckArgs),
     /// Create keys for the service
-    #[cfg(feature = "server")]
     #[command(subcommand)]
     Key(KeyCommand),
     /// Sign a URL of the service, which then works without a key until it expires
-    #[cfg(feature = "server")]
     Sign(SignArgs),
     /// Print the version
     Version,
@@ -167,17 +157,12 @@ pub(crate) struct JobArgs {
     pub(crate) limits: LimitArgs,
 }
 
-/// Returns the help of `--devices`. Builds without the service have no `doctor`.
-fn devices_help() -> String {
-    let doctor = if cfg!(feature = "server") { "; `molmesh doctor` lists the numbers" } else { "" };
-    format!("Devices to use: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software{doctor}")
-}
-
 // Devices.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct DeviceArgs {
-    /// Devices to use
-    #[arg(long, help = devices_help(), value_name = "DEVICES", default_value = "auto")]
+    /// Devices to use: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software; `molmesh doctor` lists
+    /// the numbers
+    #[arg(long, value_name = "DEVICES", default_value = "auto")]
     #[arg(env = "MOLMESH__DEVICES__USE", hide_env_values = true)]
     pub(crate) devices: DeviceChoice,
 }

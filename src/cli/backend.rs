@@ -4,9 +4,8 @@ use std::num::NonZero;
 #[cfg(feature = "gpu")]
 use std::sync::Arc;
 
-#[cfg(feature = "server")]
 use molmesh::config::DevicesConfig;
-#[cfg(all(feature = "gpu", feature = "server"))]
+#[cfg(feature = "gpu")]
 use molmesh::config::JOBS_PER_DEVICE;
 #[cfg(feature = "gpu")]
 use molmesh::picture::CpuRenderer;
@@ -47,7 +46,6 @@ pub(crate) enum Purpose {
     /// One mesh and its picture.
     Picture,
     /// A service, with the size of the readback buffers of each GPU, bytes.
-    #[cfg(feature = "server")]
     #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only GPUs have buffers"))]
     Service(u64),
 }
@@ -60,7 +58,6 @@ impl<'a> BackendRequest<'a> {
     }
 
     /// Creates the request of a service.
-    #[cfg(feature = "server")]
     pub(crate) fn for_service(backend: BackendName, config: &'a DevicesConfig) -> Self {
         let purpose = Purpose::Service(config.readback_bytes);
         Self { backend, devices: &config.choice, threads: None, work: None, purpose }
@@ -85,10 +82,8 @@ pub(crate) struct SelectedBackend {
     /// Renderer of pictures with its reason; the CPU if no pictures are needed.
     pub(crate) renderer: SelectedRenderer,
     /// All discovered devices, used or not.
-    #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) devices: Vec<FoundDevice>,
     /// Reason for not using a GPU, if none is used.
-    #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) no_gpu: Option<String>,
 }
 
@@ -210,7 +205,6 @@ fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
         return Err(NoGpu { why, devices: discovery.devices });
     }
     let settings = match requested.purpose {
-        #[cfg(feature = "server")]
         Purpose::Service(readback_bytes) => {
             PoolSettings { queue: JOBS_PER_DEVICE, readback_bytes: Some(readback_bytes), ..PoolSettings::default() }
         }

@@ -31,7 +31,6 @@ pub(crate) mod code {
     /// The output cannot be written.
     pub(crate) const OUTPUT: i32 = 7;
     /// Another service uses the data folder.
-    #[cfg(feature = "server")]
     pub(crate) const IN_USE: i32 = 8;
     /// Interrupted (Ctrl-C).
     pub(crate) const INTERRUPTED: i32 = 130;
@@ -52,7 +51,7 @@ Exit codes:
   130  interrupted; no partial file remains";
 
 /// End of hints about backends.
-const DOCTOR: &str = if cfg!(feature = "server") { "; `molmesh doctor` lists the backends" } else { "" };
+const DOCTOR: &str = "; `molmesh doctor` lists the backends";
 
 /// Error of a command.
 #[derive(Debug, Error)]
@@ -102,15 +101,12 @@ pub(crate) enum CliError {
     #[error("interrupted; nothing was written")]
     Interrupted,
     /// The service could not start, or is not healthy.
-    #[cfg(feature = "server")]
     #[error("{0}")]
     Service(String),
     /// Another service uses the data folder.
-    #[cfg(feature = "server")]
     #[error("{0}")]
     InUse(String),
     /// A service would not start, or not be ready.
-    #[cfg(feature = "server")]
     #[error("a service would not start or not be ready: {}", failed.join(", "))]
     Unfit {
         /// Names of the failed checks.
@@ -151,21 +147,14 @@ impl CliError {
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
             Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
-            Self::Job { source: JobError::Color(_), .. } => code::STRUCTURE,
+            Self::Job { source: JobError::Color(_), .. } | Self::Strict { .. } => code::STRUCTURE,
             Self::Job { source: JobError::Map(error), .. } => map_code(error),
-            Self::Job { source: JobError::Format(error), .. } => format_code(error),
-            Self::Strict { .. } => code::STRUCTURE,
-            Self::Format(error) => format_code(error),
-            Self::NoBackend { .. } => code::BACKEND,
-            #[cfg(feature = "server")]
-            Self::Unfit { backend: true, .. } => code::BACKEND,
+            Self::Job { source: JobError::Format(error), .. } | Self::Format(error) => format_code(error),
+            Self::NoBackend { .. } | Self::Unfit { backend: true, .. } => code::BACKEND,
             Self::Output { .. } => code::OUTPUT,
-            #[cfg(feature = "server")]
             Self::InUse(_) => code::IN_USE,
             Self::Interrupted => code::INTERRUPTED,
-            #[cfg(feature = "server")]
-            Self::Service(_) | Self::Unfit { .. } => code::INTERNAL,
-            Self::Internal(_) => code::INTERNAL,
+            Self::Service(_) | Self::Unfit { .. } | Self::Internal(_) => code::INTERNAL,
         }
     }
 
@@ -193,7 +182,6 @@ impl CliError {
                 _ => None,
             },
             Self::NoBackend { .. } => Some(format!("try --backend auto{DOCTOR}")),
-            #[cfg(feature = "server")]
             Self::InUse(_) => Some("stop that service, or choose another folder with --data-dir".to_owned()),
             Self::Output { source, .. } if source.kind() == io::ErrorKind::NotFound => {
                 Some("the directory must exist".to_owned())

@@ -5,18 +5,13 @@
 mod areas;
 mod args;
 mod backend;
-#[cfg(feature = "server")]
 mod banner;
-#[cfg(feature = "server")]
 mod config;
-#[cfg(feature = "server")]
 mod doctor;
 mod error;
-#[cfg(feature = "server")]
 mod healthcheck;
 mod interrupt;
 mod job;
-#[cfg(feature = "server")]
 mod key;
 mod mesh;
 mod output;
@@ -25,13 +20,10 @@ mod panics;
 mod progress;
 mod render;
 mod request;
-#[cfg(feature = "server")]
 mod serve;
-#[cfg(feature = "server")]
 mod sign;
 mod style;
 mod summary;
-#[cfg(feature = "server")]
 mod survey;
 mod tileset;
 
@@ -61,17 +53,11 @@ fn run() -> i32 {
         Command::Render(args) => panics::contained(|| render::run(&args)),
         Command::Tileset(args) => panics::contained(|| tileset::run(&args)),
         Command::Areas(args) => panics::contained(|| areas::run(&args)),
-        #[cfg(feature = "server")]
         Command::Serve(args) => serve::run(&args),
-        #[cfg(feature = "server")]
         Command::Doctor(args) => doctor::run(&args),
-        #[cfg(feature = "server")]
         Command::Config(command) => config::run(&command),
-        #[cfg(feature = "server")]
         Command::Healthcheck(args) => healthcheck::run(&args),
-        #[cfg(feature = "server")]
         Command::Key(command) => key::run(&command),
-        #[cfg(feature = "server")]
         Command::Sign(args) => sign::run(&args),
         Command::Version => version(),
     };
@@ -93,13 +79,6 @@ pub(crate) fn leave(status: i32) -> ! {
     std::process::exit(status);
 }
 
-/// Hint for an unknown command in a build without the service.
-const NO_SERVICE: &str = if cfg!(feature = "server") {
-    ""
-} else {
-    "\nThis build has no service; `serve`, `doctor` and related commands need the feature `server`.\n"
-};
-
 /// Prints help to stdout and usage errors to stderr. Returns the exit code.
 fn usage(error: clap::Error) -> i32 {
     let error = with_owners(error);
@@ -107,10 +86,9 @@ fn usage(error: clap::Error) -> i32 {
     let (written, code) = match error.kind() {
         ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => (io::stdout().write_all(text.as_bytes()), code::OK),
         ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => (io::stderr().write_all(text.as_bytes()), code::USAGE),
-        kind => {
+        _ => {
             let text = text.strip_prefix("error: ").unwrap_or(&text);
-            let hint = if kind == ErrorKind::InvalidSubcommand { NO_SERVICE } else { "" };
-            (write!(io::stderr(), "molmesh: {text}{hint}"), code::USAGE)
+            (write!(io::stderr(), "molmesh: {text}"), code::USAGE)
         }
     };
     // A closed stream is ignored.
@@ -143,13 +121,8 @@ fn with_owners(mut error: clap::Error) -> clap::Error {
 
 /// `molmesh version`.
 fn version() -> Result<(), CliError> {
-    print(&format!("molmesh {} (features: {})\n", env!("CARGO_PKG_VERSION"), features().join(", ")))
-}
-
-/// Returns the features of this build.
-fn features() -> Vec<&'static str> {
-    let features = [("cli", true), ("server", cfg!(feature = "server")), ("gpu", cfg!(feature = "gpu"))];
-    features.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
+    let gpu = if cfg!(feature = "gpu") { "" } else { " (without GPU support)" };
+    print(&format!("molmesh {}{gpu}\n", env!("CARGO_PKG_VERSION")))
 }
 
 /// Prints `text` to stdout and flushes it.

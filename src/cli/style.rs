@@ -19,7 +19,6 @@ impl Style {
     }
 
     /// Returns the style of stdout.
-    #[cfg(feature = "server")]
     pub(crate) fn stdout() -> Self {
         Self { coloured: std::io::stdout().is_terminal() && wanted() }
     }

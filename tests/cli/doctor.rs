@@ -74,6 +74,7 @@ fn all_checks_pass() {
     }
     let document: Value = serde_json::from_slice(&done.stdout).unwrap();
     assert_eq!(document["molmesh"]["version"], env!("CARGO_PKG_VERSION"));
+    assert_eq!(document["molmesh"]["gpu"], cfg!(feature = "gpu"));
     assert!(document["molmesh"]["compiler"].as_str().unwrap().starts_with("rustc "), "{document:#}");
     assert!(document["molmesh"]["target"].as_str().unwrap().contains(std::env::consts::ARCH));
     assert!(document["machine"]["cores"].as_u64().unwrap() >= 1);

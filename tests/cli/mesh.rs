@@ -358,7 +358,8 @@ fn links_are_followed_and_devices_are_not_replaced() {
 fn version_and_doctor_write_to_stdout() {
     let version = run(["version"]);
     assert_code(&version, 0);
-    assert!(stdout(&version).starts_with(concat!("molmesh ", env!("CARGO_PKG_VERSION"))));
+    let gpu = if cfg!(feature = "gpu") { "" } else { " (without GPU support)" };
+    assert_eq!(stdout(&version), format!("molmesh {}{gpu}\n", env!("CARGO_PKG_VERSION")));
     let doctor = cli_support::doctor(&[]);
     assert_code(&doctor, 0);
     let text = stdout(&doctor);

@@ -1,4 +1,4 @@
-//! The static executable, without the service. `make test` builds it with the profile of the tests.
+//! The static executable, without GPU support. `make test` builds it with the profile of the tests.
 #![cfg(target_os = "linux")]
 #![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::SystemTime;
 
-use cli_support::{Folder, assert_code, mesh, molmesh, stderr, stdout};
+use cli_support::{Folder, Service, assert_code, mesh, molmesh, prepared, stderr, stdout};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
@@ -112,20 +112,24 @@ fn renders_and_rejects_like_the_usual_executable() {
 }
 
 #[test]
-fn names_missing_features() {
+fn serves_without_gpu_support() {
     let Some(tool) = tool() else { return };
-    let folder = Folder::new();
     let version = run(&tool, &["version"]);
     assert_code(&version, 0);
-    assert!(stdout(&version).ends_with("(features: cli)\n"), "{}", stdout(&version));
+    assert_eq!(stdout(&version), concat!("molmesh ", env!("CARGO_PKG_VERSION"), " (without GPU support)\n"));
 
-    let serve = run(&tool, &["serve"]);
-    assert_eq!(serve.status.code(), Some(2));
-    assert!(stderr(&serve).contains("This build has no service"), "{}", stderr(&serve));
+    let folder = Folder::new();
+    let data = folder.path("doctor");
+    let flags = ["--report", "json", "--listen", "127.0.0.1:0", "--data-dir", data.to_str().unwrap()];
+    let doctor = prepared(Command::new(&tool)).arg("doctor").args(flags).output().unwrap();
+    assert_code(&doctor, 0);
+    let document: serde_json::Value = serde_json::from_slice(&doctor.stdout).unwrap();
+    assert_eq!((&document["molmesh"]["gpu"], &document["backend"]["name"]), (&false.into(), &"cpu".into()));
+    let (code, log) = Service::start_as(prepared(Command::new(&tool)), &folder, &[]).stop("TERM");
+    assert_eq!(code, Some(0), "{log}");
 
     let output = folder.path("4pti.glb");
     let gpu = run(&tool, &["mesh", "samples/4pti.pdb", "-o", output.to_str().unwrap(), "--backend", "gpu"]);
     assert_code(&gpu, 6);
     assert!(stderr(&gpu).contains("this build has no GPU support"), "{}", stderr(&gpu));
-    assert!(!stderr(&gpu).contains("doctor"), "{}", stderr(&gpu));
 }

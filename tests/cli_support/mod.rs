@@ -44,7 +44,8 @@ pub fn molmesh() -> Command {
     prepared(Command::new(env!("CARGO_BIN_EXE_molmesh")))
 }
 
-fn prepared(mut command: Command) -> Command {
+/// Removes the environment variables that change the output of the binary, and its use of the network.
+pub fn prepared(mut command: Command) -> Command {
     for name in ["RUST_BACKTRACE", "RUST_LOG", "MOLMESH__DEVICES__USE", "COLUMNS", "CLICOLOR_FORCE"] {
         command.env_remove(name);
     }
@@ -216,7 +217,8 @@ impl Service {
         service
     }
 
-    fn start_as(mut command: Command, folder: &Folder, more: &[&str]) -> Self {
+    /// Starts a service with the binary of `command`, as [`Self::start`] does.
+    pub fn start_as(mut command: Command, folder: &Folder, more: &[&str]) -> Self {
         use std::io::{BufRead, BufReader};
         let mut child = command
             .args(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--data-dir"])

@@ -54,8 +54,7 @@ impl fmt::Display for Interface {
 
 /// Exact measures of a surface of spheres, which do not depend on the grid spacing. The area includes the walls of
 /// voids; the volume excludes voids.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct ExactReport {
     /// Area in Å².
     pub area: f64,
@@ -75,8 +74,7 @@ pub struct ExactReport {
 }
 
 /// Area of the surface on the atoms of a chain.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct ChainArea {
     /// Name given by the author; empty if the file leaves it blank.
     pub chain: String,
@@ -91,8 +89,7 @@ pub struct ChainArea {
 }
 
 /// Parts of an area of a solvent-excluded surface.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct AreaPartsReport {
     /// Area of the contact parts in Å², where the probe touches one atom.
     pub contact: f64,
@@ -109,8 +106,7 @@ impl AreaPartsReport {
 }
 
 /// Surface area buried between two sets of chains.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct InterfaceReport {
     /// Half of the buried area of both sides in Å².
     pub area: f64,
@@ -119,8 +115,7 @@ pub struct InterfaceReport {
 }
 
 /// Side of an interface.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct InterfaceSide {
     /// Names of its chains.
     pub chains: Vec<String>,

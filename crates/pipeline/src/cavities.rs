@@ -35,8 +35,7 @@ impl Cavities {
 }
 
 /// Residue that lines a cavity or a pocket.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, utoipa::ToSchema)]
 pub struct LiningResidue {
     /// Author name of the chain.
     pub chain: String,
@@ -66,8 +65,7 @@ impl LiningResidue {
 }
 
 /// Cavity: a closed region that holds a probe. It does not depend on the grid spacing and the type of the surface.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct CavityReport {
     /// Centre of the largest sphere that fits between the atoms, in the coordinates of the structure, in Å.
     pub center: [f64; 3],

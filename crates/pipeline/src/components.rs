@@ -4,8 +4,7 @@ use molmesh_surface::Component;
 use serde::Serialize;
 
 /// Connected component of the mesh.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct ComponentReport {
     /// Number of triangles.
     pub triangles: u64,
@@ -14,7 +13,7 @@ pub struct ComponentReport {
     /// Area in Å².
     pub area: f64,
     /// Volume in Å³, negative for a void; null if the mesh is cut open.
-    #[cfg_attr(feature = "openapi", schema(required))]
+    #[schema(required)]
     pub volume: Option<f64>,
 }
 
@@ -26,8 +25,7 @@ impl ComponentReport {
 
 /// Void: a closed surface that encloses space outside the molecule. Most voids are gaps between atoms; no probe has
 /// tested whether a solvent molecule fits.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct VoidReport {
     /// Centroid in the coordinates of the structure, in Å.
     pub center: [f64; 3],

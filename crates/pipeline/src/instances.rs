@@ -11,8 +11,7 @@ use serde::Serialize;
 const PLACEMENT_BYTES: u64 = 28;
 
 /// Biological assembly.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct AssemblyReport {
     /// Id in the file.
     pub id: String,
@@ -33,8 +32,7 @@ impl AssemblyReport {
 }
 
 /// Instances of the units of an assembly.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct InstancesReport {
     /// Number of instances of all units.
     pub count: u64,

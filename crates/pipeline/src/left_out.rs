@@ -4,8 +4,7 @@ use molmesh_structure::LeftOut;
 use serde::Serialize;
 
 /// Number of atoms of one kind.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct KindCount {
     /// Kind.
     pub kind: &'static str,
@@ -14,8 +13,7 @@ pub struct KindCount {
 }
 
 /// Number of atoms of one kind with one residue name.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct ResidueCount {
     /// Residue name.
     pub name: String,
@@ -26,8 +24,7 @@ pub struct ResidueCount {
 }
 
 /// Atoms of the file that are not meshed. Each atom is counted once, under the first field that applies.
-#[derive(Debug, Clone, Default, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Default, Serialize, utoipa::ToSchema)]
 pub struct LeftOutReport {
     /// Total number of these atoms.
     pub total: u64,

@@ -22,8 +22,7 @@ use super::fit::WithoutProgress;
 const ROWS: usize = 1 << 16;
 
 /// Part of the mesh. It is closed on its own, unless `context=whole` divides one surface.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct PartReport {
     /// Name: chain (with the number of its copy in an assembly), entity, group of residues, or the chains of a unit
     /// (`instances`).
@@ -38,7 +37,7 @@ pub struct PartReport {
     /// Surface area in Å².
     pub area: f64,
     /// Enclosed volume in Å³; null for a part of one surface (`context=whole`).
-    #[cfg_attr(feature = "openapi", schema(required))]
+    #[schema(required)]
     pub volume: Option<f64>,
     /// Number of instances in the assembly; absent without `instances`.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -11,8 +11,7 @@ use super::{Job, LiningResidue, Report};
 
 /// Pocket: a region outside the molecule that the probe can enter and a large probe cannot. It does not depend on the
 /// mesh and the type of the surface.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct PocketReport {
     /// Volume in Å³.
     pub volume: f64,

@@ -19,16 +19,14 @@ use super::simplify::SimplificationReport;
 use super::{Choice, Job, StageClock};
 
 /// Quantization of the vertices in the file.
-#[derive(Debug, Clone, Copy, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Copy, Serialize, utoipa::ToSchema)]
 pub struct Quantization {
     /// Step between adjacent coordinates in Å. Rounding moves a vertex by at most half a step along each axis.
     pub step: f32,
 }
 
 /// Picture of a mesh and its renderer.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct PictureReport {
     /// Width in pixels.
     pub width: u32,
@@ -62,14 +60,13 @@ pub struct PictureReport {
 
 /// Report of a job: input, grid, mesh, measures and times.
 #[expect(clippy::struct_field_names, reason = "the fields are named like the members of the JSON")]
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct Report {
     /// PDB id or data block name; null if the file has none.
-    #[cfg_attr(feature = "openapi", schema(required))]
+    #[schema(required)]
     pub id: Option<String>,
     /// Title of the structure; null if the file has none.
-    #[cfg_attr(feature = "openapi", schema(required))]
+    #[schema(required)]
     pub title: Option<String>,
     /// Format of the structure file: `pdb`, `mmcif`, `bcif`, `pqr` or `xyz`.
     pub source_format: &'static str,
@@ -97,7 +94,7 @@ pub struct Report {
     pub left_out: LeftOutReport,
     /// Unreadable values that do not affect the mesh, at most 12; absent if there are none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    #[cfg_attr(feature = "openapi", schema(required = false))]
+    #[schema(required = false)]
     pub warnings: Vec<String>,
     /// Table of van der Waals radii, or the file that gives them.
     pub radii: &'static str,
@@ -187,7 +184,7 @@ pub struct Report {
     pub component_list: Vec<ComponentReport>,
     /// Parts of the mesh; absent if the request does not divide it.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    #[cfg_attr(feature = "openapi", schema(required = false))]
+    #[schema(required = false)]
     pub parts: Vec<PartReport>,
     /// Surface area in Å², including the walls of voids.
     pub area: f64,
@@ -197,7 +194,7 @@ pub struct Report {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub area_deficit_percent: Option<f64>,
     /// Enclosed volume in Å³, voids subtracted; null if the mesh is cut open.
-    #[cfg_attr(feature = "openapi", schema(required))]
+    #[schema(required)]
     pub volume: Option<f64>,
     /// Exact areas and volume of the surface; absent if the request does not ask for them.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -230,7 +227,7 @@ pub struct Report {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub picture: Option<PictureReport>,
     /// Wall-clock time per stage in ms.
-    #[cfg_attr(feature = "openapi", schema(value_type = std::collections::BTreeMap<String, f64>))]
+    #[schema(value_type = std::collections::BTreeMap<String, f64>)]
     pub timings_ms: Map<String, Value>,
 }
 

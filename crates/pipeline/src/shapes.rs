@@ -6,8 +6,7 @@ use serde::Serialize;
 use super::{Job, StageClock};
 
 /// Shapes of the triangles.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct TriangleReport {
     /// Smallest angle of all triangles in degrees.
     pub smallest_angle: f64,

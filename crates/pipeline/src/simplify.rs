@@ -8,8 +8,7 @@ use super::clock::StageClock;
 use super::collapse::{check_error, simplify};
 
 /// Size of the mesh before its simplification, and distance between the original and the simplified surface.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct SimplificationReport {
     /// Number of triangles before the simplification.
     pub triangles_before: u64,

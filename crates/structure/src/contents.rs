@@ -49,9 +49,8 @@ impl Kind {
 }
 
 /// Numbers of atoms by kind. Hydrogens are counted apart from the heavy atoms of their residues.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[cfg_attr(feature = "openapi", schema(as = KindCounts))]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]
+#[schema(as = KindCounts)]
 pub struct Counts {
     /// Heavy atoms of polymers, including proteins and nucleic acids.
     pub polymer: u64,

@@ -1,20 +1,18 @@
 //! Locks, channels, threads and tasks of the concurrent modules: those of `std` and Tokio, or, with the feature
 //! `shuttle`, those of Shuttle, whose scheduler explores their interleavings in the tests named `interleavings`.
 
-#[cfg(not(feature = "shuttle"))]
-pub use std::sync::{Condvar, Mutex, MutexGuard};
-#[cfg(not(feature = "shuttle"))]
-pub use std::{sync::mpsc, thread};
-#[cfg(all(feature = "tokio", not(feature = "shuttle")))]
-pub use tokio::{
-    runtime::Handle,
-    task::spawn_blocking,
-    time::{sleep, timeout},
-};
 #[cfg(feature = "shuttle")]
 pub use {
     shuttle::sync::{Condvar, Mutex, MutexGuard, mpsc},
     shuttle::thread,
+};
+#[cfg(not(feature = "shuttle"))]
+pub use {
+    std::sync::{Condvar, Mutex, MutexGuard, mpsc},
+    std::thread,
+    tokio::runtime::Handle,
+    tokio::task::spawn_blocking,
+    tokio::time::{sleep, timeout},
 };
 
 /// Counterpart of Tokio's handle: the scheduler of Shuttle runs all tasks.

@@ -107,7 +107,7 @@ impl Findings {
         json!({
             "ok": self.checks.iter().all(|check| check.state != CheckResult::Failed),
             "molmesh": {
-                "version": env!("CARGO_PKG_VERSION"), "features": super::features(),
+                "version": env!("CARGO_PKG_VERSION"), "gpu": cfg!(feature = "gpu"),
                 "target": machine::TARGET, "compiler": machine::COMPILER,
             },
             "machine": self.machine.document(),

@@ -17,7 +17,7 @@ const WIDTH: usize = 100;
 pub(super) fn text(findings: &Findings, style: Style) -> String {
     let mut page = Page::new(style, "molmesh", env!("CARGO_PKG_VERSION"));
     let machine = &findings.machine;
-    page.row("build", &format!("{TARGET}, {} ({COMPILER})", crate::cli::features().join(", ")));
+    page.row("build", &format!("{TARGET} ({COMPILER})"));
     page.row("system", &format!("{} {}", std::env::consts::OS, std::env::consts::ARCH));
     let cores = machine.cores.map_or("an unknown number".to_owned(), |cores| cores.to_string());
     page.row("cores", &format!("{cores} for this process"));

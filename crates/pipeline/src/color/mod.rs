@@ -67,8 +67,7 @@ impl Coloring {
 }
 
 /// Entry of a legend.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct LegendEntry {
     /// Value, or name of the element, chain, entity, residue or pLDDT class.
     pub label: String,
@@ -77,8 +76,7 @@ pub struct LegendEntry {
 }
 
 /// Colours of a mesh.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct ColorReport {
     /// Scheme, the value of the parameter `color`.
     pub scheme: String,
@@ -103,8 +101,7 @@ pub struct ColorReport {
 }
 
 /// Map whose values colour a mesh.
-#[derive(Debug, Clone, Serialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub struct MapReport {
     /// File format: `ccp4` (also MRC) or `dx`.
     pub format: &'static str,
