@@ -4,6 +4,7 @@
 use std::io::{self, Write};
 
 use molmesh_surface::Mesh;
+use molmesh_surface::vector::{area_vector, length};
 
 use super::block::{Placement, put_floats, write_records};
 use super::error::FormatError;
@@ -68,10 +69,8 @@ impl StlPlan {
 #[expect(clippy::cast_possible_truncation, reason = "STL requires f32")]
 fn face_normal(corners: [[f32; 3]; 3]) -> [f32; 3] {
     // Double precision: the cross product of two edges of 1e-10 Å would underflow in single precision.
-    let [a, b, c] = corners.map(|p| p.map(f64::from));
-    let (u, v): ([f64; 3], [f64; 3]) = (std::array::from_fn(|k| b[k] - a[k]), std::array::from_fn(|k| c[k] - a[k]));
-    let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
-    let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
+    let n = area_vector(corners.map(|p| p.map(f64::from)));
+    let length = length(n);
     let scale = if length > 0.0 { length.recip() } else { 0.0 };
     n.map(|v| (v * scale) as f32)
 }

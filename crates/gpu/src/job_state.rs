@@ -2,7 +2,7 @@
 //! and are not copied.
 
 use bytemuck::Pod;
-use molmesh_surface::mesh::joined_bounds;
+use molmesh_surface::vector::joined_bounds;
 use molmesh_surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage, Step};
 
 use super::engine::LoadedJob;

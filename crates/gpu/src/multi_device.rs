@@ -4,7 +4,7 @@
 //! have published their counts, it computes its triangles with the final vertex numbers. The mesh has the same bytes as
 //! that of one device.
 
-use molmesh_surface::mesh::joined_bounds;
+use molmesh_surface::vector::joined_bounds;
 use molmesh_surface::{GridStats, Mesh, MeshOutput, Stage};
 
 use super::job::Finished;

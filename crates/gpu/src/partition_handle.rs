@@ -5,8 +5,7 @@ use std::ops::Range;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 
-use molmesh_surface::SurfaceError;
-use molmesh_surface::column::SharedBytes;
+use molmesh_surface::{SharedBytes, SurfaceError};
 use molmesh_sync::{Condvar, Mutex, MutexGuard};
 
 use super::error::GpuError;

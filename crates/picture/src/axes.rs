@@ -1,5 +1,6 @@
 //! Principal axes of a surface, weighted by area rather than by vertices, so that they rotate with the molecule.
 
+use molmesh_surface::vector::{add, area_vector, cross, dot, length, sub};
 use rayon::prelude::*;
 
 /// Number of triangles per task. Fixed, so that sums do not depend on the number of threads.
@@ -45,21 +46,10 @@ pub(super) fn principal(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> Mat3 
     [right, up, cross(right, up)]
 }
 
-fn cross(a: Vec3, b: Vec3) -> Vec3 {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-fn dot(a: Vec3, b: Vec3) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
 /// Corners and area of a triangle.
 fn corners(positions: &[[f32; 3]], triangle: [u32; 3]) -> ([Vec3; 3], f64) {
     let corners = triangle.map(|v| positions[v as usize].map(f64::from));
-    let [a, b, c] = corners;
-    let edge = |p: Vec3| std::array::from_fn(|k| p[k] - a[k]);
-    let normal = cross(edge(b), edge(c));
-    (corners, 0.5 * dot(normal, normal).sqrt())
+    (corners, 0.5 * length(area_vector(corners)))
 }
 
 /// Integrals of 1, of the position, and of products of its components over the surface.
@@ -68,7 +58,7 @@ fn moments(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> (f64, Vec3, Mat3) 
         let (mut area, mut sum, mut square) = (0.0, [0.0; 3], [[0.0; 3]; 3]);
         for triangle in chunk {
             let (corners, a) = corners(positions, *triangle);
-            let total: Vec3 = std::array::from_fn(|k| corners[0][k] + corners[1][k] + corners[2][k]);
+            let total = add(add(corners[0], corners[1]), corners[2]);
             area += a;
             for i in 0..3 {
                 sum[i] += a * total[i] / 3.0;
@@ -83,9 +73,8 @@ fn moments(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> (f64, Vec3, Mat3) 
     };
     let parts: Vec<_> = triangles.par_chunks(CHUNK).map(of_chunk).collect();
     parts.iter().fold((0.0, [0.0; 3], [[0.0; 3]; 3]), |(area, sum, square), part| {
-        let sum = std::array::from_fn(|i| sum[i] + part.1[i]);
         let square = std::array::from_fn(|i| std::array::from_fn(|j| square[i][j] + part.2[i][j]));
-        (area + part.0, sum, square)
+        (area + part.0, add(sum, part.1), square)
     })
 }
 
@@ -95,7 +84,7 @@ fn third_moments(positions: &[[f32; 3]], triangles: &[[u32; 3]], mean: Vec3, axe
         let mut sums = [0.0; 2];
         for triangle in chunk {
             let ([a, b, c], area) = corners(positions, *triangle);
-            let middle: Vec3 = std::array::from_fn(|k| (a[k] + b[k] + c[k]) / 3.0 - mean[k]);
+            let middle = sub(add(add(a, b), c).map(|sum| sum / 3.0), mean);
             for (sum, axis) in sums.iter_mut().zip(axes) {
                 let along = dot(middle, axis);
                 *sum += area * along * along * along;

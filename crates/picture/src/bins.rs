@@ -1,5 +1,6 @@
 //! Binning of the front-facing triangles by screen tile.
 
+use molmesh_surface::groups::Groups;
 use molmesh_surface::{Control, SurfaceError};
 use rayon::prelude::*;
 
@@ -51,15 +52,8 @@ impl Tiles {
     }
 }
 
-/// Triangles of one task, by tile.
-struct TaskTriangles {
-    /// Start of the list of each tile; the last entry is the total.
-    starts: Vec<u32>,
-    triangles: Vec<u32>,
-}
-
-/// Front-facing triangles by tile, ascending.
-pub(super) struct Bins(Vec<TaskTriangles>);
+/// Front-facing triangles of each task by tile, ascending.
+pub(super) struct Bins(Vec<Groups>);
 
 impl Bins {
     /// Sorts triangles into tiles.
@@ -83,16 +77,12 @@ impl Bins {
 
     /// Returns the triangles of a tile.
     pub(super) fn of(&self, tile: usize) -> impl Iterator<Item = u32> {
-        self.0.iter().flat_map(move |chunk| {
-            let [from, to] = [tile, tile + 1].map(|t| chunk.starts.get(t).map_or(0, |at| *at as usize));
-            chunk.triangles.get(from..to).unwrap_or_default().iter().copied()
-        })
+        self.0.iter().flat_map(move |chunk| chunk.get(tile)).copied()
     }
 }
 
-fn bin(positions: &[[f32; 3]], part: &[[u32; 3]], first: usize, camera: &Camera, tiles: Tiles) -> TaskTriangles {
+fn bin(positions: &[[f32; 3]], part: &[[u32; 3]], first: usize, camera: &Camera, tiles: Tiles) -> Groups {
     let mut pairs: Vec<(u32, u32)> = Vec::with_capacity(part.len());
-    let mut starts = vec![0_u32; tiles.across * tiles.down + 1];
     for (n, triangle) in part.iter().enumerate() {
         let corners = triangle.map(|v| corner(camera.project(positions[v as usize])));
         // Rows count downwards, so counter-clockwise triangles have a negative area on the screen.
@@ -112,23 +102,12 @@ fn bin(positions: &[[f32; 3]], part: &[[u32; 3]], first: usize, camera: &Camera,
         for row in top..=bottom {
             for column in left..=right {
                 let tile = row * tiles.across + column;
-                starts[tile + 1] += 1;
                 #[expect(clippy::cast_possible_truncation, reason = "meshes have less than 2³² triangles")]
                 pairs.push((tile as u32, (first + n) as u32));
             }
         }
     }
-    for tile in 1..starts.len() {
-        starts[tile] += starts[tile - 1];
-    }
-    let mut next = starts.clone();
-    let mut triangles = vec![0; pairs.len()];
-    for (tile, triangle) in pairs {
-        let at = &mut next[tile as usize];
-        triangles[*at as usize] = triangle;
-        *at += 1;
-    }
-    TaskTriangles { starts, triangles }
+    Groups::new(tiles.across * tiles.down, pairs.iter().map(|(tile, triangle)| (*tile as usize, *triangle)))
 }
 
 #[cfg(test)]

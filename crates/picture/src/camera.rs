@@ -1,5 +1,6 @@
 //! Camera: directions, scale and offset of a picture, from the mesh and the view.
 
+use molmesh_surface::vector::{dot, joined_bounds};
 use rayon::prelude::*;
 
 use super::axes;
@@ -72,11 +73,6 @@ impl Camera {
     }
 }
 
-#[inline]
-pub(super) fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
 /// Axes of a named view: right, up, towards the viewer.
 fn directions(positions: &[[f32; 3]], triangles: &[[u32; 3]], view: View) -> [[f64; 3]; 3] {
     const X: [f64; 3] = [1.0, 0.0, 0.0];
@@ -106,20 +102,18 @@ fn rotated([right, up, toward]: [[f64; 3]; 3], azimuth: f64, elevation: f64) -> 
 /// Minimum and maximum projection on each axis.
 fn bounds(positions: &[[f32; 3]], axes: &[[f32; 3]; 3]) -> [[f32; 3]; 2] {
     let of_chunk = |chunk: &[[f32; 3]]| {
-        chunk.iter().fold([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]], |[low, high], position| {
-            let at = axes.map(|axis| dot(axis, *position));
-            [std::array::from_fn(|k| low[k].min(at[k])), std::array::from_fn(|k| high[k].max(at[k]))]
+        chunk.iter().fold([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]], |bounds, position| {
+            joined_bounds(bounds, [axes.map(|axis| dot(axis, *position)); 2])
         })
     };
-    let joined = |a: [[f32; 3]; 2], b: [[f32; 3]; 2]| {
-        [std::array::from_fn(|k| a[0][k].min(b[0][k])), std::array::from_fn(|k| a[1][k].max(b[1][k]))]
-    };
-    positions.par_chunks(CHUNK).map(of_chunk).reduce_with(joined).unwrap_or_default()
+    positions.par_chunks(CHUNK).map(of_chunk).reduce_with(joined_bounds).unwrap_or_default()
 }
 
 #[cfg(test)]
 #[expect(clippy::float_cmp, reason = "file axes are exact")]
 mod tests {
+    use molmesh_surface::vector::cross;
+
     use super::*;
 
     /// A box of 2 × 4 × 6 Å as eight corners.
@@ -153,9 +147,8 @@ mod tests {
             let camera = camera(view, 0.0, 0.0);
             assert_eq!((camera.axes[2], camera.axes[0]), (toward, right), "{view:?}");
             // The axes are right-handed: the picture is not mirrored.
-            let [r, u, t] = camera.axes;
-            let crossed = [r[1] * u[2] - r[2] * u[1], r[2] * u[0] - r[0] * u[2], r[0] * u[1] - r[1] * u[0]];
-            assert_eq!(crossed, t, "{view:?}");
+            let [right, up, toward] = camera.axes;
+            assert_eq!(cross(right, up), toward, "{view:?}");
         }
     }
 

@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use super::camera::dot;
+use molmesh_surface::vector::dot;
 
 /// Direction of the light in view space (right, up, towards), a unit vector.
 pub const LIGHT: [f32; 3] = [-2.0 / 7.0, 3.0 / 7.0, 6.0 / 7.0];

@@ -1,10 +1,11 @@
 //! Rasterizer of one tile: the nearest triangle at four samples of every pixel.
 
+use molmesh_surface::vector::{add, length, unit};
 use molmesh_surface::{Control, Mesh, SurfaceError, Vertices};
 
 use super::PictureError;
 use super::bins::{Bins, PARTS, TILE_HEIGHT, TILE_WIDTH, Tiles, corner, twice_area};
-use super::camera::{Camera, dot};
+use super::camera::Camera;
 use super::layers::{FULL, Facing, NOTHING, SAMPLES, UNIT};
 use super::light::{lambert, linear_levels};
 
@@ -232,7 +233,7 @@ pub(super) fn fill(
 fn mean_color(samples: &Samples, pixel: usize) -> [u16; 3] {
     let (mut sum, mut covered) = ([0.0_f32; 3], 0.0_f32);
     for i in (pixel * SAMPLES..(pixel + 1) * SAMPLES).filter(|i| samples.depth[*i] < NOTHING) {
-        (0..3).for_each(|k| sum[k] += samples.color[i][k]);
+        sum = add(sum, samples.color[i]);
         covered += 1.0;
     }
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate")]
@@ -246,15 +247,14 @@ fn resolve(samples: &Samples, pixel: usize) -> (f32, f32, Facing) {
     for i in of_pixel.filter(|i| samples.depth[*i] < NOTHING) {
         nearest = nearest.min(samples.depth[i]);
         light += samples.light[i];
-        (0..3).for_each(|k| normal[k] += samples.normal[i][k]);
+        normal = add(normal, samples.normal[i]);
         covered += 1;
     }
     if covered == 0 {
         return (NOTHING, 0.0, Facing::default());
     }
-    let length = dot(normal, normal).sqrt();
     // Opposite normals cancel. The normal of the pixel then points to the viewer.
-    let unit = if length > 0.0 { normal.map(|c| c / length) } else { [0.0, 0.0, 1.0] };
+    let unit = if length(normal) > 0.0 { unit(normal) } else { [0.0, 0.0, 1.0] };
     #[expect(clippy::cast_possible_truncation, reason = "components of a unit vector")]
     let normal = unit.map(|c| (c * UNIT + 0.5_f32.copysign(c)) as i16);
     (nearest, light / f32::from(covered), Facing { normal, covered })

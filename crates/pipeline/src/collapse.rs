@@ -17,13 +17,11 @@ mod piece;
 
 use std::ops::Range;
 
-use molmesh_surface::control::Control;
-use molmesh_surface::error::SurfaceError;
 use molmesh_surface::lattice::{to_f32, to_i32, to_u32};
-use molmesh_surface::measure::Component;
-use molmesh_surface::mesh::{Mesh, PartRange, bounds_of};
+use molmesh_surface::mesh::bounds_of;
 use molmesh_surface::params::bad;
 use molmesh_surface::triangle::{Corners, centroid};
+use molmesh_surface::{Component, Control, Mesh, PartRange, SurfaceError};
 use rayon::prelude::*;
 
 pub use self::deviation::Deviation;

@@ -6,7 +6,7 @@
 
 use molmesh_structure::{AtomPart, Selected};
 use molmesh_surface::cpu::scan;
-use molmesh_surface::mesh::joined_bounds;
+use molmesh_surface::vector::joined_bounds;
 use molmesh_surface::{
     Column, Component, Control, Measures, Mesh, MeshOutput, PartRange, Pockets, Stage, SurfaceError, Validation,
 };

@@ -124,7 +124,7 @@ impl File<'_> {
 
 #[cfg(test)]
 mod tests {
-    use molmesh_surface::mesh::joined_bounds;
+    use molmesh_surface::vector::joined_bounds;
     use molmesh_surface::{Control, CpuBackend};
 
     use super::*;

@@ -7,7 +7,7 @@ use std::borrow::Cow;
 use molmesh_structure::AtomPart;
 use molmesh_surface::cpu::scan;
 use molmesh_surface::lattice::{to_f32, to_u64};
-use molmesh_surface::mesh::joined_bounds;
+use molmesh_surface::vector::{add, joined_bounds, sub};
 use molmesh_surface::{
     Backend, BackendIdentity, Control, GridStats, Measures, Mesh, MeshOutput, PartRange, Spheres, Stage, SurfaceError,
     SurfaceLimits, SurfaceParams, candidates, grid_limit,
@@ -164,9 +164,9 @@ impl Joined {
         control: &Control<'_>,
     ) -> Result<(), SurfaceError> {
         let own = &mut output.mesh;
-        let shift: [f64; 3] = std::array::from_fn(|k| own.centre[k] - self.mesh.centre[k]);
+        let shift = sub(own.centre, self.mesh.centre);
         own.centre = self.mesh.centre;
-        let moved = |p: [f32; 3]| std::array::from_fn(|k| to_f32(f64::from(p[k]) + shift[k]));
+        let moved = |p: [f32; 3]| add(p.map(f64::from), shift).map(to_f32);
         own.positions.par_chunks_mut(ROWS).flatten_iter().for_each(|position| *position = moved(*position));
         // Moving and rounding keep the order of coordinates.
         output.bounds = output.bounds.map(|bounds| bounds.map(moved));

@@ -94,7 +94,7 @@ pub struct Archive {
 /// Bytes that are read at once.
 const READ_BYTES: usize = 1 << 18;
 /// Default limit of file sizes. The largest entries are below 1 GiB as text.
-pub const MAX_BYTES: u64 = 4 << 30;
+const MAX_BYTES: u64 = 4 << 30;
 
 impl Archive {
     /// Creates an archive over the folder `dir`, which may appear, vanish or change at any time.

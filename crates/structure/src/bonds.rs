@@ -2,6 +2,8 @@
 
 use std::ops::Range;
 
+use molmesh_surface::vector::squared_distance;
+
 use super::atoms::Slices;
 use super::contents::Kind;
 use super::kinds::{Declared, residue_end, residue_start, same_chain};
@@ -50,7 +52,7 @@ impl Joints {
     /// Returns true if a bond joins this residue to the `next` one.
     fn lead_to(&self, next: &Self) -> bool {
         let near = |a: Joint, b: Joint, limit: f64| match (self.0[a as usize], next.0[b as usize]) {
-            (Some(a), Some(b)) => a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>() <= limit * limit,
+            (Some(a), Some(b)) => squared_distance(a, b) <= limit * limit,
             _ => false,
         };
         let is_trace = self.0[Joint::C as usize].is_none() && next.0[Joint::N as usize].is_none();

@@ -1,7 +1,7 @@
 //! Structure files: reads PDB, mmCIF, BinaryCIF, PQR and XYZ, and selects atoms as [`molmesh_surface::Spheres`].
 //! Positions are in Å.
 //!
-//! The crate does not depend on grids, meshes or HTTP. Only [`archive`] reads files from disk.
+//! The crate does not depend on grids, meshes or HTTP. Only [`Archive`] reads files from disk.
 //!
 //! [`read()`] parses bytes into columns. [`Selection`] chooses the atoms to mesh, and [`Contents`] lists what can be
 //! selected. [`radii`] assigns a van der Waals radius to every element. [`strict_validator`] checks a file with a
@@ -9,11 +9,11 @@
 
 mod altloc;
 pub mod annotations;
-pub mod archive;
+mod archive;
 mod assembly;
 mod atom_layout;
 mod atom_site;
-pub mod atoms;
+mod atoms;
 mod bcif;
 mod bonds;
 mod categories;
@@ -27,7 +27,7 @@ mod decoder;
 mod divisions;
 mod duplicates;
 pub mod element;
-pub mod error;
+mod error;
 mod fields;
 mod growing;
 mod kind_set;
@@ -49,7 +49,7 @@ pub mod select;
 mod sites;
 mod sniff;
 mod source;
-pub mod split;
+mod split;
 mod stored;
 pub mod stream;
 mod strict_cost;

@@ -3,6 +3,7 @@
 use std::cmp::Reverse;
 use std::ops::Range;
 
+use molmesh_surface::vector::{dot, joined_bounds, map_components, sub};
 use rustc_hash::FxHashMap;
 
 use super::atoms::Columns;
@@ -22,8 +23,8 @@ const ROWS_PER_CHECK: usize = 1 << 17;
 struct Content {
     first: usize,
     atoms: u64,
-    low: [f64; 3],
-    high: [f64; 3],
+    /// Lowest and highest coordinates.
+    bounds: [[f64; 3]; 2],
 }
 
 /// Rejects too many atoms at one position, and returns warnings about suspect positions. A block of a file has no
@@ -93,12 +94,11 @@ fn cubes(columns: &Columns, rows: Range<usize>, reading: &Reading<'_>) -> Result
             if cube_ix == MAX_CUBES {
                 return Ok(None);
             }
-            cubes.push(Content { first: i, atoms: 0, low: at, high: at });
+            cubes.push(Content { first: i, atoms: 0, bounds: [at; 2] });
         }
         let content = &mut cubes[cube_ix];
         content.atoms += 1;
-        content.low = std::array::from_fn(|k| content.low[k].min(at[k]));
-        content.high = std::array::from_fn(|k| content.high[k].max(at[k]));
+        content.bounds = joined_bounds(content.bounds, [at; 2]);
     }
     Ok(Some(cubes))
 }
@@ -126,6 +126,7 @@ fn groups(cubes: &[Content]) -> Vec<usize> {
 }
 
 fn are_near(a: &Content, b: &Content) -> bool {
-    let gap = |k: usize| (a.low[k] - b.high[k]).max(b.low[k] - a.high[k]).max(0.0);
-    (0..3).map(|k| gap(k).powi(2)).sum::<f64>() <= FAR * FAR
+    let ([a_low, a_high], [b_low, b_high]) = (a.bounds, b.bounds);
+    let gap = map_components(sub(a_low, b_high), sub(b_low, a_high), f64::max).map(|gap| gap.max(0.0));
+    dot(gap, gap) <= FAR * FAR
 }

@@ -21,6 +21,7 @@ use super::mesh::Mesh;
 use super::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
 use super::sphere_union::{Components, Shell, rounded};
 use super::spheres::Spheres;
+use super::vector::{cross, dot, joined_bounds, length, sub, unit};
 
 /// Maximum error of the radius of the largest sphere in a cavity, Å.
 const RADIUS_ERROR: f64 = 1e-3;
@@ -244,24 +245,17 @@ impl InnerComponents {
 /// Returns the lowest and highest positions of triangles, relative to the centre of the mesh, Å.
 fn bounds(mesh: &Mesh, triangles: &[(u32, [u32; 3])]) -> [[f32; 3]; 2] {
     let corners = triangles.iter().flat_map(|(_, triangle)| *triangle).map(|v| mesh.position(v as usize));
-    corners.fold([[f32::MAX; 3], [f32::MIN; 3]], |[low, high], p| {
-        [std::array::from_fn(|k| low[k].min(p[k])), std::array::from_fn(|k| high[k].max(p[k]))]
-    })
+    corners.fold([[f32::MAX; 3], [f32::MIN; 3]], |bounds, p| joined_bounds(bounds, [p; 2]))
 }
 
 /// Returns the solid angle of triangles seen from `point`, Å: ±4π within a closed surface, 0 outside (Van Oosterom and
 /// Strackee 1983).
 fn solid_angle(mesh: &Mesh, triangles: &[(u32, [u32; 3])], point: [f64; 3]) -> f64 {
-    let from: [f64; 3] = std::array::from_fn(|k| point[k] - mesh.centre[k]);
+    let from = sub(point, mesh.centre);
     let angle = |triangle: &[u32; 3]| {
-        let [a, b, c] = triangle.map(|v| {
-            let p = mesh.position(v as usize);
-            std::array::from_fn::<f64, 3, _>(|k| f64::from(p[k]) - from[k])
-        });
-        let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-        let normal = [b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]];
-        let [la, lb, lc] = [a, b, c].map(|v| dot(v, v).sqrt());
-        2.0 * dot(a, normal).atan2(la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb)
+        let [a, b, c] = triangle.map(|v| sub(mesh.position(v as usize).map(f64::from), from));
+        let [la, lb, lc] = [a, b, c].map(length);
+        2.0 * dot(a, cross(b, c)).atan2(la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb)
     };
     triangles.iter().map(|(_, triangle)| angle(triangle)).sum()
 }
@@ -321,9 +315,7 @@ impl DepthSearch<'_> {
         let Some(&(depth, sphere)) = distances.iter().min_by(|a, b| a.0.total_cmp(&b.0)) else { return };
         if depth > 0.0 && (depth > self.depth() || diagonal <= depth) {
             let own = &self.atoms[sphere as usize];
-            let n: [f64; 3] = std::array::from_fn(|k| centre[k] - own.position(k));
-            let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
-            let component = self.components.at(sphere, n.map(|c| c / length));
+            let component = self.components.at(sphere, unit(sub(centre, own.centre())));
             let inside = component.is_some_and(|component| self.shell.components.binary_search(&component).is_ok());
             if !inside && diagonal <= depth {
                 // No sphere lies between the centre and any point of the cube.
@@ -362,8 +354,7 @@ impl DepthSearch<'_> {
 
 /// Returns the distance of a point from a sphere, negative within it, Å.
 fn distance(atom: &LatticeAtom, point: [f64; 3]) -> f64 {
-    let squares: [f64; 3] = std::array::from_fn(|k| (point[k] - atom.position(k)).powi(2));
-    (squares[0] + squares[1] + squares[2]).sqrt() - f64::from(atom.inv_length2).sqrt().recip()
+    length(sub(point, atom.centre())) - f64::from(atom.inv_length2).sqrt().recip()
 }
 
 #[cfg(test)]

@@ -70,6 +70,7 @@ pub fn mean_curvatures(
 mod tests {
     use super::*;
     use crate::reference::Density;
+    use crate::vector::length;
     use crate::{Backend, CpuBackend, SurfaceKind, SurfaceOptions};
 
     /// Returns the mean curvature of the level set of a density at `x`, by differences of its normals.
@@ -79,7 +80,7 @@ mod tests {
             let mut at = x;
             at[k] += step;
             let gradient = density.gradient(at);
-            -gradient[k] / gradient.iter().map(|c| c * c).sum::<f64>().sqrt()
+            -gradient[k] / length(gradient)
         };
         (0..3).map(|k| (along(k, STEP) - along(k, -STEP)) / (4.0 * STEP)).sum()
     }

@@ -50,6 +50,12 @@ impl LatticeAtom {
     pub fn position(&self, axis: usize) -> f64 {
         f64::from(self.cell[axis]) + f64::from(self.frac[axis])
     }
+
+    /// Returns all three components of [`position`](Self::position).
+    #[must_use]
+    pub fn centre(&self) -> [f64; 3] {
+        [0, 1, 2].map(|axis| self.position(axis))
+    }
 }
 
 /// Spheres on a lattice, in canonical order: by tile, brick, cell and offset, independent of the input's order.

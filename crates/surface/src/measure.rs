@@ -10,6 +10,7 @@ use super::mesh::Mesh;
 use super::sums::edge_shares;
 use super::topology::{self, Topology};
 use super::union_find::UnionFind;
+use super::vector::{area_vector, length};
 
 /// Method of validating closedness and manifoldness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -216,10 +217,9 @@ impl Component {
     /// Adds a triangle. By the divergence theorem, its contribution to the volume's moment along an axis is the
     /// integral of half the squared coordinate times the normal.
     pub fn add(&mut self, [a, b, c]: [[f64; 3]; 3]) {
-        let [u, v] = [b, c].map(|p| [p[0] - a[0], p[1] - a[1], p[2] - a[2]]);
-        let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+        let n = area_vector([a, b, c]);
         self.triangles += 1;
-        self.area += 0.5 * n.iter().map(|c| c * c).sum::<f64>().sqrt();
+        self.area += 0.5 * length(n);
         for (k, n) in n.into_iter().enumerate() {
             let [a, b, c] = [a[k], b[k], c[k]];
             self.volume += a * n / 6.0;

@@ -12,6 +12,7 @@ use super::error::SurfaceError;
 use super::lattice::{to_f32, to_u32};
 use super::quantize::{self, Step};
 use super::sink::Vertices;
+use super::vector::{add, area_vector, joined_bounds, length, unit};
 
 /// Rows per task.
 const ROWS: usize = 1 << 16;
@@ -120,12 +121,6 @@ pub fn bounds_of<T: Copy + PartialOrd + Send + Sync, const N: usize>(rows: &[[T;
         lanes.map(|rows| <[_; 2]>::from(rows).map(|row| [row[0], row[1], row[2]])).reduce(joined_bounds)
     };
     if rows.len() <= ROWS { of(rows) } else { rows.par_chunks(ROWS).filter_map(of).reduce_with(joined_bounds) }
-}
-
-/// Returns the bounds of both.
-pub fn joined_bounds<T: Copy + PartialOrd>([a, b]: [[T; 3]; 2], [c, d]: [[T; 3]; 2]) -> [[T; 3]; 2] {
-    let choose = |take: bool, new, old| if take { new } else { old };
-    [std::array::from_fn(|k| choose(c[k] < a[k], c[k], a[k])), std::array::from_fn(|k| choose(d[k] > b[k], d[k], b[k]))]
 }
 
 /// Converts a position to a row.
@@ -324,17 +319,15 @@ impl Mesh {
         for t in &self.triangles {
             for v in t {
                 if let Some(&i) = flat.get(v) {
-                    let normal = self.face_normal(*t);
-                    (0..3).for_each(|k| sums[i][k] += normal[k]);
+                    sums[i] = add(sums[i], self.face_normal(*t));
                 }
             }
         }
         let mut order: Vec<_> = flat.into_iter().collect();
         order.sort_unstable();
         for (v, i) in order {
-            let length = sums[i].iter().map(|c| c * c).sum::<f64>().sqrt();
             // A vertex whose triangles cancel to nothing still needs a unit vector.
-            let unit = if length > 0.0 { sums[i].map(|c| c / length) } else { [0.0, 0.0, 1.0] }.map(to_f32);
+            let unit = if length(sums[i]) > 0.0 { unit(sums[i]) } else { [0.0, 0.0, 1.0] }.map(to_f32);
             match &mut self.quantized {
                 None => self.normals[v as usize] = unit,
                 Some(quantized) => quantized.normals[v as usize] = normal_row(unit),
@@ -345,9 +338,7 @@ impl Mesh {
     /// Twice the area of a triangle times its unit normal, Å².
     #[must_use]
     pub fn face_normal(&self, triangle: [u32; 3]) -> [f64; 3] {
-        let [a, b, c] = triangle.map(|v| self.position(v as usize).map(f64::from));
-        let (u, v): ([f64; 3], [f64; 3]) = (std::array::from_fn(|k| b[k] - a[k]), std::array::from_fn(|k| c[k] - a[k]));
-        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+        area_vector(triangle.map(|v| self.position(v as usize).map(f64::from)))
     }
 
     /// Frees all columns of vertices and triangles. Centre, parts and placements remain.

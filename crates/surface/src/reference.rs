@@ -15,6 +15,7 @@ use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::sink::MeshSink;
 use super::spheres::Spheres;
+use super::vector::{add, dot, length, squared_distance, sub};
 
 /// The sequential reference backend.
 #[derive(Debug, Clone, Copy, Default)]
@@ -46,9 +47,8 @@ impl Density {
     #[must_use]
     pub fn value(&self, x: [f64; 3]) -> f64 {
         let term = |(c, length): &([f64; 3], f64)| {
-            let d2: f64 = (0..3).map(|k| (x[k] - c[k]).powi(2)).sum();
             let length2 = length * length;
-            self.profile.value(d2 / length2, MIN_DISTANCE2 / length2)
+            self.profile.value(squared_distance(x, *c) / length2, MIN_DISTANCE2 / length2)
         };
         self.spheres.iter().map(term).sum()
     }
@@ -58,11 +58,10 @@ impl Density {
     pub fn gradient(&self, x: [f64; 3]) -> [f64; 3] {
         let mut sum = [0.0; 3];
         for (c, length) in &self.spheres {
-            let d: [f64; 3] = std::array::from_fn(|k| x[k] - c[k]);
-            let length2 = length * length;
-            let u = d.iter().map(|d| d * d).sum::<f64>() / length2;
+            let (d, length2) = (sub(x, *c), length * length);
+            let u = dot(d, d) / length2;
             let slope = 2.0 / length2 * self.profile.slope(u, MIN_DISTANCE2 / length2);
-            (0..3).for_each(|k| sum[k] += slope * d[k]);
+            sum = add(sum, d.map(|d| slope * d));
         }
         sum
     }
@@ -70,9 +69,7 @@ impl Density {
     /// Returns the index of the sphere that is nearest to `x`: the distance to its centre minus its radius is smallest.
     fn nearest(&self, x: [f64; 3]) -> u32 {
         let radius_per_length = self.profile.radius_per_length();
-        let distance = |(c, length): &([f64; 3], f64)| {
-            (0..3).map(|k| (x[k] - c[k]).powi(2)).sum::<f64>().sqrt() - radius_per_length * length
-        };
+        let distance = |(c, size): &([f64; 3], f64)| length(sub(x, *c)) - radius_per_length * size;
         let best = (0_u32..).zip(&self.spheres).min_by(|(_, a), (_, b)| distance(a).total_cmp(&distance(b)));
         best.map_or(0, |(i, _)| i)
     }
@@ -219,9 +216,9 @@ fn vertices(
             let t = refined(linear, value >= iso, f / iso, f / (density.gradient(x)[axis] * h));
             let moved = at(t.clamp(margin, 1.0 - margin));
             ids[i][axis] = u32::try_from(positions.len()).unwrap_or(NONE);
-            positions.push(std::array::from_fn(|k| to_f32(moved[k] - centre[k])));
+            positions.push(sub(moved, centre).map(to_f32));
             let g = density.gradient(moved);
-            let length = g.iter().map(|c| c * c).sum::<f64>().sqrt();
+            let length = length(g);
             normals.push(if length > 1e-9 { g.map(|c| to_f32(-c / length)) } else { [0.0; 3] });
             if params.atom_ids {
                 nearest.push(density.nearest(moved));

@@ -7,15 +7,15 @@ use super::error::SurfaceError;
 
 /// Result of [`check`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Topology {
+pub(super) struct Topology {
     /// Distinct undirected edges.
-    pub edges: u64,
+    pub(super) edges: u64,
     /// True if every edge is used as often in one direction as in the other, and no triangle is degenerate.
-    pub closed: bool,
+    pub(super) closed: bool,
     /// True if no directed edge is used twice.
-    pub oriented: bool,
+    pub(super) oriented: bool,
     /// True if every edge has exactly two triangles and the triangles around every vertex form one closed fan.
-    pub manifold: bool,
+    pub(super) manifold: bool,
 }
 
 impl Topology {
@@ -57,7 +57,7 @@ const PART: usize = 1 << 15;
 ///
 /// # Errors
 /// [`SurfaceError::Cancelled`], [`SurfaceError::Memory`].
-pub fn check(triangles: &[[u32; 3]], control: &Control<'_>) -> Result<Topology, SurfaceError> {
+pub(super) fn check(triangles: &[[u32; 3]], control: &Control<'_>) -> Result<Topology, SurfaceError> {
     let _parts = control.reserve(memory(3 * triangles.len()))?;
     let corners = |part: &[[u32; 3]]| {
         control.check()?;

@@ -1,38 +1,11 @@
-//! Vectors and triangles in single precision, and their intersections, with signs of volumes in double precision.
+//! Triangles in single precision, and their intersections, with signs of volumes in double precision.
+
+use crate::vector::{cross, dot, length, map_components, sub};
 
 /// Position or vector, Å.
 pub type Vector = [f32; 3];
 /// Corners of a triangle, Å.
 pub type Corners = [Vector; 3];
-
-/// Returns the difference `a − b`.
-#[must_use]
-pub fn sub(a: Vector, b: Vector) -> Vector {
-    std::array::from_fn(|k| a[k] - b[k])
-}
-
-/// Returns the dot product.
-#[must_use]
-pub fn dot(a: Vector, b: Vector) -> f32 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-/// Returns the cross product.
-#[must_use]
-pub fn cross(a: Vector, b: Vector) -> Vector {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-/// Returns the length of a vector.
-#[must_use]
-pub fn length(a: Vector) -> f32 {
-    dot(a, a).sqrt()
-}
-
-/// Applies `f` to each pair of components.
-pub fn map_components(a: Vector, b: Vector, f: impl Fn(f32, f32) -> f32) -> Vector {
-    std::array::from_fn(|k| f(a[k], b[k]))
-}
 
 /// Returns the bounding box of a triangle.
 #[must_use]
@@ -44,12 +17,6 @@ pub fn bounds([a, b, c]: Corners) -> [Vector; 2] {
 #[must_use]
 pub fn centroid([a, b, c]: Corners) -> Vector {
     std::array::from_fn(|k| (a[k] + b[k] + c[k]) / 3.0)
-}
-
-/// Returns the normal of a triangle, twice as long as its area.
-#[must_use]
-pub fn area_vector([a, b, c]: Corners) -> Vector {
-    cross(sub(b, a), sub(c, a))
 }
 
 /// Returns the tangent of the smallest angle of a triangle; 0 for a degenerate one.
@@ -66,9 +33,8 @@ pub fn tan_smallest_angle([a, b, c]: Corners) -> f32 {
 
 /// Returns six times the signed volume of a tetrahedron.
 fn volume6([a, b, c]: &Corners, d: Vector) -> f64 {
-    let from = |p: &Vector| -> [f64; 3] { std::array::from_fn(|k| f64::from(p[k]) - f64::from(d[k])) };
-    let [a, b, c] = [from(a), from(b), from(c)];
-    a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+    let [a, b, c] = [a, b, c].map(|p| sub(p.map(f64::from), d.map(f64::from)));
+    dot(a, cross(b, c))
 }
 
 /// Returns true if a line segment passes through a triangle. One that only touches its plane or its boundary does not.

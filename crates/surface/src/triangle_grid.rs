@@ -1,6 +1,8 @@
 //! Uniform grid of cells, which finds the triangle that is nearest to a point, and triangles that intersect.
 
-use super::triangle::{Corners, Vector, bounds, dot, floor, map_components, segment_intersects, sub};
+use super::groups::{GroupCounts, Groups};
+use super::triangle::{Corners, Vector, bounds, floor, segment_intersects};
+use super::vector::{dot, map_components, sub};
 
 /// Largest number of cells per axis.
 const MAX_CELLS: f32 = 64.0;
@@ -13,10 +15,8 @@ pub struct TriangleGrid {
     cell: f32,
     /// Number of cells along each axis.
     size: [i32; 3],
-    /// First entry of each cell; the last element is the number of entries.
-    starts: Vec<u32>,
     /// Numbers of the triangles of each cell.
-    entries: Vec<u32>,
+    entries: Groups,
     triangles: Vec<Corners>,
     /// Bounding boxes of the triangles, Å.
     boxes: Vec<[Vector; 2]>,
@@ -32,25 +32,17 @@ impl TriangleGrid {
         let cell = cell.max(extent / MAX_CELLS);
         let size = std::array::from_fn(|k| floor((high[k] - low[k]) / cell) + 1);
         let n_cells = size.iter().map(|n| usize::try_from(*n).unwrap_or(0)).product::<usize>();
-        let mut grid = Self { low, cell, size, starts: Vec::new(), entries: Vec::new(), triangles, boxes: Vec::new() };
-        let cells: Vec<[[i32; 3]; 2]> = boxes.iter().map(|ends| ends.map(|end| grid.cell_of(end))).collect();
-        let mut starts = vec![0; n_cells + 1];
+        let grid = Self { low, cell, size, entries: Groups::default(), triangles, boxes };
+        let cells: Vec<[[i32; 3]; 2]> = grid.boxes.iter().map(|ends| ends.map(|end| grid.cell_of(end))).collect();
+        let mut counts = GroupCounts::new(n_cells);
         for [low, high] in &cells {
-            grid.for_each_cell(*low, *high, |at| starts[at + 1] += 1);
+            grid.for_each_cell(*low, *high, |cell| counts.add(cell));
         }
-        for at in 0..n_cells {
-            starts[at + 1] += starts[at];
-        }
-        let mut next = starts.clone();
-        let mut entries = vec![0; starts[n_cells] as usize];
+        let mut entries = counts.groups();
         for (number, [low, high]) in (0..).zip(&cells) {
-            grid.for_each_cell(*low, *high, |at| {
-                entries[next[at] as usize] = number;
-                next[at] += 1;
-            });
+            grid.for_each_cell(*low, *high, |cell| entries.push(cell, number));
         }
-        (grid.starts, grid.entries, grid.boxes) = (starts, entries, boxes);
-        grid
+        Self { entries, ..grid }
     }
 
     /// Calls `each` for the indices of the cells from `low` to `high` within the grid.
@@ -72,11 +64,6 @@ impl TriangleGrid {
         usize::try_from((z * self.size[1] + y) * self.size[0] + x).ok()
     }
 
-    /// Returns the numbers of the triangles of a cell.
-    fn entries(&self, cell: usize) -> &[u32] {
-        &self.entries[self.starts[cell] as usize..self.starts[cell + 1] as usize]
-    }
-
     /// Returns the pairs of triangles that intersect, of which at least one is `changed`. `rows` are the triangles as
     /// vertex numbers. Triangles with a common edge never count: their fold is checked otherwise.
     #[must_use]
@@ -86,7 +73,7 @@ impl TriangleGrid {
             let [low, high] = self.boxes[i];
             let [first, last] = [low, high].map(|end| self.cell_of(end));
             self.for_each_cell(first, last, |cell| {
-                for j in self.entries(cell).iter().map(|j| *j as usize) {
+                for j in self.entries.get(cell).iter().map(|j| *j as usize) {
                     // A pair of changed triangles counts once.
                     if j == i || changed[j] && j < i {
                         continue;
@@ -131,7 +118,7 @@ impl TriangleGrid {
         let [low, high] = [-limit, limit].map(|by| self.cell_of(point.map(|c| c + by)));
         let mut found = None;
         self.for_each_cell(low, high, |cell| {
-            let mut entries = self.entries(cell).iter().copied();
+            let mut entries = self.entries.get(cell).iter().copied();
             found = found.or_else(|| {
                 entries.find(|number| gap2(point, &self.boxes[*number as usize]) <= limit2 && is_near(*number))
             });
@@ -151,7 +138,7 @@ impl TriangleGrid {
         loop {
             let [low, high] = [-radius, radius].map(|by| self.cell_of(point.map(|c| c + by)));
             self.for_each_cell(low, high, |at| {
-                for number in self.entries(at) {
+                for number in self.entries.get(at) {
                     if gap2(point, &self.boxes[*number as usize]) < nearest2 {
                         let found2 = distance2(point, self.triangles[*number as usize]);
                         if found2 < nearest2 {

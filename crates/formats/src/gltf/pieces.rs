@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 use gltf_json::Root;
 use gltf_json::mesh::Primitive;
 use molmesh_surface::quantize::Step;
+use molmesh_surface::vector::joined_bounds;
 use molmesh_surface::{Mesh, Vertices};
 
 use super::buffer::ColumnRows;
@@ -351,7 +352,5 @@ fn written(rows: ColumnRows<'_>, layout: &BufferLayout) -> Result<Vec<u8>, Forma
 /// Returns the lowest and highest position per axis, in steps.
 fn bounds(positions: &[[i16; 4]]) -> [[i16; 3]; 2] {
     let start = [[i16::MAX; 3], [i16::MIN; 3]];
-    positions.iter().fold(start, |[low, high], row| {
-        [std::array::from_fn(|k| low[k].min(row[k])), std::array::from_fn(|k| high[k].max(row[k]))]
-    })
+    positions.iter().fold(start, |bounds, [x, y, z, _]| joined_bounds(bounds, [[*x, *y, *z]; 2]))
 }

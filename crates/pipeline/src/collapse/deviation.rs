@@ -2,11 +2,11 @@
 
 use std::ops::Range;
 
-use molmesh_surface::control::Control;
-use molmesh_surface::error::SurfaceError;
 use molmesh_surface::lattice::to_f32;
-use molmesh_surface::triangle::{Corners, Vector, bounds, centroid, floor, length, map_components, sub};
+use molmesh_surface::triangle::{Corners, Vector, bounds, centroid, floor};
 use molmesh_surface::triangle_grid::TriangleGrid;
+use molmesh_surface::vector::{joined_bounds, length, sub};
+use molmesh_surface::{Control, SurfaceError};
 use rayon::prelude::*;
 
 use super::{Cube, CubeSide, Triangles, TrianglesByCube};
@@ -201,9 +201,7 @@ impl<'a> Surface<'a> {
         let groups: Vec<&[(Cube, u32)]> = by_cube.chunk_by(|a, b| a.0 == b.0).collect();
         let box_of = |group: &&[(Cube, u32)]| {
             let boxes = group.iter().map(|(_, i)| bounds(triangles.corners(*i as usize)));
-            boxes
-                .reduce(|[a, b], [c, d]| [map_components(a, c, f32::min), map_components(b, d, f32::max)])
-                .unwrap_or_default()
+            boxes.reduce(joined_bounds).unwrap_or_default()
         };
         let boxes: Vec<[Vector; 2]> = groups.par_iter().map(box_of).collect();
         let mut start = 0;

@@ -1,8 +1,8 @@
 //! Simplification of a piece: the triangles of a cube.
 
 use meshopt::{SimplifyOptions, VertexDataAdapter};
+use molmesh_surface::Component;
 use molmesh_surface::lattice::{to_f32, to_u32};
-use molmesh_surface::measure::Component;
 use molmesh_surface::triangle::Corners;
 use molmesh_surface::triangle_grid::TriangleGrid;
 use molmesh_surface::union_find::UnionFind;

@@ -2,8 +2,8 @@
 
 use std::f64::consts::PI;
 
-use molmesh_surface::triangle::{length, sub};
 use molmesh_surface::triangle_grid::TriangleGrid;
+use molmesh_surface::vector::{length, sub};
 use molmesh_surface::{Backend as _, CpuBackend, Measures, Spheres, SurfaceKind, SurfaceLimits, SurfaceOptions};
 use molmesh_surface::{SurfaceParams, Validation};
 

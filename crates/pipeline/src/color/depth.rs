@@ -5,11 +5,12 @@
 
 use std::ops::Range;
 
+use molmesh_surface::vector::{add, area_vector, cross, dot, joined_bounds, length, sub, unit};
 use molmesh_surface::{Control, MemoryMeter, SurfaceError};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::vertex::{cross, dot, length, single};
+use super::vertex::single;
 
 /// Distance by which points may lie outside the hull, Å.
 const TOLERANCE: f64 = 0.01;
@@ -34,9 +35,7 @@ struct Plane {
 impl Plane {
     /// Returns the plane through three points. The normal points to the side from which they are counter-clockwise.
     fn through([a, b, c]: [Point; 3]) -> Self {
-        let normal = cross(minus(b, a), minus(c, a));
-        let size = length(normal);
-        let normal = normal.map(|v| v / size);
+        let normal = unit(area_vector([a, b, c]));
         Self { normal, offset: dot(normal, a) }
     }
 
@@ -85,14 +84,10 @@ fn measure(
     control: &Control<'_>,
 ) -> Result<(), SurfaceError> {
     control.check()?;
-    let [mut low, mut high] = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
-    for (i, _) in &*vertices {
-        let point = point(*i as usize);
-        low = std::array::from_fn(|k| low[k].min(point[k]));
-        high = std::array::from_fn(|k| high[k].max(point[k]));
-    }
-    let centre = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
-    let sides = minus(high, low);
+    let points = vertices.iter().map(|(i, _)| [point(*i as usize); 2]);
+    let [low, high] = points.fold([[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]], joined_bounds);
+    let centre = add(low, high).map(|sum| 0.5 * sum);
+    let sides = sub(high, low);
     let lowest =
         |point: Point, planes: &[Plane]| planes.iter().map(|plane| -plane.height(point)).fold(f64::INFINITY, f64::min);
     // In the bounding box, distances from a plane differ from that of the centre by half the diagonal at most.
@@ -204,18 +199,14 @@ fn tetrahedron(n: usize, displaced: impl Fn(u32) -> Point + Sync) -> Option<[u32
     };
     let (_, a) = farthest(&|p| p[0])?;
     let from = displaced(a);
-    let (_, b) = farthest(&|p| length(minus(p, from)))?;
-    let along = minus(displaced(b), from);
-    let (_, c) = farthest(&|p| length(cross(along, minus(p, from))))?;
+    let (_, b) = farthest(&|p| length(sub(p, from)))?;
+    let along = sub(displaced(b), from);
+    let (_, c) = farthest(&|p| length(cross(along, sub(p, from))))?;
     let plane = Plane::through([a, b, c].map(&displaced));
     let (height, d) = farthest(&|p| plane.height(p).abs())?;
     let is_below = plane.height(displaced(d)) < 0.0;
     // The height is not a number if all points lie on one line.
     (height > TOLERANCE).then_some(if is_below { [a, b, c, d] } else { [a, c, b, d] })
-}
-
-fn minus(a: Point, b: Point) -> Point {
-    std::array::from_fn(|k| a[k] - b[k])
 }
 
 /// Returns a number from −1 to 1 that depends on `seed` alone (`SplitMix64`).

@@ -6,6 +6,7 @@ use molmesh_formats::linear_of_srgb;
 use molmesh_structure::AtomPart;
 use molmesh_structure::map::Map;
 use molmesh_surface::curvature::mean_curvatures;
+use molmesh_surface::vector::{add, area_vector, cross, dot, length, sub, unit};
 use molmesh_surface::{Column, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, Vertices};
 
 use super::super::SPHERE_BYTES;
@@ -74,8 +75,8 @@ pub(super) fn values(
         }
         ValueSource::Curvature => normal_curvatures(mesh),
         ValueSource::Radial(centroid) => {
-            let origin: [f64; 3] = std::array::from_fn(|k| mesh.centre[k] - centroid[k]);
-            let distance = |i| length(std::array::from_fn(|k| origin[k] + f64::from(mesh.position(i)[k])));
+            let origin = sub(mesh.centre, *centroid);
+            let distance = |i| length(add(origin, mesh.position(i).map(f64::from)));
             (0..mesh.n_vertices()).map(|i| single(distance(i))).collect()
         }
         ValueSource::Depth => depth::depths(mesh.n_vertices(), |i| mesh.position(i).map(f64::from), control)?,
@@ -86,8 +87,7 @@ pub(super) fn values(
 /// Returns the normal of a vertex, of length 1 unless it is 0.
 pub(super) fn unit_normal(mesh: &Mesh, i: usize) -> [f64; 3] {
     let normal = normal(mesh, i);
-    let length = length(normal);
-    if length > 0.0 { normal.map(|v| v / length) } else { normal }
+    if length(normal) > 0.0 { unit(normal) } else { normal }
 }
 
 /// Returns the normal of a vertex as it is stored.
@@ -129,8 +129,8 @@ fn normal_curvatures(mesh: &Mesh) -> Vec<f32> {
     let mut sums = vec![[0.0; 2]; mesh.n_vertices()];
     for triangle in &mesh.triangles[..] {
         let corners = triangle.map(|i| mesh.position(i as usize).map(f64::from));
-        let edge = |from: usize, to: usize| -> [f64; 3] { std::array::from_fn(|k| corners[to][k] - corners[from][k]) };
-        let cross_product = cross(edge(0, 1), edge(0, 2));
+        let edge = |from: usize, to: usize| sub(corners[to], corners[from]);
+        let cross_product = area_vector(corners);
         let twice_area = length(cross_product);
         if twice_area <= 0.0 {
             continue;
@@ -206,18 +206,6 @@ fn nearest_srgb(linear: &[u16; 256], level: u16) -> u8 {
 #[expect(clippy::cast_possible_truncation, reason = "values of vertices are single precision")]
 pub(super) fn single(value: f64) -> f32 {
     value as f32
-}
-
-pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-pub(super) fn length(a: [f64; 3]) -> f64 {
-    dot(a, a).sqrt()
 }
 
 #[cfg(test)]

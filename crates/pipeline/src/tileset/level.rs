@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
+use molmesh_surface::groups::{GroupCounts, Groups};
 use molmesh_surface::spheres::MAX_COORDINATE;
+use molmesh_surface::vector::squared_distance;
 use molmesh_surface::{Control, Spheres, SurfaceError, SurfaceParams};
 use rustc_hash::FxHashMap;
 
@@ -41,9 +43,7 @@ pub(super) struct Buckets {
     /// Edge length of the cubes, Å.
     side: f64,
     numbers: FxHashMap<[i64; 3], u32>,
-    /// Start of each bucket in `order`, and the end of the last one.
-    starts: Vec<u32>,
-    order: Vec<u32>,
+    spheres: Groups,
 }
 
 impl Buckets {
@@ -54,7 +54,7 @@ impl Buckets {
     pub(super) fn new(spheres: &Spheres, side: f64, control: &Control<'_>) -> Result<Self, SurfaceError> {
         control.memory.grow(INDEX_BYTES * spheres.len() as u64)?;
         let mut numbers = FxHashMap::default();
-        let mut starts: Vec<u32> = Vec::new();
+        let mut counts = GroupCounts::new(0);
         // Successive atoms mostly lie in one bucket.
         let mut last = ([i64::MIN; 3], 0);
         for i in 0..spheres.len() {
@@ -63,21 +63,16 @@ impl Buckets {
             }
             let at = cube(spheres.centre(i), side);
             if at != last.0 {
-                let next = u32::try_from(starts.len()).unwrap_or(u32::MAX);
+                let next = u32::try_from(numbers.len()).unwrap_or(u32::MAX);
                 last = (at, *numbers.entry(at).or_insert(next));
                 if last.1 == next {
                     control.memory.grow(BUCKET_BYTES)?;
-                    starts.push(0);
+                    counts.push_group();
                 }
             }
-            starts[last.1 as usize] += 1;
+            counts.add(last.1 as usize);
         }
-        let mut end = 0;
-        for count in &mut starts {
-            end += std::mem::replace(count, end);
-        }
-        starts.push(end);
-        let (mut next, mut order) = (starts.clone(), vec![0; spheres.len()]);
+        let mut groups = counts.groups();
         let mut last = ([i64::MIN; 3], 0);
         for (i, row) in (0..spheres.len()).zip(0_u32..) {
             if i.is_multiple_of(PER_CHECK) {
@@ -87,15 +82,9 @@ impl Buckets {
             if at != last.0 {
                 last = (at, numbers[&at] as usize);
             }
-            order[next[last.1] as usize] = row;
-            next[last.1] += 1;
+            groups.push(last.1, row);
         }
-        Ok(Self { side, numbers, starts, order })
-    }
-
-    /// Returns the spheres of the bucket with this number, ascending.
-    fn of(&self, number: usize) -> &[u32] {
-        &self.order[self.starts[number] as usize..self.starts[number + 1] as usize]
+        Ok(Self { side, numbers, spheres: groups })
     }
 
     /// Returns each bucket with its cell of a grid, sorted by cell. A cell is a union of buckets; cells smaller than a
@@ -109,7 +98,7 @@ impl Buckets {
 
     /// Returns the spheres in a cube.
     fn at(&self, cube: [i64; 3]) -> &[u32] {
-        self.numbers.get(&cube).map_or(&[], |number| self.of(*number as usize))
+        self.numbers.get(&cube).map_or(&[], |number| self.spheres.get(*number as usize))
     }
 }
 
@@ -188,7 +177,7 @@ fn grouped(
     let (mut radii, mut rows) = (Vec::new(), Vec::new());
     for run in buckets.by_cell(spacing).chunk_by(|a, b| a.0 == b.0) {
         control.check()?;
-        let run = run.iter().map(|(_, number)| buckets.of(*number as usize));
+        let run = run.iter().map(|(_, number)| buckets.spheres.get(*number as usize));
         let _sorting = control.reserve(SORT_BYTES * run.clone().map(<[u32]>::len).sum::<usize>() as u64)?;
         let key = |i: &u32| (cube(atoms.centre(*i as usize), spacing), *i as usize);
         let mut keys: Vec<_> = run.flatten().map(key).collect();
@@ -220,7 +209,7 @@ pub(super) fn group_of(
     #[expect(clippy::cast_possible_truncation, reason = "radii have single precision")]
     let given = |effective: f64| ((effective - params.radius_offset) / params.radius_scale) as f32;
     let mean: [f64; 3] = std::array::from_fn(|k| (0..n).map(|i| atom(i).0[k]).sum::<f64>() / n as f64);
-    let distance2 = |i: usize| (0..3).map(|k| (atom(i).0[k] - mean[k]).powi(2)).sum::<f64>();
+    let distance2 = |i: usize| squared_distance(atom(i).0, mean);
     let nearest = (0..n).min_by(|a, b| distance2(*a).total_cmp(&distance2(*b)));
     let radius = (0..n).map(|i| effective(atom(i).1).powi(3)).sum::<f64>().cbrt();
     // The grid would miss a small sphere between its points.

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
 use molmesh_structure::stream::StoredBytes;
+use molmesh_surface::vector::joined_bounds;
 use molmesh_surface::{Control, MemoryMeter as _, Reservation, SurfaceError};
 use rustc_hash::FxHashMap;
 
@@ -153,10 +154,7 @@ impl SphereIndex {
     pub(super) fn push(&mut self, sphere: StoredSphere) -> Result<(), JobError> {
         let c = sphere.centre;
         self.radii = [self.radii[0].min(sphere.radius), self.radii[1].max(sphere.radius)];
-        self.bounds = [
-            std::array::from_fn(|k| self.bounds[0][k].min(c[k])),
-            std::array::from_fn(|k| self.bounds[1][k].max(c[k])),
-        ];
+        self.bounds = joined_bounds(self.bounds, [c; 2]);
         let at = cube(c, self.side);
         if at != self.latest.0 {
             let next = self.cubes.len();

@@ -7,6 +7,8 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use indexmap::IndexMap;
+use molmesh_surface::groups::{GroupCounts, Groups};
+use molmesh_surface::vector::{dot, joined_bounds, squared_distance, sub};
 use molmesh_surface::{Control, MemoryMeter as _, Reservation};
 use rayon::prelude::*;
 
@@ -124,8 +126,7 @@ impl PointBox {
     const NONE: Self = Self { low: [f64::INFINITY; 3], high: [f64::NEG_INFINITY; 3] };
 
     fn add(&mut self, point: Point) {
-        self.low = std::array::from_fn(|k| self.low[k].min(point[k]));
-        self.high = std::array::from_fn(|k| self.high[k].max(point[k]));
+        [self.low, self.high] = joined_bounds([self.low, self.high], [point; 2]);
     }
 
     /// Returns the minimum and maximum squared distance between `point` and points in the box.
@@ -133,7 +134,7 @@ impl PointBox {
         let ends: [[f64; 2]; 3] = std::array::from_fn(|k| [point[k] - self.low[k], point[k] - self.high[k]]);
         let least = ends.map(|[from_low, from_high]| (-from_low).max(from_high).max(0.0));
         let greatest = ends.map(|[from_low, from_high]| from_low.abs().max(from_high.abs()));
-        [least, greatest].map(square)
+        [least, greatest].map(|gap| dot(gap, gap))
     }
 }
 
@@ -141,10 +142,6 @@ impl PointBox {
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
 fn whole(v: f64) -> usize {
     v as usize
-}
-
-fn square([x, y, z]: Point) -> f64 {
-    x * x + y * y + z * z
 }
 
 /// Points in the cells of a uniform grid.
@@ -160,9 +157,8 @@ struct PointGrid {
     slots: Vec<u32>,
     /// Bounds of the points in each occupied cell.
     bounds: Vec<PointBox>,
-    /// Index of the first point of each occupied cell; the last element is the number of points.
-    first: Vec<u32>,
-    points: Vec<Point>,
+    /// Points of each occupied cell.
+    points: Groups<Point>,
 }
 
 impl PointGrid {
@@ -184,7 +180,7 @@ impl PointGrid {
             all.add(point);
             n_points += 1;
         }
-        let size: Point = std::array::from_fn(|k| all.high[k] - all.low[k]);
+        let size = sub(all.high, all.low);
         let sides = |cell: f64| size.map(|side| (side / cell).floor() + 1.0);
         let most = MIN_CELLS + CELLS_PER_ATOM * n_points as f64;
         // Large cells have many points. If cells are smaller than the distance, testing the bounds is enough for most
@@ -205,10 +201,9 @@ impl PointGrid {
             n,
             slots: vec![0; n_cells],
             bounds: Vec::new(),
-            first: Vec::new(),
-            points: vec![[0.0; 3]; n_points],
+            points: Groups::default(),
         };
-        let (mut counts, mut n_slots): (Vec<u32>, u32) = (Vec::new(), 0);
+        let (mut counts, mut n_slots) = (GroupCounts::new(0), 0);
         for (n, point) in atoms().enumerate() {
             if n % ATOMS_PER_CHECK == 0 {
                 check(control)?;
@@ -216,28 +211,21 @@ impl PointGrid {
             let index = grid.index(grid.cell_of(point));
             if grid.slots[index] == 0 {
                 grid.bounds.push(PointBox::NONE);
-                counts.push(0);
+                counts.push_group();
                 n_slots += 1;
                 grid.slots[index] = n_slots;
             }
             let slot = grid.slots[index] as usize - 1;
             grid.bounds[slot].add(point);
-            counts[slot] += 1;
+            counts.add(slot);
         }
-        let mut total = 0;
-        for count in &mut counts {
-            grid.first.push(total);
-            total += std::mem::replace(count, total);
-        }
-        grid.first.push(total);
-        // Each count is now the index of the next free entry.
+        grid.points = counts.groups();
         for (n, point) in atoms().enumerate() {
             if n % ATOMS_PER_CHECK == 0 {
                 check(control)?;
             }
             let slot = grid.slots[grid.index(grid.cell_of(point))] as usize - 1;
-            grid.points[counts[slot] as usize] = point;
-            counts[slot] += 1;
+            grid.points.push(slot, point);
         }
         Ok(grid)
     }
@@ -286,14 +274,14 @@ impl PointGrid {
         if slot == 0 {
             return Ok(false);
         }
-        let points = &self.points[self.first[slot - 1] as usize..self.first[slot] as usize];
+        let points = self.points.get(slot - 1);
         if points.len() > MAX_TESTED_POINTS {
             let [least, greatest] = self.bounds[slot - 1].distances2(point);
             if least > self.distance2 || greatest <= self.distance2 {
                 return Ok(greatest <= self.distance2);
             }
         }
-        let is_near = |other: &Point| square(std::array::from_fn(|k| point[k] - other[k])) <= self.distance2;
+        let is_near = |other: &Point| squared_distance(point, *other) <= self.distance2;
         for points in points.chunks(TESTS_PER_CHECK) {
             let found = points.iter().position(is_near);
             tests.add(found.unwrap_or(points.len()))?;

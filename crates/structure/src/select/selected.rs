@@ -1,5 +1,6 @@
 //! Result of a selection: the atoms to mesh, and their spheres.
 
+use molmesh_surface::vector::joined_bounds;
 use molmesh_surface::{Control, Spheres, SurfaceError};
 use rayon::prelude::*;
 
@@ -81,10 +82,7 @@ impl Selected {
         for unit in &self.units {
             let mut bounds = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
             for row in unit.rows.clone() {
-                let at = spheres.centre(row);
-                bounds = [0, 1].map(|end| {
-                    std::array::from_fn(|k| if end == 0 { bounds[0][k].min(at[k]) } else { bounds[1][k].max(at[k]) })
-                });
+                bounds = joined_bounds(bounds, [spheres.centre(row); 2]);
             }
             let corners = (0..8).map(|corner| std::array::from_fn(|k| bounds[corner >> k & 1][k]));
             let corners: Vec<[f64; 3]> = corners.collect();

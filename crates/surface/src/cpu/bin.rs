@@ -9,6 +9,7 @@ use rustc_hash::FxHashMap;
 
 use crate::control::Control;
 use crate::error::SurfaceError;
+use crate::groups::Groups;
 use crate::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32};
 use crate::memory::{MemoryMeter as _, Reservation};
 use crate::params::SurfaceLimits;
@@ -24,10 +25,10 @@ pub(super) const SLOTS: usize = SIDE * SIDE * SIDE;
 pub(super) const NORMAL_ONLY: u32 = 1 << 31;
 /// Pairs of an atom and a tile between two checks of the cancellation flag.
 const PAIRS_PER_CHECK: u64 = 1 << 16;
-/// Memory of a tile's coordinates and its first index, bytes.
-const TILE_BYTES: u64 = 20;
-/// Memory for sorting a tile, bytes: its coordinates, number, rank and cursor.
-const SORTED_TILE_BYTES: u64 = 32;
+/// Memory of a tile's coordinates and the end of its atoms, bytes.
+const TILE_BYTES: u64 = 16;
+/// Memory for sorting a tile, bytes: its coordinates, number and rank.
+const SORTED_TILE_BYTES: u64 = 24;
 /// Atoms whose candidate pairs are counted and checked against the limit together: 190,000 pairs at most.
 const ATOMS_PER_CHECK: usize = 256;
 /// Maximum capacity of a list that is kept between tiles; longer lists are freed.
@@ -40,10 +41,8 @@ pub(super) struct Tiles {
     pub(super) coords: Vec<[i32; 3]>,
     /// Index of a tile by its coordinates.
     pub(super) index: FxHashMap<[i32; 3], u32>,
-    /// Index of each tile's first atom in `atoms`, and the number of atoms last.
-    starts: Vec<usize>,
     /// Atom indices, ascending within a tile.
-    atoms: Vec<u32>,
+    atoms: Groups,
 }
 
 /// First and last tile per axis whose grid points, with the layer beyond, the atom reaches.
@@ -74,7 +73,7 @@ impl Tiles {
         // Two facts bound the allocations below. Every tile in reach holds at least one occupied brick. A tile in reach
         // of an atom holds at least one of its candidate pairs, unless the atom reaches only a corner of the tile.
         let max_tiles = limits.max_grid_points / 512 + 1;
-        let max_pairs = candidates::limit(limits).max(8 * lattice.atoms.len() as u64);
+        let max_pairs = candidates::limit(limits).max(8 * lattice.atoms.len() as u64).min(u64::from(u32::MAX));
         // Tiles in the order of their first atoms, and every pair of an atom and such a tile.
         let mut hits: Vec<(u32, u32)> = Vec::new();
         scratch.reserve_rows(&mut hits, 2 * lattice.atoms.len())?;
@@ -121,24 +120,11 @@ impl Tiles {
             rank[*id as usize] = order;
             index.insert(*tile, to_u32(order));
         }
-        // Counting sort: by tile, and by atom within a tile, as that is the order of the hits.
-        let mut starts = vec![0; met.len() + 1];
-        for (id, _) in &hits {
-            starts[rank[*id as usize] + 1] += 1;
-        }
-        for t in 0..met.len() {
-            starts[t + 1] += starts[t];
-        }
-        let mut cursor = starts.clone();
-        let mut atoms = vec![0_u32; hits.len()];
-        for (id, atom) in &hits {
-            let at = &mut cursor[rank[*id as usize]];
-            atoms[*at] = *atom;
-            *at += 1;
-        }
+        // Atoms are ascending within a tile, as that is the order of the hits.
+        let atoms = Groups::new(met.len(), hits.iter().map(|(id, atom)| (rank[*id as usize], *atom)));
         let coords = met.iter().map(|(tile, _)| *tile).collect();
         lasting.keep();
-        Ok(Self { coords, index, starts, atoms })
+        Ok(Self { coords, index, atoms })
     }
 
     /// Number of tiles.
@@ -148,7 +134,7 @@ impl Tiles {
 
     /// The atoms that reach tile `t`, ascending.
     pub(super) fn atoms(&self, t: usize) -> &[u32] {
-        &self.atoms[self.starts[t]..self.starts[t + 1]]
+        self.atoms.get(t)
     }
 }
 

@@ -13,6 +13,7 @@ use crate::params::{SurfaceLimits, SurfaceParams};
 use crate::simd::LANES;
 use crate::sphere_union::{BrickUnion, Lanes};
 use crate::spheres::Spheres;
+use crate::vector::length;
 
 /// Margin for rounding in the selection of spheres, spacings.
 const MARGIN: f64 = 0.01;
@@ -154,7 +155,7 @@ impl PointField {
 
 impl PointSample {
     fn new(depth: impl FnOnce(f32) -> f32, outward: [f32; 3]) -> Self {
-        let length = outward.iter().map(|c| c * c).sum::<f32>().sqrt();
+        let length = length(outward);
         Self { depth: depth(length), normal: outward.map(|c| c / length) }
     }
 

@@ -7,9 +7,11 @@ use super::classify::ClassifiedBricks;
 use super::distance::{DistanceField, SURFACE};
 use super::edge::Edge;
 use super::field::BrickField;
+use crate::groups::Groups;
 use crate::lattice::EDGE_MARGIN;
 use crate::simd::LANES;
 use crate::sphere_union::{BrickUnion, Feature, Lanes, Nearest};
+use crate::vector::length;
 
 /// Maximum number of steps of a root search. Every fourth one halves the bracket.
 const MAX_STEPS: usize = 64;
@@ -57,20 +59,7 @@ fn by_cube(edges: &[Edge]) -> Vec<usize> {
         let bit = |b: u16| (edge.x() >> b & 1) | (edge.y() >> b & 1) << 1 | (edge.z() >> b & 1) << 2;
         usize::from(bit(2) << 3 | bit(1))
     };
-    let mut starts = [0; 65];
-    for edge in edges {
-        starts[cube(edge) + 1] += 1;
-    }
-    for i in 0..64 {
-        starts[i + 1] += starts[i];
-    }
-    let mut order = vec![0; edges.len()];
-    for (i, edge) in edges.iter().enumerate() {
-        let at = &mut starts[cube(edge)];
-        order[*at] = i;
-        *at += 1;
-    }
-    order
+    Groups::new(64, edges.iter().enumerate().map(|(i, edge)| (cube(edge), i))).into_items()
 }
 
 /// Search for the surface on a vector of edges: Newton's method within a bracket, with bisection if it is slow.
@@ -137,7 +126,7 @@ impl RootSearch {
                 continue;
             }
             let normal = spheres.outward(found, points, lane);
-            let length = (normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]).sqrt();
+            let length = length(normal);
             let next = t + value * length / normal[self.axis[lane]];
             let bisect = step % 4 == 3 || !(from < next && next < to);
             self.t[lane] = if bisect { 0.5 * (from + to) } else { next };

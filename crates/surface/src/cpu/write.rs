@@ -20,9 +20,10 @@ use crate::control::{Control, Stage};
 use crate::error::SurfaceError;
 use crate::join::{Sheet, SheetSums};
 use crate::lattice::Lattice;
-use crate::mesh::{Mesh, Quantized, joined_bounds};
+use crate::mesh::{Mesh, Quantized};
 use crate::quantize::Step;
 use crate::sink::{MeshPart, MeshSink, SinkFailed, Vertices};
+use crate::vector::joined_bounds;
 
 thread_local! {
     // Kept per thread, as in the first pass.

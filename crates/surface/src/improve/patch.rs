@@ -1,7 +1,8 @@
 //! Patch: the triangles of a cube, with the operations that improve their shapes.
 
 use crate::lattice::to_u32;
-use crate::triangle::{Corners, Vector, area_vector, dot, length, sub, tan_smallest_angle};
+use crate::triangle::{Corners, Vector, centroid, tan_smallest_angle};
+use crate::vector::{area_vector, dot, length, sub};
 
 /// Smallest angle, as a tangent, at which a triangle needs no improvement: 35°.
 const GOOD: f32 = 0.7;
@@ -211,8 +212,7 @@ impl Patch {
         for row in self.fan(v) {
             let corners = self.corners(row);
             let weight = length(area_vector(corners));
-            let [a, b, c] = corners;
-            let step: Vector = std::array::from_fn(|k| (a[k] + b[k] + c[k]) / 3.0 - p[k]);
+            let step = sub(centroid(corners), p);
             sum = std::array::from_fn(|k| sum[k] + weight * step[k]);
             total += weight;
         }

@@ -4,7 +4,8 @@ use rayon::prelude::*;
 
 use crate::lattice::to_u64;
 use crate::mesh::Mesh;
-use crate::triangle::{Corners, Vector, area_vector, length, sub, tan_smallest_angle};
+use crate::triangle::{Corners, Vector, tan_smallest_angle};
+use crate::vector::{area_vector, length, sub};
 
 /// Upper ends of the classes of aspect ratios; the last class has none.
 pub(super) const ASPECT_ENDS: [f64; 7] = [1.25, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0];

@@ -11,6 +11,7 @@ use crate::checked_sort;
 use crate::column::Column;
 use crate::control::Control;
 use crate::error::SurfaceError;
+use crate::groups::{GroupCounts, Groups};
 use crate::kernel::Shape;
 use crate::memory::Reservation;
 use crate::params::SurfaceParams;
@@ -58,12 +59,12 @@ impl Placing<'_> {
         let parts = (0..n.div_ceil(part))
             .into_par_iter()
             .map(|i| by_bucket(self, &keys, i * part..n.min((i + 1) * part)))
-            .collect::<Result<Vec<SortedPart>, SurfaceError>>()?;
+            .collect::<Result<Vec<Groups>, SurfaceError>>()?;
         let mut atoms = Column::zeroed(n);
         let mut rest = &mut atoms[..];
         let mut buckets = Vec::with_capacity(keys.n_buckets);
         for bucket in 0..keys.n_buckets {
-            let (own, others) = rest.split_at_mut(parts.iter().map(|part| part.bucket(bucket).len()).sum());
+            let (own, others) = rest.split_at_mut(parts.iter().map(|part| part.get(bucket).len()).sum());
             buckets.push(own);
             rest = others;
         }
@@ -117,54 +118,27 @@ impl SortKeys {
     }
 }
 
-/// Spheres of a part of the input, sorted by bucket.
-struct SortedPart {
-    /// Indices of the spheres, ascending within a bucket.
-    indices: Vec<u32>,
-    /// Start of each bucket in `indices`, and the number of indices last.
-    starts: Vec<u32>,
-}
-
-impl SortedPart {
-    /// Indices of the spheres of a bucket.
-    #[inline(always)]
-    fn bucket(&self, bucket: usize) -> &[u32] {
-        &self.indices[self.starts[bucket] as usize..self.starts[bucket + 1] as usize]
-    }
-}
-
 dispatched! {
-/// Sorts the `spheres` by bucket, with a counting sort.
-fn by_bucket(placing: &Placing<'_>, keys: &SortKeys, spheres: Range<usize>) -> Result<SortedPart, SurfaceError> {
-    let mut starts = vec![0; keys.n_buckets + 1];
+/// Sorts the indices of `spheres` by bucket.
+fn by_bucket(placing: &Placing<'_>, keys: &SortKeys, spheres: Range<usize>) -> Result<Groups, SurfaceError> {
+    let mut counts = GroupCounts::new(keys.n_buckets);
     let bucket = |i| u32::try_from(keys.of(placing.cell(placing.spheres.centre(i))) >> keys.shift).unwrap_or(u32::MAX);
     let mut buckets: Vec<u32> = Vec::with_capacity(spheres.len());
     for first in spheres.clone().step_by(ATOMS_PER_CHECK) {
         placing.control.check()?;
         for i in first..spheres.end.min(first + ATOMS_PER_CHECK) {
             let bucket = bucket(i);
-            starts[bucket as usize] += 1;
+            counts.add(bucket as usize);
             buckets.push(bucket);
         }
     }
-    // Computes the ends of the buckets. The next loop decrements them to the starts.
-    let mut end = 0;
-    for start in &mut starts {
-        end += *start;
-        *start = end;
-    }
-    let mut indices = vec![0; buckets.len()];
-    let mut i = spheres.end;
-    for buckets in buckets.rchunks(ATOMS_PER_CHECK) {
+    let mut groups = counts.groups();
+    let mut pairs = buckets.iter().zip(to_u32(spheres.start)..);
+    for _ in (0..buckets.len()).step_by(ATOMS_PER_CHECK) {
         placing.control.check()?;
-        for &bucket in buckets.iter().rev() {
-            i -= 1;
-            let start = &mut starts[bucket as usize];
-            *start -= 1;
-            indices[*start as usize] = to_u32(i);
-        }
+        pairs.by_ref().take(ATOMS_PER_CHECK).for_each(|(bucket, i)| groups.push(*bucket as usize, i));
     }
-    Ok(SortedPart { indices, starts })
+    Ok(groups)
 }
 }
 
@@ -173,7 +147,7 @@ dispatched! {
 fn write_bucket(
     placing: &Placing<'_>,
     keys: &SortKeys,
-    parts: &[SortedPart],
+    parts: &[Groups],
     bucket: usize,
     scratch: &mut Vec<LatticeAtom>,
     atoms: &mut [LatticeAtom],
@@ -187,7 +161,7 @@ fn write_bucket(
     scratch.clear();
     scratch.reserve(atoms.len());
     for part in parts {
-        for indices in part.bucket(bucket).chunks(ATOMS_PER_CHECK) {
+        for indices in part.get(bucket).chunks(ATOMS_PER_CHECK) {
             control.check()?;
             scratch.extend(indices.iter().map(|&i| placing.atom(i as usize)));
         }

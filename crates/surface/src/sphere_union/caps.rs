@@ -2,6 +2,7 @@
 
 use crate::candidates::Comparisons;
 use crate::error::SurfaceError;
+use crate::vector::{cross, dot};
 
 /// Tolerance of the covering tests for meshes and components, Å: a cap covers only points that lie farther than this
 /// inside it. Points at which caps meet are then exposed, which moves the surface by the tolerance at most. Without
@@ -40,10 +41,6 @@ pub(super) enum Cover {
     Caps,
 }
 
-pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
 /// Returns the squared sine of the angle between two unit vectors, whose product is `cos`.
 pub(super) fn sin2(a: [f64; 3], b: [f64; 3], cos: f64) -> f64 {
     // The difference loses all digits for vectors that are nearly parallel.
@@ -52,10 +49,6 @@ pub(super) fn sin2(a: [f64; 3], b: [f64; 3], cos: f64) -> f64 {
     }
     let normal = cross(a, b);
     dot(normal, normal)
-}
-
-pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|k| a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3])
 }
 
 /// Fills `caps` with the caps on the sphere of number `own` that no other cap contains, largest first.

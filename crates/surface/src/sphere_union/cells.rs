@@ -10,6 +10,7 @@ use super::radius;
 use crate::control::Control;
 use crate::error::SurfaceError;
 use crate::lattice::{LatticeAtom, to_f32, to_i32, to_u32};
+use crate::vector::dot;
 
 /// Maximum memory per sphere, bytes: its cell while sorting, its number and its entry in the index.
 const BYTES: u64 = 64;
@@ -46,8 +47,7 @@ impl<'a> Cells<'a> {
         control.memory.grow(BYTES * atoms.len() as u64)?;
         // Slightly more than the diameter: rounding must not separate spheres that touch.
         let side = 2.001 * atoms.iter().map(radius).fold(0.0, f64::max) + 1.0;
-        let cell =
-            |atom: &LatticeAtom| -> [i32; 3] { std::array::from_fn(|k| to_i32((atom.position(k) / side).floor())) };
+        let cell = |atom: &LatticeAtom| atom.centre().map(|c| to_i32((c / side).floor()));
         let mut keys: Vec<([i32; 3], u32)> = Vec::with_capacity(atoms.len());
         for some in atoms.chunks(PER_CHECK) {
             control.check()?;
@@ -118,7 +118,7 @@ impl Around<'_> {
         for ((((x, y), z), radius), index) in x.iter().zip(y).zip(z).zip(radii).zip(&self.order) {
             let to = [x - cx, y - cy, z - cz];
             let reach = r + radius;
-            if to[0] * to[0] + to[1] * to[1] + to[2] * to[2] < reach * reach {
+            if dot(to, to) < reach * reach {
                 found.push(Neighbour { to, radius: *radius, index: *index });
             }
         }

@@ -12,7 +12,7 @@ use std::sync::{Mutex, PoisonError};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
-use super::caps::{self, Cap, Cover, TOLERANCE, dot};
+use super::caps::{self, Cap, Cover, TOLERANCE};
 use super::cells::Cells;
 use super::circle::Uncovered;
 use super::great_circle::GreatCircle;
@@ -20,9 +20,11 @@ use super::{CELLS_PER_PART, CapScratch, Circle, radius};
 use crate::candidates::{Comparisons, OverlapCount};
 use crate::control::Control;
 use crate::error::SurfaceError;
+use crate::groups::Groups;
 use crate::lattice::{LatticeAtom, to_i32, to_u32};
 use crate::params::SurfaceLimits;
 use crate::union_find::UnionFind;
+use crate::vector::{add, dot, squared_distance, sub, unit};
 
 /// Distance within which ends of arcs are the same vertex, Å. The tolerance of caps moves the ends of arcs that meet at
 /// a small angle by up to its square root. Components that come closer than this are joined.
@@ -78,10 +80,8 @@ pub(crate) struct Components<'a> {
     pub(super) arcs: Vec<Arc>,
     /// Component of each arc.
     pub(super) of_arc: Vec<u32>,
-    /// First entry of each sphere in `by_sphere`; the last element is the number of entries.
-    starts: Vec<u32>,
     /// Numbers of the arcs on each sphere.
-    by_sphere: Vec<u32>,
+    by_sphere: Groups,
     /// Caps of the spheres on which several sets of arcs lie.
     caps: FxHashMap<u32, Vec<Cap>>,
     /// Spheres whose whole surface is exposed, ascending. They have no arcs. Their components have the last numbers.
@@ -119,13 +119,14 @@ impl<'a> Components<'a> {
         control.memory.grow(5 * size_of::<u32>() as u64 * (arcs.len() + atoms.len()) as u64)?;
         let mut sets = UnionFind::new(arcs.len());
         join_ends(atoms, &arcs, spacing, &mut sets, control)?;
-        let (starts, by_sphere) = index(atoms.len(), &arcs);
+        let on_spheres = (0..).zip(&arcs).flat_map(|(number, arc)| arc.spheres.map(|sphere| (sphere as usize, number)));
+        let by_sphere = Groups::new(atoms.len(), on_spheres);
         let mut numbers = Vec::new();
         sets.number_sets(&mut numbers);
         let mut whole = whole.into_inner().unwrap_or_else(PoisonError::into_inner);
         whole.sort_unstable();
         let caps = FxHashMap::default();
-        let mut found = Self { atoms, arcs, of_arc: numbers, starts, by_sphere, caps, whole, tolerance, n: 0 };
+        let mut found = Self { atoms, arcs, of_arc: numbers, by_sphere, caps, whole, tolerance, n: 0 };
         let several = |own: &u32| !found.on(*own).is_empty() && found.only(*own).is_none();
         let pairs = search.for_each_sphere(several, |own, scratch, out, _| {
             let pairs = found.shared_faces(own, &scratch.caps, &mut scratch.uncovered);
@@ -144,7 +145,7 @@ impl<'a> Components<'a> {
 
     /// Returns the numbers of the arcs on a sphere.
     pub(super) fn on(&self, sphere: u32) -> &[u32] {
-        &self.by_sphere[self.starts[sphere as usize] as usize..self.starts[sphere as usize + 1] as usize]
+        self.by_sphere.get(sphere as usize)
     }
 
     /// Returns the vector from the centre of sphere `a` to that of sphere `b`.
@@ -341,15 +342,14 @@ fn join_ends(
         let atom = &atoms[arc.spheres[0] as usize];
         let [from, to, _] = arc.points();
         for end in [from, to] {
-            let x: [f64; 3] = std::array::from_fn(|k| atom.position(k) + end[k]);
+            let x = add(atom.centre(), end);
             let ([lx, ly, lz], [hx, hy, hz]) = (cell(x.map(|c| c - reach)), cell(x.map(|c| c + reach)));
             let mut nearest = f64::MAX;
             let around = (lx..=hx).flat_map(|x| (ly..=hy).flat_map(move |y| (lz..=hz).map(move |z| [x, y, z])));
             for near in around {
                 let mut next = cells.get(&near).copied().unwrap_or(NONE);
                 while let Some(&(other, of, after)) = vertices.get(next as usize) {
-                    let apart = sub(x, other);
-                    let distance2 = dot(apart, apart);
+                    let distance2 = squared_distance(x, other);
                     if distance2 <= reach * reach {
                         sets.union(n, of);
                         nearest = nearest.min(distance2);
@@ -364,35 +364,4 @@ fn join_ends(
         }
     }
     Ok(())
-}
-
-/// Returns the arcs on each sphere: the first entry of each sphere, and the numbers of the arcs.
-fn index(n: usize, arcs: &[Arc]) -> (Vec<u32>, Vec<u32>) {
-    let mut starts = vec![0_u32; n + 1];
-    arcs.iter().flat_map(|arc| arc.spheres).for_each(|sphere| starts[sphere as usize + 1] += 1);
-    for i in 0..n {
-        starts[i + 1] += starts[i];
-    }
-    let (mut next, mut by_sphere) = (starts.clone(), vec![0; 2 * arcs.len()]);
-    for (number, arc) in (0..).zip(arcs) {
-        for sphere in arc.spheres {
-            let at = &mut next[sphere as usize];
-            by_sphere[*at as usize] = number;
-            *at += 1;
-        }
-    }
-    (starts, by_sphere)
-}
-
-pub(super) fn add(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|k| a[k] + b[k])
-}
-
-pub(super) fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|k| a[k] - b[k])
-}
-
-pub(super) fn unit(v: [f64; 3]) -> [f64; 3] {
-    let length = dot(v, v).sqrt();
-    v.map(|c| c / length)
 }

@@ -2,15 +2,15 @@
 
 use std::cmp::Ordering;
 
-use super::caps::{self, Cap, Cover, Neighbour, cross, dot};
+use super::caps::{self, Cap, Cover, Neighbour};
 use super::cells::on_lattice;
-use super::components::{sub, unit};
 use super::exact::{AreaParts, EQUAL_CAPS, FaceSearch, Integrals, PER_CHECK, PartMeasures, Scratch};
 use super::region::Region;
 use crate::candidates::Comparisons;
 use crate::checked_sort;
 use crate::error::SurfaceError;
 use crate::lattice::{LatticeAtom, to_u32};
+use crate::vector::{cross, dot, length, squared_distance, sub, unit};
 
 /// Distance within which vertices coincide, Å. Where more than three spheres meet, rounding decides which triples
 /// become vertices, and their polygons may overlap.
@@ -124,7 +124,7 @@ impl<'a> Vertices<'a> {
         }
         for Neighbour { to, index, .. } in &neighbours[n_coincident..] {
             let other = &self.all[*index as usize];
-            let distance = dot(*to, *to).sqrt();
+            let distance = length(*to);
             let height = distance / (2.0 * self.probe);
             // The probe on the other side of the same spheres covers nearly the whole polygon.
             let touches = distance <= TOUCHING && other.spheres != [a, c, b];
@@ -175,8 +175,7 @@ fn coincident_vertices(
         comparisons.add(neighbours.len())?;
         let (from, first) = (neighbours[next].to, found);
         for i in first..neighbours.len() {
-            let apart = sub(neighbours[i].to, from);
-            if dot(apart, apart) < COINCIDENT * COINCIDENT {
+            if squared_distance(neighbours[i].to, from) < COINCIDENT * COINCIDENT {
                 if neighbours[i].index < own {
                     return Ok(None);
                 }
@@ -200,8 +199,7 @@ fn polygon(
     const ROUNDING: f64 = 10.0 * COINCIDENT;
     let outward = |a: [f64; 3], b: [f64; 3]| {
         let normal = cross(b, a);
-        let length = dot(normal, normal).sqrt();
-        (length > 0.0).then(|| normal.map(|c| c / length))
+        (length(normal) > 0.0).then(|| unit(normal))
     };
     let mut add = |axis| caps.push(Cap { axis, height: 0.0, index: number + to_u32(caps.len()) });
     if let [(_, a), (_, b), (_, c)] = *contacts {

@@ -3,6 +3,7 @@
 use super::{Arc, SphereUnion};
 use crate::lattice::LatticeAtom;
 use crate::simd::{LANES, dispatched, extent};
+use crate::vector::length;
 
 /// Coordinates of points, axis by axis, in spacings from the brick's first grid point.
 pub(crate) type Lanes = [[f32; LANES]; 3];
@@ -164,7 +165,7 @@ fn nearest(brick: &mut BrickUnion, union: Option<&SphereUnion>, level: f32, poin
         if depth > 0.0 && depth < enough {
             let sphere = found.sphere[lane] as usize;
             let from: [f32; 3] = std::array::from_fn(|k| points[k][lane] - brick.columns[k][sphere]);
-            let scale = (from[0] * from[0] + from[1] * from[1] + from[2] * from[2]).sqrt().recip();
+            let scale = length(from).recip();
             buried[lane] = !union.is_exposed(brick.spheres[sphere], from.map(|c| c * scale));
         }
     }

@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::caps::{self, Cap, Cover, Neighbour, dot};
+use super::caps::{self, Cap, Cover, Neighbour};
 use super::cells::{Cells, on_lattice};
 use super::circle::Uncovered;
 use super::components::Components;
@@ -27,6 +27,7 @@ use crate::lattice::{LatticeAtom, effective_radius, to_i32};
 use crate::memory::Reservation;
 use crate::params::{SurfaceKind, SurfaceLimits, SurfaceParams, bad};
 use crate::spheres::Spheres;
+use crate::vector::{dot, sub};
 
 /// Areas of the parts of a surface of spheres, Å².
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -359,7 +360,7 @@ impl FaceSearch<'_> {
         let (length, centre, other) = (radius(first), self.centre(first), self.centre(second));
         let to_plane = length * cap.height;
         let edge = length * (1.0 - cap.height * cap.height).max(0.0).sqrt();
-        let distance = dot(cap.axis, std::array::from_fn(|k| other[k] - centre[k]));
+        let distance = dot(cap.axis, sub(other, centre));
         let middle: [f64; 3] = std::array::from_fn(|k| centre[k] + to_plane * cap.axis[k]);
         let offsets = [to_plane, distance - to_plane];
         let path = ProbePath { arc, axis: cap.axis, centre: middle, radius: edge, offsets, probe };

@@ -1,8 +1,8 @@
 //! Great circles of a sphere, and the parts of them that no cap covers.
 
-use super::caps::{Cap, dot};
+use super::caps::Cap;
 use super::circle::Uncovered;
-use super::components::unit;
+use crate::vector::{dot, unit};
 
 /// Plane of a great circle, spanned by two unit vectors.
 pub(super) struct GreatCircle {

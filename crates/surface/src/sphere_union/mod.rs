@@ -27,7 +27,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
-use self::caps::{Cap, Cover, Neighbour, TOLERANCE, dot};
+use self::caps::{Cap, Cover, Neighbour, TOLERANCE};
 use self::cells::Cells;
 pub(super) use self::cells::rounded;
 use self::circle::{Exposed, Uncovered};
@@ -40,6 +40,7 @@ use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::lattice::{LatticeAtom, to_f32, to_i32, to_u32};
 use super::params::SurfaceLimits;
+use super::vector::{cross, dot};
 
 /// Exposed part of the circle of two spheres.
 #[derive(Debug, Clone, Copy)]
@@ -315,7 +316,7 @@ impl Circle {
             ([-y, x, 0.0], x * x + y * y)
         };
         let first = vector.map(|c| c / length2.sqrt());
-        let second = caps::cross(cap.axis, first);
+        let second = cross(cap.axis, first);
         let sin = (1.0 - cap.height * cap.height).max(0.0).sqrt();
         let centre = cap.axis.map(|c| c * cap.height * radius);
         Self { centre, axis: cap.axis, first, second, radius: radius * sin, sin }

@@ -8,6 +8,7 @@ use super::radius;
 use crate::control::Control;
 use crate::error::SurfaceError;
 use crate::lattice::to_i32;
+use crate::vector::sub;
 
 /// Spheres between two checks of the cancellation flag: a few milliseconds.
 const PER_CHECK: usize = 1 << 16;
@@ -39,7 +40,7 @@ impl Components<'_> {
                 let [low, high] = [-r, r].map(|r| [1, 2].map(|k| column(atom.position(k) + r)));
                 let near = (low[0]..=high[0]).flat_map(|y| (low[1]..=high[1]).map(move |z| [y, z]));
                 for &ray in near.filter_map(|near| columns.get(&near)).flatten() {
-                    let to: [f64; 3] = std::array::from_fn(|k| atom.position(k) - points[ray as usize][k]);
+                    let to = sub(atom.centre(), points[ray as usize]);
                     let square = r * r - to[1] * to[1] - to[2] * to[2];
                     let end = to[0] + square.max(0.0).sqrt();
                     if square > 0.0 && end > 0.0 {
@@ -63,7 +64,7 @@ impl Components<'_> {
         let mut odd: Vec<u32> = Vec::new();
         let mut cross = |at: f64, sphere: u32| {
             let atom = &self.atoms[sphere as usize];
-            let to: [f64; 3] = std::array::from_fn(|k| point[k] - atom.position(k));
+            let to = sub(point, atom.centre());
             let n = [to[0] + at, to[1], to[2]].map(|c| c / radius(atom));
             let Some(component) = self.at(sphere, n) else { return };
             match odd.binary_search(&component) {

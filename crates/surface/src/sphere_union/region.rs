@@ -7,10 +7,11 @@
 use std::f64::consts::PI;
 
 use super::Circle;
-use super::caps::{Cap, dot};
+use super::caps::Cap;
 use super::circle::{Exposed, Uncovered};
 use crate::candidates::Comparisons;
 use crate::error::SurfaceError;
+use crate::vector::dot;
 
 /// Part of a unit sphere.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

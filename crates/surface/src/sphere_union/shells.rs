@@ -1,12 +1,13 @@
 //! Connected components of the boundary with their measures, spheres and bounds.
 
-use super::components::{Components, add};
+use super::components::Components;
 use super::exact::ComponentMeasures;
 use super::radius;
 use crate::control::Control;
 use crate::error::SurfaceError;
 use crate::lattice::to_u32;
 use crate::params::SurfaceLimits;
+use crate::vector::add;
 
 /// Connected component of the boundary, or several that bound one region. Lengths are in Å.
 #[derive(Debug, Clone)]
@@ -76,16 +77,15 @@ impl Components<'_> {
                 _ => (arc.centre, arc.radius),
             };
             let atom = &self.atoms[arc.spheres[0] as usize];
-            let at = |x: [f64; 3]| std::array::from_fn(|k| atom.position(k) + x[k]);
             let shell = &mut shells[*set as usize];
-            shell.point = at(from);
-            shell.extend(at(centre), reach);
+            shell.point = add(atom.centre(), from);
+            shell.extend(add(atom.centre(), centre), reach);
         }
         for (&sphere, number) in self.whole.iter().zip(self.first_whole()..) {
             let atom = &self.atoms[sphere as usize];
             let shell = &mut shells[number as usize];
             shell.spheres.push(sphere);
-            shell.point = std::array::from_fn(|k| atom.position(k));
+            shell.point = atom.centre();
             shell.extend(shell.point, radius(atom));
         }
         Ok(shells)

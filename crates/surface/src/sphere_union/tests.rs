@@ -10,6 +10,7 @@
 use std::f64::consts::PI;
 
 use super::*;
+use crate::vector::{length, sub};
 
 /// Centre and radius, Å.
 type Ball = ([f64; 3], f64);
@@ -52,17 +53,9 @@ fn distance(balls: &[Ball], level: f64, point: [f64; 3]) -> f64 {
     distances(balls, level, &[point])[0].distance
 }
 
-fn norm(v: [f64; 3]) -> f64 {
-    dot(v, v).sqrt()
-}
-
-fn minus(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|k| a[k] - b[k])
-}
-
 /// Returns the distance from the point to the sphere in which it lies deepest.
 fn depth(balls: &[Ball], x: [f64; 3]) -> f64 {
-    balls.iter().map(|(c, r)| r - norm(minus(x, *c))).fold(f64::MIN, f64::max)
+    balls.iter().map(|(c, r)| r - length(sub(x, *c))).fold(f64::MIN, f64::max)
 }
 
 /// Returns evenly spread points of a unit sphere.
@@ -108,11 +101,11 @@ fn check(what: &str, balls: &[Ball], level: f64, n: u32, points: &[[f64; 3]]) {
             assert!(found.distance > level - 1e-4, "{what}: {x:?} {found:?} {deepest}");
             continue;
         }
-        let nearest = boundary.iter().map(|p| norm(minus(*p, *x))).fold(level + 1.0, f64::min);
+        let nearest = boundary.iter().map(|p| length(sub(*p, *x))).fold(level + 1.0, f64::min);
         assert!(found.distance < nearest + 1e-4, "{what}: {x:?} {found:?}, but a point is {nearest} away");
         if found.distance < level {
             // The vector leads to a point of an arc, or comes from the centre of the face's sphere.
-            let length = norm(found.vector);
+            let length = length(found.vector);
             let scale = if found.on_arc { 1.0 } else { found.distance / length };
             let foot: [f64; 3] = std::array::from_fn(|k| x[k] + scale * found.vector[k]);
             let off = depth(balls, foot);
@@ -215,7 +208,7 @@ fn degenerate_arrangements_match_points_on_the_boundary() {
             let v = [kind[0] * a, kind[1] * b, kind[2] * c];
             for turn in 0..3 {
                 let at = std::array::from_fn(|k| 0.725 * v[(k + turn) % 3] + 0.1);
-                if !fullerene.iter().any(|(p, _)| norm(minus(*p, at)) < 1e-6) {
+                if !fullerene.iter().any(|(p, _)| length(sub(*p, at)) < 1e-6) {
                     fullerene.push((at, 3.1));
                 }
             }

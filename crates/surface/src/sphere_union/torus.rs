@@ -1,7 +1,7 @@
 //! Toroidal part of a solvent-excluded surface: the probe touches two spheres and moves along an arc.
 
-use super::caps::dot;
 use super::region::EdgeArc;
+use crate::vector::dot;
 
 /// Positions of the probe along an arc.
 #[derive(Debug, Clone, Copy)]
