@@ -13,7 +13,7 @@ use super::pool::WorkerContext;
 use super::rank::Lane;
 use super::{Failure, Finished, JobId, MemoryReservation, OnStart, Outcome, Settings, Task};
 use crate::formats::Pieces;
-use crate::pipeline::{self, Choice, JobError, Product, ProgressSink, Report, StageClock};
+use crate::pipeline::{self, Choice, JobError, Product, ProgressSink, Report, Scope, StageClock};
 use crate::structure::strict_validator::{self, Diagnostic, Level, MAX_UNREAD_BYTES};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, Control, MemoryMeter as _, SurfaceError};
@@ -149,7 +149,7 @@ fn product(
     if job.tile.is_some() && !job.selection.instances {
         let clock = StageClock::new(progress);
         let (tileset, colors) = structures.tileset((*namespace, *digest), input, job, &limits.read, control, &clock)?;
-        return tileset.product((job, colors.as_deref()), choice, &limits.surface, control, clock, progress);
+        return tileset.product((job, colors.as_deref()), choice, &limits.surface, &Scope::new(&clock, control));
     }
     let read = |control: &Control<'_>| structures.get(*namespace, *digest, input, &limits.read, control);
     pipeline::run_with(read, job, limits, choice, control, progress, None)

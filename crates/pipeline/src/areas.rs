@@ -13,7 +13,7 @@ use serde::Serialize;
 
 pub use self::table::AreaLevel;
 use self::table::Row;
-use super::load::{SPHERE_BYTES, load};
+use super::load::{LoadedStructure, SPHERE_BYTES, load};
 use super::{Job, JobError, LeftOutReport, StageClock};
 
 /// Description of the values of `interface`.
@@ -175,7 +175,7 @@ pub fn measure_selection(
     surface: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<MeasuredSelection, JobError> {
-    let (_, selected, spheres) = load(|_| Ok(structure), job, read, &StageClock::new(&()), control)?;
+    let LoadedStructure { selected, spheres, .. } = load(|_| Ok(structure), job, read, &StageClock::new(&()), control)?;
     let (measures, areas) = if let Some(interface) = &job.interface {
         let (report, areas) = interface.measure(structure, &selected, &spheres, job, surface, control)?;
         (SelectionMeasures::Interface(report), areas)

@@ -4,7 +4,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use molmesh_surface::{Observer, Stage};
+use molmesh_surface::{Control, Observer, Stage};
 
 /// Receiver of progress.
 pub trait ProgressSink: Sync {
@@ -81,10 +81,9 @@ impl<'a> StageClock<'a> {
         value
     }
 
-    /// Returns the wall time of each stage, ms, in execution order.
-    #[must_use]
-    pub fn finish(self) -> Vec<(&'static str, f64)> {
-        self.wall_ms.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
+    /// Takes the wall time of each stage, ms, in execution order.
+    pub fn finish(&self) -> Vec<(&'static str, f64)> {
+        std::mem::take(&mut *self.wall_ms.lock().unwrap_or_else(std::sync::PoisonError::into_inner))
     }
 
     /// Adds a run of a stage. The runs of a stage are summed.
@@ -95,6 +94,20 @@ impl<'a> StageClock<'a> {
             Some((_, sum)) => *sum += ms,
             None => times.push((name, ms)),
         }
+    }
+}
+
+/// Scope of work: its cancellation, memory and observer, which is its clock.
+pub struct Scope<'a> {
+    pub(super) clock: &'a StageClock<'a>,
+    pub(super) control: Control<'a>,
+}
+
+impl<'a> Scope<'a> {
+    /// Creates the scope of work that `control` limits and `clock` observes.
+    #[must_use]
+    pub fn new(clock: &'a StageClock<'a>, control: &Control<'a>) -> Self {
+        Self { clock, control: Control { observer: clock, ..control.clone() } }
     }
 }
 

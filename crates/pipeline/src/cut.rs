@@ -8,11 +8,11 @@ use molmesh_structure::{AtomPart, Selected};
 use molmesh_surface::cpu::scan;
 use molmesh_surface::vector::joined_bounds;
 use molmesh_surface::{
-    Column, Component, Control, Measures, Mesh, MeshOutput, PartRange, Pockets, Stage, SurfaceError, Validation,
+    Column, Component, Control, Measures, Mesh, MeshOutput, PartRange, Pockets, Stage, SurfaceError, SurfaceLimits,
+    SurfaceParams, Validation,
 };
 use rayon::prelude::*;
 
-use super::parts::Run;
 use super::pockets::lined_by;
 
 /// Rows per task, and triangles between two checks for cancellation.
@@ -102,8 +102,8 @@ impl<'a> Cut<'a> {
         }
     }
 
-    /// Cuts the mesh of `whole`, which has atom indices if the cut needs them. Adds the memory of the result to the
-    /// meter of `control`.
+    /// Cuts the mesh of `whole`, which has atom indices if the cut needs them. `params` are those of the result, whose
+    /// memory is added to the meter of `control`.
     ///
     /// # Errors
     /// Returns [`SurfaceError::NoPatch`] if no triangle remains, [`SurfaceError::MeshTooLarge`], and the errors of
@@ -111,7 +111,8 @@ impl<'a> Cut<'a> {
     pub(super) fn apply(
         &self,
         mut whole: MeshOutput,
-        run: &Run<'_>,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<MeshOutput, SurfaceError> {
         let was_closed = whole.measure(control)?.closed;
@@ -142,7 +143,7 @@ impl<'a> Cut<'a> {
             measures = Some(exact?);
         }
         let is_closed = measures.as_ref().is_some_and(|measures| measures.closed);
-        self.renumber(mesh, &ranges, run, control)?;
+        self.renumber(mesh, &ranges, params, limits, control)?;
         mesh.cut = was_closed && !(is_closed && self.names.is_empty());
         let bounds = Some(mesh.bounds());
         Ok(MeshOutput { measures, bounds, ..whole })
@@ -181,7 +182,8 @@ impl<'a> Cut<'a> {
         &self,
         mesh: &mut Mesh,
         ranges: &[std::ops::Range<usize>],
-        run: &Run<'_>,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<(), SurfaceError> {
         let (n_vertices, n_triangles) = (mesh.n_vertices(), mesh.n_triangles());
@@ -207,7 +209,7 @@ impl<'a> Cut<'a> {
             }
             vertices.push(first..rows.len());
         }
-        scan::check_size(run.params, run.limits, rows.len() as u64, n_triangles as u64)?;
+        scan::check_size(params, limits, rows.len() as u64, n_triangles as u64)?;
         let bytes = Mesh::bytes_for(rows.len() as u64, 0, mesh.quantized.is_some());
         control.memory.grow(bytes + 4 * rows.len() as u64)?;
         mesh.take_vertices(&rows);

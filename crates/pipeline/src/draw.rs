@@ -5,8 +5,8 @@ use std::sync::Arc;
 use molmesh_picture::{PictureParams, Rendered, SelectedRenderer, png};
 use molmesh_surface::Control;
 
-use super::report::{PictureReport, Report};
-use super::{JobError, Product, ProgressSink, StageClock};
+use super::report::PictureReport;
+use super::{JobError, Product, ProgressSink, Scope, StageClock};
 
 /// Draws the mesh of `product` and replaces it with the PNG.
 ///
@@ -25,15 +25,12 @@ pub fn draw(
     let drawn = clock.time("draw", || {
         // The renderer needs random access to vertices.
         mesh.make_contiguous();
-        let control = Control { observer: &clock, ..control.clone() };
         // The mesh is freed before the PNG is allocated.
-        renderer.renderer.render(&Arc::new(mesh), params, &control)
+        renderer.renderer.render(&Arc::new(mesh), params, &Scope::new(&clock, control).control)
     })?;
     let bytes = clock.time("png", || png::encode(&drawn.image, control))?;
     product.report.picture = Some(PictureReport::new(params, renderer, &drawn));
-    for (stage, ms) in clock.finish() {
-        Report::add_timing(&mut product.report, stage, ms);
-    }
+    product.report.add_timings(&clock);
     product.picture = Some(bytes);
     Ok(())
 }

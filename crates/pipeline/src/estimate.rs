@@ -5,25 +5,24 @@
 //! vertex. The area is that of a coarser mesh.
 
 use std::ops::Deref;
-use std::sync::Arc;
 
 use molmesh_formats::Compress;
-use molmesh_structure::{AtomPart, Structure, StructureError};
+use molmesh_structure::{Structure, StructureError};
 use molmesh_surface::cpu::{LATTICE_BYTES, check_work, scan};
 use molmesh_surface::lattice::Lattice;
 use molmesh_surface::params::MAX_RESOLUTION;
 use molmesh_surface::{
-    Control, OutOfMemory, Reservation, Spheres, SurfaceError, SurfaceLimits, SurfaceParams, TriangleQuality,
-    candidates, improve,
+    Control, OutOfMemory, Reservation, SurfaceError, SurfaceParams, TriangleQuality, candidates, improve,
 };
 
 use super::collapse::{self, check_error};
 use super::color::{AtomColors, Scheme};
 use super::cut::Cut;
 use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
-use super::job_backend::{Division, of_job};
+use super::load::{LoadedStructure, load};
+use super::meshing::Meshing;
 use super::work::{self, WorkCounts};
-use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
+use super::{Choice, Job, JobError, JobLimits, StageClock};
 use super::{parts, pockets};
 
 /// Estimated size of a job.
@@ -82,46 +81,42 @@ pub fn estimate<S: Deref<Target = Structure>>(
         return Err(SurfaceError::BadParameter { name: "tile", value, expected }.into());
     }
     let clock = StageClock::new(&());
-    let (structure, selected, spheres) = super::load(read, job, &limits.read, &clock, control)?;
+    let LoadedStructure { structure, selected, spheres } = load(read, job, &limits.read, &clock, control)?;
     if let Some(coloring) = job.color.as_ref().filter(|coloring| !matches!(coloring.scheme, Scheme::Vertex(_))) {
         AtomColors::new(&structure, &selected.atoms, coloring)?;
     }
     let parts = selected.parts(&structure, job.split, &limits.read, control)?;
     let cut = Cut::of(&selected, parts.as_deref(), None, job.validation, control)?;
-    let division = Division::of(parts.as_deref(), cut.as_ref());
-    // Improved meshes would take far longer than the estimate needs.
-    let backend = of_job(choice.backend, division, TriangleQuality::Standard);
-    let (undivided, choice) = (choice, &Choice { backend: &*backend, reason: choice.reason });
-    let mut params = job.params_for(spheres.len());
-    let mut refused = None;
-    if let Spacing::MaxTriangles(limit) = job.spacing {
-        match fit::expected(&spheres, job, limit, &limits.surface, choice, control) {
-            Ok(resolution) => params.resolution = resolution,
-            Err(error) => {
-                if let SurfaceError::TooManyTriangles { resolution, .. } = error {
-                    params.resolution = resolution;
-                }
-                refused = Some(error);
-            }
-        }
-    }
-    let _storage = super::storage(job, &mut params, &spheres);
-    let plan = MeshPlan::new(&spheres, division, &params, job, &limits.surface);
-    let choice = plan.choice(undivided, choice);
+    let job_backend = choice.backend.for_job();
+    let meshing = Meshing {
+        backend: job_backend.as_deref().unwrap_or(choice.backend),
+        spheres: &spheres,
+        parts: parts.as_deref().filter(|_| cut.is_none()),
+        cut: cut.as_ref(),
+        // Improved meshes would take far longer than the estimate needs.
+        quality: TriangleQuality::Standard,
+        limits: &limits.surface,
+    };
+    let max_triangles = job.spacing.max_triangles();
+    let fitted = max_triangles.map(|limit| fit::expected(&meshing, job, limit, control)).transpose();
+    let spacing = match &fitted {
+        Ok(spacing) => *spacing,
+        Err(SurfaceError::TooManyTriangles { resolution, .. }) => Some(*resolution),
+        Err(_) => None,
+    };
+    let params = job.mesh_params(&spheres, spacing);
+    let plan = MeshPlan { meshing: &meshing, params: &params, compress: job.compress };
     let lattices = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
     let simplifies = job.simplify.map_or(Ok(()), |wanted| check_error(wanted.error, params.resolution));
     let pocket_rows = pockets::rows(job, &spheres, &limits.surface, control);
     // In the order of the job, the search for pockets comes first.
-    let checked = pocket_rows.clone().map(drop).and(simplifies).and(refused.map_or(Ok(()), Err));
-    let mesh = checked.and_then(|()| plan.mesh(&lattices, choice, control));
+    let checked = pocket_rows.clone().map(drop).and(simplifies).and(fitted.map(drop));
+    let mesh = checked.and_then(|()| plan.mesh(&lattices, control));
     drop(lattices);
-    let mesh = match (mesh, job.spacing) {
-        (Ok(mesh), Spacing::MaxTriangles(limit)) => Ok(mesh.at_most(limit, &params)),
-        (mesh, _) => mesh,
-    };
     let mesh = mesh.and_then(|mesh| {
+        let mesh = max_triangles.map_or(mesh, |limit| mesh.at_most(limit, &params));
         let with_attributes = |mesh: &MeshEstimate| mesh.bytes + job.attribute_bytes() * mesh.vertices;
         let held = with_attributes(&mesh).saturating_add(plan.compressed_bytes(mesh.vertices));
         control.memory.check(held.saturating_add(plan.bytes_before_cut(&mesh)))?;
@@ -162,12 +157,7 @@ impl MeshEstimate {
 ///
 /// # Errors
 /// Returns the errors of the mesh that can be foreseen, and those of the coarser mesh.
-pub(super) fn check_memory(
-    plan: &MeshPlan<'_>,
-    job: &Job,
-    choice: &Choice<'_>,
-    control: &Control<'_>,
-) -> Result<(), SurfaceError> {
+pub(super) fn check_memory(plan: &MeshPlan<'_>, job: &Job, control: &Control<'_>) -> Result<(), SurfaceError> {
     let (memory, params) = (&control.memory, plan.params);
     let processing = match (job.simplify, job.quality) {
         (Some(_), _) => collapse::TRIANGLE_BYTES,
@@ -178,14 +168,15 @@ pub(super) fn check_memory(
     let per_vertex = job.attribute_bytes() + 2 * processing;
     let attributes =
         |vertices: u64| vertices.saturating_mul(per_vertex).saturating_add(plan.compressed_bytes(vertices));
-    let vertices = n_vertices(plan.spheres.area(params), params.resolution);
+    let vertices = n_vertices(plan.meshing.spheres.area(params), params.resolution);
     let most = params.mesh_bytes(vertices, vertices.saturating_mul(2)).saturating_add(attributes(vertices));
     // A surface before its cut has at most the same size, besides its atom indices.
-    let most = if plan.cut.is_some() { most.saturating_mul(2).saturating_add(ID_BYTES * vertices) } else { most };
+    let most =
+        if plan.meshing.cut.is_some() { most.saturating_mul(2).saturating_add(ID_BYTES * vertices) } else { most };
     if memory.check(most).is_ok() {
         return Ok(());
     }
-    let mesh = plan.mesh(&plan.lattices(control)?, choice, control)?;
+    let mesh = plan.mesh(&plan.lattices(control)?, control)?;
     let bytes = mesh.bytes.saturating_add(attributes(mesh.vertices));
     Ok(memory.check(bytes.saturating_add(plan.bytes_before_cut(&mesh)))?)
 }
@@ -209,15 +200,12 @@ fn n_vertices(area: f64, spacing: f64) -> u64 {
     (1.5 * area / (spacing * spacing)).round() as u64
 }
 
-/// Spheres whose grid and mesh are planned.
+/// Mesh that is planned.
 pub(super) struct MeshPlan<'a> {
-    spheres: &'a Spheres,
-    parts: Option<&'a [AtomPart]>,
-    cut: Option<&'a Cut<'a>>,
-    params: &'a SurfaceParams,
-    limits: &'a SurfaceLimits,
+    pub(super) meshing: &'a Meshing<'a>,
+    pub(super) params: &'a SurfaceParams,
     /// Storage of the mesh in its file.
-    compress: Compress,
+    pub(super) compress: Compress,
 }
 
 /// Lattices of all parts, and their memory.
@@ -234,53 +222,31 @@ impl Deref for Lattices {
     }
 }
 
-impl<'a> MeshPlan<'a> {
-    /// Plans the mesh of `spheres` in a job.
-    pub(super) fn new(
-        spheres: &'a Spheres,
-        division: Option<Division<'a>>,
-        params: &'a SurfaceParams,
-        job: &Job,
-        limits: &'a SurfaceLimits,
-    ) -> Self {
-        let (parts, cut) = (division.and_then(Division::parts), division.and_then(Division::cut));
-        Self { spheres, parts, cut, params, limits, compress: job.compress }
-    }
-
+impl MeshPlan<'_> {
     /// Returns the memory of a compressed mesh, which is held besides the mesh, bytes.
     fn compressed_bytes(&self, vertices: u64) -> u64 {
         vertices.saturating_mul(self.compress.compressed_vertex_bytes())
-    }
-
-    /// Returns the choice of the backend that estimates the mesh: the one that does not divide it if the plan cuts the
-    /// mesh itself.
-    pub(super) fn choice<'c>(&self, undivided: &'c Choice<'c>, divided: &'c Choice<'c>) -> &'c Choice<'c> {
-        if self.cut.is_some() { undivided } else { divided }
     }
 
     /// Returns the memory of the surface before it is cut, with its atom indices, bytes; 0 without a cut.
     fn bytes_before_cut(&self, mesh: &MeshEstimate) -> u64 {
         let n = mesh.whole_vertices;
         let bytes = self.params.mesh_bytes(n, n.saturating_mul(2)).saturating_add(ID_BYTES.saturating_mul(n));
-        if self.cut.is_some() { bytes } else { 0 }
+        if self.meshing.cut.is_some() { bytes } else { 0 }
     }
 
     /// Places the spheres of each part on its lattice.
     fn lattices(&self, control: &Control<'_>) -> Result<Lattices, SurfaceError> {
         // All lattices, and the spheres of one part at a time.
-        let memory = control.reserve((LATTICE_BYTES + super::SPHERE_BYTES) * self.spheres.len() as u64)?;
-        let lattices = parts::spheres_of(self.spheres, self.parts).map(|own| Lattice::new(&own, self.params, control));
+        let Meshing { spheres, parts, .. } = *self.meshing;
+        let memory = control.reserve((LATTICE_BYTES + super::SPHERE_BYTES) * spheres.len() as u64)?;
+        let lattices = parts::spheres_of(spheres, parts).map(|own| Lattice::new(&own, self.params, control));
         Ok(Lattices { of_parts: lattices.collect::<Result<_, SurfaceError>>()?, _memory: memory })
     }
 
     /// Estimates the mesh.
-    fn mesh(
-        &self,
-        lattices: &[Lattice],
-        choice: &Choice<'_>,
-        control: &Control<'_>,
-    ) -> Result<MeshEstimate, SurfaceError> {
-        let Self { spheres, params, limits, .. } = *self;
+    fn mesh(&self, lattices: &[Lattice], control: &Control<'_>) -> Result<MeshEstimate, SurfaceError> {
+        let Self { meshing: Meshing { spheres, limits, .. }, params, .. } = *self;
         let (mut bricks, mut pairs, mut n_atoms, h) = (0, 0, 0, params.resolution);
         candidates::check(spheres, params, limits)?;
         let too_large = |grid_points: u64, n_atoms: usize| {
@@ -306,7 +272,7 @@ impl<'a> MeshPlan<'a> {
             // Each part fits the limit, but not all parts together.
             return Err(too_large(grid_points, n_atoms));
         }
-        let [whole_area, area] = self.areas(COARSE_FACTOR * h, choice, control)?;
+        let [whole_area, area] = self.areas(COARSE_FACTOR * h, control)?;
         let [whole_vertices, vertices] = [whole_area, area].map(|area| n_vertices(area, h));
         let triangles = 2 * vertices;
         let bytes = params.mesh_bytes(vertices, triangles);
@@ -321,11 +287,11 @@ impl<'a> MeshPlan<'a> {
 
     /// Returns the error of a run that failed with `error`. A run ends soon after its mesh exceeds a limit, when it has
     /// found little of the surface. An estimate of the whole mesh suggests a better spacing.
-    pub(super) fn run_error(&self, error: SurfaceError, choice: &Choice<'_>, control: &Control<'_>) -> SurfaceError {
+    pub(super) fn run_error(&self, error: SurfaceError, control: &Control<'_>) -> SurfaceError {
         if !matches!(error, SurfaceError::MeshTooLarge { .. }) {
             return error;
         }
-        match self.lattices(control).and_then(|lattices| self.mesh(&lattices, choice, control)) {
+        match self.lattices(control).and_then(|lattices| self.mesh(&lattices, control)) {
             Err(planned) if ends_work(&planned) || matches!(planned, SurfaceError::MeshTooLarge { .. }) => planned,
             _ => error,
         }
@@ -336,16 +302,17 @@ impl<'a> MeshPlan<'a> {
     }
 
     /// Returns the areas of a coarser mesh before and after the cut, Å². They are equal without a cut.
-    fn areas(&self, coarse: f64, choice: &Choice<'_>, control: &Control<'_>) -> Result<[f64; 2], SurfaceError> {
-        let (spheres, limits) = (self.spheres, self.limits);
-        let single = SurfaceParams { atom_ids: self.cut.is_some(), ..self.unquantized() };
+    fn areas(&self, coarse: f64, control: &Control<'_>) -> Result<[f64; 2], SurfaceError> {
+        let cut = self.meshing.cut;
+        let uncut = Meshing { cut: None, quality: TriangleQuality::Standard, ..*self.meshing };
+        let single = SurfaceParams { atom_ids: cut.is_some(), ..self.unquantized() };
         let resolution = coarse.clamp(MIN_COARSE_SPACING, MAX_RESOLUTION).max(single.resolution);
         let coarse = SurfaceParams { resolution, ..single.clone() };
-        let control = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+        let control = control.metered();
         let areas = |params: &SurfaceParams| {
-            let mut output = choice.backend.run(spheres, params, limits, &control)?;
+            let mut output = uncut.mesh(params, &control)?;
             let whole = output.measure(&control)?.area;
-            let Some(cut) = self.cut else { return Ok([whole; 2]) };
+            let Some(cut) = cut else { return Ok([whole; 2]) };
             output.mesh.make_contiguous();
             match cut.area(&output.mesh) {
                 0.0 => Err(SurfaceError::NoPatch),
@@ -363,7 +330,7 @@ impl<'a> MeshPlan<'a> {
 #[cfg(test)]
 mod tests {
     use molmesh_structure::{ReadLimits, read_with};
-    use molmesh_surface::CpuBackend;
+    use molmesh_surface::{CpuBackend, SurfaceLimits};
 
     use super::*;
     use crate::{params, run};

@@ -3,9 +3,9 @@
 use std::io::{self, Write};
 
 use molmesh_formats::{Compress, CompressedGlb, Encoder, Format, FormatError, Meta, Pieces, Storage};
-use molmesh_surface::{Control, Mesh, SurfaceError};
+use molmesh_surface::{Mesh, SurfaceError};
 
-use super::{Job, JobError, ProgressSink, Report, StageClock};
+use super::{Job, JobError, Report, Scope};
 
 /// Finished job.
 #[derive(Debug, Clone)]
@@ -64,12 +64,7 @@ impl Product {
     }
 
     /// Compresses the mesh and drops its columns if the job asks for it. Checks for cancellation between pieces.
-    pub(super) fn compress(
-        &mut self,
-        job: &Job,
-        control: &Control<'_>,
-        progress: &dyn ProgressSink,
-    ) -> Result<(), JobError> {
+    pub(super) fn compress(&mut self, job: &Job, Scope { clock, control }: &Scope<'_>) -> Result<(), JobError> {
         if job.compress != Compress::Meshopt {
             return Ok(());
         }
@@ -79,7 +74,6 @@ impl Product {
             control.check()?;
             control.memory.grow(bytes).map_err(|error| JobError::from(SurfaceError::from(error)))
         };
-        let clock = StageClock::new(progress);
         let compress = || Pieces::new(mesh, *storage, *bounds, grow, |bytes| control.memory.shrink(bytes));
         self.pieces = Some(clock.time("encode", compress)?);
         mesh.drop_columns();

@@ -7,13 +7,12 @@
 use std::sync::Arc;
 
 use molmesh_structure::Context;
-use molmesh_surface::{
-    Control, MeshOutput, Observer, Reservation, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
-};
+use molmesh_surface::{Control, MeshOutput, Observer, Reservation, Stage, SurfaceError, SurfaceParams};
 
-use super::clock::StageClock;
+use super::clock::Scope;
+use super::meshing::Meshing;
 use super::spacing::{COARSEST, FINEST, Spacing};
-use super::{Choice, Job};
+use super::{Job, JobMesh};
 
 /// Maximum number of meshes, including the first coarse one and a repetition of the best one.
 const MAX_TRIES: u32 = 8;
@@ -154,56 +153,47 @@ fn rounded(spacing: f64) -> f64 {
     (spacing * 1000.0 - 1e-6).ceil() / 1000.0
 }
 
-/// Mesh at the spacing that the search found.
-pub(super) struct Fitted {
-    pub(super) output: MeshOutput,
-    pub(super) resolution: f64,
-    /// Number of computed meshes.
-    pub(super) tries: u32,
-}
-
-/// Meshes `spheres` at the finest spacing that has at most `limit` triangles.
+/// Meshes the spheres of `meshing` at the finest spacing that has at most `limit` triangles.
 ///
 /// # Errors
 /// Returns [`SurfaceError::TooManyTriangles`] if no spacing is coarse enough, [`SurfaceError::NoSurface`] if no mesh
 /// has a surface, or another error of meshing.
 pub(super) fn mesh(
-    spheres: &Spheres,
+    meshing: &Meshing<'_>,
     job: &Job,
     limit: u64,
-    limits: &SurfaceLimits,
-    choice: &Choice<'_>,
-    clock: &StageClock<'_>,
-    control: &Control<'_>,
-) -> Result<Fitted, SurfaceError> {
-    let mut search = Search::new(limit, &job.params, spheres.len());
+    Scope { clock, control }: &Scope<'_>,
+) -> Result<JobMesh, SurfaceError> {
+    let n_atoms = meshing.spheres.len();
+    let mut search = Search::new(limit, &job.params, n_atoms);
     // The last mesh with its memory.
-    let mut last: Option<(f64, MeshOutput, Arc<Reservation>)> = None;
+    let mut last: Option<(JobMesh, Arc<Reservation>)> = None;
     // Name of the backend that computed the meshes.
     let mut made_by = None;
     let mut restarted = false;
     loop {
         let (spacing, again) = match search.next() {
             Next::Try(spacing) => (spacing, false),
-            Next::Use(spacing) => match last.take().filter(|(made, ..)| made.total_cmp(&spacing).is_eq()) {
-                Some((resolution, output, memory)) => {
-                    memory.keep();
-                    return Ok(Fitted { output, resolution, tries: search.tries() });
+            Next::Use(spacing) => {
+                match last.take().filter(|(mesh, _)| mesh.params.resolution.total_cmp(&spacing).is_eq()) {
+                    Some((mesh, memory)) => {
+                        memory.keep();
+                        return Ok(mesh);
+                    }
+                    None => (spacing, true),
                 }
-                None => (spacing, true),
-            },
+            }
             Next::Fail { resolution, triangles } => return Err(no_fit(job, limit, resolution, triangles)),
         };
         // Hold only one mesh at a time.
         last = None;
-        let mut params = SurfaceParams { resolution: spacing, ..job.params_for(spheres.len()) };
-        let _storage = super::storage(job, &mut params, spheres);
-        let without_progress = WithoutProgress(clock);
-        let observer: &dyn Observer = if search.tries() == 0 { &without_progress } else { clock };
+        let params = job.mesh_params(meshing.spheres, Some(spacing));
+        let without_progress = WithoutProgress(*clock);
+        let observer: &dyn Observer = if search.tries() == 0 { &without_progress } else { *clock };
         let memory = Arc::new(Reservation::new(&control.memory));
         let control = Control { observer, memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
-        let made = unless_empty(clock.pass(|| choice.backend.run(spheres, &params, limits, &control)))?;
-        let by = made.as_ref().map(|m| m.made_by.as_ref().map_or(choice.backend.name(), |s| s.backend));
+        let output = unless_empty(clock.pass(|| meshing.mesh(&params, &control)))?;
+        let by = output.as_ref().and_then(|output| output.made_by.as_ref()).map(|identity| identity.backend);
         if by.is_some() && made_by.is_some() && by != made_by {
             // The counts of different backends, and therefore the spacing, may differ slightly. The content key names
             // one backend, so all counts must come from it.
@@ -212,22 +202,23 @@ pub(super) fn mesh(
                     why: "different backends ran during the search for the grid spacing".into(),
                 });
             }
-            (search, made_by) = (Search::new(limit, &job.params, spheres.len()), None);
+            (search, made_by) = (Search::new(limit, &job.params, n_atoms), None);
             continue;
         }
         made_by = by.or(made_by);
-        let triangles = made.as_ref().map(|m| m.mesh.n_triangles() as u64);
+        let triangles = output.as_ref().map(|output| output.mesh.n_triangles() as u64);
         search.record(spacing, triangles);
+        let mesh = output.map(|output| JobMesh { output, params, tries: Some(search.tries()) });
         if again {
             // The same input gives the same mesh, so it fits again.
-            let meshed = made.filter(|_| triangles.is_some_and(|n| n <= limit));
-            let meshed = meshed.ok_or_else(|| SurfaceError::Device {
+            let mesh = mesh.filter(|_| triangles.is_some_and(|n| n <= limit));
+            let mesh = mesh.ok_or_else(|| SurfaceError::Device {
                 why: "two runs on the same input returned different meshes".into(),
             })?;
             memory.keep();
-            return Ok(Fitted { output: meshed, resolution: spacing, tries: search.tries() });
+            return Ok(mesh);
         }
-        last = made.map(|meshed| (spacing, meshed, memory));
+        last = mesh.map(|mesh| (mesh, memory));
     }
 }
 
@@ -236,19 +227,17 @@ pub(super) fn mesh(
 /// # Errors
 /// Returns the errors of [`mesh`].
 pub(super) fn expected(
-    spheres: &Spheres,
+    meshing: &Meshing<'_>,
     job: &Job,
     limit: u64,
-    limits: &SurfaceLimits,
-    choice: &Choice<'_>,
     control: &Control<'_>,
 ) -> Result<f64, SurfaceError> {
-    let mut search = Search::new(limit, &job.params, spheres.len());
+    let mut search = Search::new(limit, &job.params, meshing.spheres.len());
     loop {
         match search.next() {
             Next::Try(spacing) if !search.has_fit() => {
                 let params = SurfaceParams { resolution: spacing, atom_ids: false, ..job.params.clone() };
-                let made = unless_empty(choice.backend.run(spheres, &params, limits, control))?;
+                let made = unless_empty(meshing.mesh(&params, control))?;
                 search.record(spacing, made.map(|m| m.mesh.n_triangles() as u64));
             }
             Next::Try(spacing) | Next::Use(spacing) => return Ok(spacing),

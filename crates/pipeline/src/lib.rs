@@ -16,11 +16,11 @@ mod file;
 mod fit;
 mod instances;
 pub mod integer;
-mod job_backend;
 mod left_out;
 mod limits;
 mod load;
 mod map_file;
+mod meshing;
 pub mod nearest;
 pub mod params;
 mod parts;
@@ -30,6 +30,7 @@ mod report;
 mod shapes;
 mod simplify;
 pub mod spacing;
+mod steps;
 pub mod tileset;
 mod work;
 
@@ -38,7 +39,7 @@ use std::ops::Deref;
 pub use areas::{AreaLevel, ExactReport, Interface, InterfaceReport, MeasuredSelection, SelectionMeasures};
 pub use auto::AutoBackend;
 pub use cavities::{Cavities, CavityReport, LiningResidue};
-pub use clock::{ProgressSink, StageClock};
+pub use clock::{ProgressSink, Scope, StageClock};
 pub use collapse::{Deviation, SIMPLIFY_ERRORS, Simplification, Simplify};
 pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
 pub use components::{ComponentReport, VoidReport};
@@ -59,24 +60,22 @@ pub use simplify::SimplificationReport;
 pub use spacing::Spacing;
 pub use work::{BYTES_PER_ATOM, estimate_atoms, estimate_work, suits_gpu};
 
-use color::{MeshColors, MeshedSurface, Scheme};
+use color::{MeshColors, Scheme};
 use cut::Cut;
 use estimate::MeshPlan;
-use job_backend::{Division, of_job};
-use load::{SPHERE_BYTES, load};
+use load::{LoadedStructure, SPHERE_BYTES, load};
+use meshing::Meshing;
 use molmesh_formats::tileset::TileAddress;
 use molmesh_formats::{Compress, GlbSink, Normals, Packing, Step, Storage, Units};
 use molmesh_picture::PictureParams;
-use molmesh_structure::{Context, Selected, Selection, Split, Structure, StructureError};
+use molmesh_structure::{AtomPart, Context, Selection, Split, Structure, StructureError};
 use molmesh_surface::{
-    Backend, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError, SurfaceParams,
-    TriangleQuality, Validation, lattice,
+    Backend, Control, MeshOutput, Pockets, SinkFailed, Spheres, SurfaceError, SurfaceParams, TriangleQuality,
+    Validation, lattice,
 };
 use report::Counts;
+use steps::Steps;
 use tileset::{AssemblyTileset, Tileset};
-
-/// Number of atom indices that are converted between two checks for cancellation.
-const IDS_PER_CHECK: usize = 1 << 20;
 
 /// Parameters of a job: selection, surface, and storage of the mesh.
 #[derive(Debug, Clone, Default)]
@@ -176,6 +175,42 @@ impl Job {
         };
         SurfaceParams { resolution, atom_ids: self.needs_atoms(), ..self.params.clone() }
     }
+
+    /// Returns the parameters of the mesh of `spheres`, with the encoding of its vertices. `fitted` is the grid spacing
+    /// that a search found, Å.
+    fn mesh_params(&self, spheres: &Spheres, fitted: Option<f64>) -> SurfaceParams {
+        let mut params = self.params_for(spheres.len());
+        params.resolution = fitted.unwrap_or(params.resolution);
+        params.quantize = self.quantization(|| lattice::extent(spheres, &params));
+        params
+    }
+
+    /// Returns the step of quantized vertices that are at most `extent`, Å, away from the centre of their mesh.
+    fn quantization(&self, extent: impl FnOnce() -> f64) -> Option<Step> {
+        (self.compress != Compress::None).then(|| Step::covering(extent()))
+    }
+
+    /// Returns the storage options of a mesh.
+    fn storage(&self, quantize: Option<Step>) -> Storage {
+        let packing = quantize.map_or(Packing::Full, Packing::Quantized);
+        Storage { packing, normals: self.normals, units: self.units }
+    }
+}
+
+/// Results of a job before its mesh exists.
+struct PreparedJob {
+    colors: Option<MeshColors>,
+    exact: Option<ExactReport>,
+    pockets: Option<Pockets>,
+    parts: Option<Vec<AtomPart>>,
+}
+
+/// Mesh of a job, and its parameters.
+struct JobMesh {
+    output: MeshOutput,
+    params: SurfaceParams,
+    /// Number of meshes that a search for the grid spacing computed.
+    tries: Option<u32>,
 }
 
 /// Chosen backend and the reason for the choice, for reports and logs.
@@ -221,163 +256,115 @@ pub fn run_with<S: Deref<Target = Structure>>(
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
     job.check(limits)?;
-    if job.tile.is_none() {
-        return run_whole(read, job, limits, choice, control, progress, sink);
-    }
     let clock = StageClock::new(progress);
+    let scope = Scope::new(&clock, control);
+    if job.tile.is_none() {
+        let loaded = load(read, job, &limits.read, &clock, &scope.control)?;
+        return run_loaded(loaded, job, limits, choice, &scope, sink);
+    }
     if job.selection.instances {
         let assembly = AssemblyTileset::new(read, job, &limits.read, control, &clock)?;
         return assembly.root(job, limits, choice, control, progress);
     }
     let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
     let colors = job.color.map(|coloring| tileset.colors(coloring, control)).transpose()?;
-    tileset.product((job, colors.as_ref()), choice, &limits.surface, control, clock, progress)
-}
-
-/// Runs a job on the whole structure.
-fn run_whole<S: Deref<Target = Structure>>(
-    read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
-    job: &Job,
-    limits: &JobLimits,
-    choice: &Choice<'_>,
-    control: &Control<'_>,
-    progress: &dyn ProgressSink,
-    sink: Option<&GlbSink<'_>>,
-) -> Result<Product, JobError> {
-    let clock = StageClock::new(progress);
-    let loaded = load(read, job, &limits.read, &clock, &Control { observer: &clock, ..control.clone() })?;
-    run_loaded(loaded, job, limits, choice, control, clock, progress, sink)
+    tileset.product((job, colors.as_ref()), choice, &limits.surface, &scope)
 }
 
 /// Runs a job on selected spheres of a structure.
-#[expect(clippy::too_many_arguments, reason = "those of `run_with`, and what was loaded")]
 fn run_loaded<S: Deref<Target = Structure>>(
-    (structure, selected, spheres): (S, Selected, Spheres),
+    loaded: LoadedStructure<S>,
     job: &Job,
     limits: &JobLimits,
     choice: &Choice<'_>,
-    control: &Control<'_>,
-    clock: StageClock<'_>,
-    progress: &dyn ProgressSink,
+    scope: &Scope<'_>,
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
-    let control = Control { observer: &clock, ..control.clone() };
-    let read_map = |file: &MapFile| clock.time("read", || file.read(&limits.map, &control));
-    let map = job.map.as_ref().map(read_map).transpose()?;
-    let prepare = |coloring| MeshColors::new(&structure, &selected.atoms, coloring, map, &control);
-    let colors = job.color.map(prepare).transpose()?;
-    let measure = || areas::measure(&structure, &selected, &spheres, job, &limits.surface, &control);
-    let exact = job.exact.then(|| clock.time("exact", measure)).transpose()?;
-    let pockets = pockets::search(job, &spheres, &limits.surface, &clock, &control)?;
+    let PreparedJob { colors, exact, pockets, parts } = prepare(&loaded, job, limits, scope)?;
+    let LoadedStructure { structure, selected, spheres } = loaded;
     let of_pockets = pockets.as_ref().filter(|_| job.split == Split::Pocket);
-    let parts = pockets::parts(of_pockets, &structure, &selected, job.split, &limits.read, &control)?;
-    let cut = Cut::of(&selected, parts.as_deref(), of_pockets, job.validation, &control)?;
-    let division = Division::of(parts.as_deref(), cut.as_ref());
-    let [backend, planner] =
-        [job.quality, TriangleQuality::Standard].map(|quality| of_job(choice.backend, division, quality));
-    let [choice, planner, whole] = [&*backend, &*planner, choice.backend].map(|backend| Choice { backend, ..*choice });
-    let mut params = job.params_for(spheres.len());
+    let cut = Cut::of(&selected, parts.as_deref(), of_pockets, job.validation, &scope.control)?;
+    let job_backend = choice.backend.for_job();
+    let choice = Choice { backend: job_backend.as_deref().unwrap_or(choice.backend), ..*choice };
+    let meshing = Meshing {
+        backend: choice.backend,
+        spheres: &spheres,
+        parts: parts.as_deref().filter(|_| cut.is_none()),
+        cut: cut.as_ref(),
+        quality: job.quality,
+        limits: &limits.surface,
+    };
     let sink = sink.filter(|_| job.can_stream());
-    let (mut output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
-        let fitted = fit::mesh(&spheres, job, limit, &limits.surface, &choice, &clock, &control)?;
-        params.resolution = fitted.resolution;
-        let storage = storage(job, &mut params, &spheres);
-        (fitted.output, Some(fitted.tries), storage)
-    } else {
-        let storage = storage(job, &mut params, &spheres);
-        if let Some(sink) = sink {
-            sink.set_storage(storage);
-        }
-        let sink = sink.map(|sink| sink as &dyn MeshSink);
-        let plan = MeshPlan::new(&spheres, division, &params, job, &limits.surface);
-        let planner = plan.choice(&whole, &planner);
-        let checked = if sink.is_none() { estimate::check_memory(&plan, job, planner, &control) } else { Ok(()) };
-        let meshed = simplify::params_of_input(job, &params)?;
-        let write = |()| {
-            let written = clock.pass(|| backend.write(&spheres, &meshed, &limits.surface, &control, sink));
-            written.map_err(|error| plan.run_error(error, planner, &control))
-        };
-        (checked.and_then(write)?, None, storage)
-    };
-    let search = |mode| {
-        clock.time("cavities", || cavities::search(mode, &spheres, &params, &limits.surface, &mut output, &control))
-    };
-    let cavities = job.cavities.map(search).transpose()?;
-    let simplification = simplify::apply(job, &params, &mut output, &clock, &control)?;
+    let mut job_mesh = mesh(&meshing, job, scope, sink)?;
+    let steps = Steps { job, selected: &selected, pockets: pockets.as_ref(), meshing: &meshing };
+    let results = steps.apply(&mut job_mesh, colors, scope)?;
+    let JobMesh { output, params, tries } = job_mesh;
     let [n_vertices, n_triangles] = output.size();
-    let MeshOutput { mut mesh, streamed, grid, measures, bounds, made_by } = output;
-    let color = |colors: MeshColors| {
-        let parts = division.and_then(Division::parts);
-        let surface = MeshedSurface { spheres: &spheres, params: &params, limits: &limits.surface, parts };
-        clock.time("color", || colors.apply(&mut mesh, &surface, pockets.as_ref(), &control))
-    };
-    let color = colors.map(color).transpose()?;
-    to_atom_indices(&mut mesh, job, &selected, &control)?;
-    instances::place(&mut mesh, &selected.units, &control)?;
-    let measures = match measures {
-        // The cut has validated the surface before it divided it.
-        Some(measures) if cut.is_some() || measures.validation == job.validation => measures,
-        found => clock.time(Stage::Measure.name(), || measures_of(&mut mesh, found, job.validation, &control))?,
-    };
-    let shapes = TriangleReport::of_job(job, &mesh, &clock);
-    let (resolution, centre) = (params.resolution, mesh.centre);
+    let MeshOutput { mesh, streamed, grid, bounds, made_by, .. } = output;
+    let (resolution, centre, storage) = (params.resolution, mesh.centre, job.storage(params.quantize));
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
-    // The report takes the times of the clock, which observes nothing later.
-    let control = Control { observer: &(), ..control };
-    let mut report = Report::new(&structure, &selected, job, &choice, &counts, &measures, clock.finish());
+    let times = scope.clock.finish();
+    let mut report = Report::new(&structure, &selected, job, &choice, &counts, &results.measures, times);
     (report.color, report.exact, report.simplification, report.triangle_shapes) =
-        (color, exact, simplification, shapes);
-    report.set_cavities(cavities.as_ref(), &structure, &selected);
+        (results.color, exact, results.simplification, results.shapes);
+    report.set_cavities(results.cavities.as_ref(), &structure, &selected);
     report.set_pockets(pockets.as_ref(), &structure, &selected);
     report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
     let mut product = Product { bounds, ..Product::new(mesh, storage, report) };
-    product.compress(job, &control, progress)?;
+    product.compress(job, scope)?;
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
-        let clock = StageClock::new(progress);
         let finish = || sink.finish(&product.meta(), centre, streamed.bounds);
-        let bytes = clock.time("encode", finish).map_err(|SinkFailed| SurfaceError::Sink)?;
+        let bytes = scope.clock.time("encode", finish).map_err(|SinkFailed| SurfaceError::Sink)?;
         product.streamed_bytes = Some(bytes);
-        product.report.add_timings(clock);
+        product.report.add_timings(scope.clock);
     }
     Ok(product)
 }
 
-/// Measures and validates a mesh, or only validates it if its measures are `found`.
-fn measures_of(
-    mesh: &mut Mesh,
-    found: Option<Measures>,
-    validation: Validation,
-    control: &Control<'_>,
-) -> Result<Measures, SurfaceError> {
-    mesh.make_geometry_contiguous();
-    match found {
-        Some(measures) => measures.validated(validation, &mesh.triangles, control),
-        None => Measures::of(mesh, validation, control),
-    }
+/// Does the work that needs no mesh.
+fn prepare<S: Deref<Target = Structure>>(
+    LoadedStructure { structure, selected, spheres }: &LoadedStructure<S>,
+    job: &Job,
+    limits: &JobLimits,
+    scope: &Scope<'_>,
+) -> Result<PreparedJob, JobError> {
+    let Scope { clock, control } = scope;
+    let read_map = |file: &MapFile| clock.time("read", || file.read(&limits.map, control));
+    let map = job.map.as_ref().map(read_map).transpose()?;
+    let colors = |coloring| MeshColors::new(structure, &selected.atoms, coloring, map, control);
+    let colors = job.color.map(colors).transpose()?;
+    let measure = || areas::measure(structure, selected, spheres, job, &limits.surface, control);
+    let exact = job.exact.then(|| clock.time("exact", measure)).transpose()?;
+    let pockets = pockets::search(job, spheres, &limits.surface, scope)?;
+    let of_pockets = pockets.as_ref().filter(|_| job.split == Split::Pocket);
+    let parts = pockets::parts(of_pockets, structure, selected, job.split, &limits.read, control)?;
+    Ok(PreparedJob { colors, exact, pockets, parts })
 }
 
-/// Converts indices of spheres to indices of atoms in the file, or drops them if the job does not ask for them.
-fn to_atom_indices(mesh: &mut Mesh, job: &Job, selected: &Selected, control: &Control<'_>) -> Result<(), JobError> {
-    if !job.params.atom_ids {
-        mesh.atom_ids = None;
+/// Meshes the spheres of `meshing`, in memory or into `sink`.
+fn mesh(
+    meshing: &Meshing<'_>,
+    job: &Job,
+    scope: &Scope<'_>,
+    sink: Option<&GlbSink<'_>>,
+) -> Result<JobMesh, SurfaceError> {
+    if let Spacing::MaxTriangles(limit) = job.spacing {
+        return fit::mesh(meshing, job, limit, scope);
     }
-    for (n, id) in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()).enumerate() {
-        if n.is_multiple_of(IDS_PER_CHECK) {
-            control.check()?;
-        }
-        *id = selected.atoms[*id as usize];
-    }
-    Ok(())
-}
-
-/// Returns the storage options of the mesh of `spheres`, and sets the vertex encoding in `params`.
-fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage {
-    params.quantize = match job.compress {
-        Compress::None => None,
-        Compress::Quantize | Compress::Meshopt => Some(Step::covering(lattice::extent(spheres, params))),
+    let Scope { clock, control } = scope;
+    let params = job.mesh_params(meshing.spheres, None);
+    let plan = MeshPlan { meshing, params: &params, compress: job.compress };
+    let before_simplifying = simplify::params_of_input(job, &params)?;
+    let written = if let Some(sink) = sink {
+        sink.set_storage(job.storage(params.quantize));
+        let Meshing { backend, spheres, limits, .. } = *meshing;
+        clock.pass(|| backend.write(spheres, &params, limits, control, Some(sink)))
+    } else {
+        estimate::check_memory(&plan, job, control)?;
+        clock.pass(|| meshing.mesh(&before_simplifying, control))
     };
-    let packing = params.quantize.map_or(Packing::Full, Packing::Quantized);
-    Storage { packing, normals: job.normals, units: job.units }
+    let output = written.map_err(|error| plan.run_error(error, control))?;
+    Ok(JobMesh { output, params, tries: None })
 }

@@ -12,6 +12,13 @@ const INDEX_BYTES: u64 = 8;
 /// Memory of a sphere, bytes.
 pub(super) const SPHERE_BYTES: u64 = 28;
 
+/// Structure and its selected spheres.
+pub(super) struct LoadedStructure<S> {
+    pub(super) structure: S,
+    pub(super) selected: Selected,
+    pub(super) spheres: Spheres,
+}
+
 /// Reads a structure and selects its spheres.
 pub(super) fn load<S: Deref<Target = Structure>>(
     read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
@@ -19,21 +26,20 @@ pub(super) fn load<S: Deref<Target = Structure>>(
     limits: &ReadLimits,
     clock: &StageClock<'_>,
     control: &Control<'_>,
-) -> Result<(S, Selected, Spheres), JobError> {
+) -> Result<LoadedStructure<S>, JobError> {
     control.memory.also_held(job.map.as_ref().map_or(0, |map| map.as_ref().len() as u64));
-    let read = clock.time("read", || read(control))?;
-    let structure = &*read;
+    let structure = clock.time("read", || read(control))?;
     control.check()?;
     // Selecting holds an index for each atom, and a sphere for each selected one.
     control.memory.grow(INDEX_BYTES * structure.len() as u64).map_err(SurfaceError::from)?;
     let (selected, spheres) = clock.time("select", || -> Result<_, JobError> {
-        let selected = molmesh_structure::select_with(structure, &job.selection, limits, control)?;
+        let selected = molmesh_structure::select_with(&structure, &job.selection, limits, control)?;
         control.check()?;
         control.memory.grow(SPHERE_BYTES * selected.atoms.len() as u64).map_err(SurfaceError::from)?;
-        let spheres = selected.spheres(structure)?;
+        let spheres = selected.spheres(&structure)?;
         selected.check_instances(&spheres, &job.selection)?;
         selected.check_duplicates(&spheres, limits, control)?;
         Ok((selected, spheres))
     })?;
-    Ok((read, selected, spheres))
+    Ok(LoadedStructure { structure, selected, spheres })
 }

@@ -9,7 +9,7 @@ use molmesh_surface::cpu::scan;
 use molmesh_surface::lattice::{to_f32, to_u64};
 use molmesh_surface::vector::{add, joined_bounds, sub};
 use molmesh_surface::{
-    Backend, BackendIdentity, Control, GridStats, Measures, Mesh, MeshOutput, PartRange, Spheres, Stage, SurfaceError,
+    BackendIdentity, Control, GridStats, Measures, Mesh, MeshOutput, PartRange, Spheres, Stage, SurfaceError,
     SurfaceLimits, SurfaceParams, candidates, grid_limit,
 };
 use rayon::prelude::*;
@@ -66,10 +66,11 @@ pub(super) fn spheres_of<'s>(
     whole.into_iter().chain(parts.unwrap_or_default().iter().map(|part| Cow::Owned(spheres.subset(&part.rows))))
 }
 
-/// Meshes all parts on `backend`. Returns `None` if a fallback meshed some of them.
+/// Joins the meshes that `mesh` returns for the spheres of each part and the limits that remain for it. Returns `None`
+/// if a fallback meshed some of them.
 pub(super) fn join(
     parts: &[AtomPart],
-    backend: &dyn Backend,
+    mesh: impl Fn(&Spheres, &SurfaceLimits, &Control<'_>) -> Result<MeshOutput, SurfaceError>,
     run: &Run<'_>,
     control: &Control<'_>,
 ) -> Result<Option<MeshOutput>, SurfaceError> {
@@ -85,10 +86,10 @@ pub(super) fn join(
         let meshed = {
             let _spheres = control.reserve(SPHERE_BYTES * part.rows.len() as u64)?;
             let own = spheres.subset(&part.rows);
-            backend.run(&own, run.single, &joined.left_of(run), &control)
+            mesh(&own, &joined.left_of(run), &control)
         };
         match meshed {
-            Ok(output) if !joined.made_by(output.made_by.as_ref(), backend) => return Ok(None),
+            Ok(output) if !joined.made_by(output.made_by.as_ref()) => return Ok(None),
             Ok(output) => joined.push(part, output, run, &control)?,
             Err(SurfaceError::NoSurface { .. }) => joined.skip(part),
             Err(error) => return Err(joined.error(error, run, parts.len(), n_atoms as f64 / spheres.len() as f64)),
@@ -139,20 +140,19 @@ struct Joined {
     /// Measures of the parts.
     measures: Vec<Measures>,
     made_by: Option<BackendIdentity>,
-    backend: Option<&'static str>,
 }
 
 impl Joined {
     fn new(centre: [f64; 3]) -> Self {
         let mesh = Mesh { centre, ..Mesh::default() };
-        Self { mesh, grid: GridStats::default(), measures: Vec::new(), made_by: None, backend: None }
+        Self { mesh, grid: GridStats::default(), measures: Vec::new(), made_by: None }
     }
 
     /// Records the backend of a part. Returns false if it differs from that of the previous parts.
-    fn made_by(&mut self, identity: Option<&BackendIdentity>, backend: &dyn Backend) -> bool {
-        let name = identity.map_or_else(|| backend.name(), |identity| identity.backend);
+    fn made_by(&mut self, identity: Option<&BackendIdentity>) -> bool {
+        let name = |identity: Option<&BackendIdentity>| identity.map(|identity| identity.backend);
         self.made_by = self.made_by.take().or_else(|| identity.cloned());
-        *self.backend.get_or_insert(name) == name
+        name(self.made_by.as_ref()) == name(identity)
     }
 
     /// Adds the mesh of a part.

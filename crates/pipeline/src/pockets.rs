@@ -6,7 +6,7 @@ use molmesh_surface::{Control, DEFAULT_POCKET_PROBE, Mesh, Pocket, Pockets, Sphe
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::clock::StageClock;
+use super::clock::Scope;
 use super::{Job, LiningResidue, Report};
 
 /// Pocket: a region outside the molecule that the probe can enter and a large probe cannot. It does not depend on the
@@ -60,8 +60,7 @@ pub(super) fn search(
     job: &Job,
     spheres: &Spheres,
     limits: &SurfaceLimits,
-    clock: &StageClock<'_>,
-    control: &Control<'_>,
+    Scope { clock, control }: &Scope<'_>,
 ) -> Result<Option<Pockets>, SurfaceError> {
     let search = |probe| clock.time("pockets", || find(spheres, &job.params, probe, limits, control));
     job.pocket_probe().map(search).transpose()

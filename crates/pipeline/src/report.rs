@@ -344,7 +344,7 @@ impl Report {
     }
 
     /// Adds the times of the stages of `clock`.
-    pub(super) fn add_timings(&mut self, clock: StageClock<'_>) {
+    pub(super) fn add_timings(&mut self, clock: &StageClock<'_>) {
         clock.finish().into_iter().for_each(|(stage, ms)| self.add_timing(stage, ms));
     }
 

@@ -1,10 +1,10 @@
 //! Simplification of the mesh of a job, and its report.
 
-use molmesh_surface::{Control, Measures, Mesh, MeshOutput, SurfaceError, SurfaceParams, Validation};
+use molmesh_surface::{Measures, Mesh, MeshOutput, SurfaceError, SurfaceParams, Validation};
 use serde::Serialize;
 
 use super::Job;
-use super::clock::StageClock;
+use super::clock::Scope;
 use super::collapse::{check_error, simplify};
 
 /// Size of the mesh before its simplification, and distance between the original and the simplified surface.
@@ -42,8 +42,7 @@ pub(super) fn apply(
     job: &Job,
     params: &SurfaceParams,
     output: &mut MeshOutput,
-    clock: &StageClock<'_>,
-    control: &Control<'_>,
+    Scope { clock, control }: &Scope<'_>,
 ) -> Result<Option<SimplificationReport>, SurfaceError> {
     if output.streamed.is_some() {
         return Ok(None);

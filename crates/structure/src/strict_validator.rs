@@ -16,13 +16,12 @@ use std::any::Any;
 use std::cell::Cell;
 use std::io::BufReader;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use molmesh_surface::{Control, Reservation};
+use molmesh_surface::Control;
 use pdbtbx::{Context, ErrorLevel, Format, PDBError, ReadOptions, StrictnessLevel};
 
 use super::error::StructureError;
@@ -158,7 +157,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
         SourceFormat::Xyz => return unread("XYZ"),
     };
     let memory = control.reserve(MEMORY_PER_BYTE * text.len() as u64)?;
-    let of_structure = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+    let of_structure = control.metered();
     let cost = match read::read_with(text, limits, &of_structure) {
         Ok(structure) => Cost::of(&structure, text),
         Err(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }) => {

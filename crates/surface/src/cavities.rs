@@ -7,7 +7,6 @@
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 use std::f64::consts::PI;
-use std::sync::Arc;
 
 use rayon::prelude::*;
 
@@ -85,8 +84,7 @@ struct Boundary<'a> {
 impl Boundary<'_> {
     /// Returns a control whose memory is released when it is dropped, and the spheres enlarged by `probe`, Å.
     fn enlarged(&self, probe: f64) -> Result<(Control<'_>, Lattice), SurfaceError> {
-        let memory = Arc::new(Reservation::new(&self.control.memory));
-        let control = Control { memory, observer: &(), ..self.control.clone() };
+        let control = Control { observer: &(), ..self.control.metered() };
         control.memory.grow(LATTICE_BYTES * self.spheres.len() as u64)?;
         let params = SurfaceParams { probe, ..self.params.clone() };
         let mut lattice = Lattice::new(self.spheres, &params, &control)?;

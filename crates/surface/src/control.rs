@@ -152,6 +152,12 @@ impl Control<'_> {
         Ok(reservation)
     }
 
+    /// Returns a control that releases its memory when its last clone is dropped.
+    #[must_use]
+    pub fn metered(&self) -> Self {
+        Self { memory: Arc::new(Reservation::new(&self.memory)), ..self.clone() }
+    }
+
     /// Times `work` as a part of `stage` and returns its value.
     pub fn span<T>(&self, stage: Stage, work: impl FnOnce() -> T) -> T {
         let mut work = Some(work);

@@ -1,7 +1,6 @@
 //! Mean curvature at the vertices of the mesh of an isosurface, from the second derivatives of the density.
 
 use std::ops::Range;
-use std::sync::Arc;
 
 use rayon::prelude::*;
 
@@ -10,7 +9,6 @@ use super::control::Control;
 use super::cpu::points::PointField;
 use super::error::SurfaceError;
 use super::lattice::{to_f32, to_i32, to_u32};
-use super::memory::Reservation;
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
@@ -34,8 +32,7 @@ pub fn mean_curvatures(
     control: &Control<'_>,
 ) -> Result<Vec<f32>, SurfaceError> {
     // The memory of the field ends with this function.
-    let memory = Arc::new(Reservation::new(&control.memory));
-    let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
+    let metered = control.metered();
     metered.memory.grow(VERTEX_BYTES * rows.len() as u64)?;
     let field = PointField::new(spheres, params, limits, &metered)?;
     let spacings = |row: usize| -> [f64; 3] {

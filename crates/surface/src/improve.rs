@@ -16,7 +16,6 @@ mod shapes;
 
 use std::fmt;
 use std::str::FromStr;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
@@ -28,7 +27,6 @@ use super::cpu::points::PointField;
 use super::error::SurfaceError;
 use super::kind::named;
 use super::lattice::{to_f32, to_i32, to_u32};
-use super::memory::Reservation;
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
@@ -76,8 +74,7 @@ pub fn improve(
     mesh.make_contiguous();
     let _patches = control.reserve(TRIANGLE_BYTES * mesh.n_triangles() as u64)?;
     // The memory of the field ends with this function.
-    let memory = Arc::new(Reservation::new(&control.memory));
-    let metered = Control { memory: Arc::<Reservation>::clone(&memory), ..control.clone() };
+    let metered = control.metered();
     let field = PointField::new(spheres, params, limits, &metered)?;
     for (pass, shift) in SHIFTS.into_iter().enumerate() {
         let division = Cubes { field: &field, spacing: params.resolution, shift };

@@ -176,7 +176,7 @@ pub fn count_rows(
     limits: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<u64, SurfaceError> {
-    let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+    let control = &control.metered();
     control.memory.grow(BALL_BYTES * spheres.len() as u64)?;
     Ok(Grid::around(spheres, &params_at(SPACING, params), pocket_probe, limits, control)?.rows)
 }
@@ -203,7 +203,7 @@ impl Grid {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
-        let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+        let control = &control.metered();
         control.memory.grow(LATTICE_BYTES * spheres.len() as u64)?;
         let [small, large] = [params.probe, pocket_probe].map(|probe| probe / params.resolution);
         Self::new(&Lattice::new(spheres, params, control)?, small, large, limits)

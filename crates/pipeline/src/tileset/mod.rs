@@ -17,8 +17,8 @@ use std::fmt;
 use std::ops::Deref;
 use std::sync::Arc;
 
+use molmesh_formats::Units;
 use molmesh_formats::tileset::{TileAddress, TilesetBounds};
-use molmesh_formats::{Compress, Packing, Step, Storage, Units};
 use molmesh_structure::{Context, ReadLimits, Selected, Split, Structure, StructureError};
 use molmesh_surface::clip::{influence, influence_of};
 use molmesh_surface::{
@@ -33,9 +33,10 @@ pub use self::stream::{StreamSource, StructureStream, check_stream, needs_memory
 pub use self::units::AssemblyTileset;
 pub use self::write::{LevelReport, TilesetReport, UnitReport, WriteError, unit_folder, write, write_stream};
 use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, MeshedSurface, Scheme};
+use super::load::{LoadedStructure, load};
 use super::params::ParamError;
 use super::report::Counts;
-use super::{Choice, Job, JobError, Product, ProgressSink, Report, StageClock, load};
+use super::{Choice, Job, JobError, Product, Report, Scope, StageClock};
 
 /// Maximum number of tiles.
 const MAX_TILES: usize = 1_000_000;
@@ -123,7 +124,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
-        let (structure, selected, spheres) = load(read, job, limits, clock, control)?;
+        let LoadedStructure { structure, selected, spheres } = load(read, job, limits, clock, control)?;
         clock.time("index", || {
             let params = job.params_for(spheres.len());
             let layout = Layout::of(&spheres, &params)?;
@@ -178,8 +179,8 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
     }
 
     /// Meshes the tile of `job`, or the root without one, adds skirts and encodes it. The mesh is empty if the surface
-    /// does not pass through the tile. The memory of the product stays added to the meter of `control`. Its report
-    /// includes the times of `clock`. `job` differs from that of [`Self::new`] in tile, colours and encoding at most;
+    /// does not pass through the tile. The memory of the product stays added to the meter of `scope`. Its report
+    /// includes the times of its clock. `job` differs from that of [`Self::new`] in tile, colours and encoding at most;
     /// `colors` are those of [`Self::colors`].
     ///
     /// # Errors
@@ -189,33 +190,27 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         (job, colors): (&Job, Option<&TilesetColors>),
         choice: &Choice<'_>,
         limits: &SurfaceLimits,
-        control: &Control<'_>,
-        clock: StageClock<'_>,
-        progress: &dyn ProgressSink,
+        scope: &Scope<'_>,
     ) -> Result<Product, JobError> {
-        let control = Control { observer: &clock, ..control.clone() };
-        let (output, color) = self.output((job, colors), choice.backend, limits, &control, &clock)?;
+        let Scope { clock, control } = scope;
+        let (output, color) = self.output((job, colors), choice.backend, limits, scope)?;
         let MeshOutput { mut mesh, grid, made_by, .. } = output;
         let address = job.tile.unwrap_or(TileAddress::ROOT);
         let (half, resolution) = (0.5 * self.layout.side(address.level), self.layout.spacing(address.level));
         let boundary = clock.time("clip", || mesh.boundary(half, resolution));
         // Without the skirts.
-        let measure = || Measures::of_part(&mesh, boundary.len(), &control);
+        let measure = || Measures::of_part(&mesh, boundary.len(), control);
         let measures = clock.time(Stage::Measure.name(), measure)?;
         clock.time("clip", || mesh.add_skirts(&boundary, half, resolution));
         // The same step for all tiles of a level.
-        let packing = match job.compress {
-            Compress::None => Packing::Full,
-            Compress::Quantize | Compress::Meshopt => Packing::Quantized(Step::covering(half)),
-        };
-        if let Some(step) = packing.step() {
+        let quantize = job.quantization(|| half);
+        if let Some(step) = quantize {
             mesh.quantize(step);
         }
-        let storage = Storage { packing, normals: job.normals, units: job.units };
+        let storage = job.storage(quantize);
         let (n_vertices, n_triangles, centre) = (mesh.n_vertices(), mesh.n_triangles(), mesh.centre);
         let counts =
             Counts { resolution, centre, tries: None, grid, n_vertices, n_triangles, cut: true, made_by, storage };
-        let control = Control { observer: &(), ..control };
         let times = clock.finish();
         let mut report = Report::new(&self.structure, &self.selected, job, choice, &counts, &measures, times);
         report.color = color;
@@ -223,7 +218,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
             (report.atoms, report.atoms_in_file, report.radii) = (*n_atoms, *atoms_in_file, radii);
         }
         let mut product = Product::new(mesh, storage, report);
-        product.compress(job, &control, progress)?;
+        product.compress(job, scope)?;
         Ok(product)
     }
 
@@ -239,7 +234,8 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Option<Mesh>, JobError> {
-        let (output, _) = self.output((job, colors), backend, limits, control, &StageClock::new(&()))?;
+        let clock = StageClock::new(&());
+        let (output, _) = self.output((job, colors), backend, limits, &Scope::new(&clock, control))?;
         Ok(Some(output.mesh).filter(|mesh| mesh.n_triangles() > 0))
     }
 
@@ -249,8 +245,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         (job, colors): (&Job, Option<&TilesetColors>),
         backend: &dyn Backend,
         limits: &SurfaceLimits,
-        control: &Control<'_>,
-        clock: &StageClock<'_>,
+        Scope { clock, control }: &Scope<'_>,
     ) -> Result<(MeshOutput, Option<ColorReport>), JobError> {
         let (address, levels) = (job.tile.unwrap_or(TileAddress::ROOT), self.layout.levels);
         if !address.is_valid(levels) {

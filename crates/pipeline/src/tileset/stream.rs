@@ -132,7 +132,7 @@ impl BlockReader<'_> {
         let mut blocks = clock.time("read", open)?;
         loop {
             // Releases the memory of the block.
-            let of_block = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+            let of_block = control.metered();
             let Some(mut block) = clock.time("read", || blocks.next(&of_block))? else { break };
             clock.time("select", || self.add(&mut block, &of_block))?;
         }
@@ -212,7 +212,7 @@ impl Tileset<Box<Structure>> {
             StreamSource::Structure(structure) => {
                 let mut block = Block { len: structure.len(), structure: structure.clone() };
                 reader.assemblies = std::mem::take(&mut block.structure.assemblies);
-                let of_block = Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+                let of_block = control.metered();
                 clock.time("select", || reader.add(&mut block, &of_block))?;
             }
         }

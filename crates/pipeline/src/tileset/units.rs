@@ -6,14 +6,13 @@ use std::sync::Arc;
 
 use molmesh_formats::tileset::{RepeatedTileset, TilesetBounds};
 use molmesh_structure::{ReadLimits, Selected, Selection, Structure, StructureError, Unit};
-use molmesh_surface::{Control, Reservation, Spheres, SurfaceError, SurfaceParams};
+use molmesh_surface::{Control, Spheres, SurfaceError, SurfaceParams};
 
 use super::layout::{CELLS, Layout};
 use super::level::{Buckets, MIN_BUCKET, TilesetLevel};
 use crate::color::{AtomColors, Coloring, Scheme};
-use crate::{
-    Choice, Job, JobError, JobLimits, Product, ProgressSink, SPHERE_BYTES, Spacing, StageClock, load, run_loaded,
-};
+use crate::load::{LoadedStructure, SPHERE_BYTES, load};
+use crate::{Choice, Job, JobError, JobLimits, Product, ProgressSink, Scope, Spacing, StageClock, run_loaded};
 
 /// Tileset of an assembly.
 pub struct AssemblyTileset<S> {
@@ -38,7 +37,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
-        let (structure, selected, spheres) = load(read, job, limits, clock, control)?;
+        let LoadedStructure { structure, selected, spheres } = load(read, job, limits, clock, control)?;
         let bounds = |unit: &Unit| {
             control.check()?;
             let _spheres = control.reserve((SPHERE_BYTES + 4) * unit.rows.len() as u64)?;
@@ -139,8 +138,8 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         let (selected, spheres) = clock.time("index", || self.grouped(job, spacing, control))?;
         let params = SurfaceParams { resolution: spacing, ..job.params.clone() };
         let coarse = self.colored(Job { params, spacing: Spacing::Given, tile: None, ..job.clone() });
-        let loaded = (&*self.structure, selected, spheres);
-        let mut product = run_loaded(loaded, &coarse, limits, choice, control, clock, progress, None)?;
+        let loaded = LoadedStructure { structure: &*self.structure, selected, spheres };
+        let mut product = run_loaded(loaded, &coarse, limits, choice, &Scope::new(&clock, control), None)?;
         // The groups represent all atoms.
         let report = &mut product.report;
         report.atoms = self.selected.atoms.len() as u64;
@@ -169,7 +168,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         }
         for unit in &self.selected.units {
             // Releases the memory of the index of the unit.
-            let of_unit = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+            let of_unit = &control.metered();
             let rows = rows_of(unit);
             of_unit.memory.grow((SPHERE_BYTES + 4) * rows.len() as u64)?;
             let own = Arc::new(self.spheres.subset(&rows));

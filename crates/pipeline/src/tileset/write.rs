@@ -3,18 +3,17 @@
 use std::collections::BTreeSet;
 use std::io;
 use std::ops::Deref;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use molmesh_formats::Format;
 use molmesh_formats::tileset::{TileAddress, TilesetUris, assembly_document, subtree, tileset_document};
 use molmesh_structure::{Structure, StructureError, Unit};
-use molmesh_surface::{Control, Reservation, SurfaceError, SurfaceLimits, threads};
+use molmesh_surface::{Control, SurfaceError, SurfaceLimits, threads};
 use serde::Serialize;
 use thiserror::Error;
 
 use super::{AssemblyTileset, StructureStream, Tileset};
-use crate::{Choice, Job, JobError, JobLimits, LeftOutReport, Product, ProgressSink, StageClock};
+use crate::{Choice, Job, JobError, JobLimits, LeftOutReport, Product, ProgressSink, Scope, StageClock};
 
 /// Contents of a tileset.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -106,7 +105,7 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
     let mut all = TilesetReport::default();
     for (number, Unit { name, rows, operators, .. }) in (1..).zip(units) {
         // Releases all memory that is counted for the unit.
-        let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+        let control = &control.metered();
         let (job, structure) = (assembly.job_of_unit(job, number), &**assembly.structure());
         let tileset = Tileset::new(|_| Ok(structure), &job, &limits.read, control, &clock)?;
         let part = Part { sink: progress, index: number - 1, count: units.len() };
@@ -200,9 +199,10 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
         let made = threads::each(addresses.len(), |i| {
             let address = addresses[i];
             // Releases all memory that is counted for the tile. The file is not counted.
-            let control = &Control { memory: Arc::new(Reservation::new(&control.memory)), ..control.clone() };
+            let control = &control.metered();
             let job = Job { tile: Some(address), ..job.clone() };
-            let tile = self.product((&job, colors.as_ref()), choice, limits, control, StageClock::new(&()), &())?;
+            let clock = StageClock::new(&());
+            let tile = self.product((&job, colors.as_ref()), choice, limits, &Scope::new(&clock, control))?;
             let n = done.fetch_add(1, Ordering::Relaxed) + 1;
             progress.progress("tiles", n as f64 / addresses.len() as f64);
             if tile.report.triangles == 0 {

@@ -46,7 +46,7 @@ use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::kernel::Shape;
 use super::lattice::{Lattice, TILE, to_f32, to_u32};
-use super::memory::{MemoryMeter, Reservation};
+use super::memory::Reservation;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
 use super::sink::MeshSink;
@@ -188,9 +188,7 @@ pub fn check_work(
 ) -> Result<occupancy::WorkCounts, SurfaceError> {
     let counts = occupancy::count(lattice, limits, control)?;
     if matches!(lattice.shape, Shape::Sphere { .. }) {
-        let memory: Arc<dyn MemoryMeter> = Arc::new(Reservation::new(&control.memory));
-        let control = Control { memory, ..control.clone() };
-        checked_field(lattice, RunContext { params, limits, control: &control, free_threads: 1 })?;
+        checked_field(lattice, RunContext { params, limits, control: &control.metered(), free_threads: 1 })?;
     }
     Ok(counts)
 }

@@ -7,7 +7,6 @@
 //! whose point of contact with the probe is nearest.
 
 use std::ops::AddAssign;
-use std::sync::Arc;
 
 use rayon::prelude::*;
 
@@ -24,7 +23,6 @@ use crate::control::Control;
 use crate::error::SurfaceError;
 use crate::kernel::Shape;
 use crate::lattice::{LatticeAtom, effective_radius, to_i32};
-use crate::memory::Reservation;
 use crate::params::{SurfaceKind, SurfaceLimits, SurfaceParams, bad};
 use crate::spheres::Spheres;
 use crate::vector::{dot, sub};
@@ -169,8 +167,7 @@ impl ExactMeasures {
         params.check_radius(spheres.radius_range().0)?;
         control.memory.grow((size_of::<AreaParts>() * spheres.len()) as u64)?;
         // All other memory is released at the end.
-        let memory = Arc::new(Reservation::new(&control.memory));
-        let control = &Control { memory, ..control.clone() };
+        let control = &control.metered();
         control.memory.grow((size_of::<LatticeAtom>() * spheres.len()) as u64)?;
         let mut atoms = Vec::with_capacity(spheres.len());
         for i in 0..spheres.len() {
@@ -218,8 +215,7 @@ impl Components<'_> {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Vec<ComponentMeasures>, SurfaceError> {
-        let memory = Arc::new(Reservation::new(&control.memory));
-        let control = &Control { memory, ..control.clone() };
+        let control = &control.metered();
         control.memory.grow((size_of::<AreaParts>() * self.atoms.len()) as u64)?;
         let search = FaceSearch {
             atoms: self.atoms,
