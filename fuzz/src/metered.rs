@@ -4,7 +4,6 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use molmesh::formats::Format;
 use molmesh::picture::SelectedRenderer;
 use molmesh::pipeline::{self, Choice, Job, JobLimits, params};
 use molmesh::structure::read_with;
@@ -98,10 +97,8 @@ fn jobs_allocate_no_more_than_they_add_to_their_meter() {
     ];
     let mut found = Vec::new();
     for (name, text, work, parameters) in cases {
-        let mut job = params::parse(parameters.iter().copied()).unwrap().job;
-        if work == Work::Picture {
-            params::set_format(&mut job, Format::Png).unwrap();
-        }
+        let format = (work == Work::Picture).then_some(("format", "png"));
+        let job = params::parse(parameters.iter().copied().chain(format)).unwrap().job;
         let [allocated, metered] = peaks(text, &job, work);
         println!("{name}: {allocated} bytes allocated, {metered} metered");
         // Control: a meter that counts nothing would fail.

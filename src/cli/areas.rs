@@ -6,14 +6,14 @@ use molmesh::pipeline::{Job, LeftOutReport, MeasuredSelection, SelectionMeasures
 use molmesh::structure::{self, Structure};
 use molmesh::surface::{CancelToken, Control};
 use serde::Serialize;
-use serde_json::Value;
 
 use super::args::AreasArgs;
 use super::error::CliError;
 use super::output::{self, Output};
-use super::page::Page;
+use super::page::{Page, grouped};
+use super::report::{CommandReport, WrittenFile};
 use super::style::Style;
-use super::summary::{self, Written, decimal, exact_measures, grouped};
+use super::summary::{self, decimal, exact_measures};
 use super::{interrupt, job, request};
 
 /// Runs the command.
@@ -31,29 +31,32 @@ pub(super) fn run(args: &AreasArgs) -> Result<(), CliError> {
     let structure = structure::read_with(&input, &limits.read, &control).map_err(|error| failure(error.into()))?;
     let measured = measure_selection(&structure, &job, &limits.read, &limits.surface, &control).map_err(failure)?;
     measured.areas.write_csv(&structure, level, &control, &mut output).map_err(|source| output.failure(source))?;
-    let to_stdout = output.is_stdout();
-    let written = Written { name: output.name.clone(), format: "csv", bytes: output.bytes };
+    let files = [output.written("output", "csv")];
     Output::finish(vec![output])?;
-    let text = || text(&structure, &job, &measured, &written);
-    job::write_report(args.report, args.quiet, to_stdout, text, || json(&structure, &job, &measured, &written))
+    let report = AreasReport {
+        measures: &measured.measures,
+        id: structure.id.as_deref(),
+        atoms: measured.areas.len(),
+        left_out: &measured.left_out,
+        warnings: &structure.warnings,
+        surface: job.params.surface.name(),
+        probe: job.params.used_probe(),
+    };
+    let text = || text(&structure, &job, &measured, &files);
+    CommandReport { report: &report, files: &files, findings: None }.write(args.report, args.quiet, text)
 }
 
 /// Formats the summary.
-fn text(structure: &Structure, job: &Job, measured: &MeasuredSelection, written: &Written) -> String {
+fn text(structure: &Structure, job: &Job, measured: &MeasuredSelection, files: &[WrittenFile]) -> String {
     let title = summary::title(structure.title.as_deref());
     let mut page = Page::new(Style::stderr(), structure.id.as_deref().unwrap_or("structure"), &title);
     let atoms = grouped(measured.areas.len() as u64);
     let atoms_in_file = grouped(structure.len() as u64);
     page.row("atoms", &format!("{atoms} of {atoms_in_file} in the file"));
-    if let Some(id) = &job.selection.assembly {
-        page.row("assembly", &format!("{id}; the atoms are those of all copies"));
-    }
-    if measured.left_out.total > 0 {
-        page.row("left out", &summary::left_out(&measured.left_out));
-    }
-    for warning in &structure.warnings {
-        page.row("warning", warning);
-    }
+    let assembly = job.selection.assembly.as_ref();
+    page.rows("assembly", assembly.map(|id| format!("{id}; the atoms are those of all copies")));
+    page.rows("left out", summary::left_out(&measured.left_out));
+    page.rows("warning", structure.warnings.iter().cloned());
     let probe = job.params.used_probe().map(|radius| format!(", probe {radius} Å")).unwrap_or_default();
     page.row("surface", &format!("{}{probe}", job.params.surface));
     match &measured.measures {
@@ -66,7 +69,7 @@ fn text(structure: &Structure, job: &Job, measured: &MeasuredSelection, written:
             page.row("interface", &format!("{} Å²", decimal(interface.area)));
         }
     }
-    page.row("wrote", &written.text());
+    page.rows("wrote", files.iter().map(WrittenFile::text));
     page.finish()
 }
 
@@ -83,21 +86,4 @@ struct AreasReport<'a> {
     surface: &'static str,
     /// Radius of the probe, Å; null for a surface without one.
     probe: Option<f64>,
-    output: Value,
-}
-
-/// Formats the report as JSON.
-fn json(structure: &Structure, job: &Job, measured: &MeasuredSelection, written: &Written) -> Result<String, CliError> {
-    let report = AreasReport {
-        measures: &measured.measures,
-        id: structure.id.as_deref(),
-        atoms: measured.areas.len(),
-        left_out: &measured.left_out,
-        warnings: &structure.warnings,
-        surface: job.params.surface.name(),
-        probe: job.params.used_probe(),
-        output: written.json(),
-    };
-    let text = serde_json::to_string_pretty(&report).map_err(|error| CliError::Internal(error.to_string()))?;
-    Ok(text + "\n")
 }

@@ -3,6 +3,7 @@
 
 mod areas;
 mod keys;
+mod parameters;
 mod render;
 mod service;
 mod tileset;
@@ -17,7 +18,10 @@ use molmesh::surface::DeviceChoice;
 use super::error::EXIT_CODES;
 pub(crate) use areas::AreasArgs;
 pub(crate) use keys::{KeyCommand, NewKeyArgs, SignArgs, SigningKeyArgs};
-pub(crate) use render::{PictureArgs, RenderArgs};
+use parameters::{
+    AreaArgs, AreaModelArgs, ChainArgs, CheckArgs, ColorArgs, FileArgs, PartArgs, PictureArgs, SurfaceArgs,
+};
+pub(crate) use render::RenderArgs;
 pub(crate) use service::{
     ConfigCommand, ConfigStyle, DoctorArgs, HealthcheckArgs, LogStyle, PrintArgs, ServeArgs, TextOrJson,
 };
@@ -104,19 +108,8 @@ pub(crate) struct MeshArgs {
     /// glb, gltf, ply, ply-text, stl, obj, vtp, vert or face [default: by the extension of the output, glb on stdout]
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
-    /// Tile of the tileset of the structure to mesh, instead of the whole structure
-    #[arg(long, value_name = "LEVEL/X/Y/Z")]
-    pub(crate) tile: Option<String>,
-    /// Storage of glb and gltf: none, quantize (12 bytes per vertex instead of 24: 16-bit positions, 8-bit normals), or
-    /// meshopt (glb only: quantized and compressed to about a fifth) [default: none]
-    #[arg(long, value_name = "METHOD")]
-    pub(crate) compress: Option<String>,
-    /// Vertex normals: smooth, or none (smaller files, flat shading) [default: smooth]
-    #[arg(long, value_name = "NORMALS")]
-    pub(crate) normals: Option<String>,
-    /// Unit of lengths in the mesh file: angstrom, nanometer, or meter (glb and gltf only) [default: angstrom]
-    #[arg(long, value_name = "UNIT")]
-    pub(crate) units: Option<String>,
+    #[command(flatten)]
+    pub(crate) file: FileArgs,
     /// Write the atoms of the file to a CSV table, one row per index of `--atom-ids`; `-` is stdout
     #[arg(long, value_name = "FILE")]
     pub(crate) atoms: Option<PathBuf>,
@@ -141,18 +134,19 @@ pub(crate) struct JobArgs {
     /// Do not print the summary and the progress bar
     #[arg(short, long)]
     pub(crate) quiet: bool,
-    /// Reject a file in which the strict validator finds errors, and report its other findings
-    #[arg(long)]
-    pub(crate) check: bool,
-    /// Check that the mesh is watertight: checksum (of its edges, fast) or exact (edge by edge) [default: checksum]
-    #[arg(long, value_name = "METHOD")]
-    pub(crate) validation: Option<String>,
+    #[command(flatten)]
+    pub(crate) check: CheckArgs,
     #[command(flatten)]
     pub(crate) surface: SurfaceArgs,
     #[command(flatten)]
     pub(crate) color: ColorArgs,
+    /// Map for `--color map`: CCP4, MRC or OpenDX, optionally compressed with gzip or zstd
+    #[arg(long, value_name = "FILE", help_heading = "Colours")]
+    pub(crate) map: Option<PathBuf>,
     #[command(flatten)]
-    pub(crate) selection: SelectionArgs,
+    pub(crate) atoms: AtomArgs,
+    #[command(flatten)]
+    pub(crate) parts: PartArgs,
     #[command(flatten)]
     pub(crate) limits: LimitArgs,
 }
@@ -165,110 +159,6 @@ pub(crate) struct DeviceArgs {
     #[arg(long, value_name = "DEVICES", default_value = "auto")]
     #[arg(env = "MOLMESH__DEVICES__USE", hide_env_values = true)]
     pub(crate) devices: DeviceChoice,
-}
-
-// Surface parameters.
-#[derive(Debug, ClapArgs)]
-#[command(next_help_heading = "Surface")]
-pub(crate) struct SurfaceArgs {
-    /// Surface: gaussian, soft-object or inverse-square (isosurfaces of densities), vdw (van der Waals), sas
-    /// (solvent-accessible) or ses (solvent-excluded) [default: gaussian]
-    #[arg(long, value_name = "SURFACE")]
-    pub(crate) surface: Option<String>,
-    /// Radius of the probe in Å, for `--surface sas` and `ses` [default: 1.4]
-    #[arg(long, value_name = "Å")]
-    pub(crate) probe: Option<String>,
-    /// Values of parameters that are not given: default, ses-like, vdw-like, molstar, blinn or quicksurf. `ses-like`
-    /// approximates the solvent-excluded surface: its area is off by -6.2 to +11.9 % and its volume by -0.3 to +6.8 %
-    /// on 18 proteins, more for small structures (volume +9 to +15 % for three short DNA helices)
-    #[arg(long, value_name = "PRESET")]
-    pub(crate) preset: Option<String>,
-    /// Grid spacing in Å [default: 0.5]
-    #[arg(long, value_name = "Å")]
-    pub(crate) resolution: Option<String>,
-    /// Level of detail instead of a grid spacing: 0 (2 Å) to 6 (0.25 Å), coarser for more than 10,000 atoms
-    #[arg(long, value_name = "LEVEL")]
-    pub(crate) detail: Option<String>,
-    /// Use the finest grid spacing, down to 0.25 Å, whose mesh has at most N triangles
-    #[arg(long, value_name = "N")]
-    pub(crate) max_triangles: Option<String>,
-    /// Density at the surface [default: 1, the density of an isolated atom at its radius]
-    #[arg(long, value_name = "LEVEL")]
-    pub(crate) isovalue: Option<String>,
-    /// Steepness of the gaussian; a higher value gives a less smooth surface [default: 1.25]
-    #[arg(long, value_name = "A")]
-    pub(crate) smoothness: Option<String>,
-    /// Factor of all radii [default: 1]
-    #[arg(long, value_name = "FACTOR")]
-    pub(crate) radius_scale: Option<String>,
-    /// Length added to all scaled radii, in Å [default: 0]
-    #[arg(long, value_name = "Å")]
-    pub(crate) radius_offset: Option<String>,
-    /// Value at which the gaussian is cut off, relative to its value at the radius [default: 0.01]
-    #[arg(long, value_name = "FRACTION")]
-    pub(crate) cutoff_tolerance: Option<String>,
-    /// Raw parameter a of the 2010 paper (gaussian: decay in Å⁻²; soft object: height)
-    #[arg(long, value_name = "A")]
-    pub(crate) paper_a: Option<String>,
-    /// Raw parameter b of the 2010 paper (gaussian: height; otherwise a radius in Å)
-    #[arg(long, value_name = "B")]
-    pub(crate) paper_b: Option<String>,
-    /// Raw parameter c of the 2010 paper (inverse square: strength in Å²)
-    #[arg(long, value_name = "C")]
-    pub(crate) paper_c: Option<String>,
-    /// Find cavities, closed regions that hold a probe: keep (list them in the report), drop (also remove their walls
-    /// from the mesh) or only (keep nothing else)
-    #[arg(long, value_name = "MODE")]
-    pub(crate) cavities: Option<String>,
-    /// Find pockets, regions outside the molecule that the probe can enter and a large probe cannot, and list them in
-    /// the report
-    #[arg(long)]
-    pub(crate) pockets: bool,
-    /// Radius of the large probe of the search for pockets, in Å [default: 4]
-    #[arg(long, value_name = "Å")]
-    pub(crate) pocket_probe: Option<String>,
-    /// Simplify the mesh: fewer, larger triangles, with this error in Å
-    #[arg(long, value_name = "Å")]
-    pub(crate) simplify: Option<String>,
-    /// Quality of the triangles: standard, or high (few small angles; takes 10 to 50 times as long as meshing)
-    #[arg(long, value_name = "NAME")]
-    pub(crate) quality: Option<String>,
-    /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)
-    #[arg(long)]
-    pub(crate) atom_ids: bool,
-    /// Add exact areas and volume to the report, in total and by chain; `--surface vdw`, `sas` and `ses` only
-    #[arg(long)]
-    pub(crate) exact: bool,
-    /// Add the surface area buried between two sets of chains, half the sum over both sides, with `--exact`; a slash
-    /// joins chains of a side: H/L,A
-    #[arg(long, value_name = "A,B")]
-    pub(crate) interface: Option<String>,
-}
-
-// Colours.
-#[derive(Debug, ClapArgs)]
-#[command(next_help_heading = "Colours")]
-pub(crate) struct ColorArgs {
-    /// Colours of vertices: uniform:#RRGGBB, element, chain, entity, residue, secondary-structure, bfactor, occupancy,
-    /// plddt, hydrophobicity (Kyte-Doolittle), hydrophobicity:wimley-white, charge, curvature, radial, depth,
-    /// pocket, map or none [default: none]
-    #[arg(long, value_name = "SCHEME")]
-    pub(crate) color: Option<String>,
-    /// Palette of a numeric scheme: viridis, cividis, blue-white-red or red-white-blue [default: depends on the scheme]
-    #[arg(long, value_name = "PALETTE")]
-    pub(crate) palette: Option<String>,
-    /// Values at the ends of the palette [default: depends on the scheme]
-    #[arg(long, value_name = "MIN,MAX", allow_hyphen_values = true)]
-    pub(crate) color_range: Option<String>,
-    /// Transition between colours: nearest (sharp borders) or smooth (averaged over about 1 Å) [default: nearest]
-    #[arg(long, value_name = "BLEND")]
-    pub(crate) color_blend: Option<String>,
-    /// Map for `--color map`: CCP4, MRC or OpenDX, optionally compressed with gzip or zstd
-    #[arg(long, value_name = "FILE")]
-    pub(crate) map: Option<PathBuf>,
-    /// Distance from the surface at which the map is sampled, in Å [default: 1.4]
-    #[arg(long, value_name = "Å")]
-    pub(crate) color_offset: Option<String>,
 }
 
 // Atoms.
@@ -289,41 +179,8 @@ pub(crate) struct AtomArgs {
     /// Include hydrogens of the selected residues
     #[arg(long)]
     pub(crate) hydrogens: bool,
-    /// Comma-separated chains, by author name [default: all]
-    #[arg(long, value_name = "A,B")]
-    pub(crate) chains: Option<String>,
-    /// Alternative location [default: the one with the highest occupancy in each residue]
-    #[arg(long, value_name = "X")]
-    pub(crate) altloc: Option<String>,
-    /// Id of the biological assembly to build [default: asymmetric-unit, the atoms as they are in the file]
-    #[arg(long, value_name = "ID")]
-    pub(crate) assembly: Option<String>,
-}
-
-// Atoms of a mesh, and its division.
-#[derive(Debug, ClapArgs)]
-#[command(next_help_heading = "Atoms")]
-pub(crate) struct SelectionArgs {
     #[command(flatten)]
-    pub(crate) atoms: AtomArgs,
-    /// Model number, or all: one part of the mesh per model [default: the first]
-    #[arg(long, value_name = "N")]
-    pub(crate) model: Option<String>,
-    /// Mesh each distinct set of chains of the assembly once and repeat the mesh (glb and gltf only); surfaces of
-    /// neighbouring instances are not joined
-    #[arg(long)]
-    pub(crate) instances: bool,
-    /// Mesh one unit of the assembly, where it is in the file; NUMBER counts the parts of a report with --instances
-    #[arg(long, value_name = "NUMBER")]
-    pub(crate) unit: Option<String>,
-    /// Atoms whose surface is made: selection (the selected atoms alone), or whole (all polymer chains and the selected
-    /// atoms; only the triangles nearest to selected atoms are kept, and the mesh is open) [default: selection]
-    #[arg(long, value_name = "CONTEXT")]
-    pub(crate) context: Option<String>,
-    /// Divide the mesh into parts: chain (per copy in an assembly), entity, residue-group (polymer, ligand, glycan,
-    /// ion, water), pocket or none [default: none]
-    #[arg(long, value_name = "RULE")]
-    pub(crate) split: Option<String>,
+    pub(crate) chains: ChainArgs,
 }
 
 // Limits of all commands that read a structure.

@@ -5,22 +5,18 @@ use std::path::Path;
 use clap::ValueEnum as _;
 
 use molmesh::config::{self, Loaded};
-use serde_json::Value;
+use molmesh::pipeline::params::ParamError;
 
 use super::args::{ConfigCommand, ConfigStyle, LogStyle, PrintArgs, ServeArgs};
 use super::error::CliError;
+use super::report::json_text;
 
 /// Runs the command.
 pub(super) fn run(command: &ConfigCommand) -> Result<(), CliError> {
     match command {
         ConfigCommand::Print(args) => super::print(&print(args)?),
-        ConfigCommand::Schema => super::print(&pretty(&config::schema())),
+        ConfigCommand::Schema => super::print(&json_text(&config::schema())),
     }
-}
-
-/// Formats a document for output.
-pub(super) fn pretty(document: &Value) -> String {
-    format!("{document:#}\n")
 }
 
 fn print(args: &PrintArgs) -> Result<String, CliError> {
@@ -41,7 +37,7 @@ fn print(args: &PrintArgs) -> Result<String, CliError> {
             let mut document = loaded.to_json();
             document["backend"] = backend.into();
             document["warnings"] = warnings.clone().into();
-            pretty(&document)
+            json_text(&document)
         }
     })
 }
@@ -74,10 +70,8 @@ pub(super) fn load_with(
 ) -> Result<Loaded, CliError> {
     let mut flags = Vec::new();
     for set in set {
-        let (key, value) = set.split_once('=').ok_or_else(|| CliError::Usage {
-            message: format!("parameter `set`: `{set}` is not allowed; expected section.key=value"),
-            hint: None,
-        })?;
+        let bad = || ParamError::bad_value("set", set, "section.key=value");
+        let (key, value) = set.split_once('=').ok_or_else(bad)?;
         flags.push((key.to_owned(), value.to_owned()));
     }
     flags.extend(named);

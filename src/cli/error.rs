@@ -138,6 +138,11 @@ impl CliError {
         Self::Usage { message: message.into(), hint: None }
     }
 
+    /// Creates a usage error with a hint.
+    pub(crate) fn usage_with_hint(message: impl Into<String>, hint: impl Into<String>) -> Self {
+        Self::Usage { message: message.into(), hint: Some(hint.into()) }
+    }
+
     /// Returns the exit code.
     pub(crate) fn code(&self) -> i32 {
         match self {

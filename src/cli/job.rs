@@ -2,28 +2,28 @@
 
 use std::cell::{Cell, OnceCell};
 use std::fs::File;
-use std::io::{self, Read, Write};
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink};
+use molmesh::pipeline::params::Request;
 use molmesh::pipeline::tileset::{self, StreamSource, StructureStream, TilesetReport, WriteError};
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
 use molmesh::structure::stream::{BLOCK_BYTES, ScratchFile};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
 use molmesh::surface::{CancelToken, Control, SurfaceError};
-use serde_json::{Value, json};
 
-use super::args::{JobArgs, ReportStyle};
+use super::args::JobArgs;
 use super::backend::{self, BackendRequest, Purpose, SelectedBackend};
 use super::error::CliError;
 use super::output::{self, Output, is_stdio};
 use super::progress::Progress;
+use super::report::{CommandReport, finding};
 use super::style::Style;
-use super::summary::{self, Written, WrittenFiles};
-use super::{interrupt, request};
+use super::{interrupt, request, summary};
 
 /// Job of a command, with its input and backend.
 pub(super) struct CommandJob<'a> {
@@ -46,31 +46,29 @@ pub(super) struct CommandJob<'a> {
 impl<'a> CommandJob<'a> {
     /// Prepares a job and opens its output.
     pub(super) fn prepare(
-        job: Job,
-        strict: bool,
+        request: Request,
         (path, output): (&'a Path, &Path),
-        format: Format,
         args: &'a JobArgs,
     ) -> Result<(Self, Output), CliError> {
+        let format = request.format;
         let purpose = if format.is_picture() { Purpose::Picture } else { Purpose::Mesh };
         let open = |cancel: &CancelToken| {
             output::refuse_input(path, output)?;
-            if let Some(map) = args.color.map.as_deref() {
+            if let Some(map) = args.map.as_deref() {
                 output::refuse_input(map, output)?;
             }
             let output = Output::open(output, cancel)?;
             output.refuse_terminal(format)?;
             Ok(output)
         };
-        Self::prepare_for(purpose, job, strict, (path, None), args, open)
+        Self::prepare_for(purpose, request, (path, None), args, open)
     }
 
     /// Prepares a job whose output `open` opens. Cheap steps come first: flags, output, input, backend. The input is
     /// read later if its estimated number of atoms is given.
     pub(super) fn prepare_for<T>(
         purpose: Purpose,
-        mut job: Job,
-        strict: bool,
+        Request { mut job, strict, .. }: Request,
         (path, streamed): (&'a Path, Option<f64>),
         args: &'a JobArgs,
         open: impl FnOnce(&CancelToken) -> Result<T, CliError>,
@@ -78,22 +76,13 @@ impl<'a> CommandJob<'a> {
         let limits =
             if streamed.is_some() { request::limits_of_stream(&args.limits) } else { request::limits(&args.limits) };
         let mut requested = BackendRequest::for_command(args, purpose);
-        backend::check(&requested)?;
+        request::check(args, &requested, &job, path)?;
         set_threads(args.threads)?;
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
-        let map = args.color.map.as_deref();
-        if map.is_some_and(|map| is_stdio(map) && is_stdio(path)) {
-            return Err(CliError::usage("the structure and the map cannot both be read from stdin"));
-        }
-        let needs_map = job.color.is_some_and(|color| color.scheme.needs_map());
-        if needs_map != map.is_some() {
-            let message = if needs_map { "`--color map` needs `--map FILE`" } else { "`--map` needs `--color map`" };
-            return Err(CliError::usage(message));
-        }
         let output = open(&cancel)?;
         let input = if streamed.is_some() { Vec::new() } else { read(path, limits.read.max_inflated_bytes)? };
-        if let Some(map) = map {
+        if let Some(map) = args.map.as_deref() {
             // The command line makes no content keys.
             job.map = Some(MapFile::new(String::new(), read(map, limits.map.max_inflated_bytes)?));
         }
@@ -188,7 +177,7 @@ impl<'a> CommandJob<'a> {
 
     /// Converts the error of the job.
     pub(super) fn failure(&self, source: JobError) -> CliError {
-        let map = self.args.color.map.as_deref().filter(|_| matches!(source, JobError::Map(_)));
+        let map = self.args.map.as_deref().filter(|_| matches!(source, JobError::Map(_)));
         failure(source, map.unwrap_or(self.path), &self.input, &self.limits)
     }
 
@@ -212,16 +201,13 @@ impl<'a> CommandJob<'a> {
             table::write_csv(structure, &mut output).map_err(|source| output.failure(source))?;
             outputs.push(output);
         }
-        let to_stdout = outputs.iter().any(Output::is_stdout);
-        let names: Vec<(String, u64)> = outputs.iter().map(|output| (output.name.clone(), output.bytes)).collect();
+        let written = outputs.iter().zip([("output", format.name()), ("atom_table", "csv")]);
+        let files: Vec<_> = written.map(|(output, (member, format))| output.written(member, format)).collect();
         Output::finish(outputs)?;
         report.add_timing("write", (writing + start.elapsed()).as_secs_f64() * 1e3);
-        let of = |(name, bytes): &(String, u64), format| Written { name: name.clone(), format, bytes: *bytes };
-        let atom_table = names.get(1).map(|file| of(file, "csv"));
-        let written = WrittenFiles { mesh: of(&names[0], format.name()), atom_table };
         let (args, findings) = (self.args, self.findings.as_deref());
-        let text = || summary::text(&report, &written, findings.map(finding_lines).as_deref(), Style::stderr());
-        write_report(args.report, args.quiet, to_stdout, text, || json_report(&report, findings, &written))
+        let text = || summary::text(&report, &files, findings, Style::stderr());
+        CommandReport { report: &report, files: &files, findings }.write(args.report, args.quiet, text)
     }
 }
 
@@ -291,61 +277,4 @@ fn worst_finding(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<S
     let findings = strict_validator::check(input, &limits.read, &Control::default()).ok()?;
     let worst = findings.iter().filter(|f| f.level > Level::Note).max_by_key(|f| f.level)?;
     Some(format!("the strict validator reports: {}", finding(worst)))
-}
-
-/// Formats a finding on one line.
-fn finding(finding: &Diagnostic) -> String {
-    let place = finding.line.map(|n| format!("line {n}: ")).unwrap_or_default();
-    format!("{place}{}", finding.message.split_whitespace().collect::<Vec<_>>().join(" "))
-}
-
-/// Writes the report: text to stderr unless `is_quiet`, JSON to stdout, or to stderr if the file is on stdout.
-pub(super) fn write_report(
-    style: ReportStyle,
-    is_quiet: bool,
-    file_on_stdout: bool,
-    text: impl FnOnce() -> String,
-    json: impl FnOnce() -> Result<String, CliError>,
-) -> Result<(), CliError> {
-    match style {
-        ReportStyle::Text if is_quiet => Ok(()),
-        ReportStyle::Text => {
-            // The file is finished, so a closed stderr is not an error.
-            drop(io::stderr().write_all(text().as_bytes()));
-            Ok(())
-        }
-        ReportStyle::Json => {
-            let text = json()?;
-            let printed =
-                if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::print(&text) };
-            printed.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
-        }
-    }
-}
-
-/// Formats findings on one line each.
-pub(super) fn finding_lines(findings: &[Diagnostic]) -> Vec<String> {
-    findings.iter().map(|f| format!("{}: {}", f.level.name(), finding(f))).collect()
-}
-
-/// Returns findings as JSON.
-pub(super) fn findings_json(findings: &[Diagnostic]) -> Value {
-    findings.iter().map(|f| json!({ "level": f.level.name(), "message": f.message, "line": f.line })).collect()
-}
-
-fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &WrittenFiles) -> Result<String, CliError> {
-    let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialized: {e}"));
-    let mut value = serde_json::to_value(report).map_err(failed)?;
-    if let Value::Object(map) = &mut value {
-        map.insert("output".to_owned(), written.mesh.json());
-        if let Some(table) = &written.atom_table {
-            map.insert("atom_table".to_owned(), table.json());
-        }
-        if let Some(findings) = findings {
-            map.insert("findings".to_owned(), findings_json(findings));
-        }
-    }
-    let mut text = serde_json::to_string_pretty(&value).map_err(failed)?;
-    text.push('\n');
-    Ok(text)
 }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use molmesh::access::{self, Hash, Key, Quota, Scope};
+use molmesh::pipeline::params::ParamError;
 
 use super::args::{KeyCommand, NewKeyArgs, SigningKeyArgs};
 use super::error::CliError;
@@ -22,9 +23,8 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
     let id = name("id", &args.id)?;
     let group = args.group.as_deref().map(|group| name("group", group)).transpose()?;
     let scope = |name: &str| {
-        let known = Scope::ALL.map(Scope::name).join(", ");
-        let message = format!("parameter `scopes`: `{name}` is not allowed; expected {known}");
-        Scope::named(name.trim()).ok_or_else(|| CliError::usage(message))
+        let known = || Scope::ALL.map(Scope::name).join(", ");
+        Scope::named(name.trim()).ok_or_else(|| ParamError::bad_value("scopes", name, known()))
     };
     let mut scopes = args.scopes.split(',').map(scope).collect::<Result<Vec<_>, _>>()?;
     scopes.sort_unstable();
@@ -36,8 +36,7 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
         window_s: seconds("window", args.window.as_deref().unwrap_or("1m"))?,
     };
     if let Some(window) = args.window.as_ref().filter(|_| quota.requests.is_none() && quota.work_s.is_none()) {
-        let expected = "expected a quota per window as well, --requests or --work";
-        return Err(CliError::usage(format!("parameter `window`: `{window}` is not allowed; {expected}")));
+        return Err(ParamError::bad_value("window", window, "a quota per window as well, --requests or --work").into());
     }
     let key_text = access::new_key(id).map_err(|error| CliError::Internal(error.to_string()))?;
     let expires = args.expires.as_deref().map(end).transpose()?;
@@ -65,32 +64,28 @@ fn signing(args: &SigningKeyArgs) -> Result<(), CliError> {
 }
 
 /// Checks the name of a key or group.
-fn name<'a>(parameter: &str, text: &'a str) -> Result<&'a str, CliError> {
-    let expected = "expected 1 to 32 lower-case letters, digits and hyphens";
-    let message = || format!("parameter `{parameter}`: `{text}` is not allowed; {expected}");
-    Some(text).filter(|text| access::is_id(text)).ok_or_else(|| CliError::usage(message()))
+fn name<'a>(parameter: &'static str, text: &'a str) -> Result<&'a str, ParamError> {
+    let bad = || ParamError::bad_value(parameter, text, "1 to 32 lower-case letters, digits and hyphens");
+    Some(text).filter(|text| access::is_id(text)).ok_or_else(bad)
 }
 
 /// Parses a time such as `1h` into whole seconds, at least one.
-pub(super) fn seconds(parameter: &str, text: &str) -> Result<u64, CliError> {
+fn seconds(parameter: &'static str, text: &str) -> Result<u64, ParamError> {
     let seconds = humantime::parse_duration(text).map(|time| time.as_secs()).ok().filter(|seconds| *seconds >= 1);
-    let message =
-        || format!("parameter `{parameter}`: `{text}` is not allowed; expected a time such as 90s, 1h or 30d");
-    seconds.ok_or_else(|| CliError::usage(message()))
+    seconds.ok_or_else(|| ParamError::bad_value(parameter, text, "a time such as 90s, 1h or 30d"))
 }
 
 /// Parses an expiry: a time from now, or a date.
 pub(super) fn end(text: &str) -> Result<SystemTime, CliError> {
-    let message = || {
-        let expected = "expected a time from now such as 1h or 90d, or a date such as 2030-01-31T00:00:00Z";
-        CliError::usage(format!("parameter `expires`: `{text}` is not allowed; {expected}"))
-    };
+    let expected = "a time from now such as 1h or 90d, or a date such as 2030-01-31T00:00:00Z";
+    let bad = || ParamError::bad_value("expires", text, expected);
     if let Ok(date) = humantime::parse_rfc3339(text) {
         let past = || CliError::usage(format!("parameter `expires`: `{text}` is in the past"));
         return Some(date).filter(|date| *date > SystemTime::now()).ok_or_else(past);
     }
-    let from_now = seconds("expires", text).map_err(|_other| message())?;
-    SystemTime::now().checked_add(Duration::from_secs(from_now)).filter(is_a_date).ok_or_else(message)
+    let from_now = seconds("expires", text).map_err(|_other| bad())?;
+    let end = SystemTime::now().checked_add(Duration::from_secs(from_now)).filter(is_a_date);
+    Ok(end.ok_or_else(bad)?)
 }
 
 /// Returns true if the year of a time has at most four digits.

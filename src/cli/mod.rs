@@ -19,6 +19,7 @@ mod page;
 mod panics;
 mod progress;
 mod render;
+mod report;
 mod request;
 mod serve;
 mod sign;

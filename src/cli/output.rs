@@ -10,6 +10,7 @@ use molmesh::surface::CancelToken;
 
 use super::error::CliError;
 use super::interrupt;
+use super::report::WrittenFile;
 
 /// Maximum size of one write, bytes. Cancellation is checked between writes.
 const MAX_WRITE: usize = 1 << 20;
@@ -54,9 +55,10 @@ impl Output {
         cfg!(unix) && matches!(self.to, To::Staged { .. })
     }
 
-    /// Returns true if the mesh goes to stdout.
-    pub(crate) fn is_stdout(&self) -> bool {
-        matches!(self.to, To::Stdout(_))
+    /// Describes the file for a report, in which it is the member `member`.
+    pub(crate) fn written(&self, member: &'static str, format: &'static str) -> WrittenFile {
+        let is_stdout = matches!(self.to, To::Stdout(_));
+        WrittenFile { member, name: self.name.clone(), format, bytes: self.bytes, is_stdout }
     }
 
     /// Rejects a binary format on a terminal, which would interpret the bytes as commands.
@@ -70,7 +72,7 @@ impl Output {
             return Ok(());
         }
         let message = format!("{} is a terminal, and {format} is a binary format", self.name);
-        Err(CliError::Usage { message, hint: Some("name a file with -o, or redirect the output".to_owned()) })
+        Err(CliError::usage_with_hint(message, "name a file with -o, or redirect the output"))
     }
 
     /// Completes all outputs of a command: renames the files to their final names.
@@ -154,7 +156,7 @@ pub(crate) fn refuse_input(input: &Path, output: &Path) -> Result<(), CliError> 
         return Ok(());
     }
     let message = format!("the output `{}` is the input", output.display());
-    Err(CliError::Usage { message, hint: Some("name another file with -o".to_owned()) })
+    Err(CliError::usage_with_hint(message, "name another file with -o"))
 }
 
 /// Rejects two outputs with the same path, or both on stdout.

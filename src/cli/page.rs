@@ -23,6 +23,11 @@ impl Page {
         self.lines.push(format!("  {} {value}", self.style.dim(&format!("{label:<LABEL$}"))));
     }
 
+    /// Adds a labelled line for each value.
+    pub(crate) fn rows(&mut self, label: &str, values: impl IntoIterator<Item = String>) {
+        values.into_iter().for_each(|value| self.row(label, &value));
+    }
+
     /// Adds a line without a label.
     pub(crate) fn line(&mut self, line: String) {
         self.lines.push(line);
@@ -34,4 +39,9 @@ impl Page {
         text.push('\n');
         text
     }
+}
+
+/// Formats `1234567` as `1,234,567`.
+pub(super) fn grouped(n: u64) -> String {
+    indicatif::HumanCount(n).to_string()
 }

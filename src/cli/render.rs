@@ -4,7 +4,6 @@ use std::path::Path;
 use std::time::Instant;
 
 use molmesh::formats::Format;
-use molmesh::pipeline::params::Request;
 
 use super::args::RenderArgs;
 use super::error::CliError;
@@ -14,10 +13,10 @@ use super::request;
 
 /// Runs the command.
 pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
-    let Request { job, strict, .. } = request::parse_render(args)?;
+    let request = request::parse_render(args)?;
     require_png(&args.output)?;
     let paths = (args.input.as_path(), args.output.as_path());
-    let (job, mut output) = CommandJob::prepare(job, strict, paths, Format::Png, &args.job)?;
+    let (job, mut output) = CommandJob::prepare(request, paths, &args.job)?;
     let mut product = job.run(None).map_err(|source| job.failure(source))?;
     job.draw(&mut product).map_err(|source| job.failure(source))?;
     let start = Instant::now();
@@ -32,5 +31,5 @@ fn require_png(output: &Path) -> Result<(), CliError> {
         return Ok(());
     }
     let message = format!("`{}` does not end in .png", output.display());
-    Err(CliError::Usage { message, hint: Some("molmesh mesh writes meshes".to_owned()) })
+    Err(CliError::usage_with_hint(message, "molmesh mesh writes meshes"))
 }

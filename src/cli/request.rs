@@ -1,97 +1,124 @@
 //! Turns flags into a request. Names and values are those of an HTTP query and have the same parser.
 
-use molmesh::formats::Format;
+use std::path::Path;
+use std::str::FromStr as _;
+
+use molmesh::formats::{Compress, Format};
 use molmesh::pipeline::params::areas::AreasRequest;
 use molmesh::pipeline::params::{self, ParamError, Request};
-use molmesh::pipeline::tileset;
-use molmesh::pipeline::{Job, JobLimits};
+use molmesh::pipeline::{Job, JobLimits, tileset};
 use molmesh::structure::read::DISTANCES_PER_PAIR;
 
-use super::args::{
-    AreasArgs, AtomArgs, CommonLimitArgs, JobArgs, LimitArgs, MeshArgs, PictureArgs, RenderArgs, TilesetArgs,
-};
+use super::args::{AreasArgs, AtomArgs, CommonLimitArgs, JobArgs, LimitArgs, MeshArgs, RenderArgs, TilesetArgs};
+use super::backend::{self, BackendRequest};
 use super::error::CliError;
+use super::output::is_stdio;
 
-/// Parses the flags of `mesh`.
+/// Parses the flags of `mesh`. Without `--format`, the format is that of the file extension of the output.
 pub(super) fn parse_mesh(args: &MeshArgs) -> Result<Request, CliError> {
-    let own = [
-        ("format", &args.format),
-        ("tile", &args.tile),
-        ("compress", &args.compress),
-        ("normals", &args.normals),
-        ("units", &args.units),
-    ];
-    parse(&own, &args.job)
+    let format = args.format.as_ref().map_or_else(|| format_of(&args.output), |name| mesh_format(name))?;
+    parse(&args.file.0, &args.job, format)
+}
+
+/// Parses the name of a mesh format.
+fn mesh_format(name: &str) -> Result<Format, CliError> {
+    match Format::from_str(name) {
+        Ok(format) if format.is_picture() => {
+            let message = format!("{format} is a picture, not a mesh");
+            Err(CliError::usage_with_hint(message, "molmesh render writes pictures"))
+        }
+        Ok(format) => Ok(format),
+        Err(_unknown) => {
+            let expected = Format::MESHES.map(Format::name).join(", ");
+            Err(ParamError::bad_value("format", name, format!("one of {expected}")).into())
+        }
+    }
+}
+
+/// Returns the format of an output by its file extension; GLB on stdout.
+fn format_of(output: &Path) -> Result<Format, CliError> {
+    let unknown = |why: &str| {
+        let message = format!("cannot determine the format of `{}`: {why}", output.display());
+        let formats = Format::MESHES.map(Format::name).join(", ");
+        CliError::usage_with_hint(message, format!("name the format with --format: {formats}"))
+    };
+    match output.extension().map(|extension| extension.to_string_lossy()) {
+        Some(extension) if extension.parse::<Format>().is_ok() => mesh_format(&extension),
+        Some(extension) => Err(unknown(&format!("`{extension}` is not a mesh format"))),
+        None if is_stdio(output) => Ok(Format::default()),
+        None => Err(unknown("it has no extension")),
+    }
 }
 
 /// Parses the flags of `tileset`.
 pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
-    let compress = Some("meshopt".to_owned());
-    let request = parse(&[("compress", &compress)], &args.job)?;
-    tileset::check(&request.job).map_err(|error| refusal(&error))?;
+    let compress = ("compress".to_owned(), Compress::Meshopt.name().to_owned());
+    let request = parse(&[compress], &args.job, Format::Glb)?;
+    tileset::check(&request.job)?;
     if args.scratch.is_some() {
-        tileset::check_stream(&request.job, args.inputs.len()).map_err(|error| refusal(&error))?;
+        tileset::check_stream(&request.job, args.inputs.len())?;
         if request.strict {
             return Err(CliError::usage("`--check` reads the whole file; leave it out with `--scratch`"));
         }
     } else if args.inputs.len() > 1 {
-        let hint = "name a folder for an index of their atoms with --scratch".to_owned();
-        return Err(CliError::Usage {
-            message: "several files cannot be read into memory".to_owned(),
-            hint: Some(hint),
-        });
+        let hint = "name a folder for an index of their atoms with --scratch";
+        return Err(CliError::usage_with_hint("several files cannot be read into memory", hint));
     }
     Ok(request)
 }
 
 /// Parses the flags of `areas`.
 pub(super) fn parse_areas(args: &AreasArgs) -> Result<AreasRequest, CliError> {
-    let mut pairs = given(&[
-        ("surface", &args.surface),
-        ("by", &args.by),
-        ("probe", &args.probe),
-        ("radius_scale", &args.radius_scale),
-        ("radius_offset", &args.radius_offset),
-        ("interface", &args.interface),
-        ("model", &args.model),
-    ]);
-    pairs.extend(atom_pairs(&args.atoms));
-    let pairs: Vec<_> = pairs.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
-    params::areas::parse(&pairs).map_err(|error| refusal(&error))
+    let surface = ("surface".to_owned(), args.surface.clone());
+    Ok(params::areas::parse(&[&[surface][..], &args.area.0, &args.model.0, &atom_pairs(&args.atoms)].concat())?)
 }
 
 /// Parses the flags of `render`.
 pub(super) fn parse_render(args: &RenderArgs) -> Result<Request, CliError> {
-    let PictureArgs { width, height, view, azimuth, elevation, background, style } = &args.picture;
-    let own = [
-        ("width", width),
-        ("height", height),
-        ("view", view),
-        ("azimuth", azimuth),
-        ("elevation", elevation),
-        ("background", background),
-        ("style", style),
-    ];
-    let mut request = parse(&own, &args.job)?;
-    set_format(&mut request.job, Format::Png)?;
-    Ok(request)
+    parse(&args.picture.0, &args.job, Format::Png)
 }
 
-fn parse(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Result<Request, CliError> {
-    params::parse(pairs(own, args)).map_err(|error| refusal(&error))
+fn parse(own: &[(String, String)], args: &JobArgs, format: Format) -> Result<Request, CliError> {
+    let JobArgs { check, surface, color, atoms, parts, .. } = args;
+    let pairs = [own, &check.0, &surface.0, &color.0, &atom_pairs(atoms), &parts.0].concat();
+    params::parse_with(pairs, |_| Ok(format))
 }
 
-/// Sets the format of a job. Fails if the format cannot hold what the flags request.
-pub(super) fn set_format(job: &mut Job, format: Format) -> Result<(), CliError> {
-    params::set_format(job, format).map_err(|error| refusal(&error))
+/// Returns names and values of the atoms as in a query.
+fn atom_pairs(atoms: &AtomArgs) -> Vec<(String, String)> {
+    // The short flags add to `--select` or to its default.
+    let mut select = atoms.select.clone();
+    for (flag, class) in [(atoms.ligands, "ligand"), (atoms.waters, "water"), (atoms.hydrogens, "hydrogens")] {
+        if flag {
+            select = Some(format!("{},{class}", select.as_deref().unwrap_or("polymer")));
+        }
+    }
+    let select = select.map(|select| ("select".to_owned(), select));
+    atoms.chains.0.iter().cloned().chain(select).collect()
 }
 
-fn refusal(error: &ParamError) -> CliError {
-    match error {
-        ParamError::Unknown { .. } | ParamError::Repeated { .. } => CliError::Internal(error.to_string()),
-        ParamError::BadValue { .. } => CliError::Usage { message: error.to_string(), hint: None },
-        ParamError::BadExpression { text, error: bad, .. } => {
-            CliError::Usage { message: format!("{error}\n{}", with_caret(text, bad.column)), hint: None }
+/// Rejects flags of a job that contradict or need each other. `input` is the structure file.
+pub(super) fn check(args: &JobArgs, backend: &BackendRequest<'_>, job: &Job, input: &Path) -> Result<(), CliError> {
+    backend::check(backend)?;
+    let map = args.map.as_deref();
+    if map.is_some_and(|map| is_stdio(map) && is_stdio(input)) {
+        return Err(CliError::usage("the structure and the map cannot both be read from stdin"));
+    }
+    match (job.color.is_some_and(|color| color.scheme.needs_map()), map) {
+        (true, None) => Err(CliError::usage("`--color map` needs `--map FILE`")),
+        (false, Some(_)) => Err(CliError::usage("`--map` needs `--color map`")),
+        _ => Ok(()),
+    }
+}
+
+impl From<ParamError> for CliError {
+    fn from(error: ParamError) -> Self {
+        match &error {
+            ParamError::Unknown { .. } | ParamError::Repeated { .. } => Self::Internal(error.to_string()),
+            ParamError::BadValue { .. } => Self::usage(error.to_string()),
+            ParamError::BadExpression { text, error: bad, .. } => {
+                Self::usage(format!("{error}\n{}", with_caret(text, bad.column)))
+            }
         }
     }
 }
@@ -137,77 +164,6 @@ pub(super) fn limits_of_stream(args: &LimitArgs) -> JobLimits {
     limits.read.max_atoms = args.common.max_atoms.unwrap_or_else(|| u32::MAX.into());
     limits.read.max_inflated_bytes = args.common.max_input_bytes.unwrap_or(1 << 40);
     limits
-}
-
-/// Returns names and values as in a query.
-fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'static str, String)> {
-    let (surface, atoms) = (&args.surface, &args.selection);
-    let job_pairs = [
-        ("surface", &surface.surface),
-        ("probe", &surface.probe),
-        ("preset", &surface.preset),
-        ("resolution", &surface.resolution),
-        ("detail", &surface.detail),
-        ("max_triangles", &surface.max_triangles),
-        ("isovalue", &surface.isovalue),
-        ("smoothness", &surface.smoothness),
-        ("radius_scale", &surface.radius_scale),
-        ("radius_offset", &surface.radius_offset),
-        ("cutoff_tolerance", &surface.cutoff_tolerance),
-        ("paper_a", &surface.paper_a),
-        ("paper_b", &surface.paper_b),
-        ("paper_c", &surface.paper_c),
-        ("color", &args.color.color),
-        ("palette", &args.color.palette),
-        ("color_range", &args.color.color_range),
-        ("color_blend", &args.color.color_blend),
-        ("color_offset", &args.color.color_offset),
-        ("model", &atoms.model),
-        ("unit", &atoms.unit),
-        ("context", &atoms.context),
-        ("split", &atoms.split),
-        ("cavities", &surface.cavities),
-        ("pocket_probe", &surface.pocket_probe),
-        ("simplify", &surface.simplify),
-        ("quality", &surface.quality),
-        ("validation", &args.validation),
-        ("interface", &surface.interface),
-    ];
-    let mut pairs = given(&[own, &job_pairs].concat());
-    if surface.atom_ids {
-        pairs.push(("atom_ids", "true".to_owned()));
-    }
-    if surface.exact {
-        pairs.push(("exact", "true".to_owned()));
-    }
-    if surface.pockets {
-        pairs.push(("pockets", "true".to_owned()));
-    }
-    if atoms.instances {
-        pairs.push(("instances", "true".to_owned()));
-    }
-    if args.check {
-        pairs.push(("check", "strict".to_owned()));
-    }
-    pairs.extend(atom_pairs(&atoms.atoms));
-    pairs
-}
-
-/// Returns names and values of the atoms as in a query.
-fn atom_pairs(atoms: &AtomArgs) -> Vec<(&'static str, String)> {
-    // The short flags add to `--select` or to its default.
-    let mut select = atoms.select.clone();
-    for (flag, class) in [(atoms.ligands, "ligand"), (atoms.waters, "water"), (atoms.hydrogens, "hydrogens")] {
-        if flag {
-            select = Some(format!("{},{class}", select.as_deref().unwrap_or("polymer")));
-        }
-    }
-    given(&[("chains", &atoms.chains), ("altloc", &atoms.altloc), ("assembly", &atoms.assembly), ("select", &select)])
-}
-
-/// Returns the parameters that have a value.
-fn given(flags: &[(&'static str, &Option<String>)]) -> Vec<(&'static str, String)> {
-    flags.iter().filter_map(|(name, value)| Some((*name, value.as_ref()?.clone()))).collect()
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use std::time::SystemTime;
 use molmesh::access::SigningKeys;
 use molmesh::config::Config;
 use molmesh::http::check_signable;
+use molmesh::pipeline::params::ParamError;
 
 use super::args::SignArgs;
 use super::error::CliError;
@@ -24,12 +25,9 @@ pub(super) fn run(args: &SignArgs) -> Result<(), CliError> {
 }
 
 fn keys(config: &Config) -> Result<SigningKeys, CliError> {
-    let secret = config.access.signing_secret.as_ref().ok_or_else(|| CliError::Usage {
-        message: "no signing key: access.signing_secret is not set".to_owned(),
-        hint: Some(
-            "create one with `molmesh key signing`; set it in --config or MOLMESH__ACCESS__SIGNING_SECRET".to_owned(),
-        ),
-    })?;
+    let hint = "create one with `molmesh key signing`; set it in --config or MOLMESH__ACCESS__SIGNING_SECRET";
+    let missing = || CliError::usage_with_hint("no signing key: access.signing_secret is not set", hint);
+    let secret = config.access.signing_secret.as_ref().ok_or_else(missing)?;
     SigningKeys::parse(secret.reveal()).map_err(|why| CliError::usage(format!("access.signing_secret: {why}")))
 }
 
@@ -39,8 +37,7 @@ fn split(url: &str) -> Result<(&str, &str), CliError> {
         return Ok(("", url));
     };
     let path = rest.find('/').filter(|_| ["http", "https"].contains(&scheme));
-    let message = || format!("parameter `url`: `{url}` is not allowed; expected http(s)://host/path, or a path");
-    let at = path.ok_or_else(|| CliError::usage(message()))?;
+    let at = path.ok_or_else(|| ParamError::bad_value("url", url, "http(s)://host/path, or a path"))?;
     Ok(url.split_at(scheme.len() + "://".len() + at))
 }
 

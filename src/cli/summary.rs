@@ -4,47 +4,18 @@ use molmesh::pipeline::{
     AssemblyReport, CavityReport, ColorReport, ExactReport, InstancesReport, LeftOutReport, PictureReport,
     PocketReport, Report, SimplificationReport, TriangleReport,
 };
+use molmesh::structure::strict_validator::Diagnostic;
 use molmesh::surface::Validation;
-use serde_json::{Value, json};
 
-use super::page::Page;
+use super::page::{Page, grouped};
+use super::report::{self, WrittenFile};
 use super::style::Style;
 
 /// Characters of the longest bar.
 const BAR: f64 = 24.0;
 
-/// Written file.
-pub(crate) struct Written {
-    /// Path, or `stdout`.
-    pub(crate) name: String,
-    /// Format.
-    pub(crate) format: &'static str,
-    /// Bytes.
-    pub(crate) bytes: u64,
-}
-
-impl Written {
-    /// Returns the file as text.
-    pub(super) fn text(&self) -> String {
-        format!("{} ({}, {} bytes)", self.name, self.format, grouped(self.bytes))
-    }
-
-    /// Returns the file as JSON.
-    pub(super) fn json(&self) -> Value {
-        json!({ "file": self.name, "format": self.format, "bytes": self.bytes })
-    }
-}
-
-/// Files of a command.
-pub(crate) struct WrittenFiles {
-    /// Mesh or picture.
-    pub(crate) mesh: Written,
-    /// Table of the atoms, if it was requested.
-    pub(crate) atom_table: Option<Written>,
-}
-
 /// Formats the summary. `findings` are those of the strict validator, if it ran.
-pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[String]>, style: Style) -> String {
+pub(crate) fn text(report: &Report, files: &[WrittenFile], findings: Option<&[Diagnostic]>, style: Style) -> String {
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report.title.as_deref()));
     let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
     let models = match report.models {
@@ -53,21 +24,12 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
         None => format!("model {}", report.model),
     };
     page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, {models})", report.source_format));
-    if let Some(selected) = report.selected_atoms {
-        page.row("selected", &format!("{} atoms; the mesh is cut out of the surface of all atoms", grouped(selected)));
-    }
-    if let Some(assembly) = &report.assembly {
-        page.row("assembly", &assembled(assembly));
-    }
-    if let Some(instances) = &report.instances {
-        page.row("instances", &repeated(report, instances));
-    }
-    if report.left_out.total > 0 {
-        page.row("left out", &left_out(&report.left_out));
-    }
-    for warning in &report.warnings {
-        page.row("warning", warning);
-    }
+    let selected = |n| format!("{} atoms; the mesh is cut out of the surface of all atoms", grouped(n));
+    page.rows("selected", report.selected_atoms.map(selected));
+    page.rows("assembly", report.assembly.as_ref().map(assembled));
+    page.rows("instances", report.instances.as_ref().map(|instances| repeated(report, instances)));
+    page.rows("left out", left_out(&report.left_out));
+    page.rows("warning", report.warnings.iter().cloned());
     page.row("surface", &surface(report));
     let [bricks, with_surface, grid_points, dense] =
         [report.bricks, report.surface_bricks, report.grid_points, report.box_cells].map(grouped);
@@ -76,12 +38,8 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
         &format!("{bricks} bricks ({with_surface} with surface), {grid_points} grid points; box: {dense} cells"),
     );
     page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
-    if let Some(quantization) = report.quantization {
-        page.row("vertices", &format!("quantized in steps of {} Å", quantization.step));
-    }
-    if let Some(color) = &report.color {
-        page.row("colours", &colors(color));
-    }
+    page.rows("vertices", report.quantization.map(|found| format!("quantized in steps of {} Å", found.step)));
+    page.rows("colours", report.color.as_ref().map(colors));
     if let Some(picture) = &report.picture {
         page.row("picture", &drawn(picture));
         page.row("renderer", &format!("{}: {} ({})", picture.renderer, picture.device, picture.reason));
@@ -94,32 +52,20 @@ pub(crate) fn text(report: &Report, written: &WrittenFiles, findings: Option<&[S
     }
     page.row("validation", &validation(report, style));
     page.row("parts", &parts(report));
-    if let Some(found) = report.cavities {
-        page.row("cavities", &cavities(found, report.cavity_list.as_deref().unwrap_or_default()));
-    }
-    if let Some(found) = report.pockets {
-        page.row("pockets", &pockets(found, report.pocket_list.as_deref().unwrap_or_default()));
-    }
-    if let Some(found) = &report.simplification {
-        page.row("simplified", &simplified(found));
-    }
-    if let Some(shapes) = &report.triangle_shapes {
-        page.row("angles", &angles(shapes));
-    }
+    let cavities = |found| cavities(found, report.cavity_list.as_deref().unwrap_or_default());
+    page.rows("cavities", report.cavities.map(cavities));
+    let pockets = |found| pockets(found, report.pocket_list.as_deref().unwrap_or_default());
+    page.rows("pockets", report.pockets.map(pockets));
+    page.rows("simplified", report.simplification.as_ref().map(simplified));
+    page.rows("angles", report.triangle_shapes.as_ref().map(angles));
     let deficit =
         |percent| format!(" (macromolecules: up to {} % below the exact area; see --exact)", decimal(percent));
     let deficit = report.area_deficit_percent.map(deficit).unwrap_or_default();
     page.row("area", &format!("{} Å²{deficit}", decimal(report.area)));
-    if let Some(volume) = report.volume {
-        page.row("volume", &format!("{} Å³", decimal(volume)));
-    }
-    if let Some(exact) = &report.exact {
-        page.row("exact", &exact_measures(exact));
-    }
+    page.rows("volume", report.volume.map(|volume| format!("{} Å³", decimal(volume))));
+    page.rows("exact", report.exact.as_ref().map(exact_measures));
     page.row("backend", &format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
-    for file in [&written.mesh].into_iter().chain(&written.atom_table) {
-        page.row("wrote", &file.text());
-    }
+    page.rows("wrote", files.iter().map(WrittenFile::text));
     if let Some(findings) = findings {
         add_findings(&mut page, findings);
     }
@@ -188,8 +134,8 @@ fn repeated(report: &Report, instances: &InstancesReport) -> String {
     format!("{count} of {units} distinct units, not joined; sums: {atoms} atoms, {area} Å², {volume} Å³")
 }
 
-/// Formats the numbers of atoms that were left out, by residue name and reason.
-pub(super) fn left_out(left_out: &LeftOutReport) -> String {
+/// Formats the numbers of atoms that were left out, by residue name and reason, if there are any.
+pub(super) fn left_out(left_out: &LeftOutReport) -> Option<String> {
     let LeftOutReport {
         total,
         other_blocks,
@@ -215,7 +161,8 @@ pub(super) fn left_out(left_out: &LeftOutReport) -> String {
         ("coarse-grained spheres", spheres),
     ];
     let counted = counted.into_iter().filter(|(_, n)| **n > 0).map(|(what, n)| format!("{what} {}", grouped(*n)));
-    format!("{} atoms: {}", grouped(*total), named.chain(counted).collect::<Vec<_>>().join(", "))
+    let reasons = || named.chain(counted).collect::<Vec<_>>().join(", ");
+    (*total > 0).then(|| format!("{} atoms: {}", grouped(*total), reasons()))
 }
 
 /// Formats the colours and the first entries of their legend.
@@ -288,11 +235,12 @@ fn pockets(found: u64, largest: &[PocketReport]) -> String {
 }
 
 /// Adds the first findings only, as a damaged file can have one in each line.
-pub(super) fn add_findings(page: &mut Page, findings: &[String]) {
+pub(super) fn add_findings(page: &mut Page, findings: &[Diagnostic]) {
     let of = if findings.len() == 1 { "finding" } else { "findings" };
     page.row("check", &format!("{} {of} of the strict validator", findings.len()));
     for finding in findings.iter().take(5) {
-        page.line(format!("    {}", finding.chars().take(110).collect::<String>()));
+        let text = format!("{}: {}", finding.level.name(), report::finding(finding));
+        page.line(format!("    {}", text.chars().take(110).collect::<String>()));
     }
 }
 
@@ -315,11 +263,6 @@ fn bar(fraction: f64) -> String {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0..=192")]
     let eighths = (fraction.clamp(0.0, 1.0) * BAR * 8.0).round().max(1.0) as usize;
     format!("{}{}", "█".repeat(eighths / 8), EIGHTHS[eighths % 8])
-}
-
-/// Formats `1234567` as `1,234,567`.
-pub(super) fn grouped(n: u64) -> String {
-    indicatif::HumanCount(n).to_string()
 }
 
 /// Formats a number with one decimal from 100, two from 1 and three below 1.
@@ -467,8 +410,9 @@ mod tests {
 
     #[test]
     fn summary_is_complete_and_fits_one_screen() {
-        let mesh = Written { name: "a.glb".to_owned(), format: "glb", bytes: 720_000 };
-        let text = text(&report(), &WrittenFiles { mesh, atom_table: None }, None, Style::PLAIN);
+        let name = "a.glb".to_owned();
+        let mesh = WrittenFile { member: "output", name, format: "glb", bytes: 720_000, is_stdout: false };
+        let text = text(&report(), &[mesh], None, Style::PLAIN);
         for part in [
             "4PTI TRYPSIN INHIBITOR",
             "454 of 514",

@@ -1,34 +1,34 @@
 //! `molmesh tileset`: meshes one structure into the files of a tileset.
 
 use std::fs::{self, File};
-use std::io::{self, Read, Write as _};
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use molmesh::formats::tileset::MAX_LEVELS;
 use molmesh::pipeline::BYTES_PER_ATOM;
-use molmesh::pipeline::params::Request;
 use molmesh::pipeline::tileset::{LevelReport, TilesetReport, unit_folder};
-use serde_json::Value;
+use molmesh::structure::strict_validator::Diagnostic;
 
-use super::args::{ReportStyle, TilesetArgs};
+use super::args::TilesetArgs;
 use super::backend::Purpose;
 use super::error::CliError;
-use super::job::{CommandJob, finding_lines, findings_json, name_of};
+use super::job::{CommandJob, name_of};
 use super::output::is_stdio;
 use super::page::Page;
+use super::report::CommandReport;
 use super::style::Style;
 use super::{interrupt, request, summary};
 
 /// Runs the command.
 pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
-    let Request { job, strict, .. } = request::parse_tileset(args)?;
+    let request = request::parse_tileset(args)?;
     let start = Instant::now();
     let input = args.inputs.first().map_or(Path::new("-"), PathBuf::as_path);
     let scratch = args.scratch.as_deref().map(|scratch| StreamFiles::open(&args.inputs, scratch)).transpose()?;
     let open = |_: &_| Folder::create(&args.output);
     let input = (input, scratch.as_ref().map(|files| files.atoms));
-    let (job, mut folder) = CommandJob::prepare_for(Purpose::Mesh, job, strict, input, &args.job, open)?;
+    let (job, mut folder) = CommandJob::prepare_for(Purpose::Mesh, request, input, &args.job, open)?;
     let write = |path: &str, bytes: &[u8]| folder.write(path, bytes);
     let report = match scratch {
         Some(StreamFiles { inputs, scratch, .. }) => {
@@ -40,24 +40,9 @@ pub(super) fn run(args: &TilesetArgs) -> Result<(), CliError> {
     let findings = job.findings.clone();
     // Ends the progress bar.
     drop(job);
-    match args.job.report {
-        ReportStyle::Text if args.job.quiet => Ok(()),
-        ReportStyle::Text => {
-            let lines = findings.as_deref().map(finding_lines);
-            let text = text(&report, lines.as_deref(), &folder.path, start.elapsed().as_secs_f64(), Style::stderr());
-            // The tileset is complete, so a closed stderr is not an error.
-            drop(io::stderr().write_all(text.as_bytes()));
-            Ok(())
-        }
-        ReportStyle::Json => {
-            let failed = |error: serde_json::Error| CliError::Internal(error.to_string());
-            let mut value = serde_json::to_value(&report).map_err(failed)?;
-            if let (Value::Object(map), Some(findings)) = (&mut value, &findings) {
-                map.insert("findings".to_owned(), findings_json(findings));
-            }
-            super::print(&format!("{value:#}\n"))
-        }
-    }
+    let (findings, seconds) = (findings.as_deref(), start.elapsed().as_secs_f64());
+    let text = || text(&report, findings, &folder.path, seconds, Style::stderr());
+    CommandReport { report: &report, files: &[], findings }.write(args.job.report, args.job.quiet, text)
 }
 
 /// Files that are read as a stream.
@@ -116,7 +101,7 @@ impl Folder {
         fs::create_dir_all(path).map_err(failed)?;
         if fs::read_dir(path).map_err(failed)?.next().is_some() {
             let message = format!("`{}` is not empty", path.display());
-            return Err(CliError::Usage { message, hint: Some("name another folder with -o".to_owned()) });
+            return Err(CliError::usage_with_hint(message, "name another folder with -o"));
         }
         Ok(Self { path: path.to_owned(), created, complete: false })
     }
@@ -163,11 +148,9 @@ fn add_levels(page: &mut Page, levels: &[LevelReport]) {
 }
 
 /// Formats the report as text.
-fn text(report: &TilesetReport, findings: Option<&[String]>, folder: &Path, seconds: f64, style: Style) -> String {
+fn text(report: &TilesetReport, findings: Option<&[Diagnostic]>, folder: &Path, seconds: f64, style: Style) -> String {
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &format!("{} atoms", report.atoms));
-    if report.left_out.total > 0 {
-        page.row("left out", &summary::left_out(&report.left_out));
-    }
+    page.rows("left out", summary::left_out(&report.left_out));
     add_levels(&mut page, &report.levels);
     for (number, unit) in report.units.iter().enumerate() {
         let counts = format!("{}: {} atoms, {} instances", unit.name, unit.atoms, unit.instances);

@@ -11,7 +11,7 @@ use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AreaParameters, ConditionHeaders, EntryPath, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
-use super::parsed_request::{self, Pairs};
+use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
@@ -91,7 +91,7 @@ async fn answer(
     query: Pairs,
     headers: &HeaderMap,
 ) -> Result<Response, Problem> {
-    let AreasRequest { job, level, canonical } = params::areas::parse(&parsed_request::pairs(query)?)?;
+    let AreasRequest { job, level, canonical } = params::areas::parse(&query.0)?;
     let surface = app.config.limits.job().surface;
     let write = async |loaded: Loaded, delivery| {
         let listing = loaded.list_atoms(app, caller, delivery, move |structure, limits, control, memory| {

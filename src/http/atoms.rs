@@ -15,7 +15,7 @@ use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AtomParameters, ConditionHeaders, EntryPath, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
-use super::parsed_request::{self, Pairs};
+use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
@@ -169,7 +169,7 @@ async fn answer(
     query: Pairs,
     headers: &HeaderMap,
 ) -> Result<Response, Problem> {
-    let positions = atom_parameters::parse(&parsed_request::pairs(query)?)?;
+    let positions = atom_parameters::parse(&query.0)?;
     let variant = positions.as_ref().map_or_else(String::new, |positions| positions.canonical.clone());
     let write = async |loaded, delivery| list(app, caller, loaded, delivery, positions).await;
     source.document(app, caller, headers, &variant, None, write).await

@@ -18,7 +18,7 @@ use super::openapi::meshes::AtomColorsResponse;
 use super::openapi::parameters::{ColorParameters, ConditionHeaders, EntryPath, RangeHeaders, StructurePath};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
-use super::parsed_request::{self, Pairs};
+use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::range::{self, Wanted};
@@ -101,7 +101,7 @@ async fn answer(
     query: Pairs,
     headers: &HeaderMap,
 ) -> Result<Response, Problem> {
-    let (job, coloring) = color_parameters::parse(&parsed_request::pairs(query)?)?;
+    let (job, coloring) = color_parameters::parse(&query.0)?;
     let variant = params::canonical(&job);
     let write = async |loaded: Loaded, delivery| {
         let etag = source::etag(&loaded.digest, &variant)?;

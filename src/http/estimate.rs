@@ -26,6 +26,7 @@ use super::request_id::RequestId;
 use super::source::Loaded;
 use super::state::Shared;
 use crate::jobs::{Pool, Rank};
+use crate::pipeline::params::Request;
 use crate::pipeline::{self, Estimate, MeshEstimate};
 use crate::surface::Control;
 
@@ -113,8 +114,7 @@ pub(super) async fn create(
     // The response is no mesh, so `Accept` does not choose a format.
     headers.remove(ACCEPT);
     let parsed = ParsedRequest::from_body(&app, &caller, query, &headers, body).await?;
-    let ParsedRequest { source, request, format, declared, .. } = parsed;
-    let job = request.job;
+    let ParsedRequest { source, request: Request { job, format, .. }, declared, .. } = parsed;
     // An estimate is about half the work of a mesh, so it takes a delivery slot as well.
     let delivery = app.delivery(caller.client)?;
     let digest = source.digest(&app, &caller).await?;

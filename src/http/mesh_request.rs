@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::body::Body;
-use axum::extract::{FromRequestParts, Query};
+use axum::extract::FromRequestParts;
 use axum::http::header::{self, HeaderMap};
 use axum::http::request::Parts;
 use axum::http::{HeaderValue, Method, StatusCode};
@@ -16,7 +16,7 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use tracing::Instrument as _;
 
-use super::parsed_request::ParsedRequest;
+use super::parsed_request::{Pairs, ParsedRequest};
 use super::preferences::{PREFERENCE_APPLIED, RequestPreferences};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -49,7 +49,7 @@ impl FromRequestParts<Shared> for MeshRequest {
         let timing = Timing::start();
         let path = source::path_parameters(parts, app).await?;
         let file = path.iter().find_map(|(name, value)| (name == "file").then_some(value));
-        let query = Query::from_request_parts(parts, app).await;
+        let query = Pairs::from_request_parts(parts, app).await?;
         let preferences = RequestPreferences::of(&parts.headers, &parts.extensions)?;
         let structure = StructureSource::from_request_parts(parts, app).await?;
         let parsed = ParsedRequest::from_address(app, structure, file, query)?;
@@ -91,11 +91,11 @@ impl MeshRequest {
     /// Returns a response that needs no job: a stored result, a 304, or the headers for a HEAD request.
     async fn without_work(&self, digest: &Digest) -> Result<Option<Response>, Problem> {
         let Self { app, method, headers, .. } = self;
-        let ParsedRequest { request, format, report, declared, .. } = &self.parsed;
+        let ParsedRequest { request, report, declared, .. } = &self.parsed;
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
         let namespace = self.preferences.caller.namespace;
-        let key = |arithmetic: String| ContentKey::new(digest, &request.job, *format, &arithmetic, namespace);
+        let key = |arithmetic: String| ContentKey::new(digest, &request.job, request.format, &arithmetic, namespace);
         // Any backend may compute the file, and the key depends on the backend.
         let mut keys: Vec<ContentKey> = app.pool.file_arithmetics(&request.job).into_iter().map(key).collect();
         // A report has no validator.
@@ -121,11 +121,12 @@ impl MeshRequest {
                 return Ok(Some((StatusCode::NOT_MODIFIED, caching).into_response()));
             }
             for key in &keys {
-                let stored = match results::stored(app, &self.preferences.caller, key, *format, method, headers).await {
-                    // The store has logged its error. The mesh is computed again.
-                    Err(problem) if problem.is(ProblemType::StoreFailed) => break,
-                    stored => stored?,
-                };
+                let stored =
+                    match results::stored(app, &self.preferences.caller, key, request.format, method, headers).await {
+                        // The store has logged its error. The mesh is computed again.
+                        Err(problem) if problem.is(ProblemType::StoreFailed) => break,
+                        stored => stored?,
+                    };
                 if let Some(mut response) = stored {
                     response.headers_mut().remove(header::CACHE_CONTROL);
                     return Ok(Some(self.with_cache_control(response)));
@@ -136,7 +137,7 @@ impl MeshRequest {
             return Ok(None);
         }
         // The summary headers would need a run, as would the `ETag` if several backends may make the file.
-        let media_type = HeaderValue::from_static(format.media_type());
+        let media_type = HeaderValue::from_static(request.format.media_type());
         // The length is unknown as well, and an empty body would declare 0 (RFC 9110, section 8.6).
         let unknown_length = Body::from_stream(futures_util::stream::empty::<Result<Bytes, Infallible>>());
         let mut response = ([(header::CONTENT_TYPE, media_type)], unknown_length).into_response();
@@ -193,9 +194,8 @@ impl MeshRequest {
         // Dropping the last ticket of unfinished work cancels it.
         drop((ticket, loaded));
         let finished = outcome.map_err(|failure| self.failed(failure))?;
-        let Self {
-            parsed: ParsedRequest { source, request, format, declared, .. }, headers, cache, mut timing, ..
-        } = self;
+        let Self { parsed: ParsedRequest { source, request, declared, .. }, headers, cache, mut timing, .. } = self;
+        let format = request.format;
         drop(source);
         if joined {
             // The stages belong to another request as well, and some ended before this one began.
@@ -262,13 +262,13 @@ impl MeshRequest {
             *loaded = self.parsed.source.load(&self.app, &self.preferences.caller).await?;
         }
         let Input::File(file) = loaded.input.clone() else { return Err(Problem::internal("a file was not loaded")) };
-        let ParsedRequest { pairs, map, format, .. } = &self.parsed;
+        let ParsedRequest { pairs, map, request, .. } = &self.parsed;
         Ok(JobSpec {
             task: self.task(loaded),
             file,
             map: map.clone(),
             parameters: pairs.clone(),
-            format: *format,
+            format: request.format,
             idempotency_key: self.preferences.idempotency_key.clone(),
         })
     }

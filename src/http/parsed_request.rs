@@ -1,9 +1,9 @@
 //! Parsed requests for meshes: structure, parameters and format, from an address or from a body.
 
 use axum::body::Body;
-use axum::extract::Query;
-use axum::extract::rejection::QueryRejection;
+use axum::extract::{FromRequestParts, Query};
 use axum::http::header::HeaderMap;
+use axum::http::request::Parts;
 use bytes::Bytes;
 
 use super::content_type::{DeclaredType, contradiction};
@@ -24,9 +24,20 @@ use crate::structure::detect_format;
 const MAX_INLINE_JSON: usize = 4096;
 
 /// Pairs of a query, in order.
-pub(super) type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
+pub(super) struct Pairs(pub(super) Vec<(String, String)>);
 
-/// Structure, parameters and format of a request.
+impl FromRequestParts<Shared> for Pairs {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, app: &Shared) -> Result<Self, Problem> {
+        let Query(pairs) = Query::from_request_parts(parts, app)
+            .await
+            .map_err(|error| Problem::new(ProblemType::BadRequest, error.body_text()))?;
+        Ok(Self(pairs))
+    }
+}
+
+/// Structure and parameters of a request.
 pub(super) struct ParsedRequest {
     pub(super) source: StructureSource,
     pub(super) request: Request,
@@ -34,7 +45,6 @@ pub(super) struct ParsedRequest {
     pub(super) map: Option<(Digest, Bytes)>,
     /// Parameters as the client wrote them.
     pub(super) pairs: Vec<(String, String)>,
-    pub(super) format: Format,
     /// True if the response is the report instead of the mesh.
     pub(super) report: bool,
     pub(super) declared: DeclaredType,
@@ -46,13 +56,12 @@ impl ParsedRequest {
         app: &App,
         source: StructureSource,
         file: Option<&str>,
-        query: Pairs,
+        Pairs(pairs): Pairs,
     ) -> Result<Self, Problem> {
-        let pairs = self::pairs(query)?;
-        let (request, format) = parse_address(file, &pairs)?;
+        let request = parse_address(file, &pairs)?;
         app.accepts(&request.job)?;
         let report = file.is_none();
-        Ok(Self { source, request, map: None, pairs, format, report, declared: DeclaredType::Neutral })
+        Ok(Self { source, request, map: None, pairs, report, declared: DeclaredType::Neutral })
     }
 
     /// Receives a body: a structure file, a form with a file and perhaps a map, or a JSON document that names a
@@ -60,14 +69,23 @@ impl ParsedRequest {
     pub(super) async fn from_body(
         app: &Shared,
         caller: &Caller,
-        query: Pairs,
+        Pairs(mut pairs): Pairs,
         headers: &HeaderMap,
         body: Body,
     ) -> Result<Self, Problem> {
-        let (mut pairs, mut request) = parse(query)?;
         let is_json = upload::is_json(headers);
-        let body_has_parameters = is_json || upload::is_multipart(headers);
-        let early = if body_has_parameters { None } else { Some(finish(app, &mut request, headers)?) };
+        let parse = |pairs: &[(String, String)]| {
+            params::parse_with(pairs.iter().map(|(n, v)| (n, v)), |_| negotiate::format(headers))
+        };
+        let early = if is_json || upload::is_multipart(headers) {
+            // The body has parameters as well.
+            params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
+            None
+        } else {
+            let request = parse(&pairs)?;
+            app.accepts(&request.job)?;
+            Some(request)
+        };
         let (source, fields, declared, map) = if is_json {
             let json = upload::receive_json(app, caller, headers, body).await?;
             let (source, fields) = if json.len() <= MAX_INLINE_JSON {
@@ -82,52 +100,36 @@ impl ParsedRequest {
                 upload::receive(app, caller, headers, body).await?;
             (StructureSource::Uploaded(Loaded::file(bytes, digest, reservation)), fields, declared, map)
         };
-        if body_has_parameters {
-            pairs.extend(fields);
-            request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
-        }
-        request.job.map = map.as_ref().map(|(digest, bytes)| MapFile::new(digest.to_string(), bytes.clone()));
-        let format = early.map_or_else(|| finish(app, &mut request, headers), Ok)?;
-        Ok(Self { source, request, map, pairs, format, report: false, declared })
+        let request = match early {
+            Some(request) => request,
+            None => {
+                pairs.extend(fields);
+                let mut request = parse(&pairs)?;
+                request.job.map = map.as_ref().map(|(digest, bytes)| MapFile::new(digest.to_string(), bytes.clone()));
+                app.accepts(&request.job)?;
+                request
+            }
+        };
+        Ok(Self { source, request, map, pairs, report: false, declared })
     }
 }
 
-/// Returns the pairs of a query.
-pub(super) fn pairs(query: Pairs) -> Result<Vec<(String, String)>, Problem> {
-    let Query(pairs) = query.map_err(|e| Problem::new(ProblemType::BadRequest, e.body_text()))?;
-    Ok(pairs)
-}
-
-/// Parses the parameters of an address that ends in `surface.{ext}` (`file`), or in `report.json` (`None`). Returns
-/// the format as well.
-pub(super) fn parse_address(file: Option<&str>, pairs: &[(String, String)]) -> Result<(Request, Format), Problem> {
+/// Parses the parameters of an address that ends in `surface.{ext}` (`file`), or in `report.json` (`None`).
+pub(super) fn parse_address(file: Option<&str>, pairs: &[(String, String)]) -> Result<Request, Problem> {
     let named = file.map(format_of).transpose()?;
-    let mut request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
-    if let (Some(named), Some(other)) = (named, request.format) {
-        let value = other.name();
+    let format = |_: &_| Ok::<_, Problem>(named.unwrap_or_default());
+    let request = params::parse_with(pairs.iter().map(|(n, v)| (n, v)), format)?;
+    if let Some(named) = named
+        && pairs.iter().any(|(name, _)| name == "format")
+    {
+        let value = request.format.name();
         let detail = format!("parameter `format`: the path already names {}", named.name());
         return Err(Problem::new(ProblemType::BadParameter, detail)
             .with("parameter", "format")
             .with("value", value)
             .with("expected", format!("no value here, or the path surface.{value}")));
     }
-    let format = named.or(request.format).unwrap_or_default();
-    params::set_format(&mut request.job, format)?;
-    Ok((request, format))
-}
-
-fn parse(query: Pairs) -> Result<(Vec<(String, String)>, Request), Problem> {
-    let pairs = pairs(query)?;
-    let request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
-    Ok((pairs, request))
-}
-
-/// Returns the format of a request and checks the request against it.
-fn finish(app: &App, request: &mut Request, headers: &HeaderMap) -> Result<Format, Problem> {
-    let format = request.format.map_or_else(|| negotiate::format(headers), Ok)?;
-    params::set_format(&mut request.job, format)?;
-    app.accepts(&request.job)?;
-    Ok(format)
+    Ok(request)
 }
 
 /// Returns the format that `surface.{ext}` names.

@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use axum::body::Body;
-use axum::extract::{FromRequestParts, Query};
+use axum::extract::FromRequestParts;
 use axum::http::header::{self, HeaderMap};
 use axum::http::request::Parts;
 use axum::response::{IntoResponse, Response};
@@ -16,7 +16,7 @@ use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{ConditionHeaders, EntryPath, StructurePath, SubtreeParameters, TilesetParameters};
 use super::openapi::problem_responses;
 use super::openapi::problems::READING;
-use super::parsed_request;
+use super::parsed_request::{Pairs, parse_address};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
@@ -130,13 +130,11 @@ impl FromRequestParts<Shared> for TilesetRequest {
     type Rejection = Problem;
 
     async fn from_request_parts(parts: &mut Parts, app: &Shared) -> Result<Self, Problem> {
-        let query = Query::from_request_parts(parts, app).await;
-        let mut pairs = parsed_request::pairs(query)?;
-        let (mut request, _) = parsed_request::parse_address(Some("surface.glb"), &pairs)?;
+        let Pairs(mut pairs) = Pairs::from_request_parts(parts, app).await?;
         if pairs.iter().all(|(name, _)| name != "compress") {
-            request.job.compress = Compress::Meshopt;
-            pairs.push(("compress".to_owned(), request.job.compress.name().to_owned()));
+            pairs.push(("compress".to_owned(), Compress::Meshopt.name().to_owned()));
         }
+        let request = parse_address(Some("surface.glb"), &pairs)?;
         tileset::check(&request.job)?;
         if request.strict {
             let expected = "no value for a tileset; POST /v1/report checks a file".to_owned();

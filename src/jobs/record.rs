@@ -272,18 +272,19 @@ impl JobRecord {
     }
 
     /// Parses the stored parameters and the format.
-    pub(crate) fn request(&self) -> Result<(params::Request, Format), String> {
-        let mut request = params::parse(self.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
-        let format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
-        params::set_format(&mut request.job, format).map_err(|e| e.to_string())?;
+    pub(crate) fn request(&self) -> Result<params::Request, String> {
+        let format: Format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
+        let pairs = self.parameters.iter().map(|(name, value)| (name, value));
+        let request = params::parse_with(pairs, |_| Ok::<_, params::ParamError>(format));
+        let mut request = request.map_err(|error| error.to_string())?;
         request.job.map = self.map.clone().map(MapFile::not_loaded);
-        Ok((request, format))
+        Ok(request)
     }
 
     /// Returns true if both records describe the same request: equal input, map, format and parsed parameters.
     pub(super) fn is_same_request(&self, other: &Self) -> bool {
         let parsed = |record: &Self| {
-            let (request, _) = record.request().ok()?;
+            let request = record.request().ok()?;
             Some((params::canonical(&request.job), request.strict))
         };
         let same_parameters =

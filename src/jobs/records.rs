@@ -210,7 +210,7 @@ pub(super) enum LoadError {
 impl JobStore {
     /// Returns the task of a record, without its input.
     pub(super) fn task_of(&self, record: &JobRecord, digest: Digest) -> Result<(Task, Format), String> {
-        let (request, format) = record.request()?;
+        let request = record.request()?;
         let task = Task {
             input: Input::File(Bytes::new()),
             digest,
@@ -222,7 +222,7 @@ impl JobStore {
             parent: record.requester.parent(&self.0.pool.settings().tracer),
             id: Some(record.id.clone()),
         };
-        Ok((task, format))
+        Ok((task, request.format))
     }
 
     /// Loads the input of a task and its map, charged to the memory budget before they are read.

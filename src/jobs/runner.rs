@@ -296,7 +296,8 @@ async fn join_or_load(
 /// Stores the result and returns its key, with its pin.
 async fn save(jobs: &JobStore, record: &JobRecord, finished: Arc<Finished>) -> Result<(String, Pin), EndError> {
     let lost = |why| EndError::Lost { why };
-    let (request, format) = record.request().map_err(lost)?;
+    let request = record.request().map_err(lost)?;
+    let format = request.format;
     let report = &finished.product.report;
     let (resolution, digest) = (report.resolution, finished.digest);
     let key = ContentKey::new(&digest, &request.job, format, &report.file_arithmetic(), record.namespace);

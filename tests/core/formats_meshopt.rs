@@ -24,8 +24,7 @@ const NORMAL_TOLERANCE: f64 = 1.2;
 fn meshed_in(text: &str, pairs: &[(&str, &str)], control: &Control<'_>) -> Result<Product, JobError> {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let mut job = params::parse(pairs.iter().copied()).unwrap().job;
-    params::set_format(&mut job, Format::Glb).unwrap();
+    let job = params::parse(pairs.iter().copied()).unwrap().job;
     run(text.as_bytes(), &job, &JobLimits::default(), &choice, control, &(), None)
 }
 

@@ -112,8 +112,7 @@ fn sending_all_defaults_changes_nothing() {
 
 /// Reads a request as the canonical text of its parameters.
 fn read(pairs: &[(&str, &str)], format: Format) -> Result<String, ParamError> {
-    let mut request = params::parse(pairs.iter().copied())?;
-    params::set_format(&mut request.job, format)?;
+    let request = params::parse_with(pairs.iter().copied(), |_| Ok::<_, ParamError>(format))?;
     Ok(format!("{} {}", params::canonical(&request.job), request.strict))
 }
 

@@ -1,4 +1,4 @@
-//! Parser of job parameters: converts pairs of names and values to a validated [`Job`].
+//! Parser of job parameters: converts pairs of names and values to a complete, validated [`Request`].
 //!
 //! The query of the HTTP service, `/v1/capabilities` and the command line use one table of names, descriptions and
 //! ranges. The module depends on neither HTTP nor flags.
@@ -87,25 +87,48 @@ impl ParamError {
 pub struct Request {
     /// The job.
     pub job: Job,
-    /// Format, if given.
-    pub format: Option<Format>,
+    /// Format of the file.
+    pub format: Format,
     /// True if strict validation of the file is requested.
     pub strict: bool,
 }
 
-/// Parses parameters.
+/// Parses parameters. Without `format`, the file is a PNG if a parameter of pictures has a value that is not its
+/// default, otherwise a GLB.
 ///
 /// # Errors
 /// Returns a [`ParamError`] for the first parameter that is unknown, repeated, malformed, out of range, or in conflict
-/// with another one.
+/// with another one or with the format.
 pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V)>) -> Result<Request, ParamError> {
+    let is_picture = |job: &Job| job.picture.is_some_and(|picture| picture != PictureParams::default());
+    parse_with(pairs, |job| Ok(if is_picture(job) { Format::Png } else { Format::default() }))
+}
+
+/// Parses parameters like [`parse`], with the format that `format` returns for a job without this parameter.
+///
+/// # Errors
+/// Returns the errors of [`parse`] and of `format`.
+pub fn parse_with<N: AsRef<str>, V: AsRef<str>, E: From<ParamError>>(
+    pairs: impl IntoIterator<Item = (N, V)>,
+    format: impl FnOnce(&Job) -> Result<Format, E>,
+) -> Result<Request, E> {
+    let mut values = parse_values(pairs)?;
+    let format = values.format.map_or_else(|| format(&values.job), Ok)?;
+    set_format(&mut values.job, format)?;
+    Ok(Request { job: values.job, format, strict: values.strict })
+}
+
+/// Parses parameters and checks them, apart from the format.
+fn parse_values<N: AsRef<str>, V: AsRef<str>>(
+    pairs: impl IntoIterator<Item = (N, V)>,
+) -> Result<ParsedValues, ParamError> {
     let mut seen = [false; TABLE.len()];
     let mut values = ParsedValues::default();
     let mut spacings: Vec<(&'static str, String)> = Vec::new();
     for (name, value) in pairs {
         let (name, value) = (name.as_ref(), value.as_ref());
         let Some(index) = TABLE.iter().position(|p| p.name == name) else {
-            return Err(unknown(name));
+            return Err(unknown(name, TABLE.iter().map(|p| p.name)));
         };
         let parameter = &TABLE[index];
         if std::mem::replace(&mut seen[index], true) {
@@ -128,23 +151,20 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     if let [(other, _), (name, value), ..] = &spacings[..] {
         return Err(contradiction(name, value, other));
     }
-    let color = values.coloring()?;
-    let pockets = values.pockets()?;
+    values.job.color = values.coloring()?;
+    values.job.pockets = values.pockets()?;
     values.divide_models()?;
-    let ParsedValues { options, selection, mut request, .. } = values;
-    request.job = Job { selection, params: SurfaceParams::new(&options)?, color, pockets, ..request.job };
-    check_instances(&request.job)?;
-    check_cavities(&request.job)?;
-    check_pockets(&request.job)?;
-    check_exact(&request.job)?;
-    check_simplify(&request.job)?;
-    if request.job.tile.is_some() {
-        tileset::check(&request.job)?;
+    values.job.params = SurfaceParams::new(&values.options)?;
+    let job = &values.job;
+    check_instances(job)?;
+    check_cavities(job)?;
+    check_pockets(job)?;
+    check_exact(job)?;
+    check_simplify(job)?;
+    if job.tile.is_some() {
+        tileset::check(job)?;
     }
-    if let Some(format) = request.format {
-        set_format(&mut request.job, format)?;
-    }
-    Ok(request)
+    Ok(values)
 }
 
 /// Rejects a unit without an assembly, and instances without one, with one unit, or with a surface that is divided or
@@ -271,13 +291,9 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
     ParamError::bad_value(name, value, format!("no value beside `{other}`: only one of {all} sets the grid spacing"))
 }
 
-/// Sets the format of a job, for a format that was not given as a parameter. A picture format adds picture parameters,
+/// Sets the format of a job, and rejects parameters that it does not support. A picture format adds picture parameters,
 /// a format with the nearest atom of each vertex sets `atom_ids`.
-///
-/// # Errors
-/// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals`, `instances`, `tile` or a picture parameter that
-/// the format does not support.
-pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
+fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
         let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::name).collect();
         Err(ParamError::BadValue {
@@ -317,13 +333,8 @@ pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     refuse(name, value, "the default", &|f| f.is_picture())
 }
 
-/// Returns the error for an unknown name.
-#[must_use]
-pub fn unknown(name: &str) -> ParamError {
-    unknown_of(name, TABLE.iter().map(|p| p.name))
-}
-
-fn unknown_of(name: &str, known: impl IntoIterator<Item = &'static str>) -> ParamError {
+/// Returns the error for a name that is not among `known`.
+fn unknown(name: &str, known: impl IntoIterator<Item = &'static str>) -> ParamError {
     ParamError::Unknown { name: name.chars().take(64).collect(), nearest: nearest(name, known) }
 }
 
@@ -333,7 +344,7 @@ fn unknown_of(name: &str, known: impl IntoIterator<Item = &'static str>) -> Para
 /// Returns [`ParamError::Unknown`] for the first one that is not.
 pub fn check_names(pairs: &[(String, String)], known: &'static [&'static str]) -> Result<(), ParamError> {
     let bad = pairs.iter().find(|(name, _)| !known.contains(&name.as_str()));
-    bad.map_or(Ok(()), |(name, _)| Err(unknown_of(name, known.iter().copied())))
+    bad.map_or(Ok(()), |(name, _)| Err(unknown(name, known.iter().copied())))
 }
 
 impl From<SurfaceError> for ParamError {
@@ -344,5 +355,26 @@ impl From<SurfaceError> for ParamError {
                 Self::BadValue { name: "surface", value: other.to_string(), expected: "valid parameters".to_owned() }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_has_the_format_of_its_parameters() {
+        let parsed = |pairs: &[(&str, &str)]| parse(pairs.iter().copied()).unwrap();
+        assert_eq!(parsed(&[("color", "chain")]).format, Format::Glb);
+        assert_eq!(parsed(&[("background", "transparent")]).format, Format::Glb);
+        let picture = parsed(&[("width", "40")]);
+        assert_eq!((picture.format, picture.job.picture.map(|picture| picture.width)), (Format::Png, Some(40)));
+        let stl = |pairs: &[(&'static str, &'static str)]| {
+            parse_with(pairs.iter().copied(), |_| Ok::<_, ParamError>(Format::Stl))
+        };
+        assert_eq!(stl(&[]).unwrap().format, Format::Stl);
+        assert_eq!(stl(&[("format", "vert")]).unwrap().format, Format::Vert);
+        assert!(stl(&[("format", "vert")]).unwrap().job.params.atom_ids);
+        assert_eq!(stl(&[("width", "40")]).unwrap_err().parameter(), "width");
     }
 }

@@ -21,7 +21,7 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use molmesh_surface::Control;
+use molmesh_surface::{Control, Reservation};
 use pdbtbx::{Context, ErrorLevel, Format, PDBError, ReadOptions, StrictnessLevel};
 
 use super::error::StructureError;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args as ClapArgs;
 
-use super::{AtomArgs, CommonLimitArgs, EXIT_CODES, ReportStyle};
+use super::{AreaArgs, AreaModelArgs, AtomArgs, CommonLimitArgs, EXIT_CODES, ReportStyle};
 
 const AREAS_EXAMPLES: &str = "\
 Examples:
@@ -22,24 +22,10 @@ pub(crate) struct AreasArgs {
     #[arg(short, long, default_value = "-")]
     pub(crate) output: PathBuf,
     /// Surface: vdw (van der Waals), sas (solvent-accessible) or ses (solvent-excluded)
-    #[arg(long, value_name = "SURFACE", required = true)]
-    pub(crate) surface: Option<String>,
-    /// Rows of the table: atom, residue or chain [default: residue]
-    #[arg(long, value_name = "LEVEL")]
-    pub(crate) by: Option<String>,
-    /// Radius of the probe in Å, for `--surface sas` and `ses` [default: 1.4]
-    #[arg(long, value_name = "Å")]
-    pub(crate) probe: Option<String>,
-    /// Factor of all radii [default: 1]
-    #[arg(long, value_name = "FACTOR")]
-    pub(crate) radius_scale: Option<String>,
-    /// Length added to all scaled radii, in Å [default: 0]
-    #[arg(long, value_name = "Å")]
-    pub(crate) radius_offset: Option<String>,
-    /// Surface area buried between two sets of chains, half the sum over both sides; a slash joins chains of a side:
-    /// H/L,A
-    #[arg(long, value_name = "A,B")]
-    pub(crate) interface: Option<String>,
+    #[arg(long, value_name = "SURFACE")]
+    pub(crate) surface: String,
+    #[command(flatten)]
+    pub(crate) area: AreaArgs,
     /// Threads of the computation; one per core by default
     #[arg(long, value_name = "N")]
     pub(crate) threads: Option<usize>,
@@ -49,9 +35,8 @@ pub(crate) struct AreasArgs {
     /// Do not print the summary
     #[arg(short, long)]
     pub(crate) quiet: bool,
-    /// Model number [default: the first]
-    #[arg(long, value_name = "N", help_heading = "Atoms")]
-    pub(crate) model: Option<String>,
+    #[command(flatten)]
+    pub(crate) model: AreaModelArgs,
     #[command(flatten)]
     pub(crate) atoms: AtomArgs,
     #[command(flatten)]

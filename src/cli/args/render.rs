@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args as ClapArgs;
 
-use super::{EXIT_CODES, JobArgs};
+use super::{EXIT_CODES, JobArgs, PictureArgs};
 
 const RENDER_EXAMPLES: &str = "\
 Examples:
@@ -25,32 +25,4 @@ pub(crate) struct RenderArgs {
     pub(crate) picture: PictureArgs,
     #[command(flatten)]
     pub(crate) job: JobArgs,
-}
-
-// Picture parameters.
-#[derive(Debug, ClapArgs)]
-#[command(next_help_heading = "Picture")]
-pub(crate) struct PictureArgs {
-    /// Width in pixels [default: 512]
-    #[arg(long, value_name = "PIXELS")]
-    pub(crate) width: Option<String>,
-    /// Height in pixels [default: 512]
-    #[arg(long, value_name = "PIXELS")]
-    pub(crate) height: Option<String>,
-    /// View: principal (the longest axis is horizontal, the shortest points at the viewer), or front, back, left,
-    /// right, top, bottom along the axes of the file [default: principal]
-    #[arg(long, value_name = "VIEW")]
-    pub(crate) view: Option<String>,
-    /// Rotation of the viewer to the right, in degrees [default: 0]
-    #[arg(long, value_name = "DEGREES")]
-    pub(crate) azimuth: Option<String>,
-    /// Rotation of the viewer upwards after that, in degrees [default: 0]
-    #[arg(long, value_name = "DEGREES")]
-    pub(crate) elevation: Option<String>,
-    /// Background: transparent, white, black, RRGGBB or RRGGBBAA [default: transparent]
-    #[arg(long, value_name = "COLOR")]
-    pub(crate) background: Option<String>,
-    /// Shading: surface (with ambient occlusion and a soft outline), or gouraud [default: surface]
-    #[arg(long, value_name = "STYLE")]
-    pub(crate) style: Option<String>,
 }

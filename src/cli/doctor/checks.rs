@@ -6,6 +6,7 @@ use std::time::Instant;
 use molmesh::config::{Config, ConfigSource, Loaded, OwnedMemory};
 use molmesh::surface::Backend;
 use molmesh::telemetry;
+use serde::Serialize;
 
 use super::machine::Machine;
 use super::page::size;
@@ -14,7 +15,8 @@ use super::page::size;
 pub(super) const DEVICES: &str = "devices";
 
 /// Result of a check.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub(super) enum CheckResult {
     /// Passed.
     Ok,
@@ -24,19 +26,8 @@ pub(super) enum CheckResult {
     Failed,
 }
 
-impl CheckResult {
-    /// Returns the name in JSON.
-    pub(super) const fn name(self) -> &'static str {
-        match self {
-            Self::Ok => "ok",
-            Self::Warning => "warning",
-            Self::Failed => "failed",
-        }
-    }
-}
-
 /// A check with its result.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(super) struct Check {
     /// Name.
     pub(super) name: &'static str,
@@ -47,9 +38,19 @@ pub(super) struct Check {
 }
 
 impl Check {
-    /// Creates a check.
-    pub(super) fn new(name: &'static str, state: CheckResult, detail: impl Into<String>) -> Self {
-        Self { name, state, detail: detail.into() }
+    /// Creates a check that passed.
+    pub(super) fn ok(name: &'static str, detail: impl Into<String>) -> Self {
+        Self { name, state: CheckResult::Ok, detail: detail.into() }
+    }
+
+    /// Creates a check with a warning.
+    pub(super) fn warning(name: &'static str, detail: impl Into<String>) -> Self {
+        Self { name, state: CheckResult::Warning, detail: detail.into() }
+    }
+
+    /// Creates a check that failed.
+    pub(super) fn failed(name: &'static str, detail: impl Into<String>) -> Self {
+        Self { name, state: CheckResult::Failed, detail: detail.into() }
     }
 }
 
@@ -66,19 +67,19 @@ pub(super) fn sources(file: Option<&Path>, loaded: &Loaded) -> Check {
     }
     let file = file.map_or("no file".to_owned(), |file| format!("{} ({from_file} in effect)", file.display()));
     let variables = if variables.is_empty() { "no variable".to_owned() } else { variables.join(" ") };
-    Check::new("config", CheckResult::Ok, format!("{file}; {variables}; {flags} from the command line"))
+    Check::ok("config", format!("{file}; {variables}; {flags} from the command line"))
 }
 
 /// Reports the warnings of the configuration: readable secret files, misspelt variables.
 pub(super) fn warnings(loaded: &Loaded) -> impl Iterator<Item = Check> {
-    loaded.warnings.iter().map(|warning| Check::new("warnings", CheckResult::Warning, warning.clone()))
+    loaded.warnings.iter().map(|warning| Check::warning("warnings", warning.clone()))
 }
 
 /// Checks the log filter.
 pub(super) fn log(config: &Config) -> Check {
     match telemetry::check_logs(&config.log) {
-        Ok(()) => Check::new("log", CheckResult::Ok, format!("`{}`, to stderr", config.log.filter)),
-        Err(error) => Check::new("log", CheckResult::Failed, error.to_string()),
+        Ok(()) => Check::ok("log", format!("`{}`, to stderr", config.log.filter)),
+        Err(error) => Check::failed("log", error.to_string()),
     }
 }
 
@@ -88,11 +89,9 @@ pub(super) fn first_mesh(backend: &dyn Backend) -> Check {
     match backend.warm_up() {
         Ok(()) => {
             let ms = start.elapsed().as_secs_f64() * 1e3;
-            Check::new(DEVICES, CheckResult::Ok, format!("{} made a first mesh in {ms:.1} ms", backend.name()))
+            Check::ok(DEVICES, format!("{} made a first mesh in {ms:.1} ms", backend.name()))
         }
-        Err(error) => {
-            Check::new(DEVICES, CheckResult::Failed, format!("{} cannot make a mesh: {error}", backend.name()))
-        }
+        Err(error) => Check::failed(DEVICES, format!("{} cannot make a mesh: {error}", backend.name())),
     }
 }
 
@@ -117,14 +116,12 @@ pub(super) fn memory(machine: &Machine, loaded: &Loaded, devices: usize) -> Chec
     let sum: Vec<String> = parts.iter().map(|(name, bytes)| format!("{} {name}", size(*bytes))).collect();
     let sum = format!("{} at most ({})", size(most), sum.join(", "));
     match machine.memory.least() {
-        None => Check::new("memory", CheckResult::Ok, format!("{sum}; the memory size is unknown")),
+        None => Check::ok("memory", format!("{sum}; the memory size is unknown")),
         Some(OwnedMemory { bytes, owner }) if most > bytes => {
             let detail = format!("{sum} exceed the {} of {owner}: the system may kill the process", size(bytes));
-            Check::new("memory", CheckResult::Warning, detail)
+            Check::warning("memory", detail)
         }
-        Some(OwnedMemory { bytes, owner }) => {
-            Check::new("memory", CheckResult::Ok, format!("{sum}, of {} of {owner}", size(bytes)))
-        }
+        Some(OwnedMemory { bytes, owner }) => Check::ok("memory", format!("{sum}, of {} of {owner}", size(bytes))),
     }
 }
 
@@ -138,9 +135,9 @@ pub(super) fn files(machine: &Machine, config: &Config) -> Option<Check> {
     let sum = format!("{needed} ({} server.connections, {OTHER_FILES} others), of {most}", config.server.connections);
     Some(if needed > most {
         let detail = format!("{sum}: connections will fail under load; raise the limit or lower server.connections");
-        Check::new("open files", CheckResult::Warning, detail)
+        Check::warning("open files", detail)
     } else {
-        Check::new("open files", CheckResult::Ok, sum)
+        Check::ok("open files", sum)
     })
 }
 
@@ -153,9 +150,9 @@ pub(super) fn volume(volume: Option<u64>, config: &Config) -> Option<Check> {
     let sum = format!("{} store.max_bytes, {} archive.cache_bytes", size(results), size(copies));
     Some(if most > volume {
         let detail = format!("{} at most ({sum}) exceed the volume of {}: it may fill up", size(most), size(volume));
-        Check::new("volume", CheckResult::Warning, detail)
+        Check::warning("volume", detail)
     } else {
-        Check::new("volume", CheckResult::Ok, format!("{} at most ({sum}), of {}", size(most), size(volume)))
+        Check::ok("volume", format!("{} at most ({sum}), of {}", size(most), size(volume)))
     })
 }
 

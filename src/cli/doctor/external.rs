@@ -10,7 +10,7 @@ use molmesh::memory_budget::Budget;
 use molmesh::store::{self, Folder, FolderLock, Store};
 use molmesh::structure::{self, EntryId};
 
-use super::checks::{Check, CheckResult};
+use super::checks::Check;
 use super::page::size;
 
 /// Maximum number of entries to count: several times the whole archive.
@@ -25,11 +25,9 @@ pub(super) fn listeners(config: &Config) -> Vec<Check> {
         Ok(listener) => {
             held.push(listener);
             let port = if addr.port() == 0 { ", any port" } else { "" };
-            Check::new(name, CheckResult::Ok, format!("{addr} is free{port}"))
+            Check::ok(name, format!("{addr} is free{port}"))
         }
-        Err(error) => {
-            Check::new(name, CheckResult::Failed, format!("cannot listen on {addr} (server.{name}): {error}"))
-        }
+        Err(error) => Check::failed(name, format!("cannot listen on {addr} (server.{name}): {error}")),
     };
     let service = check("listen", config.server.listen);
     let metrics = config.server.metrics_listen.map(|addr| check("metrics_listen", addr));
@@ -39,7 +37,7 @@ pub(super) fn listeners(config: &Config) -> Vec<Check> {
 /// Reports another service that uses the data folder; `None` if there is none.
 pub(super) fn data_dir(config: &Config) -> Option<Check> {
     let error = FolderLock::check(&config.server.data_dir).err()?;
-    Some(Check::new("data_dir", CheckResult::Failed, error.to_string()))
+    Some(Check::failed("data_dir", error.to_string()))
 }
 
 /// Returns the size of the volume of the data folder, or of the folder that it will be created in, bytes.
@@ -69,21 +67,17 @@ pub(super) async fn store(config: &Config, limit: Duration) -> Check {
             let detail = format!("{location} can be written and read; {}, {} of {most}", held.join(", "), size(bytes));
             let link = if config.store.url.is_none() { store::link_of(&config.server.data_dir) } else { None };
             match link {
-                None => Check::new("store", CheckResult::Ok, detail),
+                None => Check::ok("store", detail),
                 Some(target) => {
                     let link = format!("; it is a symbolic link to {}, where objects are removed", target.display());
-                    Check::new("store", CheckResult::Warning, detail + &link)
+                    Check::warning("store", detail + &link)
                 }
             }
         }
-        Ok(Err(error)) => Check::new("store", CheckResult::Failed, error.to_string()),
+        Ok(Err(error)) => Check::failed("store", error.to_string()),
         Err(_elapsed) => {
             let location = config.store.url.clone().unwrap_or_else(|| config.server.data_dir.display().to_string());
-            Check::new(
-                "store",
-                CheckResult::Failed,
-                format!("{location} does not answer within {} ms", limit.as_millis()),
-            )
+            Check::failed("store", format!("{location} does not answer within {} ms", limit.as_millis()))
         }
     };
     drop(created);
@@ -124,38 +118,28 @@ pub(super) fn archive(config: &Config) -> Check {
     let dir = config.archive_dir();
     let name = dir.display();
     if config.archive.dir.is_none() && !dir.exists() {
-        return Check::new("archive", CheckResult::Ok, format!("none: there is no folder {name}"));
+        return Check::ok("archive", format!("none: there is no folder {name}"));
     }
     let survey = match structure::survey(&dir, MAX_ENTRIES) {
         Ok(survey) => survey,
         Err((path, error)) => {
             let detail = format!("{} cannot be listed, so entries are missing: {error}", path.display());
-            return Check::new("archive", CheckResult::Warning, detail);
+            return Check::warning("archive", detail);
         }
     };
     let Some(first) = &survey.first else {
-        return Check::new(
-            "archive",
-            CheckResult::Warning,
-            format!("{name} contains no entry: no file has a name like 4pti.cif"),
-        );
+        return Check::warning("archive", format!("{name} contains no entry: no file has a name like 4pti.cif"));
     };
     let more = if survey.more { "or more " } else { "" };
     match structure::Archive::new(&dir).stamp(first) {
-        Ok(Some(_)) => {
-            Check::new("archive", CheckResult::Ok, format!("{name} contains {} {more}entries", survey.entries))
-        }
+        Ok(Some(_)) => Check::ok("archive", format!("{name} contains {} {more}entries", survey.entries)),
         Ok(None) => {
             let why = "its path has no supported layout, or it is a link that leads out of the folder";
-            Check::new("archive", CheckResult::Warning, format!("{name} contains {}, but {why}", first.as_str()))
+            Check::warning("archive", format!("{name} contains {}, but {why}", first.as_str()))
         }
         Err(error) => {
             let why = std::error::Error::source(&error).map_or_else(|| error.to_string(), ToString::to_string);
-            Check::new(
-                "archive",
-                CheckResult::Warning,
-                format!("{name} contains {first}, which cannot be opened: {why}"),
-            )
+            Check::warning("archive", format!("{name} contains {first}, which cannot be opened: {why}"))
         }
     }
 }
@@ -166,10 +150,10 @@ pub(super) async fn remote(config: &Config, limit: Duration) -> Vec<Check> {
     let check = |(host, answer): (String, Result<u16, String>)| match answer {
         // A working host may lack the entry or reject the method.
         Ok(status @ (200..=399 | 404 | 405 | 410)) => {
-            Check::new("remote", CheckResult::Ok, format!("{host} answers ({status} for {id})"))
+            Check::ok("remote", format!("{host} answers ({status} for {id})"))
         }
-        Ok(status) => Check::new("remote", CheckResult::Warning, format!("{host} answers {status} for {id}")),
-        Err(why) => Check::new("remote", CheckResult::Warning, format!("the request to {host} failed: {why}")),
+        Ok(status) => Check::warning("remote", format!("{host} answers {status} for {id}")),
+        Err(why) => Check::warning("remote", format!("the request to {host} failed: {why}")),
     };
     Archive::new(config, Budget::unlimited()).reach(&id, limit).await.into_iter().map(check).collect()
 }

@@ -15,6 +15,7 @@ use serde_json::{Value, json};
 use super::args::{DoctorArgs, TextOrJson};
 use super::backend::{self, BackendRequest, SelectedBackend};
 use super::error::CliError;
+use super::report::json_text;
 use super::style::Style;
 use super::survey::{self, Availability};
 use checks::{Check, CheckResult};
@@ -38,7 +39,7 @@ pub(super) fn run(args: &DoctorArgs) -> Result<(), CliError> {
     let findings = examine(args, loaded, limit)?;
     super::print(&match args.report {
         TextOrJson::Text => page::text(&findings, Style::stdout()),
-        TextOrJson::Json => super::config::pretty(&findings.document()),
+        TextOrJson::Json => json_text(&findings.document()),
     })?;
     let failed: Vec<_> = findings.checks.iter().filter(|c| c.state == CheckResult::Failed).map(|c| c.name).collect();
     if failed.is_empty() {
@@ -64,7 +65,7 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
             (devices, taken) = (found, Some((backend.name(), reason)));
         }
         Err(error @ CliError::NoBackend { .. }) => {
-            checks.push(Check::new(checks::DEVICES, CheckResult::Failed, error.to_string()));
+            checks.push(Check::failed(checks::DEVICES, error.to_string()));
             checks.push(checks::memory(&machine, &loaded, 0));
         }
         Err(error) => return Err(error),
@@ -102,7 +103,6 @@ impl Findings {
                 "workgroup_bytes": facts.workgroup_bytes, "timestamps": facts.timestamps, "subgroups": facts.subgroups,
             })
         };
-        let check = |check: &Check| json!({ "name": check.name, "state": check.state.name(), "detail": check.detail });
         let configuration = self.loaded.to_json();
         json!({
             "ok": self.checks.iter().all(|check| check.state != CheckResult::Failed),
@@ -114,7 +114,7 @@ impl Findings {
             "backends": self.backends.iter().map(backend).collect::<Vec<_>>(),
             "devices": self.devices.iter().map(device).collect::<Vec<_>>(),
             "backend": self.taken.as_ref().map(|(name, reason)| json!({ "name": name, "reason": reason })),
-            "checks": self.checks.iter().map(check).collect::<Vec<_>>(),
+            "checks": self.checks,
             "config": configuration["config"],
             "sources": configuration["sources"],
         })

@@ -6,14 +6,14 @@ use std::str::FromStr;
 use molmesh_formats::tileset::TileAddress;
 use molmesh_formats::{Compress, Format, Normals, Units};
 use molmesh_picture::{Background, MAX_SIDE, PictureParams, Style, View};
-use molmesh_structure::{Context, ModelChoice, Selection, Split};
+use molmesh_structure::{Context, ModelChoice, Split};
 use molmesh_surface::{DEFAULT_POCKET_PROBE, Preset, SurfaceKind, SurfaceOptions, TriangleQuality, Validation};
 
 use super::table::flag;
-use super::{Domain, ParamError, Parameter, Request, unknown};
+use super::{Domain, ParamError, Parameter, unknown};
 use crate::color::{ColorBlend, Coloring, Palette, Scheme};
 use crate::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
-use crate::{Cavities, Simplify, Spacing};
+use crate::{Cavities, Job, Simplify, Spacing};
 
 /// Default of `color_offset`: the radius of a water molecule, Å.
 const DEFAULT_COLOR_OFFSET: f64 = 1.4;
@@ -25,7 +25,6 @@ const ALL_MODELS: &str = "all";
 #[derive(Default)]
 pub(super) struct ParsedValues {
     pub(super) options: SurfaceOptions,
-    pub(super) selection: Selection,
     scheme: Option<Scheme>,
     palette: Option<Palette>,
     color_range: Option<[f64; 2]>,
@@ -34,7 +33,9 @@ pub(super) struct ParsedValues {
     pockets: bool,
     pocket_probe: Option<f64>,
     max_triangles: Option<u64>,
-    pub(super) request: Request,
+    pub(super) job: Job,
+    pub(super) format: Option<Format>,
+    pub(super) strict: bool,
 }
 
 impl ParsedValues {
@@ -67,7 +68,7 @@ impl ParsedValues {
 
     /// Returns the radius of the large probe, Å, if the job lists pockets, colours them or makes parts of them.
     pub(super) fn pockets(&self) -> Result<Option<f64>, ParamError> {
-        let needed = self.scheme.is_some_and(Scheme::needs_pockets) || self.request.job.split == Split::Pocket;
+        let needed = self.scheme.is_some_and(Scheme::needs_pockets) || self.job.split == Split::Pocket;
         if self.pockets || needed {
             return Ok(Some(self.pocket_probe.unwrap_or(DEFAULT_POCKET_PROBE)));
         }
@@ -85,7 +86,7 @@ impl ParsedValues {
     /// Removes it from the parameters that set the spacing if it does not.
     pub(super) fn limit_triangles(&mut self, spacings: &mut Vec<(&'static str, String)>) {
         let Some(limit) = self.max_triangles else { return };
-        let job = &mut self.request.job;
+        let job = &mut self.job;
         if let Some(wanted) = &mut job.simplify {
             wanted.max_triangles = Some(limit);
             spacings.retain(|(name, _)| *name != "max_triangles");
@@ -96,11 +97,11 @@ impl ParsedValues {
 
     /// Divides the mesh by model if all models are meshed.
     pub(super) fn divide_models(&mut self) -> Result<(), ParamError> {
-        if self.selection.model != ModelChoice::All {
+        if self.job.selection.model != ModelChoice::All {
             return Ok(());
         }
-        let split = &mut self.request.job.split;
-        let other = match (*split, &self.selection.assembly, self.selection.context) {
+        let split = &mut self.job.split;
+        let other = match (*split, &self.job.selection.assembly, self.job.selection.context) {
             (Split::None, None, Context::Selection) => None,
             (Split::None, None, context) => Some(("context", context.name().to_owned(), Context::Selection.name())),
             (Split::None, Some(id), _) => Some(("assembly", id.clone(), "asymmetric-unit")),
@@ -116,7 +117,7 @@ impl ParsedValues {
 
     /// Returns the picture parameters of the job. The first call creates them.
     fn picture(&mut self) -> &mut PictureParams {
-        self.request.job.picture.get_or_insert_default()
+        self.job.picture.get_or_insert_default()
     }
 
     /// Parses the value of one parameter.
@@ -129,7 +130,7 @@ impl ParsedValues {
             let Domain::Number { min, max, .. } = parameter.domain else { return None };
             text.trim().parse::<f64>().ok().filter(|value| (min..=max).contains(value)).map(|value| value + 0.0)
         };
-        let job = &mut self.request.job;
+        let job = &mut self.job;
         match parameter.name {
             "preset" => self.options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
             "surface" => self.options.surface = Some(SurfaceKind::from_str(text).ok().ok_or_else(bad)?),
@@ -151,8 +152,8 @@ impl ParsedValues {
             "paper_b" => self.options.paper_b = number()?,
             "paper_c" => self.options.paper_c = number()?,
             "atom_ids" => self.options.atom_ids = flag(text).ok_or_else(bad)?,
-            "exact" => self.request.job.exact = flag(text).ok_or_else(bad)?,
-            "interface" => self.request.job.interface = Some(text.parse().ok().ok_or_else(bad)?),
+            "exact" => job.exact = flag(text).ok_or_else(bad)?,
+            "interface" => job.interface = Some(text.parse().ok().ok_or_else(bad)?),
             "color" if text == "none" => self.scheme = None,
             "color" => self.scheme = Some(text.parse().ok().ok_or_else(bad)?),
             "palette" => self.palette = Some(named(&Palette::ALL, Palette::name, text).ok_or_else(bad)?),
@@ -160,38 +161,38 @@ impl ParsedValues {
             "color_offset" => self.color_offset = Some(bounded().ok_or_else(bad)?),
             "color_range" => self.color_range = Some(range(text).ok_or_else(bad)?),
             "model" => {
-                self.selection.model = match text.trim() {
+                job.selection.model = match text.trim() {
                     ALL_MODELS => ModelChoice::All,
                     number => ModelChoice::Number(number.parse().ok().ok_or_else(bad)?),
                 };
             }
             "chains" => {
-                self.selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect());
+                job.selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect());
             }
             "select" => {
                 let bad = |error| ParamError::BadExpression { name: "select", text: text.to_owned(), error };
-                self.selection.atoms = text.parse().map_err(bad)?;
+                job.selection.atoms = text.parse().map_err(bad)?;
             }
             "assembly" => {
                 let id = Some(text.trim()).filter(|id| !id.is_empty() && !id.chars().any(char::is_control));
-                self.selection.assembly =
+                job.selection.assembly =
                     id.map(|id| (id != parameter.default).then(|| id.to_owned())).ok_or_else(bad)?;
             }
-            "instances" => self.selection.instances = flag(text).ok_or_else(bad)?,
-            "unit" => self.selection.unit = Some(number_of_unit(parameter, text).ok_or_else(bad)?),
-            "context" => self.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
-            "split" => self.request.job.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
+            "instances" => job.selection.instances = flag(text).ok_or_else(bad)?,
+            "unit" => job.selection.unit = Some(number_of_unit(parameter, text).ok_or_else(bad)?),
+            "context" => job.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
+            "split" => job.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
             "cavities" => job.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?),
             "pockets" => self.pockets = flag(text).ok_or_else(bad)?,
             "pocket_probe" => self.pocket_probe = Some(bounded().ok_or_else(bad)?),
-            "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
-            "quality" => self.request.job.quality = TriangleQuality::from_str(text).ok().ok_or_else(bad)?,
-            "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
-            "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
-            "format" => self.request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
-            "compress" => self.request.job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
-            "normals" => self.request.job.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
-            "units" => self.request.job.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
+            "altloc" => job.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
+            "quality" => job.quality = TriangleQuality::from_str(text).ok().ok_or_else(bad)?,
+            "validation" => job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
+            "check" => self.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
+            "format" => self.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
+            "compress" => job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
+            "normals" => job.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
+            "units" => job.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
             "width" => self.picture().width = side().ok_or_else(bad)?,
             "height" => self.picture().height = side().ok_or_else(bad)?,
             "view" => self.picture().view = named(&View::ALL, View::name, text).ok_or_else(bad)?,
@@ -199,7 +200,7 @@ impl ParsedValues {
             "elevation" => self.picture().elevation = bounded().ok_or_else(bad)?,
             "background" => self.picture().background = text.parse::<Background>().ok().ok_or_else(bad)?,
             "style" => self.picture().style = named(&Style::ALL, Style::name, text).ok_or_else(bad)?,
-            _ => return Err(unknown(parameter.name)),
+            name => return Err(unknown(name, [])),
         }
         Ok(())
     }
