@@ -13,7 +13,7 @@ use super::meter::QuotaMeter;
 use super::sign::{Signature, SignatureCheck, SigningKeys};
 use super::sites::Sites;
 use super::{file, forwarded};
-use crate::config::{AccessConfig, Config, Origins, ServerConfig};
+use crate::config::{Config, Origins, Proxies};
 
 /// Number of addresses with a separate quota, about 2 MB. Further addresses share one quota, because forgetting an
 /// address would give it a new one.
@@ -28,8 +28,8 @@ pub(crate) struct Access {
     address_quota: Option<Arc<Quota>>,
     meter: Arc<QuotaMeter>,
     sites: Sites,
-    config: AccessConfig,
-    server: ServerConfig,
+    allows_credentials: bool,
+    trusted_proxies: Option<Proxies>,
 }
 
 /// Keys of a key file.
@@ -53,7 +53,7 @@ impl Access {
     /// Creates the access control and reads the key file, if one is configured.
     pub(crate) fn open(config: &Config) -> Result<Self, AccessError> {
         let sites = Sites::new(config);
-        let (config, server) = (config.access.clone(), config.server.clone());
+        let (config, trusted_proxies) = (&config.access, config.server.trusted_proxies.clone());
         if config.cors_credentials && config.cors_origins == Some(Origins::Any) {
             return Err(AccessError::CredentialsForAll);
         }
@@ -75,8 +75,8 @@ impl Access {
             address_quota: (!quota.is_unlimited()).then(|| Arc::new(quota)),
             meter: Arc::new(QuotaMeter::new(MAX_ADDRESSES)),
             sites,
-            config,
-            server,
+            allows_credentials: config.cors_credentials,
+            trusted_proxies,
         })
     }
 
@@ -121,14 +121,14 @@ impl Access {
         &self.sites
     }
 
-    /// Returns the configuration.
-    pub(crate) fn config(&self) -> &AccessConfig {
-        &self.config
+    /// Returns true if pages of other origins may send credentials.
+    pub(crate) fn allows_credentials(&self) -> bool {
+        self.allows_credentials
     }
 
     /// Returns the client address of a request from `peer`, given the values of `X-Forwarded-For`.
     pub(crate) fn client<'a>(&self, peer: IpAddr, values: impl DoubleEndedIterator<Item = &'a str>) -> IpAddr {
-        forwarded::client(peer, values, self.server.trusted_proxies.as_ref())
+        forwarded::client(peer, values, self.trusted_proxies.as_ref())
     }
 
     /// Reads the key file again if it has changed, or always with `force`. Returns the number of keys, or `None` if the
@@ -159,7 +159,7 @@ mod tests {
     use super::*;
     use crate::access::keys::Scope;
     use crate::access::token;
-    use crate::config::Secret;
+    use crate::config::{AccessConfig, Secret};
 
     fn open(change: impl FnOnce(&mut AccessConfig)) -> Result<Access, AccessError> {
         let mut config = Config::default();

@@ -11,7 +11,7 @@ use crate::telemetry::ARCHIVE_BREAKER;
 /// Retry time for other requests during a trial.
 const PROBE_WAIT: Duration = Duration::from_secs(1);
 
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug)]
 enum BreakerState {
     Closed {
         failures: u32,
@@ -21,6 +21,17 @@ enum BreakerState {
     },
     /// One request tests the host.
     Probing,
+}
+
+impl BreakerState {
+    /// Returns the time to wait, or `None` if a request is allowed.
+    fn wait(&self) -> Option<Duration> {
+        match self {
+            Self::Closed { .. } => None,
+            Self::Open { until } => Some(until.saturating_duration_since(Instant::now())).filter(|d| !d.is_zero()),
+            Self::Probing => Some(PROBE_WAIT),
+        }
+    }
 }
 
 /// Circuit breaker of a host.
@@ -51,30 +62,20 @@ impl Breaker {
 
     /// Returns the time for which the breaker stays open, or `None` if requests are allowed.
     pub(super) fn open_for(&self) -> Option<Duration> {
-        match *self.state() {
-            BreakerState::Closed { .. } => None,
-            BreakerState::Open { until } => {
-                Some(until.saturating_duration_since(Instant::now())).filter(|d| !d.is_zero())
-            }
-            BreakerState::Probing => Some(PROBE_WAIT),
-        }
+        self.state().wait()
     }
 
     /// Returns a permit for one request, or the time to wait while the breaker is open.
     pub(super) fn acquire(&self) -> Result<Permit<'_>, Duration> {
-        if let Some(wait) = self.open_for() {
+        let mut state = self.state();
+        if let Some(wait) = state.wait() {
             return Err(wait);
         }
-        let mut state = self.state();
-        match *state {
-            BreakerState::Closed { .. } => Ok(Permit { breaker: self, trial: false, reported: false }),
-            BreakerState::Open { .. } => {
-                *state = BreakerState::Probing;
-                Ok(Permit { breaker: self, trial: true, reported: false })
-            }
-            // Another request became the trial since the check above.
-            BreakerState::Probing => Err(PROBE_WAIT),
+        let trial = matches!(*state, BreakerState::Open { .. });
+        if trial {
+            *state = BreakerState::Probing;
         }
+        Ok(Permit { breaker: self, trial, reported: false })
     }
 
     fn state(&self) -> MutexGuard<'_, BreakerState> {

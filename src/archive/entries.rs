@@ -266,10 +266,8 @@ impl ArchiveState {
                 tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms, "fetched an entry");
                 let kept = bytes.clone();
                 self.on_disk(id, "stored", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
-                self.remember(
-                    id,
-                    Known { digest, stamp: None, checked, fresh_until: Some(checked + self.revalidate_after) },
-                );
+                let fresh_until = Some(checked + self.revalidate_after);
+                self.remember(id, Known { digest, stamp: None, checked, fresh_until });
                 Ok(Entry { bytes, digest, source: Source::Remote })
             }
             (Ok(Answer::Unchanged), Some(stored)) => {

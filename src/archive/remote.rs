@@ -48,16 +48,11 @@ impl Remote {
         let inflated_bytes = config.limits.inflated_bytes;
         let sends_trace = config.telemetry.endpoint.is_some();
         let config = &config.archive;
+        let pause = Duration::from_millis(config.breaker_ms);
         let mut sources: Vec<(Template, Arc<Breaker>)> = Vec::new();
         for template in config.url.as_ref()?.as_slice() {
             let known = sources.iter().find(|(_, breaker)| breaker.host() == template.host());
-            let new = || {
-                Arc::new(Breaker::new(
-                    template.host(),
-                    config.breaker_failures,
-                    Duration::from_millis(config.breaker_ms),
-                ))
-            };
+            let new = || Arc::new(Breaker::new(template.host(), config.breaker_failures, pause));
             let breaker = known.map_or_else(new, |(_, breaker)| Arc::clone(breaker));
             sources.push((template.clone(), breaker));
         }

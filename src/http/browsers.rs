@@ -75,7 +75,7 @@ pub(super) fn cors(access: &Arc<Access>) -> CorsLayer {
         let all = [HeaderName::from_static("*"), header::AUTHORIZATION];
         return layer.allow_origin(Any).allow_headers(AllowHeaders::list(all));
     }
-    let (shared, credentials) = (Arc::clone(access), access.config().cors_credentials);
+    let (shared, credentials) = (Arc::clone(access), access.allows_credentials());
     let allows = move |origin: &HeaderValue, _: &Parts| origin.to_str().is_ok_and(|o| shared.sites().allows_origin(o));
     layer
         .allow_origin(AllowOrigin::predicate(allows))

@@ -95,6 +95,7 @@ mod wind_down;
 
 mod server;
 
+pub use crate::jobs::check_broker;
 pub use page::has_viewer;
 pub use server::{Chosen, ServeError, Server};
 pub use signing::check_signable;

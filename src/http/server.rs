@@ -149,11 +149,7 @@ impl Server {
             })),
             tracer: traces.tracer(),
         };
-        let store = if config.broker.url.is_some() {
-            Store::open_shared(&config.store, &config.server.data_dir).await?
-        } else {
-            Store::open(&config.store, &config.server.data_dir).await?
-        };
+        let store = Store::open_for(&config.store, &config.server.data_dir, config.broker.url.is_some()).await?;
         let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
         let job_store = open_jobs(&config, &store, &pool, secret).await?;

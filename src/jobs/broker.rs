@@ -24,6 +24,7 @@ use thiserror::Error;
 
 pub(crate) use memory::MemoryBroker;
 pub(crate) use nats::NatsBroker;
+pub use nats::check_broker;
 
 use super::record::{JobId, JobRecord};
 use crate::store::Digest;

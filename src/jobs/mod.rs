@@ -39,6 +39,7 @@ mod ticket;
 mod worker;
 
 pub(crate) use crate::memory_budget::{Budget, MemoryReservation};
+pub use broker::check_broker;
 pub(crate) use broker::{Broker, MemoryBroker, NatsBroker};
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};

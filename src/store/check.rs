@@ -11,6 +11,16 @@ use super::error::StoreError;
 use super::secret;
 
 impl Backend {
+    /// Checks at the start also that the store creates objects conditionally, and that its secret, if any, is undamaged.
+    pub(super) async fn check_start(&self) -> Result<(), StoreError> {
+        self.check().await?;
+        self.check_creation().await?;
+        match self.timed(secret::read(self.objects().as_ref())).await {
+            Ok(_) | Err(object_store::Error::NotFound { .. }) => Ok(()),
+            Err(error) => Err(self.fail("secret", "secret", &error)),
+        }
+    }
+
     /// Writes, reads and removes a small object.
     pub(super) async fn check(&self) -> Result<(), StoreError> {
         self.check_folder().await?;
@@ -33,7 +43,7 @@ impl Backend {
 
     /// Checks that the store creates an object and refuses to replace it. Otherwise nodes could record two jobs for one
     /// idempotency key, replace the end of a job, or have different secrets.
-    pub(super) async fn check_creation(&self) -> Result<(), StoreError> {
+    async fn check_creation(&self) -> Result<(), StoreError> {
         let file = secret::unique().map_err(|e| self.fail("check", CHECK, &e))?;
         let path = Path::from_iter([CHECK, &file]);
         let create = |content: &'static [u8]| {

@@ -70,8 +70,7 @@ impl Store {
     /// # Errors
     /// Returns [`StoreError::Open`] if it cannot be written and read.
     pub async fn open(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
-        let backend = Backend::open(config, data_dir).await?;
-        Self::open_backend(backend, config, false).await
+        Self::open_for(config, data_dir, false).await
     }
 
     /// Opens a store over `backend`; see [`open`](Self::open).
@@ -80,8 +79,7 @@ impl Store {
         config: &StoreConfig,
         is_shared: bool,
     ) -> Result<Self, StoreError> {
-        backend.check().await.map_err(|e| backend.open_error(&e))?;
-        backend.check_creation().await.map_err(|e| backend.open_error(&e))?;
+        backend.check_start().await.map_err(|e| backend.open_error(&e))?;
         let clock = Clock::start();
         let now = clock.now();
         // Not fatal: credentials may permit uploads without permitting their listing.
@@ -384,11 +382,7 @@ impl Store {
         let mut index = self.index();
         match meta {
             Some(meta) => index.adopt(name, seen, meta.size, self.0.clock.to_clock(meta.modified)),
-            None if index.is_current(name, seen) => {
-                index.forget(name);
-                self.0.memory.remove(name);
-                self.0.intact.remove(name);
-            }
+            None if index.is_current(name, seen) => self.forget(&mut index, name),
             None => {}
         }
     }

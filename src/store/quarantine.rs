@@ -57,7 +57,10 @@ impl Store {
     }
 
     /// Returns the number of records in quarantine.
-    pub(crate) async fn quarantined(&self) -> Result<usize, StoreError> {
+    ///
+    /// # Errors
+    /// Returns a [`StoreError`].
+    pub async fn quarantined(&self) -> Result<usize, StoreError> {
         // Without records, no request to the disk or the service is needed.
         if self.0.quarantined.load(Ordering::Relaxed) == 0 { Ok(0) } else { self.count_quarantined().await }
     }

@@ -68,7 +68,7 @@ pub(super) fn unique() -> io::Result<String> {
 
 /// Reads the secret in a bucket, or creates it.
 pub(super) async fn in_bucket(objects: &dyn ObjectStore) -> object_store::Result<Secret> {
-    match read_in_bucket(objects).await {
+    match read(objects).await {
         Err(object_store::Error::NotFound { .. }) => create_in_bucket(objects).await,
         read => read,
     }
@@ -79,17 +79,18 @@ async fn create_in_bucket(objects: &dyn ObjectStore) -> object_store::Result<Sec
     let (path, fresh) = (Path::from(NAME), random().map_err(generic)?);
     match objects.put_opts(&path, Bytes::copy_from_slice(&fresh).into(), PutMode::Create.into()).await {
         Ok(_) => Ok(fresh),
-        Err(object_store::Error::AlreadyExists { .. }) => read_in_bucket(objects).await,
+        Err(object_store::Error::AlreadyExists { .. }) => read(objects).await,
         Err(error) => Err(error),
     }
 }
 
-async fn read_in_bucket(objects: &dyn ObjectStore) -> object_store::Result<Secret> {
+/// Reads the secret in a folder or a bucket.
+pub(super) async fn read(objects: &dyn ObjectStore) -> object_store::Result<Secret> {
     secret(&objects.get(&Path::from(NAME)).await?.bytes().await?).map_err(generic)
 }
 
 fn generic(error: io::Error) -> object_store::Error {
-    object_store::Error::Generic { store: "S3", source: error.into() }
+    object_store::Error::Generic { store: "store", source: error.into() }
 }
 
 fn random() -> io::Result<Secret> {

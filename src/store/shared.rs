@@ -11,7 +11,7 @@ use bytes::Bytes;
 use super::backend::Backend;
 use super::error::StoreError;
 use super::handle::Store;
-use super::index::EvictionCandidate;
+use super::index::{EvictionCandidate, Index};
 use super::name::{Folder, Name};
 use super::object::Meta;
 use crate::config::StoreConfig;
@@ -22,13 +22,9 @@ const REFRESHED: usize = 1000;
 const CLOCK_STEP: Duration = Duration::from_secs(2);
 
 impl Store {
-    /// Opens a store that other nodes use at the same time; see [`open`](Self::open).
-    ///
-    /// # Errors
-    /// As for [`open`](Self::open).
-    pub(crate) async fn open_shared(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
-        let backend = Backend::open(config, data_dir).await?;
-        Self::open_backend(backend, config, true).await
+    /// Opens a store that other nodes use at the same time if `is_shared`; see [`open`](Self::open).
+    pub(crate) async fn open_for(config: &StoreConfig, data_dir: &Path, is_shared: bool) -> Result<Self, StoreError> {
+        Self::open_backend(Backend::open(config, data_dir).await?, config, is_shared).await
     }
 
     /// Returns the names of all job records, in name order.
@@ -56,7 +52,8 @@ impl Store {
             let listed = self.list(folder).await?;
             for name in before {
                 if listed.binary_search_by(|(listed, _)| listed.cmp(&name)).is_err() {
-                    self.forget(&name);
+                    let mut index = self.index();
+                    self.forget(&mut index, &name);
                 }
             }
             for some in listed.chunks(REFRESHED) {
@@ -86,8 +83,8 @@ impl Store {
     }
 
     /// Removes an object from index and caches.
-    pub(super) fn forget(&self, name: &Name) {
-        self.index().forget(name);
+    pub(super) fn forget(&self, index: &mut Index, name: &Name) {
+        index.forget(name);
         self.0.memory.remove(name);
         self.0.intact.remove(name);
     }

@@ -74,7 +74,7 @@ async fn nodes_that_open_an_empty_store_at_once_share_its_secret() {
     let open = async |folder: &str| {
         let url = Some(format!("file://{}", dir.path().join(folder).display()));
         let config = StoreConfig { url, ..StoreConfig::default() };
-        Store::open_shared(&config, dir.path()).await.unwrap().secret().await.unwrap()
+        Store::open_for(&config, dir.path(), true).await.unwrap().secret().await.unwrap()
     };
     let secrets = join_all((0..8).map(|_| open("one"))).await;
     assert!(secrets.iter().all(|secret| *secret == secrets[0]), "{secrets:?}");

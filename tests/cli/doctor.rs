@@ -65,7 +65,7 @@ fn all_checks_pass() {
     let folder = Folder::new();
     let done = doctor(&folder, &["--set", "jobs.queue=7"]);
     assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
-    for name in ["config", "log", "memory", "volume", "devices", "listen", "store", "archive"] {
+    for name in ["config", "log", "memory", "volume", "devices", "listen", "store", "records", "archive"] {
         let (state, detail) = check(&done, name);
         assert!(
             state == "ok" || ["memory", "volume"].contains(&name) && state == "warning",
@@ -142,26 +142,50 @@ fn unusable_store_fails() {
 }
 
 #[test]
-fn unreachable_store_fails_without_showing_its_key() {
+fn a_damaged_secret_and_quarantined_records_fail() {
     let folder = Folder::new();
+    let store = folder.path("data/store");
+    std::fs::create_dir_all(store.join("quarantine")).unwrap();
+    std::fs::write(store.join("secret"), [7; 32]).unwrap();
+    // Only job records need an operator.
+    std::fs::write(store.join("quarantine/structure"), "").unwrap();
+    assert_eq!(doctor(&folder, &[]).status.code(), Some(0), "the control");
+    std::fs::write(store.join("quarantine/1.json"), "").unwrap();
+    fails(&doctor(&folder, &[]), "records", "1 job records cannot be read", 1);
+    std::fs::write(store.join("secret"), "short").unwrap();
+    fails(&doctor(&folder, &[]), "store", "a secret has 32 bytes, this one has 5", 1);
+}
+
+#[test]
+fn an_unreachable_broker_fails() {
+    let folder = Folder::new();
+    let store = format!("store.url=file://{}", folder.path("store").display());
+    let silent = TcpListener::bind("127.0.0.1:0").unwrap();
+    let silent = silent.local_addr().unwrap().to_string();
+    for (address, timeout, words) in [(closed_address(), "30", "broker.url"), (silent, "0.5", "within 500 ms")] {
+        let broker = format!("broker.url=nats://{address}");
+        fails(&doctor(&folder, &["--timeout", timeout, "--set", &store, "--set", &broker]), "broker", words, 1);
+    }
+}
+
+/// Runs `doctor` for a bucket at `endpoint`.
+fn doctor_with_bucket(endpoint: &str, timeout: &str, store_timeout: &str) -> Output {
+    let endpoint = format!("store.endpoint=http://{endpoint}");
+    let sets = ["store.url=s3://bucket/p", "store.allow_http=true", "store.access_key_id=id", &endpoint, store_timeout];
+    let sets = sets.into_iter().chain(["store.secret_access_key=hush"]).flat_map(|set| ["--set", set]);
+    doctor(&Folder::new(), &["--timeout", timeout].into_iter().chain(sets).collect::<Vec<_>>())
+}
+
+#[test]
+fn unreachable_store_fails_without_showing_its_key() {
     // Accepts connections and sends nothing.
     let silent = TcpListener::bind("127.0.0.1:0").unwrap();
-    for (endpoint, words) in
-        [(closed_address(), ""), (silent.local_addr().unwrap().to_string(), "does not answer within 500 ms")]
+    let silent = silent.local_addr().unwrap().to_string();
+    for (endpoint, timeout, words) in
+        [(closed_address(), "30", "s3://bucket/p"), (silent, "0.5", "does not answer within 500 ms")]
     {
-        let endpoint = format!("store.endpoint=http://{endpoint}");
-        let mut args = vec!["--timeout", if words.is_empty() { "30" } else { "0.5" }];
-        for set in [
-            "store.url=s3://bucket/p",
-            &endpoint,
-            "store.allow_http=true",
-            "store.access_key_id=id",
-            "store.secret_access_key=hush",
-        ] {
-            args.extend(["--set", set]);
-        }
-        let done = doctor(&folder, &args);
-        fails(&done, "store", if words.is_empty() { "s3://bucket/p" } else { words }, 1);
+        let done = doctor_with_bucket(&endpoint, timeout, "store.timeout_ms=30000");
+        fails(&done, "store", words, 1);
         assert!(!stdout(&done).contains("hush") && !stderr(&done).contains("hush"), "{}", stdout(&done));
     }
 }
@@ -169,19 +193,9 @@ fn unreachable_store_fails_without_showing_its_key() {
 #[test]
 fn a_store_that_does_not_respond_fails_in_bounded_time() {
     let silent = TcpListener::bind("127.0.0.1:0").unwrap();
-    let endpoint = format!("store.endpoint=http://{}", silent.local_addr().unwrap());
-    let mut args = vec!["--timeout", "120"];
-    for set in [
-        "store.url=s3://bucket",
-        &endpoint,
-        "store.allow_http=true",
-        "store.timeout_ms=200",
-        "store.access_key_id=i",
-        "store.secret_access_key=k",
-    ] {
-        args.extend(["--set", set]);
-    }
-    fails(&doctor(&Folder::new(), &args), "store", "s3://bucket", 1);
+    let endpoint = silent.local_addr().unwrap().to_string();
+    let done = doctor_with_bucket(&endpoint, "120", "store.timeout_ms=200");
+    fails(&done, "store", "s3://bucket", 1);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Checks outside the process: addresses, store, folder of structures, remote archive.
+//! Checks outside the process: addresses, store, broker, folder of structures, remote archive.
 
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use molmesh::archive::Archive;
 use molmesh::config::Config;
+use molmesh::http::check_broker;
 use molmesh::memory_budget::Budget;
 use molmesh::store::{self, Folder, FolderLock, Store};
 use molmesh::structure::{self, EntryId};
@@ -53,35 +54,52 @@ pub(super) fn volume(_config: &Config) -> Option<u64> {
     None
 }
 
-/// Checks that the store can be opened, written, read and listed, and reports its content.
-pub(super) async fn store(config: &Config, limit: Duration) -> Check {
-    let created = CreatedFolders::before(config.store.url.is_none().then_some(config.server.data_dir.as_path()));
-    let opened = tokio::time::timeout(limit, Store::open(&config.store, &config.server.data_dir)).await;
-    let check = match opened {
-        Ok(Ok(store)) => {
-            let usage = Folder::ALL.map(|folder| (folder, store.usage(folder)));
-            let bytes: u64 = usage.iter().map(|(_, usage)| usage.bytes).sum();
-            let held: Vec<_> =
-                usage.iter().map(|(folder, usage)| format!("{} {}", usage.objects, folder.as_str())).collect();
-            let (location, most) = (store.location(), size(config.store.max_bytes));
-            let detail = format!("{location} can be written and read; {}, {} of {most}", held.join(", "), size(bytes));
-            let link = if config.store.url.is_none() { store::link_of(&config.server.data_dir) } else { None };
-            match link {
-                None => Check::ok("store", detail),
-                Some(target) => {
-                    let link = format!("; it is a symbolic link to {}, where objects are removed", target.display());
-                    Check::warning("store", detail + &link)
-                }
-            }
-        }
-        Ok(Err(error)) => Check::failed("store", error.to_string()),
+/// Checks that the store can be opened, written, read and listed, and that none of its job records is in quarantine.
+/// Reports its content.
+pub(super) async fn store(config: &Config, limit: Duration) -> Vec<Check> {
+    // Dropped last.
+    let _created = CreatedFolders::before(config.store.url.is_none().then_some(config.server.data_dir.as_path()));
+    match tokio::time::timeout(limit, Store::open(&config.store, &config.server.data_dir)).await {
+        Ok(Ok(store)) => vec![content(config, &store), records(&store).await],
+        Ok(Err(error)) => vec![Check::failed("store", error.to_string())],
         Err(_elapsed) => {
             let location = config.store.url.clone().unwrap_or_else(|| config.server.data_dir.display().to_string());
-            Check::failed("store", format!("{location} does not answer within {} ms", limit.as_millis()))
+            vec![Check::failed("store", format!("{location} does not answer within {} ms", limit.as_millis()))]
         }
-    };
-    drop(created);
-    check
+    }
+}
+
+fn content(config: &Config, store: &Store) -> Check {
+    let usage = Folder::ALL.map(|folder| (folder, store.usage(folder)));
+    let bytes: u64 = usage.iter().map(|(_, usage)| usage.bytes).sum();
+    let held: Vec<_> = usage.iter().map(|(folder, usage)| format!("{} {}", usage.objects, folder.as_str())).collect();
+    let (location, most) = (store.location(), size(config.store.max_bytes));
+    let detail = format!("{location} can be written and read; {}, {} of {most}", held.join(", "), size(bytes));
+    match store::link_of(&config.server.data_dir).filter(|_| config.store.url.is_none()) {
+        None => Check::ok("store", detail),
+        Some(target) => {
+            let link = format!("; it is a symbolic link to {}, where objects are removed", target.display());
+            Check::warning("store", detail + &link)
+        }
+    }
+}
+
+async fn records(store: &Store) -> Check {
+    match store.quarantined().await {
+        Ok(0) => Check::ok("records", "no job record is in quarantine"),
+        Ok(n) => Check::failed("records", format!("{n} job records cannot be read and are in quarantine")),
+        Err(error) => Check::failed("records", error.to_string()),
+    }
+}
+
+/// Checks that the broker answers; `None` without a broker.
+pub(super) async fn broker(config: &Config, limit: Duration) -> Option<Check> {
+    let url = config.broker.url.as_deref()?;
+    let answer = tokio::time::timeout(limit, check_broker(&config.broker, url)).await;
+    Some(match answer.unwrap_or_else(|_elapsed| Err(format!("no answer within {} ms", limit.as_millis()))) {
+        Ok(()) => Check::ok("broker", "the NATS server answers and offers JetStream"),
+        Err(why) => Check::failed("broker", format!("jobs cannot be dispatched (broker.url): {why}")),
+    })
 }
 
 /// Guard that removes the folders that a check created, if they are still empty.

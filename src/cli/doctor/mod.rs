@@ -76,7 +76,8 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     checks.extend(checks::volume(external::volume(&config), &config));
     let failed = |e: std::io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().map_err(failed)?;
-    checks.push(runtime.block_on(external::store(&config, limit)));
+    checks.extend(runtime.block_on(external::store(&config, limit)));
+    checks.extend(runtime.block_on(external::broker(&config, limit)));
     checks.push(external::archive(&config));
     checks.extend(runtime.block_on(external::remote(&config, limit)));
     // Do not wait for requests that are still unanswered.

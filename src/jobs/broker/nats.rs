@@ -84,6 +84,32 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+fn options(config: &BrokerConfig) -> ConnectOptions {
+    let options = ConnectOptions::new().name("molmesh").connection_timeout(REQUEST).ping_interval(REQUEST);
+    match (&config.user, &config.password) {
+        (Some(user), Some(password)) => options.user_and_password(user.clone(), password.reveal().to_owned()),
+        _ => options,
+    }
+}
+
+/// Connects to the first of the servers `url` that answers.
+async fn open(options: ConnectOptions, url: &str) -> Result<(Connection, Context), String> {
+    crate::tls::install_provider();
+    let addresses: Vec<_> = url.split(',').map(str::trim).collect();
+    let connection = options.connect(addresses).await.map_err(|error| error.to_string())?;
+    let context = ContextBuilder::new().timeout(REQUEST).ack_timeout(REQUEST).build(connection.clone());
+    Ok((connection, context))
+}
+
+/// Checks that a server of `url` accepts the credentials and offers JetStream. Changes nothing there.
+///
+/// # Errors
+/// Returns the reason.
+pub async fn check_broker(config: &BrokerConfig, url: &str) -> Result<(), String> {
+    let (_connection, context) = open(options(config), url).await?;
+    context.query_account().await.map(drop).map_err(|error| error.to_string())
+}
+
 /// Broker over NATS. Clones share one connection.
 #[derive(Clone)]
 pub(crate) struct NatsBroker(Arc<NatsState>);
@@ -95,14 +121,10 @@ impl NatsBroker {
     /// # Errors
     /// Returns the reason if an address or the credentials are malformed.
     pub(crate) async fn connect(config: &BrokerConfig, url: &str, store: &str) -> Result<Self, String> {
-        crate::tls::install_provider();
         let (losses, failure) = (Arc::new(AtomicUsize::new(0)), Arc::new(Mutex::new(None)));
         let (counted, failed) = (Arc::clone(&losses), Arc::clone(&failure));
-        let mut options = ConnectOptions::new()
-            .name("molmesh")
+        let options = options(config)
             .retry_on_initial_connect()
-            .connection_timeout(REQUEST)
-            .ping_interval(REQUEST)
             .event_callback(move |event| {
                 match event {
                     // The server may have lost its streams.
@@ -114,12 +136,7 @@ impl NatsBroker {
                 std::future::ready(())
             })
             .reconnect_delay_callback(|attempts| Duration::from_millis(100 * (attempts as u64).clamp(1, 10)));
-        if let (Some(user), Some(password)) = (&config.user, &config.password) {
-            options = options.user_and_password(user.clone(), password.reveal().to_owned());
-        }
-        let addresses: Vec<_> = url.split(',').map(str::trim).collect();
-        let connection = options.connect(addresses).await.map_err(|error| error.to_string())?;
-        let context = ContextBuilder::new().timeout(REQUEST).ack_timeout(REQUEST).build(connection.clone());
+        let (connection, context) = open(options, url).await?;
         let broker = Self(Arc::new(NatsState {
             connection,
             context,

@@ -27,7 +27,7 @@ struct Node {
 /// Starts a node over the shared folder `shared`. It does not claim jobs yet.
 async fn node(shared: &Path, broker: Arc<dyn Broker>) -> Node {
     let url = Some(format!("file://{}", shared.display()));
-    let store = Store::open_shared(&StoreConfig { url, ..StoreConfig::default() }, shared).await.unwrap();
+    let store = Store::open_for(&StoreConfig { url, ..StoreConfig::default() }, shared, true).await.unwrap();
     let budget = Budget::new(1 << 30);
     let settings = Settings::for_test(1, budget);
     let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use futures_util::StreamExt as _;
 
-use super::super::{Broker, Dispatch, NatsBroker};
+use super::super::{Broker, Dispatch, NatsBroker, check_broker};
 use super::{MAX_WAIT, SOON, claim, job, nats, none_within, on_nats, until_down};
 use crate::config::BrokerConfig;
 use crate::jobs::rank::DEFAULT_URGENCY;
@@ -92,12 +92,15 @@ async fn a_broker_that_comes_back_is_used_again() {
     on_nats(async |server| {
         let broker: Arc<dyn Broker> = Arc::new(nats(server).await);
         let queued = job(DEFAULT_URGENCY);
+        let config = BrokerConfig::default();
         assert_eq!(broker.dispatch(&queued).await, Ok(true));
         for keeps_data in [true, false] {
             server.stop(keeps_data);
             until_down(&*broker, SOON, |why| why.is_some()).await;
+            assert!(check_broker(&config, server.address()).await.is_err());
             server.restart();
             until_down(&*broker, SOON, |why| why.is_none()).await;
+            assert_eq!(check_broker(&config, server.address()).await, Ok(()));
             // Without its data the broker has lost the job.
             assert_eq!(broker.dispatch(&queued).await, Ok(!keeps_data));
             let claimed = claim(&broker).await;
