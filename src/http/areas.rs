@@ -8,9 +8,9 @@ use axum::response::{IntoResponse, Response};
 use super::document;
 use super::guard::Caller;
 use super::openapi::meshes::NotModified;
-use super::openapi::parameters::{AreaParameters, ConditionHeaders, EntryPath, StructurePath};
+use super::openapi::parameters::{AreaParameters, ConditionHeaders, StructurePath};
 use super::openapi::problem_responses;
-use super::openapi::problems::READING;
+use super::openapi::problems::{LISTING, READING};
 use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -21,20 +21,7 @@ use crate::pipeline::areas;
 use crate::pipeline::params;
 use crate::pipeline::params::areas::AreasRequest;
 
-problem_responses!(StructureProblems: [
-    READING,
-    [
-        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
-        ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
-        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
-    ],
-]);
-problem_responses!(EntryProblems: [READING, [
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable,
-    ProblemType::PreconditionFailed, ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates,
-    ProblemType::TooMuchMemory, ProblemType::MemoryFull, ProblemType::QueueFull,
-    ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
-]]);
+problem_responses!(Problems: [READING, LISTING, [ProblemType::TooManyCopies]]);
 
 /// List the exact areas of a structure
 ///
@@ -48,58 +35,24 @@ problem_responses!(EntryProblems: [READING, [
             ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, StructureProblems,
+        NotModified, Problems,
     ))]
-pub(super) async fn of_structure(
+pub(super) async fn list(
     State(app): State<Shared>,
     caller: Caller,
     source: StructureSource,
     query: Pairs,
     headers: HeaderMap,
-) -> Result<Response, Problem> {
-    answer(&app, &caller, source, query, &headers).await
-}
-
-/// List the exact areas of an archive entry
-///
-/// A CSV table with the exact area of the van der Waals, solvent-accessible or solvent-excluded surface of each
-/// residue, atom or chain. No mesh is made. With `interface`, the table has the chains of both sides, with the surface
-/// area buried between them.
-#[utoipa::path(get, path = "/v1/pdb/{id}/areas", tag = "structures", operation_id = "listEntryAreas",
-    params(EntryPath, AreaParameters, ConditionHeaders),
-    responses(
-        (status = 200, description = "The areas.", body = String, content_type = "text/csv", headers(
-            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
-            ("Cache-Control" = String, description = "Caching rules."),
-        )),
-        NotModified, EntryProblems,
-    ))]
-pub(super) async fn of_entry(
-    State(app): State<Shared>,
-    caller: Caller,
-    source: StructureSource,
-    query: Pairs,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
-    answer(&app, &caller, source, query, &headers).await
-}
-
-async fn answer(
-    app: &Shared,
-    caller: &Caller,
-    source: StructureSource,
-    query: Pairs,
-    headers: &HeaderMap,
 ) -> Result<Response, Problem> {
     let AreasRequest { job, level, canonical } = params::areas::parse(&query.0)?;
     let surface = app.config.limits.job().surface;
     let write = async |loaded: Loaded, delivery| {
-        let listing = loaded.list_atoms(app, caller, delivery, move |structure, limits, control, memory| {
+        let listing = loaded.list_atoms(&app, &caller, delivery, move |structure, limits, control, memory| {
             let refused = |error| Problem::from(Failure::Job { error, diagnostics: Vec::new() });
             let areas = areas::measure_selection(structure, &job, limits, &surface, control).map_err(refused)?.areas;
             document::collect(memory, control, |out| areas.write_csv(structure, level, control, out))
         });
         Ok(([(header::CONTENT_TYPE, "text/csv")], Body::from(listing.await?)).into_response())
     };
-    source.document(app, caller, headers, &canonical, None, write).await
+    source.document(&app, &caller, &headers, &canonical, None, write).await
 }

@@ -12,9 +12,9 @@ use super::atom_parameters::{self, Positions};
 use super::document;
 use super::guard::Caller;
 use super::openapi::meshes::NotModified;
-use super::openapi::parameters::{AtomParameters, ConditionHeaders, EntryPath, StructurePath};
+use super::openapi::parameters::{AtomParameters, ConditionHeaders, StructurePath};
 use super::openapi::problem_responses;
-use super::openapi::problems::READING;
+use super::openapi::problems::{LISTING, READING};
 use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -101,20 +101,7 @@ impl Serialize for InsertionCode {
     }
 }
 
-problem_responses!(StructureProblems: [
-    READING,
-    [
-        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
-        ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
-        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
-    ],
-]);
-problem_responses!(EntryProblems: [READING, [
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable,
-    ProblemType::PreconditionFailed, ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyCandidates,
-    ProblemType::TooMuchMemory, ProblemType::MemoryFull, ProblemType::QueueFull,
-    ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
-]]);
+problem_responses!(Problems: [READING, LISTING, [ProblemType::TooManyCopies]]);
 
 /// List the atoms of a structure
 ///
@@ -127,55 +114,22 @@ problem_responses!(EntryProblems: [READING, [
             ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, StructureProblems,
+        NotModified, Problems,
     ))]
-pub(super) async fn of_structure(
+pub(super) async fn list(
     State(app): State<Shared>,
     caller: Caller,
     source: StructureSource,
     query: Pairs,
     headers: HeaderMap,
-) -> Result<Response, Problem> {
-    answer(&app, &caller, source, query, &headers).await
-}
-
-/// List the atoms of an archive entry
-///
-/// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
-/// list. With `positions=true`, the list has the atoms of a mesh only, and their positions.
-#[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
-    params(EntryPath, AtomParameters, ConditionHeaders),
-    responses(
-        (status = 200, description = "The atoms.", body = AtomsDocument, headers(
-            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
-            ("Cache-Control" = String, description = "Caching rules."),
-        )),
-        NotModified, EntryProblems,
-    ))]
-pub(super) async fn of_entry(
-    State(app): State<Shared>,
-    caller: Caller,
-    source: StructureSource,
-    query: Pairs,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
-    answer(&app, &caller, source, query, &headers).await
-}
-
-async fn answer(
-    app: &Shared,
-    caller: &Caller,
-    source: StructureSource,
-    query: Pairs,
-    headers: &HeaderMap,
 ) -> Result<Response, Problem> {
     let positions = atom_parameters::parse(&query.0)?;
     let variant = positions.as_ref().map_or_else(String::new, |positions| positions.canonical.clone());
-    let write = async |loaded, delivery| list(app, caller, loaded, delivery, positions).await;
-    source.document(app, caller, headers, &variant, None, write).await
+    let write = async |loaded, delivery| write_list(&app, &caller, loaded, delivery, positions).await;
+    source.document(&app, &caller, &headers, &variant, None, write).await
 }
 
-async fn list(
+async fn write_list(
     app: &Shared,
     caller: &Caller,
     loaded: Loaded,

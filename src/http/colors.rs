@@ -15,9 +15,9 @@ use super::delivery;
 use super::document;
 use super::guard::Caller;
 use super::openapi::meshes::AtomColorsResponse;
-use super::openapi::parameters::{ColorParameters, ConditionHeaders, EntryPath, RangeHeaders, StructurePath};
+use super::openapi::parameters::{ColorParameters, ConditionHeaders, RangeHeaders, StructurePath};
 use super::openapi::problem_responses;
-use super::openapi::problems::READING;
+use super::openapi::problems::{LISTING, READING};
 use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -34,19 +34,7 @@ pub(super) const LEGEND: HeaderName = HeaderName::from_static("molmesh-colors");
 /// Largest number of entries of the legend, which must fit into a header.
 const MAX_ENTRIES: usize = 24;
 
-problem_responses!(StructureProblems: [
-    READING,
-    [
-        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
-        ProblemType::RangeNotSatisfiable, ProblemType::EmptySelection, ProblemType::TooManyCandidates, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
-        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
-    ],
-]);
-problem_responses!(EntryProblems: [READING, [
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable,
-    ProblemType::PreconditionFailed, ProblemType::RangeNotSatisfiable, ProblemType::EmptySelection, ProblemType::TooManyCandidates,
-    ProblemType::TooMuchMemory, ProblemType::MemoryFull, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
-]]);
+problem_responses!(Problems: [READING, LISTING, [ProblemType::RangeNotSatisfiable]]);
 
 /// Get the colours of the atoms of a structure
 ///
@@ -59,62 +47,29 @@ problem_responses!(EntryProblems: [READING, [
     tag = "structures",
     operation_id = "colorAtoms",
     params(StructurePath, ColorParameters, ConditionHeaders, RangeHeaders),
-    responses(AtomColorsResponse, StructureProblems)
+    responses(AtomColorsResponse, Problems)
 )]
-pub(super) async fn of_structure(
+pub(super) async fn list(
     State(app): State<Shared>,
     caller: Caller,
     source: StructureSource,
     query: Pairs,
     headers: HeaderMap,
-) -> Result<Response, Problem> {
-    answer(&app, &caller, source, query, &headers).await
-}
-
-/// Get the colours of the atoms of an archive entry
-///
-/// Four bytes for each atom of the file, in file order: red, green, blue (sRGB) and alpha. A mesh with `atom_ids=true`
-/// has a vertex attribute `_ATOM` (`atom` in PLY), the index of the atom in this list, so a client can recolour the
-/// vertices without requesting a new mesh. The header `Molmesh-Colors` describes the colours.
-#[utoipa::path(
-    get,
-    path = "/v1/pdb/{id}/colors",
-    tag = "structures",
-    operation_id = "colorEntryAtoms",
-    params(EntryPath, ColorParameters, ConditionHeaders, RangeHeaders),
-    responses(AtomColorsResponse, EntryProblems)
-)]
-pub(super) async fn of_entry(
-    State(app): State<Shared>,
-    caller: Caller,
-    source: StructureSource,
-    query: Pairs,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
-    answer(&app, &caller, source, query, &headers).await
-}
-
-async fn answer(
-    app: &Shared,
-    caller: &Caller,
-    source: StructureSource,
-    query: Pairs,
-    headers: &HeaderMap,
 ) -> Result<Response, Problem> {
     let (job, coloring) = color_parameters::parse(&query.0)?;
     let variant = params::canonical(&job);
     let write = async |loaded: Loaded, delivery| {
         let etag = source::etag(&loaded.digest, &variant)?;
-        let (colors, legend) = list(app, caller, (loaded, delivery), job, coloring).await?;
+        let (colors, legend) = write_list(&app, &caller, (loaded, delivery), job, coloring).await?;
         let described =
             [(header::CONTENT_TYPE, HeaderValue::from_static("application/octet-stream")), (LEGEND, legend)];
-        Ok((described, part_of(&colors, headers, &etag)?).into_response())
+        Ok((described, part_of(&colors, &headers, &etag)?).into_response())
     };
-    source.document(app, caller, headers, &variant, None, write).await
+    source.document(&app, &caller, &headers, &variant, None, write).await
 }
 
 /// Lists the colours of the atoms, with their legend.
-async fn list(
+async fn write_list(
     app: &Shared,
     caller: &Caller,
     (loaded, delivery): (Loaded, Delivery),

@@ -22,7 +22,6 @@ use tracing::Span;
 use super::observed_body::observed;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
-use super::scopes;
 use super::state::{App, Shared};
 use crate::access::{
     Access, Account, Denied, Exceeded, Key, Quota, Scope, Signature, SignatureCheck, rate_limit, rate_limit_policy,
@@ -113,13 +112,25 @@ fn client_name(address: IpAddr) -> String {
     }
 }
 
+/// Scope that a request needs; `None`: it is open. `operations` records it.
+#[derive(Clone, Copy)]
+pub(super) struct RequiredScope(pub(super) Option<Scope>);
+
+impl RequiredScope {
+    /// Returns the recorded scope.
+    pub(super) fn of(request: &Request) -> Option<Scope> {
+        // A request without a record is not open by mistake.
+        request.extensions().get::<Self>().map_or(Some(Scope::Mesh), |Self(scope)| *scope)
+    }
+}
+
 /// Middleware: passes permitted requests on, refuses the others.
 pub(super) async fn check(State(app): State<Shared>, mut request: Request, next: Next) -> Response {
     let key = presented(request.headers());
     // Handlers and logs do not see the key.
     request.headers_mut().remove(AUTHORIZATION);
     request.headers_mut().remove(API_KEY);
-    let Some(scope) = scopes::needed(&request) else { return next.run(request).await };
+    let Some(scope) = RequiredScope::of(&request) else { return next.run(request).await };
     let (caller, signature) = match authorize(&app, scope, key, &mut request) {
         Ok(authorized) => authorized,
         Err(problem) => {

@@ -6,10 +6,11 @@
 //! 4. **browsers**: security headers, also on problems of the layers below;
 //! 5. **CORS**: answers preflights and adds headers, also to errors of the layers below;
 //! 6. **panics**: a panic of a handler becomes a 500, and the connection stays open;
-//! 7. **origin**: rejects other hosts and pages of other sites;
-//! 8. **guard**: keys, signed URLs, quotas; removes keys and signatures from the request;
-//! 9. **timeout**: a backstop above the body timeout and the job deadline;
-//! 10. the router. Limits of bodies, queue and memory apply where the resource is used.
+//! 7. **operations**: records the scope that the operation needs;
+//! 8. **origin**: rejects other hosts and pages of other sites;
+//! 9. **guard**: keys, signed URLs, quotas; removes keys and signatures from the request;
+//! 10. **timeout**: a backstop above the body timeout and the job deadline;
+//! 11. the router. Limits of bodies, queue and memory apply where the resource is used.
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
@@ -26,7 +27,7 @@ use tower::ServiceBuilder;
 use super::problem::{self, Problem};
 use super::problem_types::ProblemType;
 use super::state::Shared;
-use super::{browsers, guard, observe, origin, request_id};
+use super::{browsers, guard, observe, operations, origin, request_id};
 use crate::telemetry::PANICS;
 
 /// Adds the layers to `router`.
@@ -39,6 +40,7 @@ pub(super) fn apply(router: Router, timeout: Duration, app: &Shared) -> Router {
             .layer(from_fn_with_state(Arc::clone(app), browsers::restrain))
             .layer(browsers::cors(&app.access))
             .layer(from_fn(catch_panics))
+            .layer(from_fn(operations::require_scope))
             .layer(from_fn_with_state(Arc::clone(app), origin::check))
             .layer(from_fn_with_state(Arc::clone(app), guard::check))
             .layer(from_fn_with_state(timeout, backstop)),

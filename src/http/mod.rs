@@ -9,7 +9,6 @@ mod pace;
 mod problem_types;
 mod range;
 mod request_id;
-mod scopes;
 mod signal;
 mod socket;
 mod store_health;
@@ -60,7 +59,6 @@ mod jobs;
 mod results;
 
 mod mesh_request;
-mod signing;
 
 mod areas;
 mod atoms;
@@ -71,13 +69,17 @@ mod health;
 mod meshes;
 mod metrics;
 mod page;
-mod pdb;
 mod problems;
 mod structures;
 
 mod capabilities;
 
 mod api_document;
+
+// Table of the operations, and checks that follow from it.
+mod operations;
+
+mod signing;
 
 // The service: middleware, routes, connections.
 mod accept;

@@ -9,10 +9,9 @@ use axum::http::{HeaderValue, Method, Version};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
-use super::guard;
+use super::guard::{self, RequiredScope};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
-use super::scopes;
 use super::state::Shared;
 use crate::access::{Access, SignatureCheck, Sites, authority};
 
@@ -101,5 +100,5 @@ fn opens_page(request: &Request) -> bool {
     request.method() == Method::GET
         && is(SEC_FETCH_MODE, b"navigate")
         && is(SEC_FETCH_DEST, b"document")
-        && scopes::needed(request).is_none()
+        && RequiredScope::of(request).is_none()
 }

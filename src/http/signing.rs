@@ -4,9 +4,9 @@ use axum::extract::Query;
 use axum::http::{Method, Uri};
 
 use super::jobs::{MAX_WAIT_S, Poll};
+use super::operations::{Operation, Parameters, TABLE};
 use super::parsed_request::parse_address;
 use super::problem::Problem;
-use super::scopes::{OperationScope, Parameters, TABLE};
 use super::{atom_parameters, color_parameters, results};
 use crate::formats::Format;
 use crate::pipeline::params;
@@ -50,16 +50,14 @@ fn matches(route: &str, path: &str) -> bool {
     route.split('/').all(fits) && segments.next().is_none()
 }
 
-fn check_parameters(row: &OperationScope, file: Option<&str>, uri: &Uri) -> Result<(), String> {
+fn check_parameters(row: &Operation, file: Option<&str>, uri: &Uri) -> Result<(), String> {
     let Query(pairs) = Query::<Vec<(String, String)>>::try_from_uri(uri).map_err(|error| error.body_text())?;
-    match row.parameters() {
+    match row.parameters {
         Parameters::Mesh => parse_address(file, &pairs).map(drop).map_err(Problem::into_detail),
         Parameters::Atoms => atom_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Areas => params::areas::parse(&pairs).map(drop).map_err(|error| error.to_string()),
         Parameters::Colors => color_parameters::parse(&pairs).map(drop).map_err(|error| error.to_string()),
-        Parameters::Tileset | Parameters::Subtree => {
-            Err("a signature is valid for one URL, and a tileset has many; use a key".to_owned())
-        }
+        Parameters::Tileset => Err("a signature is valid for one URL, and a tileset has many; use a key".to_owned()),
         Parameters::Wait => {
             let Query(poll) = Query::<Poll>::try_from_uri(uri).map_err(|error| error.body_text())?;
             if poll.wait() <= MAX_WAIT_S { Ok(()) } else { Err(format!("`wait` is more than {MAX_WAIT_S} s")) }

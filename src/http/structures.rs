@@ -1,5 +1,5 @@
 //! `/v1/structures`: structures that are uploaded once and meshed many times, named by the SHA-256 of the uploaded
-//! bytes.
+//! bytes. [`surface`] and [`report`] also mesh the archive entries below `/v1/pdb`.
 
 use axum::Json;
 use axum::body::Body;
@@ -129,7 +129,7 @@ problem_responses!(ShowProblems: [
     ],
 ]);
 problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
-    ProblemType::NotFound, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed, ProblemType::RangeNotSatisfiable,
+    ProblemType::NotFound, ProblemType::PreconditionFailed, ProblemType::RangeNotSatisfiable,
 ]]);
 
 /// Upload a structure
@@ -220,7 +220,7 @@ pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
 
 problem_responses!(ReportProblems: [
     PARAMETERS, READING, MESHING,
-    [ProblemType::NoSuchStructure, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed],
+    [ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded],
 ]);
 
 /// Mesh an uploaded structure and return the report

@@ -13,9 +13,9 @@ use axum::response::{IntoResponse, Response};
 
 use super::guard::Caller;
 use super::openapi::meshes::NotModified;
-use super::openapi::parameters::{ConditionHeaders, EntryPath, StructurePath, SubtreeParameters, TilesetParameters};
+use super::openapi::parameters::{ConditionHeaders, StructurePath, SubtreeParameters, TilesetParameters};
 use super::openapi::problem_responses;
-use super::openapi::problems::READING;
+use super::openapi::problems::{LISTING, READING};
 use super::parsed_request::{Pairs, parse_address};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -33,21 +33,7 @@ use crate::surface::{Control, SurfaceError};
 /// Memory of an instance in the document of an assembly, bytes.
 const DOCUMENT_BYTES: u64 = 4096;
 
-problem_responses!(StructureProblems: [
-    READING,
-    [
-        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure,
-        ProblemType::PreconditionFailed, ProblemType::EmptySelection, ProblemType::TooManyCopies,
-        ProblemType::TooManyCandidates, ProblemType::GridTooLarge, ProblemType::TooMuchMemory, ProblemType::MemoryFull,
-        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
-    ],
-]);
-problem_responses!(EntryProblems: [READING, [
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotInArchive, ProblemType::EntryTooLarge,
-    ProblemType::ArchiveUnavailable, ProblemType::PreconditionFailed, ProblemType::EmptySelection,
-    ProblemType::TooManyCopies, ProblemType::TooManyCandidates, ProblemType::GridTooLarge,
-    ProblemType::TooMuchMemory, ProblemType::MemoryFull, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
-]]);
+problem_responses!(Problems: [READING, LISTING, [ProblemType::TooManyCopies, ProblemType::GridTooLarge]]);
 
 /// Get the tileset of a structure
 ///
@@ -60,26 +46,9 @@ problem_responses!(EntryProblems: [READING, [
             ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, StructureProblems,
+        NotModified, Problems,
     ))]
-pub(super) async fn of_structure(request: TilesetRequest) -> Result<Response, Problem> {
-    request.document().await
-}
-
-/// Get the tileset of an archive entry
-///
-/// Levels of detail of a large structure, in the format 3D Tiles 1.1. Its tiles are computed when they are requested:
-/// `surface.glb` with the parameter `tile`, compressed with meshopt unless `compress` has another value.
-#[utoipa::path(get, path = "/v1/pdb/{id}/tileset.json", tag = "tilesets", operation_id = "showEntryTileset",
-    params(EntryPath, TilesetParameters, ConditionHeaders),
-    responses(
-        (status = 200, description = "The tileset.", body = serde_json::Value, headers(
-            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
-            ("Cache-Control" = String, description = "Caching rules."),
-        )),
-        NotModified, EntryProblems,
-    ))]
-pub(super) async fn of_entry(request: TilesetRequest) -> Result<Response, Problem> {
+pub(super) async fn show(request: TilesetRequest) -> Result<Response, Problem> {
     request.document().await
 }
 
@@ -93,25 +62,9 @@ pub(super) async fn of_entry(request: TilesetRequest) -> Result<Response, Proble
             ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, StructureProblems,
+        NotModified, Problems,
     ))]
-pub(super) async fn subtree_of_structure(request: TilesetRequest) -> Result<Response, Problem> {
-    request.subtree().await
-}
-
-/// Get a subtree of the tileset of an archive entry
-///
-/// Binary file that lists the tiles below `tile`, by default below the root, for clients of `tileset.json`.
-#[utoipa::path(get, path = "/v1/pdb/{id}/tileset.subtree", tag = "tilesets", operation_id = "showEntrySubtree",
-    params(EntryPath, SubtreeParameters, ConditionHeaders),
-    responses(
-        (status = 200, description = "The subtree.", body = Vec<u8>, content_type = "application/octet-stream", headers(
-            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
-            ("Cache-Control" = String, description = "Caching rules."),
-        )),
-        NotModified, EntryProblems,
-    ))]
-pub(super) async fn subtree_of_entry(request: TilesetRequest) -> Result<Response, Problem> {
+pub(super) async fn show_subtree(request: TilesetRequest) -> Result<Response, Problem> {
     request.subtree().await
 }
 

@@ -3,6 +3,14 @@
 use super::*;
 
 #[test]
+fn a_request_without_a_recorded_scope_is_not_open() {
+    let mut request = Request::default();
+    assert_eq!(RequiredScope::of(&request), Some(Scope::Mesh));
+    request.extensions_mut().insert(RequiredScope(None));
+    assert_eq!(RequiredScope::of(&request), None);
+}
+
+#[test]
 fn equal_keys_in_two_headers_are_accepted_and_different_ones_rejected() {
     let text = |pairs: &[(&'static str, &'static str)]| {
         let mut headers = HeaderMap::new();

@@ -1,6 +1,5 @@
 //! API keys in the OpenAPI document: security schemes, the scopes of each operation and its 401, 403 and 429 responses.
 
-use utoipa::Modify;
 use utoipa::openapi::path::Operation;
 use utoipa::openapi::security::{
     ApiKey, ApiKeyValue, HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme,
@@ -9,8 +8,8 @@ use utoipa::openapi::{ComponentsBuilder, OpenApi};
 
 use super::problems::responses;
 use crate::access::{SIGNATURE, Scope};
+use crate::http::operations::TABLE;
 use crate::http::problem_types::ProblemType;
-use crate::http::scopes::TABLE;
 
 /// Names of the security schemes.
 const BEARER: &str = "bearer";
@@ -29,39 +28,33 @@ const KEY_PROBLEMS: &[ProblemType] = &[
 const SIGNED_URL_PROBLEMS: &[ProblemType] = &[ProblemType::SignatureInvalid, ProblemType::SignatureExpired];
 
 /// Adds the security requirements, from the table that authorizes requests.
-pub(in crate::http) struct SecurityRequirements;
-
-impl Modify for SecurityRequirements {
-    fn modify(&self, api: &mut OpenApi) {
-        let components = api.components.get_or_insert_with(|| ComponentsBuilder::new().build());
-        let bearer = HttpBuilder::new()
-            .scheme(HttpAuthScheme::Bearer)
-            .bearer_format("mm_ID_SECRET")
-            .description(Some("API key, if the operator requires one."))
-            .build();
-        components.add_security_scheme(BEARER, SecurityScheme::Http(bearer));
-        let header = ApiKeyValue::with_description(
-            "X-Api-Key",
-            "The same API key, for clients that cannot set `Authorization`.",
-        );
-        components.add_security_scheme(API_KEY, SecurityScheme::ApiKey(ApiKey::Header(header)));
-        let query = ApiKeyValue::with_description(
-            SIGNATURE,
-            "Signature of a URL made by `molmesh sign`, beside `expires` and `key_id`. Replaces a key.",
-        );
-        components.add_security_scheme(SIGNED, SecurityScheme::ApiKey(ApiKey::Query(query)));
-        for row in TABLE {
-            let Some(scope) = row.scope else { continue };
-            let item = api.paths.paths.get_mut(row.path);
-            let operation = item.and_then(|item| match row.method.as_str() {
-                "GET" => item.get.as_mut(),
-                "POST" => item.post.as_mut(),
-                "DELETE" => item.delete.as_mut(),
-                _ => None,
-            });
-            if let Some(operation) = operation {
-                restrict(operation, scope, row.method == axum::http::Method::GET);
-            }
+pub(super) fn restrict_operations(api: &mut OpenApi) {
+    let components = api.components.get_or_insert_with(|| ComponentsBuilder::new().build());
+    let bearer = HttpBuilder::new()
+        .scheme(HttpAuthScheme::Bearer)
+        .bearer_format("mm_ID_SECRET")
+        .description(Some("API key, if the operator requires one."))
+        .build();
+    components.add_security_scheme(BEARER, SecurityScheme::Http(bearer));
+    let header =
+        ApiKeyValue::with_description("X-Api-Key", "The same API key, for clients that cannot set `Authorization`.");
+    components.add_security_scheme(API_KEY, SecurityScheme::ApiKey(ApiKey::Header(header)));
+    let query = ApiKeyValue::with_description(
+        SIGNATURE,
+        "Signature of a URL made by `molmesh sign`, beside `expires` and `key_id`. Replaces a key.",
+    );
+    components.add_security_scheme(SIGNED, SecurityScheme::ApiKey(ApiKey::Query(query)));
+    for row in TABLE {
+        let Some(scope) = row.scope else { continue };
+        let item = api.paths.paths.get_mut(row.path);
+        let operation = item.and_then(|item| match row.method.as_str() {
+            "GET" => item.get.as_mut(),
+            "POST" => item.post.as_mut(),
+            "DELETE" => item.delete.as_mut(),
+            _ => None,
+        });
+        if let Some(operation) = operation {
+            restrict(operation, scope, row.method == axum::http::Method::GET);
         }
     }
 }

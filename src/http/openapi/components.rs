@@ -39,7 +39,7 @@ const ERROR_NAMES: &[(&str, &[&str], &str)] = &[
 ];
 
 /// Replaces inline parameters, headers and the responses of several operations by references into `components`.
-pub(in crate::http) fn share(document: &mut Value) {
+pub(super) fn share(document: &mut Value) {
     let mut shared = Components::default();
     let operations = members(document, "paths").flat_map(|(path, item)| {
         let operations = item.as_object_mut().into_iter().flat_map(Map::values_mut);
@@ -158,34 +158,9 @@ pub(super) fn pascal_case(name: &str) -> String {
     words.map(|word| word[..1].to_ascii_uppercase() + &word[1..]).collect()
 }
 
-/// Serializes a document as YAML that version 1.1 reads as 1.2 does: floats in exponent notation get a point and a sign
-/// (`1.0e-6`; `1e-6` would be a string), and times get quotes.
-pub(in crate::http) fn to_yaml(document: &Value) -> Result<String, yaml_serde::Error> {
-    let line = |line: &str| {
-        let (key, value) = line.rsplit_once(' ').filter(|(key, _)| key.ends_with([':', '-']))?;
-        if value.len() >= 20 && value.starts_with(|c: char| c.is_ascii_digit()) && value.ends_with('Z') {
-            return Some(format!("{key} '{value}'"));
-        }
-        value.parse::<f64>().ok()?;
-        let (digits, exponent) = value.split_once('e')?;
-        let point = if digits.contains('.') { "" } else { ".0" };
-        let sign = if exponent.starts_with('-') { "" } else { "+" };
-        Some(format!("{key} {digits}{point}e{sign}{exponent}"))
-    };
-    let yaml = yaml_serde::to_string(document)?;
-    Ok(yaml.lines().flat_map(|text| [line(text).unwrap_or_else(|| text.to_owned()), "\n".to_owned()]).collect())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn yaml_1_1_reads_floats_and_times() {
-        let document = json!({ "a": 1e-6, "b": [1e20, 1.5e-7, 0.5, 3], "c": "at 1e-6", "d": "2030-01-01T12:00:00Z" });
-        let expected = "a: 1.0e-6\nb:\n- 1.0e+20\n- 1.5e-7\n- 0.5\n- 3\nc: at 1e-6\nd: '2030-01-01T12:00:00Z'\n";
-        assert_eq!(to_yaml(&document).unwrap(), expected);
-    }
 
     #[test]
     fn different_values_with_one_name_get_numbers() {

@@ -1,11 +1,15 @@
 //! Building blocks of the OpenAPI description: parameters, bodies and responses that several handlers share.
-//! `api_document` assembles the document.
+//! `document` assembles the document.
 
-pub(super) mod access;
+mod access;
 pub(super) mod bodies;
-pub(super) mod components;
+mod components;
+mod document;
+mod entries;
 pub(super) mod meshes;
 pub(super) mod parameters;
 pub(super) mod problems;
+mod yaml;
 
+pub(super) use document::texts;
 pub(super) use problems::problem_responses;

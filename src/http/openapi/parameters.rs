@@ -1,11 +1,11 @@
 //! Parameters in the OpenAPI document. Mesh parameters come from the table that the request parser uses.
 
 use serde_json::Value;
+use utoipa::IntoParams;
 use utoipa::openapi::extensions::Extensions;
 use utoipa::openapi::path::{Parameter, ParameterBuilder, ParameterIn};
 use utoipa::openapi::schema::{SchemaFormat, Type};
 use utoipa::openapi::{KnownFormat, ObjectBuilder, OpenApi, Ref, RefOr, Required, Schema};
-use utoipa::{IntoParams, Modify};
 
 use super::components::pascal_case;
 use crate::formats::Format;
@@ -20,29 +20,25 @@ const DIGEST_EXAMPLE: &str = "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e41
 const SURFACE_FILE: &str = "SurfaceFile";
 
 /// Adds a named schema for each parameter with a fixed set of values, so that generators make one type of each.
-pub(in crate::http) struct ChoiceSchemas;
-
-impl Modify for ChoiceSchemas {
-    fn modify(&self, api: &mut OpenApi) {
-        let schemas = &mut api.components.get_or_insert_default().schemas;
-        let files = Format::ALL.map(|format| format!("surface.{}", format.name()));
-        let files = ObjectBuilder::new()
+pub(super) fn add_choices(api: &mut OpenApi) {
+    let schemas = &mut api.components.get_or_insert_default().schemas;
+    let files = Format::ALL.map(|format| format!("surface.{}", format.name()));
+    let files = ObjectBuilder::new()
+        .schema_type(Type::String)
+        .description(Some("File name of a mesh: `surface.` and the name of the format."))
+        .enum_values(Some(files));
+    schemas.insert(SURFACE_FILE.to_owned(), RefOr::T(files.into()));
+    for parameter in TABLE {
+        let Domain::Choice(values) = parameter.domain else { continue };
+        // A format that is sent takes precedence over `Accept`, so declaring its default would change responses.
+        let declared = parameter.name != "format" && values.contains(&parameter.default);
+        let default = declared.then(|| Value::from(parameter.default));
+        let object = ObjectBuilder::new()
             .schema_type(Type::String)
-            .description(Some("File name of a mesh: `surface.` and the name of the format."))
-            .enum_values(Some(files));
-        schemas.insert(SURFACE_FILE.to_owned(), RefOr::T(files.into()));
-        for parameter in TABLE {
-            let Domain::Choice(values) = parameter.domain else { continue };
-            // A format that is sent takes precedence over `Accept`, so declaring its default would change responses.
-            let declared = parameter.name != "format" && values.contains(&parameter.default);
-            let default = declared.then(|| Value::from(parameter.default));
-            let object = ObjectBuilder::new()
-                .schema_type(Type::String)
-                .description(Some(format!("Value of `{}`.", parameter.name)))
-                .enum_values(Some(values.iter().map(|value| Value::from(*value))))
-                .default(default);
-            schemas.insert(pascal_case(parameter.name), RefOr::T(object.into()));
-        }
+            .description(Some(format!("Value of `{}`.", parameter.name)))
+            .enum_values(Some(values.iter().map(|value| Value::from(*value))))
+            .default(default);
+        schemas.insert(pascal_case(parameter.name), RefOr::T(object.into()));
     }
 }
 

@@ -46,6 +46,19 @@ pub(in crate::http) const READING: &[ProblemType] = &[
     ProblemType::TooManyAtoms,
     ProblemType::TooManyDuplicates,
 ];
+/// Problems of a document of a structure, in addition to those of reading it.
+pub(in crate::http) const LISTING: &[ProblemType] = &[
+    ProblemType::BadRequest,
+    ProblemType::BadParameter,
+    ProblemType::PreconditionFailed,
+    ProblemType::EmptySelection,
+    ProblemType::TooManyCandidates,
+    ProblemType::TooMuchMemory,
+    ProblemType::MemoryFull,
+    ProblemType::QueueFull,
+    ProblemType::TooManyDeliveries,
+    ProblemType::ShareExceeded,
+];
 /// Problems of a job after the structure was read, and of its map.
 pub(in crate::http) const MESHING: &[ProblemType] = &[
     ProblemType::UnreadableMap,
