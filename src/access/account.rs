@@ -59,7 +59,7 @@ pub(crate) struct QuotaUsage {
 
 /// Error: a quota is used up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Exceeded {
+pub(crate) struct QuotaExceeded {
     /// Policy as named in the `RateLimit` fields: `requests`, `work` or `concurrency`.
     pub(crate) policy: &'static str,
     /// Limit of the policy.

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::account::{Account, Exceeded, Quota, QuotaUsage};
+use super::account::{Account, Quota, QuotaExceeded, QuotaUsage};
 
 /// Minimum time between two searches for ended windows while the table is full.
 const SWEEP_PAUSE: Duration = Duration::from_secs(1);
@@ -47,14 +47,14 @@ impl Window {
         QuotaUsage { requests: self.requests, work: self.work, running: self.running, left: self.left(now) }
     }
 
-    fn exceeded(&self, quota: &Quota, now: Instant) -> Option<Exceeded> {
+    fn exceeded(&self, quota: &Quota, now: Instant) -> Option<QuotaExceeded> {
         let full = |limit: Option<u64>, used: u64| limit.filter(|limit| used >= *limit);
         if let Some(limit) = full(quota.concurrent, self.running) {
             // A running request may end at any time.
-            return Some(Exceeded { policy: "concurrency", limit, wait: Duration::from_secs(1) });
+            return Some(QuotaExceeded { policy: "concurrency", limit, wait: Duration::from_secs(1) });
         }
         let limit = full(quota.requests, self.requests)?;
-        Some(Exceeded { policy: "requests", limit, wait: self.left(now) })
+        Some(QuotaExceeded { policy: "requests", limit, wait: self.left(now) })
     }
 }
 
@@ -136,7 +136,7 @@ impl QuotaMeter {
     }
 
     /// Counts a request, which runs until the returned guard is dropped. Counts nothing if a quota is used up.
-    pub(crate) fn admit(self: &Arc<Self>, account: &Account, now: Instant) -> Result<Running, Exceeded> {
+    pub(crate) fn admit(self: &Arc<Self>, account: &Account, now: Instant) -> Result<Running, QuotaExceeded> {
         let mut state = self.lock();
         let (counter, window) = state.of(account, self.capacity, now);
         if let Some(exceeded) = window.exceeded(&account.quota, now) {
@@ -149,14 +149,14 @@ impl QuotaMeter {
     }
 
     /// Checks that the account has computing time left in this window.
-    pub(crate) fn admit_work(&self, account: &Account, now: Instant) -> Result<(), Exceeded> {
+    pub(crate) fn admit_work(&self, account: &Account, now: Instant) -> Result<(), QuotaExceeded> {
         let Some(limit) = account.quota.work_s else { return Ok(()) };
         let mut state = self.lock();
         let (_, window) = state.of(account, self.capacity, now);
         if window.work < Duration::from_secs(limit) {
             return Ok(());
         }
-        Err(Exceeded { policy: "work", limit, wait: window.left(now) })
+        Err(QuotaExceeded { policy: "work", limit, wait: window.left(now) })
     }
 
     /// Adds `time` of computing to the usage of `client`, or to the shared counter if the client has none.
@@ -222,7 +222,7 @@ mod tests {
         }
         // The window began with the first request, at 1 s.
         let refused = meter.admit(&me, start + 4 * S).unwrap_err();
-        assert_eq!(refused, Exceeded { policy: "requests", limit: 3, wait: 7 * S });
+        assert_eq!(refused, QuotaExceeded { policy: "requests", limit: 3, wait: 7 * S });
         let usage = meter.usage(&me, start + 5 * S);
         assert_eq!(usage, QuotaUsage { requests: 3, work: Duration::ZERO, running: 0, left: 6 * S });
         assert!(meter.admit(&me, start + Duration::from_nanos(10_999_999_999)).is_err());
@@ -259,7 +259,7 @@ mod tests {
         meter.admit_work(&me, now + S).unwrap();
         meter.spent(1, Duration::from_millis(1), now + S);
         let refused = meter.admit_work(&me, now + S).unwrap_err();
-        assert_eq!(refused, Exceeded { policy: "work", limit: 2, wait: 9 * S });
+        assert_eq!(refused, QuotaExceeded { policy: "work", limit: 2, wait: 9 * S });
         drop(meter.admit(&me, now + S).expect("requests without computing are admitted"));
         meter.admit_work(&me, now + 10 * S).unwrap();
         // A job that ends after the window counts in the next one.

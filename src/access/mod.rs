@@ -15,7 +15,7 @@ mod sign;
 mod sites;
 mod token;
 
-pub(crate) use account::{Account, Exceeded};
+pub(crate) use account::{Account, QuotaExceeded};
 pub(crate) use authorizer::Access;
 pub(crate) use fields::{rate_limit, rate_limit_policy};
 pub(crate) use file::parse as parse_key_file;

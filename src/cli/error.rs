@@ -66,13 +66,6 @@ pub(crate) enum CliError {
         name: String,
         source: io::Error,
     },
-    /// The input has more bytes than allowed.
-    #[error("{name} has more than {limit} bytes")]
-    InputTooLarge {
-        /// Path, or `stdin`.
-        name: String,
-        limit: u64,
-    },
     /// Reading, selecting or meshing failed.
     #[error("{name}: {source}")]
     Job {
@@ -148,7 +141,6 @@ impl CliError {
         match self {
             Self::Usage { .. } => code::USAGE,
             Self::Input { .. } => code::INPUT,
-            Self::InputTooLarge { .. } => code::LIMIT,
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
             Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
@@ -168,24 +160,10 @@ impl CliError {
         match self {
             Self::Usage { hint, .. } => hint.clone(),
             Self::Strict { first, .. } => Some(format!("the first: {first}")),
-            Self::InputTooLarge { .. } => Some("raise the limit with --max-input-bytes".to_owned()),
             Self::Job { source: JobError::Surface(error), .. } => surface_hint(error),
-            Self::Job { source: JobError::Structure(error), strict_finding, .. } => match error {
-                StructureError::TooManyAtoms { .. } | StructureError::AssemblyTooLarge { .. } => {
-                    Some("raise the limit with --max-atoms".to_owned())
-                }
-                StructureError::TooManyCopies { .. } => Some("raise the limit with --max-copies".to_owned()),
-                StructureError::TooManyParts { .. } => Some("raise the limit with --max-parts".to_owned()),
-                StructureError::TooManyDistances { .. } => Some("raise the limit with --max-candidates".to_owned()),
-                StructureError::TooManyDuplicates { .. } => Some("raise the limit with --max-duplicates".to_owned()),
-                StructureError::InflatedTooLarge { .. } => Some("raise the limit with --max-input-bytes".to_owned()),
-                _ => strict_finding.as_deref().map(str::to_owned),
-            },
-            Self::Job { source: JobError::Map(error), .. } => match error {
-                MapError::TooManyPoints { .. } => Some("raise the limit with --max-map-points".to_owned()),
-                MapError::InflatedTooLarge { .. } => Some("raise the limit with --max-input-bytes".to_owned()),
-                _ => None,
-            },
+            Self::Job { source: JobError::Structure(_), strict_finding, .. } => {
+                strict_finding.as_deref().map(str::to_owned)
+            }
             Self::NoBackend { .. } => Some(format!("try --backend auto{DOCTOR}")),
             Self::InUse(_) => Some("stop that service, or choose another folder with --data-dir".to_owned()),
             Self::Output { source, .. } if source.kind() == io::ErrorKind::NotFound => {
@@ -208,21 +186,14 @@ fn structure_code(error: &StructureError) -> i32 {
     match error {
         StructureError::Input { .. } => code::INPUT,
         StructureError::Scratch { .. } | StructureError::DiskFull | StructureError::DiskSpace(_) => code::OUTPUT,
-        StructureError::InflatedTooLarge { .. }
-        | StructureError::TooManyAtoms { .. }
-        | StructureError::TooManyDuplicates { .. }
-        | StructureError::TooManyCopies { .. }
-        | StructureError::TooManyParts { .. }
-        | StructureError::TooManyDistances { .. }
-        | StructureError::AssemblyTooLarge { .. }
-        | StructureError::Memory(_) => code::LIMIT,
+        StructureError::Limit(_) | StructureError::Memory(_) => code::LIMIT,
         _ => code::STRUCTURE,
     }
 }
 
 fn map_code(error: &MapError) -> i32 {
     match error {
-        MapError::TooManyPoints { .. } | MapError::InflatedTooLarge { .. } | MapError::Memory(_) => code::LIMIT,
+        MapError::Limit(_) | MapError::Memory(_) => code::LIMIT,
         _ => code::STRUCTURE,
     }
 }
@@ -235,18 +206,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         | SurfaceError::NoSurface { .. }
         | SurfaceError::NoPatch
         | SurfaceError::NoCavity { .. } => code::USAGE,
-        SurfaceError::GridTooLarge { .. }
-        | SurfaceError::PocketGridTooLarge { .. }
-        | SurfaceError::TooManyPocketRows { .. }
-        | SurfaceError::TooManyCandidates { .. }
-        | SurfaceError::TooManyOverlaps { .. }
-        | SurfaceError::MeshTooLarge { .. }
-        | SurfaceError::TooManyTriangles { .. }
-        | SurfaceError::TooManyTiles { .. }
-        | SurfaceError::TilesetTooLarge { .. }
-        | SurfaceError::DeviceMemory { .. }
-        | SurfaceError::Memory(_)
-        | SurfaceError::Deadline => code::LIMIT,
+        SurfaceError::Limit(_) | SurfaceError::Memory(_) | SurfaceError::Deadline => code::LIMIT,
         SurfaceError::Device { .. } => code::BACKEND,
         SurfaceError::Cancelled => code::INTERRUPTED,
         SurfaceError::Sink => code::INTERNAL,
@@ -255,7 +215,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
 
 fn picture_code(error: &PictureError) -> i32 {
     match error {
-        PictureError::TooLarge { .. } | PictureError::Memory(_) => code::LIMIT,
+        PictureError::Limit(_) | PictureError::Memory(_) => code::LIMIT,
         PictureError::Device { .. } => code::BACKEND,
         PictureError::Cancelled => code::INTERRUPTED,
         PictureError::Quantized | PictureError::Png(_) => code::INTERNAL,
@@ -264,43 +224,21 @@ fn picture_code(error: &PictureError) -> i32 {
 
 fn format_code(error: &FormatError) -> i32 {
     match error {
-        FormatError::TooMany { .. }
-        | FormatError::GlbTooLarge { .. }
-        | FormatError::AtomIndexTooLarge { .. }
-        | FormatError::CoordinateTooLarge { .. } => code::LIMIT,
+        FormatError::Limit(_) | FormatError::CoordinateTooLarge { .. } => code::LIMIT,
         // A broken mesh is a defect of the program.
         _ => code::INTERNAL,
     }
 }
 
 fn surface_hint(error: &SurfaceError) -> Option<String> {
-    let coarser_or = |other: &str| {
-        Some(error.suggested_resolution().map_or(other.to_owned(), |h| format!("try --resolution {h}, or {other}")))
-    };
     match error {
-        SurfaceError::GridTooLarge { .. } => coarser_or("raise --max-grid-points"),
-        SurfaceError::PocketGridTooLarge { .. } => {
-            Some("omit the search for pockets, or raise --max-grid-points".to_owned())
+        SurfaceError::Limit(error) => {
+            let coarser = error.suggested_resolution.map(|h| format!("try --resolution {h}"));
+            let raise = error.flag().map(|flag| format!("raise the limit with {flag}"));
+            let both: Vec<String> = coarser.into_iter().chain(raise).collect();
+            (!both.is_empty()).then(|| both.join(", or "))
         }
-        SurfaceError::MeshTooLarge { .. } => coarser_or("raise --max-mesh-bytes"),
-        SurfaceError::TooManyCandidates { suggested_resolution: Some(_), .. } => coarser_or("raise --max-candidates"),
-        SurfaceError::TooManyCandidates { .. } => {
-            Some("try a coarser --resolution or smaller radii, or raise --max-candidates".to_owned())
-        }
-        SurfaceError::TooManyTiles { .. } => Some("try a coarser --resolution".to_owned()),
-        SurfaceError::TooManyTriangles { simplify: Some(error), resolution, .. } => {
-            // Above one grid spacing, a larger error hardly changes the number of triangles.
-            let hint = if error < resolution {
-                "try a larger --simplify, a coarser --resolution, or a larger --max-triangles"
-            } else {
-                "try a coarser --resolution or a larger --max-triangles"
-            };
-            Some(hint.to_owned())
-        }
-        SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
-        SurfaceError::DeviceMemory { .. } => coarser_or("try --backend cpu"),
         SurfaceError::Device { .. } => Some(format!("try --backend cpu{DOCTOR}")),
-        SurfaceError::TooManyOverlaps { .. } => Some("try a smaller --probe, or raise --max-candidates".to_owned()),
         SurfaceError::NoSurface { isovalue: None } => Some("try a finer --resolution".to_owned()),
         SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
         SurfaceError::NoCavity { .. } => {
@@ -313,13 +251,28 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use clap::CommandFactory as _;
+    use molmesh::surface::limit::LIMITS;
+    use molmesh::surface::{Exceeded, Limit};
+
+    use super::super::args::Args;
     use super::*;
+
+    #[test]
+    fn every_flag_of_a_limit_exists() {
+        let mesh = Args::command().find_subcommand("mesh").unwrap().clone();
+        let flags: Vec<String> =
+            mesh.get_arguments().filter_map(|arg| Some(format!("--{}", arg.get_long()?))).collect();
+        for flag in LIMITS.iter().filter_map(|row| row.flag) {
+            assert!(flags.iter().any(|known| known == flag), "{flag}");
+        }
+    }
 
     #[test]
     fn every_error_has_its_exit_code() {
         let job = |source: JobError| CliError::Job { name: "x".into(), source, strict_finding: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
-        let cases: [(CliError, i32); 19] = [
+        let cases: [(CliError, i32); 17] = [
             (CliError::Internal(String::new()), 1),
             (CliError::Unfit { failed: vec!["store"], backend: false }, 1),
             (CliError::usage("x"), 2),
@@ -328,12 +281,10 @@ mod tests {
             (job(StructureError::NoAtoms { found: "nothing".into() }.into()), 4),
             (job(SurfaceError::NoSpheres.into()), 4),
             (CliError::Strict { name: "x".into(), errors: 1, first: String::new() }, 4),
-            (job(StructureError::TooManyAtoms { limit: 1 }.into()), 5),
-            (job(SurfaceError::MeshTooLarge { bytes: 2, limit: 1, suggested_resolution: 1.0 }.into()), 5),
-            (job(SurfaceError::DeviceMemory { needed: 2, available: 1, suggested_resolution: 1.0 }.into()), 5),
+            (job(SurfaceError::Limit(Exceeded::new(Limit::Atoms, 1).into()).into()), 5),
             (job(SurfaceError::Deadline.into()), 5),
             (job(SurfaceError::Device { why: String::new() }.into()), 6),
-            (FormatError::GlbTooLarge { bytes: 2, limit: 1 }.into(), 5),
+            (FormatError::Limit(Exceeded::new(Limit::FileBytes, 1).into()).into(), 5),
             (CliError::NoBackend { requested: "gpu", why: String::new() }, 6),
             (CliError::InUse(String::new()), 8),
             (CliError::Output { name: "x".into(), source: missing() }, 7),
@@ -352,8 +303,8 @@ mod tests {
 
     #[test]
     fn grid_limit_suggests_a_resolution() {
-        let error = SurfaceError::GridTooLarge { grid_points: 9, limit: 1, resolution: 0.1, suggested_resolution: 0.4 };
+        let error: SurfaceError = Exceeded::new(Limit::GridPoints, 1).suggest(0.4).error();
         let hint = CliError::Job { name: "x".into(), source: error.into(), strict_finding: None }.hint();
-        assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise --max-grid-points"));
+        assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise the limit with --max-grid-points"));
     }
 }

@@ -14,7 +14,7 @@ use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, MapFile, Product
 use molmesh::structure::stream::{BLOCK_BYTES, ScratchFile};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
-use molmesh::surface::{CancelToken, Control, SurfaceError};
+use molmesh::surface::{CancelToken, Control, Exceeded, Limit, SurfaceError};
 
 use super::args::JobArgs;
 use super::backend::{self, BackendRequest, Purpose, SelectedBackend};
@@ -226,7 +226,8 @@ pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
     };
     let bytes = read().map_err(|source| CliError::Input { name: name(), source })?;
     if bytes.len() as u64 > limit {
-        return Err(CliError::InputTooLarge { name: name(), limit });
+        let source = SurfaceError::Limit(Exceeded::new(Limit::InflatedBytes, limit).into()).into();
+        return Err(CliError::Job { name: name(), source, strict_finding: None });
     }
     Ok(bytes)
 }

@@ -294,6 +294,15 @@ pub(super) fn minimum(key: &str) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::surface::limit::LIMITS;
+
+    #[test]
+    fn every_key_of_a_limit_exists() {
+        let keys = Tree::new().keys();
+        for key in LIMITS.iter().filter_map(|row| row.key) {
+            assert!(keys.iter().any(|known| known == key), "{key}");
+        }
+    }
 
     #[test]
     fn requests_use_half_of_a_small_memory_unless_configured() {

@@ -5,10 +5,11 @@ mod inputs;
 use std::time::Duration;
 
 use serde::Serialize;
+use serde_json::Value;
 use utoipa::ToSchema;
 
 use super::problem::Problem;
-use super::problem_types::ProblemType;
+use super::problem_types::{ProblemEntry, ProblemType};
 use crate::client_shares::ShareExceeded;
 use crate::formats::FormatError;
 use crate::jobs::{AcceptError, EndError, Failure, Refusal, SaveError};
@@ -17,8 +18,7 @@ use crate::pipeline::JobError;
 use crate::pipeline::params::ParamError;
 use crate::store::StoreError;
 use crate::structure::strict_validator::Diagnostic;
-use crate::surface::params::MAX_RESOLUTION;
-use crate::surface::{OutOfMemory, SurfaceError};
+use crate::surface::{Exceeded, Limit, OutOfMemory, SurfaceError};
 
 /// Finding of the strict validator.
 #[derive(Debug, Serialize, ToSchema)]
@@ -51,32 +51,36 @@ fn diagnosed(problem: Problem, diagnostics: &[Diagnostic]) -> Problem {
 
 /// Returns the problem of a mesh file that exceeds `limit` bytes.
 pub(super) fn file_too_large(bytes: u64, limit: u64, resolution: f64) -> Problem {
-    oversized(&format!("the file would have {bytes} bytes and the limit is {limit}"), bytes, limit, resolution)
-}
-
-/// Returns the problem of a mesh with `actual` bytes, vertices or triangles, more than `limit`; `what` begins the
-/// explanation. These numbers grow with the inverse square of the spacing.
-#[expect(clippy::cast_precision_loss, reason = "an estimate: 52 bits suffice")]
-fn oversized(what: &str, actual: u64, limit: u64, resolution: f64) -> Problem {
-    let fits = (resolution * (actual as f64 / limit as f64).sqrt() * 105.0).ceil() / 100.0;
-    if fits > MAX_RESOLUTION {
-        return Problem::new(ProblemType::MeshTooLarge, what.to_owned()).with("limit", limit).with("actual", actual);
-    }
-    Problem::new(ProblemType::MeshTooLarge, format!("{what}; a resolution of {fits} Å should fit"))
-        .with("limit", limit)
-        .with("actual", actual)
-        .with("suggested_resolution", fits)
+    let error = Exceeded { actual: Some(bytes), ..Exceeded::new(Limit::FileBytes, limit) };
+    Problem::from(&error.suggest_for_area(resolution))
 }
 
 /// Returns the problem of a mesh that cannot be written.
 pub(super) fn format_problem(error: &FormatError, resolution: f64) -> Problem {
-    match *error {
-        FormatError::GlbTooLarge { bytes, limit } => file_too_large(bytes, limit, resolution),
-        FormatError::TooMany { count, limit, .. } => oversized(&error.to_string(), count, limit, resolution),
-        FormatError::AtomIndexTooLarge { limit, .. } => Problem::new(ProblemType::MeshTooLarge, error.to_string())
-            .with("limit", limit)
-            .with("parameter", "atom_ids"),
+    match error {
+        // A number that is not known does not depend on the grid spacing.
+        FormatError::Limit(error) if error.actual.is_none() => Problem::from(&**error),
+        FormatError::Limit(error) => Problem::from(&Exceeded::clone(error).suggest_for_area(resolution)),
         _ => Problem::internal(error),
+    }
+}
+
+impl From<&Exceeded> for Problem {
+    fn from(error: &Exceeded) -> Self {
+        let row = error.limit.row();
+        let Some(entry) = ProblemEntry::find(row.problem) else { return Self::internal(error) };
+        let members = [
+            ("parameter", row.parameter.map(Value::from)),
+            ("actual", error.actual.map(Value::from)),
+            ("resolution", error.resolution.map(Value::from)),
+            ("position", error.position.map(|position| position.to_vec().into())),
+            ("suggested_resolution", error.suggested_resolution.map(Value::from)),
+        ];
+        let problem = Self::new(entry.problem_type, error.to_string()).with("limit", error.max);
+        members
+            .into_iter()
+            .filter_map(|(name, value)| Some((name, value?)))
+            .fold(problem, |p, (name, v)| p.with(name, v))
     }
 }
 
@@ -173,9 +177,6 @@ impl From<EndError> for Problem {
         match error {
             EndError::Job(failure) => failure.into(),
             EndError::Save { error: SaveError::Format(error), resolution } => format_problem(&error, resolution),
-            EndError::Save { error: SaveError::TooLarge { bytes, limit }, resolution } => {
-                file_too_large(bytes, limit, resolution)
-            }
             EndError::Save { error: SaveError::Store(error), .. } => error.into(),
             EndError::Save { error: SaveError::Other(error), .. } => Self::internal(error),
             EndError::Poison { attempts } => {
@@ -241,10 +242,7 @@ impl From<PictureError> for Problem {
     fn from(error: PictureError) -> Self {
         let detail = error.to_string();
         match error {
-            PictureError::TooLarge { side, pixels, limit } => Self::new(ProblemType::PictureTooLarge, detail)
-                .with("parameter", side)
-                .with("limit", limit)
-                .with("actual", pixels),
+            PictureError::Limit(error) => Self::from(&*error),
             _ => Self::internal(detail), // The parameters have been checked before.
         }
     }
@@ -254,39 +252,13 @@ impl From<SurfaceError> for Problem {
     fn from(error: SurfaceError) -> Self {
         use SurfaceError as E;
         let detail = error.to_string();
-        let suggested = error.suggested_resolution();
-        let fitting =
-            |problem: Self| suggested.into_iter().fold(problem, |problem, h| problem.with("suggested_resolution", h));
-        let exceeded = |kind: ProblemType, limit: u64, actual: u64| {
-            Self::new(kind, error.to_string()).with("limit", limit).with("actual", actual)
-        };
         match error {
             E::NoSpheres => Self::new(ProblemType::NoAtoms, detail),
             E::BadSphere { index, expected, .. } => {
                 Self::new(ProblemType::UnreadableStructure, detail).with("atom", index).with("expected", expected)
             }
             E::BadParameter { .. } => ParamError::from(error).into(),
-            E::GridTooLarge { grid_points, limit, resolution, .. } => {
-                fitting(exceeded(ProblemType::GridTooLarge, limit, grid_points).with("resolution", resolution))
-            }
-            E::PocketGridTooLarge { grid_points, limit, .. } => {
-                exceeded(ProblemType::GridTooLarge, limit, grid_points).with("parameter", "pockets")
-            }
-            E::TooManyPocketRows { rows, limit } => {
-                exceeded(ProblemType::TooManyCandidates, limit, rows).with("parameter", "pockets")
-            }
-            E::TooManyCandidates { candidates, limit, resolution, .. } => {
-                fitting(exceeded(ProblemType::TooManyCandidates, limit, candidates).with("resolution", resolution))
-            }
-            E::MeshTooLarge { bytes, limit, .. } => fitting(exceeded(ProblemType::MeshTooLarge, limit, bytes)),
-            E::TooManyTriangles { triangles, limit, resolution, .. } => Self::new(ProblemType::MeshTooLarge, detail)
-                .with("parameter", "max_triangles")
-                .with("limit", limit)
-                .with("actual", triangles)
-                .with("resolution", resolution),
-            E::TooManyTiles { limit, .. } => Self::new(ProblemType::GridTooLarge, detail).with("limit", limit),
-            E::TilesetTooLarge { limit, .. } => Self::new(ProblemType::TooMuchMemory, detail).with("limit", limit),
-            E::TooManyOverlaps { overlaps, limit } => exceeded(ProblemType::TooManyCandidates, limit, overlaps),
+            E::Limit(error) => Self::from(&*error),
             E::NoSurface { isovalue: Some(isovalue) } => {
                 Self::new(ProblemType::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
             }
@@ -295,9 +267,6 @@ impl From<SurfaceError> for Problem {
             }
             E::NoCavity { .. } => Self::new(ProblemType::NoSurface, detail).with("parameter", "cavities"),
             E::NoPatch => Self::new(ProblemType::NoSurface, detail).with("parameter", "context"),
-            E::DeviceMemory { needed, available, .. } => {
-                fitting(exceeded(ProblemType::DeviceMemory, available, needed))
-            }
             // The worker has logged the driver's message.
             E::Device { .. } => {
                 Self::new(ProblemType::DeviceFailed, "no device could run the job").retry_after(Duration::from_secs(1))
@@ -313,21 +282,29 @@ impl From<SurfaceError> for Problem {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::surface::limit::LIMITS;
+
+    #[test]
+    fn every_limit_has_a_problem_type() {
+        for row in LIMITS {
+            assert!(ProblemEntry::find(row.problem).is_some_and(|entry| entry.is_rejection), "{row:?}");
+        }
+    }
 
     #[test]
     fn a_format_that_cannot_count_the_triangles_is_explained_by_their_number() {
-        let error = FormatError::TooMany { format: "STL", what: "triangles", count: 400, limit: 100 };
-        let problem = format_problem(&error, 0.5).record("");
-        assert_eq!(problem["detail"], format!("{error}; a resolution of 1.05 Å should fit"));
+        let triangles = Exceeded { actual: Some(400), ..Exceeded::new(Limit::FileTriangles, 100) };
+        let problem = format_problem(&triangles.error(), 0.5).record("");
+        assert_eq!(
+            problem["detail"],
+            "the file would have 400 triangles, the limit is 100; a resolution of 1.05 Å should fit"
+        );
         assert_eq!((&problem["limit"], &problem["suggested_resolution"]), (&100.into(), &1.05.into()));
         // No grid is coarser than 20 Å.
         let none = file_too_large(200_000, 100, 0.5).record("");
-        assert_eq!(none["detail"], "the file would have 200000 bytes and the limit is 100");
+        assert_eq!(none["detail"], "the file would have 200000 bytes, the limit is 100");
         assert!(none.get("suggested_resolution").is_none());
-        let file = format_problem(&FormatError::GlbTooLarge { bytes: 400, limit: 100 }, 0.5).record("");
-        assert_eq!(
-            file["detail"],
-            "the file would have 400 bytes and the limit is 100; a resolution of 1.05 Å should fit"
-        );
+        let atom = format_problem(&Exceeded::new(Limit::AtomIndex, 7).error(), 0.5).record("");
+        assert_eq!((&atom["parameter"], atom.get("suggested_resolution")), (&"atom_ids".into(), None));
     }
 }

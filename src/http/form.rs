@@ -13,11 +13,11 @@ use thiserror::Error;
 
 use super::body_hasher::BodyHasher;
 use super::content_type::DeclaredType;
-use super::limit::Limit;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use crate::jobs::MemoryReservation;
 use crate::store::Digest;
+use crate::surface::{Exceeded, Limit};
 
 /// Maximum size of the headers of a part, and of the preamble before the first part, bytes. Browsers send a few
 /// hundred.
@@ -81,14 +81,13 @@ impl Stream for Feed<'_> {
 const UNBOUNDED: usize = usize::MAX;
 
 fn head_too_long() -> Problem {
-    let limit = Limit { key: None, max: MAX_HEAD_BYTES as u64 };
-    limit.exceeded("the preamble or the headers of a part have", "bytes")
+    Problem::from(&Exceeded::new(Limit::PartHeadBytes, MAX_HEAD_BYTES as u64))
 }
 
 /// Returns the problem of an error of the parser, for a body with this limit.
-fn unreadable(error: &multer::Error, body: Limit) -> Problem {
+fn unreadable(error: &multer::Error, body: &Exceeded) -> Problem {
     match error {
-        multer::Error::StreamSizeExceeded { .. } => body.exceeded_by_body(),
+        multer::Error::StreamSizeExceeded { .. } => body.into(),
         multer::Error::StreamReadFailed(cause)
             if matches!(cause.downcast_ref::<FeedError>(), Some(FeedError::HeadTooLong)) =>
         {
@@ -115,7 +114,7 @@ pub(super) struct UploadedFile {
 /// Reads a form of `announced` bytes, 0 if unknown: one structure file in `file` or `structure`, at most one map in
 /// `map`, parameters in the other fields.
 pub(super) async fn read(
-    limit: Limit,
+    limit: &Exceeded,
     content_type: &str,
     announced: u64,
     body: Body,
@@ -143,7 +142,7 @@ pub(super) async fn read(
             return Err(head_too_long());
         }
         if fields.len() + usize::from(file.is_some()) + usize::from(map.is_some()) >= MAX_PARTS {
-            return Err(Limit { key: None, max: MAX_PARTS as u64 }.exceeded("the form has", "parts"));
+            return Err(Problem::from(&Exceeded::new(Limit::FormParts, MAX_PARTS as u64)));
         }
         let name = field.name().unwrap_or_default().to_owned();
         reservation.grow(name.len() as u64)?;

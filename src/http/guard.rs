@@ -24,8 +24,8 @@ use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::state::{App, Shared};
 use crate::access::{
-    Access, Account, Denied, Exceeded, Key, Quota, Scope, Signature, SignatureCheck, rate_limit, rate_limit_policy,
-    remove_signature,
+    Access, Account, Denied, Key, Quota, QuotaExceeded, Scope, Signature, SignatureCheck, rate_limit,
+    rate_limit_policy, remove_signature,
 };
 use crate::jobs::{Client, rfc3339};
 use crate::store::Namespace;
@@ -305,8 +305,8 @@ fn no_key(denied: Denied) -> Problem {
 }
 
 /// Returns the problem of an exceeded quota.
-fn refusal(exceeded: &Exceeded) -> Problem {
-    let Exceeded { policy, limit, wait } = *exceeded;
+fn refusal(exceeded: &QuotaExceeded) -> Problem {
+    let QuotaExceeded { policy, limit, wait } = *exceeded;
     let what = match policy {
         "work" => format!("the jobs of this client took {limit} s of this window or more, which is its quota"),
         "concurrency" => format!("{limit} requests of this client are running, which is its quota"),

@@ -24,7 +24,6 @@ mod conditional;
 mod content_type;
 mod errors;
 mod json_body;
-mod limit;
 mod negotiate;
 
 // State of the service, and the identity of clients.

@@ -100,15 +100,14 @@ impl ParsedRequest {
                 upload::receive(app, caller, headers, body).await?;
             (StructureSource::Uploaded(Loaded::file(bytes, digest, reservation)), fields, declared, map)
         };
-        let request = match early {
-            Some(request) => request,
-            None => {
-                pairs.extend(fields);
-                let mut request = parse(&pairs)?;
-                request.job.map = map.as_ref().map(|(digest, bytes)| MapFile::new(digest.to_string(), bytes.clone()));
-                app.accepts(&request.job)?;
-                request
-            }
+        let request = if let Some(request) = early {
+            request
+        } else {
+            pairs.extend(fields);
+            let mut request = parse(&pairs)?;
+            request.job.map = map.as_ref().map(|(digest, bytes)| MapFile::new(digest.to_string(), bytes.clone()));
+            app.accepts(&request.job)?;
+            request
         };
         Ok(Self { source, request, map, pairs, report: false, declared })
     }

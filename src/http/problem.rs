@@ -14,7 +14,7 @@ use axum::response::{IntoResponse, Response};
 use metrics::counter;
 use serde_json::{Map, Value};
 
-use super::problem_types::{PROBLEM_TYPES, ProblemType};
+use super::problem_types::{ProblemEntry, ProblemType};
 use super::request_id::RequestId;
 use crate::telemetry::REJECTED;
 
@@ -116,7 +116,7 @@ impl Problem {
         let Some(members) = document.and_then(Value::as_object) else { return lost() };
         let text = |name: &str| members.get(name).and_then(Value::as_str);
         let slug = text("type").and_then(|t| t.rsplit('/').next());
-        let Some(row) = PROBLEM_TYPES.iter().find(|row| Some(row.slug) == slug) else { return lost() };
+        let Some(row) = slug.and_then(ProblemEntry::find) else { return lost() };
         let mut problem = Self::new(row.problem_type, text("detail").unwrap_or_default());
         let own = ["type", "title", "status", "detail", "instance"];
         let others = members.iter().filter(|(name, _)| !own.contains(&name.as_str()));

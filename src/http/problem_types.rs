@@ -84,6 +84,13 @@ pub(super) struct ProblemEntry {
     pub(super) is_rejection: bool,
 }
 
+impl ProblemEntry {
+    /// Returns the row with this slug.
+    pub(super) fn find(slug: &str) -> Option<&'static Self> {
+        PROBLEM_TYPES.iter().find(|row| row.slug == slug)
+    }
+}
+
 const fn row(
     problem_type: ProblemType,
     slug: &'static str,

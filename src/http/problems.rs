@@ -50,7 +50,7 @@ pub(super) async fn list() -> Response {
     responses((status = 200, description = "The explanation.", body = ProblemDescription), OneProblems))]
 pub(super) async fn one(path: Result<Path<String>, PathRejection>) -> Result<Response, Problem> {
     let Path(slug) = path?;
-    let row = PROBLEM_TYPES.iter().find(|row| row.slug == slug);
+    let row = ProblemEntry::find(&slug);
     row.map(|row| Json(describe(row)).into_response()).ok_or_else(|| {
         Problem::new(ProblemType::NotFound, "there is no problem type with this name; /problems lists all")
     })

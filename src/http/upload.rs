@@ -12,7 +12,6 @@ use super::body_hasher::BodyHasher;
 use super::content_type::DeclaredType;
 use super::form::{self, UploadedFile};
 use super::guard::Caller;
-use super::limit::Limit;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::state::App;
@@ -20,7 +19,7 @@ use crate::jobs::MemoryReservation;
 use crate::pipeline::JobError;
 use crate::store::Digest;
 use crate::structure::{GZIP_MAGIC, SourceFormat, ZSTD_MAGIC, detect_format};
-use crate::surface::MemoryMeter as _;
+use crate::surface::{Exceeded, Limit, MemoryMeter as _};
 
 /// Maximum size of a JSON body, bytes. A document names a structure and about thirty parameters.
 pub(super) const MAX_JSON_BYTES: u64 = 64 << 10;
@@ -49,8 +48,8 @@ pub(super) async fn receive(
     headers: &HeaderMap,
     body: Body,
 ) -> Result<UploadedFile, Problem> {
-    let limit = Limit { key: Some("limits.body_bytes"), max: app.config.limits.body_bytes };
-    let announced = announced(headers, limit)?;
+    let limit = Exceeded::new(Limit::BodyBytes, app.config.limits.body_bytes);
+    let announced = announced(headers, &limit)?;
     let reservation = app.uploads.for_client(caller.client.0).reservation();
     // A declared length is rejected before the body arrives.
     reservation.check(announced)?;
@@ -60,10 +59,10 @@ pub(super) async fn receive(
             return Err(bad_encoding("a form cannot be compressed as a whole; compress the file in it"));
         }
         let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
-        let form = form::read(limit, content_type, announced, body, reservation);
+        let form = form::read(&limit, content_type, announced, body, reservation);
         in_time(app, form).await?
     } else {
-        let (bytes, digest) = in_time(app, collect(body, announced, limit, &reservation)).await?;
+        let (bytes, digest) = in_time(app, collect(body, announced, &limit, &reservation)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
         UploadedFile { bytes, digest, reservation, map: None, fields: Vec::new(), declared }
     };
@@ -103,22 +102,25 @@ pub(super) async fn receive_json(
     headers: &HeaderMap,
     body: Body,
 ) -> Result<Bytes, Problem> {
-    let limit = Limit { key: None, max: MAX_JSON_BYTES };
-    let announced = announced(headers, limit).map_err(|problem| problem.advise(NOT_JSON))?;
+    let limit = Exceeded::capped(Limit::BodyBytes, u64::MAX, MAX_JSON_BYTES);
+    let announced = announced(headers, &limit).map_err(|problem| problem.advise(NOT_JSON))?;
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
     let reservation = app.uploads.for_client(caller.client.0).reservation();
-    let received = in_time(app, collect(body, announced, limit, &reservation)).await;
+    let received = in_time(app, collect(body, announced, &limit, &reservation)).await;
     let (bytes, _digest) = received.map_err(|problem| problem.advise(NOT_JSON))?;
     // The document is charged until it has been parsed.
     Ok(reservation.attach(bytes))
 }
 
 /// Returns the length that the headers announce, 0 if they do not.
-fn announced(headers: &HeaderMap, limit: Limit) -> Result<u64, Problem> {
+fn announced(headers: &HeaderMap, limit: &Exceeded) -> Result<u64, Problem> {
     let length = text(headers, &CONTENT_LENGTH).and_then(|length| length.parse::<u64>().ok()).unwrap_or(0);
-    if length > limit.max { Err(limit.exceeded_by_body().with("actual", length)) } else { Ok(length) }
+    if length <= limit.max {
+        return Ok(length);
+    }
+    Err(Problem::from(&Exceeded { actual: Some(length), ..limit.clone() }))
 }
 
 /// Limits the time for the reception of a body.
@@ -144,7 +146,7 @@ fn broken(error: &dyn std::fmt::Display) -> Problem {
 async fn collect(
     body: Body,
     announced: u64,
-    limit: Limit,
+    limit: &Exceeded,
     reservation: &MemoryReservation,
 ) -> Result<(Bytes, Digest), Problem> {
     let mut stream = body.into_data_stream();
@@ -153,7 +155,7 @@ async fn collect(
         let data = data.map_err(|e| broken(&e))?;
         length += data.len() as u64;
         if length > limit.max {
-            return Err(limit.exceeded_by_body());
+            return Err(limit.into());
         }
         hasher.update(&data, reservation).await?;
         if first.is_empty() && all.is_empty() {

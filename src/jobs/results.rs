@@ -10,6 +10,7 @@ use thiserror::Error;
 use super::{ContentKey, Finished};
 use crate::formats::{Format, FormatError};
 use crate::store::{Digest, Hasher, Pin, Store, StoreError};
+use crate::surface::{Exceeded, Limit};
 
 /// File name extension of a report.
 pub(crate) const REPORT: &str = "json";
@@ -17,17 +18,9 @@ pub(crate) const REPORT: &str = "json";
 /// Error of [`save`].
 #[derive(Debug, Clone, Error)]
 pub(crate) enum SaveError {
-    /// The format cannot hold the mesh.
+    /// The format cannot hold the mesh, or its file would be too large.
     #[error(transparent)]
     Format(#[from] FormatError),
-    /// The file would be too large.
-    #[error("the file would take {bytes} bytes, the limit is {limit}")]
-    TooLarge {
-        /// Size of the file, bytes.
-        bytes: u64,
-        /// Allowed size, bytes.
-        limit: u64,
-    },
     /// The store failed.
     #[error(transparent)]
     Store(StoreError),
@@ -39,13 +32,19 @@ pub(crate) enum SaveError {
 impl From<StoreError> for SaveError {
     fn from(error: StoreError) -> Self {
         match error {
-            StoreError::TooLarge { bytes, max_bytes } => Self::TooLarge { bytes, limit: max_bytes },
+            StoreError::TooLarge { bytes, max_bytes } => Self::too_large(bytes, max_bytes),
             error => Self::Store(error),
         }
     }
 }
 
 impl SaveError {
+    /// Returns the error for a file of more than `limit` bytes.
+    fn too_large(bytes: u64, limit: u64) -> Self {
+        let error = Exceeded { actual: Some(bytes), ..Exceeded::new(Limit::FileBytes, limit) };
+        Self::Format(error.error())
+    }
+
     /// Returns true if a later attempt may succeed.
     pub(crate) fn is_temporary(&self) -> bool {
         matches!(self, Self::Store(error) if error.is_temporary())
@@ -153,7 +152,7 @@ pub(crate) async fn save(
         let file = finished.product.file(format)?;
         let bytes = file.bytes_bound();
         if bytes > limit {
-            return Err(SaveError::TooLarge { bytes, limit });
+            return Err(SaveError::too_large(bytes, limit));
         }
         let write = || {
             let mut writer = Hashing { writer: writing.writer(&name), hasher: Hasher::default(), bytes: 0 };

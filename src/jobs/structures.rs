@@ -19,7 +19,7 @@ use crate::pipeline::{Job, JobError, StageClock};
 use crate::store::{Digest, Namespace};
 use crate::structure::stream::BLOCK_BYTES;
 use crate::structure::{self, ReadLimits, StructureError};
-use crate::surface::{CancelToken, Control, MemoryMeter as _, OutOfMemory, Reservation, SurfaceError};
+use crate::surface::{CancelToken, Control, Exceeded, Limit, MemoryMeter as _, OutOfMemory, Reservation, SurfaceError};
 use crate::sync::{Condvar, Mutex, MutexGuard};
 use crate::telemetry::{STRUCTURE_CACHE_BYTES, STRUCTURE_CACHE_REQUESTS};
 
@@ -129,7 +129,7 @@ impl Structures {
     ///
     /// # Errors
     /// Returns the errors of [`Tileset::new`], [`Tileset::of_stream`] and [`Tileset::colors`], and
-    /// [`SurfaceError::TilesetTooLarge`] if one of them does not fit into the cache.
+    /// [`SurfaceError::Limit`] if one of them does not fit into the cache.
     pub(crate) fn tileset(
         &self,
         (namespace, digest): CacheKey,
@@ -158,16 +158,20 @@ impl Structures {
                 // Reading, or copying for an assembly, ends early if the atoms do not fit.
                 let max_atoms = limits.max_atoms.min(self.limit / BYTES_PER_ATOM);
                 match in_memory(&ReadLimits { max_atoms, ..*limits }) {
-                    Err(JobError::Surface(SurfaceError::TilesetTooLarge { .. })) => on_disk(scratch),
-                    Err(JobError::Structure(
-                        StructureError::TooManyAtoms { .. } | StructureError::AssemblyTooLarge { .. },
-                    )) if max_atoms < limits.max_atoms => on_disk(scratch),
+                    Err(JobError::Surface(SurfaceError::Limit(error)))
+                        if error.limit == Limit::TilesetBytes
+                            || error.limit == Limit::Atoms && max_atoms < limits.max_atoms =>
+                    {
+                        on_disk(scratch)
+                    }
                     made => made,
                 }
             }
             _ => in_memory(limits).map_err(|error| match error {
-                JobError::Surface(SurfaceError::TilesetTooLarge { limit, .. }) => {
-                    SurfaceError::TilesetTooLarge { limit, parameter: not_on_disk }.into()
+                JobError::Surface(SurfaceError::Limit(mut error)) if error.limit == Limit::TilesetBytes => {
+                    let on_disk = |name| format!("another `{name}`, for which a larger index can be on disk").into();
+                    error.hint = not_on_disk.map(on_disk);
+                    SurfaceError::from(error).into()
                 }
                 error => error,
             }),
@@ -250,16 +254,17 @@ impl Structures {
         prepare: impl FnOnce(&Control<'_>) -> Result<T, JobError>,
     ) -> Result<Shared<T>, JobError> {
         let limit = self.limit;
+        let too_large = || SurfaceError::from(Box::new(Exceeded::new(Limit::TilesetBytes, limit))).into();
         let reservation = Arc::new(budget.reservation());
         let charged = Control { memory: Arc::<MemoryReservation>::clone(&reservation), ..control.clone() };
         let value = prepare(&charged).map_err(|error| match error {
             JobError::Surface(SurfaceError::Memory(
                 OutOfMemory::Limit { limit: of, .. } | OutOfMemory::Budget { limit: of, .. },
-            )) if of == limit => SurfaceError::TilesetTooLarge { limit, parameter: None }.into(),
+            )) if of == limit => too_large(),
             error => error,
         })?;
         if reservation.bytes() > limit {
-            return Err(SurfaceError::TilesetTooLarge { limit, parameter: None }.into());
+            return Err(too_large());
         }
         let shared = self.charged(value, input, reservation);
         control.memory.also_held(shared.bytes());
@@ -426,7 +431,7 @@ mod tests {
         assert_eq!(*first, *elsewhere);
         let tight = ReadLimits { max_atoms: 9, ..ReadLimits::default() };
         let refused = structures.get(Namespace::default(), file.1, &file.0, &tight, &Control::default());
-        assert_eq!(refused.unwrap_err(), StructureError::TooManyAtoms { limit: 9 });
+        assert_eq!(refused.unwrap_err(), Exceeded::new(Limit::Atoms, 9).error());
     }
 
     #[test]

@@ -171,7 +171,7 @@ fn level_or_triangle_limit_sets_the_spacing() {
     fs::remove_file(&output).unwrap();
     let refused = mesh(sample, &output, &["--max-triangles", "20"]);
     assert_code(&refused, 5);
-    assert!(stderr(&refused).contains("hint: try --max-triangles "), "{}", stderr(&refused));
+    assert!(stderr(&refused).contains("hint: raise the limit with --max-triangles"), "{}", stderr(&refused));
     for flags in [
         &["--detail", "1", "--resolution", "1"][..],
         &["--detail", "1", "--max-triangles", "1000"],

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use molmesh::formats::{CompressedGlb, Format, FormatError, Meta, Normals, Packing, Pieces, Step, Storage};
 use molmesh::pipeline::{self, Choice, JobError, JobLimits, Product, params, run};
-use molmesh::surface::{CancelToken, Control, CpuBackend, Mesh, SurfaceError};
+use molmesh::surface::{CancelToken, Control, CpuBackend, Limit, Mesh, SurfaceError};
 use serde_json::Value;
 
 use crate::instances::{OPERATORS, with_rules};
@@ -248,7 +248,7 @@ fn meshes_that_cannot_be_compressed_are_rejected() {
     );
     let large = dressed(mesh, (1 << 24) + 1);
     let mut large = Mesh { centre: [0.0; 3], ..large };
-    assert!(matches!(pieces_of(&mut large), Err(FormatError::AtomIndexTooLarge { .. })));
+    assert!(matches!(pieces_of(&mut large), Err(FormatError::Limit(error)) if error.limit == Limit::AtomIndex));
     // A position beyond the step.
     let mut beyond = icosphere(2, 10.0, [0.0; 3], false);
     beyond.quantize(Step::covering(2.0));

@@ -6,8 +6,8 @@ use std::num::NonZeroU32;
 use molmesh::formats::{Encoder, Format, FormatError};
 use molmesh::pipeline::params;
 use molmesh::pipeline::{Choice, JobError, JobLimits, Product, run};
-use molmesh::structure::{ReadLimits, Selection, StructureError, read, select};
-use molmesh::surface::{Control, CpuBackend};
+use molmesh::structure::{ReadLimits, Selection, read, select};
+use molmesh::surface::{Control, CpuBackend, Limit, SurfaceError};
 use serde_json::Value;
 
 use crate::split::dimer;
@@ -277,11 +277,12 @@ fn limits_apply_to_instances_and_to_the_atoms_of_units() {
     // 912 atoms are in the file, and 2,724 would be in the copies.
     assert_eq!(limited(3, 912), Ok(908));
     let error = limited(2, 912).unwrap_err();
-    assert_eq!(error, JobError::Structure(StructureError::TooManyCopies { id: "1".into(), limit: 2 }));
+    assert!(matches!(&error, JobError::Surface(error) if error.exceeded(Limit::Copies).is_some_and(|e| e.max == 2)));
     let overlapping = with_rules(&[("A, B", &OPERATORS), ("A", &OPERATORS[1..])]);
     let read = ReadLimits { max_atoms: 912, ..ReadLimits::default() };
     let error = meshed_with(&overlapping, &[], &JobLimits { read, ..JobLimits::default() }).unwrap_err();
-    assert!(matches!(error, JobError::Structure(StructureError::AssemblyTooLarge { atoms: 1362, .. })), "{error}");
+    let JobError::Surface(SurfaceError::Limit(error)) = error else { panic!("{error}") };
+    assert_eq!((error.limit, error.actual), (Limit::Atoms, Some(1362)));
     let mut far = OPERATORS[0];
     far[3] = 99_990.0;
     let error = meshed_with(&with_rules(&[("A", &[far])]), &[], &JobLimits::default()).unwrap_err();

@@ -5,7 +5,7 @@ use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError};
 use molmesh::pipeline::{Choice, JobError, JobLimits, Product, estimate, run};
 use molmesh::structure;
-use molmesh::surface::{Control, CpuBackend, Measures, SurfaceError, Validation};
+use molmesh::surface::{Control, CpuBackend, Limit, Measures, SurfaceError, Validation};
 
 use crate::tools;
 
@@ -97,8 +97,9 @@ fn a_limit_on_triangles_ends_the_simplification() {
     }
     let job = params::parse([("simplify", "0.02"), ("max_triangles", "1000")]).unwrap().job;
     match run(SAMPLE, &job, &limits, &choice, control, &(), None) {
-        Err(JobError::Surface(SurfaceError::TooManyTriangles { triangles, limit: 1000, resolution, simplify })) => {
-            assert!(triangles > 10_000 && (resolution, simplify) == (0.5, Some(0.02)));
+        Err(JobError::Surface(SurfaceError::Limit(error))) => {
+            assert_eq!((error.limit, error.max, error.resolution), (Limit::Triangles, 1000, Some(0.5)));
+            assert!(error.actual > Some(10_000) && error.to_string().contains("an error of 0.02 Å"), "{error}");
         }
         other => panic!("{:?}", other.map(drop)),
     }

@@ -3,7 +3,7 @@
 use molmesh::pipeline::spacing::{COARSEST, FINEST};
 use molmesh::pipeline::{Choice, Estimate, JobError, JobLimits, Product, Report, estimate, params, run};
 use molmesh::structure::{ReadLimits, read_with};
-use molmesh::surface::{Control, CpuBackend, SurfaceError, SurfaceLimits};
+use molmesh::surface::{Control, CpuBackend, Limit, SurfaceError, SurfaceLimits};
 
 const PTI: &[u8] = include_bytes!("../../samples/4pti.pdb");
 const CRAMBIN: &[u8] = include_bytes!("../../samples/1crn.cif");
@@ -69,12 +69,10 @@ fn the_limit_holds_for_every_structure_and_kernel() {
                 let bounded = product(&input, &[("surface", kernel), ("max_triangles", &text)]);
                 let Product { mesh, report, .. } = match bounded {
                     Ok(product) => product,
-                    Err(JobError::Surface(SurfaceError::TooManyTriangles {
-                        triangles,
-                        limit: reported,
-                        resolution,
-                        simplify: None,
-                    })) => {
+                    Err(JobError::Surface(error)) => {
+                        let exceeded = error.exceeded(Limit::Triangles).unwrap_or_else(|| panic!("{case}: {error}"));
+                        let (reported, triangles) = (exceeded.max, exceeded.actual.unwrap());
+                        let resolution = exceeded.resolution.unwrap();
                         refused += 1;
                         // The error is correct: its spacing gives this number of triangles, and it is the coarsest one
                         // except for separate atoms.
@@ -129,7 +127,7 @@ fn the_same_limit_gives_the_same_mesh_and_report() {
 fn the_other_limits_apply_too() {
     let narrow = SurfaceLimits { max_grid_points: 40_000, ..SurfaceLimits::default() };
     let refused = with(PTI, &[("max_triangles", "1000000")], narrow).unwrap_err();
-    assert!(matches!(refused, JobError::Surface(SurfaceError::GridTooLarge { .. })), "{refused}");
+    assert!(matches!(&refused, JobError::Surface(error) if error.exceeded(Limit::GridPoints).is_some()), "{refused}");
     assert!(with(PTI, &[("max_triangles", "2000")], narrow).is_ok());
     // An isovalue above the maximum fails at any spacing.
     let nothing = product(PTI, &[("max_triangles", "1000"), ("isovalue", "100000")]).unwrap_err();

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use molmesh::structure::{self, ReadLimits, Selection};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Measures, Mesh, Observer, ReferenceBackend, Spheres, Stage, Step,
+    Backend, CancelToken, Control, CpuBackend, Limit, Measures, Mesh, Observer, ReferenceBackend, Spheres, Stage, Step,
     SurfaceError, SurfaceKind, SurfaceLimits, SurfaceOptions, SurfaceParams, Validation,
 };
 
@@ -278,10 +278,8 @@ fn overlaps_and_candidates_are_limited_and_the_search_can_be_cancelled() {
     // A large probe makes atoms overlap, and a coarse grid has few bricks.
     let large = params(SurfaceKind::Ses, Some(10.0), 8.0);
     let error = run(20_000, &large, &Control::default()).unwrap_err();
-    assert!(
-        matches!(error, SurfaceError::TooManyOverlaps { overlaps, limit: 20_000 } if overlaps > 20_000),
-        "{error:?}"
-    );
+    let exceeded = error.exceeded(Limit::Overlaps).unwrap();
+    assert!(exceeded.max == 20_000 && exceeded.actual > Some(20_000), "{error:?}");
     assert!(run(1 << 20, &large, &Control::default()).is_ok());
     // Many caps of one sphere: the comparisons count as well.
     let n = 2000;
@@ -302,15 +300,12 @@ fn overlaps_and_candidates_are_limited_and_the_search_can_be_cancelled() {
     let overlaps = run_crowd(1 << 31).unwrap();
     assert!(overlaps > pairs + pairs / 100, "{overlaps} with comparisons, {pairs} pairs");
     assert_eq!(run_crowd(overlaps), Ok(overlaps));
-    let refused = run_crowd(overlaps - 1);
-    assert!(
-        matches!(refused, Err(SurfaceError::TooManyOverlaps { limit, .. }) if limit == overlaps - 1),
-        "{refused:?}"
-    );
+    let refused = run_crowd(overlaps - 1).unwrap_err();
+    assert!(refused.exceeded(Limit::Overlaps).is_some_and(|exceeded| exceeded.max == overlaps - 1), "{refused:?}");
     // Arcs near bricks count as atoms near bricks do.
     let pairs = backend.run(&atoms, &ses, &SurfaceLimits::default(), &Control::default()).unwrap().grid.candidates;
     let error = run(pairs + 1000, &ses, &Control::default()).unwrap_err();
-    assert!(matches!(error, SurfaceError::TooManyCandidates { .. }), "{error:?}");
+    assert!(error.exceeded(Limit::Candidates).is_some(), "{error:?}");
 
     let cancel = CancelToken::default();
     let observer = CancelAfter(cancel.clone());

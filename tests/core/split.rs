@@ -8,8 +8,10 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use molmesh::formats::{Encoder, Format, FormatError};
 use molmesh::pipeline::params::{self, ParamError};
 use molmesh::pipeline::{Choice, JobError, JobLimits, PartReport, Product, Report, estimate, run};
-use molmesh::structure::{ReadLimits, StructureError, read_with};
-use molmesh::surface::{Control, CpuBackend, MemoryMeter, Mesh, OutOfMemory, SurfaceError, SurfaceLimits, Validation};
+use molmesh::structure::{ReadLimits, Split, read_with};
+use molmesh::surface::{
+    Control, CpuBackend, Exceeded, Limit, MemoryMeter, Mesh, OutOfMemory, SurfaceError, SurfaceLimits, Validation,
+};
 use serde::Deserialize;
 
 use crate::tools;
@@ -278,7 +280,7 @@ fn the_number_of_parts_is_limited() {
     };
     assert_eq!(limited(2).unwrap().report.parts.len(), 2);
     let error = limited(1).unwrap_err();
-    assert_eq!(error, JobError::Structure(StructureError::TooManyParts { rule: "split=chain", limit: 1 }));
+    assert_eq!(error, Split::Chain.too_many_parts(&ReadLimits { max_parts: 1, ..ReadLimits::default() }).into());
 }
 
 #[test]
@@ -296,31 +298,24 @@ fn limits_of_meshing_apply_to_all_parts_together() {
     assert!(with(SurfaceLimits { max_grid_points: grid_points, ..surface }, "0.8").is_ok());
     let few = SurfaceLimits { max_grid_points: grid_points - 1, ..surface };
     let error = with(few, "0.8").unwrap_err();
-    let JobError::Surface(SurfaceError::GridTooLarge { grid_points: n, limit, suggested_resolution, .. }) = error
-    else {
-        panic!("{error}")
-    };
-    assert!(n >= grid_points && limit == grid_points - 1, "{n} {limit}");
-    assert!(with(few, &suggested_resolution.to_string()).is_ok(), "{suggested_resolution}");
+    let JobError::Surface(SurfaceError::Limit(error)) = error else { panic!("{error}") };
+    assert_eq!((error.limit, error.max), (Limit::GridPoints, grid_points - 1));
+    assert!(error.actual.unwrap() >= grid_points, "{error}");
+    assert!(with(few, &error.suggested_resolution.unwrap().to_string()).is_ok(), "{error}");
     let bytes = usual.mesh.bytes();
     assert!(one.mesh.bytes() < bytes - 1);
     assert!(with(SurfaceLimits { max_mesh_bytes: bytes, ..surface }, "0.8").is_ok());
     let few = SurfaceLimits { max_mesh_bytes: bytes - 1, ..surface };
     let error = with(few, "0.8").unwrap_err();
-    let JobError::Surface(SurfaceError::MeshTooLarge { limit, suggested_resolution, .. }) = error else {
-        panic!("{error}")
-    };
-    assert_eq!(limit, bytes - 1);
-    assert!(with(few, &suggested_resolution.to_string()).is_ok(), "{suggested_resolution}");
+    let JobError::Surface(SurfaceError::Limit(error)) = error else { panic!("{error}") };
+    assert_eq!((error.limit, error.max), (Limit::MeshBytes, bytes - 1));
+    assert!(with(few, &error.suggested_resolution.unwrap().to_string()).is_ok(), "{error}");
     let few = SurfaceLimits { max_candidates: 3000, ..surface };
     let error = with(few, "0.8").unwrap_err();
-    let JobError::Surface(SurfaceError::TooManyCandidates { candidates, limit: 3000, suggested_resolution, .. }) =
-        error
-    else {
-        panic!("{error}")
-    };
-    assert!(candidates > 3000);
-    assert!(with(few, &suggested_resolution.unwrap().to_string()).is_ok(), "{suggested_resolution:?}");
+    let JobError::Surface(SurfaceError::Limit(error)) = error else { panic!("{error}") };
+    assert_eq!((error.limit, error.max), (Limit::Candidates, 3000));
+    assert!(error.actual.unwrap() > 3000, "{error}");
+    assert!(with(few, &error.suggested_resolution.unwrap().to_string()).is_ok(), "{error}");
 }
 
 #[test]
@@ -340,7 +335,7 @@ fn estimates_count_every_part() {
     let few =
         JobLimits { surface: SurfaceLimits { max_grid_points: made.grid_points - 1, ..limits.surface }, ..limits };
     let refused = estimate(read, &job, &few, &choice, &control).unwrap().mesh.unwrap_err();
-    assert!(matches!(refused, SurfaceError::GridTooLarge { .. }), "{refused}");
+    assert!(refused.exceeded(Limit::GridPoints).is_some(), "{refused}");
 }
 
 /// Meter that counts bytes.
@@ -468,8 +463,8 @@ fn all_models_exclude_other_parts_and_are_limited() {
     };
     assert_eq!(limited(3).unwrap().report.parts.len(), 3);
     let error = limited(2).unwrap_err();
-    assert_eq!(error, JobError::Structure(StructureError::TooManyParts { rule: "model=all", limit: 2 }));
+    assert_eq!(error, Split::Model.too_many_parts(&ReadLimits { max_parts: 2, ..ReadLimits::default() }).into());
     let few = JobLimits { read: ReadLimits { max_atoms: 169, ..ReadLimits::default() }, ..JobLimits::default() };
     let error = meshed_with(&ensemble(), &[("model", "all")], &few).unwrap_err();
-    assert_eq!(error, JobError::Structure(StructureError::TooManyAtoms { limit: 169 }));
+    assert_eq!(error, JobError::from(SurfaceError::from(Box::new(Exceeded::new(Limit::Atoms, 169)))));
 }

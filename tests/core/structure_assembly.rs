@@ -11,7 +11,7 @@ use molmesh::pipeline::{Choice, JobError, JobLimits, Product, params, run};
 use molmesh::structure::{
     Kind, ReadLimits, Selection, Structure, StructureError, read, read_with, select, select_with,
 };
-use molmesh::surface::{Control, CpuBackend, MemoryMeter, OutOfMemory, SurfaceError};
+use molmesh::surface::{Control, CpuBackend, Exceeded, Limit, MemoryMeter, OutOfMemory, SurfaceError};
 
 use crate::bcif_support::{block, category, file, ints, reals, texts};
 use crate::tools;
@@ -240,7 +240,11 @@ fn unusable_assemblies_are_rejected_before_they_are_expanded() {
     let message = error("7").to_string();
     assert_eq!(message, "assembly `7` is not in the file; it has the assemblies 1, 2, 3, PAU, large, gap, bad, none");
     let start = Instant::now();
-    assert_eq!(error("large"), StructureError::TooManyCopies { id: "large".into(), limit: 10_000 });
+    let copies = |id: &str, max| {
+        let subject = format!("assembly {id}").into();
+        Exceeded { subject, ..Exceeded::new(Limit::Copies, max) }.error::<StructureError>()
+    };
+    assert_eq!(error("large"), copies("large", 10_000));
     assert!(start.elapsed() < Duration::from_secs(1));
     assert!(matches!(error("gap"), StructureError::BadAssembly { found, .. } if found == "`5`"));
     assert!(matches!(error("bad"), StructureError::BadAssembly { found, .. } if found == "`(1`"));
@@ -256,8 +260,10 @@ fn unusable_assemblies_are_rejected_before_they_are_expanded() {
         select_with(&structure, &of("PAU"), &limits, &Control::default()).map(|selected| selected.atoms.len())
     };
     assert_eq!(limited(4, 24), Ok(24));
-    assert_eq!(limited(3, 24), Err(StructureError::TooManyCopies { id: "PAU".into(), limit: 3 }));
-    assert_eq!(limited(4, 23), Err(StructureError::AssemblyTooLarge { id: "PAU".into(), atoms: 24, limit: 23 }));
+    assert_eq!(limited(3, 24), Err(copies("PAU", 3)));
+    let subject = "the selection of assembly PAU".into();
+    let atoms = Exceeded { subject, actual: Some(24), ..Exceeded::new(Limit::Atoms, 23) };
+    assert_eq!(limited(4, 23), Err(atoms.error()));
 }
 
 /// Counter that refuses memory beyond a limit.
@@ -371,7 +377,7 @@ fn coinciding_copies_are_limited() {
     };
     assert_eq!(meshed(5).unwrap(), 30);
     let refused = meshed(4).unwrap_err();
-    assert!(matches!(refused, JobError::Structure(StructureError::TooManyDuplicates { limit: 4, .. })), "{refused}");
+    assert!(matches!(&refused, JobError::Surface(error) if error.exceeded(Limit::Duplicates).is_some()), "{refused}");
 }
 
 /// Returns positions in units of 10⁻³ Å, sorted. Rounding in another order may move them by one unit.

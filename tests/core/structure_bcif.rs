@@ -6,8 +6,8 @@ use crate::bcif_support;
 
 use bcif_support::Pack::{Array, Bytes, Int, Map, Nil, Real};
 use bcif_support::*;
-use molmesh::structure::{Kind, ReadLimits, Structure, StructureError, read, strict_validator};
-use molmesh::surface::Control;
+use molmesh::structure::{Kind, ReadLimits, Structure, read, strict_validator};
+use molmesh::surface::{Control, Exceeded, Limit};
 
 fn bcif(bytes: &[u8]) -> Structure {
     read(bytes, &ReadLimits::default()).unwrap_or_else(|e| panic!("{e}"))
@@ -612,9 +612,9 @@ fn checks_limits_before_allocation() {
         max_distances: u64::MAX,
     };
     assert!(bomb(n).len() < 1500);
-    assert_eq!(read(&bomb(n), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
-    assert_eq!(read(&bomb(i64::MAX), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
-    assert_eq!(read(&bomb(i64::MAX), &ReadLimits::default()), Err(StructureError::TooManyAtoms { limit: 20_000_000 }));
+    assert_eq!(read(&bomb(n), &limits), Err(Exceeded::new(Limit::Atoms, 10_000).error()));
+    assert_eq!(read(&bomb(i64::MAX), &limits), Err(Exceeded::new(Limit::Atoms, 10_000).error()));
+    assert_eq!(read(&bomb(i64::MAX), &ReadLimits::default()), Err(Exceeded::new(Limit::Atoms, 20_000_000).error()));
     // The number of rows is allowed, the number of runs is not.
     let said = read(&bomb(10_000), &limits).unwrap_err().to_string();
     assert_eq!(
@@ -628,7 +628,7 @@ fn checks_limits_before_allocation() {
     assert_eq!(read(&good, &limits).unwrap().len(), 10_000);
     let tight = |bytes| ReadLimits { max_inflated_bytes: bytes, ..limits };
     assert_eq!(read(&good, &tight(320_000)).unwrap().len(), 10_000);
-    assert_eq!(read(&good, &tight(319_999)), Err(StructureError::InflatedTooLarge { limit: 319_999 }));
+    assert_eq!(read(&good, &tight(319_999)), Err(Exceeded::new(Limit::InflatedBytes, 319_999).error()));
     // More unused texts than allowed atoms.
     let offsets = column(
         "auth_asym_id",

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use molmesh::memory_budget::Budget;
 use molmesh::structure::strict_validator::{self, Level};
 use molmesh::structure::{Contents, ModelChoice, ReadLimits, Selection, StructureError, read, select};
-use molmesh::surface::{CancelToken, Control, OutOfMemory};
+use molmesh::surface::{CancelToken, Control, Exceeded, Limit, OutOfMemory};
 
 const ATOM: &str = "ATOM      2  CA  ALA A  12      11.104  -6.134   0.500  1.00 20.25           C  \n";
 
@@ -176,14 +176,14 @@ fn compression_bombs_stop_at_the_limit() {
     let start = Instant::now();
     assert_eq!(
         read(&bomb, &ReadLimits { max_inflated_bytes: 1 << 20, ..limits() }),
-        Err(StructureError::InflatedTooLarge { limit: 1 << 20 })
+        Err(Exceeded::new(Limit::InflatedBytes, 1 << 20).error())
     );
     assert!(start.elapsed() < 20 * IN_TIME);
     refused("gzip in gzip", gzip(&gzip(b"x")), "gzip inside a compressed file");
     let large = vec![b' '; 3 << 20];
     assert_eq!(
         read(&large, &ReadLimits { max_inflated_bytes: 2 << 20, ..limits() }),
-        Err(StructureError::InflatedTooLarge { limit: 2 << 20 })
+        Err(Exceeded::new(Limit::InflatedBytes, 2 << 20).error())
     );
 }
 
@@ -276,7 +276,7 @@ fn handles_very_long_lines_and_tokens() {
 fn counts_ambiguous_atoms_before_allocation() {
     let text = ATOM.repeat(1000);
     let tight = ReadLimits { max_atoms: 999, ..limits() };
-    assert_eq!(read(text.as_bytes(), &tight), Err(StructureError::TooManyAtoms { limit: 999 }));
+    assert_eq!(read(text.as_bytes(), &tight), Err(Exceeded::new(Limit::Atoms, 999).error()));
 }
 
 // ---- strict validator ----

@@ -7,7 +7,8 @@
     reason = "tests fail by panicking and print what they skip"
 )]
 
-use molmesh::structure::{ReadLimits, Structure, StructureError, read};
+use molmesh::structure::{ReadLimits, Structure, read};
+use molmesh::surface::{Exceeded, Limit};
 
 /// Limits of files that repeat one row.
 const REPEATED: ReadLimits = ReadLimits {
@@ -280,7 +281,7 @@ fn limits_atoms() {
     for n in [10, 60_000] {
         let text = file(&ROW.repeat(n));
         let with = |max_atoms| read(text.as_bytes(), &ReadLimits { max_atoms, ..REPEATED });
-        assert_eq!(with(n as u64 - 1), Err(StructureError::TooManyAtoms { limit: n as u64 - 1 }));
+        assert_eq!(with(n as u64 - 1), Err(Exceeded::new(Limit::Atoms, n as u64 - 1).error()));
         assert_eq!(with(n as u64).unwrap().len(), n);
     }
 }

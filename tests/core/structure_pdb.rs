@@ -7,7 +7,8 @@
     reason = "tests fail by panicking and print what they skip"
 )]
 
-use molmesh::structure::{ReadLimits, Structure, StructureError, read};
+use molmesh::structure::{ReadLimits, Structure, read};
+use molmesh::surface::{Exceeded, Limit};
 
 fn pdb(text: impl AsRef<[u8]>) -> Structure {
     read(text.as_ref(), &ReadLimits::default()).unwrap_or_else(|e| panic!("{e}"))
@@ -260,9 +261,9 @@ fn unreadable_occupancies_and_b_factors_are_warnings() {
 fn limits_atoms() {
     let text = CA.repeat(10);
     let with = |max_atoms| read(text.as_bytes(), &ReadLimits { max_atoms, ..ReadLimits::default() });
-    assert_eq!(with(9), Err(StructureError::TooManyAtoms { limit: 9 }));
+    assert_eq!(with(9), Err(Exceeded::new(Limit::Atoms, 9).error()));
     assert_eq!(with(10).unwrap().len(), 10);
-    assert_eq!(with(0), Err(StructureError::TooManyAtoms { limit: 0 }));
+    assert_eq!(with(0), Err(Exceeded::new(Limit::Atoms, 0).error()));
 }
 
 #[test]

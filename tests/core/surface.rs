@@ -13,7 +13,7 @@ use crate::tools::shapes::Random;
 
 use molmesh::surface::reference::Density;
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Kernel, Measures, Mesh, MeshOutput, MeshPart, MeshSink, Observer,
+    Backend, CancelToken, Control, CpuBackend, Kernel, Limit, Measures, Mesh, MeshOutput, MeshPart, MeshSink, Observer,
     Quantized, ReferenceBackend, SinkFailed, Spheres, Stage, Step, SurfaceError, SurfaceLimits, SurfaceOptions,
     SurfaceParams, Validation, Vertices, lattice,
 };
@@ -433,9 +433,7 @@ fn atom_indices_name_the_nearest_atom_of_each_vertex() {
 /// Returns the grid spacing that an error suggests.
 fn suggestion(error: &SurfaceError) -> Option<f64> {
     match error {
-        SurfaceError::GridTooLarge { suggested_resolution, .. }
-        | SurfaceError::MeshTooLarge { suggested_resolution, .. } => Some(*suggested_resolution),
-        SurfaceError::TooManyCandidates { suggested_resolution, .. } => *suggested_resolution,
+        SurfaceError::Limit(exceeded) => exceeded.suggested_resolution,
         _ => None,
     }
 }
@@ -478,10 +476,10 @@ fn far_too_large_grids_are_rejected_before_evaluation() {
     let control = Control { observer: &seen, ..Control::default() };
     let backend = CpuBackend::new(Some(2)).unwrap();
     let error = backend.run(&at, &params(Kernel::Gaussian, 0.01), &limits, &control);
-    let SurfaceError::GridTooLarge { grid_points, limit, suggested_resolution, .. } = error.unwrap_err() else {
-        panic!()
-    };
-    assert!(grid_points > limit && (0.05..1.0).contains(&suggested_resolution), "{grid_points} {suggested_resolution}");
+    let error = error.unwrap_err();
+    let exceeded = error.exceeded(Limit::GridPoints).unwrap();
+    assert!(exceeded.actual.unwrap() > exceeded.max, "{error}");
+    assert!((0.05..1.0).contains(&exceeded.suggested_resolution.unwrap()), "{error}");
     assert_eq!(seen.all(), [Stage::Bin], "nothing was evaluated");
     // Control: a grid within the limit reaches later stages.
     backend.run(&at, &params(Kernel::Gaussian, 1.0), &limits, &control).unwrap();
@@ -623,9 +621,9 @@ fn the_byte_limit_counts_delivered_vertices() {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let within = |p: &SurfaceParams, limits: &SurfaceLimits| backend.run(&at, p, limits, &Control::default());
     assert!(within(&small, &limits).is_ok());
-    assert!(matches!(within(&single, &limits), Err(SurfaceError::MeshTooLarge { .. })));
+    assert!(within(&single, &limits).unwrap_err().exceeded(Limit::MeshBytes).is_some());
     let less = SurfaceLimits { max_mesh_bytes: bytes - 1, ..limits };
-    assert!(matches!(within(&small, &less), Err(SurfaceError::MeshTooLarge { .. })));
+    assert!(within(&small, &less).unwrap_err().exceeded(Limit::MeshBytes).is_some());
 }
 
 #[test]

@@ -9,7 +9,7 @@ use molmesh::formats::tileset::{TileAddress, assembly_document};
 use molmesh::pipeline::tileset::{AssemblyTileset, Tileset, check};
 use molmesh::pipeline::{Choice, Job, JobError, JobLimits, StageClock, params, run};
 use molmesh::structure::{self, ReadLimits, Structure};
-use molmesh::surface::{Control, CpuBackend, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
+use molmesh::surface::{Control, CpuBackend, Limit, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
 use serde_json::Value;
 
 use crate::instances::{OPERATORS, with_rules};
@@ -156,8 +156,9 @@ fn too_many_tiles_are_rejected() {
     let read = |control: &Control<'_>| structure::read_with(SAMPLE, &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
     let new = |resolution| Tileset::new(read, &job(resolution), &ReadLimits::default(), &Control::default(), &clock);
-    let Err(JobError::Surface(SurfaceError::TooManyTiles { limit, .. })) = new("0.01") else { panic!("accepted") };
-    assert!(new("0.2").is_ok_and(|tileset| (tileset.tiles().len() as u64) < limit));
+    let Err(JobError::Surface(SurfaceError::Limit(error))) = new("0.01") else { panic!("accepted") };
+    assert_eq!(error.limit, Limit::Tiles);
+    assert!(new("0.2").is_ok_and(|tileset| (tileset.tiles().len() as u64) < error.max));
 }
 
 #[test]

@@ -7,7 +7,9 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use gpu_fakes::Step::{Block, Fail, Finish, Hang, Lose, OmitResult, OutOfMemory, Panic};
-use gpu_fakes::{FakeDevice, LOST, Running, SETTINGS, devices, job, pool, start, wait_for, wait_for_load};
+use gpu_fakes::{
+    FakeDevice, LOST, Running, SETTINGS, devices, job, lack_of_memory, pool, start, wait_for, wait_for_load,
+};
 use molmesh::gpu::{DevicePool, GpuError, MAX_REBUILDS, PoolSettings};
 use molmesh::surface::SurfaceError;
 
@@ -292,7 +294,7 @@ fn a_lack_of_memory_does_not_discard_the_executor() {
     let fake = FakeDevice::new(&[OutOfMemory, Finish]);
     let pool = pool(std::slice::from_ref(&fake), SETTINGS);
     let error = pool.run(&job(1)).map(|_| ()).unwrap_err();
-    assert_eq!(error, GpuError::OutOfMemory { needed: 9, available: 5, suggested_resolution: 1.5 });
+    assert_eq!(error, GpuError::OutOfMemory(Box::new(lack_of_memory())));
     pool.run(&job(1)).unwrap();
     assert_eq!((fake.calls().len(), pool.status()[0].rebuilds), (2, 0));
 }

@@ -12,11 +12,17 @@ use molmesh::gpu::{
     PoolSettings, Prepared, SheetBlocks,
 };
 use molmesh::surface::{
-    CancelToken, Control, GridStats, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
+    CancelToken, Control, Exceeded, GridStats, Limit, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits,
+    SurfaceParams,
 };
 
 /// Message of a lost device, with line breaks as drivers write them.
 pub const LOST: &str = "scripted\n\n  loss";
+
+/// Returns the lack of memory of a device that runs [`Step::OutOfMemory`].
+pub fn lack_of_memory() -> Exceeded {
+    Exceeded { actual: Some(9), ..Exceeded::new(Limit::DeviceBytes, 5) }.suggest(1.5)
+}
 
 /// Behaviour of an executor in one call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -154,7 +160,7 @@ impl Executor for FakeExecutor {
             Step::Lose => Err(GpuError::Lost(LOST.to_owned())),
             Step::Fail => Err(GpuError::Failed("scripted failure".to_owned())),
             Step::Panic => panic!("scripted failure"),
-            Step::OutOfMemory => Err(GpuError::OutOfMemory { needed: 9, available: 5, suggested_resolution: 1.5 }),
+            Step::OutOfMemory => Err(GpuError::OutOfMemory(Box::new(lack_of_memory()))),
         };
         let n = if step == Step::OmitResult { jobs.len() - 1 } else { jobs.len() };
         jobs[..n].iter().map(result).collect()

@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use http_support::{Fake, Mode, SAMPLE, log_lines, send, start_on, wait_for};
 use molmesh::surface::{
-    Backend, BackendIdentity, Control, DeviceFacts, DeviceKind, DeviceStatus, FoundDevice, MeshOutput, MeshSink,
-    Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, BackendIdentity, Control, DeviceFacts, DeviceKind, DeviceStatus, Exceeded, FoundDevice, Limit, MeshOutput,
+    MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 /// Backend with two devices, the second of which can fail.
@@ -266,7 +266,7 @@ fn device_failures_have_their_own_problem_types() {
     wait_for("ready", || server.get("/readyz").status == 200);
     let post = || server.post("/v1/meshes", &[], SAMPLE);
     *backend.error.lock().unwrap() =
-        Some(SurfaceError::DeviceMemory { needed: 900, available: 500, suggested_resolution: 0.75 });
+        Some(Exceeded { actual: Some(900), ..Exceeded::new(Limit::DeviceBytes, 500) }.suggest(0.75).error());
     let problem = post().problem(422, "device-memory");
     assert_eq!((&problem["limit"], &problem["actual"]), (&500.into(), &900.into()));
     assert_eq!(problem["suggested_resolution"], 0.75);

@@ -14,8 +14,8 @@ use molmesh::config::Config;
 use molmesh::http::{Chosen, Server, Stop, Stopped};
 use molmesh::picture::SelectedRenderer;
 use molmesh::surface::{
-    Backend, Control, FoundDevice, GridStats, Mesh, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits,
-    SurfaceParams,
+    Backend, Control, Exceeded, FoundDevice, GridStats, Limit, Mesh, MeshOutput, MeshSink, Spheres, SurfaceError,
+    SurfaceLimits, SurfaceParams,
 };
 
 /// Sample of the product.
@@ -120,12 +120,8 @@ impl Backend for Fake {
             Mode::Uncancellable(time) => std::thread::sleep(time),
             Mode::Panic => panic!("panic of a test"),
             Mode::GridTooLarge => {
-                return Err(SurfaceError::GridTooLarge {
-                    grid_points: 1000,
-                    limit: 100,
-                    resolution: params.resolution,
-                    suggested_resolution: 1.1,
-                });
+                let error = Exceeded { actual: Some(1000), ..Exceeded::new(Limit::GridPoints, 100) };
+                return Err(Exceeded { resolution: Some(params.resolution), ..error }.suggest(1.1).error());
             }
             Mode::NoSurface => return Err(SurfaceError::NoSurface { isovalue: params.level() }),
         }

@@ -1,5 +1,6 @@
 //! Errors of writing a mesh. All are returned before the first byte is written.
 
+use molmesh_surface::Exceeded;
 use thiserror::Error;
 
 /// Error of a mesh that is invalid or that the format cannot hold.
@@ -51,36 +52,9 @@ pub enum FormatError {
         /// The component.
         value: f32,
     },
-    /// The mesh has more vertices or triangles than the format can hold.
-    #[error("{format} holds at most {limit} {what}, and the mesh has {count}")]
-    TooMany {
-        /// The format's name.
-        format: &'static str,
-        /// `vertices` or `triangles`.
-        what: &'static str,
-        /// Number in the mesh.
-        count: u64,
-        /// Maximum of the format.
-        limit: u64,
-    },
-    /// The GLB exceeds the 32-bit length field.
-    #[error(
-        "the GLB would take {bytes} bytes, the format's limit is {limit}; use a coarser resolution, PLY or a tileset"
-    )]
-    GlbTooLarge {
-        /// Length of the file.
-        bytes: u64,
-        /// Maximum length of a GLB.
-        limit: u64,
-    },
-    /// glTF attributes are 16-bit integers or 32-bit floats: larger atom indices would be rounded.
-    #[error("atom index {atom} cannot be held exactly by a glTF attribute, the limit is {limit}; use PLY")]
-    AtomIndexTooLarge {
-        /// The largest atom index of the mesh.
-        atom: u32,
-        /// Largest index that is exact.
-        limit: u32,
-    },
+    /// The format cannot hold a mesh of this size.
+    #[error(transparent)]
+    Limit(#[from] Box<Exceeded>),
     /// A coordinate has too many digits for a line of a text format.
     #[error("a coordinate of {value} cannot be written as text, the limit is ±{limit}")]
     CoordinateTooLarge {

@@ -3,8 +3,8 @@
 
 use std::io::{self, Write};
 
-use molmesh_surface::Mesh;
 use molmesh_surface::vector::{area_vector, length};
+use molmesh_surface::{Exceeded, Limit, Mesh};
 
 use super::block::{Placement, put_floats, write_records};
 use super::error::FormatError;
@@ -26,12 +26,9 @@ pub(super) struct StlPlan {
 impl StlPlan {
     pub(super) fn new(mesh: &Mesh, units: Units, meta: &Meta) -> Result<Self, FormatError> {
         let triangles = mesh.triangles.len();
-        let count = u32::try_from(triangles).map_err(|_overflow| FormatError::TooMany {
-            format: "STL",
-            what: "triangles",
-            count: triangles as u64,
-            limit: u64::from(u32::MAX),
-        })?;
+        let limit = Exceeded::new(Limit::FileTriangles, u32::MAX.into());
+        let error = |_overflow| Exceeded { actual: Some(triangles as u64), ..limit }.error::<FormatError>();
+        let count = u32::try_from(triangles).map_err(error)?;
         let mut head = [b' '; HEADER_BYTES + 4];
         // A header that begins with "solid" marks a text STL; some programs read colours after "COLOR=".
         let words =

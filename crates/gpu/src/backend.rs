@@ -145,9 +145,7 @@ impl Backend for GpuBackend {
         };
         Err(match error {
             GpuError::Surface(error) => error,
-            GpuError::OutOfMemory { needed, available, suggested_resolution } => {
-                SurfaceError::DeviceMemory { needed, available, suggested_resolution }
-            }
+            GpuError::OutOfMemory(error) => error.into(),
             error => SurfaceError::Device { why: single_line(&error.to_string()) },
         })
     }

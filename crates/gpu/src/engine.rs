@@ -7,7 +7,8 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use molmesh_surface::lattice::{LatticeAtom, slightly_coarser, to_u32};
+use molmesh_surface::lattice::{LatticeAtom, to_u32};
+use molmesh_surface::limit::{Exceeded, Limit, slightly_coarser};
 use wgpu::{Buffer, Device, Queue};
 
 use super::buffers::BufferId;
@@ -303,6 +304,6 @@ fn max_binding(limits: &wgpu::Limits) -> u64 {
 /// Returns the error of a job that needs `needed` bytes at once. The memory grows with the inverse cube of the spacing.
 fn out_of_memory(job: &GpuJob, needed: u64, available: u64) -> GpuError {
     let excess = (needed as f64 / available.max(1) as f64).max(1.0);
-    let fitting = job.prepared.lattice.spacing * excess.cbrt();
-    GpuError::OutOfMemory { needed, available, suggested_resolution: slightly_coarser(fitting) }
+    let error = Exceeded { actual: Some(needed), ..Exceeded::new(Limit::DeviceBytes, available) };
+    GpuError::OutOfMemory(Box::new(error.suggest(slightly_coarser(job.prepared.lattice.spacing * excess.cbrt()))))
 }

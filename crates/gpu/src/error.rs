@@ -1,6 +1,6 @@
 //! Errors of jobs on devices.
 
-use molmesh_surface::SurfaceError;
+use molmesh_surface::{Exceeded, SurfaceError};
 use thiserror::Error;
 
 /// Reason why a device did not finish a job.
@@ -10,18 +10,8 @@ pub enum GpuError {
     #[error(transparent)]
     Surface(#[from] SurfaceError),
     /// The device has too little memory, even in chunks.
-    #[error(
-        "the device has too little memory: {needed} bytes are needed, {available} are available; \
-         {suggested_resolution} Å should fit"
-    )]
-    OutOfMemory {
-        /// Bytes that the job's smallest chunk and its output need.
-        needed: u64,
-        /// Bytes that the device can provide.
-        available: u64,
-        /// Grid spacing that would fit, Å.
-        suggested_resolution: f64,
-    },
+    #[error("the device has too little memory: {0}")]
+    OutOfMemory(Box<Exceeded>),
     /// The device was lost; the job may succeed on the rebuilt device.
     #[error("the device was lost: {0}")]
     Lost(String),

@@ -191,7 +191,7 @@ impl DevicePool {
                     let devices = vec![self.work_of(n, &finished)];
                     return Ok(CompletedJob { finished, devices });
                 }
-                Some(Err(error)) if error.is_device_failure() && !matches!(error, GpuError::OutOfMemory { .. }) => {
+                Some(Err(error)) if error.is_device_failure() && !matches!(error, GpuError::OutOfMemory(_)) => {
                     failures[n] += 1;
                     hangs += usize::from(is_hang(&error));
                     if hangs >= MAX_HANGS {
@@ -230,7 +230,7 @@ impl DevicePool {
                 }
                 Err(error) if error.is_device_failure() => {
                     // A device without the memory for a partition does not have it for the whole job either.
-                    let no_memory = matches!(error, GpuError::OutOfMemory { .. });
+                    let no_memory = matches!(error, GpuError::OutOfMemory(_));
                     failures[ticket.device] = if no_memory { MAX_ATTEMPTS } else { 1 };
                     device_error.get_or_insert(error);
                 }

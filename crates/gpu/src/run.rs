@@ -193,7 +193,7 @@ impl Engine {
     /// Runs one job of any size.
     fn run_large(&mut self, mut state: JobState) -> JobResult {
         let result = self.run_chunks(&mut state);
-        if !matches!(result, Err(GpuError::OutOfMemory { .. })) {
+        if !matches!(result, Err(GpuError::OutOfMemory(_))) {
             self.workspaces.push(state.loaded.workspace);
             return result;
         }

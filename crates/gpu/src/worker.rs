@@ -127,7 +127,7 @@ fn run_batch(executor: &mut dyn Executor, batch: &[QueuedJob]) -> Vec<JobResult>
 /// next job may be smaller.
 fn device_failure(result: &JobResult) -> Option<String> {
     match result {
-        Err(GpuError::OutOfMemory { .. }) | Ok(_) => None,
+        Err(GpuError::OutOfMemory(_)) | Ok(_) => None,
         Err(error) => error.is_device_failure().then(|| error.to_string()),
     }
 }

@@ -23,23 +23,16 @@ use std::sync::Arc;
 use thiserror::Error;
 
 pub use cpu::CpuRenderer;
-use molmesh_surface::{BackendIdentity, Control, Mesh, OutOfMemory, SurfaceError, arithmetic};
+use molmesh_surface::{BackendIdentity, Control, Exceeded, Mesh, OutOfMemory, SurfaceError, arithmetic};
 pub use params::{Background, DEFAULT_SIDE, MAX_SIDE, PictureLimits, PictureParams, Style, View};
 pub use raster::MeshColumns;
 
 /// Reason why a picture cannot be drawn.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum PictureError {
-    /// A side has too many pixels.
-    #[error("the picture's {side} is {pixels} pixels, the limit is {limit}")]
-    TooLarge {
-        /// `width` or `height`.
-        side: &'static str,
-        /// Requested pixels.
-        pixels: u32,
-        /// Maximum.
-        limit: u32,
-    },
+    /// A limit is exceeded.
+    #[error(transparent)]
+    Limit(#[from] Box<Exceeded>),
     /// The run was cancelled.
     #[error("cancelled")]
     Cancelled,
@@ -65,6 +58,7 @@ impl From<SurfaceError> for PictureError {
         match error {
             SurfaceError::Cancelled => Self::Cancelled,
             SurfaceError::Memory(error) => Self::Memory(error),
+            SurfaceError::Limit(error) => Self::Limit(error),
             other => Self::Device { why: other.to_string() },
         }
     }
@@ -122,7 +116,7 @@ pub trait Renderer: Send + Sync {
     /// Draws `mesh`, whose vertices must not be quantized.
     ///
     /// # Errors
-    /// Any [`PictureError`] but [`PictureError::Png`] and [`PictureError::TooLarge`], which are detected earlier.
+    /// Any [`PictureError`] but [`PictureError::Png`] and [`PictureError::Limit`], which are detected earlier.
     fn render(&self, mesh: &Arc<Mesh>, params: &PictureParams, control: &Control<'_>)
     -> Result<Rendered, PictureError>;
 }

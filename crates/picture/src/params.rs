@@ -3,6 +3,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+use molmesh_surface::{Exceeded, Limit};
+
 use super::PictureError;
 
 /// Default width and height, pixels.
@@ -174,12 +176,12 @@ impl PictureParams {
     /// Checks the sides against the limits.
     ///
     /// # Errors
-    /// [`PictureError::TooLarge`].
+    /// [`PictureError::Limit`].
     pub fn check(&self, limits: PictureLimits) -> Result<(), PictureError> {
-        let limit = limits.max_side;
-        for (side, pixels) in [("width", self.width), ("height", self.height)] {
-            if pixels > limit {
-                return Err(PictureError::TooLarge { side, pixels, limit });
+        for (limit, pixels) in [(Limit::PictureWidth, self.width), (Limit::PictureHeight, self.height)] {
+            if pixels > limits.max_side {
+                let error = Exceeded::new(limit, limits.max_side.into());
+                return Err(Exceeded { actual: Some(pixels.into()), ..error }.error());
             }
         }
         Ok(())
@@ -240,8 +242,9 @@ mod tests {
         let limits = PictureLimits { max_side: 100 };
         let of = |width, height| PictureParams { width, height, ..PictureParams::default() }.check(limits);
         assert_eq!(of(100, 100), Ok(()));
-        assert_eq!(of(101, 1), Err(PictureError::TooLarge { side: "width", pixels: 101, limit: 100 }));
-        assert_eq!(of(1, 101), Err(PictureError::TooLarge { side: "height", pixels: 101, limit: 100 }));
+        let error = |limit| Exceeded { actual: Some(101), ..Exceeded::new(limit, 100) }.error();
+        assert_eq!(of(101, 1), Err(error(Limit::PictureWidth)));
+        assert_eq!(of(1, 101), Err(error(Limit::PictureHeight)));
     }
 
     #[test]

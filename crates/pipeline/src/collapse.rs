@@ -18,6 +18,7 @@ mod piece;
 use std::ops::Range;
 
 use molmesh_surface::lattice::{to_f32, to_i32, to_u32};
+use molmesh_surface::limit::{Exceeded, Limit};
 use molmesh_surface::mesh::bounds_of;
 use molmesh_surface::params::bad;
 use molmesh_surface::triangle::{Corners, centroid};
@@ -102,7 +103,7 @@ pub(crate) fn check_error(error: f64, spacing: f64) -> Result<(), SurfaceError> 
 /// again.
 ///
 /// # Errors
-/// Returns the errors of [`check_error`], [`SurfaceError::TooManyTriangles`] if the error is too small for the limit on
+/// Returns the errors of [`check_error`], [`SurfaceError::Limit`] if the error is too small for the limit on
 /// triangles, [`SurfaceError::Memory`] and [`SurfaceError::Cancelled`].
 pub(crate) fn simplify(
     mesh: &mut Mesh,
@@ -157,7 +158,12 @@ pub(crate) fn simplify(
     }
     if let Some(limit) = max_triangles.filter(|limit| mesh.n_triangles() as u64 > *limit) {
         let triangles = mesh.n_triangles() as u64;
-        return Err(SurfaceError::TooManyTriangles { triangles, limit, resolution: spacing, simplify: Some(error) });
+        let subject = format!("after simplification with an error of {error} Å, the mesh").into();
+        // Above one grid spacing, a larger error hardly changes the number of triangles.
+        let larger = if error < spacing { "a larger simplify or " } else { "" };
+        let hint = Some(format!("{larger}a coarser resolution").into());
+        let exceeded = Exceeded { subject, actual: Some(triangles), hint, ..Exceeded::new(Limit::Triangles, limit) };
+        return Err(Exceeded { resolution: Some(spacing), ..exceeded }.error());
     }
     let parts = part_ranges(mesh);
     let after = Triangles { positions: &positions, rows: &mesh.triangles, parts: &parts };

@@ -106,7 +106,7 @@ impl<'a> Cut<'a> {
     /// memory is added to the meter of `control`.
     ///
     /// # Errors
-    /// Returns [`SurfaceError::NoPatch`] if no triangle remains, [`SurfaceError::MeshTooLarge`], and the errors of
+    /// Returns [`SurfaceError::NoPatch`] if no triangle remains, [`SurfaceError::Limit`], and the errors of
     /// memory and cancellation.
     pub(super) fn apply(
         &self,

@@ -35,9 +35,10 @@ pub enum JobError {
 impl From<StructureError> for JobError {
     fn from(error: StructureError) -> Self {
         match error {
-            // Cancellation and lack of memory are the same errors in all stages.
+            // Cancellation, lack of memory and exceeded limits are the same errors in all stages.
             StructureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
             StructureError::Memory(error) => Self::Surface(error.into()),
+            StructureError::Limit(error) => Self::Surface(error.into()),
             error => Self::Structure(error),
         }
     }
@@ -48,6 +49,7 @@ impl From<MapError> for JobError {
         match error {
             MapError::Cancelled => Self::Surface(SurfaceError::Cancelled),
             MapError::Memory(error) => Self::Surface(error.into()),
+            MapError::Limit(error) => Self::Surface(error.into()),
             error => Self::Map(error),
         }
     }
@@ -58,6 +60,7 @@ impl From<PictureError> for JobError {
         match error {
             PictureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
             PictureError::Memory(error) => Self::Surface(error.into()),
+            PictureError::Limit(error) => Self::Surface(error.into()),
             PictureError::Device { why } => Self::Surface(SurfaceError::Device { why }),
             error => Self::Picture(error),
         }

@@ -12,7 +12,7 @@ use molmesh_surface::cpu::{LATTICE_BYTES, check_work, scan};
 use molmesh_surface::lattice::Lattice;
 use molmesh_surface::params::MAX_RESOLUTION;
 use molmesh_surface::{
-    Control, OutOfMemory, Reservation, SurfaceError, SurfaceParams, TriangleQuality, candidates, improve,
+    Control, Limit, OutOfMemory, Reservation, SurfaceError, SurfaceParams, TriangleQuality, candidates, improve,
 };
 
 use super::collapse::{self, check_error};
@@ -101,8 +101,7 @@ pub fn estimate<S: Deref<Target = Structure>>(
     let fitted = max_triangles.map(|limit| fit::expected(&meshing, job, limit, control)).transpose();
     let spacing = match &fitted {
         Ok(spacing) => *spacing,
-        Err(SurfaceError::TooManyTriangles { resolution, .. }) => Some(*resolution),
-        Err(_) => None,
+        Err(error) => error.exceeded(Limit::Triangles).and_then(|exceeded| exceeded.resolution),
     };
     let params = job.mesh_params(&spheres, spacing);
     let plan = MeshPlan { meshing: &meshing, params: &params, compress: job.compress };
@@ -255,11 +254,11 @@ impl MeshPlan<'_> {
         };
         for lattice in lattices {
             n_atoms += lattice.atoms.len();
-            let counts = check_work(lattice, params, limits, control).map_err(|error| match error {
-                SurfaceError::GridTooLarge { grid_points, .. } => {
-                    too_large(grid_points.saturating_add(512 * bricks), n_atoms)
+            let counts = check_work(lattice, params, limits, control).map_err(|error| {
+                match error.exceeded(Limit::GridPoints).and_then(|exceeded| exceeded.actual) {
+                    Some(grid_points) => too_large(grid_points.saturating_add(512 * bricks), n_atoms),
+                    None => error,
                 }
-                error => error,
             })?;
             bricks += counts.reached;
             pairs += counts.candidates;
@@ -288,11 +287,11 @@ impl MeshPlan<'_> {
     /// Returns the error of a run that failed with `error`. A run ends soon after its mesh exceeds a limit, when it has
     /// found little of the surface. An estimate of the whole mesh suggests a better spacing.
     pub(super) fn run_error(&self, error: SurfaceError, control: &Control<'_>) -> SurfaceError {
-        if !matches!(error, SurfaceError::MeshTooLarge { .. }) {
+        if error.exceeded(Limit::MeshBytes).is_none() {
             return error;
         }
         match self.lattices(control).and_then(|lattices| self.mesh(&lattices, control)) {
-            Err(planned) if ends_work(&planned) || matches!(planned, SurfaceError::MeshTooLarge { .. }) => planned,
+            Err(planned) if ends_work(&planned) || planned.exceeded(Limit::MeshBytes).is_some() => planned,
             _ => error,
         }
     }
@@ -330,7 +329,7 @@ impl MeshPlan<'_> {
 #[cfg(test)]
 mod tests {
     use molmesh_structure::{ReadLimits, read_with};
-    use molmesh_surface::{CpuBackend, SurfaceLimits};
+    use molmesh_surface::{CpuBackend, Exceeded, SurfaceLimits};
 
     use super::*;
     use crate::{params, run};
@@ -386,9 +385,10 @@ mod tests {
         let most = |max_candidates| search("20", SurfaceLimits { max_candidates, ..SurfaceLimits::default() });
         let least = rows.div_ceil(5);
         assert!(most(least).is_ok());
-        assert_eq!(most(least - 1), Err(SurfaceError::TooManyPocketRows { rows, limit: 5 * (least - 1) }));
+        let error = Exceeded { actual: Some(rows), ..Exceeded::new(Limit::PocketRows, 5 * (least - 1)) };
+        assert_eq!(most(least - 1), Err(error.error()));
         let small = SurfaceLimits { max_grid_points: 50_000, ..SurfaceLimits::default() };
-        assert!(matches!(search("4", small), Err(SurfaceError::PocketGridTooLarge { .. })));
+        assert!(search("4", small).unwrap_err().exceeded(Limit::PocketPoints).is_some());
     }
 
     #[test]
@@ -440,6 +440,10 @@ mod tests {
             };
             Some((error, estimate(read, &job, &limits, &choice, &control).unwrap().mesh.err()))
         };
+        let suggestion = |error: &SurfaceError| match error {
+            SurfaceError::Limit(exceeded) => exceeded.suggested_resolution,
+            _ => None,
+        };
         let any = SurfaceLimits::default();
         for (surface, resolution, limits) in [
             ("gaussian", 0.05, SurfaceLimits { max_grid_points: 20_000_000, ..any }),
@@ -459,9 +463,9 @@ mod tests {
         ] {
             let (mut spacing, mut count) = (resolution, 0);
             while let Some((error, planned)) = refused(surface, spacing, limits) {
-                let suggested = error.suggested_resolution().unwrap_or_else(|| panic!("{error}"));
+                let suggested = suggestion(&error).unwrap_or_else(|| panic!("{error}"));
                 if count == 0 {
-                    let planned = planned.and_then(|planned| planned.suggested_resolution());
+                    let planned = planned.as_ref().and_then(suggestion);
                     assert_eq!(planned, Some(suggested), "{error}");
                 }
                 count += 1;
@@ -473,7 +477,7 @@ mod tests {
             assert!(refused(surface, 0.5 * spacing, limits).is_some(), "{spacing} {limits:?}");
         }
         let (error, _) = refused("gaussian", 1.0, SurfaceLimits { max_grid_points: 511, ..any }).unwrap();
-        assert_eq!(error.suggested_resolution(), None, "a grid has one brick");
+        assert_eq!(suggestion(&error), None, "a grid has one brick");
     }
 
     #[test]
@@ -483,8 +487,8 @@ mod tests {
         let small = SurfaceLimits { max_mesh_bytes: 100_000, ..SurfaceLimits::default() };
         let limits = JobLimits { surface: small, ..JobLimits::default() };
         let refused = estimate(read, &Job::default(), &limits, &choice, &Control::default()).unwrap();
-        let Err(SurfaceError::MeshTooLarge { suggested_resolution, .. }) = refused.mesh else { panic!("{refused:?}") };
-        let text = suggested_resolution.to_string();
+        let error = refused.mesh.unwrap_err();
+        let text = error.exceeded(Limit::MeshBytes).unwrap().suggested_resolution.unwrap().to_string();
         let job = params::parse([("resolution", text.as_str())]).unwrap().job;
         assert!(estimate(read, &job, &limits, &choice, &Control::default()).unwrap().mesh.is_ok());
     }

@@ -7,7 +7,9 @@
 use std::sync::Arc;
 
 use molmesh_structure::Context;
-use molmesh_surface::{Control, MeshOutput, Observer, Reservation, Stage, SurfaceError, SurfaceParams};
+use molmesh_surface::{
+    Control, Exceeded, Limit, MeshOutput, Observer, Reservation, Stage, SurfaceError, SurfaceParams,
+};
 
 use super::clock::Scope;
 use super::meshing::Meshing;
@@ -156,7 +158,7 @@ fn rounded(spacing: f64) -> f64 {
 /// Meshes the spheres of `meshing` at the finest spacing that has at most `limit` triangles.
 ///
 /// # Errors
-/// Returns [`SurfaceError::TooManyTriangles`] if no spacing is coarse enough, [`SurfaceError::NoSurface`] if no mesh
+/// Returns [`SurfaceError::Limit`] if no spacing is coarse enough, [`SurfaceError::NoSurface`] if no mesh
 /// has a surface, or another error of meshing.
 pub(super) fn mesh(
     meshing: &Meshing<'_>,
@@ -259,7 +261,11 @@ fn no_fit(job: &Job, limit: u64, resolution: f64, triangles: u64) -> SurfaceErro
     match triangles {
         0 if job.selection.context == Context::Whole => SurfaceError::NoPatch,
         0 => SurfaceError::NoSurface { isovalue: job.params.level() },
-        _ => SurfaceError::TooManyTriangles { triangles, limit, resolution, simplify: None },
+        _ => {
+            let subject = "at the coarsest spacing, the mesh".into();
+            let error = Exceeded { subject, actual: Some(triangles), ..Exceeded::new(Limit::Triangles, limit) };
+            Exceeded { resolution: Some(resolution), ..error }.error()
+        }
     }
 }
 

@@ -9,7 +9,7 @@ use molmesh_surface::cpu::scan;
 use molmesh_surface::lattice::{to_f32, to_u64};
 use molmesh_surface::vector::{add, joined_bounds, sub};
 use molmesh_surface::{
-    BackendIdentity, Control, GridStats, Measures, Mesh, MeshOutput, PartRange, Spheres, Stage, SurfaceError,
+    BackendIdentity, Control, GridStats, Limit, Measures, Mesh, MeshOutput, PartRange, Spheres, Stage, SurfaceError,
     SurfaceLimits, SurfaceParams, candidates, grid_limit,
 };
 use rayon::prelude::*;
@@ -230,25 +230,22 @@ impl Joined {
     /// Converts the error of one of `n_parts` parts to an error of all parts. `fraction` of the atoms are in this part
     /// and the previous ones.
     fn error(&self, error: SurfaceError, run: &Run<'_>, n_parts: usize, fraction: f64) -> SurfaceError {
-        use SurfaceError as E;
         let (limits, resolution) = (run.limits, run.single.resolution);
-        match error {
-            E::GridTooLarge { grid_points, .. } => {
-                let so_far = self.grid.grid_points.saturating_add(grid_points);
+        let SurfaceError::Limit(exceeded) = &error else { return error };
+        let in_part = exceeded.actual.unwrap_or_default();
+        match exceeded.limit {
+            Limit::GridPoints => {
+                let so_far = self.grid.grid_points.saturating_add(in_part);
                 grid_too_large(so_far, fraction, n_parts, resolution, limits)
             }
-            E::TooManyCandidates { candidates, .. } => {
-                candidates::too_many(self.grid.candidates + candidates, run.spheres, run.single, limits)
-            }
-            E::TooManyOverlaps { overlaps, .. } => {
-                E::TooManyOverlaps { overlaps: self.grid.overlaps + overlaps, limit: limits.max_candidates }
-            }
-            E::MeshTooLarge { bytes, .. } => {
+            Limit::Candidates => candidates::too_many(self.grid.candidates + in_part, run.spheres, run.single, limits),
+            Limit::Overlaps => candidates::too_many_overlaps(self.grid.overlaps + in_part, limits),
+            Limit::MeshBytes => {
                 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "casts saturate")]
-                let all = (self.bytes(run.single).saturating_add(bytes) as f64 / fraction) as u64;
+                let all = (self.bytes(run.single).saturating_add(in_part) as f64 / fraction) as u64;
                 scan::too_large(all, resolution, limits.max_mesh_bytes)
             }
-            other => other,
+            _ => error,
         }
     }
 

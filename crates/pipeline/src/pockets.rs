@@ -95,7 +95,7 @@ pub(super) fn lined_by<'a>(
 /// has the atoms that line none. Without pockets, the rule `split` divides the atoms.
 ///
 /// # Errors
-/// Returns [`StructureError::TooManyParts`], and without pockets the errors of [`Selected::parts`].
+/// Returns [`StructureError::Limit`], and without pockets the errors of [`Selected::parts`].
 pub(super) fn parts(
     found: Option<&Pockets>,
     structure: &Structure,
@@ -105,9 +105,8 @@ pub(super) fn parts(
     control: &Control<'_>,
 ) -> Result<Option<Vec<AtomPart>>, StructureError> {
     let Some(found) = found else { return selected.parts(structure, split, limits, control) };
-    let limit = limits.max_parts;
-    if found.list.len() as u64 >= limit {
-        return Err(StructureError::TooManyParts { rule: split.parameter(), limit });
+    if found.list.len() as u64 >= limits.max_parts {
+        return Err(split.too_many_parts(limits));
     }
     let mut is_lining = vec![false; selected.atoms.len()];
     found.list.iter().flat_map(|pocket| &pocket.lining).for_each(|row| is_lining[*row as usize] = true);

@@ -7,7 +7,7 @@
 
 use std::collections::HashMap;
 
-use molmesh_surface::MemoryMeter as _;
+use molmesh_surface::{Exceeded, Limit, MemoryMeter as _};
 
 use super::annotations::{Annotations, ResidueConfidence, SecondaryRange};
 use super::assembly::{Assemblies, Operator};
@@ -154,7 +154,7 @@ impl Categories {
     /// a BinaryCIF file may repeat one long text.
     ///
     /// # Errors
-    /// Returns [`StructureError::InflatedTooLarge`] and [`StructureError::Memory`].
+    /// Returns [`StructureError::Limit`] and [`StructureError::Memory`].
     pub(super) fn add(&mut self, item_ix: usize, value: &[u8], reading: &Reading<'_>) -> Result<(), StructureError> {
         let values = &mut self.values[item_ix];
         if values.len() >= MAX_VALUES {
@@ -165,7 +165,7 @@ impl Categories {
         let limit = reading.limits.max_inflated_bytes;
         self.bytes += value.len() as u64;
         if self.bytes > limit {
-            return Err(StructureError::InflatedTooLarge { limit });
+            return Err(Exceeded::new(Limit::InflatedBytes, limit).error());
         }
         reading.text.grow(bytes)?;
         // A list may be a text field of several lines.
@@ -378,7 +378,7 @@ mod tests {
         let long = [b'x'; 100];
         let added = (0..11).map(|_| many.add(6, &long, &reading)).collect::<Vec<_>>();
         assert!(added[..10].iter().all(Result::is_ok));
-        assert_eq!(added[10], Err(StructureError::InflatedTooLarge { limit: 1000 }));
+        assert_eq!(added[10], Err(Exceeded::new(Limit::InflatedBytes, 1000).error()));
     }
 
     #[test]

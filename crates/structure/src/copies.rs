@@ -5,7 +5,7 @@ use std::num::NonZeroU32;
 use std::ops::Range;
 
 use indexmap::IndexMap;
-use molmesh_surface::{Control, Reservation};
+use molmesh_surface::{Control, Exceeded, Limit, Reservation};
 
 use super::assembly::{Assemblies, BadExpression, Generator, Operator};
 use super::atoms::Structure;
@@ -157,7 +157,8 @@ impl<'s> AssemblyRules<'s> {
             counts.push(count.map_err(|bad| self.bad(bad))?);
             n_copies = n_copies.saturating_add(counts.last().copied().unwrap_or_default());
             if n_copies > limits.max_copies {
-                return Err(StructureError::TooManyCopies { id: self.shown(), limit: limits.max_copies });
+                let subject = format!("assembly {}", self.shown()).into();
+                return Err(Exceeded { subject, ..Exceeded::new(Limit::Copies, limits.max_copies) }.error());
             }
             rules.push(rule);
         }
@@ -170,7 +171,8 @@ impl<'s> AssemblyRules<'s> {
         if n <= limits.max_rows() {
             return Ok(n);
         }
-        Err(StructureError::AssemblyTooLarge { id: self.shown(), atoms, limit: limits.max_atoms })
+        let subject = format!("the selection of assembly {}", self.shown()).into();
+        Err(Exceeded { subject, actual: Some(atoms), ..limits.too_many_atoms() }.error())
     }
 
     /// Returns the operators of a rule.
@@ -216,9 +218,8 @@ impl<'s> Assembly<'s> {
     /// Replaces the selected atoms by their copies, in the order of the file: by rule, operator, chain and atom.
     ///
     /// # Errors
-    /// Returns [`StructureError::BadAssembly`], [`StructureError::TooManyCopies`] and
-    /// [`StructureError::AssemblyTooLarge`], each before memory is allocated, and the errors of memory and
-    /// cancellation.
+    /// Returns [`StructureError::BadAssembly`] and [`StructureError::Limit`], each before memory is allocated, and the
+    /// errors of memory and cancellation.
     pub(super) fn copy(
         self,
         selected: Selected,

@@ -7,7 +7,7 @@ use std::borrow::Cow;
 use std::io::{self, BufRead, Chain, Cursor, Read};
 
 use flate2::bufread::GzDecoder;
-use molmesh_surface::{CancelToken, Control, MemoryMeter as _, OutOfMemory, Reservation};
+use molmesh_surface::{CancelToken, Control, Exceeded, Limit, MemoryMeter as _, OutOfMemory, Reservation};
 use ruzstd::decoding::{FrameDecoder, StreamingDecoder};
 
 use super::error::StructureError;
@@ -59,7 +59,7 @@ pub fn is_complete_gzip(bytes: &[u8], limit: u64, cancel: &CancelToken) -> bool 
         }
         Ok(())
     };
-    bytes.starts_with(GZIP_MAGIC) && matches!(inflate_all(), Ok(()) | Err(StructureError::InflatedTooLarge { .. }))
+    bytes.starts_with(GZIP_MAGIC) && matches!(inflate_all(), Ok(()) | Err(StructureError::Limit(_)))
 }
 
 /// Returns the decompressed bytes and adds them to `memory`, or returns the input itself if it is not compressed. Calls
@@ -72,7 +72,7 @@ pub(super) fn inflate<'a>(
     check_prefix: &dyn Fn(&[u8]) -> Result<(), StructureError>,
 ) -> Result<Cow<'a, [u8]>, StructureError> {
     match encoding(bytes) {
-        None if bytes.len() as u64 > limit => return Err(StructureError::InflatedTooLarge { limit }),
+        None if bytes.len() as u64 > limit => return Err(Exceeded::new(Limit::InflatedBytes, limit).error()),
         None => return Ok(Cow::Borrowed(bytes)),
         Some(_) => {}
     }
@@ -130,7 +130,7 @@ impl<'a> Decoder<'a> {
     /// Appends at most `most` bytes to `out`, less only at the end of the input.
     ///
     /// # Errors
-    /// Returns [`StructureError::Input`], [`StructureError::Decompress`], [`StructureError::InflatedTooLarge`] and the
+    /// Returns [`StructureError::Input`], [`StructureError::Decompress`], [`StructureError::Limit`] and the
     /// errors of memory and cancellation.
     pub(super) fn read(&mut self, most: u64, out: &mut Vec<u8>, control: &Control<'_>) -> Result<(), StructureError> {
         let mut left = most.min(self.remaining());
@@ -152,7 +152,7 @@ impl<'a> Decoder<'a> {
             left -= n;
             self.n_read += n;
         }
-        if self.n_read > self.limit { Err(StructureError::InflatedTooLarge { limit: self.limit }) } else { Ok(()) }
+        if self.n_read > self.limit { Err(Exceeded::new(Limit::InflatedBytes, self.limit).error()) } else { Ok(()) }
     }
 
     /// Appends bytes to `out` until it has at least `size`, or the input ends. `out` doubles when it is full, so that
@@ -345,7 +345,7 @@ mod tests {
         ] {
             assert_eq!(super::encoding(&packed), Some(encoding));
             assert_eq!(inflated(&packed, 4).unwrap(), &b"abcd"[..]);
-            assert_eq!(inflated(&packed, 3), Err(StructureError::InflatedTooLarge { limit: 3 }));
+            assert_eq!(inflated(&packed, 3), Err(Exceeded::new(Limit::InflatedBytes, 3).error()));
         }
         assert_eq!(inflated(&[gz(b"ab"), vec![0; 512]].concat(), 9).unwrap(), &b"ab"[..]);
     }
@@ -382,7 +382,7 @@ mod tests {
     fn a_bomb_stops_at_the_limit() {
         let zeros = vec![b' '; 64 << 20];
         for bomb in [gz(&zeros), zst(&zeros)] {
-            assert_eq!(inflated(&bomb, 1 << 20), Err(StructureError::InflatedTooLarge { limit: 1 << 20 }));
+            assert_eq!(inflated(&bomb, 1 << 20), Err(Exceeded::new(Limit::InflatedBytes, 1 << 20).error()));
             assert_eq!(inflated(&bomb, 64 << 20).unwrap().len(), 64 << 20);
         }
     }
@@ -454,7 +454,7 @@ mod tests {
         for step in [1000, 65_536, 300_000, 1 << 30] {
             for (i, packed) in readable.iter().enumerate() {
                 for (limit, expected) in
-                    [(n, Ok(whole.clone())), (n - 1, Err(StructureError::InflatedTooLarge { limit: n - 1 }))]
+                    [(n, Ok(whole.clone())), (n - 1, Err(Exceeded::new(Limit::InflatedBytes, n - 1).error()))]
                 {
                     assert!(inflated(packed, limit).map(Cow::into_owned) == expected, "{i} {limit}");
                     assert!(streamed(packed, limit, step) == expected, "{i} {limit} {step}");

@@ -2,6 +2,7 @@
 //! the work of a mesh grows with the square of their number. No experiment or model places more than a few atoms at one
 //! point.
 
+use molmesh_surface::{Exceeded, Limit};
 use rustc_hash::{FxBuildHasher, FxHashMap};
 use std::hash::BuildHasher as _;
 
@@ -23,8 +24,8 @@ const SUSPECT: u64 = 10;
 /// Rejects rows of which more than the limit have the same model and position. `row` returns both for a row below `n`.
 ///
 /// # Errors
-/// Returns [`StructureError::TooManyDuplicates`] with the position that exceeds the limit first, in the order of rows,
-/// and the errors of cancellation and memory.
+/// Returns [`StructureError::Limit`] with the position that exceeds the limit first, in the order of rows, and the errors of
+/// cancellation and memory.
 pub(super) fn check(
     n: usize,
     row: impl Fn(usize) -> (i32, [f64; 3]),
@@ -110,8 +111,10 @@ fn most_crowded(
         let crowded = positions.entry(key(i)).or_insert(Crowded { first: i, atoms: 0 });
         crowded.atoms += 1;
         if crowded.atoms > limit {
-            let (_, [x, y, z]) = row(i);
-            return Err(StructureError::TooManyDuplicates { limit, x, y, z });
+            let (_, position) = row(i);
+            let subject = format!("the position {}, {}, {}", position[0], position[1], position[2]).into();
+            let error = Exceeded::new(Limit::Duplicates, limit);
+            return Err(Exceeded { subject, position: Some(position), ..error }.error());
         }
     }
     let most = positions.into_values().max_by_key(|crowded| (crowded.atoms, std::cmp::Reverse(crowded.first)));
@@ -141,10 +144,14 @@ mod tests {
         }
         assert_eq!(count(&rows, 20), Ok(()));
         let found = count(&rows, 19).unwrap_err();
-        assert!(matches!(found, StructureError::TooManyDuplicates { limit: 19, x: 7.25, .. }), "{found}");
+        let at = |error: &StructureError| match error {
+            StructureError::Limit(error) => error.position.map(|[x, ..]| (error.max, x)),
+            _ => None,
+        };
+        assert_eq!(at(&found), Some((19, 7.25)), "{found}");
         // Models do not count together.
         rows[3].0 = 2;
         let found = count(&rows, 19).unwrap_err();
-        assert!(matches!(found, StructureError::TooManyDuplicates { x: 8.25, .. }), "{found}");
+        assert_eq!(at(&found), Some((19, 8.25)), "{found}");
     }
 }

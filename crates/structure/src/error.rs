@@ -1,6 +1,6 @@
 //! Errors of reading structures and selecting atoms. Messages name the location and the expected content.
 
-use molmesh_surface::OutOfMemory;
+use molmesh_surface::{Exceeded, OutOfMemory};
 use thiserror::Error;
 
 /// Errors of reading and selecting.
@@ -73,30 +73,9 @@ pub enum StructureError {
         /// Message of the decoder.
         reason: String,
     },
-    /// The input decompresses to more bytes than allowed.
-    #[error("the structure inflates to more than {limit} bytes")]
-    InflatedTooLarge {
-        /// Limit, bytes.
-        limit: u64,
-    },
-    /// More atoms than allowed.
-    #[error("the structure holds more than {limit} atoms")]
-    TooManyAtoms {
-        /// Limit, number of atoms.
-        limit: u64,
-    },
-    /// More atoms of one model at the same position than allowed.
-    #[error("more than {limit} atoms have the position {x}, {y}, {z}")]
-    TooManyDuplicates {
-        /// Limit, number of atoms.
-        limit: u64,
-        /// Coordinates, Å.
-        x: f64,
-        /// Coordinates, Å.
-        y: f64,
-        /// Coordinates, Å.
-        z: f64,
-    },
+    /// A limit is exceeded.
+    #[error(transparent)]
+    Limit(#[from] Box<Exceeded>),
     /// The requested assembly is invalid in the file.
     #[error("assembly {id}: found {found}, expected {expected}")]
     BadAssembly {
@@ -106,41 +85,6 @@ pub enum StructureError {
         found: String,
         /// The expected content.
         expected: String,
-    },
-    /// The requested assembly has more copies than allowed.
-    #[error("assembly {id} has more than {limit} copies of chains")]
-    TooManyCopies {
-        /// Id of the assembly.
-        id: String,
-        /// Limit, number of copies.
-        limit: u64,
-    },
-    /// The requested assembly has more selected atoms than allowed.
-    #[error("assembly {id} has {atoms} selected atoms, the limit is {limit}")]
-    AssemblyTooLarge {
-        /// Id of the assembly.
-        id: String,
-        /// Number of atoms.
-        atoms: u64,
-        /// Limit, number of atoms.
-        limit: u64,
-    },
-    /// `within` would test more distances than allowed.
-    #[error(
-        "`within` tests more than {limit} distances between atoms, which is the limit; select fewer atoms after `of`, \
-         or use a smaller distance"
-    )]
-    TooManyDistances {
-        /// Limit, number of distances.
-        limit: u64,
-    },
-    /// The selected atoms would be divided into more parts than allowed.
-    #[error("{rule} divides the selected atoms into more than {limit} parts")]
-    TooManyParts {
-        /// Parameter that divides the atoms, such as `split=chain`.
-        rule: &'static str,
-        /// Limit, number of parts.
-        limit: u64,
     },
     /// The atoms cannot be divided by entity.
     #[error(

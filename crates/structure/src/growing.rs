@@ -67,8 +67,7 @@ impl GrowingColumns {
     /// Reserves memory for more rows, for `expected` rows in an empty column.
     ///
     /// # Errors
-    /// Returns [`StructureError::TooManyAtoms`] at the limit, [`StructureError::TooManyDuplicates`],
-    /// [`StructureError::Memory`] and [`StructureError::Cancelled`].
+    /// Returns [`StructureError::Limit`], [`StructureError::Memory`] and [`StructureError::Cancelled`].
     pub(super) fn reserve_chunk(
         &mut self,
         tables: &Tables,
@@ -81,7 +80,7 @@ impl GrowingColumns {
         }
         reading.check()?;
         if n >= limit {
-            return Err(StructureError::TooManyAtoms { limit: reading.limits.max_atoms });
+            return Err(reading.limits.too_many_atoms().error());
         }
         // Searches only when the number of rows has doubled, so that the time of all searches grows linearly with the
         // number of rows.

@@ -342,6 +342,8 @@ fn residue_number(field: &[u8]) -> Option<(i32, u8)> {
 #[cfg(test)]
 #[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
+    use molmesh_surface::{Exceeded, Limit};
+
     use super::super::read::{ReadLimits, read};
     use super::super::select::{Selection, select};
     use super::super::source::SourceFormat;
@@ -444,7 +446,7 @@ mod tests {
     fn limits_hold() {
         let text: String = (0..50).map(|i| format!("ATOM {i} N ARG {i} {i} 0 0 0 1\n")).collect();
         let limits = ReadLimits { max_atoms: 49, ..ReadLimits::default() };
-        assert_eq!(read(text.as_bytes(), &limits), Err(StructureError::TooManyAtoms { limit: 49 }));
+        assert_eq!(read(text.as_bytes(), &limits), Err(Exceeded::new(Limit::Atoms, 49).error()));
         assert_eq!(parse(&text).unwrap().len(), 50);
     }
 }

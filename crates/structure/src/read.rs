@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::AtomicU8;
 
-use molmesh_surface::{Control, MemoryMeter, Reservation};
+use molmesh_surface::{Control, Exceeded, Limit, MemoryMeter, Reservation};
 
 use super::atoms::Structure;
 use super::error::StructureError;
@@ -50,14 +50,19 @@ impl ReadLimits {
     /// Checks the number of atoms in all models.
     ///
     /// # Errors
-    /// [`StructureError::TooManyAtoms`].
+    /// [`StructureError::Limit`].
     pub fn check_atoms(&self, n: usize) -> Result<(), StructureError> {
-        if n > self.max_rows() { Err(StructureError::TooManyAtoms { limit: self.max_atoms }) } else { Ok(()) }
+        if n > self.max_rows() { Err(self.too_many_atoms().error()) } else { Ok(()) }
+    }
+
+    /// Returns the error for too many atoms. Indices of atoms have 32 bits.
+    pub(super) fn too_many_atoms(&self) -> Exceeded {
+        Exceeded::capped(Limit::Atoms, self.max_atoms, u64::from(u32::MAX))
     }
 
     /// Maximum number of atoms in all models, limited to 32 bits.
     pub(super) fn max_rows(&self) -> usize {
-        usize::try_from(self.max_atoms.min(u64::from(u32::MAX))).unwrap_or(usize::MAX)
+        usize::try_from(self.too_many_atoms().max).unwrap_or(usize::MAX)
     }
 }
 
@@ -186,7 +191,8 @@ fn check_sample(inflated: &[u8], reading: &Reading<'_>) -> Result<(), StructureE
     let memory: Arc<dyn MemoryMeter> = Arc::new(Reservation::new(&reading.control.memory));
     let control = Control { memory, ..reading.control.clone() };
     match of_text(&sample[start..end], &Reading { pieces: Some(1), ..Reading::new(reading.limits, &control) }) {
-        Err(error @ (StructureError::TooManyDuplicates { .. } | StructureError::Cancelled)) => Err(error),
+        Err(StructureError::Limit(error)) if error.limit == Limit::Duplicates => Err(error.into()),
+        Err(StructureError::Cancelled) => Err(StructureError::Cancelled),
         _ => Ok(()),
     }
 }
@@ -304,10 +310,10 @@ mod tests {
         for file in files {
             for n_pieces in [1, 2, 7] {
                 let found = read_in_pieces(&file, &ReadLimits::default(), n_pieces).unwrap_err();
-                assert!(matches!(found, StructureError::TooManyDuplicates { x: 0.0, y: 0.0, .. }), "{found}");
+                assert!(matches!(&found, StructureError::Limit(e) if e.position == Some([0.0; 3])), "{found}");
             }
             let (read, budget) = read_within(&file, u64::MAX, u64::MAX);
-            assert!(matches!(read, Err(StructureError::TooManyDuplicates { .. })));
+            assert!(matches!(read, Err(StructureError::Limit(error)) if error.limit == Limit::Duplicates));
             let most = budget.most.load(Ordering::SeqCst);
             assert!(most < 64 << 20, "{most}");
             assert_eq!(budget.held.load(Ordering::SeqCst), 0);

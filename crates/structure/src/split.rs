@@ -1,6 +1,6 @@
 //! Division of the selected atoms into parts: each gets its own closed mesh, or its triangles of one surface.
 
-use molmesh_surface::Control;
+use molmesh_surface::{Control, Exceeded, Limit};
 use rustc_hash::FxHashMap;
 
 use super::altloc::ATOMS_PER_CHECK;
@@ -58,6 +58,13 @@ impl Split {
             Self::Model => "model=all",
         }
     }
+
+    /// Returns the error for more parts than allowed.
+    #[must_use]
+    pub fn too_many_parts(self, limits: &ReadLimits) -> StructureError {
+        let limit = if self == Self::Model { Limit::ModelParts } else { Limit::Parts };
+        Exceeded { subject: self.parameter().into(), ..Exceeded::new(limit, limits.max_parts) }.error()
+    }
 }
 
 /// Atoms of one part.
@@ -85,7 +92,7 @@ impl Selected {
     /// The units of an assembly are parts. Adds the memory of the parts to the meter of `control`.
     ///
     /// # Errors
-    /// Returns [`StructureError::TooManyParts`], [`StructureError::NoEntities`] for [`Split::Entity`] if the file has
+    /// Returns [`StructureError::Limit`], [`StructureError::NoEntities`] for [`Split::Entity`] if the file has
     /// no entities, and the errors of memory and cancellation.
     pub fn parts(
         &self,
@@ -131,7 +138,7 @@ impl Selected {
             let part = match found.get(&key) {
                 Some(&part) => part,
                 None if parts.len() as u64 >= limits.max_parts => {
-                    return Err(StructureError::TooManyParts { rule: split.parameter(), limit: limits.max_parts });
+                    return Err(split.too_many_parts(limits));
                 }
                 None => {
                     found.insert(key, parts.len());

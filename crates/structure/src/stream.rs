@@ -57,7 +57,7 @@ impl Block {
 /// atom below `n`, Å.
 ///
 /// # Errors
-/// Returns [`StructureError::TooManyDuplicates`] and the errors of memory and cancellation.
+/// Returns [`StructureError::Limit`] and the errors of memory and cancellation.
 pub fn check_positions(
     n: usize,
     centre: impl Fn(usize) -> [f64; 3],

@@ -142,7 +142,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits, control: &Control<'_>) -> Result
     let text_memory = Reservation::new(&control.memory);
     let too_large = || vec![Diagnostic::note(format!("not checked: the text is larger than {limit} bytes"))];
     let plain = match decoder::inflate(bytes, limit, &text_memory, control, &|_| Ok(())) {
-        Err(StructureError::InflatedTooLarge { .. }) if limit < limits.max_inflated_bytes => return Ok(too_large()),
+        Err(StructureError::Limit(_)) if limit < limits.max_inflated_bytes => return Ok(too_large()),
         plain => plain?,
     };
     let text = without_mark(&plain);

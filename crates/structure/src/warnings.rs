@@ -76,13 +76,13 @@ mod tests {
     }
 
     fn messages(warnings: Warnings<u64>) -> Vec<String> {
-        warnings.messages(|limit| StructureError::TooManyAtoms { limit })
+        warnings.messages(|i| StructureError::NoAtoms { found: i.to_string() })
     }
 
     #[test]
     fn messages_are_bounded_and_the_rest_is_counted() {
         assert_eq!(messages(warnings(0..0)), Vec::<String>::new());
-        assert_eq!(messages(warnings(7..8)), ["the structure holds more than 7 atoms; read as 1"]);
+        assert_eq!(messages(warnings(7..8)), ["no atoms: 7; read as 1"]);
         let all = messages(warnings(0..1000));
         assert_eq!((all.len(), all[KEPT].as_str()), (KEPT + 1, "990 more values that could not be read"));
     }

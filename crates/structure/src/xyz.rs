@@ -169,6 +169,8 @@ fn ends(text: &[u8], expected: String) -> StructureError {
 #[cfg(test)]
 #[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
+    use molmesh_surface::{Exceeded, Limit};
+
     use super::super::read::{ReadLimits, read};
     use super::super::select::{Selection, select};
     use super::*;
@@ -261,7 +263,7 @@ mod tests {
         let rows: String = (0..50).map(|i| format!("C {i} 0 0\n")).collect();
         let text = format!("50\n\n{rows}");
         let limits = ReadLimits { max_atoms: 49, ..ReadLimits::default() };
-        assert_eq!(read(text.as_bytes(), &limits), Err(StructureError::TooManyAtoms { limit: 49 }));
+        assert_eq!(read(text.as_bytes(), &limits), Err(Exceeded::new(Limit::Atoms, 49).error()));
         assert_eq!(parse(&text).unwrap().len(), 50);
         // No memory is allocated for more atoms than the file can contain.
         assert!(parse("2000000000\n\nC 0 0 0\n").is_err());

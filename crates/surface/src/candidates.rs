@@ -10,7 +10,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use super::control::Control;
 use super::error::SurfaceError;
 use super::kernel::Shape;
-use super::lattice::{BRICK, Lattice, effective_radius, slightly_coarser, to_u64};
+use super::lattice::{BRICK, Lattice, effective_radius, to_u64};
+use super::limit::{Exceeded, Limit, slightly_coarser};
 use super::params::{MAX_RESOLUTION, SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
 
@@ -27,7 +28,7 @@ pub fn limit(limits: &SurfaceLimits) -> u64 {
 /// Rejects a run that is certain to exceed the limit. Passes over the radii once and allocates nothing.
 ///
 /// # Errors
-/// [`SurfaceError::TooManyCandidates`].
+/// [`SurfaceError::Limit`].
 pub fn check(spheres: &Spheres, params: &SurfaceParams, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
     let reach = reach(params);
     let brick = f64::from(BRICK) * params.resolution;
@@ -46,7 +47,7 @@ pub fn check(spheres: &Spheres, params: &SurfaceParams, limits: &SurfaceLimits) 
 #[must_use]
 pub fn too_many(candidates: u64, spheres: &Spheres, params: &SurfaceParams, limits: &SurfaceLimits) -> SurfaceError {
     let (_, largest) = spheres.radius_range();
-    error(candidates, limit(limits), spheres.len(), reach(params)(largest), params.resolution)
+    error(candidates, limits, spheres.len(), reach(params)(largest), params.resolution)
 }
 
 /// Returns the function of a sphere's radius that gives the distance at which its effect ends, Å.
@@ -61,7 +62,7 @@ pub(super) fn exceeded(lattices: &[&Lattice], candidates: u64, limits: &SurfaceL
         |lattice: &&Lattice| lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
     let (n, longest) = (lattices.iter().map(|lattice| lattice.atoms.len()).sum(), lattices.iter().map(reach));
     let spacing = lattices.first().map_or(MAX_RESOLUTION, |lattice| lattice.spacing);
-    error(candidates, limit(limits), n, longest.fold(0.0, f64::max), spacing)
+    error(candidates, limits, n, longest.fold(0.0, f64::max), spacing)
 }
 
 /// Number of comparisons of two caps of a sphere that count as one pair of overlapping spheres. Ordinary structures
@@ -74,13 +75,13 @@ const COMPARISONS_PER_CHECK: u64 = 1 << 16;
 /// their caps.
 pub(super) struct OverlapCount {
     so_far: AtomicU64,
-    limit: u64,
+    limits: SurfaceLimits,
 }
 
 impl OverlapCount {
     /// Starts a count at 0, limited by the limit on candidate pairs.
     pub(super) fn new(limits: &SurfaceLimits) -> Self {
-        Self { so_far: AtomicU64::new(0), limit: limit(limits) }
+        Self { so_far: AtomicU64::new(0), limits: *limits }
     }
 
     /// Returns the number of pairs so far, including the pairs that stand for comparisons.
@@ -91,10 +92,10 @@ impl OverlapCount {
     /// Adds `n` ordered pairs.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`].
+    /// [`SurfaceError::Limit`].
     pub(super) fn add(&self, n: u64) -> Result<(), SurfaceError> {
         let overlaps = self.so_far.fetch_add(n, Ordering::Relaxed) + n;
-        if overlaps <= self.limit { Ok(()) } else { Err(SurfaceError::TooManyOverlaps { overlaps, limit: self.limit }) }
+        if overlaps <= limit(&self.limits) { Ok(()) } else { Err(too_many_overlaps(overlaps, &self.limits)) }
     }
 }
 
@@ -115,7 +116,7 @@ impl<'a> Comparisons<'a> {
     /// Adds `n` comparisons. Checks limit and cancellation from time to time.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::Limit`], [`SurfaceError::Cancelled`].
     #[inline]
     pub(super) fn add(&mut self, n: usize) -> Result<(), SurfaceError> {
         self.uncounted += n as u64;
@@ -126,7 +127,7 @@ impl<'a> Comparisons<'a> {
     /// depends on the parts and not on the threads.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::Limit`], [`SurfaceError::Cancelled`].
     pub(super) fn count(&mut self) -> Result<(), SurfaceError> {
         self.control.check()?;
         self.overlaps.add(self.uncounted / COMPARISONS_PER_PAIR)?;
@@ -135,9 +136,16 @@ impl<'a> Comparisons<'a> {
     }
 }
 
-fn error(candidates: u64, limit: u64, n_spheres: usize, reach: f64, resolution: f64) -> SurfaceError {
-    let suggested_resolution = fitting(limit as f64 / n_spheres as f64, reach, resolution);
-    SurfaceError::TooManyCandidates { candidates, limit, resolution, suggested_resolution }
+/// Returns the error of spheres of which at least `overlaps` pairs overlap.
+#[must_use]
+pub fn too_many_overlaps(overlaps: u64, limits: &SurfaceLimits) -> SurfaceError {
+    Exceeded { actual: Some(overlaps), ..Exceeded::capped(Limit::Overlaps, limits.max_candidates, MAX_LIMIT) }.error()
+}
+
+fn error(candidates: u64, limits: &SurfaceLimits, n_spheres: usize, reach: f64, resolution: f64) -> SurfaceError {
+    let error = Exceeded::capped(Limit::Candidates, limits.max_candidates, MAX_LIMIT);
+    let suggested_resolution = fitting(error.max as f64 / n_spheres as f64, reach, resolution);
+    Exceeded { actual: Some(candidates), resolution: Some(resolution), suggested_resolution, ..error }.error()
 }
 
 /// Returns a spacing above `resolution` (Å) at which spheres that reach `reach` Å probably have no more than `pairs`
@@ -211,11 +219,9 @@ mod tests {
         backend.run(&spheres, &params, &SurfaceLimits::default(), &control).unwrap();
         assert!(stages.0.load(Ordering::Relaxed), "the control");
         let error = run(exact - 1, &params).unwrap_err();
-        let SurfaceError::TooManyCandidates { candidates, limit, suggested_resolution, .. } = error else {
-            panic!("{error}")
-        };
-        assert!(candidates > limit && limit == exact - 1);
-        let coarser = SurfaceParams { resolution: suggested_resolution.unwrap(), ..params.clone() };
+        let exceeded = error.exceeded(Limit::Candidates).unwrap();
+        assert!(exceeded.actual.unwrap() > exceeded.max && exceeded.max == exact - 1);
+        let coarser = SurfaceParams { resolution: exceeded.suggested_resolution.unwrap(), ..params.clone() };
         assert!(coarser.resolution > params.resolution && run(exact - 1, &coarser).is_ok());
         // The occupancy count finds the same pairs.
         let lattice = Lattice::new(&spheres, &params, &Control::default()).unwrap();
@@ -235,7 +241,7 @@ mod tests {
         }
         let limits = SurfaceLimits { max_candidates: 1 << 28, ..SurfaceLimits::default() };
         let huge = check(&at_one_point(300_000), &params(0.5, 10.0), &limits);
-        assert!(matches!(huge, Err(SurfaceError::TooManyCandidates { candidates, .. }) if candidates > 1 << 29));
+        assert!(huge.unwrap_err().exceeded(Limit::Candidates).unwrap().actual.unwrap() > 1 << 29);
     }
 
     #[test]

@@ -56,7 +56,7 @@ pub struct Cavity {
 /// Finds the cavities of `spheres` with the radii and the probe of `params`, largest accessible volume first.
 ///
 /// # Errors
-/// [`SurfaceError::NoSpheres`], [`SurfaceError::BadParameter`] for a radius, [`SurfaceError::TooManyOverlaps`],
+/// [`SurfaceError::NoSpheres`], [`SurfaceError::BadParameter`] for a radius, [`SurfaceError::Limit`],
 /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
 pub fn find(
     spheres: &Spheres,

@@ -1,7 +1,8 @@
 //! Error for a grid of too many points.
 
 use super::error::SurfaceError;
-use super::lattice::{BRICK_POINTS, slightly_coarser};
+use super::lattice::BRICK_POINTS;
+use super::limit::{Exceeded, Limit, slightly_coarser};
 use super::params::SurfaceLimits;
 
 /// Bricks extend a body: one of volume s³ reaches about (s/b + `EXTENSION`)³ bricks of edge b. The extension is 1 for a
@@ -19,12 +20,9 @@ pub fn exceeded(resolution: f64, grid_points: u64, n_bodies: usize, limits: &Sur
     let edge = |points: u64| (points as f64 / (BRICK_POINTS * n_bodies) as f64).cbrt() - EXTENSION;
     let fitting = edge(limit);
     let factor = if fitting > 0.0 { (edge(grid_points) / fitting).max(1.0) } else { f64::INFINITY };
-    SurfaceError::GridTooLarge {
-        grid_points,
-        limit,
-        resolution,
-        suggested_resolution: slightly_coarser(resolution * factor),
-    }
+    let error =
+        Exceeded { actual: Some(grid_points), resolution: Some(resolution), ..Exceeded::new(Limit::GridPoints, limit) };
+    error.suggest(slightly_coarser(resolution * factor)).error()
 }
 
 #[cfg(test)]
@@ -36,7 +34,7 @@ mod tests {
     fn coarser_spacings_are_suggested_until_a_brick_is_too_large() {
         let suggested = |grid_points, n_bodies, max_grid_points| {
             let limits = SurfaceLimits { max_grid_points, ..SurfaceLimits::default() };
-            exceeded(0.5, grid_points, n_bodies, &limits).suggested_resolution()
+            exceeded(0.5, grid_points, n_bodies, &limits).exceeded(Limit::GridPoints)?.suggested_resolution
         };
         let points = |edge: f64| 512 * to_u64((edge + EXTENSION).powi(3));
         let half = suggested(points(100.0), 1, points(50.0)).unwrap();

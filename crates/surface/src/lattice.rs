@@ -159,12 +159,6 @@ pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
     [tile[2], tile[1], tile[0]]
 }
 
-/// Returns a spacing about 5 % above an estimate, rounded up to hundredths of an Å, as a suggestion.
-#[must_use]
-pub fn slightly_coarser(spacing: f64) -> f64 {
-    (spacing * 105.0).ceil() / 100.0
-}
-
 /// Converts `v` to f32, rounding.
 #[expect(clippy::cast_possible_truncation, reason = "rounding to single precision is intended")]
 #[must_use]

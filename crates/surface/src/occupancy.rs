@@ -19,6 +19,7 @@ use self::marks::{CountedBricks, Marks, RUN, longest, mark_run, runs};
 use super::control::Control;
 use super::error::SurfaceError;
 use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_u32, to_u64};
+use super::limit::Limit;
 use super::memory::{MemoryMeter as _, OutOfMemory, Reservation};
 use super::params::SurfaceLimits;
 use super::{candidates, checked_sort, grid_limit};
@@ -101,7 +102,7 @@ pub fn count(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -
 /// pairs exactly, but only if an upper bound exceeds the limit.
 ///
 /// # Errors
-/// [`SurfaceError::TooManyCandidates`], and the other errors of counting.
+/// [`SurfaceError::Limit`], and the other errors of counting.
 pub fn check_pairs(lattices: &[&Lattice], limits: &SurfaceLimits, control: &Control<'_>) -> Result<(), SurfaceError> {
     let most: f64 = lattices.iter().map(|lattice| most_pairs(lattice)).sum();
     if most <= candidates::limit(limits) as f64 {
@@ -122,11 +123,13 @@ pub fn check_pairs(lattices: &[&Lattice], limits: &SurfaceLimits, control: &Cont
         };
         match counted {
             Ok(counts) => left -= counts.candidates.min(left),
-            Err(SurfaceError::TooManyCandidates { candidates, .. }) => {
+            Err(error) => {
+                let Some(candidates) = error.exceeded(Limit::Candidates).and_then(|exceeded| exceeded.actual) else {
+                    return Err(error);
+                };
                 let so_far = candidates::limit(limits) - left + candidates;
                 return Err(candidates::exceeded(lattices, so_far, limits));
             }
-            Err(error) => return Err(error),
         }
     }
     Ok(())
@@ -148,8 +151,7 @@ impl Occupancy {
     /// Finds the occupied bricks of `lattice`.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond the
-    /// limits, [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::Limit`] before memory is allocated beyond the limits, [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let memory = Reservation::new(&control.memory);
         let reaches = Reaches::new(lattice, &memory)?;
@@ -472,15 +474,13 @@ mod tests {
         // The limit of grid points ends the search early, with an estimate for all atoms.
         let (stopped, control) = meter(u64::MAX);
         let few = SurfaceLimits { max_grid_points: 512 * n_reached / 10, ..limits };
-        match count(&lattice, &few, &control) {
-            Err(SurfaceError::GridTooLarge { grid_points, suggested_resolution, .. }) => {
-                // The box around the atoms is much larger.
-                assert!(lattice.box_points > 2 * grid_points);
-                assert!(grid_points.abs_diff(512 * n_reached) < 26 * n_reached, "{grid_points} {n_reached}");
-                assert!(suggested_resolution > 1.0);
-            }
-            other => panic!("{other:?}"),
-        }
+        let error = count(&lattice, &few, &control).unwrap_err();
+        let exceeded = error.exceeded(Limit::GridPoints).unwrap();
+        let grid_points = exceeded.actual.unwrap();
+        // The box around the atoms is much larger.
+        assert!(lattice.box_points > 2 * grid_points);
+        assert!(grid_points.abs_diff(512 * n_reached) < 26 * n_reached, "{grid_points} {n_reached}");
+        assert!(exceeded.suggested_resolution.unwrap() > 1.0);
         assert!(most(&stopped) <= most(&counting));
     }
 
@@ -496,7 +496,7 @@ mod tests {
         };
         // The upper bound exceeds both limits, so the pairs are counted.
         assert!(most_pairs(&lattice) > n as f64 && check(n).is_ok());
-        assert!(matches!(check(n - 1), Err(SurfaceError::TooManyCandidates { .. })), "the control");
+        assert!(check(n - 1).unwrap_err().exceeded(Limit::Candidates).is_some(), "the control");
     }
 
     proptest! {

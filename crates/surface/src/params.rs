@@ -4,13 +4,12 @@ use std::fmt;
 
 use super::error::SurfaceError;
 pub use super::kind::{Kernel, Preset, SurfaceKind};
+pub use super::limit::MAX_RESOLUTION;
 use super::mesh::Mesh;
 use super::quantize::Step;
 
 /// Finest grid spacing that is accepted, Å.
 pub const MIN_RESOLUTION: f64 = 0.01;
-/// Coarsest grid spacing that is accepted, Å.
-pub const MAX_RESOLUTION: f64 = 20.0;
 /// Minimum radius after scale and offset, Å.
 pub const MIN_RADIUS: f64 = 0.05;
 /// Radius of support of the soft-object and inverse-square kernels, in radii.

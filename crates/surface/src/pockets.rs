@@ -22,6 +22,7 @@ use super::control::Control;
 use super::cpu::LATTICE_BYTES;
 use super::error::SurfaceError;
 use super::lattice::{Lattice, LatticeAtom, to_i32, to_u64};
+use super::limit::{Exceeded, Limit};
 use super::memory::Reservation;
 use super::params::{SurfaceKind, SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
@@ -111,8 +112,8 @@ struct Grid {
 /// `pocket_probe`, Å.
 ///
 /// # Errors
-/// [`SurfaceError::NoSpheres`], [`SurfaceError::BadParameter`] for a radius, [`SurfaceError::PocketGridTooLarge`],
-/// [`SurfaceError::TooManyPocketRows`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+/// [`SurfaceError::NoSpheres`], [`SurfaceError::BadParameter`] for a radius, [`SurfaceError::Limit`],
+/// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
 pub fn find(
     spheres: &Spheres,
     params: &SurfaceParams,
@@ -222,9 +223,9 @@ impl Grid {
         let sides = [0, 1, 2].map(|k| high[k] - low[k] + 1.0);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "casts saturate, as wanted")]
         let (grid_points, size) = (sides.iter().product::<f64>() as u64, sides.map(|side| side as usize));
-        let limit = limits.max_grid_points.min(MAX_GRID_POINTS);
-        if grid_points > limit {
-            return Err(SurfaceError::PocketGridTooLarge { grid_points, limit, spacing: lattice.spacing });
+        let too_large = Exceeded::capped(Limit::PocketPoints, limits.max_grid_points, MAX_GRID_POINTS);
+        if grid_points > too_large.max {
+            return Err(Exceeded { actual: Some(grid_points), ..too_large }.error());
         }
         let ball = |atom: &LatticeAtom| Ball {
             centre: [0, 1, 2].map(|k| atom.position(k) - low[k]),
@@ -235,7 +236,7 @@ impl Grid {
         let rows = to_u64(balls.iter().map(|ball| rows_in_reach(ball.radius, small, large)).sum());
         let limit = ROWS_PER_PAIR.saturating_mul(limits.max_candidates);
         if rows > limit {
-            return Err(SurfaceError::TooManyPocketRows { rows, limit });
+            return Err(Exceeded { actual: Some(rows), ..Exceeded::new(Limit::PocketRows, limit) }.error());
         }
         balls.par_sort_by(|a, b| a.centre[2].total_cmp(&b.centre[2]));
         Ok(Self { balls, largest, size, origin: low.map(to_i32), rows })

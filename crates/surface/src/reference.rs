@@ -10,7 +10,8 @@ use super::cpu::MAX_SHARE;
 use super::cpu::scan;
 use super::error::SurfaceError;
 use super::kernel::{MIN_DISTANCE2, Profile};
-use super::lattice::{EDGE_MARGIN, slightly_coarser, to_f32, to_i32, to_u64};
+use super::lattice::{EDGE_MARGIN, to_f32, to_i32, to_u64};
+use super::limit::{Exceeded, Limit, slightly_coarser};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::sink::MeshSink;
@@ -96,9 +97,9 @@ impl DenseGrid {
         let grid_points = to_u64(n.iter().product());
         if grid_points > limits.max_grid_points {
             let excess = grid_points as f64 / limits.max_grid_points.max(1) as f64;
-            let suggested_resolution = slightly_coarser(h * excess.cbrt());
-            let limit = limits.max_grid_points;
-            return Err(SurfaceError::GridTooLarge { grid_points, limit, resolution: h, suggested_resolution });
+            let error = Exceeded::new(Limit::GridPoints, limits.max_grid_points);
+            let error = Exceeded { actual: Some(grid_points), resolution: Some(h), ..error };
+            return Err(error.suggest(slightly_coarser(h * excess.cbrt())).error());
         }
         Ok(Self { origin: first.map(to_i32), n: n.map(|n| usize::try_from(to_u64(n)).unwrap_or(usize::MAX)) })
     }

@@ -31,30 +31,15 @@ impl From<StructureError> for Problem {
             E::Decompress { encoding, .. } => {
                 Self::new(ProblemType::UnreadableStructure, detail).with("encoding", encoding)
             }
-            E::InflatedTooLarge { limit } => Self::new(ProblemType::InflatedTooLarge, detail).with("limit", limit),
+            E::Limit(error) => Self::from(&*error),
             E::BadAssembly { id, found, expected } => Self::new(ProblemType::UnreadableStructure, detail)
                 .with("location", format!("assembly {id}"))
                 .with("found", found)
                 .with("expected", expected),
-            E::TooManyCopies { limit, .. } => Self::new(ProblemType::TooManyCopies, detail).with("limit", limit),
-            E::TooManyDistances { limit } => {
-                Self::new(ProblemType::TooManyCandidates, detail).with("parameter", "select").with("limit", limit)
-            }
-            E::TooManyParts { rule, limit } => {
-                let parameter = rule.split('=').next().unwrap_or(rule);
-                Self::new(ProblemType::TooManyParts, detail).with("parameter", parameter).with("limit", limit)
-            }
             E::NoEntities => Self::new(ProblemType::BadParameter, detail)
                 .with("parameter", "split")
                 .with("value", Split::Entity.name())
                 .with("expected", "none, chain or residue-group"),
-            E::AssemblyTooLarge { atoms, limit, .. } => {
-                Self::new(ProblemType::TooManyAtoms, detail).with("limit", limit).with("actual", atoms)
-            }
-            E::TooManyAtoms { limit } => Self::new(ProblemType::TooManyAtoms, detail).with("limit", limit),
-            E::TooManyDuplicates { limit, x, y, z } => {
-                Self::new(ProblemType::TooManyDuplicates, detail).with("limit", limit).with("position", vec![x, y, z])
-            }
             E::Memory(error) => error.into(),
             E::Cancelled => Self::from(Failure::Stopped),
             E::NoAtoms { found } => Self::new(ProblemType::NoAtoms, detail).with("found", found),
@@ -96,10 +81,7 @@ impl From<MapError> for Problem {
                 .with("found", found.as_str())
                 .with("expected", expected.as_str()),
             E::Decompress { encoding, .. } => problem(ProblemType::UnreadableMap).with("encoding", *encoding),
-            E::TooManyPoints { points, limit } => {
-                problem(ProblemType::MapTooLarge).with("actual", *points).with("limit", *limit)
-            }
-            E::InflatedTooLarge { limit } => problem(ProblemType::InflatedTooLarge).with("limit", *limit),
+            E::Limit(error) => Self::from(&**error),
             E::Memory(error) => (*error).into(),
             E::Cancelled => Self::from(Failure::Stopped),
         }

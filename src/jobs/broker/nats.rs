@@ -136,7 +136,7 @@ impl NatsBroker {
                 std::future::ready(())
             })
             .reconnect_delay_callback(|attempts| Duration::from_millis(100 * (attempts as u64).clamp(1, 10)));
-        let (connection, context) = open(options, url).await?;
+        let (connection, context) = Box::pin(open(options, url)).await?;
         let broker = Self(Arc::new(NatsState {
             connection,
             context,

@@ -25,7 +25,7 @@ impl<'a> CompressedGlb<'a> {
     /// Plans the file of `mesh`, whose `pieces` are compressed.
     ///
     /// # Errors
-    /// Returns [`FormatError::GlbTooLarge`], or [`FormatError::OutOfQuantizationRange`] for positions beyond the range
+    /// Returns [`FormatError::Limit`], or [`FormatError::OutOfQuantizationRange`] for positions beyond the range
     /// of the step.
     pub fn new(mesh: &'a Mesh, pieces: &'a Pieces, meta: &Meta) -> Result<Self, FormatError> {
         let Pieces { storage, summary, .. } = pieces;

@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use molmesh_surface::Mesh;
+use molmesh_surface::{Exceeded, Limit, Mesh};
 
 use super::buffer::write_buffer;
 use super::document::{Content, document};
@@ -122,7 +122,12 @@ pub(super) fn head(mut json: Vec<u8>, buffer_bytes: Option<u64>, aligned: bool) 
 
 /// Returns the file length as the header stores it.
 pub(super) fn check_len(bytes: u64) -> Result<u32, FormatError> {
-    u32::try_from(bytes).map_err(|_overflow| FormatError::GlbTooLarge { bytes, limit: u64::from(u32::MAX) })
+    let error = |_overflow| {
+        let hint = Some("the format ply or a tileset".into());
+        let error = Exceeded { actual: Some(bytes), hint, ..Exceeded::new(Limit::FileBytes, u64::from(u32::MAX)) };
+        error.error()
+    };
+    u32::try_from(bytes).map_err(error)
 }
 
 #[cfg(test)]
@@ -137,8 +142,7 @@ mod tests {
         assert_eq!(GlbPlan::wrap(vec![b' '; 1000], fits).unwrap().len(), 48 * 89_000_000 + HEAD_BYTES);
         let large = BufferLayout::plain([90_000_000, 180_000_000], Packing::Full).unwrap();
         let error = GlbPlan::wrap(vec![b' '; 1000], large).unwrap_err();
-        assert_eq!(error, FormatError::GlbTooLarge { bytes: 4_320_016_384, limit: 4_294_967_295 });
-        assert!(error.to_string().contains("4320016384"));
+        assert!(error.to_string().starts_with("the file would have 4320016384 bytes, the limit is 4294967295; "));
     }
 
     #[test]

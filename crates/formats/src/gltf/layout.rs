@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use molmesh_surface::Mesh;
+use molmesh_surface::{Exceeded, Limit, Mesh};
 
 use crate::check::Summary;
 use crate::{FormatError, Storage};
@@ -64,7 +64,7 @@ impl AtomType {
         } else if max <= MAX_EXACT_F32 {
             Ok(Self::F32)
         } else {
-            Err(FormatError::AtomIndexTooLarge { atom: max, limit: MAX_EXACT_F32 })
+            Err(Exceeded::new(Limit::AtomIndex, MAX_EXACT_F32.into()).error())
         }
     }
 }
@@ -156,12 +156,8 @@ impl BufferLayout {
         colors: bool,
         atoms: Option<AtomType>,
     ) -> Result<Self, FormatError> {
-        let index_type = IndexType::for_vertices(n_indexed).ok_or(FormatError::TooMany {
-            format: "glTF",
-            what: "vertices",
-            count: n_indexed,
-            limit: u64::from(u32::MAX),
-        })?;
+        let error = || Exceeded { actual: Some(n_indexed), ..Exceeded::new(Limit::FileVertices, u32::MAX.into()) };
+        let index_type = IndexType::for_vertices(n_indexed).ok_or_else(|| error().error::<FormatError>())?;
         let mut end = 0;
         let mut span = |len: u64| {
             let offset = end;
@@ -222,10 +218,8 @@ mod tests {
                 assert!(n_vertices - 1 < (1 << (8 * index_type.bytes())) - 1, "{n_vertices}");
             }
         }
-        assert!(matches!(
-            BufferLayout::plain([1 << 32, 1], Packing::Full),
-            Err(FormatError::TooMany { count: 0x1_0000_0000, .. })
-        ));
+        let error = Exceeded { actual: Some(1 << 32), ..Exceeded::new(Limit::FileVertices, u32::MAX.into()) };
+        assert_eq!(BufferLayout::plain([1 << 32, 1], Packing::Full).err(), Some(error.error()));
     }
 
     #[test]
@@ -234,10 +228,8 @@ mod tests {
         assert_eq!(AtomType::for_largest(65_535), Ok(AtomType::U16));
         assert_eq!(AtomType::for_largest(65_536), Ok(AtomType::F32));
         assert_eq!(AtomType::for_largest(16_777_216), Ok(AtomType::F32));
-        assert_eq!(
-            AtomType::for_largest(16_777_217),
-            Err(FormatError::AtomIndexTooLarge { atom: 16_777_217, limit: 16_777_216 })
-        );
+        let error = Exceeded::new(Limit::AtomIndex, 16_777_216).error();
+        assert_eq!(AtomType::for_largest(16_777_217), Err(error));
     }
 
     #[test]

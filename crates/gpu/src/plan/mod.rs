@@ -50,7 +50,7 @@ impl Plan {
     /// Plans the bricks of `lattice`.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond the
+    /// [`SurfaceError::Limit`] before memory is allocated beyond the
     /// limits, [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let occupancy = Occupancy::new(lattice, limits, control)?;
@@ -231,7 +231,7 @@ mod tests {
     use std::collections::HashMap;
 
     use molmesh_surface::lattice::LatticeAtom;
-    use molmesh_surface::{Spheres, SurfaceOptions};
+    use molmesh_surface::{Limit, Spheres, SurfaceOptions};
 
     use super::*;
 
@@ -326,13 +326,10 @@ mod tests {
             Plan::new(&lattice, &SurfaceLimits { max_grid_points, ..SurfaceLimits::default() }, &Control::default())
         };
         assert!(with(grid_points).is_ok());
-        match with(grid_points - 1) {
-            Err(SurfaceError::GridTooLarge { grid_points: n, limit, suggested_resolution, .. }) => {
-                assert_eq!((n, limit), (grid_points, grid_points - 1));
-                assert!(suggested_resolution >= 0.5);
-            }
-            other => panic!("{:?}", other.map(|p| p.n_reached)),
-        }
+        let error = with(grid_points - 1).err().unwrap();
+        let exceeded = error.exceeded(Limit::GridPoints).unwrap();
+        assert_eq!((exceeded.actual, exceeded.max), (Some(grid_points), grid_points - 1));
+        assert!(exceeded.suggested_resolution.unwrap() >= 0.5);
         let control = Control::default();
         control.cancel.cancel();
         assert_eq!(Plan::new(&lattice, &SurfaceLimits::default(), &control).err(), Some(SurfaceError::Cancelled));

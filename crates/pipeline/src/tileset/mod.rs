@@ -22,8 +22,8 @@ use molmesh_formats::tileset::{TileAddress, TilesetBounds};
 use molmesh_structure::{Context, ReadLimits, Selected, Split, Structure, StructureError};
 use molmesh_surface::clip::{influence, influence_of};
 use molmesh_surface::{
-    Backend, Control, GridStats, Measures, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits,
-    SurfaceParams, TriangleQuality, Validation,
+    Backend, Control, Exceeded, GridStats, Limit, Measures, Mesh, MeshOutput, Spheres, Stage, SurfaceError,
+    SurfaceLimits, SurfaceParams, TriangleQuality, Validation,
 };
 
 use self::layout::Layout;
@@ -360,8 +360,10 @@ impl Layout {
             }
             control.memory.grow(TILE_BYTES).map_err(SurfaceError::from)?;
             if tiles.len() > MAX_TILES {
-                let (limit, resolution) = (MAX_TILES as u64, params.resolution);
-                return Err(SurfaceError::TooManyTiles { limit, resolution }.into());
+                let error = Exceeded::new(Limit::Tiles, MAX_TILES as u64);
+                return Err(
+                    SurfaceError::from(Box::new(Exceeded { resolution: Some(params.resolution), ..error })).into()
+                );
             }
         }
         Ok(())

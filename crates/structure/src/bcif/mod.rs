@@ -21,7 +21,7 @@ mod steps;
 pub(super) use self::row_stream::RowStream;
 pub(super) use self::skeleton::Skeleton;
 
-use molmesh_surface::MemoryMeter as _;
+use molmesh_surface::{Exceeded, Limit, MemoryMeter as _};
 
 use self::column::DecodedColumn;
 use self::column_stream::{DecodeLimits, Raw};
@@ -241,7 +241,7 @@ impl<'a> BinaryBlock<'a> {
     fn site(&self, reading: &Reading<'_>, passed: &mut Passed) -> Result<Option<SiteColumns<'a>>, StructureError> {
         let limits = reading.limits;
         let Some(category) = self.category("atom_site").filter(|category| category.rows > 0) else { return Ok(None) };
-        let bounds = category.bounds(limits).ok_or(StructureError::TooManyAtoms { limit: limits.max_atoms })?;
+        let bounds = category.bounds(limits).ok_or_else(|| limits.too_many_atoms().error::<StructureError>())?;
         let location = category.location();
         let raw = category.columns().map_err(|fault| fault.within(&location))?;
         let layout = layout(&raw).map_err(|fault| fault.within(&location))?;
@@ -266,7 +266,7 @@ impl<'a> BinaryBlock<'a> {
         // Decoded data counts as decompressed data, because a few bytes of run-length encoding may expand to many.
         let limit = reading.limits.max_inflated_bytes;
         if rows::decoded_bytes(&site.layout, site.bounds.rows) > limit {
-            return Err(StructureError::InflatedTooLarge { limit });
+            return Err(Exceeded::new(Limit::InflatedBytes, limit).error());
         }
         let value = |category, item, max| -> Result<Option<String>, StructureError> {
             let Some(category) = self.category(category) else { return Ok(None) };

@@ -1,6 +1,6 @@
 //! Errors of reading maps.
 
-use molmesh_surface::OutOfMemory;
+use molmesh_surface::{Exceeded, Limit, OutOfMemory};
 use thiserror::Error;
 
 use crate::StructureError;
@@ -27,14 +27,9 @@ pub enum MapError {
         /// The expected content.
         expected: String,
     },
-    /// More points than allowed.
-    #[error("the map has {points} points, the limit is {limit}")]
-    TooManyPoints {
-        /// Number of points.
-        points: u64,
-        /// Limit, number of points.
-        limit: u64,
-    },
+    /// A limit is exceeded.
+    #[error(transparent)]
+    Limit(#[from] Box<Exceeded>),
     /// Compressed data is broken.
     #[error("cannot decompress the map, {encoding}: {reason}")]
     Decompress {
@@ -42,12 +37,6 @@ pub enum MapError {
         encoding: &'static str,
         /// Message of the decoder.
         reason: String,
-    },
-    /// The input decompresses to more bytes than allowed.
-    #[error("the map inflates to more than {limit} bytes")]
-    InflatedTooLarge {
-        /// Limit, bytes.
-        limit: u64,
     },
     /// Not enough memory is available.
     #[error(transparent)]
@@ -62,7 +51,7 @@ impl From<StructureError> for MapError {
     fn from(error: StructureError) -> Self {
         match error {
             StructureError::Decompress { encoding, reason } => Self::Decompress { encoding, reason },
-            StructureError::InflatedTooLarge { limit } => Self::InflatedTooLarge { limit },
+            StructureError::Limit(error) => Exceeded::new(Limit::MapBytes, error.max).error(),
             StructureError::Memory(error) => Self::Memory(error),
             StructureError::Cancelled => Self::Cancelled,
             other => Self::UnknownFormat { found: other.to_string() },

@@ -9,7 +9,7 @@ mod error;
 use std::fmt;
 
 pub use error::MapError;
-use molmesh_surface::{Control, MemoryMeter as _, OutOfMemory, Reservation};
+use molmesh_surface::{Control, Exceeded, Limit, MemoryMeter as _, OutOfMemory, Reservation};
 
 use super::decoder;
 
@@ -156,10 +156,9 @@ fn number_of_points(size: [usize; 3], location: &str, limits: &MapLimits) -> Res
         let [x, y, z] = size;
         return Err(malformed(location, format!("{x} × {y} × {z} points"), "at least 2 points along each axis"));
     }
-    if points > limits.max_points {
-        return Err(MapError::TooManyPoints { points, limit: limits.max_points });
-    }
-    usize::try_from(points).map_err(|_large| MapError::TooManyPoints { points, limit: limits.max_points })
+    let fitting = usize::try_from(points).ok().filter(|_| points <= limits.max_points);
+    let error = || Exceeded { actual: Some(points), ..Exceeded::new(Limit::MapPoints, limits.max_points) };
+    fitting.ok_or_else(|| error().error())
 }
 
 /// Allocates a list of `n` values, whose memory is reserved first.

@@ -4,7 +4,7 @@ use std::io::Write as _;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use molmesh_surface::{CancelToken, MemoryMeter};
+use molmesh_surface::{CancelToken, Exceeded, Limit, MemoryMeter};
 
 use super::*;
 
@@ -266,16 +266,17 @@ fn maps_are_limited_charged_and_cancelled() {
         [text.clone().into_bytes(), Ccp4::plain().bytes()].map(|bytes| read(&bytes, &limits, &Control::default()).err())
     };
     assert_eq!(limited(60), [None, None]);
-    assert_eq!(limited(23), [60, 24].map(|points| Some(MapError::TooManyPoints { points, limit: 23 })));
+    let error = |points, max| Exceeded { actual: Some(points), ..Exceeded::new(Limit::MapPoints, max) }.error();
+    assert_eq!(limited(23), [60, 24].map(|points| Some(error(points, 23))));
     let huge = Ccp4 { size: [i32::MAX; 3], ..Ccp4::plain() }.bytes();
-    assert!(matches!(of(&huge), Err(MapError::TooManyPoints { points: u64::MAX, .. })));
+    assert_eq!(of(&huge).err(), Some(error(u64::MAX, MapLimits::default().max_points)));
     let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
     packed.write_all(text.as_bytes()).unwrap();
     let packed = packed.finish().unwrap();
     assert_eq!(of(&packed).unwrap().at([1.1, 2.2, 3.3]), of(text.as_bytes()).unwrap().at([1.1, 2.2, 3.3]));
     let limits = MapLimits { max_inflated_bytes: 100, ..MapLimits::default() };
     let error = read(&packed, &limits, &Control::default()).unwrap_err();
-    assert_eq!(error, MapError::InflatedTooLarge { limit: 100 });
+    assert_eq!(error, Exceeded::new(Limit::MapBytes, 100).error());
     assert!(matches!(of(&packed[..packed.len() / 2]), Err(MapError::Decompress { encoding: "gzip", .. })));
 
     let meter = Arc::new(Meter { limit: 240, ..Meter::default() });

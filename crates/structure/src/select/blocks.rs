@@ -104,7 +104,7 @@ impl SelectedBlocks {
     /// Selects atoms of the next block, of all chains.
     ///
     /// # Errors
-    /// Returns [`StructureError::TooManyAtoms`], [`StructureError::NotAStream`] and the errors of memory and
+    /// Returns [`StructureError::Limit`], [`StructureError::NotAStream`] and the errors of memory and
     /// cancellation.
     pub fn add(
         &mut self,
@@ -116,10 +116,8 @@ impl SelectedBlocks {
         let s = &block.structure;
         self.n_atoms += block.len as u64;
         self.unread_of_file = s.unread;
-        // Indices of atoms have 32 bits.
-        let limit = limits.max_atoms.min(u64::from(u32::MAX));
-        if self.n_atoms > limit {
-            return Err(StructureError::TooManyAtoms { limit });
+        if self.n_atoms > limits.too_many_atoms().max {
+            return Err(limits.too_many_atoms().error());
         }
         let first_model = *self.first_model.get_or_insert_with(|| s.model.first().copied().unwrap_or(1));
         let model = match selection.model {

@@ -92,8 +92,7 @@ const ATOMS_PER_TASK: usize = 1 << 14;
 /// # Errors
 /// Returns [`StructureError::EmptySelection`] if no atom is selected, and [`StructureError::NotFound`] for a model,
 /// chain, alternative location or assembly that does not exist. Returns [`StructureError::BadAssembly`],
-/// [`StructureError::TooManyCopies`] and [`StructureError::AssemblyTooLarge`] for an assembly that cannot be built
-/// within the default limits.
+/// [`StructureError::Limit`] for an assembly that cannot be built within the default limits.
 pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, StructureError> {
     select_with(structure, selection, &ReadLimits::default(), &Control::default())
 }
@@ -102,7 +101,7 @@ pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, 
 /// memory of an assembly, and [`Structure::table_bytes`], to the meter of `control`.
 ///
 /// # Errors
-/// Returns the errors of [`select`], [`StructureError::TooManyDistances`], [`StructureError::Memory`] and
+/// Returns the errors of [`select`], [`StructureError::Limit`], [`StructureError::Memory`] and
 /// [`StructureError::Cancelled`].
 pub fn select_with(
     structure: &Structure,

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use indexmap::IndexMap;
 use molmesh_surface::groups::{GroupCounts, Groups};
 use molmesh_surface::vector::{dot, joined_bounds, squared_distance, sub};
-use molmesh_surface::{Control, MemoryMeter as _, Reservation};
+use molmesh_surface::{Control, Exceeded, Limit, MemoryMeter as _, Reservation};
 use rayon::prelude::*;
 
 use crate::altloc::ATOMS_PER_CHECK;
@@ -107,7 +107,7 @@ impl Tests<'_> {
         check(self.control)?;
         let (TestCount { so_far, limit }, new) = (self.count, std::mem::take(&mut self.uncounted) as u64);
         let tests = so_far.fetch_add(new, Ordering::Relaxed) + new;
-        if tests <= *limit { Ok(()) } else { Err(StructureError::TooManyDistances { limit: *limit }) }
+        if tests <= *limit { Ok(()) } else { Err(Exceeded::new(Limit::Distances, *limit).error()) }
     }
 }
 
@@ -383,7 +383,7 @@ mod tests {
             (marked, tests.so_far.into_inner())
         };
         let (limited, tests) = run(1_000_000, &Control::default());
-        assert_eq!(limited, Err(StructureError::TooManyDistances { limit: 1_000_000 }));
+        assert_eq!(limited, Err(Exceeded::new(Limit::Distances, 1_000_000).error()));
         // Each thread stops at its next check.
         let threads = rayon::current_num_threads() as u64;
         assert!(tests <= 1_000_000 + threads * (2 * TESTS_PER_CHECK as u64 + 1), "{tests}");

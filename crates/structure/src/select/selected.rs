@@ -101,7 +101,7 @@ impl Selected {
     /// Rejects an assembly in which more atoms than allowed have the same position.
     ///
     /// # Errors
-    /// Returns [`StructureError::TooManyDuplicates`] and the errors of memory and cancellation.
+    /// Returns [`StructureError::Limit`] and the errors of memory and cancellation.
     pub fn check_duplicates(
         &self,
         spheres: &Spheres,

@@ -63,8 +63,7 @@ impl Tiles {
     /// Assigns atoms to tiles.
     ///
     /// # Errors
-    /// Returns [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond
-    /// the limits, and [`SurfaceError::Cancelled`].
+    /// Returns [`SurfaceError::Limit`] before memory is allocated beyond the limits, and [`SurfaceError::Cancelled`].
     pub(super) fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         // Only the result stays added.
         let (lasting, scratch) = (Reservation::new(&control.memory), Reservation::new(&control.memory));

@@ -39,7 +39,7 @@ pub fn tolerance(lattice: &Lattice) -> f32 {
 /// surfaces at which the distance to the nearest sphere is exact, and for isosurfaces.
 ///
 /// # Errors
-/// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+/// [`SurfaceError::Limit`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
 pub fn boundary(
     lattice: &Lattice,
     params: &SurfaceParams,
@@ -77,8 +77,8 @@ impl DistanceField {
     /// Prepares the surface of `context`.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::TooManyCandidates`] and [`SurfaceError::GridTooLarge`] before
-    /// memory is allocated beyond the limits, [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::Limit`] before memory is allocated beyond the limits, [`SurfaceError::Memory`],
+    /// [`SurfaceError::Cancelled`].
     pub(super) fn new(lattice: &Lattice, context: RunContext<'_>) -> Result<Self, SurfaceError> {
         let RunContext { params, limits, control, .. } = context;
         let found = boundary(lattice, params, limits, control)?.map(|(union, bounds)| {

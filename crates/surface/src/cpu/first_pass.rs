@@ -114,8 +114,7 @@ impl Pass<'_> {
     /// all slabs of the tile are finished.
     ///
     /// # Errors
-    /// Returns [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`] or [`SurfaceError::MeshTooLarge`] as
-    /// soon as the slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
+    /// Returns [`SurfaceError::Limit`] as soon as the slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
     pub(super) fn evaluate(&self, i: usize) -> Result<Option<Tile>, SurfaceError> {
         self.context.control.check()?;
         let slab = &self.slabs[i];

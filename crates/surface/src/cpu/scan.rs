@@ -2,7 +2,7 @@
 
 use super::Tile;
 use crate::error::SurfaceError;
-use crate::lattice::slightly_coarser;
+use crate::limit::{Exceeded, Limit};
 use crate::params::{SurfaceLimits, SurfaceParams};
 
 /// Totals of a run.
@@ -17,7 +17,7 @@ pub(super) struct Totals {
 /// Sets the first vertex and triangle of every tile.
 ///
 /// # Errors
-/// Returns [`SurfaceError::MeshTooLarge`] if the mesh exceeds the limit, or 32-bit indices.
+/// Returns [`SurfaceError::Limit`] if the mesh exceeds the limit, or 32-bit indices.
 pub(super) fn scan(tiles: &mut [Tile], params: &SurfaceParams, limits: &SurfaceLimits) -> Result<Totals, SurfaceError> {
     let (mut vertices, mut triangles) = (0, 0);
     for tile in &mut *tiles {
@@ -32,7 +32,7 @@ pub(super) fn scan(tiles: &mut [Tile], params: &SurfaceParams, limits: &SurfaceL
 /// Rejects a mesh that exceeds the limit or whose vertices 32-bit indices cannot number.
 ///
 /// # Errors
-/// Returns [`SurfaceError::MeshTooLarge`].
+/// Returns [`SurfaceError::Limit`].
 pub fn check_size(
     params: &SurfaceParams,
     limits: &SurfaceLimits,
@@ -41,14 +41,13 @@ pub fn check_size(
 ) -> Result<(), SurfaceError> {
     let bytes = params.mesh_bytes(n_vertices, n_triangles);
     // The highest value of an index is the primitive restart of graphics interfaces.
-    let limit = limits.max_mesh_bytes.min(params.mesh_bytes(u64::from(u32::MAX), 0));
-    if bytes <= limit { Ok(()) } else { Err(too_large(bytes, params.resolution, limit)) }
+    let cap = params.mesh_bytes(u64::from(u32::MAX), 0);
+    let error = Exceeded { actual: Some(bytes), ..Exceeded::capped(Limit::MeshBytes, limits.max_mesh_bytes, cap) };
+    if bytes <= error.max { Ok(()) } else { Err(error.suggest_for_area(params.resolution).error()) }
 }
 
-/// Returns the error for a mesh of `bytes` bytes. The number of bytes grows with the inverse square of the spacing, as
-/// the area stays the same.
+/// Returns the error for a mesh of `bytes` bytes.
 #[must_use]
 pub fn too_large(bytes: u64, spacing: f64, limit: u64) -> SurfaceError {
-    let excess = (bytes as f64 / limit.max(1) as f64).max(1.0);
-    SurfaceError::MeshTooLarge { bytes, limit, suggested_resolution: slightly_coarser(spacing * excess.sqrt()) }
+    Exceeded { actual: Some(bytes), ..Exceeded::new(Limit::MeshBytes, limit) }.suggest_for_area(spacing).error()
 }

@@ -287,14 +287,17 @@ fn limits_and_cancellation_end_the_search() {
         find(&spheres(balls), &params(1.4), 4.0, &limits, control).map(|found| found.list.len())
     };
     let balls = cluster(20, 5.0);
-    let Err(SurfaceError::PocketGridTooLarge { grid_points, limit: 100, .. }) = search(&balls, 100, &control) else {
-        panic!("not rejected")
+    let error = search(&balls, 100, &control).unwrap_err();
+    let Some(Exceeded { actual: Some(grid_points), max: 100, .. }) = error.exceeded(Limit::PocketPoints) else {
+        panic!("{error}")
     };
+    let grid_points = *grid_points;
     assert_eq!(search(&balls, grid_points - 1, &control).map_err(drop), Err(()));
     assert!(search(&balls, grid_points, &control).is_ok());
     // Two spheres that are far from each other, with any limit.
     let far = [([0.0; 3], 1.0), ([1e5; 3], 1.0)];
-    assert!(matches!(search(&far, u64::MAX, &control), Err(SurfaceError::PocketGridTooLarge { .. })));
+    let error = search(&far, u64::MAX, &control).unwrap_err();
+    assert!(error.exceeded(Limit::PocketPoints).is_some_and(|exceeded| exceeded.key().is_none()), "{error}");
     let n = cluster(CLUSTER.0, CLUSTER.1);
     let with = |bytes: i64| {
         let memory = Arc::new(Budget(bytes.into()));
@@ -325,8 +328,10 @@ fn rows_in_reach_of_probes_are_limited() {
         (-200..=200).map(half).filter(|half2| *half2 > 0.0).map(|half2| 2.0 * half2.sqrt()).sum::<f64>()
     };
     let rows = 2.0 * (2.0 * disc(51.4) + disc(70.0));
-    let Err(SurfaceError::TooManyPocketRows { rows: counted, limit }) = run(10) else { panic!("50 rows are too few") };
-    assert!(limit == 50 && (counted as f64 / rows - 1.0).abs() < 0.01, "{counted} {rows}");
+    let error = run(10).unwrap_err();
+    let exceeded = error.exceeded(Limit::PocketRows).unwrap();
+    let counted = exceeded.actual.unwrap();
+    assert!(exceeded.max == 50 && (counted as f64 / rows - 1.0).abs() < 0.01, "{counted} {rows}");
     let least = counted.div_ceil(ROWS_PER_PAIR);
     assert!(run(least).is_ok() && run(least - 1).is_err());
 }

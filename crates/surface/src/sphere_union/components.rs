@@ -94,7 +94,7 @@ impl<'a> Components<'a> {
     /// Finds the components of the boundary of `atoms`, whose radius is the length scale.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::Limit`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub(crate) fn new(
         atoms: &'a [LatticeAtom],
         spacing: f64,

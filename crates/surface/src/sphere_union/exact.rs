@@ -152,7 +152,7 @@ impl ExactMeasures {
     /// Measures the surface of `spheres`. The memory of the result remains charged to `control`.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::BadParameter`] for an isosurface or if scale and offset leave
+    /// [`SurfaceError::Limit`], [`SurfaceError::BadParameter`] for an isosurface or if scale and offset leave
     /// a radius that is too small, [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub fn of(
         spheres: &Spheres,
@@ -208,7 +208,7 @@ impl Components<'_> {
     /// Measures all components, whose atoms are on a lattice with a spacing of 1 Å and have radii that include `probe`.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::Limit`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub(super) fn measure(
         &self,
         probe: f64,

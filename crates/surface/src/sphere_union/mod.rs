@@ -119,7 +119,7 @@ impl SphereUnion {
     /// of each arc, enlarged by `reach`.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`] if more pairs of spheres overlap than candidate pairs are allowed;
+    /// [`SurfaceError::Limit`] if more pairs of spheres overlap than candidate pairs are allowed;
     /// [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub(crate) fn new(
         atoms: &[LatticeAtom],

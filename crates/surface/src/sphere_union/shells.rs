@@ -46,7 +46,7 @@ impl Components<'_> {
     /// Å, and their radii include that of the `probe`, Å.
     ///
     /// # Errors
-    /// [`SurfaceError::TooManyOverlaps`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::Limit`], [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub(crate) fn shells(
         &self,
         probe: f64,
