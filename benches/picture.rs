@@ -28,9 +28,9 @@ fn structures() -> Vec<(&'static str, PathBuf)> {
 fn mesh(path: &PathBuf) -> Mesh {
     let backend = CpuBackend::new(None).unwrap();
     let choice = Choice { backend: &backend, reason: "measured" };
-    let job = params::parse::<&str, &str>([]).unwrap().job;
+    let options = params::parse::<&str, &str>([]).unwrap().options;
     let bytes = std::fs::read(path).unwrap();
-    let product = pipeline::run(&bytes, &job, &JobLimits::default(), &choice, &Control::default(), &(), None);
+    let product = pipeline::run(&bytes, &options, &JobLimits::default(), &choice, &Control::default(), &(), None);
     let mut mesh = product.unwrap().mesh;
     mesh.make_contiguous();
     mesh

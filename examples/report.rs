@@ -11,7 +11,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let input = arguments.next().ok_or("usage: report STRUCTURE [PARAMETER=VALUE…]")?;
     // The names and values of the command line and of the HTTP query.
     let pairs: Vec<String> = arguments.collect();
-    let options = params::parse(pairs.iter().map(|pair| pair.split_once('=').unwrap_or((pair, ""))))?.job;
+    let options = params::parse(pairs.iter().map(|pair| pair.split_once('=').unwrap_or((pair, ""))))?.options;
     let backend = CpuBackend::new(None)?;
     let choice = Choice { backend: &backend, reason: "example" };
     let limits = JobLimits::default();

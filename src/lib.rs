@@ -41,7 +41,7 @@ pub use molmesh_pipeline as pipeline;
 pub use molmesh_structure as structure;
 pub use molmesh_surface as surface;
 use molmesh_sync as sync;
-pub use pipeline::{Job as Options, JobError as Error};
+pub use pipeline::{JobError as Error, Options};
 pub use surface::Mesh;
 
 /// Meshes a structure file on the CPU.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use molmesh::picture::SelectedRenderer;
-use molmesh::pipeline::{self, Choice, Job, JobLimits, params};
+use molmesh::pipeline::{self, Choice, JobLimits, Options, params};
 use molmesh::structure::read_with;
 use molmesh::surface::{Control, CpuBackend, MemoryMeter, OutOfMemory};
 
@@ -53,7 +53,7 @@ enum Work {
 }
 
 /// Runs a job. Returns the maximum of the memory that it allocated, and that of its meter.
-fn peaks(text: &str, job: &Job, work: Work) -> [u64; 2] {
+fn peaks(text: &str, options: &Options, work: Work) -> [u64; 2] {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
     let limits = JobLimits::default();
@@ -61,11 +61,11 @@ fn peaks(text: &str, job: &Job, work: Work) -> [u64; 2] {
         let control = Control { memory: meter, ..Control::default() };
         if work == Work::Estimate {
             let read = |control: &Control<'_>| read_with(text.as_bytes(), &limits.read, control).map(Box::new);
-            assert!(pipeline::estimate(read, job, &limits, &choice, &control).unwrap().mesh.is_ok());
+            assert!(pipeline::estimate(read, options, &limits, &choice, &control).unwrap().mesh.is_ok());
             return;
         }
-        let mut product = pipeline::run(text.as_bytes(), job, &limits, &choice, &control, &(), None).unwrap();
-        if let Some(picture) = &job.picture {
+        let mut product = pipeline::run(text.as_bytes(), options, &limits, &choice, &control, &(), None).unwrap();
+        if let Some(picture) = &options.picture {
             pipeline::draw(&mut product, picture, &SelectedRenderer::cpu(""), &control, &()).unwrap();
         }
     };
@@ -98,8 +98,8 @@ fn jobs_allocate_no_more_than_they_add_to_their_meter() {
     let mut found = Vec::new();
     for (name, text, work, parameters) in cases {
         let format = (work == Work::Picture).then_some(("format", "png"));
-        let job = params::parse(parameters.iter().copied().chain(format)).unwrap().job;
-        let [allocated, metered] = peaks(text, &job, work);
+        let options = params::parse(parameters.iter().copied().chain(format)).unwrap().options;
+        let [allocated, metered] = peaks(text, &options, work);
         println!("{name}: {allocated} bytes allocated, {metered} metered");
         // Control: a meter that counts nothing would fail.
         assert!(allocated > 2 * SLACK, "{name}: {allocated}");

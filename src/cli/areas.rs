@@ -2,7 +2,7 @@
 
 use molmesh::pipeline::areas::measure_selection;
 use molmesh::pipeline::params::areas::AreasRequest;
-use molmesh::pipeline::{Job, LeftOutReport, MeasuredSelection, SelectionMeasures};
+use molmesh::pipeline::{LeftOutReport, MeasuredSelection, Options, SelectionMeasures};
 use molmesh::structure::{self, Structure};
 use molmesh::surface::{CancelToken, Control};
 use serde::Serialize;
@@ -18,7 +18,7 @@ use super::{interrupt, job, request};
 
 /// Runs the command.
 pub(super) fn run(args: &AreasArgs) -> Result<(), CliError> {
-    let AreasRequest { job, level, .. } = request::parse_areas(args)?;
+    let AreasRequest { options, level, .. } = request::parse_areas(args)?;
     let limits = request::common_limits(&args.limits);
     job::set_threads(args.threads)?;
     let cancel = CancelToken::default();
@@ -29,7 +29,7 @@ pub(super) fn run(args: &AreasArgs) -> Result<(), CliError> {
     let control = Control { cancel, ..Control::default() };
     let failure = |error| job::failure(error, &args.input, &input, &limits);
     let structure = structure::read_with(&input, &limits.read, &control).map_err(|error| failure(error.into()))?;
-    let measured = measure_selection(&structure, &job, &limits.read, &limits.surface, &control).map_err(failure)?;
+    let measured = measure_selection(&structure, &options, &limits.read, &limits.surface, &control).map_err(failure)?;
     measured.areas.write_csv(&structure, level, &control, &mut output).map_err(|source| output.failure(source))?;
     let files = [output.written("output", "csv")];
     Output::finish(vec![output])?;
@@ -39,26 +39,26 @@ pub(super) fn run(args: &AreasArgs) -> Result<(), CliError> {
         atoms: measured.areas.len(),
         left_out: &measured.left_out,
         warnings: &structure.warnings,
-        surface: job.params.surface.name(),
-        probe: job.params.used_probe(),
+        surface: options.params.surface.name(),
+        probe: options.params.used_probe(),
     };
-    let text = || text(&structure, &job, &measured, &files);
+    let text = || text(&structure, &options, &measured, &files);
     CommandReport { report: &report, files: &files, findings: None }.write(args.report, args.quiet, text)
 }
 
 /// Formats the summary.
-fn text(structure: &Structure, job: &Job, measured: &MeasuredSelection, files: &[WrittenFile]) -> String {
+fn text(structure: &Structure, options: &Options, measured: &MeasuredSelection, files: &[WrittenFile]) -> String {
     let title = summary::title(structure.title.as_deref());
     let mut page = Page::new(Style::stderr(), structure.id.as_deref().unwrap_or("structure"), &title);
     let atoms = grouped(measured.areas.len() as u64);
     let atoms_in_file = grouped(structure.len() as u64);
     page.row("atoms", &format!("{atoms} of {atoms_in_file} in the file"));
-    let assembly = job.selection.assembly.as_ref();
+    let assembly = options.selection.assembly.as_ref();
     page.rows("assembly", assembly.map(|id| format!("{id}; the atoms are those of all copies")));
     page.rows("left out", summary::left_out(&measured.left_out));
     page.rows("warning", structure.warnings.iter().cloned());
-    let probe = job.params.used_probe().map(|radius| format!(", probe {radius} Å")).unwrap_or_default();
-    page.row("surface", &format!("{}{probe}", job.params.surface));
+    let probe = options.params.used_probe().map(|radius| format!(", probe {radius} Å")).unwrap_or_default();
+    page.row("surface", &format!("{}{probe}", options.params.surface));
     match &measured.measures {
         SelectionMeasures::Exact(exact) => page.row("exact", &exact_measures(exact)),
         SelectionMeasures::Interface(interface) => {

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use molmesh::formats::{Format, GlbSink};
 use molmesh::pipeline::params::Request;
 use molmesh::pipeline::tileset::{self, StreamSource, StructureStream, TilesetReport, WriteError};
-use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, MapFile, Product, Report};
+use molmesh::pipeline::{self, Choice, JobError, JobLimits, MapFile, Options, Product, Report};
 use molmesh::structure::stream::{BLOCK_BYTES, ScratchFile};
 use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::structure::{self, Structure, StructureError, table};
@@ -29,7 +29,7 @@ use super::{interrupt, request, summary};
 pub(super) struct CommandJob<'a> {
     path: &'a Path,
     args: &'a JobArgs,
-    job: Job,
+    options: Options,
     limits: JobLimits,
     cancel: CancelToken,
     input: Vec<u8>,
@@ -68,7 +68,7 @@ impl<'a> CommandJob<'a> {
     /// read later if its estimated number of atoms is given.
     pub(super) fn prepare_for<T>(
         purpose: Purpose,
-        Request { mut job, strict, .. }: Request,
+        Request { mut options, strict, .. }: Request,
         (path, streamed): (&'a Path, Option<f64>),
         args: &'a JobArgs,
         open: impl FnOnce(&CancelToken) -> Result<T, CliError>,
@@ -76,7 +76,7 @@ impl<'a> CommandJob<'a> {
         let limits =
             if streamed.is_some() { request::limits_of_stream(&args.limits) } else { request::limits(&args.limits) };
         let mut requested = BackendRequest::for_command(args, purpose);
-        request::check(args, &requested, &job, path)?;
+        request::check(args, &requested, &options, path)?;
         set_threads(args.threads)?;
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
@@ -84,15 +84,16 @@ impl<'a> CommandJob<'a> {
         let input = if streamed.is_some() { Vec::new() } else { read(path, limits.read.max_inflated_bytes)? };
         if let Some(map) = args.map.as_deref() {
             // The command line makes no content keys.
-            job.map = Some(MapFile::new(String::new(), read(map, limits.map.max_inflated_bytes)?));
+            options.map = Some(MapFile::new(String::new(), read(map, limits.map.max_inflated_bytes)?));
         }
         let atoms = streamed.unwrap_or_else(|| pipeline::estimate_atoms(&input));
-        requested.work = Some(pipeline::estimate_work(atoms, &job));
+        requested.work = Some(pipeline::estimate_work(atoms, &options));
         let selected = backend::select(&requested)?;
         let progress = Progress::new(!args.quiet);
         let findings = if strict { Some(check(path, &input, &limits)?) } else { None };
         let (atom_table, structure) = (None, OnceCell::new());
-        let job = Self { path, args, job, limits, cancel, input, selected, progress, findings, atom_table, structure };
+        let job =
+            Self { path, args, options, limits, cancel, input, selected, progress, findings, atom_table, structure };
         Ok((job, output))
     }
 
@@ -119,7 +120,7 @@ impl<'a> CommandJob<'a> {
             }
             Ok(structure)
         };
-        pipeline::run_with(read, &self.job, &self.limits, &choice, &self.control(), &self.progress, sink)
+        pipeline::run_with(read, &self.options, &self.limits, &choice, &self.control(), &self.progress, sink)
     }
 
     /// Meshes all tiles of a tileset and passes each file to `write`. `folder` is for messages.
@@ -130,7 +131,8 @@ impl<'a> CommandJob<'a> {
     ) -> Result<TilesetReport, CliError> {
         let read = |control: &Control<'_>| structure::read_with(&self.input, &self.limits.read, control).map(Box::new);
         let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
-        let written = tileset::write(read, &self.job, &choice, &self.limits, &self.control(), &self.progress, write);
+        let written =
+            tileset::write(read, &self.options, &choice, &self.limits, &self.control(), &self.progress, write);
         written.map_err(|error| self.write_failure(folder, self.path, error))
     }
 
@@ -150,7 +152,7 @@ impl<'a> CommandJob<'a> {
         let stream =
             StructureStream { source, scratch, block_bytes: BLOCK_BYTES, began: &|number| current.set(number) };
         let (control, sink) = (self.control(), &self.progress);
-        let written = tileset::write_stream(stream, &self.job, &choice, &self.limits, &control, sink, write);
+        let written = tileset::write_stream(stream, &self.options, &choice, &self.limits, &control, sink, write);
         written.map_err(|error| self.write_failure(folder, inputs.get(current.get()).map_or(self.path, |p| p), error))
     }
 
@@ -171,7 +173,7 @@ impl<'a> CommandJob<'a> {
 
     /// Draws the picture of a product.
     pub(super) fn draw(&self, product: &mut Product) -> Result<(), JobError> {
-        let params = self.job.picture.unwrap_or_default();
+        let params = self.options.picture.unwrap_or_default();
         pipeline::draw(product, &params, &self.selected.renderer, &self.control(), &self.progress)
     }
 

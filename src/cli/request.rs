@@ -6,7 +6,7 @@ use std::str::FromStr as _;
 use molmesh::formats::{Compress, Format};
 use molmesh::pipeline::params::areas::AreasRequest;
 use molmesh::pipeline::params::{self, ParamError, Request};
-use molmesh::pipeline::{Job, JobLimits, tileset};
+use molmesh::pipeline::{JobLimits, Options, tileset};
 use molmesh::structure::read::DISTANCES_PER_PAIR;
 
 use super::args::{AreasArgs, AtomArgs, CommonLimitArgs, JobArgs, LimitArgs, MeshArgs, RenderArgs, TilesetArgs};
@@ -54,9 +54,9 @@ fn format_of(output: &Path) -> Result<Format, CliError> {
 pub(super) fn parse_tileset(args: &TilesetArgs) -> Result<Request, CliError> {
     let compress = ("compress".to_owned(), Compress::Meshopt.name().to_owned());
     let request = parse(&[compress], &args.job, Format::Glb)?;
-    tileset::check(&request.job)?;
+    tileset::check(&request.options)?;
     if args.scratch.is_some() {
-        tileset::check_stream(&request.job, args.inputs.len())?;
+        tileset::check_stream(&request.options, args.inputs.len())?;
         if request.strict {
             return Err(CliError::usage("`--check` reads the whole file; leave it out with `--scratch`"));
         }
@@ -98,13 +98,18 @@ fn atom_pairs(atoms: &AtomArgs) -> Vec<(String, String)> {
 }
 
 /// Rejects flags of a job that contradict or need each other. `input` is the structure file.
-pub(super) fn check(args: &JobArgs, backend: &BackendRequest<'_>, job: &Job, input: &Path) -> Result<(), CliError> {
+pub(super) fn check(
+    args: &JobArgs,
+    backend: &BackendRequest<'_>,
+    options: &Options,
+    input: &Path,
+) -> Result<(), CliError> {
     backend::check(backend)?;
     let map = args.map.as_deref();
     if map.is_some_and(|map| is_stdio(map) && is_stdio(input)) {
         return Err(CliError::usage("the structure and the map cannot both be read from stdin"));
     }
-    match (job.color.is_some_and(|color| color.scheme.needs_map()), map) {
+    match (options.color.is_some_and(|color| color.scheme.needs_map()), map) {
         (true, None) => Err(CliError::usage("`--color map` needs `--map FILE`")),
         (false, Some(_)) => Err(CliError::usage("`--map` needs `--color map`")),
         _ => Ok(()),
@@ -187,7 +192,7 @@ mod tests {
 
     #[test]
     fn short_flags_add_to_the_selection() {
-        let selection = |flags: &[&str]| request(flags).unwrap().job.selection;
+        let selection = |flags: &[&str]| request(flags).unwrap().options.selection;
         let plain = selection(&[]);
         assert_eq!(plain.atoms.to_string(), "polymer");
         let more = selection(&["--ligands", "--hydrogens"]);
@@ -238,7 +243,7 @@ mod tests {
                 "color_range" => vec![&flag, "0,50", "--color", "bfactor"],
                 _ => vec![&flag, "2"],
             };
-            let key = |r: &Request| (params::canonical(&r.job), r.format, r.strict);
+            let key = |r: &Request| (params::canonical(&r.options), r.format, r.strict);
             let pictures = parameter.doc.contains("picture") && parameter.name != "format";
             let ask = if pictures { drawn } else { request };
             let changed = ask(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
@@ -255,7 +260,10 @@ mod tests {
         let both = request(&["--detail", "3", "--resolution", "0.6"]).unwrap_err();
         let message = both.to_string();
         let default = request(&["--detail", "3", "--resolution", "0.5"]).unwrap();
-        assert_eq!(params::canonical(&default.job), params::canonical(&request(&["--detail", "3"]).unwrap().job));
+        assert_eq!(
+            params::canonical(&default.options),
+            params::canonical(&request(&["--detail", "3"]).unwrap().options)
+        );
         assert!(both.code() == 2 && message.contains("`detail`") && message.contains("`resolution`"), "{message}");
         for flags in [&["--instances"][..], &["--instances", "--assembly", "1", "--context", "whole"]] {
             let message = request(flags).unwrap_err().to_string();

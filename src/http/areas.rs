@@ -44,12 +44,13 @@ pub(super) async fn list(
     query: Pairs,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let AreasRequest { job, level, canonical } = params::areas::parse(&query.0)?;
+    let AreasRequest { options, level, canonical } = params::areas::parse(&query.0)?;
     let surface = app.config.limits.job().surface;
     let write = async |loaded: Loaded, delivery| {
         let listing = loaded.list_atoms(&app, &caller, delivery, move |structure, limits, control, memory| {
             let refused = |error| Problem::from(Failure::Job { error, diagnostics: Vec::new() });
-            let areas = areas::measure_selection(structure, &job, limits, &surface, control).map_err(refused)?.areas;
+            let areas =
+                areas::measure_selection(structure, &options, limits, &surface, control).map_err(refused)?.areas;
             document::collect(memory, control, |out| areas.write_csv(structure, level, control, out))
         });
         Ok(([(header::CONTENT_TYPE, "text/csv")], Body::from(listing.await?)).into_response())

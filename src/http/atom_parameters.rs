@@ -22,7 +22,7 @@ pub(super) struct Positions {
 pub(super) fn parse(pairs: &[(String, String)]) -> Result<Option<Positions>, ParamError> {
     params::check_names(pairs, &NAMES)?;
     let (own, of_mesh): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == POSITIONS);
-    let job = params::parse(of_mesh.iter().map(|(name, value)| (name, value)))?.job;
+    let job = params::parse(of_mesh.iter().map(|(name, value)| (name, value)))?.options;
     let positions = match &own[..] {
         [] => false,
         [(_, value)] => match value.as_str() {

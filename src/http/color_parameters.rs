@@ -2,7 +2,7 @@
 
 use crate::pipeline::color::Scheme;
 use crate::pipeline::params::{self, ParamError};
-use crate::pipeline::{Coloring, Job, color};
+use crate::pipeline::{Coloring, Options, color};
 
 /// Names of the parameters.
 pub(super) const NAMES: [&str; 9] =
@@ -12,17 +12,17 @@ pub(super) const NAMES: [&str; 9] =
 ///
 /// # Errors
 /// Returns a [`ParamError`], including if there is no scheme or a parameter applies to meshes only.
-pub(super) fn parse(pairs: &[(String, String)]) -> Result<(Job, Coloring), ParamError> {
+pub(super) fn parse(pairs: &[(String, String)]) -> Result<(Options, Coloring), ParamError> {
     params::check_names(pairs, &NAMES)?;
     let renamed = pairs.iter().map(|(name, value)| (if name == "scheme" { "color" } else { name }, value));
-    let job = params::parse(renamed).map_err(rename_color)?.job;
+    let options = params::parse(renamed).map_err(rename_color)?.options;
     let is_named = pairs.iter().any(|(name, _)| name == "scheme");
     let missing = || bad_scheme(if is_named { "none" } else { "no value" }.to_owned());
-    let coloring = job.color.ok_or_else(missing)?;
+    let coloring = options.color.ok_or_else(missing)?;
     if matches!(coloring.scheme, Scheme::Vertex(_)) {
         return Err(bad_scheme(format!("`{}`", coloring.scheme)));
     }
-    Ok((job, coloring))
+    Ok((options, coloring))
 }
 
 /// Replaces `color` by `scheme` in an error.
@@ -48,7 +48,7 @@ pub(super) fn expected() -> String {
 mod tests {
     use super::*;
 
-    fn parsed(pairs: &[(&str, &str)]) -> Result<(Job, Coloring), ParamError> {
+    fn parsed(pairs: &[(&str, &str)]) -> Result<(Options, Coloring), ParamError> {
         let pairs: Vec<_> = pairs.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect();
         parse(&pairs)
     }
@@ -56,8 +56,8 @@ mod tests {
     #[test]
     fn parameters_are_those_of_a_mesh_with_scheme_instead_of_color() {
         assert_eq!(parsed(&[("scheme", "bfactor"), ("chains", "A")]).unwrap().1.scheme, color::Scheme::BFactor);
-        let (job, _) = parsed(&[("scheme", "bfactor"), ("assembly", "1"), ("context", "whole")]).unwrap();
-        assert_eq!(job.selection.assembly.as_deref(), Some("1"));
+        let (options, _) = parsed(&[("scheme", "bfactor"), ("assembly", "1"), ("context", "whole")]).unwrap();
+        assert_eq!(options.selection.assembly.as_deref(), Some("1"));
         for (pairs, name) in [
             (&[][..], "scheme"),
             (&[("scheme", "none")], "scheme"),

@@ -25,7 +25,7 @@ use super::range::{self, Wanted};
 use super::source::{self, Loaded, StructureSource};
 use super::state::{Delivery, Shared};
 use crate::jobs::MemoryReservation;
-use crate::pipeline::{AtomColors, ColorError, Coloring, Job, params};
+use crate::pipeline::{AtomColors, ColorError, Coloring, Options, params};
 use crate::structure::{self, ReadLimits, Structure};
 use crate::surface::Control;
 
@@ -56,11 +56,11 @@ pub(super) async fn list(
     query: Pairs,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let (job, coloring) = color_parameters::parse(&query.0)?;
-    let variant = params::canonical(&job);
+    let (options, coloring) = color_parameters::parse(&query.0)?;
+    let variant = params::canonical(&options);
     let write = async |loaded: Loaded, delivery| {
         let etag = source::etag(&loaded.digest, &variant)?;
-        let (colors, legend) = write_list(&app, &caller, (loaded, delivery), job, coloring).await?;
+        let (colors, legend) = write_list(&app, &caller, (loaded, delivery), options, coloring).await?;
         let described =
             [(header::CONTENT_TYPE, HeaderValue::from_static("application/octet-stream")), (LEGEND, legend)];
         Ok((described, part_of(&colors, &headers, &etag)?).into_response())
@@ -73,7 +73,7 @@ async fn write_list(
     app: &Shared,
     caller: &Caller,
     (loaded, delivery): (Loaded, Delivery),
-    job: Job,
+    options: Options,
     coloring: Coloring,
 ) -> Result<(Bytes, HeaderValue), Problem> {
     let max_atoms = app.config.limits.job().read.max_atoms;
@@ -81,7 +81,7 @@ async fn write_list(
         // The list has the atoms of the file. Copies in an assembly affect only the range of numbers.
         let limits = ReadLimits { max_atoms, ..*limits };
         control.memory.grow(SELECTED_BYTES * structure.len() as u64)?;
-        let selected = structure::select_with(structure, &job.selection, &limits, control)?.atoms;
+        let selected = structure::select_with(structure, &options.selection, &limits, control)?.atoms;
         let colors = AtomColors::new(structure, &selected, &coloring).map_err(not_colorable)?;
         let list = document::collect(memory, control, |out| {
             (0..structure.len()).try_for_each(|i| out.write_all(&colors.of(i)))

@@ -114,30 +114,30 @@ pub(super) async fn create(
     // The response is no mesh, so `Accept` does not choose a format.
     headers.remove(ACCEPT);
     let parsed = ParsedRequest::from_body(&app, &caller, query, &headers, body).await?;
-    let ParsedRequest { source, request: Request { job, format, .. }, declared, .. } = parsed;
+    let ParsedRequest { source, request: Request { options, format, .. }, declared, .. } = parsed;
     // An estimate is about half the work of a mesh, so it takes a delivery slot as well.
     let delivery = app.delivery(caller.client)?;
     let digest = source.digest(&app, &caller).await?;
     let Loaded { input, digest, reservation } = source.find(&app, &caller, &digest, None).await?;
     drop(source);
-    let (seconds, lane) = (app.pool.expected(&input, &job), Pool::lane(&Rank::default(), &input, &job));
-    let backend = app.pool.choice(&input, &job).backend.name();
+    let (seconds, lane) = (app.pool.expected(&input, &options), Pool::lane(&Rank::default(), &input, &options));
+    let backend = app.pool.choice(&input, &options).backend.name();
     let reading = app.read(&caller, (reservation, delivery), {
-        let (app, job, namespace) = (Arc::clone(&app), job.clone(), caller.namespace);
+        let (app, options, namespace) = (Arc::clone(&app), options.clone(), caller.namespace);
         move |control| {
-            let choice = app.pool.choice(&input, &job);
+            let choice = app.pool.choice(&input, &options);
             let limits = app.config.limits.job();
             let read = |control: &Control<'_>| app.structures().get(namespace, digest, &input, &limits.read, control);
-            pipeline::estimate(read, &job, &limits, &choice, control)
+            pipeline::estimate(read, &options, &limits, &choice, control)
         }
     });
     let estimate = reading.await?.map_err(|error| declared.explain(error.into()))?;
     // The estimate from the file size does not include the copies in an assembly.
     let guess = seconds * estimate.atoms as f64 / estimate.distinct_atoms as f64;
-    let seconds = estimate.work(&job).map_or(guess, |units| app.pool.seconds(units));
+    let seconds = estimate.work(&options).map_or(guess, |units| app.pool.seconds(units));
     let wait = app.pool.estimated_wait(lane).as_secs_f64();
     let mesh = estimate.mesh.as_ref().ok();
-    let file_bytes = |m: &MeshEstimate| match job.compress.compressed_vertex_bytes() {
+    let file_bytes = |m: &MeshEstimate| match options.compress.compressed_vertex_bytes() {
         0 => format.estimated_bytes(m.bytes, m.vertices, m.triangles),
         bytes => bytes.saturating_mul(m.vertices),
     };
@@ -149,8 +149,8 @@ pub(super) async fn create(
         atoms: estimate.atoms,
         atoms_in_file: estimate.atoms_in_file,
         resolution: estimate.resolution,
-        resolution_from: job.spacing.parameter(),
-        surface: job.params.surface.name(),
+        resolution_from: options.spacing.parameter(),
+        surface: options.params.surface.name(),
         format: format.name(),
         box_cells: estimate.box_cells,
         bricks: mesh.map(|m| m.bricks),

@@ -82,7 +82,7 @@ impl MeshRequest {
         let loaded = if self.parsed.request.strict || self.is_answered_with_job() {
             source.load(&self.app, caller).await?
         } else {
-            source.find(&self.app, caller, &digest, Some(&self.parsed.request.job)).await?
+            source.find(&self.app, caller, &digest, Some(&self.parsed.request.options)).await?
         };
         self.timing.lap("load");
         self.compute(loaded).await
@@ -95,9 +95,10 @@ impl MeshRequest {
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
         let namespace = self.preferences.caller.namespace;
-        let key = |arithmetic: String| ContentKey::new(digest, &request.job, request.format, &arithmetic, namespace);
+        let key =
+            |arithmetic: String| ContentKey::new(digest, &request.options, request.format, &arithmetic, namespace);
         // Any backend may compute the file, and the key depends on the backend.
-        let mut keys: Vec<ContentKey> = app.pool.file_arithmetics(&request.job).into_iter().map(key).collect();
+        let mut keys: Vec<ContentKey> = app.pool.file_arithmetics(&request.options).into_iter().map(key).collect();
         // A report has no validator.
         if !report {
             let mut rejected = Ok(());
@@ -208,7 +209,8 @@ impl MeshRequest {
             return delivery::report(&finished, timing);
         }
         // Another backend may have computed the mesh, with other bytes.
-        let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.file_arithmetic(), namespace);
+        let key =
+            ContentKey::new(&digest, &request.options, format, &finished.product.report.file_arithmetic(), namespace);
         let is_stored = results::save_later(&app, &finished, format, &key);
         // The current file, one of several possible ones, is known only now.
         conditional::check_match(&headers, &delivery::etag(&key))?;
@@ -229,7 +231,7 @@ impl MeshRequest {
             digest: loaded.digest,
             namespace: self.preferences.caller.namespace,
             strict: self.parsed.request.strict,
-            job: self.parsed.request.job.clone(),
+            options: self.parsed.request.options.clone(),
             rank: self.preferences.rank,
             reservation: Some(Arc::clone(&loaded.reservation)),
             parent: SpanParent::current(),
@@ -248,7 +250,7 @@ impl MeshRequest {
         // A client that disconnects now does not interrupt the acceptance.
         let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());
         let view = accepted.await.map_err(Problem::internal)??;
-        let duration = Duration::from_secs_f64(app.pool.expected(&loaded.input, &parsed.request.job));
+        let duration = Duration::from_secs_f64(app.pool.expected(&loaded.input, &parsed.request.options));
         let mut response = jobs::accepted(&view, app.pool.estimated_wait(Lane::Batch) + duration);
         if preferences.respond_async {
             response.headers_mut().insert(PREFERENCE_APPLIED, HeaderValue::from_static("respond-async"));

@@ -59,7 +59,7 @@ impl ParsedRequest {
         Pairs(pairs): Pairs,
     ) -> Result<Self, Problem> {
         let request = parse_address(file, &pairs)?;
-        app.accepts(&request.job)?;
+        app.accepts(&request.options)?;
         let report = file.is_none();
         Ok(Self { source, request, map: None, pairs, report, declared: DeclaredType::Neutral })
     }
@@ -83,7 +83,7 @@ impl ParsedRequest {
             None
         } else {
             let request = parse(&pairs)?;
-            app.accepts(&request.job)?;
+            app.accepts(&request.options)?;
             Some(request)
         };
         let (source, fields, declared, map) = if is_json {
@@ -105,8 +105,8 @@ impl ParsedRequest {
         } else {
             pairs.extend(fields);
             let mut request = parse(&pairs)?;
-            request.job.map = map.as_ref().map(|(digest, bytes)| MapFile::new(digest.to_string(), bytes.clone()));
-            app.accepts(&request.job)?;
+            request.options.map = map.as_ref().map(|(digest, bytes)| MapFile::new(digest.to_string(), bytes.clone()));
+            app.accepts(&request.options)?;
             request
         };
         Ok(Self { source, request, map, pairs, report: false, declared })

@@ -20,7 +20,7 @@ use super::problem_types::ProblemType;
 use super::state::{Delivery, Shared};
 use crate::archive::{Entry, FetchError, UnavailableReason};
 use crate::jobs::{Input, MemoryReservation};
-use crate::pipeline::{Job, algorithm_versions};
+use crate::pipeline::{Options, algorithm_versions};
 use crate::store::{Digest, Name};
 use crate::structure::{ArchiveError, EntryId, ReadLimits, Structure};
 use crate::surface::Control;
@@ -110,10 +110,10 @@ impl StructureSource {
         app: &Shared,
         caller: &Caller,
         digest: &Digest,
-        job: Option<&Job>,
+        options: Option<&Options>,
     ) -> Result<Loaded, Problem> {
         let namespace = caller.namespace;
-        match (self, app.structures().find(namespace, *digest, job)) {
+        match (self, app.structures().find(namespace, *digest, options)) {
             (Self::Stored(_) | Self::Entry(_), Some(input)) => {
                 if let Self::Stored(_) = self {
                     app.store.touch(&Name::input(digest).within(namespace), app.store.now());
@@ -157,7 +157,7 @@ impl StructureSource {
         caller: &Caller,
         headers: &HeaderMap,
         variant: &str,
-        job: Option<&Job>,
+        options: Option<&Options>,
         write: impl FnOnce(Loaded, Delivery) -> F,
     ) -> Result<Response, Problem>
     where
@@ -171,7 +171,7 @@ impl StructureSource {
         }
         app.admit_work(caller)?;
         let delivery = app.delivery(caller.client)?;
-        let loaded = self.find(app, caller, &digest, job).await?;
+        let loaded = self.find(app, caller, &digest, options).await?;
         let validators = self::validators(&loaded.digest, variant)?;
         Ok((validators, write(loaded, delivery).await?).into_response())
     }

@@ -16,7 +16,7 @@ use crate::archive::Archive;
 use crate::client_shares::{ClientShares, SharePermit};
 use crate::config::Config;
 use crate::jobs::{Budget, Client, ContentKey, Failure, JobStore, Lane, Pool, Structures};
-use crate::pipeline::Job;
+use crate::pipeline::Options;
 use crate::readers::Readers;
 use crate::single_flight::SingleFlight;
 use crate::store::{Namespace, Secret, Store};
@@ -65,10 +65,10 @@ pub(super) struct App {
 
 impl App {
     /// Rejects a job that is invalid regardless of its input.
-    pub(super) fn accepts(&self, job: &Job) -> Result<(), Problem> {
+    pub(super) fn accepts(&self, options: &Options) -> Result<(), Problem> {
         let refused = |error| Failure::Job { error, diagnostics: Vec::new() };
-        job.check(&self.config.limits.job()).map_err(refused)?;
-        Ok(self.pool.settings().budget.reservation().check(job.picture.map_or(0, |picture| picture.bytes()))?)
+        options.check(&self.config.limits.job()).map_err(refused)?;
+        Ok(self.pool.settings().budget.reservation().check(options.picture.map_or(0, |picture| picture.bytes()))?)
     }
 
     /// Returns the namespace of a group of keys. Without keys all clients share the common one.

@@ -26,7 +26,7 @@ use crate::formats::tileset::{TileAddress, TilesetUris, assembly_document, subtr
 use crate::jobs::{CacheKey, Failure, Input, SharedStructure, SharedTileset};
 use crate::pipeline::params::ParamError;
 use crate::pipeline::tileset::AssemblyTileset;
-use crate::pipeline::{Job, JobError, StageClock, params, tileset};
+use crate::pipeline::{JobError, Options, StageClock, params, tileset};
 use crate::structure::ReadLimits;
 use crate::surface::{Control, SurfaceError};
 
@@ -76,7 +76,7 @@ pub(super) struct TilesetRequest {
     headers: HeaderMap,
     /// Parameters of the tiles, without `tile`.
     pairs: Vec<(String, String)>,
-    job: Job,
+    options: Options,
 }
 
 impl FromRequestParts<Shared> for TilesetRequest {
@@ -88,27 +88,34 @@ impl FromRequestParts<Shared> for TilesetRequest {
             pairs.push(("compress".to_owned(), Compress::Meshopt.name().to_owned()));
         }
         let request = parse_address(Some("surface.glb"), &pairs)?;
-        tileset::check(&request.job)?;
+        tileset::check(&request.options)?;
         if request.strict {
             let expected = "no value for a tileset; POST /v1/report checks a file".to_owned();
             return Err(ParamError::BadValue { name: "check", value: "`strict`".to_owned(), expected }.into());
         }
-        app.accepts(&request.job)?;
+        app.accepts(&request.options)?;
         pairs.retain(|(name, _)| name != "tile");
         let caller = Caller::of(&parts.extensions);
         let source = StructureSource::from_request_parts(parts, app).await?;
-        Ok(Self { app: Arc::clone(app), caller, source, headers: parts.headers.clone(), pairs, job: request.job })
+        Ok(Self {
+            app: Arc::clone(app),
+            caller,
+            source,
+            headers: parts.headers.clone(),
+            pairs,
+            options: request.options,
+        })
     }
 }
 
 impl TilesetRequest {
     /// Answers with `tileset.json`.
     async fn document(self) -> Result<Response, Problem> {
-        if let Some(tile) = self.job.tile {
+        if let Some(tile) = self.options.tile {
             let (value, expected) = (format!("`{}`", tile.path()), "no value for tileset.json".to_owned());
             return Err(ParamError::BadValue { name: "tile", value, expected }.into());
         }
-        if self.job.selection.instances {
+        if self.options.selection.instances {
             return self.assembly().await;
         }
         let query = query(&self.pairs, None);
@@ -143,8 +150,8 @@ impl TilesetRequest {
 
     /// Answers with the subtree below a tile, by default the root.
     async fn subtree(self) -> Result<Response, Problem> {
-        let root = self.job.tile.unwrap_or(TileAddress::ROOT);
-        if self.job.selection.instances {
+        let root = self.options.tile.unwrap_or(TileAddress::ROOT);
+        if self.options.selection.instances {
             let expected = "false for a subtree, which belongs to one unit".to_owned();
             return Err(ParamError::BadValue { name: "instances", value: "`true`".to_owned(), expected }.into());
         }
@@ -168,16 +175,16 @@ impl TilesetRequest {
         media_type: &'static str,
         write: impl FnOnce(&Preparation<'_>) -> Result<Vec<u8>, Problem> + Send + 'static,
     ) -> Result<Response, Problem> {
-        let Self { app, caller, source, headers, job, .. } = self;
-        let variant = format!("{media_type}\n{}", params::canonical(&job));
+        let Self { app, caller, source, headers, options, .. } = self;
+        let variant = format!("{media_type}\n{}", params::canonical(&options));
         // Finds the tileset in the cache, as jobs on its tiles do.
-        let of_tile = Job { tile: Some(TileAddress::ROOT), ..job.clone() };
+        let of_tile = Options { tile: Some(TileAddress::ROOT), ..options.clone() };
         let made = async |loaded: Loaded, delivery: Delivery| {
             let Loaded { input, digest, reservation } = loaded;
             let (shared, key) = (Arc::clone(&app), (caller.namespace, digest));
             let made = app.read(&caller, (reservation, delivery), move |control| {
                 let limits = shared.config.limits.job().read;
-                write(&Preparation { app: &shared, key, input: &input, job: &job, limits, control })
+                write(&Preparation { app: &shared, key, input: &input, options: &options, limits, control })
             });
             Ok(([(header::CONTENT_TYPE, media_type)], Body::from(made.await??)).into_response())
         };
@@ -190,7 +197,7 @@ struct Preparation<'a> {
     app: &'a Shared,
     key: CacheKey,
     input: &'a Input,
-    job: &'a Job,
+    options: &'a Options,
     limits: ReadLimits,
     control: &'a Control<'a>,
 }
@@ -198,16 +205,16 @@ struct Preparation<'a> {
 impl Preparation<'_> {
     /// Returns the tileset, and prepares it if necessary.
     fn tileset(&self) -> Result<SharedTileset, Problem> {
-        let Self { app, key, input, job, limits, control } = self;
-        let prepared = app.structures().tileset(*key, input, job, limits, control, &StageClock::new(&()));
+        let Self { app, key, input, options, limits, control } = self;
+        let prepared = app.structures().tileset(*key, input, options, limits, control, &StageClock::new(&()));
         Ok(prepared.map_err(Failure::from)?.0)
     }
 
     /// Returns the tileset of the assembly.
     fn assembly(&self) -> Result<AssemblyTileset<SharedStructure>, Problem> {
-        let Self { app, key: (namespace, digest), input, job, limits, control } = self;
+        let Self { app, key: (namespace, digest), input, options, limits, control } = self;
         let read = |control: &Control<'_>| app.structures().get(*namespace, *digest, input, limits, control);
-        let assembly = AssemblyTileset::new(read, job, limits, control, &StageClock::new(&()));
+        let assembly = AssemblyTileset::new(read, options, limits, control, &StageClock::new(&()));
         Ok(assembly.map_err(Failure::from)?)
     }
 }

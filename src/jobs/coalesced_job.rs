@@ -22,7 +22,7 @@ use crate::telemetry::TraceSpan;
 /// one job.
 pub(super) fn work_key(task: &Task) -> Digest {
     let Task { namespace, strict, digest, .. } = task;
-    Digest::of(format!("{namespace}\n{strict}\n{}\n{digest}\n", params::canonical(&task.job)).as_bytes())
+    Digest::of(format!("{namespace}\n{strict}\n{}\n{digest}\n", params::canonical(&task.options)).as_bytes())
 }
 
 /// Progress of a job, written by its worker.

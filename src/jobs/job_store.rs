@@ -199,7 +199,7 @@ impl JobStore {
             format: spec.format.name().to_owned(),
             client,
             urgency: spec.task.rank.urgency,
-            suits_gpu: suits_gpu(spec.task.input.atoms(), &spec.task.job),
+            suits_gpu: suits_gpu(spec.task.input.atoms(), &spec.task.options),
             status: Status::Accepted,
             attempts: u32::from(ticket.is_some()),
             memory_waits: 0,
@@ -266,9 +266,9 @@ impl JobStore {
 
     /// Returns the key of a task's result, pinned, if it is stored. Strict tasks always run.
     pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<(String, Pin)>, StoreError> {
-        let arithmetics = if task.strict { Vec::new() } else { self.0.pool.file_arithmetics(&task.job) };
+        let arithmetics = if task.strict { Vec::new() } else { self.0.pool.file_arithmetics(&task.options) };
         for arithmetic in arithmetics {
-            let key = ContentKey::new(&task.digest, &task.job, format, &arithmetic, task.namespace);
+            let key = ContentKey::new(&task.digest, &task.options, format, &arithmetic, task.namespace);
             let pin = self.0.store.pin(&key.name(format.name())?);
             if results::is_stored(&self.0.store, format, &key).await? {
                 return Ok(Some((key.to_string(), pin)));

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use super::MemoryReservation;
 use crate::memory_budget::Buffers;
 use crate::pipeline::tileset::{Tileset, TilesetColors};
-use crate::pipeline::{Job, estimate_atoms, params};
+use crate::pipeline::{Options, estimate_atoms, params};
 use crate::store::{Digest, Namespace};
 use crate::structure::Structure;
 
@@ -191,16 +191,16 @@ impl CacheState {
 }
 
 /// Returns the digest of a tileset with its atoms on disk, whose index has the colours.
-pub(super) fn streamed_digest(digest: &Digest, job: &Job) -> Digest {
-    let color = job.color.map(|coloring| coloring.canonical());
-    Digest::of(format!("on disk\n{}\n{color:?}", tileset_digest(digest, job)).as_bytes())
+pub(super) fn streamed_digest(digest: &Digest, options: &Options) -> Digest {
+    let color = options.color.map(|coloring| coloring.canonical());
+    Digest::of(format!("on disk\n{}\n{color:?}", tileset_digest(digest, options)).as_bytes())
 }
 
 /// Returns the digest of a tileset: of its structure file and of the parameters that affect the index.
-pub(super) fn tileset_digest(digest: &Digest, job: &Job) -> Digest {
-    let Job { compress, normals, .. } = Job::default();
-    let mut job = Job { tile: None, color: None, compress, normals, ..job.clone() };
-    job.params.atom_ids = false;
-    let canonical = params::canonical(&job);
+pub(super) fn tileset_digest(digest: &Digest, options: &Options) -> Digest {
+    let Options { compress, normals, .. } = Options::default();
+    let mut options = Options { tile: None, color: None, compress, normals, ..options.clone() };
+    options.params.atom_ids = false;
+    let canonical = params::canonical(&options);
     Digest::of(format!("tileset\n{digest}\n{canonical}").as_bytes())
 }

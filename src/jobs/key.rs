@@ -3,7 +3,7 @@
 use std::fmt;
 
 use crate::formats::Format;
-use crate::pipeline::{Job, algorithm_versions, params};
+use crate::pipeline::{Options, algorithm_versions, params};
 use crate::store::{BadDigest, Digest, Name, Namespace, StoreError};
 
 /// Name of a mesh file, with the namespace in which it is stored. Equal names mean equal bytes in every namespace.
@@ -16,8 +16,14 @@ pub(crate) struct ContentKey {
 impl ContentKey {
     /// Returns the key of a result. `arithmetic` names the arithmetic of the backend, followed by that of a picture's
     /// renderer. Releases with the same algorithms give the same keys.
-    pub(crate) fn new(input: &Digest, job: &Job, format: Format, arithmetic: &str, namespace: Namespace) -> Self {
-        let (canonical, versions) = (params::canonical(job), algorithm_versions::file_versions(job));
+    pub(crate) fn new(
+        input: &Digest,
+        options: &Options,
+        format: Format,
+        arithmetic: &str,
+        namespace: Namespace,
+    ) -> Self {
+        let (canonical, versions) = (params::canonical(options), algorithm_versions::file_versions(options));
         let text = format!("molmesh {versions}\n{arithmetic}\n{}\n{canonical}\n{input}\n", format.name());
         Self { digest: Digest::of(text.as_bytes()), namespace }
     }
@@ -46,14 +52,15 @@ mod tests {
 
     #[test]
     fn different_results_have_different_keys() {
-        let plain = Job::default();
-        let fine = params::parse([("resolution", "0.4")]).unwrap().job;
-        let chain = params::parse([("chains", "A")]).unwrap().job;
-        let png = params::parse([("format", "png")]).unwrap().job;
-        let wide = params::parse([("format", "png"), ("width", "600")]).unwrap().job;
+        let plain = Options::default();
+        let fine = params::parse([("resolution", "0.4")]).unwrap().options;
+        let chain = params::parse([("chains", "A")]).unwrap().options;
+        let png = params::parse([("format", "png")]).unwrap().options;
+        let wide = params::parse([("format", "png"), ("width", "600")]).unwrap().options;
         let (a, b) = (Digest::of(b"a"), Digest::of(b"b"));
-        let key =
-            |input, job, format, arithmetic| ContentKey::new(input, job, format, arithmetic, Namespace::default());
+        let key = |input, options, format, arithmetic| {
+            ContentKey::new(input, options, format, arithmetic, Namespace::default())
+        };
         let mut keys = vec![
             key(&a, &plain, Format::Glb, "cpu"),
             key(&b, &plain, Format::Glb, "cpu"),
@@ -65,7 +72,7 @@ mod tests {
             key(&a, &png, Format::Png, "cpu+gpu"),
             key(&a, &wide, Format::Png, "cpu+cpu"),
         ];
-        assert_eq!(keys[0], key(&a, &Job::default(), Format::Glb, "cpu"));
+        assert_eq!(keys[0], key(&a, &Options::default(), Format::Glb, "cpu"));
         keys.sort_by_key(ToString::to_string);
         keys.dedup();
         assert_eq!(keys.len(), 9);

@@ -56,7 +56,7 @@ pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;
 
-use crate::pipeline::{Job, Product};
+use crate::pipeline::{Options, Product};
 use crate::store::{Digest, Namespace};
 use crate::structure::strict_validator::Diagnostic;
 use crate::telemetry::SpanParent;
@@ -73,7 +73,7 @@ pub(crate) struct Task {
     /// Run the strict validator as well, and reject a file in which it finds errors.
     pub(crate) strict: bool,
     /// Parameters of the mesh.
-    pub(crate) job: Job,
+    pub(crate) options: Options,
     /// Client and priority.
     pub(crate) rank: Rank,
     /// Memory budget that `input` is charged to.

@@ -12,7 +12,7 @@ use super::rank::{Lane, Rank};
 use super::threads::ThreadPools;
 use super::{Budget, Client, Input, OnStart, Refusal, Structures, Task, Ticket, worker};
 use crate::picture::SelectedRenderer;
-use crate::pipeline::{self, Choice, Job, JobLimits, file_arithmetic};
+use crate::pipeline::{self, Choice, JobLimits, Options, file_arithmetic};
 use crate::surface::Backend;
 use crate::telemetry::{JOBS_SUBMITTED, Tracer};
 
@@ -70,9 +70,9 @@ pub(super) struct WorkerContext {
 
 impl WorkerContext {
     /// Returns the backend of a job, with the reason.
-    pub(super) fn choice(&self, input: &Input, job: &Job) -> Choice<'_> {
+    pub(super) fn choice(&self, input: &Input, options: &Options) -> Choice<'_> {
         match self.backend.cpu() {
-            Some(backend) if !pipeline::suits_gpu(input.atoms(), job) => {
+            Some(backend) if !pipeline::suits_gpu(input.atoms(), options) => {
                 Choice { backend, reason: "auto: the job does not suit a GPU" }
             }
             _ => Choice { backend: self.backend.as_ref(), reason: &self.reason },
@@ -135,8 +135,8 @@ impl Pool {
     }
 
     /// Estimates the duration of a job on this machine, s, without its time in the queue.
-    pub(crate) fn expected(&self, input: &Input, job: &Job) -> f64 {
-        self.shared.queue.expected(pipeline::estimate_work(input.atoms(), job))
+    pub(crate) fn expected(&self, input: &Input, options: &Options) -> f64 {
+        self.shared.queue.expected(pipeline::estimate_work(input.atoms(), options))
     }
 
     /// Estimates the duration of `units` of work on this machine, s.
@@ -145,8 +145,8 @@ impl Pool {
     }
 
     /// Returns the lane of a job.
-    pub(crate) fn lane(rank: &Rank, input: &Input, job: &Job) -> Lane {
-        Lane::of(rank, pipeline::estimate_work(input.atoms(), job))
+    pub(crate) fn lane(rank: &Rank, input: &Input, options: &Options) -> Lane {
+        Lane::of(rank, pipeline::estimate_work(input.atoms(), options))
     }
 
     /// Estimates the queueing time of a job of a lane that is accepted now.
@@ -175,8 +175,8 @@ impl Pool {
     }
 
     /// Returns the backend of a job, with the reason.
-    pub(crate) fn choice(&self, input: &Input, job: &Job) -> Choice<'_> {
-        self.shared.choice(input, job)
+    pub(crate) fn choice(&self, input: &Input, options: &Options) -> Choice<'_> {
+        self.shared.choice(input, options)
     }
 
     /// Returns the reason for the choice of the backend.
@@ -185,8 +185,8 @@ impl Pool {
     }
 
     /// Returns the arithmetics that a job's file may have, provided that the renderer does not fall back.
-    pub(crate) fn file_arithmetics(&self, job: &Job) -> Vec<String> {
-        let renderer = job.picture.map(|_| self.shared.settings.renderer.renderer.arithmetic());
+    pub(crate) fn file_arithmetics(&self, options: &Options) -> Vec<String> {
+        let renderer = options.picture.map(|_| self.shared.settings.renderer.renderer.arithmetic());
         let backends = self.shared.backend.arithmetics();
         backends.iter().map(|backend| file_arithmetic(backend, renderer.as_deref())).collect()
     }

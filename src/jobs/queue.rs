@@ -114,7 +114,7 @@ impl Queue {
         }
         let id = state.next_id;
         state.next_id += 1;
-        let units = pipeline::estimate_work(task.input.atoms(), &task.job);
+        let units = pipeline::estimate_work(task.input.atoms(), &task.options);
         let now = Instant::now();
         let is_durable = task.rank.batch;
         let (sender, outcome) = single_flight::channel();
@@ -126,7 +126,7 @@ impl Queue {
             rank: task.rank,
             lane,
             units,
-            is_tile: task.job.tile.is_some(),
+            is_tile: task.options.tile.is_some(),
             tag: 0.0,
             accepted: now,
             begun: None,
@@ -206,7 +206,7 @@ impl Queue {
         if task.rank.batch {
             return Ok(None);
         }
-        let units = pipeline::estimate_work(task.input.atoms(), &task.job);
+        let units = pipeline::estimate_work(task.input.atoms(), &task.options);
         let lane = Lane::of(&task.rank, units);
         let (wait, expected) = (self.wait(state, lane, now), Self::expected_now(state, lane, units, now));
         // A job of a free worker counts as running before the worker has woken up.

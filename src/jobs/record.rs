@@ -277,7 +277,7 @@ impl JobRecord {
         let pairs = self.parameters.iter().map(|(name, value)| (name, value));
         let request = params::parse_with(pairs, |_| Ok::<_, params::ParamError>(format));
         let mut request = request.map_err(|error| error.to_string())?;
-        request.job.map = self.map.clone().map(MapFile::not_loaded);
+        request.options.map = self.map.clone().map(MapFile::not_loaded);
         Ok(request)
     }
 
@@ -285,7 +285,7 @@ impl JobRecord {
     pub(super) fn is_same_request(&self, other: &Self) -> bool {
         let parsed = |record: &Self| {
             let request = record.request().ok()?;
-            Some((params::canonical(&request.job), request.strict))
+            Some((params::canonical(&request.options), request.strict))
         };
         let same_parameters =
             || self.parameters == other.parameters || parsed(self).is_some_and(|own| parsed(other) == Some(own));

@@ -216,7 +216,7 @@ impl JobStore {
             digest,
             namespace: record.namespace,
             strict: request.strict,
-            job: request.job,
+            options: request.options,
             rank: Rank { client: Client(record.client), batch: true, urgency: record.urgency },
             reservation: None,
             parent: record.requester.parent(&self.0.pool.settings().tracer),
@@ -228,7 +228,7 @@ impl JobStore {
     /// Loads the input of a task and its map, charged to the memory budget before they are read.
     pub(super) async fn load_input(&self, task: &mut Task) -> Result<(), LoadError> {
         let reservation = self.0.pool.settings().budget.for_client(task.rank.client.0).reservation();
-        let map: Option<Digest> = match &task.job.map {
+        let map: Option<Digest> = match &task.options.map {
             Some(map) => Some(map.digest().parse().map_err(|_bad: BadDigest| LoadError::Removed)?),
             None => None,
         };
@@ -242,7 +242,7 @@ impl JobStore {
             Some(digest) => Some(MapFile::new(digest.to_string(), load(digest).await?)),
             None => None,
         };
-        task.job.map = loaded;
+        task.options.map = loaded;
         task.input = Input::File(file);
         task.reservation = Some(Arc::new(reservation));
         Ok(())

@@ -300,7 +300,7 @@ async fn save(jobs: &JobStore, record: &JobRecord, finished: Arc<Finished>) -> R
     let format = request.format;
     let report = &finished.product.report;
     let (resolution, digest) = (report.resolution, finished.digest);
-    let key = ContentKey::new(&digest, &request.job, format, &report.file_arithmetic(), record.namespace);
+    let key = ContentKey::new(&digest, &request.options, format, &report.file_arithmetic(), record.namespace);
     let parent = record.requester.parent(&jobs.0.pool.settings().tracer);
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
     let failed = |error| EndError::Save { error, resolution };

@@ -15,7 +15,7 @@ use super::kept::{
 use super::{MemoryReservation, ScratchSpace};
 use crate::memory_budget::{Budget, Reclaim};
 use crate::pipeline::tileset::{self, StreamSource, StructureStream, Tileset};
-use crate::pipeline::{Job, JobError, StageClock};
+use crate::pipeline::{JobError, Options, StageClock};
 use crate::store::{Digest, Namespace};
 use crate::structure::stream::BLOCK_BYTES;
 use crate::structure::{self, ReadLimits, StructureError};
@@ -63,9 +63,9 @@ impl Structures {
 
     /// Finds a file in the cache. For a `job` on a tile, its tileset comes first: returns the tileset itself if its
     /// atoms are on disk, else its structure.
-    pub(crate) fn find(&self, namespace: Namespace, digest: Digest, job: Option<&Job>) -> Option<Input> {
-        let job = job.filter(|job| job.tile.is_some());
-        let tilesets = job.map(|job| [tileset_digest(&digest, job), streamed_digest(&digest, job)]);
+    pub(crate) fn find(&self, namespace: Namespace, digest: Digest, options: Option<&Options>) -> Option<Input> {
+        let options = options.filter(|options| options.tile.is_some());
+        let tilesets = options.map(|options| [tileset_digest(&digest, options), streamed_digest(&digest, options)]);
         let mut state = self.lock();
         let mut digests = tilesets.into_iter().flatten().chain([digest]);
         match digests.find_map(|digest| state.find(&(namespace, digest)))? {
@@ -134,25 +134,25 @@ impl Structures {
         &self,
         (namespace, digest): CacheKey,
         input: &Input,
-        job: &Job,
+        options: &Options,
         limits: &ReadLimits,
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<(SharedTileset, Option<SharedColors>), JobError> {
         let as_tileset = |kept: Kept| if let Kept::Tileset(tileset) = kept { Some(tileset) } else { None };
-        let [of_memory, of_disk] = [tileset_digest(&digest, job), streamed_digest(&digest, job)];
+        let [of_memory, of_disk] = [tileset_digest(&digest, options), streamed_digest(&digest, options)];
         let keys = [of_memory, of_disk].map(|digest| (namespace, digest));
         let in_memory = |limits: &ReadLimits| {
             let read = |control: &Control<'_>| self.get(namespace, digest, input, limits, control);
-            let prepare = |control: &Control<'_>| Tileset::new(read, job, limits, control, clock);
+            let prepare = |control: &Control<'_>| Tileset::new(read, options, limits, control, clock);
             self.made(keys[0], input, control, &self.budget.part(self.limit), Kept::Tileset, prepare)
         };
         let on_disk = |scratch: &ScratchSpace| {
-            let prepare = |control: &Control<'_>| self.streamed(scratch, input, job, limits, control, clock);
+            let prepare = |control: &Control<'_>| self.streamed(scratch, input, options, limits, control, clock);
             // Only what remains must fit into the cache, not the memory of reading and sorting.
             self.made(keys[1], input, control, &self.budget, Kept::Tileset, prepare)
         };
-        let not_on_disk = tileset::needs_memory(job, 1).map(|(name, ..)| name);
+        let not_on_disk = tileset::needs_memory(options, 1).map(|(name, ..)| name);
         let make = || match &self.scratch {
             Some(scratch) if self.limit > 0 && not_on_disk.is_none() => {
                 // Reading, or copying for an assembly, ends early if the atoms do not fit.
@@ -181,7 +181,7 @@ impl Structures {
             _ => self.found_or_made(&keys, control, as_tileset, make)?,
         };
         let of_tileset = if tileset.is_streamed() { of_disk } else { of_memory };
-        let Some(coloring) = job.color else { return Ok((tileset, None)) };
+        let Some(coloring) = options.color else { return Ok((tileset, None)) };
         let key = (namespace, Digest::of(format!("colors\n{of_tileset}\n{}", coloring.canonical()).as_bytes()));
         let prepare = |control: &Control<'_>| tileset.colors(coloring, control);
         let as_colors = |kept: Kept| if let Kept::Colors(colors) = kept { Some(colors) } else { None };
@@ -196,7 +196,7 @@ impl Structures {
         &self,
         scratch: &ScratchSpace,
         input: &Input,
-        job: &Job,
+        options: &Options,
         limits: &ReadLimits,
         control: &Control<'_>,
         clock: &StageClock<'_>,
@@ -219,7 +219,7 @@ impl Structures {
         let block_bytes = usize::try_from(self.limit / BLOCKS).unwrap_or(usize::MAX).clamp(MIN_BLOCK, BLOCK_BYTES);
         let scratch = [scratch.file()?, scratch.file()?];
         let stream = StructureStream { source, scratch, block_bytes, began: &|_| {} };
-        let tileset = Tileset::of_stream(stream, job, limits, control, clock)?;
+        let tileset = Tileset::of_stream(stream, options, limits, control, clock)?;
         drop(copy);
         let reservation = Arc::new(self.budget.reservation());
         Ok(tileset.with_structure(|structure| self.charged(*structure, input, reservation)))
@@ -494,13 +494,13 @@ mod tests {
         let budget = Budget::unlimited();
         let structures = Structures::new(1 << 24, &budget, None);
         let (input, digest) = file(20_000);
-        let job = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().job;
-        let [root, child] = ["0/0/0/0", "1/0/0/0"].map(|tile| job(&[("tile", tile), ("select", "all")]));
-        let other = job(&[("tile", "0/0/0/0"), ("select", "all"), ("resolution", "1")]);
-        let get = |job: &Job| {
+        let options = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().options;
+        let [root, child] = ["0/0/0/0", "1/0/0/0"].map(|tile| options(&[("tile", tile), ("select", "all")]));
+        let other = options(&[("tile", "0/0/0/0"), ("select", "all"), ("resolution", "1")]);
+        let get = |options: &Options| {
             let (limits, clock) = (ReadLimits::default(), StageClock::new(&()));
             let key = (Namespace::default(), digest);
-            structures.tileset(key, &input, job, &limits, &Control::default(), &clock).unwrap().0
+            structures.tileset(key, &input, options, &limits, &Control::default(), &clock).unwrap().0
         };
         let start = Barrier::new(4);
         let got: Vec<SharedTileset> = std::thread::scope(|scope| {
@@ -517,14 +517,14 @@ mod tests {
         assert!(got.iter().all(|tileset| Arc::ptr_eq(&tileset.0, &got[0].0)));
         assert!(!Arc::ptr_eq(&got[0].0, &get(&other).0), "the control");
         // A structure that was evicted is found in its tileset, for jobs on its tiles only.
-        let found = |job| match structures.find(Namespace::default(), digest, job) {
+        let found = |options| match structures.find(Namespace::default(), digest, options) {
             Some(Input::Kept(found)) => Some(Arc::as_ptr(&found.0)),
             _ => None,
         };
         let structure = found(None);
         assert!(structure.is_some());
         structures.lock().remove(&(Namespace::default(), digest));
-        assert_eq!((found(None), found(Some(&Job::default())), found(Some(&child))), (None, None, structure));
+        assert_eq!((found(None), found(Some(&Options::default())), found(Some(&child))), (None, None, structure));
         // Both values are in the budget, and are freed if nothing uses them.
         drop(got);
         let bytes = structures.lock().bytes;
@@ -539,12 +539,12 @@ mod tests {
         let space = scratch.budget().clone();
         let structures = Structures::new(1 << 20, &budget, Some(scratch));
         let (input, digest) = file(20_000);
-        let job = params::parse([("tile", "0/0/0/0"), ("select", "all")]).unwrap().job;
+        let options = params::parse([("tile", "0/0/0/0"), ("select", "all")]).unwrap().options;
         let start = Barrier::new(4);
         let get = || {
             let (limits, clock, key) = (ReadLimits::default(), StageClock::new(&()), (Namespace::default(), digest));
             start.wait();
-            let got = structures.tileset(key, &input, &job, &limits, &Control::default(), &clock).unwrap().0;
+            let got = structures.tileset(key, &input, &options, &limits, &Control::default(), &clock).unwrap().0;
             let has_read = clock.finish().iter().any(|(stage, _)| *stage == "read");
             (got, has_read)
         };

@@ -140,7 +140,7 @@ impl Task {
             input: Input::File(file),
             namespace: Namespace::default(),
             strict: false,
-            job: params::parse(parameters.iter().copied()).unwrap().job,
+            options: params::parse(parameters.iter().copied()).unwrap().options,
             rank,
             reservation: None,
             parent: SpanParent::default(),
@@ -388,9 +388,9 @@ async fn versions_of_states_continue_after_a_restart() {
 async fn tiles_do_not_change_the_estimated_duration_of_jobs() {
     let fixture = Fixture::new(1, Duration::ZERO).await;
     let pool = &fixture.jobs.0.pool;
-    let run = async |job: &[(&str, &str)]| {
-        let job = params::parse(job.iter().copied()).unwrap().job;
-        let mut ticket = pool.submit(Task { job, ..task("a", "2") }, MAX_WAIT, None).unwrap();
+    let run = async |pairs: &[(&str, &str)]| {
+        let options = params::parse(pairs.iter().copied()).unwrap().options;
+        let mut ticket = pool.submit(Task { options, ..task("a", "2") }, MAX_WAIT, None).unwrap();
         assert!(ticket.wait().await.is_ok());
         pool.seconds(1.0)
     };

@@ -75,14 +75,14 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
         // The memory for drawing is known in advance: reserved now, jobs do not fail at their end for lack of it.
         // Reading notes the file and the map.
         drawing.also_held(input_bytes(&task));
-        drawing.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
+        drawing.grow(task.options.picture.map_or(0, |picture| picture.bytes()))?;
         reservation.also_held(drawing.bytes());
         let control = Control {
             cancel: cancel.clone(),
             memory: Arc::<MemoryReservation>::clone(&reservation),
             ..Control::default()
         };
-        let choice = shared.choice(&task.input, &task.job);
+        let choice = shared.choice(&task.input, &task.options);
         let work = || {
             OnStart::run_all(on_start);
             let file = task.input.file();
@@ -96,7 +96,7 @@ fn run(shared: &WorkerContext, entry: QueuedTask) -> TaskEnd {
             };
             let mut product = product(shared, &task, &choice, &control, progress.as_ref())
                 .map_err(|error| explained(shared, file, error, &control))?;
-            if let Some(picture) = &task.job.picture {
+            if let Some(picture) = &task.options.picture {
                 pipeline::draw(&mut product, picture, &shared.settings.renderer, &control, progress.as_ref())?;
             }
             if let Some(time) = checked {
@@ -145,14 +145,16 @@ fn product(
     control: &Control<'_>,
     progress: &dyn ProgressSink,
 ) -> Result<Product, JobError> {
-    let (Task { namespace, digest, input, job, .. }, Settings { structures, limits, .. }) = (task, &shared.settings);
-    if job.tile.is_some() && !job.selection.instances {
+    let (Task { namespace, digest, input, options, .. }, Settings { structures, limits, .. }) =
+        (task, &shared.settings);
+    if options.tile.is_some() && !options.selection.instances {
         let clock = StageClock::new(progress);
-        let (tileset, colors) = structures.tileset((*namespace, *digest), input, job, &limits.read, control, &clock)?;
-        return tileset.product((job, colors.as_deref()), choice, &limits.surface, &Scope::new(&clock, control));
+        let (tileset, colors) =
+            structures.tileset((*namespace, *digest), input, options, &limits.read, control, &clock)?;
+        return tileset.product((options, colors.as_deref()), choice, &limits.surface, &Scope::new(&clock, control));
     }
     let read = |control: &Control<'_>| structures.get(*namespace, *digest, input, &limits.read, control);
-    pipeline::run_with(read, job, limits, choice, control, progress, None)
+    pipeline::run_with(read, options, limits, choice, control, progress, None)
 }
 
 /// Sets attributes and status of the span of a job, and ends it.
@@ -236,7 +238,7 @@ fn count(report: &Report) {
 
 /// Returns the size of the file and the map of a task, bytes.
 fn input_bytes(task: &Task) -> u64 {
-    let map = task.job.map.as_ref().map_or(0, |map| map.as_ref().len());
+    let map = task.options.map.as_ref().map_or(0, |map| map.as_ref().len());
     (task.input.file().map_or(0, Bytes::len) + map) as u64
 }
 

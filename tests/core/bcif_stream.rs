@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use molmesh::pipeline::tileset::{StreamSource, StructureStream, TilesetReport, write, write_stream};
-use molmesh::pipeline::{Choice, Job, JobLimits, params};
+use molmesh::pipeline::{Choice, JobLimits, Options, params};
 use molmesh::structure::stream::{BLOCK_BYTES, Blocks, ScratchFile, StoredBytes};
 use molmesh::structure::{ReadLimits, Structure, StructureError, read, read_with};
 use molmesh::surface::{Control, CpuBackend, MemoryMeter, OutOfMemory};
@@ -106,18 +106,18 @@ fn with_mask(column: Pack, n: usize, is_null: impl Fn(usize) -> bool) -> Pack {
     column.with("mask", Pack::Map(vec![("data", Pack::Bytes(data)), ("encoding", Pack::Array(chain))]))
 }
 
-/// Options of [`copies`].
+/// Content of [`copies`].
 #[derive(Clone, Copy)]
-struct Options {
+struct Content {
     entities: bool,
     /// True if HETATM records have a `label_seq_id`. One of them is not water then.
     numbered: bool,
 }
 
-const PLAIN: Options = Options { entities: true, numbered: false };
+const PLAIN: Content = Content { entities: true, numbered: false };
 
 /// Returns a file of copies of the sample, with every encoding and with the atoms in the middle of it.
-fn copies(n: usize, Options { entities, numbered }: Options) -> Vec<u8> {
+fn copies(n: usize, Content { entities, numbered }: Content) -> Vec<u8> {
     let s = read(include_bytes!("../../samples/4pti.pdb"), &ReadLimits::default()).unwrap();
     let rows: Vec<(usize, usize)> = (0..n).flat_map(|copy| (0..s.len()).map(move |i| (copy, i))).collect();
     let n_rows = rows.len();
@@ -234,7 +234,7 @@ fn streamed(bytes: &[u8], block_bytes: usize, limits: &ReadLimits) -> Result<Str
 #[test]
 fn blocks_have_the_atoms_of_the_file() {
     let limits = ReadLimits::default();
-    for options in [PLAIN, Options { entities: false, ..PLAIN }] {
+    for options in [PLAIN, Content { entities: false, ..PLAIN }] {
         let bytes = copies(6, options);
         let whole = read(&bytes, &limits).unwrap();
         let expected = atoms_of(&whole, whole.len());
@@ -381,12 +381,12 @@ fn inconsistent_columns_give_the_errors_of_files_in_memory() {
 #[test]
 fn hetatm_records_that_depend_on_the_whole_file_are_rejected() {
     let limits = ReadLimits::default();
-    let all_numbered = copies(2, Options { entities: false, numbered: true });
+    let all_numbered = copies(2, Content { entities: false, numbered: true });
     let found = streamed(&all_numbered, ROW * 100, &limits).unwrap_err();
     assert!(matches!(found, StructureError::NotAStream { .. }), "{found}");
     assert!(read(&all_numbered, &limits).is_ok());
     // Control: known entities decide.
-    let known = copies(2, Options { numbered: true, ..PLAIN });
+    let known = copies(2, Content { numbered: true, ..PLAIN });
     assert_eq!(assert_equal_results(&known, &limits, 100, &"entities"), Outcome::Read);
 }
 
@@ -503,21 +503,21 @@ fn written(make: impl FnOnce(&(dyn Fn(&str, &[u8]) -> std::io::Result<()> + Sync
     (files.into_inner().unwrap(), serde_json::to_string(&report).unwrap())
 }
 
-fn in_memory(bytes: &[u8], job: &Job) -> Written {
+fn in_memory(bytes: &[u8], options: &Options) -> Written {
     let (limits, control, backend) = (JobLimits::default(), Control::default(), CpuBackend::default());
     let choice = Choice { backend: &backend, reason: "test" };
     let read = |_: &Control<'_>| read(bytes, &limits.read).map(Box::new);
-    written(|store| write(read, job, &choice, &limits, &control, &(), store).unwrap())
+    written(|store| write(read, options, &choice, &limits, &control, &(), store).unwrap())
 }
 
-fn from_stream(files: &[&[u8]], block_bytes: usize, job: &Job) -> Written {
+fn from_stream(files: &[&[u8]], block_bytes: usize, options: &Options) -> Written {
     let (limits, control, backend) = (JobLimits::default(), Control::default(), CpuBackend::default());
     let choice = Choice { backend: &backend, reason: "test" };
     let files = files.iter().map(|file| Box::new(*file) as Box<dyn Read + Send>).collect();
     let source = StreamSource::Files(files);
     let scratch = [(); 2].map(|()| scratch(tempfile::tempfile().unwrap()));
     let stream = StructureStream { source, scratch, block_bytes, began: &|_| {} };
-    written(|store| write_stream(stream, job, &choice, &limits, &control, &(), store).unwrap())
+    written(|store| write_stream(stream, options, &choice, &limits, &control, &(), store).unwrap())
 }
 
 #[test]
@@ -529,12 +529,12 @@ fn a_stream_gives_the_bytes_of_a_structure_in_memory() {
         &[("resolution", "4"), ("color", "residue"), ("surface", "ses")],
         &[("resolution", "3"), ("color", "bfactor"), ("color_range", "5,40"), ("select", "byres name CA")],
     ] {
-        let job = params::parse(query.iter().copied().chain([("compress", "meshopt")])).unwrap().job;
-        let expected = in_memory(&bytes, &job);
+        let options = params::parse(query.iter().copied().chain([("compress", "meshopt")])).unwrap().options;
+        let expected = in_memory(&bytes, &options);
         assert!(expected.0.len() > 4, "{query:?}");
-        assert!(in_memory(&other, &job) != expected);
+        assert!(in_memory(&other, &options) != expected);
         for block_bytes in [3000, 20_000, BLOCK_BYTES] {
-            assert!(from_stream(&[&bytes], block_bytes, &job) == expected, "{query:?} {block_bytes}");
+            assert!(from_stream(&[&bytes], block_bytes, &options) == expected, "{query:?} {block_bytes}");
         }
     }
 }

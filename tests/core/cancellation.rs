@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use molmesh::formats::{Format, GlbSink, RandomAccess};
 use molmesh::picture::{PictureParams, SelectedRenderer};
-use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, ProgressSink, params};
+use molmesh::pipeline::{self, Choice, JobError, JobLimits, Options, ProgressSink, params};
 use molmesh::structure::{self, ReadLimits, Selection};
 use molmesh::surface::lattice::Lattice;
 use molmesh::surface::{
@@ -160,8 +160,8 @@ fn lattice(n: usize) -> Vec<u8> {
     atoms((0..n * n * n).map(|i| (place(i), 'A')))
 }
 
-fn job(pairs: &[(&str, &str)]) -> Job {
-    params::parse(pairs.iter().copied()).unwrap().job
+fn options(pairs: &[(&str, &str)]) -> Options {
+    params::parse(pairs.iter().copied()).unwrap().options
 }
 
 #[test]
@@ -170,18 +170,18 @@ fn jobs_end_soon_after_cancellation_in_any_stage() {
     let choice = Choice { backend: &backend, reason: "set by a test" };
     let many = lattice(100);
     let few = lattice(20);
-    let exact = job(&[("resolution", "0.4"), ("validation", "exact")]);
-    for (stage, input, job) in [("read", &many, &exact), ("select", &many, &exact), ("measure", &few, &exact)] {
+    let exact = options(&[("resolution", "0.4"), ("validation", "exact")]);
+    for (stage, input, options) in [("read", &many, &exact), ("select", &many, &exact), ("measure", &few, &exact)] {
         assert_in_time(stage, || {
             let at = CancelIn::new(stage);
-            let stopped = pipeline::run(input, job, &JobLimits::default(), &choice, &at.control(), &at, None);
+            let stopped = pipeline::run(input, options, &JobLimits::default(), &choice, &at.control(), &at, None);
             let time = at.time();
             assert!(matches!(stopped, Err(JobError::Surface(SurfaceError::Cancelled))), "{stage}");
             time
         });
     }
 
-    let quick = job(&[("resolution", "0.4")]);
+    let quick = options(&[("resolution", "0.4")]);
     let product = pipeline::run(&few, &quick, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
     assert_in_time("encode", || {
         let at = CancelIn::new("encode");
@@ -255,25 +255,25 @@ fn jobs_of_ten_seconds_end_soon_after_cancellation_at_any_time() {
     let choice = Choice { backend: &backend, reason: "set by a test" };
     let lattice = lattice(60);
     let copies = assembly(20);
-    let fine = |pairs: &[(&str, &str)]| job(&[&[("resolution", "0.25")][..], pairs].concat());
+    let fine = |pairs: &[(&str, &str)]| options(&[&[("resolution", "0.25")][..], pairs].concat());
     let jobs = [
         ("ses", &lattice, fine(&[("surface", "ses")])),
         ("sas", &lattice, fine(&[("surface", "sas")])),
         ("vdw", &lattice, fine(&[("surface", "vdw")])),
-        ("overlaps of one atom", &crowd(20_000), job(&[("surface", "ses"), ("resolution", "1")])),
-        ("within", &distant_crowds(300_000, 310), job(&[("select", "chain A and within 50 of chain B")])),
+        ("overlaps of one atom", &crowd(20_000), options(&[("surface", "ses"), ("resolution", "1")])),
+        ("within", &distant_crowds(300_000, 310), options(&[("select", "chain A and within 50 of chain B")])),
         ("split", &copies, fine(&[("split", "chain"), ("assembly", "1")])),
         ("color", &lattice, fine(&[("color", "element"), ("atom_ids", "true")])),
         ("context", &lattice, fine(&[("context", "whole"), ("select", "elem C")])),
         ("occupancy", &lattice, fine(&[("color", "occupancy")])),
-        ("max_triangles", &lattice, job(&[("max_triangles", "10000000")])),
+        ("max_triangles", &lattice, options(&[("max_triangles", "10000000")])),
         ("assembly", &copies, fine(&[("assembly", "1")])),
     ];
-    for (what, input, job) in &jobs {
+    for (what, input, options) in &jobs {
         for delay in [20, 200, 700].map(Duration::from_millis) {
             assert_in_time(&format!("{what} after {delay:?}"), || {
                 let at = CancelIn { delay, ..CancelIn::new("read") };
-                let stopped = pipeline::run(input, job, &JobLimits::default(), &choice, &at.control(), &at, None);
+                let stopped = pipeline::run(input, options, &JobLimits::default(), &choice, &at.control(), &at, None);
                 let time = at.time();
                 let cancelled = matches!(stopped, Err(JobError::Surface(SurfaceError::Cancelled)));
                 assert!(cancelled, "{what} after {delay:?}: {:?}", stopped.map(|product| product.report.timings_ms));
@@ -288,9 +288,9 @@ fn simplifications_and_improvements_end_soon_after_cancellation_at_any_time() {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
     for (stage, parameter) in [("simplify", ("simplify", "0.1")), ("improve", ("quality", "high"))] {
-        let (input, job) = (lattice(8), job(&[("resolution", "0.5"), parameter]));
+        let (input, options) = (lattice(8), options(&[("resolution", "0.5"), parameter]));
         let run = |control: &Control<'_>, progress: &dyn ProgressSink| {
-            pipeline::run(&input, &job, &JobLimits::default(), &choice, control, progress, None)
+            pipeline::run(&input, &options, &JobLimits::default(), &choice, control, progress, None)
         };
         let whole = run(&Control::default(), &()).unwrap().report.timings_ms[stage].as_f64().unwrap();
         let time = Duration::from_secs_f64(whole / 1e3);
@@ -312,7 +312,7 @@ fn simplifications_and_improvements_end_soon_after_cancellation_at_any_time() {
 fn pictures_end_soon_after_cancellation_at_any_time() {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
-    let coarse = job(&[("resolution", "0.7")]);
+    let coarse = options(&[("resolution", "0.7")]);
     let product =
         pipeline::run(&lattice(20), &coarse, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
     let picture = PictureParams { width: 2048, height: 2048, ..PictureParams::default() };

@@ -38,8 +38,8 @@ fn hollow(z: f64) -> String {
 fn meshed_with(file: impl AsRef<[u8]>, pairs: &[(&str, &str)]) -> Result<Product, JobError> {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
-    run(file.as_ref(), &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
+    run(file.as_ref(), &options, &JobLimits::default(), &choice, &Control::default(), &(), None)
 }
 
 fn meshed(file: impl AsRef<[u8]>, pairs: &[(&str, &str)]) -> Product {
@@ -116,7 +116,7 @@ fn walls_of_cavities_are_removed_or_kept_alone() {
 
 #[test]
 fn cavities_of_divided_surfaces_are_rejected() {
-    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().options);
     let all = [&[][..], &[("cavities", "keep")], &[("cavities", "drop")], &[("cavities", "only")]].map(canonical);
     assert!((0..4).all(|i| (0..i).all(|j| all[i] != all[j])), "{all:?}");
     let others = [("split", "chain"), ("context", "whole"), ("model", "all"), ("instances", "true"), ("exact", "true")];

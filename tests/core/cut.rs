@@ -21,8 +21,8 @@ const SAMPLE: &str = include_str!("../../samples/4pti.pdb");
 fn meshed_with(text: &str, pairs: &[(&str, &str)], limits: &JobLimits) -> Result<Product, JobError> {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
-    run(text.as_bytes(), &job, limits, &choice, &Control::default(), &(), None)
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
+    run(text.as_bytes(), &options, limits, &choice, &Control::default(), &(), None)
 }
 
 fn meshed(text: &str, pairs: &[(&str, &str)]) -> Product {
@@ -51,7 +51,7 @@ fn triangles(mesh: &Mesh) -> BTreeSet<Corners> {
 /// brute force in double precision.
 fn distances(text: &str, mesh: &Mesh, pairs: &[(&str, &str)]) -> Vec<[f64; 2]> {
     let structure = read(text.as_bytes(), &ReadLimits::default()).unwrap();
-    let selected = select(&structure, &params::parse(pairs.iter().copied()).unwrap().job.selection).unwrap();
+    let selected = select(&structure, &params::parse(pairs.iter().copied()).unwrap().options.selection).unwrap();
     let spheres = selected.spheres(&structure).unwrap();
     let of_vertex = |v: usize| {
         let at: [f64; 3] = std::array::from_fn(|k| mesh.centre[k] + f64::from(mesh.position(v)[k]));
@@ -303,10 +303,10 @@ fn limits_and_estimates_know_the_whole_surface() {
     assert_eq!(made.report.grid_points, plain.report.grid_points);
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
     let estimated = |limits: &JobLimits| {
         let read = |control: &Control<'_>| read_with(SAMPLE.as_bytes(), &limits.read, control).map(Box::new);
-        estimate(read, &job, limits, &choice, &Control::default()).unwrap()
+        estimate(read, &options, limits, &choice, &Control::default()).unwrap()
     };
     let expected = estimated(&JobLimits::default());
     let mesh = expected.mesh.clone().unwrap();
@@ -319,7 +319,7 @@ fn limits_and_estimates_know_the_whole_surface() {
         let ratio = guess as f64 / n as f64;
         assert!((0.75..1.3).contains(&ratio), "{guess} {n}");
     }
-    assert!(expected.work(&job).unwrap() > 0.0);
+    assert!(expected.work(&options).unwrap() > 0.0);
     // The size of the whole surface is limited, not that of the patch.
     let few = SurfaceLimits { max_mesh_bytes: plain.mesh.bytes() / 2, ..SurfaceLimits::default() };
     let few = JobLimits { surface: few, ..JobLimits::default() };
@@ -352,9 +352,9 @@ fn only_the_memory_of_the_patch_stays_counted() {
     let held = |pairs: &[(&str, &str)]| {
         let (backend, meter) = (CpuBackend::new(Some(1)).unwrap(), Arc::new(Meter::default()));
         let choice = Choice { backend: &backend, reason: "" };
-        let job = params::parse(pairs.iter().copied()).unwrap().job;
+        let options = params::parse(pairs.iter().copied()).unwrap().options;
         let control = Control { memory: meter.clone(), ..Control::default() };
-        let product = run(SAMPLE.as_bytes(), &job, &JobLimits::default(), &choice, &control, &(), None).unwrap();
+        let product = run(SAMPLE.as_bytes(), &options, &JobLimits::default(), &choice, &control, &(), None).unwrap();
         let (mesh, atoms) = (product.mesh, [product.report.atoms_in_file, product.report.atoms].map(|n| n as i64));
         (meter.0.load(Ordering::Relaxed), mesh.bytes() as i64, mesh.n_vertices() as i64, atoms)
     };
@@ -389,8 +389,8 @@ fn bad_values_name_the_valid_ones() {
     let error = params::parse([("context", "all")]).unwrap_err();
     assert!(matches!(error, ParamError::BadValue { name: "context", .. }), "{error}");
     assert!(error.to_string().contains("selection, whole"), "{error}");
-    let key = |value| params::canonical(&params::parse([("context", value)]).unwrap().job);
-    let none = params::canonical(&params::parse::<&str, &str>([]).unwrap().job);
+    let key = |value| params::canonical(&params::parse([("context", value)]).unwrap().options);
+    let none = params::canonical(&params::parse::<&str, &str>([]).unwrap().options);
     assert_eq!(key("selection"), none);
     assert_ne!(key("whole"), none);
 }

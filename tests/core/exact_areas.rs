@@ -19,17 +19,17 @@ fn complex() -> (Vec<u8>, Structure) {
 
 fn product(input: &[u8], pairs: &[(&str, &str)]) -> Result<Product, JobError> {
     let pairs = [("exact", "true"), ("resolution", "1.5")].into_iter().chain(pairs.iter().copied());
-    let job = params::parse(pairs).unwrap().job;
+    let options = params::parse(pairs).unwrap().options;
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
-    run(input, &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
+    run(input, &options, &JobLimits::default(), &choice, &Control::default(), &(), None)
 }
 
 /// Measures a structure without a mesh.
 fn measured(structure: &Structure, pairs: &[(&str, &str)]) -> MeasuredSelection {
-    let job = params::parse(pairs.iter().copied().chain([("exact", "true")])).unwrap().job;
+    let options = params::parse(pairs.iter().copied().chain([("exact", "true")])).unwrap().options;
     let (read, surface) = (ReadLimits::default(), SurfaceLimits::default());
-    areas::measure_selection(structure, &job, &read, &surface, &Control::default()).unwrap()
+    areas::measure_selection(structure, &options, &read, &surface, &Control::default()).unwrap()
 }
 
 /// Rows of a table, by the names of its columns.

@@ -24,8 +24,8 @@ const NORMAL_TOLERANCE: f64 = 1.2;
 fn meshed_in(text: &str, pairs: &[(&str, &str)], control: &Control<'_>) -> Result<Product, JobError> {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
-    run(text.as_bytes(), &job, &JobLimits::default(), &choice, control, &(), None)
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
+    run(text.as_bytes(), &options, &JobLimits::default(), &choice, control, &(), None)
 }
 
 /// Returns the GLB of a job with this value of `compress`.
@@ -310,10 +310,10 @@ fn a_cancelled_job_is_not_compressed() {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
     for (compress, stops) in [("meshopt", true), ("quantize", false)] {
-        let job = params::parse([("resolution", "1"), ("compress", compress)]).unwrap().job;
+        let options = params::parse([("resolution", "1"), ("compress", compress)]).unwrap().options;
         let control = Control::default();
         let sink = CancelAtEncode(control.cancel.clone());
-        let done = run(SAMPLE.as_bytes(), &job, &JobLimits::default(), &choice, &control, &sink, None);
+        let done = run(SAMPLE.as_bytes(), &options, &JobLimits::default(), &choice, &control, &sink, None);
         assert_eq!(matches!(done, Err(JobError::Surface(SurfaceError::Cancelled))), stops, "{compress}");
     }
 }

@@ -51,8 +51,8 @@ fn meshed_with(text: &str, pairs: &[(&str, &str)], limits: &JobLimits) -> Result
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
     let own = [("assembly", "1"), ("resolution", "1.2"), ("instances", "true")];
-    let job = params::parse(own.iter().chain(pairs).copied()).unwrap().job;
-    run(text.as_bytes(), &job, limits, &choice, &Control::default(), &(), None)
+    let options = params::parse(own.iter().chain(pairs).copied()).unwrap().options;
+    run(text.as_bytes(), &options, limits, &choice, &Control::default(), &(), None)
 }
 
 fn meshed(text: &str, pairs: &[(&str, &str)]) -> Product {
@@ -194,12 +194,12 @@ fn units_are_meshed_once_and_sums_count_every_instance() {
     // A unit has the mesh of its atoms alone.
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let alone = params::parse([("chains", "A"), ("resolution", "1.2")]).unwrap().job;
+    let alone = params::parse([("chains", "A"), ("resolution", "1.2")]).unwrap().options;
     let alone =
         run(text.as_bytes(), &alone, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap().report;
     assert_eq!((alone.triangles, alone.vertices), (report.parts[0].triangles, report.parts[0].vertices));
     // Without instances there are no sums, and the copies are in memory.
-    let joined = params::parse([("assembly", "1"), ("resolution", "1.2")]).unwrap().job;
+    let joined = params::parse([("assembly", "1"), ("resolution", "1.2")]).unwrap().options;
     let joined =
         run(text.as_bytes(), &joined, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap().report;
     assert!(joined.instances.is_none() && joined.parts.is_empty());
@@ -247,11 +247,12 @@ fn one_unit_is_meshed_where_it_is_in_the_file() {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
     let pairs = [("assembly", "1"), ("unit", "2"), ("chains", "B"), ("resolution", "1.2")];
-    let job = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().job;
-    let run = |job| run(text.as_bytes(), &job, &JobLimits::default(), &choice, &Control::default(), &(), None);
-    assert!(run(job(&pairs)).unwrap_err().to_string().contains("one unit"));
-    let report = run(job(&[("assembly", "1"), ("unit", "1"), ("chains", "B"), ("resolution", "1.2")])).unwrap().report;
-    let alone = run(job(&[("chains", "B"), ("resolution", "1.2")])).unwrap().report;
+    let options = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().options;
+    let run = |options| run(text.as_bytes(), &options, &JobLimits::default(), &choice, &Control::default(), &(), None);
+    assert!(run(options(&pairs)).unwrap_err().to_string().contains("one unit"));
+    let report =
+        run(options(&[("assembly", "1"), ("unit", "1"), ("chains", "B"), ("resolution", "1.2")])).unwrap().report;
+    let alone = run(options(&[("chains", "B"), ("resolution", "1.2")])).unwrap().report;
     assert_eq!((report.triangles, report.area.to_bits()), (alone.triangles, alone.area.to_bits()));
     let assembly = report.assembly.unwrap();
     assert_eq!((assembly.copies, assembly.unit, alone.assembly.is_none()), (1, Some(1), true));
@@ -309,7 +310,7 @@ fn other_requests_are_rejected_with_the_reason() {
         let error = params::parse(pairs.iter().copied()).unwrap_err().to_string();
         assert!(error.contains("`instances`") && error.contains(reason), "{pairs:?}: {error}");
     }
-    let key = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+    let key = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().options);
     assert_ne!(key(&[("assembly", "1")]), key(&[("assembly", "1"), ("instances", "true")]));
     assert_eq!(key(&[]), key(&[("instances", "false")]));
     // Encoders of other formats reject the mesh.

@@ -15,8 +15,8 @@ fn meshed_with(file: &[u8], pairs: &[(&str, &str)], limits: &JobLimits) -> Resul
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
     let pairs = [&[("resolution", "1")], pairs].concat();
-    let job = params::parse(pairs).unwrap().job;
-    run(file, &job, limits, &choice, &Control::default(), &(), None)
+    let options = params::parse(pairs).unwrap().options;
+    run(file, &options, limits, &choice, &Control::default(), &(), None)
 }
 
 fn meshed(file: &[u8], pairs: &[(&str, &str)]) -> Product {
@@ -154,7 +154,7 @@ fn pockets_are_parts_of_one_surface() {
 
 #[test]
 fn parameters_of_pockets_are_checked() {
-    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().options);
     let all = [
         &[][..],
         &[("pockets", "true")],

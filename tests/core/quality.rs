@@ -16,8 +16,8 @@ const CHAINS: &[u8] = include_bytes!("../structures/1ubq.pdb.gz");
 fn meshed(file: &[u8], pairs: &[(&str, &str)], threads: usize) -> Product {
     let backend = CpuBackend::new(Some(threads)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
-    run(file, &job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap()
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
+    run(file, &options, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap()
 }
 
 type Point = [f64; 3];
@@ -82,7 +82,7 @@ fn intersections(mesh: &Mesh) -> usize {
 }
 
 fn parsed(pairs: &[(&str, &str)]) -> SurfaceParams {
-    params::parse(pairs.iter().copied()).unwrap().job.params
+    params::parse(pairs.iter().copied()).unwrap().options.params
 }
 
 #[test]
@@ -216,10 +216,10 @@ fn estimates_state_the_mesh_before_its_improvement() {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let (choice, control) = (Choice { backend: &backend, reason: "" }, Control::default());
     let estimates = ["standard", "high"].map(|quality| {
-        let job = params::parse([("quality", quality), ("resolution", "0.5")]).unwrap().job;
+        let options = params::parse([("quality", quality), ("resolution", "0.5")]).unwrap().options;
         let read = |control: &Control<'_>| structure::read_with(CHAINS, &Default::default(), control).map(Box::new);
-        let estimate = estimate(read, &job, &JobLimits::default(), &choice, &control).unwrap();
-        (estimate.work(&job).unwrap(), estimate.mesh.unwrap())
+        let estimate = estimate(read, &options, &JobLimits::default(), &choice, &control).unwrap();
+        (estimate.work(&options).unwrap(), estimate.mesh.unwrap())
     });
     assert_eq!(estimates[0].1, estimates[1].1);
     assert!(estimates[1].0 > 10.0 * estimates[0].0, "{estimates:?}");
@@ -232,7 +232,7 @@ fn improved_triangles_are_not_simplified() {
         panic!("accepted")
     };
     assert!(name == "simplify" && expected.contains("quality=high"), "{name} {expected}");
-    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().options);
     assert_eq!(canonical(&[("quality", "standard")]), canonical(&[]));
     assert_ne!(canonical(&[("quality", "high")]), canonical(&[]));
 }

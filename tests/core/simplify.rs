@@ -15,8 +15,8 @@ const CHAINS: &[u8] = include_bytes!("../structures/1ubq.pdb.gz");
 fn meshed(file: &[u8], pairs: &[(&str, &str)]) -> Product {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
-    run(file, &job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap()
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
+    run(file, &options, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap()
 }
 
 fn glb(product: &Product) -> Vec<u8> {
@@ -88,15 +88,15 @@ fn a_limit_on_triangles_ends_the_simplification() {
                 assert_eq!(report.resolution_from, if extra == [("detail", "5")] { "detail" } else { "resolution" });
                 deviations.push(found.mean_deviation);
                 let read = |control: &Control<'_>| structure::read_with(SAMPLE, &limits.read, control).map(Box::new);
-                let job = params::parse(pairs).unwrap().job;
-                let expected = estimate(read, &job, &limits, &choice, control).unwrap().mesh.unwrap();
+                let options = params::parse(pairs).unwrap().options;
+                let expected = estimate(read, &options, &limits, &choice, control).unwrap().mesh.unwrap();
                 assert_eq!(expected.triangles, most, "{what}");
             }
             assert!(deviations[0] < deviations[1], "{surface} {extra:?}: {deviations:?}");
         }
     }
-    let job = params::parse([("simplify", "0.02"), ("max_triangles", "1000")]).unwrap().job;
-    match run(SAMPLE, &job, &limits, &choice, control, &(), None) {
+    let options = params::parse([("simplify", "0.02"), ("max_triangles", "1000")]).unwrap().options;
+    match run(SAMPLE, &options, &limits, &choice, control, &(), None) {
         Err(JobError::Surface(SurfaceError::Limit(error))) => {
             assert_eq!((error.limit, error.max, error.resolution), (Limit::Triangles, 1000, Some(0.5)));
             assert!(error.actual > Some(10_000) && error.to_string().contains("an error of 0.02 Å"), "{error}");
@@ -110,7 +110,7 @@ fn a_limit_on_triangles_ends_the_simplification() {
     // Distances have single precision.
     assert!(unchanged.report.simplification.unwrap().max_deviation < 2e-3);
     // Without a simplification, the limit sets the spacing.
-    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().options);
     assert_ne!(canonical(&[("simplify", "1")]), canonical(&[("simplify", "1"), ("max_triangles", "9000")]));
     for several in [[("resolution", "0.6"), ("max_triangles", "9000")], [("detail", "3"), ("resolution", "0.6")]] {
         let Err(ParamError::BadValue { name, .. }) = params::parse(several) else { panic!("{several:?}") };
@@ -186,7 +186,7 @@ fn a_larger_error_leaves_fewer_triangles_and_the_parameter_is_part_of_the_key() 
         });
         assert!(triangles.windows(2).all(|pair| pair[1] < pair[0]), "{surface} {triangles:?}");
     }
-    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().options);
     assert_ne!(canonical(&[]), canonical(&[("simplify", "0.1")]));
     assert_ne!(canonical(&[("simplify", "0.2")]), canonical(&[("simplify", "0.1")]));
     for value in ["0", "-1", "11", "nan", "fine"] {

@@ -36,10 +36,10 @@ fn structures() -> Vec<(&'static str, Vec<u8>)> {
 }
 
 fn with(input: &[u8], pairs: &[(&str, &str)], surface: SurfaceLimits) -> Result<Product, JobError> {
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
     let backend = CpuBackend::new(None).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
-    run(input, &job, &JobLimits { surface, ..JobLimits::default() }, &choice, &Control::default(), &(), None)
+    run(input, &options, &JobLimits { surface, ..JobLimits::default() }, &choice, &Control::default(), &(), None)
 }
 
 fn product(input: &[u8], pairs: &[(&str, &str)]) -> Result<Product, JobError> {
@@ -51,11 +51,11 @@ fn report(input: &[u8], pairs: &[(&str, &str)]) -> Report {
 }
 
 fn expected(input: &[u8], pairs: &[(&str, &str)]) -> Estimate {
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
     let backend = CpuBackend::new(None).unwrap();
     let choice = Choice { backend: &backend, reason: "set by a test" };
     let read = |control: &Control<'_>| read_with(input, &ReadLimits::default(), control).map(Box::new);
-    estimate(read, &job, &JobLimits::default(), &choice, &Control::default()).unwrap()
+    estimate(read, &options, &JobLimits::default(), &choice, &Control::default()).unwrap()
 }
 
 #[test]

@@ -42,8 +42,8 @@ pub(crate) fn dimer() -> String {
 fn meshed_with(text: &str, pairs: &[(&str, &str)], limits: &JobLimits) -> Result<Product, JobError> {
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
-    run(text.as_bytes(), &job, limits, &choice, &Control::default(), &(), None)
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
+    run(text.as_bytes(), &options, limits, &choice, &Control::default(), &(), None)
 }
 
 fn meshed(text: &str, pairs: &[(&str, &str)]) -> Product {
@@ -155,8 +155,8 @@ fn bad_values_name_the_valid_ones() {
     let error = params::parse([("split", "atom")]).unwrap_err();
     assert!(matches!(error, ParamError::BadValue { name: "split", .. }), "{error}");
     assert!(error.to_string().contains("none, chain, entity, residue-group"), "{error}");
-    let key = |value| params::canonical(&params::parse([("split", value)]).unwrap().job);
-    let none = params::canonical(&params::parse::<&str, &str>([]).unwrap().job);
+    let key = |value| params::canonical(&params::parse([("split", value)]).unwrap().options);
+    let none = params::canonical(&params::parse::<&str, &str>([]).unwrap().options);
     let keys = ["none", "chain", "entity", "residue-group"].map(key);
     assert_eq!(keys[0], none);
     assert!((1..4).all(|n| !keys[..n].contains(&keys[n])), "{keys:?}");
@@ -323,18 +323,18 @@ fn estimates_count_every_part() {
     let text = dimer();
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let job = params::parse([("split", "chain"), ("resolution", "0.8"), ("compress", "quantize")]).unwrap().job;
+    let options = params::parse([("split", "chain"), ("resolution", "0.8"), ("compress", "quantize")]).unwrap().options;
     let (limits, control) = (JobLimits::default(), Control::default());
     let read = |control: &Control<'_>| read_with(text.as_bytes(), &limits.read, control).map(Box::new);
-    let made = run(text.as_bytes(), &job, &limits, &choice, &control, &(), None).unwrap().report;
-    let expected = estimate(read, &job, &limits, &choice, &control).unwrap();
+    let made = run(text.as_bytes(), &options, &limits, &choice, &control, &(), None).unwrap().report;
+    let expected = estimate(read, &options, &limits, &choice, &control).unwrap();
     let mesh = expected.mesh.unwrap();
     assert_eq!((mesh.grid_points, expected.box_cells), (made.grid_points, made.box_cells));
     let ratio = mesh.triangles as f64 / made.triangles as f64;
     assert!((0.8..1.25).contains(&ratio), "{ratio}");
     let few =
         JobLimits { surface: SurfaceLimits { max_grid_points: made.grid_points - 1, ..limits.surface }, ..limits };
-    let refused = estimate(read, &job, &few, &choice, &control).unwrap().mesh.unwrap_err();
+    let refused = estimate(read, &options, &few, &choice, &control).unwrap().mesh.unwrap_err();
     assert!(refused.exceeded(Limit::GridPoints).is_some(), "{refused}");
 }
 
@@ -359,10 +359,10 @@ fn memory_of_the_joined_mesh_stays_counted() {
     let held = |pairs: &[(&str, &str)]| {
         let (backend, meter) = (CpuBackend::new(Some(1)).unwrap(), Arc::new(Meter::default()));
         let choice = Choice { backend: &backend, reason: "" };
-        let job = params::parse(pairs.iter().copied()).unwrap().job;
-        assert_eq!(job.validation, Validation::Checksum);
+        let options = params::parse(pairs.iter().copied()).unwrap().options;
+        assert_eq!(options.validation, Validation::Checksum);
         let control = Control { memory: meter.clone(), ..Control::default() };
-        let product = run(text.as_bytes(), &job, &JobLimits::default(), &choice, &control, &(), None).unwrap();
+        let product = run(text.as_bytes(), &options, &JobLimits::default(), &choice, &control, &(), None).unwrap();
         (meter.0.load(Ordering::Relaxed), product.mesh.bytes() as i64, product.report.atoms as i64)
     };
     let (whole, bytes, _) = held(&[("resolution", "1")]);
@@ -453,7 +453,7 @@ fn all_models_exclude_other_parts_and_are_limited() {
         assert_eq!((name, expected.as_str()), ("model", "the number of a model of the file, or all"), "{bad}");
     }
     // Defaults do not conflict, and the keys of one model and of all differ.
-    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+    let canonical = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().options);
     let all = canonical(&[("model", "all")]);
     assert_eq!(all, canonical(&[("model", "all"), ("split", "none"), ("assembly", "asymmetric-unit")]));
     assert_ne!(all, canonical(&[]));

@@ -318,8 +318,8 @@ fn memory_is_counted_before_it_is_used() {
 fn meshed(text: &str, pairs: &[(&str, &str)], threads: usize) -> Result<Product, JobError> {
     let backend = CpuBackend::new(Some(threads)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
-    run(text.as_bytes(), &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
+    run(text.as_bytes(), &options, &JobLimits::default(), &choice, &Control::default(), &(), None)
 }
 
 #[test]
@@ -367,13 +367,14 @@ fn copies_far_from_the_origin_keep_their_precision() {
 #[test]
 fn coinciding_copies_are_limited() {
     let text = mmcif().replace("1 '1'", "1 '1,1,1,1,1'");
-    let job = params::parse([("assembly", "1")]).unwrap().job;
+    let options = params::parse([("assembly", "1")]).unwrap().options;
     let backend = CpuBackend::new(Some(1)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
     let meshed = |max_duplicates| {
         let read = ReadLimits { max_duplicates, ..ReadLimits::default() };
         let limits = JobLimits { read, ..JobLimits::default() };
-        run(text.as_bytes(), &job, &limits, &choice, &Control::default(), &(), None).map(|product| product.report.atoms)
+        run(text.as_bytes(), &options, &limits, &choice, &Control::default(), &(), None)
+            .map(|product| product.report.atoms)
     };
     assert_eq!(meshed(5).unwrap(), 30);
     let refused = meshed(4).unwrap_err();

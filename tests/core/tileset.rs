@@ -7,7 +7,7 @@ use std::ops::Deref;
 
 use molmesh::formats::tileset::{TileAddress, assembly_document};
 use molmesh::pipeline::tileset::{AssemblyTileset, Tileset, check};
-use molmesh::pipeline::{Choice, Job, JobError, JobLimits, StageClock, params, run};
+use molmesh::pipeline::{Choice, JobError, JobLimits, Options, StageClock, params, run};
 use molmesh::structure::{self, ReadLimits, Structure};
 use molmesh::surface::{Control, CpuBackend, Limit, Measures, Mesh, SurfaceError, SurfaceLimits, Validation};
 use serde_json::Value;
@@ -19,16 +19,17 @@ const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 /// Tileset with its job.
 struct Prepared {
     tileset: Tileset<Box<Structure>>,
-    job: Job,
+    options: Options,
 }
 
 impl Prepared {
     fn mesh(&self, tile: TileAddress) -> Option<Mesh> {
-        let (backend, job) = (CpuBackend::new(Some(2)).unwrap(), Job { tile: Some(tile), ..self.job.clone() });
+        let (backend, options) =
+            (CpuBackend::new(Some(2)).unwrap(), Options { tile: Some(tile), ..self.options.clone() });
         let color = |coloring| self.tileset.colors(coloring, &Control::default()).unwrap();
-        let colors = job.color.map(color);
+        let colors = options.color.map(color);
         let limits = SurfaceLimits::default();
-        self.tileset.mesh((&job, colors.as_ref()), &backend, &limits, &Control::default()).unwrap()
+        self.tileset.mesh((&options, colors.as_ref()), &backend, &limits, &Control::default()).unwrap()
     }
 }
 
@@ -45,11 +46,12 @@ fn tileset(pairs: &[(&str, &str)]) -> Prepared {
 }
 
 fn tileset_of(file: &[u8], pairs: &[(&str, &str)]) -> Prepared {
-    let job = params::parse(pairs.iter().copied()).unwrap().job;
-    check(&job).unwrap();
+    let options = params::parse(pairs.iter().copied()).unwrap().options;
+    check(&options).unwrap();
     let read = |control: &Control<'_>| structure::read_with(file, &ReadLimits::default(), control).map(Box::new);
-    let tileset = Tileset::new(read, &job, &ReadLimits::default(), &Control::default(), &StageClock::new(&())).unwrap();
-    Prepared { tileset, job }
+    let tileset =
+        Tileset::new(read, &options, &ReadLimits::default(), &Control::default(), &StageClock::new(&())).unwrap();
+    Prepared { tileset, options }
 }
 
 /// Returns the meshes of all tiles of a level.
@@ -107,8 +109,8 @@ fn tiles_of_each_level_join_to_a_closed_mesh() {
             let what = format!("{surface}, {resolution} Å: {} tiles", all.len());
             assert!(found.closed && found.oriented && found.manifold, "{what}");
             assert!(all.len() > 1 || level == 0, "{what}");
-            let job = params::parse([("surface", surface), ("resolution", &*resolution)]).unwrap().job;
-            let whole = run(SAMPLE, &job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
+            let options = params::parse([("surface", surface), ("resolution", &*resolution)]).unwrap().options;
+            let whole = run(SAMPLE, &options, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
             assert_eq!(joined.triangles.len() as u64, whole.report.triangles, "{what}");
             assert!(
                 (found.area / whole.report.area - 1.0).abs() < 1e-6,
@@ -152,10 +154,11 @@ fn coarse_levels_group_atoms_and_keep_the_shape() {
 
 #[test]
 fn too_many_tiles_are_rejected() {
-    let job = |resolution| params::parse([("radius_offset", "10"), ("resolution", resolution)]).unwrap().job;
+    let options = |resolution| params::parse([("radius_offset", "10"), ("resolution", resolution)]).unwrap().options;
     let read = |control: &Control<'_>| structure::read_with(SAMPLE, &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
-    let new = |resolution| Tileset::new(read, &job(resolution), &ReadLimits::default(), &Control::default(), &clock);
+    let new =
+        |resolution| Tileset::new(read, &options(resolution), &ReadLimits::default(), &Control::default(), &clock);
     let Err(JobError::Surface(SurfaceError::Limit(error))) = new("0.01") else { panic!("accepted") };
     assert_eq!(error.limit, Limit::Tiles);
     assert!(new("0.2").is_ok_and(|tileset| (tileset.tiles().len() as u64) < error.max));
@@ -166,16 +169,16 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
     let [one, two, three] = OPERATORS;
     let text = with_rules(&[("A", &[one]), ("A, B", &[two, three])]);
     let pairs = [("assembly", "1"), ("resolution", "1"), ("instances", "true")];
-    let job = params::parse(pairs).unwrap().job;
-    check(&job).unwrap();
+    let options = params::parse(pairs).unwrap().options;
+    check(&options).unwrap();
     let read =
         |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
-    let assembly = AssemblyTileset::new(read, &job, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    let assembly = AssemblyTileset::new(read, &options, &ReadLimits::default(), &Control::default(), &clock).unwrap();
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
     let (limits, control) = (JobLimits::default(), Control::default());
-    let whole = run(text.as_bytes(), &job, &limits, &choice, &control, &(), None).unwrap();
+    let whole = run(text.as_bytes(), &options, &limits, &choice, &control, &(), None).unwrap();
     let parts = &whole.report.parts;
     assert_eq!((assembly.units().len(), parts.len()), (2, 2));
     let repeated = assembly.repeated(|number| number.to_string());
@@ -189,7 +192,7 @@ fn an_assembly_repeats_the_tilesets_of_its_units() {
         assert!(joined.closed && (joined.area / part.area - 1.0).abs() < 1e-6, "{} {}", joined.area, part.area);
     }
     // The root is the coarse mesh of all instances.
-    let root = assembly.root(&job, &limits, &choice, &control, &()).unwrap().report;
+    let root = assembly.root(&options, &limits, &choice, &control, &()).unwrap().report;
     assert_eq!((root.atoms, root.instances.as_ref().unwrap().count), (whole.report.atoms, 3));
     assert_eq!(root.instances.unwrap().atoms_sum, whole.report.instances.unwrap().atoms_sum);
     assert_eq!(root.parts.iter().map(|part| part.atoms).collect::<Vec<_>>(), [454, 908]);
@@ -233,15 +236,15 @@ fn units_have_the_colours_and_the_small_parts_of_the_assembly() {
     text.truncate(text.find("ATOM").unwrap());
     text += &(atom('A', 0.3, 5.0) + &atom('A', 2000.7, 25.0) + &atom('B', 50.1, 90.0));
     let pairs = [("assembly", "1"), ("instances", "true"), ("select", "all"), ("color", "bfactor")];
-    let job = params::parse(pairs).unwrap().job;
+    let options = params::parse(pairs).unwrap().options;
     let read =
         |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
-    let assembly = AssemblyTileset::new(read, &job, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    let assembly = AssemblyTileset::new(read, &options, &ReadLimits::default(), &Control::default(), &clock).unwrap();
     assert_eq!(assembly.color_range(), Some([5.0, 90.0]));
     let backend = CpuBackend::new(Some(2)).unwrap();
     let choice = Choice { backend: &backend, reason: "" };
-    let root = assembly.root(&job, &JobLimits::default(), &choice, &Control::default(), &()).unwrap().report;
+    let root = assembly.root(&options, &JobLimits::default(), &choice, &Control::default(), &()).unwrap().report;
     assert!(root.resolution > 8.0, "{}", root.resolution);
     assert_eq!((root.components, root.color.unwrap().range), (3, Some([5.0, 90.0])));
     // Each atom lies between the grid points of the roots, which do not group atoms.
@@ -252,13 +255,13 @@ fn units_have_the_colours_and_the_small_parts_of_the_assembly() {
         .concat();
     let pairs =
         [("assembly", "1"), ("instances", "true"), ("select", "all"), ("surface", "vdw"), ("radius_scale", "0.4")];
-    let job = params::parse(pairs).unwrap().job;
+    let options = params::parse(pairs).unwrap().options;
     let read =
         |control: &Control<'_>| structure::read_with(text.as_bytes(), &ReadLimits::default(), control).map(Box::new);
     let clock = StageClock::new(&());
-    let assembly = AssemblyTileset::new(read, &job, &ReadLimits::default(), &Control::default(), &clock).unwrap();
+    let assembly = AssemblyTileset::new(read, &options, &ReadLimits::default(), &Control::default(), &clock).unwrap();
     let coarsest = assembly.repeated(|_| String::new())[0].bounds.error;
-    let root = assembly.root(&job, &JobLimits::default(), &choice, &Control::default(), &()).unwrap().report;
+    let root = assembly.root(&options, &JobLimits::default(), &choice, &Control::default(), &()).unwrap().report;
     assert_eq!((root.components, coarsest / root.resolution), (2, 2.0));
 }
 
@@ -283,8 +286,8 @@ fn a_job_can_mesh_one_tile() {
     let pairs = [("resolution", "0.25"), ("atom_ids", "true"), ("color", "chain")];
     let tileset = tileset(&pairs);
     let made = |tile: &str| {
-        let job = params::parse(pairs.iter().copied().chain([("tile", tile)])).unwrap().job;
-        run(SAMPLE, &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
+        let options = params::parse(pairs.iter().copied().chain([("tile", tile)])).unwrap().options;
+        run(SAMPLE, &options, &JobLimits::default(), &choice, &Control::default(), &(), None)
     };
     let mut triangles = 0;
     for address in tileset.tiles() {

@@ -46,7 +46,7 @@ fn gpu() -> GpuBackend {
 
 fn made(backend: &dyn Backend, pairs: &[(&str, &str)]) -> Product {
     let choice = Choice { backend, reason: "set by a test" };
-    let job = params::parse([("resolution", "1")].iter().chain(pairs).copied()).unwrap().job;
+    let job = params::parse([("resolution", "1")].iter().chain(pairs).copied()).unwrap().options;
     let text = dimer();
     pipeline::run(text.as_bytes(), &job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap()
 }

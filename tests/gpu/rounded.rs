@@ -12,7 +12,7 @@ use std::net::TcpStream;
 use cli_support::{Folder, Service, assert_code, mesh, run, stdout};
 use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Packing, Step};
 use molmesh::gpu::{DevicePool, Executor, GpuBackend, PoolDevice, PoolSettings};
-use molmesh::pipeline::{self, Choice, Job, JobLimits, Product, params};
+use molmesh::pipeline::{self, Choice, JobLimits, Options, Product, params};
 use molmesh::surface::{
     Backend, Control, CpuBackend, Mesh, ReferenceBackend, SurfaceLimits, SurfaceParams, Validation,
 };
@@ -26,9 +26,9 @@ fn sample() -> Vec<u8> {
     fs::read(SAMPLE).unwrap()
 }
 
-fn job(more: &[(&'static str, &'static str)]) -> Job {
+fn options(more: &[(&'static str, &'static str)]) -> Options {
     let pairs = [("compress", "quantize")].iter().chain(more).copied();
-    params::parse(pairs).unwrap().job
+    params::parse(pairs).unwrap().options
 }
 
 /// Returns a backend of `n` software devices.
@@ -41,9 +41,9 @@ fn devices(n: usize) -> GpuBackend {
     GpuBackend::with_pool(DevicePool::start((0..n).map(device).collect(), &settings).unwrap())
 }
 
-fn made(backend: &dyn Backend, job: &Job) -> Product {
+fn made(backend: &dyn Backend, options: &Options) -> Product {
     let choice = Choice { backend, reason: "set by a test" };
-    pipeline::run(&sample(), job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap()
+    pipeline::run(&sample(), options, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap()
 }
 
 fn glb(product: &Product) -> Vec<u8> {
@@ -73,11 +73,11 @@ fn near(a: f64, b: f64, bound: f64) -> bool {
 
 #[test]
 fn every_backend_returns_integers_and_reports_their_measures() {
-    let job = job(&[("resolution", "0.8")]);
-    let plain = params::parse([("resolution", "0.8")]).unwrap().job;
+    let options = options(&[("resolution", "0.8")]);
+    let plain = params::parse([("resolution", "0.8")]).unwrap().options;
     let (one, cpu) = (devices(1), CpuBackend::new(Some(2)).unwrap());
     for backend in [&one as &dyn Backend, &cpu, &ReferenceBackend] {
-        let product = made(backend, &job);
+        let product = made(backend, &options);
         let name = backend.name();
         assert!(product.mesh.quantized.is_some() && product.mesh.positions.is_empty(), "{name}");
         assert_eq!(Packing::of(&product.mesh), product.storage.packing, "{name}");
@@ -102,7 +102,7 @@ fn every_backend_returns_integers_and_reports_their_measures() {
 fn the_exact_validation_measures_the_same_vertices() {
     for backend in [&devices(1) as &dyn Backend, &CpuBackend::new(Some(2)).unwrap()] {
         let [quick, exact] = ["checksum", "exact"]
-            .map(|validation| made(backend, &job(&[("validation", validation), ("resolution", "1")])));
+            .map(|validation| made(backend, &options(&[("validation", validation), ("resolution", "1")])));
         assert_eq!((quick.report.validation, exact.report.validation), ("checksum", "exact"));
         assert!(quick.mesh == exact.mesh);
         assert!(near(quick.report.area, exact.report.area, 2e-6) && exact.report.manifold);
@@ -139,9 +139,9 @@ fn document_without_sums(glb: &[u8]) -> Value {
 
 #[test]
 fn one_and_two_devices_make_the_same_file_in_any_write_order() {
-    let job = job(&[("resolution", "0.4")]);
+    let options = options(&[("resolution", "0.4")]);
     let [one, two] = [1, 2].map(devices);
-    let (alone, spread) = (made(&one, &job), made(&two, &job));
+    let (alone, spread) = (made(&one, &options), made(&two, &options));
     assert!(spread.report.device.starts_with("2 devices"), "{}", spread.report.device);
     let expected = [&alone, &spread].map(glb);
     assert_eq!(document_without_sums(&expected[0]), document_without_sums(&expected[1]));
@@ -153,13 +153,13 @@ fn one_and_two_devices_make_the_same_file_in_any_write_order() {
         let sink = GlbSink::new(&file);
         let (choice, limits) = (Choice { backend, reason: "set by a test" }, JobLimits::default());
         let control = Control::default();
-        let product = pipeline::run(&sample(), &job, &limits, &choice, &control, &(), Some(&sink)).unwrap();
+        let product = pipeline::run(&sample(), &options, &limits, &choice, &control, &(), Some(&sink)).unwrap();
         drop(sink);
         assert!(product.mesh.positions.is_empty() && product.streamed_bytes == Some(expected.len() as u64));
         assert!(file.into_bytes() == *expected);
     }
     // Control: another spacing gives another file.
-    let other = glb(&made(&one, &self::job(&[("resolution", "0.45")])));
+    let other = glb(&made(&one, &self::options(&[("resolution", "0.45")])));
     assert!(
         contents(&other).1 != contents(&expected[0]).1
             && document_without_sums(&other) != document_without_sums(&expected[0])
@@ -188,7 +188,7 @@ fn external_readers_accept_vertices_quantized_by_devices() {
         ("soft", vec![("surface", "soft-object"), ("resolution", "0.6")]),
         ("inverse", vec![("surface", "inverse-square"), ("resolution", "0.6"), ("atom_ids", "true")]),
     ] {
-        let product = made(&two, &job(&more));
+        let product = made(&two, &options(&more));
         files.add(&format!("{name}.glb"), &glb(&product));
         reports.push(product.report);
     }
@@ -254,7 +254,7 @@ fn the_command_line_quantizes_on_a_device() {
     assert_code(&piped, 0);
     assert!(piped.stdout == file, "file and pipe differ");
     // The library makes the same mesh on the same device.
-    assert!(contents(&glb(&made(&devices(1), &job(&[("resolution", "0.5")])))).1 == bin);
+    assert!(contents(&glb(&made(&devices(1), &options(&[("resolution", "0.5")])))).1 == bin);
     let text = mesh(SAMPLE.as_ref(), &folder.path("out.gltf"), &quiet);
     assert_code(&text, 0);
     let ply = mesh(SAMPLE.as_ref(), &folder.path("out.ply"), &quiet);
@@ -286,7 +286,7 @@ fn a_service_quantizes_on_a_device() {
     let file = post(&service.addr, &format!("meshes?{query}"));
     let (extras, bin) = contents(&file);
     assert_eq!(extras["backend"], "gpu");
-    let expected = made(&devices(1), &job(&[("resolution", "0.5")]));
+    let expected = made(&devices(1), &options(&[("resolution", "0.5")]));
     assert!(contents(&glb(&expected)).1 == bin);
     let report: Value = serde_json::from_slice(&post(&service.addr, &format!("report?{query}"))).unwrap();
     let [area, volume] = measured(&file);

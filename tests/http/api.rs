@@ -724,7 +724,7 @@ fn areas_are_those_of_the_library() {
         let reply = SERVER.get(&format!("{address}/areas?{query}"));
         assert_eq!((reply.status, reply.header("content-type")), (200, Some("text/csv")), "{query}");
         let kind = query.split('&').next().and_then(|pair| pair.split_once('='));
-        let job = params::parse(kind.into_iter().chain([("exact", "true")])).unwrap().job;
+        let job = params::parse(kind.into_iter().chain([("exact", "true")])).unwrap().options;
         let measured = areas::measure_selection(&structure, &job, &read, &surface, &Control::default()).unwrap();
         let mut expected = Vec::new();
         measured.areas.write_csv(&structure, level, &Control::default(), &mut expected).unwrap();

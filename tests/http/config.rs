@@ -220,7 +220,7 @@ fn the_table_and_the_core_agree_on_every_range() {
 
 #[test]
 fn canonical_texts_differ_exactly_if_the_jobs_differ() {
-    let text = |list: &[(&str, &str)]| canonical(&parse(list.iter().copied()).unwrap().job);
+    let text = |list: &[(&str, &str)]| canonical(&parse(list.iter().copied()).unwrap().options);
     let plain = text(&[]);
     // The same job with equivalent parameters.
     for same in [

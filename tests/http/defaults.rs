@@ -113,7 +113,7 @@ fn sending_all_defaults_changes_nothing() {
 /// Reads a request as the canonical text of its parameters.
 fn read(pairs: &[(&str, &str)], format: Format) -> Result<String, ParamError> {
     let request = params::parse_with(pairs.iter().copied(), |_| Ok::<_, ParamError>(format))?;
-    Ok(format!("{} {}", params::canonical(&request.job), request.strict))
+    Ok(format!("{} {}", params::canonical(&request.options), request.strict))
 }
 
 #[test]

@@ -6,7 +6,7 @@
 
 use molmesh_surface::SurfaceKind;
 
-use super::Job;
+use super::Options;
 
 /// Version of what precedes a surface: reading, selection, radii. All files and documents depend on it.
 const STRUCTURES: u32 = 1;
@@ -44,9 +44,9 @@ const fn surface(kind: SurfaceKind) -> u32 {
 
 /// Names the versions that determine the file of a job.
 #[must_use]
-pub fn file_versions(job: &Job) -> String {
-    let picture = job.picture.map(|_| format!(" pictures {PICTURES}")).unwrap_or_default();
-    let surface = surface(job.params.surface);
+pub fn file_versions(options: &Options) -> String {
+    let picture = options.picture.map(|_| format!(" pictures {PICTURES}")).unwrap_or_default();
+    let surface = surface(options.params.surface);
     format!("structures {STRUCTURES} surface {surface} meshes {MESHES}{picture}")
 }
 

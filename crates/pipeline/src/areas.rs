@@ -14,7 +14,7 @@ use serde::Serialize;
 pub use self::table::AreaLevel;
 use self::table::Row;
 use super::load::{LoadedStructure, SPHERE_BYTES, load};
-use super::{Job, JobError, LeftOutReport, StageClock};
+use super::{JobError, LeftOutReport, Options, StageClock};
 
 /// Description of the values of `interface`.
 pub const EXPECTED: &str = "the chains of both sides, separated by a comma, such as A,B; several chains of a side are joined by a slash: H/L,A";
@@ -170,17 +170,18 @@ pub enum SelectionMeasures {
 /// Returns the errors of [`super::run`] before meshing.
 pub fn measure_selection(
     structure: &Structure,
-    job: &Job,
+    options: &Options,
     read: &ReadLimits,
     surface: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<MeasuredSelection, JobError> {
-    let LoadedStructure { selected, spheres, .. } = load(|_| Ok(structure), job, read, &StageClock::new(&()), control)?;
-    let (measures, areas) = if let Some(interface) = &job.interface {
-        let (report, areas) = interface.measure(structure, &selected, &spheres, job, surface, control)?;
+    let LoadedStructure { selected, spheres, .. } =
+        load(|_| Ok(structure), options, read, &StageClock::new(&()), control)?;
+    let (measures, areas) = if let Some(interface) = &options.interface {
+        let (report, areas) = interface.measure(structure, &selected, &spheres, options, surface, control)?;
         (SelectionMeasures::Interface(report), areas)
     } else {
-        let (report, areas) = whole(structure, &selected, &spheres, job, surface, control)?;
+        let (report, areas) = whole(structure, &selected, &spheres, options, surface, control)?;
         (SelectionMeasures::Exact(report), areas)
     };
     Ok(MeasuredSelection { left_out: LeftOutReport::new(&selected.left_out), measures, areas })
@@ -191,13 +192,13 @@ pub(super) fn measure(
     structure: &Structure,
     selected: &Selected,
     spheres: &Spheres,
-    job: &Job,
+    options: &Options,
     limits: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<ExactReport, JobError> {
-    let (mut report, _) = whole(structure, selected, spheres, job, limits, control)?;
-    if let Some(interface) = &job.interface {
-        report.interface = Some(interface.measure(structure, selected, spheres, job, limits, control)?.0);
+    let (mut report, _) = whole(structure, selected, spheres, options, limits, control)?;
+    if let Some(interface) = &options.interface {
+        report.interface = Some(interface.measure(structure, selected, spheres, options, limits, control)?.0);
     }
     Ok(report)
 }
@@ -207,12 +208,12 @@ fn whole(
     structure: &Structure,
     selected: &Selected,
     spheres: &Spheres,
-    job: &Job,
+    options: &Options,
     limits: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<(ExactReport, AtomAreas), SurfaceError> {
-    let whole = ExactMeasures::of(spheres, &job.params, limits, control)?;
-    let has_parts = job.params.surface == SurfaceKind::Ses;
+    let whole = ExactMeasures::of(spheres, &options.params, limits, control)?;
+    let has_parts = options.params.surface == SurfaceKind::Ses;
     control.memory.grow(size_of_val(&*selected.atoms) as u64)?;
     let parts = whole.parts();
     let mut report = ExactReport {
@@ -277,7 +278,7 @@ impl Interface {
         structure: &Structure,
         selected: &Selected,
         spheres: &Spheres,
-        job: &Job,
+        options: &Options,
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<(InterfaceReport, AtomAreas), JobError> {
@@ -286,7 +287,7 @@ impl Interface {
         let _memory = control.reserve(2 * (SPHERE_BYTES + 32) * all).map_err(SurfaceError::from)?;
         let [first, second] = self.rows(structure, selected, control)?;
         let of = |rows: &[u32]| -> Result<Vec<AreaParts>, SurfaceError> {
-            Ok(ExactMeasures::of(&spheres.subset(rows), &job.params, limits, control)?.of_spheres)
+            Ok(ExactMeasures::of(&spheres.subset(rows), &options.params, limits, control)?.of_spheres)
         };
         let totals = |areas: &[AreaParts]| areas.iter().map(AreaParts::total).collect();
         let mut alone: Vec<f64> = totals(&of(&first)?);
@@ -301,7 +302,7 @@ impl Interface {
         let sides = [side(0, 0..first.len()), side(1, first.len()..rows.len())];
         let area = round(0.5 * (sides[0].buried + sides[1].buried));
         let atoms = rows.iter().map(|&row| selected.atoms[row as usize]).collect();
-        let has_parts = job.params.surface == SurfaceKind::Ses;
+        let has_parts = options.params.surface == SurfaceKind::Ses;
         Ok((InterfaceReport { area, sides }, AtomAreas { atoms, areas, alone: Some(alone), has_parts }))
     }
 }

@@ -22,7 +22,7 @@ use super::fit::{self, COARSE_FACTOR, MIN_COARSE_SPACING};
 use super::load::{LoadedStructure, load};
 use super::meshing::Meshing;
 use super::work::{self, WorkCounts};
-use super::{Choice, Job, JobError, JobLimits, StageClock};
+use super::{Choice, JobError, JobLimits, Options, StageClock};
 use super::{parts, pockets};
 
 /// Estimated size of a job.
@@ -71,22 +71,22 @@ pub struct MeshEstimate {
 /// Returns a [`JobError`] if reading or selecting fails, or the job is cancelled.
 pub fn estimate<S: Deref<Target = Structure>>(
     read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
-    job: &Job,
+    options: &Options,
     limits: &JobLimits,
     choice: &Choice<'_>,
     control: &Control<'_>,
 ) -> Result<Estimate, JobError> {
-    if let Some(tile) = job.tile {
+    if let Some(tile) = options.tile {
         let (value, expected) = (format!("`{}`", tile.path()), "no value in an estimate".to_owned());
         return Err(SurfaceError::BadParameter { name: "tile", value, expected }.into());
     }
     let clock = StageClock::new(&());
-    let LoadedStructure { structure, selected, spheres } = load(read, job, &limits.read, &clock, control)?;
-    if let Some(coloring) = job.color.as_ref().filter(|coloring| !matches!(coloring.scheme, Scheme::Vertex(_))) {
+    let LoadedStructure { structure, selected, spheres } = load(read, options, &limits.read, &clock, control)?;
+    if let Some(coloring) = options.color.as_ref().filter(|coloring| !matches!(coloring.scheme, Scheme::Vertex(_))) {
         AtomColors::new(&structure, &selected.atoms, coloring)?;
     }
-    let parts = selected.parts(&structure, job.split, &limits.read, control)?;
-    let cut = Cut::of(&selected, parts.as_deref(), None, job.validation, control)?;
+    let parts = selected.parts(&structure, options.split, &limits.read, control)?;
+    let cut = Cut::of(&selected, parts.as_deref(), None, options.validation, control)?;
     let job_backend = choice.backend.for_job();
     let meshing = Meshing {
         backend: job_backend.as_deref().unwrap_or(choice.backend),
@@ -97,29 +97,29 @@ pub fn estimate<S: Deref<Target = Structure>>(
         quality: TriangleQuality::Standard,
         limits: &limits.surface,
     };
-    let max_triangles = job.spacing.max_triangles();
-    let fitted = max_triangles.map(|limit| fit::expected(&meshing, job, limit, control)).transpose();
+    let max_triangles = options.spacing.max_triangles();
+    let fitted = max_triangles.map(|limit| fit::expected(&meshing, options, limit, control)).transpose();
     let spacing = match &fitted {
         Ok(spacing) => *spacing,
         Err(error) => error.exceeded(Limit::Triangles).and_then(|exceeded| exceeded.resolution),
     };
-    let params = job.mesh_params(&spheres, spacing);
-    let plan = MeshPlan { meshing: &meshing, params: &params, compress: job.compress };
+    let params = options.mesh_params(&spheres, spacing);
+    let plan = MeshPlan { meshing: &meshing, params: &params, compress: options.compress };
     let lattices = plan.lattices(control)?;
     let box_cells = lattices.iter().fold(0, |all: u64, lattice| all.saturating_add(lattice.box_cells));
     let resolution = params.resolution;
-    let simplifies = job.simplify.map_or(Ok(()), |wanted| check_error(wanted.error, params.resolution));
-    let pocket_rows = pockets::rows(job, &spheres, &limits.surface, control);
+    let simplifies = options.simplify.map_or(Ok(()), |wanted| check_error(wanted.error, params.resolution));
+    let pocket_rows = pockets::rows(options, &spheres, &limits.surface, control);
     // In the order of the job, the search for pockets comes first.
     let checked = pocket_rows.clone().map(drop).and(simplifies).and(fitted.map(drop));
     let mesh = checked.and_then(|()| plan.mesh(&lattices, control));
     drop(lattices);
     let mesh = mesh.and_then(|mesh| {
         let mesh = max_triangles.map_or(mesh, |limit| mesh.at_most(limit, &params));
-        let with_attributes = |mesh: &MeshEstimate| mesh.bytes + job.attribute_bytes() * mesh.vertices;
+        let with_attributes = |mesh: &MeshEstimate| mesh.bytes + options.attribute_bytes() * mesh.vertices;
         let held = with_attributes(&mesh).saturating_add(plan.compressed_bytes(mesh.vertices));
         control.memory.check(held.saturating_add(plan.bytes_before_cut(&mesh)))?;
-        let mesh = job.max_triangles().map_or(mesh, |limit| mesh.at_most(limit, &params));
+        let mesh = options.max_triangles().map_or(mesh, |limit| mesh.at_most(limit, &params));
         Ok(MeshEstimate { bytes: with_attributes(&mesh), ..mesh })
     });
     let mesh = match mesh {
@@ -135,10 +135,10 @@ pub fn estimate<S: Deref<Target = Structure>>(
 impl Estimate {
     /// Returns the work of the job in atoms at 0.5 Å, if the job would be accepted.
     #[must_use]
-    pub fn work(&self, job: &Job) -> Option<f64> {
+    pub fn work(&self, options: &Options) -> Option<f64> {
         let Self { atoms_in_file: atoms, pocket_rows, .. } = *self;
         let MeshEstimate { grid_points, pairs, whole_vertices: vertices, .. } = *self.mesh.as_ref().ok()?;
-        Some(work::counted_work(job, &WorkCounts { atoms, pairs, grid_points, vertices, pocket_rows }))
+        Some(work::counted_work(options, &WorkCounts { atoms, pairs, grid_points, vertices, pocket_rows }))
     }
 }
 
@@ -156,15 +156,15 @@ impl MeshEstimate {
 ///
 /// # Errors
 /// Returns the errors of the mesh that can be foreseen, and those of the coarser mesh.
-pub(super) fn check_memory(plan: &MeshPlan<'_>, job: &Job, control: &Control<'_>) -> Result<(), SurfaceError> {
+pub(super) fn check_memory(plan: &MeshPlan<'_>, options: &Options, control: &Control<'_>) -> Result<(), SurfaceError> {
     let (memory, params) = (&control.memory, plan.params);
-    let processing = match (job.simplify, job.quality) {
+    let processing = match (options.simplify, options.quality) {
         (Some(_), _) => collapse::TRIANGLE_BYTES,
         (None, TriangleQuality::High) => improve::TRIANGLE_BYTES,
         (None, TriangleQuality::Standard) => 0,
     };
     // A vertex has two triangles.
-    let per_vertex = job.attribute_bytes() + 2 * processing;
+    let per_vertex = options.attribute_bytes() + 2 * processing;
     let attributes =
         |vertices: u64| vertices.saturating_mul(per_vertex).saturating_add(plan.compressed_bytes(vertices));
     let vertices = n_vertices(plan.meshing.spheres.area(params), params.resolution);
@@ -345,10 +345,10 @@ mod tests {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
         for resolution in ["0.3", "0.5", "1", "2"] {
-            let job = params::parse([("resolution", resolution)]).unwrap().job;
+            let options = params::parse([("resolution", resolution)]).unwrap().options;
             let (limits, control) = (JobLimits::default(), Control::default());
-            let estimate = estimate(read, &job, &limits, &choice, &control).unwrap();
-            let report = run(SAMPLE, &job, &limits, &choice, &control, &(), None).unwrap().report;
+            let estimate = estimate(read, &options, &limits, &choice, &control).unwrap();
+            let report = run(SAMPLE, &options, &limits, &choice, &control, &(), None).unwrap().report;
             let mesh = estimate.mesh.unwrap();
             assert_eq!((mesh.grid_points, estimate.atoms), (report.grid_points, report.atoms));
             let ratio = mesh.triangles as f64 / report.triangles as f64;
@@ -361,12 +361,12 @@ mod tests {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
         let of = |pairs: &[(&str, &str)], surface: SurfaceLimits| {
-            let (job, limits) = (params::parse(pairs.iter().copied()).unwrap().job, JobLimits::default());
+            let (options, limits) = (params::parse(pairs.iter().copied()).unwrap().options, JobLimits::default());
             let (limits, control) = (JobLimits { surface, ..limits }, Control::default());
-            let done = run(SAMPLE, &job, &limits, &choice, &control, &(), None).map(drop);
-            let estimate = estimate(read, &job, &limits, &choice, &control).unwrap();
+            let done = run(SAMPLE, &options, &limits, &choice, &control, &(), None).map(drop);
+            let estimate = estimate(read, &options, &limits, &choice, &control).unwrap();
             match (done, &estimate.mesh) {
-                (Ok(()), Ok(_)) => Ok((estimate.pocket_rows, estimate.work(&job).unwrap())),
+                (Ok(()), Ok(_)) => Ok((estimate.pocket_rows, estimate.work(&options).unwrap())),
                 (Err(JobError::Surface(error)), Err(refused)) if error == *refused => Err(error),
                 (done, mesh) => panic!("{done:?} and {mesh:?}"),
             }
@@ -396,8 +396,8 @@ mod tests {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
         let of = |compress: &str| {
-            let job = params::parse([("compress", compress)]).unwrap().job;
-            estimate(read, &job, &JobLimits::default(), &choice, &Control::default()).unwrap().mesh.unwrap()
+            let options = params::parse([("compress", compress)]).unwrap().options;
+            estimate(read, &options, &JobLimits::default(), &choice, &Control::default()).unwrap().mesh.unwrap()
         };
         let (single, rounded) = (of("none"), of("quantize"));
         assert_eq!((single.vertices, single.triangles), (rounded.vertices, rounded.triangles));
@@ -409,10 +409,10 @@ mod tests {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
         let of = |pairs: &[(&str, &str)]| {
-            let job = params::parse(pairs.iter().copied()).unwrap().job;
+            let options = params::parse(pairs.iter().copied()).unwrap().options;
             let (limits, control) = (JobLimits::default(), Control::default());
-            let estimate = estimate(read, &job, &limits, &choice, &control).unwrap().mesh.unwrap();
-            let product = run(SAMPLE, &job, &limits, &choice, &control, &(), None).unwrap();
+            let estimate = estimate(read, &options, &limits, &choice, &control).unwrap().mesh.unwrap();
+            let product = run(SAMPLE, &options, &limits, &choice, &control, &(), None).unwrap();
             let bytes = product.file(molmesh_formats::Format::Glb).unwrap().bytes().unwrap();
             // The number of vertices is an estimate. At this spacing, indices have 32 bits, as in memory.
             let ratio = bytes as f64 / estimate.bytes as f64;
@@ -432,13 +432,13 @@ mod tests {
         let choice = Choice { backend: &backend, reason: "" };
         let refused = |surface: &str, resolution: f64, limits: SurfaceLimits| {
             let text = resolution.to_string();
-            let job = params::parse([("surface", surface), ("resolution", text.as_str())]).unwrap().job;
+            let options = params::parse([("surface", surface), ("resolution", text.as_str())]).unwrap().options;
             let (limits, control) = (JobLimits { surface: limits, ..JobLimits::default() }, Control::default());
-            let error = match run(SAMPLE, &job, &limits, &choice, &control, &(), None).err()? {
+            let error = match run(SAMPLE, &options, &limits, &choice, &control, &(), None).err()? {
                 JobError::Surface(error) => error,
                 error => panic!("{error}"),
             };
-            Some((error, estimate(read, &job, &limits, &choice, &control).unwrap().mesh.err()))
+            Some((error, estimate(read, &options, &limits, &choice, &control).unwrap().mesh.err()))
         };
         let suggestion = |error: &SurfaceError| match error {
             SurfaceError::Limit(exceeded) => exceeded.suggested_resolution,
@@ -486,10 +486,10 @@ mod tests {
         let choice = Choice { backend: &backend, reason: "" };
         let small = SurfaceLimits { max_mesh_bytes: 100_000, ..SurfaceLimits::default() };
         let limits = JobLimits { surface: small, ..JobLimits::default() };
-        let refused = estimate(read, &Job::default(), &limits, &choice, &Control::default()).unwrap();
+        let refused = estimate(read, &Options::default(), &limits, &choice, &Control::default()).unwrap();
         let error = refused.mesh.unwrap_err();
         let text = error.exceeded(Limit::MeshBytes).unwrap().suggested_resolution.unwrap().to_string();
-        let job = params::parse([("resolution", text.as_str())]).unwrap().job;
-        assert!(estimate(read, &job, &limits, &choice, &Control::default()).unwrap().mesh.is_ok());
+        let options = params::parse([("resolution", text.as_str())]).unwrap().options;
+        assert!(estimate(read, &options, &limits, &choice, &Control::default()).unwrap().mesh.is_ok());
     }
 }

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use molmesh_formats::{Compress, CompressedGlb, Encoder, Format, FormatError, Meta, Pieces, Storage};
 use molmesh_surface::{Mesh, SurfaceError};
 
-use super::{Job, JobError, Report, Scope};
+use super::{JobError, Options, Report, Scope};
 
 /// Finished job.
 #[derive(Debug, Clone)]
@@ -64,8 +64,8 @@ impl Product {
     }
 
     /// Compresses the mesh and drops its columns if the job asks for it. Checks for cancellation between pieces.
-    pub(super) fn compress(&mut self, job: &Job, Scope { clock, control }: &Scope<'_>) -> Result<(), JobError> {
-        if job.compress != Compress::Meshopt {
+    pub(super) fn compress(&mut self, options: &Options, Scope { clock, control }: &Scope<'_>) -> Result<(), JobError> {
+        if options.compress != Compress::Meshopt {
             return Ok(());
         }
         let Self { mesh, storage, bounds, .. } = self;
@@ -143,9 +143,10 @@ mod tests {
             &[("split", "residue-group"), ("select", "all"), ("compress", "quantize")],
         ];
         for pairs in cases {
-            let job = params::parse(pairs.iter().copied()).unwrap().job;
+            let options = params::parse(pairs.iter().copied()).unwrap().options;
             let sample = include_bytes!("../../../samples/4pti.pdb");
-            let product = run(sample, &job, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
+            let product =
+                run(sample, &options, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
             let [low, high] = product.bounds.unwrap();
             assert_eq!([low, high], product.mesh.bounds(), "{pairs:?}");
             for part in &product.mesh.parts {

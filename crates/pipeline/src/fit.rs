@@ -14,7 +14,7 @@ use molmesh_surface::{
 use super::clock::Scope;
 use super::meshing::Meshing;
 use super::spacing::{COARSEST, FINEST, Spacing};
-use super::{Job, JobMesh};
+use super::{JobMesh, Options};
 
 /// Maximum number of meshes, including the first coarse one and a repetition of the best one.
 const MAX_TRIES: u32 = 8;
@@ -162,12 +162,12 @@ fn rounded(spacing: f64) -> f64 {
 /// has a surface, or another error of meshing.
 pub(super) fn mesh(
     meshing: &Meshing<'_>,
-    job: &Job,
+    options: &Options,
     limit: u64,
     Scope { clock, control }: &Scope<'_>,
 ) -> Result<JobMesh, SurfaceError> {
     let n_atoms = meshing.spheres.len();
-    let mut search = Search::new(limit, &job.params, n_atoms);
+    let mut search = Search::new(limit, &options.params, n_atoms);
     // The last mesh with its memory.
     let mut last: Option<(JobMesh, Arc<Reservation>)> = None;
     // Name of the backend that computed the meshes.
@@ -185,11 +185,11 @@ pub(super) fn mesh(
                     None => (spacing, true),
                 }
             }
-            Next::Fail { resolution, triangles } => return Err(no_fit(job, limit, resolution, triangles)),
+            Next::Fail { resolution, triangles } => return Err(no_fit(options, limit, resolution, triangles)),
         };
         // Hold only one mesh at a time.
         last = None;
-        let params = job.mesh_params(meshing.spheres, Some(spacing));
+        let params = options.mesh_params(meshing.spheres, Some(spacing));
         let without_progress = WithoutProgress(*clock);
         let observer: &dyn Observer = if search.tries() == 0 { &without_progress } else { *clock };
         let memory = Arc::new(Reservation::new(&control.memory));
@@ -204,7 +204,7 @@ pub(super) fn mesh(
                     why: "different backends ran during the search for the grid spacing".into(),
                 });
             }
-            (search, made_by) = (Search::new(limit, &job.params, n_atoms), None);
+            (search, made_by) = (Search::new(limit, &options.params, n_atoms), None);
             continue;
         }
         made_by = by.or(made_by);
@@ -230,20 +230,20 @@ pub(super) fn mesh(
 /// Returns the errors of [`mesh`].
 pub(super) fn expected(
     meshing: &Meshing<'_>,
-    job: &Job,
+    options: &Options,
     limit: u64,
     control: &Control<'_>,
 ) -> Result<f64, SurfaceError> {
-    let mut search = Search::new(limit, &job.params, meshing.spheres.len());
+    let mut search = Search::new(limit, &options.params, meshing.spheres.len());
     loop {
         match search.next() {
             Next::Try(spacing) if !search.has_fit() => {
-                let params = SurfaceParams { resolution: spacing, atom_ids: false, ..job.params.clone() };
+                let params = SurfaceParams { resolution: spacing, atom_ids: false, ..options.params.clone() };
                 let made = unless_empty(meshing.mesh(&params, control))?;
                 search.record(spacing, made.map(|m| m.mesh.n_triangles() as u64));
             }
             Next::Try(spacing) | Next::Use(spacing) => return Ok(spacing),
-            Next::Fail { resolution, triangles } => return Err(no_fit(job, limit, resolution, triangles)),
+            Next::Fail { resolution, triangles } => return Err(no_fit(options, limit, resolution, triangles)),
         }
     }
 }
@@ -257,10 +257,10 @@ fn unless_empty(made: Result<MeshOutput, SurfaceError>) -> Result<Option<MeshOut
 }
 
 /// Returns the error for a search without a result.
-fn no_fit(job: &Job, limit: u64, resolution: f64, triangles: u64) -> SurfaceError {
+fn no_fit(options: &Options, limit: u64, resolution: f64, triangles: u64) -> SurfaceError {
     match triangles {
-        0 if job.selection.context == Context::Whole => SurfaceError::NoPatch,
-        0 => SurfaceError::NoSurface { isovalue: job.params.level() },
+        0 if options.selection.context == Context::Whole => SurfaceError::NoPatch,
+        0 => SurfaceError::NoSurface { isovalue: options.params.level() },
         _ => {
             let subject = "at the coarsest spacing, the mesh".into();
             let error = Exceeded { subject, actual: Some(triangles), ..Exceeded::new(Limit::Triangles, limit) };

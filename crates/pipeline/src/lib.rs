@@ -79,7 +79,7 @@ use tileset::{AssemblyTileset, Tileset};
 
 /// Parameters of a job: selection, surface, and storage of the mesh.
 #[derive(Debug, Clone, Default)]
-pub struct Job {
+pub struct Options {
     /// Selection of atoms.
     pub selection: Selection,
     /// Parameters of the surface. The resolution applies if `spacing` is [`Spacing::Given`].
@@ -118,7 +118,7 @@ pub struct Job {
     pub interface: Option<Interface>,
 }
 
-impl Job {
+impl Options {
     /// Checks the size of the picture, and that there is a map if and only if the colours need one, before any other
     /// work.
     ///
@@ -231,7 +231,7 @@ pub struct Choice<'a> {
 /// Returns a [`JobError`]; with [`SurfaceError::Sink`] if `sink` failed.
 pub fn run(
     bytes: &[u8],
-    job: &Job,
+    options: &Options,
     limits: &JobLimits,
     choice: &Choice<'_>,
     control: &Control<'_>,
@@ -239,7 +239,7 @@ pub fn run(
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
     let read = |control: &Control<'_>| molmesh_structure::read_with(bytes, &limits.read, control).map(Box::new);
-    run_with(read, job, limits, choice, control, progress, sink)
+    run_with(read, options, limits, choice, control, progress, sink)
 }
 
 /// Runs a job as [`run`] does, on the structure that `read` returns.
@@ -248,42 +248,42 @@ pub fn run(
 /// Returns the errors of [`run`].
 pub fn run_with<S: Deref<Target = Structure>>(
     read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
-    job: &Job,
+    options: &Options,
     limits: &JobLimits,
     choice: &Choice<'_>,
     control: &Control<'_>,
     progress: &dyn ProgressSink,
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
-    job.check(limits)?;
+    options.check(limits)?;
     let clock = StageClock::new(progress);
     let scope = Scope::new(&clock, control);
-    if job.tile.is_none() {
-        let loaded = load(read, job, &limits.read, &clock, &scope.control)?;
-        return run_loaded(loaded, job, limits, choice, &scope, sink);
+    if options.tile.is_none() {
+        let loaded = load(read, options, &limits.read, &clock, &scope.control)?;
+        return run_loaded(loaded, options, limits, choice, &scope, sink);
     }
-    if job.selection.instances {
-        let assembly = AssemblyTileset::new(read, job, &limits.read, control, &clock)?;
-        return assembly.root(job, limits, choice, control, progress);
+    if options.selection.instances {
+        let assembly = AssemblyTileset::new(read, options, &limits.read, control, &clock)?;
+        return assembly.root(options, limits, choice, control, progress);
     }
-    let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
-    let colors = job.color.map(|coloring| tileset.colors(coloring, control)).transpose()?;
-    tileset.product((job, colors.as_ref()), choice, &limits.surface, &scope)
+    let tileset = Tileset::new(read, options, &limits.read, control, &clock)?;
+    let colors = options.color.map(|coloring| tileset.colors(coloring, control)).transpose()?;
+    tileset.product((options, colors.as_ref()), choice, &limits.surface, &scope)
 }
 
 /// Runs a job on selected spheres of a structure.
 fn run_loaded<S: Deref<Target = Structure>>(
     loaded: LoadedStructure<S>,
-    job: &Job,
+    options: &Options,
     limits: &JobLimits,
     choice: &Choice<'_>,
     scope: &Scope<'_>,
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
-    let PreparedJob { colors, exact, pockets, parts } = prepare(&loaded, job, limits, scope)?;
+    let PreparedJob { colors, exact, pockets, parts } = prepare(&loaded, options, limits, scope)?;
     let LoadedStructure { structure, selected, spheres } = loaded;
-    let of_pockets = pockets.as_ref().filter(|_| job.split == Split::Pocket);
-    let cut = Cut::of(&selected, parts.as_deref(), of_pockets, job.validation, &scope.control)?;
+    let of_pockets = pockets.as_ref().filter(|_| options.split == Split::Pocket);
+    let cut = Cut::of(&selected, parts.as_deref(), of_pockets, options.validation, &scope.control)?;
     let job_backend = choice.backend.for_job();
     let choice = Choice { backend: job_backend.as_deref().unwrap_or(choice.backend), ..*choice };
     let meshing = Meshing {
@@ -291,29 +291,29 @@ fn run_loaded<S: Deref<Target = Structure>>(
         spheres: &spheres,
         parts: parts.as_deref().filter(|_| cut.is_none()),
         cut: cut.as_ref(),
-        quality: job.quality,
+        quality: options.quality,
         limits: &limits.surface,
     };
-    let sink = sink.filter(|_| job.can_stream());
-    let mut job_mesh = mesh(&meshing, job, scope, sink)?;
-    let steps = Steps { job, selected: &selected, pockets: pockets.as_ref(), meshing: &meshing };
+    let sink = sink.filter(|_| options.can_stream());
+    let mut job_mesh = mesh(&meshing, options, scope, sink)?;
+    let steps = Steps { options, selected: &selected, pockets: pockets.as_ref(), meshing: &meshing };
     let results = steps.apply(&mut job_mesh, colors, scope)?;
     let JobMesh { output, params, tries } = job_mesh;
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mesh, streamed, grid, bounds, made_by, .. } = output;
-    let (resolution, centre, storage) = (params.resolution, mesh.centre, job.storage(params.quantize));
+    let (resolution, centre, storage) = (params.resolution, mesh.centre, options.storage(params.quantize));
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, cut: mesh.cut, made_by, storage };
     let times = scope.clock.finish();
-    let mut report = Report::new(&structure, &selected, job, &choice, &counts, &results.measures, times);
+    let mut report = Report::new(&structure, &selected, options, &choice, &counts, &results.measures, times);
     (report.color, report.exact, report.simplification, report.triangle_shapes) =
         (results.color, exact, results.simplification, results.shapes);
     report.set_cavities(results.cavities.as_ref(), &structure, &selected);
     report.set_pockets(pockets.as_ref(), &structure, &selected);
-    report.models = parts.as_ref().filter(|_| job.split == Split::Model).map(|parts| parts.len() as u64);
+    report.models = parts.as_ref().filter(|_| options.split == Split::Model).map(|parts| parts.len() as u64);
     report.instances = InstancesReport::new(&selected.units, &mesh);
     report.parts = PartReport::all(parts.as_deref().unwrap_or_default(), &mesh);
     let mut product = Product { bounds, ..Product::new(mesh, storage, report) };
-    product.compress(job, scope)?;
+    product.compress(options, scope)?;
     if let (Some(sink), Some(streamed)) = (sink, streamed) {
         let finish = || sink.finish(&product.meta(), centre, streamed.bounds);
         let bytes = scope.clock.time("encode", finish).map_err(|SinkFailed| SurfaceError::Sink)?;
@@ -326,43 +326,43 @@ fn run_loaded<S: Deref<Target = Structure>>(
 /// Does the work that needs no mesh.
 fn prepare<S: Deref<Target = Structure>>(
     LoadedStructure { structure, selected, spheres }: &LoadedStructure<S>,
-    job: &Job,
+    options: &Options,
     limits: &JobLimits,
     scope: &Scope<'_>,
 ) -> Result<PreparedJob, JobError> {
     let Scope { clock, control } = scope;
     let read_map = |file: &MapFile| clock.time("read", || file.read(&limits.map, control));
-    let map = job.map.as_ref().map(read_map).transpose()?;
+    let map = options.map.as_ref().map(read_map).transpose()?;
     let colors = |coloring| MeshColors::new(structure, &selected.atoms, coloring, map, control);
-    let colors = job.color.map(colors).transpose()?;
-    let measure = || areas::measure(structure, selected, spheres, job, &limits.surface, control);
-    let exact = job.exact.then(|| clock.time("exact", measure)).transpose()?;
-    let pockets = pockets::search(job, spheres, &limits.surface, scope)?;
-    let of_pockets = pockets.as_ref().filter(|_| job.split == Split::Pocket);
-    let parts = pockets::parts(of_pockets, structure, selected, job.split, &limits.read, control)?;
+    let colors = options.color.map(colors).transpose()?;
+    let measure = || areas::measure(structure, selected, spheres, options, &limits.surface, control);
+    let exact = options.exact.then(|| clock.time("exact", measure)).transpose()?;
+    let pockets = pockets::search(options, spheres, &limits.surface, scope)?;
+    let of_pockets = pockets.as_ref().filter(|_| options.split == Split::Pocket);
+    let parts = pockets::parts(of_pockets, structure, selected, options.split, &limits.read, control)?;
     Ok(PreparedJob { colors, exact, pockets, parts })
 }
 
 /// Meshes the spheres of `meshing`, in memory or into `sink`.
 fn mesh(
     meshing: &Meshing<'_>,
-    job: &Job,
+    options: &Options,
     scope: &Scope<'_>,
     sink: Option<&GlbSink<'_>>,
 ) -> Result<JobMesh, SurfaceError> {
-    if let Spacing::MaxTriangles(limit) = job.spacing {
-        return fit::mesh(meshing, job, limit, scope);
+    if let Spacing::MaxTriangles(limit) = options.spacing {
+        return fit::mesh(meshing, options, limit, scope);
     }
     let Scope { clock, control } = scope;
-    let params = job.mesh_params(meshing.spheres, None);
-    let plan = MeshPlan { meshing, params: &params, compress: job.compress };
-    let before_simplifying = simplify::params_of_input(job, &params)?;
+    let params = options.mesh_params(meshing.spheres, None);
+    let plan = MeshPlan { meshing, params: &params, compress: options.compress };
+    let before_simplifying = simplify::params_of_input(options, &params)?;
     let written = if let Some(sink) = sink {
-        sink.set_storage(job.storage(params.quantize));
+        sink.set_storage(options.storage(params.quantize));
         let Meshing { backend, spheres, limits, .. } = *meshing;
         clock.pass(|| backend.write(spheres, &params, limits, control, Some(sink)))
     } else {
-        estimate::check_memory(&plan, job, control)?;
+        estimate::check_memory(&plan, options, control)?;
         clock.pass(|| meshing.mesh(&before_simplifying, control))
     };
     let output = written.map_err(|error| plan.run_error(error, control))?;

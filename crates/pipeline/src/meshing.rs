@@ -129,12 +129,12 @@ mod tests {
 
     #[test]
     fn all_parts_come_from_one_backend() {
-        let job = params::parse([("split", "residue-group"), ("select", "all")]).unwrap().job;
+        let options = params::parse([("split", "residue-group"), ("select", "all")]).unwrap().options;
         for (n_meshes, expected) in [(100, ("gpu", false, true)), (1, ("cpu", true, true))] {
             let auto = AutoBackend::new(Box::new(CpuBackend::default()), Box::new(FailingGpu(n_meshes.into())));
             let (choice, control) = (Choice { backend: &auto, reason: "" }, Control::default());
             let sample = include_bytes!("../../../samples/4pti.pdb");
-            let report = run(sample, &job, &JobLimits::default(), &choice, &control, &(), None).unwrap().report;
+            let report = run(sample, &options, &JobLimits::default(), &choice, &control, &(), None).unwrap().report;
             assert_eq!((report.backend, report.fallback.is_some(), report.parts.len() > 1), expected);
         }
     }

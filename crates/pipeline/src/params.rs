@@ -24,7 +24,7 @@ pub use table::{Parameter, TABLE, usual_range};
 use values::ParsedValues;
 
 use super::nearest::nearest;
-use super::{Cavities, Interface, Job, Simplify, tileset};
+use super::{Cavities, Interface, Options, Simplify, tileset};
 
 /// Errors of parsing parameters.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -86,7 +86,7 @@ impl ParamError {
 #[derive(Debug, Clone, Default)]
 pub struct Request {
     /// The job.
-    pub job: Job,
+    pub options: Options,
     /// Format of the file.
     pub format: Format,
     /// True if strict validation of the file is requested.
@@ -100,8 +100,8 @@ pub struct Request {
 /// Returns a [`ParamError`] for the first parameter that is unknown, repeated, malformed, out of range, or in conflict
 /// with another one or with the format.
 pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V)>) -> Result<Request, ParamError> {
-    let is_picture = |job: &Job| job.picture.is_some_and(|picture| picture != PictureParams::default());
-    parse_with(pairs, |job| Ok(if is_picture(job) { Format::Png } else { Format::default() }))
+    let is_picture = |options: &Options| options.picture.is_some_and(|picture| picture != PictureParams::default());
+    parse_with(pairs, |options| Ok(if is_picture(options) { Format::Png } else { Format::default() }))
 }
 
 /// Parses parameters like [`parse`], with the format that `format` returns for a job without this parameter.
@@ -110,12 +110,12 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
 /// Returns the errors of [`parse`] and of `format`.
 pub fn parse_with<N: AsRef<str>, V: AsRef<str>, E: From<ParamError>>(
     pairs: impl IntoIterator<Item = (N, V)>,
-    format: impl FnOnce(&Job) -> Result<Format, E>,
+    format: impl FnOnce(&Options) -> Result<Format, E>,
 ) -> Result<Request, E> {
     let mut values = parse_values(pairs)?;
-    let format = values.format.map_or_else(|| format(&values.job), Ok)?;
-    set_format(&mut values.job, format)?;
-    Ok(Request { job: values.job, format, strict: values.strict })
+    let format = values.format.map_or_else(|| format(&values.options), Ok)?;
+    set_format(&mut values.options, format)?;
+    Ok(Request { options: values.options, format, strict: values.strict })
 }
 
 /// Parses parameters and checks them, apart from the format.
@@ -151,26 +151,26 @@ fn parse_values<N: AsRef<str>, V: AsRef<str>>(
     if let [(other, _), (name, value), ..] = &spacings[..] {
         return Err(contradiction(name, value, other));
     }
-    values.job.color = values.coloring()?;
-    values.job.pockets = values.pockets()?;
+    values.options.color = values.coloring()?;
+    values.options.pockets = values.pockets()?;
     values.divide_models()?;
-    values.job.params = SurfaceParams::new(&values.options)?;
-    let job = &values.job;
-    check_instances(job)?;
-    check_cavities(job)?;
-    check_pockets(job)?;
-    check_exact(job)?;
-    check_simplify(job)?;
-    if job.tile.is_some() {
-        tileset::check(job)?;
+    values.options.params = SurfaceParams::new(&values.surface)?;
+    let options = &values.options;
+    check_instances(options)?;
+    check_cavities(options)?;
+    check_pockets(options)?;
+    check_exact(options)?;
+    check_simplify(options)?;
+    if options.tile.is_some() {
+        tileset::check(options)?;
     }
     Ok(values)
 }
 
 /// Rejects a unit without an assembly, and instances without one, with one unit, or with a surface that is divided or
 /// joined otherwise.
-fn check_instances(job: &Job) -> Result<(), ParamError> {
-    let Selection { assembly, context, instances, unit, .. } = &job.selection;
+fn check_instances(options: &Options) -> Result<(), ParamError> {
+    let Selection { assembly, context, instances, unit, .. } = &options.selection;
     let unfit = match (assembly, context) {
         (None, _) => Some("no value without assembly".to_owned()),
         (_, Context::Whole) => Some(format!("no value with context={}", context.name())),
@@ -179,9 +179,9 @@ fn check_instances(job: &Job) -> Result<(), ParamError> {
     if let (Some(unfit), Some(unit)) = (unfit, unit) {
         return Err(ParamError::BadValue { name: "unit", value: format!("`{unit}`"), expected: unfit });
     }
-    let expected = match (assembly, context, job.split) {
+    let expected = match (assembly, context, options.split) {
         _ if unit.is_some() => "false with a value of unit".to_owned(),
-        _ if job.tile.is_some_and(|tile| tile != TileAddress::ROOT) => {
+        _ if options.tile.is_some_and(|tile| tile != TileAddress::ROOT) => {
             "false for a tile below the root: it belongs to one unit".to_owned()
         }
         (None, ..) => "false for the asymmetric unit, or a value of assembly".to_owned(),
@@ -197,11 +197,11 @@ fn check_instances(job: &Job) -> Result<(), ParamError> {
 
 /// Rejects cavities of a surface that is divided or repeated: they are found for all selected atoms together. Exact
 /// measures include the walls that `drop` and `only` remove from the mesh.
-fn check_cavities(job: &Job) -> Result<(), ParamError> {
-    let Some(cavities) = job.cavities else { return Ok(()) };
-    let expected = match divided_by(job.split, &job.selection) {
+fn check_cavities(options: &Options) -> Result<(), ParamError> {
+    let Some(cavities) = options.cavities else { return Ok(()) };
+    let expected = match divided_by(options.split, &options.selection) {
         Some(divided) => format!("no value with {divided}"),
-        None if job.exact && cavities != Cavities::Keep => "keep, or no value, with exact=true".to_owned(),
+        None if options.exact && cavities != Cavities::Keep => "keep, or no value, with exact=true".to_owned(),
         None => return Ok(()),
     };
     Err(ParamError::BadValue { name: "cavities", value: format!("`{}`", cavities.name()), expected })
@@ -209,12 +209,12 @@ fn check_cavities(job: &Job) -> Result<(), ParamError> {
 
 /// Rejects pockets of a surface that is divided or repeated: they are found for all selected atoms together. The large
 /// probe must be larger than the other one.
-fn check_pockets(job: &Job) -> Result<(), ParamError> {
-    let Some(large) = job.pockets else { return Ok(()) };
-    let splits = job.split == Split::Pocket;
-    let split = if splits { Split::None } else { job.split };
-    if let Some(divided) = divided_by(split, &job.selection) {
-        let coloured = job.color.is_some_and(|color| color.scheme.needs_pockets());
+fn check_pockets(options: &Options) -> Result<(), ParamError> {
+    let Some(large) = options.pockets else { return Ok(()) };
+    let splits = options.split == Split::Pocket;
+    let split = if splits { Split::None } else { options.split };
+    if let Some(divided) = divided_by(split, &options.selection) {
+        let coloured = options.color.is_some_and(|color| color.scheme.needs_pockets());
         let (name, value, otherwise) = match (splits, coloured) {
             (true, _) => ("split", "pocket", "another value"),
             (false, true) => ("color", "pocket", "another value"),
@@ -222,7 +222,7 @@ fn check_pockets(job: &Job) -> Result<(), ParamError> {
         };
         return Err(ParamError::bad_value(name, value, format!("{otherwise} with {divided}")));
     }
-    let probe = job.params.probe;
+    let probe = options.params.probe;
     if probe < POCKET_SPACING {
         let expected = format!("at least {POCKET_SPACING} Å with pockets, the spacing of their grid");
         return Err(ParamError::bad_value("probe", &probe.to_string(), expected));
@@ -245,10 +245,10 @@ fn divided_by(split: Split, Selection { context, instances, .. }: &Selection) ->
 
 /// Rejects the simplification of improved triangles, and of one surface that is divided into parts: vertices on borders
 /// are stored once per part, so the check for common edges would not find those of two parts.
-fn check_simplify(job: &Job) -> Result<(), ParamError> {
-    let Some(Simplify { error, .. }) = job.simplify else { return Ok(()) };
-    let expected = match (job.split, job.selection.context) {
-        _ if job.quality == TriangleQuality::High => "no value with quality=high, whose triangles it would replace",
+fn check_simplify(options: &Options) -> Result<(), ParamError> {
+    let Some(Simplify { error, .. }) = options.simplify else { return Ok(()) };
+    let expected = match (options.split, options.selection.context) {
+        _ if options.quality == TriangleQuality::High => "no value with quality=high, whose triangles it would replace",
         (Split::Pocket, _) => "no value with split=pocket, which divides one surface",
         (split, Context::Whole) if split != Split::None => {
             "no value with split and context=whole, which divide one surface"
@@ -259,8 +259,8 @@ fn check_simplify(job: &Job) -> Result<(), ParamError> {
 }
 
 /// Rejects exact areas of a surface that has none, or that is divided or cut.
-fn check_exact(job: &Job) -> Result<(), ParamError> {
-    let Job { params, selection, split, exact, interface, .. } = job;
+fn check_exact(options: &Options) -> Result<(), ParamError> {
+    let Options { params, selection, split, exact, interface, .. } = options;
     if !exact {
         let refuse = |interface: &Interface| {
             Err(ParamError::bad_value("interface", &interface.to_string(), "exact=true beside it"))
@@ -293,7 +293,7 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
 
 /// Sets the format of a job, and rejects parameters that it does not support. A picture format adds picture parameters,
 /// a format with the nearest atom of each vertex sets `atom_ids`.
-fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
+fn set_format(options: &mut Options, format: Format) -> Result<(), ParamError> {
     let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
         let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::name).collect();
         Err(ParamError::BadValue {
@@ -302,29 +302,29 @@ fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
             expected: format!("{instead} for {format}, or one of the formats {}", formats.join(", ")),
         })
     };
-    if !job.compress.is_held_by(format) {
+    if !options.compress.is_held_by(format) {
         let instead: Vec<_> = Compress::ALL.into_iter().filter(|c| c.is_held_by(format)).map(Compress::name).collect();
-        return refuse("compress", job.compress.name(), &instead.join(", "), &|f| job.compress.is_held_by(f));
+        return refuse("compress", options.compress.name(), &instead.join(", "), &|f| options.compress.is_held_by(f));
     }
-    if !format.holds_units(job.units) {
+    if !format.holds_units(options.units) {
         let instead: Vec<_> = Units::ALL.into_iter().filter(|u| format.holds_units(*u)).map(Units::name).collect();
-        return refuse("units", job.units.name(), &instead.join(", "), &|f| f.holds_units(job.units));
+        return refuse("units", options.units.name(), &instead.join(", "), &|f| f.holds_units(options.units));
     }
-    if job.selection.instances && !format.holds_instances() {
+    if options.selection.instances && !format.holds_instances() {
         return refuse("instances", "true", "false", &|f| f.holds_instances());
     }
-    if job.normals == Normals::None && format.is_picture() {
-        return refuse("normals", job.normals.name(), Normals::Smooth.name(), &|f| !f.is_picture());
+    if options.normals == Normals::None && format.is_picture() {
+        return refuse("normals", options.normals.name(), Normals::Smooth.name(), &|f| !f.is_picture());
     }
-    job.params.atom_ids |= format.needs_atom_ids();
-    if let Some(tile) = job.tile.filter(|_| format.is_picture()) {
+    options.params.atom_ids |= format.needs_atom_ids();
+    if let Some(tile) = options.tile.filter(|_| format.is_picture()) {
         return refuse("tile", &tile.path(), "no value", &|f| !f.is_picture());
     }
     if format.is_picture() {
-        job.picture.get_or_insert_default();
+        options.picture.get_or_insert_default();
         return Ok(());
     }
-    let Some(picture) = job.picture.take() else { return Ok(()) };
+    let Some(picture) = options.picture.take() else { return Ok(()) };
     // The first parameter that differs from its default; a mesh ignores the defaults.
     let (given, plain) = (picture.canonical(), PictureParams::default().canonical());
     let differs = given.split('&').zip(plain.split('&')).find(|(given, plain)| given != plain);
@@ -368,13 +368,13 @@ mod tests {
         assert_eq!(parsed(&[("color", "chain")]).format, Format::Glb);
         assert_eq!(parsed(&[("background", "transparent")]).format, Format::Glb);
         let picture = parsed(&[("width", "40")]);
-        assert_eq!((picture.format, picture.job.picture.map(|picture| picture.width)), (Format::Png, Some(40)));
+        assert_eq!((picture.format, picture.options.picture.map(|picture| picture.width)), (Format::Png, Some(40)));
         let stl = |pairs: &[(&'static str, &'static str)]| {
             parse_with(pairs.iter().copied(), |_| Ok::<_, ParamError>(Format::Stl))
         };
         assert_eq!(stl(&[]).unwrap().format, Format::Stl);
         assert_eq!(stl(&[("format", "vert")]).unwrap().format, Format::Vert);
-        assert!(stl(&[("format", "vert")]).unwrap().job.params.atom_ids);
+        assert!(stl(&[("format", "vert")]).unwrap().options.params.atom_ids);
         assert_eq!(stl(&[("width", "40")]).unwrap_err().parameter(), "width");
     }
 }

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::clock::Scope;
-use super::{Job, LiningResidue, Report};
+use super::{LiningResidue, Options, Report};
 
 /// Pocket: a region outside the molecule that the probe can enter and a large probe cannot. It does not depend on the
 /// mesh and the type of the surface.
@@ -44,7 +44,7 @@ impl PocketReport {
     }
 }
 
-impl Job {
+impl Options {
     /// Returns the radius of the large probe, Å, if the job lists pockets, colours them or makes parts of them.
     pub(super) fn pocket_probe(&self) -> Option<f64> {
         let needed = self.split == Split::Pocket || self.color.is_some_and(|color| color.scheme.needs_pockets());
@@ -57,13 +57,13 @@ impl Job {
 /// # Errors
 /// Returns the errors of [`find`].
 pub(super) fn search(
-    job: &Job,
+    options: &Options,
     spheres: &Spheres,
     limits: &SurfaceLimits,
     Scope { clock, control }: &Scope<'_>,
 ) -> Result<Option<Pockets>, SurfaceError> {
-    let search = |probe| clock.time("pockets", || find(spheres, &job.params, probe, limits, control));
-    job.pocket_probe().map(search).transpose()
+    let search = |probe| clock.time("pockets", || find(spheres, &options.params, probe, limits, control));
+    options.pocket_probe().map(search).transpose()
 }
 
 /// Counts the rows of grid points that [`search`] passes over; 0 if the job needs no pockets.
@@ -71,12 +71,12 @@ pub(super) fn search(
 /// # Errors
 /// Returns the errors of [`count_rows`].
 pub(super) fn rows(
-    job: &Job,
+    options: &Options,
     spheres: &Spheres,
     limits: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<u64, SurfaceError> {
-    job.pocket_probe().map_or(Ok(0), |probe| count_rows(spheres, &job.params, probe, limits, control))
+    options.pocket_probe().map_or(Ok(0), |probe| count_rows(spheres, &options.params, probe, limits, control))
 }
 
 /// Returns the index of the pocket that each vertex lines; `None` for vertices that line no pocket.

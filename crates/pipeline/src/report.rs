@@ -16,7 +16,7 @@ use super::parts::PartReport;
 use super::pockets::PocketReport;
 use super::shapes::TriangleReport;
 use super::simplify::SimplificationReport;
-use super::{Choice, Job, StageClock};
+use super::{Choice, Options, StageClock};
 
 /// Quantization of the vertices in the file.
 #[derive(Debug, Clone, Copy, Serialize, utoipa::ToSchema)]
@@ -250,13 +250,13 @@ impl Report {
     pub(super) fn new(
         structure: &Structure,
         selected: &Selected,
-        job: &Job,
+        options: &Options,
         choice: &Choice<'_>,
         counts: &Counts,
         measures: &Measures,
         timings: Vec<(&'static str, f64)>,
     ) -> Self {
-        let params = &job.params;
+        let params = &options.params;
         let gaussian = params.surface == SurfaceKind::Gaussian && params.paper.is_none();
         let made_by = counts.made_by.clone().unwrap_or_else(|| choice.backend.identity());
         let is_open = counts.cut && !measures.closed;
@@ -272,7 +272,7 @@ impl Report {
             atoms_in_file: structure.n_in_file(),
             model: selected.model,
             models: None,
-            assembly: AssemblyReport::new(&job.selection, selected),
+            assembly: AssemblyReport::new(&options.selection, selected),
             instances: None,
             left_out: LeftOutReport::new(&selected.left_out),
             warnings: structure.warnings.clone(),
@@ -281,9 +281,9 @@ impl Report {
             probe: params.used_probe(),
             preset: params.preset.name(),
             resolution: counts.resolution,
-            resolution_from: job.spacing.parameter(),
-            detail: job.spacing.detail(),
-            max_triangles: job.max_triangles(),
+            resolution_from: options.spacing.parameter(),
+            detail: options.spacing.detail(),
+            max_triangles: options.max_triangles(),
             tries: counts.tries,
             isovalue: params.level(),
             smoothness: gaussian.then_some(params.smoothness),
@@ -316,7 +316,7 @@ impl Report {
             component_list: components.iter().take(100).map(|c| ComponentReport::new(c, is_open)).collect(),
             parts: Vec::new(),
             area: measures.area,
-            area_deficit_percent: area_deficit_percent(structure, job, counts),
+            area_deficit_percent: area_deficit_percent(structure, options, counts),
             volume: (!is_open).then_some(measures.volume),
             exact: None,
             report_units: Units::Angstrom.name(),
@@ -367,9 +367,9 @@ impl Report {
 
 /// Returns [`molmesh_surface::SurfaceParams::area_deficit_percent`] of a mesh whose area nothing else changes: radii of
 /// the file, simplification or a cut. A report with exact areas needs no estimate.
-fn area_deficit_percent(structure: &Structure, job: &Job, counts: &Counts) -> Option<f64> {
-    let needs_estimate = !job.exact && structure.radius.is_empty() && job.simplify.is_none() && !counts.cut;
-    job.params.area_deficit_percent(counts.resolution).filter(|_| needs_estimate)
+fn area_deficit_percent(structure: &Structure, options: &Options, counts: &Counts) -> Option<f64> {
+    let needs_estimate = !options.exact && structure.radius.is_empty() && options.simplify.is_none() && !counts.cut;
+    options.params.area_deficit_percent(counts.resolution).filter(|_| needs_estimate)
 }
 
 /// Fields of the report that mesh files do not contain. The last digits of `exact` and `triangle_shapes` depend on

@@ -3,7 +3,7 @@
 use molmesh_surface::{Mesh, Stage, TriangleQuality, TriangleShapes};
 use serde::Serialize;
 
-use super::{Job, StageClock};
+use super::{Options, StageClock};
 
 /// Shapes of the triangles.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
@@ -25,8 +25,8 @@ pub struct TriangleReport {
 
 impl TriangleReport {
     /// Returns the report of a mesh if the job improves triangles.
-    pub(super) fn of_job(job: &Job, mesh: &Mesh, clock: &StageClock<'_>) -> Option<Self> {
-        let is_improved = job.quality == TriangleQuality::High;
+    pub(super) fn of_job(options: &Options, mesh: &Mesh, clock: &StageClock<'_>) -> Option<Self> {
+        let is_improved = options.quality == TriangleQuality::High;
         is_improved.then(|| clock.time(Stage::Measure.name(), || Self::new(mesh)))
     }
 

@@ -3,7 +3,7 @@
 use molmesh_surface::{Measures, Mesh, MeshOutput, SurfaceError, SurfaceParams, Validation};
 use serde::Serialize;
 
-use super::Job;
+use super::Options;
 use super::clock::Scope;
 use super::collapse::{check_error, simplify};
 
@@ -28,9 +28,9 @@ pub struct SimplificationReport {
 ///
 /// # Errors
 /// [`SurfaceError::BadParameter`] if the error of the simplification is too large for the grid.
-pub(super) fn params_of_input(job: &Job, params: &SurfaceParams) -> Result<SurfaceParams, SurfaceError> {
-    job.simplify.map_or(Ok(()), |wanted| check_error(wanted.error, params.resolution))?;
-    Ok(SurfaceParams { quantize: params.quantize.filter(|_| job.simplify.is_none()), ..params.clone() })
+pub(super) fn params_of_input(options: &Options, params: &SurfaceParams) -> Result<SurfaceParams, SurfaceError> {
+    options.simplify.map_or(Ok(()), |wanted| check_error(wanted.error, params.resolution))?;
+    Ok(SurfaceParams { quantize: params.quantize.filter(|_| options.simplify.is_none()), ..params.clone() })
 }
 
 /// Simplifies the mesh of `output` if the job requires it, and then quantizes it if `params` require it. Does nothing
@@ -39,7 +39,7 @@ pub(super) fn params_of_input(job: &Job, params: &SurfaceParams) -> Result<Surfa
 /// # Errors
 /// Returns the errors of [`simplify`], [`SurfaceError::Memory`] and [`SurfaceError::Cancelled`].
 pub(super) fn apply(
-    job: &Job,
+    options: &Options,
     params: &SurfaceParams,
     output: &mut MeshOutput,
     Scope { clock, control }: &Scope<'_>,
@@ -57,7 +57,7 @@ pub(super) fn apply(
             intersections: found.deviation.intersections,
         })
     };
-    let report = job.simplify.map(simplified).transpose()?;
+    let report = options.simplify.map(simplified).transpose()?;
     let whole = std::mem::replace(output, MeshOutput::new(Mesh::default(), output.grid));
     *output = whole.deliver(params, control, None)?;
     if output.measures.is_none() && output.mesh.cut {

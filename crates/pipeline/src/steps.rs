@@ -7,14 +7,14 @@ use super::cavities::{self, FoundCavities};
 use super::clock::Scope;
 use super::color::{ColorReport, MeshColors, MeshedSurface};
 use super::meshing::Meshing;
-use super::{Job, JobError, JobMesh, SimplificationReport, TriangleReport, instances, simplify};
+use super::{JobError, JobMesh, Options, SimplificationReport, TriangleReport, instances, simplify};
 
 /// Number of atom indices that are converted between two checks for cancellation.
 const IDS_PER_CHECK: usize = 1 << 20;
 
 /// Input of the steps.
 pub(super) struct Steps<'a> {
-    pub(super) job: &'a Job,
+    pub(super) options: &'a Options,
     pub(super) selected: &'a Selected,
     pub(super) pockets: Option<&'a Pockets>,
     pub(super) meshing: &'a Meshing<'a>,
@@ -38,22 +38,22 @@ impl Steps<'_> {
         scope: &Scope<'_>,
     ) -> Result<StepResults, JobError> {
         let Scope { clock, control } = scope;
-        let Self { job, selected, pockets, meshing: Meshing { spheres, parts, cut, limits, .. } } = *self;
+        let Self { options, selected, pockets, meshing: Meshing { spheres, parts, cut, limits, .. } } = *self;
         let search = |mode| clock.time("cavities", || cavities::search(mode, spheres, params, limits, output, control));
-        let cavities = job.cavities.map(search).transpose()?;
-        let simplification = simplify::apply(job, params, output, scope)?;
+        let cavities = options.cavities.map(search).transpose()?;
+        let simplification = simplify::apply(options, params, output, scope)?;
         let mesh = &mut output.mesh;
         let surface = MeshedSurface { spheres, params, limits, parts: *parts };
         let color = |colors: MeshColors| clock.time("color", || colors.apply(mesh, &surface, pockets, control));
         let color = colors.map(color).transpose()?;
-        to_atom_indices(mesh, job, selected, control)?;
+        to_atom_indices(mesh, options, selected, control)?;
         instances::place(mesh, &selected.units, control)?;
         let measures = match output.measures.take() {
             // The cut has validated the surface before it divided it.
-            Some(measures) if cut.is_some() || measures.validation == job.validation => measures,
-            found => clock.time(Stage::Measure.name(), || measures_of(mesh, found, job.validation, control))?,
+            Some(measures) if cut.is_some() || measures.validation == options.validation => measures,
+            found => clock.time(Stage::Measure.name(), || measures_of(mesh, found, options.validation, control))?,
         };
-        let shapes = TriangleReport::of_job(job, mesh, clock);
+        let shapes = TriangleReport::of_job(options, mesh, clock);
         Ok(StepResults { cavities, simplification, color, measures, shapes })
     }
 }
@@ -73,8 +73,13 @@ fn measures_of(
 }
 
 /// Converts indices of spheres to indices of atoms in the file, or drops them if the job does not ask for them.
-fn to_atom_indices(mesh: &mut Mesh, job: &Job, selected: &Selected, control: &Control<'_>) -> Result<(), JobError> {
-    if !job.params.atom_ids {
+fn to_atom_indices(
+    mesh: &mut Mesh,
+    options: &Options,
+    selected: &Selected,
+    control: &Control<'_>,
+) -> Result<(), JobError> {
+    if !options.params.atom_ids {
         mesh.atom_ids = None;
     }
     for (n, id) in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()).enumerate() {

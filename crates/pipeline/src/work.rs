@@ -4,7 +4,7 @@ use molmesh_structure::{GZIP_MAGIC, ZSTD_MAGIC};
 use molmesh_surface::pockets::{SPACING, rows_in_reach};
 use molmesh_surface::{SurfaceKind, TriangleQuality};
 
-use super::Job;
+use super::Options;
 use super::color::{Scheme, VertexProperty};
 
 /// Approximate bytes of text per atom. A line of a PDB file has 81, a line of an mmCIF file 90 to 110.
@@ -76,24 +76,24 @@ pub fn estimate_atoms(input: &[u8]) -> f64 {
 
 /// Estimates the work of a job on a file of about `atoms` atoms, in atoms at 0.5 Å.
 #[must_use]
-pub fn estimate_work(atoms: f64, job: &Job) -> f64 {
-    if job.tile.is_some() {
+pub fn estimate_work(atoms: f64, options: &Options) -> f64 {
+    if options.tile.is_some() {
         // The root of an assembly is not kept in memory.
-        let reading = if job.selection.instances { 0.3 * (atoms + MIN_WORK) } else { 0.0 };
-        return reading + relative_time(job.params.surface) * mesh_work(atoms.min(TILE_ATOMS), 0.5);
+        let reading = if options.selection.instances { 0.3 * (atoms + MIN_WORK) } else { 0.0 };
+        return reading + relative_time(options.params.surface) * mesh_work(atoms.min(TILE_ATOMS), 0.5);
     }
-    let resolution = job.spacing.expected(&job.params, atoms);
-    let mesh = if job.spacing.max_triangles().is_some() { search_work } else { mesh_work };
+    let resolution = options.spacing.expected(&options.params, atoms);
+    let mesh = if options.spacing.max_triangles().is_some() { search_work } else { mesh_work };
     // Reading does not depend on the spacing.
     0.3 * (atoms + MIN_WORK)
-        + 0.7 * relative_time(job.params.surface) * mesh(atoms, resolution)
-        + exact(job, atoms)
-        + cavities(job, atoms)
-        + pockets(job, atoms)
-        + depth(job, VERTICES * atoms * (0.5 / resolution).powi(2))
-        + simplification(job, VERTICES * atoms * (0.5 / resolution).powi(2))
-        + improvement(job, VERTICES * atoms * (0.5 / resolution).powi(2))
-        + drawing(job)
+        + 0.7 * relative_time(options.params.surface) * mesh(atoms, resolution)
+        + exact(options, atoms)
+        + cavities(options, atoms)
+        + pockets(options, atoms)
+        + depth(options, VERTICES * atoms * (0.5 / resolution).powi(2))
+        + simplification(options, VERTICES * atoms * (0.5 / resolution).powi(2))
+        + improvement(options, VERTICES * atoms * (0.5 / resolution).powi(2))
+        + drawing(options)
 }
 
 /// Minimum work of a surface that a GPU should compute, in atoms at 0.5 Å: about 10 ms on two cores. A GPU needs a
@@ -104,10 +104,10 @@ const MIN_GPU_WORK: f64 = 2_500.0;
 /// Returns true if a GPU would make a job on a file of about `atoms` atoms faster: its surface takes most of the time,
 /// and at least `MIN_GPU_WORK`. Tiles are too small.
 #[must_use]
-pub fn suits_gpu(atoms: f64, job: &Job) -> bool {
-    let resolution = job.spacing.expected(&job.params, atoms);
-    let surface = relative_time(job.params.surface) * mesh_work(atoms, resolution);
-    job.tile.is_none() && surface >= MIN_GPU_WORK && 2.0 * surface >= estimate_work(atoms, job)
+pub fn suits_gpu(atoms: f64, options: &Options) -> bool {
+    let resolution = options.spacing.expected(&options.params, atoms);
+    let surface = relative_time(options.params.surface) * mesh_work(atoms, resolution);
+    options.tile.is_none() && surface >= MIN_GPU_WORK && 2.0 * surface >= estimate_work(atoms, options)
 }
 
 /// Work of a job besides its atoms and its grid, in atoms: about 1 ms.
@@ -132,39 +132,39 @@ pub(super) struct WorkCounts {
 }
 
 /// Estimates the work of a job with known counts, in atoms at 0.5 Å.
-pub(super) fn counted_work(job: &Job, counts: &WorkCounts) -> f64 {
+pub(super) fn counted_work(options: &Options, counts: &WorkCounts) -> f64 {
     let [atoms, pairs, grid_points, vertices, pocket_rows] =
         [counts.atoms, counts.pairs, counts.grid_points, counts.vertices, counts.pocket_rows].map(|n| n as f64);
     let mesh = PAIR * pairs + GRID_POINT * grid_points + VERTEX * vertices;
-    let tries = if job.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
+    let tries = if options.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
     OVERHEAD
         + 0.3 * atoms
-        + tries * relative_time(job.params.surface) * mesh
-        + exact(job, atoms)
-        + cavities(job, atoms)
+        + tries * relative_time(options.params.surface) * mesh
+        + exact(options, atoms)
+        + cavities(options, atoms)
         + POCKET_ROW * pocket_rows
-        + depth(job, vertices)
-        + simplification(job, vertices)
-        + improvement(job, vertices)
-        + drawing(job)
+        + depth(options, vertices)
+        + simplification(options, vertices)
+        + improvement(options, vertices)
+        + drawing(options)
 }
 
 /// Work of the exact areas of an atom, in atoms: they take about a third of the time of a solvent-excluded surface.
 const EXACT: f64 = 1.5;
 
 /// Estimates the work of exact areas, in atoms at 0.5 Å.
-fn exact(job: &Job, atoms: f64) -> f64 {
+fn exact(options: &Options, atoms: f64) -> f64 {
     // An interface needs three measurements: the sides are measured alone and together, and the whole selection.
-    let times = if job.interface.is_some() { 3.0 } else { 1.0 };
-    if job.exact { EXACT * times * atoms } else { 0.0 }
+    let times = if options.interface.is_some() { 3.0 } else { 1.0 };
+    if options.exact { EXACT * times * atoms } else { 0.0 }
 }
 
 /// Work of the search for cavities at an atom, in atoms: 55 to 80 µs on two cores.
 const CAVITIES: f64 = 18.0;
 
 /// Estimates the work of the search for cavities, in atoms at 0.5 Å.
-fn cavities(job: &Job, atoms: f64) -> f64 {
-    if job.cavities.is_some() { CAVITIES * atoms } else { 0.0 }
+fn cavities(options: &Options, atoms: f64) -> f64 {
+    if options.cavities.is_some() { CAVITIES * atoms } else { 0.0 }
 }
 
 /// Work of the search for pockets at a row of grid points in reach of a probe, in atoms: 20 ns on two cores.
@@ -173,12 +173,12 @@ const POCKET_ROW: f64 = 0.005;
 const RADIUS: f64 = 1.8;
 
 /// Estimates the work of the search for pockets, in atoms at 0.5 Å.
-fn pockets(job: &Job, atoms: f64) -> f64 {
+fn pockets(options: &Options, atoms: f64) -> f64 {
     let rows = |large: f64| {
-        let [radius, small, large] = [RADIUS, job.params.probe, large].map(|length| length / SPACING);
+        let [radius, small, large] = [RADIUS, options.params.probe, large].map(|length| length / SPACING);
         rows_in_reach(radius, small, large)
     };
-    POCKET_ROW * atoms * job.pocket_probe().map_or(0.0, rows)
+    POCKET_ROW * atoms * options.pocket_probe().map_or(0.0, rows)
 }
 
 /// Work of the depth of a vertex, in atoms: 0.4 µs on two cores.
@@ -187,8 +187,8 @@ const DEPTH: f64 = 0.1;
 const VERTICES: f64 = 36.0;
 
 /// Estimates the work of the depths of vertices, in atoms at 0.5 Å.
-fn depth(job: &Job, vertices: f64) -> f64 {
-    let is_depth = job.color.is_some_and(|color| matches!(color.scheme, Scheme::Vertex(VertexProperty::Depth)));
+fn depth(options: &Options, vertices: f64) -> f64 {
+    let is_depth = options.color.is_some_and(|color| matches!(color.scheme, Scheme::Vertex(VertexProperty::Depth)));
     if is_depth { DEPTH * vertices } else { 0.0 }
 }
 
@@ -196,8 +196,8 @@ fn depth(job: &Job, vertices: f64) -> f64 {
 const SIMPLIFICATION: f64 = 0.65;
 
 /// Estimates the work of a simplification of a mesh with this number of vertices, in atoms at 0.5 Å.
-fn simplification(job: &Job, vertices: f64) -> f64 {
-    if job.simplify.is_some() { SIMPLIFICATION * vertices } else { 0.0 }
+fn simplification(options: &Options, vertices: f64) -> f64 {
+    if options.simplify.is_some() { SIMPLIFICATION * vertices } else { 0.0 }
 }
 
 /// Work of the improvement of triangles at a vertex, in atoms: 10 to 12 µs on two cores.
@@ -205,14 +205,14 @@ const IMPROVEMENT: f64 = 3.0;
 
 /// Estimates the work of the improvement of a mesh with this number of vertices, in atoms at 0.5 Å. A search for a
 /// spacing improves each mesh.
-fn improvement(job: &Job, vertices: f64) -> f64 {
-    let tries = if job.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
-    if job.quality == TriangleQuality::High { IMPROVEMENT * tries * vertices } else { 0.0 }
+fn improvement(options: &Options, vertices: f64) -> f64 {
+    let tries = if options.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
+    if options.quality == TriangleQuality::High { IMPROVEMENT * tries * vertices } else { 0.0 }
 }
 
 /// Estimates the work of drawing, in atoms at 0.5 Å.
-fn drawing(job: &Job) -> f64 {
-    PIXEL * job.picture.map_or(0.0, |picture| f64::from(picture.width) * f64::from(picture.height))
+fn drawing(options: &Options) -> f64 {
+    PIXEL * options.picture.map_or(0.0, |picture| f64::from(picture.width) * f64::from(picture.height))
 }
 
 #[cfg(test)]
@@ -227,14 +227,15 @@ mod tests {
     /// Counts of 1AON at 0.5 Å.
     const LARGE_PROTEIN: WorkCounts = counts(58_870, 1_300_000, 20_000_000, 2_100_000);
 
-    fn estimate_work(input: &[u8], job: &Job) -> f64 {
-        super::estimate_work(estimate_atoms(input), job)
+    fn estimate_work(input: &[u8], options: &Options) -> f64 {
+        super::estimate_work(estimate_atoms(input), options)
     }
 
     #[test]
     fn large_surfaces_suit_a_gpu() {
-        let suits =
-            |atoms: f64, pairs: &[(&str, &str)]| suits_gpu(atoms, &params::parse(pairs.iter().copied()).unwrap().job);
+        let suits = |atoms: f64, pairs: &[(&str, &str)]| {
+            suits_gpu(atoms, &params::parse(pairs.iter().copied()).unwrap().options)
+        };
         assert!(suits(60_000.0, &[]) && suits(602.0, &[]) && !suits(300.0, &[]) && suits(300.0, &[("surface", "ses")]));
         // Most of the time is spent on the CPU.
         assert!(
@@ -245,7 +246,7 @@ mod tests {
 
     #[test]
     fn finer_larger_and_compressed_inputs_cost_more() {
-        let at = |resolution: &str| params::parse([("resolution", resolution)]).unwrap().job;
+        let at = |resolution: &str| params::parse([("resolution", resolution)]).unwrap().options;
         let text = vec![b'A'; 90_000];
         let gzip = [&[0x1f, 0x8b][..], &text].concat();
         let coarse = estimate_work(&text, &at("1"));
@@ -260,21 +261,23 @@ mod tests {
 
     #[test]
     fn surfaces_of_spheres_cost_more() {
-        let (text, of) = (vec![b'A'; 90_000], |surface: &str| params::parse([("surface", surface)]).unwrap().job);
+        let (text, of) = (vec![b'A'; 90_000], |surface: &str| params::parse([("surface", surface)]).unwrap().options);
         let [gaussian, sas, ses] = ["gaussian", "sas", "ses"].map(|surface| estimate_work(&text, &of(surface)));
         assert!(gaussian < sas && sas < ses, "{gaussian} {sas} {ses}");
     }
 
     #[test]
     fn cavities_cost_more() {
-        let at = |pairs: &[(&str, &str)]| super::estimate_work(1e4, &params::parse(pairs.iter().copied()).unwrap().job);
+        let at =
+            |pairs: &[(&str, &str)]| super::estimate_work(1e4, &params::parse(pairs.iter().copied()).unwrap().options);
         let [with, without] = [&[("cavities", "keep")][..], &[]].map(at);
         assert!((with - without - 18e4).abs() < 1.0, "{with} {without}");
     }
 
     #[test]
     fn wide_searches_for_pockets_cost_more() {
-        let at = |pairs: &[(&str, &str)]| super::estimate_work(1e4, &params::parse(pairs.iter().copied()).unwrap().job);
+        let at =
+            |pairs: &[(&str, &str)]| super::estimate_work(1e4, &params::parse(pairs.iter().copied()).unwrap().options);
         let [without, narrow, wide] =
             [&[][..], &[("pockets", "true")], &[("pockets", "true"), ("pocket_probe", "20")]].map(at);
         assert!(narrow > without + 1e4 && wide > without + 5.0 * (narrow - without), "{without} {narrow} {wide}");
@@ -282,7 +285,7 @@ mod tests {
 
     #[test]
     fn depths_cost_more() {
-        let at = |color: &str| params::parse([("color", color), ("resolution", "0.5")]).unwrap().job;
+        let at = |color: &str| params::parse([("color", color), ("resolution", "0.5")]).unwrap().options;
         let counted = |color: &str| counted_work(&at(color), &LARGE_PROTEIN);
         let guessed = |color: &str| super::estimate_work(58_870.0, &at(color));
         let [counted, guessed] = [counted("depth") - counted("radial"), guessed("depth") - guessed("radial")];
@@ -291,7 +294,7 @@ mod tests {
 
     #[test]
     fn simplifications_and_improvements_cost_more() {
-        let at = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().job;
+        let at = |pairs: &[(&str, &str)]| params::parse(pairs.iter().copied()).unwrap().options;
         let counted = |pairs: &[(&str, &str)]| counted_work(&at(pairs), &LARGE_PROTEIN);
         let guessed = |pairs: &[(&str, &str)]| super::estimate_work(58_870.0, &at(pairs));
         let without = &[("resolution", "0.5")];
@@ -304,7 +307,7 @@ mod tests {
 
     #[test]
     fn counted_work_agrees_for_proteins_and_not_for_a_sphere_on_a_fine_grid() {
-        let at = |resolution: &str| params::parse([("resolution", resolution)]).unwrap().job;
+        let at = |resolution: &str| params::parse([("resolution", resolution)]).unwrap().options;
         let protein = counted_work(&at("0.5"), &LARGE_PROTEIN);
         assert!((0.5..2.0).contains(&(protein / super::estimate_work(58_870.0, &at("0.5")))), "{protein}");
         // An atom at 0.02 Å takes tens of milliseconds, 4 µs for each unit.
@@ -316,13 +319,13 @@ mod tests {
     #[test]
     fn large_pictures_cost_more() {
         let (text, of) =
-            (vec![b'A'; 90_000], |side: &str| params::parse([("format", "png"), ("width", side)]).unwrap().job);
+            (vec![b'A'; 90_000], |side: &str| params::parse([("format", "png"), ("width", side)]).unwrap().options);
         assert!(estimate_work(&text, &of("4096")) > 1.2 * estimate_work(&text, &of("512")));
     }
 
     #[test]
     fn automatic_spacing_is_estimated_from_the_input_size() {
-        let of = |name: &str, value: &str| params::parse([(name, value)]).unwrap().job;
+        let of = |name: &str, value: &str| params::parse([(name, value)]).unwrap().options;
         let [small, large] = [90_000, 90_000_000].map(|n| vec![b'A'; n]);
         assert!(
             (estimate_work(&small, &of("detail", "4")) / estimate_work(&small, &of("resolution", "0.5")) - 1.0).abs()

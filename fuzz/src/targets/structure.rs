@@ -220,7 +220,7 @@ pub(super) fn mesh(bytes: &[u8]) {
         rest /= texts.len();
     }
     let pairs = query.split('&').filter_map(|pair| pair.split_once('='));
-    let job = params::parse(pairs).expect("valid parameters").job;
+    let job = params::parse(pairs).expect("valid parameters").options;
     let choice = Choice { backend: &CpuBackend::default(), reason: "fuzzing" };
     let product = match pipeline::run(bytes, &job, &LIMITS, &choice, &Control::default(), &(), None) {
         Ok(product) => product,

@@ -138,13 +138,13 @@ pub(super) fn parameters(bytes: &[u8]) {
     let pairs: Vec<_> = text.split('&').map(|pair| pair.split_once('=').unwrap_or((pair, ""))).collect();
     match params::parse(pairs.iter().copied()) {
         Ok(request) => {
-            let canonical = params::canonical(&request.job);
+            let canonical = params::canonical(&request.options);
             assert!(!canonical.contains('\n'), "more than one line: {canonical:?}");
             // The order of parameters does not matter.
             let reversed = params::parse(pairs.iter().rev().copied()).expect("the same parameters in another order");
-            assert_eq!(canonical, params::canonical(&reversed.job));
+            assert_eq!(canonical, params::canonical(&reversed.options));
             // The canonical form of an expression is an expression with the same meaning.
-            let atoms = request.job.selection.atoms;
+            let atoms = request.options.selection.atoms;
             assert_eq!(atoms.to_string().parse(), Ok(atoms));
         }
         Err(error) => assert_short(&error.to_string()),

@@ -95,8 +95,9 @@ impl Fixture {
 
     /// Stores a result of the job.
     fn store_result(&self, entry: &QueuedTask) {
-        let arithmetic = self.jobs.0.pool.file_arithmetics(&entry.task.job).remove(0);
-        let key = ContentKey::new(&entry.task.digest, &entry.task.job, Format::Glb, &arithmetic, Namespace::default());
+        let arithmetic = self.jobs.0.pool.file_arithmetics(&entry.task.options).remove(0);
+        let key =
+            ContentKey::new(&entry.task.digest, &entry.task.options, Format::Glb, &arithmetic, Namespace::default());
         let report = results::report_file(b"{}".to_vec(), &Hasher::default(), 0).unwrap();
         for (extension, bytes) in [("glb", Bytes::new()), (REPORT, report)] {
             block_on(self.store.put(&key.name(extension).unwrap(), bytes)).unwrap();

@@ -433,7 +433,7 @@ HETATM Xx X XYZ D W 71.0 1.0 16 0 0
     }
 
     fn coloring(pairs: &[(&str, &str)]) -> Coloring {
-        params::parse(pairs.iter().copied()).unwrap().job.color.unwrap()
+        params::parse(pairs.iter().copied()).unwrap().options.color.unwrap()
     }
 
     const ALL: [u32; 5] = [0, 1, 2, 3, 4];
@@ -591,9 +591,9 @@ HETATM Xx X XYZ D W 71.0 1.0 16 0 0
 
     fn product(pairs: &[(&str, &str)]) -> Result<Product, JobError> {
         let backend = CpuBackend::new(None).unwrap();
-        let job = params::parse(pairs.iter().copied()).unwrap().job;
+        let options = params::parse(pairs.iter().copied()).unwrap().options;
         let choice = Choice { backend: &backend, reason: "" };
-        run(SAMPLE, &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
+        run(SAMPLE, &options, &JobLimits::default(), &choice, &Control::default(), &(), None)
     }
 
     #[test]
@@ -637,7 +637,7 @@ HETATM Xx X XYZ D W 71.0 1.0 16 0 0
         assert!(refuse(&[("color", "chain"), ("color_blend", "sharp")]).contains("one of nearest, smooth"));
         assert!(refuse(&[("color_blend", "smooth")]).contains("nearest without colours"));
         assert!(refuse(&[("color", "bfactor"), ("palette", "jet")]).contains("one of viridis, cividis"));
-        let key = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().job);
+        let key = |pairs: &[(&str, &str)]| params::canonical(&params::parse(pairs.iter().copied()).unwrap().options);
         assert_eq!(key(&[("color", "bfactor")]), key(&[("color", "bfactor"), ("palette", "viridis")]));
         assert_ne!(key(&[("color", "bfactor")]), key(&[("color", "bfactor"), ("palette", "cividis")]));
         assert_ne!(key(&[("color", "chain")]), key(&[("color", "element")]));

@@ -72,10 +72,10 @@ mod tests {
     fn product(map: &str, pairs: &[(&str, &str)]) -> Result<Product, JobError> {
         let backend = CpuBackend::new(None).unwrap();
         let own = [("resolution", "1.5"), ("color", "map")];
-        let mut job = params::parse(own.iter().chain(pairs).copied()).unwrap().job;
-        job.map = Some(MapFile::new(String::new(), map.as_bytes().to_vec()));
+        let mut options = params::parse(own.iter().chain(pairs).copied()).unwrap().options;
+        options.map = Some(MapFile::new(String::new(), map.as_bytes().to_vec()));
         let choice = Choice { backend: &backend, reason: "" };
-        run(SAMPLE, &job, &JobLimits::default(), &choice, &Control::default(), &(), None)
+        run(SAMPLE, &options, &JobLimits::default(), &choice, &Control::default(), &(), None)
     }
 
     /// Returns the largest difference between a colour of the mesh and that of the closed form at `offset`.
@@ -119,7 +119,7 @@ mod tests {
         let made = product(&linear_map(1.0, 11, 8.0), &[]).unwrap();
         assert!(worst(&made, -1.0, 1.4, Palette::RedWhiteBlue) > 50);
         assert!(worst(&made, 1.0, 0.0, Palette::RedWhiteBlue) > 2);
-        let plain = crate::params::parse([("resolution", "1.5")]).unwrap().job;
+        let plain = crate::params::parse([("resolution", "1.5")]).unwrap().options;
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
         let plain = run(SAMPLE, &plain, &JobLimits::default(), &choice, &Control::default(), &(), None).unwrap();
@@ -159,11 +159,11 @@ mod tests {
         let limits = JobLimits { map: MapLimits { max_points: 7, ..MapLimits::default() }, ..JobLimits::default() };
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
-        let mut job = params::parse([("color", "map")]).unwrap().job;
+        let mut options = params::parse([("color", "map")]).unwrap().options;
         let mut refused = |map: Option<MapFile>, color: bool| {
-            job.map = map;
-            job.color = job.color.filter(|_| color);
-            run(SAMPLE, &job, &limits, &choice, &Control::default(), &(), None).unwrap_err().to_string()
+            options.map = map;
+            options.color = options.color.filter(|_| color);
+            run(SAMPLE, &options, &limits, &choice, &Control::default(), &(), None).unwrap_err().to_string()
         };
         let map = || Some(MapFile::new(String::new(), linear_map(1.0, 2, 90.0)));
         assert!(refused(None, true).contains("it needs a map"));
@@ -174,9 +174,9 @@ mod tests {
     #[test]
     fn keys_contain_the_map_and_the_offset() {
         let key = |pairs: &[(&str, &str)], digest: &str| {
-            let mut job = params::parse(pairs.iter().copied()).unwrap().job;
-            job.map = Some(MapFile::not_loaded(digest.to_owned()));
-            params::canonical(&job)
+            let mut options = params::parse(pairs.iter().copied()).unwrap().options;
+            options.map = Some(MapFile::not_loaded(digest.to_owned()));
+            params::canonical(&options)
         };
         let plain = [("color", "map")];
         assert_eq!(key(&plain, "1"), key(&[("color", "map"), ("color_offset", "1.4")], "1"));

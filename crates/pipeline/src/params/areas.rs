@@ -3,7 +3,7 @@
 use molmesh_surface::SurfaceKind;
 
 use super::ParamError;
-use crate::{AreaLevel, Job};
+use crate::{AreaLevel, Options};
 
 /// Name of the parameter that selects the rows.
 pub const BY: &str = "by";
@@ -30,7 +30,7 @@ pub const NAMES: [&str; 11] = [
 #[derive(Debug, Clone)]
 pub struct AreasRequest {
     /// Job with exact areas, whose parameters of the mesh have no effect.
-    pub job: Job,
+    pub options: Options,
     /// Rows of the table.
     pub level: AreaLevel,
     /// Canonical text of the parameters, equal for equal tables only.
@@ -53,7 +53,7 @@ pub fn parse(pairs: &[(String, String)]) -> Result<AreasRequest, ParamError> {
     }
     let (own, of_mesh): (Vec<_>, Vec<_>) = pairs.iter().partition(|(name, _)| name == BY);
     let of_mesh = of_mesh.iter().map(|(name, value)| (name.as_str(), value.as_str()));
-    let job = super::parse(of_mesh.chain([("exact", "true")]))?.job;
+    let options = super::parse(of_mesh.chain([("exact", "true")]))?.options;
     let level = match &own[..] {
         [] => AreaLevel::default(),
         [(_, value)] => {
@@ -62,8 +62,8 @@ pub fn parse(pairs: &[(String, String)]) -> Result<AreasRequest, ParamError> {
         }
         _ => return Err(ParamError::Repeated { name: BY }),
     };
-    let canonical = format!("{BY}={}&{}", level.name(), super::canonical(&job));
-    Ok(AreasRequest { job, level, canonical })
+    let canonical = format!("{BY}={}&{}", level.name(), super::canonical(&options));
+    Ok(AreasRequest { options, level, canonical })
 }
 
 fn value_of<'a>(pairs: &'a [(String, String)], name: &str) -> Option<&'a str> {

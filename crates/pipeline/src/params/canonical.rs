@@ -3,14 +3,14 @@
 use molmesh_structure::{Context, Selection, Split};
 use molmesh_surface::{PaperParams, SurfaceParams, TriangleQuality};
 
-use crate::{Coloring, Job, PictureParams, Spacing};
+use crate::{Coloring, Options, PictureParams, Spacing};
 
 /// Returns all parameters of a job as one line of text, which is equal for equal jobs only. It is part of the content
 /// key. A new parameter is written only if it differs from its default, so that the keys of other jobs stay the same.
 #[must_use]
-pub fn canonical(job: &Job) -> String {
+pub fn canonical(options: &Options) -> String {
     // Destructured, so that the compiler requires every new field here.
-    let Job {
+    let Options {
         selection,
         params,
         split,
@@ -29,7 +29,7 @@ pub fn canonical(job: &Job) -> String {
         picture,
         exact,
         interface,
-    } = job;
+    } = options;
     let Selection { model, chains, atoms, altloc, assembly, context, instances, unit } = selection;
     let SurfaceParams {
         surface,

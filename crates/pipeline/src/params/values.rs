@@ -13,7 +13,7 @@ use super::table::flag;
 use super::{Domain, ParamError, Parameter, unknown};
 use crate::color::{ColorBlend, Coloring, Palette, Scheme};
 use crate::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
-use crate::{Cavities, Job, Simplify, Spacing};
+use crate::{Cavities, Options, Simplify, Spacing};
 
 /// Default of `color_offset`: the radius of a water molecule, Å.
 const DEFAULT_COLOR_OFFSET: f64 = 1.4;
@@ -24,7 +24,7 @@ const ALL_MODELS: &str = "all";
 /// Values of the parameters that are parsed so far.
 #[derive(Default)]
 pub(super) struct ParsedValues {
-    pub(super) options: SurfaceOptions,
+    pub(super) surface: SurfaceOptions,
     scheme: Option<Scheme>,
     palette: Option<Palette>,
     color_range: Option<[f64; 2]>,
@@ -33,7 +33,7 @@ pub(super) struct ParsedValues {
     pockets: bool,
     pocket_probe: Option<f64>,
     max_triangles: Option<u64>,
-    pub(super) job: Job,
+    pub(super) options: Options,
     pub(super) format: Option<Format>,
     pub(super) strict: bool,
 }
@@ -68,7 +68,7 @@ impl ParsedValues {
 
     /// Returns the radius of the large probe, Å, if the job lists pockets, colours them or makes parts of them.
     pub(super) fn pockets(&self) -> Result<Option<f64>, ParamError> {
-        let needed = self.scheme.is_some_and(Scheme::needs_pockets) || self.job.split == Split::Pocket;
+        let needed = self.scheme.is_some_and(Scheme::needs_pockets) || self.options.split == Split::Pocket;
         if self.pockets || needed {
             return Ok(Some(self.pocket_probe.unwrap_or(DEFAULT_POCKET_PROBE)));
         }
@@ -86,22 +86,22 @@ impl ParsedValues {
     /// Removes it from the parameters that set the spacing if it does not.
     pub(super) fn limit_triangles(&mut self, spacings: &mut Vec<(&'static str, String)>) {
         let Some(limit) = self.max_triangles else { return };
-        let job = &mut self.job;
-        if let Some(wanted) = &mut job.simplify {
+        let options = &mut self.options;
+        if let Some(wanted) = &mut options.simplify {
             wanted.max_triangles = Some(limit);
             spacings.retain(|(name, _)| *name != "max_triangles");
         } else {
-            job.spacing = Spacing::MaxTriangles(limit);
+            options.spacing = Spacing::MaxTriangles(limit);
         }
     }
 
     /// Divides the mesh by model if all models are meshed.
     pub(super) fn divide_models(&mut self) -> Result<(), ParamError> {
-        if self.job.selection.model != ModelChoice::All {
+        if self.options.selection.model != ModelChoice::All {
             return Ok(());
         }
-        let split = &mut self.job.split;
-        let other = match (*split, &self.job.selection.assembly, self.job.selection.context) {
+        let split = &mut self.options.split;
+        let other = match (*split, &self.options.selection.assembly, self.options.selection.context) {
             (Split::None, None, Context::Selection) => None,
             (Split::None, None, context) => Some(("context", context.name().to_owned(), Context::Selection.name())),
             (Split::None, Some(id), _) => Some(("assembly", id.clone(), "asymmetric-unit")),
@@ -117,7 +117,7 @@ impl ParsedValues {
 
     /// Returns the picture parameters of the job. The first call creates them.
     fn picture(&mut self) -> &mut PictureParams {
-        self.job.picture.get_or_insert_default()
+        self.options.picture.get_or_insert_default()
     }
 
     /// Parses the value of one parameter.
@@ -130,30 +130,30 @@ impl ParsedValues {
             let Domain::Number { min, max, .. } = parameter.domain else { return None };
             text.trim().parse::<f64>().ok().filter(|value| (min..=max).contains(value)).map(|value| value + 0.0)
         };
-        let job = &mut self.job;
+        let options = &mut self.options;
         match parameter.name {
-            "preset" => self.options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
-            "surface" => self.options.surface = Some(SurfaceKind::from_str(text).ok().ok_or_else(bad)?),
-            "probe" => self.options.probe = number()?,
-            "resolution" => self.options.resolution = number()?,
-            "detail" => job.spacing = Spacing::Detail(level(text).ok_or_else(bad)?),
+            "preset" => self.surface.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
+            "surface" => self.surface.surface = Some(SurfaceKind::from_str(text).ok().ok_or_else(bad)?),
+            "probe" => self.surface.probe = number()?,
+            "resolution" => self.surface.resolution = number()?,
+            "detail" => options.spacing = Spacing::Detail(level(text).ok_or_else(bad)?),
             "max_triangles" => {
                 let allowed = u64::from(MIN_TRIANGLE_LIMIT)..=u64::from(MAX_TRIANGLE_LIMIT);
                 self.max_triangles = Some(whole(text).filter(|n| allowed.contains(n)).ok_or_else(bad)?);
             }
-            "isovalue" => self.options.isovalue = number()?,
-            "smoothness" => self.options.smoothness = number()?,
-            "radius_scale" => self.options.radius_scale = number()?,
-            "radius_offset" => self.options.radius_offset = number()?,
-            "simplify" => job.simplify = Some(Simplify { error: bounded().ok_or_else(bad)?, max_triangles: None }),
-            "tile" => job.tile = Some(TileAddress::parse(text).ok_or_else(bad)?),
-            "cutoff_tolerance" => self.options.cutoff_tolerance = number()?,
-            "paper_a" => self.options.paper_a = number()?,
-            "paper_b" => self.options.paper_b = number()?,
-            "paper_c" => self.options.paper_c = number()?,
-            "atom_ids" => self.options.atom_ids = flag(text).ok_or_else(bad)?,
-            "exact" => job.exact = flag(text).ok_or_else(bad)?,
-            "interface" => job.interface = Some(text.parse().ok().ok_or_else(bad)?),
+            "isovalue" => self.surface.isovalue = number()?,
+            "smoothness" => self.surface.smoothness = number()?,
+            "radius_scale" => self.surface.radius_scale = number()?,
+            "radius_offset" => self.surface.radius_offset = number()?,
+            "simplify" => options.simplify = Some(Simplify { error: bounded().ok_or_else(bad)?, max_triangles: None }),
+            "tile" => options.tile = Some(TileAddress::parse(text).ok_or_else(bad)?),
+            "cutoff_tolerance" => self.surface.cutoff_tolerance = number()?,
+            "paper_a" => self.surface.paper_a = number()?,
+            "paper_b" => self.surface.paper_b = number()?,
+            "paper_c" => self.surface.paper_c = number()?,
+            "atom_ids" => self.surface.atom_ids = flag(text).ok_or_else(bad)?,
+            "exact" => options.exact = flag(text).ok_or_else(bad)?,
+            "interface" => options.interface = Some(text.parse().ok().ok_or_else(bad)?),
             "color" if text == "none" => self.scheme = None,
             "color" => self.scheme = Some(text.parse().ok().ok_or_else(bad)?),
             "palette" => self.palette = Some(named(&Palette::ALL, Palette::name, text).ok_or_else(bad)?),
@@ -161,38 +161,38 @@ impl ParsedValues {
             "color_offset" => self.color_offset = Some(bounded().ok_or_else(bad)?),
             "color_range" => self.color_range = Some(range(text).ok_or_else(bad)?),
             "model" => {
-                job.selection.model = match text.trim() {
+                options.selection.model = match text.trim() {
                     ALL_MODELS => ModelChoice::All,
                     number => ModelChoice::Number(number.parse().ok().ok_or_else(bad)?),
                 };
             }
             "chains" => {
-                job.selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect());
+                options.selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect());
             }
             "select" => {
                 let bad = |error| ParamError::BadExpression { name: "select", text: text.to_owned(), error };
-                job.selection.atoms = text.parse().map_err(bad)?;
+                options.selection.atoms = text.parse().map_err(bad)?;
             }
             "assembly" => {
                 let id = Some(text.trim()).filter(|id| !id.is_empty() && !id.chars().any(char::is_control));
-                job.selection.assembly =
+                options.selection.assembly =
                     id.map(|id| (id != parameter.default).then(|| id.to_owned())).ok_or_else(bad)?;
             }
-            "instances" => job.selection.instances = flag(text).ok_or_else(bad)?,
-            "unit" => job.selection.unit = Some(number_of_unit(parameter, text).ok_or_else(bad)?),
-            "context" => job.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
-            "split" => job.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
-            "cavities" => job.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?),
+            "instances" => options.selection.instances = flag(text).ok_or_else(bad)?,
+            "unit" => options.selection.unit = Some(number_of_unit(parameter, text).ok_or_else(bad)?),
+            "context" => options.selection.context = named(&Context::ALL, Context::name, text).ok_or_else(bad)?,
+            "split" => options.split = named(&Split::ALL, Split::name, text).ok_or_else(bad)?,
+            "cavities" => options.cavities = Some(named(&Cavities::ALL, Cavities::name, text).ok_or_else(bad)?),
             "pockets" => self.pockets = flag(text).ok_or_else(bad)?,
             "pocket_probe" => self.pocket_probe = Some(bounded().ok_or_else(bad)?),
-            "altloc" => job.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
-            "quality" => job.quality = TriangleQuality::from_str(text).ok().ok_or_else(bad)?,
-            "validation" => job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
+            "altloc" => options.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
+            "quality" => options.quality = TriangleQuality::from_str(text).ok().ok_or_else(bad)?,
+            "validation" => options.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
             "check" => self.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
             "format" => self.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
-            "compress" => job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
-            "normals" => job.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
-            "units" => job.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
+            "compress" => options.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
+            "normals" => options.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
+            "units" => options.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
             "width" => self.picture().width = side().ok_or_else(bad)?,
             "height" => self.picture().height = side().ok_or_else(bad)?,
             "view" => self.picture().view = named(&View::ALL, View::name, text).ok_or_else(bad)?,

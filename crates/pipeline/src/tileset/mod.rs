@@ -36,7 +36,7 @@ use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, MeshedSurface,
 use super::load::{LoadedStructure, load};
 use super::params::ParamError;
 use super::report::Counts;
-use super::{Choice, Job, JobError, Product, Report, Scope, StageClock};
+use super::{Choice, JobError, Options, Product, Report, Scope, StageClock};
 
 /// Maximum number of tiles.
 const MAX_TILES: usize = 1_000_000;
@@ -83,25 +83,33 @@ pub const NOT_APPLICABLE: [&str; 17] = [
 ///
 /// # Errors
 /// Returns [`ParamError::BadValue`].
-pub fn check(job: &Job) -> Result<(), ParamError> {
-    let selection = &job.selection;
+pub fn check(options: &Options) -> Result<(), ParamError> {
+    let selection = &options.selection;
     let when = |is_refused: bool, value: &str| is_refused.then(|| value.to_owned());
     let of_vertices = |color: &Coloring| matches!(color.scheme, Scheme::Vertex(_));
     let refused = [
-        ("split", when(job.split != Split::None && job.split != Split::Model, job.split.name()), "none"),
-        ("model", when(job.split == Split::Model, "all"), "one model"),
+        ("split", when(options.split != Split::None && options.split != Split::Model, options.split.name()), "none"),
+        ("model", when(options.split == Split::Model, "all"), "one model"),
         ("context", when(selection.context != Context::Selection, selection.context.name()), "selection"),
-        ("cavities", job.cavities.map(|cavities| cavities.name().to_owned()), "no value"),
-        ("color", job.color.filter(of_vertices).map(|color| color.scheme.to_string()), "a scheme that colours atoms"),
-        ("color_blend", when(job.color.is_some_and(|color| color.blend == ColorBlend::Smooth), "smooth"), "nearest"),
-        ("pockets", when(job.pockets.is_some(), "true"), "false"),
-        ("exact", when(job.exact, "true"), "false"),
-        ("max_triangles", job.max_triangles().map(|limit| limit.to_string()), "no value"),
-        ("simplify", job.simplify.map(|wanted| wanted.error.to_string()), "no value"),
-        ("quality", when(job.quality != TriangleQuality::Standard, job.quality.name()), "standard"),
-        ("units", when(job.units != Units::Angstrom, job.units.name()), "angstrom"),
-        ("paper_b", when(job.params.paper.is_some(), "a raw constant"), "no value"),
-        ("validation", when(job.validation != Validation::default(), job.validation.name()), "checksum"),
+        ("cavities", options.cavities.map(|cavities| cavities.name().to_owned()), "no value"),
+        (
+            "color",
+            options.color.filter(of_vertices).map(|color| color.scheme.to_string()),
+            "a scheme that colours atoms",
+        ),
+        (
+            "color_blend",
+            when(options.color.is_some_and(|color| color.blend == ColorBlend::Smooth), "smooth"),
+            "nearest",
+        ),
+        ("pockets", when(options.pockets.is_some(), "true"), "false"),
+        ("exact", when(options.exact, "true"), "false"),
+        ("max_triangles", options.max_triangles().map(|limit| limit.to_string()), "no value"),
+        ("simplify", options.simplify.map(|wanted| wanted.error.to_string()), "no value"),
+        ("quality", when(options.quality != TriangleQuality::Standard, options.quality.name()), "standard"),
+        ("units", when(options.units != Units::Angstrom, options.units.name()), "angstrom"),
+        ("paper_b", when(options.params.paper.is_some(), "a raw constant"), "no value"),
+        ("validation", when(options.validation != Validation::default(), options.validation.name()), "checksum"),
     ];
     match refused.into_iter().find_map(|(name, value, expected)| Some((name, value?, expected))) {
         Some((name, value, expected)) => {
@@ -113,20 +121,20 @@ pub fn check(job: &Job) -> Result<(), ParamError> {
 }
 
 impl<S: Deref<Target = Structure>> Tileset<S> {
-    /// Prepares the levels of the structure that `read` returns. The grid spacing of `job` is that of the last level.
+    /// Prepares the levels of the structure that `read` returns. The grid spacing of `options` is that of the last level.
     ///
     /// # Errors
     /// Returns a [`JobError`] if reading or selecting fails, there are too many tiles, or the job is cancelled.
     pub fn new(
         read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
-        job: &Job,
+        options: &Options,
         limits: &ReadLimits,
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
-        let LoadedStructure { structure, selected, spheres } = load(read, job, limits, clock, control)?;
+        let LoadedStructure { structure, selected, spheres } = load(read, options, limits, clock, control)?;
         clock.time("index", || {
-            let params = job.params_for(spheres.len());
+            let params = options.params_for(spheres.len());
             let layout = Layout::of(&spheres, &params)?;
             let (levels, tiles) = layout.index(&Arc::new(spheres), &params, control)?;
             Ok(Self { structure, layout, levels, tiles, selected, streamed: None })
@@ -178,24 +186,24 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         self.layout.spacing(level)
     }
 
-    /// Meshes the tile of `job`, or the root without one, adds skirts and encodes it. The mesh is empty if the surface
+    /// Meshes the tile of `options`, or the root without one, adds skirts and encodes it. The mesh is empty if the surface
     /// does not pass through the tile. The memory of the product stays added to the meter of `scope`. Its report
-    /// includes the times of its clock. `job` differs from that of [`Self::new`] in tile, colours and encoding at most;
+    /// includes the times of its clock. `options` differs from that of [`Self::new`] in tile, colours and encoding at most;
     /// `colors` are those of [`Self::colors`].
     ///
     /// # Errors
     /// Returns the errors of meshing and compression, and [`SurfaceError::BadParameter`] for a tile outside the cube.
     pub fn product(
         &self,
-        (job, colors): (&Job, Option<&TilesetColors>),
+        (options, colors): (&Options, Option<&TilesetColors>),
         choice: &Choice<'_>,
         limits: &SurfaceLimits,
         scope: &Scope<'_>,
     ) -> Result<Product, JobError> {
         let Scope { clock, control } = scope;
-        let (output, color) = self.output((job, colors), choice.backend, limits, scope)?;
+        let (output, color) = self.output((options, colors), choice.backend, limits, scope)?;
         let MeshOutput { mut mesh, grid, made_by, .. } = output;
-        let address = job.tile.unwrap_or(TileAddress::ROOT);
+        let address = options.tile.unwrap_or(TileAddress::ROOT);
         let (half, resolution) = (0.5 * self.layout.side(address.level), self.layout.spacing(address.level));
         let boundary = clock.time("clip", || mesh.boundary(half, resolution));
         // Without the skirts.
@@ -203,51 +211,51 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         let measures = clock.time(Stage::Measure.name(), measure)?;
         clock.time("clip", || mesh.add_skirts(&boundary, half, resolution));
         // The same step for all tiles of a level.
-        let quantize = job.quantization(|| half);
+        let quantize = options.quantization(|| half);
         if let Some(step) = quantize {
             mesh.quantize(step);
         }
-        let storage = job.storage(quantize);
+        let storage = options.storage(quantize);
         let (n_vertices, n_triangles, centre) = (mesh.n_vertices(), mesh.n_triangles(), mesh.centre);
         let counts =
             Counts { resolution, centre, tries: None, grid, n_vertices, n_triangles, cut: true, made_by, storage };
         let times = clock.finish();
-        let mut report = Report::new(&self.structure, &self.selected, job, choice, &counts, &measures, times);
+        let mut report = Report::new(&self.structure, &self.selected, options, choice, &counts, &measures, times);
         report.color = color;
         if let Some(Streamed { n_atoms, atoms_in_file, radii, .. }) = &self.streamed {
             (report.atoms, report.atoms_in_file, report.radii) = (*n_atoms, *atoms_in_file, radii);
         }
         let mut product = Product::new(mesh, storage, report);
-        product.compress(job, scope)?;
+        product.compress(options, scope)?;
         Ok(product)
     }
 
-    /// Meshes the tile of `job`, as [`Self::product`] does, without skirts and encoding; `None` if the surface does not
+    /// Meshes the tile of `options`, as [`Self::product`] does, without skirts and encoding; `None` if the surface does not
     /// pass through it. The mesh has a boundary at the faces of the tile.
     ///
     /// # Errors
     /// Returns the errors of meshing.
     pub fn mesh(
         &self,
-        (job, colors): (&Job, Option<&TilesetColors>),
+        (options, colors): (&Options, Option<&TilesetColors>),
         backend: &dyn Backend,
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Option<Mesh>, JobError> {
         let clock = StageClock::new(&());
-        let (output, _) = self.output((job, colors), backend, limits, &Scope::new(&clock, control))?;
+        let (output, _) = self.output((options, colors), backend, limits, &Scope::new(&clock, control))?;
         Ok(Some(output.mesh).filter(|mesh| mesh.n_triangles() > 0))
     }
 
     /// Meshes a tile and colours it.
     fn output(
         &self,
-        (job, colors): (&Job, Option<&TilesetColors>),
+        (options, colors): (&Options, Option<&TilesetColors>),
         backend: &dyn Backend,
         limits: &SurfaceLimits,
         Scope { clock, control }: &Scope<'_>,
     ) -> Result<(MeshOutput, Option<ColorReport>), JobError> {
-        let (address, levels) = (job.tile.unwrap_or(TileAddress::ROOT), self.layout.levels);
+        let (address, levels) = (options.tile.unwrap_or(TileAddress::ROOT), self.layout.levels);
         if !address.is_valid(levels) {
             let (value, last) = (format!("`{}`", address.path()), levels - 1);
             let expected = format!("a tile of the tileset, whose levels are 0 to {last}");
@@ -255,8 +263,12 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         }
         let level = &self.levels[address.level as usize];
         let (spacing, bounds) = (self.layout.spacing(address.level), self.layout.tile(address));
-        let params =
-            SurfaceParams { resolution: spacing, atom_ids: job.needs_atoms(), quantize: None, ..job.params.clone() };
+        let params = SurfaceParams {
+            resolution: spacing,
+            atom_ids: options.needs_atoms(),
+            quantize: None,
+            ..options.params.clone()
+        };
         let empty = || Ok((MeshOutput::new(Mesh::default(), GridStats::default()), None));
         if !self.tiles.contains(&address) {
             return empty();
@@ -281,7 +293,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         let surface = MeshedSurface { spheres: &spheres, params: &params, limits, parts: None };
         let color = |colors: MeshColors| clock.time("color", || colors.apply(mesh, &surface, None, control));
         let color = colors.map(color).transpose()?;
-        if !job.params.atom_ids {
+        if !options.params.atom_ids {
             mesh.atom_ids = None;
         }
         for id in mesh.atom_ids.iter_mut().flat_map(|ids| ids.iter_mut()) {

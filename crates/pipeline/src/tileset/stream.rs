@@ -21,7 +21,7 @@ use super::stored::{SphereIndex, SphereList, StoredSphere};
 use crate::color::{BlockColors, Scheme};
 use crate::load::SPHERE_BYTES;
 use crate::params::ParamError;
-use crate::{Job, JobError, StageClock};
+use crate::{JobError, Options, StageClock};
 
 /// Buffer of the index, in blocks.
 const BUFFERED_BLOCKS: usize = 4;
@@ -57,8 +57,8 @@ pub struct StructureStream<'a> {
 ///
 /// # Errors
 /// Returns [`ParamError::BadValue`].
-pub fn check_stream(job: &Job, n_files: usize) -> Result<(), ParamError> {
-    match needs_memory(job, n_files) {
+pub fn check_stream(options: &Options, n_files: usize) -> Result<(), ParamError> {
+    match needs_memory(options, n_files) {
         Some((name, value, expected)) => {
             let expected = format!("{expected} with `--scratch`, which reads the structure as a stream");
             Err(ParamError::bad_value(name, &value, expected))
@@ -69,17 +69,17 @@ pub fn check_stream(job: &Job, n_files: usize) -> Result<(), ParamError> {
 
 /// Finds a parameter that [`check_stream`] rejects. Returns its name, its value and the expected value.
 #[must_use]
-pub fn needs_memory(job: &Job, n_files: usize) -> Option<(&'static str, String, &'static str)> {
-    let selection = &job.selection;
+pub fn needs_memory(options: &Options, n_files: usize) -> Option<(&'static str, String, &'static str)> {
+    let selection = &options.selection;
     let of_range = |scheme| matches!(scheme, Scheme::BFactor | Scheme::Occupancy);
     let when = |is_refused: bool, value: String| is_refused.then_some(value);
-    let color = job.color.map(|color| (color.scheme, color.range.is_some()));
+    let color = options.color.map(|color| (color.scheme, color.range.is_some()));
     let refused = [
         ("select", when(selection.atoms.has_within(), selection.atoms.to_string()), "an expression without `within`"),
         ("assembly", selection.assembly.clone().filter(|_| n_files > 1), "no value for several files, or one file"),
         ("instances", when(selection.instances, "true".to_owned()), "false"),
         ("unit", selection.unit.map(|unit| unit.to_string()), "no value"),
-        ("detail", job.spacing.detail().map(|level| level.to_string()), "a `resolution` instead"),
+        ("detail", options.spacing.detail().map(|level| level.to_string()), "a `resolution` instead"),
         (
             "color",
             color.filter(|(scheme, has_range)| of_range(*scheme) && !has_range).map(|(scheme, _)| scheme.to_string()),
@@ -104,7 +104,7 @@ enum ReadSpheres {
 
 /// Reader of the blocks of a stream.
 struct BlockReader<'a> {
-    job: &'a Job,
+    options: &'a Options,
     limits: &'a ReadLimits,
     selected: SelectedBlocks,
     colors: Option<BlockColors>,
@@ -127,7 +127,7 @@ impl BlockReader<'_> {
         clock: &StageClock<'_>,
     ) -> Result<(), JobError> {
         self.selected.begin_file();
-        let needs_secondary = self.job.color.is_some_and(|color| color.scheme == Scheme::SecondaryStructure);
+        let needs_secondary = self.options.color.is_some_and(|color| color.scheme == Scheme::SecondaryStructure);
         let open = || Blocks::new(input, block_bytes, needs_secondary, file, self.limits, control);
         let mut blocks = clock.time("read", open)?;
         loop {
@@ -146,7 +146,8 @@ impl BlockReader<'_> {
     fn add(&mut self, block: &mut Block, control: &Control<'_>) -> Result<(), JobError> {
         control.memory.grow(SELECT_BYTES * block.len as u64).map_err(SurfaceError::from)?;
         let first = self.selected.n_atoms;
-        let SelectedOfBlock { atoms, chains } = self.selected.add(block, &self.job.selection, self.limits, control)?;
+        let SelectedOfBlock { atoms, chains } =
+            self.selected.add(block, &self.options.selection, self.limits, control)?;
         let structure = &block.structure;
         let colors = self.colors.as_mut().map(|colors| colors.add(structure, &atoms, &chains)).transpose()?;
         let column = |column: &[f64]| atoms.iter().map(|&i| column[i as usize]).collect();
@@ -172,19 +173,19 @@ impl BlockReader<'_> {
 }
 
 impl Tileset<Box<Structure>> {
-    /// Prepares the levels of the structure in a stream. The grid spacing of `job` is that of the last level.
+    /// Prepares the levels of the structure in a stream. The grid spacing of `options` is that of the last level.
     ///
     /// # Errors
     /// Returns a [`JobError`] if reading or selecting fails, there are too many tiles, the index cannot be written, or
     /// the job is cancelled.
     pub fn of_stream(
         stream: StructureStream<'_>,
-        job: &Job,
+        options: &Options,
         limits: &ReadLimits,
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
-        let params = SurfaceParams { atom_ids: job.needs_atoms(), ..job.params.clone() };
+        let params = SurfaceParams { atom_ids: options.needs_atoms(), ..options.params.clone() };
         let [file, columns] = stream.scratch.map(|file| Arc::new(StoredBytes::new(file)));
         let mut side = order_side(params.resolution);
         while side >= 2.0 * MIN_BUCKET {
@@ -192,16 +193,16 @@ impl Tileset<Box<Structure>> {
         }
         let buffer = BUFFERED_BLOCKS * stream.block_bytes;
         let new_index = || SphereIndex::new(&file, side, buffer, control);
-        let is_assembly = job.selection.assembly.is_some();
+        let is_assembly = options.selection.assembly.is_some();
         let spheres = if is_assembly {
             ReadSpheres::Distinct(SphereList::new(&columns, control)?)
         } else {
             ReadSpheres::Index(new_index()?)
         };
         let (selected, colors) =
-            (SelectedBlocks::new(control), job.color.map(|coloring| BlockColors::new(coloring, control)));
+            (SelectedBlocks::new(control), options.color.map(|coloring| BlockColors::new(coloring, control)));
         let (assemblies, memory) = (Assemblies::default(), Reservation::new(&control.memory));
-        let mut reader = BlockReader { job, limits, selected, colors, spheres, head: None, assemblies, memory };
+        let mut reader = BlockReader { options, limits, selected, colors, spheres, head: None, assemblies, memory };
         match stream.source {
             StreamSource::Files(files) => {
                 for (number, input) in files.into_iter().enumerate() {
@@ -218,12 +219,12 @@ impl Tileset<Box<Structure>> {
         }
         let BlockReader { selected, colors, spheres, head, assemblies, memory: _memory, .. } = reader;
         let atoms_in_file = selected.n_in_files();
-        let assembly = match &job.selection.assembly {
+        let assembly = match &options.selection.assembly {
             Some(id) => Some(AssemblyRules::find(&assemblies, &selected.chain_names(), id, control)?),
             None => None,
         };
         let n_of_chains = selected.n_of_chains();
-        let mut selected = selected.finish(&job.selection, assembly.as_ref())?;
+        let mut selected = selected.finish(&options.selection, assembly.as_ref())?;
         let placements = assembly.map(|assembly| assembly.placements(&n_of_chains, limits, control)).transpose()?;
         let groups = placements.as_ref().map_or_else(|| vec![0], Placements::chains);
         let colors = colors.map(|colors| colors.finish(groups.into_iter())).transpose()?;
@@ -433,9 +434,9 @@ mod tests {
 
     type Written = (BTreeMap<String, Vec<u8>>, TilesetReport);
 
-    fn job(query: &[(&str, &str)]) -> Job {
+    fn options(query: &[(&str, &str)]) -> Options {
         let all = query.iter().copied().chain([("compress", "meshopt")]);
-        params::parse(all).unwrap().job
+        params::parse(all).unwrap().options
     }
 
     fn choice(backend: &CpuBackend) -> Choice<'_> {
@@ -443,7 +444,7 @@ mod tests {
     }
 
     /// Returns the files of the tileset of a structure in memory.
-    fn in_memory(text: &str, job: &Job) -> Written {
+    fn in_memory(text: &str, options: &Options) -> Written {
         let (files, limits, control) = (Mutex::default(), JobLimits::default(), Control::default());
         let store = |path: &str, bytes: &[u8]| {
             let files: &Mutex<BTreeMap<_, _>> = &files;
@@ -451,7 +452,7 @@ mod tests {
             Ok(())
         };
         let read = |_: &Control<'_>| read(text.as_bytes(), &limits.read).map(Box::new);
-        let report = write(read, job, &choice(&CpuBackend::default()), &limits, &control, &(), store).unwrap();
+        let report = write(read, options, &choice(&CpuBackend::default()), &limits, &control, &(), store).unwrap();
         (files.into_inner().unwrap(), report)
     }
 
@@ -460,8 +461,8 @@ mod tests {
     }
 
     /// Returns the files of the tileset of a stream.
-    fn streamed(texts: &[&str], block_bytes: usize, job: &Job) -> Result<Written, String> {
-        check_stream(job, texts.len()).map_err(|error| error.to_string())?;
+    fn streamed(texts: &[&str], block_bytes: usize, options: &Options) -> Result<Written, String> {
+        check_stream(options, texts.len()).map_err(|error| error.to_string())?;
         let (files, limits, control) = (Mutex::default(), JobLimits::default(), Control::default());
         let store = |path: &str, bytes: &[u8]| {
             let files: &Mutex<BTreeMap<_, _>> = &files;
@@ -471,7 +472,7 @@ mod tests {
         let inputs = texts.iter().map(|text| Box::new(text.as_bytes()) as Box<dyn Read + Send>).collect();
         let stream =
             StructureStream { source: StreamSource::Files(inputs), scratch: scratch(), block_bytes, began: &|_| {} };
-        let written = write_stream(stream, job, &choice(&CpuBackend::default()), &limits, &control, &(), store);
+        let written = write_stream(stream, options, &choice(&CpuBackend::default()), &limits, &control, &(), store);
         let report = written.map_err(|error| error.to_string())?;
         Ok((files.into_inner().unwrap(), report))
     }
@@ -499,11 +500,11 @@ mod tests {
             &[("resolution", "4"), ("color", "bfactor"), ("color_range", "0,0.004")],
             &[("resolution", "1.5"), ("select", "water or chain B0"), ("radius_offset", "0.2")],
         ] {
-            let job = job(query);
-            let expected = in_memory(&text, &job);
+            let options = options(query);
+            let expected = in_memory(&text, &options);
             assert!(expected.1.levels.len() > 1 && expected.0.len() > 4, "{query:?}");
             for block_bytes in [3000, 20_000, 1 << 24] {
-                let found = streamed(&[&text], block_bytes, &job).unwrap();
+                let found = streamed(&[&text], block_bytes, &options).unwrap();
                 assert_same(&found, &expected, &format!("{query:?} {block_bytes}"));
             }
         }
@@ -513,19 +514,19 @@ mod tests {
     #[test]
     fn several_files_are_one_structure() {
         let (head, rows) = copies(5);
-        let job = job(&[("resolution", "2"), ("color", "chain"), ("atom_ids", "true"), ("select", "all")]);
-        let expected = in_memory(&(head.clone() + &rows.concat()), &job);
+        let options = options(&[("resolution", "2"), ("color", "chain"), ("atom_ids", "true"), ("select", "all")]);
+        let expected = in_memory(&(head.clone() + &rows.concat()), &options);
         let file = |rows: &[String]| head.clone() + &rows.concat();
         let third = rows.len() / 5;
         let files = [file(&rows[..third]), file(&rows[third..3 * third]), file(&rows[3 * third..])];
         let texts = || files.iter().map(String::as_str).collect::<Vec<_>>();
-        assert_same(&streamed(&texts(), 5000, &job).unwrap(), &expected, "three files");
+        assert_same(&streamed(&texts(), 5000, &options).unwrap(), &expected, "three files");
         let short = file(&rows[3 * third + 1..]);
-        let found = streamed(&[&files[0], &files[1], &short], 5000, &job).unwrap();
+        let found = streamed(&[&files[0], &files[1], &short], 5000, &options).unwrap();
         assert_ne!(found.0, expected.0);
         assert_eq!(found.1.atoms + 1, expected.1.atoms);
         // The order of the files determines colours and indices.
-        let found = streamed(&[&files[1], &files[0], &files[2]], 5000, &job).unwrap();
+        let found = streamed(&[&files[1], &files[0], &files[2]], 5000, &options).unwrap();
         assert_ne!(found.0, expected.0);
     }
 
@@ -568,21 +569,21 @@ mod tests {
             (&[("resolution", "1.5"), ("color", "residue"), ("chains", "A0,B0")], 0),
         ] {
             let query: Vec<(&str, &str)> = all.iter().chain(query).copied().collect();
-            let job = job(&query);
+            let options = options(&query);
             for text in &texts {
-                let expected = in_memory(text, &job);
+                let expected = in_memory(text, &options);
                 assert!(expected.1.levels.len() > 1 && expected.1.atoms > n_atoms, "{}", expected.1.atoms);
                 for block_bytes in [3000, 20_000, 1 << 24] {
-                    let found = streamed(&[text], block_bytes, &job).unwrap();
+                    let found = streamed(&[text], block_bytes, &options).unwrap();
                     assert_same(&found, &expected, &format!("{query:?} {block_bytes}"));
                 }
             }
         }
         // Negative controls: one operator, and the rules twice.
-        let single = streamed(&[&texts[0]], 3000, &job(&[("assembly", "2"), ("resolution", "2")])).unwrap();
+        let single = streamed(&[&texts[0]], 3000, &options(&[("assembly", "2"), ("resolution", "2")])).unwrap();
         assert!(single.1.atoms < 500, "{}", single.1.atoms);
         let other = texts[2].replace("data_y", "");
-        let query = job(&[("assembly", "1"), ("resolution", "2")]);
+        let query = options(&[("assembly", "1"), ("resolution", "2")]);
         assert_ne!(in_memory(&other, &query).1.atoms, in_memory(&texts[2], &query).1.atoms);
         assert_same(&streamed(&[&other], 3000, &query).unwrap(), &in_memory(&other, &query), "two tables");
     }
@@ -592,17 +593,17 @@ mod tests {
         let (head, rows) = copies(3);
         let text = head + &rows.concat() + ASSEMBLY + &operators();
         let of = |id: &str, limits: &ReadLimits| {
-            let job = job(&[("assembly", id), ("resolution", "2")]);
+            let options = options(&[("assembly", id), ("resolution", "2")]);
             let stream = StructureStream {
                 source: StreamSource::Files(vec![Box::new(text.as_bytes())]),
                 scratch: scratch(),
                 block_bytes: 5000,
                 began: &|_| {},
             };
-            let made = Tileset::of_stream(stream, &job, limits, &Control::default(), &StageClock::new(&()));
+            let made = Tileset::of_stream(stream, &options, limits, &Control::default(), &StageClock::new(&()));
             let expected = molmesh_structure::select_with(
                 &read(text.as_bytes(), limits).unwrap(),
-                &job.selection,
+                &options.selection,
                 limits,
                 &Control::default(),
             );
@@ -625,7 +626,7 @@ mod tests {
     fn what_needs_the_whole_structure_is_rejected() {
         let (head, rows) = copies(2);
         let text = head.clone() + &rows.concat();
-        let of = |query: &[(&str, &str)]| streamed(&[&text], 3000, &job(query)).unwrap_err();
+        let of = |query: &[(&str, &str)]| streamed(&[&text], 3000, &options(query)).unwrap_err();
         for (query, expected) in [
             (&[("select", "within 5 of water")][..], "`select`"),
             (&[("assembly", "1"), ("instances", "true")], "`instances`"),
@@ -646,7 +647,7 @@ mod tests {
         }
         // A residue with alternative locations occurs twice.
         let twice = head + &rows[..1000].concat() + &rows[..400].concat();
-        let found = streamed(&[&twice], 3000, &job(&[])).unwrap_err();
+        let found = streamed(&[&twice], 3000, &options(&[])).unwrap_err();
         assert!(found.contains("residue 20 of chain `B0`"), "{found}");
     }
 

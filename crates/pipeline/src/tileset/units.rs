@@ -12,7 +12,7 @@ use super::layout::{CELLS, Layout};
 use super::level::{Buckets, MIN_BUCKET, TilesetLevel};
 use crate::color::{AtomColors, Coloring, Scheme};
 use crate::load::{LoadedStructure, SPHERE_BYTES, load};
-use crate::{Choice, Job, JobError, JobLimits, Product, ProgressSink, Scope, Spacing, StageClock, run_loaded};
+use crate::{Choice, JobError, JobLimits, Options, Product, ProgressSink, Scope, Spacing, StageClock, run_loaded};
 
 /// Tileset of an assembly.
 pub struct AssemblyTileset<S> {
@@ -26,30 +26,30 @@ pub struct AssemblyTileset<S> {
 }
 
 impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
-    /// Prepares the units of the structure that `read` returns. `job` has `instances`.
+    /// Prepares the units of the structure that `read` returns. `options` has `instances`.
     ///
     /// # Errors
     /// Returns a [`JobError`] if reading or selecting fails, or the job is cancelled.
     pub fn new(
         read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
-        job: &Job,
+        options: &Options,
         limits: &ReadLimits,
         control: &Control<'_>,
         clock: &StageClock<'_>,
     ) -> Result<Self, JobError> {
-        let LoadedStructure { structure, selected, spheres } = load(read, job, limits, clock, control)?;
+        let LoadedStructure { structure, selected, spheres } = load(read, options, limits, clock, control)?;
         let bounds = |unit: &Unit| {
             control.check()?;
             let _spheres = control.reserve((SPHERE_BYTES + 4) * unit.rows.len() as u64)?;
             let own = spheres.subset(&rows_of(unit));
-            Ok(Layout::of(&own, &job.params_for(own.len()))?.bounds())
+            Ok(Layout::of(&own, &options.params_for(own.len()))?.bounds())
         };
         let bounds = selected.units.iter().map(bounds).collect::<Result<_, SurfaceError>>()?;
         let needs_range = |coloring: &&Coloring| {
             coloring.range.is_none() && matches!(coloring.scheme, Scheme::BFactor | Scheme::Occupancy)
         };
         let range = |coloring| Ok::<_, JobError>(AtomColors::new(&structure, &selected.atoms, coloring)?.range());
-        let range = job.color.as_ref().filter(needs_range).map(range).transpose()?;
+        let range = options.color.as_ref().filter(needs_range).map(range).transpose()?;
         // A range without extent cannot be requested, and is the same for all units.
         let color_range = range.filter(|[low, high]| low < high);
         Ok(Self { structure, selected, spheres, bounds, color_range })
@@ -84,18 +84,18 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
     }
 
     /// Returns the job of the tileset of a unit, numbered from 1.
-    pub(super) fn job_of_unit(&self, job: &Job, number: usize) -> Job {
+    pub(super) fn job_of_unit(&self, options: &Options, number: usize) -> Options {
         let unit = u32::try_from(number).ok().and_then(NonZeroU32::new);
-        let selection = Selection { instances: false, unit, ..job.selection.clone() };
-        self.colored(Job { selection, ..job.clone() })
+        let selection = Selection { instances: false, unit, ..options.selection.clone() };
+        self.colored(Options { selection, ..options.clone() })
     }
 
     /// Sets the range of the colours.
-    fn colored(&self, mut job: Job) -> Job {
-        if let Some(coloring) = &mut job.color {
+    fn colored(&self, mut options: Options) -> Options {
+        if let Some(coloring) = &mut options.color {
             coloring.range = coloring.range.or(self.color_range);
         }
-        job
+        options
     }
 
     /// Meshes the root: all instances at the coarsest grid spacing of the units, or at the next level at which the grid
@@ -105,7 +105,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
     /// Returns the errors of meshing and compression.
     pub fn root(
         &self,
-        job: &Job,
+        options: &Options,
         limits: &JobLimits,
         choice: &Choice<'_>,
         control: &Control<'_>,
@@ -117,7 +117,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         loop {
             let spacing = coarsest / f64::from(1_u32 << level);
             level += 1;
-            match self.root_at(spacing, job, limits, choice, control, progress) {
+            match self.root_at(spacing, options, limits, choice, control, progress) {
                 Err(JobError::Surface(SurfaceError::NoSurface { .. })) if level < levels => {}
                 made => return made,
             }
@@ -128,22 +128,22 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
     fn root_at(
         &self,
         spacing: f64,
-        job: &Job,
+        options: &Options,
         limits: &JobLimits,
         choice: &Choice<'_>,
         control: &Control<'_>,
         progress: &dyn ProgressSink,
     ) -> Result<Product, JobError> {
         let clock = StageClock::new(progress);
-        let (selected, spheres) = clock.time("index", || self.grouped(job, spacing, control))?;
-        let params = SurfaceParams { resolution: spacing, ..job.params.clone() };
-        let coarse = self.colored(Job { params, spacing: Spacing::Given, tile: None, ..job.clone() });
+        let (selected, spheres) = clock.time("index", || self.grouped(options, spacing, control))?;
+        let params = SurfaceParams { resolution: spacing, ..options.params.clone() };
+        let coarse = self.colored(Options { params, spacing: Spacing::Given, tile: None, ..options.clone() });
         let loaded = LoadedStructure { structure: &*self.structure, selected, spheres };
         let mut product = run_loaded(loaded, &coarse, limits, choice, &Scope::new(&clock, control), None)?;
         // The groups represent all atoms.
         let report = &mut product.report;
         report.atoms = self.selected.atoms.len() as u64;
-        (report.resolution_from, report.detail) = (job.spacing.parameter(), job.spacing.detail());
+        (report.resolution_from, report.detail) = (options.spacing.parameter(), options.spacing.detail());
         if let (Some(color), Some(coloring)) = (&mut report.color, &coarse.color) {
             let all = &self.selected.atoms;
             color.legend = AtomColors::new(&self.structure, all, coloring)?.report(all).legend;
@@ -159,7 +159,12 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
     }
 
     /// Returns the spheres of all units on a grid with this spacing, Å, with the atoms that represent them.
-    fn grouped(&self, job: &Job, spacing: f64, control: &Control<'_>) -> Result<(Selected, Spheres), SurfaceError> {
+    fn grouped(
+        &self,
+        options: &Options,
+        spacing: f64,
+        control: &Control<'_>,
+    ) -> Result<(Selected, Spheres), SurfaceError> {
         let [mut x, mut y, mut z] = [const { Vec::new() }; 3];
         let (mut radii, mut atoms, mut units) = (Vec::new(), Vec::new(), Vec::new());
         let mut side = CELLS * spacing;
@@ -173,7 +178,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
             of_unit.memory.grow((SPHERE_BYTES + 4) * rows.len() as u64)?;
             let own = Arc::new(self.spheres.subset(&rows));
             let buckets = Arc::new(Buckets::new(&own, side, of_unit)?);
-            let params = job.params_for(own.len());
+            let params = options.params_for(own.len());
             let level = TilesetLevel::new(&own, &buckets, &params, [spacing, CELLS * spacing], of_unit)?;
             control.memory.grow((SPHERE_BYTES + 4) * level.spheres.len() as u64)?;
             let first = atoms.len();

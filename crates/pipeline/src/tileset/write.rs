@@ -13,7 +13,7 @@ use serde::Serialize;
 use thiserror::Error;
 
 use super::{AssemblyTileset, StructureStream, Tileset};
-use crate::{Choice, Job, JobError, JobLimits, LeftOutReport, Product, ProgressSink, Scope, StageClock};
+use crate::{Choice, JobError, JobLimits, LeftOutReport, Options, Product, ProgressSink, Scope, StageClock};
 
 /// Contents of a tileset.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -87,7 +87,7 @@ pub enum WriteError {
 /// Returns a [`WriteError`] if the structure cannot be read, or for the first tile that cannot be meshed or written.
 pub fn write<S: Deref<Target = Structure> + Sync>(
     read: impl FnOnce(&Control<'_>) -> Result<S, StructureError>,
-    job: &Job,
+    options: &Options,
     choice: &Choice<'_>,
     limits: &JobLimits,
     control: &Control<'_>,
@@ -96,21 +96,21 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
 ) -> Result<TilesetReport, WriteError> {
     let clock = StageClock::new(progress);
     let store = |path: &str, bytes: &[u8]| store(&write, path, bytes);
-    if !job.selection.instances {
-        let tileset = Tileset::new(read, job, &limits.read, control, &clock)?;
-        return tileset.write(job, choice, &limits.surface, control, progress, store);
+    if !options.selection.instances {
+        let tileset = Tileset::new(read, options, &limits.read, control, &clock)?;
+        return tileset.write(options, choice, &limits.surface, control, progress, store);
     }
-    let assembly = AssemblyTileset::new(read, job, &limits.read, control, &clock)?;
+    let assembly = AssemblyTileset::new(read, options, &limits.read, control, &clock)?;
     let units = assembly.units();
     let mut all = TilesetReport::default();
     for (number, Unit { name, rows, operators, .. }) in (1..).zip(units) {
         // Releases all memory that is counted for the unit.
         let control = &control.metered();
-        let (job, structure) = (assembly.job_of_unit(job, number), &**assembly.structure());
-        let tileset = Tileset::new(|_| Ok(structure), &job, &limits.read, control, &clock)?;
+        let (options, structure) = (assembly.job_of_unit(options, number), &**assembly.structure());
+        let tileset = Tileset::new(|_| Ok(structure), &options, &limits.read, control, &clock)?;
         let part = Part { sink: progress, index: number - 1, count: units.len() };
         let in_folder = |path: &str, bytes: &[u8]| store(&format!("{}/{path}", unit_folder(number)), bytes);
-        let report = tileset.write(&job, choice, &limits.surface, control, &part, in_folder)?;
+        let report = tileset.write(&options, choice, &limits.surface, control, &part, in_folder)?;
         let (name, atoms, instances) = (name.clone(), rows.len() as u64, operators.len() as u64);
         all.units.push(UnitReport { name, atoms, instances, levels: report.levels });
         all.atoms += atoms;
@@ -118,7 +118,7 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
         all.bytes += report.bytes;
     }
     let root = format!("{}.glb", TileAddress::ROOT.path());
-    let product = assembly.root(job, limits, choice, control, &())?;
+    let product = assembly.root(options, limits, choice, control, &())?;
     all.bytes += store(&root, &glb_of(&product)?)?;
     let repeated = assembly.repeated(|number| format!("{}/tileset.json", unit_folder(number)));
     let document = assembly_document(&root, &repeated).to_string();
@@ -135,7 +135,7 @@ pub fn write<S: Deref<Target = Structure> + Sync>(
 /// Returns the errors of [`write()`], and those of the temporary file.
 pub fn write_stream(
     stream: StructureStream<'_>,
-    job: &Job,
+    options: &Options,
     choice: &Choice<'_>,
     limits: &JobLimits,
     control: &Control<'_>,
@@ -143,9 +143,9 @@ pub fn write_stream(
     write: impl Fn(&str, &[u8]) -> io::Result<()> + Sync,
 ) -> Result<TilesetReport, WriteError> {
     let clock = StageClock::new(progress);
-    let tileset = Tileset::of_stream(stream, job, &limits.read, control, &clock)?;
+    let tileset = Tileset::of_stream(stream, options, &limits.read, control, &clock)?;
     let store = |path: &str, bytes: &[u8]| store(&write, path, bytes);
-    tileset.write(job, choice, &limits.surface, control, progress, store)
+    tileset.write(options, choice, &limits.surface, control, progress, store)
 }
 
 /// Passes a file to `write`. Returns its size, bytes.
@@ -185,14 +185,14 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
     /// Meshes all tiles and passes each file with its path to `store`, which returns its size, bytes.
     fn write(
         &self,
-        job: &Job,
+        options: &Options,
         choice: &Choice<'_>,
         limits: &SurfaceLimits,
         control: &Control<'_>,
         progress: &dyn ProgressSink,
         store: impl Fn(&str, &[u8]) -> Result<u64, WriteError> + Sync,
     ) -> Result<TilesetReport, WriteError> {
-        let colors = job.color.map(|coloring| self.colors(coloring, control)).transpose()?;
+        let colors = options.color.map(|coloring| self.colors(coloring, control)).transpose()?;
         let addresses: Vec<TileAddress> = self.tiles.iter().copied().collect();
         let done = AtomicUsize::new(0);
         // Not by parallel iterators: a thread that waits within a tile would begin other tiles, without a limit.
@@ -200,9 +200,9 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
             let address = addresses[i];
             // Releases all memory that is counted for the tile. The file is not counted.
             let control = &control.metered();
-            let job = Job { tile: Some(address), ..job.clone() };
+            let options = Options { tile: Some(address), ..options.clone() };
             let clock = StageClock::new(&());
-            let tile = self.product((&job, colors.as_ref()), choice, limits, &Scope::new(&clock, control))?;
+            let tile = self.product((&options, colors.as_ref()), choice, limits, &Scope::new(&clock, control))?;
             let n = done.fetch_add(1, Ordering::Relaxed) + 1;
             progress.progress("tiles", n as f64 / addresses.len() as f64);
             if tile.report.triangles == 0 {
@@ -213,7 +213,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
         })?;
         let made: Vec<(TileAddress, u64, u64)> = made.into_iter().flatten().collect();
         if made.is_empty() {
-            return Err(JobError::from(SurfaceError::NoSurface { isovalue: job.params.level() }).into());
+            return Err(JobError::from(SurfaceError::NoSurface { isovalue: options.params.level() }).into());
         }
         let level = |level| LevelReport { spacing: self.spacing(level), ..LevelReport::default() };
         let mut levels: Vec<LevelReport> = (0..self.layout.levels).map(level).collect();
