@@ -48,7 +48,7 @@ fmt: ## Format
 fmt-check:
 	$(CARGO) fmt --all -- --check
 
-# `static-if-possible` compiles the program without the feature `gpu`.
+# With the feature `gpu` only: `static-if-possible` compiles the program without it.
 lint: ## Clippy and documentation of everything; warnings are errors
 	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --quiet
@@ -127,8 +127,8 @@ static: web-if-possible ## Build a static file for any Linux, without GPU suppor
 	deploy/static.sh
 
 # For the tests, with their profile, so that both share procedural macros and build scripts. Warnings are errors, as in
-# `lint`. Without Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A failed build
-# is an error.
+# `lint`. Without Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A
+# failed build is an error.
 static-if-possible:
 	@RUSTFLAGS="-D warnings" deploy/static.sh dev || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
 

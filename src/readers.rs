@@ -43,14 +43,15 @@ impl ReadTimes {
 
 /// Requests at the gate.
 #[derive(Debug, Default)]
-struct LineState {
+struct GateState {
     waiting: usize,
     /// Starts of the reads in progress.
     reading: Vec<Instant>,
+    /// Durations of the reads that have ended.
     ended: ReadTimes,
 }
 
-impl LineState {
+impl GateState {
     /// Returns the durations of reads at this moment: a read in progress that takes longer than the mean counts as if
     /// it had just ended. Otherwise a burst of requests would wait before the first read has shown how long they take.
     fn times(&self) -> ReadTimes {
@@ -76,7 +77,7 @@ pub struct Busy {
 pub struct Readers {
     permits: Arc<Semaphore>,
     shares: Arc<ClientShares>,
-    state: Arc<Mutex<LineState>>,
+    state: Arc<Mutex<GateState>>,
     number: usize,
 }
 
@@ -87,12 +88,12 @@ impl Readers {
         Self { permits, shares, state: Arc::default(), number }
     }
 
-    fn lock(&self) -> MutexGuard<'_, LineState> {
+    fn lock(&self) -> MutexGuard<'_, GateState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Estimates the time until a request that arrives now is read.
-    fn estimated_wait(&self, state: &LineState) -> Duration {
+    fn estimated_wait(&self, state: &GateState) -> Duration {
         if state.waiting + state.reading.len() < self.number {
             return Duration::ZERO;
         }

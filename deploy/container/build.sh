@@ -47,7 +47,8 @@ if $debootstrap; then
     deploy/container/debian-base.sh "$suite" target/container/base.tar
     BASE_IMAGE=localhost/molmesh-base:$suite
     { "${engine[@]}" import target/container/base.tar "$BASE_IMAGE" >/dev/null &&
-        "${engine[@]}" run --rm --network none --ulimit nofile=1024:1024 --ulimit nproc=4096:4096 "$BASE_IMAGE" true; } ||
+        "${engine[@]}" run --rm --network none --ulimit nofile=1024:1024 --ulimit nproc=4096:4096 \
+            "$BASE_IMAGE" true; } ||
         impossible "this machine cannot run containers"
     rm target/container/base.tar
 fi

@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use metrics::{counter, histogram};
 use quick_cache::sync::Cache;
-
 use tracing::Instrument as _;
 
 use super::client::Answer;

@@ -4,7 +4,7 @@ use molmesh::pipeline::areas::measure_selection;
 use molmesh::pipeline::params::areas::AreasRequest;
 use molmesh::pipeline::{LeftOutReport, MeasuredSelection, Options, SelectionMeasures};
 use molmesh::structure::{self, Structure};
-use molmesh::surface::{CancelToken, Control};
+use molmesh::surface::{CancelToken, Control, Limit};
 use serde::Serialize;
 
 use super::args::AreasArgs;
@@ -25,7 +25,7 @@ pub(super) fn run(args: &AreasArgs) -> Result<(), CliError> {
     interrupt::watch(&cancel)?;
     output::refuse_input(&args.input, &args.output)?;
     let mut output = Output::open(&args.output, &cancel)?;
-    let input = job::read(&args.input, limits.read.max_inflated_bytes)?;
+    let input = job::read(&args.input, Limit::InflatedBytes, limits.read.max_inflated_bytes)?;
     let control = Control { cancel, ..Control::default() };
     let failure = |error| job::failure(error, &args.input, &input, &limits);
     let structure = structure::read_with(&input, &limits.read, &control).map_err(|error| failure(error.into()))?;

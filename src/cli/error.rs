@@ -3,10 +3,8 @@
 use std::io::{self, Write};
 
 use molmesh::formats::FormatError;
-use molmesh::picture::PictureError;
 use molmesh::pipeline::JobError;
 use molmesh::structure::StructureError;
-use molmesh::structure::map::MapError;
 use molmesh::surface::SurfaceError;
 use thiserror::Error;
 
@@ -143,15 +141,16 @@ impl CliError {
             Self::Input { .. } => code::INPUT,
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
-            Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
-            Self::Job { source: JobError::Color(_), .. } | Self::Strict { .. } => code::STRUCTURE,
-            Self::Job { source: JobError::Map(error), .. } => map_code(error),
+            Self::Job { source: JobError::Color(_) | JobError::Map(_), .. } | Self::Strict { .. } => code::STRUCTURE,
             Self::Job { source: JobError::Format(error), .. } | Self::Format(error) => format_code(error),
             Self::NoBackend { .. } | Self::Unfit { backend: true, .. } => code::BACKEND,
             Self::Output { .. } => code::OUTPUT,
             Self::InUse(_) => code::IN_USE,
             Self::Interrupted => code::INTERRUPTED,
-            Self::Service(_) | Self::Unfit { .. } | Self::Internal(_) => code::INTERNAL,
+            Self::Job { source: JobError::Picture(_), .. }
+            | Self::Service(_)
+            | Self::Unfit { .. }
+            | Self::Internal(_) => code::INTERNAL,
         }
     }
 
@@ -186,14 +185,6 @@ fn structure_code(error: &StructureError) -> i32 {
     match error {
         StructureError::Input { .. } => code::INPUT,
         StructureError::Scratch { .. } | StructureError::DiskFull | StructureError::DiskSpace(_) => code::OUTPUT,
-        StructureError::Limit(_) | StructureError::Memory(_) => code::LIMIT,
-        _ => code::STRUCTURE,
-    }
-}
-
-fn map_code(error: &MapError) -> i32 {
-    match error {
-        MapError::Limit(_) | MapError::Memory(_) => code::LIMIT,
         _ => code::STRUCTURE,
     }
 }
@@ -210,15 +201,6 @@ fn surface_code(error: &SurfaceError) -> i32 {
         SurfaceError::Device { .. } => code::BACKEND,
         SurfaceError::Cancelled => code::INTERRUPTED,
         SurfaceError::Sink => code::INTERNAL,
-    }
-}
-
-fn picture_code(error: &PictureError) -> i32 {
-    match error {
-        PictureError::Limit(_) | PictureError::Memory(_) => code::LIMIT,
-        PictureError::Device { .. } => code::BACKEND,
-        PictureError::Cancelled => code::INTERRUPTED,
-        PictureError::Quantized | PictureError::Png(_) => code::INTERNAL,
     }
 }
 
@@ -260,7 +242,9 @@ mod tests {
 
     #[test]
     fn every_flag_of_a_limit_exists() {
-        let mesh = Args::command().find_subcommand("mesh").unwrap().clone();
+        let mut args = Args::command();
+        args.build();
+        let mesh = args.find_subcommand("mesh").unwrap();
         let flags: Vec<String> =
             mesh.get_arguments().filter_map(|arg| Some(format!("--{}", arg.get_long()?))).collect();
         for flag in LIMITS.iter().filter_map(|row| row.flag) {

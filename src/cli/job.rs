@@ -81,10 +81,15 @@ impl<'a> CommandJob<'a> {
         let cancel = CancelToken::default();
         interrupt::watch(&cancel)?;
         let output = open(&cancel)?;
-        let input = if streamed.is_some() { Vec::new() } else { read(path, limits.read.max_inflated_bytes)? };
+        let input = if streamed.is_some() {
+            Vec::new()
+        } else {
+            read(path, Limit::InflatedBytes, limits.read.max_inflated_bytes)?
+        };
         if let Some(map) = args.map.as_deref() {
             // The command line makes no content keys.
-            options.map = Some(MapFile::new(String::new(), read(map, limits.map.max_inflated_bytes)?));
+            let bytes = read(map, Limit::MapBytes, limits.map.max_inflated_bytes)?;
+            options.map = Some(MapFile::new(String::new(), bytes));
         }
         let atoms = streamed.unwrap_or_else(|| pipeline::estimate_atoms(&input));
         requested.work = Some(pipeline::estimate_work(atoms, &options));
@@ -179,7 +184,11 @@ impl<'a> CommandJob<'a> {
 
     /// Converts the error of the job.
     pub(super) fn failure(&self, source: JobError) -> CliError {
-        let map = self.args.map.as_deref().filter(|_| matches!(source, JobError::Map(_)));
+        let is_about_map = match &source {
+            JobError::Surface(SurfaceError::Limit(error)) => matches!(error.limit, Limit::MapBytes | Limit::MapPoints),
+            other => matches!(other, JobError::Map(_)),
+        };
+        let map = self.args.map.as_deref().filter(|_| is_about_map);
         failure(source, map.unwrap_or(self.path), &self.input, &self.limits)
     }
 
@@ -213,22 +222,23 @@ impl<'a> CommandJob<'a> {
     }
 }
 
-/// Reads the input, of at most `limit` bytes. The limit of decompressed bytes also suits a compressed input.
-pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
+/// Reads a file of at most `max` bytes; `limit` is the limit that a larger one exceeds. That of decompressed bytes also
+/// suits a compressed file.
+pub(super) fn read(path: &Path, limit: Limit, max: u64) -> Result<Vec<u8>, CliError> {
     let stdin = is_stdio(path);
     let name = || name_of(path);
     let read = || -> io::Result<Vec<u8>> {
         if stdin {
-            return take(io::stdin().lock(), 0, limit);
+            return take(io::stdin().lock(), 0, max);
         }
         let file = File::open(path)?;
         let size = file.metadata()?.len();
         // One spare byte lets the reader detect the end of the file without growing the buffer.
-        take(file, if size > limit { 0 } else { size + 1 }, limit)
+        take(file, if size > max { 0 } else { size + 1 }, max)
     };
     let bytes = read().map_err(|source| CliError::Input { name: name(), source })?;
-    if bytes.len() as u64 > limit {
-        let source = SurfaceError::Limit(Exceeded::new(Limit::InflatedBytes, limit).into()).into();
+    if bytes.len() as u64 > max {
+        let source = SurfaceError::Limit(Exceeded::new(limit, max).into()).into();
         return Err(CliError::Job { name: name(), source, strict_finding: None });
     }
     Ok(bytes)

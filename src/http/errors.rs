@@ -76,7 +76,7 @@ impl From<&Exceeded> for Problem {
             ("position", error.position.map(|position| position.to_vec().into())),
             ("suggested_resolution", error.suggested_resolution.map(Value::from)),
         ];
-        let problem = Self::new(entry.problem_type, error.to_string()).with("limit", error.max);
+        let problem = Self::new(entry.problem_type, error.message(error.key())).with("limit", error.max);
         members
             .into_iter()
             .filter_map(|(name, value)| Some((name, value?)))

@@ -116,19 +116,18 @@ impl ParsedRequest {
 /// Parses the parameters of an address that ends in `surface.{ext}` (`file`), or in `report.json` (`None`).
 pub(super) fn parse_address(file: Option<&str>, pairs: &[(String, String)]) -> Result<Request, Problem> {
     let named = file.map(format_of).transpose()?;
-    let format = |_: &_| Ok::<_, Problem>(named.unwrap_or_default());
-    let request = params::parse_with(pairs.iter().map(|(n, v)| (n, v)), format)?;
     if let Some(named) = named
-        && pairs.iter().any(|(name, _)| name == "format")
+        && let Some((_, value)) = pairs.iter().find(|(name, _)| name == "format")
+        && Format::ALL.iter().any(|format| format.name() == value)
     {
-        let value = request.format.name();
         let detail = format!("parameter `format`: the path already names {}", named.name());
         return Err(Problem::new(ProblemType::BadParameter, detail)
             .with("parameter", "format")
-            .with("value", value)
+            .with("value", value.as_str())
             .with("expected", format!("no value here, or the path surface.{value}")));
     }
-    Ok(request)
+    let format = |_: &_| Ok::<_, Problem>(named.unwrap_or_default());
+    params::parse_with(pairs.iter().map(|(n, v)| (n, v)), format)
 }
 
 /// Returns the format that `surface.{ext}` names.

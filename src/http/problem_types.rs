@@ -214,7 +214,7 @@ pub(super) const PROBLEM_TYPES: &[ProblemEntry] = &[
     row(ProblemType::DeviceFailed, "device-failed", S::SERVICE_UNAVAILABLE, false, "No device could run the job",
         "All devices that could run the job failed, and there is no fallback. The job is not the cause. Retry after `Retry-After` seconds; the server log has the details."),
     row(ProblemType::QueueFull, "queue-full", S::SERVICE_UNAVAILABLE, true, "Too many jobs are waiting",
-        "All workers are busy and `limit` jobs are waiting, or the job would miss its deadline in the queue. `Retry-After` is an estimate in seconds."),
+        "All workers are busy and `limit` jobs are waiting, or the request would probably miss its deadline, `limit` ms. `Retry-After` is an estimate in seconds."),
     row(ProblemType::TooManyJobs, "too-many-jobs", S::SERVICE_UNAVAILABLE, true, "Too many asynchronous jobs are open",
         "The server keeps records of at most `limit` asynchronous jobs, in total or for one client, and none of these jobs has ended. Wait for the end of a job, or cancel one. Retry after `Retry-After` seconds."),
     row(ProblemType::MemoryFull, "memory-full", S::SERVICE_UNAVAILABLE, true, "The memory limit is reached",

@@ -22,8 +22,8 @@ use crate::archive::{Entry, FetchError, UnavailableReason};
 use crate::jobs::{Input, MemoryReservation};
 use crate::pipeline::{Options, algorithm_versions};
 use crate::store::{Digest, Name};
-use crate::structure::{ArchiveError, EntryId, ReadLimits, Structure};
-use crate::surface::Control;
+use crate::structure::{ArchiveError, EntryId, ReadLimits, Structure, StructureError};
+use crate::surface::{Control, Limit};
 
 /// Caching of everything that follows from a structure and its parameters. Archive entries are revised rarely, so a day
 /// without revalidation is acceptable.
@@ -65,12 +65,18 @@ impl Loaded {
         list: impl FnOnce(&Structure, &ReadLimits, &Control<'_>, MemoryReservation) -> Result<T, Problem> + Send + 'static,
     ) -> Result<T, Problem> {
         let mut limits = app.config.limits.job().read;
+        let is_fixed = app.config.limits.labels < limits.max_atoms;
         limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
         let reservation = app.memory(caller.client).reservation();
         let (structures, namespace) = (app.structures(), caller.namespace);
         let Self { input, digest, reservation: file } = self;
         let listing = app.read(caller, (file, delivery), move |control| {
-            let structure = structures.get(namespace, digest, &input, &limits, control)?;
+            let structure = structures.get(namespace, digest, &input, &limits, control).map_err(|mut error| {
+                if let StructureError::Limit(exceeded) = &mut error {
+                    exceeded.is_fixed |= is_fixed && exceeded.limit == Limit::Atoms;
+                }
+                error
+            })?;
             list(&structure, &limits, control, reservation)
         });
         listing.await?

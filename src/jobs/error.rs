@@ -23,7 +23,8 @@ pub(crate) enum Refusal {
     },
     /// The job would miss its deadline in the queue.
     #[error(
-        "the jobs ahead take about {:.0} s and this one about {:.0} s, and it must end within {:.0} s (`jobs.deadline_ms`)",
+        "the jobs ahead take about {:.0} s and this one about {:.0} s, and it must end within {:.0} s \
+         (`jobs.deadline_ms`)",
         wait.as_secs_f64().ceil(),
         expected.as_secs_f64().ceil(),
         allowed.as_secs_f64().floor()

@@ -228,7 +228,6 @@ async fn attempt(
             Attempt::Stopped
         }
         Err(Failure::Memory(error)) => Attempt::OutOfMemory(error),
-
         Err(failure) => Attempt::Ended(Err(failure.into())),
     }
 }

@@ -13,7 +13,7 @@ use super::pool::WorkerContext;
 use super::rank::Lane;
 use super::{Failure, Finished, JobId, MemoryReservation, OnStart, Outcome, Settings, Task};
 use crate::formats::Pieces;
-use crate::pipeline::{self, Choice, JobError, Product, ProgressSink, Report, Scope, StageClock};
+use crate::pipeline::{self, Choice, JobError, Product, ProgressSink, Report, StageClock, WorkScope};
 use crate::structure::strict_validator::{self, Diagnostic, Level, MAX_UNREAD_BYTES};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, Control, MemoryMeter as _, SurfaceError};
@@ -151,7 +151,12 @@ fn product(
         let clock = StageClock::new(progress);
         let (tileset, colors) =
             structures.tileset((*namespace, *digest), input, options, &limits.read, control, &clock)?;
-        return tileset.product((options, colors.as_deref()), choice, &limits.surface, &Scope::new(&clock, control));
+        return tileset.product(
+            (options, colors.as_deref()),
+            choice,
+            &limits.surface,
+            &WorkScope::new(&clock, control),
+        );
     }
     let read = |control: &Control<'_>| structures.get(*namespace, *digest, input, &limits.read, control);
     pipeline::run_with(read, options, limits, choice, control, progress, None)

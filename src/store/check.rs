@@ -11,7 +11,8 @@ use super::error::StoreError;
 use super::secret;
 
 impl Backend {
-    /// Checks at the start also that the store creates objects conditionally, and that its secret, if any, is undamaged.
+    /// Runs the checks of the start: [`check`](Self::check), conditional creation, and the secret, which must be absent
+    /// or undamaged.
     pub(super) async fn check_start(&self) -> Result<(), StoreError> {
         self.check().await?;
         self.check_creation().await?;

@@ -22,7 +22,7 @@ const REFRESHED: usize = 1000;
 const CLOCK_STEP: Duration = Duration::from_secs(2);
 
 impl Store {
-    /// Opens a store that other nodes use at the same time if `is_shared`; see [`open`](Self::open).
+    /// Opens a store, which other nodes use at the same time if `is_shared`; see [`open`](Self::open).
     pub(crate) async fn open_for(config: &StoreConfig, data_dir: &Path, is_shared: bool) -> Result<Self, StoreError> {
         Self::open_backend(Backend::open(config, data_dir).await?, config, is_shared).await
     }

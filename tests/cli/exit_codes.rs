@@ -144,10 +144,8 @@ fn exceeded_limits_exit_with_5_and_are_named() {
     let message = fails(rod(), &["--max-grid-points", "20_000", "--resolution", "0.1"], 5);
     assert!(message.contains("limit is 20000") && message.contains("hint: try --resolution "), "{message}");
     let message = fails(rod(), &["--max-grid-points", "100"], 5);
-    assert!(
-        message.contains("limit is 100 (limits.grid_points, --max") && message.contains("hint: raise"),
-        "{message}"
-    );
+    let hint = "hint: raise the limit with --max-grid-points";
+    assert!(message.contains("limit is 100") && message.contains(hint), "{message}");
     let message = fails(rod(), &["--max-mesh-bytes", "1000"], 5);
     assert!(message.contains("limit is 1000") && message.contains("hint: try --resolution "), "{message}");
     let message = fails(rod(), &["--max-input-bytes", "100"], 5);

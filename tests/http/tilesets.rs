@@ -279,7 +279,7 @@ fn a_tileset_larger_than_the_cache_is_rejected() {
             } else {
                 let problem = reply.problem(422, "too-much-memory");
                 assert_eq!(problem["limit"], bytes, "{problem}");
-                assert!(problem["detail"].as_str().unwrap().contains("the cache of structures"), "{problem}");
+                assert!(problem["detail"].as_str().unwrap().contains("limits.structure_cache_bytes"), "{problem}");
             }
         }
     }
@@ -363,7 +363,7 @@ fn a_tileset_larger_than_the_cache_is_on_disk() {
         assert!(problem["detail"].as_str().unwrap().contains(parameter), "{problem}");
     }
     drop((on_disk, narrow));
-    for (scratch, place) in [(1_000_000, "disk space"), (0, "the cache of structures")] {
+    for (scratch, place) in [(1_000_000, "disk space"), (0, "limits.structure_cache_bytes")] {
         let server = started(CACHE, scratch);
         let path = format!("{}/tileset.json?select=all&resolution=4", upload(&server, &text));
         let problem = server.get(&path).problem(422, "too-much-memory");

@@ -98,12 +98,12 @@ impl<'a> StageClock<'a> {
 }
 
 /// Scope of work: its cancellation, memory and observer, which is its clock.
-pub struct Scope<'a> {
+pub struct WorkScope<'a> {
     pub(super) clock: &'a StageClock<'a>,
     pub(super) control: Control<'a>,
 }
 
-impl<'a> Scope<'a> {
+impl<'a> WorkScope<'a> {
     /// Creates the scope of work that `control` limits and `clock` observes.
     #[must_use]
     pub fn new(clock: &'a StageClock<'a>, control: &Control<'a>) -> Self {

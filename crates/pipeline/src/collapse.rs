@@ -103,8 +103,8 @@ pub(crate) fn check_error(error: f64, spacing: f64) -> Result<(), SurfaceError> 
 /// again.
 ///
 /// # Errors
-/// Returns the errors of [`check_error`], [`SurfaceError::Limit`] if the error is too small for the limit on
-/// triangles, [`SurfaceError::Memory`] and [`SurfaceError::Cancelled`].
+/// Returns the errors of [`check_error`], [`SurfaceError::Limit`] if the error is too small for the limit on triangles,
+/// [`SurfaceError::Memory`] and [`SurfaceError::Cancelled`].
 pub(crate) fn simplify(
     mesh: &mut Mesh,
     wanted: Simplify,

@@ -106,8 +106,8 @@ impl<'a> Cut<'a> {
     /// memory is added to the meter of `control`.
     ///
     /// # Errors
-    /// Returns [`SurfaceError::NoPatch`] if no triangle remains, [`SurfaceError::Limit`], and the errors of
-    /// memory and cancellation.
+    /// Returns [`SurfaceError::NoPatch`] if no triangle remains, [`SurfaceError::Limit`], and the errors of memory and
+    /// cancellation.
     pub(super) fn apply(
         &self,
         mut whole: MeshOutput,

@@ -6,7 +6,7 @@ use molmesh_picture::{PictureParams, Rendered, SelectedRenderer, png};
 use molmesh_surface::Control;
 
 use super::report::PictureReport;
-use super::{JobError, Product, ProgressSink, Scope, StageClock};
+use super::{JobError, Product, ProgressSink, StageClock, WorkScope};
 
 /// Draws the mesh of `product` and replaces it with the PNG.
 ///
@@ -26,7 +26,7 @@ pub fn draw(
         // The renderer needs random access to vertices.
         mesh.make_contiguous();
         // The mesh is freed before the PNG is allocated.
-        renderer.renderer.render(&Arc::new(mesh), params, &Scope::new(&clock, control).control)
+        renderer.renderer.render(&Arc::new(mesh), params, &WorkScope::new(&clock, control).control)
     })?;
     let bytes = clock.time("png", || png::encode(&drawn.image, control))?;
     product.report.picture = Some(PictureReport::new(params, renderer, &drawn));

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use molmesh_formats::{Compress, CompressedGlb, Encoder, Format, FormatError, Meta, Pieces, Storage};
 use molmesh_surface::{Mesh, SurfaceError};
 
-use super::{JobError, Options, Report, Scope};
+use super::{JobError, Options, Report, WorkScope};
 
 /// Finished job.
 #[derive(Debug, Clone)]
@@ -64,7 +64,11 @@ impl Product {
     }
 
     /// Compresses the mesh and drops its columns if the job asks for it. Checks for cancellation between pieces.
-    pub(super) fn compress(&mut self, options: &Options, Scope { clock, control }: &Scope<'_>) -> Result<(), JobError> {
+    pub(super) fn compress(
+        &mut self,
+        options: &Options,
+        WorkScope { clock, control }: &WorkScope<'_>,
+    ) -> Result<(), JobError> {
         if options.compress != Compress::Meshopt {
             return Ok(());
         }

@@ -11,7 +11,7 @@ use molmesh_surface::{
     Control, Exceeded, Limit, MeshOutput, Observer, Reservation, Stage, SurfaceError, SurfaceParams,
 };
 
-use super::clock::Scope;
+use super::clock::WorkScope;
 use super::meshing::Meshing;
 use super::spacing::{COARSEST, FINEST, Spacing};
 use super::{JobMesh, Options};
@@ -158,13 +158,13 @@ fn rounded(spacing: f64) -> f64 {
 /// Meshes the spheres of `meshing` at the finest spacing that has at most `limit` triangles.
 ///
 /// # Errors
-/// Returns [`SurfaceError::Limit`] if no spacing is coarse enough, [`SurfaceError::NoSurface`] if no mesh
-/// has a surface, or another error of meshing.
+/// Returns [`SurfaceError::Limit`] if no spacing is coarse enough, [`SurfaceError::NoSurface`] if no mesh has a
+/// surface, or another error of meshing.
 pub(super) fn mesh(
     meshing: &Meshing<'_>,
     options: &Options,
     limit: u64,
-    Scope { clock, control }: &Scope<'_>,
+    WorkScope { clock, control }: &WorkScope<'_>,
 ) -> Result<JobMesh, SurfaceError> {
     let n_atoms = meshing.spheres.len();
     let mut search = Search::new(limit, &options.params, n_atoms);

@@ -39,7 +39,7 @@ use std::ops::Deref;
 pub use areas::{AreaLevel, ExactReport, Interface, InterfaceReport, MeasuredSelection, SelectionMeasures};
 pub use auto::AutoBackend;
 pub use cavities::{Cavities, CavityReport, LiningResidue};
-pub use clock::{ProgressSink, Scope, StageClock};
+pub use clock::{ProgressSink, StageClock, WorkScope};
 pub use collapse::{Deviation, SIMPLIFY_ERRORS, Simplification, Simplify};
 pub use color::{AtomColors, ColorError, ColorReport, Coloring, MapReport};
 pub use components::{ComponentReport, VoidReport};
@@ -257,7 +257,7 @@ pub fn run_with<S: Deref<Target = Structure>>(
 ) -> Result<Product, JobError> {
     options.check(limits)?;
     let clock = StageClock::new(progress);
-    let scope = Scope::new(&clock, control);
+    let scope = WorkScope::new(&clock, control);
     if options.tile.is_none() {
         let loaded = load(read, options, &limits.read, &clock, &scope.control)?;
         return run_loaded(loaded, options, limits, choice, &scope, sink);
@@ -277,7 +277,7 @@ fn run_loaded<S: Deref<Target = Structure>>(
     options: &Options,
     limits: &JobLimits,
     choice: &Choice<'_>,
-    scope: &Scope<'_>,
+    scope: &WorkScope<'_>,
     sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
     let PreparedJob { colors, exact, pockets, parts } = prepare(&loaded, options, limits, scope)?;
@@ -328,9 +328,9 @@ fn prepare<S: Deref<Target = Structure>>(
     LoadedStructure { structure, selected, spheres }: &LoadedStructure<S>,
     options: &Options,
     limits: &JobLimits,
-    scope: &Scope<'_>,
+    scope: &WorkScope<'_>,
 ) -> Result<PreparedJob, JobError> {
-    let Scope { clock, control } = scope;
+    let WorkScope { clock, control } = scope;
     let read_map = |file: &MapFile| clock.time("read", || file.read(&limits.map, control));
     let map = options.map.as_ref().map(read_map).transpose()?;
     let colors = |coloring| MeshColors::new(structure, &selected.atoms, coloring, map, control);
@@ -347,21 +347,21 @@ fn prepare<S: Deref<Target = Structure>>(
 fn mesh(
     meshing: &Meshing<'_>,
     options: &Options,
-    scope: &Scope<'_>,
+    scope: &WorkScope<'_>,
     sink: Option<&GlbSink<'_>>,
 ) -> Result<JobMesh, SurfaceError> {
     if let Spacing::MaxTriangles(limit) = options.spacing {
         return fit::mesh(meshing, options, limit, scope);
     }
-    let Scope { clock, control } = scope;
+    let WorkScope { clock, control } = scope;
     let params = options.mesh_params(meshing.spheres, None);
     let plan = MeshPlan { meshing, params: &params, compress: options.compress };
-    let before_simplifying = simplify::params_of_input(options, &params)?;
     let written = if let Some(sink) = sink {
         sink.set_storage(options.storage(params.quantize));
         let Meshing { backend, spheres, limits, .. } = *meshing;
         clock.pass(|| backend.write(spheres, &params, limits, control, Some(sink)))
     } else {
+        let before_simplifying = simplify::params_of_input(options, &params)?;
         estimate::check_memory(&plan, options, control)?;
         clock.pass(|| meshing.mesh(&before_simplifying, control))
     };

@@ -232,6 +232,10 @@ impl Joined {
     fn error(&self, error: SurfaceError, run: &Run<'_>, n_parts: usize, fraction: f64) -> SurfaceError {
         let (limits, resolution) = (run.limits, run.single.resolution);
         let SurfaceError::Limit(exceeded) = &error else { return error };
+        // The part exceeds a fixed limit on its own.
+        if exceeded.is_fixed {
+            return error;
+        }
         let in_part = exceeded.actual.unwrap_or_default();
         match exceeded.limit {
             Limit::GridPoints => {

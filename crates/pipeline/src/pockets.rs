@@ -6,7 +6,7 @@ use molmesh_surface::{Control, DEFAULT_POCKET_PROBE, Mesh, Pocket, Pockets, Sphe
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::clock::Scope;
+use super::clock::WorkScope;
 use super::{LiningResidue, Options, Report};
 
 /// Pocket: a region outside the molecule that the probe can enter and a large probe cannot. It does not depend on the
@@ -60,7 +60,7 @@ pub(super) fn search(
     options: &Options,
     spheres: &Spheres,
     limits: &SurfaceLimits,
-    Scope { clock, control }: &Scope<'_>,
+    WorkScope { clock, control }: &WorkScope<'_>,
 ) -> Result<Option<Pockets>, SurfaceError> {
     let search = |probe| clock.time("pockets", || find(spheres, &options.params, probe, limits, control));
     options.pocket_probe().map(search).transpose()

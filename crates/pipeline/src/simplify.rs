@@ -4,7 +4,7 @@ use molmesh_surface::{Measures, Mesh, MeshOutput, SurfaceError, SurfaceParams, V
 use serde::Serialize;
 
 use super::Options;
-use super::clock::Scope;
+use super::clock::WorkScope;
 use super::collapse::{check_error, simplify};
 
 /// Size of the mesh before its simplification, and distance between the original and the simplified surface.
@@ -42,7 +42,7 @@ pub(super) fn apply(
     options: &Options,
     params: &SurfaceParams,
     output: &mut MeshOutput,
-    Scope { clock, control }: &Scope<'_>,
+    WorkScope { clock, control }: &WorkScope<'_>,
 ) -> Result<Option<SimplificationReport>, SurfaceError> {
     if output.streamed.is_some() {
         return Ok(None);

@@ -4,7 +4,7 @@ use molmesh_structure::Selected;
 use molmesh_surface::{Control, Measures, Mesh, Pockets, Stage, SurfaceError, Validation};
 
 use super::cavities::{self, FoundCavities};
-use super::clock::Scope;
+use super::clock::WorkScope;
 use super::color::{ColorReport, MeshColors, MeshedSurface};
 use super::meshing::Meshing;
 use super::{JobError, JobMesh, Options, SimplificationReport, TriangleReport, instances, simplify};
@@ -35,9 +35,9 @@ impl Steps<'_> {
         &self,
         JobMesh { output, params, .. }: &mut JobMesh,
         colors: Option<MeshColors>,
-        scope: &Scope<'_>,
+        scope: &WorkScope<'_>,
     ) -> Result<StepResults, JobError> {
-        let Scope { clock, control } = scope;
+        let WorkScope { clock, control } = scope;
         let Self { options, selected, pockets, meshing: Meshing { spheres, parts, cut, limits, .. } } = *self;
         let search = |mode| clock.time("cavities", || cavities::search(mode, spheres, params, limits, output, control));
         let cavities = options.cavities.map(search).transpose()?;

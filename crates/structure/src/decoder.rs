@@ -5,9 +5,10 @@
 
 use std::borrow::Cow;
 use std::io::{self, BufRead, Chain, Cursor, Read};
+use std::sync::Arc;
 
 use flate2::bufread::GzDecoder;
-use molmesh_surface::{CancelToken, Control, Exceeded, Limit, MemoryMeter as _, OutOfMemory, Reservation};
+use molmesh_surface::{CancelToken, Control, Exceeded, Limit, MemoryMeter, OutOfMemory, Reservation};
 use ruzstd::decoding::{FrameDecoder, StreamingDecoder};
 
 use super::error::StructureError;
@@ -103,6 +104,8 @@ enum DecoderState<'a> {
 /// Decompressed bytes of an input.
 pub(super) struct Decoder<'a> {
     state: DecoderState<'a>,
+    /// Meter of the windows. A frame may outlive the control of the call that begins it.
+    memory: Arc<dyn MemoryMeter>,
     /// Maximum number of decompressed bytes.
     limit: u64,
     /// Number of decompressed bytes so far.
@@ -110,7 +113,7 @@ pub(super) struct Decoder<'a> {
 }
 
 impl<'a> Decoder<'a> {
-    /// Begins to decompress an input to at most `limit` bytes.
+    /// Begins to decompress an input to at most `limit` bytes. Adds the memory of windows to the meter of `control`.
     ///
     /// # Errors
     /// Returns the errors of [`Self::read`].
@@ -119,7 +122,8 @@ impl<'a> Decoder<'a> {
         limit: u64,
         control: &Control<'_>,
     ) -> Result<Self, StructureError> {
-        Ok(Self { state: begin(Cursor::default().chain(input), None, control)?, limit, n_read: 0 })
+        let memory = Arc::clone(&control.memory);
+        Ok(Self { state: begin(Cursor::default().chain(input), None, &memory, control)?, memory, limit, n_read: 0 })
     }
 
     /// Returns true after the end of the input has been read.
@@ -130,8 +134,8 @@ impl<'a> Decoder<'a> {
     /// Appends at most `most` bytes to `out`, less only at the end of the input.
     ///
     /// # Errors
-    /// Returns [`StructureError::Input`], [`StructureError::Decompress`], [`StructureError::Limit`] and the
-    /// errors of memory and cancellation.
+    /// Returns [`StructureError::Input`], [`StructureError::Decompress`], [`StructureError::Limit`] and the errors of
+    /// memory and cancellation.
     pub(super) fn read(&mut self, most: u64, out: &mut Vec<u8>, control: &Control<'_>) -> Result<(), StructureError> {
         let mut left = most.min(self.remaining());
         while left > 0 && !self.at_end() {
@@ -147,7 +151,7 @@ impl<'a> Decoder<'a> {
                 DecoderState::End => Ok(0),
             }? as u64;
             if n < left {
-                self.state = std::mem::replace(&mut self.state, DecoderState::End).next(control)?;
+                self.state = std::mem::replace(&mut self.state, DecoderState::End).next(&self.memory, control)?;
             }
             left -= n;
             self.n_read += n;
@@ -191,10 +195,10 @@ impl<'a> Decoder<'a> {
 
 impl DecoderState<'_> {
     /// Ends a part whose bytes have been read, and begins the next one.
-    fn next(self, control: &Control<'_>) -> Result<Self, StructureError> {
+    fn next(self, memory: &Arc<dyn MemoryMeter>, control: &Control<'_>) -> Result<Self, StructureError> {
         match self {
             Self::Plain(_) | Self::End => Ok(Self::End),
-            Self::Member(member) => begin(member.into_inner(), Some("gzip"), control),
+            Self::Member(member) => begin(member.into_inner(), Some("gzip"), memory, control),
             Self::Frame(frame, window) => {
                 // The frame may end with a checksum of the decompressed data.
                 let declared = frame.decoder.get_checksum_from_data();
@@ -206,7 +210,7 @@ impl DecoderState<'_> {
                 }
                 let input = frame.into_inner();
                 drop(window);
-                begin(input, Some("zstd"), control)
+                begin(input, Some("zstd"), memory, control)
             }
         }
     }
@@ -216,6 +220,7 @@ impl DecoderState<'_> {
 fn begin<'a>(
     mut input: Peeked<'a>,
     mut after: Option<&'static str>,
+    memory: &Arc<dyn MemoryMeter>,
     control: &Control<'_>,
 ) -> Result<DecoderState<'a>, StructureError> {
     loop {
@@ -231,7 +236,8 @@ fn begin<'a>(
                 after = Some("zstd");
             }
             (Some("zstd"), None | Some("zstd")) => {
-                let window = control.reserve(zstd_window(head).min(MAX_ZSTD_WINDOW))?;
+                let window = Reservation::new(memory);
+                window.grow(zstd_window(head).min(MAX_ZSTD_WINDOW))?;
                 let frame = StreamingDecoder::new_with_max_window_size(input, MAX_ZSTD_WINDOW)
                     .map_err(|error| broken("zstd", &error))?;
                 return Ok(DecoderState::Frame(Box::new(frame), window));
@@ -315,10 +321,7 @@ fn broken(encoding: &'static str, reason: &impl ToString) -> StructureError {
 #[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use std::io::{BufReader, Write};
-    use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
-
-    use molmesh_surface::MemoryMeter;
 
     use super::*;
 
@@ -504,12 +507,17 @@ mod tests {
         let held = || peak.held.load(Ordering::Relaxed);
         let mut out = Vec::new();
         for expected in [1 << 10, 1 << 20, 1 << 20, 1 << 10] {
-            decoder.read(1, &mut out, &control).unwrap();
+            // A window does not keep other memory of the call that begins its frame.
+            let call = control.metered();
+            call.memory.grow(9).unwrap();
+            decoder.read(1, &mut out, &call).unwrap();
+            assert_eq!(held(), expected + 9);
+            drop(call);
             assert_eq!(held(), expected);
         }
         decoder.read(1, &mut out, &control).unwrap();
         assert!(decoder.at_end() && out == b"aaaa");
-        assert_eq!((held(), peak.most.load(Ordering::Relaxed)), (0, 1 << 20));
+        assert_eq!((held(), peak.most.load(Ordering::Relaxed)), (0, (1 << 20) + 9));
     }
 
     /// Cancels when its bytes have been read.

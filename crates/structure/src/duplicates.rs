@@ -24,8 +24,8 @@ const SUSPECT: u64 = 10;
 /// Rejects rows of which more than the limit have the same model and position. `row` returns both for a row below `n`.
 ///
 /// # Errors
-/// Returns [`StructureError::Limit`] with the position that exceeds the limit first, in the order of rows, and the errors of
-/// cancellation and memory.
+/// Returns [`StructureError::Limit`] with the position that exceeds the limit first, in the order of rows, and the
+/// errors of cancellation and memory.
 pub(super) fn check(
     n: usize,
     row: impl Fn(usize) -> (i32, [f64; 3]),

@@ -1,9 +1,8 @@
 //! Entry point of the readers, and their limits.
 
-use std::sync::Arc;
 use std::sync::atomic::AtomicU8;
 
-use molmesh_surface::{Control, Exceeded, Limit, MemoryMeter, Reservation};
+use molmesh_surface::{Control, Exceeded, Limit, MemoryMeter as _, Reservation};
 
 use super::atoms::Structure;
 use super::error::StructureError;
@@ -188,8 +187,7 @@ fn check_sample(inflated: &[u8], reading: &Reading<'_>) -> Result<(), StructureE
     let is_end = |b: &u8| *b == b'\n';
     let start = if last { sample.iter().position(is_end).map_or(0, |i| i + 1) } else { 0 };
     let end = sample.iter().rposition(is_end).map_or(start, |i| i + 1).max(start);
-    let memory: Arc<dyn MemoryMeter> = Arc::new(Reservation::new(&reading.control.memory));
-    let control = Control { memory, ..reading.control.clone() };
+    let control = reading.control.metered();
     match of_text(&sample[start..end], &Reading { pieces: Some(1), ..Reading::new(reading.limits, &control) }) {
         Err(StructureError::Limit(error)) if error.limit == Limit::Duplicates => Err(error.into()),
         Err(StructureError::Cancelled) => Err(StructureError::Cancelled),
@@ -219,9 +217,10 @@ pub(super) fn without_mark(text: &[u8]) -> &[u8] {
 mod tests {
     use std::fmt::Write as _;
     use std::io::Write as _;
+    use std::sync::Arc;
     use std::sync::atomic::{AtomicU64, Ordering};
 
-    use molmesh_surface::{CancelToken, OutOfMemory};
+    use molmesh_surface::{CancelToken, MemoryMeter, OutOfMemory};
 
     use super::*;
 

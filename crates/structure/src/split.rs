@@ -92,8 +92,8 @@ impl Selected {
     /// The units of an assembly are parts. Adds the memory of the parts to the meter of `control`.
     ///
     /// # Errors
-    /// Returns [`StructureError::Limit`], [`StructureError::NoEntities`] for [`Split::Entity`] if the file has
-    /// no entities, and the errors of memory and cancellation.
+    /// Returns [`StructureError::Limit`], [`StructureError::NoEntities`] for [`Split::Entity`] if the file has no
+    /// entities, and the errors of memory and cancellation.
     pub fn parts(
         &self,
         structure: &Structure,

@@ -40,7 +40,7 @@ mod tests {
         let half = suggested(points(100.0), 1, points(50.0)).unwrap();
         assert!((1.05..1.07).contains(&half), "{half}");
         assert_eq!(suggested(3 * points(100.0), 3, 3 * points(50.0)), Some(half));
-        // A device may not have enough numbers for bricks within the limit.
+        // No finer spacing is suggested.
         assert_eq!(suggested(1 << 20, 1, 1 << 30), Some(0.53));
         assert_eq!(suggested(1 << 20, 1, 1700), None);
     }

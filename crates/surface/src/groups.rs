@@ -3,7 +3,7 @@
 //! The first pass counts the items of each group. The second pass adds them, and keeps their order within a group.
 //! Callers make both passes themselves where they check for cancellation. The number of items has 32 bits.
 
-/// Numbers of items of groups.
+/// Number of items in each group.
 #[derive(Debug)]
 pub struct GroupCounts {
     /// Count of each group, after a zero.

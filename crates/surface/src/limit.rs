@@ -88,9 +88,9 @@ pub const LIMITS: &[LimitRow] = &[
         predicate: "have {} bytes", problem: "body-too-large", ..NONE },
     LimitRow { limit: Limit::FormParts, subject: "the form", predicate: "has {} parts",
         problem: "body-too-large", ..NONE },
-    LimitRow { limit: Limit::InflatedBytes, subject: "the structure", predicate: "has {} bytes after decompression",
+    LimitRow { limit: Limit::InflatedBytes, subject: "the structure", predicate: "has {} bytes",
         key: Some("limits.inflated_bytes"), flag: Some("--max-input-bytes"), problem: "inflated-too-large", ..NONE },
-    LimitRow { limit: Limit::MapBytes, subject: "the map", predicate: "has {} bytes after decompression",
+    LimitRow { limit: Limit::MapBytes, subject: "the map", predicate: "has {} bytes",
         key: Some("limits.inflated_bytes"), flag: Some("--max-input-bytes"), parameter: Some("map"),
         problem: "inflated-too-large", ..NONE },
     LimitRow { limit: Limit::MapPoints, subject: "the map", predicate: "has {} points", flag: Some("--max-map-points"),
@@ -105,7 +105,8 @@ pub const LIMITS: &[LimitRow] = &[
         flag: Some("--max-parts"), parameter: Some("split"), problem: "too-many-parts", ..NONE },
     LimitRow { limit: Limit::ModelParts, subject: "model=all", predicate: "divides the selected atoms into {} parts",
         flag: Some("--max-parts"), parameter: Some("model"), problem: "too-many-parts", ..NONE },
-    LimitRow { limit: Limit::Distances, subject: "`within`", predicate: "tests {} distances between atoms",
+    LimitRow { limit: Limit::Distances, subject: "`within`",
+        predicate: "tests {} distances between atoms (64 count as a pair)",
         key: PAIRS_KEY, flag: PAIRS_FLAG, parameter: Some("select"),
         hint: Some("fewer atoms after `of` or a smaller distance"), problem: "too-many-candidates" },
     LimitRow { limit: Limit::GridPoints, subject: "the grid", predicate: "would need about {} grid points",
@@ -114,12 +115,13 @@ pub const LIMITS: &[LimitRow] = &[
         key: Some("limits.grid_points"), flag: Some("--max-grid-points"), parameter: Some("pockets"),
         hint: Some("a smaller selection or a smaller pocket_probe"), problem: "grid-too-large" },
     LimitRow { limit: Limit::PocketRows, subject: "the search for pockets",
-        predicate: "would pass over {} rows of grid points in reach of the probes", key: PAIRS_KEY, flag: PAIRS_FLAG,
+        predicate: "would pass over {} rows of grid points in reach of the probes (5 count as a pair)",
+        key: PAIRS_KEY, flag: PAIRS_FLAG,
         parameter: Some("pockets"), hint: Some("fewer atoms, smaller radii or a smaller pocket_probe"),
         problem: "too-many-candidates" },
     LimitRow { limit: Limit::Candidates, subject: "the spheres",
         predicate: "would reach at least {} grid bricks in total", key: PAIRS_KEY, flag: PAIRS_FLAG,
-        hint: Some("smaller radii"), problem: "too-many-candidates", ..NONE },
+        hint: Some("smaller radii or a coarser resolution"), problem: "too-many-candidates", ..NONE },
     LimitRow { limit: Limit::Overlaps, subject: "enlarged by the probe, the spheres",
         predicate: "have at least {} overlapping pairs (64 comparisons of overlaps count as a pair)",
         key: PAIRS_KEY, flag: PAIRS_FLAG, hint: Some("a smaller probe or smaller radii"),
@@ -224,6 +226,22 @@ impl Exceeded {
         Box::new(self).into()
     }
 
+    /// Returns the message, with the `name` under which its reader knows the limit.
+    #[must_use]
+    pub fn message(&self, name: Option<&str>) -> String {
+        let number = self.actual.map_or_else(|| format!("more than {}", self.max), |actual| actual.to_string());
+        let mut text = format!("{} {}", self.subject, self.limit.row().predicate.replace("{}", &number));
+        let parts = [
+            self.resolution.map(|resolution| format!(" at {resolution} Å")),
+            self.actual.map(|_| format!(", the limit is {}", self.max)),
+            name.map(|name| format!(" ({name})")),
+            self.suggested_resolution.map(|spacing| format!("; a resolution of {spacing} Å should fit")),
+            self.hint.as_ref().map(|hint| format!("; try {hint}")),
+        ];
+        text.extend(parts.into_iter().flatten());
+        text
+    }
+
     /// Returns the configuration key that changes the limit.
     #[must_use]
     pub fn key(&self) -> Option<&'static str> {
@@ -239,22 +257,7 @@ impl Exceeded {
 
 impl fmt::Display for Exceeded {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let number = self.actual.map_or_else(|| format!("more than {}", self.max), |actual| actual.to_string());
-        write!(f, "{} {}", self.subject, self.limit.row().predicate.replace("{}", &number))?;
-        if let Some(resolution) = self.resolution {
-            write!(f, " at {resolution} Å")?;
-        }
-        if self.actual.is_some() {
-            write!(f, ", the limit is {}", self.max)?;
-        }
-        let names: Vec<&str> = [self.key(), self.flag()].into_iter().flatten().collect();
-        if !names.is_empty() {
-            write!(f, " ({})", names.join(", "))?;
-        }
-        if let Some(spacing) = self.suggested_resolution {
-            write!(f, "; a resolution of {spacing} Å should fit")?;
-        }
-        self.hint.as_ref().map_or(Ok(()), |hint| write!(f, "; try {hint}"))
+        f.write_str(&self.message(None))
     }
 }
 
@@ -279,25 +282,26 @@ mod tests {
     }
 
     #[test]
-    fn messages_name_number_limit_key_flag_and_suggestion() {
+    fn messages_name_number_limit_key_and_suggestion() {
         let grid = Exceeded { actual: Some(9), resolution: Some(0.1), ..Exceeded::new(Limit::GridPoints, 1) };
+        let grid = grid.suggest(0.4);
         assert_eq!(
-            grid.suggest(0.4).to_string(),
-            "the grid would need about 9 grid points at 0.1 Å, the limit is 1 (limits.grid_points, --max-grid-points); \
-             a resolution of 0.4 Å should fit"
+            grid.message(grid.key()),
+            "the grid would need about 9 grid points at 0.1 Å, the limit is 1 (limits.grid_points); a resolution of \
+             0.4 Å should fit"
         );
         assert_eq!(
             Exceeded::new(Limit::Tiles, 5).to_string(),
-            "the tileset would have more than 5 tiles; try a coarser \
-             resolution"
+            "the tileset would have more than 5 tiles; try a coarser resolution"
         );
     }
 
     #[test]
     fn a_cap_below_the_configured_limit_names_no_key() {
         let error = |configured| Exceeded::capped(Limit::Atoms, configured, 10);
-        assert_eq!(error(9).to_string(), "the structure has more than 9 atoms (limits.atoms, --max-atoms)");
+        assert_eq!((error(9).key(), error(9).flag()), (Some("limits.atoms"), Some("--max-atoms")));
         assert_eq!((error(10).key(), error(10).max), (Some("limits.atoms"), 10));
+        assert_eq!((error(11).key(), error(11).flag()), (None, None));
         assert_eq!(error(11).to_string(), "the structure has more than 10 atoms");
     }
 

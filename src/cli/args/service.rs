@@ -9,7 +9,8 @@ use super::BackendName;
 const DOCTOR_CODES: &str = "\
 Exit codes:
     0  a service with this configuration would start and be ready; warnings do not count
-    1  it would not: an address is taken, the store cannot be used, or the log filter is wrong
+    1  it would not: an address is taken, the store or the broker cannot be used, job records are
+       in quarantine, or the log filter is wrong
     2  bad usage or a bad configuration
     6  no such backend or device on this machine, or it cannot make a mesh";
 
@@ -84,7 +85,7 @@ pub(crate) struct DoctorArgs {
     /// Format of the report on stdout
     #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
     pub(crate) report: TextOrJson,
-    /// Seconds to wait for the store and for the remote archive
+    /// Seconds to wait for the store, the broker and the remote archive
     #[arg(long, value_name = "SECONDS", default_value_t = 5.0)]
     pub(crate) timeout: f64,
     #[command(flatten)]

@@ -21,6 +21,7 @@ use async_nats::connection::State;
 use async_nats::jetstream::consumer::{Consumer, pull};
 use async_nats::jetstream::context::PublishErrorKind;
 use async_nats::jetstream::message::PublishMessage;
+use async_nats::jetstream::response::Response;
 use async_nats::jetstream::{Context, ContextBuilder};
 use async_nats::{Client as Connection, ConnectOptions, Event};
 use futures_util::future::BoxFuture;
@@ -92,7 +93,7 @@ fn options(config: &BrokerConfig) -> ConnectOptions {
     }
 }
 
-/// Connects to the first of the servers `url` that answers.
+/// Connects to one of the servers `url`, a list with commas.
 async fn open(options: ConnectOptions, url: &str) -> Result<(Connection, Context), String> {
     crate::tls::install_provider();
     let addresses: Vec<_> = url.split(',').map(str::trim).collect();
@@ -107,7 +108,11 @@ async fn open(options: ConnectOptions, url: &str) -> Result<(Connection, Context
 /// Returns the reason.
 pub async fn check_broker(config: &BrokerConfig, url: &str) -> Result<(), String> {
     let (_connection, context) = open(options(config), url).await?;
-    context.query_account().await.map(drop).map_err(|error| error.to_string())
+    // Releases of NATS differ in the fields of the account.
+    match context.request::<_, _, Response<serde_json::Value>>("INFO", b"").await.map_err(|error| error.to_string())? {
+        Response::Ok(_account) => Ok(()),
+        Response::Err { error } => Err(error.to_string()),
+    }
 }
 
 /// Broker over NATS. Clones share one connection.

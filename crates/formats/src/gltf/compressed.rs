@@ -25,8 +25,8 @@ impl<'a> CompressedGlb<'a> {
     /// Plans the file of `mesh`, whose `pieces` are compressed.
     ///
     /// # Errors
-    /// Returns [`FormatError::Limit`], or [`FormatError::OutOfQuantizationRange`] for positions beyond the range
-    /// of the step.
+    /// Returns [`FormatError::Limit`], or [`FormatError::OutOfQuantizationRange`] for positions beyond the range of the
+    /// step.
     pub fn new(mesh: &'a Mesh, pieces: &'a Pieces, meta: &Meta) -> Result<Self, FormatError> {
         let Pieces { storage, summary, .. } = pieces;
         let content = (!pieces.is_empty()).then_some(Content::Pieces(pieces));

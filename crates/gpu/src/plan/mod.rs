@@ -11,9 +11,9 @@ pub mod partition;
 
 use molmesh_surface::cpu::distance;
 use molmesh_surface::cpu::field::Constants;
-use molmesh_surface::grid_limit;
 use molmesh_surface::kernel::Shape;
-use molmesh_surface::lattice::{BRICK, Lattice, tile_order, to_f32, to_u32, to_u64};
+use molmesh_surface::lattice::{BRICK, BRICK_POINTS, Lattice, tile_order, to_f32, to_u32, to_u64};
+use molmesh_surface::limit::{Exceeded, Limit, slightly_coarser};
 use molmesh_surface::occupancy::{AtomBrick, BrickBits, Occupancy, TileOccupancy, count_ones};
 use molmesh_surface::{Control, Step, SurfaceError, SurfaceLimits, SurfaceParams};
 use rayon::prelude::*;
@@ -50,12 +50,10 @@ impl Plan {
     /// Plans the bricks of `lattice`.
     ///
     /// # Errors
-    /// [`SurfaceError::Limit`] before memory is allocated beyond the
-    /// limits, [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::Limit`] before memory is allocated beyond the limits, [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let occupancy = Occupancy::new(lattice, limits, control)?;
-        let (bases, n_bricks) = tile_bases(&occupancy.tiles)
-            .ok_or_else(|| grid_limit::exceeded(lattice.spacing, u64::from(u32::MAX) * 512, 1, limits))?;
+        let (bases, n_bricks) = tile_bases(&occupancy.tiles).ok_or_else(|| too_many_bricks(lattice.spacing))?;
         let occupied = &occupancy.tiles;
         let per_tile = size_of::<Tile>() + size_of::<u32>() + size_of::<u64>();
         let rows = per_tile * occupied.len() + 2 * size_of::<u32>() * (n_bricks + 1);
@@ -151,6 +149,19 @@ fn distance_params(lattice: &Lattice, params: &SurfaceParams) -> Params {
     }
 }
 
+/// Returns the error of a grid with more tiles or bricks than the shaders can number. No configured limit changes that.
+fn too_many_bricks(spacing: f64) -> SurfaceError {
+    let max = u64::from(u32::MAX) * BRICK_POINTS as u64;
+    let error = Exceeded {
+        actual: Some(max + BRICK_POINTS as u64),
+        is_fixed: true,
+        hint: Some("the backend cpu".into()),
+        resolution: Some(spacing),
+        ..Exceeded::new(Limit::GridPoints, max)
+    };
+    error.suggest(slightly_coarser(spacing)).error()
+}
+
 /// First brick of each tile, and the number of bricks. `None` if there are more tiles or bricks than the shaders can
 /// number.
 fn tile_bases(tiles: &[TileOccupancy]) -> Option<(Vec<u32>, usize)> {
@@ -231,7 +242,7 @@ mod tests {
     use std::collections::HashMap;
 
     use molmesh_surface::lattice::LatticeAtom;
-    use molmesh_surface::{Limit, Spheres, SurfaceOptions};
+    use molmesh_surface::{Spheres, SurfaceOptions};
 
     use super::*;
 

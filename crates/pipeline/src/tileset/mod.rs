@@ -36,7 +36,7 @@ use super::color::{ColorBlend, ColorReport, Coloring, MeshColors, MeshedSurface,
 use super::load::{LoadedStructure, load};
 use super::params::ParamError;
 use super::report::Counts;
-use super::{Choice, JobError, Options, Product, Report, Scope, StageClock};
+use super::{Choice, JobError, Options, Product, Report, StageClock, WorkScope};
 
 /// Maximum number of tiles.
 const MAX_TILES: usize = 1_000_000;
@@ -121,7 +121,8 @@ pub fn check(options: &Options) -> Result<(), ParamError> {
 }
 
 impl<S: Deref<Target = Structure>> Tileset<S> {
-    /// Prepares the levels of the structure that `read` returns. The grid spacing of `options` is that of the last level.
+    /// Prepares the levels of the structure that `read` returns. The grid spacing of `options` is that of the last
+    /// level.
     ///
     /// # Errors
     /// Returns a [`JobError`] if reading or selecting fails, there are too many tiles, or the job is cancelled.
@@ -186,10 +187,10 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         self.layout.spacing(level)
     }
 
-    /// Meshes the tile of `options`, or the root without one, adds skirts and encodes it. The mesh is empty if the surface
-    /// does not pass through the tile. The memory of the product stays added to the meter of `scope`. Its report
-    /// includes the times of its clock. `options` differs from that of [`Self::new`] in tile, colours and encoding at most;
-    /// `colors` are those of [`Self::colors`].
+    /// Meshes the tile of `options`, or the root without one, adds skirts and encodes it. The mesh is empty if the
+    /// surface does not pass through the tile. The memory of the product stays added to the meter of `scope`. Its
+    /// report includes the times of its clock. `options` differs from that of [`Self::new`] in tile, colours and
+    /// encoding at most; `colors` are those of [`Self::colors`].
     ///
     /// # Errors
     /// Returns the errors of meshing and compression, and [`SurfaceError::BadParameter`] for a tile outside the cube.
@@ -198,9 +199,9 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         (options, colors): (&Options, Option<&TilesetColors>),
         choice: &Choice<'_>,
         limits: &SurfaceLimits,
-        scope: &Scope<'_>,
+        scope: &WorkScope<'_>,
     ) -> Result<Product, JobError> {
-        let Scope { clock, control } = scope;
+        let WorkScope { clock, control } = scope;
         let (output, color) = self.output((options, colors), choice.backend, limits, scope)?;
         let MeshOutput { mut mesh, grid, made_by, .. } = output;
         let address = options.tile.unwrap_or(TileAddress::ROOT);
@@ -230,8 +231,8 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         Ok(product)
     }
 
-    /// Meshes the tile of `options`, as [`Self::product`] does, without skirts and encoding; `None` if the surface does not
-    /// pass through it. The mesh has a boundary at the faces of the tile.
+    /// Meshes the tile of `options`, as [`Self::product`] does, without skirts and encoding; `None` if the surface does
+    /// not pass through it. The mesh has a boundary at the faces of the tile.
     ///
     /// # Errors
     /// Returns the errors of meshing.
@@ -243,7 +244,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         control: &Control<'_>,
     ) -> Result<Option<Mesh>, JobError> {
         let clock = StageClock::new(&());
-        let (output, _) = self.output((options, colors), backend, limits, &Scope::new(&clock, control))?;
+        let (output, _) = self.output((options, colors), backend, limits, &WorkScope::new(&clock, control))?;
         Ok(Some(output.mesh).filter(|mesh| mesh.n_triangles() > 0))
     }
 
@@ -253,7 +254,7 @@ impl<S: Deref<Target = Structure>> Tileset<S> {
         (options, colors): (&Options, Option<&TilesetColors>),
         backend: &dyn Backend,
         limits: &SurfaceLimits,
-        Scope { clock, control }: &Scope<'_>,
+        WorkScope { clock, control }: &WorkScope<'_>,
     ) -> Result<(MeshOutput, Option<ColorReport>), JobError> {
         let (address, levels) = (options.tile.unwrap_or(TileAddress::ROOT), self.layout.levels);
         if !address.is_valid(levels) {
@@ -373,9 +374,8 @@ impl Layout {
             control.memory.grow(TILE_BYTES).map_err(SurfaceError::from)?;
             if tiles.len() > MAX_TILES {
                 let error = Exceeded::new(Limit::Tiles, MAX_TILES as u64);
-                return Err(
-                    SurfaceError::from(Box::new(Exceeded { resolution: Some(params.resolution), ..error })).into()
-                );
+                let error = Exceeded { resolution: Some(params.resolution), ..error };
+                return Err(error.error::<SurfaceError>().into());
             }
         }
         Ok(())

@@ -12,7 +12,7 @@ use super::layout::{CELLS, Layout};
 use super::level::{Buckets, MIN_BUCKET, TilesetLevel};
 use crate::color::{AtomColors, Coloring, Scheme};
 use crate::load::{LoadedStructure, SPHERE_BYTES, load};
-use crate::{Choice, JobError, JobLimits, Options, Product, ProgressSink, Scope, Spacing, StageClock, run_loaded};
+use crate::{Choice, JobError, JobLimits, Options, Product, ProgressSink, Spacing, StageClock, WorkScope, run_loaded};
 
 /// Tileset of an assembly.
 pub struct AssemblyTileset<S> {
@@ -139,7 +139,7 @@ impl<S: Deref<Target = Structure>> AssemblyTileset<S> {
         let params = SurfaceParams { resolution: spacing, ..options.params.clone() };
         let coarse = self.colored(Options { params, spacing: Spacing::Given, tile: None, ..options.clone() });
         let loaded = LoadedStructure { structure: &*self.structure, selected, spheres };
-        let mut product = run_loaded(loaded, &coarse, limits, choice, &Scope::new(&clock, control), None)?;
+        let mut product = run_loaded(loaded, &coarse, limits, choice, &WorkScope::new(&clock, control), None)?;
         // The groups represent all atoms.
         let report = &mut product.report;
         report.atoms = self.selected.atoms.len() as u64;

@@ -13,7 +13,7 @@ use serde::Serialize;
 use thiserror::Error;
 
 use super::{AssemblyTileset, StructureStream, Tileset};
-use crate::{Choice, JobError, JobLimits, LeftOutReport, Options, Product, ProgressSink, Scope, StageClock};
+use crate::{Choice, JobError, JobLimits, LeftOutReport, Options, Product, ProgressSink, StageClock, WorkScope};
 
 /// Contents of a tileset.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -202,7 +202,7 @@ impl<S: Deref<Target = Structure> + Sync> Tileset<S> {
             let control = &control.metered();
             let options = Options { tile: Some(address), ..options.clone() };
             let clock = StageClock::new(&());
-            let tile = self.product((&options, colors.as_ref()), choice, limits, &Scope::new(&clock, control))?;
+            let tile = self.product((&options, colors.as_ref()), choice, limits, &WorkScope::new(&clock, control))?;
             let n = done.fetch_add(1, Ordering::Relaxed) + 1;
             progress.progress("tiles", n as f64 / addresses.len() as f64);
             if tile.report.triangles == 0 {

@@ -104,8 +104,7 @@ impl SelectedBlocks {
     /// Selects atoms of the next block, of all chains.
     ///
     /// # Errors
-    /// Returns [`StructureError::Limit`], [`StructureError::NotAStream`] and the errors of memory and
-    /// cancellation.
+    /// Returns [`StructureError::Limit`], [`StructureError::NotAStream`] and the errors of memory and cancellation.
     pub fn add(
         &mut self,
         block: &Block,

@@ -91,8 +91,9 @@ const ATOMS_PER_TASK: usize = 1 << 14;
 ///
 /// # Errors
 /// Returns [`StructureError::EmptySelection`] if no atom is selected, and [`StructureError::NotFound`] for a model,
-/// chain, alternative location or assembly that does not exist. Returns [`StructureError::BadAssembly`],
-/// [`StructureError::Limit`] for an assembly that cannot be built within the default limits.
+/// chain, alternative location or assembly that does not exist. Returns [`StructureError::BadAssembly`] for an assembly
+/// that cannot be built, and [`StructureError::Limit`] if it exceeds the default limits or `within` tests too many
+/// distances.
 pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, StructureError> {
     select_with(structure, selection, &ReadLimits::default(), &Control::default())
 }
@@ -101,8 +102,7 @@ pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, 
 /// memory of an assembly, and [`Structure::table_bytes`], to the meter of `control`.
 ///
 /// # Errors
-/// Returns the errors of [`select`], [`StructureError::Limit`], [`StructureError::Memory`] and
-/// [`StructureError::Cancelled`].
+/// Returns the errors of [`select`], [`StructureError::Memory`] and [`StructureError::Cancelled`].
 pub fn select_with(
     structure: &Structure,
     selection: &Selection,

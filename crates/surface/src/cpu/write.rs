@@ -107,9 +107,8 @@ pub(super) fn write(
             output.measure(control)?.clone()
         }
     };
-    let bounds = written.bounds.unwrap_or_default();
     let mesh = Mesh { centre, ..Mesh::default() };
-    let streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds });
+    let streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds: written.bounds.unwrap_or_default() });
     Ok(MeshOutput { streamed, measures: Some(measures), ..MeshOutput::new(mesh, grid) })
 }
 

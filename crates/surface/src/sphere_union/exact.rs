@@ -152,8 +152,8 @@ impl ExactMeasures {
     /// Measures the surface of `spheres`. The memory of the result remains charged to `control`.
     ///
     /// # Errors
-    /// [`SurfaceError::Limit`], [`SurfaceError::BadParameter`] for an isosurface or if scale and offset leave
-    /// a radius that is too small, [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::Limit`], [`SurfaceError::BadParameter`] for an isosurface or if scale and offset leave a radius
+    /// that is too small, [`SurfaceError::Memory`], [`SurfaceError::Cancelled`].
     pub fn of(
         spheres: &Spheres,
         params: &SurfaceParams,
