@@ -40,6 +40,14 @@ impl ClientShares {
         (Arc::clone(share), SharePermit { shares: Arc::clone(self), client, permit: None })
     }
 
+    /// Returns the number of requests that must end before a new one of the client gets a slot, in units of its share:
+    /// below 1, it gets one at once.
+    pub(crate) fn load(&self, client: u64) -> f64 {
+        // Each request that holds a slot or waits for one refers to the share, and so does the map.
+        let requests = self.clients().get(&client).map_or(0, |share| Arc::strong_count(share) - 1);
+        requests as f64 / self.limit as f64
+    }
+
     /// Takes a slot for a client until the permit is dropped.
     pub(crate) fn take(self: &Arc<Self>, client: u64) -> Result<SharePermit, ShareExceeded> {
         let (share, mut slot) = self.share(client);
@@ -86,7 +94,9 @@ mod tests {
     #[test]
     fn a_client_holds_its_share_and_leaves_the_rest_to_others() {
         let shares = ClientShares::new(6, 0.25);
-        let (first, second) = (shares.take(1).unwrap(), shares.take(1).unwrap());
+        let first = shares.take(1).unwrap();
+        assert_eq!((shares.load(1), shares.load(2)), (0.5, 0.0));
+        let second = shares.take(1).unwrap();
         assert_eq!(shares.take(1).unwrap_err(), ShareExceeded { limit: 2 });
         let other = shares.take(2).unwrap();
         drop(first);

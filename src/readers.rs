@@ -52,6 +52,18 @@ struct GateState {
 }
 
 impl GateState {
+    /// Estimates the time of `n` reads one after another.
+    fn rounds(&self, n: f64) -> Duration {
+        Duration::try_from_secs_f64(n * self.times().mean).unwrap_or(Duration::MAX)
+    }
+
+    /// Returns true if a request that waits for `wait` would probably begin after `begin_by` or end after `end`.
+    fn is_late(&self, wait: Duration, begin_by: Instant, end: Instant) -> bool {
+        let now = Instant::now();
+        wait > begin_by.saturating_duration_since(now)
+            || wait.saturating_add(self.times().longest()) > end.saturating_duration_since(now)
+    }
+
     /// Returns the durations of reads at this moment: a read in progress that takes longer than the mean counts as if
     /// it had just ended. Otherwise a burst of requests would wait before the first read has shown how long they take.
     fn times(&self) -> ReadTimes {
@@ -97,8 +109,7 @@ impl Readers {
         if state.waiting + state.reading.len() < self.number {
             return Duration::ZERO;
         }
-        let rounds = (state.waiting + state.reading.len().min(self.number)) as f64 / self.number as f64;
-        Duration::try_from_secs_f64(rounds * state.times().mean).unwrap_or(Duration::MAX)
+        state.rounds((state.waiting + state.reading.len().min(self.number)) as f64 / self.number as f64)
     }
 
     fn busy(&self) -> Busy {
@@ -109,32 +120,35 @@ impl Readers {
     /// by `end`. Cancel safe.
     ///
     /// # Errors
-    /// Returns [`Busy`] at once if other requests wait and this one would probably wait longer, or end later; after the
-    /// wait if the read would probably end later.
+    /// Returns [`Busy`] at once if other requests wait, of the client or with their shares, and this one would probably
+    /// wait longer, or end later; after the wait if the read would probably end later.
     pub async fn wait(&self, client: Option<u64>, begin_by: Instant, end: Instant) -> Result<Reading, Busy> {
-        let waiting = self.enter(begin_by, end)?;
-        let begin_by = tokio::time::Instant::from_std(begin_by);
-        // In this order, a client that waits for its share takes no permit of others.
+        let end_of_wait = tokio::time::Instant::from_std(begin_by);
+        let load = client.map_or(0.0, |client| self.shares.load(client));
+        let after_own = Busy { wait: self.lock().rounds(load) };
+        if load > 1.0 && self.lock().is_late(after_own.wait, begin_by, end) {
+            return Err(after_own);
+        }
+        // In this order, requests that wait for the share of their client neither take a permit nor count for others.
         let share = match client {
-            Some(client) => Some(self.shares.wait(client, begin_by).await.map_err(|_full| self.busy())?),
+            Some(client) => Some(self.shares.wait(client, end_of_wait).await.map_err(|_full| after_own)?),
             None => None,
         };
+        let waiting = self.enter(load >= 1.0, begin_by, end)?;
         // The semaphore is never closed.
-        let permit = timeout_at(begin_by, Arc::clone(&self.permits).acquire_owned()).await.ok().and_then(Result::ok);
+        let permit = timeout_at(end_of_wait, Arc::clone(&self.permits).acquire_owned()).await.ok().and_then(Result::ok);
         let permit = permit.ok_or_else(|| self.busy())?;
         waiting.begin(end, permit, share)
     }
 
-    /// Counts a request that waits.
-    fn enter(&self, begin_by: Instant, end: Instant) -> Result<Waiting, Busy> {
-        let (mut state, now) = (self.lock(), Instant::now());
+    /// Counts a request that waits for a permit, and may have waited for the share of its client.
+    fn enter(&self, has_waited: bool, begin_by: Instant, end: Instant) -> Result<Waiting, Busy> {
+        let mut state = self.lock();
         let wait = self.estimated_wait(&state);
-        let is_late = wait > begin_by.saturating_duration_since(now)
-            || wait.saturating_add(state.times().longest()) > end.saturating_duration_since(now);
-        if state.waiting > 0 && is_late {
+        if state.waiting > 0 && state.is_late(wait, begin_by, end) {
             return Err(Busy { wait });
         }
-        let had_to_wait = state.waiting + state.reading.len() >= self.number;
+        let had_to_wait = has_waited || state.waiting + state.reading.len() >= self.number;
         state.waiting += 1;
         Ok(Waiting { readers: self.clone(), had_to_wait })
     }
@@ -143,7 +157,7 @@ impl Readers {
 /// Request that waits for a reader. Dropping it ends the wait.
 struct Waiting {
     readers: Readers,
-    /// True if no reader was free when it came.
+    /// True if no reader was free for it when it came.
     had_to_wait: bool,
 }
 
@@ -207,11 +221,14 @@ mod tests {
         let reading = (read(&readers).await, read(&readers).await);
         assert_eq!(readers.busy().wait, Duration::from_mins(1));
         // One request may always wait, because the mean may be wrong.
-        let waiting = readers.enter(after(50.0), after(1e4)).unwrap();
-        assert!(readers.enter(after(50.0), after(1e4)).is_err() && readers.enter(after(100.0), after(1e4)).is_ok());
-        assert!(readers.enter(after(100.0), after(200.0)).is_err(), "it would end too late");
+        let waiting = readers.enter(false, after(50.0), after(1e4)).unwrap();
+        assert!(
+            readers.enter(false, after(50.0), after(1e4)).is_err()
+                && readers.enter(false, after(100.0), after(1e4)).is_ok()
+        );
+        assert!(readers.enter(false, after(100.0), after(200.0)).is_err(), "it would end too late");
         drop((reading, waiting));
-        assert!(readers.busy().wait.is_zero() && readers.enter(after(50.0), after(50.0)).is_ok());
+        assert!(readers.busy().wait.is_zero() && readers.enter(false, after(50.0), after(50.0)).is_ok());
     }
 
     #[tokio::test]
@@ -225,7 +242,7 @@ mod tests {
         // A free reader tries it, because the estimate may be wrong.
         let (first, second) = (read(&readers).await, read(&readers).await);
         let begin = async |seconds: f64, free: Vec<Reading>| {
-            let waiting = readers.enter(after(seconds), after(1e4)).unwrap();
+            let waiting = readers.enter(false, after(seconds), after(1e4)).unwrap();
             drop(free);
             let permit = Arc::clone(&readers.permits).acquire_owned().await.unwrap();
             readers.lock().ended = ReadTimes { mean: 10.0, deviation: 2.0 };
@@ -256,5 +273,22 @@ mod tests {
         assert!(second.is_err() && other.is_ok());
         drop(first);
         assert!(readers.wait(Some(1), after(1.0), after(1.0)).await.is_ok());
+    }
+
+    #[tokio::test]
+    async fn requests_that_wait_for_the_share_of_their_client_delay_no_other_client() {
+        let readers = Readers::new(2, 0.5);
+        readers.lock().ended.learn(10.0);
+        let _reading = readers.wait(Some(1), after(30.0), after(60.0)).await.unwrap();
+        let mut waiting = Vec::new();
+        for _ in 0..2 {
+            let readers = readers.clone();
+            waiting.push(tokio::spawn(async move { readers.wait(Some(1), after(30.0), after(60.0)).await }));
+            tokio::task::yield_now().await;
+        }
+        // Three requests of 10 s are ahead of the next one of this client, and none of others.
+        assert!(readers.wait(Some(1), after(30.0), after(60.0)).await.is_err_and(|busy| busy.wait.as_secs() == 30));
+        assert!(readers.wait(Some(2), after(30.0), after(60.0)).await.is_ok());
+        waiting.iter().for_each(tokio::task::JoinHandle::abort);
     }
 }
