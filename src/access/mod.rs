@@ -21,7 +21,7 @@ pub(crate) use fields::{rate_limit, rate_limit_policy};
 pub(crate) use file::parse as parse_key_file;
 pub(crate) use forwarded::client as forwarded_client;
 pub(crate) use keys::Denied;
-pub(crate) use sign::{SIGNATURE, Signature, SignatureCheck, remove_signature};
+pub(crate) use sign::{Signature, SignatureCheck, remove_signature};
 pub(crate) use sites::{Sites, authority};
 
 pub use account::Quota;

@@ -10,10 +10,8 @@ use super::guard::Caller;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AreaParameters, ConditionHeaders, StructurePath};
 use super::openapi::problem_responses;
-use super::openapi::problems::{LISTING, READING};
 use super::parsed_request::Pairs;
 use super::problem::Problem;
-use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::Shared;
 use crate::jobs::Failure;
@@ -21,7 +19,7 @@ use crate::pipeline::areas;
 use crate::pipeline::params;
 use crate::pipeline::params::areas::AreasRequest;
 
-problem_responses!(Problems: [READING, LISTING, [ProblemType::TooManyCopies]]);
+problem_responses!(Problems: [READING LISTING] TooManyCopies);
 
 /// List the exact areas of a structure
 ///
@@ -31,10 +29,7 @@ problem_responses!(Problems: [READING, LISTING, [ProblemType::TooManyCopies]]);
 #[utoipa::path(get, path = "/v1/structures/{digest}/areas", tag = "structures", operation_id = "listAreas",
     params(StructurePath, AreaParameters, ConditionHeaders),
     responses(
-        (status = 200, description = "The areas.", body = String, content_type = "text/csv", headers(
-            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
-            ("Cache-Control" = String, description = "Caching rules."),
-        )),
+        (status = 200, description = "The areas.", body = String, content_type = "text/csv", headers(("ETag"), ("Cache-Control"))),
         NotModified, Problems,
     ))]
 pub(super) async fn list(

@@ -14,10 +14,8 @@ use super::guard::Caller;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{AtomParameters, ConditionHeaders, StructurePath};
 use super::openapi::problem_responses;
-use super::openapi::problems::{LISTING, READING};
 use super::parsed_request::Pairs;
 use super::problem::Problem;
-use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
 use crate::structure::{self, Selected, Structure, element};
@@ -101,7 +99,7 @@ impl Serialize for InsertionCode {
     }
 }
 
-problem_responses!(Problems: [READING, LISTING, [ProblemType::TooManyCopies]]);
+problem_responses!(Problems: [READING LISTING] TooManyCopies);
 
 /// List the atoms of a structure
 ///
@@ -110,10 +108,7 @@ problem_responses!(Problems: [READING, LISTING, [ProblemType::TooManyCopies]]);
 #[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
     params(StructurePath, AtomParameters, ConditionHeaders),
     responses(
-        (status = 200, description = "The atoms.", body = AtomsDocument, headers(
-            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
-            ("Cache-Control" = String, description = "Caching rules."),
-        )),
+        (status = 200, description = "The atoms.", body = AtomsDocument, headers(("ETag"), ("Cache-Control"))),
         NotModified, Problems,
     ))]
 pub(super) async fn list(

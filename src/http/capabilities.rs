@@ -9,7 +9,6 @@ use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
 use super::openapi::problem_responses;
-use super::problem_types::ProblemType;
 use super::state::Shared;
 use super::{form, pace, page, upload};
 use crate::config::Config;
@@ -239,7 +238,7 @@ struct Radii {
     values: Map<String, Value>,
 }
 
-problem_responses!(ShowProblems: [[ProblemType::BadRequest, ProblemType::BadParameter]]);
+problem_responses!(ShowProblems: [PARAMETERS]);
 
 /// List formats, parameters, limits and devices
 #[utoipa::path(get, path = "/v1/capabilities", tag = "service", operation_id = "capabilities",

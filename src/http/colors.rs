@@ -17,7 +17,6 @@ use super::guard::Caller;
 use super::openapi::meshes::AtomColorsResponse;
 use super::openapi::parameters::{ColorParameters, ConditionHeaders, RangeHeaders, StructurePath};
 use super::openapi::problem_responses;
-use super::openapi::problems::{LISTING, READING};
 use super::parsed_request::Pairs;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
@@ -34,7 +33,7 @@ pub(super) const LEGEND: HeaderName = HeaderName::from_static("molmesh-colors");
 /// Largest number of entries of the legend, which must fit into a header.
 const MAX_ENTRIES: usize = 24;
 
-problem_responses!(Problems: [READING, LISTING, [ProblemType::RangeNotSatisfiable]]);
+problem_responses!(Problems: [READING LISTING] RangeNotSatisfiable);
 
 /// Get the colours of the atoms of a structure
 ///

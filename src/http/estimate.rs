@@ -18,10 +18,9 @@ use super::guard::Caller;
 use super::openapi::bodies::{AS_FOR_MESHES, StructureFile};
 use super::openapi::parameters::{ContentEncodingHeader, MeshParameters};
 use super::openapi::problem_responses;
-use super::openapi::problems::{BODY, NAMED_STRUCTURE, PARAMETERS, ProblemDocument, READING};
+use super::openapi::problems::ProblemDocument;
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::problem::Problem;
-use super::problem_types::ProblemType;
 use super::request_id::RequestId;
 use super::source::Loaded;
 use super::state::Shared;
@@ -89,10 +88,9 @@ pub(super) struct EstimateDocument {
     backend: &'static str,
 }
 
-problem_responses!(EstimateProblems: [BODY, NAMED_STRUCTURE, PARAMETERS, READING, [
-    ProblemType::EmptySelection, ProblemType::TooManyCopies, ProblemType::TooManyParts, ProblemType::TooManyCandidates, ProblemType::PictureTooLarge,
-    ProblemType::Internal, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::Deadline,
-]]);
+problem_responses!(EstimateProblems: [BODY STRUCTURE ENTRY PARAMETERS READING WAITING]
+    EmptySelection TooManyCopies TooManyParts TooManyCandidates PictureTooLarge Internal Deadline
+);
 
 /// Estimate a mesh
 ///

@@ -17,7 +17,6 @@ use super::jobs;
 use super::openapi::parameters::{JobPath, LastEventIdHeader};
 use super::openapi::problem_responses;
 use super::problem::Problem;
-use super::problem_types::ProblemType;
 use super::state::Shared;
 use super::stop::{self, Stop};
 use crate::jobs::{JobId, JobView};
@@ -38,10 +37,7 @@ struct Listener {
     over: bool,
 }
 
-problem_responses!(EventsProblems: [[
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::RecordUnreadable,
-    ProblemType::OtherRelease, ProblemType::StoreFailed,
-]]);
+problem_responses!(EventsProblems: [RECORD]);
 
 /// Follow a job as server-sent events
 ///

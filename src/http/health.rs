@@ -71,7 +71,7 @@ impl ReadinessCheck {
     }
 }
 
-problem_responses!(ReadyProblems: [[ProblemType::NotReady]]);
+problem_responses!(ReadyProblems: [] NotReady);
 
 /// Check that the service is ready for requests
 ///

@@ -18,7 +18,7 @@ use super::delivery;
 use super::guard::Caller;
 use super::openapi::parameters::JobPath;
 use super::openapi::problem_responses;
-use super::openapi::problems::{MESHING, ProblemDocument, READING};
+use super::openapi::problems::ProblemDocument;
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::state::Shared;
@@ -128,20 +128,9 @@ impl Poll {
     }
 }
 
-problem_responses!(ShowProblems: [[
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::RecordUnreadable,
-    ProblemType::OtherRelease, ProblemType::StoreFailed,
-]]);
-problem_responses!(DismissProblems: [[
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::JobEnded,
-    ProblemType::RecordUnreadable, ProblemType::OtherRelease, ProblemType::StoreFull, ProblemType::StoreFailed,
-]]);
-problem_responses!(ResultProblems: [READING, MESHING, [
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchJob, ProblemType::NoResultYet, ProblemType::JobDismissed,
-    ProblemType::ResultGone, ProblemType::JobAbandoned,
-    ProblemType::RecordUnreadable, ProblemType::OtherRelease,
-    ProblemType::StoreFull, ProblemType::StoreFailed,
-]]);
+problem_responses!(ShowProblems: [RECORD]);
+problem_responses!(DismissProblems: [RECORD] JobEnded StoreFull);
+problem_responses!(ResultProblems: [RECORD READING MESHING] NoResultYet JobDismissed ResultGone JobAbandoned StoreFull);
 
 /// Reads the job id from the path.
 impl FromRequestParts<Shared> for JobId {
@@ -167,8 +156,7 @@ pub(super) fn no_such_job(id: &str) -> Problem {
 /// With `wait`, the response is delayed until the job has ended or the time has passed.
 #[utoipa::path(get, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "showJob", params(JobPath, Poll),
     responses(
-        (status = 200, description = "Status of the job.", body = JobDocument,
-            headers(("Retry-After" = u64, description = "Seconds to wait before the next request. Absent if waiting does not help.")),
+        (status = 200, description = "Status of the job.", body = JobDocument, headers(("Retry-After")),
             links(("result" = (operation_id = "showResult", parameters(("file" = "$response.body#/result")))))),
         ShowProblems,
     ))]
@@ -225,8 +213,7 @@ pub(super) async fn dismiss(State(app): State<Shared>, caller: Caller, id: JobId
 /// failed job the response is the error that the synchronous request would have returned.
 #[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
     responses(
-        (status = 303, description = "The job has succeeded.",
-            headers(("Location" = String, description = "Path of the result, job or structure."))),
+        (status = 303, description = "The job has succeeded.", headers(("Location"))),
         ResultProblems,
     ))]
 pub(super) async fn result(State(app): State<Shared>, caller: Caller, id: JobId) -> Result<Response, Problem> {

@@ -14,17 +14,13 @@ use super::openapi::bodies::{AS_FOR_MESHES, STRUCTURE_TO_MESH, StructureFile};
 use super::openapi::meshes::{MeshOrJob, ReportResponse};
 use super::openapi::parameters::{ContentEncodingHeader, MeshParameters, PreferenceHeaders};
 use super::openapi::problem_responses;
-use super::openapi::problems::{BODY, MESHING, NAMED_STRUCTURE, PARAMETERS, READING, SUBMITTING};
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::preferences::RequestPreferences;
 use super::problem::Problem;
-use super::problem_types::ProblemType;
 use super::state::Shared;
 use super::timing::Timing;
 
-problem_responses!(MeshProblems: [
-    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING, SUBMITTING, [ProblemType::NotAcceptable],
-]);
+problem_responses!(MeshProblems: [BODY STRUCTURE ENTRY PARAMETERS READING MESHING SUBMITTING] NotAcceptable);
 
 /// Mesh a structure
 ///
@@ -44,10 +40,7 @@ pub(super) async fn create(
     answer(&app, query, &headers, &extensions, body, false).await
 }
 
-problem_responses!(ReportProblems: [
-    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING,
-    [ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded],
-]);
+problem_responses!(ReportProblems: [BODY STRUCTURE ENTRY PARAMETERS READING MESHING WAITING]);
 
 /// Mesh a structure and return the report
 ///

@@ -128,7 +128,7 @@ impl Problem {
     pub(super) fn document(&self, instance: &str) -> Vec<u8> {
         let row = self.kind.row();
         let mut document = Map::new();
-        document.insert("type".to_owned(), format!("/problems/{}", row.slug).into());
+        document.insert("type".to_owned(), row.r#type.into());
         document.insert("title".to_owned(), row.title.into());
         document.insert("status".to_owned(), row.status.as_u16().into());
         document.insert("detail".to_owned(), self.detail.as_str().into());

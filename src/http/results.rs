@@ -41,13 +41,10 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
     format!("/v1/results/{key}.{extension}")
 }
 
-problem_responses!(ShowProblems: [[
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotFound, ProblemType::PreconditionFailed, ProblemType::RangeNotSatisfiable,
-    ProblemType::MemoryFull, ProblemType::ShareExceeded, ProblemType::StoreFailed,
-]]);
-problem_responses!(ReportProblems: [[
-    ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NotFound, ProblemType::PreconditionFailed, ProblemType::StoreFailed,
-]]);
+problem_responses!(ShowProblems: [PARAMETERS]
+    NotFound PreconditionFailed RangeNotSatisfiable MemoryFull ShareExceeded StoreFailed
+);
+problem_responses!(ReportProblems: [PARAMETERS] NotFound PreconditionFailed StoreFailed);
 
 /// Get a stored mesh
 ///
@@ -89,8 +86,7 @@ pub(super) async fn show(
 #[utoipa::path(get, path = "/v1/results/{key}/report.json", tag = "results", operation_id = "showReport",
     params(ResultPath, ConditionHeaders),
     responses(
-        (status = 200, description = "The report of the run that computed the mesh.", body = Report,
-            headers(("ETag" = String, description = "Strong validator: equal tags mean equal bytes."))),
+        (status = 200, description = "The report of the run that computed the mesh.", body = Report, headers(("ETag"))),
         NotModified, ReportProblems,
     ))]
 pub(super) async fn report(

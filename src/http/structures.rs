@@ -20,7 +20,6 @@ use super::openapi::parameters::{
     SurfaceParameters,
 };
 use super::openapi::problem_responses;
-use super::openapi::problems::{BODY, MESHING, PARAMETERS, READING, SUBMITTING};
 use super::problem::Problem;
 use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
@@ -115,22 +114,11 @@ struct AssemblyDocument {
     copies: Option<u64>,
 }
 
-problem_responses!(CreateProblems: [
-    BODY, READING,
-    [ProblemType::BadParameter, ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded,
-     ProblemType::StoreFull, ProblemType::StoreFailed],
-]);
-problem_responses!(ShowProblems: [
-    READING,
-    [
-        ProblemType::BadRequest, ProblemType::BadParameter, ProblemType::NoSuchStructure, ProblemType::PreconditionFailed,
-        ProblemType::TooMuchMemory, ProblemType::MemoryFull,
-        ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded, ProblemType::StoreFailed,
-    ],
-]);
-problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
-    ProblemType::NotFound, ProblemType::PreconditionFailed, ProblemType::RangeNotSatisfiable,
-]]);
+problem_responses!(CreateProblems: [BODY READING WAITING] BadParameter StoreFull StoreFailed);
+problem_responses!(ShowProblems: [PARAMETERS READING WAITING STRUCTURE] PreconditionFailed TooMuchMemory MemoryFull);
+problem_responses!(SurfaceProblems: [PARAMETERS READING MESHING SUBMITTING]
+    NotFound PreconditionFailed RangeNotSatisfiable
+);
 
 /// Upload a structure
 ///
@@ -144,11 +132,9 @@ problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
         content_type = "application/octet-stream",
     ),
     responses(
-        (status = 201, description = "The structure was stored.", body = StructureDocument,
-            headers(("Location" = String, description = "Path of the result, job or structure.")),
+        (status = 201, description = "The structure was stored.", body = StructureDocument, headers(("Location")),
             links(("mesh" = (operation_id = "meshStructure", parameters(("digest" = "$response.body#/digest")))))),
-        (status = 200, description = "The structure was already stored.", body = StructureDocument,
-            headers(("Location" = String, description = "Path of the result, job or structure."))),
+        (status = 200, description = "The structure was already stored.", body = StructureDocument, headers(("Location"))),
         CreateProblems,
     ))]
 pub(super) async fn create(
@@ -187,10 +173,7 @@ pub(super) async fn create(
 #[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
     params(StructurePath, ConditionHeaders),
     responses(
-        (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(
-            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
-            ("Cache-Control" = String, description = "Caching rules."),
-        )),
+        (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(("ETag"), ("Cache-Control"))),
         NotModified, ShowProblems,
     ))]
 pub(super) async fn show(
@@ -218,10 +201,7 @@ pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
     request.answer().await
 }
 
-problem_responses!(ReportProblems: [
-    PARAMETERS, READING, MESHING,
-    [ProblemType::QueueFull, ProblemType::TooManyDeliveries, ProblemType::ShareExceeded],
-]);
+problem_responses!(ReportProblems: [PARAMETERS READING MESHING WAITING]);
 
 /// Mesh an uploaded structure and return the report
 #[utoipa::path(

@@ -15,10 +15,8 @@ use super::guard::Caller;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{ConditionHeaders, StructurePath, SubtreeParameters, TilesetParameters};
 use super::openapi::problem_responses;
-use super::openapi::problems::{LISTING, READING};
 use super::parsed_request::{Pairs, parse_address};
 use super::problem::Problem;
-use super::problem_types::ProblemType;
 use super::source::{Loaded, StructureSource};
 use super::state::{Delivery, Shared};
 use crate::formats::Compress;
@@ -33,7 +31,7 @@ use crate::surface::{Control, SurfaceError};
 /// Memory of an instance in the document of an assembly, bytes.
 const DOCUMENT_BYTES: u64 = 4096;
 
-problem_responses!(Problems: [READING, LISTING, [ProblemType::TooManyCopies, ProblemType::GridTooLarge]]);
+problem_responses!(Problems: [READING LISTING] TooManyCopies GridTooLarge);
 
 /// Get the tileset of a structure
 ///
@@ -42,10 +40,7 @@ problem_responses!(Problems: [READING, LISTING, [ProblemType::TooManyCopies, Pro
 #[utoipa::path(get, path = "/v1/structures/{digest}/tileset.json", tag = "tilesets", operation_id = "showTileset",
     params(StructurePath, TilesetParameters, ConditionHeaders),
     responses(
-        (status = 200, description = "The tileset.", body = serde_json::Value, headers(
-            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
-            ("Cache-Control" = String, description = "Caching rules."),
-        )),
+        (status = 200, description = "The tileset.", body = serde_json::Value, headers(("ETag"), ("Cache-Control"))),
         NotModified, Problems,
     ))]
 pub(super) async fn show(request: TilesetRequest) -> Result<Response, Problem> {
@@ -58,10 +53,7 @@ pub(super) async fn show(request: TilesetRequest) -> Result<Response, Problem> {
 #[utoipa::path(get, path = "/v1/structures/{digest}/tileset.subtree", tag = "tilesets", operation_id = "showSubtree",
     params(StructurePath, SubtreeParameters, ConditionHeaders),
     responses(
-        (status = 200, description = "The subtree.", body = Vec<u8>, content_type = "application/octet-stream", headers(
-            ("ETag" = String, description = "Strong validator: equal tags mean equal bytes."),
-            ("Cache-Control" = String, description = "Caching rules."),
-        )),
+        (status = 200, description = "The subtree.", body = Vec<u8>, content_type = "application/octet-stream", headers(("ETag"), ("Cache-Control"))),
         NotModified, Problems,
     ))]
 pub(super) async fn show_subtree(request: TilesetRequest) -> Result<Response, Problem> {

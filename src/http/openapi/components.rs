@@ -1,15 +1,18 @@
-//! Post-processing of the OpenAPI document: moves repeated parameters, responses and headers to `components`, and adds
-//! the request bodies that no operation declares and the example of a report.
+//! Post-processing of the OpenAPI document: moves repeated parameters and responses to `components`, and adds the
+//! components that follow from no type, such as headers, and the example of a report.
 
 use serde_json::{Map, Value, json};
 
-use super::bodies::request_bodies;
+use crate::http::delivery::{PICTURE, SUMMARY, SummaryHeader};
+use crate::http::problem_types::PROBLEM_TYPES;
 use crate::pipeline::params::areas;
 
 /// Temporary extension of an error response with its problem types, from which [`share`] derives the name of the
 /// component.
 pub(super) const PROBLEM_TYPES_EXTENSION: &str = "x-problem-types";
 
+/// Components that follow from no type and no table, as YAML.
+const FIXED: &str = include_str!("components.yaml");
 /// Example of a report, as JSON.
 const REPORT_EXAMPLE: &str = include_str!("report_example.json");
 
@@ -39,7 +42,7 @@ const ERROR_NAMES: &[(&str, &[&str], &str)] = &[
 ];
 
 /// Replaces inline parameters, headers and the responses of several operations by references into `components`.
-pub(super) fn share(document: &mut Value) {
+pub(super) fn share(document: &mut Value) -> Result<(), yaml_serde::Error> {
     let mut shared = Components::default();
     let operations = members(document, "paths").flat_map(|(path, item)| {
         let operations = item.as_object_mut().into_iter().flat_map(Map::values_mut);
@@ -56,7 +59,7 @@ pub(super) fn share(document: &mut Value) {
         }
         for (status, response) in members(operation, "responses") {
             for (name, header) in members(response, "headers") {
-                shared.replace("headers", name, header);
+                *header = reference("headers", name);
             }
             if let Some(name) = response_name(status, response) {
                 if let Some(response) = response.as_object_mut() {
@@ -66,17 +69,26 @@ pub(super) fn share(document: &mut Value) {
             }
         }
     }
-    if let Some(components) = document.get_mut("components") {
-        members(components, "schemas").for_each(|(_, schema)| remove_least_counts(schema));
-        if let Some(Value::Object(report)) = components.pointer_mut("/schemas/Report") {
-            // `json!` of the schema's attribute cannot expand an object of this size.
-            report.insert("example".to_owned(), serde_json::from_str(REPORT_EXAMPLE).unwrap_or_default());
-        }
-        if let Value::Object(components) = components {
-            components.insert("requestBodies".to_owned(), request_bodies());
-            components.append(&mut shared.0);
+    let mut fixed: Value = yaml_serde::from_str(FIXED)?;
+    for SummaryHeader { name, kind, doc, .. } in SUMMARY.iter().chain(&PICTURE) {
+        fixed["headers"][*name] = json!({ "schema": { "type": kind }, "description": doc });
+    }
+    let types: Vec<&str> = PROBLEM_TYPES.iter().map(|row| row.r#type).collect();
+    fixed["schemas"]["Problem"]["properties"]["type"]["enum"] = types.into();
+    let components = &mut document["components"];
+    members(components, "schemas").for_each(|(_, schema)| remove_least_counts(schema));
+    // `json!` of the schema's attribute cannot expand an object of this size.
+    components["schemas"]["Report"]["example"] = serde_json::from_str(REPORT_EXAMPLE).unwrap_or_default();
+    for (kind, objects) in [fixed, Value::Object(shared.0)].iter_mut().filter_map(Value::as_object_mut).flatten() {
+        match (&mut components[kind], objects.take()) {
+            (Value::Object(present), Value::Object(mut objects)) => {
+                present.append(&mut objects);
+                present.sort_keys();
+            }
+            (absent, objects) => *absent = objects,
         }
     }
+    Ok(())
 }
 
 /// Removes `minimum: 0` from a schema and its members. Counts are never negative, and the document becomes shorter.
@@ -110,9 +122,13 @@ impl Components {
             number += 1;
             key = format!("{name}-{number}");
         }
-        let reference = json!({ "$ref": format!("#/components/{kind}/{key}") });
+        let reference = reference(kind, &key);
         of_kind.insert(key, std::mem::replace(value, reference));
     }
+}
+
+fn reference(kind: &str, name: &str) -> Value {
+    json!({ "$ref": format!("#/components/{kind}/{name}") })
 }
 
 /// Returns a parameter's own name. The first segment after the version precedes that of a path parameter (`jobs-id`),
@@ -170,7 +186,7 @@ mod tests {
             "paths": { "/jobs/{id}": operation("a"), "/jobs/{id}/x": operation("a"), "/jobs/{id}/y": operation("b") },
             "components": {},
         });
-        share(&mut document);
+        share(&mut document).unwrap();
         let parameter = |path: &str| &document["paths"][path]["get"]["parameters"][0];
         for path in ["/jobs/{id}", "/jobs/{id}/x"] {
             assert_eq!(parameter(path), &json!({ "$ref": "#/components/parameters/jobs-id" }));

@@ -4,7 +4,7 @@
 use bytes::Bytes;
 use utoipa::OpenApi;
 
-use super::{access, bodies, components, entries, parameters, problems, yaml};
+use super::{access, components, entries, parameters, problems, yaml};
 use crate::http::operations;
 
 const ABOUT: &str = "Watertight molecular-surface meshes from PDB, mmCIF, BinaryCIF, PQR and XYZ files.
@@ -35,9 +35,7 @@ and `.`, or a new one.";
         (name = "results", description = "Fetch stored meshes and their reports."),
         (name = "service", description = "Capabilities, problem types and health."),
     ),
-    components(schemas(
-        problems::ProblemDocument, crate::http::delivery::ReportDocument, bodies::NamedStructure, bodies::StructureForm,
-    )),
+    components(schemas(problems::ProblemDocument, crate::http::delivery::ReportDocument)),
 )]
 struct Description;
 
@@ -48,7 +46,7 @@ pub(in crate::http) fn texts() -> Result<[Bytes; 2], String> {
     access::restrict_operations(&mut api);
     parameters::add_choices(&mut api);
     let mut document = serde_json::to_value(api).map_err(|error| error.to_string())?;
-    components::share(&mut document);
+    components::share(&mut document).map_err(|error| error.to_string())?;
     let yaml = yaml::to_yaml(&document).map_err(|error| error.to_string())?;
     Ok([yaml.into(), format!("{document:#}").into()])
 }

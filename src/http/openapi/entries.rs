@@ -7,14 +7,8 @@ use utoipa::openapi::{OpenApi, RefOr};
 
 use super::components::PROBLEM_TYPES_EXTENSION;
 use super::parameters::EntryPath;
-use super::problems::responses;
+use super::problems;
 use crate::http::problem_types::{PROBLEM_TYPES, ProblemType};
-
-/// Problems of a path that names an uploaded structure.
-const STRUCTURE_PROBLEMS: &[ProblemType] = &[ProblemType::NoSuchStructure, ProblemType::StoreFailed];
-/// Problems of a path that names an archive entry.
-const ENTRY_PROBLEMS: &[ProblemType] =
-    &[ProblemType::NotInArchive, ProblemType::EntryTooLarge, ProblemType::ArchiveUnavailable];
 
 /// Adds the operations on archive entries, and the problems of naming a structure or an entry.
 pub(super) fn describe(api: &mut OpenApi) {
@@ -23,7 +17,7 @@ pub(super) fn describe(api: &mut OpenApi) {
         let Some(end) = path.strip_prefix("/v1/structures/{digest}/") else { continue };
         let mut entry = item.clone();
         entry.get.iter_mut().for_each(name_entry);
-        item.get.iter_mut().for_each(|operation| add_problems(operation, STRUCTURE_PROBLEMS));
+        item.get.iter_mut().for_each(|operation| add_problems(operation, problems::STRUCTURE));
         entries.push((format!("/v1/pdb/{{id}}/{end}"), entry));
     }
     api.paths.paths.extend(entries);
@@ -31,7 +25,7 @@ pub(super) fn describe(api: &mut OpenApi) {
 
 /// Changes an operation on an uploaded structure to the same operation on an archive entry.
 fn name_entry(operation: &mut Operation) {
-    add_problems(operation, ENTRY_PROBLEMS);
+    add_problems(operation, problems::ENTRY);
     operation.operation_id = operation.operation_id.as_deref().map(entry_operation_id);
     let summary = operation.summary.as_ref();
     operation.summary = summary
@@ -63,7 +57,7 @@ fn add_problems(operation: &mut Operation, more: &[ProblemType]) {
         lists.any(|slugs| slugs.iter().any(|slug| *slug == problem_type.row().slug))
     };
     let present: Vec<ProblemType> = PROBLEM_TYPES.iter().map(|row| row.problem_type).filter(is_present).collect();
-    operation.responses.responses.extend(responses(&[&present, more]));
+    operation.responses.responses.extend(problems::responses(&[&present, more]));
 }
 
 #[cfg(test)]

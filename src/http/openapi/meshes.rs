@@ -3,39 +3,19 @@
 use std::collections::BTreeMap;
 
 use utoipa::openapi::link::Link;
-use utoipa::openapi::schema::Type;
-use utoipa::openapi::{
-    Content, ContentBuilder, Header, HeaderBuilder, ObjectBuilder, Ref, RefOr, Response, ResponseBuilder,
-};
+use utoipa::openapi::{Content, ContentBuilder, Header, Ref, RefOr, Response, ResponseBuilder};
 use utoipa::{IntoResponses, ToSchema};
 
 use super::bodies::binary;
+use super::problems::with_headers;
 use crate::formats::Format;
 use crate::http::delivery::{PICTURE, ReportDocument, SUMMARY};
 use crate::http::jobs::JobDocument;
 use crate::http::negotiate::OCTETS;
 
-/// Descriptions of headers that several responses have. Equal descriptions become one component.
-const ETAG: &str = "Strong validator: equal tags mean equal bytes.";
-const RANGES: &str = "`bytes`, if parts of the file can be requested.";
-
-fn header(kind: Type, doc: &str) -> Header {
-    HeaderBuilder::new().schema(Some(ObjectBuilder::new().schema_type(kind))).description(Some(doc)).build()
-}
-
-fn text(doc: &str) -> Header {
-    header(Type::String, doc)
-}
-
 /// Adds the headers that summarize the report.
 fn summarized(response: ResponseBuilder) -> ResponseBuilder {
-    let all = SUMMARY.iter().chain(&PICTURE);
-    all.fold(response, |response, summary| response.header(summary.name, header(summary.kind.clone(), summary.doc)))
-}
-
-fn timed(response: ResponseBuilder) -> ResponseBuilder {
-    let doc = "Time per stage in ms; the entries add up to `total`. `cache;desc=hit` marks a stored result.";
-    response.header("Server-Timing", text(doc))
+    with_headers(response, SUMMARY.iter().chain(&PICTURE).map(|summary| summary.name))
 }
 
 fn reference<T: ToSchema>() -> Content {
@@ -49,23 +29,15 @@ fn whole() -> RefOr<Response> {
                `application/ply`, `model/x-ply-text`, `model/stl`, `model/obj`, `model/x-vtp`, \
                `model/x-msms-vert`, `model/x-msms-face` or `image/png`; `application/octet-stream` if `Accept` \
                prefers it.";
-    let response = ResponseBuilder::new()
-        .description(doc)
-        .header("Accept-Ranges", text(RANGES))
-        .header("Cache-Control", text("Caching rules."))
-        .header("Content-Disposition", text("Suggested file name."))
-        .header(
-            "Content-Location",
-            text("Path of the stored result: `/v1/results/{file}`. Absent if it is not stored."),
-        )
-        .header("ETag", text(ETAG))
-        .header("Vary", text("`accept`, in responses whose media type depends on `Accept`."));
+    let response = ResponseBuilder::new().description(doc);
+    let response = with_headers(response, ["ETag", "Cache-Control", "Accept-Ranges"]);
+    let response = with_headers(response, ["Content-Disposition", "Content-Location", "Server-Timing", "Vary"]);
     let file = || ContentBuilder::new().schema(Some(binary("Bytes of the file."))).build();
     let types = Format::ALL.map(Format::media_type).into_iter();
     let others = types.filter(|media_type| !media_type.starts_with("model/"));
     let types = [OCTETS, "model/*"].into_iter().chain(others);
     let add = |response: ResponseBuilder, media_type| response.content(media_type, file());
-    RefOr::T(types.fold(summarized(timed(response)), add).build())
+    RefOr::T(types.fold(summarized(response), add).build())
 }
 
 /// 202: a job, with links to the operations on it.
@@ -76,56 +48,33 @@ fn accepted() -> RefOr<Response> {
     let response = ResponseBuilder::new()
         .description("A job was accepted: the request has `Prefer: respond-async`, or `Prefer: wait=` and the mesh takes longer.")
         .content("application/json", reference::<JobDocument>())
-        .header("Location", text("Path of the result, job or structure."))
-        .header("Retry-After", super::problems::retry_after())
-        .header("Preference-Applied", text("`respond-async`, if the request prefers it."))
         .link("job", link("showJob", "Status of the job."))
         .link("events", link("watchJob", "Events of the job."))
         .link("result", link("showJobResult", "Result of the job."))
         .link("cancel", link("dismissJob", "Cancels the job."));
-    RefOr::T(response.build())
+    RefOr::T(with_headers(response, ["Location", "Retry-After", "Preference-Applied"]).build())
 }
 
-/// Returns the response for a part of the content: that of status 200, with other headers.
+/// 206: a part of the content, described like that of status 200, with other headers.
 fn part_of(whole: RefOr<Response>) -> RefOr<Response> {
     let RefOr::T(mut response) = whole else { return whole };
     "The requested part of the file, with the headers of status 200.".clone_into(&mut response.description);
     response.headers.clear();
-    response.headers.insert("Content-Range".to_owned(), text(super::problems::CONTENT_RANGE).into());
+    response.headers.insert("Content-Range".to_owned(), Header::default().into());
     RefOr::T(response)
-}
-
-/// 206: a part of the file.
-fn part() -> RefOr<Response> {
-    part_of(whole())
 }
 
 /// 200: the colours of atoms.
 fn colors() -> RefOr<Response> {
     let list = ContentBuilder::new().schema(Some(binary("Red, green, blue and alpha of each atom."))).build();
-    let legend = "JSON object with `scheme`, for numeric schemes `palette` and `range`, and at most 24 entries of the \
-                  `legend`, each with `label` and `color`.";
-    let response = ResponseBuilder::new()
-        .description("The colours, four bytes per atom.")
-        .content(OCTETS, list)
-        .header("ETag", text(ETAG))
-        .header("Cache-Control", text("Caching rules."))
-        .header("Accept-Ranges", text(RANGES))
-        .header("molmesh-colors", text(legend));
-    RefOr::T(response.build())
-}
-
-fn part_of_colors() -> RefOr<Response> {
-    part_of(colors())
+    let response = ResponseBuilder::new().description("The colours, four bytes per atom.").content(OCTETS, list);
+    RefOr::T(with_headers(response, ["ETag", "Cache-Control", "Accept-Ranges", "molmesh-colors"]).build())
 }
 
 /// 304: the client has the current version.
 fn unchanged() -> RefOr<Response> {
-    let response = ResponseBuilder::new()
-        .description("The client already has the current version.")
-        .header("ETag", text(ETAG))
-        .header("Cache-Control", text("Caching rules."));
-    RefOr::T(response.build())
+    let response = ResponseBuilder::new().description("The client already has the current version.");
+    RefOr::T(with_headers(response, ["ETag", "Cache-Control"]).build())
 }
 
 /// Declares a type that describes responses by status.
@@ -148,15 +97,15 @@ answers!(
 );
 answers!(
     /// Responses of a path that names a structure.
-    CacheableMeshOrJob: "200": whole(), "202": accepted(), "206": part(), "304": unchanged()
+    CacheableMeshOrJob: "200": whole(), "202": accepted(), "206": part_of(whole()), "304": unchanged()
 );
 answers!(
     /// Responses of a stored result.
-    StoredMesh: "200": whole(), "206": part(), "304": unchanged()
+    StoredMesh: "200": whole(), "206": part_of(whole()), "304": unchanged()
 );
 answers!(
     /// Responses with the colours of atoms.
-    AtomColorsResponse: "200": colors(), "206": part_of_colors(), "304": unchanged()
+    AtomColorsResponse: "200": colors(), "206": part_of(colors()), "304": unchanged()
 );
 answers!(
     /// Response of a conditional request for a document.
@@ -171,5 +120,5 @@ fn report() -> RefOr<Response> {
     let response = ResponseBuilder::new()
         .description("The report. It is not cached, because its times are those of this request.")
         .content("application/json", reference::<ReportDocument>());
-    RefOr::T(summarized(timed(response)).build())
+    RefOr::T(summarized(with_headers(response, ["Server-Timing"])).build())
 }
